@@ -18,7 +18,7 @@ use blindgrasp_objects::{objects_id, objects_named};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::{Manifest, RecordingError, RecordingInfo, RecordingReader, RecordingWriter, part_path};
 use blindgrasp_simulator::candidate::SimulatedGrasp;
-use blindgrasp_simulator::options::{SimulatorOptions, check_hand};
+use blindgrasp_simulator::options::{SimulatorOptions, Thresholds, check_hand};
 use blindgrasp_simulator::protocol::Approach;
 use blindgrasp_simulator::simulator::{Part, SimulateError, Simulation, SimulationReport};
 use blindgrasp_stages::hand::Hand;
@@ -56,6 +56,9 @@ pub(super) struct Arguments {
     /// which takes a second of CPU time a candidate [default: wrench-space].
     #[arg(long, value_parser = label)]
     label: Option<Label>,
+    /// Least epsilon and volume of a stable grasp with label wrench-space [default: 0.07,0.1, the paper's].
+    #[arg(long, value_name = "EPSILON,VOLUME", value_parser = thresholds)]
+    thresholds: Option<Thresholds>,
     /// Approach of the palm: blind, from anywhere; planned, by a planner that knows the object [default: blind].
     #[arg(long, value_parser = approach)]
     protocol: Option<Approach>,
@@ -286,6 +289,7 @@ fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {
     options.seed = arguments.seed.unwrap_or(options.seed);
     options.label = arguments.label.unwrap_or(options.label);
     options.protocol.approach = arguments.protocol.unwrap_or(options.protocol.approach);
+    options.thresholds = arguments.thresholds.unwrap_or(options.thresholds);
     options.friction = arguments.friction.unwrap_or(options.friction);
     if let Some(StableFraction(fraction)) = arguments.stable_fraction {
         options.stable_fraction = fraction;
@@ -306,6 +310,13 @@ fn stable_fraction(text: &str) -> Result<StableFraction, String> {
     }
 }
 
+fn thresholds(text: &str) -> Result<Thresholds, String> {
+    let numbers = text.split_once(',').and_then(|(epsilon, volume)| {
+        Some(Thresholds { epsilon: epsilon.trim().parse().ok()?, volume: volume.trim().parse().ok()? })
+    });
+    numbers.ok_or_else(|| "expected two numbers, as in 0.03,0.02".into())
+}
+
 fn label(text: &str) -> Result<Label, String> {
     let found = Label::ALL.into_iter().find(|label| label.word() == text);
     found.ok_or_else(|| "expected wrench-space or lift".into())
@@ -316,13 +327,19 @@ fn label(text: &str) -> Result<Label, String> {
 struct AllOptions<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     label: Option<Label>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    thresholds: Option<Thresholds>,
     #[serde(flatten)]
     options: &'a SimulatorOptions,
 }
 
 impl<'a> AllOptions<'a> {
     fn of(options: &'a SimulatorOptions) -> Self {
-        AllOptions { label: (options.label == Label::default()).then_some(options.label), options }
+        AllOptions {
+            label: (options.label == Label::default()).then_some(options.label),
+            thresholds: options.thresholds.is_default().then_some(options.thresholds),
+            options,
+        }
     }
 }
 
@@ -390,10 +407,15 @@ fn print_report(json: bool, out: &Path, report: &SimulationReport) -> anyhow::Re
         print_line(&serde_json::to_string_pretty(report)?)?;
         return Ok(());
     }
+    let Thresholds { epsilon, volume } = report.thresholds;
+    let meaning = match report.label {
+        Label::WrenchSpace => format!("wrench-space (stable: epsilon > {epsilon} and volume > {volume})"),
+        label => label.meaning().into(),
+    };
     let share = |part: usize, whole: usize| percent((whole > 0).then(|| part as f64 / whole as f64));
     for (what, value) in [
         ("recorded to", out.display().to_string()),
-        ("label", report.label.meaning().into()),
+        ("label", meaning),
         ("grasps", format!("{}, {} stable", report.n_grasps, share(report.n_stable, report.n_grasps))),
         (
             "candidates",

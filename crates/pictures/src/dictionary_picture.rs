@@ -60,6 +60,7 @@ pub fn dictionary_svg(hand: &Hand, joints_rad: &[f64], words: &[DrawnWord]) -> R
         object: ObjectSurface::Unknown(String::new()),
         prediction: None,
         decision: None,
+        is_hand_alone: false,
     };
     let placed = Placed::new(hand, &posture)?;
     let surfaces = Surfaces::new(&placed);

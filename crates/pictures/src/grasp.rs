@@ -21,7 +21,7 @@ pub enum ObjectSurface {
 pub struct RecordedGrasp {
     /// Its number.
     pub grasp_id: u64,
-    /// Its frames in order; the last settled one is shown, else the last one.
+    /// Its frames in order; the last settled one is shown, else the last one, of a hand alone the first one.
     pub frames: Vec<Stamped<TactileFrame>>,
     /// What it really was, where the recording says.
     pub truth: Option<GraspTruth>,
@@ -33,6 +33,33 @@ pub struct RecordedGrasp {
     pub prediction: Option<Prediction>,
     /// What the arbiter decided, where the recording says.
     pub decision: Option<LiftDecision>,
+    /// Whether this is no grasp, but a hand that is shown by itself.
+    pub is_hand_alone: bool,
+}
+
+impl RecordedGrasp {
+    /// A hand by itself in these postures (joint values), each of its cells pressed by 1 N, so that its normal shows.
+    pub fn hand_alone(hand: &Hand, postures: &[Vec<f64>]) -> RecordedGrasp {
+        let frame = |joints_rad: &Vec<f64>| TactileFrame {
+            phase: Phase::Open,
+            joints_rad: joints_rad.clone(),
+            cells_newtons: vec![1.0; hand.n_cells()],
+            ..TactileFrame::default()
+        };
+        RecordedGrasp {
+            grasp_id: 0,
+            frames: postures
+                .iter()
+                .map(|posture| Stamped { header: Default::default(), message: frame(posture) })
+                .collect(),
+            truth: None,
+            scene: None,
+            object: ObjectSurface::Unknown(String::new()),
+            prediction: None,
+            decision: None,
+            is_hand_alone: true,
+        }
+    }
 }
 
 /// What a contact is to the picture.
@@ -99,8 +126,7 @@ impl<'a> Placed<'a> {
                 .map_err(|source| PictureError::Joints { grasp_id: grasp.grasp_id, source })?;
         }
         let settled = grasp.frames.iter().rev().find(|frame| frame.message.phase == Phase::Settled);
-        let frame = settled
-            .or(grasp.frames.last())
+        let frame = if grasp.is_hand_alone { grasp.frames.first() } else { settled.or(grasp.frames.last()) }
             .map(|frame| &frame.message)
             .ok_or(PictureError::NoFrames { grasp_id: grasp.grasp_id })?;
         // The scene's joints are what the contacts belong to; the frame's are rounded by the encoders.
@@ -110,6 +136,7 @@ impl<'a> Placed<'a> {
             .map_err(|source| PictureError::Joints { grasp_id: grasp.grasp_id, source })?;
         let (mut notes, mut contacts, mut object_in_palm) = (Vec::new(), Vec::new(), None);
         match (&grasp.scene, &grasp.object) {
+            (None, _) if grasp.is_hand_alone => {}
             (None, _) => notes.push(
                 "Object and contacts are not known: the recording has no /scene for this grasp. Shown are the active \
                  cells."

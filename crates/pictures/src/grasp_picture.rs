@@ -78,7 +78,10 @@ pub(super) fn draw(placed: &Placed<'_>, surfaces: &Surfaces, cameras: &[Camera; 
         [COLUMN, TOP + 2.0],
         Anchor::Start,
         "head",
-        &format!("CELLS, {} FRAME", placed.frame.phase.as_str().to_uppercase()),
+        &match placed.grasp.is_hand_alone {
+            true => "CELLS".into(),
+            false => format!("CELLS, {} FRAME", placed.frame.phase.as_str().to_uppercase()),
+        },
     );
     let pads_height = draw_pads(&mut svg, placed, [COLUMN, TOP + 16.0], column_width, VIEW[1] - 16.0)?;
     // A hand with few joints has them under its pads, aligned with the contacts where there is room.
@@ -86,20 +89,31 @@ pub(super) fn draw(placed: &Placed<'_>, surfaces: &Surfaces, cameras: &[Camera; 
     let left_end = draw_contacts(&mut svg, placed, below);
     let right_end = draw_joints(&mut svg, placed, joints_top, column_width);
     let height = left_end.max(right_end) + MARGIN - 6.0;
-    let title = format!("Grasp {} of {}", placed.grasp.grasp_id, title(placed.grasp));
-    Ok(svg.finish(WIDTH, height, &title, STYLE))
+    Ok(svg.finish(WIDTH, height, &page_title(placed), STYLE))
+}
+
+/// The title of the document.
+pub(super) fn page_title(placed: &Placed<'_>) -> String {
+    match placed.grasp {
+        grasp if grasp.is_hand_alone => format!("Hand {}", placed.hand.name),
+        grasp => format!("Grasp {} of {}", grasp.grasp_id, title(grasp)),
+    }
 }
 
 fn draw_header(svg: &mut Svg, placed: &Placed<'_>) {
     let grasp = placed.grasp;
-    let title = fit_text(&title(grasp), 25.0, 420.0);
+    let title = if grasp.is_hand_alone { placed.hand.name.clone() } else { title(grasp) };
+    let title = fit_text(&title, 25.0, 420.0);
     svg.text([MARGIN, 50.0], Anchor::Start, "title", &title);
     let mut about = Vec::new();
     if let Some(truth) = &grasp.truth {
         about.push(format!("class {}", truth.class));
         about.push(format!("grasp {}", grasp.grasp_id));
     }
-    about.push(format!("hand {}", placed.hand.name));
+    match grasp.is_hand_alone {
+        true => about.push("the hand and its cells".into()),
+        false => about.push(format!("hand {}", placed.hand.name)),
+    }
     if let Some(scene) = &grasp.scene {
         about.push(format!("{:.0} g", 1000.0 * scene.mass_kg));
         about.push(format!("friction {}", px(scene.friction)));
@@ -142,6 +156,12 @@ fn draw_header(svg: &mut Svg, placed: &Placed<'_>) {
             let (text, fill) = if truth.stable { ("stable", green) } else { ("unstable", red) };
             chip(svg, text, "true label", fill, "light");
         }
+        None if grasp.is_hand_alone => {
+            let (n_joints, n_pads) = (placed.hand.joints.len(), placed.hand.pads.len());
+            chip(svg, &placed.hand.n_cells().to_string(), "cells", grey, "");
+            chip(svg, &n_pads.to_string(), "pads", grey, "");
+            chip(svg, &n_joints.to_string(), "joints", grey, "");
+        }
         None => chip(svg, "not labelled", "true label", grey, ""),
     }
     svg.element("line", &[("x1", &MARGIN), ("x2", &(WIDTH - MARGIN)), ("y1", &93), ("y2", &93), ("class", &"rule")]);
@@ -167,7 +187,10 @@ fn draw_contacts(svg: &mut Svg, placed: &Placed<'_>, top: f64) -> f64 {
         y += 24.0;
     }
     if placed.contacts.is_empty() {
-        if placed.grasp.scene.is_none() {
+        if placed.grasp.is_hand_alone {
+            let what = "lines: the normal of each cell, towards the object; joint values are below the pads";
+            svg.text([MARGIN, y + 4.0], Anchor::Start, "note", what);
+        } else if placed.grasp.scene.is_none() {
             let what = format!(
                 "lines: reading of each active cell along its normal; the longest possible is {} {}",
                 px(placed.scale_newtons),

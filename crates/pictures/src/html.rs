@@ -9,7 +9,7 @@ use super::PictureError;
 use super::colour::{HAND, OBJECT, Rgb, SILENT_CELL, bytes, force_colour, lightness};
 use super::geometry::{cells_in_link, link_mesh};
 use super::grasp::{ContactKind, Placed, RecordedGrasp};
-use super::grasp_picture::{VIEW, draw, style, title};
+use super::grasp_picture::{VIEW, draw, page_title, style};
 use super::pads::draw_pads;
 use super::svg::{Svg, escape};
 use super::view::{Surfaces, choose_cameras};
@@ -97,13 +97,13 @@ pub fn grasp_html(hand: &Hand, grasp: &RecordedGrasp) -> Result<String, PictureE
     let pads = pads.finish(300.0, height + 28.0, "Cells of the frame chosen", style());
     let data = serde_json::to_string(&data(&placed, cameras[0].azimuth_rad())?)
         .map_err(|source| PictureError::Data { source })?;
-    let title = escape(&format!("Grasp {} of {}", grasp.grasp_id, title(grasp)));
+    let title = escape(&page_title(&placed));
     Ok(format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>{title}</title>\n\
          <style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n<figure>\n{picture}</figure>\n\
-         <section>\n<h2>The grasp to turn</h2>\n<div class=\"scene\">\n\
-         <div class=\"stage\"><canvas id=\"stage\" tabindex=\"0\" aria-label=\"the grasp in three dimensions\"></canvas>\
+         <section>\n<h2>To turn</h2>\n<div class=\"scene\">\n\
+         <div class=\"stage\"><canvas id=\"stage\" tabindex=\"0\" aria-label=\"the hand in three dimensions\"></canvas>\
          <div id=\"numbers\"></div><p id=\"without-webgl\" hidden>This browser has no WebGL 2: the view to turn cannot be \
          shown.</p></div>\n<div id=\"pads\">{pads}</div>\n</div>\n\
          <div class=\"time\"><button id=\"play\" type=\"button\">Play</button>\

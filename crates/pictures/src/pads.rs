@@ -5,7 +5,7 @@ use nalgebra::Vector3;
 use super::PictureError;
 use super::colour::{SILENT_CELL, force_colour, hex, lightness};
 use super::grasp::{Placed, active_newtons};
-use super::svg::{Anchor, Svg, fit_text, px};
+use super::svg::{Anchor, Svg, fit_text, px, text_width};
 use blindgrasp_messages::TactileFrame;
 use blindgrasp_stages::hand::{Cell, CellUnit, Hand, Pad};
 
@@ -144,7 +144,16 @@ pub(super) fn draw_pads(
         let flat = &panel.pads[pad_idx];
         let room = (flat.width_m * panel.pixels_per_m).max(LEAST_WIDTH);
         svg.text([left, top + 11.0], Anchor::Start, "strong", &fit_text(&pad.name.replace('_', " "), 13.0, room));
-        let sum = pad_summary(placed.frame, pad, hand.cell_unit);
+        let n_cells = pad.cells.len();
+        let sum = match placed.grasp.is_hand_alone {
+            true => format!("{n_cells} cells").replace("1 cells", "1 cell"),
+            false => pad_summary(placed.frame, pad, hand.cell_unit),
+        };
+        // Where the numbers of newtons and cells would run into the next caption, the newtons have the room.
+        let sum = match sum.split_once(',') {
+            Some((newtons, _)) if text_width(&sum, 12.0) > room + GAP - 4.0 => newtons.into(),
+            _ => sum,
+        };
         svg.text_with([left, top + 27.0], Anchor::Start, "note", &sum, &[("data-pad", &pad_idx)]);
         for (idx, (cell, [cell_x, cell_y, cell_width, cell_height])) in pad.cells.iter().zip(&flat.cells).enumerate() {
             let cell_idx = pad.first_cell_idx + idx;
@@ -167,12 +176,16 @@ pub(super) fn draw_pads(
                 ],
             );
             if size[0] >= 15.0 && size[1] >= 10.5 {
-                let label = active.map_or(String::new(), cell_label);
+                let is_labelled = !placed.grasp.is_hand_alone;
+                let label = active.filter(|_| is_labelled).map_or(String::new(), cell_label);
                 let class = if lightness(fill) < DARK { "cell-force on-dark" } else { "cell-force" };
                 let at = [corner[0] + size[0] / 2.0, corner[1] + size[1] / 2.0 + 3.2];
                 svg.text_with(at, Anchor::Middle, class, &label, &[("data-force", &cell_idx)]);
             }
         }
+    }
+    if placed.grasp.is_hand_alone {
+        return Ok(panel.height);
     }
     draw_scale(svg, [x, y + panel.height + 16.0], width.min(230.0), placed.scale_newtons, hand.cell_unit);
     Ok(panel.height + SCALE_HEIGHT)

@@ -38,6 +38,7 @@ pub(super) fn simulated(objects: &str, seed: u64) -> (Hand, RecordedGrasp) {
         object,
         prediction: None,
         decision: None,
+        is_hand_alone: false,
     };
     (hand, recorded)
 }

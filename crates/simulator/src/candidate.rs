@@ -120,7 +120,7 @@ pub(super) fn try_candidate(
     match quality(&grasp_case(object, &exploration.palm_from_object, &contacts, options.friction)) {
         Ok(quality) => Ok(Outcome::Judged(Box::new(Judged {
             object_idx,
-            is_stable: quality.is_stable(),
+            is_stable: options.thresholds.hold(&quality),
             quality,
             made: Made::Closed(Grasp { object_idx, candidate, exploration, contacts }),
         }))),
@@ -146,7 +146,7 @@ impl Grasp {
                 grasp_id,
                 epsilon: quality.epsilon,
                 volume: quality.volume,
-                stable: quality.is_stable(),
+                stable: options.thresholds.hold(quality),
                 object: object.name.clone(),
                 class: object.class.clone(),
             },

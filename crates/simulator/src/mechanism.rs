@@ -27,6 +27,8 @@ pub struct Mechanism<'a> {
     movers: Vec<Vec<Mover>>,
     /// Per link: a bound on the speed of its points while everything closes, metres per unit of progress.
     pub(super) top_speed: Vec<f64>,
+    /// Per closing joint: the links of each finger that it moves by itself. More than one finger: mimic joints.
+    pub(super) fingers: Vec<Vec<Vec<usize>>>,
     /// Links that may come to touch each other while closing.
     pub pairs: Vec<(usize, usize)>,
 }
@@ -118,9 +120,28 @@ impl<'a> Mechanism<'a> {
                 movers[link_idx].iter().map(speed_of).sum()
             })
             .collect();
-        let mut mechanism = Mechanism { hand, shapes, joints, movers, top_speed, pairs: Vec::new() };
+        let fingers = joints.iter().map(|joint| fingers(hand, joint.joint_idx)).collect();
+        let mut mechanism = Mechanism { hand, shapes, joints, movers, top_speed, fingers, pairs: Vec::new() };
         mechanism.pairs = mechanism.pairs();
         mechanism
+    }
+
+    /// The joints' values while the hand closes on nothing from a posture on, in so many steps of equal progress. Links pass
+    /// through each other.
+    pub fn closing_postures(&self, from: &[f64], n_steps: usize) -> Vec<Vec<f64>> {
+        let end = self.joints.iter().map(|joint| joint.end).fold(0.0, f64::max);
+        (0..=n_steps)
+            .map(|step| {
+                let mut posture = from.to_vec();
+                let progress = end * step as f64 / n_steps as f64;
+                for joint in &self.joints {
+                    let of_hand = &self.hand.joints[joint.joint_idx];
+                    let value = from[joint.joint_idx] + joint.rate * progress;
+                    posture[joint.joint_idx] = value.clamp(of_hand.lower, of_hand.upper);
+                }
+                posture
+            })
+            .collect()
     }
 
     /// The progress at which a link came to its final place.
@@ -225,6 +246,27 @@ impl<'a> Mechanism<'a> {
         let moves_against = |(a, b): (usize, usize)| self.movers[a].iter().map(key).ne(self.movers[b].iter().map(key));
         self.hand.self_collision_pairs().iter().copied().filter(|pair| moves_against(*pair)).collect()
     }
+}
+
+/// The links that a joint moves, those of each finger together: a finger begins at a link that the joint moves and that
+/// hangs on no other such link.
+fn fingers(hand: &Hand, joint_idx: usize) -> Vec<Vec<usize>> {
+    let mut fingers: Vec<(usize, Vec<usize>)> = Vec::new();
+    for link_idx in 0..hand.links.len() {
+        let Some(first) = first_moved(hand, link_idx, joint_idx) else { continue };
+        match fingers.iter_mut().find(|(other, _)| *other == first) {
+            Some((_, links)) => links.push(link_idx),
+            None => fingers.push((first, vec![link_idx])),
+        }
+    }
+    fingers.into_iter().map(|(_, links)| links).collect()
+}
+
+/// Of the links that bear `link_idx`, and itself, the one nearest to the root that the joint moves.
+pub(crate) fn first_moved(hand: &Hand, link_idx: usize, joint_idx: usize) -> Option<usize> {
+    let is_moved =
+        |idx: &usize| matches!(hand.links[*idx].motion, Motion::Joint { joint_idx: by, .. } if by == joint_idx);
+    std::iter::successors(Some(link_idx), |idx| hand.links[*idx].parent_idx).filter(is_moved).last()
 }
 
 /// The greatest distance by which a link slides from its joint's origin.

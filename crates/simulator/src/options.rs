@@ -5,11 +5,11 @@ use serde::{Deserialize, Serialize};
 use super::contact_points::ContactOptions;
 use super::option_check::{OptionError, not_negative, require, share};
 use super::planner::PlannerOptions;
-use super::protocol::{Approach, ProtocolOptions};
+use super::protocol::ProtocolOptions;
 use super::soft_finger::SoftFingerOptions;
 use super::tactile_sensor::SensorOptions;
-use super::wrench_space::MAX_FRICTION;
-use crate::trial::{PhysicsOptions, TrialProtocol};
+use super::wrench_space::{MAX_FRICTION, Quality, STABLE_EPSILON, STABLE_VOLUME};
+use crate::trial::{PhysicsOptions, TrialProtocol, check_planner};
 use blindgrasp_stages::hand::{CellUnit, Hand};
 use blindgrasp_stages::label::Label;
 
@@ -24,6 +24,9 @@ pub struct SimulatorOptions {
     /// The meaning of stable. A lift takes about a second of CPU time a candidate.
     #[serde(skip_serializing_if = "Label::is_default")]
     pub label: Label,
+    /// The least epsilon and volume of a stable grasp, with label `wrench-space`.
+    #[serde(skip_serializing_if = "Thresholds::is_default")]
+    pub thresholds: Thresholds,
     /// Share of stable grasps among those kept, rounded to whole grasps; `None` keeps the natural share. 0.48, as in the
     /// paper.
     pub stable_fraction: Option<f64>,
@@ -59,6 +62,7 @@ impl Default for SimulatorOptions {
             n_grasps: 1000,
             seed: 0,
             label: Label::default(),
+            thresholds: Thresholds::default(),
             stable_fraction: Some(0.48),
             grasps_per_part: 500,
             max_candidates_per_grasp: 50,
@@ -94,6 +98,7 @@ impl SimulatorOptions {
         self.lift.check()?;
         match self.label {
             Label::WrenchSpace => {
+                self.thresholds.check()?;
                 require("lift", "set", self.lift.is_default(), "its default without label lift: nothing is lifted")
             }
             Label::Lift => self.check_for_lift(),
@@ -102,8 +107,8 @@ impl SimulatorOptions {
 
     /// Refuses options that the physics do not have.
     fn check_for_lift(&self) -> Result<(), OptionError> {
-        let is_blind = self.protocol.approach == Approach::Blind;
-        require("protocol.approach", "planned", is_blind, "blind with label lift: the physics have no planner")?;
+        let expected = "its default with label lift: whether the lift keeps the object decides";
+        require("thresholds", "set", self.thresholds.is_default(), expected)?;
         require(
             "frames.period_nanos",
             self.frames.period_nanos,
@@ -119,7 +124,39 @@ impl SimulatorOptions {
         ] {
             require(option, found, found == default, expected)?;
         }
-        require("planner", "set", self.planner == PlannerOptions::default(), expected)
+        check_planner(&self.planner)
+    }
+}
+
+/// A grasp is stable if both its qualities exceed these. Those of Dang & Allen (section IV) suit a hand of three fingers; a
+/// gripper's best grasps have an epsilon of about 0.04.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Thresholds {
+    pub epsilon: f64,
+    pub volume: f64,
+}
+
+impl Default for Thresholds {
+    fn default() -> Self {
+        Thresholds { epsilon: STABLE_EPSILON, volume: STABLE_VOLUME }
+    }
+}
+
+impl Thresholds {
+    /// Whether these are the paper's.
+    pub fn is_default(&self) -> bool {
+        *self == Thresholds::default()
+    }
+
+    /// Whether a grasp of this quality is stable.
+    pub fn hold(&self, quality: &Quality) -> bool {
+        quality.epsilon > self.epsilon && quality.volume > self.volume
+    }
+
+    fn check(&self) -> Result<(), OptionError> {
+        not_negative("thresholds.epsilon", self.epsilon)?;
+        not_negative("thresholds.volume", self.volume)
     }
 }
 

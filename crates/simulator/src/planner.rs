@@ -72,7 +72,7 @@ pub fn plan_start(
 
 /// A start whose palm faces a point of the surface along its normal, or the centre along a principal axis; roll and
 /// preshape are drawn as in a blind one.
-fn draw_approach(
+pub(crate) fn draw_approach(
     hand: &Hand,
     object: &Object,
     protocol: &ProtocolOptions,
@@ -125,7 +125,7 @@ fn surface_point(object: &Object, from_centre: &UnitVector3<f64>) -> (Point3<f64
 /// Mean over the pads of the distance to the object, in units of the scale and at most 1, and of 1 - cos of the angle
 /// between the pad's normal and the direction to the object: GraspIt!'s contact energy, at the closed hand, but that a
 /// pad which is not near counts the same however far it is.
-fn energy(
+pub(crate) fn energy(
     hand: &Hand,
     object: &Object,
     exploration: &Exploration,

@@ -1,6 +1,7 @@
 //! Blind exploration: the palm comes to the object from anywhere, then the fingers close with break-away.
 //!
-//! Nothing is pushed away: the object stays where it is. The hand is taken from its description, not assumed to be a
+//! Nothing is pushed away: the object stays where it is, unless one motor moves several fingers (a gripper's jaws, by a
+//! URDF's mimic joints). Such fingers push it without turning it until another one touches: a gripper centres what it grips. The hand is taken from its description, not assumed to be a
 //! Barrett hand: preshape joints without an open value are drawn, the other joints close from their open values towards
 //! their closed limits, all leaders at the same speed and followers at their ratio. One rule makes break-away: **a link that is stopped stops every joint that moves
 //! it**. A stopped proximal link stops its joint, and the follower goes on alone; a stopped distal link stops the
@@ -10,7 +11,7 @@
 //! motion goes that way: a finger that touches from the start with the side it closes to stays open, one that touches
 //! with its back closes. The reference link must not be moved by a closing joint.
 
-use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
@@ -153,6 +154,11 @@ const CHEAP_M: f64 = 0.03;
 const EXACT_M: f64 = 0.002;
 /// A link that touches but moves away is looked at again after this progress.
 const LEAVING_STEP: f64 = 5e-4;
+/// Fingers of one motor push an object at most so often, each time by half the way that is left.
+const MOST_PUSHES: usize = 20;
+/// Fingers farther from the object than this do not come to hold what another finger of their motor pushes.
+const FARTHEST_PUSH_M: f64 = 0.2;
+
 impl Mechanism<'_> {
     /// Approaches and closes. `None` if the hand passes by the object, or the open hand touches itself.
     ///
@@ -171,9 +177,74 @@ impl Mechanism<'_> {
             return Ok(None);
         };
         palm_from_object.translation.vector.z += start.back_off_m;
-        let joints = self.close(object, &palm_from_object, &start.open_joints_rad, options)?;
+        let mut joints = self.close(object, &palm_from_object, &start.open_joints_rad, options)?;
+        for _ in 0..MOST_PUSHES {
+            let posture = joints_rad(&start.open_joints_rad, &joints, f64::INFINITY);
+            let Some(push) = self.push(object, &palm_from_object, &posture, &joints, options)? else { break };
+            let pushed = Translation3::from(push) * palm_from_object;
+            if !self.is_apart(object, &pushed, &start.open_joints_rad)? {
+                break;
+            }
+            palm_from_object = pushed;
+            joints = self.close(object, &palm_from_object, &start.open_joints_rad, options)?;
+        }
         let end = joints.iter().map(|joint| joint.end).fold(0.0, f64::max);
         Ok(Some(Exploration { palm_from_object, open_joints_rad: start.open_joints_rad.clone(), joints, end }))
+    }
+
+    /// The way by which fingers of one motor push the object on: half the way from a finger that touches it to the nearest
+    /// finger that does not. `None` where no finger touches, or all do, or the motor is at its limit.
+    fn push(
+        &self,
+        object: &Object,
+        palm_from_object: &Isometry3<f64>,
+        joints_rad: &[f64],
+        joints: &[ClosingJoint],
+        options: &ProtocolOptions,
+    ) -> Result<Option<Vector3<f64>>, JointError> {
+        let palm_from_links = self.hand.palm_from_links(joints_rad)?;
+        let object_pose = pose_from_isometry(palm_from_object);
+        for (closing_idx, fingers) in self.fingers.iter().enumerate() {
+            if fingers.len() < 2 || joints[closing_idx].end >= self.joints[closing_idx].end {
+                continue;
+            }
+            let closest = fingers.iter().map(|links| {
+                let shapes = self.shapes.iter().filter(|shape| links.contains(&shape.link_idx));
+                shapes
+                    .filter_map(|shape| {
+                        let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
+                        let closest = shape.closest_to_object(&pose, &object_pose, object, FARTHEST_PUSH_M)?;
+                        Some((shape.link_idx, closest))
+                    })
+                    .min_by(|(_, a), (_, b)| a.distance_m.total_cmp(&b.distance_m))
+            });
+            let touches = |closest: &ClosestPoints| closest.distance_m <= options.touch_tolerance_m;
+            let (touching, apart): (Vec<_>, Vec<_>) = closest.flatten().partition(|(_, closest)| touches(closest));
+            let nearest = apart.iter().map(|(_, closest)| closest.distance_m).fold(f64::INFINITY, f64::min);
+            if let Some((link_idx, closest)) = touching.first()
+                && nearest.is_finite()
+            {
+                let velocity = self.velocity(*link_idx, closest.point_on_first, &palm_from_links, &self.joints, 0.0);
+                let direction = Vector3::new(velocity.x, velocity.y, velocity.z).try_normalize(1e-12);
+                return Ok(direction.map(|direction| direction * (nearest / 2.0)));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Whether no link of the hand is in the object.
+    fn is_apart(
+        &self,
+        object: &Object,
+        palm_from_object: &Isometry3<f64>,
+        joints_rad: &[f64],
+    ) -> Result<bool, JointError> {
+        let palm_from_links = self.hand.palm_from_links(joints_rad)?;
+        let object_pose = pose_from_isometry(palm_from_object);
+        Ok(self.shapes.iter().all(|shape| {
+            let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
+            shape.closest_to_object(&pose, &object_pose, object, EXACT_M).is_none_or(|closest| closest.distance_m > 0.0)
+        }))
     }
 
     /// Lets the object come down along the palm's -z until the first link touches it: `palm_from_object` then.

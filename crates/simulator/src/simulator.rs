@@ -20,7 +20,7 @@ use serde::{Deserialize, Serialize};
 use super::candidate::{self, CandidateError, Judged, Outcome, SimulatedGrasp};
 use super::mechanism::Mechanism;
 use super::option_check::OptionError;
-use super::options::{CellUnitError, check_hand};
+use super::options::{CellUnitError, Thresholds, check_hand};
 use crate::trial::lift_label;
 use blindgrasp_messages::{Phase, SceneContact};
 use blindgrasp_objects::Object;
@@ -61,6 +61,9 @@ pub struct SimulationReport {
     /// The meaning of stable.
     #[serde(default, skip_serializing_if = "Label::is_default")]
     pub label: Label,
+    /// The least qualities of a stable grasp, with label `wrench-space`.
+    #[serde(default, skip_serializing_if = "Thresholds::is_default")]
+    pub thresholds: Thresholds,
     /// Candidates tried, up to the last one kept.
     pub n_candidates: usize,
     /// Grasps kept.
@@ -109,7 +112,7 @@ pub struct ObjectReport {
 impl SimulationReport {
     /// Adds another part's report, of the same simulation.
     pub fn add(&mut self, other: &SimulationReport) {
-        self.label = other.label;
+        (self.label, self.thresholds) = (other.label, other.thresholds);
         self.n_candidates += other.n_candidates;
         self.n_grasps += other.n_grasps;
         self.n_stable += other.n_stable;
@@ -258,7 +261,8 @@ struct PartRun<'a> {
 
 impl<'a> PartRun<'a> {
     fn new(options: &SimulatorOptions, part: &'a Part) -> Self {
-        let report = SimulationReport { label: options.label, ..SimulationReport::default() };
+        let SimulatorOptions { label, thresholds, .. } = *options;
+        let report = SimulationReport { label, thresholds, ..SimulationReport::default() };
         PartRun { part, order: Order::new(options.seed, part), report }
     }
 

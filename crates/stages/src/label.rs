@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Label {
-    /// Epsilon and volume of the grasp wrench space exceed the thresholds of Dang & Allen.
+    /// Epsilon and volume of the grasp wrench space exceed thresholds: those of Dang & Allen, unless the simulation's options
+    /// have others.
     #[default]
     WrenchSpace,
     /// In physics (the simulator's lift trials), the object stays in the hand, which lifts, holds and shakes it.
@@ -27,7 +28,9 @@ impl Label {
     /// The label's meaning for people.
     pub fn meaning(self) -> &'static str {
         match self {
-            Label::WrenchSpace => "wrench-space (stable: epsilon > 0.07 and volume > 0.1)",
+            Label::WrenchSpace => {
+                "wrench-space (stable: epsilon > 0.07 and volume > 0.1, unless the simulation had other thresholds)"
+            }
             Label::Lift => "lift (stable: kept while lifted and shaken in physics)",
         }
     }

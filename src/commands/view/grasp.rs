@@ -16,7 +16,7 @@ use blindgrasp_recording::{Record, RecordingReader};
 
 /// The kind of picture, by the file's extension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Format {
+pub(super) enum Format {
     Svg,
     Html,
 }
@@ -37,7 +37,7 @@ pub(super) fn draw(recording: &Path, out: &Path, arguments: &GraspArguments) -> 
     Ok(Outcome::Done)
 }
 
-fn format_of(out: &Path) -> anyhow::Result<Format> {
+pub(super) fn format_of(out: &Path) -> anyhow::Result<Format> {
     match out.extension().and_then(|extension| extension.to_str()).map(str::to_lowercase).as_deref() {
         Some("svg") => Ok(Format::Svg),
         Some("html" | "htm") => Ok(Format::Html),
@@ -57,6 +57,7 @@ fn read_grasp(path: &Path, wanted: Option<u64>) -> anyhow::Result<RecordedGrasp>
         object: ObjectSurface::Unknown(String::new()),
         prediction: None,
         decision: None,
+        is_hand_alone: false,
     };
     let mut wanted_id = wanted;
     if wanted_id.is_none() {

@@ -2,34 +2,39 @@
 
 mod graph;
 mod grasp;
+mod hand;
 
 use std::path::{Path, PathBuf};
 
 use blindgrasp_graph::dataflow::Override;
 use clap::{Args, ValueEnum};
 
+use super::hand_cells::joint;
 use super::{Outcome, number_in};
 
-/// Draw a graph, running or not, or a recorded grasp.
+/// Draw a graph, running or not, a recorded grasp, or a hand.
 ///
 /// The programs of a dataflow file are run with --describe: a foreign dataflow file is code.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp view dataflow.yaml --out graph.svg\n         \
                         blindgrasp view --running --format mermaid\n         \
-                        blindgrasp view recordings/held-out.mcap --grasp 3 --out grasp.html\n\n\
+                        blindgrasp view recordings/held-out.mcap --grasp 3 --out grasp.html\n         \
+                        blindgrasp view hands/allegro.yaml --out hand.html\n\n\
                         In a graph, 'run' is the launching command: it reads the decisions, and the label where a source knows it.\n\
                         In a recording with /scene the object and all contacts are shown, in any other the active cells.")]
 pub(super) struct Arguments {
-    /// The dataflow file (YAML) or the recording (MCAP)
+    /// The dataflow file (YAML), the recording (MCAP), or a hand: its pad layout (YAML) or the name of a built-in one
     #[arg(default_value = "dataflow.yaml")]
     file: PathBuf,
-    /// Write to this file: .svg, .mmd or .dot for a graph, .svg or .html for a grasp
+    /// Write to this file: .svg, .mmd or .dot for a graph, .svg or .html for a grasp or a hand
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
     #[command(flatten)]
     graph: GraphArguments,
     #[command(flatten)]
     grasp: GraspArguments,
+    #[command(flatten)]
+    alone: HandArguments,
 }
 
 #[derive(Debug, Args)]
@@ -76,6 +81,14 @@ struct GraspArguments {
     objects: Option<PathBuf>,
 }
 
+#[derive(Debug, Args)]
+#[command(next_help_heading = "A hand")]
+struct HandArguments {
+    /// Posture: joints that are not open, in radians, or metres of a slide
+    #[arg(long, value_name = "NAME=VALUE,…", value_delimiter = ',', value_parser = joint)]
+    joints: Vec<(String, f64)>,
+}
+
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Format {
     /// A picture, laid out by Graphviz (the program `dot`).
@@ -88,6 +101,15 @@ enum Format {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let (graph, grasp) = (&arguments.graph, &arguments.grasp);
+    if graph.running.is_none() && hand::is_hand(&arguments.file) {
+        let Some(out) = &arguments.out else {
+            refuse("--out is missing: name the picture of the hand, .svg or .html");
+        };
+        return hand::draw(&arguments.file, out, &arguments.alone.joints);
+    }
+    if !arguments.alone.joints.is_empty() {
+        refuse("--joints is for hands: name a pad layout (.yaml) or a built-in hand");
+    }
     if graph.running.is_some() || is_dataflow(&arguments.file) {
         if grasp.grasp.is_some() || grasp.hand.is_some() || grasp.objects.is_some() {
             refuse("--grasp, --hand and --objects are for recordings: name an .mcap file");

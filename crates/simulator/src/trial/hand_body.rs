@@ -19,7 +19,7 @@ use rapier3d_f64::geometry::{ColliderHandle, Group};
 use rapier3d_f64::parry::mass_properties::MassProperties;
 use rapier3d_f64::parry::shape::{Shape, SharedShape};
 
-use crate::mechanism::{Mechanism, closing_rate};
+use crate::mechanism::{Mechanism, closing_rate, first_moved};
 use crate::trial::world::{MAX_LINKS_WITH_SHAPES, World, to_engine};
 use crate::trial::{PhysicsOptions, TrialError};
 use blindgrasp_stages::hand::{Hand, JointKind, Motion, pose_from_isometry};
@@ -412,16 +412,9 @@ fn travel(world: &World, axle: &Axle) -> f64 {
 /// speeds of the fingers, each that of the fastest middle of a pad, per speed of the joint.
 fn lever(mechanism: &Mechanism<'_>, joint_idx: usize, palm_from_links: &[Isometry3<f64>]) -> f64 {
     let hand = mechanism.hand;
-    let is_moved =
-        |idx: usize| matches!(hand.links[idx].motion, Motion::Joint { joint_idx: by, .. } if by == joint_idx);
-    // The outermost of the links that the joint moves and that bear a link.
-    let finger_of = |link_idx: usize| {
-        let above = std::iter::successors(Some(link_idx), |idx| hand.links[*idx].parent_idx);
-        above.filter(|idx| is_moved(*idx)).last()
-    };
     let mut fingers: Vec<(usize, f64)> = Vec::new();
     for pad in &hand.pads {
-        let Some(finger) = finger_of(pad.link_idx) else { continue };
+        let Some(finger) = first_moved(hand, pad.link_idx, joint_idx) else { continue };
         let middle = palm_from_links[pad.link_idx] * pad.middle_in_link_m();
         let speed = mechanism.speed(pad.link_idx, &middle, joint_idx, palm_from_links);
         match fingers.iter_mut().find(|(other, _)| *other == finger) {

@@ -107,7 +107,9 @@ fn varied(object: &Object, options: &SimulatorOptions, rng: &mut impl rand::Rng)
 /// The options of the physics: the simulator's where it has them, defaults elsewhere.
 fn trial_options(options: &SimulatorOptions) -> TrialOptions {
     TrialOptions {
+        planner: options.planner.clone(),
         protocol: TrialProtocol {
+            approach: options.protocol.approach,
             preshape_range: options.protocol.preshape_range,
             lateral_offset_m: options.protocol.lateral_offset_m,
             frame_nanos: options.frames.period_nanos,

@@ -31,6 +31,7 @@ use crate::OptionError;
 use blindgrasp_objects::Object;
 
 pub use attempt::{Attempt, Probe};
+pub(crate) use options::check_planner;
 pub use options::{PhysicsOptions, TrialOptions, TrialProtocol};
 pub use start::{choose_start, draw_start, sensor_seed};
 

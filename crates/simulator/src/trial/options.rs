@@ -8,7 +8,8 @@ use super::TrialError;
 use crate::OptionError;
 use crate::contact_points::ContactOptions;
 use crate::option_check::{not_negative, positive, require};
-use crate::protocol::check_preshape_range;
+use crate::planner::PlannerOptions;
+use crate::protocol::{Approach, check_preshape_range};
 use crate::soft_finger::SoftFingerOptions;
 use crate::tactile_sensor::SensorOptions;
 
@@ -18,6 +19,8 @@ use crate::tactile_sensor::SensorOptions;
 pub struct TrialOptions {
     /// Options of the hand's path and of the length of each phase.
     pub protocol: TrialProtocol,
+    /// Options of the planner, which the protocol's approach `planned` uses.
+    pub planner: PlannerOptions,
     /// Options of hand, stand and engine.
     pub physics: PhysicsOptions,
     /// Options of cells and encoders.
@@ -28,6 +31,9 @@ pub struct TrialOptions {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct TrialProtocol {
+    /// The approach of the palm. Blind, as the paper's robot. `planned` is for hands that need to know the object's place,
+    /// such as a gripper: the best of the planner's approaches from above.
+    pub approach: Approach,
     /// Part of their range from which preshape joints are drawn uniformly. `[0, 0.5]`, as in the training data.
     pub preshape_range: [f64; 2],
     /// Largest distance of the target's centre of mass from the palm's axis, uniform over the disc. 15 mm, as in the
@@ -83,6 +89,7 @@ pub struct TrialProtocol {
 impl Default for TrialProtocol {
     fn default() -> Self {
         TrialProtocol {
+            approach: Approach::Blind,
             preshape_range: [0.0, 0.5],
             lateral_offset_m: 0.015,
             least_descent_rad: 0.0,
@@ -197,9 +204,18 @@ impl TrialOptions {
     /// The first value that cannot be used.
     pub fn check(&self) -> Result<(), OptionError> {
         self.protocol.check()?;
+        self.planner.check()?;
+        check_planner(&self.planner)?;
         self.physics.check()?;
         self.sensor.check()
     }
+}
+
+/// Refuses the planner's option that lifts do not have.
+pub(crate) fn check_planner(options: &PlannerOptions) -> Result<(), OptionError> {
+    let stand_off_m = options.stand_off_m;
+    let is_default = stand_off_m == PlannerOptions::default().stand_off_m;
+    require("planner.stand_off_m", stand_off_m, is_default, "its default: a lift closes the hand where it touches")
 }
 
 impl TrialProtocol {

@@ -9,7 +9,8 @@ use super::rest;
 use super::world::{stand_shape, world_from_stand};
 use super::{LiftTarget, PhysicsOptions, Start, TrialError, TrialOptions};
 use crate::mechanism::Mechanism;
-use crate::protocol::{self, ProtocolOptions};
+use crate::planner::{draw_approach, energy};
+use crate::protocol::{self, Approach, ProtocolOptions};
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::{Hand, pose_from_isometry};
 
@@ -50,6 +51,9 @@ pub fn draw_start(
             ..ProtocolOptions::default()
         },
     );
+    if protocol.approach == Approach::Planned {
+        return plan(&mechanism, target, options, &range, yaw_rad, &mut rng);
+    }
     for _ in 0..MOST_DRAWS {
         let drawn = protocol::draw_start(hand, &range, &mut rng);
         let turn = std::f64::consts::TAU * rng.random::<f64>();
@@ -76,6 +80,54 @@ pub fn draw_start(
         }
     }
     Err(TrialError::NoApproach { target: target.name.clone(), n_draws: MOST_DRAWS })
+}
+
+/// The planned approach of least energy of those that come from above and pass the stand. The planner's energy is that of
+/// the hand closed on an object that stays where it is.
+fn plan(
+    mechanism: &Mechanism<'_>,
+    target: &LiftTarget,
+    options: &TrialOptions,
+    range: &ProtocolOptions,
+    yaw_rad: f64,
+    rng: &mut ChaCha8Rng,
+) -> Result<Start, TrialError> {
+    let refuse = |reason: String| TrialError::Hand { hand: mechanism.hand.name.clone(), reason };
+    let (protocol, planner) = (&options.protocol, &options.planner);
+    let world_from_target = world_from_standing(target, yaw_rad);
+    let mut best: Option<(f64, Start)> = None;
+    let mut n_found = 0;
+    for _ in 0..MOST_DRAWS.max(8 * planner.n_approaches) {
+        let drawn = draw_approach(mechanism.hand, &target.object, range, planner, rng);
+        let drawn = protocol::Start { back_off_m: 0.0, ..drawn };
+        let world_from_palm = world_from_target.rotation * drawn.palm_from_object_rotation.inverse();
+        if -(world_from_palm * Vector3::z()).z < protocol.least_descent_rad.sin() {
+            continue;
+        }
+        let start = Start {
+            world_from_palm_xyzw: world_from_palm.coords.into(),
+            lateral_offset_m: drawn.lateral_offset_m,
+            open_joints_rad: drawn.open_joints_rad.clone(),
+            yaw_rad,
+        };
+        let Some(touch) = first_touch(mechanism, target, &start)? else { continue };
+        if stand_distance_m(mechanism, &start, &touch.palm_from_world, &options.physics)? < protocol.stand_clearance_m {
+            continue;
+        }
+        let explored = mechanism.explore(&target.object, &drawn, range).map_err(|error| refuse(error.to_string()))?;
+        let Some(exploration) = explored else { continue };
+        let energy = energy(mechanism.hand, &target.object, &exploration, planner);
+        let energy = energy.map_err(|error| refuse(error.to_string()))?;
+        if best.as_ref().is_none_or(|(least, _)| energy < *least) {
+            best = Some((energy, start));
+        }
+        n_found += 1;
+        if n_found == planner.n_approaches {
+            break;
+        }
+    }
+    let none = || TrialError::NoApproach { target: target.name.clone(), n_draws: MOST_DRAWS };
+    best.map(|(_, start)| start).ok_or_else(none)
 }
 
 /// Draws attempt number `attempt` of trial number `trial` as [`draw_start`] does, or, with a prior, several of them, of

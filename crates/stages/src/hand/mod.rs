@@ -313,19 +313,20 @@ pub enum HandError {
     },
 }
 
-/// Pad layout and URDF of the hands that come with the program.
-const BUILTIN: [(&str, &str, &str); 2] = [
-    (
-        "barrett-bh8-280",
-        include_str!("../../../../hands/barrett-bh8-280.yaml"),
-        include_str!("../../../../hands/barrett-bh8-280.urdf"),
-    ),
-    (
-        "shadow-biotac-sp",
-        include_str!("../../../../hands/shadow-biotac-sp.yaml"),
-        include_str!("../../../../hands/shadow-biotac-sp.urdf"),
-    ),
-];
+/// Name, pad layout and URDF of a hand of the folder `hands`.
+macro_rules! builtin {
+    ($name:literal) => {
+        (
+            $name,
+            include_str!(concat!("../../../../hands/", $name, ".yaml")),
+            include_str!(concat!("../../../../hands/", $name, ".urdf")),
+        )
+    };
+}
+
+/// The hands that come with the program.
+const BUILTIN: [(&str, &str, &str); 4] =
+    [builtin!("allegro"), builtin!("barrett-bh8-280"), builtin!("parallel-gripper"), builtin!("shadow-biotac-sp")];
 
 impl Hand {
     /// Reads a hand from a pad layout file, or takes the built-in hand of that name.
