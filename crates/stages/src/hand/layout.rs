@@ -166,7 +166,7 @@ impl Layout {
                 .flat_map(|pad| pad.cells.iter().map(|cell| cell.noise_threshold_newtons))
                 .collect(),
             pads,
-            n_ignored_shapes: tree.n_ignored_shapes,
+            ignored_meshes: tree.ignored_meshes,
             cell_unit: self.cell_unit,
             id: 0,
             description_id: 0,

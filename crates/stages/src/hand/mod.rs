@@ -1,11 +1,12 @@
 //! A hand: its kinematic tree, collision shapes and tactile pads, read from a URDF and a pad layout.
 //!
 //! The URDF holds links, joints and collision shapes. The pad layout, a YAML file that names the URDF, adds the palm
-//! link, the position and size of each tactile cell, and the joints that follow others until they are blocked. Mesh
-//! collision shapes are not read; [`Hand::n_ignored_shapes`] counts them.
+//! link, the position and size of each tactile cell, and the joints that follow others until they are blocked. A
+//! collision mesh counts as its convex hull.
 
 mod kinematics;
 mod layout;
+mod meshes;
 mod self_collision;
 mod urdf;
 mod urdf_xml;
@@ -34,8 +35,8 @@ pub struct Hand {
     pub links: Vec<Link>,
     /// The pads in the order of the layout; cells are numbered through them in order.
     pub pads: Vec<Pad>,
-    /// Collision shapes of the URDF that were not read (meshes).
-    pub n_ignored_shapes: usize,
+    /// Collision meshes that could not be used, each with its link and the reason.
+    pub ignored_meshes: Vec<String>,
     /// The unit of the cells' readings.
     pub cell_unit: CellUnit,
     /// The noise threshold of each cell, through all pads: in a row, because each frame is compared with all of them.
@@ -346,10 +347,15 @@ impl Hand {
         }
         let layout = read(path_or_name)?;
         let folder = path_or_name.parent().unwrap_or(Path::new("")).to_path_buf();
-        Hand::parse(path_or_name, &layout, |urdf| read(&folder.join(urdf)))
+        let hull = |urdf: &Path, mesh: &str, scale| {
+            let urdf_folder = folder.join(urdf).parent().unwrap_or(Path::new("")).to_path_buf();
+            meshes::hull(&meshes::find(mesh, &urdf_folder)?, scale)
+        };
+        Hand::parse_with_meshes(path_or_name, &layout, |urdf| read(&folder.join(urdf)), hull)
     }
 
-    /// A hand from the texts of a pad layout and of the URDF it names, which `read_urdf` supplies.
+    /// A hand from the texts of a pad layout and of the URDF it names, which `read_urdf` supplies. Collision meshes are
+    /// ignored.
     ///
     /// # Errors
     /// As [`Hand::load`].
@@ -358,12 +364,27 @@ impl Hand {
         layout_text: &str,
         read_urdf: impl FnOnce(&Path) -> Result<String, HandError>,
     ) -> Result<Hand, HandError> {
+        let no_hull = |_: &Path, mesh: &str, _| Err(format!("{mesh} is not read"));
+        Hand::parse_with_meshes(layout_path, layout_text, read_urdf, no_hull)
+    }
+
+    fn parse_with_meshes(
+        layout_path: &Path,
+        layout_text: &str,
+        read_urdf: impl FnOnce(&Path) -> Result<String, HandError>,
+        hull: impl Fn(&Path, &str, [f64; 3]) -> Result<SharedShape, String>,
+    ) -> Result<Hand, HandError> {
         let layout = layout::parse(layout_path, layout_text)?;
         let urdf_path = layout_path.parent().unwrap_or(Path::new("")).join(&layout.urdf);
         let urdf = read_urdf(Path::new(&layout.urdf))?;
-        let tree = urdf::parse(&urdf_path, &urdf)?;
+        let tree = urdf::parse(&urdf_path, &urdf, |mesh, scale| hull(Path::new(&layout.urdf), mesh, scale))?;
         let mut hand = layout.into_hand(layout_path, tree)?;
-        hand.description_id = first_bytes(Sha256::new().chain_update(layout_text).chain_update(urdf));
+        let mut description = Sha256::new().chain_update(layout_text).chain_update(urdf);
+        let shapes = hand.links.iter().flat_map(|link| &link.shapes);
+        for corner in shapes.filter_map(|shape| shape.core.as_convex_polyhedron()).flat_map(|hull| hull.points()) {
+            corner.to_array().iter().for_each(|number| description.update(number.to_le_bytes()));
+        }
+        hand.description_id = first_bytes(description);
         hand.self_collision_pairs = self_collision::pairs(&hand);
         hand.id = hand.digest();
         Ok(hand)
@@ -372,12 +393,9 @@ impl Hand {
     /// Warnings about self-collision: collision shapes that were not read, or a hand without any.
     pub fn warnings(&self) -> Vec<String> {
         let mut warnings = Vec::new();
-        if self.n_ignored_shapes > 0 {
-            warnings.push(format!(
-                "{}: {} collision meshes are not read; those links touch nothing",
-                self.name, self.n_ignored_shapes
-            ));
-        }
+        warnings.extend(self.ignored_meshes.iter().map(|ignored| {
+            format!("{}: a collision mesh is left out, and its link touches nothing with it: {ignored}", self.name)
+        }));
         if self.self_collision_pairs.is_empty() {
             warnings.push(format!(
                 "{}: no two links can be seen to touch each other; fingers on fingers will go unnoticed",

@@ -20,7 +20,8 @@ const MAX_MIMIC: f64 = 100.0;
 pub(super) struct Tree {
     pub(super) links: Vec<TreeLink>,
     pub(super) joints: BTreeMap<String, TreeJoint>,
-    pub(super) n_ignored_shapes: usize,
+    /// Meshes that cannot be used, with the reasons.
+    pub(super) ignored_meshes: Vec<String>,
 }
 
 pub(super) struct TreeLink {
@@ -40,7 +41,12 @@ pub(super) struct TreeJoint {
     pub(super) mimic: Option<(String, f64, f64)>,
 }
 
-pub(super) fn parse(path: &Path, text: &str) -> Result<Tree, HandError> {
+/// Reads a URDF. `hull` supplies the convex hull of a mesh file, or the reason why there is none.
+pub(super) fn parse(
+    path: &Path,
+    text: &str,
+    mut hull: impl FnMut(&str, [f64; 3]) -> Result<SharedShape, String>,
+) -> Result<Tree, HandError> {
     let invalid = |message: String| HandError::Invalid { path: path.into(), message };
     let robot = urdf_xml::read(text).map_err(invalid)?;
     for (idx, link) in robot.links.iter().enumerate() {
@@ -70,7 +76,7 @@ pub(super) fn parse(path: &Path, text: &str) -> Result<Tree, HandError> {
         let names: Vec<_> = roots.iter().map(|link| format!("'{}'", link.name)).collect();
         return Err(invalid(format!("expected one root link (child of no joint), found {}", names.join(", "))));
     };
-    let mut tree = Tree { links: Vec::new(), joints: BTreeMap::new(), n_ignored_shapes: 0 };
+    let mut tree = Tree { links: Vec::new(), joints: BTreeMap::new(), ignored_meshes: Vec::new() };
     let mut pending = vec![(root, None)];
     while let Some((link, parent_idx)) = pending.pop() {
         let link_idx = tree.links.len();
@@ -87,10 +93,18 @@ pub(super) fn parse(path: &Path, text: &str) -> Result<Tree, HandError> {
             tree_link.joint = moving_joint(joint, &mut tree.joints).map_err(invalid)?;
         }
         for collision in &link.collisions {
-            match shape(collision).map_err(|what| invalid(format!("link '{}': {what}", link.name)))? {
-                Some(shape) => tree_link.shapes.push(shape),
-                None => tree.n_ignored_shapes += 1,
+            if let Some(Geometry::Mesh { file, scale }) = &collision.geometry {
+                match hull(file, *scale) {
+                    Ok(core) => {
+                        let link_from_shape = collision.link_from_shape;
+                        tree_link.shapes.push(LinkShape { link_from_shape, core, edge_radius_m: 0.0 });
+                    }
+                    Err(reason) => tree.ignored_meshes.push(format!("link '{}': {reason}", link.name)),
+                }
+                continue;
             }
+            let shape = shape(collision).map_err(|what| invalid(format!("link '{}': {what}", link.name)))?;
+            tree_link.shapes.extend(shape);
         }
         tree.links.push(tree_link);
         // Reversed, so that popping visits the children in the file's order.
@@ -163,27 +177,28 @@ fn moving_joint(
 fn shape(collision: &Collision) -> Result<Option<LinkShape>, String> {
     let geometry = collision
         .geometry
+        .as_ref()
         .ok_or("a <collision> without a shape: expected a <geometry> with a box, cylinder, capsule, sphere or mesh")?;
     // Sizes are checked first, because parry panics on invalid ones.
-    let sizes: Vec<f64> = match geometry {
+    let sizes: Vec<f64> = match *geometry {
         Geometry::Box { size_m } => size_m.to_vec(),
         Geometry::Sphere { radius_m } => vec![radius_m],
         Geometry::Cylinder { radius_m, length_m } | Geometry::Capsule { radius_m, length_m } => {
             vec![radius_m, length_m]
         }
-        Geometry::Mesh => return Ok(None),
+        Geometry::Mesh { .. } => return Ok(None),
     };
     if !sizes.iter().all(|size| (MIN_SIZE_M..=MAX_LENGTH_M).contains(size)) {
         return Err(format!("a collision shape of size {sizes:?}: expected {MIN_SIZE_M} to {MAX_LENGTH_M} metres"));
     }
     let link_from_origin = collision.link_from_shape;
     let upright = link_from_origin * z_from_y();
-    let (link_from_shape, core) = match geometry {
+    let (link_from_shape, core) = match *geometry {
         Geometry::Box { size_m: [x, y, z] } => (link_from_origin, SharedShape::cuboid(x / 2.0, y / 2.0, z / 2.0)),
         Geometry::Sphere { radius_m } => (link_from_origin, SharedShape::ball(radius_m)),
         Geometry::Cylinder { radius_m, length_m } => (upright, SharedShape::cylinder(length_m / 2.0, radius_m)),
         Geometry::Capsule { radius_m, length_m } => (upright, SharedShape::capsule_y(length_m / 2.0, radius_m)),
-        Geometry::Mesh => return Ok(None),
+        Geometry::Mesh { .. } => return Ok(None),
     };
     Ok(Some(LinkShape { link_from_shape, core, edge_radius_m: 0.0 }))
 }

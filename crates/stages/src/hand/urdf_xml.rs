@@ -41,13 +41,13 @@ pub(super) struct Collision {
 }
 
 /// A shape with its sizes in metres.
-#[derive(Clone, Copy)]
+#[derive(Clone)]
 pub(super) enum Geometry {
     Box { size_m: [f64; 3] },
     Cylinder { radius_m: f64, length_m: f64 },
     Capsule { radius_m: f64, length_m: f64 },
     Sphere { radius_m: f64 },
-    Mesh,
+    Mesh { file: String, scale: [f64; 3] },
 }
 
 pub(super) struct Joint {
@@ -201,7 +201,10 @@ impl Geometry {
             "sphere" => Geometry::Sphere { radius_m: number("radius")? },
             "cylinder" => Geometry::Cylinder { radius_m: number("radius")?, length_m: number("length")? },
             "capsule" => Geometry::Capsule { radius_m: number("radius")?, length_m: number("length")? },
-            "mesh" => Geometry::Mesh,
+            "mesh" => Geometry::Mesh {
+                file: attributes.required("filename")?,
+                scale: attributes.numbers("scale")?.unwrap_or([1.0; 3]),
+            },
             _ => return Ok(None),
         }))
     }

@@ -1,0 +1,144 @@
+//! Collision meshes of a URDF: finding the file, and its convex hull.
+
+use std::path::{Path, PathBuf};
+
+use blindgrasp_objects::mesh::read::read_mesh;
+use nalgebra::Vector3;
+use parry3d_f64::math::Vector;
+use parry3d_f64::shape::SharedShape;
+use parry3d_f64::transformation::try_convex_hull;
+
+/// Corners of a hull. A hull of more is cut down to the outermost points in so many directions.
+const N_DIRECTIONS: usize = 200;
+
+/// The convex hull of a mesh file, whose coordinates are multiplied by `scale`.
+///
+/// # Errors
+/// No such file, a file that is no mesh, or a mesh without volume.
+pub(super) fn hull(path: &Path, scale: [f64; 3]) -> Result<SharedShape, String> {
+    let mesh = read_mesh(path, 1.0).map_err(|error| error.to_string())?;
+    let points: Vec<Vector> = mesh
+        .vertices_m
+        .iter()
+        .map(|point| Vector::new(point.x * scale[0], point.y * scale[1], point.z * scale[2]))
+        .collect();
+    let refused = |reason: &dyn std::fmt::Display| format!("{}: it has no convex hull: {reason}", path.display());
+    let hull = |points: &[Vector]| try_convex_hull(points).map_err(|error| refused(&error));
+    let (mut corners, mut triangles) = hull(&points)?;
+    if corners.len() > N_DIRECTIONS {
+        let mut outermost: Vec<usize> = directions().map(|direction| outermost(&corners, &direction)).collect();
+        outermost.sort_unstable();
+        outermost.dedup();
+        let kept: Vec<Vector> = outermost.into_iter().map(|idx| corners[idx]).collect();
+        (corners, triangles) = hull(&kept)?;
+    }
+    SharedShape::convex_mesh(corners, &triangles).ok_or_else(|| refused(&"it is flat"))
+}
+
+/// Directions that are spread evenly over the sphere (a Fibonacci lattice).
+fn directions() -> impl Iterator<Item = Vector3<f64>> {
+    let golden_angle = std::f64::consts::PI * (3.0 - 5.0_f64.sqrt());
+    (0..N_DIRECTIONS).map(move |idx| {
+        let z = 1.0 - (2.0 * idx as f64 + 1.0) / N_DIRECTIONS as f64;
+        let (sin, cos) = (golden_angle * idx as f64).sin_cos();
+        let radius = (1.0 - z * z).sqrt();
+        Vector3::new(radius * cos, radius * sin, z)
+    })
+}
+
+fn outermost(points: &[Vector], direction: &Vector3<f64>) -> usize {
+    let along = |point: &Vector| point.x * direction.x + point.y * direction.y + point.z * direction.z;
+    (0..points.len()).max_by(|a, b| along(&points[*a]).total_cmp(&along(&points[*b]))).unwrap_or(0)
+}
+
+/// The file that a URDF names: a path, relative to the URDF's folder; `file://PATH`; or `package://PACKAGE/PATH`, where the
+/// package is a folder above the URDF, a folder beside one of those, or a folder of ROS's `ROS_PACKAGE_PATH` or
+/// `AMENT_PREFIX_PATH`.
+///
+/// # Errors
+/// A package that is in none of these places.
+pub(super) fn find(named: &str, urdf_folder: &Path) -> Result<PathBuf, String> {
+    if let Some(path) = named.strip_prefix("file://") {
+        return Ok(urdf_folder.join(path));
+    }
+    let Some(in_package) = named.strip_prefix("package://").or_else(|| named.strip_prefix("model://")) else {
+        return Ok(urdf_folder.join(named));
+    };
+    let (package, rest) = in_package.split_once('/').unwrap_or((in_package, ""));
+    let above = std::path::absolute(urdf_folder).unwrap_or_else(|_| urdf_folder.into());
+    let above = above.ancestors().flat_map(|folder| {
+        let itself = folder.file_name().is_some_and(|name| name == package).then(|| folder.to_path_buf());
+        itself.into_iter().chain([folder.join(package)])
+    });
+    let listed = |variable: &str, between: &str| -> Vec<PathBuf> {
+        let paths = std::env::var_os(variable).unwrap_or_default();
+        std::env::split_paths(&paths).map(|folder| folder.join(between).join(package)).collect()
+    };
+    let ros = listed("ROS_PACKAGE_PATH", "").into_iter().chain(listed("AMENT_PREFIX_PATH", "share"));
+    let found = above.chain(ros).map(|folder| folder.join(rest)).find(|path| path.is_file());
+    found.ok_or_else(|| {
+        format!(
+            "{named}: no such file in a folder '{package}' above the URDF or beside one of these, or in ROS_PACKAGE_PATH or \
+             AMENT_PREFIX_PATH"
+        )
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An OBJ file of a ball of 1,000 corners with a radius of 20 mm, in millimetres.
+    fn ball_obj() -> String {
+        let ball = parry3d_f64::shape::Ball::new(20.0).to_trimesh(32, 32);
+        let corners: String = ball.0.iter().map(|point| format!("v {} {} {}\n", point.x, point.y, point.z)).collect();
+        let faces: String = ball.1.iter().map(|[a, b, c]| format!("f {} {} {}\n", a + 1, b + 1, c + 1)).collect();
+        corners + &faces
+    }
+
+    #[test]
+    fn a_hull_has_few_corners_and_the_meshs_size() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("ball.obj");
+        std::fs::write(&path, ball_obj()).expect("written");
+        let hull = hull(&path, [0.001; 3]).expect("a hull");
+        let n_corners = hull.as_convex_polyhedron().expect("a polyhedron").points().len();
+        assert!((100..=N_DIRECTIONS).contains(&n_corners), "{n_corners}");
+        let volume_m3 = hull.mass_properties(1.0).mass();
+        let of_ball_m3 = 4.0 / 3.0 * std::f64::consts::PI * 0.02_f64.powi(3);
+        assert!((0.93..1.0).contains(&(volume_m3 / of_ball_m3)), "{}", volume_m3 / of_ball_m3);
+    }
+
+    #[test]
+    fn a_flat_mesh_and_a_missing_one_are_refused() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let flat = folder.path().join("flat.obj");
+        std::fs::write(&flat, "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n").expect("written");
+        for path in [flat, folder.path().join("none.stl"), folder.path().join("scene.dae")] {
+            let error = hull(&path, [1.0; 3]).expect_err("no hull");
+            assert!(error.contains(path.file_name().and_then(|name| name.to_str()).expect("a name")), "{error}");
+        }
+    }
+
+    #[test]
+    fn packages_are_found_above_and_beside_the_urdf() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let package = folder.path().join("my_hand");
+        for name in ["my_hand/urdf", "my_hand/meshes", "other/meshes"] {
+            std::fs::create_dir_all(folder.path().join(name)).expect("made");
+        }
+        std::fs::write(package.join("meshes/tip.stl"), "").expect("written");
+        std::fs::write(folder.path().join("other/meshes/palm.stl"), "").expect("written");
+        let urdf = package.join("urdf");
+        for (named, expected) in [
+            ("package://my_hand/meshes/tip.stl", package.join("meshes/tip.stl")),
+            ("package://other/meshes/palm.stl", folder.path().join("other/meshes/palm.stl")),
+            ("../meshes/tip.stl", urdf.join("../meshes/tip.stl")),
+            ("file:///tip.stl", PathBuf::from("/tip.stl")),
+        ] {
+            assert_eq!(find(named, &urdf), Ok(expected), "{named}");
+        }
+        let error = find("package://nowhere/tip.stl", &urdf).expect_err("no package");
+        assert!(error.contains("'nowhere'") && error.contains("AMENT_PREFIX_PATH"), "{error}");
+    }
+}
