@@ -22,6 +22,7 @@ pub mod loaded_contacts;
 pub mod mechanism;
 pub(crate) mod option_check;
 pub mod options;
+pub mod pad_grid;
 pub mod planner;
 pub mod protocol;
 pub mod simulator;

@@ -9,7 +9,8 @@ use serde::Deserialize;
 
 use super::urdf::{Tree, TreeLink};
 use super::{
-    Cell, CellUnit, Coupling, Hand, HandError, Joint, JointKind, Link, LinkShape, Motion, Pad, pose_from_isometry,
+    BareHand, Cell, CellUnit, Coupling, Hand, HandError, Joint, JointKind, Link, LinkShape, Motion, Pad,
+    pose_from_isometry,
 };
 use blindgrasp_messages::{MAX_CELLS, MAX_JOINTS, MAX_PADS};
 
@@ -94,11 +95,32 @@ pub(super) fn parse(path: &Path, text: &str) -> Result<Layout, HandError> {
 }
 
 impl Layout {
-    pub(super) fn into_hand(self, path: &Path, tree: Tree) -> Result<Hand, HandError> {
-        self.build(tree).map_err(|message| HandError::Invalid { path: path.into(), message })
+    /// The layout of a hand without cells: the joints are those of the URDF that mimic no other, in its order.
+    pub(super) fn without_cells(tree: &Tree, bare: &BareHand) -> Layout {
+        let joints = tree.links.iter().filter_map(|link| link.joint.as_ref().map(|(name, _)| name));
+        let has_value = |name: &&String| tree.joints.get(*name).is_some_and(|joint| joint.mimic.is_none());
+        Layout {
+            format: FORMAT.into(),
+            name: bare.name.clone(),
+            urdf: String::new(),
+            reference_link: bare.palm.clone().unwrap_or_else(|| tree.links[0].name.clone()),
+            joints: joints.filter(has_value).cloned().collect(),
+            couplings: Vec::new(),
+            open: bare.open.clone(),
+            preshape_joints: bare.preshape_joints.clone(),
+            self_collision_margin_m: default_self_collision_margin_m(),
+            edge_radius_m: 0.0,
+            cell_unit: CellUnit::default(),
+            pads: Vec::new(),
+            layouts: BTreeMap::new(),
+        }
     }
 
-    fn build(self, tree: Tree) -> Result<Hand, String> {
+    pub(super) fn into_hand(self, path: &Path, tree: Tree, least_cells: usize) -> Result<Hand, HandError> {
+        self.build(tree, least_cells).map_err(|message| HandError::Invalid { path: path.into(), message })
+    }
+
+    fn build(self, tree: Tree, least_cells: usize) -> Result<Hand, String> {
         let link_idx = |name: &str, used_by: &str| {
             tree.links.iter().position(|link| link.name == name).ok_or_else(|| {
                 let known: Vec<_> = tree.links.iter().map(|link| link.name.as_str()).collect();
@@ -137,11 +159,13 @@ impl Layout {
             pads.push(Pad { name: pad.name.clone(), link_idx, first_cell_idx, cells });
             first_cell_idx += n_cells;
         }
-        for (what, found, most) in
-            [("pads", pads.len(), MAX_PADS), ("cells", first_cell_idx, MAX_CELLS), ("joints", joints.len(), MAX_JOINTS)]
-        {
-            if found == 0 || found > most {
-                return Err(format!("{found} {what}, expected 1 to {most}"));
+        for (what, found, least, most) in [
+            ("pads", pads.len(), least_cells, MAX_PADS),
+            ("cells", first_cell_idx, least_cells, MAX_CELLS),
+            ("joints", joints.len(), 1, MAX_JOINTS),
+        ] {
+            if found < least || found > most {
+                return Err(format!("{found} {what}, expected {least} to {most}"));
             }
         }
         if !(0.0..=0.02).contains(&self.self_collision_margin_m) {

@@ -57,7 +57,7 @@ fn outermost(points: &[Vector], direction: &Vector3<f64>) -> usize {
 ///
 /// # Errors
 /// A package that is in none of these places.
-pub(super) fn find(named: &str, urdf_folder: &Path) -> Result<PathBuf, String> {
+pub fn find(named: &str, urdf_folder: &Path) -> Result<PathBuf, String> {
     if let Some(path) = named.strip_prefix("file://") {
         return Ok(urdf_folder.join(path));
     }

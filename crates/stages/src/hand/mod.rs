@@ -11,6 +11,7 @@ mod self_collision;
 mod urdf;
 mod urdf_xml;
 
+use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -20,7 +21,10 @@ use parry3d_f64::shape::SharedShape;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use layout::Layout;
+
 pub use kinematics::{CellPose, JointError};
+pub use meshes::find as find_mesh;
 pub(crate) use self_collision::PosedShapes;
 pub use self_collision::pose_from_isometry;
 
@@ -291,6 +295,17 @@ pub struct Cell {
     pub noise_threshold_newtons: f64,
 }
 
+/// A hand as its URDF alone does not say it.
+#[derive(Debug, Clone, Default)]
+pub struct BareHand {
+    pub name: String,
+    /// The link whose frame is the palm frame; the root if none is given.
+    pub palm: Option<String>,
+    /// Values of joints of the open hand.
+    pub open: BTreeMap<String, f64>,
+    pub preshape_joints: Vec<String>,
+}
+
 /// Why a hand could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum HandError {
@@ -368,6 +383,18 @@ impl Hand {
         Hand::parse_with_meshes(layout_path, layout_text, read_urdf, no_hull)
     }
 
+    /// A hand without cells, from the text of a URDF alone: a layout is made for it. Its identity is 0.
+    ///
+    /// # Errors
+    /// A URDF that is inconsistent, or names in `bare` that it does not have.
+    pub fn without_cells(urdf_path: &Path, urdf: &str, bare: &BareHand) -> Result<Hand, HandError> {
+        let folder = urdf_path.parent().unwrap_or(Path::new(""));
+        let tree = urdf::parse(urdf_path, urdf, |mesh, scale| meshes::hull(&meshes::find(mesh, folder)?, scale))?;
+        let mut hand = Layout::without_cells(&tree, bare).into_hand(urdf_path, tree, 0)?;
+        hand.self_collision_pairs = self_collision::pairs(&hand);
+        Ok(hand)
+    }
+
     fn parse_with_meshes(
         layout_path: &Path,
         layout_text: &str,
@@ -378,7 +405,7 @@ impl Hand {
         let urdf_path = layout_path.parent().unwrap_or(Path::new("")).join(&layout.urdf);
         let urdf = read_urdf(Path::new(&layout.urdf))?;
         let tree = urdf::parse(&urdf_path, &urdf, |mesh, scale| hull(Path::new(&layout.urdf), mesh, scale))?;
-        let mut hand = layout.into_hand(layout_path, tree)?;
+        let mut hand = layout.into_hand(layout_path, tree, 1)?;
         let mut description = Sha256::new().chain_update(layout_text).chain_update(urdf);
         let shapes = hand.links.iter().flat_map(|link| &link.shapes);
         for corner in shapes.filter_map(|shape| shape.core.as_convex_polyhedron()).flat_map(|hull| hull.points()) {

@@ -1,5 +1,7 @@
 //! `blindgrasp new`
 
+mod hand;
+
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -7,9 +9,9 @@ use clap::{Args, Subcommand};
 
 use super::{Outcome, print_line};
 
-/// Make a folder with an operator of your own
+/// Make a folder with an operator or a hand of your own
 ///
-/// Make a folder with an operator of your own that builds and runs at once.
+/// Make a folder with an operator of your own that builds and runs at once, or with the description of your hand.
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(subcommand)]
@@ -19,6 +21,7 @@ pub(super) struct Arguments {
 #[derive(Debug, Subcommand)]
 enum What {
     Operator(OperatorArguments),
+    Hand(hand::Arguments),
 }
 
 /// An operator in Rust, or in Python: program, test, README with the next commands.
@@ -48,10 +51,10 @@ struct OperatorArguments {
     blindgrasp: Option<PathBuf>,
 }
 
-const OPERATOR_PY: &str = include_str!("../../operators/blindgrasp_operator.py");
-const MESSAGES_PY: &str = include_str!("../../operators/blindgrasp_messages.py");
+const OPERATOR_PY: &str = include_str!("../../../operators/blindgrasp_operator.py");
+const MESSAGES_PY: &str = include_str!("../../../operators/blindgrasp_messages.py");
 /// The versions that blindgrasp is tested with: the new operator is built with the same.
-const CARGO_LOCK: &str = include_str!("../../Cargo.lock");
+const CARGO_LOCK: &str = include_str!("../../../Cargo.lock");
 const REQUIREMENTS: &str = "iceoryx2==0.10.0\nnumpy>=1.26\n";
 const MAX_NAME_CHARS: usize = 32;
 /// Names that Cargo refuses, or that a dependency of the new operator has.
@@ -83,9 +86,9 @@ const KINDS: [Kind; 4] = [
         function: "measure",
         param: "min_newtons: 5.0",
         source: "recorded_source/tactile",
-        rust: include_str!("templates/judge_frames.rs.in"),
-        python: include_str!("templates/judge_frames.py.in"),
-        python_test: include_str!("templates/test_judge_frames.py.in"),
+        rust: include_str!("../templates/judge_frames.rs.in"),
+        python: include_str!("../templates/judge_frames.py.in"),
+        python_test: include_str!("../templates/test_judge_frames.py.in"),
     },
     Kind {
         from: "ContactSet",
@@ -94,9 +97,9 @@ const KINDS: [Kind; 4] = [
         function: "measure",
         param: "min_newtons: 5.0",
         source: "contacts/contacts",
-        rust: include_str!("templates/judge_contacts.rs.in"),
-        python: include_str!("templates/judge_contacts.py.in"),
-        python_test: include_str!("templates/test_judge_contacts.py.in"),
+        rust: include_str!("../templates/judge_contacts.rs.in"),
+        python: include_str!("../templates/judge_contacts.py.in"),
+        python_test: include_str!("../templates/test_judge_contacts.py.in"),
     },
     Kind {
         from: "GraspFeature",
@@ -105,9 +108,9 @@ const KINDS: [Kind; 4] = [
         function: "measure",
         param: "min_pads: 2.0",
         source: "encoder/feature",
-        rust: include_str!("templates/judge_features.rs.in"),
-        python: include_str!("templates/judge_features.py.in"),
-        python_test: include_str!("templates/test_judge_features.py.in"),
+        rust: include_str!("../templates/judge_features.rs.in"),
+        python: include_str!("../templates/judge_features.py.in"),
+        python_test: include_str!("../templates/test_judge_features.py.in"),
     },
     Kind {
         from: "TactileFrame",
@@ -116,14 +119,17 @@ const KINDS: [Kind; 4] = [
         function: "filtered",
         param: "min_newtons: 0.1",
         source: "recorded_source/tactile",
-        rust: include_str!("templates/filter.rs.in"),
-        python: include_str!("templates/filter.py.in"),
-        python_test: include_str!("templates/test_filter.py.in"),
+        rust: include_str!("../templates/filter.rs.in"),
+        python: include_str!("../templates/filter.py.in"),
+        python_test: include_str!("../templates/test_filter.py.in"),
     },
 ];
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let What::Operator(arguments) = &arguments.what;
+    let arguments = match &arguments.what {
+        What::Operator(arguments) => arguments,
+        What::Hand(arguments) => return hand::run(arguments),
+    };
     let folder = &arguments.name;
     let name = checked_name(folder, arguments.python)?;
     let kind = Kind::of(arguments)?;
@@ -177,6 +183,12 @@ fn checked_name(folder: &Path, is_python: bool) -> anyhow::Result<String> {
     if !is_python && TAKEN_IN_RUST.split(' ').any(|taken| taken == name) {
         anyhow::bail!("'{name}' means something else in Rust: choose another name, like my_{name}");
     }
+    check_free(folder)?;
+    Ok(name.into())
+}
+
+/// Refuses a folder that is there already, or that cannot be made.
+fn check_free(folder: &Path) -> anyhow::Result<()> {
     if folder.symlink_metadata().is_ok() {
         anyhow::bail!("{} is there already, and nothing is overwritten: choose another name", folder.display());
     }
@@ -184,7 +196,7 @@ fn checked_name(folder: &Path, is_python: bool) -> anyhow::Result<String> {
         Some(parent) if parent != Path::new("") && !parent.is_dir() => {
             anyhow::bail!("there is no folder {} to make it in: make it first", parent.display())
         }
-        _ => Ok(name.into()),
+        _ => Ok(()),
     }
 }
 
@@ -274,10 +286,10 @@ fn patch(source: &Path) -> anyhow::Result<String> {
 
 fn rust_files(kind: &Kind) -> Vec<File> {
     vec![
-        ("Cargo.toml", include_str!("templates/Cargo.toml.in"), false),
+        ("Cargo.toml", include_str!("../templates/Cargo.toml.in"), false),
         ("Cargo.lock", CARGO_LOCK, false),
         ("src/main.rs", kind.rust, false),
-        ("README.md", include_str!("templates/README-rust.md.in"), false),
+        ("README.md", include_str!("../templates/README-rust.md.in"), false),
         (".gitignore", "/target\n", false),
     ]
 }
@@ -290,7 +302,7 @@ fn python_files(kind: &Kind) -> Vec<File> {
         ("blindgrasp_operator.py", OPERATOR_PY, false),
         ("blindgrasp_messages.py", MESSAGES_PY, false),
         ("requirements.txt", REQUIREMENTS, false),
-        ("README.md", include_str!("templates/README-python.md.in"), false),
+        ("README.md", include_str!("../templates/README-python.md.in"), false),
         (".gitignore", "/.venv\n__pycache__/\n", false),
     ]
 }

@@ -1,0 +1,125 @@
+//! Grids of cells on the face of a link that meets the object as the hand closes.
+
+use blindgrasp_stages::hand::{Cell, Hand, JointError, pose_from_isometry};
+use nalgebra::{Point3, Unit, UnitVector3, Vector3};
+use parry3d_f64::math::Vector;
+use parry3d_f64::query::Ray;
+
+use crate::mechanism::Mechanism;
+
+/// The part of the face that the cells take, along each of its directions.
+const SHARE_OF_FACE: f64 = 0.85;
+/// The part of a cell's place that the cell takes, along each direction.
+const SHARE_OF_PITCH: f64 = 0.85;
+
+/// Cells in a grid of `rows` × `columns` on a link: on the side towards which it moves as the open hand closes, of the palm
+/// on the side of +z. The rows follow the longer direction of that side, outwards. Each cell lies on the link's collision
+/// shapes, where a line against the direction of closing meets them.
+///
+/// # Errors
+/// A link without collision shapes, or a grid that leaves the shapes.
+pub fn pad_grid(
+    mechanism: &Mechanism<'_>,
+    link_idx: usize,
+    [n_rows, n_columns]: [usize; 2],
+    noise_threshold_newtons: f64,
+) -> Result<Vec<Cell>, String> {
+    let hand = mechanism.hand;
+    let link = &hand.links[link_idx];
+    if link.shapes.is_empty() {
+        return Err("it has no collision shape on which cells could lie".into());
+    }
+    let inner = inner_direction(mechanism, link_idx).map_err(|error| error.to_string())?;
+    let (along, across) = face_directions(hand, link_idx, &inner);
+    let [row_range, column_range] = [along, across].map(|direction| extent(hand, link_idx, &direction));
+    let place = |[least, most]: [f64; 2], idx: usize, n: usize| {
+        let middle = (least + most) / 2.0;
+        let length = (most - least) * SHARE_OF_FACE;
+        middle + length * ((idx as f64 + 0.5) / n as f64 - 0.5)
+    };
+    let pitch_m = |[least, most]: [f64; 2], n: usize| (most - least) * SHARE_OF_FACE / n as f64;
+    let size_m = [pitch_m(row_range, n_rows), pitch_m(column_range, n_columns)].map(|pitch_m| pitch_m * SHARE_OF_PITCH);
+    let [_, outermost_m] = extent(hand, link_idx, &inner);
+    (0..n_rows * n_columns)
+        .map(|idx| {
+            let (row, column) = (idx / n_columns, idx % n_columns);
+            let from = along.into_inner() * place(row_range, row, n_rows)
+                + across.into_inner() * place(column_range, column, n_columns)
+                + inner.into_inner() * (outermost_m + 0.01);
+            let (position_in_link_m, normal_in_link) = meet(hand, link_idx, &from, &inner)
+                .ok_or_else(|| format!("row {row}, column {column} of the grid is beside the link's shapes"))?;
+            let along_in_link =
+                Unit::new_normalize(along.into_inner() - normal_in_link.into_inner() * normal_in_link.dot(&along));
+            Ok(Cell { position_in_link_m, normal_in_link, along_in_link, size_m, noise_threshold_newtons })
+        })
+        .collect()
+}
+
+/// The direction in the link's frame in which its middle moves when the hand is half closed, along the nearest axis of the
+/// frame, so that a grid lies flat on a box; the palm's +z of a link that does not move.
+fn inner_direction(mechanism: &Mechanism<'_>, link_idx: usize) -> Result<UnitVector3<f64>, JointError> {
+    let hand = mechanism.hand;
+    let half_closed = mechanism.closing_postures(&hand.open_joints_rad(), 2).swap_remove(1);
+    let palm_from_links = hand.palm_from_links(&half_closed)?;
+    let palm_from_link = &palm_from_links[link_idx];
+    let middle = palm_from_link * middle(hand, link_idx);
+    let point = Vector::new(middle.x, middle.y, middle.z);
+    let velocity = mechanism.velocity(link_idx, point, &palm_from_links, &mechanism.joints, 0.0);
+    let velocity = Vector3::new(velocity.x, velocity.y, velocity.z);
+    let in_palm = Unit::try_new(velocity, 1e-9).unwrap_or_else(Vector3::z_axis);
+    let in_link = palm_from_link.inverse() * in_palm;
+    let axes = [Vector3::x_axis(), Vector3::y_axis(), Vector3::z_axis()];
+    let nearest =
+        axes.into_iter().flat_map(|axis| [axis, -axis]).max_by(|a, b| a.dot(&in_link).total_cmp(&b.dot(&in_link)));
+    Ok(nearest.unwrap_or(in_link))
+}
+
+/// The longer and the shorter direction of the face, the longer one away from the link's joint.
+fn face_directions(hand: &Hand, link_idx: usize, inner: &UnitVector3<f64>) -> (UnitVector3<f64>, UnitVector3<f64>) {
+    let axes = [Vector3::x_axis(), Vector3::y_axis(), Vector3::z_axis()];
+    let mut across = axes.into_iter().filter(|axis| axis.dot(inner).abs() < 0.5);
+    let pair = (across.next().unwrap_or(Vector3::x_axis()), across.next().unwrap_or(Vector3::y_axis()));
+    let length =
+        |direction: &UnitVector3<f64>| extent(hand, link_idx, direction).iter().fold(0.0, |sum, end| end - sum);
+    let along = if length(&pair.0) > length(&pair.1) { pair.0 } else { pair.1 };
+    let along = if middle(hand, link_idx).coords.dot(&along) < 0.0 { -along } else { along };
+    (along, Unit::new_normalize(inner.cross(&along)))
+}
+
+fn middle(hand: &Hand, link_idx: usize) -> Point3<f64> {
+    let axes = [Vector3::x_axis(), Vector3::y_axis(), Vector3::z_axis()];
+    Point3::from(axes.map(|axis| extent(hand, link_idx, &axis).iter().sum::<f64>() / 2.0))
+}
+
+/// The least and the greatest coordinate of the link's shapes along a direction.
+fn extent(hand: &Hand, link_idx: usize, direction: &UnitVector3<f64>) -> [f64; 2] {
+    let mut ends = [f64::INFINITY, f64::NEG_INFINITY];
+    for shape in &hand.links[link_idx].shapes {
+        let in_shape = shape.link_from_shape.inverse() * direction;
+        let Some(core) = shape.core.as_support_map() else { continue };
+        let far = |sign: f64| {
+            let point = core.local_support_point(Vector::new(in_shape.x, in_shape.y, in_shape.z) * sign);
+            let point = shape.link_from_shape * Point3::new(point.x, point.y, point.z);
+            point.coords.dot(direction) + sign * shape.edge_radius_m
+        };
+        ends = [ends[0].min(far(-1.0)), ends[1].max(far(1.0))];
+    }
+    ends
+}
+
+/// Where a line from `from` against `inner` meets the link's shapes, and the normal there.
+fn meet(
+    hand: &Hand,
+    link_idx: usize,
+    from: &Vector3<f64>,
+    inner: &UnitVector3<f64>,
+) -> Option<(Point3<f64>, UnitVector3<f64>)> {
+    let ray = Ray::new(Vector::new(from.x, from.y, from.z), Vector::new(-inner.x, -inner.y, -inner.z));
+    let hits = hand.links[link_idx].shapes.iter().filter_map(|shape| {
+        let pose = pose_from_isometry(&shape.link_from_shape);
+        shape.rounded().cast_ray_and_get_normal(&pose, &ray, 1.0, true)
+    });
+    let hit = hits.min_by(|a, b| a.time_of_impact.total_cmp(&b.time_of_impact))?;
+    let normal = Unit::try_new(Vector3::new(hit.normal.x, hit.normal.y, hit.normal.z), 1e-9)?;
+    Some((Point3::from(from - inner.into_inner() * hit.time_of_impact), normal))
+}

@@ -1,0 +1,401 @@
+//! `blindgrasp new hand`: a pad layout from a URDF and a table of cells or grids of cells.
+
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use anyhow::{Context, bail};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_pictures::{RecordedGrasp, grasp_svg};
+use blindgrasp_simulator::mechanism::Mechanism;
+use blindgrasp_simulator::pad_grid::pad_grid;
+use blindgrasp_stages::hand::{BareHand, Cell, Hand, find_mesh};
+use clap::Args;
+use nalgebra::{Unit, Vector3};
+use serde::Deserialize;
+
+use super::super::hand_cells::joint;
+use super::super::{Outcome, print_line};
+use super::{check_free, in_shell};
+
+/// A hand: its URDF, a pad layout, and a picture.
+///
+/// The folder gets the URDF (expanded, if it is a xacro file, and with the collision meshes beside it), the pad layout and a
+/// picture of the hand. Without --cells and --grid, the links and joints are listed and nothing is made.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:\n  \
+                  blindgrasp new hand my_gripper --urdf gripper.urdf\n  \
+                  blindgrasp new hand my_gripper --urdf gripper.urdf.xacro --palm hand_base --open finger_joint=0.04 \\\n    \
+                  --grid left_finger=4x3 --grid right_finger=4x3\n  \
+                  blindgrasp new hand my_hand --urdf my_hand.urdf --cells cells.csv\n\n\
+                  The table of cells has a column for each of: link, x, y, z (metres, in the link's frame), nx, ny, nz (the normal,\n\
+                  out of the pad). It may have: pad, width and height (metres), ax, ay, az (the direction of the width), and\n\
+                  threshold (newtons).")]
+pub(super) struct Arguments {
+    /// The folder to make; its last part is the hand's name.
+    name: PathBuf,
+    /// The hand's URDF. A name that ends in .xacro is expanded by the program xacro (from PyPI or ROS).
+    #[arg(long, value_name = "FILE")]
+    urdf: PathBuf,
+    /// Table of the cells (CSV).
+    #[arg(long, value_name = "FILE")]
+    cells: Option<PathBuf>,
+    /// A pad of ROWS x COLUMNS cells on the side of a link that meets the object as the hand closes. Can be repeated.
+    #[arg(long = "grid", value_name = "LINK=ROWSxCOLUMNS", value_parser = grid)]
+    grids: Vec<(String, [usize; 2])>,
+    /// The link in whose frame contacts are given, +z out of the palm [default: the root].
+    #[arg(long, value_name = "LINK")]
+    palm: Option<String>,
+    /// Pose of the palm frame in that link, if its own +z does not point out of the palm: metres and radians.
+    #[arg(
+        long,
+        value_name = "X,Y,Z,ROLL,PITCH,YAW",
+        value_delimiter = ',',
+        num_args = 1,
+        allow_negative_numbers = true
+    )]
+    palm_pose: Vec<f64>,
+    /// The value of a joint of the open hand [default: 0]. The hand closes towards the limit that is farther from it.
+    #[arg(long, value_name = "JOINT=VALUE,…", value_delimiter = ',', value_parser = joint)]
+    open: Vec<(String, f64)>,
+    /// Joints that are set before a grasp and do not close.
+    #[arg(long, value_name = "JOINT,…", value_delimiter = ',')]
+    preshape: Vec<String>,
+    /// Noise threshold of the cells, newtons.
+    #[arg(long, default_value_t = 0.05, value_name = "NEWTONS")]
+    threshold: f64,
+}
+
+/// A pad of the layout to be written.
+struct NewPad {
+    name: String,
+    link: String,
+    cells: Vec<Cell>,
+}
+
+/// A row of the table of cells.
+#[derive(Debug, Deserialize)]
+struct Row {
+    link: String,
+    pad: Option<String>,
+    x: f64,
+    y: f64,
+    z: f64,
+    nx: f64,
+    ny: f64,
+    nz: f64,
+    ax: Option<f64>,
+    ay: Option<f64>,
+    az: Option<f64>,
+    width: Option<f64>,
+    height: Option<f64>,
+    threshold: Option<f64>,
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let folder = &arguments.name;
+    let name = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default().to_owned();
+    check_free(folder)?;
+    let mut urdf = urdf_text(&arguments.urdf)?;
+    let mut bare = BareHand {
+        name: name.clone(),
+        palm: arguments.palm.clone(),
+        open: arguments.open.iter().cloned().collect(),
+        preshape_joints: arguments.preshape.clone(),
+    };
+    if let Some(palm) = with_palm_frame(&mut urdf, arguments)? {
+        bare.palm = Some(palm);
+    }
+    let hand = Hand::without_cells(&arguments.urdf, &urdf, &bare)?;
+    print_parts(&hand)?;
+    let mechanism = Mechanism::new(&hand);
+    let mut pads =
+        arguments.cells.as_deref().map(|table| read_table(table, arguments.threshold)).transpose()?.unwrap_or_default();
+    for (link, grid) in &arguments.grids {
+        let known = || hand.links.iter().map(|link| link.name.as_str()).collect::<Vec<_>>().join(", ");
+        let link_idx = hand.links.iter().position(|other| other.name == *link);
+        let link_idx =
+            link_idx.with_context(|| format!("--grid: the URDF has no link '{link}' (it has {})", known()))?;
+        let cells = pad_grid(&mechanism, link_idx, *grid, arguments.threshold);
+        let cells = cells.map_err(|reason| anyhow::anyhow!("--grid {link}: {reason}"))?;
+        pads.push(NewPad { name: link.clone(), link: link.clone(), cells });
+    }
+    if pads.is_empty() {
+        bail!("the cells are missing: give a table with --cells, or pads with --grid LINK=ROWSxCOLUMNS");
+    }
+    let (urdf, meshes) = with_meshes_beside(&urdf, arguments.urdf.parent().unwrap_or(Path::new("")));
+    let layout = layout(&name, &hand, &pads, &bare);
+    std::fs::create_dir(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+    let written = write_folder(folder, &name, &urdf, &layout, &meshes);
+    if written.is_err() {
+        let _ = std::fs::remove_dir_all(folder);
+    }
+    let hand = written?;
+    warn_of_the_palm(&hand)?;
+    let layout_path = folder.join(format!("{name}.yaml"));
+    let shown = in_shell(&layout_path.display().to_string());
+    print_line(&format!(
+        "\n{}: {} pads, {} cells; picture: {name}.svg\nnext:\n  blindgrasp view {shown} --out hand.html      turn it, close it\n  \
+         blindgrasp simulate --hand {shown} --protocol planned --grasps 1000 --out grasps.mcap\n  \
+         blindgrasp train grasps.mcap --hand {shown} --out model.json",
+        layout_path.display(),
+        hand.pads.len(),
+        hand.n_cells()
+    ))?;
+    Ok(Outcome::Done)
+}
+
+/// Writes all files, and reads the hand from them.
+fn write_folder(
+    folder: &Path,
+    name: &str,
+    urdf: &str,
+    layout: &str,
+    meshes: &[(PathBuf, String)],
+) -> anyhow::Result<Hand> {
+    let write = |extension: &str, text: &str| {
+        let path = folder.join(format!("{name}.{extension}"));
+        std::fs::write(&path, text).with_context(|| format!("cannot write {}", path.display()))?;
+        anyhow::Ok(path)
+    };
+    if !meshes.is_empty() {
+        std::fs::create_dir(folder.join("meshes")).context("cannot make the folder of the meshes")?;
+    }
+    for (from, to) in meshes {
+        std::fs::copy(from, folder.join(to)).with_context(|| format!("cannot copy {}", from.display()))?;
+    }
+    write("urdf", urdf)?;
+    let hand = Hand::load(&write("yaml", layout)?)?;
+    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
+    write("svg", &grasp_svg(&hand, &RecordedGrasp::hand_alone(&hand, &[hand.open_joints_rad()]))?)?;
+    Ok(hand)
+}
+
+/// The text of the URDF. A xacro file is expanded.
+fn urdf_text(path: &Path) -> anyhow::Result<String> {
+    if path.extension().is_none_or(|extension| extension != "xacro") {
+        return std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()));
+    }
+    let output = Command::new("xacro").arg(path).output().map_err(|error| match error.kind() {
+        std::io::ErrorKind::NotFound => {
+            anyhow::anyhow!("{}: the program xacro is not installed: pip install xacro, or source ROS", path.display())
+        }
+        _ => anyhow::anyhow!("cannot run xacro: {error}"),
+    })?;
+    if !output.status.success() {
+        bail!("xacro {}: {}", path.display(), String::from_utf8_lossy(&output.stderr).trim());
+    }
+    String::from_utf8(output.stdout).with_context(|| format!("xacro {}: its output is no text", path.display()))
+}
+
+/// Adds a link at --palm-pose to the URDF; its name.
+fn with_palm_frame(urdf: &mut String, arguments: &Arguments) -> anyhow::Result<Option<String>> {
+    let pose = &arguments.palm_pose;
+    if pose.is_empty() {
+        return Ok(None);
+    }
+    let [x, y, z, roll, pitch, yaw] = pose[..] else {
+        bail!("--palm-pose: expected X,Y,Z,ROLL,PITCH,YAW, found {} numbers", pose.len());
+    };
+    let Some(palm) = &arguments.palm else { bail!("--palm-pose needs --palm: the link in which it is given") };
+    let end = urdf.rfind("</robot>").context("the URDF does not end with </robot>")?;
+    let frame = "blindgrasp_palm";
+    urdf.insert_str(
+        end,
+        &format!(
+            "  <link name=\"{frame}\"/>\n  <joint name=\"{frame}_joint\" type=\"fixed\">\n    <parent link=\"{palm}\"/>\
+             <child link=\"{frame}\"/>\n    <origin xyz=\"{x} {y} {z}\" rpy=\"{roll} {pitch} {yaw}\"/>\n  </joint>\n"
+        ),
+    );
+    Ok(Some(frame.into()))
+}
+
+fn print_parts(hand: &Hand) -> anyhow::Result<()> {
+    print_line("joint            kind        from      to        open      closes to")?;
+    for joint in &hand.joints {
+        let kind = format!("{:?}", joint.kind).to_lowercase();
+        let closed =
+            if joint.is_preshape { "-".into() } else { format!("{:.4} {}", joint.closed(), joint.kind.unit()) };
+        let (lower, upper, open) = (joint.lower, joint.upper, joint.open());
+        print_line(&format!("{:<16} {kind:<9} {lower:>8.4}  {upper:>8.4}  {open:>8.4}   {closed}", joint.name))?;
+    }
+    print_line("\nlink             collision shapes")?;
+    for link in &hand.links {
+        print_line(&format!("{:<16} {}", link.name, link.shapes.len()))?;
+    }
+    for ignored in &hand.ignored_meshes {
+        print_diagnostic(&format!("a collision mesh is left out: {ignored}"));
+    }
+    Ok(())
+}
+
+/// Cells of the table, pad by pad.
+fn read_table(path: &Path, threshold_newtons: f64) -> anyhow::Result<Vec<NewPad>> {
+    let mut reader = csv::ReaderBuilder::new()
+        .trim(csv::Trim::All)
+        .comment(Some(b'#'))
+        .from_path(path)
+        .with_context(|| format!("cannot read {}", path.display()))?;
+    let mut pads: Vec<NewPad> = Vec::new();
+    let mut is_sized = true;
+    for row in reader.deserialize() {
+        let row: Row = row.with_context(|| format!("{}", path.display()))?;
+        let normal = Unit::try_new(Vector3::new(row.nx, row.ny, row.nz), 1e-6)
+            .with_context(|| format!("{}: a normal without a direction on link '{}'", path.display(), row.link))?;
+        let along = match (row.ax, row.ay, row.az) {
+            (Some(x), Some(y), Some(z)) => Vector3::new(x, y, z),
+            // Of the frame's axes the one that is nearest to the cell's plane; z, x, y where they are alike.
+            _ => [Vector3::z(), Vector3::x(), Vector3::y()]
+                .into_iter()
+                .min_by(|a, b| normal.dot(a).abs().total_cmp(&normal.dot(b).abs()))
+                .unwrap_or_else(Vector3::z),
+        };
+        let along_in_link = Unit::try_new(along - normal.into_inner() * normal.dot(&along), 1e-6)
+            .with_context(|| format!("{}: ax, ay, az run along the normal on link '{}'", path.display(), row.link))?;
+        is_sized &= row.width.is_some() && row.height.is_some();
+        let cell = Cell {
+            position_in_link_m: [row.x, row.y, row.z].into(),
+            normal_in_link: normal,
+            along_in_link,
+            size_m: [row.width.unwrap_or(0.0), row.height.unwrap_or(0.0)],
+            noise_threshold_newtons: row.threshold.unwrap_or(threshold_newtons),
+        };
+        let name = row.pad.unwrap_or_else(|| row.link.clone());
+        match pads.iter_mut().find(|pad| pad.name == name) {
+            Some(pad) if pad.link != row.link => {
+                bail!("{}: pad '{name}' has cells on the links '{}' and '{}'", path.display(), pad.link, row.link)
+            }
+            Some(pad) => pad.cells.push(cell),
+            None => pads.push(NewPad { name, link: row.link, cells: vec![cell] }),
+        }
+    }
+    if !is_sized {
+        pads.iter_mut().for_each(size_by_neighbours);
+        print_line(
+            "\nno width and height in the table: a cell is 0.8 times as wide and high as the nearest one is away",
+        )?;
+    }
+    Ok(pads)
+}
+
+fn size_by_neighbours(pad: &mut NewPad) {
+    let places: Vec<_> = pad.cells.iter().map(|cell| cell.position_in_link_m).collect();
+    for (idx, cell) in pad.cells.iter_mut().enumerate() {
+        let others = places.iter().enumerate().filter(|(other, _)| *other != idx);
+        let nearest_m = others.map(|(_, place)| (place - places[idx]).norm()).fold(f64::INFINITY, f64::min);
+        // A cell alone on its pad has no neighbour.
+        let size_m = if nearest_m.is_finite() { 0.8 * nearest_m } else { 0.005 };
+        cell.size_m = [size_m; 2];
+    }
+}
+
+/// The URDF with the names of collision meshes changed to files beside it, and the files to copy there.
+fn with_meshes_beside(urdf: &str, urdf_folder: &Path) -> (String, Vec<(PathBuf, String)>) {
+    let mut copies: BTreeMap<PathBuf, String> = BTreeMap::new();
+    let mut text = String::new();
+    for (idx, part) in urdf.split("<collision").enumerate() {
+        if idx == 0 {
+            text.push_str(part);
+            continue;
+        }
+        text.push_str("<collision");
+        let (inside, after) = part.split_once("</collision>").unwrap_or((part, ""));
+        let quoted = inside.split_once("filename=\"").and_then(|(before, rest)| {
+            let (named, after) = rest.split_once('"')?;
+            Some((before, named, after))
+        });
+        match quoted.and_then(|(before, named, after)| Some((before, find_mesh(named, urdf_folder).ok()?, after))) {
+            Some((before, file, after)) if file.is_file() => {
+                let n = copies.len();
+                let name = file.file_name().and_then(|name| name.to_str()).unwrap_or("mesh.stl").to_owned();
+                let taken = copies.values().any(|other| *other == format!("meshes/{name}"));
+                let beside = copies
+                    .entry(file)
+                    .or_insert_with(|| if taken { format!("meshes/{n}-{name}") } else { format!("meshes/{name}") });
+                let _ = write!(text, "{before}filename=\"{beside}\"{after}");
+            }
+            _ => text.push_str(inside),
+        }
+        if part.contains("</collision>") {
+            text.push_str("</collision>");
+        }
+        text.push_str(after);
+    }
+    (text, copies.into_iter().collect())
+}
+
+fn layout(name: &str, hand: &Hand, pads: &[NewPad], bare: &BareHand) -> String {
+    let joints: Vec<&str> = hand.joints.iter().map(|joint| joint.name.as_str()).collect();
+    let palm = bare.palm.clone().unwrap_or_else(|| hand.links[0].name.clone());
+    let mut text = format!(
+        "# Made by: blindgrasp new hand. The keys are explained in hands/README.md of blindgrasp.\n\
+         format: blindgrasp-hand/1\nname: {name}\nurdf: {name}.urdf\n\
+         # Contacts are expressed in this link's frame; +z points out of the palm.\nreference_link: {palm}\n\
+         joints: [{}]\n",
+        joints.join(", ")
+    );
+    if !bare.preshape_joints.is_empty() {
+        let _ = writeln!(text, "preshape_joints: [{}]", bare.preshape_joints.join(", "));
+    }
+    if !bare.open.is_empty() {
+        let open: Vec<String> = bare.open.iter().map(|(name, value)| format!("{name}: {value}")).collect();
+        let _ = writeln!(text, "open: {{{}}}", open.join(", "));
+    }
+    text.push_str("pads:\n");
+    for pad in pads {
+        let threshold = pad.cells.first().map_or(0.0, |cell| cell.noise_threshold_newtons);
+        let NewPad { name, link, .. } = pad;
+        let _ =
+            writeln!(text, "  - {{name: {name}, link: {link}, layout: {name}, noise_threshold_newtons: {threshold}}}");
+    }
+    text.push_str("layouts:\n");
+    for pad in pads {
+        let _ = writeln!(text, "  {}:", pad.name);
+        let of_pad = pad.cells.first().map_or(0.0, |cell| cell.noise_threshold_newtons);
+        for cell in &pad.cells {
+            let own = cell.noise_threshold_newtons;
+            let threshold = if own == of_pad { String::new() } else { format!(", noise_threshold_newtons: {own}") };
+            let _ = writeln!(
+                text,
+                "    - {{at_m: {}, normal: {}, along: {}, size_m: {}{threshold}}}",
+                numbers(cell.position_in_link_m.coords.as_slice(), 1e6),
+                numbers(cell.normal_in_link.as_slice(), 1e9),
+                numbers(cell.along_in_link.as_slice(), 1e9),
+                numbers(&cell.size_m, 1e6),
+            );
+        }
+    }
+    text
+}
+
+/// A list in YAML, rounded to parts of `per_unit`.
+fn numbers(values: &[f64], per_unit: f64) -> String {
+    // Adding 0 makes a 0 of a -0.
+    let rounded = values.iter().map(|value| ((value * per_unit).round() / per_unit + 0.0).to_string());
+    format!("[{}]", rounded.collect::<Vec<_>>().join(", "))
+}
+
+/// Says so if the cells look as if the palm's frame pointed the other way.
+fn warn_of_the_palm(hand: &Hand) -> anyhow::Result<()> {
+    let cells = hand.cells_in_palm(&hand.open_joints_rad())?;
+    let n_behind = cells.iter().filter(|cell| cell.position_in_palm_m.z < -0.005).count();
+    if 2 * n_behind > cells.len() {
+        print_diagnostic(&format!(
+            "{n_behind} of {} cells lie behind the palm: expected +z of the palm frame to point out of the palm, towards the \
+             object; give another link with --palm, or a pose with --palm-pose",
+            cells.len()
+        ));
+    }
+    Ok(())
+}
+
+fn grid(text: &str) -> Result<(String, [usize; 2]), String> {
+    let parsed = text.split_once('=').and_then(|(link, size)| {
+        let (rows, columns) = size.split_once('x')?;
+        Some((link.to_owned(), [rows.parse().ok()?, columns.parse().ok()?]))
+    });
+    parsed
+        .filter(|(_, [rows, columns])| (1..=256).contains(rows) && (1..=256).contains(columns))
+        .ok_or_else(|| "expected LINK=ROWSxCOLUMNS, as in left_finger=4x3, of 1 to 256 each".into())
+}
