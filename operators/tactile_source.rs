@@ -333,7 +333,13 @@ fn ros2(params: &Params, hand: &Hand) -> anyhow::Result<Ros2> {
         phase: named(&topics.phase_topic)?,
         wrench: named(&topics.wrench_topic)?,
         imu: named(&topics.imu_topic)?,
-        joint_names: hand.joints.iter().map(|joint| (format!("{prefix}{}", joint.name), !joint.is_preshape)).collect(),
+        joint_names: (0..hand.joints.len())
+            .map(|idx| {
+                let joint = &hand.joints[idx];
+                let closing_rate = Some(hand.closing_rate(idx)).filter(|rate| !joint.is_preshape && *rate != 0.0);
+                (format!("{prefix}{}", joint.name), closing_rate)
+            })
+            .collect(),
         tolerance_nanos: (topics.tolerance_ms.unwrap_or(20.0) * 1e6) as u64,
         namespace,
     };

@@ -12,7 +12,7 @@ const GROUPS: [(&str, &[&str]); 4] = [
 ];
 /// Words of earlier versions and of other tools, with the command that does it here.
 const HINTS: [(&str, &str); 15] = [
-    ("hand", "info HAND.yaml --joints NAME=RADIANS"),
+    ("hand", "info HAND.yaml --joints NAME=VALUE"),
     ("objects", "simulate --list"),
     ("quality", "info CASES.json"),
     ("features", "export --features MODEL"),

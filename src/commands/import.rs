@@ -39,7 +39,7 @@ pub(super) struct Arguments {
     /// Newtons per unit of the cells' columns, for a hand whose cells are in newtons and a table that is not.
     #[arg(long, conflicts_with = "unit", value_parser = |text: &str| number_in(text, 1e-12..=1e12))]
     newtons_per_unit: Option<f64>,
-    /// The posture of all grasps, NAME=RADIANS,…; joints not given are 0, or follow their coupling.
+    /// The posture of all grasps, NAME=VALUE,…; joints not given are 0, or follow their coupling.
     #[arg(long, value_delimiter = ',', value_parser = joint, required_unless_present = "joint_columns",
         conflicts_with = "joint_columns")]
     joints: Vec<(String, f64)>,

@@ -53,7 +53,7 @@ pub(super) struct Arguments {
     #[arg(long, conflicts_with_all = ["full", "hand"])]
     repair: bool,
     /// Joint angles of a hand in radians; other joints are 0 or follow their coupling
-    #[arg(long, value_name = "NAME=RADIANS,…", value_delimiter = ',', value_parser = hand_cells::joint)]
+    #[arg(long, value_name = "NAME=VALUE,…", value_delimiter = ',', value_parser = hand_cells::joint)]
     joints: Vec<(String, f64)>,
     /// Print JSON, with every object
     #[arg(long)]

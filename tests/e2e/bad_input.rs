@@ -69,15 +69,15 @@ fn hands() {
     );
     cells(
         &layout,
-        &urdf.replace("name=\"finger_1\" type=\"revolute\"", "name=\"finger_1\" type=\"prismatic\""),
-        &["finger_1", "prismatic"],
+        &urdf.replace("name=\"finger_1\" type=\"revolute\"", "name=\"finger_1\" type=\"planar\""),
+        &["finger_1", "planar", "prismatic"],
     );
     check(&["info", "nosuchhand"], 1, &["nosuchhand"]);
     check(&["info", &folder.at("absent.yaml")], 1, &["absent.yaml"]);
     check(&["info", HAND, "--joints", "thumb=1"], 1, &["thumb", "finger_1"]);
     check(&["info", HAND, "--joints", "spread=9"], 1, &["spread", "9"]);
     check(&["info", HAND, "--joints", "spread=nan"], 1, &["spread"]);
-    check(&["info", HAND, "--joints", "spread"], 2, &["NAME=RADIANS"]);
+    check(&["info", HAND, "--joints", "spread"], 2, &["NAME=VALUE"]);
     check(&["info", HAND, "--joints", "spread=1,spread=2"], 1, &["spread", "twice"]);
     cells(&layout, &urdf.replace("radius=\"0.0445\"", "radius=\"-1\""), &["hand_base", "-1"]);
     cells(&layout, &urdf.replace("radius=\"0.0445\"", "radius=\"1e300\""), &["hand_base", "metres"]);

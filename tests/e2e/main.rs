@@ -10,6 +10,7 @@ mod evaluate;
 mod export;
 mod graph;
 mod grid;
+mod hands;
 mod import;
 mod launcher;
 mod libsvm;

@@ -7,6 +7,7 @@ message! {
     pub struct TactileFrame = "blindgrasp/TactileFrame/4" on "/tactile" {
         pub grasp_id: u64,
         pub phase: Phase,
+        /// Radians, and metres of joints that slide.
         #[ros = "Radians, in the hand's order."]
         #[serde(deserialize_with = "crate::serialized::any_list")]
         #[max(MAX_JOINTS)]

@@ -63,18 +63,6 @@ impl Mover {
     }
 }
 
-/// The change of a closing joint's value per unit of progress.
-pub(crate) fn closing_rate(hand: &Hand, joint_idx: usize) -> f64 {
-    let of_leader = |idx: usize| {
-        let joint = &hand.joints[idx];
-        (joint.closed() - joint.open()).signum() * joint.kind.per_radian()
-    };
-    match hand.joints[joint_idx].coupling {
-        Some(coupling) => coupling.ratio * of_leader(coupling.follows_idx),
-        None => of_leader(joint_idx),
-    }
-}
-
 impl<'a> Mechanism<'a> {
     /// Prepares a hand.
     pub fn new(hand: &'a Hand) -> Self {
@@ -84,7 +72,7 @@ impl<'a> Mechanism<'a> {
             .enumerate()
             .filter(|(_, joint)| !joint.is_preshape)
             .map(|(joint_idx, joint)| {
-                let rate = closing_rate(hand, joint_idx);
+                let rate = hand.closing_rate(joint_idx);
                 let limit = if rate > 0.0 { joint.upper } else { joint.lower };
                 let end = if rate == 0.0 { 0.0 } else { ((limit - joint.open()) / rate).max(0.0) };
                 ClosingJoint { joint_idx, rate, end }

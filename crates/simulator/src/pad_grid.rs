@@ -55,23 +55,27 @@ pub fn pad_grid(
         .collect()
 }
 
-/// The direction in the link's frame in which its middle moves when the hand is half closed, along the nearest axis of the
-/// frame, so that a grid lies flat on a box; the palm's +z of a link that does not move.
+/// The mean direction in the link's frame in which its middle moves until the hand is half closed, along the nearest axis of
+/// the frame, so that a grid lies flat on a box; the palm's +z of a link that does not move.
 fn inner_direction(mechanism: &Mechanism<'_>, link_idx: usize) -> Result<UnitVector3<f64>, JointError> {
+    /// Postures from open to closed, of which the first half counts.
+    const N_STEPS: usize = 20;
     let hand = mechanism.hand;
-    let half_closed = mechanism.closing_postures(&hand.open_joints_rad(), 2).swap_remove(1);
-    let palm_from_links = hand.palm_from_links(&half_closed)?;
-    let palm_from_link = &palm_from_links[link_idx];
-    let middle = palm_from_link * middle(hand, link_idx);
-    let point = Vector::new(middle.x, middle.y, middle.z);
-    let velocity = mechanism.velocity(link_idx, point, &palm_from_links, &mechanism.joints, 0.0);
-    let velocity = Vector3::new(velocity.x, velocity.y, velocity.z);
-    let in_palm = Unit::try_new(velocity, 1e-9).unwrap_or_else(Vector3::z_axis);
-    let in_link = palm_from_link.inverse() * in_palm;
+    let middle = middle(hand, link_idx);
+    let mut sum = Vector3::zeros();
+    let postures = mechanism.closing_postures(&hand.open_joints_rad(), N_STEPS);
+    for posture in &postures[..=N_STEPS / 2] {
+        let palm_from_links = hand.palm_from_links(posture)?;
+        let palm_from_link = &palm_from_links[link_idx];
+        let point = palm_from_link * middle;
+        let point = Vector::new(point.x, point.y, point.z);
+        let velocity = mechanism.velocity(link_idx, point, &palm_from_links, &mechanism.joints, 0.0);
+        let in_palm = Unit::try_new(Vector3::new(velocity.x, velocity.y, velocity.z), 1e-9);
+        sum += palm_from_link.rotation.inverse() * in_palm.unwrap_or_else(Vector3::z_axis).into_inner();
+    }
     let axes = [Vector3::x_axis(), Vector3::y_axis(), Vector3::z_axis()];
-    let nearest =
-        axes.into_iter().flat_map(|axis| [axis, -axis]).max_by(|a, b| a.dot(&in_link).total_cmp(&b.dot(&in_link)));
-    Ok(nearest.unwrap_or(in_link))
+    let axes = axes.into_iter().flat_map(|axis| [axis, -axis]);
+    Ok(axes.max_by(|a, b| a.dot(&sum).total_cmp(&b.dot(&sum))).unwrap_or_else(Vector3::z_axis))
 }
 
 /// The longer and the shorter direction of the face, the longer one away from the link's joint.

@@ -391,17 +391,21 @@ impl GraspSummary {
         }
     }
 
-    /// When a joint stopped that is now at `angle_rad`, if it closed evenly before.
-    fn stalled(&self, joint: usize, angle_rad: f64) -> f64 {
+    /// When a joint stopped that is now at `value`, if it closed evenly before.
+    fn stalled(&self, hand: &Hand, joint: usize, value: f64) -> f64 {
         let Some(open) = self.open_joints_rad.get(joint) else { return NEVER };
         let so_far = || std::iter::once(*open).chain(self.closing_rad.iter().map(|joints| joints[joint]));
-        let fastest = so_far().zip(so_far().skip(1)).map(|(a, b)| (b - a).abs()).fold(1e-3, f64::max);
-        (angle_rad - open).abs() / fastest
+        let fastest = so_far()
+            .zip(so_far().skip(1))
+            .map(|(a, b)| (b - a).abs())
+            .fold(1e-3 * hand.joints[joint].kind.per_radian(), f64::max);
+        (value - open).abs() / fastest
     }
 
-    /// The last frame in which a joint was not yet at `angle_rad`.
-    fn last_moving(&self, joint: usize, angle_rad: f64) -> f64 {
-        let moving = |joints: &Vec<f64>| (angle_rad - joints[joint]).abs() > MOVING_RAD;
+    /// The last frame in which a joint was not yet at `value`.
+    fn last_moving(&self, hand: &Hand, joint: usize, value: f64) -> f64 {
+        let least = MOVING_RAD * hand.joints[joint].kind.per_radian();
+        let moving = |joints: &Vec<f64>| (value - joints[joint]).abs() > least;
         self.closing_rad.iter().rposition(moving).map_or(0.0, |idx| idx as f64 + 1.0)
     }
 
@@ -418,7 +422,7 @@ impl GraspSummary {
                 .as_ref()
                 .map_or(0.0, |coupling| angle - coupling.ratio * joints_rad[coupling.follows_idx]);
             let open = self.open_joints_rad.get(idx).copied();
-            values.extend([*angle, open.unwrap_or(NEVER), breakaway, self.stalled(idx, *angle)]);
+            values.extend([*angle, open.unwrap_or(NEVER), breakaway, self.stalled(hand, idx, *angle)]);
         }
         let loads = pad_loads(hand, contacts);
         let total: f64 = loads.iter().sum();
@@ -440,7 +444,7 @@ impl GraspSummary {
             let after_joint = |nth: usize| {
                 let joint = joints_before(hand, hand.pads[pad].link_idx).nth(nth);
                 joint.zip(began).map_or([NEVER; 2], |(joint, began)| {
-                    [self.stalled(joint, joints_rad[joint]), self.last_moving(joint, joints_rad[joint])]
+                    [self.stalled(hand, joint, joints_rad[joint]), self.last_moving(hand, joint, joints_rad[joint])]
                         .map(|moment| began - moment)
                 })
             };

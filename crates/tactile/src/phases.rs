@@ -23,7 +23,7 @@ impl PhaseFinder {
         PhaseFinder { moving_rad_per_s, still_nanos, phase: Phase::Open, anchor: None, still_since_nanos: None }
     }
 
-    /// The phase at a posture of the fingers, radians. They close as their angles grow.
+    /// The phase at a posture of the fingers: for each, how far it has closed, radians, from anywhere on.
     pub fn phase(&mut self, stamp_nanos: u64, fingers_rad: &[f64]) -> Phase {
         let Some((since_nanos, before)) = &self.anchor else {
             self.anchor = Some((stamp_nanos, fingers_rad.to_vec()));

@@ -39,8 +39,9 @@ pub struct Topics {
     pub wrench: Option<String>,
     /// `sensor_msgs/msg/Imu`, in the palm frame.
     pub imu: Option<String>,
-    /// The hand's joints as ROS names them, in the hand's order; whether each closes with the others.
-    pub joint_names: Vec<(String, bool)>,
+    /// The hand's joints as ROS names them, in the hand's order, each with the change of its value while the hand closes by a
+    /// radian; `None` for a joint that does not close.
+    pub joint_names: Vec<(String, Option<f64>)>,
     /// Joint angles and senses must be this near to the cells in time.
     pub tolerance_nanos: u64,
 }
@@ -185,8 +186,9 @@ impl Ros2 {
             }
         }
         if has_any && self.topics.phase.is_none() {
-            let fingers = self.topics.joint_names.iter().zip(&self.joints).filter(|((_, closes), _)| *closes);
-            let fingers: Option<Vec<f64>> = fingers.map(|(_, joint)| joint.map(|(angle, _)| angle)).collect();
+            let joints = self.topics.joint_names.iter().zip(&self.joints);
+            let fingers = joints.filter_map(|((_, closing_rate), joint)| Some((closing_rate.as_ref()?, joint)));
+            let fingers: Option<Vec<f64>> = fingers.map(|(rate, joint)| joint.map(|(value, _)| value / rate)).collect();
             if let Some(fingers) = fingers {
                 self.phase = Some((self.finder.phase(stamp_nanos, &fingers), at_nanos));
             }
@@ -422,7 +424,7 @@ mod tests {
             phase: Some("/phase".into()),
             wrench: Some("/wrench".into()),
             imu: Some("/imu".into()),
-            joint_names: vec![("a".into(), true), ("b".into(), true)],
+            joint_names: vec![("a".into(), Some(1.0)), ("b".into(), Some(1.0))],
             tolerance_nanos: 20_000_000,
         };
         Ros2::new(topics, PhaseFinder::new(0.05, 200_000_000))
@@ -503,6 +505,24 @@ mod tests {
         assert!(
             why(take(&mut driver, Topic::Cells, old, later, Some(8))).contains("is 30.0 ms from the cells in time")
         );
+    }
+
+    #[test]
+    fn a_jaw_whose_value_falls_closes() {
+        let mut driver = driver("std_msgs/msg/Float64MultiArray", "data");
+        driver.topics.phase = None;
+        // 0.1 m count as a radian: 20 mm/s are a speed of 0.2 rad/s.
+        driver.topics.joint_names = vec![("jaw".into(), Some(-0.1))];
+        driver.joints = vec![None];
+        let mut phases = Vec::new();
+        for step in 0..20 {
+            let (nanos, jaw) = (SEC_NANOS + step * 60_000_000, 0.04 - 0.0012 * step.min(8) as f64);
+            let joints = joints(&driver, &["jaw"], &[jaw], nanos);
+            assert!(take(&mut driver, Topic::Joints, joints, nanos, None).is_none());
+            phases.push(driver.phase.expect("a phase").0);
+        }
+        phases.dedup();
+        assert_eq!(phases, [Phase::Open, Phase::Closing, Phase::Settled]);
     }
 
     #[test]

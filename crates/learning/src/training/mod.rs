@@ -174,6 +174,9 @@ pub fn train(
             progress(&format!("not learned: {n_without} of {} grasps have no such frames", examples.len()));
         }
         let mut probe = probes::learn(hand, recipe, &fitted.features, phase, &examples, &folds, options.seed)?;
+        if probe.is_none() && n_without == 0 && matches!(recipe.learner, Learner::Boosting(_)) {
+            progress(&format!("not learned: frames of {} hands say nothing of objects not seen", phase.as_str()));
+        }
         if let Some(learned) = &mut probe {
             let threshold = options.thresholds.threshold_probability;
             (learned.probe.classifier.threshold_probability, learned.probe.classifier.unsure_from_probability) =

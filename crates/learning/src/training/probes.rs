@@ -55,7 +55,8 @@ pub(super) fn n_without(phase: Phase, examples: &[&Example]) -> usize {
     examples.iter().filter(|example| felt(phase, example).is_none()).count()
 }
 
-/// Learns to judge the frames of a phase; `None` if a grasp has none, or the recipe has no boosted trees.
+/// Learns to judge the frames of a phase; `None` if a grasp has none, the recipe has no boosted trees, or the frames of
+/// objects not seen say nothing of the outcome.
 pub(super) fn learn(
     hand: &Hand,
     recipe: &Recipe,
@@ -100,6 +101,10 @@ pub(super) fn learn(
         folds: kept_idxs.iter().map(|idx| folds[*idx]).collect(),
     };
     let stable: Vec<bool> = kept.examples.iter().map(|example| example.stable).collect();
+    let calibration = calibrate(&kept.examples, &kept.decision_values)?;
+    if calibration.a >= 0.0 {
+        return Ok(None);
+    }
     let judged = out_of_fold_probabilities(&kept)?;
     let mut probabilities = vec![None; examples.len()];
     for (idx, probability) in kept_idxs.iter().zip(&judged) {
@@ -110,7 +115,7 @@ pub(super) fn learn(
     let probe = ProbeModel {
         classifier: Classifier {
             predictor: Predictor::Boosting(fitted(&all, &|_| true)?),
-            calibration: calibrate(&kept.examples, &kept.decision_values)?,
+            calibration,
             threshold_probability: 1.0,
             unsure_from_probability: 1.0,
         },

@@ -19,7 +19,7 @@ use rapier3d_f64::geometry::{ColliderHandle, Group};
 use rapier3d_f64::parry::mass_properties::MassProperties;
 use rapier3d_f64::parry::shape::{Shape, SharedShape};
 
-use crate::mechanism::{Mechanism, closing_rate, first_moved};
+use crate::mechanism::{Mechanism, first_moved};
 use crate::trial::world::{MAX_LINKS_WITH_SHAPES, World, to_engine};
 use crate::trial::{PhysicsOptions, TrialError};
 use blindgrasp_stages::hand::{Hand, JointKind, Motion, pose_from_isometry};
@@ -138,7 +138,7 @@ impl HandBody {
                 }
             };
             let spec = &hand.joints[joint_idx];
-            let rate = closing_rate(hand, joint_idx);
+            let rate = hand.closing_rate(joint_idx);
             let sign = if rate < 0.0 { -1.0 } else { 1.0 };
             let reach_m = reach_m(hand, link_idx);
             let body = world.engine.insert_body(
@@ -492,15 +492,26 @@ mod tests {
     /// The hand, open, before a ball that nothing moves, its middle so far from the palm's frame along z; no gravity.
     fn before_a_ball(radius_m: f64, middle_m: f64, test: impl FnOnce(&mut World, &mut HandBody, &PhysicsOptions)) {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let (mechanism, options) = (Mechanism::new(&hand), PhysicsOptions::default());
+        with_a_ball(&hand, radius_m, [0.0, 0.0, middle_m], 1e4, test);
+    }
+
+    /// As [`before_a_ball`], with any hand, and a ball of that mass anywhere in the palm frame.
+    fn with_a_ball(
+        hand: &Hand,
+        radius_m: f64,
+        [x, y, z]: [f64; 3],
+        mass_kg: f64,
+        test: impl FnOnce(&mut World, &mut HandBody, &PhysicsOptions),
+    ) {
+        let (mechanism, options) = (Mechanism::new(hand), PhysicsOptions::default());
         let object = Object::new("ball".into(), "ball".into(), SharedShape::ball(radius_m), 1000.0, false);
-        let target = LiftTarget::new("ball".into(), "ball".into(), object, 1e4, 1.0);
+        let target = LiftTarget::new("ball".into(), "ball".into(), object, mass_kg, 1.0);
         // The stand is far away.
         let palm_from_world = Isometry3::translation(0.0, 0.0, -5.0);
-        let world_from_target = Isometry3::translation(0.0, 0.0, 5.0 + middle_m);
+        let world_from_target = Isometry3::translation(x, y, 5.0 + z);
         let mut world = World::new(&target, &world_from_target, &palm_from_world, &options);
         world.engine.gravity = to_engine(&Vector3::zeros());
-        let open = vec![0.0; hand.joints.len()];
+        let open = hand.open_joints_rad();
         let mut body = HandBody::new(&mut world, &mechanism, &open, &options).expect("a hand");
         test(&mut world, &mut body, &options);
     }
@@ -580,6 +591,72 @@ mod tests {
             let parts = body.drives.iter().filter(|drive| !drive.has_broken_away);
             let parts: Vec<f64> = parts.map(|drive| part_of(options.lift_grip_newtons, world, drive)).collect();
             assert!(parts.iter().any(|part| *part >= 0.97), "{parts:?}");
+        });
+    }
+
+    #[test]
+    fn jaws_centre_a_ball_and_press_alike_from_both_sides() {
+        let hand = Hand::load(Path::new("parallel-gripper")).expect("built in");
+        // 15 mm nearer to the left jaw, which pushes it to the right one.
+        with_a_ball(&hand, 0.02, [0.0, 0.015, 0.04], 0.2, |world, body, options| {
+            close_until_stopped(world, body, options);
+            grip(world, body, options);
+            let ball = world.palm_from_target().translation.vector;
+            assert!(ball.y.abs() < 0.001, "{ball}");
+            assert!((body.joints_rad(world)[0] - 0.02).abs() < 0.001, "{:?}", body.joints_rad(world));
+            let touches = world.touches(&body.shapes);
+            let newtons: Vec<f64> = touches.iter().map(|touch| touch.newtons).collect();
+            assert_eq!(touches.len(), 2, "{newtons:?}");
+            let wanted = options.lift_grip_newtons;
+            assert!(newtons.iter().all(|found| (found - wanted).abs() < 0.1 * wanted), "{newtons:?}");
+        });
+    }
+
+    /// Two fingers of a parallel linkage, as of the 2F-85: their tips keep their direction while the knuckles turn.
+    const LINKAGE: &str = r#"<robot name="linkage">
+<link name="palm"><collision><origin xyz="0 0 -0.03"/><geometry><box size="0.06 0.07 0.06"/></geometry></collision></link>
+<link name="left_knuckle"/><link name="right_knuckle"/>
+<link name="left_tip"><collision><origin xyz="0 0.006 0.025"/><geometry><box size="0.022 0.012 0.05"/></geometry></collision></link>
+<link name="right_tip"><collision><origin xyz="0 -0.006 0.025"/><geometry><box size="0.022 0.012 0.05"/></geometry></collision></link>
+<joint name="finger" type="revolute"><parent link="palm"/><child link="left_knuckle"/><origin xyz="0 0.02 0.01" rpy="-0.8 0 0"/>
+<axis xyz="1 0 0"/><limit lower="0" upper="0.9"/></joint>
+<joint name="left_bar" type="revolute"><parent link="left_knuckle"/><child link="left_tip"/><origin xyz="0 0 0.06" rpy="0.8 0 0"/>
+<axis xyz="1 0 0"/><limit lower="-1" upper="1"/><mimic joint="finger" multiplier="-1"/></joint>
+<joint name="right_finger" type="revolute"><parent link="palm"/><child link="right_knuckle"/>
+<origin xyz="0 -0.02 0.01" rpy="0.8 0 0"/><axis xyz="-1 0 0"/><limit lower="0" upper="0.9"/><mimic joint="finger"/></joint>
+<joint name="right_bar" type="revolute"><parent link="right_knuckle"/><child link="right_tip"/><origin xyz="0 0 0.06" rpy="-0.8 0 0"/>
+<axis xyz="-1 0 0"/><limit lower="-1" upper="1"/><mimic joint="finger" multiplier="-1"/></joint></robot>"#;
+
+    fn linkage() -> Hand {
+        let cell = "size_m: [0.009, 0.005], along: [0, 0, 1], at_m: [0, 0, 0.03]";
+        let layout = format!(
+            "format: blindgrasp-hand/1\nname: linkage\nurdf: linkage.urdf\nreference_link: palm\njoints: [finger]\n\
+             edge_radius_m: 0.002\npads:\n\
+             \x20 - {{name: left, link: left_tip, layout: left, noise_threshold_newtons: 0.05}}\n\
+             \x20 - {{name: right, link: right_tip, layout: right, noise_threshold_newtons: 0.05}}\n\
+             layouts:\n  left:\n    - {{normal: [0, -1, 0], {cell}}}\n  right:\n    - {{normal: [0, 1, 0], {cell}}}\n"
+        );
+        Hand::parse(Path::new("linkage.yaml"), &layout, |_| Ok(LINKAGE.into())).expect("a hand")
+    }
+
+    #[test]
+    fn the_tips_of_a_parallel_linkage_stay_parallel_under_load() {
+        let hand = linkage();
+        with_a_ball(&hand, 0.02, [0.0, 0.0, 0.085], 0.2, |world, body, options| {
+            close_until_stopped(world, body, options);
+            grip(world, body, options);
+            let touches = world.touches(&body.shapes);
+            let newtons: Vec<f64> = touches.iter().map(|touch| touch.newtons).collect();
+            // The motor's torque is that of the full force for a tip that moves straight at the object. The knuckles are
+            // still turned outwards by so much, so that the tips move slower towards it and press harder.
+            let outwards_rad = 0.8 - body.joints_rad(world)[0];
+            let wanted = options.lift_grip_newtons / outwards_rad.cos();
+            assert!(touches.len() == 2, "{newtons:?}");
+            assert!(newtons.iter().all(|found| (found - wanted).abs() < 0.02 * wanted), "{newtons:?} {wanted}");
+            for axle in body.drives.iter().flat_map(|drive| &drive.axles) {
+                let off_rad = travel(world, axle) - axle.ratio * body.drives[0].travel(world);
+                assert!(off_rad.abs() < 0.02, "{off_rad}");
+            }
         });
     }
 

@@ -168,7 +168,6 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use crate::protocol::Approach;
     use crate::simulator::{SimulateError, SimulationReport, simulate_all};
     use crate::wrench_space::GraspCase;
     use blindgrasp_objects::select;
@@ -262,17 +261,17 @@ mod tests {
             }
         };
         let mut options = SimulatorOptions { label: Label::Lift, ..SimulatorOptions::default() };
-        options.protocol.approach = Approach::Planned;
-        assert!(refused(&options).starts_with("option protocol.approach is planned, expected blind"));
-        options.protocol.approach = Approach::Blind;
         options.frames.period_nanos = 1;
         assert!(refused(&options).starts_with("option frames.period_nanos is 1, expected 1e6 to 1e8"));
         options.frames = FrameOptions::default();
         options.protocol.back_off_m = 0.01;
         assert!(refused(&options).starts_with("option protocol.back_off_m is 0.01, expected its default"));
         options.protocol.back_off_m = 0.0;
-        options.planner.n_approaches += 1;
-        assert!(refused(&options).starts_with("option planner is set, expected its default"));
+        options.planner.stand_off_m = 0.01;
+        assert!(refused(&options).starts_with("option planner.stand_off_m is 0.01, expected its default"));
+        options.planner = crate::planner::PlannerOptions::default();
+        options.thresholds.epsilon = 0.03;
+        assert!(refused(&options).starts_with("option thresholds is set, expected its default with label lift"));
         options = SimulatorOptions { label: Label::Lift, ..SimulatorOptions::default() };
         options.lift.mass_factor = [2.0, 0.5];
         assert!(refused(&options).starts_with("option lift.mass_factor is [2, 0.5], expected two ascending"));

@@ -359,7 +359,7 @@ fn check_place(cell: &Cell, link: &TreeLink) -> Result<(), String> {
             "it is {off_m:.3} m away from every collision shape of the link, expected at most {MAX_OFF_M} m"
         ));
     }
-    if distance_m(PROBE_M) < distance_m(-PROBE_M) - PROBE_M {
+    if distance_m(PROBE_M) < distance_m(-PROBE_M) - PROBE_M / 2.0 {
         return Err(format!(
             "its normal {:.3?} points into the link: expected the direction out of the pad, towards the object",
             [normal.x, normal.y, normal.z]
@@ -403,6 +403,65 @@ mod tests {
     fn built(at_m: [f64; 3], size_m: [f64; 2]) -> Result<Vec<Cell>, String> {
         let (normal, along) = ([0.0, 0.0, 1.0], [1.0, 0.0, 0.0]);
         LayoutCell { at_m, normal, along, size_m, noise_threshold_newtons: None, grid: None, pitch_m: None }.build(0.1)
+    }
+
+    const GRIPPER_URDF: &str = include_str!("../../../../hands/parallel-gripper.urdf");
+    const GRIPPER: &str = include_str!("../../../../hands/parallel-gripper.yaml");
+
+    fn gripper(layout: &str, urdf: &str) -> Result<Hand, String> {
+        Hand::parse(Path::new("gripper.yaml"), layout, |_| Ok(urdf.into())).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn jaws_slide_apart_and_a_grid_is_told_row_by_row() {
+        let hand = gripper(GRIPPER, GRIPPER_URDF).expect("a hand");
+        assert_eq!(
+            (hand.joints[0].kind, hand.joints[0].open(), hand.joints[0].closed()),
+            (JointKind::Prismatic, 0.0425, 0.0)
+        );
+        let cells = hand.cells_in_palm(&[0.02]).expect("a joint");
+        // The second direction is normal x along: of the left jaw -y x z = -x.
+        for (idx, x, y, z) in
+            [(0, 0.006, 0.02, 0.025), (1, 0.0, 0.02, 0.025), (3, 0.006, 0.02, 0.035), (12, -0.006, -0.02, 0.025)]
+        {
+            let expected = nalgebra::Point3::new(x, y, z);
+            assert!(
+                (cells[idx].position_in_palm_m - expected).norm() < 1e-12,
+                "{idx}: {}",
+                cells[idx].position_in_palm_m
+            );
+        }
+        assert!(hand.joints[0].allows(0.0425 + 0.009, 0.1) && !hand.joints[0].allows(0.0425 + 0.011, 0.1));
+        assert_eq!(hand.posture([]).expect("open"), [0.0425]);
+    }
+
+    #[test]
+    fn another_kind_of_joint_is_another_hand() {
+        let slides = gripper(GRIPPER, GRIPPER_URDF).expect("a hand");
+        let turns = gripper(GRIPPER, &GRIPPER_URDF.replace("prismatic", "revolute")).expect("a hand");
+        assert_ne!(slides.id(), turns.id());
+    }
+
+    #[test]
+    fn a_layout_that_makes_no_sense_is_refused() {
+        let inwards = "normal: [0, 1, 0], along: [0, 0, 1]";
+        for (from, to, expected) in [
+            ("normal: [0, -1, 0], along: [0, 0, 1]", inwards, "pad 'left', cell 0, on link 'left_jaw': its normal"),
+            ("at_m: [0, 0, 0.04]", "at_m: [0, -0.04, 0.04]", "away from every collision shape"),
+            ("at_m: [0, 0, 0.04]", "at_m: [0, 0, 40]", "metres, not millimetres"),
+            ("pitch_m: [0.01, 0.006]", "pitch_m: [10, 6]", "metres, not millimetres"),
+            ("grid: [4, 3], ", "", "'grid' or 'pitch_m' alone"),
+            ("grid: [4, 3]", "grid: [4, 0]", "grid is [4, 0]"),
+            ("open: {jaw: 0.0425}", "open: {jaw: 0.5}", "open: 'jaw' is 0.5, expected 0 to 0.0425 m"),
+            ("open: {jaw: 0.0425}", "open: {jaws: 0}", "open: 'jaws' is not listed"),
+        ] {
+            assert!(GRIPPER.contains(from), "{from}");
+            let error = gripper(&GRIPPER.replacen(from, to, 1), GRIPPER_URDF).err().unwrap_or_default();
+            assert!(error.contains(expected), "{to}: {error}");
+        }
+        let error =
+            gripper(GRIPPER, &GRIPPER_URDF.replace("upper=\"0.0425\"", "upper=\"42.5\"")).expect_err("millimetres");
+        assert!(error.contains("within 1.00 m of 0"), "{error}");
     }
 
     #[test]

@@ -452,6 +452,19 @@ impl Hand {
         self.joints.iter().map(Joint::open).collect()
     }
 
+    /// The change of a joint's value while the hand closes by a radian: towards the closed limit, of a follower the coupling's
+    /// ratio of its leader's.
+    pub fn closing_rate(&self, joint_idx: usize) -> f64 {
+        let of_leader = |idx: usize| {
+            let joint = &self.joints[idx];
+            (joint.closed() - joint.open()).signum() * joint.kind.per_radian()
+        };
+        match self.joints[joint_idx].coupling {
+            Some(coupling) => coupling.ratio * of_leader(coupling.follows_idx),
+            None => of_leader(joint_idx),
+        }
+    }
+
     /// Index of the joint of that name.
     pub fn joint_idx(&self, name: &str) -> Option<usize> {
         self.joints.iter().position(|joint| joint.name == name)

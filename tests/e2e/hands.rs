@@ -1,0 +1,220 @@
+//! Hands of every kind: grippers and hands of many joints from their URDF to decisions, `blindgrasp new hand`, pictures of hands.
+
+use std::path::Path;
+use std::process::Command;
+
+use crate::common::python::{python, utf8};
+use crate::common::{blindgrasp, project, run, text};
+
+fn read(path: &str) -> String {
+    std::fs::read_to_string(project().join(path)).expect("readable")
+}
+
+/// Runs a command in a folder.
+fn run_in(folder: &Path, arguments: &[&str], exit_code: i32) -> (String, String) {
+    let mut command = blindgrasp();
+    // xacro lies beside Python.
+    let programs = python().parent().expect("a folder");
+    let path = std::env::join_paths([programs, Path::new("/usr/bin"), Path::new("/bin")]).expect("a path");
+    let output = command.current_dir(folder).args(arguments).env("PATH", path).output().expect("started");
+    let (stdout, stderr) = (text(&output.stdout).to_owned(), text(&output.stderr).to_owned());
+    assert_eq!(output.status.code(), Some(exit_code), "blindgrasp {arguments:?}\n{stdout}\n{stderr}");
+    (stdout, stderr)
+}
+
+#[test]
+fn a_gripper_is_simulated_trained_and_run_by_one_command() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let output = Command::new(project().join("scripts/try-hand"))
+        .args(["hands/parallel-gripper.yaml", utf8(folder.path()), "90"])
+        .env("BLINDGRASP", env!("CARGO_BIN_EXE_blindgrasp"))
+        .output()
+        .expect("started");
+    let (stdout, stderr) = (text(&output.stdout), text(&output.stderr));
+    assert!(output.status.success(), "{stdout}\n{stderr}");
+    for expected in ["label: lift", "promised for new objects", "grasps           30 (", "samples lost     0"] {
+        assert!(stdout.contains(expected), "'{expected}' in\n{stdout}");
+    }
+    // 0 undecided, and some of each: the model tells grasps apart.
+    assert!(stdout.contains("LIFT, ") && stdout.contains("HOLD), 0 undecided"), "{stdout}");
+    assert!(!stdout.contains("(0 LIFT") && !stdout.contains(", 0 HOLD"), "{stdout}");
+}
+
+#[test]
+fn a_hand_of_sixteen_joints_is_simulated_trained_and_judged() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| utf8(&folder.path().join(name)).to_owned();
+    let (grasps, model) = (at("grasps.mcap"), at("model.json"));
+    let simulate = ["simulate", "--hand", "allegro", "--protocol", "planned", "--grasps", "150", "--out", &grasps];
+    let report = text(&run(&[&simulate[..], &["--thresholds", "0.03,0.02"]].concat(), 0).stdout).to_owned();
+    assert!(report.contains("stable: epsilon > 0.03 and volume > 0.02"), "{report}");
+    run(&["train", &grasps, "--hand", "allegro", "--out", &model], 0);
+    let judged = text(&run(&["evaluate", &model, &grasps, "--hand", "allegro"], 0).stdout).to_owned();
+    assert!(judged.contains("accuracy"), "{judged}");
+    // A lift in physics, of the same hand.
+    let lifted = at("lifted.mcap");
+    let lift = ["simulate", "--hand", "allegro", "--label", "lift", "--protocol", "planned", "--grasps", "4"];
+    run(&[&lift[..], &["--objects", "ball,can", "--stable-fraction", "natural", "--out", &lifted]].concat(), 0);
+}
+
+#[test]
+fn planned_lifts_are_felt_more_often_than_blind_ones() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let n_felt = |approach: &str| {
+        let out = utf8(&folder.path().join(format!("{approach}.mcap"))).to_owned();
+        let lift =
+            ["simulate", "--hand", "parallel-gripper", "--label", "lift", "--protocol", approach, "--grasps", "40"];
+        run(&[&lift[..], &["--stable-fraction", "natural", "--out", &out]].concat(), 0);
+        let frames = text(&run(&["export", &out, "--format", "jsonl"], 0).stdout).to_owned();
+        let settled = frames.lines().filter(|line| line.contains("\"phase\":\"settled\""));
+        let felt: std::collections::BTreeSet<String> = settled
+            .filter_map(|line| {
+                let frame: serde_json::Value = serde_json::from_str(line).expect("JSON");
+                let cells = frame["data"]["cells_newtons"].as_array()?;
+                cells.iter().any(|cell| cell.as_f64() > Some(0.05)).then(|| frame["data"]["grasp_id"].to_string())
+            })
+            .collect();
+        felt.len()
+    };
+    let (blind, planned) = (n_felt("blind"), n_felt("planned"));
+    assert!(planned > 20 && planned >= blind, "{planned} of 40 planned grasps are felt, {blind} blind ones");
+}
+
+/// A gripper as ROS has it: a xacro macro for both jaws, and a mesh of a package.
+const XACRO: &str = r#"<robot name="gripper" xmlns:xacro="http://www.ros.org/wiki/xacro">
+<xacro:macro name="jaw" params="side sign">
+  <link name="${side}_jaw"><collision><origin xyz="0 ${sign * 0.006} 0.03"/>
+    <geometry><mesh filename="package://my_gripper/meshes/jaw.obj" scale="0.001 0.001 0.001"/></geometry></collision></link>
+</xacro:macro>
+<link name="base"><collision><origin xyz="0 0 -0.03"/><geometry><box size="0.06 0.1 0.06"/></geometry></collision></link>
+<xacro:jaw side="left" sign="1"/>
+<xacro:jaw side="right" sign="-1"/>
+<joint name="jaw" type="prismatic"><parent link="base"/><child link="left_jaw"/><axis xyz="0 1 0"/>
+  <limit lower="0" upper="0.04"/></joint>
+<joint name="right" type="prismatic"><parent link="base"/><child link="right_jaw"/><axis xyz="0 -1 0"/>
+  <limit lower="0" upper="0.04"/><mimic joint="jaw"/></joint>
+</robot>"#;
+
+/// A box of 20 x 12 x 60 mm around the origin, in millimetres.
+fn jaw_obj() -> String {
+    let corners: String = (0..8)
+        .map(|idx| {
+            let side = |bit: usize, half: i32| if idx & bit == 0 { -half } else { half };
+            format!("v {} {} {}\n", side(1, 10), side(2, 6), side(4, 30))
+        })
+        .collect();
+    let faces = ["1 3 4 2", "5 6 8 7", "1 2 6 5", "3 7 8 4", "1 5 7 3", "2 4 8 6"];
+    corners + &faces.map(|face| format!("f {face}\n")).concat()
+}
+
+/// A ROS package with the gripper.
+fn package(folder: &Path) {
+    for name in ["my_gripper/urdf", "my_gripper/meshes"] {
+        std::fs::create_dir_all(folder.join(name)).expect("made");
+    }
+    std::fs::write(folder.join("my_gripper/urdf/gripper.urdf.xacro"), XACRO).expect("written");
+    std::fs::write(folder.join("my_gripper/meshes/jaw.obj"), jaw_obj()).expect("written");
+}
+
+const URDF: &str = "my_gripper/urdf/gripper.urdf.xacro";
+
+#[test]
+fn a_hand_is_made_from_xacro_with_meshes_and_grids() {
+    let folder = tempfile::tempdir().expect("a folder");
+    package(folder.path());
+    let new = ["new", "hand", "mine", "--urdf", URDF, "--open", "jaw=0.04"];
+    let grids = ["--grid", "left_jaw=4x3", "--grid", "right_jaw=4x3"];
+    let (stdout, _) = run_in(folder.path(), &[&new[..], &grids[..]].concat(), 0);
+    assert!(
+        stdout.contains("prismatic") && stdout.contains("0.0000 m") && stdout.contains("2 pads, 24 cells"),
+        "{stdout}"
+    );
+    let made = folder.path().join("mine");
+    let urdf = std::fs::read_to_string(made.join("mine.urdf")).expect("a URDF");
+    assert!(urdf.contains("filename=\"meshes/jaw.obj\"") && !urdf.contains("package://"), "{urdf}");
+    assert!(made.join("meshes/jaw.obj").is_file() && made.join("mine.svg").is_file());
+    // The cells lie on the inner faces of the meshes' hulls and look at each other.
+    let (cells, stderr) = run_in(folder.path(), &["info", "mine/mine.yaml", "--joints", "jaw=0.02", "--json"], 0);
+    assert!(stderr.is_empty(), "{stderr}");
+    let cells: serde_json::Value = serde_json::from_str(&cells).expect("JSON");
+    for cell in cells.as_array().expect("cells") {
+        let side = if cell["pad"] == "left_jaw" { 1.0 } else { -1.0 };
+        let number = |key: &str, idx: usize| cell[key][idx].as_f64().expect("a number");
+        assert!((number("position_m", 1) - side * 0.02).abs() < 1e-6, "{cell}");
+        assert!((number("normal", 1) + side).abs() < 1e-6, "{cell}");
+    }
+    let simulate = ["simulate", "--hand", "mine/mine.yaml", "--protocol", "planned", "--grasps", "10"];
+    run_in(folder.path(), &[&simulate[..], &["--stable-fraction", "natural", "--out", "grasps.mcap"]].concat(), 0);
+}
+
+/// The command that makes another hand of the gripper.
+fn other<'a>(more: &[&'a str]) -> Vec<&'a str> {
+    [&["new", "hand", "other", "--urdf", "gripper.urdf"][..], more].concat()
+}
+
+#[test]
+fn a_hand_is_made_from_a_table_of_cells() {
+    let folder = tempfile::tempdir().expect("a folder");
+    std::fs::write(folder.path().join("gripper.urdf"), read("hands/parallel-gripper.urdf")).expect("written");
+    let table = "link,pad,x,y,z,nx,ny,nz,threshold\nleft_jaw,left,0,0,0.03,0,-1,0,0.2\nleft_jaw,left,0,0,0.04,0,-1,0,\n\
+                 right_jaw,right,0,0,0.03,0,1,0,\n";
+    let write = |table: &str| std::fs::write(folder.path().join("cells.csv"), table).expect("written");
+    write(table);
+    let new = ["new", "hand", "mine", "--urdf", "gripper.urdf", "--cells", "cells.csv", "--open", "jaw=0.0425"];
+    let (stdout, _) = run_in(folder.path(), &new, 0);
+    assert!(stdout.contains("2 pads, 3 cells") && stdout.contains("no width and height"), "{stdout}");
+    let layout = std::fs::read_to_string(folder.path().join("mine/mine.yaml")).expect("a layout");
+    assert!(
+        layout.contains("at_m: [0, 0, 0.03], normal: [0, -1, 0], along: [0, 0, 1], size_m: [0.008, 0.008]"),
+        "{layout}"
+    );
+    assert!(layout.contains("noise_threshold_newtons: 0.05}"), "{layout}");
+
+    // Nothing is overwritten, and a hand that is refused leaves no folder.
+    let (_, stderr) = run_in(folder.path(), &new, 1);
+    assert!(stderr.contains("mine is there already"), "{stderr}");
+    let from_table = |table: &str, expected: &[&str]| {
+        write(table);
+        let (_, stderr) = run_in(folder.path(), &other(&["--cells", "cells.csv"]), 1);
+        assert!(expected.iter().all(|part| stderr.contains(part)), "{expected:?} in {stderr}");
+        assert!(!folder.path().join("other").exists());
+    };
+    from_table(&table.replace("0,-1,0", "0,1,0"), &["pad 'left'", "points into the link"]);
+    from_table(&table.replace("0.03", "30"), &["metres, not millimetres"]);
+    from_table(&table.replace("left_jaw", "thumb"), &["no link 'thumb'", "left_jaw"]);
+    from_table(&table.replace("0,-1,0", "0,0,0"), &["a normal without a direction"]);
+    from_table(&table.replace("nx", "normal"), &["cells.csv", "nx"]);
+    for (more, expected) in [
+        (&[][..], "the cells are missing"),
+        (&["--grid", "thumb=2x2"], "no link 'thumb'"),
+        (&["--grid", "left_jaw=2x2", "--open", "jaw=1"], "open: 'jaw' is 1"),
+        (&["--grid", "left_jaw=2x2", "--preshape", "wrist"], "'wrist' is not listed"),
+        (&["--grid", "left_jaw=2x2", "--palm-pose", "0,0,0,0,0,0"], "--palm-pose needs --palm"),
+    ] {
+        let (_, stderr) = run_in(folder.path(), &other(more), 1);
+        assert!(stderr.contains(expected), "{more:?}: {stderr}");
+        assert!(!folder.path().join("other").exists());
+    }
+    // A palm frame that looks into the gripper is said.
+    let grid = ["--grid", "left_jaw=2x2", "--grid", "right_jaw=2x2", "--palm", "palm"];
+    let (_, stderr) = run_in(folder.path(), &other(&[&grid[..], &["--palm-pose", "0,0,0,3.14159,0,0"]].concat()), 0);
+    assert!(stderr.contains("8 of 8 cells lie behind the palm"), "{stderr}");
+}
+
+#[test]
+fn a_hand_is_drawn_by_itself() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (svg, html) = (folder.path().join("hand.svg"), folder.path().join("hand.html"));
+    run(&["view", "hands/parallel-gripper.yaml", "--joints", "jaw=0.01", "--out", utf8(&svg)], 0);
+    let picture = std::fs::read_to_string(&svg).expect("a picture");
+    for expected in ["parallel-gripper", ">24<", "the normal of each cell", "0.010", "RAD, M"] {
+        assert!(picture.contains(expected), "{expected}");
+    }
+    assert!(!picture.contains("not labelled"));
+    run(&["view", "allegro", "--out", utf8(&html)], 0);
+    assert!(std::fs::read_to_string(&html).expect("a page").contains("<title>Hand allegro</title>"));
+    let error = text(&run(&["view", "allegro"], 2).stderr).to_owned();
+    assert!(error.contains("--out is missing"), "{error}");
+    let error = text(&run(&["view", "allegro", "--joints", "joint_1=9", "--out", utf8(&svg)], 1).stderr).to_owned();
+    assert!(error.contains("joint 'joint_1' is 9 rad, expected -0.196 to 1.61"), "{error}");
+}
