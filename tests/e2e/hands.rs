@@ -26,13 +26,13 @@ fn run_in(folder: &Path, arguments: &[&str], exit_code: i32) -> (String, String)
 fn a_gripper_is_simulated_trained_and_run_by_one_command() {
     let folder = tempfile::tempdir().expect("a folder");
     let output = Command::new(project().join("scripts/try-hand"))
-        .args(["hands/parallel-gripper.yaml", utf8(folder.path()), "90"])
+        .args(["hands/parallel-gripper.yaml", utf8(folder.path()), "75"])
         .env("BLINDGRASP", env!("CARGO_BIN_EXE_blindgrasp"))
         .output()
         .expect("started");
     let (stdout, stderr) = (text(&output.stdout), text(&output.stderr));
     assert!(output.status.success(), "{stdout}\n{stderr}");
-    for expected in ["label: lift", "promised for new objects", "grasps           30 (", "samples lost     0"] {
+    for expected in ["label: lift", "promised for new objects", "grasps           25 (", "samples lost     0"] {
         assert!(stdout.contains(expected), "'{expected}' in\n{stdout}");
     }
     // 0 undecided, and some of each: the model tells grasps apart.
@@ -45,11 +45,14 @@ fn a_hand_of_sixteen_joints_is_simulated_trained_and_judged() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| utf8(&folder.path().join(name)).to_owned();
     let (grasps, model) = (at("grasps.mcap"), at("model.json"));
-    let simulate = ["simulate", "--hand", "allegro", "--protocol", "planned", "--grasps", "150", "--out", &grasps];
+    let simulate = ["simulate", "--hand", "allegro", "--protocol", "planned", "--grasps", "80", "--out", &grasps];
     let report = text(&run(&[&simulate[..], &["--thresholds", "0.03,0.02"]].concat(), 0).stdout).to_owned();
     assert!(report.contains("stable: epsilon > 0.03 and volume > 0.02"), "{report}");
     run(&["train", &grasps, "--hand", "allegro", "--out", &model], 0);
-    let judged = text(&run(&["evaluate", &model, &grasps, "--hand", "allegro"], 0).stdout).to_owned();
+    let others = at("others.mcap");
+    let simulate = ["simulate", "--hand", "allegro", "--protocol", "planned", "--grasps", "15", "--seed", "2"];
+    run(&[&simulate[..], &["--stable-fraction", "natural", "--out", &others]].concat(), 0);
+    let judged = text(&run(&["evaluate", &model, &others, "--hand", "allegro"], 0).stdout).to_owned();
     assert!(judged.contains("accuracy"), "{judged}");
     // A lift in physics, of the same hand.
     let lifted = at("lifted.mcap");
@@ -63,7 +66,7 @@ fn planned_lifts_are_felt_more_often_than_blind_ones() {
     let n_felt = |approach: &str| {
         let out = utf8(&folder.path().join(format!("{approach}.mcap"))).to_owned();
         let lift =
-            ["simulate", "--hand", "parallel-gripper", "--label", "lift", "--protocol", approach, "--grasps", "40"];
+            ["simulate", "--hand", "parallel-gripper", "--label", "lift", "--protocol", approach, "--grasps", "20"];
         run(&[&lift[..], &["--stable-fraction", "natural", "--out", &out]].concat(), 0);
         let frames = text(&run(&["export", &out, "--format", "jsonl"], 0).stdout).to_owned();
         let settled = frames.lines().filter(|line| line.contains("\"phase\":\"settled\""));
@@ -77,7 +80,7 @@ fn planned_lifts_are_felt_more_often_than_blind_ones() {
         felt.len()
     };
     let (blind, planned) = (n_felt("blind"), n_felt("planned"));
-    assert!(planned > 20 && planned >= blind, "{planned} of 40 planned grasps are felt, {blind} blind ones");
+    assert!(planned > 10 && planned >= blind, "{planned} of 20 planned grasps are felt, {blind} blind ones");
 }
 
 /// A gripper as ROS has it: a xacro macro for both jaws, and a mesh of a package.
