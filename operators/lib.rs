@@ -13,6 +13,7 @@ mod link;
 mod recorded_source;
 mod regrasp;
 mod ros2;
+mod ros2_markers;
 mod senses;
 mod simulated_hand;
 mod tactile_source;
@@ -33,7 +34,7 @@ pub struct Shipped {
 
 /// All of them, with their variants.
 #[rustfmt::skip]
-pub const SHIPPED: [Shipped; 18] = [
+pub const SHIPPED: [Shipped; 19] = [
     of("recorded_source", "", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "tactile", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "contacts", recorded_source::describe::<ContactSet>, recorded_source::work::<ContactSet>),
@@ -51,6 +52,7 @@ pub const SHIPPED: [Shipped; 18] = [
     of("lift_arbiter", "", lift_arbiter::describe, lift_arbiter::work),
     of("regrasp", "", regrasp::describe, regrasp::work),
     of("ros2", "", ros2::describe, ros2::work),
+    of("zenoh", "", ros2::describe_json, ros2::work_json),
     of("link", "", link::describe, link::work),
 ];
 

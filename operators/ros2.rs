@@ -1,4 +1,4 @@
-//! Publishes samples of the graph as topics of ROS 2.
+//! Publishes samples of the graph as topics of ROS 2 (operator `ros2`), or as JSON on keys of Zenoh (operator `zenoh`).
 //!
 //! Its inputs must be `latest`: the network never holds up the graph. Nothing that comes from the network is read.
 
@@ -7,6 +7,7 @@ use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use super::ros2_markers::hand_markers;
 use anyhow::{Context as _, bail};
 use blindgrasp_bridge::certificates::key_files;
 use blindgrasp_bridge::config::KeyFiles;
@@ -23,7 +24,7 @@ use blindgrasp_operator::source::{self, Source, Step};
 use blindgrasp_recording::cdr;
 use blindgrasp_ros::definition::Definition;
 use blindgrasp_ros::node::{
-    Keys, MAX_DOMAIN, MessageType, Network, Quality, RosError, RosNode, RosPublisher, topic_name,
+    KeyPublisher, Keys, MAX_DOMAIN, MessageType, Network, Quality, RosError, RosNode, RosPublisher, Session, topic_name,
 };
 use blindgrasp_ros::standard;
 use blindgrasp_stages::hand::Hand;
@@ -36,6 +37,8 @@ const KEY_NAME: &str = "ros2";
 /// The definition of decisions, made for programs that move an arm.
 const DECISION: &str = include_str!("Decision.msg");
 const DECISION_SCHEMA: &str = "blindgrasp_msgs/msg/Decision";
+/// The least time between two pictures of the hand: 10 a second.
+const MARKER_NANOS: u64 = 100_000_000;
 /// The pause between two attempts to reach the router.
 const RETRY_NANOS: u64 = 1_000_000_000;
 
@@ -112,52 +115,153 @@ fn is_on_loopback(endpoint: &str) -> bool {
 
 pub(crate) fn describe() -> OperatorDescription {
     let mut description = OperatorDescription::new("ros2", "Publishes samples as topics of ROS 2");
-    for (name, type_name, summary) in [
-        ("decision", LiftDecision::TYPE_NAME, "Topic decision, and when it ceases to be valid"),
-        ("tactile", TactileFrame::TYPE_NAME, "Topic tactile; with the param 'hand', joint_states as well"),
-        ("contacts", ContactSet::TYPE_NAME, "Topics contacts and contact_points"),
-        ("feature", GraspFeature::TYPE_NAME, "Topic feature"),
-        ("prediction", Prediction::TYPE_NAME, "Topic prediction"),
-    ] {
+    for (name, type_name, summary) in INPUTS {
         description = description.optional_input(name, type_name, summary);
     }
     with_network_params(description.uses_network()).optional_param(
         "hand",
         ParamKind::Path { must_exist: true },
-        "The hand's pad layout (YAML), which names the joints of joint_states",
+        "The hand's pad layout (YAML), for joint_states and hand_markers",
     )
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let (network, domain, namespace) = params.network.network()?;
-    let joint_names = match &params.hand {
-        Some(path) => Hand::load(path)?.joints.iter().map(|joint| joint.name.clone()).collect(),
-        None => Vec::new(),
-    };
+    let hand = params.hand.as_deref().map(Hand::load).transpose()?;
     let mut edges: Vec<Box<dyn Forward>> = Vec::new();
     edges.extend(edge::<LiftDecision>(operator, "decision", vec![decision_topic()?])?);
     let mut tactile = vec![topic_of::<TactileFrame>("tactile")?];
-    if !joint_names.is_empty() {
+    if let Some(hand) = hand {
+        let joint_names: Vec<String> = hand.joints.iter().map(|joint| joint.name.clone()).collect();
         tactile.push(Topic {
             name: "joint_states",
-            message: standard_type("sensor_msgs/msg/JointState")?,
+            message: Some(standard_type("sensor_msgs/msg/JointState")?),
             quality: Quality::Sensor,
             encode: Box::new(move |sample, data| cdr::joint_state(&sample.header, &joint_names, &sample.message, data)),
+            interval_nanos: 0,
+        });
+        tactile.push(Topic {
+            name: "hand_markers",
+            message: Some(standard_type("visualization_msgs/msg/MarkerArray")?),
+            quality: Quality::Sensor,
+            encode: Box::new(move |sample, data| hand_markers(&hand, sample, data)),
+            interval_nanos: MARKER_NANOS,
         });
     }
     edges.extend(edge::<TactileFrame>(operator, "tactile", tactile)?);
     let points = Topic {
         name: "contact_points",
-        message: standard_type("sensor_msgs/msg/PointCloud2")?,
+        message: Some(standard_type("sensor_msgs/msg/PointCloud2")?),
         quality: Quality::Sensor,
         encode: Box::new(|sample: &Stamped<ContactSet>, data: &mut Vec<u8>| {
             cdr::contact_points(&sample.header, &sample.message, data)
         }),
+        interval_nanos: 0,
     };
     edges.extend(edge::<ContactSet>(operator, "contacts", vec![topic_of::<ContactSet>("contacts")?, points])?);
     edges.extend(edge::<GraspFeature>(operator, "feature", vec![topic_of::<GraspFeature>("feature")?])?);
     edges.extend(edge::<Prediction>(operator, "prediction", vec![topic_of::<Prediction>("prediction")?])?);
+    publish(operator, network, domain, namespace, edges, Form::Ros)
+}
+
+/// The inputs of both operators.
+const INPUTS: [(&str, &str, &str); 5] = [
+    ("decision", LiftDecision::TYPE_NAME, "Topic decision, and when it ceases to be valid"),
+    ("tactile", TactileFrame::TYPE_NAME, "Topic tactile; with the param 'hand', joint_states and hand_markers as well"),
+    ("contacts", ContactSet::TYPE_NAME, "Topics contacts and contact_points"),
+    ("feature", GraspFeature::TYPE_NAME, "Topic feature"),
+    ("prediction", Prediction::TYPE_NAME, "Topic prediction"),
+];
+
+/// What other programs see.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Form {
+    /// Topics of a node, in CDR.
+    Ros,
+    /// Keys, with JSON.
+    Json,
+}
+
+pub(crate) fn describe_json() -> OperatorDescription {
+    let mut description = OperatorDescription::new("zenoh", "Publishes samples as JSON on keys of Zenoh");
+    for (name, type_name, _) in INPUTS {
+        description = description.optional_input(name, type_name, &format!("Key PREFIX/{name}"));
+    }
+    description
+        .uses_network()
+        .optional_param("connect", ParamKind::String {}, "A Zenoh router or node, like tcp/localhost:7447, the default")
+        .optional_param(
+            "listen",
+            ParamKind::String {},
+            "An endpoint at which programs connect, like tcp/127.0.0.1:7448",
+        )
+        .optional_param(
+            "keys",
+            ParamKind::Path { must_exist: true },
+            "A folder with ca.pem, ros2.pem and ros2.key.pem, for endpoints tls/HOST:PORT",
+        )
+        .optional_param("prefix", ParamKind::String {}, "Before the names of keys, blindgrasp by default")
+}
+
+pub(crate) fn work_json(operator: &Operator) -> anyhow::Result<()> {
+    #[derive(Deserialize)]
+    struct Params {
+        prefix: Option<String>,
+        #[serde(flatten)]
+        network: NetworkParams,
+    }
+    let params: Params = operator.params()?;
+    let (network, ..) = params.network.network()?;
+    let prefix = params.prefix.unwrap_or_else(|| "blindgrasp".into());
+    topic_name("/", &prefix.replace('/', "_"))
+        .ok()
+        .filter(|_| !prefix.is_empty() && !prefix.starts_with('/') && !prefix.ends_with('/'))
+        .with_context(|| format!("prefix '{prefix}': expected words of letters, digits and _, with / between them"))?;
+    let mut edges: Vec<Box<dyn Forward>> = Vec::new();
+    edges.extend(json_edge::<LiftDecision>(operator, "decision", Quality::KeepLast(1))?);
+    edges.extend(json_edge::<TactileFrame>(operator, "tactile", Quality::Sensor)?);
+    edges.extend(json_edge::<ContactSet>(operator, "contacts", Quality::Sensor)?);
+    edges.extend(json_edge::<GraspFeature>(operator, "feature", Quality::Sensor)?);
+    edges.extend(json_edge::<Prediction>(operator, "prediction", Quality::Sensor)?);
+    publish(operator, network, 0, prefix, edges, Form::Json)
+}
+
+/// An input whose samples are published as JSON.
+fn json_edge<M: Message + Serialize>(
+    operator: &Operator,
+    name: &'static str,
+    quality: Quality,
+) -> anyhow::Result<Option<Box<dyn Forward>>> {
+    #[derive(Serialize)]
+    struct Sample<'a, M> {
+        seq: u64,
+        stamp_nanos: u64,
+        /// For how long a decision is still valid when it is sent.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        valid_for_nanos: Option<u64>,
+        data: &'a M,
+    }
+    let encode: Encode<M> = Box::new(move |sample: &Stamped<M>, data: &mut Vec<u8>| {
+        let Stamped { header, message } = sample;
+        let until = header.valid_until_nanos().unwrap_or(0);
+        let valid_for_nanos = (name == "decision").then(|| until.saturating_sub(monotonic_nanos()));
+        let sample = Sample { seq: header.seq, stamp_nanos: header.stamp_nanos, valid_for_nanos, data: message };
+        data.clear();
+        serde_json::to_writer(data, &sample).map_err(|error| error.to_string())
+    });
+    edge(operator, name, vec![Topic { name, message: None, quality, encode, interval_nanos: 0 }])
+}
+
+/// Publishes the samples of all edges until the graph ends.
+fn publish(
+    operator: &Operator,
+    network: Network,
+    domain: u32,
+    namespace: String,
+    edges: Vec<Box<dyn Forward>>,
+    form: Form,
+) -> anyhow::Result<()> {
     if edges.is_empty() {
         bail!("it has no input: connect one of decision, tactile, contacts, feature and prediction");
     }
@@ -167,6 +271,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         domain,
         namespace,
         edges,
+        form,
         node: None,
         retry_nanos: 0,
         said: None,
@@ -180,16 +285,25 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
 /// A topic that the samples of an edge make.
 struct Topic<M> {
     name: &'static str,
-    message: MessageType,
+    /// The type in ROS 2; `None` for JSON.
+    message: Option<MessageType>,
     quality: Quality,
     encode: Encode<M>,
+    /// Samples that come sooner after the last one make no message.
+    interval_nanos: u64,
 }
 
 type Encode<M> = Box<dyn Fn(&Stamped<M>, &mut Vec<u8>) -> Result<(), String>>;
 
 fn topic_of<M: Recorded>(name: &'static str) -> anyhow::Result<Topic<M>> {
     let message = type_of(M::SCHEMA, &M::definition())?;
-    Ok(Topic { name, message, quality: Quality::Sensor, encode: Box::new(cdr::encode) })
+    Ok(Topic {
+        name,
+        message: Some(message),
+        quality: Quality::Sensor,
+        encode: Box::new(cdr::encode),
+        interval_nanos: 0,
+    })
 }
 
 fn type_of(name: &str, definition: &str) -> anyhow::Result<MessageType> {
@@ -223,10 +337,10 @@ fn decision_topic() -> anyhow::Result<Topic<LiftDecision>> {
     };
     Ok(Topic {
         name: "decision",
-        message: type_of(DECISION_SCHEMA, &standard::with_parts(DECISION, &["builtin_interfaces/Time"]))?,
+        message: Some(type_of(DECISION_SCHEMA, &standard::with_parts(DECISION, &["builtin_interfaces/Time"]))?),
         quality: Quality::KeepLast(1),
         encode: Box::new(move |sample, data| {
-            let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64;
+            let now = unix_nanos();
             let until = sample.header.valid_until_nanos().unwrap_or(0);
             let left = until.saturating_sub(monotonic_nanos());
             let message = &sample.message;
@@ -240,12 +354,17 @@ fn decision_topic() -> anyhow::Result<Topic<LiftDecision>> {
             };
             cdr::encode(&decision, data)
         }),
+        interval_nanos: 0,
     })
+}
+
+fn unix_nanos() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64
 }
 
 /// An input and its topics.
 trait Forward {
-    fn open(&mut self, node: &mut RosNode, namespace: &str) -> Result<(), RosError>;
+    fn open(&mut self, node: &mut Node, namespace: &str) -> Result<(), RosError>;
     fn close(&mut self);
     fn connect(&self) -> anyhow::Result<()>;
     /// Publishes the next sample, if there is a session.
@@ -264,7 +383,20 @@ enum Forwarded {
 struct Edge<M: Message> {
     subscriber: Subscriber<M>,
     topics: Vec<Topic<M>>,
-    publishers: Vec<RosPublisher>,
+    publishers: Vec<Publisher>,
+    /// For each topic, the time of the last sample that made a message.
+    sent_nanos: Vec<Option<u64>>,
+}
+
+/// The graph as other programs see it.
+enum Node {
+    Ros(RosNode),
+    Json(Session),
+}
+
+enum Publisher {
+    Ros(RosPublisher),
+    Json(KeyPublisher),
 }
 
 fn edge<M: Message>(
@@ -279,13 +411,25 @@ fn edge<M: Message>(
         );
     }
     let subscriber = operator.optional_subscriber::<M>(port)?;
-    Ok(subscriber.map(|subscriber| Box::new(Edge { subscriber, topics, publishers: Vec::new() }) as Box<dyn Forward>))
+    Ok(subscriber.map(|subscriber| {
+        let sent_nanos = vec![None; topics.len()];
+        Box::new(Edge { subscriber, topics, publishers: Vec::new(), sent_nanos }) as Box<dyn Forward>
+    }))
 }
 
 impl<M: Message> Forward for Edge<M> {
-    fn open(&mut self, node: &mut RosNode, namespace: &str) -> Result<(), RosError> {
-        let open =
-            |topic: &Topic<M>| node.publisher(&topic_name(namespace, topic.name)?, &topic.message, topic.quality);
+    fn open(&mut self, node: &mut Node, namespace: &str) -> Result<(), RosError> {
+        let open = |topic: &Topic<M>| match (&mut *node, &topic.message) {
+            (Node::Ros(node), Some(message)) => {
+                Ok(Publisher::Ros(node.publisher(&topic_name(namespace, topic.name)?, message, topic.quality)?))
+            }
+            (Node::Ros(_), None) => Err(RosError::Topic(topic.name.into())),
+            (Node::Json(session), _) => {
+                let key = format!("{namespace}/{}", topic.name);
+                let publisher = KeyPublisher::new(session, &key, topic.quality)?;
+                Ok(Publisher::Json(publisher))
+            }
+        };
         self.publishers = self.topics.iter().map(open).collect::<Result<_, _>>()?;
         Ok(())
     }
@@ -317,9 +461,17 @@ impl<M: Message> Forward for Edge<M> {
             return Ok(Forwarded::Unpublished);
         }
         let stamped = Stamped { header, message };
-        for (topic, publisher) in self.topics.iter().zip(&mut self.publishers) {
+        for ((topic, publisher), sent_nanos) in self.topics.iter().zip(&mut self.publishers).zip(&mut self.sent_nanos) {
+            let is_soon = |sent: u64| header.stamp_nanos.wrapping_sub(sent) < topic.interval_nanos;
+            if sent_nanos.is_some_and(is_soon) {
+                continue;
+            }
+            *sent_nanos = Some(header.stamp_nanos);
             (topic.encode)(&stamped, data).map_err(|error| anyhow::anyhow!("{}: {error}", topic.name))?;
-            publisher.publish(data)?;
+            match publisher {
+                Publisher::Ros(publisher) => publisher.publish(data)?,
+                Publisher::Json(publisher) => publisher.publish(data, header.seq, unix_nanos())?,
+            }
         }
         Ok(Forwarded::Published)
     }
@@ -331,7 +483,8 @@ struct Publishing<'a> {
     domain: u32,
     namespace: String,
     edges: Vec<Box<dyn Forward>>,
-    node: Option<RosNode>,
+    form: Form,
+    node: Option<Node>,
     retry_nanos: u64,
     said: Option<String>,
     n_published: u64,
@@ -342,7 +495,10 @@ struct Publishing<'a> {
 impl Publishing<'_> {
     fn open(&mut self) -> Result<(), RosError> {
         let session = self.network.open()?;
-        let mut node = RosNode::new(session, self.domain, &self.namespace, "blindgrasp")?;
+        let mut node = match self.form {
+            Form::Ros => Node::Ros(RosNode::new(session, self.domain, &self.namespace, "blindgrasp")?),
+            Form::Json => Node::Json(session),
+        };
         for edge in &mut self.edges {
             edge.open(&mut node, &self.namespace)?;
         }
@@ -379,7 +535,10 @@ impl Publishing<'_> {
             return;
         }
         match self.open() {
-            Ok(()) => print_diagnostic(&format!("publishes in {}, domain {}", self.namespace, self.domain)),
+            Ok(()) => match self.form {
+                Form::Ros => print_diagnostic(&format!("publishes in {}, domain {}", self.namespace, self.domain)),
+                Form::Json => print_diagnostic(&format!("publishes on {}/*", self.namespace)),
+            },
             Err(error) => {
                 self.edges.iter_mut().for_each(|edge| edge.close());
                 self.retry_nanos = monotonic_nanos() + RETRY_NANOS;
@@ -499,7 +658,7 @@ mod tests {
             topic_of::<Prediction>("prediction").map(|topic| topic.message),
         ];
         for message in hashes {
-            assert!(message.expect("a definition").hash.starts_with("RIHS01_"));
+            assert!(message.expect("a definition").expect("of ROS 2").hash.starts_with("RIHS01_"));
         }
     }
 

@@ -43,6 +43,8 @@ def main() -> None:
     decisions = queue.Queue()
     late = QosProfile(durability=QosDurability.TRANSIENT_LOCAL)
     node(ROS2Subscriber, "/decision", DECISION, callback=decisions.put)
+    markers = []
+    node(ROS2Subscriber, "/hand_markers", "visualization_msgs/msg/MarkerArray", callback=lambda said: markers.append(said.markers))
     joints = node(ROS2Publisher, "/robot/joint_states", "sensor_msgs/msg/JointState")
     cells = node(ROS2Publisher, "/cells", "std_msgs/msg/Float64MultiArray")
     phases = node(ROS2Publisher, "/phase", "std_msgs/msg/String")
@@ -87,6 +89,10 @@ def main() -> None:
     replies = manager.liveliness.get("@ros2_lv/**")
     tokens = sorted("/".join(str(reply.ok.key_expr).split("/")[5:]) for reply in replies if reply.ok)
     print(json.dumps({"tokens": tokens}), flush=True)
+    hand = markers[-1]
+    red = max(range(len(hand[-1].colors)), key=lambda idx: hand[-1].colors[idx].r)
+    print(json.dumps({"pictures": len(markers), "shapes": len(hand) - 1, "cells": len(hand[-1].points),
+                      "size": [hand[0].scale.x, hand[0].scale.y, hand[0].scale.z], "felt": hand[-1].colors[red].r > 0.4}), flush=True)
 
 
 try:

@@ -116,6 +116,14 @@ fn a_robot_in_ros_2_gets_the_decisions_of_its_recording() {
     ] {
         assert!(tokens.contains(expected), "{expected} is not in {tokens}");
     }
+    let hand = Hand::load(&project().join("hands/barrett-bh8-280.yaml")).expect("a hand");
+    let picture = peer.line();
+    let n_shapes: usize = hand.links.iter().map(|link| link.shapes.len()).sum();
+    assert_eq!((&picture["shapes"], &picture["cells"]), (&n_shapes.into(), &hand.n_cells().into()), "{picture}");
+    // The frames are 10 ms apart, the pictures 100 ms.
+    let most = 2 + grasps(N_GRASPS).len() / 10;
+    assert!(picture["pictures"].as_u64().is_some_and(|n| (2..=most as u64).contains(&n)), "{picture}");
+    assert!(picture["felt"] == true && picture["size"][0].as_f64() > Some(0.01), "{picture}");
     let counts = graph.node("tactile_source")["counts"].clone();
     assert_eq!(counts["malformed"], 0, "{counts}");
     let published = || graph.node("ros2")["counts"]["published"].clone();
@@ -240,6 +248,92 @@ session.close()
     // The line that is no JSON, and the second sender, leave a gap in the numbers.
     expected[0] = ("hold".into(), "out_of_order".into());
     assert_eq!(found, [expected.clone(), expected].concat());
+}
+
+#[test]
+fn decisions_go_to_keys_of_zenoh_as_json() {
+    // A router that sends frames and prints the samples of the graph.
+    const CLIENT: &str = "
+import json, sys, time, zenoh
+config = {'mode': 'router', 'listen': {'endpoints': [f'tcp/127.0.0.1:{sys.argv[1]}']}, 'scouting': {'multicast': {'enabled': False}}}
+session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+def show(sample):
+    numbers = bytes(sample.attachment)
+    print(json.dumps({'key': str(sample.key_expr), 'encoding': str(sample.encoding), 'seq': int.from_bytes(numbers[:8], 'little'),
+                      'sent': int.from_bytes(numbers[8:16], 'little') / 1e9 - time.time(),
+                      'sample': json.loads(bytes(sample.payload))}), flush=True)
+subscriber = session.declare_subscriber('robot/hand/*', show)
+publisher = session.declare_publisher('frames', congestion_control=zenoh.CongestionControl.BLOCK)
+print('null', flush=True)
+while not publisher.matching_status.matching:
+    time.sleep(0.05)
+for line in sys.stdin:
+    publisher.put(line)
+time.sleep(60)
+";
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let mut client = Command::new(python());
+    let client = client.args(["-c", CLIENT, &port.to_string()]).stdin(Stdio::piped()).stdout(Stdio::piped());
+    let mut client = client.spawn().expect("started");
+    let stdout = BufReader::new(client.stdout.take().expect("stdout"));
+    let mut stdin = client.stdin.take().expect("stdin");
+    let mut peer = Peer(client, stdout);
+    assert_eq!(peer.line(), Value::Null);
+    let connect = format!("connect: tcp/127.0.0.1:{port}");
+    let source = format!("driver: zenoh\n      {connect}\n      key: frames\n      max_delay_ms: 20000");
+    let flow = live_dataflow(folder.path(), &source);
+    let mut text = std::fs::read_to_string(&flow).expect("readable");
+    let edge = |from: &str| format!("{{from: {from}, policy: latest, capacity: 256}}");
+    write!(
+        text,
+        "\n  zenoh:\n    inputs:\n      decision: {}\n      prediction: {}\n    params: {{{connect}, prefix: robot/hand}}\n    \
+         sandbox: on\n",
+        edge("lift_arbiter/decision"),
+        edge("classifier/prediction")
+    )
+    .expect("written");
+    std::fs::write(&flow, text).expect("written");
+    let graph = Graph::launch(&unique_name(), &flow, &[]);
+    wait_until(|| graph.said().contains("publishes on robot/hand/*"), || graph.said());
+    for frame in grasps(N_GRASPS) {
+        let message = &frame.message;
+        let line = json!({
+            "joints_rad": message.joints_rad, "cells_newtons": message.cells_newtons, "phase": message.phase,
+            "seq": frame.header.seq,
+        });
+        writeln!(stdin, "{line}").expect("written");
+    }
+    let expected = &undisturbed()[..N_GRASPS as usize - 1];
+    let mut found = Vec::new();
+    let mut n_predictions = 0;
+    while found.len() < expected.len() {
+        let line = peer.line();
+        assert_eq!(line["encoding"], "application/json", "{line}");
+        assert!(line["sent"].as_f64().is_some_and(|secs| secs.abs() < 20.0), "{line}");
+        assert_eq!(line["seq"], line["sample"]["seq"]);
+        let (key, sample) = (line["key"].as_str().expect("a key"), &line["sample"]);
+        if key == "robot/hand/prediction" {
+            n_predictions += 1;
+            continue;
+        }
+        assert_eq!(key, "robot/hand/decision");
+        let data = &sample["data"];
+        let word = |key: &str| data[key].as_str().expect("a word").to_owned();
+        let is_valid = sample["valid_for_nanos"].as_u64().expect("a time") > 0;
+        assert!(is_valid || word("action") == "hold", "{line}");
+        found.push((word("action"), word("reason")));
+    }
+    assert_eq!(found, expected);
+    assert!(n_predictions > found.len(), "{n_predictions}");
+    drop(stdin);
+    graph.stop();
+    let flow = std::fs::read_to_string(&flow).expect("readable").replace("robot/hand}", "/robot}");
+    let wrong = folder.path().join("wrong.yaml");
+    std::fs::write(&wrong, flow).expect("written");
+    let said = run(&["run", wrong.to_str().expect("UTF-8")], 1);
+    let said = String::from_utf8_lossy(&said.stderr).into_owned();
+    assert!(said.contains("prefix '/robot': expected words"), "{said}");
 }
 
 /// Rosbags computes the hashes of types on its own, from its own definitions of ROS 2 Jazzy and from our package.

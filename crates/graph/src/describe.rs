@@ -13,7 +13,7 @@ use blindgrasp_operator::description::OperatorDescription;
 
 /// The operators that come with blindgrasp, by the name that `run:` gives. The package `blindgrasp-operators` has the
 /// same table with their functions.
-pub const SHIPPED: [&str; 13] = [
+pub const SHIPPED: [&str; 14] = [
     "recorded_source",
     "tactile_source",
     "simulated_hand",
@@ -27,6 +27,7 @@ pub const SHIPPED: [&str; 13] = [
     "lift_arbiter",
     "regrasp",
     "ros2",
+    "zenoh",
 ];
 /// Those that can share a process: they answer samples, and have no source or device of their own.
 pub const GROUPABLE: [&str; 9] = [

@@ -8,10 +8,13 @@ use serde_json::json;
 use sha2::{Digest, Sha256};
 use zenoh::bytes::Encoding;
 use zenoh::liveliness::LivelinessToken;
+use zenoh::pubsub::PublisherBuilder;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::sample::Sample;
-use zenoh::{Config, Session, Wait};
-use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt as _, CacheConfig};
+use zenoh::{Config, Wait};
+use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilder, AdvancedPublisherBuilderExt as _, CacheConfig};
+
+pub use zenoh::Session;
 
 /// A longer message is dropped by Zenoh.
 const MAX_MESSAGE_BYTES: usize = 16 << 20;
@@ -237,17 +240,8 @@ impl RosNode {
         let gid = self.endpoint("MP", topic, message, quality)?;
         let key = format!("{}{topic}/{}/{}", self.domain, dds_name(message)?, message.hash);
         let builder = self.session.declare_publisher(key).encoding(Encoding::APPLICATION_CDR);
-        let publisher = match quality {
-            Quality::Sensor => builder.congestion_control(CongestionControl::Drop).advanced(),
-            Quality::KeepLast(n) => builder
-                .congestion_control(CongestionControl::Block)
-                .priority(Priority::InteractiveHigh)
-                .express(true)
-                .advanced()
-                .cache(CacheConfig::default().max_samples(n))
-                .publisher_detection(),
-        };
-        Ok(RosPublisher { publisher: publisher.wait().map_err(of_zenoh)?, gid, n_sent: 0 })
+        let publisher = with_quality(builder, quality).wait().map_err(of_zenoh)?;
+        Ok(RosPublisher { publisher, gid, n_sent: 0 })
     }
 
     /// Calls `take` with each message on a topic, of whatever type, from a thread of Zenoh. The node says that it expects
@@ -270,6 +264,22 @@ impl RosNode {
             .wait()
             .map_err(of_zenoh)?;
         Ok(RosSubscriber { _subscriber: subscriber })
+    }
+}
+
+fn with_quality<'a>(
+    builder: PublisherBuilder<'a, 'static>,
+    quality: Quality,
+) -> AdvancedPublisherBuilder<'a, 'static, 'static> {
+    match quality {
+        Quality::Sensor => builder.congestion_control(CongestionControl::Drop).advanced(),
+        Quality::KeepLast(n) => builder
+            .congestion_control(CongestionControl::Block)
+            .priority(Priority::InteractiveHigh)
+            .express(true)
+            .advanced()
+            .cache(CacheConfig::default().max_samples(n))
+            .publisher_detection(),
     }
 }
 
@@ -298,6 +308,33 @@ impl RosPublisher {
         attachment.extend(self.gid);
         self.n_sent += 1;
         self.publisher.put(cdr).attachment(attachment).wait().map_err(of_zenoh)
+    }
+}
+
+/// Sends samples to a key of its own, for programs that are no nodes of ROS 2.
+pub struct KeyPublisher {
+    publisher: AdvancedPublisher<'static>,
+}
+
+impl KeyPublisher {
+    /// A publisher of JSON.
+    ///
+    /// # Errors
+    /// It is no key, or Zenoh refuses it.
+    pub fn new(session: &Session, key: &str, quality: Quality) -> Result<KeyPublisher, RosError> {
+        let builder = session.declare_publisher(key.to_owned()).encoding(Encoding::APPLICATION_JSON);
+        let publisher = with_quality(builder, quality).wait().map_err(of_zenoh)?;
+        Ok(KeyPublisher { publisher })
+    }
+
+    /// Sends a sample, with its number and its time (nanoseconds since 1970) as the attachment: two integers of 64 bits,
+    /// little endian.
+    ///
+    /// # Errors
+    /// The session is closed.
+    pub fn publish(&self, payload: &[u8], seq: u64, unix_nanos: u64) -> Result<(), RosError> {
+        let attachment = [seq.to_le_bytes(), unix_nanos.to_le_bytes()].concat();
+        self.publisher.put(payload).attachment(attachment).wait().map_err(of_zenoh)
     }
 }
 

@@ -6,7 +6,7 @@ use crate::definition::Definition;
 type Standard = (&'static str, &'static str, &'static [&'static str]);
 
 /// The types that a message of the list below consists of.
-const PARTS: [(&str, &str); 8] = [
+const PARTS: [(&str, &str); 16] = [
     ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n"),
     ("std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n"),
     ("std_msgs/MultiArrayDimension", "string label\nuint32 size\nuint32 stride\n"),
@@ -14,13 +14,28 @@ const PARTS: [(&str, &str); 8] = [
     ("geometry_msgs/Vector3", "float64 x\nfloat64 y\nfloat64 z\n"),
     ("geometry_msgs/Quaternion", "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n"),
     ("geometry_msgs/Wrench", "Vector3 force\nVector3 torque\n"),
+    ("builtin_interfaces/Duration", "int32 sec\nuint32 nanosec\n"),
+    ("geometry_msgs/Point", "float64 x\nfloat64 y\nfloat64 z\n"),
+    ("geometry_msgs/Pose", "Point position\nQuaternion orientation\n"),
+    ("std_msgs/ColorRGBA", "float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n"),
+    ("sensor_msgs/CompressedImage", "std_msgs/Header header\nstring format\nuint8[] data\n"),
+    ("visualization_msgs/UVCoordinate", "float32 u\nfloat32 v\n"),
+    ("visualization_msgs/MeshFile", "string filename\nuint8[] data\n"),
+    (
+        "visualization_msgs/Marker",
+        "std_msgs/Header header\nstring ns\nint32 id\nint32 type\nint32 action\ngeometry_msgs/Pose pose\n\
+         geometry_msgs/Vector3 scale\nstd_msgs/ColorRGBA color\nbuiltin_interfaces/Duration lifetime\nbool frame_locked\n\
+         geometry_msgs/Point[] points\nstd_msgs/ColorRGBA[] colors\nstring texture_resource\n\
+         sensor_msgs/CompressedImage texture\nUVCoordinate[] uv_coordinates\nstring text\nstring mesh_resource\n\
+         MeshFile mesh_file\nbool mesh_use_embedded_materials\n",
+    ),
     ("sensor_msgs/PointField", "string name\nuint32 offset\nuint8 datatype\nuint32 count\n"),
 ];
 
 const HEADER: &[&str] = &["std_msgs/Header", "builtin_interfaces/Time"];
 const ARRAY: &[&str] = &["std_msgs/MultiArrayLayout", "std_msgs/MultiArrayDimension"];
 
-const TYPES: [Standard; 10] = [
+const TYPES: [Standard; 11] = [
     (
         "sensor_msgs/msg/JointState",
         "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n",
@@ -53,6 +68,24 @@ const TYPES: [Standard; 10] = [
     ("std_msgs/msg/Float64MultiArray", "MultiArrayLayout layout\nfloat64[] data\n", ARRAY),
     ("std_msgs/msg/UInt16MultiArray", "MultiArrayLayout layout\nuint16[] data\n", ARRAY),
     ("std_msgs/msg/UInt8MultiArray", "MultiArrayLayout layout\nuint8[] data\n", ARRAY),
+    (
+        "visualization_msgs/msg/MarkerArray",
+        "Marker[] markers\n",
+        &[
+            "visualization_msgs/Marker",
+            "std_msgs/Header",
+            "builtin_interfaces/Time",
+            "builtin_interfaces/Duration",
+            "geometry_msgs/Pose",
+            "geometry_msgs/Point",
+            "geometry_msgs/Quaternion",
+            "geometry_msgs/Vector3",
+            "std_msgs/ColorRGBA",
+            "sensor_msgs/CompressedImage",
+            "visualization_msgs/UVCoordinate",
+            "visualization_msgs/MeshFile",
+        ],
+    ),
     ("std_msgs/msg/String", "string data\n", &[]),
 ];
 

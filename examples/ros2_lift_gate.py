@@ -1,0 +1,52 @@
+#!/usr/bin/env python3
+"""A ROS 2 node that lifts only on a fresh LIFT of blindgrasp. Needs ROS 2 with rmw_zenoh and the package blindgrasp_msgs.
+
+    RMW_IMPLEMENTATION=rmw_zenoh_cpp python3 ros2_lift_gate.py
+
+Put the motion of your arm into `lift`. Nothing else may start it.
+"""
+
+import time
+
+import rclpy
+from blindgrasp_msgs.msg import Decision
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
+
+
+class LiftGate(Node):
+    def __init__(self):
+        super().__init__("lift_gate")
+        self.lifted_grasp = None
+        # The last decision is kept for a node that starts late: it may be an old one.
+        qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.create_subscription(Decision, "/blindgrasp/decision", self.on_decision, qos)
+
+    def on_decision(self, decision):
+        if decision.action != Decision.LIFT:
+            self.get_logger().info(f"grasp {decision.grasp_id}: hold, {decision.reason}")
+            return
+        # valid_until is a time of the wall clock, whatever use_sim_time says; the clocks of two machines must agree (NTP).
+        if time.time_ns() >= Time.from_msg(decision.valid_until).nanoseconds:
+            self.get_logger().warning(f"grasp {decision.grasp_id}: LIFT is no longer valid, hold")
+            return
+        # A grasp is lifted once, however often its decision comes.
+        if decision.grasp_id != self.lifted_grasp:
+            self.lifted_grasp = decision.grasp_id
+            self.lift(decision)
+
+    def lift(self, decision):
+        self.get_logger().info(f"grasp {decision.grasp_id}: lift, probability {decision.probability_stable:.2f}")
+
+
+def main():
+    rclpy.init()
+    try:
+        rclpy.spin(LiftGate())
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()
