@@ -336,6 +336,48 @@ time.sleep(60)
     assert!(said.contains("prefix '/robot': expected words"), "{said}");
 }
 
+/// The example node, with stand-ins for ROS: it lifts each grasp once, and only while the LIFT is valid.
+#[test]
+fn the_example_node_lifts_only_on_a_fresh_lift() {
+    const ROBOT: &str = "
+import importlib.util, sys, time, types
+from unittest.mock import MagicMock
+class Node:
+    def __init__(self, name): pass
+    def create_subscription(self, message, topic, take, qos): self.topic = topic
+    def get_logger(self): return MagicMock()
+class Time:
+    def __init__(self, nanoseconds): self.nanoseconds = nanoseconds
+    @staticmethod
+    def from_msg(nanos): return Time(nanos)
+class Decision:
+    HOLD, LIFT, REGRASP, SQUEEZE, TEST_LIFT = range(5)
+    def __init__(self, grasp_id, action, left_secs):
+        self.grasp_id, self.action, self.reason, self.probability_stable = grasp_id, action, 'stable', 0.9
+        self.valid_until = time.time_ns() + int(left_secs * 1e9)
+for name in ['rclpy', 'rclpy.node', 'rclpy.qos', 'rclpy.time', 'blindgrasp_msgs', 'blindgrasp_msgs.msg']:
+    sys.modules[name] = MagicMock()
+sys.modules['rclpy.node'].Node = Node
+sys.modules['rclpy.time'].Time = Time
+sys.modules['blindgrasp_msgs.msg'].Decision = Decision
+spec = importlib.util.spec_from_file_location('gate', sys.argv[1])
+gate = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(gate)
+node, lifted = gate.LiftGate(), []
+node.lift = lambda decision: lifted.append(decision.grasp_id)
+for decision in [Decision(1, Decision.HOLD, 60), Decision(2, Decision.LIFT, -1), Decision(3, Decision.LIFT, 0),
+                 Decision(4, Decision.LIFT, 60), Decision(4, Decision.LIFT, 60), Decision(5, Decision.REGRASP, 60),
+                 Decision(6, Decision.TEST_LIFT, 60), Decision(7, Decision.LIFT, 60)]:
+    node.on_decision(decision)
+print(node.topic, lifted)
+";
+    let example = project().join("examples/ros2_lift_gate.py");
+    let output = Command::new(python()).args(["-c", ROBOT]).arg(example).env("PYTHONDONTWRITEBYTECODE", "1").output();
+    let output = output.expect("started");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(String::from_utf8_lossy(&output.stdout).trim(), "/blindgrasp/decision [4, 7]", "{said}");
+}
+
 /// Rosbags computes the hashes of types on its own, from its own definitions of ROS 2 Jazzy and from our package.
 #[test]
 fn hashes_of_types_are_those_that_rosbags_computes() {
