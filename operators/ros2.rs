@@ -1,11 +1,14 @@
 //! Publishes samples of the graph as topics of ROS 2 (operator `ros2`), or as JSON on keys of Zenoh (operator `zenoh`).
 //!
-//! Its inputs must be `latest`: the network never holds up the graph. Nothing that comes from the network is read.
+//! Its inputs must be `latest`: the network never holds up the graph. All that is read from the network are calls of the
+//! service `decide`, which tells a decision and changes nothing.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use super::ros2_markers::hand_markers;
 use anyhow::{Context as _, bail};
@@ -24,7 +27,8 @@ use blindgrasp_operator::source::{self, Source, Step};
 use blindgrasp_recording::cdr;
 use blindgrasp_ros::definition::Definition;
 use blindgrasp_ros::node::{
-    KeyPublisher, Keys, MAX_DOMAIN, MessageType, Network, Quality, RosError, RosNode, RosPublisher, Session, topic_name,
+    KeyPublisher, Keys, MAX_DOMAIN, MessageType, Network, Quality, Request, RosError, RosNode, RosPublisher,
+    RosService, Session, topic_name,
 };
 use blindgrasp_ros::standard;
 use blindgrasp_stages::hand::Hand;
@@ -37,6 +41,12 @@ const KEY_NAME: &str = "ros2";
 /// The definition of decisions, made for programs that move an arm.
 const DECISION: &str = include_str!("Decision.msg");
 const DECISION_SCHEMA: &str = "blindgrasp_msgs/msg/Decision";
+/// The service that waits for a decision.
+const DECIDE: &str = include_str!("Decide.srv");
+const DECIDE_SCHEMA: &str = "blindgrasp_msgs/srv/Decide";
+const MAX_TIMEOUT_SECS: f64 = 60.0;
+/// Calls that wait at the same time; others are answered at once, without a decision.
+const MAX_WAITING: usize = 16;
 /// The least time between two pictures of the hand: 10 a second.
 const MARKER_NANOS: u64 = 100_000_000;
 /// The pause between two attempts to reach the router.
@@ -130,7 +140,9 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let (network, domain, namespace) = params.network.network()?;
     let hand = params.hand.as_deref().map(Hand::load).transpose()?;
     let mut edges: Vec<Box<dyn Forward>> = Vec::new();
-    edges.extend(edge::<LiftDecision>(operator, "decision", vec![decision_topic()?])?);
+    let last = Arc::new(LastDecision::default());
+    edges.extend(edge::<LiftDecision>(operator, "decision", vec![decision_topic(&last)?])?);
+    let decides = !edges.is_empty();
     let mut tactile = vec![topic_of::<TactileFrame>("tactile")?];
     if let Some(hand) = hand {
         let joint_names: Vec<String> = hand.joints.iter().map(|joint| joint.name.clone()).collect();
@@ -162,7 +174,8 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     edges.extend(edge::<ContactSet>(operator, "contacts", vec![topic_of::<ContactSet>("contacts")?, points])?);
     edges.extend(edge::<GraspFeature>(operator, "feature", vec![topic_of::<GraspFeature>("feature")?])?);
     edges.extend(edge::<Prediction>(operator, "prediction", vec![topic_of::<Prediction>("prediction")?])?);
-    publish(operator, network, domain, namespace, edges, Form::Ros)
+    let form = if decides { Form::Ros(Some(last)) } else { Form::Ros(None) };
+    publish(operator, network, domain, namespace, edges, form)
 }
 
 /// The inputs of both operators.
@@ -175,10 +188,9 @@ const INPUTS: [(&str, &str, &str); 5] = [
 ];
 
 /// What other programs see.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Form {
-    /// Topics of a node, in CDR.
-    Ros,
+    /// Topics of a node, in CDR, and the service that tells the last decision.
+    Ros(Option<Arc<LastDecision>>),
     /// Keys, with JSON.
     Json,
 }
@@ -271,8 +283,10 @@ fn publish(
         domain,
         namespace,
         edges,
+        decide: matches!(form, Form::Ros(Some(_))).then(decide_type).transpose()?,
         form,
         node: None,
+        service: None,
         retry_nanos: 0,
         said: None,
         n_published: 0,
@@ -316,46 +330,115 @@ fn standard_type(name: &str) -> anyhow::Result<MessageType> {
 }
 
 /// The topic of decisions, for programs that move an arm.
-fn decision_topic() -> anyhow::Result<Topic<LiftDecision>> {
-    #[derive(Serialize)]
-    struct Time {
-        sec: i32,
-        nanosec: u32,
-    }
-    #[derive(Serialize)]
-    struct Decision<'a> {
-        stamp: Time,
-        valid_until: Time,
-        grasp_id: u64,
-        action: u8,
-        reason: &'a str,
-        probability_stable: f64,
-    }
-    let time = |nanos: u64| Time {
-        sec: i32::try_from(nanos / 1_000_000_000).unwrap_or(i32::MAX),
-        nanosec: (nanos % 1_000_000_000) as u32,
-    };
+fn decision_topic(last: &Arc<LastDecision>) -> anyhow::Result<Topic<LiftDecision>> {
+    let last = Arc::clone(last);
     Ok(Topic {
         name: "decision",
         message: Some(type_of(DECISION_SCHEMA, &standard::with_parts(DECISION, &["builtin_interfaces/Time"]))?),
         quality: Quality::KeepLast(1),
         encode: Box::new(move |sample, data| {
-            let now = unix_nanos();
-            let until = sample.header.valid_until_nanos().unwrap_or(0);
-            let left = until.saturating_sub(monotonic_nanos());
-            let message = &sample.message;
-            let decision = Decision {
-                stamp: time(now),
-                valid_until: time(now + left),
-                grasp_id: message.grasp_id,
-                action: message.action.code() as u8,
-                reason: message.reason.as_str(),
-                probability_stable: message.probability_stable,
-            };
-            cdr::encode(&decision, data)
+            let until_nanos = sample.header.valid_until_nanos().unwrap_or(0);
+            last.set(&sample.message, until_nanos);
+            cdr::encode(&Decision::new(&sample.message, until_nanos), data)
         }),
         interval_nanos: 0,
     })
+}
+
+/// `blindgrasp_msgs/msg/Decision`.
+#[derive(Serialize, Default)]
+struct Decision {
+    stamp: Time,
+    valid_until: Time,
+    grasp_id: u64,
+    action: u8,
+    reason: String,
+    probability_stable: f64,
+}
+
+#[derive(Serialize, Default)]
+struct Time {
+    sec: i32,
+    nanosec: u32,
+}
+
+impl Decision {
+    /// As it is said now, of a decision that is valid until a time of this machine.
+    fn new(decision: &LiftDecision, until_nanos: u64) -> Decision {
+        let time = |nanos: u64| Time {
+            sec: i32::try_from(nanos / 1_000_000_000).unwrap_or(i32::MAX),
+            nanosec: (nanos % 1_000_000_000) as u32,
+        };
+        let now = unix_nanos();
+        Decision {
+            stamp: time(now),
+            valid_until: time(now + until_nanos.saturating_sub(monotonic_nanos())),
+            grasp_id: decision.grasp_id,
+            action: decision.action.code() as u8,
+            reason: decision.reason.as_str().into(),
+            probability_stable: decision.probability_stable,
+        }
+    }
+}
+
+/// The last decision, for calls that wait for one.
+#[derive(Default)]
+struct LastDecision {
+    /// The decision, and until when it is valid by the clock of this machine.
+    decision: Mutex<Option<(LiftDecision, u64)>>,
+    comes: Condvar,
+    n_waiting: AtomicUsize,
+}
+
+impl LastDecision {
+    fn set(&self, decision: &LiftDecision, until_nanos: u64) {
+        *self.decision.lock().unwrap_or_else(PoisonError::into_inner) = Some((decision.clone(), until_nanos));
+        self.comes.notify_all();
+    }
+
+    /// The last decision if it is valid, or else the next one that is, within the time.
+    fn wait(&self, longest: Duration) -> Option<Decision> {
+        let valid = |decision: &mut Option<(LiftDecision, u64)>| {
+            !decision.as_ref().is_some_and(|(_, until_nanos)| *until_nanos > monotonic_nanos())
+        };
+        let decision = self.decision.lock().unwrap_or_else(PoisonError::into_inner);
+        let waited = self.comes.wait_timeout_while(decision, longest, valid);
+        let (decision, timeout) = waited.unwrap_or_else(PoisonError::into_inner);
+        let (decision, until_nanos) = decision.as_ref().filter(|_| !timeout.timed_out())?;
+        Some(Decision::new(decision, *until_nanos))
+    }
+
+    /// Answers a call, in a thread of its own, because it waits.
+    fn answer(self: &Arc<Self>, request: Request) {
+        let last = Arc::clone(self);
+        // CDR: four bytes of its kind, then the number.
+        let timeout_secs = request.bytes.get(4..12).and_then(|bytes| Some(f64::from_le_bytes(bytes.try_into().ok()?)));
+        let timeout_secs = timeout_secs.filter(|secs| (0.0..=MAX_TIMEOUT_SECS).contains(secs)).unwrap_or(0.0);
+        let has_room = self.n_waiting.fetch_add(1, Ordering::Relaxed) < MAX_WAITING;
+        let longest = Duration::from_secs_f64(if has_room { timeout_secs } else { 0.0 });
+        let answering = move || {
+            let decision = last.wait(longest);
+            let mut data = Vec::new();
+            let answer = (decision.is_some(), decision.unwrap_or_default());
+            if cdr::encode(&answer, &mut data).is_ok()
+                && let Err(error) = request.answer(&data)
+            {
+                print_diagnostic(&format!("a call of decide is not answered: {error}"));
+            }
+            last.n_waiting.fetch_sub(1, Ordering::Relaxed);
+        };
+        if std::thread::Builder::new().name("decide".into()).spawn(answering).is_err() {
+            self.n_waiting.fetch_sub(1, Ordering::Relaxed);
+        }
+    }
+}
+
+fn decide_type() -> anyhow::Result<MessageType> {
+    let (request, response) = DECIDE.split_once("---").context("Decide.srv has no line ---")?;
+    let line = "=".repeat(80);
+    let parts = format!("{line}\nMSG: blindgrasp_msgs/Decision\n{DECISION}\n");
+    let definition = standard::service(DECIDE_SCHEMA, request, response, &parts)?;
+    Ok(MessageType { name: DECIDE_SCHEMA.into(), hash: definition.hash() })
 }
 
 fn unix_nanos() -> u64 {
@@ -484,7 +567,10 @@ struct Publishing<'a> {
     namespace: String,
     edges: Vec<Box<dyn Forward>>,
     form: Form,
+    /// The type of the service.
+    decide: Option<MessageType>,
     node: Option<Node>,
+    service: Option<RosService>,
     retry_nanos: u64,
     said: Option<String>,
     n_published: u64,
@@ -495,9 +581,17 @@ struct Publishing<'a> {
 impl Publishing<'_> {
     fn open(&mut self) -> Result<(), RosError> {
         let session = self.network.open()?;
-        let mut node = match self.form {
-            Form::Ros => Node::Ros(RosNode::new(session, self.domain, &self.namespace, "blindgrasp")?),
+        let mut node = match &self.form {
             Form::Json => Node::Json(session),
+            Form::Ros(last) => {
+                let mut node = RosNode::new(session, self.domain, &self.namespace, "blindgrasp")?;
+                if let (Some(last), Some(service)) = (last, &self.decide) {
+                    let last = Arc::clone(last);
+                    let name = topic_name(&self.namespace, "decide")?;
+                    self.service = Some(node.service(&name, service, move |request| last.answer(request))?);
+                }
+                Node::Ros(node)
+            }
         };
         for edge in &mut self.edges {
             edge.open(&mut node, &self.namespace)?;
@@ -535,12 +629,13 @@ impl Publishing<'_> {
             return;
         }
         match self.open() {
-            Ok(()) => match self.form {
-                Form::Ros => print_diagnostic(&format!("publishes in {}, domain {}", self.namespace, self.domain)),
+            Ok(()) => match &self.form {
+                Form::Ros(_) => print_diagnostic(&format!("publishes in {}, domain {}", self.namespace, self.domain)),
                 Form::Json => print_diagnostic(&format!("publishes on {}/*", self.namespace)),
             },
             Err(error) => {
                 self.edges.iter_mut().for_each(|edge| edge.close());
+                self.service = None;
                 self.retry_nanos = monotonic_nanos() + RETRY_NANOS;
                 let error = error.to_string();
                 if self.said.as_ref() != Some(&error) {
@@ -577,6 +672,7 @@ impl Source for Publishing<'_> {
             }
         }
         self.edges.iter_mut().for_each(|edge| edge.close());
+        self.service = None;
         self.node = None;
         self.report_counts();
     }
@@ -629,6 +725,34 @@ mod tests {
         files
     }
 
+    #[test]
+    fn a_call_gets_the_valid_decision_or_waits_for_the_next_or_gets_none() {
+        let last = Arc::new(LastDecision::default());
+        let decision = |grasp_id| LiftDecision { grasp_id, ..LiftDecision::default() };
+        assert!(last.wait(Duration::ZERO).is_none());
+        // One that is no longer valid is not told.
+        last.set(&decision(1), monotonic_nanos() - 1);
+        assert!(last.wait(Duration::from_millis(20)).is_none());
+        last.set(&decision(2), monotonic_nanos() + 60_000_000_000);
+        assert_eq!(last.wait(Duration::ZERO).map(|decision| decision.grasp_id), Some(2));
+        last.set(&decision(3), 0);
+        let other = Arc::clone(&last);
+        let waiting = std::thread::spawn(move || other.wait(Duration::from_secs(60)).map(|found| found.grasp_id));
+        std::thread::sleep(Duration::from_millis(20));
+        last.set(&decision(4), monotonic_nanos() + 60_000_000_000);
+        assert_eq!(waiting.join().expect("ended"), Some(4));
+    }
+
+    /// The file of the service.
+    #[test]
+    fn the_package_has_the_service_of_this_version() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/blindgrasp_msgs/srv/Decide.srv");
+        if std::env::var_os("BLINDGRASP_REMAKE").is_some() {
+            std::fs::write(&path, DECIDE).expect("written");
+        }
+        assert_eq!(std::fs::read_to_string(&path).expect("readable"), DECIDE);
+    }
+
     /// With BLINDGRASP_REMAKE the files are written.
     #[test]
     fn the_package_of_messages_is_that_of_this_version() {
@@ -651,7 +775,7 @@ mod tests {
     #[test]
     fn our_types_have_hashes() {
         let hashes = [
-            decision_topic().map(|topic| topic.message),
+            decision_topic(&Arc::default()).map(|topic| topic.message),
             topic_of::<TactileFrame>("tactile").map(|topic| topic.message),
             topic_of::<ContactSet>("contacts").map(|topic| topic.message),
             topic_of::<GraspFeature>("feature").map(|topic| topic.message),

@@ -19,11 +19,13 @@ os.environ["GIT_PYTHON_REFRESH"] = "quiet"
 import numpy
 import zenoh
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
+from zenoh_ros2_sdk import ROS2Publisher, ROS2ServiceClient, ROS2Subscriber
 from zenoh_ros2_sdk.qos import QosDurability, QosProfile
 from zenoh_ros2_sdk.session import ZenohSession
+from zenoh_ros2_sdk.utils import compute_service_type_hash
 
 DECISION = "blindgrasp_msgs/msg/Decision"
+DECIDE = "blindgrasp_msgs/srv/Decide"
 
 
 def main() -> None:
@@ -82,6 +84,14 @@ def main() -> None:
         valid_secs = (said.valid_until.sec - said.stamp.sec) + 1e-9 * (said.valid_until.nanosec - said.stamp.nanosec)
         print(json.dumps({"grasp_id": said.grasp_id, "action": said.action, "reason": said.reason,
                           "probability": said.probability_stable, "valid_secs": valid_secs}), flush=True)
+    # It is told again to a node that asks.
+    with open(sys.argv[4].replace("Decision.msg", "Decide.srv"), encoding="utf-8") as file:
+        request, response = file.read().split("---")
+    client = ROS2ServiceClient(
+        service_name="/decide", srv_type=DECIDE, request_definition=request, response_definition=response, router_port=port,
+        type_hash=compute_service_type_hash(DECIDE, request, response, {DECISION: definition}), timeout=30)
+    answers = [client.call(timeout_secs=secs) for secs in (5.0, -1.0)]
+    print(json.dumps([[answer.decided, answer.decision.grasp_id, answer.decision.action] for answer in answers]), flush=True)
     # A node that comes later gets the last decision. (zenoh-ros2-sdk finds no publisher whose topic has two words.)
     again = queue.Queue()
     node(ROS2Subscriber, "/decision", DECISION, callback=again.put, qos=late)

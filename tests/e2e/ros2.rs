@@ -106,11 +106,15 @@ fn a_robot_in_ros_2_gets_the_decisions_of_its_recording() {
     peer.send();
     let mut expected = undisturbed()[..N_GRASPS as usize].to_vec();
     assert_decisions(&mut peer, &expected);
+    let (action, _) = &expected[N_GRASPS as usize - 1];
+    let action = serde_json::from_value::<Action>(action.as_str().into()).expect("an action").code();
+    assert_eq!(peer.line(), json!([[true, N_GRASPS - 1, action], [true, N_GRASPS - 1, action]]));
     let late = peer.line();
     assert!(late["late"].is_u64(), "{late}");
     let tokens = peer.line()["tokens"].to_string();
     for expected in [
         "MP/%/%/blindgrasp/%decision/blindgrasp_msgs::msg::dds_::Decision_/RIHS01_",
+        "SS/%/%/blindgrasp/%decide/blindgrasp_msgs::srv::dds_::Decide_/RIHS01_",
         "MP/%/%/blindgrasp/%joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_a13ee3",
         "MS/%/%blindgrasp/blindgrasp_tactile_source/%cells/std_msgs::msg::dds_::Float64MultiArray_/RIHS01_",
     ] {

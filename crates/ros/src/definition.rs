@@ -244,19 +244,21 @@ fn field(line: &str, line_number: usize, of_message: &str) -> Result<Option<Fiel
     Ok(Some(Field { name, element, count }))
 }
 
-/// `package/msg/Name` of `package/msg/Name`, `package/Name` or, in a message of the same package, `Name`.
+/// `package/msg/Name` of `package/msg/Name`, `package/Name` or, in a message of the same package, `Name`. The messages of a
+/// service are `package/srv/Name`.
 fn full_name(name: &str, package: &str) -> Option<String> {
     let parts: Vec<&str> = name.split('/').collect();
-    let (package, name) = match parts.as_slice() {
-        [name] => (package, *name),
-        [package, name] | [package, "msg", name] => (*package, *name),
+    let (package, kind, name) = match parts.as_slice() {
+        [name] => (package, "msg", *name),
+        [package, name] => (*package, "msg", *name),
+        [package, kind @ ("msg" | "srv"), name] => (*package, *kind, *name),
         _ => return None,
     };
     let is_word = |word: &str| {
         word.starts_with(|first: char| first.is_ascii_alphabetic())
             && word.chars().all(|char| char.is_ascii_alphanumeric() || char == '_')
     };
-    (is_word(package) && is_word(name)).then(|| format!("{package}/msg/{name}"))
+    (is_word(package) && is_word(name)).then(|| format!("{package}/{kind}/{name}"))
 }
 
 #[cfg(test)]

@@ -244,6 +244,27 @@ impl RosNode {
         Ok(RosPublisher { publisher, gid, n_sent: 0 })
     }
 
+    /// Calls `take` with each call of a service, from a thread of Zenoh.
+    ///
+    /// # Errors
+    /// Zenoh refuses it.
+    pub fn service(
+        &mut self,
+        name: &str,
+        service: &MessageType,
+        take: impl Fn(Request) + Send + Sync + 'static,
+    ) -> Result<RosService, RosError> {
+        self.endpoint("SS", name, service, Quality::KeepLast(1))?;
+        let key = format!("{}{name}/{}/{}", self.domain, dds_name(service)?, service.hash);
+        let call = move |query| {
+            if let Some(request) = Request::of(query) {
+                take(request);
+            }
+        };
+        let queryable = self.session.declare_queryable(key).complete(true).callback(call).wait().map_err(of_zenoh)?;
+        Ok(RosService { _queryable: queryable })
+    }
+
     /// Calls `take` with each message on a topic, of whatever type, from a thread of Zenoh. The node says that it expects
     /// `message`.
     ///
@@ -285,6 +306,43 @@ fn with_quality<'a>(
 
 fn of_zenoh(error: zenoh::Error) -> RosError {
     RosError::Zenoh(error.to_string())
+}
+
+/// It answers until it is dropped.
+pub struct RosService {
+    _queryable: zenoh::query::Queryable<()>,
+}
+
+/// A call of a service.
+pub struct Request {
+    query: zenoh::query::Query,
+    seq: [u8; 8],
+    client: [u8; 16],
+    /// Of the request, in CDR.
+    pub bytes: Vec<u8>,
+}
+
+impl Request {
+    /// `None` for a call that is not a node's: it has no number and no caller.
+    fn of(query: zenoh::query::Query) -> Option<Request> {
+        let attachment = query.attachment()?.to_bytes().into_owned();
+        let payload = query.payload()?;
+        let bytes = if payload.len() > MAX_RECEIVED_BYTES { return None } else { payload.to_bytes().into_owned() };
+        // The caller's hash comes behind its length.
+        let (seq, client) = (attachment.get(..8)?.try_into().ok()?, attachment.get(17..33)?.try_into().ok()?);
+        Some(Request { query, seq, client, bytes })
+    }
+
+    /// Answers it.
+    ///
+    /// # Errors
+    /// The session is closed.
+    pub fn answer(self, cdr: &[u8]) -> Result<(), RosError> {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as i64;
+        let attachment = [&self.seq[..], &now.to_le_bytes(), &[self.client.len() as u8], &self.client].concat();
+        let key = self.query.key_expr().clone();
+        self.query.reply(key, cdr).attachment(attachment).wait().map_err(of_zenoh)
+    }
 }
 
 /// Sends messages to a topic.

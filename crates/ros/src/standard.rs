@@ -1,12 +1,12 @@
 //! The definitions of the standard messages that blindgrasp reads and writes.
 
-use crate::definition::Definition;
+use crate::definition::{Definition, DefinitionError};
 
 /// A standard message type: its name, its own fields, and the types in it.
 type Standard = (&'static str, &'static str, &'static [&'static str]);
 
 /// The types that a message of the list below consists of.
-const PARTS: [(&str, &str); 16] = [
+const PARTS: [(&str, &str); 17] = [
     ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n"),
     ("std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n"),
     ("std_msgs/MultiArrayDimension", "string label\nuint32 size\nuint32 stride\n"),
@@ -28,6 +28,10 @@ const PARTS: [(&str, &str); 16] = [
          geometry_msgs/Point[] points\nstd_msgs/ColorRGBA[] colors\nstring texture_resource\n\
          sensor_msgs/CompressedImage texture\nUVCoordinate[] uv_coordinates\nstring text\nstring mesh_resource\n\
          MeshFile mesh_file\nbool mesh_use_embedded_materials\n",
+    ),
+    (
+        "service_msgs/ServiceEventInfo",
+        "uint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number\n",
     ),
     ("sensor_msgs/PointField", "string name\nuint32 offset\nuint8 datatype\nuint32 count\n"),
 ];
@@ -107,6 +111,24 @@ pub fn with_parts(fields: &str, parts: &[&str]) -> String {
         format!("{}\nMSG: {name}\n{fields}", "=".repeat(80))
     };
     fields.to_owned() + &parts.iter().map(part).collect::<String>()
+}
+
+/// The definition of a service `PACKAGE/srv/NAME` as one message, from which its hash is made: request, response, and the event
+/// of a call. `parts` are the definitions of the messages in them, each behind its line `MSG: PACKAGE/NAME`.
+///
+/// # Errors
+/// It is no service.
+pub fn service(name: &str, request: &str, response: &str, parts: &str) -> Result<Definition, DefinitionError> {
+    let line = "=".repeat(80);
+    let event_parts = with_parts("", &["service_msgs/ServiceEventInfo", "builtin_interfaces/Time"]);
+    Definition::parse(
+        name,
+        &format!(
+            "{name}_Request request_message\n{name}_Response response_message\n{name}_Event event_message\n\
+             {line}\nMSG: {name}_Request\n{request}\n{line}\nMSG: {name}_Response\n{response}\n{line}\nMSG: {name}_Event\n\
+             service_msgs/ServiceEventInfo info\n{name}_Request[<=1] request\n{name}_Response[<=1] response\n{parts}{event_parts}"
+        ),
+    )
 }
 
 /// The definition of a standard type.
