@@ -398,11 +398,11 @@ impl LastDecision {
 
     /// The last decision if it is valid, or else the next one that is, within the time.
     fn wait(&self, longest: Duration) -> Option<Decision> {
-        let valid = |decision: &mut Option<(LiftDecision, u64)>| {
-            !decision.as_ref().is_some_and(|(_, until_nanos)| *until_nanos > monotonic_nanos())
+        let is_too_old = |decision: &mut Option<(LiftDecision, u64)>| {
+            decision.as_ref().is_none_or(|(_, until_nanos)| *until_nanos <= monotonic_nanos())
         };
         let decision = self.decision.lock().unwrap_or_else(PoisonError::into_inner);
-        let waited = self.comes.wait_timeout_while(decision, longest, valid);
+        let waited = self.comes.wait_timeout_while(decision, longest, is_too_old);
         let (decision, timeout) = waited.unwrap_or_else(PoisonError::into_inner);
         let (decision, until_nanos) = decision.as_ref().filter(|_| !timeout.timed_out())?;
         Some(Decision::new(decision, *until_nanos))
