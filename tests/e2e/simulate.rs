@@ -155,8 +155,11 @@ fn options_show_the_label() {
     assert!(printed(&["--options", options, "--label", "wrench-space"]).contains("label: wrench-space"));
     let unknown = run(&["simulate", "--label", "shake", "--print-options"], 2);
     assert!(text(&unknown.stderr).contains("expected wrench-space or lift"), "{}", text(&unknown.stderr));
-    let planned = run(&["simulate", "--label", "lift", "--protocol", "planned", "--out", "x.mcap"], 1);
-    assert!(text(&planned.stderr).contains("approach is planned, expected blind"), "{}", text(&planned.stderr));
+    let own = printed(&["--thresholds", "0.03,0.02"]);
+    assert!(own.contains("epsilon: 0.03") && own.contains("volume: 0.02"), "{own}");
+    let both = ["simulate", "--label", "lift", "--thresholds", "0.03,0.02", "--out", "x.mcap"];
+    let refused = run(&both, 1);
+    assert!(text(&refused.stderr).contains("option thresholds is set"), "{}", text(&refused.stderr));
 }
 
 #[test]

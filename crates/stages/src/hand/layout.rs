@@ -336,7 +336,7 @@ impl LayoutCell {
 /// Refuses a cell that is far from every collision shape of its link, or whose normal points into them.
 fn check_place(cell: &Cell, link: &TreeLink) -> Result<(), String> {
     /// Greatest distance between a cell and its link's shapes, which are simpler than the link.
-    const MAX_OFF_M: f64 = 0.03;
+    const MAX_OFF_M: f64 = 0.1;
     /// The distance is compared so far outside and inside of the cell.
     const PROBE_M: f64 = 0.005;
     if link.shapes.is_empty() {
@@ -447,7 +447,7 @@ mod tests {
         let inwards = "normal: [0, 1, 0], along: [0, 0, 1]";
         for (from, to, expected) in [
             ("normal: [0, -1, 0], along: [0, 0, 1]", inwards, "pad 'left', cell 0, on link 'left_jaw': its normal"),
-            ("at_m: [0, 0, 0.04]", "at_m: [0, -0.04, 0.04]", "away from every collision shape"),
+            ("at_m: [0, 0, 0.04]", "at_m: [0, -0.2, 0.04]", "away from every collision shape"),
             ("at_m: [0, 0, 0.04]", "at_m: [0, 0, 40]", "metres, not millimetres"),
             ("pitch_m: [0.01, 0.006]", "pitch_m: [10, 6]", "metres, not millimetres"),
             ("grid: [4, 3], ", "", "'grid' or 'pitch_m' alone"),

@@ -32,7 +32,9 @@ pub(super) fn hull(path: &Path, scale: [f64; 3]) -> Result<SharedShape, String> 
         let kept: Vec<Vector> = outermost.into_iter().map(|idx| corners[idx]).collect();
         (corners, triangles) = hull(&kept)?;
     }
-    SharedShape::convex_mesh(corners, &triangles).ok_or_else(|| refused(&"it is flat"))
+    let shape = SharedShape::convex_mesh(corners, &triangles);
+    // A flat mesh has a hull without a volume; a cube of a tenth of a millimetre has 1e-12 m³.
+    shape.filter(|shape| shape.mass_properties(1.0).mass() > 1e-12).ok_or_else(|| refused(&"it is flat"))
 }
 
 /// Directions that are spread evenly over the sphere (a Fibonacci lattice).
