@@ -65,11 +65,13 @@ fn a_hand_of_sixteen_joints_is_simulated_trained_and_run_by_one_command() {
 #[test]
 fn planned_lifts_are_felt_more_often_than_blind_ones() {
     let folder = tempfile::tempdir().expect("a folder");
-    let n_felt = |approach: &str| {
+    // Of the candidates: a blind approach often meets nothing.
+    let share_felt = |approach: &str| {
         let out = utf8(&folder.path().join(format!("{approach}.mcap"))).to_owned();
         let lift =
             ["simulate", "--hand", "parallel-gripper", "--label", "lift", "--protocol", approach, "--grasps", "20"];
-        run(&[&lift[..], &["--stable-fraction", "natural", "--out", &out]].concat(), 0);
+        let report = run(&[&lift[..], &["--stable-fraction", "natural", "--json", "--out", &out]].concat(), 0);
+        let report: serde_json::Value = serde_json::from_slice(&report.stdout).expect("JSON");
         let frames = text(&run(&["export", &out, "--format", "jsonl"], 0).stdout).to_owned();
         let settled = frames.lines().filter(|line| line.contains("\"phase\":\"settled\""));
         let felt: std::collections::BTreeSet<String> = settled
@@ -79,10 +81,13 @@ fn planned_lifts_are_felt_more_often_than_blind_ones() {
                 cells.iter().any(|cell| cell.as_f64() > Some(0.05)).then(|| frame["data"]["grasp_id"].to_string())
             })
             .collect();
-        felt.len()
+        felt.len() as f64 / report["n_candidates"].as_f64().expect("a number")
     };
-    let (blind, planned) = (n_felt("blind"), n_felt("planned"));
-    assert!(planned > 10 && planned >= blind, "{planned} of 20 planned grasps are felt, {blind} blind ones");
+    let (blind, planned) = (share_felt("blind"), share_felt("planned"));
+    assert!(
+        planned > 0.5 && planned > 1.2 * blind,
+        "{planned} of the planned candidates are felt, {blind} of the blind ones"
+    );
 }
 
 /// A gripper as ROS has it: a xacro macro for both jaws, and a mesh of a package.
@@ -161,7 +166,8 @@ fn other<'a>(more: &[&'a str]) -> Vec<&'a str> {
 fn a_hand_is_made_from_a_table_of_cells() {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::write(folder.path().join("gripper.urdf"), read("hands/parallel-gripper.urdf")).expect("written");
-    let table = "link,pad,x,y,z,nx,ny,nz,threshold\nleft_jaw,left,0,0,0.03,0,-1,0,0.2\nleft_jaw,left,0,0,0.04,0,-1,0,\n\
+    // Names that YAML would take for numbers stay names.
+    let table = "link,pad,x,y,z,nx,ny,nz,threshold\nleft_jaw,1.0,0,0,0.03,0,-1,0,0.2\nleft_jaw,1.0,0,0,0.04,0,-1,0,\n\
                  right_jaw,right,0,0,0.03,0,1,0,\n";
     let write = |table: &str| std::fs::write(folder.path().join("cells.csv"), table).expect("written");
     write(table);
@@ -184,7 +190,7 @@ fn a_hand_is_made_from_a_table_of_cells() {
         assert!(expected.iter().all(|part| stderr.contains(part)), "{expected:?} in {stderr}");
         assert!(!folder.path().join("other").exists());
     };
-    from_table(&table.replace("0,-1,0", "0,1,0"), &["pad 'left'", "points into the link"]);
+    from_table(&table.replace("0,-1,0", "0,1,0"), &["pad '1.0'", "points into the link"]);
     from_table(&table.replace("0.03", "30"), &["metres, not millimetres"]);
     from_table(&table.replace("left_jaw", "thumb"), &["no link 'thumb'", "left_jaw"]);
     from_table(&table.replace("0,-1,0", "0,0,0"), &["a normal without a direction"]);

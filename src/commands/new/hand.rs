@@ -326,32 +326,36 @@ fn with_meshes_beside(urdf: &str, urdf_folder: &Path) -> (String, Vec<(PathBuf, 
 }
 
 fn layout(name: &str, hand: &Hand, pads: &[NewPad], bare: &BareHand) -> String {
-    let joints: Vec<&str> = hand.joints.iter().map(|joint| joint.name.as_str()).collect();
-    let palm = bare.palm.clone().unwrap_or_else(|| hand.links[0].name.clone());
+    // Quoted as in JSON, which YAML reads: a name such as 3.0 is no number.
+    let quoted = |name: &str| serde_json::Value::from(name).to_string();
+    let joints: Vec<String> = hand.joints.iter().map(|joint| quoted(&joint.name)).collect();
+    let palm = quoted(bare.palm.as_ref().unwrap_or(&hand.links[0].name));
+    let (name, urdf) = (quoted(name), quoted(&format!("{name}.urdf")));
     let mut text = format!(
         "# Made by: blindgrasp new hand. The keys are explained in hands/README.md of blindgrasp.\n\
-         format: blindgrasp-hand/1\nname: {name}\nurdf: {name}.urdf\n\
+         format: blindgrasp-hand/1\nname: {name}\nurdf: {urdf}\n\
          # Contacts are expressed in this link's frame; +z points out of the palm.\nreference_link: {palm}\n\
          joints: [{}]\n",
         joints.join(", ")
     );
     if !bare.preshape_joints.is_empty() {
-        let _ = writeln!(text, "preshape_joints: [{}]", bare.preshape_joints.join(", "));
+        let preshape: Vec<String> = bare.preshape_joints.iter().map(|name| quoted(name)).collect();
+        let _ = writeln!(text, "preshape_joints: [{}]", preshape.join(", "));
     }
     if !bare.open.is_empty() {
-        let open: Vec<String> = bare.open.iter().map(|(name, value)| format!("{name}: {value}")).collect();
+        let open: Vec<String> = bare.open.iter().map(|(name, value)| format!("{}: {value}", quoted(name))).collect();
         let _ = writeln!(text, "open: {{{}}}", open.join(", "));
     }
     text.push_str("pads:\n");
     for pad in pads {
         let threshold = pad.cells.first().map_or(0.0, |cell| cell.noise_threshold_newtons);
-        let NewPad { name, link, .. } = pad;
+        let (name, link) = (quoted(&pad.name), quoted(&pad.link));
         let _ =
             writeln!(text, "  - {{name: {name}, link: {link}, layout: {name}, noise_threshold_newtons: {threshold}}}");
     }
     text.push_str("layouts:\n");
     for pad in pads {
-        let _ = writeln!(text, "  {}:", pad.name);
+        let _ = writeln!(text, "  {}:", quoted(&pad.name));
         let of_pad = pad.cells.first().map_or(0.0, |cell| cell.noise_threshold_newtons);
         for cell in &pad.cells {
             let own = cell.noise_threshold_newtons;
