@@ -22,7 +22,7 @@ fn run_in(folder: &Path, arguments: &[&str], exit_code: i32) -> (String, String)
     (stdout, stderr)
 }
 
-/// Runs `scripts/try-hand`, with a label that takes less time than lifts; what it prints.
+/// Runs `scripts/try-hand` with a label that takes less time than lifts, and returns the printed text.
 fn try_hand(hand: &str, folder: &Path, options: &[&str]) -> String {
     let output = Command::new(project().join("scripts/try-hand"))
         .args([hand, utf8(folder), "250"])

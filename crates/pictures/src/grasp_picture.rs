@@ -188,8 +188,8 @@ fn draw_contacts(svg: &mut Svg, placed: &Placed<'_>, top: f64) -> f64 {
     }
     if placed.contacts.is_empty() {
         if placed.grasp.is_hand_alone {
-            let what = "lines: the normal of each cell, towards the object; joint values are below the pads";
-            svg.text([MARGIN, y + 4.0], Anchor::Start, "note", what);
+            let note = "lines: the normal of each cell, towards the object; joint values are below the pads";
+            svg.text([MARGIN, y + 4.0], Anchor::Start, "note", note);
         } else if placed.grasp.scene.is_none() {
             let what = format!(
                 "lines: reading of each active cell along its normal; the longest possible is {} {}",

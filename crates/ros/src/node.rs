@@ -113,7 +113,7 @@ impl Network {
                 "listen_private_key": private_key,
                 "connect_certificate": certificate,
                 "connect_private_key": private_key,
-                // The authority is the robot's own: who has its certificate may take part, at any address.
+                // The authority is the robot's own: a node with its certificate may take part, at any address.
                 "verify_name_on_connect": false,
                 "close_link_on_expiration": true,
             });

@@ -1,11 +1,14 @@
 //! Blind exploration: the palm comes to the object from anywhere, then the fingers close with break-away.
 //!
 //! Nothing is pushed away: the object stays where it is, unless one motor moves several fingers (a gripper's jaws, by a
-//! URDF's mimic joints). Such fingers push it without turning it until another one touches: a gripper centres what it grips. The hand is taken from its description, not assumed to be a
-//! Barrett hand: preshape joints without an open value are drawn, the other joints close from their open values towards
-//! their closed limits, all leaders at the same speed and followers at their ratio. One rule makes break-away: **a link that is stopped stops every joint that moves
-//! it**. A stopped proximal link stops its joint, and the follower goes on alone; a stopped distal link stops the
-//! whole finger. A joint's limit stops that joint only.
+//! URDF's mimic joints). Such fingers push the object, without turning it, until another finger touches it, so that a gripper
+//! centres the object.
+//!
+//! The hand is taken from its description, not assumed to be a Barrett hand: preshape joints without an open value are drawn;
+//! the other joints close from their open values towards their closed limits, all leaders at the same speed and followers at
+//! their ratio. One rule makes break-away: **a link that is stopped stops every joint that moves it**. A stopped proximal link
+//! stops its joint, and the follower goes on alone; a stopped distal link stops the whole finger. A joint's limit stops that
+//! joint only.
 //!
 //! A link is stopped by the object, or by another link of the hand that it comes nearer to than a clearance, if its own
 //! motion goes that way: a finger that touches from the start with the side it closes to stays open, one that touches
@@ -156,7 +159,7 @@ const EXACT_M: f64 = 0.002;
 const LEAVING_STEP: f64 = 5e-4;
 /// Fingers of one motor push an object at most so often, each time by half the way that is left.
 const MOST_PUSHES: usize = 20;
-/// Fingers farther from the object than this do not come to hold what another finger of their motor pushes.
+/// A finger farther from the object than this does not count: the object is not pushed towards it.
 const FARTHEST_PUSH_M: f64 = 0.2;
 
 impl Mechanism<'_> {
@@ -192,8 +195,8 @@ impl Mechanism<'_> {
         Ok(Some(Exploration { palm_from_object, open_joints_rad: start.open_joints_rad.clone(), joints, end }))
     }
 
-    /// The way by which fingers of one motor push the object on: half the way from a finger that touches it to the nearest
-    /// finger that does not. `None` where no finger touches, or all do, or the motor is at its limit.
+    /// The way by which fingers of one motor push the object: in the direction of a finger that touches it, by half the
+    /// distance to the nearest finger that does not. `None` where no finger touches, or all do, or the motor is at its limit.
     fn push(
         &self,
         object: &Object,

@@ -109,7 +109,7 @@ impl<T: Send + 'static> Inbox<T> {
         Ok(next)
     }
 
-    /// Lets go of what was opened.
+    /// Closes the session and its subscribers.
     pub(super) fn close(&self) {
         self.queue().is_closed = true;
         self.closing.notify_all();

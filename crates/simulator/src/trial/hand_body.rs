@@ -67,6 +67,8 @@ struct Drive {
     limit: f64,
     /// Where the motor is; its gears give by the difference to the axles.
     target: f64,
+    /// Speed of the target while the joint closes. It is 0 when the target waits for the joint.
+    target_speed: f64,
     /// Of all gears together, as the motor feels it.
     stiffness: f64,
     is_stopped: bool,
@@ -84,7 +86,7 @@ impl Drive {
         }
     }
 
-    /// Where the motor would be if its gears did not give: the axles' mean, weighted by what the motor feels of them.
+    /// Where the motor would be if its gears did not give: the mean of the axles, weighted by their stiffness as the motor feels it.
     fn travel(&self, world: &World) -> f64 {
         match &self.axles[..] {
             [axle] => travel(world, axle) / axle.ratio,
@@ -193,6 +195,7 @@ impl HandBody {
                 lever: 0.0,
                 limit: 0.0,
                 target: 0.0,
+                target_speed: 0.0,
                 stiffness: 0.0,
                 axles: vec![axle],
                 is_stopped: false,
@@ -311,7 +314,9 @@ impl HandBody {
             let most = travel + 1.2 * drive.limit / drive.stiffness;
             let step = drive.rate * options.closing_rad_per_sec * dt;
             // Its target waits for the joint: no further ahead of it than to be sure that it lags.
-            drive.target = (drive.target + step).min(most.max(drive.target)).min(drive.range);
+            let before = drive.target;
+            drive.target = (before + step).min(most.max(before)).min(drive.range);
+            drive.target_speed = (drive.target - before) / dt;
         }
         let all_stopped = self.drives.iter().all(|drive| drive.is_stopped);
         self.command(world, if all_stopped { 0.0 } else { options.closing_rad_per_sec }, options);
@@ -348,11 +353,12 @@ impl HandBody {
 
     fn command(&mut self, world: &mut World, rad_per_sec: f64, options: &PhysicsOptions) {
         for drive in &self.drives {
-            // A linkage is rigid: its gears hold with more than the motor has.
+            // A linkage is rigid: its gears hold with more than the motor has. What limits them is the target, which waits, and
+            // must not go on by its speed.
             let (speed, newtons) = match (drive.is_stopped, drive.axles.len()) {
                 (true, _) => (0.0, options.hold_newtons),
                 (false, 1) => (drive.rate * rad_per_sec, options.grip_newtons),
-                (false, _) => (drive.rate * rad_per_sec, options.hold_newtons),
+                (false, _) => (drive.target_speed, options.hold_newtons),
             };
             for axle in &drive.axles {
                 let Some((multibody, link_id)) = world.engine.multibody_joints.get_mut(axle.joint) else { continue };
@@ -580,7 +586,7 @@ mod tests {
             grip(world, body, options);
             for (drive, before_rad) in body.drives.iter().zip(before) {
                 if drive.has_broken_away {
-                    assert_eq!(drive.target, before_rad, "nothing drives what has broken away");
+                    assert_eq!(drive.target, before_rad, "no motor drives a joint that has broken away");
                 }
             }
         });
@@ -657,9 +663,7 @@ mod tests {
             let outwards_rad = 0.8 - body.joints_rad(world)[0];
             let wanted = options.lift_grip_newtons / outwards_rad.cos();
             assert!(touches.len() == 2, "{newtons:?}");
-            // The gears are not driven backwards: they keep what the swing of the fingers tightened.
-            assert!((newtons[0] - newtons[1]).abs() < 0.01 * wanted, "{newtons:?}");
-            assert!((0.99 * wanted..1.5 * wanted).contains(&newtons[0]), "{newtons:?} {wanted}");
+            assert!(newtons.iter().all(|found| (found - wanted).abs() < 0.02 * wanted), "{newtons:?} {wanted}");
             for axle in body.drives.iter().flat_map(|drive| &drive.axles) {
                 let off_rad = travel(world, axle) - axle.ratio * body.drives[0].travel(world);
                 assert!(off_rad.abs() < 0.02, "{off_rad}");
