@@ -6,17 +6,21 @@
 #[cfg(test)]
 mod allocations;
 mod classifier;
+mod connection;
 mod contacts;
 mod encoder;
 mod lift_arbiter;
 mod link;
+mod publishing;
 mod recorded_source;
 mod regrasp;
 mod ros2;
+mod ros2_decision;
 mod ros2_markers;
 mod senses;
 mod simulated_hand;
 mod tactile_source;
+mod zenoh;
 
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, TactileFrame};
 use blindgrasp_operator::description::OperatorDescription;
@@ -52,7 +56,7 @@ pub const SHIPPED: [Shipped; 19] = [
     of("lift_arbiter", "", lift_arbiter::describe, lift_arbiter::work),
     of("regrasp", "", regrasp::describe, regrasp::work),
     of("ros2", "", ros2::describe, ros2::work),
-    of("zenoh", "", ros2::describe_json, ros2::work_json),
+    of("zenoh", "", zenoh::describe, zenoh::work),
     of("link", "", link::describe, link::work),
 ];
 

@@ -254,9 +254,9 @@ fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box
         ("recording", params.recording.is_some()),
         ("idle_limit_ms", params.idle_limit_ms.is_some()),
         ("key", params.key.is_some()),
-        ("connect", params.network.connect.is_some()),
-        ("listen", params.network.listen.is_some()),
-        ("keys", params.network.keys.is_some()),
+        ("connect", params.network.connection.connect.is_some()),
+        ("listen", params.network.connection.listen.is_some()),
+        ("keys", params.network.connection.keys.is_some()),
         ("domain", params.network.domain.is_some()),
         ("namespace", params.network.namespace.is_some()),
         ("joints_topic", topics.joints_topic.is_some()),
@@ -298,7 +298,7 @@ fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box
         DriverWord::Ros2 => return ros2(params, hand).map(|driver| Box::new(driver) as Box<dyn TactileDriver>),
         DriverWord::Zenoh => {
             let key = params.key.clone().with_context(|| lacks("key", "hand/frames"))?;
-            let (network, ..) = params.network.network()?;
+            let network = params.network.connection.network()?;
             return Ok(Box::new(ZenohKey::new(network, key, max_line_bytes(&expected))?));
         }
     };

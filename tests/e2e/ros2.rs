@@ -11,7 +11,7 @@ use std::process::{Child, Command, Stdio};
 use crate::common::python::python;
 use crate::common::{Graph, RECORDING, project, run, undisturbed, unique_name, wait_until};
 use crate::tactile_source::{grasps, live_dataflow};
-use blindgrasp_messages::{Action, Recorded, of_each_type};
+use blindgrasp_messages::{Action, Recorded, Stamped, TactileFrame, of_each_type};
 use blindgrasp_ros::definition::Definition;
 use blindgrasp_ros::node::{Keys, Network};
 use blindgrasp_ros::standard;
@@ -19,6 +19,15 @@ use blindgrasp_stages::hand::Hand;
 use serde_json::{Value, json};
 
 const N_GRASPS: u64 = 12;
+
+/// A frame in the line protocol.
+fn line_of(frame: &Stamped<TactileFrame>) -> Value {
+    let message = &frame.message;
+    json!({
+        "joints_rad": message.joints_rad, "cells_newtons": message.cells_newtons, "phase": message.phase,
+        "seq": frame.header.seq,
+    })
+}
 
 fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr()).expect("a port").port()
@@ -230,12 +239,7 @@ session.close()
         let mut client = client.spawn().expect("started");
         let mut stdin = client.stdin.take().expect("stdin");
         for frame in grasps(N_GRASPS) {
-            let message = &frame.message;
-            let line = json!({
-                "joints_rad": message.joints_rad, "cells_newtons": message.cells_newtons, "phase": message.phase,
-                "seq": frame.header.seq,
-            });
-            writeln!(stdin, "{line}").expect("written");
+            writeln!(stdin, "{}", line_of(&frame)).expect("written");
         }
         drop(stdin);
         assert!(client.wait().expect("ended").success());
@@ -301,12 +305,7 @@ time.sleep(60)
     let graph = Graph::launch(&unique_name(), &flow, &[]);
     wait_until(|| graph.said().contains("publishes on robot/hand/*"), || graph.said());
     for frame in grasps(N_GRASPS) {
-        let message = &frame.message;
-        let line = json!({
-            "joints_rad": message.joints_rad, "cells_newtons": message.cells_newtons, "phase": message.phase,
-            "seq": frame.header.seq,
-        });
-        writeln!(stdin, "{line}").expect("written");
+        writeln!(stdin, "{}", line_of(&frame)).expect("written");
     }
     let expected = &undisturbed()[..N_GRASPS as usize - 1];
     let mut found = Vec::new();
@@ -338,6 +337,33 @@ time.sleep(60)
     let said = run(&["run", wrong.to_str().expect("UTF-8")], 1);
     let said = String::from_utf8_lossy(&said.stderr).into_owned();
     assert!(said.contains("prefix '/robot': expected words"), "{said}");
+}
+
+/// Frames of another hand than the node's are no joint states and no markers of it. They are counted, and the graph goes on.
+#[test]
+fn frames_of_another_hand_are_counted_as_unpublished() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let hand = project().join("hands/parallel-gripper.yaml");
+    let node = format!(
+        "\n  ros2:\n    inputs:\n      tactile: {{from: recorded_source/tactile, policy: latest, capacity: 256}}\n    \
+         params: {{hand: {}, listen: tcp/127.0.0.1:{}}}\n    sandbox: on\n",
+        hand.display(),
+        free_port()
+    );
+    let flow = std::fs::read_to_string(project().join("dataflow.yaml")).expect("readable");
+    let absolute =
+        |text: String, part: &str| text.replace(&format!(": {part}/"), &format!(": {}/{part}/", project().display()));
+    let flow = ["hands", "models", "recordings"].iter().fold(flow + &node, |text, part| absolute(text, part));
+    let path = folder.path().join("dataflow.yaml");
+    std::fs::write(&path, flow).expect("written");
+    let graph = Graph::launch(&unique_name(), &path, &["--set", "recorded_source.repeat=forever"]);
+    let unpublished = || graph.node("ros2")["counts"]["unpublished"].as_u64().unwrap_or(0);
+    wait_until(|| unpublished() > 5 && graph.n_decisions() > 5, || graph.said());
+    assert_eq!(graph.node("ros2")["n_restarts"], 0, "{}", graph.node("ros2"));
+    let said = graph.said();
+    assert!(said.contains("is not published as joint_states: 7 joint values, the hand has 1"), "{said}");
+    assert_eq!(said.matches("is not published as").count(), 2, "each reason is said once: {said}");
+    graph.stop();
 }
 
 /// The example node, with stand-ins for ROS: it lifts each grasp once, and only while the LIFT is valid.

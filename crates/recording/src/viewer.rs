@@ -136,6 +136,9 @@ pub(super) fn joint_state(
     frame: &TactileFrame,
     data: &mut Vec<u8>,
 ) -> Result<(), String> {
+    if names.len() != frame.joints_rad.len() {
+        return Err(format!("{} joint values, the hand has {}", frame.joints_rad.len(), names.len()));
+    }
     let header = StandardHeader::new(header);
     encode(&JointState { header, name: names, position: &frame.joints_rad, velocity: &[], effort: &[] }, data)
 }

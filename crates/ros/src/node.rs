@@ -183,6 +183,7 @@ pub struct RosNode {
     place: String,
     next_id: usize,
     tokens: Vec<LivelinessToken>,
+    services: Vec<zenoh::query::Queryable<()>>,
 }
 
 /// A name as a part of a key.
@@ -202,7 +203,7 @@ impl RosNode {
     pub fn new(session: Session, domain: u32, namespace: &str, name: &str) -> Result<RosNode, RosError> {
         let namespace = Some(mangled(namespace.trim_end_matches('/'))).filter(|namespace| !namespace.is_empty());
         let place = format!("%/{}/{name}", namespace.as_deref().unwrap_or("%"));
-        let mut node = RosNode { session, domain, place, next_id: 1, tokens: Vec::new() };
+        let mut node = RosNode { session, domain, place, next_id: 1, tokens: Vec::new(), services: Vec::new() };
         node.declare(&format!("0/NN/{}", node.place))?;
         Ok(node)
     }
@@ -244,7 +245,7 @@ impl RosNode {
         Ok(RosPublisher { publisher, gid, n_sent: 0 })
     }
 
-    /// Calls `take` with each call of a service, from a thread of Zenoh.
+    /// Calls `take` with each call of a service, from a thread of Zenoh, until the node is dropped.
     ///
     /// # Errors
     /// Zenoh refuses it.
@@ -253,16 +254,17 @@ impl RosNode {
         name: &str,
         service: &MessageType,
         take: impl Fn(Request) + Send + Sync + 'static,
-    ) -> Result<RosService, RosError> {
+    ) -> Result<(), RosError> {
         self.endpoint("SS", name, service, Quality::KeepLast(1))?;
         let key = format!("{}{name}/{}/{}", self.domain, dds_name(service)?, service.hash);
-        let call = move |query| {
-            if let Some(request) = Request::of(query) {
-                take(request);
-            }
+        let call = move |query: zenoh::query::Query| match Request::of(&query) {
+            Some(request) => take(request),
+            // The caller learns it; an answer that does not reach it is lost with the call.
+            None => drop(query.reply_err("expected a request of a ROS 2 node, with its attachment").wait()),
         };
         let queryable = self.session.declare_queryable(key).complete(true).callback(call).wait().map_err(of_zenoh)?;
-        Ok(RosService { _queryable: queryable })
+        self.services.push(queryable);
+        Ok(())
     }
 
     /// Calls `take` with each message on a topic, of whatever type, from a thread of Zenoh. The node says that it expects
@@ -308,11 +310,6 @@ fn of_zenoh(error: zenoh::Error) -> RosError {
     RosError::Zenoh(error.to_string())
 }
 
-/// It answers until it is dropped.
-pub struct RosService {
-    _queryable: zenoh::query::Queryable<()>,
-}
-
 /// A call of a service.
 pub struct Request {
     query: zenoh::query::Query,
@@ -323,14 +320,13 @@ pub struct Request {
 }
 
 impl Request {
-    /// `None` for a call that is not a node's: it has no number and no caller.
-    fn of(query: zenoh::query::Query) -> Option<Request> {
+    /// `None` for a call that is not a node's: it has no number, no caller or no request.
+    fn of(query: &zenoh::query::Query) -> Option<Request> {
         let attachment = query.attachment()?.to_bytes().into_owned();
-        let payload = query.payload()?;
-        let bytes = if payload.len() > MAX_RECEIVED_BYTES { return None } else { payload.to_bytes().into_owned() };
+        let payload = query.payload().filter(|payload| payload.len() <= MAX_RECEIVED_BYTES)?;
         // The caller's hash comes behind its length.
         let (seq, client) = (attachment.get(..8)?.try_into().ok()?, attachment.get(17..33)?.try_into().ok()?);
-        Some(Request { query, seq, client, bytes })
+        Some(Request { query: query.clone(), seq, client, bytes: payload.to_bytes().into_owned() })
     }
 
     /// Answers it.
