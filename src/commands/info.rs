@@ -52,7 +52,7 @@ pub(super) struct Arguments {
     /// stays as it is.
     #[arg(long, conflicts_with_all = ["full", "hand"])]
     repair: bool,
-    /// Joint angles of a hand in radians; other joints are 0 or follow their coupling
+    /// Joint values of a hand, radians or metres of a slide; other joints are open or follow their coupling
     #[arg(long, value_name = "NAME=VALUE,…", value_delimiter = ',', value_parser = hand_cells::joint)]
     joints: Vec<(String, f64)>,
     /// Print JSON, with every object

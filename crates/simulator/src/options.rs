@@ -128,8 +128,8 @@ impl SimulatorOptions {
     }
 }
 
-/// A grasp is stable if both its qualities exceed these. Those of Dang & Allen (section IV) suit a hand of three fingers; a
-/// gripper's best grasps have an epsilon of about 0.04.
+/// A grasp is stable if both its qualities exceed these. Those of Dang & Allen (section IV) were chosen for a hand of
+/// three fingers.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Thresholds {
