@@ -16,11 +16,15 @@ const ROUTER: &str = "tcp/localhost:7447";
 /// The name of this program's files in a folder of keys.
 const KEY_NAME: &str = "ros2";
 
-#[derive(Deserialize, Clone)]
-pub(crate) struct ConnectionParams {
-    pub(crate) connect: Option<String>,
-    pub(crate) listen: Option<String>,
-    pub(crate) keys: Option<PathBuf>,
+/// A connection: the router on this machine by default.
+#[derive(Debug, Deserialize, Clone, Default)]
+pub struct ConnectionParams {
+    /// A router or node, like `tcp/localhost:7447`.
+    pub connect: Option<String>,
+    /// An endpoint at which others connect.
+    pub listen: Option<String>,
+    /// A folder with `ca.pem`, `ros2.pem` and `ros2.key.pem`.
+    pub keys: Option<PathBuf>,
 }
 
 /// Adds the parameters of a connection.
@@ -40,7 +44,7 @@ impl ConnectionParams {
     ///
     /// # Errors
     /// An endpoint is not valid.
-    pub(crate) fn network(&self) -> Result<Network, RosError> {
+    pub fn network(&self) -> Result<Network, RosError> {
         let keys = self.keys.as_deref().map(|folder| {
             let KeyFiles { authority, certificate, private_key } = key_files(folder, KEY_NAME);
             Keys { authority, certificate, private_key }

@@ -6,7 +6,7 @@
 #[cfg(test)]
 mod allocations;
 mod classifier;
-mod connection;
+pub mod connection;
 mod contacts;
 mod encoder;
 mod lift_arbiter;

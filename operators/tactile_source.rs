@@ -42,7 +42,7 @@ const DEFAULT_BAUD: u32 = 115_200;
 /// Half of the age that the arbiter allows by default, which counts from the source on.
 const DEFAULT_MAX_DELAY_MS: f64 = 100.0;
 /// The parameters of the driver ros2.
-const ROS2_PARAMS: [&str; 17] = [
+const ROS2_PARAMS: [&str; 19] = [
     "domain",
     "namespace",
     "connect",
@@ -57,6 +57,8 @@ const ROS2_PARAMS: [&str; 17] = [
     "phase_topic",
     "wrench_topic",
     "imu_topic",
+    "gravity_frame",
+    "palm_frame",
     "tolerance_ms",
     "moving_rad_per_s",
     "still_ms",
@@ -97,6 +99,8 @@ struct TopicParams {
     phase_topic: Option<String>,
     wrench_topic: Option<String>,
     imu_topic: Option<String>,
+    gravity_frame: Option<String>,
+    palm_frame: Option<String>,
     tolerance_ms: Option<f64>,
     moving_rad_per_s: Option<f64>,
     still_ms: Option<f64>,
@@ -171,6 +175,11 @@ pub(crate) fn describe() -> OperatorDescription {
         ("phase_topic", "ros2: std_msgs/msg/String with the phase; inferred from the fingers' motion without it"),
         ("wrench_topic", "ros2: geometry_msgs/msg/WrenchStamped of the wrist, in the palm frame"),
         ("imu_topic", "ros2: sensor_msgs/msg/Imu of the palm, in the palm frame"),
+        (
+            "gravity_frame",
+            "ros2: a frame of /tf whose z axis points upwards, like world: gravity in the palm frame comes from it",
+        ),
+        ("palm_frame", "ros2: the palm frame in /tf, the hand's palm link by default"),
     ]
     .into_iter()
     .fold(description, |description, (name, summary)| topic(description, name, summary));
@@ -268,6 +277,8 @@ fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box
         ("phase_topic", topics.phase_topic.is_some()),
         ("wrench_topic", topics.wrench_topic.is_some()),
         ("imu_topic", topics.imu_topic.is_some()),
+        ("gravity_frame", topics.gravity_frame.is_some()),
+        ("palm_frame", topics.palm_frame.is_some()),
         ("tolerance_ms", topics.tolerance_ms.is_some()),
         ("moving_rad_per_s", topics.moving_rad_per_s.is_some()),
         ("still_ms", topics.still_ms.is_some()),
@@ -299,7 +310,7 @@ fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box
         DriverWord::Zenoh => {
             let key = params.key.clone().with_context(|| lacks("key", "hand/frames"))?;
             let network = params.network.connection.network()?;
-            return Ok(Box::new(ZenohKey::new(network, key, max_line_bytes(&expected))?));
+            return Ok(Box::new(ZenohKey::new(network, key, max_line_bytes(&expected), hand.id())?));
         }
     };
     let is_local = |address: &String| address.starts_with("unix:");
@@ -323,6 +334,14 @@ fn ros2(params: &Params, hand: &Hand) -> anyhow::Result<Ros2> {
     let cells = named(&topics.cells_topic)?.context("driver ros2 needs the param 'cells_topic', like /hand/tactile")?;
     let cells_type = topics.cells_type.as_deref().unwrap_or("std_msgs/msg/Float64MultiArray");
     let prefix = topics.joint_prefix.as_deref().unwrap_or_default();
+    let palm_frame = topics.palm_frame.clone().unwrap_or_else(|| hand.palm_link().to_owned());
+    match &topics.gravity_frame {
+        Some(_) if topics.imu_topic.is_some() => {
+            bail!("params 'gravity_frame' and 'imu_topic' both tell gravity: leave one of them out")
+        }
+        None if topics.palm_frame.is_some() => bail!("param 'palm_frame' needs 'gravity_frame', like world"),
+        _ => {}
+    }
     let topics = Topics {
         network,
         domain,
@@ -333,6 +352,10 @@ fn ros2(params: &Params, hand: &Hand) -> anyhow::Result<Ros2> {
         phase: named(&topics.phase_topic)?,
         wrench: named(&topics.wrench_topic)?,
         imu: named(&topics.imu_topic)?,
+        gravity_frames: topics
+            .gravity_frame
+            .as_ref()
+            .map(|upright| [upright, &palm_frame].map(|frame| frame.trim_start_matches('/').to_owned())),
         joint_names: (0..hand.joints.len())
             .map(|idx| {
                 let joint = &hand.joints[idx];

@@ -5,7 +5,7 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 
 /// The commands of each group, in the order of the help.
 const GROUPS: [(&str, &[&str]); 4] = [
-    ("Run", &["run", "ps", "top", "stop", "set", "swap", "logs", "doctor"]),
+    ("Run", &["run", "ps", "top", "stop", "set", "swap", "logs", "doctor", "diagnostics"]),
     ("Record", &["record", "replay", "test", "export", "info", "view"]),
     ("Learn", &["simulate", "import", "train", "evaluate", "trials", "reproduce", "model", "sensors"]),
     ("Describe", &["init", "new", "keys", "completions"]),

@@ -5,6 +5,7 @@ mod background;
 mod cases;
 mod check;
 mod completions;
+mod diagnostics;
 mod doctor;
 mod evaluate;
 mod export;
@@ -24,6 +25,7 @@ mod ps;
 mod record;
 mod replay;
 mod reproduce;
+mod ros2_network;
 mod run;
 mod sensors;
 mod set;
@@ -89,6 +91,7 @@ enum Command {
     #[command(alias = "graph")]
     View(view::Arguments),
     Doctor(doctor::Arguments),
+    Diagnostics(diagnostics::Arguments),
     Completions(completions::Arguments),
     Operator(operator::Arguments),
 }
@@ -160,6 +163,7 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::New(arguments) => new::run(&arguments),
         Command::Keys(arguments) => keys::run(&arguments),
         Command::View(arguments) => view::run(&arguments),
+        Command::Diagnostics(arguments) => diagnostics::run(&arguments),
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
         // `main` has run it.

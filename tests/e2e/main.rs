@@ -35,6 +35,7 @@ mod regression;
 mod replay;
 mod reproduce;
 mod ros2;
+mod ros2_commands;
 mod sandbox;
 mod scaffold;
 mod sensors;

@@ -12,6 +12,7 @@ use crate::common::python::python;
 use crate::common::{Graph, RECORDING, project, run, undisturbed, unique_name, wait_until};
 use crate::tactile_source::{grasps, live_dataflow};
 use blindgrasp_messages::{Action, Recorded, Stamped, TactileFrame, of_each_type};
+use blindgrasp_recording::cdr;
 use blindgrasp_ros::definition::Definition;
 use blindgrasp_ros::node::{Keys, Network};
 use blindgrasp_ros::standard;
@@ -29,7 +30,18 @@ fn line_of(frame: &Stamped<TactileFrame>) -> Value {
     })
 }
 
-fn free_port() -> u16 {
+/// A frame as `blindgrasp_msgs/msg/TactileFrame` in CDR, hexadecimal, with its number alone.
+fn cdr_of(frame: &Stamped<TactileFrame>) -> String {
+    let mut frame = frame.clone();
+    frame.header.stamp_nanos = 0;
+    // The source numbers grasps as the phases tell them, or as the sender does, which counts on.
+    frame.message.grasp_id += N_GRASPS;
+    let mut bytes = Vec::new();
+    cdr::encode(&frame, &mut bytes).expect("CDR");
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+pub(crate) fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr()).expect("a port").port()
 }
 
@@ -55,9 +67,18 @@ fn ros_graph(folder: &Path, port: u16, params: &str) -> Graph {
     Graph::launch(&unique_name(), &flow, &[])
 }
 
-struct Peer(Child, BufReader<std::process::ChildStdout>);
+pub(crate) struct Peer(Child, BufReader<std::process::ChildStdout>);
 
 impl Peer {
+    /// Runs a program in Python, with a port and more words.
+    pub(crate) fn of_script(script: &str, port: u16, words: &[&str]) -> Peer {
+        let mut command = Command::new(python());
+        command.args(["-c", script, &port.to_string()]).args(words).stdin(Stdio::piped()).stdout(Stdio::piped());
+        let mut child = command.spawn().expect("started");
+        let stdout = BufReader::new(child.stdout.take().expect("stdout"));
+        Peer(child, stdout)
+    }
+
     fn start(port: u16, rate_hz: u32, n_decisions: u64) -> Peer {
         let mut child = Command::new(python())
             .arg(project().join("tests/ros2_peer.py"))
@@ -78,7 +99,7 @@ impl Peer {
         peer
     }
 
-    fn line(&mut self) -> Value {
+    pub(crate) fn line(&mut self) -> Value {
         let mut line = String::new();
         self.1.read_line(&mut line).expect("read");
         serde_json::from_str(&line).unwrap_or_else(|error| panic!("{line:?}: {error}"))
@@ -207,7 +228,7 @@ fn a_lossless_input_or_a_wrong_endpoint_is_refused() {
     }
 }
 
-/// Frames as JSON on a key, from a plain client of Zenoh that connects to the source.
+/// Frames on a key, from a plain client of Zenoh that connects to the source: first as JSON, then as CDR.
 #[test]
 fn frames_on_a_key_of_zenoh_are_decided_and_a_sender_may_start_again() {
     const CLIENT: &str = "
@@ -224,7 +245,10 @@ while not publisher.matching_status.matching:
     time.sleep(0.05)
 publisher.put('no JSON')
 for line in sys.stdin:
-    publisher.put(line)
+    if line.startswith('{'):
+        publisher.put(line)
+    else:
+        publisher.put(bytes.fromhex(line), encoding=zenoh.Encoding.APPLICATION_CDR)
 session.close()
 ";
     let folder = tempfile::tempdir().expect("a folder");
@@ -239,7 +263,8 @@ session.close()
         let mut client = client.spawn().expect("started");
         let mut stdin = client.stdin.take().expect("stdin");
         for frame in grasps(N_GRASPS) {
-            writeln!(stdin, "{}", line_of(&frame)).expect("written");
+            let line = if round == 0 { line_of(&frame).to_string() } else { cdr_of(&frame) };
+            writeln!(stdin, "{line}").expect("written");
         }
         drop(stdin);
         assert!(client.wait().expect("ended").success());
@@ -281,12 +306,8 @@ time.sleep(60)
 ";
     let folder = tempfile::tempdir().expect("a folder");
     let port = free_port();
-    let mut client = Command::new(python());
-    let client = client.args(["-c", CLIENT, &port.to_string()]).stdin(Stdio::piped()).stdout(Stdio::piped());
-    let mut client = client.spawn().expect("started");
-    let stdout = BufReader::new(client.stdout.take().expect("stdout"));
-    let mut stdin = client.stdin.take().expect("stdin");
-    let mut peer = Peer(client, stdout);
+    let mut peer = Peer::of_script(CLIENT, port, &[]);
+    let mut stdin = peer.0.stdin.take().expect("stdin");
     assert_eq!(peer.line(), Value::Null);
     let connect = format!("connect: tcp/127.0.0.1:{port}");
     let source = format!("driver: zenoh\n      {connect}\n      key: frames\n      max_delay_ms: 20000");

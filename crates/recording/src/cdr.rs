@@ -1,6 +1,6 @@
 //! Messages as CDR, for topics of ROS 2.
 
-use blindgrasp_messages::{ContactSet, Header, TactileFrame};
+use blindgrasp_messages::{ContactSet, Header, Recorded, Stamped, TactileFrame};
 use serde::Serialize;
 
 use super::{types, viewer};
@@ -11,6 +11,14 @@ use super::{types, viewer};
 /// A value that CDR does not have.
 pub fn encode(value: &impl Serialize, data: &mut Vec<u8>) -> Result<(), String> {
     types::encode(value, data)
+}
+
+/// Reads a message of the package `blindgrasp_msgs`: little-endian CDR behind the four bytes of its encapsulation.
+///
+/// # Errors
+/// Why it is no such message, for a person.
+pub fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
+    types::decode(data)
 }
 
 /// A frame's joint angles as `sensor_msgs/msg/JointState`, under these names.

@@ -114,7 +114,7 @@ fn body(data: &[u8]) -> Result<&[u8], String> {
     data.strip_prefix(&CDR_LITTLE_ENDIAN[..]).ok_or_else(|| "expected little-endian CDR".into())
 }
 
-fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
+pub(super) fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
     let body = body(data)?;
     let (sample, n_bytes) = from_bytes::<Stamped<M>, byteorder::LittleEndian>(body)
         .map_err(|error| format!("not a {}: {error}", M::TYPE_NAME))?;

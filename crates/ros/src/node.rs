@@ -5,14 +5,17 @@ use std::path::PathBuf;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde_json::json;
-use sha2::{Digest, Sha256};
+use twox_hash::XxHash3_128;
 use zenoh::bytes::Encoding;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::PublisherBuilder;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::sample::Sample;
 use zenoh::{Config, Wait};
-use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilder, AdvancedPublisherBuilderExt as _, CacheConfig};
+use zenoh_ext::{
+    AdvancedPublisher, AdvancedPublisherBuilder, AdvancedPublisherBuilderExt as _, AdvancedSubscriberBuilderExt as _,
+    CacheConfig, HistoryConfig,
+};
 
 pub use zenoh::Session;
 
@@ -161,7 +164,7 @@ pub struct MessageType {
 pub enum Quality {
     /// Samples of a sensor: one that the network has no room for is dropped.
     Sensor,
-    /// None is dropped, and a subscriber that comes later gets the last ones, as many as this.
+    /// None is dropped, and a subscriber that comes later gets the last ones, as many as this (`transient_local`).
     KeepLast(usize),
 }
 
@@ -184,6 +187,11 @@ pub struct RosNode {
     next_id: usize,
     tokens: Vec<LivelinessToken>,
     services: Vec<zenoh::query::Queryable<()>>,
+}
+
+/// The name of an endpoint in the attachments of its messages: the hash XXH3 of its token.
+fn gid_of(token: &str) -> [u8; 16] {
+    XxHash3_128::oneshot(token.as_bytes()).to_le_bytes()
 }
 
 /// A name as a part of a key.
@@ -211,8 +219,7 @@ impl RosNode {
     /// Declares a token `@ros2_lv/DOMAIN/SESSION/NODE/…`; returns the hash of it.
     fn declare(&mut self, rest: &str) -> Result<[u8; 16], RosError> {
         let token = format!("@ros2_lv/{}/{}/0/{rest}", self.domain, self.session.zid());
-        let mut gid = [0; 16];
-        gid.copy_from_slice(&Sha256::digest(&token)[..16]);
+        let gid = gid_of(&token);
         self.tokens.push(self.session.liveliness().declare_token(token).wait().map_err(of_zenoh)?);
         Ok(gid)
     }
@@ -242,7 +249,7 @@ impl RosNode {
         let key = format!("{}{topic}/{}/{}", self.domain, dds_name(message)?, message.hash);
         let builder = self.session.declare_publisher(key).encoding(Encoding::APPLICATION_CDR);
         let publisher = with_quality(builder, quality).wait().map_err(of_zenoh)?;
-        Ok(RosPublisher { publisher, gid, n_sent: 0 })
+        Ok(RosPublisher { publisher, gid, next_seq: 1 })
     }
 
     /// Calls `take` with each call of a service, from a thread of Zenoh, until the node is dropped.
@@ -268,7 +275,7 @@ impl RosNode {
     }
 
     /// Calls `take` with each message on a topic, of whatever type, from a thread of Zenoh. The node says that it expects
-    /// `message`.
+    /// `message`. With [`Quality::KeepLast`] it gets the last messages of each publisher that keeps them.
     ///
     /// # Errors
     /// Zenoh refuses it.
@@ -276,16 +283,19 @@ impl RosNode {
         &mut self,
         topic: &str,
         message: &MessageType,
+        quality: Quality,
         take: impl Fn(Received) + Send + Sync + 'static,
     ) -> Result<RosSubscriber, RosError> {
-        self.endpoint("MS", topic, message, Quality::Sensor)?;
+        self.endpoint("MS", topic, message, quality)?;
         let key = format!("{}{topic}/*/*", self.domain);
-        let subscriber = self
-            .session
-            .declare_subscriber(key)
-            .callback(move |sample| take(Received::of(&sample)))
-            .wait()
-            .map_err(of_zenoh)?;
+        let builder = self.session.declare_subscriber(key).callback(move |sample| take(Received::of(&sample)));
+        let subscriber: Box<dyn Send> = match quality {
+            Quality::Sensor => Box::new(builder.wait().map_err(of_zenoh)?),
+            Quality::KeepLast(n) => {
+                let history = HistoryConfig::default().detect_late_publishers().max_samples(n);
+                Box::new(builder.advanced().history(history).wait().map_err(of_zenoh)?)
+            }
+        };
         Ok(RosSubscriber { _subscriber: subscriber })
     }
 }
@@ -345,7 +355,7 @@ impl Request {
 pub struct RosPublisher {
     publisher: AdvancedPublisher<'static>,
     gid: [u8; 16],
-    n_sent: i64,
+    next_seq: i64,
 }
 
 impl RosPublisher {
@@ -356,11 +366,11 @@ impl RosPublisher {
     pub fn publish(&mut self, cdr: &[u8]) -> Result<(), RosError> {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as i64;
         let mut attachment = Vec::with_capacity(33);
-        attachment.extend(self.n_sent.to_le_bytes());
+        attachment.extend(self.next_seq.to_le_bytes());
         attachment.extend(now.to_le_bytes());
         attachment.push(self.gid.len() as u8);
         attachment.extend(self.gid);
-        self.n_sent += 1;
+        self.next_seq += 1;
         self.publisher.put(cdr).attachment(attachment).wait().map_err(of_zenoh)
     }
 }
@@ -394,7 +404,7 @@ impl KeyPublisher {
 
 /// It receives until it is dropped.
 pub struct RosSubscriber {
-    _subscriber: zenoh::pubsub::Subscriber<()>,
+    _subscriber: Box<dyn Send>,
 }
 
 /// A message from the network.
@@ -415,18 +425,23 @@ pub struct Received {
 
 impl Received {
     fn of(sample: &Sample) -> Received {
-        let mut parts = sample.key_expr().as_str().rsplit('/');
+        let attachment = sample.attachment().map(|bytes| bytes.to_bytes().into_owned()).unwrap_or_default();
+        let n_bytes = sample.payload().len();
+        let bytes = if n_bytes > MAX_RECEIVED_BYTES { Vec::new() } else { sample.payload().to_bytes().into_owned() };
+        Received::new(sample.key_expr().as_str(), &attachment, bytes, n_bytes)
+    }
+
+    fn new(key: &str, attachment: &[u8], bytes: Vec<u8>, n_bytes: usize) -> Received {
+        let mut parts = key.rsplit('/');
         let hash = parts.next().unwrap_or_default().into();
         let name = hiroz_schema::type_name::ros_from_dds(parts.next().unwrap_or_default());
-        let attachment = sample.attachment().map(|bytes| bytes.to_bytes().into_owned()).unwrap_or_default();
         let number = |at: usize| {
             let bytes = attachment.get(at..at + 8)?.try_into().ok()?;
             u64::try_from(i64::from_le_bytes(bytes)).ok()
         };
-        let n_bytes = sample.payload().len();
         Received {
             message: MessageType { name, hash },
-            bytes: if n_bytes > MAX_RECEIVED_BYTES { Vec::new() } else { sample.payload().to_bytes().into_owned() },
+            bytes,
             n_bytes,
             source_nanos: number(8),
             seq: number(0),
@@ -461,6 +476,73 @@ mod tests {
         assert!(Network { keys: Some(keys), ..network("tcp/localhost:7447") }.check().is_err());
     }
 
+    /// Of nodes with rmw_zenoh_cpp 0.2.11 (Jazzy), as others captured them: the token of a publisher, and the attachment of a
+    /// message of it.
+    const CAPTURED: [(&str, &str); 4] = [
+        (
+            "@ros2_lv/0/45000cc3452ec777e9664270c90b5af/0/4/MP/%/%/p_be/%q_best_effort/std_msgs::msg::dds_::String_/HASH/2::,10:,:,:,,",
+            "150000000000000058d1b24cf9a2dc1810a4461b1ae3b3b1de4a54c9c5e9e88fd0",
+        ),
+        (
+            "@ros2_lv/0/914ec2c920f5151f26394cf0ba959999/0/4/MP/%/%/p_tl/%q_transient/std_msgs::msg::dds_::String_/HASH/:1:,10:,:,:,,",
+            "15000000000000008903674cf9a2dc1810b9249d3fec6b1be4c0c8a0e3eb3550bb",
+        ),
+        (
+            "@ros2_lv/0/a52f44b281e33efee354a095ad96d9e9/0/11/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/HASH/::,7:,:,:,,",
+            "1a0000000000000005301f32f9a2dc18103e1e8c9234b1602a9dba5860eed86e33",
+        ),
+        (
+            "@ros2_lv/7/6977b59f87229328a8d406ad77b301a6/0/11/MP/%/%cell4/gw/%cell4%chatter/std_msgs::msg::dds_::String_/HASH/::,7:,:,:,,",
+            "1a00000000000000699e1332f9a2dc1810b7aef695b2cd04ba45f9eed0c4a6c584",
+        ),
+    ];
+    const STRING_HASH: &str = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18";
+
+    #[test]
+    fn captured_messages_of_rmw_zenoh_are_read_and_their_senders_known() {
+        for (token, attachment) in CAPTURED {
+            let token = token.replace("HASH", STRING_HASH);
+            let bytes: Vec<u8> = (0..attachment.len())
+                .step_by(2)
+                .map(|at| u8::from_str_radix(&attachment[at..at + 2], 16).expect("hexadecimal"))
+                .collect();
+            let key = format!("0/chatter/std_msgs::msg::dds_::String_/{STRING_HASH}");
+            let received = Received::new(&key, &bytes, vec![0, 1, 0, 0], 4);
+            assert_eq!(received.sender, Some(gid_of(&token)), "{token}");
+            assert_eq!(received.message, MessageType { name: "std_msgs/msg/String".into(), hash: STRING_HASH.into() });
+            assert!(received.seq.is_some_and(|seq| (21..=26).contains(&seq)), "{received:?}");
+            let secs = received.source_nanos.expect("a time") / 1_000_000_000;
+            assert!((1_700_000_000..1_900_000_000).contains(&secs), "{secs}");
+        }
+    }
+
+    /// The same publishers, declared here, have those tokens, but for the session and the numbers.
+    #[test]
+    fn tokens_are_those_of_rmw_zenoh() {
+        let listens = Network { listen: vec!["tcp/127.0.0.1:0".into()], ..Network::default() };
+        let session = listens.open().expect("a session");
+        let message = MessageType { name: "std_msgs/msg/String".into(), hash: STRING_HASH.into() };
+        let tokens: Vec<String> = [(0, "/", "p_tl", "/q_transient"), (7, "/cell4", "gw", "/cell4/chatter")]
+            .into_iter()
+            .map(|(domain, namespace, name, topic)| {
+                let mut node = RosNode::new(session.clone(), domain, namespace, name).expect("a node");
+                let _publisher = node.publisher(topic, &message, Quality::KeepLast(10)).expect("a publisher");
+                let replies = session.liveliness().get("@ros2_lv/*/*/*/*/MP/**").wait().expect("tokens");
+                let reply = replies.recv().expect("a token").into_result().expect("a token");
+                reply.key_expr().to_string()
+            })
+            .collect();
+        let without_numbers = |token: &str| {
+            let mut parts: Vec<&str> = token.split('/').collect();
+            parts.drain(2..5);
+            parts[..parts.len() - 1].join("/")
+        };
+        for (token, (captured, _)) in tokens.iter().zip([CAPTURED[1], CAPTURED[3]]) {
+            assert_eq!(without_numbers(token), without_numbers(&captured.replace("HASH", STRING_HASH)));
+        }
+        assert!(tokens[0].ends_with("/:1:,10:,:,:,,"), "{}", tokens[0]);
+    }
+
     /// One node on loopback hears another one.
     #[test]
     fn a_message_and_its_sender_are_known_at_the_other_node() {
@@ -472,7 +554,7 @@ mod tests {
         let (sender, heard) = std::sync::mpsc::channel();
         let topic = topic_name("/robot", "words").expect("a topic");
         let _subscriber = heard_at
-            .subscriber(&topic, &message, move |received| sender.send(received).expect("a receiver"))
+            .subscriber(&topic, &message, Quality::Sensor, move |received| sender.send(received).expect("a receiver"))
             .expect("a subscriber");
         let connects = Network { connect: vec![endpoint], ..Network::default() };
         let mut said_at = RosNode::new(connects.open().expect("a session"), 3, "/robot", "sayer").expect("a node");
@@ -486,6 +568,15 @@ mod tests {
         assert_eq!((&received.message, received.bytes.as_slice()), (&message, &[0, 1, 0, 0][..]));
         assert!(received.seq.is_some() && received.source_nanos.is_some());
         assert_eq!(received.sender, Some(publisher.gid));
+        // A subscriber that comes later gets the last message if it asks for it.
+        let (sender, late) = std::sync::mpsc::channel();
+        let _late = heard_at
+            .subscriber(&topic, &message, Quality::KeepLast(1), move |received| {
+                sender.send(received).expect("a receiver")
+            })
+            .expect("a subscriber");
+        let kept = late.recv_timeout(std::time::Duration::from_secs(10)).expect("a message");
+        assert_eq!((kept.message, kept.sender), (message.clone(), Some(publisher.gid)));
         // Another domain hears nothing.
         let mut other = RosNode::new(said_at.session.clone(), 4, "/robot", "other").expect("a node");
         let mut elsewhere = other.publisher(&topic, &message, Quality::Sensor).expect("a publisher");

@@ -6,7 +6,7 @@ use crate::definition::{Definition, DefinitionError};
 type Standard = (&'static str, &'static str, &'static [&'static str]);
 
 /// The types that a message of the list below consists of.
-const PARTS: [(&str, &str); 17] = [
+const PARTS: [(&str, &str); 21] = [
     ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n"),
     ("std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n"),
     ("std_msgs/MultiArrayDimension", "string label\nuint32 size\nuint32 stride\n"),
@@ -33,13 +33,20 @@ const PARTS: [(&str, &str); 17] = [
         "service_msgs/ServiceEventInfo",
         "uint8 event_type\nbuiltin_interfaces/Time stamp\nuint8[16] client_gid\nint64 sequence_number\n",
     ),
+    ("geometry_msgs/Transform", "Vector3 translation\nQuaternion rotation\n"),
+    ("geometry_msgs/TransformStamped", "std_msgs/Header header\nstring child_frame_id\nTransform transform\n"),
+    ("diagnostic_msgs/KeyValue", "string key\nstring value\n"),
+    (
+        "diagnostic_msgs/DiagnosticStatus",
+        "byte level\nstring name\nstring message\nstring hardware_id\nKeyValue[] values\n",
+    ),
     ("sensor_msgs/PointField", "string name\nuint32 offset\nuint8 datatype\nuint32 count\n"),
 ];
 
 const HEADER: &[&str] = &["std_msgs/Header", "builtin_interfaces/Time"];
 const ARRAY: &[&str] = &["std_msgs/MultiArrayLayout", "std_msgs/MultiArrayDimension"];
 
-const TYPES: [Standard; 11] = [
+const TYPES: [Standard; 13] = [
     (
         "sensor_msgs/msg/JointState",
         "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n",
@@ -91,6 +98,23 @@ const TYPES: [Standard; 11] = [
         ],
     ),
     ("std_msgs/msg/String", "string data\n", &[]),
+    (
+        "tf2_msgs/msg/TFMessage",
+        "geometry_msgs/TransformStamped[] transforms\n",
+        &[
+            "geometry_msgs/TransformStamped",
+            "geometry_msgs/Transform",
+            "geometry_msgs/Vector3",
+            "geometry_msgs/Quaternion",
+            "std_msgs/Header",
+            "builtin_interfaces/Time",
+        ],
+    ),
+    (
+        "diagnostic_msgs/msg/DiagnosticArray",
+        "std_msgs/Header header\nDiagnosticStatus[] status\n",
+        &["std_msgs/Header", "builtin_interfaces/Time", "diagnostic_msgs/DiagnosticStatus", "diagnostic_msgs/KeyValue"],
+    ),
 ];
 
 /// The names of the types that are known here.

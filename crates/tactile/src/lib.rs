@@ -23,6 +23,7 @@ pub mod phases;
 pub mod replay;
 pub mod ros2;
 pub mod stream;
+mod transforms;
 pub mod zenoh_key;
 
 use rustix::event::PollFd;

@@ -11,15 +11,24 @@ use rustix::event::{PollFd, PollFlags};
 
 use super::inbox::Inbox;
 use super::phases::PhaseFinder;
+use super::transforms::Transforms;
 use super::{Arrival, DriverError, Event, Place, Reading, Refusal, RefusalKind, TactileDriver};
 use blindgrasp_messages::{MAX_CELLS, Phase};
+use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_ros::cdr::{self, Value};
 use blindgrasp_ros::definition::Definition;
-use blindgrasp_ros::node::{MAX_RECEIVED_BYTES, MessageType, Network, Received, RosNode};
+use blindgrasp_ros::node::{MAX_RECEIVED_BYTES, MessageType, Network, Quality, Received, RosNode};
 use blindgrasp_ros::standard;
 
 /// A sender that has sent nothing for so long gives way to another one.
 const SILENT_NANOS: u64 = 2_000_000_000;
+
+/// Transforms of `/tf` must be this near to the cells in time: robots send them less often than angles, and an arm turns slowly.
+const TRANSFORM_NANOS: u64 = 200_000_000;
+/// The static transforms of a publisher that come to a subscriber later.
+const N_STATIC: usize = 100;
+/// Gravity at sea level, in metres per second squared.
+const GRAVITY_M_PER_S2: f64 = 9.81;
 
 /// The topics and how to read them.
 #[derive(Debug, Clone)]
@@ -39,6 +48,8 @@ pub struct Topics {
     pub wrench: Option<String>,
     /// `sensor_msgs/msg/Imu`, in the palm frame.
     pub imu: Option<String>,
+    /// The frames of `/tf` that tell gravity: the first has its z axis upwards, the second is the palm's.
+    pub gravity_frames: Option<[String; 2]>,
     /// The hand's joints as ROS names them, in the hand's order, each with the change of its value while the hand closes by a
     /// radian; `None` for a joint that does not close.
     pub joint_names: Vec<(String, Option<f64>)>,
@@ -53,6 +64,8 @@ enum Topic {
     Phase,
     Wrench,
     Imu,
+    Transforms,
+    StaticTransforms,
 }
 
 /// Reads frames from topics of ROS 2.
@@ -67,6 +80,9 @@ pub struct Ros2 {
     phase: Option<(Phase, u64)>,
     wrench: Option<(Vec<f64>, u64)>,
     gravity: Option<(Vec<f64>, u64)>,
+    transforms: Transforms,
+    /// Whether the log says that the transforms do not tell gravity.
+    lacks_gravity: bool,
     senders: BTreeMap<Topic, ([u8; 16], u64)>,
     /// From the sender's numbers of frames to those of the source.
     offset: i128,
@@ -88,6 +104,11 @@ impl Ros2 {
         add(Topic::Phase, &topics.phase, standard::definition("std_msgs/msg/String"));
         add(Topic::Wrench, &topics.wrench, standard::definition("geometry_msgs/msg/WrenchStamped"));
         add(Topic::Imu, &topics.imu, standard::definition("sensor_msgs/msg/Imu"));
+        if topics.gravity_frames.is_some() {
+            let message = || standard::definition("tf2_msgs/msg/TFMessage");
+            add(Topic::Transforms, &Some("/tf".into()), message());
+            add(Topic::StaticTransforms, &Some("/tf_static".into()), message());
+        }
         Ros2 {
             topics,
             definitions,
@@ -97,6 +118,8 @@ impl Ros2 {
             phase: None,
             wrench: None,
             gravity: None,
+            transforms: Transforms::default(),
+            lacks_gravity: false,
             senders: BTreeMap::new(),
             offset: 0,
             pending: None,
@@ -106,8 +129,8 @@ impl Ros2 {
     fn take(&mut self, topic: Topic, received: Received, at_nanos: u64, place: &Place) -> Option<Event> {
         let sender = received.sender.unwrap_or_default();
         let (current, last_nanos) = *self.senders.get(&topic).unwrap_or(&(sender, 0));
-        // Joint angles may come from several nodes, each with a part of them.
-        let is_single = topic != Topic::Joints;
+        // Joint angles and transforms may come from several nodes, each with a part of them.
+        let is_single = !matches!(topic, Topic::Joints | Topic::Transforms | Topic::StaticTransforms);
         if is_single && current != sender && at_nanos.saturating_sub(last_nanos) < SILENT_NANOS {
             return Some(Event::TurnedAway);
         }
@@ -166,6 +189,8 @@ impl Ros2 {
                 // A sensor at rest measures the force that keeps it from falling.
                 self.gravity = Some((acceleration.iter().map(|part| -part).collect(), stamp_nanos));
             }
+            Topic::Transforms => self.transforms.take(&value, false)?,
+            Topic::StaticTransforms => self.transforms.take(&value, true)?,
             Topic::Cells => return self.frame(&value, received, stamp, stamp_nanos, at_nanos).map(Some),
         }
         Ok(None)
@@ -196,8 +221,27 @@ impl Ros2 {
         Ok(())
     }
 
+    /// Gravity in the palm frame at a time, if transforms tell it. The log says once that they do not.
+    fn take_gravity(&mut self, stamp_nanos: u64) {
+        let Some([upright, palm]) = &self.topics.gravity_frames else {
+            return;
+        };
+        let palm_from_upright = self.transforms.rotation(palm, upright, stamp_nanos, TRANSFORM_NANOS);
+        let lacks = palm_from_upright.is_none();
+        if std::mem::replace(&mut self.lacks_gravity, lacks) != lacks {
+            print_diagnostic(&match lacks {
+                true => format!("gravity is unknown: no transforms of the last 0.2 s join '{palm}' to '{upright}'"),
+                false => format!("gravity is known: transforms join '{palm}' to '{upright}'"),
+            });
+        }
+        self.gravity = palm_from_upright.map(|rotation| {
+            let gravity = rotation * nalgebra::Vector3::new(0.0, 0.0, -GRAVITY_M_PER_S2);
+            (gravity.as_slice().to_vec(), stamp_nanos)
+        });
+    }
+
     fn frame(
-        &self,
+        &mut self,
         value: &Value,
         received: &Received,
         stamp: Option<u64>,
@@ -205,6 +249,7 @@ impl Ros2 {
         at_nanos: u64,
     ) -> Result<Event, String> {
         let cells_newtons = cells(value, &self.topics.cells_field)?;
+        self.take_gravity(stamp_nanos);
         let is_near = |other: u64| other.abs_diff(stamp_nanos) <= self.topics.tolerance_nanos;
         let mut joints_rad = Vec::with_capacity(self.joints.len());
         for ((name, _), joint) in self.topics.joint_names.iter().zip(&self.joints) {
@@ -256,7 +301,9 @@ impl TactileDriver for Ros2 {
             let mut subscribers = Vec::new();
             for (topic, name, message) in &wanted {
                 let (topic, inbox) = (*topic, Arc::clone(inbox));
-                let subscriber = node.subscriber(name, message, move |received| {
+                let quality =
+                    if topic == Topic::StaticTransforms { Quality::KeepLast(N_STATIC) } else { Quality::Sensor };
+                let subscriber = node.subscriber(name, message, quality, move |received| {
                     let n_bytes = received.bytes.len();
                     inbox.put((topic, received), n_bytes);
                 });
@@ -424,6 +471,7 @@ mod tests {
             phase: Some("/phase".into()),
             wrench: Some("/wrench".into()),
             imu: Some("/imu".into()),
+            gravity_frames: None,
             joint_names: vec![("a".into(), Some(1.0)), ("b".into(), Some(1.0))],
             tolerance_nanos: 20_000_000,
         };
@@ -505,6 +553,43 @@ mod tests {
         assert!(
             why(take(&mut driver, Topic::Cells, old, later, Some(8))).contains("is 30.0 ms from the cells in time")
         );
+    }
+
+    #[test]
+    fn transforms_tell_gravity_while_they_are_new() {
+        let mut topics = driver("std_msgs/msg/Float64MultiArray", "data").topics;
+        topics.imu = None;
+        topics.gravity_frames = Some(["world".into(), "palm".into()]);
+        let mut driver = Ros2::new(topics, PhaseFinder::new(0.05, 200_000_000));
+        let t = 5 * SEC_NANOS;
+        let turned = std::f64::consts::FRAC_1_SQRT_2;
+        // The arm is turned by 90 degrees about x; the palm is fixed to it, turned by 90 degrees about z.
+        let transform = |parent: &'static str, child: &'static str, xyzw: [f64; 4], nanos: u64| {
+            vec![(((nanos / SEC_NANOS) as i32, (nanos % SEC_NANOS) as u32, parent), child, [0.1, 0.2, 0.3], xyzw)]
+        };
+        let arm = message(&driver, Topic::Transforms, &(transform("world", "arm", [turned, 0.0, 0.0, turned], t),), t);
+        let palm = transform("arm", "palm", [0.0, 0.0, turned, turned], 0);
+        let palm = message(&driver, Topic::StaticTransforms, &(palm,), t);
+        let gravity = |driver: &mut Ros2, nanos: u64| {
+            let angles = joints(driver, &["a", "b"], &[0.1, 0.2], nanos);
+            take(driver, Topic::Joints, angles, nanos, None);
+            let settled = message(driver, Topic::Phase, &"settled", nanos);
+            take(driver, Topic::Phase, settled, nanos, None);
+            let cells = floats(driver, &[1.0], nanos, nanos);
+            let event = take(driver, Topic::Cells, cells, nanos, None);
+            match driver.pending.take().or(event) {
+                Some(Event::Frame(reading, _)) => reading.gravity_m_per_s2,
+                other => panic!("no frame: {other:?}"),
+            }
+        };
+        take(&mut driver, Topic::StaticTransforms, palm, t, None);
+        assert!(gravity(&mut driver, t).is_empty() && driver.lacks_gravity);
+        take(&mut driver, Topic::Transforms, arm, t, None);
+        let found = gravity(&mut driver, t + 100_000_000);
+        // In the arm's frame gravity is along -y, in the palm's along -x.
+        assert!(found.iter().zip([-9.81, 0.0, 0.0]).all(|(a, b)| (a - b).abs() < 1e-9), "{found:?}");
+        assert!(!driver.lacks_gravity);
+        assert!(gravity(&mut driver, t + SEC_NANOS).is_empty());
     }
 
     #[test]

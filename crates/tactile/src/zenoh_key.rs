@@ -1,4 +1,5 @@
-//! The driver for frames on a key of Zenoh: the JSON of the [line protocol](super::line_protocol), one frame a sample.
+//! The driver for frames on a key of Zenoh, one a sample: the JSON of the [line protocol](super::line_protocol), or
+//! `blindgrasp_msgs/msg/TactileFrame` in CDR, if that is the encoding of the sample.
 
 use std::sync::Arc;
 
@@ -6,36 +7,81 @@ use rustix::event::{PollFd, PollFlags};
 
 use super::inbox::Inbox;
 use super::line_protocol::parse;
-use super::{Arrival, DriverError, Event, Place, Refusal, RefusalKind, TactileDriver};
+use super::{Arrival, DriverError, Event, Place, Reading, Refusal, RefusalKind, TactileDriver};
+use blindgrasp_messages::TactileFrame;
+use blindgrasp_recording::cdr;
 use blindgrasp_ros::node::Network;
 use zenoh::Wait;
+use zenoh::bytes::Encoding;
 
-/// The bytes of a frame, none if there are too many, and their number.
-type FrameBytes = (Vec<u8>, usize);
+struct Sample {
+    /// None if there are too many.
+    bytes: Vec<u8>,
+    n_bytes: usize,
+    is_cdr: bool,
+}
 
 /// Reads frames from a key.
 pub struct ZenohKey {
     network: Network,
     key: String,
     max_bytes: usize,
+    hand_id: u64,
     has_begun: bool,
-    inbox: Option<Arc<Inbox<FrameBytes>>>,
+    inbox: Option<Arc<Inbox<Sample>>>,
     /// From the sender's numbers of frames to those of the source.
     offset: u64,
     pending: Option<Event>,
 }
 
 impl ZenohKey {
-    /// A driver for a key expression. A frame of more than `max_bytes` is refused.
+    /// A driver for a key expression. A frame of more than `max_bytes` is refused, and one that names another hand.
     ///
     /// # Errors
     /// It is no key expression.
-    pub fn new(network: Network, key: String, max_bytes: usize) -> Result<Self, DriverError> {
+    pub fn new(network: Network, key: String, max_bytes: usize, hand_id: u64) -> Result<Self, DriverError> {
         let error = zenoh::key_expr::KeyExpr::new(key.as_str()).err().map(|error| error.to_string());
         match error {
             Some(why) => Err(DriverError::Key { key, why }),
-            None => Ok(ZenohKey { network, key, max_bytes, has_begun: false, inbox: None, offset: 0, pending: None }),
+            None => Ok(ZenohKey {
+                network,
+                key,
+                max_bytes,
+                hand_id,
+                has_begun: false,
+                inbox: None,
+                offset: 0,
+                pending: None,
+            }),
         }
+    }
+}
+
+impl ZenohKey {
+    /// The reading in a message `blindgrasp_msgs/msg/TactileFrame`.
+    ///
+    /// # Errors
+    /// It is no such message, or of another hand.
+    fn frame_of(&self, bytes: &[u8]) -> Result<Reading, Refusal> {
+        let malformed = |why| Refusal { kind: RefusalKind::Malformed, why };
+        let found = cdr::decode::<TactileFrame>(bytes);
+        let found = found.map_err(|why| malformed(format!("not a TactileFrame in CDR: {why}")))?;
+        let (header, frame) = (found.header, found.message);
+        if header.hand_id != 0 && header.hand_id != self.hand_id {
+            return Err(malformed(format!("the hand is {:016x}, expected {:016x}", header.hand_id, self.hand_id)));
+        }
+        Ok(Reading {
+            joints_rad: frame.joints_rad,
+            cells_newtons: frame.cells_newtons,
+            phase: frame.phase,
+            gravity_m_per_s2: frame.gravity_m_per_s2,
+            wrist_wrench: frame.wrist_wrench,
+            joint_torques: frame.joint_torques,
+            grasp_id: Some(frame.grasp_id),
+            seq: Some(header.seq),
+            stamp_nanos: Some(header.stamp_nanos).filter(|nanos| *nanos > 0),
+            day: Some(frame.day).filter(|day| *day > 0),
+        })
     }
 }
 
@@ -52,7 +98,8 @@ impl TactileDriver for ZenohKey {
                     // Of a frame that is too long, only the length matters.
                     let n_bytes = sample.payload().len();
                     let bytes = if n_bytes > max_bytes { vec![] } else { sample.payload().to_bytes().into_owned() };
-                    inbox.put((bytes, n_bytes), n_bytes.min(max_bytes));
+                    let is_cdr = *sample.encoding() == Encoding::APPLICATION_CDR;
+                    inbox.put(Sample { bytes, n_bytes, is_cdr }, n_bytes.min(max_bytes));
                 })
                 .wait()
                 .map_err(|error| format!("key {key}: {error}"))?;
@@ -87,7 +134,7 @@ impl TactileDriver for ZenohKey {
             return Ok(Some(Event::Began));
         }
         let refused = |kind, why| Ok(Some(Event::Refused(Refusal { kind, why })));
-        let ((bytes, n_bytes), at_nanos) = match inbox.next() {
+        let (Sample { bytes, n_bytes, is_cdr }, at_nanos) = match inbox.next() {
             Ok(None) => return Ok(None),
             Ok(Some(next)) => next,
             Err(Refusal { kind, why }) => return refused(kind, why),
@@ -96,7 +143,8 @@ impl TactileDriver for ZenohKey {
             let why = format!("{n_bytes} bytes, a frame of this hand has at most {}", self.max_bytes);
             return refused(RefusalKind::Oversized, why);
         }
-        match parse(bytes.trim_ascii_end()) {
+        let reading = if is_cdr { self.frame_of(&bytes) } else { parse(bytes.trim_ascii_end()) };
+        match reading {
             Ok(mut reading) => {
                 let last = place.seq;
                 // A sender that was switched off and on counts from its first number again: a gap before that frame.

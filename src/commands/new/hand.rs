@@ -4,10 +4,14 @@ use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{RecordedGrasp, grasp_svg};
+use blindgrasp_ros::cdr::{self, Value};
+use blindgrasp_ros::node::{MAX_RECEIVED_BYTES, MessageType, Quality, RosNode, topic_name};
+use blindgrasp_ros::standard;
 use blindgrasp_simulator::mechanism::Mechanism;
 use blindgrasp_simulator::pad_grid::pad_grid;
 use blindgrasp_stages::hand::{BareHand, Cell, Hand, find_mesh};
@@ -16,6 +20,7 @@ use nalgebra::{Unit, Vector3};
 use serde::Deserialize;
 
 use super::super::hand_cells::joint;
+use super::super::ros2_network::Ros2Network;
 use super::super::{Outcome, print_line};
 use super::{check_free, in_shell};
 
@@ -28,7 +33,8 @@ use super::{check_free, in_shell};
                   blindgrasp new hand my_gripper --urdf gripper.urdf\n  \
                   blindgrasp new hand my_gripper --urdf gripper.urdf.xacro --palm hand_base --open finger_joint=0.04 \\\n    \
                   --grid left_finger=4x3 --grid right_finger=4x3\n  \
-                  blindgrasp new hand my_hand --urdf my_hand.urdf --cells cells.csv\n\n\
+                  blindgrasp new hand my_hand --urdf my_hand.urdf --cells cells.csv\n  \
+                  blindgrasp new hand my_hand --robot-description --palm hand_base --cells cells.csv\n\n\
                   The table of cells has a column for each of: link, x, y, z (metres, in the link's frame), nx, ny, nz (the normal,\n\
                   out of the pad). It may have: pad, width and height (metres), ax, ay, az (the direction of the width), and\n\
                   threshold (newtons).")]
@@ -36,8 +42,19 @@ pub(super) struct Arguments {
     /// The folder to make; its last part is the hand's name.
     name: PathBuf,
     /// The hand's URDF. A name that ends in .xacro is expanded by the program xacro (from PyPI or ROS).
-    #[arg(long, value_name = "FILE")]
-    urdf: PathBuf,
+    #[arg(long, value_name = "FILE", required_unless_present = "robot_description")]
+    urdf: Option<PathBuf>,
+    /// The URDF that a robot in ROS 2 publishes on this topic [default: /robot_description]
+    #[arg(
+        long,
+        value_name = "TOPIC",
+        num_args = 0..=1,
+        default_missing_value = "/robot_description",
+        conflicts_with = "urdf"
+    )]
+    robot_description: Option<String>,
+    #[command(flatten)]
+    network: Ros2Network,
     /// Table of the cells (CSV).
     #[arg(long, value_name = "FILE")]
     cells: Option<PathBuf>,
@@ -66,6 +83,9 @@ pub(super) struct Arguments {
     #[arg(long, default_value_t = 0.05, value_name = "NEWTONS")]
     threshold: f64,
 }
+
+/// The description of a robot must come within this time.
+const DESCRIPTION_LIMIT: Duration = Duration::from_secs(10);
 
 /// A pad of the layout to be written.
 struct NewPad {
@@ -97,7 +117,17 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let folder = &arguments.name;
     let name = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default().to_owned();
     check_free(folder)?;
-    let mut urdf = urdf_text(&arguments.urdf)?;
+    let (source, mut urdf) = match (&arguments.urdf, &arguments.robot_description) {
+        (None, Some(topic)) => (PathBuf::from("robot_description.urdf"), described(topic, &arguments.network)?),
+        (Some(_), _) if arguments.network.is_given() => {
+            bail!("--connect, --keys and --domain are of no use to --urdf: they belong to --robot-description")
+        }
+        (path, _) => {
+            let path = path.clone().unwrap_or_default();
+            let text = urdf_text(&path)?;
+            (path, text)
+        }
+    };
     let mut bare = BareHand {
         name: name.clone(),
         palm: arguments.palm.clone(),
@@ -107,7 +137,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(palm) = with_palm_frame(&mut urdf, arguments)? {
         bare.palm = Some(palm);
     }
-    let hand = Hand::without_cells(&arguments.urdf, &urdf, &bare)?;
+    let hand = Hand::without_cells(&source, &urdf, &bare)?;
     print_parts(&hand)?;
     let mechanism = Mechanism::new(&hand);
     let mut pads =
@@ -124,7 +154,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if pads.is_empty() {
         bail!("the cells are missing: give a table with --cells, or pads with --grid LINK=ROWSxCOLUMNS");
     }
-    let (urdf, meshes) = with_meshes_beside(&urdf, arguments.urdf.parent().unwrap_or(Path::new("")));
+    let (urdf, meshes) = with_meshes_beside(&urdf, source.parent().unwrap_or(Path::new("")));
     let layout = layout(&name, &hand, &pads, &bare);
     std::fs::create_dir(folder).with_context(|| format!("cannot make {}", folder.display()))?;
     let written = write_folder(folder, &name, &urdf, &layout, &meshes);
@@ -170,6 +200,37 @@ fn write_folder(
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     write("svg", &grasp_svg(&hand, &RecordedGrasp::hand_alone(&hand, &[hand.open_joints_rad()]))?)?;
     Ok(hand)
+}
+
+/// The URDF that a robot publishes, as its `robot_state_publisher` does.
+fn described(topic: &str, network: &Ros2Network) -> anyhow::Result<String> {
+    let (network, domain) = network.network()?;
+    let topic = topic_name("/", topic)?;
+    let definition = standard::definition("std_msgs/msg/String").context("no definition of std_msgs/msg/String")?;
+    let message = MessageType { name: definition.name.clone(), hash: definition.hash() };
+    let mut node = RosNode::new(network.open()?, domain, "/", "blindgrasp_new_hand")?;
+    let (sender, received) = std::sync::mpsc::channel();
+    let _subscriber = node.subscriber(&topic, &message, Quality::KeepLast(1), move |it| drop(sender.send(it)))?;
+    let received = received.recv_timeout(DESCRIPTION_LIMIT).map_err(|_| {
+        anyhow::anyhow!(
+            "{topic}: no message has come in {} s: does robot_state_publisher run, with rmw_zenoh and in domain {domain}?",
+            DESCRIPTION_LIMIT.as_secs()
+        )
+    })?;
+    if received.message.name != message.name || received.n_bytes > MAX_RECEIVED_BYTES {
+        bail!(
+            "{topic}: a message of type {} and {} bytes, expected {}",
+            received.message.name,
+            received.n_bytes,
+            message.name
+        );
+    }
+    let value = cdr::read(&definition, &received.bytes).with_context(|| topic.clone())?;
+    let text = value.at("data").as_ref().and_then(Value::text).unwrap_or_default().to_owned();
+    if !text.contains("<robot") {
+        bail!("{topic}: the message is no URDF: it has no <robot> element");
+    }
+    Ok(text)
 }
 
 /// The text of the URDF. A xacro file is expanded.

@@ -345,6 +345,11 @@ const BUILTIN: [(&str, &str, &str); 4] =
     [builtin!("allegro"), builtin!("barrett-bh8-280"), builtin!("parallel-gripper"), builtin!("shadow-biotac-sp")];
 
 impl Hand {
+    /// The name of the link whose frame is the palm frame.
+    pub fn palm_link(&self) -> &str {
+        &self.links[self.reference_link_idx].name
+    }
+
     /// Reads a hand from a pad layout file, or takes the built-in hand of that name.
     ///
     /// # Errors

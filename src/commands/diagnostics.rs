@@ -1,0 +1,202 @@
+//! `blindgrasp diagnostics`: the state of a graph as `diagnostic_msgs/msg/DiagnosticArray`, for ROS 2.
+
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use anyhow::Context as _;
+use blindgrasp_graph::client::{ClientError, pick_graph};
+use blindgrasp_graph::control::{GraphState, NodeState};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_recording::cdr;
+use blindgrasp_ros::node::{MessageType, Quality, RosNode, RosPublisher};
+use blindgrasp_ros::standard;
+use clap::Args;
+use serde::Serialize;
+
+use super::ps::{node_state_word, state_word, warnings};
+use super::ros2_network::Ros2Network;
+use super::top::poller::Poller;
+use super::top::sample::{Look, Measured, MeasuredEdge, MeasuredNode, Window, measure};
+use super::{Outcome, number_in};
+
+/// Publish a graph's state to ROS 2, on /diagnostics
+///
+/// A status for the graph, each node and each edge, for rqt_robot_monitor and diagnostic_aggregator. A graph that has ended is
+/// an error until it runs again. The command runs until it is interrupted.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp diagnostics grasp_gate --connect tcp/localhost:7447")]
+pub(super) struct Arguments {
+    /// Graph, which need not run yet [default: the only one running]
+    graph: Option<String>,
+    #[command(flatten)]
+    network: Ros2Network,
+    /// Publish every so many seconds
+    #[arg(long, value_name = "SECS", default_value = "1", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    interval: f64,
+}
+
+const TYPE: &str = "diagnostic_msgs/msg/DiagnosticArray";
+const OK: u8 = 0;
+const WARN: u8 = 1;
+const ERROR: u8 = 2;
+
+/// `diagnostic_msgs/msg/DiagnosticStatus`.
+#[derive(Debug, Serialize)]
+struct Status {
+    level: u8,
+    name: String,
+    message: String,
+    hardware_id: &'static str,
+    values: Vec<(&'static str, String)>,
+}
+
+/// The node of ROS and its publisher.
+type Publishing = (RosNode, RosPublisher);
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let graph = match &arguments.graph {
+        Some(graph) => graph.clone(),
+        None => pick_graph(None)?,
+    };
+    let (network, domain) = arguments.network.network()?;
+    let definition = standard::definition(TYPE).context("no definition of the diagnostics")?;
+    let message = MessageType { name: TYPE.into(), hash: definition.hash() };
+    let open = || -> anyhow::Result<Publishing> {
+        let mut node = RosNode::new(network.open()?, domain, "/", "blindgrasp_diagnostics")?;
+        let publisher = node.publisher("/diagnostics", &message, Quality::KeepLast(1))?;
+        Ok((node, publisher))
+    };
+    let (mut publishing, mut said) = (None, String::new());
+    let mut watched = Watched { graph, connection: None };
+    let (interval, mut due) = (Duration::from_secs_f64(arguments.interval), Instant::now());
+    loop {
+        if publishing.is_none() {
+            match open() {
+                Ok(opened) => {
+                    print_diagnostic(&format!("publishes the state of graph '{}' on /diagnostics", watched.graph));
+                    publishing = Some(opened);
+                }
+                Err(error) if said != error.to_string() => {
+                    said = error.to_string();
+                    print_diagnostic(&format!("{said}; trying again"));
+                }
+                Err(_) => {}
+            }
+        }
+        let statuses = watched.look();
+        if let Some((_, publisher)) = &mut publishing {
+            let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+            let stamp = (i32::try_from(now.as_secs()).unwrap_or(i32::MAX), now.subsec_nanos());
+            let mut data = Vec::new();
+            cdr::encode(&((stamp, ""), statuses), &mut data).map_err(anyhow::Error::msg)?;
+            publisher.publish(&data)?;
+        }
+        due = (due + interval).max(Instant::now());
+        std::thread::sleep(due.saturating_duration_since(Instant::now()));
+    }
+}
+
+/// A graph that may end and run again.
+struct Watched {
+    graph: String,
+    connection: Option<(Poller, Look)>,
+}
+
+impl Watched {
+    /// The statuses now; the graph's comes first.
+    fn look(&mut self) -> Vec<Status> {
+        match self.measured() {
+            Ok((measured, warnings)) => statuses(&measured, &warnings),
+            Err(error) => {
+                self.connection = None;
+                vec![status(ERROR, &self.graph, "graph", format!("{:#}", anyhow::Error::from(error)), vec![])]
+            }
+        }
+    }
+
+    /// The activity since the look before, and the graph's warnings.
+    fn measured(&mut self) -> Result<(Measured, Vec<String>), ClientError> {
+        let (mut poller, before) = match self.connection.take() {
+            Some((poller, before)) => (poller, Some(before)),
+            None => (Poller::connect(&self.graph)?.0, None),
+        };
+        let now = poller.look()?;
+        // The first time all counts are those since the start of the graph.
+        let since = before.as_ref();
+        let window = Window { previous: since.unwrap_or(&now), rates_since: since, counts_since: since };
+        let measured = measure(&now, window);
+        let warnings = warnings(&now.status);
+        self.connection = Some((poller, now));
+        Ok((measured, warnings))
+    }
+}
+
+fn status(level: u8, graph: &str, part: &str, message: String, values: Vec<(&'static str, String)>) -> Status {
+    Status { level, name: format!("blindgrasp/{graph}: {part}"), message, hardware_id: "blindgrasp", values }
+}
+
+fn statuses(measured: &Measured, warnings: &[String]) -> Vec<Status> {
+    let graph = &measured.graph;
+    let level = match measured.state {
+        GraphState::Degraded => ERROR,
+        GraphState::Running if warnings.is_empty() => OK,
+        _ => WARN,
+    };
+    let message = if warnings.is_empty() { state_word(measured.state).to_lowercase() } else { warnings.join("; ") };
+    let decisions = &measured.decisions;
+    let mut values = vec![
+        ("uptime_secs", format!("{:.1}", measured.uptime_secs)),
+        ("n_lift", decisions.n_lift.to_string()),
+        ("n_hold", decisions.n_hold.to_string()),
+        ("n_false_positives", decisions.n_false_positives.to_string()),
+    ];
+    if let Some(latency) = measured.decision_latency_nanos {
+        values.push(("decision_latency_p50_nanos", latency.p50.to_string()));
+        values.push(("decision_latency_p99_nanos", latency.p99.to_string()));
+    }
+    if let Some(last) = decisions.new.last() {
+        values.push(("last_action", last.action.as_str().into()));
+        values.push(("last_reason", last.reason.as_str().into()));
+    }
+    let mut all = vec![status(level, graph, "graph", message, values)];
+    all.extend(measured.nodes.iter().map(|node| of_node(graph, node)));
+    all.extend(measured.edges.iter().map(|edge| of_edge(graph, edge)));
+    all
+}
+
+fn of_node(graph: &str, node: &MeasuredNode) -> Status {
+    let level = match node.state {
+        NodeState::Running | NodeState::Done => OK,
+        NodeState::Starting | NodeState::Restarting => WARN,
+        NodeState::Failed => ERROR,
+    };
+    let mut values = vec![("restarts", node.n_restarts.to_string()), ("swaps", node.n_swaps.to_string())];
+    let mut add = |name, value: Option<String>| values.extend(value.map(|value| (name, value)));
+    add("pid", node.pid.map(|pid| pid.to_string()));
+    add("cpu_percent", node.cpu_percent.map(|percent| format!("{percent:.1}")));
+    add("resident_bytes", node.resident_bytes.map(|bytes| bytes.to_string()));
+    add("heartbeat_age_millis", node.heartbeat_age_millis.map(|millis| millis.to_string()));
+    let counts: Vec<String> = node.counts.iter().map(|(name, count)| format!("{name} {count}")).collect();
+    add("counts", Some(counts.join(", ")).filter(|counts| !counts.is_empty()));
+    status(level, graph, &node.node, node_state_word(node.state).to_lowercase(), values)
+}
+
+/// Samples that an edge lost since the look before are a warning.
+fn of_edge(graph: &str, edge: &MeasuredEdge) -> Status {
+    let troubles = [("dropped", edge.dropped), ("missing", edge.missing), ("late", edge.late)];
+    let words: Vec<String> =
+        troubles.iter().filter(|(_, n)| *n > 0).map(|(word, n)| format!("{n} samples {word}")).collect();
+    let level = if words.is_empty() { OK } else { WARN };
+    let message = if words.is_empty() { format!("{:.1} Hz", edge.rate_hz) } else { words.join(", ") };
+    let mut values = vec![
+        ("rate_hz", format!("{:.1}", edge.rate_hz)),
+        ("received", edge.received.to_string()),
+        ("queued", edge.n_queued.to_string()),
+        ("repeated", edge.repeated.to_string()),
+    ];
+    values.extend(troubles.map(|(word, n)| (word, n.to_string())));
+    if let Some(age) = edge.age_nanos {
+        values.push(("age_p50_nanos", age.p50.to_string()));
+        values.push(("age_p99_nanos", age.p99.to_string()));
+    }
+    status(level, graph, &format!("{} -> {}", edge.from, edge.to), message, values)
+}

@@ -1,0 +1,37 @@
+//! The options of commands that speak to nodes of ROS 2.
+
+use std::path::PathBuf;
+
+use blindgrasp_operators::connection::ConnectionParams;
+use blindgrasp_ros::node::{MAX_DOMAIN, Network};
+use clap::Args;
+
+#[derive(Debug, Args)]
+pub(super) struct Ros2Network {
+    /// Zenoh router of the robot [default: tcp/localhost:7447]
+    #[arg(long, value_name = "ENDPOINT")]
+    connect: Option<String>,
+    /// Folder with ca.pem, ros2.pem and ros2.key.pem, for an endpoint tls/HOST:PORT
+    #[arg(long, value_name = "DIR")]
+    keys: Option<PathBuf>,
+    /// ROS domain [default: 0]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=i64::from(MAX_DOMAIN)))]
+    domain: Option<u32>,
+}
+
+impl Ros2Network {
+    /// Whether there is any of the options.
+    pub(super) fn is_given(&self) -> bool {
+        self.connect.is_some() || self.keys.is_some() || self.domain.is_some()
+    }
+
+    /// The network and the domain.
+    ///
+    /// # Errors
+    /// The endpoint is not valid.
+    pub(super) fn network(&self) -> anyhow::Result<(Network, u32)> {
+        let connection =
+            ConnectionParams { connect: self.connect.clone(), keys: self.keys.clone(), ..ConnectionParams::default() };
+        Ok((connection.network()?, self.domain.unwrap_or(0)))
+    }
+}
