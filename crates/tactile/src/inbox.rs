@@ -72,7 +72,8 @@ impl<T: Send + 'static> Inbox<T> {
         });
     }
 
-    pub(super) fn put(&self, message: T, n_bytes: usize) {
+    /// Appends a message. The source looks for one that does not wake it when it wakes the next time.
+    pub(super) fn put(&self, message: T, n_bytes: usize, wakes: bool) {
         let at_nanos = monotonic_nanos();
         let mut queue = self.queue();
         while queue.waiting.len() >= MAX_WAITING || queue.n_bytes + n_bytes > MAX_WAITING_BYTES {
@@ -84,8 +85,11 @@ impl<T: Send + 'static> Inbox<T> {
         }
         queue.n_bytes += n_bytes;
         queue.waiting.push_back((message, n_bytes, at_nanos));
-        // A full counter wakes as well.
-        let _ = rustix::io::write(&self.event, &1_u64.to_ne_bytes());
+        drop(queue);
+        if wakes {
+            // A full counter wakes as well.
+            let _ = rustix::io::write(&self.event, &1_u64.to_ne_bytes());
+        }
     }
 
     /// The next message and its arrival.
@@ -133,12 +137,12 @@ mod tests {
     #[test]
     fn messages_beyond_the_limits_are_dropped_and_said() {
         let inbox = Inbox::new().expect("an event");
-        (0..5).for_each(|number| inbox.put(number, MAX_WAITING_BYTES / 4));
+        (0..5).for_each(|number| inbox.put(number, MAX_WAITING_BYTES / 4, true));
         let refusal = inbox.next().expect_err("dropped");
         assert!(refusal.why.starts_with("1 messages were dropped"), "{}", refusal.why);
         let rest: Vec<i32> = std::iter::from_fn(|| inbox.next().expect("no more dropped")).map(|(it, _)| it).collect();
         assert_eq!(rest, [1, 2, 3, 4]);
-        (0..MAX_WAITING + 3).for_each(|number| inbox.put(number as i32, 1));
+        (0..MAX_WAITING + 3).for_each(|number| inbox.put(number as i32, 1, true));
         assert!(inbox.next().expect_err("dropped").why.starts_with("3 messages"));
     }
 }

@@ -305,7 +305,8 @@ impl TactileDriver for Ros2 {
                     if topic == Topic::StaticTransforms { Quality::KeepLast(N_STATIC) } else { Quality::Sensor };
                 let subscriber = node.subscriber(name, message, quality, move |received| {
                     let n_bytes = received.bytes.len();
-                    inbox.put((topic, received), n_bytes);
+                    // Only cells complete a frame.
+                    inbox.put((topic, received), n_bytes, topic == Topic::Cells);
                 });
                 subscribers.push(subscriber.map_err(|error| error.to_string())?);
             }

@@ -99,7 +99,7 @@ impl TactileDriver for ZenohKey {
                     let n_bytes = sample.payload().len();
                     let bytes = if n_bytes > max_bytes { vec![] } else { sample.payload().to_bytes().into_owned() };
                     let is_cdr = *sample.encoding() == Encoding::APPLICATION_CDR;
-                    inbox.put(Sample { bytes, n_bytes, is_cdr }, n_bytes.min(max_bytes));
+                    inbox.put(Sample { bytes, n_bytes, is_cdr }, n_bytes.min(max_bytes), true);
                 })
                 .wait()
                 .map_err(|error| format!("key {key}: {error}"))?;
