@@ -42,7 +42,7 @@ const DEFAULT_BAUD: u32 = 115_200;
 /// Half of the age that the arbiter allows by default, which counts from the source on.
 const DEFAULT_MAX_DELAY_MS: f64 = 100.0;
 /// The parameters of the driver ros2.
-const ROS2_PARAMS: [&str; 19] = [
+const ROS2_PARAMS: [&str; 20] = [
     "domain",
     "namespace",
     "connect",
@@ -57,6 +57,7 @@ const ROS2_PARAMS: [&str; 19] = [
     "phase_topic",
     "wrench_topic",
     "imu_topic",
+    "tf_topic",
     "gravity_frame",
     "palm_frame",
     "tolerance_ms",
@@ -99,6 +100,7 @@ struct TopicParams {
     phase_topic: Option<String>,
     wrench_topic: Option<String>,
     imu_topic: Option<String>,
+    tf_topic: Option<String>,
     gravity_frame: Option<String>,
     palm_frame: Option<String>,
     tolerance_ms: Option<f64>,
@@ -277,6 +279,7 @@ fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box
         ("phase_topic", topics.phase_topic.is_some()),
         ("wrench_topic", topics.wrench_topic.is_some()),
         ("imu_topic", topics.imu_topic.is_some()),
+        ("tf_topic", topics.tf_topic.is_some()),
         ("gravity_frame", topics.gravity_frame.is_some()),
         ("palm_frame", topics.palm_frame.is_some()),
         ("tolerance_ms", topics.tolerance_ms.is_some()),
@@ -334,14 +337,22 @@ fn ros2(params: &Params, hand: &Hand) -> anyhow::Result<Ros2> {
     let cells = named(&topics.cells_topic)?.context("driver ros2 needs the param 'cells_topic', like /hand/tactile")?;
     let cells_type = topics.cells_type.as_deref().unwrap_or("std_msgs/msg/Float64MultiArray");
     let prefix = topics.joint_prefix.as_deref().unwrap_or_default();
-    let palm_frame = topics.palm_frame.clone().unwrap_or_else(|| hand.palm_link().to_owned());
-    match &topics.gravity_frame {
-        Some(_) if topics.imu_topic.is_some() => {
+    let frame = |name: &String| name.trim_start_matches('/').to_owned();
+    let gravity = match (&topics.gravity_frame, &topics.palm_frame) {
+        (Some(_), _) if topics.imu_topic.is_some() => {
             bail!("params 'gravity_frame' and 'imu_topic' both tell gravity: leave one of them out")
         }
-        None if topics.palm_frame.is_some() => bail!("param 'palm_frame' needs 'gravity_frame', like world"),
-        _ => {}
-    }
+        (Some(upright), Some(palm)) if frame(upright) != frame(palm) => {
+            let topic = named(&topics.tf_topic)?.unwrap_or_else(|| "/tf".into());
+            Some((topic, [frame(upright), frame(palm)]))
+        }
+        (None, None) if topics.tf_topic.is_none() => None,
+        _ => bail!(
+            "params 'gravity_frame' (a frame whose z axis points upwards, like world) and 'palm_frame' (the frame of the hand's \
+             {}) belong together, and are different frames",
+            hand.palm_link().name
+        ),
+    };
     let topics = Topics {
         network,
         domain,
@@ -352,10 +363,7 @@ fn ros2(params: &Params, hand: &Hand) -> anyhow::Result<Ros2> {
         phase: named(&topics.phase_topic)?,
         wrench: named(&topics.wrench_topic)?,
         imu: named(&topics.imu_topic)?,
-        gravity_frames: topics
-            .gravity_frame
-            .as_ref()
-            .map(|upright| [upright, &palm_frame].map(|frame| frame.trim_start_matches('/').to_owned())),
+        gravity,
         joint_names: (0..hand.joints.len())
             .map(|idx| {
                 let joint = &hand.joints[idx];

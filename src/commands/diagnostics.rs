@@ -4,8 +4,9 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::Context as _;
 use blindgrasp_graph::client::{ClientError, pick_graph};
-use blindgrasp_graph::control::{GraphState, NodeState};
+use blindgrasp_graph::control::{EdgeStatus, GraphState, NodeState, NodeStatus};
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_recording::cdr;
 use blindgrasp_ros::node::{MessageType, Quality, RosNode, RosPublisher};
 use blindgrasp_ros::standard;
@@ -38,6 +39,18 @@ const TYPE: &str = "diagnostic_msgs/msg/DiagnosticArray";
 const OK: u8 = 0;
 const WARN: u8 = 1;
 const ERROR: u8 = 2;
+/// Counts of nodes that tell of samples from outside that were not used, or not sent.
+const REFUSALS: [&str; 9] = [
+    "malformed",
+    "oversized",
+    "cut_off",
+    "late",
+    "out_of_order",
+    "disbelieved",
+    "refused_clients",
+    "unzeroed",
+    "unpublished",
+];
 
 /// `diagnostic_msgs/msg/DiagnosticStatus`.
 #[derive(Debug, Serialize)]
@@ -104,29 +117,26 @@ struct Watched {
 impl Watched {
     /// The statuses now; the graph's comes first.
     fn look(&mut self) -> Vec<Status> {
-        match self.measured() {
-            Ok((measured, warnings)) => statuses(&measured, &warnings),
-            Err(error) => {
-                self.connection = None;
-                vec![status(ERROR, &self.graph, "graph", format!("{:#}", anyhow::Error::from(error)), vec![])]
-            }
-        }
+        self.looked().unwrap_or_else(|error| {
+            self.connection = None;
+            vec![status(ERROR, &self.graph, "graph", format!("{:#}", anyhow::Error::from(error)), vec![])]
+        })
     }
 
-    /// The activity since the look before, and the graph's warnings.
-    fn measured(&mut self) -> Result<(Measured, Vec<String>), ClientError> {
-        let (mut poller, before) = match self.connection.take() {
-            Some((poller, before)) => (poller, Some(before)),
-            None => (Poller::connect(&self.graph)?.0, None),
+    fn looked(&mut self) -> Result<Vec<Status>, ClientError> {
+        let (poller, now, before) = match self.connection.take() {
+            Some((mut poller, before)) => {
+                let now = poller.look()?;
+                (poller, now, Some(before))
+            }
+            None => {
+                let (poller, now) = Poller::connect(&self.graph)?;
+                (poller, now, None)
+            }
         };
-        let now = poller.look()?;
-        // The first time all counts are those since the start of the graph.
-        let since = before.as_ref();
-        let window = Window { previous: since.unwrap_or(&now), rates_since: since, counts_since: since };
-        let measured = measure(&now, window);
-        let warnings = warnings(&now.status);
+        let statuses = statuses(&now, before.as_ref());
         self.connection = Some((poller, now));
-        Ok((measured, warnings))
+        Ok(statuses)
     }
 }
 
@@ -134,8 +144,25 @@ fn status(level: u8, graph: &str, part: &str, message: String, values: Vec<(&'st
     Status { level, name: format!("blindgrasp/{graph}: {part}"), message, hardware_id: "blindgrasp", values }
 }
 
-fn statuses(measured: &Measured, warnings: &[String]) -> Vec<Status> {
+/// Counts are those since the start of the graph. Rates, and losses that are a warning, are those since the look before.
+fn statuses(now: &Look, before: Option<&Look>) -> Vec<Status> {
+    let window = Window { previous: before.unwrap_or(now), rates_since: before, counts_since: None };
+    let measured = measure(now, window);
     let graph = &measured.graph;
+    let mut all = vec![of_graph(now, &measured)];
+    all.extend(measured.nodes.iter().map(|node| {
+        let before = before.and_then(|look| look.status.nodes.iter().find(|other| other.node == node.node));
+        of_node(graph, node, before)
+    }));
+    all.extend(measured.edges.iter().map(|edge| {
+        let mut edges = before.iter().flat_map(|look| &look.status.edges);
+        of_edge(graph, edge, edges.find(|other| other.from == edge.from && other.to == edge.to))
+    }));
+    all
+}
+
+fn of_graph(now: &Look, measured: &Measured) -> Status {
+    let warnings = warnings(&now.status);
     let level = match measured.state {
         GraphState::Degraded => ERROR,
         GraphState::Running if warnings.is_empty() => OK,
@@ -153,22 +180,35 @@ fn statuses(measured: &Measured, warnings: &[String]) -> Vec<Status> {
         values.push(("decision_latency_p50_nanos", latency.p50.to_string()));
         values.push(("decision_latency_p99_nanos", latency.p99.to_string()));
     }
-    if let Some(last) = decisions.new.last() {
+    if let Some(last) = now.status.decisions.latest.back() {
+        values.push(("last_grasp_id", last.grasp_id.to_string()));
         values.push(("last_action", last.action.as_str().into()));
         values.push(("last_reason", last.reason.as_str().into()));
     }
-    let mut all = vec![status(level, graph, "graph", message, values)];
-    all.extend(measured.nodes.iter().map(|node| of_node(graph, node)));
-    all.extend(measured.edges.iter().map(|edge| of_edge(graph, edge)));
-    all
+    status(level, &measured.graph, "graph", message, values)
 }
 
-fn of_node(graph: &str, node: &MeasuredNode) -> Status {
+/// What a node refused since the look before is a warning.
+fn of_node(graph: &str, node: &MeasuredNode, before: Option<&NodeStatus>) -> Status {
+    let refused = REFUSALS.iter().filter_map(|name| {
+        let now = node.counts.get(*name)?;
+        let n = now.saturating_sub(*before?.counts.get(*name).unwrap_or(&0));
+        (n > 0).then(|| format!("{n} {name}"))
+    });
+    let refused: Vec<String> = refused.collect();
     let level = match node.state {
-        NodeState::Running | NodeState::Done => OK,
-        NodeState::Starting | NodeState::Restarting => WARN,
         NodeState::Failed => ERROR,
+        NodeState::Starting | NodeState::Restarting => WARN,
+        NodeState::Running | NodeState::Done => {
+            if refused.is_empty() {
+                OK
+            } else {
+                WARN
+            }
+        }
     };
+    let state = node_state_word(node.state).to_lowercase();
+    let message = if refused.is_empty() { state } else { format!("{state}; {}", refused.join(", ")) };
     let mut values = vec![("restarts", node.n_restarts.to_string()), ("swaps", node.n_swaps.to_string())];
     let mut add = |name, value: Option<String>| values.extend(value.map(|value| (name, value)));
     add("pid", node.pid.map(|pid| pid.to_string()));
@@ -177,12 +217,14 @@ fn of_node(graph: &str, node: &MeasuredNode) -> Status {
     add("heartbeat_age_millis", node.heartbeat_age_millis.map(|millis| millis.to_string()));
     let counts: Vec<String> = node.counts.iter().map(|(name, count)| format!("{name} {count}")).collect();
     add("counts", Some(counts.join(", ")).filter(|counts| !counts.is_empty()));
-    status(level, graph, &node.node, node_state_word(node.state).to_lowercase(), values)
+    status(level, graph, &node.node, message, values)
 }
 
-/// Samples that an edge lost since the look before are a warning.
-fn of_edge(graph: &str, edge: &MeasuredEdge) -> Status {
-    let troubles = [("dropped", edge.dropped), ("missing", edge.missing), ("late", edge.late)];
+/// Samples that came late or that a lossless edge lost since the look before are a warning.
+fn of_edge(graph: &str, edge: &MeasuredEdge, before: Option<&EdgeStatus>) -> Status {
+    let since = |now: u64, count: fn(&EdgeStatus) -> u64| before.map_or(0, |before| now.saturating_sub(count(before)));
+    let lost = if edge.policy == EdgePolicy::Lossless { since(edge.dropped, |edge| edge.dropped) } else { 0 };
+    let troubles = [("lost", lost), ("late", since(edge.late, |edge| edge.late))];
     let words: Vec<String> =
         troubles.iter().filter(|(_, n)| *n > 0).map(|(word, n)| format!("{n} samples {word}")).collect();
     let level = if words.is_empty() { OK } else { WARN };
@@ -191,9 +233,11 @@ fn of_edge(graph: &str, edge: &MeasuredEdge) -> Status {
         ("rate_hz", format!("{:.1}", edge.rate_hz)),
         ("received", edge.received.to_string()),
         ("queued", edge.n_queued.to_string()),
+        ("dropped", edge.dropped.to_string()),
+        ("missing", edge.missing.to_string()),
+        ("late", edge.late.to_string()),
         ("repeated", edge.repeated.to_string()),
     ];
-    values.extend(troubles.map(|(word, n)| (word, n.to_string())));
     if let Some(age) = edge.age_nanos {
         values.push(("age_p50_nanos", age.p50.to_string()));
         values.push(("age_p99_nanos", age.p99.to_string()));

@@ -209,6 +209,23 @@ fn a_hand_is_made_from_a_table_of_cells() {
     assert!(stderr.contains("8 of 8 cells lie behind the palm"), "{stderr}");
 }
 
+/// The arm does not become a part of the hand.
+#[test]
+fn a_hand_is_made_from_the_urdf_of_a_whole_robot() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let arm = "<link name=\"world\"/>\n<joint name=\"wrist\" type=\"revolute\"><parent link=\"world\"/><child link=\"palm\"/>\
+               <axis xyz=\"0 0 1\"/><limit lower=\"-3\" upper=\"3\"/></joint>\n</robot>";
+    let robot = read("hands/parallel-gripper.urdf").replace("</robot>", arm);
+    std::fs::write(folder.path().join("gripper.urdf"), robot).expect("written");
+    let grids = ["--open", "jaw=0.0425", "--grid", "left_jaw=2x2", "--grid", "right_jaw=2x2"];
+    let (_, stderr) = run_in(folder.path(), &other(&[&grids[..], &["--palm", "palm"]].concat()), 1);
+    assert!(stderr.contains("joint 'wrist' moves the palm: give the first link of the hand with --base"), "{stderr}");
+    let (stdout, _) = run_in(folder.path(), &other(&[&grids[..], &["--base", "palm"]].concat()), 0);
+    assert!(stdout.contains("2 pads, 8 cells") && !stdout.contains("wrist"), "{stdout}");
+    let (_, stderr) = run_in(folder.path(), &["new", "hand", "third", "--urdf", "gripper.urdf", "--base", "thumb"], 1);
+    assert!(stderr.contains("--base: the URDF has no link 'thumb'"), "{stderr}");
+}
+
 #[test]
 fn a_hand_is_drawn_by_itself() {
     let folder = tempfile::tempdir().expect("a folder");

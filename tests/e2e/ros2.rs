@@ -248,7 +248,7 @@ for line in sys.stdin:
     if line.startswith('{'):
         publisher.put(line)
     else:
-        publisher.put(bytes.fromhex(line), encoding=zenoh.Encoding.APPLICATION_CDR)
+        publisher.put(bytes.fromhex(line))
 session.close()
 ";
     let folder = tempfile::tempdir().expect("a folder");

@@ -72,7 +72,7 @@ impl<T: Send + 'static> Inbox<T> {
         });
     }
 
-    /// Appends a message. The source looks for one that does not wake it when it wakes the next time.
+    /// Appends a message. One that does not wake the source is read at its next look.
     pub(super) fn put(&self, message: T, n_bytes: usize, wakes: bool) {
         let at_nanos = monotonic_nanos();
         let mut queue = self.queue();
@@ -142,6 +142,11 @@ mod tests {
         assert!(refusal.why.starts_with("1 messages were dropped"), "{}", refusal.why);
         let rest: Vec<i32> = std::iter::from_fn(|| inbox.next().expect("no more dropped")).map(|(it, _)| it).collect();
         assert_eq!(rest, [1, 2, 3, 4]);
+        inbox.put(5, 1, false);
+        let mut fds = [rustix::event::PollFd::new(&inbox.event, rustix::event::PollFlags::IN)];
+        let now = rustix::event::Timespec { tv_sec: 0, tv_nsec: 0 };
+        assert_eq!(rustix::event::poll(&mut fds, Some(&now)), Ok(0));
+        assert_eq!(inbox.next().expect("no more dropped").map(|(it, _)| it), Some(5));
         (0..MAX_WAITING + 3).for_each(|number| inbox.put(number as i32, 1, true));
         assert!(inbox.next().expect_err("dropped").why.starts_with("3 messages"));
     }

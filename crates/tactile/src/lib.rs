@@ -51,7 +51,7 @@ pub trait TactileDriver {
     /// Adds the file descriptors to wait for.
     fn watch<'a>(&'a self, fds: &mut Vec<PollFd<'a>>);
 
-    /// The time for the next poll if no descriptor is ready before.
+    /// The time for the next poll if no descriptor is ready before; the source polls at least every 0.1 s.
     fn due_nanos(&self) -> Option<u64>;
 
     /// Returns the next event; `None` when there is nothing now. `place` is the source's progress.

@@ -14,7 +14,6 @@ use super::phases::PhaseFinder;
 use super::transforms::Transforms;
 use super::{Arrival, DriverError, Event, Place, Reading, Refusal, RefusalKind, TactileDriver};
 use blindgrasp_messages::{MAX_CELLS, Phase};
-use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_ros::cdr::{self, Value};
 use blindgrasp_ros::definition::Definition;
 use blindgrasp_ros::node::{MAX_RECEIVED_BYTES, MessageType, Network, Quality, Received, RosNode};
@@ -23,8 +22,8 @@ use blindgrasp_ros::standard;
 /// A sender that has sent nothing for so long gives way to another one.
 const SILENT_NANOS: u64 = 2_000_000_000;
 
-/// Transforms of `/tf` must be this near to the cells in time: robots send them less often than angles, and an arm turns slowly.
-const TRANSFORM_NANOS: u64 = 200_000_000;
+/// Transforms must be this near to the cells in time: `robot_state_publisher` sends 20 a second.
+const TRANSFORM_NANOS: u64 = 100_000_000;
 /// The static transforms of a publisher that come to a subscriber later.
 const N_STATIC: usize = 100;
 /// Gravity at sea level, in metres per second squared.
@@ -48,8 +47,9 @@ pub struct Topics {
     pub wrench: Option<String>,
     /// `sensor_msgs/msg/Imu`, in the palm frame.
     pub imu: Option<String>,
-    /// The frames of `/tf` that tell gravity: the first has its z axis upwards, the second is the palm's.
-    pub gravity_frames: Option<[String; 2]>,
+    /// `tf2_msgs/msg/TFMessage`, and the frames that tell gravity: the z axis of the first points upwards, the second is the palm
+    /// frame. The static transforms are on the topic of this name with `_static` behind it.
+    pub gravity: Option<(String, [String; 2])>,
     /// The hand's joints as ROS names them, in the hand's order, each with the change of its value while the hand closes by a
     /// radian; `None` for a joint that does not close.
     pub joint_names: Vec<(String, Option<f64>)>,
@@ -81,8 +81,6 @@ pub struct Ros2 {
     wrench: Option<(Vec<f64>, u64)>,
     gravity: Option<(Vec<f64>, u64)>,
     transforms: Transforms,
-    /// Whether the log says that the transforms do not tell gravity.
-    lacks_gravity: bool,
     senders: BTreeMap<Topic, ([u8; 16], u64)>,
     /// From the sender's numbers of frames to those of the source.
     offset: i128,
@@ -104,10 +102,10 @@ impl Ros2 {
         add(Topic::Phase, &topics.phase, standard::definition("std_msgs/msg/String"));
         add(Topic::Wrench, &topics.wrench, standard::definition("geometry_msgs/msg/WrenchStamped"));
         add(Topic::Imu, &topics.imu, standard::definition("sensor_msgs/msg/Imu"));
-        if topics.gravity_frames.is_some() {
+        if let Some((topic, _)) = &topics.gravity {
             let message = || standard::definition("tf2_msgs/msg/TFMessage");
-            add(Topic::Transforms, &Some("/tf".into()), message());
-            add(Topic::StaticTransforms, &Some("/tf_static".into()), message());
+            add(Topic::Transforms, &Some(topic.clone()), message());
+            add(Topic::StaticTransforms, &Some(format!("{topic}_static")), message());
         }
         Ros2 {
             topics,
@@ -119,7 +117,6 @@ impl Ros2 {
             wrench: None,
             gravity: None,
             transforms: Transforms::default(),
-            lacks_gravity: false,
             senders: BTreeMap::new(),
             offset: 0,
             pending: None,
@@ -189,8 +186,10 @@ impl Ros2 {
                 // A sensor at rest measures the force that keeps it from falling.
                 self.gravity = Some((acceleration.iter().map(|part| -part).collect(), stamp_nanos));
             }
-            Topic::Transforms => self.transforms.take(&value, false)?,
-            Topic::StaticTransforms => self.transforms.take(&value, true)?,
+            Topic::Transforms | Topic::StaticTransforms => {
+                let is_static = topic == Topic::StaticTransforms;
+                self.transforms.take(&value, is_static, received.sender.unwrap_or_default(), at_nanos);
+            }
             Topic::Cells => return self.frame(&value, received, stamp, stamp_nanos, at_nanos).map(Some),
         }
         Ok(None)
@@ -221,23 +220,24 @@ impl Ros2 {
         Ok(())
     }
 
-    /// Gravity in the palm frame at a time, if transforms tell it. The log says once that they do not.
-    fn take_gravity(&mut self, stamp_nanos: u64) {
-        let Some([upright, palm]) = &self.topics.gravity_frames else {
-            return;
+    /// Gravity in the palm frame by the transforms, if these are its source.
+    ///
+    /// # Errors
+    /// They do not tell it, for a person.
+    fn take_gravity(&mut self, stamp_nanos: u64, at_nanos: u64) -> Result<(), String> {
+        let Some((topic, [upright, palm])) = &self.topics.gravity else {
+            return Ok(());
         };
-        let palm_from_upright = self.transforms.rotation(palm, upright, stamp_nanos, TRANSFORM_NANOS);
-        let lacks = palm_from_upright.is_none();
-        if std::mem::replace(&mut self.lacks_gravity, lacks) != lacks {
-            print_diagnostic(&match lacks {
-                true => format!("gravity is unknown: no transforms of the last 0.2 s join '{palm}' to '{upright}'"),
-                false => format!("gravity is known: transforms join '{palm}' to '{upright}'"),
-            });
-        }
-        self.gravity = palm_from_upright.map(|rotation| {
-            let gravity = rotation * nalgebra::Vector3::new(0.0, 0.0, -GRAVITY_M_PER_S2);
-            (gravity.as_slice().to_vec(), stamp_nanos)
-        });
+        let palm_from_upright = self.transforms.rotation(palm, upright, stamp_nanos, TRANSFORM_NANOS, at_nanos);
+        let palm_from_upright = palm_from_upright.ok_or_else(|| {
+            format!(
+                "gravity is not known: the transforms of {topic} and {topic}_static do not lead from frame '{palm}' up to \
+                 '{upright}', each from one node and within 0.1 s of the cells"
+            )
+        })?;
+        let gravity = palm_from_upright * nalgebra::Vector3::new(0.0, 0.0, -GRAVITY_M_PER_S2);
+        self.gravity = Some((gravity.as_slice().to_vec(), stamp_nanos));
+        Ok(())
     }
 
     fn frame(
@@ -249,7 +249,7 @@ impl Ros2 {
         at_nanos: u64,
     ) -> Result<Event, String> {
         let cells_newtons = cells(value, &self.topics.cells_field)?;
-        self.take_gravity(stamp_nanos);
+        self.take_gravity(stamp_nanos, at_nanos)?;
         let is_near = |other: u64| other.abs_diff(stamp_nanos) <= self.topics.tolerance_nanos;
         let mut joints_rad = Vec::with_capacity(self.joints.len());
         for ((name, _), joint) in self.topics.joint_names.iter().zip(&self.joints) {
@@ -264,16 +264,20 @@ impl Ros2 {
         let (phase, _) = self
             .phase
             .ok_or_else(|| format!("no phase has come on {}", self.topics.phase.as_deref().unwrap_or_default()))?;
-        let sense = |sense: &Option<(Vec<f64>, u64)>| {
-            sense.as_ref().filter(|(_, at)| is_near(*at)).map(|(values, _)| values.clone()).unwrap_or_default()
+        // A frame has all senses that the parameters name: a model must not decide without one.
+        let sense = |topic: &Option<String>, sense: &Option<(Vec<f64>, u64)>| match (topic, sense) {
+            (None, _) => Ok(Vec::new()),
+            (Some(_), Some((values, at))) if is_near(*at) => Ok(values.clone()),
+            (Some(topic), _) => Err(format!("no message of {topic} has come that is near the cells in time")),
         };
+        let gravity_topic = self.topics.imu.as_ref().or(self.topics.gravity.as_ref().map(|(topic, _)| topic)).cloned();
         let seq = received.seq.and_then(|seq| u64::try_from(i128::from(seq) + self.offset).ok());
         let reading = Reading {
             joints_rad,
             cells_newtons,
             phase,
-            gravity_m_per_s2: sense(&self.gravity),
-            wrist_wrench: sense(&self.wrench),
+            gravity_m_per_s2: sense(&gravity_topic, &self.gravity)?,
+            wrist_wrench: sense(&self.topics.wrench, &self.wrench)?,
             seq,
             stamp_nanos: stamp,
             ..Reading::default()
@@ -472,7 +476,7 @@ mod tests {
             phase: Some("/phase".into()),
             wrench: Some("/wrench".into()),
             imu: Some("/imu".into()),
-            gravity_frames: None,
+            gravity: None,
             joint_names: vec![("a".into(), Some(1.0)), ("b".into(), Some(1.0))],
             tolerance_nanos: 20_000_000,
         };
@@ -548,6 +552,10 @@ mod tests {
         assert_eq!(reading.wrist_wrench, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
         assert_eq!(reading.gravity_m_per_s2, [0.0, 0.0, -9.8]);
         assert_eq!((reading.phase, reading.seq, reading.stamp_nanos), (Phase::Settled, Some(8), Some(t)));
+        // A frame without a sense that the parameters name is refused.
+        driver.wrench = None;
+        let lacking = floats(&driver, &[1.0, 2.0], t, 9);
+        assert!(why(take(&mut driver, Topic::Cells, lacking, t, Some(8))).contains("no message of /wrench has come"));
         // Angles of another time are no angles, and a lost message leaves a gap in the numbers.
         let later = t + 30_000_000;
         let old = floats(&driver, &[1.0], later, 9);
@@ -559,8 +567,8 @@ mod tests {
     #[test]
     fn transforms_tell_gravity_while_they_are_new() {
         let mut topics = driver("std_msgs/msg/Float64MultiArray", "data").topics;
-        topics.imu = None;
-        topics.gravity_frames = Some(["world".into(), "palm".into()]);
+        (topics.imu, topics.wrench) = (None, None);
+        topics.gravity = Some(("/tf".into(), ["world".into(), "palm".into()]));
         let mut driver = Ros2::new(topics, PhaseFinder::new(0.05, 200_000_000));
         let t = 5 * SEC_NANOS;
         let turned = std::f64::consts::FRAC_1_SQRT_2;
@@ -579,18 +587,18 @@ mod tests {
             let cells = floats(driver, &[1.0], nanos, nanos);
             let event = take(driver, Topic::Cells, cells, nanos, None);
             match driver.pending.take().or(event) {
-                Some(Event::Frame(reading, _)) => reading.gravity_m_per_s2,
-                other => panic!("no frame: {other:?}"),
+                Some(Event::Frame(reading, _)) => Ok(reading.gravity_m_per_s2),
+                refused => Err(why(refused)),
             }
         };
         take(&mut driver, Topic::StaticTransforms, palm, t, None);
-        assert!(gravity(&mut driver, t).is_empty() && driver.lacks_gravity);
+        let refused = gravity(&mut driver, t).expect_err("no transform of the arm");
+        assert!(refused.contains("do not lead from frame 'palm' up to 'world'"), "{refused}");
         take(&mut driver, Topic::Transforms, arm, t, None);
-        let found = gravity(&mut driver, t + 100_000_000);
+        let found = gravity(&mut driver, t + 100_000_000).expect("gravity");
         // In the arm's frame gravity is along -y, in the palm's along -x.
         assert!(found.iter().zip([-9.81, 0.0, 0.0]).all(|(a, b)| (a - b).abs() < 1e-9), "{found:?}");
-        assert!(!driver.lacks_gravity);
-        assert!(gravity(&mut driver, t + SEC_NANOS).is_empty());
+        assert!(gravity(&mut driver, t + SEC_NANOS).is_err());
     }
 
     #[test]
@@ -614,6 +622,7 @@ mod tests {
     #[test]
     fn another_sender_waits_until_the_first_is_silent_and_leaves_a_gap() {
         let mut driver = driver("std_msgs/msg/Float64MultiArray", "data");
+        (driver.topics.imu, driver.topics.wrench) = (None, None);
         let t = 5 * SEC_NANOS;
         let angles = joints(&driver, &["a", "b"], &[0.1, 0.2], t);
         take(&mut driver, Topic::Joints, angles, t, None);

@@ -1,5 +1,5 @@
 //! The driver for frames on a key of Zenoh, one a sample: the JSON of the [line protocol](super::line_protocol), or
-//! `blindgrasp_msgs/msg/TactileFrame` in CDR, if that is the encoding of the sample.
+//! `blindgrasp_msgs/msg/TactileFrame` in CDR.
 
 use std::sync::Arc;
 
@@ -12,14 +12,11 @@ use blindgrasp_messages::TactileFrame;
 use blindgrasp_recording::cdr;
 use blindgrasp_ros::node::Network;
 use zenoh::Wait;
-use zenoh::bytes::Encoding;
 
-struct Sample {
-    /// None if there are too many.
-    bytes: Vec<u8>,
-    n_bytes: usize,
-    is_cdr: bool,
-}
+/// The bytes of a frame, none if there are too many, and their number.
+type FrameBytes = (Vec<u8>, usize);
+/// The begin of CDR, little endian. Nodes of ROS 2 name no encoding, and JSON begins in another way.
+const CDR_BEGIN: [u8; 2] = [0, 1];
 
 /// Reads frames from a key.
 pub struct ZenohKey {
@@ -28,7 +25,7 @@ pub struct ZenohKey {
     max_bytes: usize,
     hand_id: u64,
     has_begun: bool,
-    inbox: Option<Arc<Inbox<Sample>>>,
+    inbox: Option<Arc<Inbox<FrameBytes>>>,
     /// From the sender's numbers of frames to those of the source.
     offset: u64,
     pending: Option<Event>,
@@ -98,8 +95,7 @@ impl TactileDriver for ZenohKey {
                     // Of a frame that is too long, only the length matters.
                     let n_bytes = sample.payload().len();
                     let bytes = if n_bytes > max_bytes { vec![] } else { sample.payload().to_bytes().into_owned() };
-                    let is_cdr = *sample.encoding() == Encoding::APPLICATION_CDR;
-                    inbox.put(Sample { bytes, n_bytes, is_cdr }, n_bytes.min(max_bytes), true);
+                    inbox.put((bytes, n_bytes), n_bytes.min(max_bytes), true);
                 })
                 .wait()
                 .map_err(|error| format!("key {key}: {error}"))?;
@@ -134,7 +130,7 @@ impl TactileDriver for ZenohKey {
             return Ok(Some(Event::Began));
         }
         let refused = |kind, why| Ok(Some(Event::Refused(Refusal { kind, why })));
-        let (Sample { bytes, n_bytes, is_cdr }, at_nanos) = match inbox.next() {
+        let ((bytes, n_bytes), at_nanos) = match inbox.next() {
             Ok(None) => return Ok(None),
             Ok(Some(next)) => next,
             Err(Refusal { kind, why }) => return refused(kind, why),
@@ -143,7 +139,7 @@ impl TactileDriver for ZenohKey {
             let why = format!("{n_bytes} bytes, a frame of this hand has at most {}", self.max_bytes);
             return refused(RefusalKind::Oversized, why);
         }
-        let reading = if is_cdr { self.frame_of(&bytes) } else { parse(bytes.trim_ascii_end()) };
+        let reading = if bytes.starts_with(&CDR_BEGIN) { self.frame_of(&bytes) } else { parse(bytes.trim_ascii_end()) };
         match reading {
             Ok(mut reading) => {
                 let last = place.seq;

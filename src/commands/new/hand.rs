@@ -14,7 +14,7 @@ use blindgrasp_ros::node::{MAX_RECEIVED_BYTES, MessageType, Quality, RosNode, to
 use blindgrasp_ros::standard;
 use blindgrasp_simulator::mechanism::Mechanism;
 use blindgrasp_simulator::pad_grid::pad_grid;
-use blindgrasp_stages::hand::{BareHand, Cell, Hand, find_mesh};
+use blindgrasp_stages::hand::{BareHand, Cell, Hand, find_mesh, part_below};
 use clap::Args;
 use nalgebra::{Unit, Vector3};
 use serde::Deserialize;
@@ -34,7 +34,7 @@ use super::{check_free, in_shell};
                   blindgrasp new hand my_gripper --urdf gripper.urdf.xacro --palm hand_base --open finger_joint=0.04 \\\n    \
                   --grid left_finger=4x3 --grid right_finger=4x3\n  \
                   blindgrasp new hand my_hand --urdf my_hand.urdf --cells cells.csv\n  \
-                  blindgrasp new hand my_hand --robot-description --palm hand_base --cells cells.csv\n\n\
+                  blindgrasp new hand my_hand --robot-description --base hand_base --cells cells.csv\n\n\
                   The table of cells has a column for each of: link, x, y, z (metres, in the link's frame), nx, ny, nz (the normal,\n\
                   out of the pad). It may have: pad, width and height (metres), ax, ay, az (the direction of the width), and\n\
                   threshold (newtons).")]
@@ -61,6 +61,9 @@ pub(super) struct Arguments {
     /// A pad of ROWS x COLUMNS cells on the side of a link that meets the object as the hand closes. Can be repeated.
     #[arg(long = "grid", value_name = "LINK=ROWSxCOLUMNS", value_parser = grid)]
     grids: Vec<(String, [usize; 2])>,
+    /// The first link of the hand, if the URDF is that of a whole robot: the hand consists of it and of the links below it.
+    #[arg(long, value_name = "LINK")]
+    base: Option<String>,
     /// The link in whose frame contacts are given, +z out of the palm [default: the root].
     #[arg(long, value_name = "LINK")]
     palm: Option<String>,
@@ -118,16 +121,18 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let name = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default().to_owned();
     check_free(folder)?;
     let (source, mut urdf) = match (&arguments.urdf, &arguments.robot_description) {
-        (None, Some(topic)) => (PathBuf::from("robot_description.urdf"), described(topic, &arguments.network)?),
         (Some(_), _) if arguments.network.is_given() => {
             bail!("--connect, --keys and --domain are of no use to --urdf: they belong to --robot-description")
         }
-        (path, _) => {
-            let path = path.clone().unwrap_or_default();
-            let text = urdf_text(&path)?;
-            (path, text)
+        (Some(path), _) => (path.clone(), urdf_text(path)?),
+        (None, topic) => {
+            let topic = topic.as_deref().unwrap_or("/robot_description");
+            (PathBuf::from("robot_description.urdf"), described(topic, &arguments.network)?)
         }
     };
+    if let Some(base) = &arguments.base {
+        urdf = part_below(&urdf, base).map_err(|reason| anyhow::anyhow!("--base: {reason}"))?;
+    }
     let mut bare = BareHand {
         name: name.clone(),
         palm: arguments.palm.clone(),
@@ -139,6 +144,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     let hand = Hand::without_cells(&source, &urdf, &bare)?;
     print_parts(&hand)?;
+    if let Some(joint) = hand.joint_above_palm() {
+        bail!("joint '{}' moves the palm: give the first link of the hand with --base", joint.name);
+    }
     let mechanism = Mechanism::new(&hand);
     let mut pads =
         arguments.cells.as_deref().map(|table| read_table(table, arguments.threshold)).transpose()?.unwrap_or_default();

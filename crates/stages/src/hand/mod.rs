@@ -9,6 +9,7 @@ mod layout;
 mod meshes;
 mod self_collision;
 mod urdf;
+mod urdf_part;
 mod urdf_xml;
 
 use std::collections::BTreeMap;
@@ -27,6 +28,7 @@ pub use kinematics::{CellPose, JointError};
 pub use meshes::find as find_mesh;
 pub(crate) use self_collision::PosedShapes;
 pub use self_collision::pose_from_isometry;
+pub use urdf_part::part_below;
 
 /// A hand of any make: kinematic tree, collision shapes and tactile pads.
 #[derive(Debug, Clone)]
@@ -345,9 +347,18 @@ const BUILTIN: [(&str, &str, &str); 4] =
     [builtin!("allegro"), builtin!("barrett-bh8-280"), builtin!("parallel-gripper"), builtin!("shadow-biotac-sp")];
 
 impl Hand {
-    /// The name of the link whose frame is the palm frame.
-    pub fn palm_link(&self) -> &str {
-        &self.links[self.reference_link_idx].name
+    /// The link whose frame is the palm frame.
+    pub fn palm_link(&self) -> &Link {
+        &self.links[self.reference_link_idx]
+    }
+
+    /// A joint that moves the palm itself, as those of an arm do.
+    pub fn joint_above_palm(&self) -> Option<&Joint> {
+        let above = std::iter::successors(Some(self.palm_link()), |link| Some(&self.links[link.parent_idx?]));
+        above.into_iter().find_map(|link| match link.motion {
+            Motion::Joint { joint_idx, .. } => Some(&self.joints[joint_idx]),
+            Motion::Fixed => None,
+        })
     }
 
     /// Reads a hand from a pad layout file, or takes the built-in hand of that name.

@@ -243,10 +243,10 @@ impl Joint {
 }
 
 /// An element's attributes by name.
-struct Attributes(BTreeMap<String, String>);
+pub(super) struct Attributes(BTreeMap<String, String>);
 
 impl Attributes {
-    fn of(element: &BytesStart<'_>) -> Result<Attributes, String> {
+    pub(super) fn of(element: &BytesStart<'_>) -> Result<Attributes, String> {
         let mut by_name = BTreeMap::new();
         // The reader's own check for duplicates compares every attribute with every other.
         for attribute in element.attributes().with_checks(false) {
@@ -260,7 +260,7 @@ impl Attributes {
         Ok(Attributes(by_name))
     }
 
-    fn required(&self, name: &str) -> Result<String, String> {
+    pub(super) fn required(&self, name: &str) -> Result<String, String> {
         self.0.get(name).cloned().ok_or_else(|| format!("expected an attribute '{name}', found none"))
     }
 
