@@ -16,6 +16,7 @@ mod launcher;
 mod libsvm;
 mod link_identity;
 mod link_security;
+mod live_page;
 mod main_job;
 mod many_cells;
 mod meshes;

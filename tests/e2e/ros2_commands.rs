@@ -44,7 +44,7 @@ time.sleep(60)
     let connect = format!("tcp/127.0.0.1:{port}");
     let made = folder.path().join("mine").display().to_string();
     let new = |topic: &str, code: i32| {
-        let from = ["--robot-description", topic, "--connect", &connect];
+        let from = [&format!("--robot-description={topic}"), "--connect", &connect];
         let how = ["--open", "jaw=0.0425", "--grid", "left_jaw=2x2", "--grid", "right_jaw=2x2"];
         run(&[&["new", "hand", &made][..], &from, &how].concat(), code)
     };

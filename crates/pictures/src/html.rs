@@ -7,10 +7,11 @@ use serde::Serialize;
 
 use super::PictureError;
 use super::colour::{HAND, OBJECT, Rgb, SILENT_CELL, bytes, force_colour, lightness};
-use super::geometry::{cells_in_link, link_mesh};
+use super::geometry::link_mesh;
 use super::grasp::{ContactKind, Placed, RecordedGrasp};
 use super::grasp_picture::{VIEW, draw, page_title, style};
 use super::pads::draw_pads;
+use super::scene::{cells, pads};
 use super::svg::{Svg, escape};
 use super::view::{Surfaces, choose_cameras};
 use blindgrasp_objects::mesh::Mesh;
@@ -48,22 +49,22 @@ struct Data<'a> {
 }
 
 #[derive(Serialize)]
-struct Surface {
+pub(super) struct Surface {
     positions_m: Vec<f64>,
     triangles: Vec<u32>,
 }
 
 #[derive(Serialize)]
-struct CellData {
-    link: usize,
-    corners_m: Vec<f64>,
-    threshold_newtons: f64,
+pub(super) struct CellData {
+    pub(super) link: usize,
+    pub(super) corners_m: Vec<f64>,
+    pub(super) threshold_newtons: f64,
 }
 
 #[derive(Serialize)]
-struct PadData {
-    first_cell: usize,
-    n_cells: usize,
+pub(super) struct PadData {
+    pub(super) first_cell: usize,
+    pub(super) n_cells: usize,
 }
 
 #[derive(Serialize)]
@@ -92,9 +93,9 @@ pub fn grasp_html(hand: &Hand, grasp: &RecordedGrasp) -> Result<String, PictureE
     let surfaces = Surfaces::new(&placed);
     let cameras = choose_cameras(&placed, &surfaces, VIEW);
     let picture = draw(&placed, &surfaces, &cameras)?;
-    let mut pads = Svg::default();
-    let height = draw_pads(&mut pads, &placed, [14.0, 14.0], 272.0, 400.0)?;
-    let pads = pads.finish(300.0, height + 28.0, "Cells of the frame chosen", style());
+    let mut drawn_pads = Svg::default();
+    let height = draw_pads(&mut drawn_pads, &placed, [14.0, 14.0], 272.0, 400.0)?;
+    let pads = drawn_pads.finish(300.0, height + 28.0, "Cells of the frame chosen", style());
     let data = serde_json::to_string(&data(&placed, cameras[0].azimuth_rad())?)
         .map_err(|source| PictureError::Data { source })?;
     let title = escape(&page_title(&placed));
@@ -149,20 +150,8 @@ fn data<'a>(placed: &'a Placed<'_>, azimuth_rad: f64) -> Result<Data<'a>, Pictur
     let colours: Vec<Rgb> = (0..N_COLOURS).map(|idx| force_colour(idx as f64 / (N_COLOURS - 1) as f64)).collect();
     Ok(Data {
         links: hand.links.iter().map(|link| surface(&link_mesh(link))).collect(),
-        cells: hand
-            .cells()
-            .zip(cells_in_link(hand))
-            .map(|((pad_idx, cell), corners)| CellData {
-                link: hand.pads[pad_idx].link_idx,
-                corners_m: corners.iter().flat_map(point).collect(),
-                threshold_newtons: cell.noise_threshold_newtons,
-            })
-            .collect(),
-        pads: hand
-            .pads
-            .iter()
-            .map(|pad| PadData { first_cell: pad.first_cell_idx, n_cells: pad.cells.len() })
-            .collect(),
+        cells: cells(hand),
+        pads: pads(hand),
         object: placed.object_in_palm.as_ref().map(surface),
         contacts: placed
             .contacts
@@ -224,18 +213,18 @@ fn contact_table(placed: &Placed<'_>) -> String {
     table
 }
 
-fn surface(mesh: &Mesh) -> Surface {
+pub(super) fn surface(mesh: &Mesh) -> Surface {
     Surface {
         positions_m: mesh.vertices_m.iter().flat_map(point).collect(),
         triangles: mesh.triangles.iter().flatten().copied().collect(),
     }
 }
 
-fn point(point: &Point3<f64>) -> [f64; 3] {
+pub(super) fn point(point: &Point3<f64>) -> [f64; 3] {
     point.coords.map(rounded).into()
 }
 
-fn rows(palm_from_link: &Isometry3<f64>) -> Vec<f64> {
+pub(super) fn rows(palm_from_link: &Isometry3<f64>) -> Vec<f64> {
     let matrix = palm_from_link.to_homogeneous();
     (0..12).map(|idx| rounded(matrix[(idx / 4, idx % 4)])).collect()
 }

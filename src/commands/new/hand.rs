@@ -49,6 +49,7 @@ pub(super) struct Arguments {
         long,
         value_name = "TOPIC",
         num_args = 0..=1,
+        require_equals = true,
         default_missing_value = "/robot_description",
         conflicts_with = "urdf"
     )]

@@ -105,6 +105,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         record: arguments.record.clone(),
         record_options: arguments.record_options.clone(),
         metrics: None,
+        view: None,
         json: arguments.json,
         is_quiet: false,
         tap,

@@ -39,7 +39,7 @@ pub(super) struct Arguments {
     /// Asks each program for its ports and parameters, and prints nodes and edges with every value filled in. The
     /// programs of the file are run for that, with --describe: a foreign dataflow file is code. With --machine, the programs and files of other machines need not be here. With --json: {"graph": …}, with
     /// "crossing" edges where the file names machines, or {"errors": […]}.
-    #[arg(long, conflicts_with_all = ["record", "detach", "stay", "metrics"])]
+    #[arg(long, conflicts_with_all = ["record", "detach", "stay", "metrics", "view"])]
     check: bool,
     /// Name of the running graph [default: the file's]
     #[arg(long)]
@@ -62,6 +62,18 @@ pub(super) struct Arguments {
     /// The address is http://127.0.0.1:PORT/metrics.
     #[arg(long, value_name = "PORT")]
     metrics: Option<u16>,
+    /// Show the graph in a browser, on this port of 127.0.0.1 (0: a free one)
+    ///
+    /// As `blindgrasp view GRAPH`, which shows a graph that runs already. The address is printed.
+    #[arg(
+        long,
+        value_name = "PORT",
+        num_args = 0..=1,
+        require_equals = true,
+        default_missing_value = "0",
+        conflicts_with = "detach"
+    )]
+    view: Option<u16>,
     /// Format of the log files: text, or JSON, one object a line
     #[arg(long, value_name = "FORMAT", default_value = "text")]
     log_format: LogFormatArgument,
@@ -252,6 +264,7 @@ fn session(arguments: &Arguments) -> Session {
         record: arguments.record.clone(),
         record_options: arguments.record_options.clone(),
         metrics: arguments.metrics,
+        view: arguments.view,
         json: arguments.json,
         is_quiet: false,
         tap: None,

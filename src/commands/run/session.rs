@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use anyhow::Context;
@@ -34,6 +35,8 @@ pub(in crate::commands) struct Session {
     pub(in crate::commands) record_options: RecordOptions,
     /// Prometheus is answered on this port.
     pub(in crate::commands) metrics: Option<u16>,
+    /// Port of the page in a browser.
+    pub(in crate::commands) view: Option<u16>,
     /// Decisions and summary are printed as JSON.
     pub(in crate::commands) json: bool,
     /// Neither decisions nor the summary go to stdout; warnings and errors still go to stderr.
@@ -89,6 +92,7 @@ impl Session {
             }
             None => None,
         };
+        let _page = self.view.map(|port| Page::start(name, port)).transpose()?;
         let is_recorded = recorder.is_some();
         let run::Ended { summary, sink, outcome } =
             run.run(Console::new(self.json, self.is_quiet, recorder, self.tap), n_stops)?;
@@ -129,6 +133,27 @@ impl Session {
         let is_recording_lossy = summary.recording_error.is_some() || summary.samples_not_recorded > 0;
         let is_lossy = summary.run.is_lossy(self.clock) || is_recording_lossy;
         Ok(Ended { summary, outcome: if is_lossy { Outcome::FinishedWithLoss } else { Outcome::Done } })
+    }
+}
+
+/// The process that serves the page of the graph; it ends with this one.
+struct Page(Child);
+
+impl Page {
+    fn start(graph: &str, port: u16) -> anyhow::Result<Page> {
+        let program = std::env::current_exe().context("the program of the page is not known")?;
+        let mut command = Command::new(program);
+        command.args(["view", graph, "--wait", "--port", &port.to_string()]);
+        command.stdin(Stdio::null()).stdout(Stdio::null());
+        Ok(Page(command.spawn().context("cannot start the page (--view)")?))
+    }
+}
+
+impl Drop for Page {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
     }
 }
 

@@ -133,6 +133,7 @@ impl Runner<'_> {
             record: Some(found.to_path_buf()),
             record_options: RecordOptions { overwrite: true, ..RecordOptions::default() },
             metrics: None,
+            view: None,
             json: false,
             is_quiet: true,
             tap: None,

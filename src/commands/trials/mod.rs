@@ -247,6 +247,7 @@ fn run_way(
         record: arguments.record.clone(),
         record_options: RecordOptions::default(),
         metrics: None,
+        view: None,
         json: false,
         is_quiet: true,
         tap: Some(watch.tap()),

@@ -3,32 +3,42 @@
 mod graph;
 mod grasp;
 mod hand;
+mod live;
 
 use std::path::{Path, PathBuf};
 
+use blindgrasp_graph::client::is_graph_name;
 use blindgrasp_graph::dataflow::Override;
 use clap::{Args, ValueEnum};
 
 use super::hand_cells::joint;
 use super::{Outcome, number_in};
 
-/// Draw a graph, running or not, a recorded grasp, or a hand.
+/// Show a running graph in a browser; draw a graph, a recorded grasp, or a hand.
 ///
 /// The programs of a dataflow file are run with --describe: a foreign dataflow file is code.
 #[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp view dataflow.yaml --out graph.svg\n         \
+#[command(after_help = "Example: blindgrasp view grasp_gate\n         \
+                        blindgrasp view dataflow.yaml --out graph.svg\n         \
                         blindgrasp view --running --format mermaid\n         \
                         blindgrasp view recordings/held-out.mcap --grasp 3 --out grasp.html\n         \
                         blindgrasp view hands/allegro.yaml --out hand.html\n\n\
                         In a graph, 'run' is the launching command: it reads the decisions, and the label where a source knows it.\n\
                         In a recording with /scene the object and all contacts are shown, in any other the active cells.")]
 pub(super) struct Arguments {
-    /// The dataflow file (YAML), the recording (MCAP), or a hand: its pad layout (YAML) or the name of a built-in one
+    /// A running graph by its name; the dataflow file (YAML); the recording (MCAP); or a hand: its pad layout (YAML) or the name
+    /// of a built-in one
     #[arg(default_value = "dataflow.yaml")]
     file: PathBuf,
     /// Write to this file: .svg, .mmd or .dot for a graph, .svg or .html for a grasp or a hand
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Port of the page of a running graph, on 127.0.0.1 [default: any free one]
+    #[arg(long, value_name = "PORT", conflicts_with = "out")]
+    port: Option<u16>,
+    /// Wait for the graph, which is being started (run --view)
+    #[arg(long, hide = true, requires = "port")]
+    wait: bool,
     #[command(flatten)]
     graph: GraphArguments,
     #[command(flatten)]
@@ -101,6 +111,12 @@ enum Format {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let (graph, grasp) = (&arguments.graph, &arguments.grasp);
+    if let Some(name) = graph_name(arguments) {
+        return live::show(name, arguments.port.unwrap_or(0), arguments.wait);
+    }
+    if arguments.port.is_some() {
+        refuse("--port is for the page of a running graph: name the graph");
+    }
     if graph.running.is_none() && hand::is_hand(&arguments.file) {
         let Some(out) = &arguments.out else {
             refuse("--out is missing: name the picture of the hand, .svg or .html");
@@ -123,6 +139,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         refuse("--out is missing: name the picture of the grasp, .svg or .html");
     };
     grasp::draw(&arguments.file, out, grasp)
+}
+
+/// The name of a running graph, if the argument is one.
+fn graph_name(arguments: &Arguments) -> Option<&str> {
+    let name = arguments.file.to_str().filter(|name| is_graph_name(name))?;
+    let is_other = arguments.file.exists() || arguments.graph.running.is_some() || hand::is_hand(&arguments.file);
+    (arguments.out.is_none() && !is_other).then_some(name)
 }
 
 /// Ends the process with a usage error.

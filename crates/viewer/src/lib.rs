@@ -1,0 +1,284 @@
+//! A page in a browser that shows a graph as it runs, served by the program itself.
+//!
+//! The page, its style, its script and the library three.js are files in the program. The page reads one stream of events
+//! (server-sent events), which [`Viewer::send`] feeds: the caller decides what an event says. A browser that reads too slowly
+//! misses events and is told how many; it holds up neither the caller nor other browsers.
+//!
+//! The page can only be read: no request changes anything. It is served on the loopback interface, and requests that a page
+//! from elsewhere makes are refused by their host and origin.
+
+use std::collections::BTreeMap;
+use std::convert::Infallible;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use axum::Router;
+use axum::body::{Body, Bytes};
+use axum::extract::{Request, State};
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
+use axum::middleware::{self, Next};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use futures_util::stream;
+use tokio::sync::broadcast;
+use tokio::sync::broadcast::error::RecvError;
+
+/// Events that wait for a browser; the eldest are dropped for newer ones.
+const MAX_WAITING: usize = 64;
+/// Browsers that are served at a time; others are turned away.
+const MAX_BROWSERS: usize = 64;
+/// Scripts and styles come from here alone, and no other page may frame this one.
+const CONTENT_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; \
+                              base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+const FILES: [(&str, &str, &str); 4] = [
+    ("/", "text/html; charset=utf-8", include_str!("../assets/index.html")),
+    ("/app.css", "text/css; charset=utf-8", include_str!("../assets/app.css")),
+    ("/app.js", "text/javascript; charset=utf-8", include_str!("../assets/app.js")),
+    ("/three.js", "text/javascript; charset=utf-8", include_str!("../assets/three.js")),
+];
+
+#[derive(Debug, thiserror::Error)]
+pub enum ViewerError {
+    #[error("cannot listen on port {port} of 127.0.0.1: {source}; give another port, or 0 for any free one")]
+    Listen { port: u16, source: std::io::Error },
+}
+
+/// A page that is being served until the process ends.
+#[derive(Clone)]
+pub struct Viewer {
+    shared: Arc<Shared>,
+    address: SocketAddr,
+}
+
+struct Shared {
+    events: broadcast::Sender<Bytes>,
+    /// The last event of each name that a browser gets when it comes.
+    kept: Mutex<BTreeMap<&'static str, Bytes>>,
+    n_browsers: AtomicUsize,
+}
+
+impl Viewer {
+    /// Serves the page on a port of the loopback interface, 0 for any free one, from a thread of its own.
+    ///
+    /// # Errors
+    /// The port is taken.
+    pub fn serve(port: u16) -> Result<Viewer, ViewerError> {
+        let refused = |source| ViewerError::Listen { port, source };
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(refused)?;
+        let listener = runtime
+            .block_on(tokio::net::TcpListener::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, port))))
+            .map_err(refused)?;
+        let address = listener.local_addr().map_err(refused)?;
+        let shared = Arc::new(Shared {
+            events: broadcast::channel(MAX_WAITING).0,
+            kept: Mutex::default(),
+            n_browsers: AtomicUsize::new(0),
+        });
+        let files = FILES.into_iter().fold(Router::new(), |router, (path, kind, text)| {
+            router.route(path, get(move || async move { ([(header::CONTENT_TYPE, kind)], text) }))
+        });
+        let pages =
+            files.route("/events", get(events)).with_state(Arc::clone(&shared)).layer(middleware::from_fn(guard));
+        std::thread::spawn(move || runtime.block_on(async { axum::serve(listener, pages).await }));
+        Ok(Viewer { shared, address })
+    }
+
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// The number of browsers that read the events.
+    pub fn n_browsers(&self) -> usize {
+        self.shared.n_browsers.load(Ordering::Relaxed)
+    }
+
+    /// Sends an event with JSON to all browsers.
+    pub fn send(&self, name: &'static str, json: &str) {
+        // Without browsers nobody misses it.
+        let _ = self.shared.events.send(event(name, json));
+    }
+
+    /// Sends an event, and sends it again to each browser that comes later, until the next of this name.
+    pub fn keep(&self, name: &'static str, json: &str) {
+        let event = event(name, json);
+        self.shared.kept.lock().unwrap_or_else(PoisonError::into_inner).insert(name, event.clone());
+        let _ = self.shared.events.send(event);
+    }
+
+    /// Sends the kept event of this name to no browser any more.
+    pub fn forget(&self, name: &str) {
+        self.shared.kept.lock().unwrap_or_else(PoisonError::into_inner).remove(name);
+    }
+}
+
+fn event(name: &str, json: &str) -> Bytes {
+    format!("event: {name}\ndata: {}\n\n", json.replace('\n', " ")).into()
+}
+
+/// Refuses what a page from elsewhere asks for, and adds what tells browsers to be strict.
+async fn guard(request: Request, next: Next) -> Response {
+    let refused = |status: StatusCode, why: &'static str| (status, why).into_response();
+    let mut response = if !is_from_here(request.headers()) {
+        refused(StatusCode::FORBIDDEN, "expected Host: localhost or 127.0.0.1, and no page from elsewhere\n")
+    } else if !matches!(*request.method(), Method::GET | Method::HEAD) {
+        refused(StatusCode::METHOD_NOT_ALLOWED, "expected GET: the page can only be read\n")
+    } else {
+        next.run(request).await
+    };
+    let headers = response.headers_mut();
+    for (name, value) in [
+        (header::CONTENT_SECURITY_POLICY, CONTENT_POLICY),
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::REFERRER_POLICY, "no-referrer"),
+        (header::CACHE_CONTROL, "no-cache"),
+    ] {
+        headers.insert(name, HeaderValue::from_static(value));
+    }
+    response
+}
+
+/// Whether the request names a host of the loopback interface, and comes from a page of this server or from none. A browser
+/// tells the name by which it found the host, so that a name that was made to lead here (DNS rebinding) is of no use.
+fn is_from_here(headers: &HeaderMap) -> bool {
+    let text = |name| headers.get(name).map(|value| value.to_str().unwrap_or("?"));
+    let host = text(header::HOST).unwrap_or_default();
+    let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
+    let is_loopback = ["localhost", "127.0.0.1", "[::1]"].iter().any(|known| name.eq_ignore_ascii_case(known));
+    let is_own = text(header::ORIGIN).is_none_or(|origin| origin == format!("http://{host}"));
+    let is_same_site = text(header::HeaderName::from_static("sec-fetch-site"))
+        .is_none_or(|site| ["same-origin", "none"].contains(&site));
+    is_loopback && is_own && is_same_site
+}
+
+/// A browser that reads events; it is counted until the response is dropped.
+struct Reader {
+    shared: Arc<Shared>,
+    kept: Vec<Bytes>,
+    receiver: broadcast::Receiver<Bytes>,
+}
+
+impl Drop for Reader {
+    fn drop(&mut self) {
+        self.shared.n_browsers.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+async fn events(State(shared): State<Arc<Shared>>) -> Response {
+    if shared.n_browsers.fetch_add(1, Ordering::Relaxed) >= MAX_BROWSERS {
+        shared.n_browsers.fetch_sub(1, Ordering::Relaxed);
+        return (StatusCode::SERVICE_UNAVAILABLE, format!("{MAX_BROWSERS} browsers are served already\n"))
+            .into_response();
+    }
+    let receiver = shared.events.subscribe();
+    // The last first: they are taken from the end.
+    let kept = shared.kept.lock().unwrap_or_else(PoisonError::into_inner).values().rev().cloned().collect();
+    let stream = stream::unfold(Reader { shared, kept, receiver }, |mut reader| async {
+        let next = match reader.kept.pop() {
+            Some(kept) => kept,
+            None => match reader.receiver.recv().await {
+                Ok(event) => event,
+                Err(RecvError::Lagged(n)) => event("dropped", &n.to_string()),
+                Err(RecvError::Closed) => return None,
+            },
+        };
+        Some((Ok::<_, Infallible>(next), reader))
+    });
+    ([(header::CONTENT_TYPE, "text/event-stream")], Body::from_stream(stream)).into_response()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::{BufRead, BufReader, Read, Write};
+    use std::net::TcpStream;
+
+    use super::*;
+
+    fn asked(viewer: &Viewer, head: &str) -> TcpStream {
+        let mut client = TcpStream::connect(viewer.address()).expect("connected");
+        write!(client, "{head}\r\n\r\n").expect("sent");
+        client
+    }
+
+    fn answer(viewer: &Viewer, head: &str) -> String {
+        let mut text = String::new();
+        asked(viewer, &format!("{head}\r\nConnection: close")).read_to_string(&mut text).expect("an answer");
+        text
+    }
+
+    #[test]
+    fn pages_from_elsewhere_get_nothing_and_nothing_can_be_sent() {
+        let viewer = Viewer::serve(0).expect("served");
+        let page = answer(&viewer, "GET / HTTP/1.1\r\nHost: localhost");
+        assert!(page.starts_with("HTTP/1.1 200") && page.contains("<title>"), "{page}");
+        assert!(page.contains("content-security-policy: default-src 'none'; script-src 'self'"), "{page}");
+        for head in [
+            "GET / HTTP/1.1\r\nHost: robot.example",
+            "GET /events HTTP/1.1\r\nHost: localhost\r\nOrigin: http://robot.example",
+            "GET /events HTTP/1.1\r\nHost: localhost\r\nSec-Fetch-Site: cross-site",
+            "GET / HTTP/1.1\r\nHost: localhost.robot.example:80",
+        ] {
+            let page = answer(&viewer, head);
+            assert!(page.starts_with("HTTP/1.1 403") && !page.contains("<title>"), "{head}: {page}");
+        }
+        assert!(answer(&viewer, "POST / HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 405"));
+        assert!(answer(&viewer, "GET /secret HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 404"));
+    }
+
+    /// Lines of an event stream until this one.
+    fn read_until(reader: &mut impl BufRead, expected: &str) -> Vec<String> {
+        let mut lines = Vec::new();
+        loop {
+            let mut line = String::new();
+            assert!(reader.read_line(&mut line).expect("read") > 0, "the end; {lines:?}");
+            lines.push(line.trim_end().to_owned());
+            if lines.last().is_some_and(|line| line == expected) {
+                return lines;
+            }
+        }
+    }
+
+    #[test]
+    fn a_late_browser_gets_what_is_kept_and_a_slow_one_is_told_of_what_it_missed() {
+        let viewer = Viewer::serve(0).expect("served");
+        viewer.keep("scene", "{\"hand\":\n1}");
+        viewer.send("frame", "0");
+        let mut reader = BufReader::new(asked(&viewer, "GET /events HTTP/1.1\r\nHost: localhost"));
+        let lines = read_until(&mut reader, "data: {\"hand\": 1}");
+        assert!(lines.contains(&"event: scene".to_owned()) && !lines.contains(&"event: frame".to_owned()), "{lines:?}");
+        assert_eq!(viewer.n_browsers(), 1);
+        // More than sockets and queue hold, while it does not read.
+        let large = "7".repeat(100_000);
+        (0..400).for_each(|_| viewer.send("frame", &large));
+        viewer.send("frame", "\"last\"");
+        let lines = read_until(&mut reader, "data: \"last\"");
+        let n_frames = lines.iter().filter(|line| line.starts_with("data: 777")).count();
+        let told = lines.windows(2).filter(|pair| pair[0] == "event: dropped");
+        let n_dropped: usize =
+            told.map(|pair| pair[1].trim_start_matches("data: ").parse::<usize>().expect("a number")).sum();
+        assert!(n_dropped > 0 && n_frames + n_dropped == 400, "{n_frames} frames, {n_dropped} dropped");
+    }
+
+    #[test]
+    fn browsers_beyond_the_most_are_turned_away() {
+        let viewer = Viewer::serve(0).expect("served");
+        viewer.keep("scene", "1");
+        let readers: Vec<_> = (0..MAX_BROWSERS)
+            .map(|_| {
+                let mut reader = BufReader::new(asked(&viewer, "GET /events HTTP/1.1\r\nHost: localhost"));
+                read_until(&mut reader, "data: 1");
+                reader
+            })
+            .collect();
+        assert!(answer(&viewer, "GET /events HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 503"));
+        drop(readers);
+        for _ in 0..500 {
+            if viewer.n_browsers() == 0 {
+                return;
+            }
+            viewer.send("frame", "0");
+            std::thread::sleep(std::time::Duration::from_millis(20));
+        }
+        panic!("{} browsers are still counted", viewer.n_browsers());
+    }
+}

@@ -1,0 +1,50 @@
+#!/usr/bin/env python3
+"""A browser for tests/e2e/live_page.rs: headless Chromium, driven by selenium.
+
+Opens URL and prints null. Then it reads lines from stdin: an expression in JavaScript, whose value is printed as a line of JSON;
+`axe`, for the list of problems that axe-core finds; `errors`, for what the console said; `picture FILE`, for a screenshot;
+`size WIDTH HEIGHT`.
+
+Usage: browser.py URL
+"""
+
+import json
+import sys
+import tempfile
+
+from axe_core_python.selenium import Axe
+from selenium import webdriver
+
+
+def main() -> None:
+    options = webdriver.ChromeOptions()
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    with tempfile.TemporaryDirectory() as profile:
+        for word in ("headless=new", "no-sandbox", "use-angle=swiftshader", "enable-unsafe-swiftshader", "disable-quic", "no-first-run",
+                     "disable-background-networking", "disable-component-update", "disable-sync", f"user-data-dir={profile}"):
+            options.add_argument(f"--{word}")
+        driver = webdriver.Chrome(options, webdriver.ChromeService("/usr/bin/chromedriver"))
+        try:
+            driver.set_window_size(1280, 1000)
+            driver.get(sys.argv[1])
+            print("null", flush=True)
+            for line in sys.stdin:
+                print(json.dumps(answer(driver, line.strip())), flush=True)
+        finally:
+            driver.quit()
+
+
+def answer(driver, line):
+    word, _, rest = line.partition(" ")
+    if word == "axe":
+        return [f"{found['id']}: {found['nodes'][0]['html']}" for found in Axe().run(driver)["violations"]]
+    if word == "errors":
+        return [entry["message"] for entry in driver.get_log("browser")]
+    if word == "picture":
+        return driver.get_screenshot_as_file(rest)
+    if word == "size":
+        return driver.set_window_size(*map(int, rest.split()))
+    return driver.execute_script(f"return {line}")
+
+
+main()

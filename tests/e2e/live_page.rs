@@ -1,0 +1,209 @@
+//! The page of a running graph, in headless Chromium (`tests/browser.py`).
+
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use crate::common::python::python;
+use crate::common::{Graph, RECORDING, blindgrasp, project, skipped, swap, unique_name, wait_until};
+use blindgrasp_recording::{Record, RecordingReader};
+use blindgrasp_stages::hand::Hand;
+use serde_json::Value;
+
+/// A program whose lines are read; it ends with this.
+struct Running {
+    child: Child,
+    stdout: BufReader<std::process::ChildStdout>,
+}
+
+impl Running {
+    fn start(command: &mut Command) -> Running {
+        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().expect("started");
+        let stdout = BufReader::new(child.stdout.take().expect("stdout"));
+        Running { child, stdout }
+    }
+
+    fn line(&mut self) -> String {
+        let mut line = String::new();
+        assert!(self.stdout.read_line(&mut line).expect("read") > 0, "it has ended");
+        line.trim_end().to_owned()
+    }
+
+    /// The page of a graph, and its address.
+    fn page(graph: &str, port: u16) -> (Running, String) {
+        let mut page = Running::start(blindgrasp().args(["view", graph, "--port", &port.to_string()]));
+        let address = page.line();
+        (page, address)
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+struct Browser(Running);
+
+impl Browser {
+    fn open(address: &str) -> Browser {
+        let mut command = Command::new(python());
+        command.arg(project().join("tests/browser.py")).arg(address).env("PYTHONDONTWRITEBYTECODE", "1");
+        let mut browser = Running::start(&mut command);
+        assert_eq!(browser.line(), "null");
+        Browser(browser)
+    }
+
+    /// The value of an expression, or the answer to another word.
+    fn ask(&mut self, line: &str) -> Value {
+        use std::io::Write;
+        writeln!(self.0.child.stdin.as_mut().expect("stdin"), "{line}").expect("written");
+        let answer = self.0.line();
+        serde_json::from_str(&answer).unwrap_or_else(|error| panic!("{line}: {answer}: {error}"))
+    }
+
+    fn wait_until(&mut self, expression: &str) {
+        let mut last = Value::Null;
+        wait_until(
+            || {
+                last = self.ask(expression);
+                last == true
+            },
+            || format!("{expression} is not true"),
+        );
+    }
+
+    fn text(&mut self, id: &str) -> String {
+        self.ask(&format!("document.getElementById('{id}').textContent")).as_str().expect("a text").to_owned()
+    }
+
+    /// So many frames more than now.
+    fn wait_for_frames(&mut self, n: u64) {
+        let shown = self.ask("blindgrasp.frames").as_u64().expect("a number");
+        self.wait_until(&format!("blindgrasp.frames >= {}", shown + n));
+    }
+}
+
+fn launch(name: &str) -> Graph {
+    Graph::launch(name, &project().join("dataflow.yaml"), &["--set", "recorded_source.repeat=forever"])
+}
+
+fn numbers(value: &Value) -> Vec<f64> {
+    value.as_array().expect("a list").iter().map(|number| number.as_f64().expect("a number")).collect()
+}
+
+fn assert_near(found: &[f64], expected: &[f64], what: &str) {
+    let is_near = found.len() == expected.len() && found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 2e-5);
+    assert!(is_near, "{what}: {found:?}, expected {expected:?}");
+}
+
+#[test]
+fn a_browser_shows_a_graph_as_it_runs() {
+    if !Path::new("/usr/bin/chromedriver").exists() {
+        return skipped("no chromium-driver: scripts/test installs it on Debian");
+    }
+    let name = unique_name();
+    let graph = launch(&name);
+    graph.wait_for_decisions(1);
+    let (page, address) = Running::page(&name, 0);
+    let mut browser = Browser::open(&address);
+    browser.wait_for_frames(20);
+    browser.wait_until("blindgrasp.decision !== null && blindgrasp.graph !== null");
+
+    // The posture, as three.js draws it, is that of a frame of the recording; so are the colours of the cells.
+    let shown = browser.ask(
+        "(({ frame, meshes, cellColours, scene, colouredCells }) => ({ frame, cellColours, silent: scene.silent_colour, \
+         meshes: meshes.map((mesh) => [...mesh.matrix.elements]), drawn: colouredCells() }))(blindgrasp)",
+    );
+    let frame = &shown["frame"];
+    let recorded = RecordingReader::open(&project().join(RECORDING)).expect("a recording").find_map(|record| {
+        let Record::Tactile(sample) = record.expect("a record").1 else { return None };
+        let is_it = sample.message.joints_rad == numbers(&frame["joints"])
+            && sample.message.cells_newtons == numbers(&frame["cells"]);
+        is_it.then_some(sample.message)
+    });
+    let recorded = recorded.expect("a frame of the recording");
+    let hand = Hand::load(&project().join("hands/barrett-bh8-280.yaml")).expect("a hand");
+    let poses = hand.palm_from_links(&recorded.joints_rad).expect("a posture");
+    for (idx, pose) in poses.iter().enumerate() {
+        // Column by column, as nalgebra's.
+        assert_near(&numbers(&shown["meshes"][idx]), pose.to_homogeneous().as_slice(), &hand.links[idx].name);
+    }
+    for (idx, (newtons, (_, cell))) in recorded.cells_newtons.iter().zip(hand.cells()).enumerate() {
+        let is_silent = shown["cellColours"][idx] == shown["silent"];
+        assert_eq!(is_silent, *newtons <= cell.noise_threshold_newtons, "cell {idx}: {newtons} N");
+        let wanted: Vec<f64> = numbers(&shown["cellColours"][idx]).iter().map(|part| part / 255.0).collect();
+        let drawn = numbers(&shown["drawn"][idx]);
+        assert!(wanted.iter().zip(&drawn).all(|(a, b)| (a - b).abs() < 0.01), "cell {idx}: {drawn:?}, {wanted:?}");
+    }
+    assert!(browser.ask("blindgrasp.renderer.info.render.triangles").as_u64() > Some(500));
+
+    // What is written.
+    let decision = browser.text("action");
+    assert!(["lift", "hold"].contains(&decision.as_str()), "{decision}");
+    assert!(browser.text("why").contains("probability 0."), "{}", browser.text("why"));
+    assert_eq!(browser.ask("document.getElementById('nodes').rows.length"), 5);
+    assert!(browser.text("edges").contains("contacts/contacts"), "{}", browser.text("edges"));
+    assert!(browser.text("spoken").contains("Grasp "));
+    browser.wait_until("/running, decisions in \\d/.test(document.getElementById('state').textContent)");
+    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
+    browser.ask("size 400 800");
+    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
+    assert_eq!(browser.ask("document.documentElement.scrollWidth <= window.innerWidth"), true);
+    assert_eq!(browser.ask("errors"), Value::Array(vec![]));
+    if let Ok(path) = std::env::var("BLINDGRASP_PICTURE") {
+        browser.ask("size 1280 1000");
+        browser.wait_for_frames(5);
+        browser.ask(&format!("picture {path}"));
+    }
+
+    // A swap, the end of the graph, and its next run.
+    swap(&graph, &["classifier"], 0);
+    browser.wait_until("blindgrasp.graph.nodes.some((node) => node.n_swaps === 1)");
+    browser.wait_for_frames(10);
+    graph.stop();
+    browser.wait_until("document.getElementById('state').textContent.includes('has ended; waiting for it')");
+    let graph = launch(&name);
+    browser.wait_for_frames(10);
+    browser.wait_until("document.getElementById('state').className === ''");
+
+    // The page's server goes and comes.
+    let port = address.rsplit(':').next().and_then(|port| port.parse().ok()).expect("a port");
+    drop(page);
+    browser.wait_until("document.getElementById('state').textContent.startsWith('the connection is broken')");
+    let _page = Running::page(&name, port);
+    browser.wait_for_frames(10);
+    assert_eq!(graph.node("recorded_source")["n_restarts"], 0);
+    graph.stop();
+}
+
+#[test]
+fn run_starts_the_page_and_ends_it() {
+    let name = unique_name();
+    let graph =
+        Graph::launch(&name, &project().join("dataflow.yaml"), &["--set", "recorded_source.repeat=forever", "--view"]);
+    wait_until(|| graph.said().contains("in a browser on this machine: http://"), || graph.said());
+    let said = graph.said();
+    let address = said.split("this machine: http://").nth(1).and_then(|rest| rest.lines().next()).expect("an address");
+    let events = || -> std::io::Result<String> {
+        let mut client = std::net::TcpStream::connect(address.trim())?;
+        std::io::Write::write_all(&mut client, format!("GET /events HTTP/1.1\r\nHost: {address}\r\n\r\n").as_bytes())?;
+        let mut lines = BufReader::new(client).lines();
+        lines.find(|line| line.as_ref().map_or(true, |line| line.starts_with("event: frame"))).expect("a line")
+    };
+    assert!(events().is_ok());
+    graph.stop();
+    wait_until(|| events().is_err(), || format!("{address} still answers"));
+}
+
+#[test]
+fn a_page_needs_a_graph_that_runs() {
+    let output = blindgrasp().args(["view", "no_such_graph"]).output().expect("started");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(1) && said.contains("no_such_graph"), "{said}");
+    let output =
+        blindgrasp().args(["view", "dataflow.yaml", "--port", "1"]).current_dir(project()).output().expect("started");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(2) && said.contains("--port is for the page of a running graph"), "{said}");
+}
