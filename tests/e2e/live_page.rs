@@ -46,6 +46,14 @@ impl Drop for Running {
 
 struct Browser(Running);
 
+impl Drop for Browser {
+    /// Without input the program ends the browser. If it were killed, the browser would go on.
+    fn drop(&mut self) {
+        drop(self.0.child.stdin.take());
+        let _ = self.0.child.wait();
+    }
+}
+
 impl Browser {
     fn open(address: &str) -> Browser {
         let mut command = Command::new(python());
