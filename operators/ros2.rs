@@ -20,7 +20,7 @@ use serde::Deserialize;
 use super::connection::{ConnectionParams, with_connection_params};
 use super::publishing::{Forward, Node, Outside, Topic, edge, publish};
 use super::ros2_decision::{Decision, LastDecision, decide_type, decision_type};
-use super::ros2_markers::hand_markers;
+use super::ros2_markers::{cell_points, hand_markers};
 
 /// The least time between two pictures of the hand: 10 a second.
 const MARKER_NANOS: u64 = 100_000_000;
@@ -70,7 +70,7 @@ pub(crate) fn describe() -> OperatorDescription {
         (
             "tactile",
             TactileFrame::TYPE_NAME,
-            "Topic tactile; with the param 'hand', joint_states and hand_markers as well",
+            "Topic tactile; with the param 'hand', joint_states, cell_points and hand_markers as well",
         ),
         ("contacts", ContactSet::TYPE_NAME, "Topics contacts and contact_points"),
         ("feature", GraspFeature::TYPE_NAME, "Topic feature"),
@@ -81,7 +81,7 @@ pub(crate) fn describe() -> OperatorDescription {
     with_network_params(description.uses_network()).optional_param(
         "hand",
         ParamKind::Path { must_exist: true },
-        "The hand's pad layout (YAML), for joint_states and hand_markers",
+        "The hand's pad layout (YAML), for joint_states, cell_points and hand_markers",
     )
 }
 
@@ -101,6 +101,15 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
             message: Some(standard_type("sensor_msgs/msg/JointState")?),
             quality: Quality::Sensor,
             encode: Box::new(move |sample, data| cdr::joint_state(&sample.header, &joint_names, &sample.message, data)),
+            interval_nanos: 0,
+        });
+        let hand = Arc::new(hand);
+        let of_cells = Arc::clone(&hand);
+        tactile.push(Topic {
+            name: "cell_points",
+            message: Some(standard_type("sensor_msgs/msg/PointCloud2")?),
+            quality: Quality::Sensor,
+            encode: Box::new(move |sample, data| cell_points(&of_cells, sample, data)),
             interval_nanos: 0,
         });
         tactile.push(Topic {

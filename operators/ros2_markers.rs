@@ -1,4 +1,5 @@
-//! The hand as `visualization_msgs/msg/MarkerArray`: the shapes of its links, and its cells in the colour of their force.
+//! The hand as `visualization_msgs/msg/MarkerArray`: the shapes of its links, and its cells in the colour of their force; and its
+//! cells as `sensor_msgs/msg/PointCloud2`.
 
 use blindgrasp_messages::{Stamped, TactileFrame};
 use blindgrasp_recording::cdr;
@@ -112,6 +113,21 @@ pub(crate) fn hand_markers(hand: &Hand, sample: &Stamped<TactileFrame>, data: &m
     cell_marker.colors = frame.cells_newtons.iter().map(|newtons| colour(*newtons)).collect();
     markers.push(cell_marker);
     cdr::encode(&(markers,), data)
+}
+
+/// Writes all cells of a frame with their forces as `sensor_msgs/msg/PointCloud2`, in CDR.
+///
+/// # Errors
+/// The frame is another hand's.
+pub(crate) fn cell_points(hand: &Hand, sample: &Stamped<TactileFrame>, data: &mut Vec<u8>) -> Result<(), String> {
+    let frame = &sample.message;
+    let cells = hand.cells_in_palm(&frame.joints_rad).map_err(|error| error.to_string())?;
+    if frame.cells_newtons.len() != cells.len() {
+        return Err(format!("{} cells, the hand has {}", frame.cells_newtons.len(), cells.len()));
+    }
+    let points = cells.iter().zip(&frame.cells_newtons);
+    let points = points.map(|(cell, newtons)| (cell.position_in_palm_m.coords.into(), *newtons));
+    cdr::force_points(&sample.header, points, data)
 }
 
 /// The marker of a shape: its type, its pose in the link and its outer sizes. A capsule is drawn as a cylinder, a hull as the

@@ -47,6 +47,8 @@ def main() -> None:
     node(ROS2Subscriber, "/decision", DECISION, callback=decisions.put)
     markers = []
     node(ROS2Subscriber, "/hand_markers", "visualization_msgs/msg/MarkerArray", callback=lambda said: markers.append(said.markers))
+    clouds = []
+    node(ROS2Subscriber, "/cell_points", "sensor_msgs/msg/PointCloud2", callback=clouds.append)
     joints = node(ROS2Publisher, "/robot/joint_states", "sensor_msgs/msg/JointState")
     cells = node(ROS2Publisher, "/cells", "std_msgs/msg/Float64MultiArray")
     phases = node(ROS2Publisher, "/phase", "std_msgs/msg/String")
@@ -102,6 +104,7 @@ def main() -> None:
     hand = markers[-1]
     red = max(range(len(hand[-1].colors)), key=lambda idx: hand[-1].colors[idx].r)
     print(json.dumps({"pictures": len(markers), "shapes": len(hand) - 1, "cells": len(hand[-1].points),
+                      "points": [clouds[-1].width, [field.name for field in clouds[-1].fields]],
                       "size": [hand[0].scale.x, hand[0].scale.y, hand[0].scale.z], "felt": hand[-1].colors[red].r > 0.4}), flush=True)
 
 

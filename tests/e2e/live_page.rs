@@ -1,11 +1,13 @@
-//! The page of a running graph, in headless Chromium (`tests/browser.py`).
+//! The page of a running graph or a recording, in headless Chromium (`tests/browser.py`).
 
+use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 use crate::common::python::python;
-use crate::common::{Graph, RECORDING, blindgrasp, project, skipped, swap, unique_name, wait_until};
+use crate::common::{Graph, RECORDING, blindgrasp, project, run, skipped, swap, unique_name, wait_until};
+use blindgrasp_messages::Action;
 use blindgrasp_recording::{Record, RecordingReader};
 use blindgrasp_stages::hand::Hand;
 use serde_json::Value;
@@ -154,7 +156,11 @@ fn a_browser_shows_a_graph_as_it_runs() {
     assert_eq!(browser.ask("document.getElementById('nodes').rows.length"), 5);
     assert!(browser.text("edges").contains("contacts/contacts"), "{}", browser.text("edges"));
     assert!(browser.text("spoken").contains("Grasp "));
-    browser.wait_until("/running, decisions in \\d/.test(document.getElementById('state').textContent)");
+    browser.wait_until("/^decisions in \\d/.test(document.getElementById('latency').textContent)");
+    assert_eq!(browser.text("state"), "running");
+    browser.wait_until(
+        "document.body.className === '' && /^decided \\d+ s ago$/.test(document.getElementById('decided').textContent)",
+    );
     assert_eq!(browser.ask("axe"), Value::Array(vec![]));
     browser.ask("size 400 800");
     assert_eq!(browser.ask("axe"), Value::Array(vec![]));
@@ -172,8 +178,10 @@ fn a_browser_shows_a_graph_as_it_runs() {
     browser.wait_for_frames(10);
     graph.stop();
     browser.wait_until("document.getElementById('state').textContent.includes('has ended; waiting for it')");
+    browser.wait_until("document.body.className === 'stale'");
     let graph = launch(&name);
     browser.wait_for_frames(10);
+    browser.wait_until("blindgrasp.decision !== null && blindgrasp.decision.truth !== null");
     browser.wait_until("document.getElementById('state').className === ''");
 
     // The page's server goes and comes.
@@ -181,9 +189,77 @@ fn a_browser_shows_a_graph_as_it_runs() {
     drop(page);
     browser.wait_until("document.getElementById('state').textContent.startsWith('the connection is broken')");
     let _page = Running::page(&name, port);
-    browser.wait_for_frames(10);
+    // The page loads again, because it is another server's.
+    browser.wait_until("typeof blindgrasp === 'object' && blindgrasp.frames > 10");
     assert_eq!(graph.node("recorded_source")["n_restarts"], 0);
     graph.stop();
+}
+
+#[test]
+fn a_browser_shows_the_grasps_of_a_recording() {
+    if !Path::new("/usr/bin/chromedriver").exists() {
+        return skipped("no chromium-driver: scripts/test installs it on Debian");
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let recording = folder.path().join("run.mcap");
+    let path = recording.to_str().expect("UTF-8");
+    let flow = project().join("dataflow.yaml");
+    let flow = flow.to_str().expect("UTF-8");
+    run(&["run", flow, "--name", &unique_name(), "--set", "recorded_source.rate=max", "--record", path], 0);
+    let (mut lifts, mut stable, mut frames) = (BTreeMap::new(), BTreeMap::new(), BTreeMap::<u64, Vec<_>>::new());
+    for record in RecordingReader::open(&recording).expect("a recording") {
+        match record.expect("a record").1 {
+            Record::Decision(it) => drop(lifts.insert(it.message.grasp_id, it.message.action == Action::Lift)),
+            Record::Truth(it) => drop(stable.insert(it.message.grasp_id, it.message.stable)),
+            Record::Tactile(it) => frames.entry(it.message.grasp_id).or_default().push(it.message),
+            _ => {}
+        }
+    }
+    let n_wrong = |lifted: bool| lifts.iter().filter(|(id, lift)| **lift == lifted && stable[*id] != lifted).count();
+    let (n_false_positives, n_false_negatives) = (n_wrong(true), n_wrong(false));
+    assert!(n_false_positives > 0 && n_false_negatives > 0);
+    let (_page, address) = Running::page(path, 0);
+    let mut browser = Browser::open(&address);
+    browser.wait_until("blindgrasp.player.frames.length > 0 && blindgrasp.frame !== null");
+    let said = browser.text("state");
+    assert_eq!(
+        said,
+        format!("{} grasps, {n_false_positives} false positives, {n_false_negatives} false negatives", lifts.len())
+    );
+    browser.ask("document.getElementById('mistake').click()");
+    browser.wait_until("blindgrasp.player.verdict(blindgrasp.player.grasps[blindgrasp.player.at]).startsWith('false')");
+    browser.wait_until("blindgrasp.frame.grasp_id === blindgrasp.player.grasps[blindgrasp.player.at].id");
+    let id: u64 = browser.ask("blindgrasp.frame.grasp_id").as_str().and_then(|id| id.parse().ok()).expect("a number");
+    assert_ne!(lifts[&id], stable[&id]);
+    assert!(browser.text("why").contains(if stable[&id] { "It was stable." } else { "It was not stable." }));
+    let expected = &frames[&id];
+    assert_eq!(browser.ask("blindgrasp.player.frames.length"), expected.len());
+    for (idx, frame) in expected.iter().enumerate().step_by(5) {
+        let at = format!("blindgrasp.player.frames[{idx}]");
+        assert_eq!(numbers(&browser.ask(&format!("{at}.joints"))), frame.joints_rad);
+        assert_eq!(numbers(&browser.ask(&format!("{at}.cells"))), frame.cells_newtons);
+    }
+    assert!(browser.ask("blindgrasp.player.frames.at(-1).probability").is_f64());
+    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
+    if let Ok(path) = std::env::var("BLINDGRASP_PICTURE") {
+        browser.ask("document.getElementById('frame').value = 12");
+        browser.ask("document.getElementById('frame').dispatchEvent(new Event('input'))");
+        browser.ask(&format!("picture {path}.recording.png"));
+    }
+    // It plays to the end of the grasp, and goes on.
+    browser.ask("document.getElementById('play').click()");
+    browser.wait_until(&format!("Number(blindgrasp.frame.grasp_id) > {id} && blindgrasp.player.n > 2"));
+    browser.ask("document.getElementById('play').click()");
+    assert_eq!(browser.ask("blindgrasp.player.isPlaying"), false);
+    assert_eq!(browser.ask("errors"), Value::Array(vec![]));
+    // A recording of the simulator has the object, and no decisions.
+    let (_page, address) = Running::page(project().join(RECORDING).to_str().expect("UTF-8"), 0);
+    let mut browser = Browser::open(&address);
+    browser.wait_until("blindgrasp.player.frames.length > 0 && blindgrasp.frame !== null");
+    assert!(browser.text("state").ends_with("grasps, no decisions in the recording"), "{}", browser.text("state"));
+    assert!(browser.ask("blindgrasp.object().triangles").as_u64() > Some(10));
+    let wrong = run(&["view", path, "--grasp", "99999"], 1);
+    assert!(String::from_utf8_lossy(&wrong.stderr).contains("has no grasp 99999"));
 }
 
 #[test]
@@ -213,5 +289,8 @@ fn a_page_needs_a_graph_that_runs() {
     let output =
         blindgrasp().args(["view", "dataflow.yaml", "--port", "1"]).current_dir(project()).output().expect("started");
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert!(output.status.code() == Some(2) && said.contains("--port is for the page of a running graph"), "{said}");
+    assert!(
+        output.status.code() == Some(2) && said.contains("--port is for the page of a running graph or a recording"),
+        "{said}"
+    );
 }

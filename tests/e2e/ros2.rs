@@ -154,6 +154,7 @@ fn a_robot_in_ros_2_gets_the_decisions_of_its_recording() {
     let picture = peer.line();
     let n_shapes: usize = hand.links.iter().map(|link| link.shapes.len()).sum();
     assert_eq!((&picture["shapes"], &picture["cells"]), (&n_shapes.into(), &hand.n_cells().into()), "{picture}");
+    assert_eq!(picture["points"], json!([hand.n_cells(), ["x", "y", "z", "force"]]), "{picture}");
     // The frames are 10 ms apart, the pictures 100 ms.
     let most = 2 + grasps(N_GRASPS).len() / 10;
     assert!(picture["pictures"].as_u64().is_some_and(|n| (2..=most as u64).contains(&n)), "{picture}");
@@ -384,7 +385,7 @@ fn frames_of_another_hand_are_counted_as_unpublished() {
     assert_eq!(graph.node("ros2")["n_restarts"], 0, "{}", graph.node("ros2"));
     let said = graph.said();
     assert!(said.contains("is not published as joint_states: 7 joint values, the hand has 1"), "{said}");
-    assert_eq!(said.matches("is not published as").count(), 2, "each reason is said once: {said}");
+    assert_eq!(said.matches("is not published as").count(), 3, "each reason is said once: {said}");
     graph.stop();
 }
 

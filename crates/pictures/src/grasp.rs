@@ -217,7 +217,7 @@ fn contact_marks(hand: &Hand, scene: &GraspScene) -> Result<Vec<ContactMark>, Pi
         .collect()
 }
 
-fn palm_from_object(scene: &GraspScene) -> Isometry3<f64> {
+pub(super) fn palm_from_object(scene: &GraspScene) -> Isometry3<f64> {
     let [x, y, z, w] = scene.object_rotation_xyzw;
     let rotation = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-9).unwrap_or_default();
     Isometry3::from_parts(Translation3::from(scene.object_position_m), rotation)

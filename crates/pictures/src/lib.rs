@@ -45,7 +45,7 @@ pub use grasp_picture::grasp_svg;
 pub use heat_map::{HeatMap, HeatMapAxis, HeatMapCell, heat_map_svg};
 pub use html::grasp_html;
 pub use posed_scene::{PosedScene, posed_scene_images};
-pub use scene::{HandScene, link_poses};
+pub use scene::{HandScene, ObjectScene, link_poses};
 pub use svg::escape;
 
 use blindgrasp_stages::hand::JointError;

@@ -3,9 +3,12 @@
 use nalgebra::Isometry3;
 use serde::Serialize;
 
-use super::colour::{HAND, Rgb, SILENT_CELL, bytes, force_colour};
+use super::colour::{HAND, OBJECT, Rgb, SILENT_CELL, bytes, force_colour};
 use super::geometry::{cells_in_link, link_mesh};
+use super::grasp::palm_from_object;
 use super::html::{CellData, PadData, Surface, point, rows, surface};
+use blindgrasp_messages::GraspScene;
+use blindgrasp_objects::mesh::Mesh;
 use blindgrasp_stages::hand::{Hand, JointError};
 
 /// Colours of the scale of forces.
@@ -42,6 +45,21 @@ impl HandScene {
             hand_colour: bytes(HAND),
             silent_colour: bytes(SILENT_CELL),
         }
+    }
+}
+
+/// The surface of an object in the palm frame, where the scene of a grasp has it.
+#[derive(Serialize)]
+pub struct ObjectScene {
+    surface: Surface,
+    colour: [u8; 3],
+}
+
+impl ObjectScene {
+    pub fn new(mesh: &Mesh, scene: &GraspScene) -> ObjectScene {
+        let mut mesh = mesh.clone();
+        mesh.transform(&palm_from_object(scene));
+        ObjectScene { surface: surface(&mesh), colour: bytes(OBJECT) }
     }
 }
 

@@ -36,3 +36,15 @@ pub fn joint_state(header: &Header, names: &[String], frame: &TactileFrame, data
 pub fn contact_points(header: &Header, contacts: &ContactSet, data: &mut Vec<u8>) -> Result<(), String> {
     viewer::contact_points(header, contacts, data)
 }
+
+/// Points in the palm frame, metres, each with a force, newtons, as `sensor_msgs/msg/PointCloud2` with `x`, `y`, `z`, `force`.
+///
+/// # Errors
+/// As [`encode`].
+pub fn force_points(
+    header: &Header,
+    points: impl ExactSizeIterator<Item = ([f64; 3], f64)>,
+    data: &mut Vec<u8>,
+) -> Result<(), String> {
+    viewer::force_points(header, points, data)
+}

@@ -145,11 +145,19 @@ pub(super) fn joint_state(
 
 /// A sample's contacts: palm frame, metres, and the force of each in newtons.
 pub(super) fn contact_points(header: &Header, contacts: &ContactSet, data: &mut Vec<u8>) -> Result<(), String> {
-    let width = contacts.contacts.len() as u32;
+    force_points(header, contacts.contacts.iter().map(|contact| (contact.position_m, contact.force_newtons)), data)
+}
+
+/// Points in the palm frame, metres, each with a force, newtons.
+pub(super) fn force_points(
+    header: &Header,
+    points: impl ExactSizeIterator<Item = ([f64; 3], f64)>,
+    data: &mut Vec<u8>,
+) -> Result<(), String> {
+    let width = points.len() as u32;
     let field =
         |(idx, name): (usize, &&'static str)| PointField { name, offset: 4 * idx as u32, datatype: FLOAT32, count: 1 };
-    let values =
-        contacts.contacts.iter().flat_map(|contact| contact.position_m.into_iter().chain([contact.force_newtons]));
+    let values = points.flat_map(|(position_m, newtons)| position_m.into_iter().chain([newtons]));
     let cloud = PointCloud {
         header: StandardHeader::new(header),
         height: 1,

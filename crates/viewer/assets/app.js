@@ -1,4 +1,4 @@
-// The page of a running graph: draws the events of /events. It sends nothing.
+// The page of a running graph or a recording: draws the events of /events, and grasps of a recording. It sends nothing.
 import {
   ArrowHelper, BufferAttribute, BufferGeometry, Color, DirectionalLight, DoubleSide, Group, HemisphereLight, Mesh, MeshBasicMaterial,
   MeshLambertMaterial, OrbitControls, PerspectiveCamera, Scene, Vector3, WebGLRenderer,
@@ -9,9 +9,11 @@ const CHART_SECS = 20;
 const MAX_CONTACTS = 64;
 // A screen reader is told a decision at most so often.
 const SPOKEN_MS = 2000;
+// The graph tells its state each second: after this time without it, the page says so.
+const SILENT_MS = 3000;
 
 // What is shown, for tests and for the curious.
-const shown = (window.blindgrasp = { scene: null, frame: null, decision: null, graph: null, dropped: 0, frames: 0, cellColours: [] });
+const shown = (window.blindgrasp = { server: null, scene: null, frame: null, decision: null, graph: null, dropped: 0, frames: 0, cellColours: [] });
 
 // --- the hand
 const hand = (() => {
@@ -21,7 +23,7 @@ const hand = (() => {
     renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true });
   } catch {
     byId("without-webgl").hidden = false;
-    return { build() {}, show() {} };
+    return { build() {}, show() {}, surround() {} };
   }
   shown.renderer = renderer;
   const scene = new Scene(), camera = new PerspectiveCamera(35, 1, 0.01, 10);
@@ -120,7 +122,23 @@ const hand = (() => {
     }
     return found.map(({ r, g, b }) => [r, g, b]);
   }
+  let object = null;
+  shown.object = () => ({ triangles: object ? object.geometry.index.count / 3 : 0 });
   return {
+    // Shows the surface of an object, half transparent, or none.
+    surround(data) {
+      if (object) scene.remove(object);
+      object?.geometry.dispose();
+      object?.material.dispose();
+      object = null;
+      if (data) {
+        const colour = new Color(...data.colour.map((part) => part / 255));
+        object = new Mesh(geometry(data.surface.positions_m, data.surface.triangles),
+          new MeshLambertMaterial({ color: colour, transparent: true, opacity: 0.45, depthWrite: false }));
+        scene.add(object);
+      }
+      draw();
+    },
     build(data) {
       scene.remove(parts);
       parts.traverse((part) => { part.geometry?.dispose(); part.material?.dispose(); });
@@ -235,62 +253,211 @@ const showDecision = (decision) => {
   action.className = `action ${decision.action in colours ? decision.action : "probe"}`;
   const wrong = decision.action === "lift" && decision.truth === false ? " This lift is wrong: the grasp is known to be unstable." : "";
   byId("why").textContent = `Grasp ${decision.grasp_id}: ${decision.reason.replaceAll("_", " ")}, probability ` +
-    `${decision.probability_stable.toFixed(2)}.${wrong}`;
+    `${decision.probability_stable.toFixed(2)}.${decision.why ?? wrong}`;
   if (performance.now() - spokenAt > SPOKEN_MS) {
     spokenAt = performance.now();
     byId("spoken").textContent = `${action.textContent}. ${byId("why").textContent}`;
   }
 };
 
-// --- the chart: times are those of the page's clock
+// --- the chart: the last seconds by the page's clock, or the frames of a recorded grasp
 const points = [], marks = [];
-const chart = () => {
-  const canvas = byId("chart"), ratio = window.devicePixelRatio || 1;
-  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-  canvas.width = width * ratio;
-  canvas.height = height * ratio;
-  const pen = canvas.getContext("2d"), style = getComputedStyle(document.documentElement);
-  const colour = (name) => style.getPropertyValue(name).trim();
-  pen.scale(ratio, ratio);
-  const now = performance.now(), left = 30, bottom = 6;
-  const x = (at) => left + (width - left) * (1 - (now - at) / 1000 / CHART_SECS), y = (p) => bottom + (height - 2 * bottom) * (1 - p);
-  pen.font = "11px sans-serif";
-  pen.fillStyle = colour("--soft");
-  pen.strokeStyle = colour("--line");
-  for (const p of [0, 0.5, 1]) {
-    pen.fillText(p.toFixed(1), 2, y(p) + 4);
-    pen.beginPath();
-    pen.moveTo(left, y(p));
-    pen.lineTo(width, y(p));
-    pen.stroke();
+const trim = (now) => {
+  for (const list of [points, marks]) {
+    const n = list.findIndex((item) => now - item.at <= CHART_SECS * 1000);
+    if (n !== 0) list.splice(0, n < 0 ? list.length : n);
   }
-  const old = (list) => { while (list.length && now - list[0].at > CHART_SECS * 1000) list.shift(); };
-  old(points);
-  old(marks);
-  for (const mark of marks) {
-    pen.strokeStyle = colour(colours[mark.action] ?? "--probe");
-    pen.beginPath();
-    pen.moveTo(x(mark.at), height);
-    pen.lineTo(x(mark.at), height - 14);
-    pen.stroke();
-  }
-  pen.fillStyle = colour("--mark");
-  for (const point of points) pen.fillRect(x(point.at) - 1, y(point.p) - 1, 2, 2);
 };
-setInterval(() => { if (!document.hidden) chart(); }, 100);
+const pen = (canvas) => {
+  const ratio = window.devicePixelRatio || 1;
+  [canvas.width, canvas.height] = [canvas.clientWidth * ratio, canvas.clientHeight * ratio];
+  const made = canvas.getContext("2d");
+  made.scale(ratio, ratio);
+  return made;
+};
+const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const chart = () => {
+  const canvas = byId("chart"), draw = pen(canvas);
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight], left = 30, bottom = 6;
+  const now = performance.now(), y = (p) => bottom + (height - 2 * bottom) * (1 - p);
+  const line = (colourName, ...corners) => {
+    draw.strokeStyle = colour(colourName);
+    draw.beginPath();
+    corners.forEach(([x, y], idx) => (idx ? draw.lineTo(x, y) : draw.moveTo(x, y)));
+    draw.stroke();
+  };
+  draw.font = "11px sans-serif";
+  draw.fillStyle = colour("--soft");
+  for (const p of [0, 0.5, 1]) {
+    draw.fillText(p.toFixed(1), 2, y(p) + 4);
+    line("--line", [left, y(p)], [width, y(p)]);
+  }
+  const x = (share) => left + (width - left) * share;
+  const dot = (at, p, size) => draw.fillRect(at - size / 2, y(p) - size / 2, size, size);
+  if (player.grasps.length) {
+    if (!player.frames.length) return;
+    const end = player.frames.at(-1).since_start_ms || 1, at = (frame) => x(frame.since_start_ms / end);
+    const present = player.frames[player.n];
+    line("--soft", [at(present), 0], [at(present), height]);
+    draw.fillStyle = colour("--mark");
+    for (const frame of player.frames) if (frame.probability !== null) dot(at(frame), frame.probability, 5);
+    return;
+  }
+  trim(now);
+  const at = (item) => x(1 - (now - item.at) / 1000 / CHART_SECS);
+  for (const mark of marks) line(colours[mark.action] ?? "--probe", [at(mark), height], [at(mark), height - 14]);
+  draw.fillStyle = colour("--mark");
+  for (const point of points) dot(at(point), point.p, 2);
+};
+
+// --- a recording
+const player = (() => {
+  const state = { grasps: [], at: -1, frames: [], n: 0, isPlaying: false, verdict };
+  let opening = 0, abort = null, run = 0, due = 0, wholeStep = 1;
+  // The outcome of a grasp, by decision and label.
+  function verdict({ action, truth }) {
+    if (action === null || truth === null) return "other";
+    if (action === "lift") return truth ? "right" : "false-positive";
+    if (action !== "hold" && action !== "regrasp") return "other";
+    return truth ? "false-negative" : "right";
+  }
+  const colourOf = { right: "--lift", "false-positive": "--hold", "false-negative": "--probe", other: "--soft" };
+  const bars = () => {
+    const canvas = byId("grasps"), draw = pen(canvas), width = canvas.clientWidth / state.grasps.length;
+    state.grasps.forEach((grasp, idx) => {
+      const isShown = idx === state.at;
+      draw.fillStyle = colour(colourOf[verdict(grasp)]);
+      draw.fillRect(idx * width, isShown ? 0 : 12, Math.max(1, width - (width > 4 ? 1 : 0)), isShown ? 40 : 22);
+    });
+  };
+  const showAt = (n) => {
+    const frame = state.frames[n], grasp = state.grasps[state.at];
+    if (!frame) return;
+    state.n = n;
+    byId("frame").value = n;
+    const nth = wholeStep > 1 ? ` (every ${wholeStep}th is shown)` : "";
+    byId("when").textContent = frame.links
+      ? `grasp ${grasp.id}, ${frame.since_start_ms.toFixed(0)} ms, frame ${n + 1} of ${state.frames.length}${nth}`
+      : `grasp ${grasp.id}, frame ${n + 1}: its joints are not those of the hand`;
+    if (frame.links) showFrame(frame);
+    chart();
+  };
+  // Shows a grasp; false if another one was asked for meanwhile, or there is no answer.
+  const open = async (idx) => {
+    const mine = ++opening, grasp = state.grasps[idx];
+    abort?.abort();
+    abort = new AbortController();
+    [state.at, state.frames, state.n] = [idx, [], 0];
+    byId("when").textContent = `loading grasp ${grasp.id}`;
+    hand.surround(null);
+    bars();
+    const label = grasp.truth === null ? "" : grasp.truth ? " It was stable." : " It was not stable.";
+    if (grasp.action !== null) showDecision({ ...grasp, grasp_id: grasp.id, why: label });
+    else {
+      byId("action").textContent = "not recorded";
+      byId("action").className = "action";
+      byId("why").textContent = `Grasp ${grasp.id}.${label}`;
+    }
+    try {
+      const answer = await fetch(`/grasps/${idx}`, { signal: abort.signal });
+      if (!answer.ok) throw new Error(await answer.text());
+      const { frames, object, step } = await answer.json();
+      if (mine !== opening) return false;
+      [state.frames, wholeStep, due] = [frames, step, performance.now()];
+      byId("frame").max = Math.max(0, frames.length - 1);
+      hand.surround(object);
+      showAt(0);
+      return frames.length > 0;
+    } catch (error) {
+      if (mine === opening) byId("when").textContent = `grasp ${grasp.id} cannot be shown: ${error.message}`;
+      return false;
+    }
+  };
+  const setPlaying = (isPlaying) => {
+    state.isPlaying = isPlaying;
+    byId("play").textContent = isPlaying ? "Pause" : "Play";
+    byId("play").setAttribute("aria-pressed", String(isPlaying));
+  };
+  // Plays at the recording's own pace, and goes on with the next grasp.
+  const play = async () => {
+    const mine = ++run;
+    setPlaying(true);
+    if (state.n === state.frames.length - 1) showAt(0);
+    due = performance.now();
+    while (mine === run) {
+      const now = await new Promise(requestAnimationFrame);
+      if (mine !== run) return;
+      const speed = Number(byId("speed").value), frames = state.frames;
+      if (!frames.length) continue;
+      const pause = (n) => (frames[n + 1].since_start_ms - frames[n].since_start_ms) / speed;
+      let n = state.n;
+      while (n + 1 < frames.length && now - due >= pause(n)) {
+        due += pause(n);
+        n += 1;
+      }
+      if (n !== state.n) showAt(n);
+      else if (n + 1 >= frames.length && now - due > 500 / speed) {
+        if (state.at + 1 >= state.grasps.length) break;
+        const shownNext = await open(state.at + 1);
+        // Another grasp that was chosen meanwhile is played.
+        if (!shownNext && byId("when").textContent.includes("cannot be shown")) break;
+      }
+    }
+    if (mine === run) setPlaying(false);
+  };
+  const stop = () => {
+    run += 1;
+    setPlaying(false);
+  };
+  const go = (idx) => { if (idx >= 0 && idx < state.grasps.length) open(idx); };
+  byId("before").addEventListener("click", () => go(state.at - 1));
+  byId("after").addEventListener("click", () => go(state.at + 1));
+  byId("mistake").addEventListener("click", () => {
+    const isMistake = (grasp) => verdict(grasp).startsWith("false");
+    const idx = state.grasps.findIndex((grasp, idx) => idx > state.at && isMistake(grasp));
+    go(idx >= 0 ? idx : state.grasps.findIndex(isMistake));
+  });
+  byId("play").addEventListener("click", () => (state.isPlaying ? stop() : play()));
+  byId("frame").addEventListener("input", () => showAt(Number(byId("frame").value)));
+  byId("grasps").addEventListener("click", (event) => go(Math.floor(event.offsetX / byId("grasps").clientWidth * state.grasps.length)));
+  new ResizeObserver(() => { if (state.grasps.length) { bars(); chart(); } }).observe(byId("grasps"));
+  state.start = ({ file, first, grasps }) => {
+    // The same recording, after a broken connection.
+    if (state.grasps.length) return;
+    document.body.classList.add("recorded");
+    byId("recording").hidden = false;
+    state.grasps = grasps;
+    const n = (kind) => grasps.filter((grasp) => verdict(grasp) === kind).length;
+    const isKnown = n("other") < grasps.length;
+    byId("graph").textContent = file.split("/").at(-1);
+    document.title = `${byId("graph").textContent} - blindgrasp`;
+    byId("mistake").disabled = !isKnown;
+    const without = grasps.every((grasp) => grasp.action === null) ? "no decisions" : "no labels of decided grasps";
+    const other = n("other") > 0 ? `, ${n("other")} not known` : "";
+    state.summary = isKnown
+      ? `${grasps.length} grasps, ${n("false-positive")} false positives, ${n("false-negative")} false negatives${other}`
+      : `${grasps.length} grasps, ${without} in the recording`;
+    say(state.summary, false);
+    open(first);
+  };
+  return state;
+})();
+shown.player = player;
+setInterval(() => { if (!document.hidden && !player.grasps.length) chart(); }, 100);
 
 // --- the graph
 const time = (nanos) => nanos < 1e6 ? `${(nanos / 1e3).toFixed(0)} µs` : nanos < 1e9 ? `${(nanos / 1e6).toFixed(1)} ms` : `${(nanos / 1e9).toFixed(1)} s`;
-const say = (text, isTrouble) => {
+function say(text, isTrouble) {
   if (byId("state").textContent !== text) byId("state").textContent = text;
   byId("state").className = isTrouble ? "trouble" : "";
-};
+}
 const showGraph = (graph) => {
   shown.graph = graph;
   byId("graph").textContent = graph.graph;
   document.title = `${graph.graph} - blindgrasp`;
-  const latency = graph.decision_latency_nanos ? `, decisions in ${time(graph.decision_latency_nanos.p50)}` : "";
-  say(graph.warnings.length ? graph.warnings.join("; ") : `${graph.state}${latency}`, graph.warnings.length > 0);
+  graphAt = performance.now();
+  byId("latency").textContent = graph.decision_latency_nanos ? `decisions in ${time(graph.decision_latency_nanos.p50)}` : "";
+  say(graph.warnings.length ? graph.warnings.join("; ") : graph.state, graph.warnings.length > 0);
   graph.nodes.forEach((node, idx) => {
     const counts = Object.entries(node.counts).filter(([, n]) => n > 0).map(([name, n]) => `${name} ${n}`).join(", ");
     const isWell = node.state === "running" || node.state === "done";
@@ -307,24 +474,57 @@ const showGraph = (graph) => {
   cut(byId("edges"), graph.edges.length);
 };
 
+// --- ages: what is old must not look as if it were present
+let graphAt = null, frameAt = null, decidedAt = null;
+const age = (at) => (at === null ? "" : `, ${Math.max(0, (performance.now() - at) / 1000).toFixed(0)} s ago`);
+setInterval(() => {
+  if (player.grasps.length) return;
+  const isSilent = graphAt === null || performance.now() - graphAt > SILENT_MS;
+  if (graphAt !== null && isSilent) say(`no news of the graph${age(graphAt).replace(", ", " since ").replace(" ago", "")}`, true);
+  document.body.classList.toggle("stale", isSilent);
+  byId("decided").textContent = decidedAt === null ? "" : `decided${age(decidedAt).slice(1)}`;
+  byId("frame-age").textContent = frameAt !== null && performance.now() - frameAt > SILENT_MS ? `last frame${age(frameAt).slice(1)}` : "";
+  byId("stage").classList.toggle("old", frameAt === null || performance.now() - frameAt > SILENT_MS);
+}, 500);
+
 // --- the stream
 const source = new EventSource("/events");
 const on = (name, take) => source.addEventListener(name, (event) => take(JSON.parse(event.data)));
+on("server", (server) => {
+  // Another server at the same address: the page begins anew.
+  if (shown.server !== null && shown.server !== server) location.reload();
+  shown.server = server;
+});
 on("scene", (scene) => {
   shown.scene = scene;
-  [largest, shown.frame] = [1, null];
+  [largest, shown.frame, shown.decision] = [1, null, null];
   for (const id of ["pads", "joints"]) cut(byId(id), 0);
-  hand.build(scene);
+  byId("moment").textContent = scene ? "no frame yet" : "the graph has no hand that can be shown";
+  for (const id of ["scale", "why"]) byId(id).textContent = "";
+  byId("action").textContent = "none yet";
+  byId("action").className = "action";
+  hand.build(scene ?? { links: [], cells: [], hand_colour: [0, 0, 0] });
 });
 on("frame", (frame) => {
   const now = performance.now();
-  for (const p of frame.probabilities) points.push({ at: now, p });
+  trim(now);
+  for (const p of frame.probabilities) if (p !== null) points.push({ at: now, p });
   for (const action of frame.actions) marks.push({ at: now, action });
-  if (frame.links) showFrame(frame);
+  if (frame.links) {
+    frameAt = now;
+    showFrame(frame);
+  }
 });
-on("decision", showDecision);
+on("decision", (decision) => {
+  decidedAt = performance.now();
+  showDecision(decision);
+});
 on("graph", showGraph);
-on("ended", (why) => say(why, true));
+on("recording", (recording) => player.start(recording));
+on("ended", (why) => {
+  graphAt = null;
+  say(why, true);
+});
 on("dropped", (n) => {
   shown.dropped += n;
   byId("missed").textContent = `This browser is too slow: it missed ${shown.dropped} updates of the page. The graph lost nothing.`;

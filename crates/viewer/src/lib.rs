@@ -1,21 +1,22 @@
-//! A page in a browser that shows a graph as it runs, served by the program itself.
+//! A page in a browser that shows a graph as it runs, or a recording, served by the program itself.
 //!
 //! The page, its style, its script and the library three.js are files in the program. The page reads one stream of events
 //! (server-sent events), which [`Viewer::send`] feeds: the caller decides what an event says. A browser that reads too slowly
-//! misses events and is told how many; it holds up neither the caller nor other browsers.
+//! misses events and is told how many; it holds up neither the caller nor other browsers. Of a recording, the page asks for one
+//! grasp after the other ([`Grasps`]).
 //!
 //! The page can only be read: no request changes anything. It is served on the loopback interface, and requests that a page
 //! from elsewhere makes are refused by their host and origin.
 
-use std::collections::BTreeMap;
 use std::convert::Infallible;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use axum::Router;
 use axum::body::{Body, Bytes};
-use axum::extract::{Request, State};
+use axum::extract::{Path, Request, State};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
@@ -44,6 +45,10 @@ pub enum ViewerError {
     Listen { port: u16, source: std::io::Error },
 }
 
+/// Answers the page's question for a grasp of a recording by its place in the list: JSON, or the reason why there is none. It is
+/// asked one question at a time.
+pub type Grasps = Box<dyn FnMut(usize) -> Result<String, String> + Send>;
+
 /// A page that is being served until the process ends.
 #[derive(Clone)]
 pub struct Viewer {
@@ -53,17 +58,19 @@ pub struct Viewer {
 
 struct Shared {
     events: broadcast::Sender<Bytes>,
-    /// The last event of each name that a browser gets when it comes.
-    kept: Mutex<BTreeMap<&'static str, Bytes>>,
+    /// The last event of each name that a browser gets when it comes, in the order of the names' first events.
+    kept: Mutex<Vec<(&'static str, Bytes)>>,
     n_browsers: AtomicUsize,
+    grasps: Option<Mutex<Grasps>>,
 }
 
 impl Viewer {
-    /// Serves the page on a port of the loopback interface, 0 for any free one, from a thread of its own.
+    /// Serves the page on a port of the loopback interface, 0 for any free one, from a thread of its own. A page of a recording
+    /// asks for its grasps.
     ///
     /// # Errors
     /// The port is taken.
-    pub fn serve(port: u16) -> Result<Viewer, ViewerError> {
+    pub fn serve(port: u16, grasps: Option<Grasps>) -> Result<Viewer, ViewerError> {
         let refused = |source| ViewerError::Listen { port, source };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(refused)?;
         let listener = runtime
@@ -74,14 +81,22 @@ impl Viewer {
             events: broadcast::channel(MAX_WAITING).0,
             kept: Mutex::default(),
             n_browsers: AtomicUsize::new(0),
+            grasps: grasps.map(Mutex::new),
         });
         let files = FILES.into_iter().fold(Router::new(), |router, (path, kind, text)| {
             router.route(path, get(move || async move { ([(header::CONTENT_TYPE, kind)], text) }))
         });
-        let pages =
-            files.route("/events", get(events)).with_state(Arc::clone(&shared)).layer(middleware::from_fn(guard));
+        let pages = files
+            .route("/events", get(events))
+            .route("/grasps/{idx}", get(grasp))
+            .with_state(Arc::clone(&shared))
+            .layer(middleware::from_fn(guard));
         std::thread::spawn(move || runtime.block_on(async { axum::serve(listener, pages).await }));
-        Ok(Viewer { shared, address })
+        let viewer = Viewer { shared, address };
+        // A page that finds another server behind the same address begins anew.
+        let started = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
+        viewer.keep("server", &format!("\"{started}\""));
+        Ok(viewer)
     }
 
     pub fn address(&self) -> SocketAddr {
@@ -102,13 +117,28 @@ impl Viewer {
     /// Sends an event, and sends it again to each browser that comes later, until the next of this name.
     pub fn keep(&self, name: &'static str, json: &str) {
         let event = event(name, json);
-        self.shared.kept.lock().unwrap_or_else(PoisonError::into_inner).insert(name, event.clone());
+        let mut kept = self.shared.kept();
+        match kept.iter_mut().find(|(known, _)| *known == name) {
+            Some((_, last)) => *last = event.clone(),
+            None => kept.push((name, event.clone())),
+        }
         let _ = self.shared.events.send(event);
     }
 
     /// Sends the kept event of this name to no browser any more.
     pub fn forget(&self, name: &str) {
-        self.shared.kept.lock().unwrap_or_else(PoisonError::into_inner).remove(name);
+        self.shared.kept().retain(|(known, _)| *known != name);
+    }
+}
+
+impl Shared {
+    fn kept(&self) -> MutexGuard<'_, Vec<(&'static str, Bytes)>> {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The kept events, the last one first: they are taken from the end.
+    fn kept_reversed(&self) -> Vec<Bytes> {
+        self.kept().iter().rev().map(|(_, event)| event.clone()).collect()
     }
 }
 
@@ -171,20 +201,37 @@ async fn events(State(shared): State<Arc<Shared>>) -> Response {
             .into_response();
     }
     let receiver = shared.events.subscribe();
-    // The last first: they are taken from the end.
-    let kept = shared.kept.lock().unwrap_or_else(PoisonError::into_inner).values().rev().cloned().collect();
+    let kept = shared.kept_reversed();
     let stream = stream::unfold(Reader { shared, kept, receiver }, |mut reader| async {
         let next = match reader.kept.pop() {
             Some(kept) => kept,
             None => match reader.receiver.recv().await {
                 Ok(event) => event,
-                Err(RecvError::Lagged(n)) => event("dropped", &n.to_string()),
+                Err(RecvError::Lagged(n)) => {
+                    // Among the missed events may have been kept ones.
+                    reader.kept = reader.shared.kept_reversed();
+                    event("dropped", &n.to_string())
+                }
                 Err(RecvError::Closed) => return None,
             },
         };
         Some((Ok::<_, Infallible>(next), reader))
     });
     ([(header::CONTENT_TYPE, "text/event-stream")], Body::from_stream(stream)).into_response()
+}
+
+async fn grasp(State(shared): State<Arc<Shared>>, Path(idx): Path<usize>) -> Response {
+    // It reads a file, which takes its time.
+    let answer = tokio::task::spawn_blocking(move || {
+        let grasps = shared.grasps.as_ref()?;
+        Some(grasps.lock().unwrap_or_else(PoisonError::into_inner)(idx))
+    });
+    match answer.await {
+        Ok(Some(Ok(json))) => ([(header::CONTENT_TYPE, "application/json")], json).into_response(),
+        Ok(Some(Err(why))) => (StatusCode::NOT_FOUND, why).into_response(),
+        Ok(None) => (StatusCode::NOT_FOUND, "the page is not of a recording\n").into_response(),
+        Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
+    }
 }
 
 #[cfg(test)]
@@ -208,7 +255,7 @@ mod tests {
 
     #[test]
     fn pages_from_elsewhere_get_nothing_and_nothing_can_be_sent() {
-        let viewer = Viewer::serve(0).expect("served");
+        let viewer = Viewer::serve(0, None).expect("served");
         let page = answer(&viewer, "GET / HTTP/1.1\r\nHost: localhost");
         assert!(page.starts_with("HTTP/1.1 200") && page.contains("<title>"), "{page}");
         assert!(page.contains("content-security-policy: default-src 'none'; script-src 'self'"), "{page}");
@@ -221,6 +268,12 @@ mod tests {
             let page = answer(&viewer, head);
             assert!(page.starts_with("HTTP/1.1 403") && !page.contains("<title>"), "{head}: {page}");
         }
+        let recording =
+            Viewer::serve(0, Some(Box::new(|idx| if idx == 3 { Ok("{}".into()) } else { Err("no grasp".into()) })));
+        let recording = recording.expect("served");
+        let of = |id: &str| answer(&recording, &format!("GET /grasps/{id} HTTP/1.1\r\nHost: localhost"));
+        assert!(of("3").ends_with("{}") && of("4").starts_with("HTTP/1.1 404") && of("x").starts_with("HTTP/1.1 400"));
+        assert!(answer(&viewer, "GET /grasps/3 HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 404"));
         assert!(answer(&viewer, "POST / HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 405"));
         assert!(answer(&viewer, "GET /secret HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 404"));
     }
@@ -240,7 +293,7 @@ mod tests {
 
     #[test]
     fn a_late_browser_gets_what_is_kept_and_a_slow_one_is_told_of_what_it_missed() {
-        let viewer = Viewer::serve(0).expect("served");
+        let viewer = Viewer::serve(0, None).expect("served");
         viewer.keep("scene", "{\"hand\":\n1}");
         viewer.send("frame", "0");
         let mut reader = BufReader::new(asked(&viewer, "GET /events HTTP/1.1\r\nHost: localhost"));
@@ -261,7 +314,7 @@ mod tests {
 
     #[test]
     fn browsers_beyond_the_most_are_turned_away() {
-        let viewer = Viewer::serve(0).expect("served");
+        let viewer = Viewer::serve(0, None).expect("served");
         viewer.keep("scene", "1");
         let readers: Vec<_> = (0..MAX_BROWSERS)
             .map(|_| {

@@ -71,7 +71,7 @@ pub(super) struct Arguments {
         num_args = 0..=1,
         require_equals = true,
         default_missing_value = "0",
-        conflicts_with = "detach"
+        conflicts_with_all = ["detach", "stay"]
     )]
     view: Option<u16>,
     /// Format of the log files: text, or JSON, one object a line

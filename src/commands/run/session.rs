@@ -1,11 +1,14 @@
 //! A run of a graph as a command does it: with decisions on stdout, a recording, and the summary at the end.
 
 use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader};
+use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use serde::Serialize;
 use serde_json::json;
 
@@ -22,6 +25,9 @@ use blindgrasp_learning::of_graph::of_graph;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_recording::Record;
+
+/// The page of a graph that ends has this time to show its end.
+const PAGE_LIMIT: Duration = Duration::from_secs(3);
 
 /// Receives every sample of a run: its topic and content, and the time of its receipt (CLOCK_BOOTTIME).
 pub(in crate::commands) type Tap = Box<dyn FnMut(&str, &Record, u64) -> anyhow::Result<()> + Send>;
@@ -136,21 +142,36 @@ impl Session {
     }
 }
 
-/// The process that serves the page of the graph; it ends with this one.
+/// The process that serves the page of the graph. It ends when its stdin does, also if this process is killed.
 struct Page(Child);
 
 impl Page {
+    /// Starts it, and waits until the page is served.
     fn start(graph: &str, port: u16) -> anyhow::Result<Page> {
         let program = std::env::current_exe().context("the program of the page is not known")?;
         let mut command = Command::new(program);
         command.args(["view", graph, "--wait", "--port", &port.to_string()]);
-        command.stdin(Stdio::null()).stdout(Stdio::null());
-        Ok(Page(command.spawn().context("cannot start the page (--view)")?))
+        // Ctrl-C is for the graph: the page shows its end.
+        command.stdin(Stdio::piped()).stdout(Stdio::piped()).process_group(0);
+        let mut page = Page(command.spawn().context("cannot start the page (--view)")?);
+        let mut address = String::new();
+        if let Some(stdout) = page.0.stdout.take() {
+            BufReader::new(stdout).read_line(&mut address).context("the page does not answer (--view)")?;
+        }
+        if address.is_empty() {
+            bail!("the page cannot be served (--view)");
+        }
+        Ok(page)
     }
 }
 
 impl Drop for Page {
     fn drop(&mut self) {
+        drop(self.0.stdin.take());
+        let limit = Instant::now() + PAGE_LIMIT;
+        while matches!(self.0.try_wait(), Ok(None)) && Instant::now() < limit {
+            std::thread::sleep(Duration::from_millis(10));
+        }
         // It may have ended by itself.
         let _ = self.0.kill();
         let _ = self.0.wait();

@@ -1,7 +1,7 @@
 //! The page of a running graph: the hand, the touch, the decisions and the graph itself, as they change.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -32,16 +32,24 @@ const MAX_PROBABILITIES: usize = 200;
 /// Labels of grasps that wait for their decision.
 const MAX_TRUTHS: usize = 256;
 
-/// Serves the page until the command is interrupted. A graph that ends may run again. With `waits`, it need not run yet.
+/// Serves the page until the command is interrupted. A graph that ends may run again. With `waits`, it need not run yet, and the
+/// end of stdin ends the page: the process that started it has gone.
 pub(super) fn show(graph: &str, port: u16, waits: bool) -> anyhow::Result<Outcome> {
     if machine_of(graph).is_some() {
         bail!("{graph}: the page shows graphs of this machine; run the command there, or use blindgrasp top {graph}");
     }
     let stop = stop_signal()?;
-    let is_interrupted = || stop.load(Ordering::Relaxed);
     // A graph that does not run is a mistake at the start only.
     let mut connection = if waits { None } else { Some(Connection::open(graph)?) };
-    let viewer = Viewer::serve(port)?;
+    let viewer = Viewer::serve(port, None)?;
+    if waits {
+        let stop = Arc::clone(&stop);
+        std::thread::spawn(move || {
+            let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+            stop.store(true, Ordering::Relaxed);
+        });
+    }
+    let is_interrupted = || stop.load(Ordering::Relaxed);
     let address = format!("http://{}", viewer.address());
     print_diagnostic(&format!("shows graph '{graph}' in a browser on this machine: {address}"));
     print_line(&address)?;
@@ -67,62 +75,87 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
         other => return Err(connection.unexpected(&other).into()),
     };
     let Attachment { domain, edges, graph, .. } = attachment;
-    let hand = hand_path(&graph).map(|path| Hand::load(&path)).transpose()?;
-    if let Some(hand) = &hand {
-        viewer.keep("scene", &serde_json::to_string(&HandScene::new(hand))?);
-    }
+    let hand = hand_of(&graph);
+    let (mut poller, mut before) = Poller::connect(connection.graph())?;
+    let first = graph_event(&before, None)?;
+    // Nothing of a run before stays.
+    viewer.forget("decision");
+    viewer.keep("scene", &serde_json::to_string(&hand.as_ref().map(HandScene::new))?);
     let edges = edges.into_iter().filter(|edge| can_observe(&edge.input.service.type_name));
     let edges = edges.map(|edge| ObservedEdge { topic: edge.topic, input: edge.input, is_prompt: false }).collect();
     let latest = Arc::new(Mutex::new(Latest::default()));
-    let observer = Observer::start_attached(&domain, edges, Reader { latest: Arc::clone(&latest) })
-        .context("cannot read the graph's edges")?;
-    let (mut poller, mut before) = Poller::connect(connection.graph())?;
+    let reader = Reader { latest: Arc::clone(&latest), hand_id: hand.as_ref().map(Hand::id) };
+    let observer = Observer::start_attached(&domain, edges, reader).context("cannot read the graph's edges")?;
     viewer.forget("ended");
-    viewer.keep("graph", &graph_event(&before, None)?);
+    viewer.keep("graph", &first);
     let mut graph_due = Instant::now() + GRAPH_PAUSE;
-    let ended = loop {
-        if is_interrupted() {
-            break Ok(());
-        }
-        match connection.receive_within(TICK) {
-            Ok(None) if observer.has_failed() => break Err(anyhow::anyhow!("the graph cannot be read any more")),
-            Ok(None) => {}
-            Ok(Some(Reply::Drained)) | Err(ClientError::Ended { .. }) => {
-                break Err(anyhow::anyhow!("graph '{}' has ended; waiting for it", connection.graph()));
-            }
-            Ok(Some(other)) => break Err(connection.unexpected(&other).into()),
-            Err(error) => break Err(error.into()),
-        }
-        let taken = std::mem::take(&mut *latest.lock().unwrap_or_else(PoisonError::into_inner));
+    let pass_on = || {
+        let mut locked = latest.lock().unwrap_or_else(PoisonError::into_inner);
+        let taken = std::mem::take(&mut *locked);
+        // Labels wait for decisions that come later.
+        locked.truths.clone_from(&taken.truths);
+        drop(locked);
         if let Some(decision) = taken.decisions.last() {
             viewer.keep("decision", &decision_event(decision, &taken.truths));
         }
-        // The labels wait for decisions that come later.
-        latest.lock().unwrap_or_else(PoisonError::into_inner).keep(&taken);
         if viewer.n_browsers() > 0
             && let Some(event) = frame_event(hand.as_ref(), taken)
         {
             viewer.send("frame", &event);
         }
+    };
+    let (ended, is_over) = loop {
+        if is_interrupted() {
+            break (Ok(()), false);
+        }
+        match connection.receive_within(TICK) {
+            Ok(None) if observer.has_failed() => {
+                break (Err(anyhow::anyhow!("the graph cannot be read any more")), false);
+            }
+            Ok(None) => {}
+            Ok(Some(Reply::Drained)) | Err(ClientError::Ended { .. }) => {
+                break (Err(anyhow::anyhow!("graph '{}' has ended; waiting for it", connection.graph())), true);
+            }
+            Ok(Some(other)) => break (Err(connection.unexpected(&other).into()), false),
+            Err(error) => break (Err(error.into()), false),
+        }
+        pass_on();
         if Instant::now() >= graph_due {
             graph_due = Instant::now() + GRAPH_PAUSE;
-            let now = match poller.look() {
-                Ok(now) => now,
-                Err(error) => break Err(error.into()),
-            };
-            viewer.keep("graph", &graph_event(&now, Some(&before))?);
-            before = now;
+            match poller
+                .look()
+                .map_err(anyhow::Error::from)
+                .and_then(|now| Ok((graph_event(&now, Some(&before))?, now)))
+            {
+                Ok((event, now)) => {
+                    viewer.keep("graph", &event);
+                    before = now;
+                }
+                Err(error) => break (Err(error), false),
+            }
         }
     };
-    drop(if ended.is_ok() { observer.leave() } else { observer.finish() });
+    // A graph that goes on has no end to wait for.
+    drop(if is_over { observer.finish() } else { observer.leave() });
+    pass_on();
     ended
 }
 
-/// The pad layout that a node of the graph reads.
-fn hand_path(graph: &Value) -> Option<PathBuf> {
+/// The hand of the first node with a pad layout. A layout that cannot be read is said, and the page is without a hand.
+fn hand_of(graph: &Value) -> Option<Hand> {
     let nodes = graph["nodes"].as_array()?;
-    nodes.iter().find_map(|node| node["params"]["hand"].as_str()).map(|path| Path::new(path).to_owned())
+    let path = nodes.iter().find_map(|node| node["params"]["hand"].as_str())?;
+    match Hand::load(Path::new(path)) {
+        Ok(hand) => Some(hand),
+        Err(error) => {
+            print_diagnostic(&format!("the page shows no hand: {:#}", anyhow::Error::from(error)));
+            None
+        }
+    }
 }
+
+/// A grasp: the source's epoch, and its number.
+type GraspKey = (u64, u64);
 
 /// The samples since the last tick.
 #[derive(Default)]
@@ -130,40 +163,38 @@ struct Latest {
     frame: Option<TactileFrame>,
     contacts: Option<ContactSet>,
     probabilities: Vec<f64>,
-    decisions: Vec<LiftDecision>,
-    /// Whether a grasp was stable, by its number.
-    truths: BTreeMap<u64, bool>,
-}
-
-impl Latest {
-    /// Takes over what still matters of an earlier tick.
-    fn keep(&mut self, earlier: &Latest) {
-        for (grasp_id, stable) in &earlier.truths {
-            self.truths.entry(*grasp_id).or_insert(*stable);
-        }
-        while self.truths.len() > MAX_TRUTHS {
-            self.truths.pop_first();
-        }
-    }
+    decisions: Vec<(GraspKey, LiftDecision)>,
+    /// Whether a grasp was stable.
+    truths: BTreeMap<GraspKey, bool>,
 }
 
 /// Reads a graph's edges. It takes each sample at once, so that no writer waits for a browser.
 struct Reader {
     latest: Arc<Mutex<Latest>>,
+    hand_id: Option<u64>,
 }
 
 impl Sink for Reader {
     fn take(&mut self, _topic: &str, record: Record, _received_nanos: u64) -> anyhow::Result<()> {
         let mut latest = self.latest.lock().unwrap_or_else(PoisonError::into_inner);
+        // A graph may have several hands: the page shows one. 0 stands for an unknown hand.
+        let is_shown = |hand_id: u64| hand_id == 0 || self.hand_id.is_none_or(|shown| shown == hand_id);
         match record {
-            Record::Tactile(sample) => latest.frame = Some(sample.message),
-            Record::Contacts(sample) => latest.contacts = Some(sample.message),
-            Record::Prediction(sample) if latest.probabilities.len() < MAX_PROBABILITIES => {
+            Record::Tactile(sample) if is_shown(sample.header.hand_id) => latest.frame = Some(sample.message),
+            Record::Contacts(sample) if is_shown(sample.header.hand_id) => latest.contacts = Some(sample.message),
+            Record::Prediction(sample)
+                if is_shown(sample.header.hand_id) && latest.probabilities.len() < MAX_PROBABILITIES =>
+            {
                 latest.probabilities.push(sample.message.probability_stable);
             }
-            Record::Decision(sample) => latest.decisions.push(sample.message),
+            Record::Decision(sample) if is_shown(sample.header.hand_id) => {
+                latest.decisions.push(((sample.header.epoch, sample.message.grasp_id), sample.message));
+            }
             Record::Truth(sample) => {
-                latest.truths.insert(sample.message.grasp_id, sample.message.stable);
+                latest.truths.insert((sample.header.epoch, sample.message.grasp_id), sample.message.stable);
+                if latest.truths.len() > MAX_TRUTHS {
+                    latest.truths.pop_first();
+                }
             }
             _ => {}
         }
@@ -171,41 +202,44 @@ impl Sink for Reader {
     }
 }
 
-fn decision_event(decision: &LiftDecision, truths: &BTreeMap<u64, bool>) -> String {
+/// Numbers of grasps are texts: JavaScript has no integers beyond 2^53.
+fn decision_event((key, decision): &(GraspKey, LiftDecision), truths: &BTreeMap<GraspKey, bool>) -> String {
     json!({
-        "grasp_id": decision.grasp_id, "action": decision.action, "reason": decision.reason,
-        "probability_stable": decision.probability_stable, "truth": truths.get(&decision.grasp_id),
+        "grasp_id": decision.grasp_id.to_string(), "action": decision.action, "reason": decision.reason,
+        "probability_stable": decision.probability_stable, "truth": truths.get(key),
     })
     .to_string()
 }
 
-/// `None` if there is nothing new. Of a frame that is not of this hand, only what needs no hand is told.
+/// `None` if there is nothing new.
 fn frame_event(hand: Option<&Hand>, latest: Latest) -> Option<String> {
     let Latest { frame, contacts, probabilities, decisions, .. } = latest;
     if frame.is_none() && probabilities.is_empty() && decisions.is_empty() {
         return None;
     }
-    let actions: Vec<_> = decisions.iter().map(|decision| decision.action).collect();
+    let actions: Vec<_> = decisions.iter().map(|(_, decision)| decision.action).collect();
     let mut event = json!({"probabilities": probabilities, "actions": actions});
-    if let (Some(hand), Some(frame)) = (hand, frame)
-        && let Ok(links) = link_poses(hand, &frame.joints_rad)
-    {
-        let contacts = contacts.filter(|contacts| contacts.grasp_id == frame.grasp_id);
-        let contacts = contacts.map_or_else(Vec::new, |contacts| contacts.contacts);
-        let contacts = contacts.iter().map(|contact| {
-            // The arrow shows the force on the object's side of the pad: along the outward normal.
-            [&contact.position_m[..], &contact.normal, &[contact.force_newtons]].concat()
-        });
-        event["grasp_id"] = frame.grasp_id.into();
-        event["phase"] = json!(frame.phase);
-        event["joints"] = json!(frame.joints_rad);
-        event["links"] = json!(links);
-        // JSON has no NaN: null stands for it.
-        event["cells"] = json!(frame.cells_newtons);
-        event["contacts"] = contacts.collect::<Vec<_>>().into();
-        event["gravity"] = if frame.gravity_m_per_s2.is_empty() { Value::Null } else { json!(frame.gravity_m_per_s2) };
+    if let (Some(hand), Some(frame)) = (hand, frame) {
+        add_frame(&mut event, hand, &frame, contacts.as_ref());
     }
     Some(event.to_string())
+}
+
+/// Adds a frame with the contacts of its grasp, unless its joints are not those of the hand.
+pub(super) fn add_frame(event: &mut Value, hand: &Hand, frame: &TactileFrame, contacts: Option<&ContactSet>) {
+    let Ok(links) = link_poses(hand, &frame.joints_rad) else { return };
+    let contacts = contacts.filter(|contacts| contacts.grasp_id == frame.grasp_id);
+    // Each as its point, the outward normal of its pad, and its force.
+    let contacts = contacts.into_iter().flat_map(|contacts| &contacts.contacts);
+    let contacts = contacts.map(|it| [&it.position_m[..], &it.normal, &[it.force_newtons]].concat());
+    event["grasp_id"] = frame.grasp_id.to_string().into();
+    event["phase"] = json!(frame.phase);
+    event["joints"] = json!(frame.joints_rad);
+    event["links"] = json!(links);
+    // JSON has no NaN: null stands for it.
+    event["cells"] = json!(frame.cells_newtons);
+    event["contacts"] = contacts.collect::<Vec<_>>().into();
+    event["gravity"] = if frame.gravity_m_per_s2.is_empty() { Value::Null } else { json!(frame.gravity_m_per_s2) };
 }
 
 fn graph_event(now: &Look, before: Option<&Look>) -> anyhow::Result<String> {

@@ -4,6 +4,7 @@ mod graph;
 mod grasp;
 mod hand;
 mod live;
+mod recorded;
 
 use std::path::{Path, PathBuf};
 
@@ -14,17 +15,18 @@ use clap::{Args, ValueEnum};
 use super::hand_cells::joint;
 use super::{Outcome, number_in};
 
-/// Show a running graph in a browser; draw a graph, a recorded grasp, or a hand.
+/// Show a graph or a recording in a browser; draw it, or a hand.
 ///
 /// The programs of a dataflow file are run with --describe: a foreign dataflow file is code.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp view grasp_gate\n         \
+                        blindgrasp view recordings/paper-recipe.mcap\n         \
                         blindgrasp view dataflow.yaml --out graph.svg\n         \
                         blindgrasp view --running --format mermaid\n         \
                         blindgrasp view recordings/held-out.mcap --grasp 3 --out grasp.html\n         \
                         blindgrasp view hands/allegro.yaml --out hand.html\n\n\
                         In a graph, 'run' is the launching command: it reads the decisions, and the label where a source knows it.\n\
-                        In a recording with /scene the object and all contacts are shown, in any other the active cells.")]
+                        In a picture of a recording with /scene the object and all contacts are shown, in any other the active cells.")]
 pub(super) struct Arguments {
     /// A running graph by its name; the dataflow file (YAML); the recording (MCAP); or a hand: its pad layout (YAML) or the name
     /// of a built-in one
@@ -33,7 +35,7 @@ pub(super) struct Arguments {
     /// Write to this file: .svg, .mmd or .dot for a graph, .svg or .html for a grasp or a hand
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Port of the page of a running graph, on 127.0.0.1 [default: any free one]
+    /// Port of the page of a running graph or a recording, on 127.0.0.1 [default: any free one]
     #[arg(long, value_name = "PORT", conflicts_with = "out")]
     port: Option<u16>,
     /// Wait for the graph, which is being started (run --view)
@@ -111,11 +113,15 @@ enum Format {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let (graph, grasp) = (&arguments.graph, &arguments.grasp);
-    if let Some(name) = graph_name(arguments) {
-        return live::show(name, arguments.port.unwrap_or(0), arguments.wait);
+    if arguments.wait {
+        return live::show(&arguments.file.to_string_lossy(), arguments.port.unwrap_or(0), true);
     }
-    if arguments.port.is_some() {
-        refuse("--port is for the page of a running graph: name the graph");
+    if let Some(name) = graph_name(arguments) {
+        return live::show(name, arguments.port.unwrap_or(0), false);
+    }
+    let is_recording = arguments.file.extension().is_some_and(|extension| extension == "mcap");
+    if arguments.port.is_some() && !is_recording {
+        refuse("--port is for the page of a running graph or a recording: name one");
     }
     if graph.running.is_none() && hand::is_hand(&arguments.file) {
         let Some(out) = &arguments.out else {
@@ -135,10 +141,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if !graph.overrides.is_empty() || graph.machine.is_some() || graph.format.is_some() || graph.json {
         refuse("--set, --machine, --format and --json are for graphs: name a dataflow file (.yaml)");
     }
-    let Some(out) = &arguments.out else {
-        refuse("--out is missing: name the picture of the grasp, .svg or .html");
-    };
-    grasp::draw(&arguments.file, out, grasp)
+    match &arguments.out {
+        Some(out) => grasp::draw(&arguments.file, out, grasp),
+        None => recorded::show(&arguments.file, arguments.port.unwrap_or(0), grasp),
+    }
 }
 
 /// The name of a running graph, if the argument is one.

@@ -1,0 +1,195 @@
+//! The page of a recording: its grasps with their decisions, each frame by frame.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use anyhow::bail;
+use blindgrasp_learning::dataset::hand_of;
+use blindgrasp_messages::{Action, ContactSet, GraspTruth, LiftDecision, Recorded as _, TactileFrame};
+use blindgrasp_objects::find_mesh;
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_pictures::{HandScene, ObjectScene};
+use blindgrasp_recording::{ChosenSamples, Reach, Record};
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_viewer::{Grasps, Viewer};
+use serde::Serialize;
+use serde_json::{Value, json};
+
+use super::super::{Outcome, print_line, stop_signal};
+use super::GraspArguments;
+use super::live::add_frame;
+
+const POLL: Duration = Duration::from_millis(100);
+/// Of a grasp with more frames, every nth is shown: a robot may hold an object for minutes.
+const MAX_FRAMES: u64 = 2000;
+/// And with more readings of cells in all.
+const MAX_READINGS: u64 = 2_000_000;
+
+/// Samples that belong to a frame are written at most so much later, by the recorded time: operators may be far behind a source
+/// that sends as fast as it can.
+const BEHIND_NANOS: u64 = 60_000_000_000;
+
+/// A grasp in the list of the page.
+#[derive(Debug, Clone, Serialize)]
+struct Listed {
+    /// Its number, as text: JavaScript has no integers beyond 2^53.
+    id: String,
+    n_frames: u64,
+    action: Option<Action>,
+    reason: Option<&'static str>,
+    probability_stable: Option<f64>,
+    /// Whether it was stable, if the recording tells.
+    truth: Option<bool>,
+    object: String,
+    #[serde(skip)]
+    stamps_nanos: [u64; 2],
+}
+
+/// Serves the page until the command is interrupted.
+pub(super) fn show(recording: &Path, port: u16, arguments: &GraspArguments) -> anyhow::Result<Outcome> {
+    let stop = stop_signal()?;
+    let hand = hand_of(recording, arguments.hand.as_deref())?;
+    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
+    let list = list(recording)?;
+    if list.is_empty() {
+        bail!("{} holds no frames on /tactile: there is no grasp to show", recording.display());
+    }
+    let first = match arguments.grasp {
+        None => 0,
+        Some(id) => list.keys().position(|known| *known == id).ok_or_else(|| {
+            anyhow::anyhow!("{} has no grasp {id}: it has {} grasps", recording.display(), list.len())
+        })?,
+    };
+    let scene = serde_json::to_string(&HandScene::new(&hand))?;
+    let about =
+        json!({"file": recording.display().to_string(), "first": first, "grasps": list.values().collect::<Vec<_>>()});
+    let reading = Reading { recording: recording.into(), objects: arguments.objects.clone(), hand, list };
+    let grasps: Grasps = Box::new(move |idx| reading.grasp(idx).map_err(|error| format!("{error:#}")));
+    let viewer = Viewer::serve(port, Some(grasps))?;
+    viewer.keep("scene", &scene);
+    viewer.keep("recording", &about.to_string());
+    let address = format!("http://{}", viewer.address());
+    print_diagnostic(&format!("shows {} in a browser on this machine: {address}", recording.display()));
+    print_line(&address)?;
+    while !stop.load(Ordering::Relaxed) {
+        std::thread::sleep(POLL);
+    }
+    Ok(Outcome::Done)
+}
+
+/// The grasps of a recording by number.
+fn list(recording: &Path) -> anyhow::Result<BTreeMap<u64, Listed>> {
+    let wanted =
+        |_: &str, schema: &str| [TactileFrame::SCHEMA, GraspTruth::SCHEMA, LiftDecision::SCHEMA].contains(&schema);
+    let mut samples = ChosenSamples::open(recording, Box::new(wanted), Reach::ByIndex)?;
+    let mut list: BTreeMap<u64, Listed> = BTreeMap::new();
+    while let Some(sample) = samples.advance()? {
+        let stamp = sample.header.stamp_nanos;
+        let grasp = list.entry(sample.grasp_id).or_insert_with(|| Listed {
+            id: sample.grasp_id.to_string(),
+            n_frames: 0,
+            action: None,
+            reason: None,
+            probability_stable: None,
+            truth: None,
+            object: String::new(),
+            stamps_nanos: [stamp; 2],
+        });
+        grasp.stamps_nanos = [grasp.stamps_nanos[0].min(stamp), grasp.stamps_nanos[1].max(stamp)];
+        if sample.schema == TactileFrame::SCHEMA {
+            grasp.n_frames += 1;
+            continue;
+        }
+        match samples.decode(&sample)? {
+            Record::Truth(truth) => {
+                grasp.truth = Some(truth.message.stable);
+                grasp.object = truth.message.object;
+            }
+            Record::Decision(decision) => {
+                grasp.action = Some(decision.message.action);
+                grasp.reason = Some(decision.message.reason.as_str());
+                grasp.probability_stable = Some(decision.message.probability_stable);
+            }
+            _ => {}
+        }
+    }
+    list.retain(|_, grasp| grasp.n_frames > 0);
+    Ok(list)
+}
+
+/// A recording whose grasps are read one by one.
+struct Reading {
+    recording: PathBuf,
+    objects: Option<PathBuf>,
+    hand: Hand,
+    list: BTreeMap<u64, Listed>,
+}
+
+/// The samples of a grasp.
+#[derive(Default)]
+struct Samples {
+    /// Number and stamp of each, and the frame.
+    frames: Vec<(u64, u64, TactileFrame)>,
+    contacts: BTreeMap<u64, ContactSet>,
+    probabilities: BTreeMap<u64, f64>,
+    object: Option<ObjectScene>,
+}
+
+impl Reading {
+    /// The frames of a grasp, with contacts and probability where the recording has them, and the object.
+    fn grasp(&self, idx: usize) -> anyhow::Result<String> {
+        let Some((id, listed)) = self.list.iter().nth(idx) else { bail!("there are {} grasps", self.list.len()) };
+        let most = MAX_FRAMES.min(MAX_READINGS / self.hand.n_cells().max(1) as u64).max(1);
+        let step = listed.n_frames.div_ceil(most).max(1);
+        let Samples { frames, contacts, probabilities, object } = self.samples(*id, listed, step)?;
+        let start_nanos = frames.first().map_or(0, |(_, stamp, _)| *stamp);
+        let events = frames.iter().map(|(seq, stamp, frame)| {
+            let mut event = json!({
+                "since_start_ms": stamp.saturating_sub(start_nanos) as f64 / 1e6,
+                "probability": probabilities.get(seq),
+            });
+            add_frame(&mut event, &self.hand, frame, contacts.get(seq));
+            event
+        });
+        let events: Vec<Value> = events.collect();
+        Ok(json!({"step": step, "frames": events, "object": object}).to_string())
+    }
+
+    /// Every `step`th frame of a grasp, and what belongs to these.
+    fn samples(&self, id: u64, listed: &Listed, step: u64) -> anyhow::Result<Samples> {
+        let mesh = if listed.object.is_empty() { None } else { find_mesh(&listed.object, self.objects.as_deref())? };
+        let mut samples = ChosenSamples::open(&self.recording, Box::new(|_, _| true), Reach::ByIndex)?;
+        samples.skip_to(listed.stamps_nanos[0]);
+        let (mut found, mut n_frames) = (Samples::default(), 0_u64);
+        while let Some(sample) = samples.advance()? {
+            let is_past = sample.header.stamp_nanos > listed.stamps_nanos[1].saturating_add(BEHIND_NANOS);
+            if n_frames == listed.n_frames && is_past {
+                break;
+            }
+            if sample.grasp_id != id {
+                continue;
+            }
+            n_frames += u64::from(sample.schema == TactileFrame::SCHEMA);
+            // By number: contacts and predictions may be written before their frame.
+            let is_chosen = sample.header.seq % step == 0;
+            match samples.decode(&sample)? {
+                Record::Tactile(frame) if is_chosen => {
+                    found.frames.push((frame.header.seq, frame.header.stamp_nanos, frame.message));
+                }
+                Record::Contacts(contacts) if is_chosen => {
+                    found.contacts.insert(contacts.header.seq, contacts.message);
+                }
+                Record::Prediction(prediction) if is_chosen => {
+                    found.probabilities.insert(prediction.header.seq, prediction.message.probability_stable);
+                }
+                Record::Scene(scene) => {
+                    found.object = mesh.as_ref().map(|mesh| ObjectScene::new(mesh, &scene.message));
+                }
+                _ => {}
+            }
+        }
+        Ok(found)
+    }
+}
