@@ -117,7 +117,9 @@ fn drawings_that_are_impossible_are_refused() {
     check(&["view", RECORDING, "--out", &at("")], 1, &["is a folder"]);
     check(&["view", RECORDING, "--out", &at("absent/a.svg")], 1, &["no such folder"]);
     check(&["view", "absent.mcap", "--out", &at("a.svg")], 1, &["absent.mcap"]);
-    check(&["view", RECORDING], 2, &["--out"]);
+    // Without --out the recording is served, if it can be.
+    check(&["view", "absent.mcap"], 1, &["absent.mcap"]);
+    check(&["view", RECORDING, "--grasp", "99999"], 1, &["no grasp 99999"]);
     assert!(!Path::new(&at("a.svg")).exists());
     // A hand with another pad is not the recording's.
     let layout = std::fs::read_to_string(project().join("hands/barrett-bh8-280.yaml")).expect("readable");
