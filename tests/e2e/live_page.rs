@@ -149,7 +149,7 @@ fn a_browser_shows_a_graph_as_it_runs() {
     }
     assert!(browser.ask("blindgrasp.renderer.info.render.triangles").as_u64() > Some(500));
 
-    // What is written.
+    // The texts of the page.
     let decision = browser.text("action");
     assert!(["lift", "hold"].contains(&decision.as_str()), "{decision}");
     assert!(browser.text("why").contains("probability 0."), "{}", browser.text("why"));

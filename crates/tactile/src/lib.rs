@@ -22,6 +22,7 @@ pub mod open_hand;
 pub mod phases;
 pub mod replay;
 pub mod ros2;
+mod ros2_cells;
 pub mod stream;
 mod transforms;
 pub mod zenoh_key;

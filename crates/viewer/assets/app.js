@@ -7,12 +7,12 @@ import {
 const byId = (id) => document.getElementById(id);
 const CHART_SECS = 20;
 const MAX_CONTACTS = 64;
-// A screen reader is told a decision at most so often.
+// The least time between two decisions that a screen reader says.
 const SPOKEN_MS = 2000;
 // The graph tells its state each second: after this time without it, the page says so.
 const SILENT_MS = 3000;
 
-// What is shown, for tests and for the curious.
+// The present state, which tests read.
 const shown = (window.blindgrasp = { server: null, scene: null, frame: null, decision: null, graph: null, dropped: 0, frames: 0, cellColours: [] });
 
 // --- the hand
@@ -87,7 +87,7 @@ const hand = (() => {
     const side = new Vector3().crossVectors(camera.up, offset).normalize();
     offset.applyAxisAngle(camera.up, right);
     const tilted = offset.clone().applyAxisAngle(side, up);
-    // Not over the pole.
+    // The camera does not pass over the pole.
     if (Math.abs(tilted.clone().normalize().z) < 0.99) offset.copy(tilted);
     camera.position.copy(controls.target).add(offset);
     controls.update();
@@ -221,7 +221,8 @@ const showFrame = (frame) => {
   shown.cellColours = frame.cells.map(cellColour);
   hand.show(frame, shown.cellColours);
   byId("moment").textContent = `grasp ${frame.grasp_id}, ${frame.phase}`;
-  byId("scale").textContent = `(darkest cell: ${largest} ${scene.cell_unit})`;
+  const more = frame.contacts.length > MAX_CONTACTS ? `; ${MAX_CONTACTS} of ${frame.contacts.length} contacts have an arrow` : "";
+  byId("scale").textContent = `(the colours end at ${largest} ${scene.cell_unit}${more})`;
   scene.pads.forEach((pad, idx) => {
     const cells = frame.cells.slice(pad.first_cell, pad.first_cell + pad.n_cells);
     const active = cells.filter((newtons, n) => newtons !== null && newtons > scene.cells[pad.first_cell + n].threshold_newtons);
@@ -474,7 +475,7 @@ const showGraph = (graph) => {
   cut(byId("edges"), graph.edges.length);
 };
 
-// --- ages: what is old must not look as if it were present
+// --- ages: an old state must not look like the present one
 let graphAt = null, frameAt = null, decidedAt = null;
 const age = (at) => (at === null ? "" : `, ${Math.max(0, (performance.now() - at) / 1000).toFixed(0)} s ago`);
 setInterval(() => {

@@ -45,8 +45,8 @@ pub enum ViewerError {
     Listen { port: u16, source: std::io::Error },
 }
 
-/// Answers the page's question for a grasp of a recording by its place in the list: JSON, or the reason why there is none. It is
-/// asked one question at a time.
+/// Gives a grasp of a recording as JSON, by its place in the list of grasps, or the reason for its lack. Only one call runs at a
+/// time.
 pub type Grasps = Box<dyn FnMut(usize) -> Result<String, String> + Send>;
 
 /// A page that is being served until the process ends.
@@ -93,7 +93,7 @@ impl Viewer {
             .layer(middleware::from_fn(guard));
         std::thread::spawn(move || runtime.block_on(async { axum::serve(listener, pages).await }));
         let viewer = Viewer { shared, address };
-        // A page that finds another server behind the same address begins anew.
+        // A page reloads if another server answers at its address.
         let started = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
         viewer.keep("server", &format!("\"{started}\""));
         Ok(viewer)
@@ -110,7 +110,7 @@ impl Viewer {
 
     /// Sends an event with JSON to all browsers.
     pub fn send(&self, name: &'static str, json: &str) {
-        // Without browsers nobody misses it.
+        // It fails without browsers, which is no loss.
         let _ = self.shared.events.send(event(name, json));
     }
 

@@ -56,7 +56,7 @@ pub(super) fn show(graph: &str, port: u16, waits: bool) -> anyhow::Result<Outcom
     let say = |message: &str| viewer.keep("ended", &json!(message).to_string());
     say(&format!("waits for graph '{graph}'"));
     while !is_interrupted() {
-        // It may not run yet, or not any more.
+        // The graph may not run at this moment.
         if let Ok(connection) = connection.take().map_or_else(|| Connection::open(graph), Ok)
             && let Err(error) = watch(connection, &viewer, &is_interrupted)
         {
@@ -78,7 +78,7 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
     let hand = hand_of(&graph);
     let (mut poller, mut before) = Poller::connect(connection.graph())?;
     let first = graph_event(&before, None)?;
-    // Nothing of a run before stays.
+    // The decision and the hand of an earlier run are not shown any more.
     viewer.forget("decision");
     viewer.keep("scene", &serde_json::to_string(&hand.as_ref().map(HandScene::new))?);
     let edges = edges.into_iter().filter(|edge| can_observe(&edge.input.service.type_name));
