@@ -123,6 +123,31 @@ fn a_graph_that_is_stopped_on_probation_loses_nothing() {
     assert_eq!(ended.summary["restarts"], 1, "{}", ended.stderr);
 }
 
+/// The reader finds the samples of the new instance first, and those of the old one only when that gets the processor again.
+#[test]
+fn a_reader_that_is_started_again_waits_for_an_old_instance_that_stands_still() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let slow = of_node("classifier", &["heartbeat_ms: 60000"]);
+    let flow = dataflow_with(folder.path(), &[of_node("lift_arbiter", &["heartbeat_ms: 1000"]), slow]);
+    let slow = ["--set", "recorded_source.rate=2", "--set", "recorded_source.repeat=forever", "--wait-limit", "30"];
+    let graph = Graph::start(&flow, &slow);
+    let (old, arbiter) = (graph.pid_of("classifier"), graph.pid_of("lift_arbiter"));
+    signal(arbiter, Signal::STOP);
+    let mut swapping = blindgrasp();
+    swapping.args(["swap", "classifier", "--probation", "30", "--graph", &graph.name]);
+    let mut swapping = swapping.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("started");
+    wait_until(|| graph.pid_of("classifier") != old, || format!("no probation: {}", graph.said()));
+    signal(old, Signal::STOP);
+    let is_back = || graph.node("lift_arbiter")["state"] == "running" && graph.pid_of("lift_arbiter") != arbiter;
+    wait_until(is_back, || format!("not started again: {}", graph.said()));
+    std::thread::sleep(Duration::from_millis(300));
+    signal(old, Signal::CONT);
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    let ended = graph.stop();
+    swapping.wait().expect("waited");
+    ended.assert_undisturbed("a reader that was started again while an old instance stood still");
+}
+
 #[test]
 fn an_operator_can_be_swapped_at_ten_thousand_frames_a_second() {
     let folder = tempfile::tempdir().expect("a folder");

@@ -13,6 +13,9 @@ use crate::wiring::InputCounts;
 
 /// An early sample waits at most this long for those before it.
 pub const HOLD_LIMIT: Duration = Duration::from_millis(50);
+/// In its first time, a reader waits longer: each publisher gives it the samples that it kept once it has noticed the reader,
+/// and on a busy machine one publisher can be much later than another.
+pub const START_HOLD_LIMIT: Duration = Duration::from_secs(2);
 /// The number of publishers whose last sample is remembered: more than there can be at a time.
 const N_PUBLISHERS: usize = 16;
 
@@ -37,6 +40,8 @@ pub struct Sequencer<T> {
     held: BTreeMap<Place, (T, Instant)>,
     /// Whether samples wait for those before them at all.
     may_hold: bool,
+    /// Early samples wait at least until then.
+    patient_until: Option<Instant>,
     counts: InputCounts,
 }
 
@@ -62,6 +67,7 @@ impl<T> Sequencer<T> {
             publishers: VecDeque::new(),
             held: BTreeMap::new(),
             may_hold: true,
+            patient_until: None,
             counts: InputCounts::default(),
         }
     }
@@ -89,6 +95,11 @@ impl<T> Sequencer<T> {
     /// The order of an edge on which samples may be dropped: no sample waits for those before it.
     pub fn without_waiting(self) -> Self {
         Sequencer { may_hold: false, ..self }
+    }
+
+    /// The order of a reader that was connected at `start`.
+    pub fn beginning_at(self, start: Instant) -> Self {
+        Sequencer { patient_until: Some(start + START_HOLD_LIMIT), ..self }
     }
 
     pub fn counts(&self) -> InputCounts {
@@ -172,8 +183,7 @@ impl<T> Sequencer<T> {
     /// The next held sample, if its wait is over. Ask for it only when no more samples have come: after a long stop, the
     /// samples that it waits for may lie in the queue.
     pub fn next_overdue(&mut self, now: Instant) -> Option<T> {
-        let (_, (_, since)) = self.held.first_key_value()?;
-        if now.duration_since(*since) < HOLD_LIMIT {
+        if now < self.deadline()? {
             return None;
         }
         self.first_held()
@@ -210,7 +220,9 @@ impl<T> Sequencer<T> {
 
     /// When the wait of the next held sample is over.
     pub fn deadline(&self) -> Option<Instant> {
-        self.held.first_key_value().map(|(_, (_, since))| *since + HOLD_LIMIT)
+        let (_, (_, since)) = self.held.first_key_value()?;
+        let deadline = *since + HOLD_LIMIT;
+        Some(self.patient_until.map_or(deadline, |patient_until| deadline.max(patient_until)))
     }
 
     pub fn n_held(&self) -> usize {
@@ -408,6 +420,23 @@ mod tests {
         delivered.extend(std::iter::from_fn(|| sequencer.next_in_order()));
         assert_eq!(delivered, (0..60).collect::<Vec<u64>>());
         assert_eq!((sequencer.counts().n_missing, sequencer.counts().n_repeated), (0, 0));
+    }
+
+    #[test]
+    fn a_reader_that_has_just_come_waits_longer_for_a_publisher_that_has_not_noticed_it() {
+        let start = Instant::now();
+        let mut sequencer = Sequencer::resume(None, None, InputCounts::default()).beginning_at(start);
+        let id = |seq| SampleId { epoch: EPOCH, seq };
+        assert_eq!(sequencer.push(5, id(5), 2, || true, || start), Verdict::Hold);
+        assert_eq!(sequencer.next_overdue(start + 2 * HOLD_LIMIT), None);
+        for seq in 0..5 {
+            assert_eq!(sequencer.push(seq, id(seq), 1, || true, || start), Verdict::Deliver(seq));
+        }
+        assert_eq!(sequencer.next_in_order(), Some(5));
+        // The first sample of a third publisher comes long after the start.
+        let later = start + START_HOLD_LIMIT;
+        assert_eq!(sequencer.push(8, id(8), 3, || true, || later), Verdict::Hold);
+        assert_eq!(sequencer.next_overdue(later + HOLD_LIMIT), Some(8));
     }
 
     /// A standby has opened its publisher and sends nothing: the gaps of the other publisher are gaps.

@@ -72,11 +72,13 @@ impl<M: Message> Subscriber<M> {
     }
 
     fn begin_with(&mut self, sequencer: Sequencer<PortSample<M>>) {
+        let now = Instant::now();
+        let sequencer = sequencer.beginning_at(now);
         let sequencer = if self.may_hold { sequencer } else { sequencer.without_waiting() };
         let before = std::mem::replace(&mut self.sequencer, sequencer);
         // Samples that this reader has received and not answered exist nowhere else any more.
         let put_back = self.put_back.take().map(|(key, sample)| (key, sample.copied()));
-        self.sequencer.hold_again(before, put_back, Instant::now());
+        self.sequencer.hold_again(before, put_back, now);
     }
 
     /// Connects to its publishers; false if there is none yet.
