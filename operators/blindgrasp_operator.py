@@ -51,6 +51,7 @@ WIRING_VARIABLE = "BLINDGRASP_WIRING"
 TICK_NANOS = 100_000_000
 # An early sample waits so long for those before it.
 HOLD_LIMIT_NANOS = 50_000_000
+START_HOLD_LIMIT_NANOS = 2_000_000_000
 # A writer that waits for its readers sleeps so long between looks, and looks so often for readers that have come back.
 RETRY_PAUSE_SECS = 50e-6
 LOOK_PAUSE_NANOS = 1_000_000
@@ -552,6 +553,8 @@ class _Sequencer:
     def __init__(self, may_hold: bool) -> None:
         """The order of a reader that begins with whatever sample comes first."""
         self.may_hold = may_hold
+        # In its first time, a reader waits longer: each publisher gives it the samples that it kept once it has noticed the reader.
+        self.patient_until = _now_nanos() + START_HOLD_LIMIT_NANOS
         self.epochs: list[int] = []
         self.last: Key | None = None
         self.answered: Key | None = None
@@ -630,7 +633,7 @@ class _Sequencer:
         self.held.update({place: (sample, now) for place, sample in places if last is None or place > last})
 
     def deadline(self) -> int | None:
-        return self.held[min(self.held)][1] + HOLD_LIMIT_NANOS if self.held else None
+        return max(self.held[min(self.held)][1] + HOLD_LIMIT_NANOS, self.patient_until) if self.held else None
 
     def _n_before(self, place: Key) -> int:
         """The number of samples before this place, which is after the last one, that have not come."""
