@@ -123,8 +123,8 @@ fn a_browser_shows_a_graph_as_it_runs() {
 
     // The posture, as three.js draws it, is that of a frame of the recording; so are the colours of the cells.
     let shown = browser.ask(
-        "(({ frame, meshes, cellColours, scene, colouredCells }) => ({ frame, cellColours, silent: scene.silent_colour, \
-         meshes: meshes.map((mesh) => [...mesh.matrix.elements]), drawn: colouredCells() }))(blindgrasp)",
+        "(({ frame, hand, cellColours, scene }) => ({ frame, cellColours, silent: scene.silent_colour, \
+         meshes: hand.meshes().map((mesh) => [...mesh.matrix.elements]), drawn: hand.colouredCells() }))(blindgrasp)",
     );
     let frame = &shown["frame"];
     let recorded = RecordingReader::open(&project().join(RECORDING)).expect("a recording").find_map(|record| {
@@ -147,7 +147,7 @@ fn a_browser_shows_a_graph_as_it_runs() {
         let drawn = numbers(&shown["drawn"][idx]);
         assert!(wanted.iter().zip(&drawn).all(|(a, b)| (a - b).abs() < 0.01), "cell {idx}: {drawn:?}, {wanted:?}");
     }
-    assert!(browser.ask("blindgrasp.renderer.info.render.triangles").as_u64() > Some(500));
+    assert!(browser.ask("blindgrasp.hand.renderer.info.render.triangles").as_u64() > Some(500));
 
     // The texts of the page.
     let decision = browser.text("action");
@@ -257,9 +257,42 @@ fn a_browser_shows_the_grasps_of_a_recording() {
     let mut browser = Browser::open(&address);
     browser.wait_until("blindgrasp.player.frames.length > 0 && blindgrasp.frame !== null");
     assert!(browser.text("state").ends_with("grasps, no decisions in the recording"), "{}", browser.text("state"));
-    assert!(browser.ask("blindgrasp.object().triangles").as_u64() > Some(10));
+    assert!(browser.ask("blindgrasp.hand.objectTriangles()").as_u64() > Some(10));
     let wrong = run(&["view", path, "--grasp", "99999"], 1);
     assert!(String::from_utf8_lossy(&wrong.stderr).contains("has no grasp 99999"));
+}
+
+/// One file, opened from the disk: the same hand, drawn by the same code.
+#[test]
+fn the_page_of_a_picture_draws_the_grasp() {
+    if !Path::new("/usr/bin/chromedriver").exists() {
+        return skipped("no chromium-driver: scripts/test installs it on Debian");
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let page = folder.path().join("grasp.html");
+    let page = page.to_str().expect("UTF-8");
+    run(&["view", project().join(RECORDING).to_str().expect("UTF-8"), "--out", page], 0);
+    let mut browser = Browser::open(&format!("file://{page}"));
+    browser.wait_until("typeof blindgrasp === 'object' && document.getElementById('when').textContent !== ''");
+    browser.wait_until("blindgrasp.hand.renderer.info.render.triangles > 500");
+    assert!(browser.ask("blindgrasp.hand.objectTriangles()").as_u64() > Some(10));
+    let n_contacts = browser.ask("document.querySelectorAll('table .badge').length").as_u64().expect("a number");
+    assert!(n_contacts > 2);
+    let n_numbers =
+        "[...document.querySelectorAll('#numbers span')].filter((it) => it.style.left !== '' && !it.hidden)";
+    browser.wait_until(&format!("{n_numbers}.length === {n_contacts}"));
+    let drawn = browser.ask("JSON.stringify(blindgrasp.hand.colouredCells())");
+    if let Ok(path) = std::env::var("BLINDGRASP_PICTURE") {
+        browser.ask("document.getElementById('stage').scrollIntoView()");
+        browser.ask(&format!("picture {path}.sheet.png"));
+    }
+    // Its first frame is of the open hand.
+    browser.ask("document.getElementById('frame').value = 0");
+    browser.ask("document.getElementById('frame').dispatchEvent(new Event('input'))");
+    assert_eq!(browser.ask(&format!("{n_numbers}.length")), 0);
+    assert_ne!(browser.ask("JSON.stringify(blindgrasp.hand.colouredCells())"), drawn);
+    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
+    assert_eq!(browser.ask("errors"), Value::Array(vec![]));
 }
 
 #[test]

@@ -2,69 +2,38 @@
 
 use std::fmt::Write;
 
-use nalgebra::{Isometry3, Point3};
 use serde::Serialize;
 
 use super::PictureError;
-use super::colour::{HAND, OBJECT, Rgb, SILENT_CELL, bytes, force_colour, lightness};
-use super::geometry::link_mesh;
+use super::colour::{Rgb, force_colour, lightness};
 use super::grasp::{ContactKind, Placed, RecordedGrasp};
 use super::grasp_picture::{VIEW, draw, page_title, style};
 use super::pads::draw_pads;
-use super::scene::{cells, pads};
+use super::scene::{HandScene, N_COLOURS, ObjectScene, STAGE_JS, THREE_JS, link_poses, point, rounded};
 use super::svg::{Svg, escape};
 use super::view::{Surfaces, choose_cameras};
-use blindgrasp_objects::mesh::Mesh;
 use blindgrasp_stages::hand::Hand;
 
-const SCRIPT: &str = include_str!("viewer.js");
-const STYLE: &str = include_str!("viewer.css");
+const SCRIPT: &str = include_str!("../assets/sheet.js");
+const STYLE: &str = include_str!("../assets/sheet.css");
 /// More frames than this are thinned out evenly: a robot's recording may hold minutes.
 const MOST_FRAMES: usize = 150;
-/// Colours of the force scale.
-const N_COLOURS: usize = 64;
 
-/// What the page's script draws from. Lengths in metres, to hundredths of a millimetre.
+/// The page's script draws from this. Lengths in metres, to hundredths of a millimetre.
 #[derive(Serialize)]
 struct Data<'a> {
-    links: Vec<Surface>,
-    cells: Vec<CellData>,
-    pads: Vec<PadData>,
-    object: Option<Surface>,
+    #[serde(flatten)]
+    scene: HandScene,
+    object: Option<ObjectScene>,
     contacts: Vec<ContactData<'a>>,
     frames: Vec<FrameData<'a>>,
     /// The frame that the picture shows.
     shown: usize,
-    /// From which side it is looked at first.
+    /// The side from which it is looked at first.
     azimuth_rad: f64,
     scale_newtons: f64,
-    /// What readings are in.
-    cell_unit: &'static str,
-    colours: Vec<[u8; 3]>,
     /// From this colour on, writing on it is white.
     first_dark_colour: usize,
-    hand_colour: [u8; 3],
-    object_colour: [u8; 3],
-    silent_colour: [u8; 3],
-}
-
-#[derive(Serialize)]
-pub(super) struct Surface {
-    positions_m: Vec<f64>,
-    triangles: Vec<u32>,
-}
-
-#[derive(Serialize)]
-pub(super) struct CellData {
-    pub(super) link: usize,
-    pub(super) corners_m: Vec<f64>,
-    pub(super) threshold_newtons: f64,
-}
-
-#[derive(Serialize)]
-pub(super) struct PadData {
-    pub(super) first_cell: usize,
-    pub(super) n_cells: usize,
 }
 
 #[derive(Serialize)]
@@ -79,9 +48,8 @@ struct ContactData<'a> {
 struct FrameData<'a> {
     since_start_ms: f64,
     phase: &'a str,
-    /// Of each link: the upper three rows of `palm_from_link`, row by row.
-    palm_from_links: Vec<Vec<f64>>,
-    cells_newtons: Vec<Option<f64>>,
+    links: Vec<Vec<f64>>,
+    cells: Vec<Option<f64>>,
 }
 
 /// A grasp as an HTML page that needs nothing else.
@@ -102,16 +70,18 @@ pub fn grasp_html(hand: &Hand, grasp: &RecordedGrasp) -> Result<String, PictureE
     Ok(format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>{title}</title>\n\
-         <style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n<figure>\n{picture}</figure>\n\
+         <style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n<h1>{title}</h1>\n<figure>\n{picture}</figure>\n\
          <section>\n<h2>To turn</h2>\n<div class=\"scene\">\n\
          <div class=\"stage\"><canvas id=\"stage\" tabindex=\"0\" aria-label=\"the hand in three dimensions\"></canvas>\
-         <div id=\"numbers\"></div><p id=\"without-webgl\" hidden>This browser has no WebGL 2: the view to turn cannot be \
+         <div id=\"numbers\"></div><p id=\"without-webgl\" hidden>This browser has no WebGL: the view to turn cannot be \
          shown.</p></div>\n<div id=\"pads\">{pads}</div>\n</div>\n\
          <div class=\"time\"><button id=\"play\" type=\"button\">Play</button>\
          <input id=\"frame\" type=\"range\" min=\"0\" step=\"1\" aria-label=\"frame\"><output id=\"when\"></output></div>\n\
-         <p class=\"hint\">Drag or arrow keys: turn. Ctrl + wheel, + and −: zoom. Double click: back.{}</p>\n\
+         <p class=\"hint\">Drag or arrow keys: turn. Wheel, + and −: zoom. Double click: back.{}</p>\n\
          </section>\n{}</main>\n<script type=\"application/json\" id=\"grasp\">{}</script>\n\
-         <script>\n{SCRIPT}</script>\n</body>\n</html>\n",
+         <script type=\"text/plain\" id=\"three.js\">{THREE_JS}</script>\n\
+         <script type=\"text/plain\" id=\"stage.js\">{STAGE_JS}</script>\n\
+         <script type=\"module\">\n{SCRIPT}</script>\n</body>\n</html>\n",
         if placed.object_in_palm.is_some() { " The object is shown where the grasp ends." } else { "" },
         contact_table(&placed),
         // A name in the data must not end the script.
@@ -131,14 +101,13 @@ fn data<'a>(placed: &'a Placed<'_>, azimuth_rad: f64) -> Result<Data<'a>, Pictur
         .iter()
         .map(|idx| {
             let frame = &all[*idx];
-            let palm_from_links = hand
-                .palm_from_links(&frame.message.joints_rad)
+            let links = link_poses(hand, &frame.message.joints_rad)
                 .map_err(|source| PictureError::Joints { grasp_id: placed.grasp.grasp_id, source })?;
             Ok(FrameData {
                 since_start_ms: frame.header.stamp_nanos.saturating_sub(start_nanos) as f64 / 1e6,
                 phase: frame.message.phase.as_str(),
-                palm_from_links: palm_from_links.iter().map(rows).collect(),
-                cells_newtons: frame
+                links,
+                cells: frame
                     .message
                     .cells_newtons
                     .iter()
@@ -147,12 +116,11 @@ fn data<'a>(placed: &'a Placed<'_>, azimuth_rad: f64) -> Result<Data<'a>, Pictur
             })
         })
         .collect::<Result<_, PictureError>>()?;
-    let colours: Vec<Rgb> = (0..N_COLOURS).map(|idx| force_colour(idx as f64 / (N_COLOURS - 1) as f64)).collect();
+    let is_dark = |colour: Rgb| lightness(colour) < super::pads::DARK;
+    let mut scale = (0..N_COLOURS).map(|idx| force_colour(idx as f64 / (N_COLOURS - 1) as f64));
     Ok(Data {
-        links: hand.links.iter().map(|link| surface(&link_mesh(link))).collect(),
-        cells: cells(hand),
-        pads: pads(hand),
-        object: placed.object_in_palm.as_ref().map(surface),
+        scene: HandScene::new(hand),
+        object: placed.object_in_palm.as_ref().map(ObjectScene::placed),
         contacts: placed
             .contacts
             .iter()
@@ -167,15 +135,7 @@ fn data<'a>(placed: &'a Placed<'_>, azimuth_rad: f64) -> Result<Data<'a>, Pictur
         azimuth_rad: rounded(azimuth_rad),
         shown: chosen.iter().position(|idx| *idx == shown).unwrap_or(0),
         scale_newtons: placed.scale_newtons,
-        cell_unit: hand.cell_unit.symbol(),
-        first_dark_colour: colours
-            .iter()
-            .position(|colour| lightness(*colour) < super::pads::DARK)
-            .unwrap_or(N_COLOURS),
-        colours: colours.into_iter().map(bytes).collect(),
-        hand_colour: bytes(HAND),
-        object_colour: bytes(OBJECT),
-        silent_colour: bytes(SILENT_CELL),
+        first_dark_colour: scale.position(is_dark).unwrap_or(N_COLOURS),
     })
 }
 
@@ -211,25 +171,4 @@ fn contact_table(placed: &Placed<'_>) -> String {
     }
     table.push_str("</tbody>\n</table>\n</section>\n");
     table
-}
-
-pub(super) fn surface(mesh: &Mesh) -> Surface {
-    Surface {
-        positions_m: mesh.vertices_m.iter().flat_map(point).collect(),
-        triangles: mesh.triangles.iter().flatten().copied().collect(),
-    }
-}
-
-pub(super) fn point(point: &Point3<f64>) -> [f64; 3] {
-    point.coords.map(rounded).into()
-}
-
-pub(super) fn rows(palm_from_link: &Isometry3<f64>) -> Vec<f64> {
-    let matrix = palm_from_link.to_homogeneous();
-    (0..12).map(|idx| rounded(matrix[(idx / 4, idx % 4)])).collect()
-}
-
-/// To five decimals.
-fn rounded(value: f64) -> f64 {
-    (value * 1e5).round() / 1e5 + 0.0
 }

@@ -4,7 +4,7 @@
 //!   each pad feels, and what is known of the grasp. One file, no script, a light card that dark pages show as it is.
 //! * [`grasp_html`] - the same, and the grasp in three dimensions to turn by hand, with a slider over its frames. One
 //!   file that asks the network for nothing.
-//! * [`HandScene`], [`link_poses`] - a hand for a page that draws it frame by frame.
+//! * [`HandScene`], [`link_poses`] - a hand for a page that draws it frame by frame, with [`STAGE_JS`] and [`THREE_JS`].
 //! * [`posed_scene_images`] - a hand and a thing on a table, moment by moment, by one camera.
 //! * [`heat_map_svg`] - a search's scores over two parameters.
 //! * [`dictionary_svg`] - a contact dictionary over the hand.
@@ -45,7 +45,7 @@ pub use grasp_picture::grasp_svg;
 pub use heat_map::{HeatMap, HeatMapAxis, HeatMapCell, heat_map_svg};
 pub use html::grasp_html;
 pub use posed_scene::{PosedScene, posed_scene_images};
-pub use scene::{HandScene, ObjectScene, link_poses};
+pub use scene::{HandScene, ObjectScene, STAGE_JS, THREE_JS, link_poses};
 pub use svg::escape;
 
 use blindgrasp_stages::hand::JointError;

@@ -1,18 +1,40 @@
 //! A hand as a page draws it in three dimensions: its surfaces once, its posture frame by frame.
 
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Point3};
 use serde::Serialize;
 
 use super::colour::{HAND, OBJECT, Rgb, SILENT_CELL, bytes, force_colour};
 use super::geometry::{cells_in_link, link_mesh};
 use super::grasp::palm_from_object;
-use super::html::{CellData, PadData, Surface, point, rows, surface};
 use blindgrasp_messages::GraspScene;
 use blindgrasp_objects::mesh::Mesh;
 use blindgrasp_stages::hand::{Hand, JointError};
 
+/// The parts of three.js that pages use, as a module.
+pub const THREE_JS: &str = include_str!("../assets/three.js");
+/// Draws a [`HandScene`] with three.js, frame by frame.
+pub const STAGE_JS: &str = include_str!("../assets/stage.js");
 /// Colours of the scale of forces.
-const N_COLOURS: usize = 64;
+pub(super) const N_COLOURS: usize = 64;
+
+#[derive(Serialize)]
+struct Surface {
+    positions_m: Vec<f64>,
+    triangles: Vec<u32>,
+}
+
+#[derive(Serialize)]
+struct CellData {
+    link: usize,
+    corners_m: Vec<f64>,
+    threshold_newtons: f64,
+}
+
+#[derive(Serialize)]
+struct PadData {
+    first_cell: usize,
+    n_cells: usize,
+}
 
 /// The parts of a hand that do not change. Lengths in metres, to hundredths of a millimetre.
 #[derive(Serialize)]
@@ -59,7 +81,12 @@ impl ObjectScene {
     pub fn new(mesh: &Mesh, scene: &GraspScene) -> ObjectScene {
         let mut mesh = mesh.clone();
         mesh.transform(&palm_from_object(scene));
-        ObjectScene { surface: surface(&mesh), colour: bytes(OBJECT) }
+        Self::placed(&mesh)
+    }
+
+    /// Of a surface that is in the palm frame already.
+    pub(super) fn placed(mesh: &Mesh) -> ObjectScene {
+        ObjectScene { surface: surface(mesh), colour: bytes(OBJECT) }
     }
 }
 
@@ -71,7 +98,7 @@ pub fn link_poses(hand: &Hand, joints_rad: &[f64]) -> Result<Vec<Vec<f64>>, Join
     Ok(hand.palm_from_links(joints_rad)?.iter().map(|pose: &Isometry3<f64>| rows(pose)).collect())
 }
 
-pub(super) fn cells(hand: &Hand) -> Vec<CellData> {
+fn cells(hand: &Hand) -> Vec<CellData> {
     hand.cells()
         .zip(cells_in_link(hand))
         .map(|((pad_idx, cell), corners)| CellData {
@@ -82,6 +109,27 @@ pub(super) fn cells(hand: &Hand) -> Vec<CellData> {
         .collect()
 }
 
-pub(super) fn pads(hand: &Hand) -> Vec<PadData> {
+fn pads(hand: &Hand) -> Vec<PadData> {
     hand.pads.iter().map(|pad| PadData { first_cell: pad.first_cell_idx, n_cells: pad.cells.len() }).collect()
+}
+
+fn surface(mesh: &Mesh) -> Surface {
+    Surface {
+        positions_m: mesh.vertices_m.iter().flat_map(point).collect(),
+        triangles: mesh.triangles.iter().flatten().copied().collect(),
+    }
+}
+
+pub(super) fn point(point: &Point3<f64>) -> [f64; 3] {
+    point.coords.map(rounded).into()
+}
+
+fn rows(palm_from_link: &Isometry3<f64>) -> Vec<f64> {
+    let matrix = palm_from_link.to_homogeneous();
+    (0..12).map(|idx| rounded(matrix[(idx / 4, idx % 4)])).collect()
+}
+
+/// To five decimals.
+pub(super) fn rounded(value: f64) -> f64 {
+    (value * 1e5).round() / 1e5 + 0.0
 }

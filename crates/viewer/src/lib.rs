@@ -21,6 +21,7 @@ use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
+use blindgrasp_pictures::{STAGE_JS, THREE_JS};
 use futures_util::stream;
 use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::RecvError;
@@ -32,11 +33,12 @@ const MAX_BROWSERS: usize = 64;
 /// Scripts and styles come from here alone, and no other page may frame this one.
 const CONTENT_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; \
                               base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
-const FILES: [(&str, &str, &str); 4] = [
+const FILES: [(&str, &str, &str); 5] = [
     ("/", "text/html; charset=utf-8", include_str!("../assets/index.html")),
     ("/app.css", "text/css; charset=utf-8", include_str!("../assets/app.css")),
     ("/app.js", "text/javascript; charset=utf-8", include_str!("../assets/app.js")),
-    ("/three.js", "text/javascript; charset=utf-8", include_str!("../assets/three.js")),
+    ("/stage.js", "text/javascript; charset=utf-8", STAGE_JS),
+    ("/three.js", "text/javascript; charset=utf-8", THREE_JS),
 ];
 
 #[derive(Debug, thiserror::Error)]

@@ -1,0 +1,211 @@
+// A hand in three dimensions, with an object, contacts and gravity, on a canvas. All lengths are in metres in the palm frame.
+export const MAX_CONTACTS = 64;
+
+// `three` is the module of scripts/vendor-three. Without WebGL the stage has no `renderer` and draws nothing.
+export const makeStage = (three, canvas) => {
+  const {
+    ArrowHelper, BufferAttribute, BufferGeometry, Color, DirectionalLight, DoubleSide, Group, HemisphereLight, Mesh, MeshBasicMaterial,
+    MeshLambertMaterial, OrbitControls, PerspectiveCamera, Scene, Vector3, WebGLRenderer,
+  } = three;
+  let renderer;
+  try {
+    renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true });
+  } catch {
+    return { renderer: null, build() {}, show() {}, surround() {}, lookFrom() {}, project: () => null };
+  }
+  const scene = new Scene(), camera = new PerspectiveCamera(35, 1, 0.01, 10);
+  camera.up.set(0, 0, 1);
+  scene.add(new HemisphereLight(0xffffff, 0x8090a0, 2.2));
+  const lamp = new DirectionalLight(0xffffff, 1.6);
+  lamp.position.set(-0.5, 0.4, 0.8);
+  scene.add(lamp);
+  const controls = new OrbitControls(camera, canvas);
+  let parts = new Group(), links = [], pads = [], object = null, isDue = false;
+  // Towards the camera at first.
+  let side = new Vector3(0.5, -0.66, 0.56);
+  const contacts = Array.from({ length: MAX_CONTACTS }, () => arrow(0xc92a2a));
+  const gravity = arrow(0x1f6feb);
+
+  function arrow(colour) {
+    const made = new ArrowHelper(new Vector3(0, 0, 1), new Vector3(), 0.03, colour, 0.010, 0.006);
+    made.visible = false;
+    scene.add(made);
+    return made;
+  }
+  function draw() {
+    if (isDue) return;
+    isDue = true;
+    requestAnimationFrame(() => {
+      isDue = false;
+      renderer.render(scene, camera);
+      stage.onDrawn();
+    });
+  }
+  // The middle and the size of the hand in its first posture, and of the object.
+  const size = { middle: new Vector3(0, 0, 0.08), radius: 0.15, isKnown: false };
+  function measure() {
+    const least = new Vector3(Infinity, Infinity, Infinity), most = least.clone().negate(), corner = new Vector3();
+    for (const link of object ? [...links, object] : links) {
+      const positions = link.geometry.getAttribute("position");
+      for (let k = 0; k < positions.count; k++) {
+        corner.fromBufferAttribute(positions, k).applyMatrix4(link.matrix);
+        least.min(corner);
+        most.max(corner);
+      }
+    }
+    size.middle.addVectors(least, most).multiplyScalar(0.5);
+    size.radius = least.distanceTo(most) / 2;
+    size.isKnown = true;
+    home();
+  }
+  function home() {
+    controls.target.copy(size.middle);
+    camera.position.copy(side).multiplyScalar(3.4 * size.radius).add(size.middle);
+    controls.update();
+    draw();
+  }
+  function resize() {
+    const { clientWidth, clientHeight } = canvas;
+    renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
+    renderer.setSize(clientWidth, clientHeight, false);
+    camera.aspect = clientWidth / Math.max(1, clientHeight);
+    camera.updateProjectionMatrix();
+    draw();
+  }
+  function turn(right, up) {
+    const offset = camera.position.clone().sub(controls.target);
+    const across = new Vector3().crossVectors(camera.up, offset).normalize();
+    offset.applyAxisAngle(camera.up, right);
+    const tilted = offset.clone().applyAxisAngle(across, up);
+    // The camera does not pass over the pole.
+    if (Math.abs(tilted.clone().normalize().z) < 0.99) offset.copy(tilted);
+    camera.position.copy(controls.target).add(offset);
+    controls.update();
+  }
+  controls.addEventListener("change", draw);
+  // A page that is scrolled past the canvas scrolls on.
+  canvas.addEventListener("wheel", (event) => {
+    controls.enableZoom = event.ctrlKey || event.metaKey || document.activeElement === canvas;
+  }, { capture: true, passive: true });
+  canvas.addEventListener("pointerdown", () => canvas.focus({ preventScroll: true }));
+  canvas.addEventListener("dblclick", home);
+  canvas.addEventListener("keydown", (event) => {
+    const turns = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] };
+    const zoom = { "+": 0.87, "=": 0.87, "-": 1.15 }[event.key];
+    if (turns[event.key]) turn(...turns[event.key]);
+    else if (zoom) {
+      camera.position.sub(controls.target).multiplyScalar(zoom).add(controls.target);
+      controls.update();
+    } else if (event.key === "Home") home();
+    else return;
+    event.preventDefault();
+  });
+  function geometry(positions, index) {
+    const made = new BufferGeometry();
+    made.setAttribute("position", new BufferAttribute(new Float32Array(positions), 3));
+    made.setIndex(index);
+    made.computeVertexNormals();
+    return made;
+  }
+  // The colour of each cell as it is drawn, red, green, blue from 0 to 1.
+  function colouredCells() {
+    const found = [], colour = new Color();
+    for (const { idxs, colours } of pads) {
+      idxs.forEach((cell, n) => { found[cell] = colour.fromBufferAttribute(colours, 4 * n).getRGB({}, "srgb"); });
+    }
+    return found.map(({ r, g, b }) => [r, g, b]);
+  }
+  const stage = {
+    renderer,
+    // Called after each picture.
+    onDrawn() {},
+    // The links, and the colours of the cells as they are drawn; tests read them.
+    meshes: () => links,
+    colouredCells,
+    objectTriangles: () => (object ? object.geometry.index.count / 3 : 0),
+    // The place of a point on the canvas, in pixels.
+    project(point) {
+      const { x, y } = new Vector3(...point).project(camera);
+      return [canvas.clientWidth / 2 * (1 + x), canvas.clientHeight / 2 * (1 - y)];
+    },
+    // Looks from this side of the hand.
+    lookFrom(azimuth_rad) {
+      side = new Vector3(Math.cos(0.35) * Math.cos(azimuth_rad), Math.cos(0.35) * Math.sin(azimuth_rad), Math.sin(0.35));
+    },
+    // Shows the surface of an object, half transparent, or none.
+    surround(data) {
+      if (object) scene.remove(object);
+      object?.geometry.dispose();
+      object?.material.dispose();
+      object = null;
+      if (data) {
+        const colour = new Color(...data.colour.map((part) => part / 255));
+        object = new Mesh(geometry(data.surface.positions_m, data.surface.triangles),
+          new MeshLambertMaterial({ color: colour, transparent: true, opacity: 0.45, depthWrite: false }));
+        scene.add(object);
+      }
+      draw();
+    },
+    build(data) {
+      scene.remove(parts);
+      parts.traverse((part) => { part.geometry?.dispose(); part.material?.dispose(); });
+      parts = new Group();
+      const skin = new MeshLambertMaterial({ color: new Color(...data.hand_colour.map((part) => part / 255)), flatShading: true });
+      links = data.links.map((link) => {
+        const mesh = new Mesh(geometry(link.positions_m, link.triangles), skin);
+        mesh.matrixAutoUpdate = false;
+        parts.add(mesh);
+        return mesh;
+      });
+      // The cells of a link are one mesh with a colour for each corner.
+      pads = data.links.map((_, link) => data.cells.map((cell, idx) => ({ ...cell, idx })).filter((cell) => cell.link === link))
+        .map((cells, link) => {
+          if (cells.length === 0) return null;
+          const made = geometry(cells.flatMap((cell) => cell.corners_m), cells.flatMap((_, n) => [0, 1, 2, 0, 2, 3].map((k) => 4 * n + k)));
+          made.setAttribute("color", new BufferAttribute(new Float32Array(12 * cells.length), 3));
+          links[link].add(new Mesh(made, new MeshBasicMaterial({ vertexColors: true, side: DoubleSide })));
+          return { idxs: cells.map((cell) => cell.idx), colours: made.getAttribute("color") };
+        }).filter((pad) => pad !== null);
+      scene.add(parts);
+      size.isKnown = false;
+      draw();
+    },
+    // Shows a frame: the poses of the links, the colours of the cells (0 to 255), contacts as point, direction, force and perhaps
+    // colour, and gravity or null.
+    show(frame, cellColours) {
+      frame.links.forEach((rows, idx) => {
+        if (!links[idx]) return;
+        links[idx].matrix.set(...rows, 0, 0, 0, 1);
+        links[idx].matrixWorldNeedsUpdate = true;
+      });
+      if (!size.isKnown) measure();
+      const colour = new Color();
+      for (const { idxs, colours } of pads) {
+        idxs.forEach((cell, n) => {
+          colour.setRGB(...cellColours[cell].map((part) => part / 255), "srgb");
+          for (let corner = 4 * n; corner < 4 * n + 4; corner++) colours.setXYZ(corner, colour.r, colour.g, colour.b);
+        });
+        colours.needsUpdate = true;
+      }
+      contacts.forEach((made, idx) => {
+        const contact = frame.contacts[idx];
+        made.visible = contact !== undefined;
+        if (!contact) return;
+        made.position.set(...contact.slice(0, 3));
+        made.setDirection(new Vector3(...contact.slice(3, 6)).normalize());
+        made.setLength(0.012 + 0.02 * Math.min(1, contact[6] / 2), 0.010, 0.006);
+        if (contact[7]) made.setColor(contact[7]);
+      });
+      gravity.visible = frame.gravity !== null;
+      if (frame.gravity) {
+        gravity.position.copy(size.middle).add(new Vector3(-0.8 * size.radius, 0.8 * size.radius, 0.5 * size.radius));
+        gravity.setDirection(new Vector3(...frame.gravity).normalize());
+        gravity.setLength(0.06, 0.018, 0.010);
+      }
+      draw();
+    },
+  };
+  new ResizeObserver(resize).observe(canvas);
+  home();
+  return stage;
+};
