@@ -33,7 +33,11 @@ impl Running {
 
     /// The page of a graph, and its address.
     fn page(graph: &str, port: u16) -> (Running, String) {
-        let mut page = Running::start(blindgrasp().args(["view", graph, "--port", &port.to_string()]));
+        Running::page_with(graph, port, &[])
+    }
+
+    fn page_with(graph: &str, port: u16, options: &[&str]) -> (Running, String) {
+        let mut page = Running::start(blindgrasp().args(["view", graph, "--port", &port.to_string()]).args(options));
         let address = page.line();
         (page, address)
     }
@@ -99,6 +103,11 @@ fn launch(name: &str) -> Graph {
     Graph::launch(name, &project().join("dataflow.yaml"), &["--set", "recorded_source.repeat=forever"])
 }
 
+fn model_file() -> Value {
+    let text = std::fs::read(project().join("models/barrett-bh8-280.json")).expect("a model");
+    serde_json::from_slice(&text).expect("JSON")
+}
+
 fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().expect("a list").iter().map(|number| number.as_f64().expect("a number")).collect()
 }
@@ -156,6 +165,15 @@ fn a_browser_shows_a_graph_as_it_runs() {
     assert_eq!(browser.ask("document.getElementById('nodes').rows.length"), 5);
     assert!(browser.text("edges").contains("contacts/contacts"), "{}", browser.text("edges"));
     assert!(browser.text("spoken").contains("Grasp "));
+    // Feature, words, thresholds, votes and log.
+    let model = browser.ask("blindgrasp.model");
+    assert_eq!(model["threshold"].as_f64(), model_file()["classifier"]["threshold_probability"].as_f64());
+    browser.wait_until("document.getElementById('blocks').textContent.includes('histogram')");
+    browser.wait_until(
+        "document.getElementById('waits').textContent.includes('waits for 3 settled predictions that agree')",
+    );
+    browser.wait_until("blindgrasp.hand.wordCount() > 2");
+    assert!(browser.text("log").contains("recorded_source"), "{}", browser.text("log"));
     browser.wait_until("/^decisions in \\d/.test(document.getElementById('latency').textContent)");
     assert_eq!(browser.text("state"), "running");
     browser.wait_until(
@@ -193,6 +211,58 @@ fn a_browser_shows_a_graph_as_it_runs() {
     browser.wait_until("typeof blindgrasp === 'object' && blindgrasp.frames > 10");
     assert_eq!(graph.node("recorded_source")["n_restarts"], 0);
     graph.stop();
+}
+
+#[test]
+fn a_page_with_the_token_sets_swaps_and_stops() {
+    if !Path::new("/usr/bin/chromedriver").exists() {
+        return skipped("no chromium-driver: scripts/test installs it on Debian");
+    }
+    let name = unique_name();
+    let graph = launch(&name);
+    graph.wait_for_decisions(1);
+    let (_page, address) = Running::page_with(&name, 0, &["--view-control"]);
+    let (without, token) = address.split_once("/#").expect("a token");
+    let mut reader = Browser::open(without);
+    reader.wait_until("blindgrasp.graph !== null");
+    assert_eq!(reader.ask("document.getElementById('control').hidden"), true);
+    let mut browser = Browser::open(&address);
+    browser.wait_until("document.getElementById('set-param').options.length > 5");
+    assert_eq!(browser.ask("location.hash"), "", "the token stays out of the address");
+    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
+    let fill = |browser: &mut Browser, id: &str, value: &str| {
+        browser.ask(&format!("document.getElementById('{id}').value = '{value}'"));
+    };
+    let click = |browser: &mut Browser, button: &str| {
+        browser.ask(&format!("document.querySelector('{button}').click()"));
+        browser.wait_until("!document.getElementById('stop').disabled");
+    };
+    fill(&mut browser, "set-param", "lift_arbiter.votes");
+    fill(&mut browser, "set-value", "5");
+    click(&mut browser, "#set button");
+    assert!(browser.text("answer").contains("lift_arbiter.votes: 3 → 5"), "{}", browser.text("answer"));
+    assert_eq!(graph.node("lift_arbiter")["params"]["votes"], 5);
+    browser.wait_until("document.getElementById('waits').textContent.includes('waits for 5 settled')");
+    fill(&mut browser, "set-value", "many");
+    click(&mut browser, "#set button");
+    assert_eq!(browser.ask("document.getElementById('answer').className"), "answer trouble");
+    fill(&mut browser, "swap-node", "classifier");
+    fill(&mut browser, "swap-compare", "1");
+    if let Ok(path) = std::env::var("BLINDGRASP_PICTURE") {
+        browser.ask("document.getElementById('control').scrollIntoView()");
+        browser.ask(&format!("picture {path}.control.png"));
+    }
+    click(&mut browser, "#swap button");
+    assert_eq!(graph.node("classifier")["n_swaps"], 1, "{}", browser.text("answer"));
+    // The audit log has the orders.
+    let log = run(&["logs", "audit", "--graph", &name], 0);
+    let log = String::from_utf8_lossy(&log.stdout).into_owned();
+    assert!(log.contains("set lift_arbiter.votes=5") && !log.contains(token), "{log}");
+    browser.ask("document.getElementById('stop').click()");
+    assert_eq!(graph.node("classifier")["state"], "running", "the first click asks");
+    browser.ask("document.getElementById('stop').click()");
+    browser.wait_until("document.getElementById('state').textContent.includes('has ended')");
+    graph.finish();
 }
 
 #[test]

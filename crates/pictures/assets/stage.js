@@ -11,7 +11,7 @@ export const makeStage = (three, canvas) => {
   try {
     renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true });
   } catch {
-    return { renderer: null, build() {}, show() {}, surround() {}, lookFrom() {}, project: () => null };
+    return { renderer: null, build() {}, show() {}, surround() {}, showWords() {}, lookFrom() {}, project: () => null };
   }
   const scene = new Scene(), camera = new PerspectiveCamera(35, 1, 0.01, 10);
   camera.up.set(0, 0, 1);
@@ -32,14 +32,15 @@ export const makeStage = (three, canvas) => {
     scene.add(made);
     return made;
   }
+  function render() {
+    isDue = false;
+    renderer.render(scene, camera);
+    stage.onDrawn();
+  }
   function draw() {
     if (isDue) return;
     isDue = true;
-    requestAnimationFrame(() => {
-      isDue = false;
-      renderer.render(scene, camera);
-      stage.onDrawn();
-    });
+    requestAnimationFrame(render);
   }
   // The middle and the size of the hand in its first posture, and of the object.
   const size = { middle: new Vector3(0, 0, 0.08), radius: 0.15, isKnown: false };
@@ -70,7 +71,8 @@ export const makeStage = (three, canvas) => {
     renderer.setSize(clientWidth, clientHeight, false);
     camera.aspect = clientWidth / Math.max(1, clientHeight);
     camera.updateProjectionMatrix();
-    draw();
+    // At once: a new size has emptied the canvas.
+    render();
   }
   function turn(right, up) {
     const offset = camera.position.clone().sub(controls.target);
@@ -107,6 +109,10 @@ export const makeStage = (three, canvas) => {
     made.computeVertexNormals();
     return made;
   }
+  let words = [];
+  const octahedron = geometry([1, 0, 0, -1, 0, 0, 0, 1, 0, 0, -1, 0, 0, 0, 1, 0, 0, -1],
+    [0, 2, 4, 2, 1, 4, 1, 3, 4, 3, 0, 4, 2, 0, 5, 1, 2, 5, 3, 1, 5, 0, 3, 5]);
+  const wordSkin = new MeshLambertMaterial({ color: 0x6741d9, flatShading: true, transparent: true, opacity: 0.7 });
   // The colour of each cell as it is drawn, red, green, blue from 0 to 1.
   function colouredCells() {
     const found = [], colour = new Color();
@@ -122,6 +128,7 @@ export const makeStage = (three, canvas) => {
     // The links, and the colours of the cells as they are drawn; tests read them.
     meshes: () => links,
     colouredCells,
+    wordCount: () => words.length,
     objectTriangles: () => (object ? object.geometry.index.count / 3 : 0),
     // The place of a point on the canvas, in pixels.
     project(point) {
@@ -131,6 +138,21 @@ export const makeStage = (three, canvas) => {
     // Looks from this side of the hand.
     lookFrom(azimuth_rad) {
       side = new Vector3(Math.cos(0.35) * Math.cos(azimuth_rad), Math.cos(0.35) * Math.sin(azimuth_rad), Math.sin(0.35));
+    },
+    // Shows the words of a dictionary as bodies of the size of their weight; none without points.
+    showWords(points_m, weights) {
+      words.forEach((word) => scene.remove(word));
+      words = [];
+      const most = Math.max(...weights, 1e-9);
+      points_m.forEach((point, idx) => {
+        if (!(weights[idx] > 0.02 * most)) return;
+        const word = new Mesh(octahedron, wordSkin);
+        word.position.set(...point);
+        word.scale.setScalar(0.002 + 0.007 * Math.sqrt(weights[idx] / most));
+        scene.add(word);
+        words.push(word);
+      });
+      draw();
     },
     // Shows the surface of an object, half transparent, or none.
     surround(data) {

@@ -119,7 +119,8 @@ impl FeatureExtractor {
         self.len() == 0
     }
 
-    pub(crate) fn block_len(&self, block: Block) -> usize {
+    /// Values of a part of a feature.
+    pub fn block_len(&self, block: Block) -> usize {
         match block {
             Block::Histogram => self.dictionary.len(),
             Block::Cells | Block::RelativeCells => self.n_cells(),

@@ -1,4 +1,5 @@
-// The page of a running graph or a recording: draws the events of /events, and grasps of a recording. It sends nothing.
+// The page of a running graph or a recording: draws the events of /events, and grasps of a recording. With a token in its address it
+// sends orders.
 import * as three from "/three.js";
 import { MAX_CONTACTS, makeStage } from "/stage.js";
 
@@ -10,7 +11,7 @@ const SPOKEN_MS = 2000;
 const SILENT_MS = 3000;
 
 // The present state, which tests read.
-const shown = (window.blindgrasp = { server: null, scene: null, frame: null, decision: null, graph: null, dropped: 0, frames: 0, cellColours: [] });
+const shown = (window.blindgrasp = { server: null, scene: null, model: null, frame: null, decision: null, graph: null, dropped: 0, frames: 0, cellColours: [] });
 
 // --- the hand
 const hand = makeStage(three, byId("stage"));
@@ -123,10 +124,46 @@ const chart = () => {
     return;
   }
   trim(now);
+  draw.setLineDash([5, 4]);
+  for (const p of new Set(shown.model ? [shown.model.threshold, shown.model.unsure_from] : [])) line("--soft", [left, y(p)], [width, y(p)]);
+  draw.setLineDash([]);
   const at = (item) => x(1 - (now - item.at) / 1000 / CHART_SECS);
   for (const mark of marks) line(colours[mark.action] ?? "--probe", [at(mark), height], [at(mark), height - 14]);
   draw.fillStyle = colour("--mark");
   for (const point of points) dot(at(point), point.p, 2);
+};
+
+// --- the feature: a bar for each value, up or down from 0, and the words on the hand
+let feature = null;
+const showFeature = () => {
+  byId("feature-part").hidden = feature === null;
+  if (feature === null) return;
+  const canvas = byId("feature"), draw = pen(canvas), [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  const most = Math.max(...feature, 1e-9), least = Math.min(...feature, 0), step = width / feature.length;
+  const y = (value) => 4 + (height - 8) * (most - value) / (most - least);
+  // The parts of the feature have colours in turn.
+  const ends = [];
+  for (const block of shown.model?.blocks ?? []) ends.push((ends.at(-1) ?? 0) + block.n_values);
+  feature.forEach((value, idx) => {
+    const part = Math.max(0, ends.findIndex((end) => idx < end));
+    draw.fillStyle = colour(["--mark", "--soft"][part % 2]);
+    const [top, bottom] = [Math.min(y(value), y(0)), Math.max(y(value), y(0))];
+    draw.fillRect(idx * step, top, Math.max(1, step - (step > 4 ? 1 : 0)), Math.max(1, bottom - top));
+  });
+  const parts = (shown.model?.blocks ?? []).map(({ name, n_values }) => `${name.replaceAll("_", " ")} (${n_values})`).join(", ");
+  const text = `${feature.length} values from ${least.toFixed(2)} to ${most.toFixed(2)}${parts && `: ${parts}`}`;
+  if (byId("blocks").textContent !== text) byId("blocks").textContent = text;
+};
+
+// --- votes: the arbiter waits for so many settled predictions that agree
+const showVotes = ({ side, n }, frame) => {
+  const votes = Object.values(shown.graph?.params ?? {}).find((params) => "votes" in params)?.votes;
+  if (!votes) return;
+  const isOpen = shown.decision?.grasp_id !== frame.grasp_id;
+  const wanted = `${votes} settled predictions that agree`;
+  const text = !isOpen ? "" : n === 0 ? `Grasp ${frame.grasp_id} waits for ${wanted}; the hand is ${frame.phase}.`
+    : `Grasp ${frame.grasp_id} waits for ${wanted}; the last ${n} say ${side}.`;
+  byId("waits").textContent = text;
 };
 
 // --- a recording
@@ -291,7 +328,77 @@ const showGraph = (graph) => {
       [...(lost ? [6] : []), ...(edge.missing ? [7] : [])]);
   });
   cut(byId("edges"), graph.edges.length);
+  if (token) showChoices(graph);
 };
+
+// --- orders: with the token that the command has printed in the address
+const token = location.hash.slice(1) || sessionStorage.getItem("token");
+if (token) {
+  sessionStorage.setItem("token", token);
+  // It is not seen over a shoulder, nor kept in the history.
+  history.replaceState(null, "", location.pathname);
+  byId("control").hidden = false;
+}
+const order = async (order) => {
+  const buttons = byId("control").querySelectorAll("button");
+  buttons.forEach((button) => { button.disabled = true; });
+  byId("answer").textContent = order.compare_secs > 0 ? `compares for ${order.compare_secs} s` : "…";
+  byId("answer").classList.remove("trouble");
+  try {
+    const headers = { Authorization: `Bearer ${token}`, "Content-Type": "application/json" };
+    const answer = await fetch("/orders", { method: "POST", headers, body: JSON.stringify(order) });
+    byId("answer").textContent = await answer.text();
+    byId("answer").classList.toggle("trouble", !answer.ok);
+  } catch (error) {
+    byId("answer").textContent = `no answer: ${error.message}`;
+    byId("answer").classList.add("trouble");
+  }
+  buttons.forEach((button) => { button.disabled = false; });
+};
+// Choices are made again only if they are others, so that a choice stays.
+const choose = (id, texts) => {
+  const known = [...byId(id).options].map((option) => option.text);
+  if (known.join("\n") !== texts.join("\n")) byId(id).replaceChildren(...texts.map((text) => new Option(text)));
+};
+const presentValue = () => {
+  const [node, ...param] = byId("set-param").value.split(".");
+  byId("set-value").value = shown.graph?.params[node]?.[param.join(".")] ?? "";
+};
+const showChoices = ({ nodes, params }) => {
+  const isFirst = byId("set-param").options.length === 0;
+  choose("set-param", Object.entries(params).flatMap(([node, of]) => Object.keys(of).map((name) => `${node}.${name}`)));
+  choose("swap-node", nodes.map(({ node }) => node));
+  if (isFirst) presentValue();
+};
+byId("set-param").addEventListener("change", presentValue);
+byId("set").addEventListener("submit", (event) => {
+  event.preventDefault();
+  const [node, ...param] = byId("set-param").value.split(".");
+  order({ order: "set", node, param: param.join("."), value: byId("set-value").value });
+});
+byId("swap").addEventListener("submit", (event) => {
+  event.preventDefault();
+  const changes = byId("swap-changes").value.split(/\s+/).filter((change) => change !== "");
+  order({
+    order: "swap", node: byId("swap-node").value, changes, compare_secs: Number(byId("swap-compare").value),
+    min_agreement: Number(byId("swap-agreement").value),
+  });
+});
+// The first click asks, the second stops.
+const unsure = () => {
+  byId("stop").textContent = "Stop the graph";
+  byId("stop").classList.remove("sure");
+};
+byId("stop").addEventListener("blur", unsure);
+byId("stop").addEventListener("click", () => {
+  if (!byId("stop").classList.contains("sure")) {
+    byId("stop").textContent = "Click again to stop the graph";
+    byId("stop").classList.add("sure");
+    return;
+  }
+  unsure();
+  order({ order: "stop" });
+});
 
 // --- ages: an old state must not look like the present one
 let graphAt = null, frameAt = null, decidedAt = null;
@@ -316,7 +423,10 @@ on("server", (server) => {
 });
 on("scene", (scene) => {
   shown.scene = scene;
-  [largest, shown.frame, shown.decision] = [1, null, null];
+  [largest, shown.frame, shown.decision, feature] = [1, null, null, null];
+  hand.showWords([], []);
+  showFeature();
+  byId("waits").textContent = "";
   for (const id of ["pads", "joints"]) cut(byId(id), 0);
   byId("moment").textContent = scene ? "no frame yet" : "the graph has no hand that can be shown";
   for (const id of ["scale", "why"]) byId(id).textContent = "";
@@ -332,6 +442,12 @@ on("frame", (frame) => {
   if (frame.links) {
     frameAt = now;
     showFrame(frame);
+    showVotes(frame.votes, frame);
+  }
+  if (frame.feature?.length) {
+    feature = frame.feature;
+    if (!document.hidden) showFeature();
+    hand.showWords(shown.model?.words_m ?? [], frame.words);
   }
 });
 on("decision", (decision) => {
@@ -339,6 +455,21 @@ on("decision", (decision) => {
   showDecision(decision);
 });
 on("graph", showGraph);
+on("model", (model) => {
+  shown.model = model;
+  hand.showWords([], []);
+  if (feature) showFeature();
+});
+on("log", (lines) => {
+  const body = byId("log"), region = body.closest("div");
+  const isAtEnd = region.scrollTop + region.clientHeight >= region.scrollHeight - 4;
+  lines.forEach(({ time, operator, level, text, fields }, idx) => {
+    const values = Object.entries(fields ?? {}).map(([name, value]) => ` ${name}=${JSON.stringify(value)}`).join("");
+    fill(body, idx, [time, operator, level ?? "", text + values], [], ["error", "warn"].includes(level) ? [2] : []);
+  });
+  cut(body, lines.length);
+  if (isAtEnd) region.scrollTop = region.scrollHeight;
+});
 on("recording", (recording) => player.start(recording));
 on("ended", (why) => {
   graphAt = null;

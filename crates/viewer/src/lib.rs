@@ -5,8 +5,10 @@
 //! misses events and is told how many; it holds up neither the caller nor other browsers. Of a recording, the page asks for one
 //! grasp after the other ([`Grasps`]).
 //!
-//! The page can only be read: no request changes anything. It is served on the loopback interface, and requests that a page
-//! from elsewhere makes are refused by their host and origin.
+//! Without a [`Control`] the page can only be read. With one, a browser that knows the token may give orders. The page is served
+//! on the loopback interface, and requests that a page from elsewhere makes are refused by their host and origin.
+
+mod control;
 
 use std::convert::Infallible;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -20,16 +22,20 @@ use axum::extract::{Path, Request, State};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
-use axum::routing::get;
+use axum::routing::{get, post};
 use blindgrasp_pictures::{STAGE_JS, THREE_JS};
 use futures_util::stream;
 use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::RecvError;
 
+pub use control::{Act, Control, Order};
+
 /// Events that wait for a browser; the eldest are dropped for newer ones.
 const MAX_WAITING: usize = 64;
 /// Browsers that are served at a time; others are turned away.
 const MAX_BROWSERS: usize = 64;
+/// The address of orders.
+const ORDERS: &str = "/orders";
 /// Scripts and styles come from here alone, and no other page may frame this one.
 const CONTENT_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; \
                               base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
@@ -64,15 +70,24 @@ struct Shared {
     kept: Mutex<Vec<(&'static str, Bytes)>>,
     n_browsers: AtomicUsize,
     grasps: Option<Mutex<Grasps>>,
+    control: Option<Control>,
+}
+
+/// The abilities of a page beside showing events.
+#[derive(Default)]
+pub struct Abilities {
+    /// The grasps of a recording.
+    pub grasps: Option<Grasps>,
+    /// Orders to a graph.
+    pub control: Option<Control>,
 }
 
 impl Viewer {
-    /// Serves the page on a port of the loopback interface, 0 for any free one, from a thread of its own. A page of a recording
-    /// asks for its grasps.
+    /// Serves the page on a port of the loopback interface, 0 for any free one, from a thread of its own.
     ///
     /// # Errors
     /// The port is taken.
-    pub fn serve(port: u16, grasps: Option<Grasps>) -> Result<Viewer, ViewerError> {
+    pub fn serve(port: u16, abilities: Abilities) -> Result<Viewer, ViewerError> {
         let refused = |source| ViewerError::Listen { port, source };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(refused)?;
         let listener = runtime
@@ -83,7 +98,8 @@ impl Viewer {
             events: broadcast::channel(MAX_WAITING).0,
             kept: Mutex::default(),
             n_browsers: AtomicUsize::new(0),
-            grasps: grasps.map(Mutex::new),
+            grasps: abilities.grasps.map(Mutex::new),
+            control: abilities.control,
         });
         let files = FILES.into_iter().fold(Router::new(), |router, (path, kind, text)| {
             router.route(path, get(move || async move { ([(header::CONTENT_TYPE, kind)], text) }))
@@ -91,6 +107,7 @@ impl Viewer {
         let pages = files
             .route("/events", get(events))
             .route("/grasps/{idx}", get(grasp))
+            .route(ORDERS, post(control::order))
             .with_state(Arc::clone(&shared))
             .layer(middleware::from_fn(guard));
         std::thread::spawn(move || runtime.block_on(async { axum::serve(listener, pages).await }));
@@ -101,8 +118,10 @@ impl Viewer {
         Ok(viewer)
     }
 
-    pub fn address(&self) -> SocketAddr {
-        self.address
+    /// The address of the page. With a control it holds the token, which browsers do not send with it.
+    pub fn address(&self) -> String {
+        let token = self.shared.control.as_ref().map(|control| format!("/#{}", control.token()));
+        format!("http://{}{}", self.address, token.unwrap_or_default())
     }
 
     /// The number of browsers that read the events.
@@ -153,8 +172,8 @@ async fn guard(request: Request, next: Next) -> Response {
     let refused = |status: StatusCode, why: &'static str| (status, why).into_response();
     let mut response = if !is_from_here(request.headers()) {
         refused(StatusCode::FORBIDDEN, "expected Host: localhost or 127.0.0.1, and no page from elsewhere\n")
-    } else if !matches!(*request.method(), Method::GET | Method::HEAD) {
-        refused(StatusCode::METHOD_NOT_ALLOWED, "expected GET: the page can only be read\n")
+    } else if !matches!(*request.method(), Method::GET | Method::HEAD) && request.uri().path() != ORDERS {
+        refused(StatusCode::METHOD_NOT_ALLOWED, "expected GET: this can only be read\n")
     } else {
         next.run(request).await
     };
@@ -244,7 +263,7 @@ mod tests {
     use super::*;
 
     fn asked(viewer: &Viewer, head: &str) -> TcpStream {
-        let mut client = TcpStream::connect(viewer.address()).expect("connected");
+        let mut client = TcpStream::connect(viewer.address).expect("connected");
         write!(client, "{head}\r\n\r\n").expect("sent");
         client
     }
@@ -257,7 +276,7 @@ mod tests {
 
     #[test]
     fn pages_from_elsewhere_get_nothing_and_nothing_can_be_sent() {
-        let viewer = Viewer::serve(0, None).expect("served");
+        let viewer = Viewer::serve(0, Abilities::default()).expect("served");
         let page = answer(&viewer, "GET / HTTP/1.1\r\nHost: localhost");
         assert!(page.starts_with("HTTP/1.1 200") && page.contains("<title>"), "{page}");
         assert!(page.contains("content-security-policy: default-src 'none'; script-src 'self'"), "{page}");
@@ -270,14 +289,57 @@ mod tests {
             let page = answer(&viewer, head);
             assert!(page.starts_with("HTTP/1.1 403") && !page.contains("<title>"), "{head}: {page}");
         }
-        let recording =
-            Viewer::serve(0, Some(Box::new(|idx| if idx == 3 { Ok("{}".into()) } else { Err("no grasp".into()) })));
-        let recording = recording.expect("served");
+        let grasps: Grasps = Box::new(|idx| if idx == 3 { Ok("{}".into()) } else { Err("no grasp".into()) });
+        let recording = Viewer::serve(0, Abilities { grasps: Some(grasps), control: None }).expect("served");
         let of = |id: &str| answer(&recording, &format!("GET /grasps/{id} HTTP/1.1\r\nHost: localhost"));
         assert!(of("3").ends_with("{}") && of("4").starts_with("HTTP/1.1 404") && of("x").starts_with("HTTP/1.1 400"));
         assert!(answer(&viewer, "GET /grasps/3 HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 404"));
         assert!(answer(&viewer, "POST / HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 405"));
         assert!(answer(&viewer, "GET /secret HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 404"));
+    }
+
+    #[test]
+    fn orders_need_the_token_and_a_page_of_this_server() {
+        let orders = Arc::new(Mutex::new(Vec::new()));
+        let taken = Arc::clone(&orders);
+        let act: Act = Box::new(move |order| {
+            taken.lock().expect("a list").push(order.clone());
+            if order == (Order::Stop {}) { Err("it goes on".into()) } else { Ok("done".into()) }
+        });
+        let viewer = Viewer::serve(0, Abilities { grasps: None, control: Some(Control::new(act).expect("a token")) });
+        let viewer = viewer.expect("served");
+        let token = viewer.address().split_once('#').map(|(_, token)| token.to_owned()).expect("a token");
+        assert_eq!(token.len(), 32);
+        let sent = |viewer: &Viewer, head: &str, body: &str| {
+            let length = body.len();
+            let head = format!(
+                "POST /orders HTTP/1.1\r\nHost: localhost\r\nContent-Length: {length}\r\nConnection: close\r\n{head}"
+            );
+            let mut client = TcpStream::connect(viewer.address).expect("connected");
+            write!(client, "{head}\r\n\r\n{body}").expect("sent");
+            let mut text = String::new();
+            client.read_to_string(&mut text).expect("an answer");
+            text
+        };
+        let set = r#"{"order":"set","node":"a","param":"b","value":"1"}"#;
+        let with_token = format!("Authorization: Bearer {token}");
+        for (head, status) in [
+            ("X: y".to_owned(), 401),
+            (format!("Authorization: Bearer {}", &token[1..]), 401),
+            (format!("Authorization: Bearer {}0", &token[..31]).replace("00", "11"), 401),
+            (format!("{with_token}\r\nOrigin: http://robot.example"), 403),
+            (format!("{with_token}\r\nSec-Fetch-Site: cross-site"), 403),
+        ] {
+            let answer = sent(&viewer, &head, set);
+            assert!(answer.starts_with(&format!("HTTP/1.1 {status}")), "{head}: {answer}");
+        }
+        assert!(orders.lock().expect("a list").is_empty());
+        assert!(sent(&viewer, &with_token, set).ends_with("done"));
+        assert!(sent(&viewer, &with_token, r#"{"order":"stop"}"#).ends_with("it goes on"));
+        assert!(sent(&viewer, &with_token, r#"{"order":"burn"}"#).starts_with("HTTP/1.1 400"));
+        assert_eq!(orders.lock().expect("a list").len(), 2);
+        let reader = Viewer::serve(0, Abilities::default()).expect("served");
+        assert!(sent(&reader, &with_token, set).starts_with("HTTP/1.1 404"));
     }
 
     /// Lines of an event stream until this one.
@@ -295,7 +357,7 @@ mod tests {
 
     #[test]
     fn a_late_browser_gets_what_is_kept_and_a_slow_one_is_told_of_what_it_missed() {
-        let viewer = Viewer::serve(0, None).expect("served");
+        let viewer = Viewer::serve(0, Abilities::default()).expect("served");
         viewer.keep("scene", "{\"hand\":\n1}");
         viewer.send("frame", "0");
         let mut reader = BufReader::new(asked(&viewer, "GET /events HTTP/1.1\r\nHost: localhost"));
@@ -316,7 +378,7 @@ mod tests {
 
     #[test]
     fn browsers_beyond_the_most_are_turned_away() {
-        let viewer = Viewer::serve(0, None).expect("served");
+        let viewer = Viewer::serve(0, Abilities::default()).expect("served");
         viewer.keep("scene", "1");
         let readers: Vec<_> = (0..MAX_BROWSERS)
             .map(|_| {

@@ -106,6 +106,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         record_options: arguments.record_options.clone(),
         metrics: None,
         view: None,
+        may_control: false,
         json: arguments.json,
         is_quiet: false,
         tap,

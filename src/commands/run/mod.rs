@@ -74,6 +74,11 @@ pub(super) struct Arguments {
         conflicts_with_all = ["detach", "stay"]
     )]
     view: Option<u16>,
+    /// Let the page of --view set parameters, swap nodes and stop the graph
+    ///
+    /// The address that is printed holds a token. The page without it can only be read.
+    #[arg(long, requires = "view")]
+    view_control: bool,
     /// Format of the log files: text, or JSON, one object a line
     #[arg(long, value_name = "FORMAT", default_value = "text")]
     log_format: LogFormatArgument,
@@ -265,6 +270,7 @@ fn session(arguments: &Arguments) -> Session {
         record_options: arguments.record_options.clone(),
         metrics: arguments.metrics,
         view: arguments.view,
+        may_control: arguments.view_control,
         json: arguments.json,
         is_quiet: false,
         tap: None,

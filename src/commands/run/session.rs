@@ -43,6 +43,8 @@ pub(in crate::commands) struct Session {
     pub(in crate::commands) metrics: Option<u16>,
     /// Port of the page in a browser.
     pub(in crate::commands) view: Option<u16>,
+    /// Whether the page may change the graph.
+    pub(in crate::commands) may_control: bool,
     /// Decisions and summary are printed as JSON.
     pub(in crate::commands) json: bool,
     /// Neither decisions nor the summary go to stdout; warnings and errors still go to stderr.
@@ -98,7 +100,7 @@ impl Session {
             }
             None => None,
         };
-        let _page = self.view.map(|port| Page::start(name, port)).transpose()?;
+        let _page = self.view.map(|port| Page::start(name, port, self.may_control)).transpose()?;
         let is_recorded = recorder.is_some();
         let run::Ended { summary, sink, outcome } =
             run.run(Console::new(self.json, self.is_quiet, recorder, self.tap), n_stops)?;
@@ -147,10 +149,11 @@ struct Page(Child);
 
 impl Page {
     /// Starts it, and waits until the page is served.
-    fn start(graph: &str, port: u16) -> anyhow::Result<Page> {
+    fn start(graph: &str, port: u16, may_control: bool) -> anyhow::Result<Page> {
         let program = std::env::current_exe().context("the program of the page is not known")?;
         let mut command = Command::new(program);
         command.args(["view", graph, "--wait", "--port", &port.to_string()]);
+        command.args(may_control.then_some("--view-control"));
         // Ctrl-C is for the graph: the page shows its end.
         command.stdin(Stdio::piped()).stdout(Stdio::piped()).process_group(0);
         let mut page = Page(command.spawn().context("cannot start the page (--view)")?);

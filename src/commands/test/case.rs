@@ -134,6 +134,7 @@ impl Runner<'_> {
             record_options: RecordOptions { overwrite: true, ..RecordOptions::default() },
             metrics: None,
             view: None,
+            may_control: false,
             json: false,
             is_quiet: true,
             tap: None,

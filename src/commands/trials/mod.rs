@@ -248,6 +248,7 @@ fn run_way(
         record_options: RecordOptions::default(),
         metrics: None,
         view: None,
+        may_control: false,
         json: false,
         is_quiet: true,
         tap: Some(watch.tap()),

@@ -1,6 +1,6 @@
 //! The page of a running graph: the hand, the touch, the decisions and the graph itself, as they change.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -9,18 +9,22 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, machine_of};
 use blindgrasp_graph::control::{Attachment, Reply, Request};
+use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
-use blindgrasp_messages::{ContactSet, LiftDecision, Record, TactileFrame};
+use blindgrasp_messages::{ContactSet, Fault, GraspFeature, LiftDecision, Phase, Prediction, Record, TactileFrame};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, link_poses};
 use blindgrasp_stages::hand::Hand;
-use blindgrasp_viewer::Viewer;
+use blindgrasp_viewer::{Abilities, Viewer};
+use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::super::ps::warnings;
 use super::super::top::poller::Poller;
 use super::super::top::sample::{Look, Window, measure};
 use super::super::{Outcome, print_line, stop_signal};
+use super::control::control_of;
+use super::model::ShownModel;
 
 /// The page gets frames so often: 30 a second.
 const TICK: Duration = Duration::from_millis(33);
@@ -29,19 +33,23 @@ const GRAPH_PAUSE: Duration = Duration::from_secs(1);
 const RETRY: Duration = Duration::from_millis(500);
 /// Probabilities of a tick that are drawn.
 const MAX_PROBABILITIES: usize = 200;
+/// Lines of the log that are shown.
+const MAX_LOG_LINES: usize = 100;
 /// Labels of grasps that wait for their decision.
 const MAX_TRUTHS: usize = 256;
 
 /// Serves the page until the command is interrupted. A graph that ends may run again. With `waits`, it need not run yet, and the
 /// end of stdin ends the page: the process that started it has gone.
-pub(super) fn show(graph: &str, port: u16, waits: bool) -> anyhow::Result<Outcome> {
+/// With `may_control`, the page may change the graph.
+pub(super) fn show(graph: &str, port: u16, waits: bool, may_control: bool) -> anyhow::Result<Outcome> {
     if machine_of(graph).is_some() {
         bail!("{graph}: the page shows graphs of this machine; run the command there, or use blindgrasp top {graph}");
     }
     let stop = stop_signal()?;
     // A graph that does not run is a mistake at the start only.
     let mut connection = if waits { None } else { Some(Connection::open(graph)?) };
-    let viewer = Viewer::serve(port, None)?;
+    let control = may_control.then(|| control_of(graph)).transpose().context("no token for the page")?;
+    let viewer = Viewer::serve(port, Abilities { grasps: None, control })?;
     if waits {
         let stop = Arc::clone(&stop);
         std::thread::spawn(move || {
@@ -50,7 +58,7 @@ pub(super) fn show(graph: &str, port: u16, waits: bool) -> anyhow::Result<Outcom
         });
     }
     let is_interrupted = || stop.load(Ordering::Relaxed);
-    let address = format!("http://{}", viewer.address());
+    let address = viewer.address();
     print_diagnostic(&format!("shows graph '{graph}' in a browser on this machine: {address}"));
     print_line(&address)?;
     let say = |message: &str| viewer.keep("ended", &json!(message).to_string());
@@ -88,18 +96,30 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
     let observer = Observer::start_attached(&domain, edges, reader).context("cannot read the graph's edges")?;
     viewer.forget("ended");
     viewer.keep("graph", &first);
+    let mut model = ShownModel::default();
+    let mut log = ShownLog::open(&before.status.log_folder);
+    let tell = |model: &mut ShownModel, log: &mut ShownLog, now: &Look| {
+        if let Some(event) = model.update(&now.status) {
+            viewer.keep("model", &event);
+        }
+        if log.update() {
+            viewer.keep("log", &json!(log.lines).to_string());
+        }
+    };
+    tell(&mut model, &mut log, &before);
     let mut graph_due = Instant::now() + GRAPH_PAUSE;
-    let pass_on = || {
+    let pass_on = |model: &ShownModel| {
         let mut locked = latest.lock().unwrap_or_else(PoisonError::into_inner);
         let taken = std::mem::take(&mut *locked);
-        // Labels wait for decisions that come later.
+        // Labels wait for decisions that come later, and votes for more of their kind.
         locked.truths.clone_from(&taken.truths);
+        locked.votes = taken.votes;
         drop(locked);
         if let Some(decision) = taken.decisions.last() {
             viewer.keep("decision", &decision_event(decision, &taken.truths));
         }
         if viewer.n_browsers() > 0
-            && let Some(event) = frame_event(hand.as_ref(), taken)
+            && let Some(event) = frame_event(hand.as_ref(), model, taken)
         {
             viewer.send("frame", &event);
         }
@@ -119,7 +139,7 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
             Ok(Some(other)) => break (Err(connection.unexpected(&other).into()), false),
             Err(error) => break (Err(error.into()), false),
         }
-        pass_on();
+        pass_on(&model);
         if Instant::now() >= graph_due {
             graph_due = Instant::now() + GRAPH_PAUSE;
             match poller
@@ -129,6 +149,7 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
             {
                 Ok((event, now)) => {
                     viewer.keep("graph", &event);
+                    tell(&mut model, &mut log, &now);
                     before = now;
                 }
                 Err(error) => break (Err(error), false),
@@ -137,8 +158,36 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
     };
     // A graph that goes on has no end to wait for.
     drop(if is_over { observer.finish() } else { observer.leave() });
-    pass_on();
+    pass_on(&model);
+    if log.update() {
+        viewer.keep("log", &json!(log.lines).to_string());
+    }
     ended
+}
+
+/// The last lines of a graph's logs. Logs that cannot be read are left out.
+struct ShownLog {
+    tail: Option<LogTail>,
+    lines: VecDeque<LogLine>,
+    is_new: bool,
+}
+
+impl ShownLog {
+    fn open(folder: &Path) -> ShownLog {
+        match LogTail::open(LogFolder::at(folder.into()), None, MAX_LOG_LINES, u64::MAX) {
+            Ok((tail, lines)) => ShownLog { tail: Some(tail), lines: lines.into(), is_new: true },
+            Err(_) => ShownLog { tail: None, lines: VecDeque::new(), is_new: true },
+        }
+    }
+
+    /// Reads on; whether the lines are others than before.
+    fn update(&mut self) -> bool {
+        let more = self.tail.as_mut().and_then(|tail| tail.more().ok()).unwrap_or_default();
+        let is_new = std::mem::take(&mut self.is_new) || !more.is_empty();
+        self.lines.extend(more);
+        self.lines.drain(..self.lines.len().saturating_sub(MAX_LOG_LINES));
+        is_new
+    }
 }
 
 /// The hand of the first node with a pad layout. A layout that cannot be read is said, and the page is without a hand.
@@ -162,10 +211,44 @@ type GraspKey = (u64, u64);
 struct Latest {
     frame: Option<TactileFrame>,
     contacts: Option<ContactSet>,
+    feature: Option<GraspFeature>,
     probabilities: Vec<f64>,
     decisions: Vec<(GraspKey, LiftDecision)>,
     /// Whether a grasp was stable.
     truths: BTreeMap<GraspKey, bool>,
+    votes: Votes,
+}
+
+/// The last settled predictions of a grasp that agree, as the arbiter counts them.
+#[derive(Clone, Copy, Default, Serialize)]
+struct Votes {
+    #[serde(skip)]
+    grasp: GraspKey,
+    side: Side,
+    n: u32,
+}
+
+#[derive(Clone, Copy, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+enum Side {
+    Stable,
+    #[default]
+    Unstable,
+    Unsure,
+}
+
+impl Votes {
+    fn count(&mut self, grasp: GraspKey, prediction: &Prediction) {
+        let side = match prediction {
+            Prediction { stable: true, .. } => Side::Stable,
+            Prediction { unsure: true, .. } => Side::Unsure,
+            _ => Side::Unstable,
+        };
+        let is_vote = prediction.phase == Phase::Settled && prediction.fault == Fault::None;
+        let goes_on = self.grasp == grasp && self.side == side;
+        let n = if is_vote { if goes_on { self.n + 1 } else { 1 } } else { 0 };
+        *self = Votes { grasp, side, n };
+    }
 }
 
 /// Reads a graph's edges. It takes each sample at once, so that no writer waits for a browser.
@@ -182,10 +265,12 @@ impl Sink for Reader {
         match record {
             Record::Tactile(sample) if is_shown(sample.header.hand_id) => latest.frame = Some(sample.message),
             Record::Contacts(sample) if is_shown(sample.header.hand_id) => latest.contacts = Some(sample.message),
-            Record::Prediction(sample)
-                if is_shown(sample.header.hand_id) && latest.probabilities.len() < MAX_PROBABILITIES =>
-            {
-                latest.probabilities.push(sample.message.probability_stable);
+            Record::Feature(sample) if is_shown(sample.header.hand_id) => latest.feature = Some(sample.message),
+            Record::Prediction(sample) if is_shown(sample.header.hand_id) => {
+                if latest.probabilities.len() < MAX_PROBABILITIES {
+                    latest.probabilities.push(sample.message.probability_stable);
+                }
+                latest.votes.count((sample.header.epoch, sample.message.grasp_id), &sample.message);
             }
             Record::Decision(sample) if is_shown(sample.header.hand_id) => {
                 latest.decisions.push(((sample.header.epoch, sample.message.grasp_id), sample.message));
@@ -212,13 +297,17 @@ fn decision_event((key, decision): &(GraspKey, LiftDecision), truths: &BTreeMap<
 }
 
 /// `None` if there is nothing new.
-fn frame_event(hand: Option<&Hand>, latest: Latest) -> Option<String> {
-    let Latest { frame, contacts, probabilities, decisions, .. } = latest;
+fn frame_event(hand: Option<&Hand>, model: &ShownModel, latest: Latest) -> Option<String> {
+    let Latest { frame, contacts, feature, probabilities, decisions, votes, .. } = latest;
     if frame.is_none() && probabilities.is_empty() && decisions.is_empty() {
         return None;
     }
     let actions: Vec<_> = decisions.iter().map(|(_, decision)| decision.action).collect();
-    let mut event = json!({"probabilities": probabilities, "actions": actions});
+    let mut event = json!({"probabilities": probabilities, "actions": actions, "votes": votes});
+    if let Some(feature) = feature {
+        event["feature"] = json!(feature.values);
+        event["words"] = model.words(feature.dictionary_id, &feature.values).into();
+    }
     if let (Some(hand), Some(frame)) = (hand, frame) {
         add_frame(&mut event, hand, &frame, contacts.as_ref());
     }
@@ -246,5 +335,7 @@ fn graph_event(now: &Look, before: Option<&Look>) -> anyhow::Result<String> {
     let window = Window { previous: before.unwrap_or(now), rates_since: before, counts_since: None };
     let mut event = serde_json::to_value(measure(now, window))?;
     event["warnings"] = json!(warnings(&now.status));
+    let params = now.status.nodes.iter().map(|node| (&node.node, &node.params));
+    event["params"] = json!(params.collect::<BTreeMap<_, _>>());
     Ok(event.to_string())
 }

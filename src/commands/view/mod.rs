@@ -1,9 +1,11 @@
 //! `blindgrasp view`
 
+mod control;
 mod graph;
 mod grasp;
 mod hand;
 mod live;
+mod model;
 mod recorded;
 
 use std::path::{Path, PathBuf};
@@ -38,6 +40,11 @@ pub(super) struct Arguments {
     /// Port of the page of a running graph or a recording, on 127.0.0.1 [default: any free one]
     #[arg(long, value_name = "PORT", conflicts_with = "out")]
     port: Option<u16>,
+    /// Let the page set parameters, swap nodes and stop the graph
+    ///
+    /// The address that is printed holds a token. The page without it can only be read.
+    #[arg(long, conflicts_with = "out")]
+    view_control: bool,
     /// Wait for the graph, which is being started (run --view)
     #[arg(long, hide = true, requires = "port")]
     wait: bool,
@@ -114,10 +121,18 @@ enum Format {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let (graph, grasp) = (&arguments.graph, &arguments.grasp);
     if arguments.wait {
-        return live::show(&arguments.file.to_string_lossy(), arguments.port.unwrap_or(0), true);
+        return live::show(
+            &arguments.file.to_string_lossy(),
+            arguments.port.unwrap_or(0),
+            true,
+            arguments.view_control,
+        );
     }
     if let Some(name) = graph_name(arguments) {
-        return live::show(name, arguments.port.unwrap_or(0), false);
+        return live::show(name, arguments.port.unwrap_or(0), false, arguments.view_control);
+    }
+    if arguments.view_control {
+        refuse("--view-control is for the page of a running graph: name one");
     }
     let is_recording = arguments.file.extension().is_some_and(|extension| extension == "mcap");
     if arguments.port.is_some() && !is_recording {

@@ -13,7 +13,7 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, ObjectScene};
 use blindgrasp_recording::{ChosenSamples, Reach, Record};
 use blindgrasp_stages::hand::Hand;
-use blindgrasp_viewer::{Grasps, Viewer};
+use blindgrasp_viewer::{Abilities, Grasps, Viewer};
 use serde::Serialize;
 use serde_json::{Value, json};
 
@@ -67,10 +67,10 @@ pub(super) fn show(recording: &Path, port: u16, arguments: &GraspArguments) -> a
         json!({"file": recording.display().to_string(), "first": first, "grasps": list.values().collect::<Vec<_>>()});
     let reading = Reading { recording: recording.into(), objects: arguments.objects.clone(), hand, list };
     let grasps: Grasps = Box::new(move |idx| reading.grasp(idx).map_err(|error| format!("{error:#}")));
-    let viewer = Viewer::serve(port, Some(grasps))?;
+    let viewer = Viewer::serve(port, Abilities { grasps: Some(grasps), control: None })?;
     viewer.keep("scene", &scene);
     viewer.keep("recording", &about.to_string());
-    let address = format!("http://{}", viewer.address());
+    let address = viewer.address();
     print_diagnostic(&format!("shows {} in a browser on this machine: {address}", recording.display()));
     print_line(&address)?;
     while !stop.load(Ordering::Relaxed) {

@@ -1,0 +1,90 @@
+//! Orders from the page to the graph, for a browser that knows the token.
+
+use std::sync::{Arc, Mutex, TryLockError};
+
+use axum::body::Bytes;
+use axum::extract::State;
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Deserialize;
+
+use crate::Shared;
+
+/// A change of the graph that the page asks for.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(tag = "order", rename_all = "snake_case", deny_unknown_fields)]
+pub enum Order {
+    /// Changes a live parameter.
+    Set { node: String, param: String, value: String },
+    /// Replaces a node, after a comparison if that takes any time.
+    Swap {
+        node: String,
+        /// Parameters that the replacement has other values of, as `NAME=VALUE`.
+        changes: Vec<String>,
+        compare_secs: f64,
+        min_agreement: f64,
+    },
+    /// Stops the graph.
+    Stop {},
+}
+
+/// Carries an order out, which may take its time, and gives the answer for the page, or the reason for the failure.
+pub type Act = Box<dyn FnMut(Order) -> Result<String, String> + Send>;
+
+/// The right to change the graph.
+pub struct Control {
+    token: String,
+    act: Arc<Mutex<Act>>,
+}
+
+impl Control {
+    /// Makes a token that nobody can guess.
+    ///
+    /// # Errors
+    /// The operating system gives no random numbers.
+    pub fn new(act: Act) -> std::io::Result<Control> {
+        let mut bytes = [0; 16];
+        getrandom::fill(&mut bytes).map_err(|error| std::io::Error::other(error.to_string()))?;
+        let token = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
+        Ok(Control { token, act: Arc::new(Mutex::new(act)) })
+    }
+
+    pub fn token(&self) -> &str {
+        &self.token
+    }
+
+    /// Whether a request bears the token. The time that this takes does not tell how much of a wrong one is right.
+    fn is_allowed(&self, headers: &HeaderMap) -> bool {
+        let given = headers.get(header::AUTHORIZATION).map(|value| value.as_bytes()).unwrap_or_default();
+        let expected = format!("Bearer {}", self.token);
+        let differs = given.iter().zip(expected.as_bytes()).fold(0, |differs, (a, b)| differs | (a ^ b));
+        given.len() == expected.len() && differs == 0
+    }
+}
+
+pub(crate) async fn order(State(shared): State<Arc<Shared>>, headers: HeaderMap, body: Bytes) -> Response {
+    let Some(control) = &shared.control else {
+        return (StatusCode::NOT_FOUND, "the page only shows the graph: start it with --view-control\n")
+            .into_response();
+    };
+    if !control.is_allowed(&headers) {
+        let why = "the token is not that of this page: open the address that the command has printed\n";
+        return (StatusCode::UNAUTHORIZED, why).into_response();
+    }
+    let order: Order = match serde_json::from_slice(&body) {
+        Ok(order) => order,
+        Err(error) => return (StatusCode::BAD_REQUEST, format!("expected an order: {error}\n")).into_response(),
+    };
+    let act = Arc::clone(&control.act);
+    let answer = tokio::task::spawn_blocking(move || match act.try_lock() {
+        Ok(mut act) => Some(act(order)),
+        Err(TryLockError::Poisoned(act)) => Some(act.into_inner()(order)),
+        Err(TryLockError::WouldBlock) => None,
+    });
+    match answer.await {
+        Ok(Some(Ok(text))) => text.into_response(),
+        Ok(Some(Err(why))) => (StatusCode::UNPROCESSABLE_ENTITY, why).into_response(),
+        Ok(None) => (StatusCode::CONFLICT, "another order is being carried out: wait for its answer\n").into_response(),
+        Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
+    }
+}
