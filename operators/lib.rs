@@ -22,6 +22,8 @@ mod simulated_hand;
 mod tactile_source;
 mod zenoh;
 
+pub use ros2_markers::hand_markers;
+
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, TactileFrame};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;

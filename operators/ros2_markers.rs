@@ -64,7 +64,7 @@ struct Texture {
 ///
 /// # Errors
 /// The frame is another hand's.
-pub(crate) fn hand_markers(hand: &Hand, sample: &Stamped<TactileFrame>, data: &mut Vec<u8>) -> Result<(), String> {
+pub fn hand_markers(hand: &Hand, sample: &Stamped<TactileFrame>, data: &mut Vec<u8>) -> Result<(), String> {
     let frame = &sample.message;
     let palm_from_links = hand.palm_from_links(&frame.joints_rad).map_err(|error| error.to_string())?;
     if frame.cells_newtons.len() != hand.n_cells() {

@@ -365,6 +365,57 @@ fn the_page_of_a_picture_draws_the_grasp() {
     assert_eq!(browser.ask("errors"), Value::Array(vec![]));
 }
 
+/// Messages decoded by rosbags, from a connection by websockets: neither was written here.
+#[test]
+fn foxglove_reads_the_samples_of_a_graph() {
+    let name = unique_name();
+    let graph = launch(&name);
+    graph.wait_for_decisions(1);
+    let (_page, address) = Running::page_with(&name, 0, &["--foxglove"]);
+    let address = address.replace("http://", "ws://") + "/foxglove";
+    let peer = |arguments: &[&str]| {
+        let mut command = Command::new(python());
+        command.arg(project().join("tests/foxglove_peer.py")).arg(&address).args(arguments);
+        command.env("PYTHONDONTWRITEBYTECODE", "1").output().expect("started")
+    };
+    for (subprotocol, origin) in
+        [("foxglove.sdk.v1", "https://app.foxglove.dev"), ("foxglove.websocket.v1", "http://localhost:8080")]
+    {
+        let output = peer(&[subprotocol, origin]);
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let found: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        let schema = |topic: &str| found[topic]["schema"].as_str().map(str::to_owned);
+        assert_eq!(schema("/prediction").as_deref(), Some("blindgrasp_msgs/msg/Prediction"), "{found}");
+        assert_eq!(schema("/decision").as_deref(), Some("blindgrasp_msgs/msg/LiftDecision"));
+        let tactile = &found["/tactile"]["fields"];
+        let is_recorded = RecordingReader::open(&project().join(RECORDING)).expect("a recording").any(|record| {
+            let Record::Tactile(sample) = record.expect("a record").1 else { return false };
+            sample.message.joints_rad == numbers(&tactile["joints_rad"])
+                && sample.message.cells_newtons == numbers(&tactile["cells_newtons"])
+        });
+        assert!(is_recorded, "{tactile}");
+        assert_eq!(found["/joint_states"]["fields"]["name"].as_array().map(Vec::len), Some(7));
+        assert_eq!(found["/contact_points"]["fields"]["header"]["frame_id"], "palm");
+        assert!(found["/hand_markers"]["fields"]["markers"].as_array().is_some_and(|markers| markers.len() > 10));
+        // The layout names topics that there are.
+        let layout = std::fs::read_to_string(project().join("docs/foxglove-layout.json")).expect("a layout");
+        for (topic, _) in found.as_object().expect("topics").iter().filter(|(topic, _)| topic.starts_with("/hand")) {
+            assert!(layout.contains(topic), "{topic}");
+        }
+    }
+    for wrong in [&["foxglove.sdk.v1", "https://robot.example"][..], &["chat.v1"]] {
+        let output = peer(wrong);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!output.status.success() && (said.contains("403") || said.contains("400")), "{wrong:?}: {said}");
+    }
+    let (_page, address) = Running::page_with(&name, 0, &[]);
+    let mut command = Command::new(python());
+    command.arg(project().join("tests/foxglove_peer.py")).arg(address.replace("http://", "ws://") + "/foxglove");
+    let output = command.arg("foxglove.sdk.v1").output().expect("started");
+    assert!(String::from_utf8_lossy(&output.stderr).contains("404"), "without --foxglove nothing is served");
+    graph.stop().assert_undisturbed("clients of Foxglove");
+}
+
 #[test]
 fn run_starts_the_page_and_ends_it() {
     let name = unique_name();

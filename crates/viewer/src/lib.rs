@@ -9,6 +9,7 @@
 //! on the loopback interface, and requests that a page from elsewhere makes are refused by their host and origin.
 
 mod control;
+mod foxglove;
 
 use std::convert::Infallible;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -29,6 +30,8 @@ use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::RecvError;
 
 pub use control::{Act, Control, Order};
+pub use foxglove::Channel;
+use foxglove::Streams;
 
 /// Events that wait for a browser; the eldest are dropped for newer ones.
 const MAX_WAITING: usize = 64;
@@ -36,6 +39,10 @@ const MAX_WAITING: usize = 64;
 const MAX_BROWSERS: usize = 64;
 /// The address of orders.
 const ORDERS: &str = "/orders";
+/// The address of Foxglove's WebSocket.
+const FOXGLOVE: &str = "/foxglove";
+/// Pages and programs from elsewhere that may open it: Foxglove in the browser, and as an application.
+const FOXGLOVE_ORIGINS: [&str; 3] = ["https://app.foxglove.dev", "https://studio.foxglove.dev", "file://"];
 /// Scripts and styles come from here alone, and no other page may frame this one.
 const CONTENT_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; \
                               base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
@@ -71,6 +78,7 @@ struct Shared {
     n_browsers: AtomicUsize,
     grasps: Option<Mutex<Grasps>>,
     control: Option<Control>,
+    streams: Option<Streams>,
 }
 
 /// The abilities of a page beside showing events.
@@ -80,6 +88,8 @@ pub struct Abilities {
     pub grasps: Option<Grasps>,
     /// Orders to a graph.
     pub control: Option<Control>,
+    /// Whether Foxglove may read the graph's samples (see [`Viewer::advertise`]).
+    pub foxglove: bool,
 }
 
 impl Viewer {
@@ -100,6 +110,7 @@ impl Viewer {
             n_browsers: AtomicUsize::new(0),
             grasps: abilities.grasps.map(Mutex::new),
             control: abilities.control,
+            streams: abilities.foxglove.then(Streams::new),
         });
         let files = FILES.into_iter().fold(Router::new(), |router, (path, kind, text)| {
             router.route(path, get(move || async move { ([(header::CONTENT_TYPE, kind)], text) }))
@@ -108,6 +119,7 @@ impl Viewer {
             .route("/events", get(events))
             .route("/grasps/{idx}", get(grasp))
             .route(ORDERS, post(control::order))
+            .route(FOXGLOVE, get(foxglove::connect))
             .with_state(Arc::clone(&shared))
             .layer(middleware::from_fn(guard));
         std::thread::spawn(move || runtime.block_on(async { axum::serve(listener, pages).await }));
@@ -122,6 +134,26 @@ impl Viewer {
     pub fn address(&self) -> String {
         let token = self.shared.control.as_ref().map(|control| format!("/#{}", control.token()));
         format!("http://{}{}", self.address, token.unwrap_or_default())
+    }
+
+    /// The address for Foxglove, if it may read.
+    pub fn foxglove_address(&self) -> Option<String> {
+        self.shared.streams.as_ref().map(|_| format!("ws://{}{FOXGLOVE}", self.address))
+    }
+
+    /// Replaces the streams that Foxglove may read.
+    pub fn advertise(&self, channels: Vec<Channel>) {
+        self.shared.streams.iter().for_each(|streams| streams.advertise(channels.clone()));
+    }
+
+    /// Whether a client of Foxglove reads a stream, by its place in the list of [`Viewer::advertise`].
+    pub fn is_wanted(&self, channel: usize) -> bool {
+        self.shared.streams.as_ref().is_some_and(|streams| streams.is_wanted(channel))
+    }
+
+    /// Sends a message, in CDR, to the clients of Foxglove that read this stream.
+    pub fn send_to_foxglove(&self, channel: usize, data: &[u8]) {
+        self.shared.streams.iter().for_each(|streams| streams.send(channel, data));
     }
 
     /// The number of browsers that read the events.
@@ -170,7 +202,8 @@ fn event(name: &str, json: &str) -> Bytes {
 /// Refuses what a page from elsewhere asks for, and adds what tells browsers to be strict.
 async fn guard(request: Request, next: Next) -> Response {
     let refused = |status: StatusCode, why: &'static str| (status, why).into_response();
-    let mut response = if !is_from_here(request.headers()) {
+    let is_allowed = if request.uri().path() == FOXGLOVE { may_be_foxglove } else { is_from_here };
+    let mut response = if !is_allowed(request.headers()) {
         refused(StatusCode::FORBIDDEN, "expected Host: localhost or 127.0.0.1, and no page from elsewhere\n")
     } else if !matches!(*request.method(), Method::GET | Method::HEAD) && request.uri().path() != ORDERS {
         refused(StatusCode::METHOD_NOT_ALLOWED, "expected GET: this can only be read\n")
@@ -189,17 +222,31 @@ async fn guard(request: Request, next: Next) -> Response {
     response
 }
 
-/// Whether the request names a host of the loopback interface, and comes from a page of this server or from none. A browser
-/// tells the name by which it found the host, so that a name that was made to lead here (DNS rebinding) is of no use.
-fn is_from_here(headers: &HeaderMap) -> bool {
-    let text = |name| headers.get(name).map(|value| value.to_str().unwrap_or("?"));
-    let host = text(header::HOST).unwrap_or_default();
+fn text(headers: &HeaderMap, name: header::HeaderName) -> Option<&str> {
+    headers.get(name).map(|value| value.to_str().unwrap_or("?"))
+}
+
+/// Whether `HOST:PORT` is of the loopback interface. A browser tells the name by which it found the host, so that a name that was
+/// made to lead here (DNS rebinding) is of no use.
+fn is_loopback(host: &str) -> bool {
     let name = host.rsplit_once(':').map_or(host, |(name, _)| name);
-    let is_loopback = ["localhost", "127.0.0.1", "[::1]"].iter().any(|known| name.eq_ignore_ascii_case(known));
-    let is_own = text(header::ORIGIN).is_none_or(|origin| origin == format!("http://{host}"));
-    let is_same_site = text(header::HeaderName::from_static("sec-fetch-site"))
+    ["localhost", "127.0.0.1", "[::1]"].iter().any(|known| name.eq_ignore_ascii_case(known))
+}
+
+/// Whether the request names a host of the loopback interface, and comes from a page of this server or from none.
+fn is_from_here(headers: &HeaderMap) -> bool {
+    let host = text(headers, header::HOST).unwrap_or_default();
+    let is_own = text(headers, header::ORIGIN).is_none_or(|origin| origin == format!("http://{host}"));
+    let is_same_site = text(headers, header::HeaderName::from_static("sec-fetch-site"))
         .is_none_or(|site| ["same-origin", "none"].contains(&site));
-    is_loopback && is_own && is_same_site
+    is_loopback(host) && is_own && is_same_site
+}
+
+/// Whether the request names a host of the loopback interface, and comes from Foxglove, a page of this machine, or no page.
+fn may_be_foxglove(headers: &HeaderMap) -> bool {
+    let is_known =
+        |origin: &str| FOXGLOVE_ORIGINS.contains(&origin) || origin.strip_prefix("http://").is_some_and(is_loopback);
+    is_loopback(text(headers, header::HOST).unwrap_or_default()) && text(headers, header::ORIGIN).is_none_or(is_known)
 }
 
 /// A browser that reads events; it is counted until the response is dropped.
@@ -290,7 +337,7 @@ mod tests {
             assert!(page.starts_with("HTTP/1.1 403") && !page.contains("<title>"), "{head}: {page}");
         }
         let grasps: Grasps = Box::new(|idx| if idx == 3 { Ok("{}".into()) } else { Err("no grasp".into()) });
-        let recording = Viewer::serve(0, Abilities { grasps: Some(grasps), control: None }).expect("served");
+        let recording = Viewer::serve(0, Abilities { grasps: Some(grasps), ..Abilities::default() }).expect("served");
         let of = |id: &str| answer(&recording, &format!("GET /grasps/{id} HTTP/1.1\r\nHost: localhost"));
         assert!(of("3").ends_with("{}") && of("4").starts_with("HTTP/1.1 404") && of("x").starts_with("HTTP/1.1 400"));
         assert!(answer(&viewer, "GET /grasps/3 HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 404"));
@@ -306,7 +353,8 @@ mod tests {
             taken.lock().expect("a list").push(order.clone());
             if order == (Order::Stop {}) { Err("it goes on".into()) } else { Ok("done".into()) }
         });
-        let viewer = Viewer::serve(0, Abilities { grasps: None, control: Some(Control::new(act).expect("a token")) });
+        let viewer =
+            Viewer::serve(0, Abilities { control: Some(Control::new(act).expect("a token")), ..Abilities::default() });
         let viewer = viewer.expect("served");
         let token = viewer.address().split_once('#').map(|(_, token)| token.to_owned()).expect("a token");
         assert_eq!(token.len(), 32);

@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 
 pub(super) use self::feed::{Fed, Feed};
 use super::run::{RecordOptions, Session};
+use super::view::Rights;
 use super::{Outcome, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::describe::{describe, shipped};
@@ -106,7 +107,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         record_options: arguments.record_options.clone(),
         metrics: None,
         view: None,
-        may_control: false,
+        rights: Rights::default(),
         json: arguments.json,
         is_quiet: false,
         tap,

@@ -14,6 +14,7 @@ use clap::{Args, ValueEnum};
 
 pub(super) use self::recorder::RecordOptions;
 pub(super) use self::session::{Session, Tap};
+use super::view::Rights;
 use super::{Outcome, background, check, number_in, stop_requests};
 use blindgrasp_bridge::local::{Placement, local_graph};
 use blindgrasp_graph::dataflow::{self, Graph, Override, Scope};
@@ -74,11 +75,8 @@ pub(super) struct Arguments {
         conflicts_with_all = ["detach", "stay"]
     )]
     view: Option<u16>,
-    /// Let the page of --view set parameters, swap nodes and stop the graph
-    ///
-    /// The address that is printed holds a token. The page without it can only be read.
-    #[arg(long, requires = "view")]
-    view_control: bool,
+    #[command(flatten)]
+    rights: Rights,
     /// Format of the log files: text, or JSON, one object a line
     #[arg(long, value_name = "FORMAT", default_value = "text")]
     log_format: LogFormatArgument,
@@ -158,6 +156,10 @@ impl From<LogFormatArgument> for LogFormat {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if arguments.rights.is_any() && arguments.view.is_none() {
+        let message = "--view-control and --foxglove are for the page of the graph: add --view\n";
+        clap::Error::raw(clap::error::ErrorKind::MissingRequiredArgument, message).exit();
+    }
     if arguments.check {
         let (dataflow, overrides) = (arguments.dataflow.clone(), arguments.overrides.clone());
         let (machine, json) = (arguments.machines.machine.clone(), arguments.json);
@@ -270,7 +272,7 @@ fn session(arguments: &Arguments) -> Session {
         record_options: arguments.record_options.clone(),
         metrics: arguments.metrics,
         view: arguments.view,
-        may_control: arguments.view_control,
+        rights: arguments.rights,
         json: arguments.json,
         is_quiet: false,
         tap: None,

@@ -12,6 +12,7 @@ use anyhow::{Context, bail};
 use serde::Serialize;
 use serde_json::json;
 
+use super::super::view::Rights;
 use super::super::{Outcome, check_output};
 use super::console::Console;
 use super::recorder::{RecordOptions, Recorded, Recorder};
@@ -43,8 +44,8 @@ pub(in crate::commands) struct Session {
     pub(in crate::commands) metrics: Option<u16>,
     /// Port of the page in a browser.
     pub(in crate::commands) view: Option<u16>,
-    /// Whether the page may change the graph.
-    pub(in crate::commands) may_control: bool,
+    /// The abilities of the page beside showing the graph.
+    pub(in crate::commands) rights: Rights,
     /// Decisions and summary are printed as JSON.
     pub(in crate::commands) json: bool,
     /// Neither decisions nor the summary go to stdout; warnings and errors still go to stderr.
@@ -100,7 +101,7 @@ impl Session {
             }
             None => None,
         };
-        let _page = self.view.map(|port| Page::start(name, port, self.may_control)).transpose()?;
+        let _page = self.view.map(|port| Page::start(name, port, self.rights)).transpose()?;
         let is_recorded = recorder.is_some();
         let run::Ended { summary, sink, outcome } =
             run.run(Console::new(self.json, self.is_quiet, recorder, self.tap), n_stops)?;
@@ -149,11 +150,11 @@ struct Page(Child);
 
 impl Page {
     /// Starts it, and waits until the page is served.
-    fn start(graph: &str, port: u16, may_control: bool) -> anyhow::Result<Page> {
+    fn start(graph: &str, port: u16, rights: Rights) -> anyhow::Result<Page> {
         let program = std::env::current_exe().context("the program of the page is not known")?;
         let mut command = Command::new(program);
         command.args(["view", graph, "--wait", "--port", &port.to_string()]);
-        command.args(may_control.then_some("--view-control"));
+        command.args(rights.options());
         // Ctrl-C is for the graph: the page shows its end.
         command.stdin(Stdio::piped()).stdout(Stdio::piped()).process_group(0);
         let mut page = Page(command.spawn().context("cannot start the page (--view)")?);

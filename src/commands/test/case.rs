@@ -8,6 +8,7 @@ use anyhow::bail;
 use serde::Serialize;
 use serde_json::json;
 
+use super::super::view::Rights;
 use super::scratch::Scratch;
 use super::settings;
 use crate::commands::replay::{Fed, Feed};
@@ -134,7 +135,7 @@ impl Runner<'_> {
             record_options: RecordOptions { overwrite: true, ..RecordOptions::default() },
             metrics: None,
             view: None,
-            may_control: false,
+            rights: Rights::default(),
             json: false,
             is_quiet: true,
             tap: None,

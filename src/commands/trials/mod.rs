@@ -16,6 +16,7 @@ use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
 use super::model::write_at_once;
 use super::run::{RecordOptions, Session};
+use super::view::Rights;
 use super::{Outcome, check_output, print_line, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
@@ -248,7 +249,7 @@ fn run_way(
         record_options: RecordOptions::default(),
         metrics: None,
         view: None,
-        may_control: false,
+        rights: Rights::default(),
         json: false,
         is_quiet: true,
         tap: Some(watch.tap()),

@@ -23,7 +23,9 @@ use super::super::ps::warnings;
 use super::super::top::poller::Poller;
 use super::super::top::sample::{Look, Window, measure};
 use super::super::{Outcome, print_line, stop_signal};
+use super::Rights;
 use super::control::control_of;
+use super::foxglove::Streams;
 use super::model::ShownModel;
 
 /// The page gets frames so often: 30 a second.
@@ -40,16 +42,15 @@ const MAX_TRUTHS: usize = 256;
 
 /// Serves the page until the command is interrupted. A graph that ends may run again. With `waits`, it need not run yet, and the
 /// end of stdin ends the page: the process that started it has gone.
-/// With `may_control`, the page may change the graph.
-pub(super) fn show(graph: &str, port: u16, waits: bool, may_control: bool) -> anyhow::Result<Outcome> {
+pub(super) fn show(graph: &str, port: u16, waits: bool, rights: Rights) -> anyhow::Result<Outcome> {
     if machine_of(graph).is_some() {
         bail!("{graph}: the page shows graphs of this machine; run the command there, or use blindgrasp top {graph}");
     }
     let stop = stop_signal()?;
     // A graph that does not run is a mistake at the start only.
     let mut connection = if waits { None } else { Some(Connection::open(graph)?) };
-    let control = may_control.then(|| control_of(graph)).transpose().context("no token for the page")?;
-    let viewer = Viewer::serve(port, Abilities { grasps: None, control })?;
+    let control = rights.view_control.then(|| control_of(graph)).transpose().context("no token for the page")?;
+    let viewer = Viewer::serve(port, Abilities { grasps: None, control, foxglove: rights.foxglove })?;
     if waits {
         let stop = Arc::clone(&stop);
         std::thread::spawn(move || {
@@ -60,6 +61,9 @@ pub(super) fn show(graph: &str, port: u16, waits: bool, may_control: bool) -> an
     let is_interrupted = || stop.load(Ordering::Relaxed);
     let address = viewer.address();
     print_diagnostic(&format!("shows graph '{graph}' in a browser on this machine: {address}"));
+    if let Some(address) = viewer.foxglove_address() {
+        print_diagnostic(&format!("Foxglove: open the connection {address}"));
+    }
     print_line(&address)?;
     let say = |message: &str| viewer.keep("ended", &json!(message).to_string());
     say(&format!("waits for graph '{graph}'"));
@@ -89,10 +93,11 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
     // The decision and the hand of an earlier run are not shown any more.
     viewer.forget("decision");
     viewer.keep("scene", &serde_json::to_string(&hand.as_ref().map(HandScene::new))?);
+    let streams = viewer.foxglove_address().map(|_| Streams::begin(viewer, &edges, hand.as_ref()));
     let edges = edges.into_iter().filter(|edge| can_observe(&edge.input.service.type_name));
     let edges = edges.map(|edge| ObservedEdge { topic: edge.topic, input: edge.input, is_prompt: false }).collect();
     let latest = Arc::new(Mutex::new(Latest::default()));
-    let reader = Reader { latest: Arc::clone(&latest), hand_id: hand.as_ref().map(Hand::id) };
+    let reader = Reader { latest: Arc::clone(&latest), hand_id: hand.as_ref().map(Hand::id), streams };
     let observer = Observer::start_attached(&domain, edges, reader).context("cannot read the graph's edges")?;
     viewer.forget("ended");
     viewer.keep("graph", &first);
@@ -255,13 +260,18 @@ impl Votes {
 struct Reader {
     latest: Arc<Mutex<Latest>>,
     hand_id: Option<u64>,
+    streams: Option<Streams>,
 }
 
 impl Sink for Reader {
-    fn take(&mut self, _topic: &str, record: Record, _received_nanos: u64) -> anyhow::Result<()> {
-        let mut latest = self.latest.lock().unwrap_or_else(PoisonError::into_inner);
+    fn take(&mut self, topic: &str, record: Record, _received_nanos: u64) -> anyhow::Result<()> {
         // A graph may have several hands: the page shows one. 0 stands for an unknown hand.
-        let is_shown = |hand_id: u64| hand_id == 0 || self.hand_id.is_none_or(|shown| shown == hand_id);
+        let shown = self.hand_id;
+        let is_shown = |hand_id: u64| hand_id == 0 || shown.is_none_or(|shown| shown == hand_id);
+        if let Some(streams) = &mut self.streams {
+            streams.send(topic, &record, is_shown(record.header().hand_id));
+        }
+        let mut latest = self.latest.lock().unwrap_or_else(PoisonError::into_inner);
         match record {
             Record::Tactile(sample) if is_shown(sample.header.hand_id) => latest.frame = Some(sample.message),
             Record::Contacts(sample) if is_shown(sample.header.hand_id) => latest.contacts = Some(sample.message),

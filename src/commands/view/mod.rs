@@ -1,6 +1,7 @@
 //! `blindgrasp view`
 
 mod control;
+mod foxglove;
 mod graph;
 mod grasp;
 mod hand;
@@ -40,11 +41,8 @@ pub(super) struct Arguments {
     /// Port of the page of a running graph or a recording, on 127.0.0.1 [default: any free one]
     #[arg(long, value_name = "PORT", conflicts_with = "out")]
     port: Option<u16>,
-    /// Let the page set parameters, swap nodes and stop the graph
-    ///
-    /// The address that is printed holds a token. The page without it can only be read.
-    #[arg(long, conflicts_with = "out")]
-    view_control: bool,
+    #[command(flatten)]
+    rights: Rights,
     /// Wait for the graph, which is being started (run --view)
     #[arg(long, hide = true, requires = "port")]
     wait: bool,
@@ -54,6 +52,33 @@ pub(super) struct Arguments {
     grasp: GraspArguments,
     #[command(flatten)]
     alone: HandArguments,
+}
+
+/// The abilities of the page of a running graph, beside showing it.
+#[derive(Debug, Clone, Copy, Default, Args)]
+pub(in crate::commands) struct Rights {
+    /// Let the page set parameters, swap nodes and stop the graph
+    ///
+    /// The address that is printed holds a token. The page without it can only be read.
+    #[arg(long)]
+    pub(in crate::commands) view_control: bool,
+    /// Let Foxglove read the graph's samples, at ws://127.0.0.1:PORT/foxglove
+    #[arg(long)]
+    pub(in crate::commands) foxglove: bool,
+}
+
+impl Rights {
+    /// Whether there is any.
+    pub(in crate::commands) fn is_any(self) -> bool {
+        self.view_control || self.foxglove
+    }
+
+    /// The options that give them.
+    pub(in crate::commands) fn options(self) -> impl Iterator<Item = &'static str> {
+        [(self.view_control, "--view-control"), (self.foxglove, "--foxglove")]
+            .into_iter()
+            .filter_map(|(is, option)| is.then_some(option))
+    }
 }
 
 #[derive(Debug, Args)]
@@ -121,18 +146,13 @@ enum Format {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let (graph, grasp) = (&arguments.graph, &arguments.grasp);
     if arguments.wait {
-        return live::show(
-            &arguments.file.to_string_lossy(),
-            arguments.port.unwrap_or(0),
-            true,
-            arguments.view_control,
-        );
+        return live::show(&arguments.file.to_string_lossy(), arguments.port.unwrap_or(0), true, arguments.rights);
     }
     if let Some(name) = graph_name(arguments) {
-        return live::show(name, arguments.port.unwrap_or(0), false, arguments.view_control);
+        return live::show(name, arguments.port.unwrap_or(0), false, arguments.rights);
     }
-    if arguments.view_control {
-        refuse("--view-control is for the page of a running graph: name one");
+    if arguments.rights.is_any() {
+        refuse("--view-control and --foxglove are for the page of a running graph: name one");
     }
     let is_recording = arguments.file.extension().is_some_and(|extension| extension == "mcap");
     if arguments.port.is_some() && !is_recording {

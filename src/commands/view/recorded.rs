@@ -67,7 +67,7 @@ pub(super) fn show(recording: &Path, port: u16, arguments: &GraspArguments) -> a
         json!({"file": recording.display().to_string(), "first": first, "grasps": list.values().collect::<Vec<_>>()});
     let reading = Reading { recording: recording.into(), objects: arguments.objects.clone(), hand, list };
     let grasps: Grasps = Box::new(move |idx| reading.grasp(idx).map_err(|error| format!("{error:#}")));
-    let viewer = Viewer::serve(port, Abilities { grasps: Some(grasps), control: None })?;
+    let viewer = Viewer::serve(port, Abilities { grasps: Some(grasps), ..Abilities::default() })?;
     viewer.keep("scene", &scene);
     viewer.keep("recording", &about.to_string());
     let address = viewer.address();
