@@ -37,6 +37,7 @@ mod replay;
 mod reproduce;
 mod ros2;
 mod ros2_commands;
+mod run_report;
 mod sandbox;
 mod scaffold;
 mod sensors;

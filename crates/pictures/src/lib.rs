@@ -10,6 +10,7 @@
 //! * [`dictionary_svg`] - a contact dictionary over the hand.
 //! * [`graph_mermaid`], [`graph_dot`] - a graph of processes.
 //! * [`chart`] - lines, points and bars over axes.
+//! * [`ReportPage`] - a page of text, tables and pictures.
 //!
 //! Surfaces are rendered here, by a small z-buffered rasteriser (no graphics card, no fonts), and embedded as PNG; what
 //! must be sharp or read (arrows, numbers, heat maps, text) lies over them as vectors. The same input gives the same
@@ -31,6 +32,7 @@ mod pads;
 mod png_image;
 mod posed_scene;
 mod raster;
+mod report;
 mod scene;
 mod svg;
 mod view;
@@ -45,6 +47,7 @@ pub use grasp_picture::grasp_svg;
 pub use heat_map::{HeatMap, HeatMapAxis, HeatMapCell, heat_map_svg};
 pub use html::grasp_html;
 pub use posed_scene::{PosedScene, posed_scene_images};
+pub use report::{ReportPage, report_table};
 pub use scene::{HandScene, ObjectScene, STAGE_JS, THREE_JS, link_poses};
 pub use svg::escape;
 

@@ -108,6 +108,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         metrics: None,
         view: None,
         rights: Rights::default(),
+        report: None,
         json: arguments.json,
         is_quiet: false,
         tap,

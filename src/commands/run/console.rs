@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use super::recorder::Recorder;
+use super::report::RunReport;
 use super::session::Tap;
 use blindgrasp_graph::run::{RunSink, SeenDecision};
 use blindgrasp_messages::{Action, GraspTruth, LiftOutcome};
@@ -18,6 +19,7 @@ pub(super) struct Console {
     /// Decisions are made and recorded whether or not stdout is read.
     pub(super) printer: LinePrinter,
     pub(super) recorder: Option<Recorder>,
+    pub(super) report: Option<RunReport>,
     tap: Option<Tap>,
 }
 
@@ -41,8 +43,15 @@ struct OutcomeLine<'a> {
 }
 
 impl Console {
-    pub(super) fn new(json: bool, is_quiet: bool, recorder: Option<Recorder>, tap: Option<Tap>) -> Console {
-        Console { json, is_quiet, printer: LinePrinter::new(std::io::stdout(), MAX_UNREAD_LINES), recorder, tap }
+    pub(super) fn new(
+        json: bool,
+        is_quiet: bool,
+        recorder: Option<Recorder>,
+        report: Option<RunReport>,
+        tap: Option<Tap>,
+    ) -> Console {
+        let printer = LinePrinter::new(std::io::stdout(), MAX_UNREAD_LINES);
+        Console { json, is_quiet, printer, recorder, report, tap }
     }
 }
 
@@ -51,6 +60,9 @@ impl RunSink for Console {
         if let Some(tap) = &mut self.tap {
             tap(topic, &record, received_nanos)?;
         }
+        if let Some(report) = &mut self.report {
+            report.sample(&record);
+        }
         if let Some(recorder) = &mut self.recorder {
             recorder.push(topic, record);
         }
@@ -58,6 +70,9 @@ impl RunSink for Console {
     }
 
     fn decision(&mut self, seen: &SeenDecision<'_>) -> anyhow::Result<()> {
+        if let Some(report) = &mut self.report {
+            report.decision(seen);
+        }
         if self.is_quiet {
             return Ok(());
         }

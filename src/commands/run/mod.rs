@@ -2,6 +2,7 @@
 
 mod console;
 pub(super) mod recorder;
+mod report;
 mod session;
 mod table;
 
@@ -77,6 +78,12 @@ pub(super) struct Arguments {
     view: Option<u16>,
     #[command(flatten)]
     rights: Rights,
+    /// Write a report with pictures to this file (.html) at the end
+    ///
+    /// Decisions in time, ages on arrival, losses, the log, and the first wrong decisions where the truth is known. Like a recording,
+    /// it reads every edge.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["detach", "stay"])]
+    report: Option<PathBuf>,
     /// Format of the log files: text, or JSON, one object a line
     #[arg(long, value_name = "FORMAT", default_value = "text")]
     log_format: LogFormatArgument,
@@ -273,6 +280,7 @@ fn session(arguments: &Arguments) -> Session {
         metrics: arguments.metrics,
         view: arguments.view,
         rights: arguments.rights,
+        report: arguments.report.clone(),
         json: arguments.json,
         is_quiet: false,
         tap: None,

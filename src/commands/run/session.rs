@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader};
 use std::os::unix::process::CommandExt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -16,6 +16,7 @@ use super::super::view::Rights;
 use super::super::{Outcome, check_output};
 use super::console::Console;
 use super::recorder::{RecordOptions, Recorded, Recorder};
+use super::report::RunReport;
 use super::table::table;
 use blindgrasp_graph::dataflow::Graph;
 use blindgrasp_graph::launcher::LaunchOptions;
@@ -26,6 +27,7 @@ use blindgrasp_learning::of_graph::of_graph;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_recording::Record;
+use blindgrasp_stages::hand::Hand;
 
 /// The page of a graph that ends has this time to show its end.
 const PAGE_LIMIT: Duration = Duration::from_secs(3);
@@ -46,6 +48,8 @@ pub(in crate::commands) struct Session {
     pub(in crate::commands) view: Option<u16>,
     /// The abilities of the page beside showing the graph.
     pub(in crate::commands) rights: Rights,
+    /// The report is written to this file (HTML) at the end.
+    pub(in crate::commands) report: Option<PathBuf>,
     /// Decisions and summary are printed as JSON.
     pub(in crate::commands) json: bool,
     /// Neither decisions nor the summary go to stdout; warnings and errors still go to stderr.
@@ -85,11 +89,15 @@ impl Session {
             check_output(path, &inputs)?;
             self.record_options.check(path)?;
         }
+        if let Some(path) = &self.report {
+            let inputs: Vec<PathBuf> = self.record.iter().cloned().collect();
+            check_output(path, &inputs)?;
+        }
         let listen = |port| metrics::listen(port).with_context(|| format!("cannot answer on port {port} (--metrics)"));
         let options = RunOptions {
             launch: self.launch,
             clock: self.clock,
-            reads_all: self.record.is_some() || self.tap.is_some(),
+            reads_all: self.record.is_some() || self.tap.is_some() || self.report.is_some(),
             metrics: self.metrics.map(listen).transpose()?,
             is_quiet: self.is_quiet,
         };
@@ -103,11 +111,12 @@ impl Session {
         };
         let _page = self.view.map(|port| Page::start(name, port, self.rights)).transpose()?;
         let is_recorded = recorder.is_some();
+        let report = self.report.as_ref().map(|_| RunReport::begin(hand_of(graph)));
         let run::Ended { summary, sink, outcome } =
-            run.run(Console::new(self.json, self.is_quiet, recorder, self.tap), n_stops)?;
+            run.run(Console::new(self.json, self.is_quiet, recorder, report, self.tap), n_stops)?;
         let n_seen = n_stops.load(Ordering::Relaxed);
 
-        let Console { mut printer, recorder, .. } = sink;
+        let Console { mut printer, recorder, report, .. } = sink;
         let ending = if outcome.is_ok() { Ending::Graph } else { Ending::Broken };
         let mut recorded: Recorded = recorder.map(|recorder| recorder.finish(ending)).unwrap_or_default();
         if outcome.is_err() {
@@ -135,6 +144,12 @@ impl Session {
         if !self.is_quiet {
             summary.print_recording();
         }
+        if let (Some(report), Some(path)) = (report, &self.report) {
+            report.write(path, &summary.run)?;
+            if !self.is_quiet {
+                print_diagnostic(&format!("the report of the run is {}", path.display()));
+            }
+        }
         outcome?;
         if let Some(error) = printer.take_failure() {
             return Err(error).context("decisions were made that could not be written to stdout");
@@ -143,6 +158,12 @@ impl Session {
         let is_lossy = summary.run.is_lossy(self.clock) || is_recording_lossy;
         Ok(Ended { summary, outcome: if is_lossy { Outcome::FinishedWithLoss } else { Outcome::Done } })
     }
+}
+
+/// The hand of the first node with a pad layout. The operator itself says if it cannot be read.
+fn hand_of(graph: &Graph) -> Option<Hand> {
+    let paths = graph.nodes.iter().filter_map(|node| node.params.get("hand")?.as_str());
+    Hand::load(Path::new(paths.into_iter().next()?)).ok()
 }
 
 /// The process that serves the page of the graph. It ends when its stdin does, also if this process is killed.

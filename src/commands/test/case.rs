@@ -136,6 +136,7 @@ impl Runner<'_> {
             metrics: None,
             view: None,
             rights: Rights::default(),
+            report: None,
             json: false,
             is_quiet: true,
             tap: None,

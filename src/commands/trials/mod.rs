@@ -250,6 +250,7 @@ fn run_way(
         metrics: None,
         view: None,
         rights: Rights::default(),
+        report: None,
         json: false,
         is_quiet: true,
         tap: Some(watch.tap()),

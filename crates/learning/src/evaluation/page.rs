@@ -12,10 +12,9 @@ use crate::dataset::label_line;
 use blindgrasp_pictures::chart::{
     Axis, BarChart, COLOURS, Chart, Line, NumberFormat, Series, bar_chart_svg, chart_svg, range_from_zero, thousands,
 };
-use blindgrasp_pictures::{DrawnWord, PictureError, dictionary_svg, escape};
+use blindgrasp_pictures::{DrawnWord, PictureError, ReportPage, dictionary_svg, escape, report_table};
 use blindgrasp_stages::hand::Hand;
 
-const STYLE: &str = include_str!("../report.css");
 /// As in the paper's Figure 2: green for errors, yellow for false positives.
 const ERRORS: &str = "#2f9e44";
 const FALSE_POSITIVES: &str = "#f2b701";
@@ -28,28 +27,18 @@ const FULL_WIDTH: f64 = 1152.0;
 /// # Errors
 /// A dictionary that cannot be drawn on this hand.
 pub fn report_page(hand: &Hand, report: &Report) -> Result<String, PictureError> {
-    let title = escape(&title(report));
-    let mut page = format!(
-        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
-         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>{title}</title>\n\
-         <style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n<h1>{title}</h1>\n<p class=\"lead\">{}</p>\n",
-        summary(report)
-    );
-    section(&mut page, "Table I: learning performance in simulation", &table_1(report));
-    section(&mut page, "Decisions", &measures_table(report));
+    let mut page = ReportPage::begin(&title(report), &summary(report));
+    page.section("Table I: learning performance in simulation", &table_1(report));
+    page.section("Decisions", &measures_table(report));
     if !report.comparisons.is_empty() {
-        section(&mut page, "Recipes against each other", &comparisons(report));
+        page.section("Recipes against each other", &comparisons(report));
     }
     if !report.repeats.is_empty() {
-        section(&mut page, "The same with other folds", &repeats(report));
+        page.section("The same with other folds", &repeats(report));
     }
     let mut charts = vec![roc(report), precision_recall(report), reliability(report), thresholds(report)];
     charts.extend(learning_curves(report));
-    page.push_str("<div class=\"pairs\">\n");
-    for chart in &charts {
-        let _ = writeln!(page, "<figure>\n{}</figure>", chart_svg(chart));
-    }
-    page.push_str("</div>\n");
+    page.pairs(charts.iter().map(chart_svg));
     let problems: Vec<String> = report
         .learning_curve
         .iter()
@@ -59,23 +48,22 @@ pub fn report_page(hand: &Hand, report: &Report) -> Result<String, PictureError>
         })
         .collect();
     if !problems.is_empty() {
-        let _ = writeln!(page, "<p class=\"aside\">Too little to learn from: {}.</p>", problems.join("; "));
+        page.raw(&format!("<p class=\"aside\">Too little to learn from: {}.</p>\n", problems.join("; ")));
     }
     for chart in figure_2(report) {
-        let _ = writeln!(page, "<figure>\n{}</figure>", bar_chart_svg(&chart));
+        page.figure(&bar_chart_svg(&chart), "");
     }
     if let Some(picture) = figure_1(hand, report)? {
-        let _ = writeln!(
-            page,
-            "<figure>\n{picture}<figcaption class=\"caption\">As the paper's Figure 1. The dictionary is {}; each word \
-             stands for the contacts nearest to it. The hand is in the median posture of the grasps.</figcaption></figure>",
+        let caption = format!(
+            "As the paper's Figure 1. The dictionary is {}; each word stands for the contacts nearest to it. The hand is in the \
+             median posture of the grasps.",
             escape(&report.dictionary.from)
         );
+        page.figure(&picture, &caption);
     }
-    section(&mut page, "By class", &classes_table(report));
-    section(&mut page, "How this was made", &how_made(report));
-    page.push_str("</main>\n</body>\n</html>\n");
-    Ok(page)
+    page.section("By class", &classes_table(report));
+    page.section("How this was made", &how_made(report));
+    Ok(page.finish())
 }
 
 /// Table I as CSV.
@@ -132,11 +120,6 @@ fn figure_1(hand: &Hand, report: &Report) -> Result<Option<String>, PictureError
     dictionary_svg(hand, &report.dictionary.joints_rad, &words).map(Some)
 }
 
-fn section(page: &mut String, title: &str, body: &str) {
-    // Writing to a string cannot fail.
-    let _ = writeln!(page, "<section>\n<h2>{title}</h2>\n{body}</section>");
-}
-
 fn title(report: &Report) -> String {
     match (&report.made.split, report.judges.as_slice()) {
         (None, [model]) => format!("What {} is worth", model.name),
@@ -183,24 +166,6 @@ fn summary(report: &Report) -> String {
     text
 }
 
-fn table(head: &[(&str, bool)], rows: &[(bool, Vec<String>)]) -> String {
-    let class = |number: bool| if number { " class=\"number\"" } else { "" };
-    let mut text = String::from("<div class=\"scroll\"><table>\n<thead><tr>");
-    for (name, number) in head {
-        let _ = write!(text, "<th{}>{name}</th>", class(*number));
-    }
-    text.push_str("</tr></thead>\n<tbody>\n");
-    for (own, cells) in rows {
-        text.push_str(if *own { "<tr class=\"own\">" } else { "<tr>" });
-        for (cell, (_, number)) in cells.iter().zip(head) {
-            let _ = write!(text, "<td{}>{cell}</td>", class(*number));
-        }
-        text.push_str("</tr>\n");
-    }
-    text.push_str("</tbody>\n</table></div>\n");
-    text
-}
-
 fn table_1(report: &Report) -> String {
     let row = |row: &TableRow| {
         let whose = if row.of_paper { "Dang &amp; Allen: " } else { "" };
@@ -224,7 +189,7 @@ fn table_1(report: &Report) -> String {
         ("accuracy", true),
         ("false positives", true),
     ];
-    let mut text = table(&head, &report.table_1.iter().map(row).collect::<Vec<_>>());
+    let mut text = report_table(&head, &report.table_1.iter().map(row).collect::<Vec<_>>());
     let data = &report.data;
     let _ = writeln!(
         text,
@@ -281,7 +246,7 @@ fn measures_table(report: &Report) -> String {
         let all = |judge| (false, row(judge, ", all", &judge.all, false));
         rows.extend(report.judges.iter().map(all));
     }
-    let mut text = table(&head, &rows);
+    let mut text = report_table(&head, &rows);
     let about: Vec<String> = report
         .judges
         .iter()
@@ -337,7 +302,7 @@ fn comparisons(report: &Report) -> String {
         ("false positives", true),
         ("fewer", true),
     ];
-    let mut text = table(&head, &report.comparisons.iter().map(row).collect::<Vec<_>>());
+    let mut text = report_table(&head, &report.comparisons.iter().map(row).collect::<Vec<_>>());
     text.push_str(
         "<p class=\"caption\">The same grasps, the same folds. Fewer errors: by which share of the second one's errors \
          the first one's are fewer. Only one right: grasps that only the first, and only the second, decides rightly; \
@@ -380,7 +345,7 @@ fn repeats(report: &Report) -> String {
         )
     }));
     rows.push((true, means));
-    table(&head, &rows)
+    report_table(&head, &rows)
 }
 
 fn classes_table(report: &Report) -> String {
@@ -407,7 +372,7 @@ fn classes_table(report: &Report) -> String {
             (false, cells)
         })
         .collect();
-    format!("<details><summary>The numbers of Figure 2</summary>\n{}</details>\n", table(&head, &rows))
+    format!("<details><summary>The numbers of Figure 2</summary>\n{}</details>\n", report_table(&head, &rows))
 }
 
 fn how_made(report: &Report) -> String {

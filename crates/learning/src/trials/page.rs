@@ -8,17 +8,13 @@ use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
 
 use super::tables::{Table, TrialsReport, tables};
 use super::tally::TrialRecord;
-use blindgrasp_pictures::{PictureError, PosedScene, escape, posed_scene_images};
+use blindgrasp_pictures::{PictureError, PosedScene, ReportPage, escape, posed_scene_images};
 use blindgrasp_simulator::trial::{
     Attempt, LiftTarget, Probe, Snapshot, TrialError, TrialOptions, choose_start, sensor_seed,
 };
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
 
-/// The same look as the evaluation's report.
-const STYLE: &str = include_str!("../report.css");
-const STRIP_STYLE: &str = ".strip{display:flex;gap:8px;flex-wrap:wrap;background:#fff;border-radius:8px;padding:6px;\
-                           width:max-content;max-width:100%;box-sizing:border-box}.strip img{display:block}";
 /// Images of a lift: from when it begins to its end.
 const N_MOMENTS: usize = 4;
 /// Pixels.
@@ -45,37 +41,29 @@ pub enum StripError {
 
 /// The page.
 pub fn trials_page(report: &TrialsReport, strips: &[Strip]) -> String {
-    let mut page = format!(
-        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
-         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>Lift trials</title>\n\
-         <style>\n{STYLE}{STRIP_STYLE}\n</style>\n</head>\n<body>\n<main>\n<h1>Lift trials</h1>\n<p class=\"lead\">{}</p>\n",
-        escape(&lead(report))
-    );
-    // Writing to a string cannot fail.
+    let mut page = ReportPage::begin("Lift trials", &escape(&lead(report)));
     for table in tables(report) {
-        let _ = write!(page, "<section>\n<h2>{}</h2>\n{}</section>\n", escape(&table.title), html(&table));
+        page.section(&table.title, &html(&table));
     }
     if !strips.is_empty() {
-        page.push_str("<section>\n<h2>Some of the trials</h2>\n");
+        let mut body = String::new();
         for strip in strips {
-            let _ = write!(page, "<figure>\n<div class=\"strip\">\n");
+            body.push_str("<figure>\n<div class=\"strip\">\n");
             for (secs, image) in &strip.images {
                 let [width, height] = IMAGE;
+                // Writing to a string cannot fail.
                 let _ = writeln!(
-                    page,
+                    body,
                     "<img src=\"{image}\" width=\"{width}\" height=\"{height}\" alt=\"after {secs:.2} s\" \
                      title=\"after {secs:.2} s\">"
                 );
             }
-            let _ = write!(
-                page,
-                "</div>\n<figcaption class=\"caption\">{}</figcaption>\n</figure>\n",
-                escape(&strip.caption)
-            );
+            let caption = escape(&strip.caption);
+            let _ = write!(body, "</div>\n<figcaption class=\"caption\">{caption}</figcaption>\n</figure>\n");
         }
-        page.push_str("</section>\n");
+        page.section("Some of the trials", &body);
     }
-    let _ = write!(page, "<section>\n<h2>How this was made</h2>\n<dl>\n");
+    let mut made = String::from("<dl>\n");
     for (name, value) in [
         ("command", report.command.clone()),
         ("objects", report.objects.clone()),
@@ -84,10 +72,10 @@ pub fn trials_page(report: &TrialsReport, strips: &[Strip]) -> String {
         ("intervals", "95 %, Wilson's; lifts count as independent".into()),
         ("assumed", "the objects' sizes and their friction; the paper's masses".into()),
     ] {
-        let _ = writeln!(page, "<dt>{name}</dt><dd>{}</dd>", escape(&value));
+        let _ = writeln!(made, "<dt>{name}</dt><dd>{}</dd>", escape(&value));
     }
-    page.push_str("</dl>\n</section>\n</main>\n</body>\n</html>\n");
-    page
+    page.section("How this was made", &format!("{made}</dl>\n"));
+    page.finish()
 }
 
 /// Of each group, with the gate (or without, if there was none), the first grasp that held, the first that was dropped

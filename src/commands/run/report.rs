@@ -1,0 +1,350 @@
+//! The report of a run as a page: its decisions in time, latencies, losses, changes, and pictures of wrong decisions.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::time::Instant;
+
+use blindgrasp_graph::log::{LogFolder, LogTail};
+use blindgrasp_graph::run::{SeenDecision, Summary};
+use blindgrasp_messages::{Action, GraspTruth, LiftDecision, Phase, Record, Stamped, TactileFrame};
+use blindgrasp_operator::ages::Ages;
+use blindgrasp_pictures::chart::{
+    Axis, BarChart, COLOURS, Chart, Line, NumberFormat, Series, bar_chart_svg, chart_svg, range_from_zero,
+};
+use blindgrasp_pictures::{ObjectSurface, RecordedGrasp, ReportPage, escape, grasp_svg, report_table};
+use blindgrasp_stages::hand::Hand;
+
+/// Decisions in the chart; of more, every nth is drawn, and every wrong one.
+const MAX_DRAWN: usize = 2000;
+/// Wrong decisions of a kind in the chart.
+const MAX_WRONG: usize = 500;
+/// Pictures of wrong lifts, and of wrong holds.
+const MAX_PICTURES: usize = 6;
+/// Grasps whose decision or truth may come later.
+const MAX_OPEN: usize = 256;
+/// Lines of the log.
+const MAX_LINES: usize = 200;
+
+/// A grasp: the source's epoch, and its number.
+type GraspKey = (u64, u64);
+
+/// A decision in the chart: seconds since the start, and the probability.
+type Point = [f64; 2];
+
+/// The things that a report needs of a run, in bounded memory.
+pub(super) struct RunReport {
+    start: Instant,
+    hand: Option<Hand>,
+    open: BTreeMap<GraspKey, Open>,
+    /// Decisions that count as right, or of which the truth is not known: every `step`th.
+    others: Vec<Point>,
+    step: usize,
+    n_others: usize,
+    wrong_lifts: Wrong,
+    wrong_holds: Wrong,
+}
+
+/// A grasp of which not all is known.
+#[derive(Default)]
+struct Open {
+    /// The last settled frame, or the last one.
+    frame: Option<Stamped<TactileFrame>>,
+    decision: Option<(f64, LiftDecision)>,
+    truth: Option<GraspTruth>,
+}
+
+#[derive(Default)]
+struct Wrong {
+    n: usize,
+    points: Vec<Point>,
+    pictures: Vec<RecordedGrasp>,
+}
+
+impl RunReport {
+    pub(super) fn begin(hand: Option<Hand>) -> RunReport {
+        RunReport {
+            start: Instant::now(),
+            hand,
+            open: BTreeMap::new(),
+            others: Vec::new(),
+            step: 1,
+            n_others: 0,
+            wrong_lifts: Wrong::default(),
+            wrong_holds: Wrong::default(),
+        }
+    }
+
+    fn open(&mut self, key: GraspKey) -> &mut Open {
+        if !self.open.contains_key(&key) && self.open.len() >= MAX_OPEN {
+            // The oldest will not be completed.
+            if let Some((_, Open { decision: Some((secs, decision)), .. })) = self.open.pop_first() {
+                self.add([secs, decision.probability_stable]);
+            }
+        }
+        self.open.entry(key).or_default()
+    }
+
+    pub(super) fn sample(&mut self, record: &Record) {
+        match record {
+            Record::Tactile(sample) => {
+                let hand = self.hand.as_ref().map(|hand| (hand.id(), hand.n_cells()));
+                let is_shown = hand.is_some_and(|(id, n_cells)| {
+                    [0, id].contains(&sample.header.hand_id) && sample.message.cells_newtons.len() == n_cells
+                });
+                if is_shown {
+                    let open = self.open((sample.header.epoch, sample.message.grasp_id));
+                    let is_settled = |frame: &TactileFrame| frame.phase == Phase::Settled;
+                    if is_settled(&sample.message) || !open.frame.as_ref().is_some_and(|last| is_settled(&last.message))
+                    {
+                        open.frame = Some(sample.clone());
+                    }
+                }
+            }
+            Record::Truth(truth) => {
+                let key = (truth.header.epoch, truth.message.grasp_id);
+                self.open(key).truth = Some(truth.message.clone());
+                self.settle(key);
+            }
+            _ => {}
+        }
+    }
+
+    pub(super) fn decision(&mut self, seen: &SeenDecision<'_>) {
+        let key = (seen.header.epoch, seen.decision.grasp_id);
+        let secs = self.start.elapsed().as_secs_f64();
+        let open = self.open(key);
+        open.decision = Some((secs, seen.decision.clone()));
+        open.truth = open.truth.take().or_else(|| seen.truth.cloned());
+        self.settle(key);
+    }
+
+    /// Counts a grasp whose decision and truth are known.
+    fn settle(&mut self, key: GraspKey) {
+        if self.open.get(&key).is_none_or(|open| open.decision.is_none() || open.truth.is_none()) {
+            return;
+        }
+        let Some(Open { frame, decision: Some((secs, decision)), truth: Some(truth) }) = self.open.remove(&key) else {
+            return;
+        };
+        let point = [secs, decision.probability_stable];
+        let wrong = match (decision.action, truth.stable) {
+            (Action::Lift, false) => &mut self.wrong_lifts,
+            (Action::Hold | Action::Regrasp, true) => &mut self.wrong_holds,
+            _ => return self.add(point),
+        };
+        wrong.n += 1;
+        if wrong.points.len() < MAX_WRONG {
+            wrong.points.push(point);
+        }
+        if let Some(frame) = frame.filter(|_| wrong.pictures.len() < MAX_PICTURES) {
+            wrong.pictures.push(RecordedGrasp {
+                grasp_id: decision.grasp_id,
+                frames: vec![frame],
+                truth: Some(truth),
+                scene: None,
+                object: ObjectSurface::Unknown("The object is not drawn: a graph does not know where it is.".into()),
+                prediction: None,
+                decision: Some(decision),
+                is_hand_alone: false,
+            });
+        }
+    }
+
+    fn add(&mut self, point: Point) {
+        if self.n_others.is_multiple_of(self.step) {
+            self.others.push(point);
+        }
+        self.n_others += 1;
+        if self.others.len() > MAX_DRAWN {
+            let mut idx = 0;
+            self.others.retain(|_| {
+                idx += 1;
+                idx % 2 == 1
+            });
+            self.step *= 2;
+        }
+    }
+
+    /// Writes the page.
+    ///
+    /// # Errors
+    /// The file cannot be written, or a picture cannot be made.
+    pub(super) fn write(mut self, path: &Path, summary: &Summary) -> anyhow::Result<()> {
+        let open = std::mem::take(&mut self.open).into_values();
+        for (secs, decision) in open.filter_map(|open| open.decision) {
+            self.add([secs, decision.probability_stable]);
+        }
+        let page = self.page(summary)?;
+        std::fs::write(path, page)
+            .map_err(|error| anyhow::anyhow!("cannot write {} (--report): {error}", path.display()))
+    }
+
+    fn page(&self, summary: &Summary) -> anyhow::Result<String> {
+        let mut page = ReportPage::begin(&format!("Run of {}", summary.graph), &lead(summary));
+        page.section("Decisions", &reasons(summary));
+        page.figure(&chart_svg(&self.timeline()), &self.timeline_caption());
+        page.section("Edges", &edges(summary));
+        let decided = summary.edges.iter().rev().find(|edge| edge.to == "run" && edge.ages.n_samples() > 0);
+        let charts = decided.into_iter().chain(summary.edges.iter().filter(|edge| edge.to != "run"));
+        page.pairs(charts.filter(|edge| edge.ages.n_samples() > 0).map(|edge| {
+            bar_chart_svg(&histogram(&format!("Age on arrival, {} to {}", edge.from, edge.to), &edge.ages))
+        }));
+        page.section("Changes and messages", &changes(summary));
+        if let Some(hand) = &self.hand {
+            for (title, wrong) in
+                [("Lifts of unstable grasps", &self.wrong_lifts), ("Holds of stable grasps", &self.wrong_holds)]
+            {
+                if wrong.n == 0 {
+                    continue;
+                }
+                let shown = wrong.pictures.len();
+                page.section(title, &format!("<p>{} in all; the first {shown} are shown.</p>\n", wrong.n));
+                for grasp in &wrong.pictures {
+                    page.figure(&grasp_svg(hand, grasp)?, "");
+                }
+            }
+        }
+        Ok(page.finish())
+    }
+
+    fn timeline(&self) -> Chart {
+        let series = |name: &str, colour, points: &[Point], radius| Series {
+            name: name.into(),
+            colour,
+            line: Line::Solid,
+            points: Vec::new(),
+            discs: points.iter().map(|[secs, probability]| [*secs, *probability, radius]).collect(),
+            intervals: Vec::new(),
+        };
+        let all = [&self.others, &self.wrong_holds.points, &self.wrong_lifts.points];
+        Chart {
+            title: "Probability of stable, by decision".into(),
+            size: [1152.0, 360.0],
+            x: Axis {
+                label: "seconds since the start".into(),
+                range: range_from_zero(all.into_iter().flatten().map(|[secs, _]| *secs)),
+                format: NumberFormat::Count,
+            },
+            y: Axis { label: "probability (%)".into(), range: [0.0, 1.0], format: NumberFormat::Percent },
+            series: vec![
+                series("right, or truth not known", COLOURS[4], &self.others, 2.0),
+                series("held, stable", COLOURS[1], &self.wrong_holds.points, 3.5),
+                series("lifted, unstable", COLOURS[5], &self.wrong_lifts.points, 4.5),
+            ],
+        }
+    }
+
+    fn timeline_caption(&self) -> String {
+        match self.step {
+            1 => String::new(),
+            n => format!(
+                "Of the right decisions, every {n}th is drawn; of the wrong ones of a kind, the first {MAX_WRONG}."
+            ),
+        }
+    }
+}
+
+fn lead(summary: &Summary) -> String {
+    let loss = match summary.samples_lost {
+        0 => "No sample was lost.".into(),
+        n => format!("<b>{n} samples were lost.</b>"),
+    };
+    let truth = match summary.with_truth {
+        0 => "The truth of no grasp is known.".into(),
+        n => format!("Of {n} grasps whose truth is known, {} were lifted and unstable.", summary.false_positives),
+    };
+    let latency = summary.latency_nanos.as_ref().map_or(String::new(), |latency| {
+        format!(" A decision took {} in the median and {} at 99 %.", time(latency.p50), time(latency.p99))
+    });
+    format!(
+        "{}: {} grasps, {} lifted, {} held. {truth}{latency} {loss} {} restarts, {} swaps.",
+        escape(summary.end),
+        summary.grasps,
+        summary.lift,
+        summary.hold,
+        summary.restarts,
+        summary.swaps
+    )
+}
+
+fn time(nanos: u64) -> String {
+    match nanos as f64 {
+        nanos if nanos < 1e6 => format!("{:.0} µs", nanos / 1e3),
+        nanos if nanos < 1e9 => format!("{:.1} ms", nanos / 1e6),
+        nanos => format!("{:.1} s", nanos / 1e9),
+    }
+}
+
+fn reasons(summary: &Summary) -> String {
+    let rows = summary.reasons.iter().map(|(reason, n)| (false, vec![escape(reason), n.to_string()]));
+    report_table(&[("reason", false), ("grasps", true)], &rows.collect::<Vec<_>>())
+}
+
+fn edges(summary: &Summary) -> String {
+    let rows = summary.edges.iter().map(|edge| {
+        let age = |share| edge.ages.quantile_nanos(share).map_or("–".into(), time);
+        let cells = vec![
+            escape(&edge.from),
+            escape(&edge.to),
+            edge.sent.to_string(),
+            edge.received.to_string(),
+            edge.missing.to_string(),
+            edge.dropped.to_string(),
+            edge.late.to_string(),
+            age(0.5),
+            age(0.99),
+        ];
+        (edge.missing > 0, cells)
+    });
+    let head = ["from", "to", "sent", "received", "missing", "dropped", "late", "age p50", "age p99"];
+    let head: Vec<(&str, bool)> = head.iter().enumerate().map(|(idx, name)| (*name, idx > 1)).collect();
+    report_table(&head, &rows.collect::<Vec<_>>())
+}
+
+/// A bar for each doubling of the age.
+fn histogram(title: &str, ages: &Ages) -> BarChart {
+    let mut octaves: BTreeMap<u32, u64> = BTreeMap::new();
+    for (upper_nanos, count) in ages.buckets() {
+        *octaves.entry(upper_nanos.saturating_sub(1).max(1).ilog2()).or_default() += count;
+    }
+    let n = ages.n_samples().max(1) as f64;
+    let (first, last) = (octaves.keys().next().copied(), octaves.keys().last().copied());
+    let all: Vec<u32> = first.zip(last).map(|(first, last)| (first..=last).collect()).unwrap_or_default();
+    let shares: Vec<f64> =
+        all.iter().map(|octave| octaves.get(octave).copied().unwrap_or_default() as f64 / n).collect();
+    BarChart {
+        title: title.into(),
+        size: [566.0, 280.0],
+        y: Axis {
+            label: "share of samples (%)".into(),
+            range: range_from_zero(shares.iter().copied()),
+            format: NumberFormat::Percent,
+        },
+        groups: all.iter().map(|octave| format!("≤ {}", time(2_u64 << octave))).collect(),
+        series: vec![("samples".into(), COLOURS[0], shares)],
+    }
+}
+
+/// The lines that this run has left in its logs.
+fn changes(summary: &Summary) -> String {
+    let lines = LogTail::open(LogFolder::of_graph(&summary.graph), None, usize::MAX, 1 << 20).map(|(_, lines)| lines);
+    let mut lines = lines.unwrap_or_default();
+    // All logs begin the run at the same time.
+    let begin = lines.iter().rposition(|line| line.operator == "run" && line.text.starts_with("== new run"));
+    let mut lines = lines.split_off(begin.unwrap_or(0));
+    lines.retain(|line| !line.text.starts_with("== new run"));
+    let n_left_out = lines.len().saturating_sub(MAX_LINES);
+    let rows = lines.iter().skip(n_left_out).map(|line| {
+        let level = line.level.map(|level| format!("{level:?}").to_lowercase()).unwrap_or_default();
+        (level == "error", vec![escape(&line.time), escape(&line.operator), level, escape(&line.text)])
+    });
+    let rows: Vec<_> = rows.collect();
+    if rows.is_empty() {
+        return "<p>None.</p>\n".into();
+    }
+    let left_out = match n_left_out {
+        0 => String::new(),
+        n => format!("<p class=\"caption\">{n} earlier lines are left out: see blindgrasp logs.</p>\n"),
+    };
+    report_table(&[("time", false), ("operator", false), ("level", false), ("text", false)], &rows) + &left_out
+}

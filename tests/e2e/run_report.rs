@@ -1,0 +1,57 @@
+//! `run --report`: the page of a run says the same as its summary.
+
+use crate::common::{Graph, json_lines, project, run, swap, unique_name};
+
+#[test]
+fn the_report_of_a_run_shows_its_decisions_edges_and_mistakes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let page = folder.path().join("run.html");
+    let flow = project().join("dataflow.yaml");
+    let (flow, path) = (flow.to_str().expect("UTF-8"), page.to_str().expect("UTF-8"));
+    let fastest = ["--set", "recorded_source.rate=max", "--name"];
+    let name = unique_name();
+    let ended = run(&[&["run", flow, "--json", "--report", path][..], &fastest, &[&name]].concat(), 0);
+    let lines = json_lines(&ended.stdout);
+    let summary = &lines.last().expect("a summary")["summary"];
+    let html = std::fs::read_to_string(&page).expect("a page");
+    let (n_grasps, n_wrong_lifts) = (&summary["grasps"], summary["false_positives"].as_u64().expect("a number"));
+    assert!(html.contains(&format!("finished: {n_grasps} grasps, ")), "{}", &html[..2000]);
+    assert!(html.contains(&format!("<p>{n_wrong_lifts} in all; the first {} are shown.", n_wrong_lifts.min(6))));
+    for (reason, n) in summary["reasons"].as_object().expect("reasons") {
+        assert!(html.contains(&format!("<td>{reason}</td><td class=\"number\">{n}</td>")), "{reason}");
+    }
+    for edge in summary["edges"].as_array().expect("edges") {
+        let (from, to) = (edge["from"].as_str().expect("a port"), edge["to"].as_str().expect("a port"));
+        let row = format!("<td>{from}</td><td>{to}</td><td class=\"number\">{}</td>", edge["sent"]);
+        assert!(html.contains(&row), "{row}");
+    }
+    let n_wrong_holds = lines.iter().filter(|line| line["action"] == "hold" && line["truth"]["stable"] == true).count();
+    assert!(html.contains(&format!("<p>{n_wrong_holds} in all; the first {} are shown.", n_wrong_holds.min(6))));
+    // A picture of a grasp is two images.
+    let n_images = html.matches("data:image/png;base64,").count() as u64;
+    assert_eq!(n_images, 2 * (n_wrong_lifts.min(6) + n_wrong_holds.min(6) as u64));
+    let names = ["http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"];
+    let addresses = names.iter().fold(html.clone(), |html, name| html.replace(name, ""));
+    assert!(!addresses.contains("http") && !addresses.contains("<script"), "it needs nothing else");
+
+    let wrong = run(&["run", flow, "--report", "absent/run.html"], 1);
+    assert!(String::from_utf8_lossy(&wrong.stderr).contains("absent"), "refused before the start");
+}
+
+#[test]
+fn the_report_of_a_run_tells_its_changes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let page = folder.path().join("run.html");
+    let options = ["--set", "recorded_source.repeat=forever", "--report", page.to_str().expect("UTF-8")];
+    let graph = Graph::launch(&unique_name(), &project().join("dataflow.yaml"), &options);
+    graph.wait_for_decisions(3);
+    run(&["set", "lift_arbiter.votes=2", "--graph", &graph.name], 0);
+    swap(&graph, &["classifier", "--probation", "0"], 0);
+    graph.kill("contacts");
+    graph.wait_for_restart("contacts", 1);
+    graph.stop();
+    let html = std::fs::read_to_string(&page).expect("a page");
+    for change in ["set lift_arbiter.votes=2", "'classifier' swapped after", "node 'contacts'", "1 restarts, 1 swaps"] {
+        assert!(html.contains(change), "{change}");
+    }
+}
