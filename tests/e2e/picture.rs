@@ -185,3 +185,46 @@ fn objects_are_listed_and_written() {
         }
     }
 }
+
+/// The frames of two grasps, each with the decision that a graph makes of it.
+#[test]
+fn grasps_are_drawn_as_a_moving_picture() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_owned();
+    let draw = |out: &str| {
+        let (model, out) = ("models/barrett-bh8-280.json", at(out));
+        run(&["view", RECORDING, "--grasp", "4,2", "--animate", model, "--out", &out], 0);
+        std::fs::read_to_string(out).expect("written")
+    };
+    let svg = draw("a.svg");
+    let frames = |id: u64| {
+        let records = RecordingReader::open(&project().join(RECORDING)).expect("a recording");
+        records.filter(
+            move |record| matches!(&record.as_ref().expect("a record").1, Record::Tactile(it) if it.message.grasp_id == id),
+        )
+    };
+    let n_frames = frames(4).count() + frames(2).count();
+    assert_eq!(svg.matches("class=\"moment\"").count(), n_frames);
+    assert_eq!(svg.matches("<image").count(), n_frames);
+    assert_eq!(svg.matches("@keyframes").count(), n_frames);
+    // As the graph of dataflow.yaml decides them.
+    let decided: Vec<&str> = ["LIFT</text>", "HOLD</text>"].into_iter().filter(|text| svg.contains(text)).collect();
+    assert_eq!(decided.len(), 2);
+    assert!(svg.find("LIFT</text>") < svg.find("HOLD</text>"));
+    assert!(svg.contains("The grasp is stable.") && svg.contains("The grasp is not stable."));
+    assert!(svg.contains("prefers-reduced-motion"));
+    assert_eq!(svg, draw("b.svg"), "the same bytes again");
+    let refused = |arguments: &[&str], exit_code: i32, expected: &str| {
+        let output = run(&[&["view", RECORDING][..], arguments].concat(), exit_code);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(said.contains(expected), "{arguments:?}: {said}");
+    };
+    refused(&["--grasp", "1,2", "--out", &at("c.svg")], 2, "--grasp takes one number");
+    refused(
+        &["--animate", "models/barrett-bh8-280.json", "--out", &at("c.html")],
+        1,
+        "expected a name that ends in .svg",
+    );
+    refused(&["--animate", "models/absent.json", "--out", &at("c.svg")], 1, "absent.json");
+    refused(&["--animate", "models/barrett-bh8-280.json"], 2, "--out");
+}

@@ -4,8 +4,9 @@
 //!   each pad feels, and what is known of the grasp. One file, no script, a light card that dark pages show as it is.
 //! * [`grasp_html`] - the same, and the grasp in three dimensions to turn by hand, with a slider over its frames. One
 //!   file that asks the network for nothing.
+//! * [`animation_svg`] - grasps as a moving picture, with the probability and the decision.
 //! * [`HandScene`], [`link_poses`] - a hand for a page that draws it frame by frame, with [`STAGE_JS`] and [`THREE_JS`].
-//! * [`posed_scene_images`] - a hand and a thing on a table, moment by moment, by one camera.
+//! * [`posed_scene_images`] - a hand and a thing on a post, moment by moment, by one camera.
 //! * [`heat_map_svg`] - a search's scores over two parameters.
 //! * [`dictionary_svg`] - a contact dictionary over the hand.
 //! * [`graph_mermaid`], [`graph_dot`] - a graph of processes.
@@ -19,6 +20,7 @@
 //! Not here: reading recordings or object files, which is the caller's. Links are drawn as their collision shapes, the
 //! only geometry that a hand's description here has.
 
+mod animation;
 pub mod chart;
 mod colour;
 mod dictionary_picture;
@@ -40,6 +42,7 @@ mod view;
 #[cfg(test)]
 mod tests;
 
+pub use animation::{AnimatedGrasp, animation_svg};
 pub use dictionary_picture::{DrawnWord, dictionary_svg};
 pub use graph::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid};
 pub use grasp::{ObjectSurface, RecordedGrasp};

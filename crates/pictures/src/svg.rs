@@ -36,6 +36,11 @@ impl Svg {
         self.body.push_str(">\n");
     }
 
+    /// Everything that another one has so far.
+    pub(super) fn append(&mut self, other: Svg) {
+        self.body.push_str(&other.body);
+    }
+
     /// An element's end.
     pub(super) fn end(&mut self, name: &str) {
         let _ = writeln!(self.body, "</{name}>");

@@ -158,7 +158,7 @@ pub(super) fn draw_view(
     [left, top]: [f64; 2],
     [width, height]: [f64; 2],
 ) -> Result<(), PictureError> {
-    let image = render(surfaces, camera, [width, height]);
+    let image = render(surfaces, camera, [width, height], IMAGE_SCALE);
     let transform = format!("translate({} {})", px(left), px(top));
     svg.start("g", &[("transform", &transform)]);
     let href = data_uri(&image.to_png()?);
@@ -174,9 +174,27 @@ pub(super) fn draw_view(
     Ok(())
 }
 
-fn render(surfaces: &Surfaces, camera: &Camera, [width, height]: [f64; 2]) -> Image {
-    let (width, height) = ((width * IMAGE_SCALE).round() as usize, (height * IMAGE_SCALE).round() as usize);
-    let camera = camera.scaled(IMAGE_SCALE * SAMPLES_PER_SIDE as f64);
+/// Draws the surfaces, in an image that is small as a file, and a line from each active cell.
+pub(super) fn draw_small_view(
+    svg: &mut Svg,
+    placed: &Placed<'_>,
+    surfaces: &Surfaces,
+    camera: &Camera,
+    [left, top]: [f64; 2],
+    [width, height]: [f64; 2],
+) -> Result<(), PictureError> {
+    let href = data_uri(&render(surfaces, camera, [width, height], 1.0).to_small_png()?);
+    svg.start("g", &[("transform", &format!("translate({} {})", px(left), px(top)))]);
+    svg.element("image", &[("width", &px(width)), ("height", &px(height)), ("href", &href)]);
+    draw_cell_forces(svg, placed, camera);
+    svg.end("g");
+    Ok(())
+}
+
+/// With `scale` pixels to a pixel of the picture.
+fn render(surfaces: &Surfaces, camera: &Camera, [width, height]: [f64; 2], scale: f64) -> Image {
+    let (width, height) = ((width * scale).round() as usize, (height * scale).round() as usize);
+    let camera = camera.scaled(scale * SAMPLES_PER_SIDE as f64);
     let (n_x, n_y) = (width * SAMPLES_PER_SIDE, height * SAMPLES_PER_SIDE);
     let hand = surfaces.hand_samples(&camera, n_x, n_y);
     let mut object = Samples::new(n_x, n_y);

@@ -8,11 +8,13 @@ use anyhow::bail;
 use super::super::{Outcome, check_output, print_line};
 use super::GraspArguments;
 use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_messages::Phase;
+use blindgrasp_learning::evaluation::decide_grasp;
+use blindgrasp_messages::{Fault, Phase, Prediction};
 use blindgrasp_objects::find_mesh;
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_pictures::{ObjectSurface, RecordedGrasp, grasp_html, grasp_svg};
+use blindgrasp_pictures::{AnimatedGrasp, ObjectSurface, RecordedGrasp, animation_svg, grasp_html, grasp_svg};
 use blindgrasp_recording::{Record, RecordingReader};
+use blindgrasp_stages::model::Model;
 
 /// The kind of picture, by the file's extension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,7 +28,7 @@ pub(super) fn draw(recording: &Path, out: &Path, arguments: &GraspArguments) -> 
     let format = format_of(out)?;
     let hand = hand_of(recording, arguments.hand.as_deref())?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
-    let mut grasp = read_grasp(recording, arguments.grasp)?;
+    let mut grasp = read_grasp(recording, arguments.grasp.first().copied())?;
     grasp.object = surface(&grasp, arguments.objects.as_deref())?;
     let picture = match format {
         Format::Svg => grasp_svg(&hand, &grasp)?,
@@ -34,6 +36,41 @@ pub(super) fn draw(recording: &Path, out: &Path, arguments: &GraspArguments) -> 
     };
     std::fs::write(out, picture).map_err(|error| anyhow::anyhow!("cannot write {}: {error}", out.display()))?;
     print_line(&format!("grasp {} drawn to {}", grasp.grasp_id, out.display()))?;
+    Ok(Outcome::Done)
+}
+
+/// Draws grasps as a moving picture, as this model decides them.
+pub(super) fn animate(recording: &Path, out: &Path, arguments: &GraspArguments) -> anyhow::Result<Outcome> {
+    check_output(out, &[recording.to_owned()])?;
+    if format_of(out)? != Format::Svg {
+        bail!("{}: expected a name that ends in .svg: a moving picture is an SVG", out.display());
+    }
+    let hand = hand_of(recording, arguments.hand.as_deref())?;
+    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
+    let path = arguments.animate.as_deref().unwrap_or(Path::new(""));
+    let model = Model::load(path)?;
+    if model.hand.id != hand.id() {
+        bail!("{} is for the hand '{}', the recording is of '{}'", path.display(), model.hand.name, hand.name);
+    }
+    let wanted = arguments.grasp.iter().map(|id| Some(*id));
+    let wanted: Vec<_> = if arguments.grasp.is_empty() { vec![None] } else { wanted.collect() };
+    let mut animated = Vec::new();
+    for id in wanted {
+        let mut grasp = read_grasp(recording, id)?;
+        grasp.object = surface(&grasp, arguments.objects.as_deref())?;
+        let alone = decide_grasp(&hand, &model, &grasp.frames);
+        grasp.decision = alone.decision;
+        let probability = |it: &Prediction| (it.fault == Fault::None).then_some(it.probability_stable);
+        animated.push(AnimatedGrasp {
+            probabilities: alone.predictions.iter().map(probability).collect(),
+            decided_at: alone.decided_at,
+            threshold: model.classifier.threshold_probability,
+            grasp,
+        });
+    }
+    let picture = animation_svg(&hand, &animated)?;
+    std::fs::write(out, picture).map_err(|error| anyhow::anyhow!("cannot write {}: {error}", out.display()))?;
+    print_line(&format!("{} grasps drawn to {}", animated.len(), out.display()))?;
     Ok(Outcome::Done)
 }
 

@@ -56,9 +56,9 @@ pub(super) fn show(recording: &Path, port: u16, arguments: &GraspArguments) -> a
     if list.is_empty() {
         bail!("{} holds no frames on /tactile: there is no grasp to show", recording.display());
     }
-    let first = match arguments.grasp {
+    let first = match arguments.grasp.first() {
         None => 0,
-        Some(id) => list.keys().position(|known| *known == id).ok_or_else(|| {
+        Some(id) => list.keys().position(|known| known == id).ok_or_else(|| {
             anyhow::anyhow!("{} has no grasp {id}: it has {} grasps", recording.display(), list.len())
         })?,
     };

@@ -27,7 +27,9 @@ use crate::dataset::{DatasetError, Grasp, read_grasps};
 use crate::training::TrainingError;
 use blindgrasp_messages::score::is_judged;
 pub use blindgrasp_messages::score::{Evaluation, Score};
-use blindgrasp_messages::{Action, Fault, GraspTruth, LiftDecision, Phase, Prediction, Reason, Stamped, TactileFrame};
+use blindgrasp_messages::{
+    Action, Fault, GraspTruth, Header, LiftDecision, Phase, Prediction, Reason, Stamped, TactileFrame,
+};
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::day::GraspPlace;
 use blindgrasp_stages::encoder::Reading;
@@ -189,6 +191,36 @@ fn decide_recording(
         truth: grasp.truth,
     };
     Ok(grasps.into_iter().map(decided).collect())
+}
+
+/// A grasp decided by itself.
+#[derive(Debug, Clone)]
+pub struct DecidedAlone {
+    /// Of each frame.
+    pub predictions: Vec<Prediction>,
+    /// `None` if the frames end before it.
+    pub decision: Option<LiftDecision>,
+    /// The frame at which it came.
+    pub decided_at: Option<usize>,
+}
+
+/// Decides a grasp by its frames as a graph would that sees no other.
+pub fn decide_grasp(hand: &Hand, model: &Model, frames: &[Stamped<TactileFrame>]) -> DecidedAlone {
+    let mut arbiter = LiftArbiter::new(ArbiterOptions::default());
+    let (mut memory, dictionary_id) = (Memory::default(), model.dictionary_id());
+    let mut alone = DecidedAlone { predictions: Vec::new(), decision: None, decided_at: None };
+    for (idx, frame) in frames.iter().enumerate() {
+        let prediction = predict(hand, (model, dictionary_id), &mut memory, frame);
+        // Its first frame is the first of all.
+        let header = Header { seq: idx as u64, ..frame.header };
+        let mut decisions = Vec::new();
+        arbiter.on_prediction(&header, &prediction, 0, &mut decisions);
+        alone.predictions.push(prediction);
+        if let (None, Some(decision)) = (&alone.decision, decisions.into_iter().find(|it| !it.action.is_probe())) {
+            (alone.decision, alone.decided_at) = (Some(decision), Some(idx));
+        }
+    }
+    alone
 }
 
 /// Runs the stages between a frame and the arbiter.

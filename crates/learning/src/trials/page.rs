@@ -17,6 +17,8 @@ use blindgrasp_stages::hand::Hand;
 
 /// Images of a lift: from when it begins to its end.
 const N_MOMENTS: usize = 4;
+/// A target that has gone so far in the hand has left it.
+const DROPPED_M: f64 = 0.09;
 /// Pixels.
 const IMAGE: [usize; 2] = [220, 250];
 
@@ -131,16 +133,36 @@ pub fn strip(
     if record.lifted {
         attempt.lift(|snapshot| snapshots.push(snapshot.clone()));
     }
-    let n_moments = N_MOMENTS.min(snapshots.len());
-    let last = snapshots.len() - 1;
-    // Closer together at the beginning, where the target rises; later it is still.
-    let share = |moment: usize| (moment as f64 / (n_moments - 1).max(1) as f64).powi(2);
-    let moments: Vec<&Snapshot> =
-        (0..n_moments).map(|moment| &snapshots[(share(moment) * last as f64).round() as usize]).collect();
+    let moments =
+        if record.lifted && !record.held { moments_of_a_drop(&snapshots) } else { moments_of_a_lift(&snapshots) };
     let scenes: Vec<PosedScene> = moments.iter().map(|snapshot| scene(snapshot)).collect();
-    let images = posed_scene_images(hand, &target.object.to_mesh(), &scenes, IMAGE)?;
+    let images = posed_scene_images(hand, &target.object.to_mesh(), options.physics.stand_radius_m, &scenes, IMAGE)?;
     let secs = moments.iter().map(|snapshot| snapshot.elapsed_nanos as f64 / 1e9);
     Ok(Strip { caption: caption(record), images: secs.zip(images).collect() })
+}
+
+/// Closer together at the beginning, where the target rises; later it is still.
+fn moments_of_a_lift(snapshots: &[Snapshot]) -> Vec<&Snapshot> {
+    let n_moments = N_MOMENTS.min(snapshots.len());
+    let last = snapshots.len() - 1;
+    let share = |moment: usize| (moment as f64 / (n_moments - 1).max(1) as f64).powi(2);
+    (0..n_moments).map(|moment| &snapshots[(share(moment) * last as f64).round() as usize]).collect()
+}
+
+/// From the grasp until the target has left the hand, at equal steps of its way in the hand.
+fn moments_of_a_drop(snapshots: &[Snapshot]) -> Vec<&Snapshot> {
+    let in_palm = |snapshot: &Snapshot| {
+        let scene = scene(snapshot);
+        scene.world_from_palm.inverse_transform_point(&scene.world_from_thing.translation.vector.into())
+    };
+    let first = in_palm(&snapshots[0]);
+    let way = |snapshot: &&Snapshot| (in_palm(snapshot) - first).norm();
+    let most = snapshots.iter().map(|snapshot| way(&snapshot)).fold(0.0, f64::max).min(DROPPED_M);
+    let goals = (0..N_MOMENTS).map(|moment| most * moment as f64 / (N_MOMENTS - 1) as f64);
+    let mut moments: Vec<&Snapshot> =
+        goals.filter_map(|goal| snapshots.iter().find(|snapshot| way(snapshot) >= goal)).collect();
+    moments.dedup_by_key(|snapshot| snapshot.elapsed_nanos);
+    moments
 }
 
 fn caption(record: &TrialRecord) -> String {
