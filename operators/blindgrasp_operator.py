@@ -553,8 +553,9 @@ class _Sequencer:
     def __init__(self, may_hold: bool) -> None:
         """The order of a reader that begins with whatever sample comes first."""
         self.may_hold = may_hold
-        # In its first time, a reader waits longer: each publisher gives it the samples that it kept once it has noticed the reader.
-        self.patient_until = _now_nanos() + START_HOLD_LIMIT_NANOS
+        # The last sample that was sent before this reader began, and until when those up to it are awaited: each publisher gives a
+        # reader the samples that it kept once it has noticed the reader.
+        self.awaited: tuple[Key, int] | None = None
         self.epochs: list[int] = []
         self.last: Key | None = None
         self.answered: Key | None = None
@@ -633,7 +634,14 @@ class _Sequencer:
         self.held.update({place: (sample, now) for place, sample in places if last is None or place > last})
 
     def deadline(self) -> int | None:
-        return max(self.held[min(self.held)][1] + HOLD_LIMIT_NANOS, self.patient_until) if self.held else None
+        if not self.held:
+            return None
+        deadline = self.held[min(self.held)][1] + HOLD_LIMIT_NANOS
+        if self.awaited is None:
+            return deadline
+        (epoch, seq), until = self.awaited
+        has_all = self.last is not None and epoch in self.epochs and (self.epochs.index(epoch), seq) <= self.last
+        return deadline if has_all else max(deadline, until)
 
     def _n_before(self, place: Key) -> int:
         """The number of samples before this place, which is after the last one, that have not come."""
@@ -686,6 +694,8 @@ class _Subscriber:
 
     def begin_with(self, sequencer: _Sequencer) -> None:
         before, self.sequencer = self.sequencer, sequencer
+        sent = None if self.cell is None else self.board.sent(self.writer_cell)
+        sequencer.awaited = None if sent is None else (sent, _now_nanos() + START_HOLD_LIMIT_NANOS)
         sequencer.hold_again([sample for sample, _ in before.held.values()] + self.put_back)
         self.put_back = []
 

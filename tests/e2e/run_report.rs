@@ -34,8 +34,19 @@ fn the_report_of_a_run_shows_its_decisions_edges_and_mistakes() {
     let addresses = names.iter().fold(html.clone(), |html, name| html.replace(name, ""));
     assert!(!addresses.contains("http") && !addresses.contains("<script"), "it needs nothing else");
 
-    let wrong = run(&["run", flow, "--report", "absent/run.html"], 1);
-    assert!(String::from_utf8_lossy(&wrong.stderr).contains("absent"), "refused before the start");
+    // Mistakes are refused before the start, and no file is overwritten by one.
+    let same = folder.path().join("same.html");
+    let same = same.to_str().expect("UTF-8");
+    for (arguments, expected) in [
+        (&["--report", "absent/run.html"][..], "absent"),
+        (&["--report", "models/barrett-bh8-280.json"], "models/barrett-bh8-280.json"),
+        (&["--report", "run.txt"], ".html"),
+        (&["--report", same, "--record", same], "choose two files"),
+    ] {
+        let wrong = run(&[&["run", flow][..], arguments].concat(), 1);
+        let said = String::from_utf8_lossy(&wrong.stderr).into_owned();
+        assert!(said.contains(expected) && wrong.stdout.is_empty(), "{arguments:?}: {said}");
+    }
 }
 
 #[test]

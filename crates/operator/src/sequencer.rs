@@ -13,8 +13,8 @@ use crate::wiring::InputCounts;
 
 /// An early sample waits at most this long for those before it.
 pub const HOLD_LIMIT: Duration = Duration::from_millis(50);
-/// In its first time, a reader waits longer: each publisher gives it the samples that it kept once it has noticed the reader,
-/// and on a busy machine one publisher can be much later than another.
+/// A reader that has just begun waits so long for samples that were sent before: each publisher gives it those that it kept once
+/// it has noticed the reader, and on a busy machine one publisher can be much later than another.
 pub const START_HOLD_LIMIT: Duration = Duration::from_secs(2);
 /// The number of publishers whose last sample is remembered: more than there can be at a time.
 const N_PUBLISHERS: usize = 16;
@@ -40,8 +40,8 @@ pub struct Sequencer<T> {
     held: BTreeMap<Place, (T, Instant)>,
     /// Whether samples wait for those before them at all.
     may_hold: bool,
-    /// Early samples wait at least until then.
-    patient_until: Option<Instant>,
+    /// The last sample that was sent before this reader began, and until when those up to it are awaited.
+    awaited: Option<(SampleId, Instant)>,
     counts: InputCounts,
 }
 
@@ -67,7 +67,7 @@ impl<T> Sequencer<T> {
             publishers: VecDeque::new(),
             held: BTreeMap::new(),
             may_hold: true,
-            patient_until: None,
+            awaited: None,
             counts: InputCounts::default(),
         }
     }
@@ -97,9 +97,9 @@ impl<T> Sequencer<T> {
         Sequencer { may_hold: false, ..self }
     }
 
-    /// The order of a reader that was connected at `start`.
-    pub fn beginning_at(self, start: Instant) -> Self {
-        Sequencer { patient_until: Some(start + START_HOLD_LIMIT), ..self }
+    /// The order of a reader that begins at `start`, when `sent` was the last sample that its writer had sent.
+    pub fn beginning_at(self, start: Instant, sent: Option<SampleId>) -> Self {
+        Sequencer { awaited: sent.map(|sent| (sent, start + START_HOLD_LIMIT)), ..self }
     }
 
     pub fn counts(&self) -> InputCounts {
@@ -222,7 +222,13 @@ impl<T> Sequencer<T> {
     pub fn deadline(&self) -> Option<Instant> {
         let (_, (_, since)) = self.held.first_key_value()?;
         let deadline = *since + HOLD_LIMIT;
-        Some(self.patient_until.map_or(deadline, |patient_until| deadline.max(patient_until)))
+        let Some((sent, until)) = self.awaited else { return Some(deadline) };
+        let has_all = self.last.is_some_and(|(generation, seq)| {
+            // An epoch that has not come yet begins after all others.
+            let of_sent = self.epochs.iter().position(|epoch| *epoch == sent.epoch);
+            of_sent.is_some_and(|of_sent| (of_sent, sent.seq) <= (generation, seq))
+        });
+        Some(if has_all { deadline } else { deadline.max(until) })
     }
 
     pub fn n_held(&self) -> usize {
@@ -425,18 +431,25 @@ mod tests {
     #[test]
     fn a_reader_that_has_just_come_waits_longer_for_a_publisher_that_has_not_noticed_it() {
         let start = Instant::now();
-        let mut sequencer = Sequencer::resume(None, None, InputCounts::default()).beginning_at(start);
         let id = |seq| SampleId { epoch: EPOCH, seq };
+        let mut sequencer = Sequencer::resume(None, None, InputCounts::default()).beginning_at(start, Some(id(5)));
         assert_eq!(sequencer.push(5, id(5), 2, || true, || start), Verdict::Hold);
         assert_eq!(sequencer.next_overdue(start + 2 * HOLD_LIMIT), None);
         for seq in 0..5 {
             assert_eq!(sequencer.push(seq, id(seq), 1, || true, || start), Verdict::Deliver(seq));
         }
         assert_eq!(sequencer.next_in_order(), Some(5));
-        // The first sample of a third publisher comes long after the start.
-        let later = start + START_HOLD_LIMIT;
-        assert_eq!(sequencer.push(8, id(8), 3, || true, || later), Verdict::Hold);
-        assert_eq!(sequencer.next_overdue(later + HOLD_LIMIT), Some(8));
+        // A gap of later samples is not waited for longer.
+        assert_eq!(sequencer.push(8, id(8), 3, || true, || start), Verdict::Hold);
+        assert_eq!(sequencer.next_overdue(start + HOLD_LIMIT), Some(8));
+        // Those that do not come are given up in the end.
+        let mut sequencer = Sequencer::resume(None, None, InputCounts::default()).beginning_at(start, Some(id(5)));
+        assert_eq!(sequencer.push(5, id(5), 2, || true, || start), Verdict::Hold);
+        assert_eq!(sequencer.next_overdue(start + START_HOLD_LIMIT), Some(5));
+        // A reader that begins before its writer awaits nothing.
+        let mut first = Sequencer::resume(None, None, InputCounts::default()).beginning_at(start, None);
+        assert_eq!(first.push(5, id(5), 2, || true, || start), Verdict::Hold);
+        assert_eq!(first.next_overdue(start + HOLD_LIMIT), Some(5));
     }
 
     /// A standby has opened its publisher and sends nothing: the gaps of the other publisher are gaps.

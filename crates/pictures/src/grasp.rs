@@ -138,7 +138,7 @@ impl<'a> Placed<'a> {
         match (&grasp.scene, &grasp.object) {
             (None, _) if grasp.is_hand_alone => {}
             (None, _) => notes.push(
-                "Object and contacts are not known: the recording has no /scene for this grasp. Shown are the active \
+                "Object and contacts are not known: there is no /scene for this grasp. Shown are the active \
                  cells."
                     .into(),
             ),

@@ -11,7 +11,7 @@ const SPOKEN_MS = 2000;
 const SILENT_MS = 3000;
 
 // The present state, which tests read.
-const shown = (window.blindgrasp = { server: null, scene: null, model: null, frame: null, decision: null, graph: null, dropped: 0, frames: 0, cellColours: [] });
+const shown = (window.blindgrasp = { server: null, scene: null, model: null, frame: null, decision: null, graph: null, dropped: 0, frames: 0, cellColours: [], painted: [] });
 
 // --- the hand
 const hand = makeStage(three, byId("stage"));
@@ -74,6 +74,11 @@ const showDecision = (decision) => {
   const wrong = decision.action === "lift" && decision.truth === false ? " This lift is wrong: the grasp is known to be unstable." : "";
   byId("why").textContent = `Grasp ${decision.grasp_id}: ${decision.reason.replaceAll("_", " ")}, probability ` +
     `${decision.probability_stable.toFixed(2)}.${decision.why ?? wrong}`;
+  // When it was on the screen, which scripts/bench-view reads.
+  requestAnimationFrame(() => setTimeout(() => {
+    shown.painted.push([decision.grasp_id, Date.now()]);
+    if (shown.painted.length > 100) shown.painted.shift();
+  }));
   if (performance.now() - spokenAt > SPOKEN_MS) {
     spokenAt = performance.now();
     byId("spoken").textContent = `${action.textContent}. ${byId("why").textContent}`;
@@ -159,9 +164,10 @@ const showFeature = () => {
 const showVotes = ({ side, n }, frame) => {
   const votes = Object.values(shown.graph?.params ?? {}).find((params) => "votes" in params)?.votes;
   if (!votes) return;
-  const isOpen = shown.decision?.grasp_id !== frame.grasp_id;
+  const isOpen = shown.decision?.grasp_id !== frame.grasp_id || ["squeeze", "test_lift"].includes(shown.decision.action);
+  const isProbed = !["open", "closing", "settled", "ended"].includes(frame.phase);
   const wanted = `${votes} settled predictions that agree`;
-  const text = !isOpen ? "" : n === 0 ? `Grasp ${frame.grasp_id} waits for ${wanted}; the hand is ${frame.phase}.`
+  const text = !isOpen ? "" : isProbed ? `Grasp ${frame.grasp_id} is probed; the hand is ${frame.phase.replaceAll("_", " ")}.` : n === 0 ? `Grasp ${frame.grasp_id} waits for ${wanted}; the hand is ${frame.phase}.`
     : `Grasp ${frame.grasp_id} waits for ${wanted}; the last ${n} say ${side}.`;
   byId("waits").textContent = text;
 };
@@ -331,22 +337,47 @@ const showGraph = (graph) => {
   if (token) showChoices(graph);
 };
 
-// --- orders: with the token that the command has printed in the address
-const token = location.hash.slice(1) || sessionStorage.getItem("token");
-if (token) {
-  sessionStorage.setItem("token", token);
+// --- orders and the log: with the token that the command has printed in the address
+const remembered = (() => { try { return sessionStorage; } catch { return null; } })();
+let token = remembered?.getItem("token") ?? null;
+const takeToken = () => {
+  if (location.hash.length < 2) return;
+  token = location.hash.slice(1);
+  remembered?.setItem("token", token);
   // It is not seen over a shoulder, nor kept in the history.
   history.replaceState(null, "", location.pathname);
-  byId("control").hidden = false;
-}
+};
+takeToken();
+window.addEventListener("hashchange", takeToken);
+const headers = () => ({ Authorization: `Bearer ${token}`, "Content-Type": "application/json" });
+const showLog = (lines) => {
+  const body = byId("log"), region = body.closest("div");
+  const isAtEnd = region.scrollTop + region.clientHeight >= region.scrollHeight - 4;
+  lines.forEach(({ time, operator, level, text, fields }, idx) => {
+    const values = Object.entries(fields ?? {}).map(([name, value]) => ` ${name}=${JSON.stringify(value)}`).join("");
+    fill(body, idx, [time, operator, level ?? "", text + values], [], ["error", "warn"].includes(level) ? [2] : []);
+  });
+  cut(body, lines.length);
+  if (isAtEnd) region.scrollTop = region.scrollHeight;
+};
+// A server that knows the token gives the log, and takes orders.
+const readLog = async () => {
+  let answer = null;
+  try {
+    if (token && !document.hidden) answer = await fetch("/log", { headers: headers() });
+  } catch { /* The stream of events says that the connection is broken. */ }
+  if (answer !== null) for (const id of ["control", "log-part"]) byId(id).hidden = !answer.ok;
+  if (answer?.ok) showLog(await answer.json());
+  setTimeout(readLog, 1000);
+};
 const order = async (order) => {
-  const buttons = byId("control").querySelectorAll("button");
+  // To stop is possible at any time.
+  const buttons = byId("control").querySelectorAll("form button");
   buttons.forEach((button) => { button.disabled = true; });
   byId("answer").textContent = order.compare_secs > 0 ? `compares for ${order.compare_secs} s` : "…";
   byId("answer").classList.remove("trouble");
   try {
-    const headers = { Authorization: `Bearer ${token}`, "Content-Type": "application/json" };
-    const answer = await fetch("/orders", { method: "POST", headers, body: JSON.stringify(order) });
+    const answer = await fetch("/orders", { method: "POST", headers: headers(), body: JSON.stringify(order) });
     byId("answer").textContent = await answer.text();
     byId("answer").classList.toggle("trouble", !answer.ok);
   } catch (error) {
@@ -365,10 +396,10 @@ const presentValue = () => {
   byId("set-value").value = shown.graph?.params[node]?.[param.join(".")] ?? "";
 };
 const showChoices = ({ nodes, params }) => {
-  const isFirst = byId("set-param").options.length === 0;
+  const before = byId("set-param").value;
   choose("set-param", Object.entries(params).flatMap(([node, of]) => Object.keys(of).map((name) => `${node}.${name}`)));
   choose("swap-node", nodes.map(({ node }) => node));
-  if (isFirst) presentValue();
+  if (byId("set-param").value !== before) presentValue();
 };
 byId("set-param").addEventListener("change", presentValue);
 byId("set").addEventListener("submit", (event) => {
@@ -412,6 +443,8 @@ setInterval(() => {
   byId("frame-age").textContent = frameAt !== null && performance.now() - frameAt > SILENT_MS ? `last frame${age(frameAt).slice(1)}` : "";
   byId("stage").classList.toggle("old", frameAt === null || performance.now() - frameAt > SILENT_MS);
 }, 500);
+
+readLog();
 
 // --- the stream
 const source = new EventSource("/events");
@@ -459,16 +492,6 @@ on("model", (model) => {
   shown.model = model;
   hand.showWords([], []);
   if (feature) showFeature();
-});
-on("log", (lines) => {
-  const body = byId("log"), region = body.closest("div");
-  const isAtEnd = region.scrollTop + region.clientHeight >= region.scrollHeight - 4;
-  lines.forEach(({ time, operator, level, text, fields }, idx) => {
-    const values = Object.entries(fields ?? {}).map(([name, value]) => ` ${name}=${JSON.stringify(value)}`).join("");
-    fill(body, idx, [time, operator, level ?? "", text + values], [], ["error", "warn"].includes(level) ? [2] : []);
-  });
-  cut(body, lines.length);
-  if (isAtEnd) region.scrollTop = region.scrollHeight;
 });
 on("recording", (recording) => player.start(recording));
 on("ended", (why) => {

@@ -29,12 +29,14 @@ pub enum Order {
 }
 
 /// Carries an order out, which may take its time, and gives the answer for the page, or the reason for the failure.
-pub type Act = Box<dyn FnMut(Order) -> Result<String, String> + Send>;
+pub type Act = Box<dyn Fn(Order) -> Result<String, String> + Send + Sync>;
 
 /// The right to change the graph.
 pub struct Control {
     token: String,
-    act: Arc<Mutex<Act>>,
+    act: Act,
+    /// Locked while an order is carried out, but for the order to stop, which waits for nothing.
+    busy: Mutex<()>,
 }
 
 impl Control {
@@ -46,7 +48,7 @@ impl Control {
         let mut bytes = [0; 16];
         getrandom::fill(&mut bytes).map_err(|error| std::io::Error::other(error.to_string()))?;
         let token = bytes.iter().map(|byte| format!("{byte:02x}")).collect();
-        Ok(Control { token, act: Arc::new(Mutex::new(act)) })
+        Ok(Control { token, act, busy: Mutex::new(()) })
     }
 
     pub fn token(&self) -> &str {
@@ -62,24 +64,43 @@ impl Control {
     }
 }
 
+/// The right of a request; otherwise the answer to it.
+fn control_for<'a>(shared: &'a Shared, headers: &HeaderMap) -> Result<&'a Control, Box<Response>> {
+    let refused = |status: StatusCode, why: &'static str| Err(Box::new((status, why).into_response()));
+    match &shared.control {
+        None => refused(StatusCode::NOT_FOUND, "the page only shows the graph: start it with --view-control\n"),
+        Some(control) if !control.is_allowed(headers) => refused(
+            StatusCode::UNAUTHORIZED,
+            "the token is not that of this page: open the address that the command has printed\n",
+        ),
+        Some(control) => Ok(control),
+    }
+}
+
+/// The log, which other users of the machine may not read.
+pub(crate) async fn log(State(shared): State<Arc<Shared>>, headers: HeaderMap) -> Response {
+    match control_for(&shared, &headers) {
+        Ok(_) => ([(header::CONTENT_TYPE, "application/json")], shared.log()).into_response(),
+        Err(refused) => *refused,
+    }
+}
+
 pub(crate) async fn order(State(shared): State<Arc<Shared>>, headers: HeaderMap, body: Bytes) -> Response {
-    let Some(control) = &shared.control else {
-        return (StatusCode::NOT_FOUND, "the page only shows the graph: start it with --view-control\n")
-            .into_response();
-    };
-    if !control.is_allowed(&headers) {
-        let why = "the token is not that of this page: open the address that the command has printed\n";
-        return (StatusCode::UNAUTHORIZED, why).into_response();
+    if let Err(refused) = control_for(&shared, &headers) {
+        return *refused;
     }
     let order: Order = match serde_json::from_slice(&body) {
         Ok(order) => order,
         Err(error) => return (StatusCode::BAD_REQUEST, format!("expected an order: {error}\n")).into_response(),
     };
-    let act = Arc::clone(&control.act);
-    let answer = tokio::task::spawn_blocking(move || match act.try_lock() {
-        Ok(mut act) => Some(act(order)),
-        Err(TryLockError::Poisoned(act)) => Some(act.into_inner()(order)),
-        Err(TryLockError::WouldBlock) => None,
+    let answer = tokio::task::spawn_blocking(move || {
+        let control = shared.control.as_ref()?;
+        let turn = match control.busy.try_lock() {
+            Ok(turn) => Some(turn),
+            Err(TryLockError::Poisoned(turn)) => Some(turn.into_inner()),
+            Err(TryLockError::WouldBlock) => None,
+        };
+        (turn.is_some() || order == (Order::Stop {})).then(|| (control.act)(order))
     });
     match answer.await {
         Ok(Some(Ok(text))) => text.into_response(),

@@ -75,6 +75,8 @@ struct Shared {
     events: broadcast::Sender<Bytes>,
     /// The last event of each name that a browser gets when it comes, in the order of the names' first events.
     kept: Mutex<Vec<(&'static str, Bytes)>>,
+    /// Lines of the log as JSON, for browsers with the token.
+    log: Mutex<String>,
     n_browsers: AtomicUsize,
     grasps: Option<Mutex<Grasps>>,
     control: Option<Control>,
@@ -107,6 +109,7 @@ impl Viewer {
         let shared = Arc::new(Shared {
             events: broadcast::channel(MAX_WAITING).0,
             kept: Mutex::default(),
+            log: Mutex::new("[]".into()),
             n_browsers: AtomicUsize::new(0),
             grasps: abilities.grasps.map(Mutex::new),
             control: abilities.control,
@@ -119,6 +122,7 @@ impl Viewer {
             .route("/events", get(events))
             .route("/grasps/{idx}", get(grasp))
             .route(ORDERS, post(control::order))
+            .route("/log", get(control::log))
             .route(FOXGLOVE, get(foxglove::connect))
             .with_state(Arc::clone(&shared))
             .layer(middleware::from_fn(guard));
@@ -178,6 +182,11 @@ impl Viewer {
         let _ = self.shared.events.send(event);
     }
 
+    /// Replaces the log that a browser with the token of the [`Control`] may read.
+    pub fn show_log(&self, json: String) {
+        *self.shared.log.lock().unwrap_or_else(PoisonError::into_inner) = json;
+    }
+
     /// Sends the kept event of this name to no browser any more.
     pub fn forget(&self, name: &str) {
         self.shared.kept().retain(|(known, _)| *known != name);
@@ -187,6 +196,10 @@ impl Viewer {
 impl Shared {
     fn kept(&self) -> MutexGuard<'_, Vec<(&'static str, Bytes)>> {
         self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn log(&self) -> String {
+        self.log.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
     /// The kept events, the last one first: they are taken from the end.
@@ -386,6 +399,10 @@ mod tests {
         assert!(sent(&viewer, &with_token, r#"{"order":"stop"}"#).ends_with("it goes on"));
         assert!(sent(&viewer, &with_token, r#"{"order":"burn"}"#).starts_with("HTTP/1.1 400"));
         assert_eq!(orders.lock().expect("a list").len(), 2);
+        viewer.show_log(r#"["a secret"]"#.into());
+        let asked = |head: &str| answer(&viewer, &format!("GET /log HTTP/1.1\r\nHost: localhost\r\n{head}"));
+        assert!(asked(&with_token).ends_with(r#"["a secret"]"#));
+        assert!(asked("X: y").starts_with("HTTP/1.1 401") && !asked("X: y").contains("secret"));
         let reader = Viewer::serve(0, Abilities::default()).expect("served");
         assert!(sent(&reader, &with_token, set).starts_with("HTTP/1.1 404"));
     }

@@ -41,7 +41,7 @@ pub(super) struct Arguments {
     /// Asks each program for its ports and parameters, and prints nodes and edges with every value filled in. The
     /// programs of the file are run for that, with --describe: a foreign dataflow file is code. With --machine, the programs and files of other machines need not be here. With --json: {"graph": …}, with
     /// "crossing" edges where the file names machines, or {"errors": […]}.
-    #[arg(long, conflicts_with_all = ["record", "detach", "stay", "metrics", "view"])]
+    #[arg(long, conflicts_with_all = ["record", "detach", "stay", "metrics", "view", "report"])]
     check: bool,
     /// Name of the running graph [default: the file's]
     #[arg(long)]

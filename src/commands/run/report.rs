@@ -4,17 +4,19 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Instant;
 
+use blindgrasp_graph::audit::AUDIT;
 use blindgrasp_graph::log::{LogFolder, LogTail};
 use blindgrasp_graph::run::{SeenDecision, Summary};
 use blindgrasp_messages::{Action, GraspTruth, LiftDecision, Phase, Record, Stamped, TactileFrame};
 use blindgrasp_operator::ages::Ages;
+use blindgrasp_operator::wiring::LogLevel;
 use blindgrasp_pictures::chart::{
     Axis, BarChart, COLOURS, Chart, Line, NumberFormat, Series, bar_chart_svg, chart_svg, range_from_zero,
 };
 use blindgrasp_pictures::{ObjectSurface, RecordedGrasp, ReportPage, escape, grasp_svg, report_table};
 use blindgrasp_stages::hand::Hand;
 
-/// Decisions in the chart; of more, every nth is drawn, and every wrong one.
+/// Decisions in the chart, but for wrong ones; of more, every nth is drawn.
 const MAX_DRAWN: usize = 2000;
 /// Wrong decisions of a kind in the chart.
 const MAX_WRONG: usize = 500;
@@ -110,6 +112,10 @@ impl RunReport {
     }
 
     pub(super) fn decision(&mut self, seen: &SeenDecision<'_>) {
+        // Another decision follows a probe.
+        if seen.decision.action.is_probe() {
+            return;
+        }
         let key = (seen.header.epoch, seen.decision.grasp_id);
         let secs = self.start.elapsed().as_secs_f64();
         let open = self.open(key);
@@ -142,7 +148,7 @@ impl RunReport {
                 frames: vec![frame],
                 truth: Some(truth),
                 scene: None,
-                object: ObjectSurface::Unknown("The object is not drawn: a graph does not know where it is.".into()),
+                object: ObjectSurface::Unknown(String::new()),
                 prediction: None,
                 decision: Some(decision),
                 is_hand_alone: false,
@@ -174,12 +180,11 @@ impl RunReport {
         for (secs, decision) in open.filter_map(|open| open.decision) {
             self.add([secs, decision.probability_stable]);
         }
-        let page = self.page(summary)?;
-        std::fs::write(path, page)
+        std::fs::write(path, self.page(summary))
             .map_err(|error| anyhow::anyhow!("cannot write {} (--report): {error}", path.display()))
     }
 
-    fn page(&self, summary: &Summary) -> anyhow::Result<String> {
+    fn page(&self, summary: &Summary) -> String {
         let mut page = ReportPage::begin(&format!("Run of {}", summary.graph), &lead(summary));
         page.section("Decisions", &reasons(summary));
         page.figure(&chart_svg(&self.timeline()), &self.timeline_caption());
@@ -200,11 +205,14 @@ impl RunReport {
                 let shown = wrong.pictures.len();
                 page.section(title, &format!("<p>{} in all; the first {shown} are shown.</p>\n", wrong.n));
                 for grasp in &wrong.pictures {
-                    page.figure(&grasp_svg(hand, grasp)?, "");
+                    match grasp_svg(hand, grasp) {
+                        Ok(picture) => page.figure(&picture, ""),
+                        Err(error) => page.raw(&format!("<p>{}</p>\n", escape(&error.to_string()))),
+                    }
                 }
             }
         }
-        Ok(page.finish())
+        page.finish()
     }
 
     fn timeline(&self) -> Chart {
@@ -235,20 +243,27 @@ impl RunReport {
     }
 
     fn timeline_caption(&self) -> String {
-        match self.step {
+        let others = match self.step {
             1 => String::new(),
-            n => format!(
-                "Of the right decisions, every {n}th is drawn; of the wrong ones of a kind, the first {MAX_WRONG}."
-            ),
+            n => format!("Of the right decisions, every {n}th is drawn. "),
+        };
+        match self.wrong_lifts.n.max(self.wrong_holds.n) {
+            n if n > MAX_WRONG => format!("{others}Of the wrong ones of a kind, the first {MAX_WRONG} are drawn."),
+            _ => others,
         }
     }
 }
 
 fn lead(summary: &Summary) -> String {
-    let loss = match summary.samples_lost {
-        0 => "No sample was lost.".into(),
-        n => format!("<b>{n} samples were lost.</b>"),
-    };
+    let losses = [
+        (summary.samples_lost, "samples were lost"),
+        (summary.samples_dropped, "samples were dropped for newer ones"),
+        (summary.edges_unknown as u64, "edges do not tell their losses"),
+        (summary.undecided as u64, "grasps were not decided"),
+    ];
+    let losses = losses.iter().filter(|(n, _)| *n > 0).map(|(n, what)| format!("<b>{n} {what}.</b>"));
+    let losses: Vec<String> = losses.collect();
+    let loss = if losses.is_empty() { "No sample was lost.".into() } else { losses.join(" ") };
     let truth = match summary.with_truth {
         0 => "The truth of no grasp is known.".into(),
         n => format!("Of {n} grasps whose truth is known, {} were lifted and unstable.", summary.false_positives),
@@ -325,18 +340,26 @@ fn histogram(title: &str, ages: &Ages) -> BarChart {
     }
 }
 
-/// The lines that this run has left in its logs.
+/// The lines of this run in the logs of the launcher and of its clients, and the warnings and errors of its operators.
 fn changes(summary: &Summary) -> String {
-    let lines = LogTail::open(LogFolder::of_graph(&summary.graph), None, usize::MAX, 1 << 20).map(|(_, lines)| lines);
-    let mut lines = lines.unwrap_or_default();
+    let mut lines = match LogTail::open(LogFolder::of_graph(&summary.graph), None, usize::MAX, 1 << 20) {
+        Ok((_, lines)) => lines,
+        Err(error) => return format!("<p>The logs cannot be read: {}</p>\n", escape(&error.to_string())),
+    };
     // All logs begin the run at the same time.
     let begin = lines.iter().rposition(|line| line.operator == "run" && line.text.starts_with("== new run"));
     let mut lines = lines.split_off(begin.unwrap_or(0));
-    lines.retain(|line| !line.text.starts_with("== new run"));
+    lines.retain(|line| {
+        let is_telling = ["run", AUDIT].contains(&line.operator.as_str())
+            || matches!(line.level, Some(LogLevel::Error | LogLevel::Warn));
+        is_telling && !line.text.starts_with("== new run")
+    });
     let n_left_out = lines.len().saturating_sub(MAX_LINES);
     let rows = lines.iter().skip(n_left_out).map(|line| {
         let level = line.level.map(|level| format!("{level:?}").to_lowercase()).unwrap_or_default();
-        (level == "error", vec![escape(&line.time), escape(&line.operator), level, escape(&line.text)])
+        let fields: String = line.fields.iter().map(|(name, value)| format!(" {name}={value}")).collect();
+        let text = escape(&format!("{}{fields}", line.text));
+        (level == "error", vec![escape(&line.time), escape(&line.operator), level, text])
     });
     let rows: Vec<_> = rows.collect();
     if rows.is_empty() {

@@ -83,15 +83,20 @@ impl Session {
     /// # Errors
     /// The graph cannot start, or an operator failed; the summary has been printed then.
     pub(in crate::commands) fn run(self, graph: &Graph, name: &str, n_stops: &AtomicUsize) -> anyhow::Result<Ended> {
+        let params = graph.nodes.iter().flat_map(|node| node.params.values());
+        let inputs: Vec<PathBuf> = params.filter_map(|param| Some(PathBuf::from(param.as_str()?))).collect();
         if let Some(path) = &self.record {
-            let params = graph.nodes.iter().flat_map(|node| node.params.values());
-            let inputs: Vec<PathBuf> = params.filter_map(|param| Some(PathBuf::from(param.as_str()?))).collect();
             check_output(path, &inputs)?;
             self.record_options.check(path)?;
         }
         if let Some(path) = &self.report {
-            let inputs: Vec<PathBuf> = self.record.iter().cloned().collect();
             check_output(path, &inputs)?;
+            if self.record.as_ref() == Some(path) {
+                bail!("{} is given for --record and for --report: choose two files", path.display());
+            }
+            if !path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("html")) {
+                bail!("{} (--report): expected a name that ends in .html", path.display());
+            }
         }
         let listen = |port| metrics::listen(port).with_context(|| format!("cannot answer on port {port} (--metrics)"));
         let options = RunOptions {
@@ -144,13 +149,15 @@ impl Session {
         if !self.is_quiet {
             summary.print_recording();
         }
-        if let (Some(report), Some(path)) = (report, &self.report) {
-            report.write(path, &summary.run)?;
-            if !self.is_quiet {
-                print_diagnostic(&format!("the report of the run is {}", path.display()));
-            }
-        }
+        let reported = match (report, &self.report) {
+            (Some(report), Some(path)) => report.write(path, &summary.run),
+            _ => Ok(()),
+        };
         outcome?;
+        reported?;
+        if let Some(path) = self.report.filter(|_| !self.is_quiet) {
+            print_diagnostic(&format!("the report of the run is {}", path.display()));
+        }
         if let Some(error) = printer.take_failure() {
             return Err(error).context("decisions were made that could not be written to stdout");
         }

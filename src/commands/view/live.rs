@@ -11,7 +11,9 @@ use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, machine_of
 use blindgrasp_graph::control::{Attachment, Reply, Request};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
-use blindgrasp_messages::{ContactSet, Fault, GraspFeature, LiftDecision, Phase, Prediction, Record, TactileFrame};
+use blindgrasp_messages::{
+    ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Record, TactileFrame,
+};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, link_poses};
 use blindgrasp_stages::hand::Hand;
@@ -28,8 +30,8 @@ use super::control::control_of;
 use super::foxglove::Streams;
 use super::model::ShownModel;
 
-/// The page gets frames so often: 30 a second.
-const TICK: Duration = Duration::from_millis(33);
+/// The page gets frames so often: 60 a second.
+const TICK: Duration = Duration::from_millis(16);
 const GRAPH_PAUSE: Duration = Duration::from_secs(1);
 /// A graph that does not run is looked for so often.
 const RETRY: Duration = Duration::from_millis(500);
@@ -103,12 +105,17 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
     viewer.keep("graph", &first);
     let mut model = ShownModel::default();
     let mut log = ShownLog::open(&before.status.log_folder);
+    let min_probability_of = |now: &Look| {
+        let mut params = now.status.nodes.iter().filter_map(|node| node.params.get("min_probability_stable"));
+        params.next().and_then(Value::as_f64).unwrap_or_default()
+    };
     let tell = |model: &mut ShownModel, log: &mut ShownLog, now: &Look| {
         if let Some(event) = model.update(&now.status) {
             viewer.keep("model", &event);
         }
+        latest.lock().unwrap_or_else(PoisonError::into_inner).min_probability_stable = min_probability_of(now);
         if log.update() {
-            viewer.keep("log", &json!(log.lines).to_string());
+            viewer.show_log(json!(log.lines).to_string());
         }
     };
     tell(&mut model, &mut log, &before);
@@ -119,6 +126,7 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
         // Labels wait for decisions that come later, and votes for more of their kind.
         locked.truths.clone_from(&taken.truths);
         locked.votes = taken.votes;
+        locked.min_probability_stable = taken.min_probability_stable;
         drop(locked);
         if let Some(decision) = taken.decisions.last() {
             viewer.keep("decision", &decision_event(decision, &taken.truths));
@@ -165,7 +173,7 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
     drop(if is_over { observer.finish() } else { observer.leave() });
     pass_on(&model);
     if log.update() {
-        viewer.keep("log", &json!(log.lines).to_string());
+        viewer.show_log(json!(log.lines).to_string());
     }
     ended
 }
@@ -222,6 +230,8 @@ struct Latest {
     /// Whether a grasp was stable.
     truths: BTreeMap<GraspKey, bool>,
     votes: Votes,
+    /// The arbiter's param.
+    min_probability_stable: f64,
 }
 
 /// The last settled predictions of a grasp that agree, as the arbiter counts them.
@@ -229,6 +239,11 @@ struct Latest {
 struct Votes {
     #[serde(skip)]
     grasp: GraspKey,
+    /// A model agrees with itself only, and a reading that is sent again has one vote.
+    #[serde(skip)]
+    made_by: u64,
+    #[serde(skip)]
+    stamp_nanos: u64,
     side: Side,
     n: u32,
 }
@@ -243,16 +258,22 @@ enum Side {
 }
 
 impl Votes {
-    fn count(&mut self, grasp: GraspKey, prediction: &Prediction) {
+    fn count(&mut self, header: &Header, prediction: &Prediction, min_probability_stable: f64) {
+        let grasp = (header.epoch, prediction.grasp_id);
         let side = match prediction {
-            Prediction { stable: true, .. } => Side::Stable,
-            Prediction { unsure: true, .. } => Side::Unsure,
+            Prediction { stable: true, probability_stable, .. } if *probability_stable >= min_probability_stable => {
+                Side::Stable
+            }
+            Prediction { stable: true, .. } | Prediction { unsure: true, .. } => Side::Unsure,
             _ => Side::Unstable,
         };
+        let is_same = self.grasp == grasp && self.made_by == header.made_by;
+        if is_same && self.n > 0 && self.stamp_nanos == header.stamp_nanos {
+            return;
+        }
         let is_vote = prediction.phase == Phase::Settled && prediction.fault == Fault::None;
-        let goes_on = self.grasp == grasp && self.side == side;
-        let n = if is_vote { if goes_on { self.n + 1 } else { 1 } } else { 0 };
-        *self = Votes { grasp, side, n };
+        let n = if is_vote { if is_same && self.side == side { self.n + 1 } else { 1 } } else { 0 };
+        *self = Votes { grasp, made_by: header.made_by, stamp_nanos: header.stamp_nanos, side, n };
     }
 }
 
@@ -280,7 +301,8 @@ impl Sink for Reader {
                 if latest.probabilities.len() < MAX_PROBABILITIES {
                     latest.probabilities.push(sample.message.probability_stable);
                 }
-                latest.votes.count((sample.header.epoch, sample.message.grasp_id), &sample.message);
+                let min_probability_stable = latest.min_probability_stable;
+                latest.votes.count(&sample.header, &sample.message, min_probability_stable);
             }
             Record::Decision(sample) if is_shown(sample.header.hand_id) => {
                 latest.decisions.push(((sample.header.epoch, sample.message.grasp_id), sample.message));

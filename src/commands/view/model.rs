@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 /// The model of the first node that has one; it is read again after a swap.
 #[derive(Default)]
 pub(super) struct ShownModel {
-    /// The file and how often the node was swapped, once the graph was looked at.
+    /// The file and how often the node was swapped and started again, once the graph was looked at.
     source: Option<Option<(String, u32)>>,
     model: Option<Model>,
 }
@@ -24,8 +24,9 @@ impl ShownModel {
         let with_model = |node: &str| status.nodes.iter().find(|status| status.node == node);
         // The thresholds are those of the classifier.
         let nodes = with_model("classifier").into_iter().chain(&status.nodes);
-        let source =
-            nodes.into_iter().find_map(|node| Some((node.params.get("model")?.as_str()?.to_owned(), node.n_swaps)));
+        let source = nodes
+            .into_iter()
+            .find_map(|node| Some((node.params.get("model")?.as_str()?.to_owned(), node.n_swaps + node.n_restarts)));
         if self.source.as_ref() == Some(&source) {
             return None;
         }

@@ -73,7 +73,7 @@ impl<M: Message> Subscriber<M> {
 
     fn begin_with(&mut self, sequencer: Sequencer<PortSample<M>>) {
         let now = Instant::now();
-        let sequencer = sequencer.beginning_at(now);
+        let sequencer = sequencer.beginning_at(now, self.written());
         let sequencer = if self.may_hold { sequencer } else { sequencer.without_waiting() };
         let before = std::mem::replace(&mut self.sequencer, sequencer);
         // Samples that this reader has received and not answered exist nowhere else any more.
