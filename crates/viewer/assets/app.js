@@ -11,7 +11,7 @@ const SPOKEN_MS = 2000;
 const SILENT_MS = 3000;
 
 // The present state, which tests read.
-const shown = (window.blindgrasp = { server: null, scene: null, model: null, frame: null, decision: null, graph: null, dropped: 0, frames: 0, cellColours: [], painted: [] });
+const shown = (window.blindgrasp = { server: null, scene: null, model: null, frame: null, decision: null, graph: null, dropped: 0, frames: 0, cellColours: [], painted: [], firstFrameMs: null });
 
 // --- the hand
 const hand = makeStage(three, byId("stage"));
@@ -37,6 +37,7 @@ const showFrame = (frame) => {
   if (greatest > largest) largest = roundUp(greatest);
   shown.frame = frame;
   shown.frames += 1;
+  shown.firstFrameMs ??= performance.now();
   shown.cellColours = frame.cells.map(cellColour);
   hand.show(frame, shown.cellColours);
   byId("moment").textContent = `grasp ${frame.grasp_id}, ${frame.phase}`;
@@ -140,6 +141,8 @@ const chart = () => {
 
 // --- the feature: a bar for each value, up or down from 0, and the words on the hand
 let feature = null;
+// Those that are not drawn yet.
+let words = null;
 const showFeature = () => {
   byId("feature-part").hidden = feature === null;
   if (feature === null) return;
@@ -305,7 +308,14 @@ const player = (() => {
   return state;
 })();
 shown.player = player;
-setInterval(() => { if (!document.hidden && !player.grasps.length) chart(); }, 100);
+setInterval(() => {
+  if (document.hidden || player.grasps.length) return;
+  chart();
+  if (words === null) return;
+  showFeature();
+  hand.showWords(shown.model?.words_m ?? [], words);
+  words = null;
+}, 100);
 
 // --- the graph
 const time = (nanos) => nanos < 1e6 ? `${(nanos / 1e3).toFixed(0)} µs` : nanos < 1e9 ? `${(nanos / 1e6).toFixed(1)} ms` : `${(nanos / 1e9).toFixed(1)} s`;
@@ -456,7 +466,7 @@ on("server", (server) => {
 });
 on("scene", (scene) => {
   shown.scene = scene;
-  [largest, shown.frame, shown.decision, feature] = [1, null, null, null];
+  [largest, shown.frame, shown.decision, feature, words] = [1, null, null, null, null];
   hand.showWords([], []);
   showFeature();
   byId("waits").textContent = "";
@@ -479,8 +489,7 @@ on("frame", (frame) => {
   }
   if (frame.feature?.length) {
     feature = frame.feature;
-    if (!document.hidden) showFeature();
-    hand.showWords(shown.model?.words_m ?? [], frame.words);
+    words = frame.words;
   }
 });
 on("decision", (decision) => {

@@ -30,8 +30,10 @@ use super::control::control_of;
 use super::foxglove::Streams;
 use super::model::ShownModel;
 
-/// The page gets frames so often: 60 a second.
-const TICK: Duration = Duration::from_millis(16);
+/// The page gets frames so often: 30 a second. More cost the graph more than a viewer sees.
+const TICK: Duration = Duration::from_millis(33);
+/// A decision goes to the page at once, but for this time.
+const POLL: Duration = Duration::from_millis(8);
 const GRAPH_PAUSE: Duration = Duration::from_secs(1);
 /// A graph that does not run is looked for so often.
 const RETRY: Duration = Duration::from_millis(500);
@@ -119,7 +121,18 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
         }
     };
     tell(&mut model, &mut log, &before);
+    let mut frame_due = Instant::now();
     let mut graph_due = Instant::now() + GRAPH_PAUSE;
+    let pass_on_decision = || {
+        let mut latest = latest.lock().unwrap_or_else(PoisonError::into_inner);
+        if std::mem::take(&mut latest.is_decided)
+            && let Some(decision) = latest.decisions.last()
+        {
+            let event = decision_event(decision, &latest.truths);
+            drop(latest);
+            viewer.keep("decision", &event);
+        }
+    };
     let pass_on = |model: &ShownModel| {
         let mut locked = latest.lock().unwrap_or_else(PoisonError::into_inner);
         let taken = std::mem::take(&mut *locked);
@@ -128,9 +141,6 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
         locked.votes = taken.votes;
         locked.min_probability_stable = taken.min_probability_stable;
         drop(locked);
-        if let Some(decision) = taken.decisions.last() {
-            viewer.keep("decision", &decision_event(decision, &taken.truths));
-        }
         if viewer.n_browsers() > 0
             && let Some(event) = frame_event(hand.as_ref(), model, taken)
         {
@@ -141,7 +151,7 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
         if is_interrupted() {
             break (Ok(()), false);
         }
-        match connection.receive_within(TICK) {
+        match connection.receive_within(POLL) {
             Ok(None) if observer.has_failed() => {
                 break (Err(anyhow::anyhow!("the graph cannot be read any more")), false);
             }
@@ -152,7 +162,11 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
             Ok(Some(other)) => break (Err(connection.unexpected(&other).into()), false),
             Err(error) => break (Err(error.into()), false),
         }
-        pass_on(&model);
+        pass_on_decision();
+        if Instant::now() >= frame_due {
+            frame_due = Instant::now() + TICK;
+            pass_on(&model);
+        }
         if Instant::now() >= graph_due {
             graph_due = Instant::now() + GRAPH_PAUSE;
             match poller
@@ -171,6 +185,7 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
     };
     // A graph that goes on has no end to wait for.
     drop(if is_over { observer.finish() } else { observer.leave() });
+    pass_on_decision();
     pass_on(&model);
     if log.update() {
         viewer.show_log(json!(log.lines).to_string());
@@ -227,6 +242,8 @@ struct Latest {
     feature: Option<GraspFeature>,
     probabilities: Vec<f64>,
     decisions: Vec<(GraspKey, LiftDecision)>,
+    /// Whether the last one is not on the page yet.
+    is_decided: bool,
     /// Whether a grasp was stable.
     truths: BTreeMap<GraspKey, bool>,
     votes: Votes,
@@ -305,6 +322,7 @@ impl Sink for Reader {
                 latest.votes.count(&sample.header, &sample.message, min_probability_stable);
             }
             Record::Decision(sample) if is_shown(sample.header.hand_id) => {
+                latest.is_decided = true;
                 latest.decisions.push(((sample.header.epoch, sample.message.grasp_id), sample.message));
             }
             Record::Truth(sample) => {
