@@ -9,6 +9,7 @@ Usage: browser.py URL
 """
 
 import json
+import os
 import sys
 import tempfile
 
@@ -20,6 +21,8 @@ def main() -> None:
     options = webdriver.ChromeOptions()
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     with tempfile.TemporaryDirectory() as profile:
+        # The driver leaves folders of its own behind.
+        os.environ["TMPDIR"] = profile
         for word in ("headless=new", "no-sandbox", "use-angle=swiftshader", "enable-unsafe-swiftshader", "disable-quic", "no-first-run",
                      "disable-background-networking", "disable-component-update", "disable-sync", f"user-data-dir={profile}"):
             options.add_argument(f"--{word}")

@@ -14,7 +14,7 @@ use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::training::write_feature_table;
 use blindgrasp_messages::files::partial_path;
 use blindgrasp_recording::export::{CsvTable, ExportError, row, table_shapes};
-use blindgrasp_recording::{RecordingReader, present_topic, recordings_in};
+use blindgrasp_recording::{Record, RecordingReader, present_topic, recordings_in};
 use blindgrasp_stages::model::Model;
 
 /// Write a recording as JSON lines or CSV, or a table of features
@@ -118,14 +118,7 @@ fn write_lines(recording: &Path, wanted: &[String], to: impl Write) -> anyhow::R
     for record in RecordingReader::open(recording)? {
         let (topic, record) = record?;
         if wanted.is_empty() || wanted.contains(&topic) {
-            let header = record.header();
-            let line = json!({
-                "topic": topic,
-                "seq": header.seq,
-                "stamp_nanos": header.stamp_nanos,
-                "data": record.to_json()?,
-            });
-            writeln!(to, "{line}")?;
+            writeln!(to, "{}", json_line(&topic, &record)?)?;
         }
         topics.insert(topic);
     }
@@ -259,4 +252,11 @@ impl Drop for NewFile {
             let _ = std::fs::remove_file(partial_path(&self.path));
         }
     }
+}
+
+/// A sample as a line of JSON.
+pub(super) fn json_line(topic: &str, record: &Record) -> serde_json::Result<String> {
+    let header = record.header();
+    let data = record.to_json()?;
+    Ok(json!({"topic": topic, "seq": header.seq, "stamp_nanos": header.stamp_nanos, "data": data}).to_string())
 }

@@ -5,13 +5,13 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 
 /// The commands of each group, in the order of the help.
 const GROUPS: [(&str, &[&str]); 4] = [
-    ("Run", &["run", "ps", "top", "stop", "set", "swap", "logs", "doctor", "diagnostics"]),
+    ("Run", &["run", "ps", "top", "echo", "stop", "set", "swap", "logs", "doctor", "diagnostics"]),
     ("Record", &["record", "replay", "test", "export", "info", "view"]),
     ("Learn", &["simulate", "import", "train", "evaluate", "trials", "reproduce", "model", "sensors"]),
     ("Describe", &["init", "new", "keys", "completions"]),
 ];
 /// Words of earlier versions and of other tools, with the command that does it here.
-const HINTS: [(&str, &str); 15] = [
+const HINTS: [(&str, &str); 18] = [
     ("hand", "info HAND.yaml --joints NAME=VALUE"),
     ("objects", "simulate --list"),
     ("quality", "info CASES.json"),
@@ -23,8 +23,11 @@ const HINTS: [(&str, &str); 15] = [
     ("status", "ps"),
     ("list", "ps"),
     ("restart", "swap"),
-    ("echo", "export"),
+    ("down", "stop"),
+    ("topic", "echo"),
+    ("hz", "top"),
     ("get", "set"),
+    ("param", "set"),
     ("play", "replay"),
     ("plot", "view"),
 ];

@@ -7,6 +7,7 @@ mod check;
 mod completions;
 mod diagnostics;
 mod doctor;
+mod echo;
 mod evaluate;
 mod export;
 mod grid;
@@ -70,6 +71,7 @@ enum Command {
     Test(test::Arguments),
     Ps(ps::Arguments),
     Top(top::Arguments),
+    Echo(echo::Arguments),
     Stop(stop::Arguments),
     Logs(logs::Arguments),
     Set(set::Arguments),
@@ -145,6 +147,7 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Test(arguments) => test::run(&arguments),
         Command::Ps(arguments) => ps::run(&arguments),
         Command::Top(arguments) => top::run(&arguments),
+        Command::Echo(arguments) => echo::run(&arguments),
         Command::Stop(arguments) => stop::run(&arguments),
         Command::Logs(arguments) => logs::run(&arguments),
         Command::Set(arguments) => set::run(&arguments),

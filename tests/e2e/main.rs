@@ -6,6 +6,7 @@ mod common;
 mod bad_input;
 mod check;
 mod days;
+mod echo;
 mod evaluate;
 mod export;
 mod graph;

@@ -55,6 +55,11 @@ impl LinePrinter {
         }
     }
 
+    /// Whether no line is written any more: the reader has gone, or there was an error.
+    pub fn has_ended(&self) -> bool {
+        self.thread.as_ref().is_none_or(JoinHandle::is_finished)
+    }
+
     /// Lines that were dropped because the reader was too far behind.
     pub fn n_dropped(&self) -> u64 {
         self.n_dropped

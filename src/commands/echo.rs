@@ -1,0 +1,112 @@
+//! `blindgrasp echo`
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use clap::Args;
+
+use super::export::json_line;
+use super::{Outcome, number_in, stop_signal};
+use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, machine_of, pick_graph};
+use blindgrasp_graph::control::{Attachment, Reply, Request};
+use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
+use blindgrasp_messages::Record;
+use blindgrasp_operator::diagnostics::{LinePrinter, print_diagnostic};
+
+const POLL: Duration = Duration::from_millis(20);
+/// This many lines wait for the reader of stdout.
+const MAX_UNREAD_LINES: usize = 1 << 14;
+
+/// Print the samples of a running graph, one JSON object a line
+#[derive(Debug, Args)]
+#[command(after_help = "Examples: blindgrasp echo lift_arbiter/decision\n          \
+                        blindgrasp echo -n 1 classifier/prediction contacts/contacts\n\n\
+                        The lines are those of blindgrasp export. The graph does not wait for a reader of stdout that is too slow:\n\
+                        lines that are left out for that reason are counted. blindgrasp top shows rates.")]
+pub(super) struct Arguments {
+    /// Outputs to read [default: all]
+    #[arg(value_name = "NODE/PORT")]
+    edges: Vec<String>,
+    /// End after so many samples
+    #[arg(short = 'n', long, value_parser = clap::value_parser!(u64).range(1..))]
+    samples: Option<u64>,
+    /// End after so many seconds
+    #[arg(long = "for", value_name = "SECS", value_parser = |text: &str| number_in(text, 0.01..=1e8))]
+    for_secs: Option<f64>,
+    /// Graph [default: the only one running]
+    #[arg(long)]
+    graph: Option<String>,
+}
+
+/// Prints samples until there are enough.
+struct Echo {
+    printer: LinePrinter,
+    n_left: Arc<AtomicU64>,
+}
+
+impl Sink for Echo {
+    fn take(&mut self, topic: &str, record: Record, _received_nanos: u64) -> anyhow::Result<()> {
+        if self.printer.has_ended() {
+            // The reader of stdout has gone.
+            self.n_left.store(0, Ordering::Relaxed);
+        }
+        if self.n_left.load(Ordering::Relaxed) > 0 {
+            self.printer.print(json_line(topic, &record)?);
+            self.n_left.fetch_sub(1, Ordering::Relaxed);
+        }
+        Ok(())
+    }
+}
+
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let stop: Arc<AtomicBool> = stop_signal()?;
+    let graph = pick_graph(arguments.graph.as_deref())?;
+    if machine_of(&graph).is_some() {
+        bail!(
+            "{graph}: echo reads graphs of this machine; run it there, or record the part with blindgrasp record {graph}"
+        );
+    }
+    let mut connection = Connection::open(&graph)?;
+    let attachment = match connection.ask(&Request::Attach { ports: arguments.edges.clone() }, ANSWER_LIMIT)? {
+        Reply::Attached(attachment) => attachment,
+        other => return Err(connection.unexpected(&other).into()),
+    };
+    let Attachment { domain, edges, .. } = attachment;
+    let edges = edges.into_iter().filter(|edge| can_observe(&edge.input.service.type_name));
+    let edges = edges.map(|edge| ObservedEdge { topic: edge.topic, input: edge.input, is_prompt: false }).collect();
+    let n_left = Arc::new(AtomicU64::new(arguments.samples.unwrap_or(u64::MAX)));
+    let printer = LinePrinter::new(std::io::stdout(), MAX_UNREAD_LINES);
+    let echo = Echo { printer, n_left: Arc::clone(&n_left) };
+    let observer = Observer::start_attached(&domain, edges, echo).context("cannot read the graph's edges")?;
+    let end = arguments.for_secs.map(|secs| Instant::now() + Duration::from_secs_f64(secs));
+    let is_over = loop {
+        let is_enough = n_left.load(Ordering::Relaxed) == 0;
+        let is_interrupted = stop.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end);
+        if is_enough || is_interrupted || observer.has_failed() {
+            break false;
+        }
+        match connection.receive_within(POLL) {
+            Ok(None) => {}
+            Ok(Some(Reply::Drained)) | Err(ClientError::Ended { .. }) => break true,
+            Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
+            Err(error) => return Err(error.into()),
+        }
+    };
+    let finished = if is_over { observer.finish() } else { observer.leave() };
+    drop(connection);
+    let (mut echo, _) = finished.context("cannot read the graph's edges any more")?;
+    echo.printer.flush(&|| stop.load(Ordering::Relaxed));
+    if let Some(error) = echo.printer.take_failure() {
+        return Err(error).context("samples could not be written to stdout");
+    }
+    if echo.printer.n_dropped() > 0 {
+        print_diagnostic(&format!(
+            "blindgrasp: {} lines were not printed: stdout is read too slowly",
+            echo.printer.n_dropped()
+        ));
+        return Ok(Outcome::FinishedWithLoss);
+    }
+    Ok(Outcome::Done)
+}

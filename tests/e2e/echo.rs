@@ -1,0 +1,41 @@
+//! `blindgrasp echo`: the samples of a running graph on stdout.
+
+use std::io::{BufRead, BufReader};
+use std::process::Stdio;
+
+use crate::common::{FAST_FOREVER, Graph, blindgrasp, json_lines, project, run, text, unique_name};
+
+#[test]
+fn the_samples_of_a_running_graph_are_printed_as_they_are() {
+    let graph = Graph::launch(&unique_name(), &project().join("dataflow.yaml"), &FAST_FOREVER);
+    graph.wait_for_decisions(1);
+    let echo = |arguments: &[&str]| run(&[&["echo", "--graph", &graph.name][..], arguments].concat(), 0);
+    let lines = json_lines(&echo(&["-n", "20", "lift_arbiter/decision"]).stdout);
+    assert_eq!(lines.len(), 20);
+    let last = lines[19]["data"]["grasp_id"].as_u64().expect("a number");
+    graph.wait_for_decisions(last as usize + 1);
+    let decided = graph.lines();
+    for line in &lines {
+        let found = decided.iter().find(|decision| decision["grasp_id"] == line["data"]["grasp_id"]).expect("decided");
+        assert_eq!((&line["topic"], &line["seq"]), (&"/decision".into(), &found["seq"]));
+        for field in ["action", "reason", "probability_stable"] {
+            assert_eq!(line["data"][field], found[field], "{line}");
+        }
+    }
+    assert!(lines.windows(2).all(|pair| pair[1]["seq"].as_u64() == pair[0]["seq"].as_u64().map(|seq| seq + 1)));
+    // All edges, for a time.
+    let lines = json_lines(&echo(&["--for", "0.5"]).stdout);
+    for topic in ["/tactile", "/contacts", "/feature", "/prediction", "/decision", "/truth"] {
+        assert!(lines.iter().any(|line| line["topic"] == topic), "{topic}");
+    }
+    let wrong = run(&["echo", "--graph", &graph.name, "lift_arbiter/decisions"], 1);
+    assert!(text(&wrong.stderr).contains("lift_arbiter/decisions"), "{}", text(&wrong.stderr));
+    // A reader that goes ends it.
+    let mut command = blindgrasp();
+    command.args(["echo", "--graph", &graph.name]).stdout(Stdio::piped());
+    let mut child = command.spawn().expect("started");
+    let mut line = String::new();
+    BufReader::new(child.stdout.take().expect("stdout")).read_line(&mut line).expect("read");
+    assert!(child.wait().expect("waited").success());
+    graph.stop().assert_undisturbed("samples printed beside it");
+}
