@@ -102,10 +102,10 @@ def main() -> None:
     tokens = sorted("/".join(str(reply.ok.key_expr).split("/")[5:]) for reply in replies if reply.ok)
     print(json.dumps({"tokens": tokens}), flush=True)
     hand = markers[-1]
-    red = max(range(len(hand[-1].colors)), key=lambda idx: hand[-1].colors[idx].r)
+    felt = any(colour.r > 0.4 for picture in markers for colour in picture[-1].colors)
     print(json.dumps({"pictures": len(markers), "shapes": len(hand) - 1, "cells": len(hand[-1].points),
                       "points": [clouds[-1].width, [field.name for field in clouds[-1].fields]],
-                      "size": [hand[0].scale.x, hand[0].scale.y, hand[0].scale.z], "felt": hand[-1].colors[red].r > 0.4}), flush=True)
+                      "size": [hand[0].scale.x, hand[0].scale.y, hand[0].scale.z], "felt": felt}), flush=True)
 
 
 try:

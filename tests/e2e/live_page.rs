@@ -125,7 +125,7 @@ fn a_browser_shows_a_graph_as_it_runs() {
     let name = unique_name();
     let graph = launch(&name);
     graph.wait_for_decisions(1);
-    let (page, address) = Running::page(&name, 0);
+    let (page, address) = Running::page_with(&name, 0, &["--shadow", "models/barrett-bh8-280.json"]);
     let mut browser = Browser::open(&address);
     browser.wait_for_frames(20);
     browser.wait_until("blindgrasp.decision !== null && blindgrasp.graph !== null");
@@ -173,6 +173,9 @@ fn a_browser_shows_a_graph_as_it_runs() {
         "document.getElementById('waits').textContent.includes('waits for 3 settled predictions that agree')",
     );
     browser.wait_until("blindgrasp.hand.wordCount() > 2");
+    browser.wait_until(
+        "/^The model beside: (LIFT|HOLD) for grasp \\d/.test(document.getElementById('shadow').textContent)",
+    );
     browser.wait_until("/^decisions in \\d/.test(document.getElementById('latency').textContent)");
     assert_eq!(browser.text("state"), "running");
     browser.wait_until(
@@ -323,6 +326,25 @@ fn a_browser_shows_the_grasps_of_a_recording() {
     browser.ask("document.getElementById('play').click()");
     assert_eq!(browser.ask("blindgrasp.player.isPlaying"), false);
     assert_eq!(browser.ask("errors"), Value::Array(vec![]));
+    // Another model beside: the decisions of this one are those of the recording, grasp by grasp.
+    let model = project().join("models/barrett-bh8-280.json");
+    let (_page, address) = Running::page_with(path, 0, &["--shadow", model.to_str().expect("UTF-8")]);
+    let mut browser = Browser::open(&address);
+    for idx in [0, 1, 7] {
+        browser.ask(&format!("blindgrasp.player.go({idx})"));
+        browser.wait_until(&format!("blindgrasp.player.at === {idx} && blindgrasp.player.frames.length > 0"));
+        let grasp = browser.ask(&format!("blindgrasp.player.grasps[{idx}]"));
+        let action = grasp["action"].as_str().expect("an action").to_uppercase();
+        let said = browser.text("shadow");
+        assert!(
+            said.contains(&format!("{action} for grasp {}", grasp["id"].as_str().expect("an id"))),
+            "{said}, {grasp}"
+        );
+        let last = browser.ask("blindgrasp.player.frames.at(-1)");
+        assert_eq!(last["shadow"], last["probability"]);
+    }
+    assert_eq!(browser.ask("document.getElementById('chart-key').hidden"), false);
+    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
     // A recording of the simulator has the object, and no decisions.
     let (_page, address) = Running::page(project().join(RECORDING).to_str().expect("UTF-8"), 0);
     let mut browser = Browser::open(&address);

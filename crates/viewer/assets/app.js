@@ -86,10 +86,17 @@ const showDecision = (decision) => {
   }
 };
 
+// --- a model beside the graph
+const showShadow = (decision) => {
+  byId("shadow").textContent = decision === null ? "" : `The model beside: ${decision.action.replaceAll("_", " ").toUpperCase()} for grasp ` +
+    `${decision.grasp_id}, ${decision.reason.replaceAll("_", " ")}, probability ${decision.probability_stable.toFixed(2)}.`;
+};
+const showKey = (hasShadow) => { if (hasShadow) byId("chart-key").hidden = false; };
+
 // --- the chart: the last seconds by the page's clock, or the frames of a recorded grasp
-const points = [], marks = [];
+const points = [], shadows = [], marks = [];
 const trim = (now) => {
-  for (const list of [points, marks]) {
+  for (const list of [points, shadows, marks]) {
     const n = list.findIndex((item) => now - item.at <= CHART_SECS * 1000);
     if (n !== 0) list.splice(0, n < 0 ? list.length : n);
   }
@@ -125,6 +132,8 @@ const chart = () => {
     const end = player.frames.at(-1).since_start_ms || 1, at = (frame) => x(frame.since_start_ms / end);
     const present = player.frames[player.n];
     line("--soft", [at(present), 0], [at(present), height]);
+    draw.fillStyle = colour("--probe");
+    for (const frame of player.frames) if (frame.shadow !== null) dot(at(frame), frame.shadow, 5);
     draw.fillStyle = colour("--mark");
     for (const frame of player.frames) if (frame.probability !== null) dot(at(frame), frame.probability, 5);
     return;
@@ -135,6 +144,8 @@ const chart = () => {
   draw.setLineDash([]);
   const at = (item) => x(1 - (now - item.at) / 1000 / CHART_SECS);
   for (const mark of marks) line(colours[mark.action] ?? "--probe", [at(mark), height], [at(mark), height - 14]);
+  draw.fillStyle = colour("--probe");
+  for (const point of shadows) dot(at(point), point.p, 2);
   draw.fillStyle = colour("--mark");
   for (const point of points) dot(at(point), point.p, 2);
 };
@@ -215,6 +226,7 @@ const player = (() => {
     [state.at, state.frames, state.n] = [idx, [], 0];
     byId("when").textContent = `loading grasp ${grasp.id}`;
     hand.surround(null);
+    showShadow(null);
     bars();
     const label = grasp.truth === null ? "" : grasp.truth ? " It was stable." : " It was not stable.";
     if (grasp.action !== null) showDecision({ ...grasp, grasp_id: grasp.id, why: label });
@@ -226,11 +238,13 @@ const player = (() => {
     try {
       const answer = await fetch(`/grasps/${idx}`, { signal: abort.signal });
       if (!answer.ok) throw new Error(await answer.text());
-      const { frames, object, step } = await answer.json();
+      const { frames, object, step, shadow } = await answer.json();
       if (mine !== opening) return false;
       [state.frames, wholeStep, due] = [frames, step, performance.now()];
       byId("frame").max = Math.max(0, frames.length - 1);
       hand.surround(object);
+      showShadow(shadow);
+      showKey(shadow !== null);
       showAt(0);
       return frames.length > 0;
     } catch (error) {
@@ -286,6 +300,7 @@ const player = (() => {
   byId("frame").addEventListener("input", () => showAt(Number(byId("frame").value)));
   byId("grasps").addEventListener("click", (event) => go(Math.floor(event.offsetX / byId("grasps").clientWidth * state.grasps.length)));
   new ResizeObserver(() => { if (state.grasps.length) { bars(); chart(); } }).observe(byId("grasps"));
+  state.go = go;
   state.start = ({ file, first, grasps }) => {
     // The same recording, after a broken connection.
     if (state.grasps.length) return;
@@ -470,6 +485,7 @@ on("scene", (scene) => {
   hand.showWords([], []);
   showFeature();
   byId("waits").textContent = "";
+  showShadow(null);
   for (const id of ["pads", "joints"]) cut(byId(id), 0);
   byId("moment").textContent = scene ? "no frame yet" : "the graph has no hand that can be shown";
   for (const id of ["scale", "why"]) byId(id).textContent = "";
@@ -481,6 +497,8 @@ on("frame", (frame) => {
   const now = performance.now();
   trim(now);
   for (const p of frame.probabilities) if (p !== null) points.push({ at: now, p });
+  for (const p of frame.shadow) if (p !== null) shadows.push({ at: now, p });
+  showKey(frame.shadow.length > 0);
   for (const action of frame.actions) marks.push({ at: now, action });
   if (frame.links) {
     frameAt = now;
@@ -496,6 +514,7 @@ on("decision", (decision) => {
   decidedAt = performance.now();
   showDecision(decision);
 });
+on("shadow", showShadow);
 on("graph", showGraph);
 on("model", (model) => {
   shown.model = model;

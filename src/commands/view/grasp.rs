@@ -8,12 +8,13 @@ use anyhow::bail;
 use super::super::{Outcome, check_output, print_line};
 use super::GraspArguments;
 use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::evaluation::decide_grasp;
+use blindgrasp_learning::evaluation::Judge;
 use blindgrasp_messages::{Fault, Phase, Prediction};
 use blindgrasp_objects::find_mesh;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{AnimatedGrasp, ObjectSurface, RecordedGrasp, animation_svg, grasp_html, grasp_svg};
 use blindgrasp_recording::{Record, RecordingReader};
+use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 
 /// The kind of picture, by the file's extension.
@@ -48,23 +49,20 @@ pub(super) fn animate(recording: &Path, out: &Path, arguments: &GraspArguments) 
     let hand = hand_of(recording, arguments.hand.as_deref())?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let path = arguments.animate.as_deref().unwrap_or(Path::new(""));
-    let model = Model::load(path)?;
-    if model.hand.id != hand.id() {
-        bail!("{} is for the hand '{}', the recording is of '{}'", path.display(), model.hand.name, hand.name);
-    }
+    let mut judge = judge_of(path, &hand)?;
     let wanted = arguments.grasp.iter().map(|id| Some(*id));
     let wanted: Vec<_> = if arguments.grasp.is_empty() { vec![None] } else { wanted.collect() };
     let mut animated = Vec::new();
     for id in wanted {
         let mut grasp = read_grasp(recording, id)?;
         grasp.object = surface(&grasp, arguments.objects.as_deref())?;
-        let alone = decide_grasp(&hand, &model, &grasp.frames);
+        let alone = judge.decide_alone(&grasp.frames);
         grasp.decision = alone.decision;
         let probability = |it: &Prediction| (it.fault == Fault::None).then_some(it.probability_stable);
         animated.push(AnimatedGrasp {
             probabilities: alone.predictions.iter().map(probability).collect(),
             decided_at: alone.decided_at,
-            threshold: model.classifier.threshold_probability,
+            threshold: judge.model().classifier.threshold_probability,
             grasp,
         });
     }
@@ -72,6 +70,12 @@ pub(super) fn animate(recording: &Path, out: &Path, arguments: &GraspArguments) 
     std::fs::write(out, picture).map_err(|error| anyhow::anyhow!("cannot write {}: {error}", out.display()))?;
     print_line(&format!("{} grasps drawn to {}", animated.len(), out.display()))?;
     Ok(Outcome::Done)
+}
+
+/// Judges grasps of this hand by a model.
+pub(super) fn judge_of(model: &Path, hand: &Hand) -> anyhow::Result<Judge> {
+    let judge = Judge::new(hand.clone(), Model::load(model)?);
+    judge.map_err(|message| anyhow::anyhow!("{}: {message}", model.display()))
 }
 
 pub(super) fn format_of(out: &Path) -> anyhow::Result<Format> {

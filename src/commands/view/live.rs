@@ -11,12 +11,14 @@ use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, machine_of
 use blindgrasp_graph::control::{Attachment, Reply, Request};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
+use blindgrasp_learning::evaluation::Judge;
 use blindgrasp_messages::{
     ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Record, TactileFrame,
 };
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, link_poses};
 use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::model::Model;
 use blindgrasp_viewer::{Abilities, Viewer};
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -28,6 +30,7 @@ use super::super::{Outcome, print_line, stop_signal};
 use super::Rights;
 use super::control::control_of;
 use super::foxglove::Streams;
+use super::grasp::judge_of;
 use super::model::ShownModel;
 
 /// The page gets frames so often: 30 a second. More cost the graph more than a viewer sees.
@@ -46,7 +49,17 @@ const MAX_TRUTHS: usize = 256;
 
 /// Serves the page until the command is interrupted. A graph that ends may run again. With `waits`, it need not run yet, and the
 /// end of stdin ends the page: the process that started it has gone.
-pub(super) fn show(graph: &str, port: u16, waits: bool, rights: Rights) -> anyhow::Result<Outcome> {
+///
+/// Frames are judged by the model `shadow` as well, if there is one.
+pub(super) fn show(
+    graph: &str,
+    port: u16,
+    waits: bool,
+    rights: Rights,
+    shadow: Option<&Path>,
+) -> anyhow::Result<Outcome> {
+    // A file that cannot be read is a mistake at the start only.
+    shadow.map(Model::load).transpose()?;
     if machine_of(graph).is_some() {
         bail!("{graph}: the page shows graphs of this machine; run the command there, or use blindgrasp top {graph}");
     }
@@ -74,7 +87,7 @@ pub(super) fn show(graph: &str, port: u16, waits: bool, rights: Rights) -> anyho
     while !is_interrupted() {
         // The graph may not run at this moment.
         if let Ok(connection) = connection.take().map_or_else(|| Connection::open(graph), Ok)
-            && let Err(error) = watch(connection, &viewer, &is_interrupted)
+            && let Err(error) = watch(connection, &viewer, shadow, &is_interrupted)
         {
             viewer.forget("graph");
             say(&format!("{error:#}"));
@@ -85,7 +98,12 @@ pub(super) fn show(graph: &str, port: u16, waits: bool, rights: Rights) -> anyho
 }
 
 /// Feeds the page until the graph ends, which is an error, or the command is interrupted.
-fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() -> bool) -> anyhow::Result<()> {
+fn watch(
+    mut connection: Connection,
+    viewer: &Viewer,
+    shadow: Option<&Path>,
+    is_interrupted: &dyn Fn() -> bool,
+) -> anyhow::Result<()> {
     let attachment = match connection.ask(&Request::Attach { ports: Vec::new() }, ANSWER_LIMIT)? {
         Reply::Attached(attachment) => attachment,
         other => return Err(connection.unexpected(&other).into()),
@@ -97,11 +115,17 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
     // The decision and the hand of an earlier run are not shown any more.
     viewer.forget("decision");
     viewer.keep("scene", &serde_json::to_string(&hand.as_ref().map(HandScene::new))?);
+    let shadow = match (shadow, &hand) {
+        (Some(model), Some(hand)) => Some(judge_of(model, hand)?),
+        (Some(_), None) => bail!("the graph has no hand that is known: --shadow cannot judge its frames"),
+        (None, _) => None,
+    };
+    viewer.forget("shadow");
     let streams = viewer.foxglove_address().map(|_| Streams::begin(viewer, &edges, hand.as_ref()));
     let edges = edges.into_iter().filter(|edge| can_observe(&edge.input.service.type_name));
     let edges = edges.map(|edge| ObservedEdge { topic: edge.topic, input: edge.input, is_prompt: false }).collect();
     let latest = Arc::new(Mutex::new(Latest::default()));
-    let reader = Reader { latest: Arc::clone(&latest), hand_id: hand.as_ref().map(Hand::id), streams };
+    let reader = Reader { latest: Arc::clone(&latest), hand_id: hand.as_ref().map(Hand::id), streams, shadow };
     let observer = Observer::start_attached(&domain, edges, reader).context("cannot read the graph's edges")?;
     viewer.forget("ended");
     viewer.keep("graph", &first);
@@ -141,6 +165,9 @@ fn watch(mut connection: Connection, viewer: &Viewer, is_interrupted: &dyn Fn() 
         locked.votes = taken.votes;
         locked.min_probability_stable = taken.min_probability_stable;
         drop(locked);
+        if let Some(decision) = &taken.shadow_decision {
+            viewer.keep("shadow", &shadow_event(decision).to_string());
+        }
         if viewer.n_browsers() > 0
             && let Some(event) = frame_event(hand.as_ref(), model, taken)
         {
@@ -241,6 +268,9 @@ struct Latest {
     contacts: Option<ContactSet>,
     feature: Option<GraspFeature>,
     probabilities: Vec<f64>,
+    /// Those of the model beside.
+    shadow_probabilities: Vec<f64>,
+    shadow_decision: Option<LiftDecision>,
     decisions: Vec<(GraspKey, LiftDecision)>,
     /// Whether the last one is not on the page yet.
     is_decided: bool,
@@ -299,6 +329,7 @@ struct Reader {
     latest: Arc<Mutex<Latest>>,
     hand_id: Option<u64>,
     streams: Option<Streams>,
+    shadow: Option<Judge>,
 }
 
 impl Sink for Reader {
@@ -309,7 +340,17 @@ impl Sink for Reader {
         if let Some(streams) = &mut self.streams {
             streams.send(topic, &record, is_shown(record.header().hand_id));
         }
+        let judged = match (&mut self.shadow, &record) {
+            (Some(judge), Record::Tactile(sample)) if is_shown(sample.header.hand_id) => Some(judge.take(sample)),
+            _ => None,
+        };
         let mut latest = self.latest.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((prediction, decision)) = judged {
+            if latest.shadow_probabilities.len() < MAX_PROBABILITIES {
+                latest.shadow_probabilities.push(prediction.probability_stable);
+            }
+            latest.shadow_decision = decision.or(latest.shadow_decision.take());
+        }
         match record {
             Record::Tactile(sample) if is_shown(sample.header.hand_id) => latest.frame = Some(sample.message),
             Record::Contacts(sample) if is_shown(sample.header.hand_id) => latest.contacts = Some(sample.message),
@@ -346,14 +387,24 @@ fn decision_event((key, decision): &(GraspKey, LiftDecision), truths: &BTreeMap<
     .to_string()
 }
 
+/// The decision of the model beside.
+pub(super) fn shadow_event(decision: &LiftDecision) -> Value {
+    json!({
+        "grasp_id": decision.grasp_id.to_string(), "action": decision.action, "reason": decision.reason,
+        "probability_stable": decision.probability_stable,
+    })
+}
+
 /// `None` if there is nothing new.
 fn frame_event(hand: Option<&Hand>, model: &ShownModel, latest: Latest) -> Option<String> {
-    let Latest { frame, contacts, feature, probabilities, decisions, votes, .. } = latest;
+    let Latest { frame, contacts, feature, probabilities, shadow_probabilities, decisions, votes, .. } = latest;
     if frame.is_none() && probabilities.is_empty() && decisions.is_empty() {
         return None;
     }
     let actions: Vec<_> = decisions.iter().map(|(_, decision)| decision.action).collect();
-    let mut event = json!({"probabilities": probabilities, "actions": actions, "votes": votes});
+    let mut event = json!({
+        "probabilities": probabilities, "shadow": shadow_probabilities, "actions": actions, "votes": votes,
+    });
     if let Some(feature) = feature {
         event["feature"] = json!(feature.values);
         event["words"] = model.words(feature.dictionary_id, &feature.values).into();

@@ -43,6 +43,9 @@ pub(super) struct Arguments {
     port: Option<u16>,
     #[command(flatten)]
     rights: Rights,
+    /// Judge the frames by this model as well, and show both on the page
+    #[arg(long, value_name = "MODEL", conflicts_with = "out")]
+    shadow: Option<PathBuf>,
     /// Wait for the graph, which is being started (run --view)
     #[arg(long, hide = true, requires = "port")]
     wait: bool,
@@ -148,11 +151,13 @@ enum Format {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let (graph, grasp) = (&arguments.graph, &arguments.grasp);
+    let port = arguments.port.unwrap_or(0);
+    let shadow = arguments.shadow.as_deref();
     if arguments.wait {
-        return live::show(&arguments.file.to_string_lossy(), arguments.port.unwrap_or(0), true, arguments.rights);
+        return live::show(&arguments.file.to_string_lossy(), port, true, arguments.rights, shadow);
     }
     if let Some(name) = graph_name(arguments) {
-        return live::show(name, arguments.port.unwrap_or(0), false, arguments.rights);
+        return live::show(name, port, false, arguments.rights, shadow);
     }
     if arguments.rights.is_any() {
         refuse("--view-control and --foxglove are for the page of a running graph: name one");
@@ -160,6 +165,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let is_recording = arguments.file.extension().is_some_and(|extension| extension == "mcap");
     if arguments.port.is_some() && !is_recording {
         refuse("--port is for the page of a running graph or a recording: name one");
+    }
+    if shadow.is_some() && !is_recording {
+        refuse("--shadow is for the page of a running graph or a recording: name one");
     }
     if graph.running.is_none() && hand::is_hand(&arguments.file) {
         let Some(out) = &arguments.out else {
@@ -188,7 +196,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     match &arguments.out {
         Some(out) if grasp.animate.is_some() => grasp::animate(&arguments.file, out, grasp),
         Some(out) => grasp::draw(&arguments.file, out, grasp),
-        None => recorded::show(&arguments.file, arguments.port.unwrap_or(0), grasp),
+        None => recorded::show(&arguments.file, port, grasp, shadow),
     }
 }
 

@@ -7,7 +7,8 @@ use std::time::Duration;
 
 use anyhow::bail;
 use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_messages::{Action, ContactSet, GraspTruth, LiftDecision, Recorded as _, TactileFrame};
+use blindgrasp_learning::evaluation::Judge;
+use blindgrasp_messages::{Action, ContactSet, GraspTruth, LiftDecision, Recorded as _, Stamped, TactileFrame};
 use blindgrasp_objects::find_mesh;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, ObjectScene};
@@ -19,7 +20,8 @@ use serde_json::{Value, json};
 
 use super::super::{Outcome, print_line, stop_signal};
 use super::GraspArguments;
-use super::live::add_frame;
+use super::grasp::judge_of;
+use super::live::{add_frame, shadow_event};
 
 const POLL: Duration = Duration::from_millis(100);
 /// Of a grasp with more frames, every nth is shown: a robot may hold an object for minutes.
@@ -48,7 +50,12 @@ struct Listed {
 }
 
 /// Serves the page until the command is interrupted.
-pub(super) fn show(recording: &Path, port: u16, arguments: &GraspArguments) -> anyhow::Result<Outcome> {
+pub(super) fn show(
+    recording: &Path,
+    port: u16,
+    arguments: &GraspArguments,
+    shadow: Option<&Path>,
+) -> anyhow::Result<Outcome> {
     let stop = stop_signal()?;
     let hand = hand_of(recording, arguments.hand.as_deref())?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
@@ -65,7 +72,9 @@ pub(super) fn show(recording: &Path, port: u16, arguments: &GraspArguments) -> a
     let scene = serde_json::to_string(&HandScene::new(&hand))?;
     let about =
         json!({"file": recording.display().to_string(), "first": first, "grasps": list.values().collect::<Vec<_>>()});
-    let reading = Reading { recording: recording.into(), objects: arguments.objects.clone(), hand, list };
+    let shadow = shadow.map(|model| judge_of(model, &hand)).transpose()?;
+    let objects = arguments.objects.clone();
+    let mut reading = Reading { recording: recording.into(), objects, hand, list, shadow };
     let grasps: Grasps = Box::new(move |idx| reading.grasp(idx).map_err(|error| format!("{error:#}")));
     let viewer = Viewer::serve(port, Abilities { grasps: Some(grasps), ..Abilities::default() })?;
     viewer.keep("scene", &scene);
@@ -125,13 +134,14 @@ struct Reading {
     objects: Option<PathBuf>,
     hand: Hand,
     list: BTreeMap<u64, Listed>,
+    /// Judges the grasps as well.
+    shadow: Option<Judge>,
 }
 
 /// The samples of a grasp.
 #[derive(Default)]
 struct Samples {
-    /// Number and stamp of each, and the frame.
-    frames: Vec<(u64, u64, TactileFrame)>,
+    frames: Vec<Stamped<TactileFrame>>,
     contacts: BTreeMap<u64, ContactSet>,
     probabilities: BTreeMap<u64, f64>,
     object: Option<ObjectScene>,
@@ -139,22 +149,26 @@ struct Samples {
 
 impl Reading {
     /// The frames of a grasp, with contacts and probability where the recording has them, and the object.
-    fn grasp(&self, idx: usize) -> anyhow::Result<String> {
+    fn grasp(&mut self, idx: usize) -> anyhow::Result<String> {
         let Some((id, listed)) = self.list.iter().nth(idx) else { bail!("there are {} grasps", self.list.len()) };
         let most = MAX_FRAMES.min(MAX_READINGS / self.hand.n_cells().max(1) as u64).max(1);
         let step = listed.n_frames.div_ceil(most).max(1);
         let Samples { frames, contacts, probabilities, object } = self.samples(*id, listed, step)?;
-        let start_nanos = frames.first().map_or(0, |(_, stamp, _)| *stamp);
-        let events = frames.iter().map(|(seq, stamp, frame)| {
+        // Of a thinned out grasp, the gaps would decide.
+        let shadow = self.shadow.as_mut().filter(|_| step == 1).map(|judge| judge.decide_alone(&frames));
+        let start_nanos = frames.first().map_or(0, |frame| frame.header.stamp_nanos);
+        let events = frames.iter().enumerate().map(|(idx, Stamped { header, message })| {
             let mut event = json!({
-                "since_start_ms": stamp.saturating_sub(start_nanos) as f64 / 1e6,
-                "probability": probabilities.get(seq),
+                "since_start_ms": header.stamp_nanos.saturating_sub(start_nanos) as f64 / 1e6,
+                "probability": probabilities.get(&header.seq),
+                "shadow": shadow.as_ref().map(|shadow| shadow.predictions[idx].probability_stable),
             });
-            add_frame(&mut event, &self.hand, frame, contacts.get(seq));
+            add_frame(&mut event, &self.hand, message, contacts.get(&header.seq));
             event
         });
         let events: Vec<Value> = events.collect();
-        Ok(json!({"step": step, "frames": events, "object": object}).to_string())
+        let decision = shadow.as_ref().and_then(|shadow| shadow.decision.as_ref()).map(shadow_event);
+        Ok(json!({"step": step, "frames": events, "object": object, "shadow": decision}).to_string())
     }
 
     /// Every `step`th frame of a grasp, and what belongs to these.
@@ -176,7 +190,7 @@ impl Reading {
             let is_chosen = sample.header.seq % step == 0;
             match samples.decode(&sample)? {
                 Record::Tactile(frame) if is_chosen => {
-                    found.frames.push((frame.header.seq, frame.header.stamp_nanos, frame.message));
+                    found.frames.push(frame);
                 }
                 Record::Contacts(contacts) if is_chosen => {
                     found.contacts.insert(contacts.header.seq, contacts.message);

@@ -204,23 +204,54 @@ pub struct DecidedAlone {
     pub decided_at: Option<usize>,
 }
 
-/// Decides a grasp by its frames as a graph would that sees no other.
-pub fn decide_grasp(hand: &Hand, model: &Model, frames: &[Stamped<TactileFrame>]) -> DecidedAlone {
-    let mut arbiter = LiftArbiter::new(ArbiterOptions::default());
-    let (mut memory, dictionary_id) = (Memory::default(), model.dictionary_id());
-    let mut alone = DecidedAlone { predictions: Vec::new(), decision: None, decided_at: None };
-    for (idx, frame) in frames.iter().enumerate() {
-        let prediction = predict(hand, (model, dictionary_id), &mut memory, frame);
-        // Its first frame is the first of all.
-        let header = Header { seq: idx as u64, ..frame.header };
-        let mut decisions = Vec::new();
-        arbiter.on_prediction(&header, &prediction, 0, &mut decisions);
-        alone.predictions.push(prediction);
-        if let (None, Some(decision)) = (&alone.decision, decisions.into_iter().find(|it| !it.action.is_probe())) {
-            (alone.decision, alone.decided_at) = (Some(decision), Some(idx));
+/// Judges frames one after the other as the stages of a graph do, with an arbiter that has the default options.
+pub struct Judge {
+    hand: Hand,
+    model: Model,
+    dictionary_id: u64,
+    memory: Memory,
+    arbiter: LiftArbiter,
+}
+
+impl Judge {
+    /// # Errors
+    /// The model is of another hand.
+    pub fn new(hand: Hand, model: Model) -> Result<Judge, String> {
+        if model.hand.id != hand.id() {
+            return Err(format!("the model is for the hand '{}', expected one for '{}'", model.hand.name, hand.name));
         }
+        let (dictionary_id, memory) = (model.dictionary_id(), Memory::default());
+        Ok(Judge { hand, model, dictionary_id, memory, arbiter: LiftArbiter::new(ArbiterOptions::default()) })
     }
-    alone
+
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
+    /// The prediction for a frame, and the decision, if it comes with this frame. Frames are numbered without gaps.
+    pub fn take(&mut self, frame: &Stamped<TactileFrame>) -> (Prediction, Option<LiftDecision>) {
+        let prediction = predict(&self.hand, (&self.model, self.dictionary_id), &mut self.memory, frame);
+        let mut decisions = Vec::new();
+        self.arbiter.on_prediction(&frame.header, &prediction, 0, &mut decisions);
+        (prediction, decisions.into_iter().rfind(|decision| !decision.action.is_probe()))
+    }
+
+    /// Decides a grasp by its frames as a graph would that sees no other.
+    pub fn decide_alone(&mut self, frames: &[Stamped<TactileFrame>]) -> DecidedAlone {
+        self.memory = Memory::default();
+        self.arbiter = LiftArbiter::new(ArbiterOptions::default());
+        let mut alone = DecidedAlone { predictions: Vec::new(), decision: None, decided_at: None };
+        for (idx, frame) in frames.iter().enumerate() {
+            // Its first frame is the first of all.
+            let header = Header { seq: idx as u64, ..frame.header };
+            let (prediction, decision) = self.take(&Stamped { header, message: frame.message.clone() });
+            alone.predictions.push(prediction);
+            if let (None, Some(decision)) = (&alone.decision, decision) {
+                (alone.decision, alone.decided_at) = (Some(decision), Some(idx));
+            }
+        }
+        alone
+    }
 }
 
 /// Runs the stages between a frame and the arbiter.
