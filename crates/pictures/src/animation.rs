@@ -1,4 +1,4 @@
-//! Grasps as a moving picture: the hand closes, cells light up, the probability rises or falls, and the decision comes.
+//! Grasps as a moving picture: the hand closes, cells feel the object, the probability appears, and the decision comes.
 
 use blindgrasp_messages::Action;
 use blindgrasp_stages::hand::Hand;
@@ -25,9 +25,9 @@ const LAST_SECS: f64 = 2.6;
 pub struct AnimatedGrasp {
     /// Its frames are shown in order, and its decision from `decided_at` on.
     pub grasp: RecordedGrasp,
-    /// Of each frame; `None` where there is none.
+    /// The probability of stable for each frame, if the frame has one.
     pub probabilities: Vec<Option<f64>>,
-    /// The frame at which the decision came.
+    /// The index of the frame at which the decision came.
     pub decided_at: Option<usize>,
     /// The model's threshold of stable.
     pub threshold: f64,
@@ -85,7 +85,7 @@ pub fn animation_svg(hand: &Hand, grasps: &[AnimatedGrasp]) -> Result<String, Pi
         begin += secs;
     }
     style += "@media (prefers-reduced-motion:reduce){.moment{animation:none!important}}";
-    let title = "Grasps: the hand closes, its cells feel the object, the probability changes, and the decision comes";
+    let title = "Grasps: the hand closes, its cells feel the object, the probability appears, and the decision comes";
     Ok(svg.finish(SIZE[0], SIZE[1], title, &style))
 }
 

@@ -1,6 +1,6 @@
 //! The report of a run as a page: its decisions in time, latencies, losses, changes, and pictures of wrong decisions.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::time::Instant;
 
@@ -22,8 +22,8 @@ const MAX_DRAWN: usize = 2000;
 const MAX_WRONG: usize = 500;
 /// Pictures of wrong lifts, and of wrong holds.
 const MAX_PICTURES: usize = 6;
-/// Grasps whose decision or truth may come later.
-const MAX_OPEN: usize = 256;
+/// The last grasps: their decision or truth may come late, and frames may come after these.
+const MAX_GRASPS: usize = 256;
 /// Lines of the log.
 const MAX_LINES: usize = 200;
 
@@ -37,7 +37,8 @@ type Point = [f64; 2];
 pub(super) struct RunReport {
     start: Instant,
     hand: Option<Hand>,
-    open: BTreeMap<GraspKey, Open>,
+    /// The last grasps, in the order in which they came: neither epochs nor numbers need to rise.
+    grasps: VecDeque<(GraspKey, Grasp)>,
     /// Decisions that count as right, or of which the truth is not known: every `step`th.
     others: Vec<Point>,
     step: usize,
@@ -46,13 +47,14 @@ pub(super) struct RunReport {
     wrong_holds: Wrong,
 }
 
-/// A grasp of which not all is known.
+/// The things that are known of a grasp.
 #[derive(Default)]
-struct Open {
+struct Grasp {
     /// The last settled frame, or the last one.
     frame: Option<Stamped<TactileFrame>>,
     decision: Option<(f64, LiftDecision)>,
     truth: Option<GraspTruth>,
+    is_counted: bool,
 }
 
 #[derive(Default)]
@@ -67,7 +69,7 @@ impl RunReport {
         RunReport {
             start: Instant::now(),
             hand,
-            open: BTreeMap::new(),
+            grasps: VecDeque::new(),
             others: Vec::new(),
             step: 1,
             n_others: 0,
@@ -76,14 +78,26 @@ impl RunReport {
         }
     }
 
-    fn open(&mut self, key: GraspKey) -> &mut Open {
-        if !self.open.contains_key(&key) && self.open.len() >= MAX_OPEN {
-            // The oldest will not be completed.
-            if let Some((_, Open { decision: Some((secs, decision)), .. })) = self.open.pop_first() {
-                self.add([secs, decision.probability_stable]);
+    fn grasp(&mut self, key: GraspKey) -> &mut Grasp {
+        // Most often it is one of the last.
+        let known = self.grasps.iter().rposition(|(known, _)| *known == key);
+        let idx = known.unwrap_or_else(|| {
+            if self.grasps.len() >= MAX_GRASPS
+                && let Some((_, oldest)) = self.grasps.pop_front()
+            {
+                self.add_without_truth(&oldest);
             }
+            self.grasps.push_back((key, Grasp::default()));
+            self.grasps.len() - 1
+        });
+        &mut self.grasps[idx].1
+    }
+
+    /// Counts a decision whose truth has not come.
+    fn add_without_truth(&mut self, grasp: &Grasp) {
+        if let (false, Some((secs, decision))) = (grasp.is_counted, &grasp.decision) {
+            self.add([*secs, decision.probability_stable]);
         }
-        self.open.entry(key).or_default()
     }
 
     pub(super) fn sample(&mut self, record: &Record) {
@@ -94,17 +108,17 @@ impl RunReport {
                     [0, id].contains(&sample.header.hand_id) && sample.message.cells_newtons.len() == n_cells
                 });
                 if is_shown {
-                    let open = self.open((sample.header.epoch, sample.message.grasp_id));
+                    let grasp = self.grasp((sample.header.epoch, sample.message.grasp_id));
                     let is_settled = |frame: &TactileFrame| frame.phase == Phase::Settled;
-                    if is_settled(&sample.message) || !open.frame.as_ref().is_some_and(|last| is_settled(&last.message))
-                    {
-                        open.frame = Some(sample.clone());
+                    let has_settled = grasp.frame.as_ref().is_some_and(|last| is_settled(&last.message));
+                    if !grasp.is_counted && (is_settled(&sample.message) || !has_settled) {
+                        grasp.frame = Some(sample.clone());
                     }
                 }
             }
             Record::Truth(truth) => {
                 let key = (truth.header.epoch, truth.message.grasp_id);
-                self.open(key).truth = Some(truth.message.clone());
+                self.grasp(key).truth = Some(truth.message.clone());
                 self.settle(key);
             }
             _ => {}
@@ -118,20 +132,21 @@ impl RunReport {
         }
         let key = (seen.header.epoch, seen.decision.grasp_id);
         let secs = self.start.elapsed().as_secs_f64();
-        let open = self.open(key);
-        open.decision = Some((secs, seen.decision.clone()));
-        open.truth = open.truth.take().or_else(|| seen.truth.cloned());
+        let grasp = self.grasp(key);
+        grasp.decision = Some((secs, seen.decision.clone()));
+        grasp.truth = grasp.truth.take().or_else(|| seen.truth.cloned());
         self.settle(key);
     }
 
     /// Counts a grasp whose decision and truth are known.
     fn settle(&mut self, key: GraspKey) {
-        if self.open.get(&key).is_none_or(|open| open.decision.is_none() || open.truth.is_none()) {
-            return;
-        }
-        let Some(Open { frame, decision: Some((secs, decision)), truth: Some(truth) }) = self.open.remove(&key) else {
+        let grasp = self.grasp(key);
+        let Grasp { decision: Some((secs, decision)), truth: Some(truth), is_counted: false, .. } = grasp else {
             return;
         };
+        let (secs, decision, truth) = (*secs, decision.clone(), truth.clone());
+        grasp.is_counted = true;
+        let frame = grasp.frame.take();
         let point = [secs, decision.probability_stable];
         let wrong = match (decision.action, truth.stable) {
             (Action::Lift, false) => &mut self.wrong_lifts,
@@ -174,11 +189,10 @@ impl RunReport {
     /// Writes the page.
     ///
     /// # Errors
-    /// The file cannot be written, or a picture cannot be made.
+    /// The file cannot be written.
     pub(super) fn write(mut self, path: &Path, summary: &Summary) -> anyhow::Result<()> {
-        let open = std::mem::take(&mut self.open).into_values();
-        for (secs, decision) in open.filter_map(|open| open.decision) {
-            self.add([secs, decision.probability_stable]);
+        for (_, grasp) in std::mem::take(&mut self.grasps) {
+            self.add_without_truth(&grasp);
         }
         std::fs::write(path, self.page(summary))
             .map_err(|error| anyhow::anyhow!("cannot write {} (--report): {error}", path.display()))
@@ -370,4 +384,55 @@ fn changes(summary: &Summary) -> String {
         n => format!("<p class=\"caption\">{n} earlier lines are left out: see blindgrasp logs.</p>\n"),
     };
     report_table(&[("time", false), ("operator", false), ("level", false), ("text", false)], &rows) + &left_out
+}
+
+#[cfg(test)]
+mod tests {
+    use blindgrasp_messages::{Header, Reason};
+
+    use super::*;
+
+    /// A source that starts again may count its grasps from 0, in an epoch that is not above the one before.
+    #[test]
+    fn each_decision_is_counted_once_whatever_the_order_of_grasps_and_epochs() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
+        let n_cells = hand.n_cells();
+        let mut report = RunReport::begin(Some(hand));
+        let n_grasps = 3 * MAX_GRASPS as u64;
+        for (epoch, grasp_id) in [9, 4].into_iter().flat_map(|epoch| (0..n_grasps).rev().map(move |id| (epoch, id))) {
+            let header = Header { epoch, ..Header::default() };
+            let frame = TactileFrame {
+                grasp_id,
+                phase: Phase::Settled,
+                cells_newtons: vec![0.0; n_cells],
+                ..TactileFrame::default()
+            };
+            let frame = Record::Tactile(Stamped { header, message: frame });
+            report.sample(&frame);
+            let action = if grasp_id % 3 == 0 { Action::Lift } else { Action::Hold };
+            let decision = LiftDecision { grasp_id, action, reason: Reason::Stable, ..LiftDecision::default() };
+            // The truth of every second grasp comes after its decision; of every fifth, never.
+            let truth = GraspTruth { grasp_id, stable: false, ..GraspTruth::default() };
+            let is_early = grasp_id % 2 == 0 && grasp_id % 5 != 0;
+            let seen = SeenDecision {
+                header: &header,
+                decision: &decision,
+                latency_nanos: None,
+                truth: is_early.then_some(&truth),
+            };
+            report.decision(&seen);
+            if grasp_id % 5 != 0 {
+                report.sample(&Record::Truth(Stamped { header, message: truth }));
+            }
+            // The hand still holds the object after the decision.
+            report.sample(&frame);
+        }
+        for (_, grasp) in std::mem::take(&mut report.grasps) {
+            report.add_without_truth(&grasp);
+        }
+        let n_wrong = 2 * (0..n_grasps).filter(|id| id % 3 == 0 && id % 5 != 0).count();
+        assert_eq!((report.wrong_lifts.n, report.wrong_holds.n), (n_wrong, 0));
+        assert_eq!(report.n_others, 2 * n_grasps as usize - n_wrong);
+        assert_eq!(report.wrong_lifts.pictures.len(), MAX_PICTURES);
+    }
 }

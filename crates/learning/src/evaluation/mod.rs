@@ -196,11 +196,11 @@ fn decide_recording(
 /// A grasp decided by itself.
 #[derive(Debug, Clone)]
 pub struct DecidedAlone {
-    /// Of each frame.
+    /// One for each frame.
     pub predictions: Vec<Prediction>,
-    /// `None` if the frames end before it.
+    /// `None` if the frames end before the decision comes.
     pub decision: Option<LiftDecision>,
-    /// The frame at which it came.
+    /// The index of the frame at which the decision came.
     pub decided_at: Option<usize>,
 }
 
