@@ -29,6 +29,8 @@ fn an_operator_that_hangs_ends_with_a_launcher_that_is_killed() {
 /// The log of an operator that prints without end is a pipe that nobody reads.
 #[test]
 fn a_log_that_blocks_stops_neither_supervision_nor_decisions() {
+    // A pipe takes a part of a long write, and a report of the operator may come before the rest.
+    const FLOOD: &str = "import os\nlines = b\"flood\\n\" * 20000\nwhile True: os.write(1, lines)";
     let (folder, name) = (tempfile::tempdir().expect("a folder"), unique_name());
     let logs = folder.path().join("state/blindgrasp").join(&name);
     std::fs::DirBuilder::new().recursive(true).mode(0o700).create(&logs).expect("a folder");
@@ -37,7 +39,7 @@ fn a_log_that_blocks_stops_neither_supervision_nor_decisions() {
         folder.path(),
         "contacts.sh",
         &format!(
-            "if [ \"$1\" = --describe ]; then exec {real} \"$@\"; fi\nyes flood &\nexec {real}",
+            "if [ \"$1\" = --describe ]; then exec {real} \"$@\"; fi\npython3 -c '{FLOOD}' &\nexec {real}",
             real = operator("contacts")
         ),
     );

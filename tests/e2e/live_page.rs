@@ -161,7 +161,9 @@ fn a_browser_shows_a_graph_as_it_runs() {
     // The texts of the page.
     let decision = browser.text("action");
     assert!(["lift", "hold"].contains(&decision.as_str()), "{decision}");
-    assert!(browser.text("why").contains("probability 0."), "{}", browser.text("why"));
+    let why = browser.text("why");
+    // Two digits of a number from 0 to 1: 0.996 is 1.00.
+    assert!(why.contains("probability 0.") || why.contains("probability 1.00"), "{why}");
     assert_eq!(browser.ask("document.getElementById('nodes').rows.length"), 5);
     assert!(browser.text("edges").contains("contacts/contacts"), "{}", browser.text("edges"));
     assert!(browser.text("spoken").contains("Grasp "));

@@ -523,8 +523,15 @@ fn forward_lines(stream: impl Read, hearers: &[Hearer], events: &SyncSender<Even
             Ok(_) => {}
         }
         let line = String::from_utf8_lossy(&bytes).trim_end().to_string();
-        match line.strip_prefix(REPORT_PREFIX).map(serde_json::from_str::<Addressed<Report>>) {
+        // A text stands before a report if another writer to the same pipe, such as a child of the operator, had written
+        // a part of its line.
+        let (text, report) =
+            line.split_once(REPORT_PREFIX).map_or((&line[..], None), |(text, json)| (text, Some(json)));
+        match report.map(serde_json::from_str::<Addressed<Report>>) {
             Some(Ok(Addressed { member, message })) => {
+                if !text.is_empty() {
+                    first.take(LogEntry::plain(text));
+                }
                 let named = |hearer: &&Hearer| member.as_ref().is_some_and(|member| *member == hearer.sink.node);
                 let hearer = hearers.iter().find(named).unwrap_or(first);
                 match message {
@@ -536,10 +543,10 @@ fn forward_lines(stream: impl Read, hearers: &[Hearer], events: &SyncSender<Even
                     }
                 }
             }
-            Some(Err(error)) => {
+            Some(Err(error)) if text.is_empty() => {
                 first.take(LogEntry::plain(format!("not a report of this version ({error}): {line}")));
             }
-            None => first.take(LogEntry::plain(line)),
+            _ => first.take(LogEntry::plain(line)),
         }
     }
     let _ = events.send(Event::Output(first.id, ProcessOutput::Closed));
@@ -575,5 +582,34 @@ impl LineSink {
         if let Some(log) = &self.log {
             log.write_patiently(entry);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_report_behind_a_part_of_a_line_is_heard() {
+        let (events, heard) = std::sync::mpsc::sync_channel(10);
+        let sink = LineSink { node: "contacts".into(), log: None, printer: None };
+        let hearer = Hearer { id: 7, sink, lines: Lines::default() };
+        let output = format!(
+            "fl{prefix}{{\"report\": \"drained\"}}\nood\nit printed '{prefix}'\n{prefix}?\n",
+            prefix = REPORT_PREFIX
+        );
+        forward_lines(output.as_bytes(), std::slice::from_ref(&hearer), &events);
+        let heard: Vec<Event> = heard.try_iter().collect();
+        assert!(
+            matches!(
+                heard.as_slice(),
+                [Event::Output(7, ProcessOutput::Report(Report::Drained)), Event::Output(7, ProcessOutput::Closed)]
+            ),
+            "{}",
+            heard.len()
+        );
+        let lines = hearer.lines.lock().expect("lines");
+        assert_eq!(lines.iter().take(3).collect::<Vec<_>>(), ["fl", "ood", "it printed '@blindgrasp '"]);
+        assert!(lines.len() == 4 && lines[3].starts_with("not a report of this version"), "{lines:?}");
     }
 }

@@ -3,7 +3,8 @@
 //! * `PROGRAM --describe` answers with an [`OperatorDescription`](crate::description::OperatorDescription) as JSON.
 //! * The launcher starts `PROGRAM` with a [`Wiring`] as JSON in the environment variable [`WIRING_VARIABLE`].
 //! * The operator reports on stdout, one line each, beginning with [`REPORT_PREFIX`]: see [`Report`]. Any other line on
-//!   stdout or stderr is a log line.
+//!   stdout or stderr is a log line. A report of at most 4096 bytes that is written in one go is heard even if a child of
+//!   the operator writes to the same pipe.
 //! * The launcher writes [`Command`]s to its stdin, one line of JSON each. The end of stdin asks it to exit.
 //! * SIGTERM asks it to answer the samples that still lie in its inputs, report `drained`, and keep its ports open until
 //!   its stdin ends. An operator that exits at SIGTERM at once is accepted too.
