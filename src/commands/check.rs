@@ -21,7 +21,7 @@ pub(super) struct Arguments {
     #[arg(default_value = "dataflow.yaml")]
     pub(super) dataflow: PathBuf,
     /// Set a parameter, as in run
-    #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
+    #[arg(long = "set", value_name = "[NODE.]PARAM=VALUE", value_parser = Override::parse)]
     pub(super) overrides: Vec<Override>,
     /// Check the file for this machine only
     #[arg(long)]

@@ -17,7 +17,7 @@ use super::ps::{node_state_word, state_word, warnings};
 use super::ros2_network::Ros2Network;
 use super::top::poller::Poller;
 use super::top::sample::{Look, Measured, MeasuredEdge, MeasuredNode, Window, measure};
-use super::{Outcome, number_in};
+use super::{Outcome, secs_in};
 
 /// Publish a graph's state to ROS 2, on /diagnostics
 ///
@@ -31,7 +31,7 @@ pub(super) struct Arguments {
     #[command(flatten)]
     network: Ros2Network,
     /// Publish every so many seconds
-    #[arg(long, value_name = "SECS", default_value = "1", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    #[arg(long, value_name = "TIME", default_value = "1", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
     interval: f64,
 }
 

@@ -8,7 +8,7 @@ use anyhow::{Context, bail};
 use clap::Args;
 
 use super::export::json_line;
-use super::{Outcome, number_in, stop_signal};
+use super::{Outcome, secs_in, stop_signal};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, machine_of, pick_graph};
 use blindgrasp_graph::control::{Attachment, Reply, Request};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
@@ -33,10 +33,10 @@ pub(super) struct Arguments {
     #[arg(short = 'n', long, value_parser = clap::value_parser!(u64).range(1..))]
     samples: Option<u64>,
     /// End after so many seconds
-    #[arg(long = "for", value_name = "SECS", value_parser = |text: &str| number_in(text, 0.01..=1e8))]
+    #[arg(long = "for", value_name = "TIME", value_parser = |text: &str| secs_in(text, 0.01..=1e8))]
     for_secs: Option<f64>,
     /// Graph [default: the only one running]
-    #[arg(long)]
+    #[arg(short, long)]
     graph: Option<String>,
 }
 

@@ -9,7 +9,7 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 use serde_json::json;
 
-use super::{Outcome, check_output, print_line};
+use super::{Outcome, check_new, print_line};
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::training::write_feature_table;
 use blindgrasp_messages::files::partial_path;
@@ -42,8 +42,11 @@ pub(super) struct Arguments {
     #[arg(long, value_enum, default_value_t = Format::Jsonl)]
     format: Format,
     /// Where to write it; default: stdout. Tables of several topics go to a folder, /a/b as a.b.csv.
-    #[arg(long)]
+    #[arg(short, long)]
     out: Option<PathBuf>,
+    /// Replace files of these names
+    #[arg(long)]
+    overwrite: bool,
     /// Write the table of features (CSV) that this model sees of recorded grasps, for other tools to learn from.
     #[arg(long, value_name = "MODEL", requires = "out", conflicts_with_all = ["topic", "format"])]
     features: Option<PathBuf>,
@@ -76,7 +79,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::Result<Outcome> {
     let recordings = recordings_in(&arguments.recordings)?;
     let first = recordings.first().context("expected a recording")?;
-    check_output(out, &[&recordings[..], &[model.to_path_buf()]].concat())?;
+    check_new(out, &[&recordings[..], &[model.to_path_buf()]].concat(), arguments.overwrite)?;
     let (path, model) = (model, Model::load(model)?);
     let hand = hand_of(first, arguments.hand.as_deref())?;
     if hand.id() != model.hand.id {
@@ -104,7 +107,7 @@ fn export_lines(arguments: &Arguments, recording: &Path) -> anyhow::Result<Outco
     match &arguments.out {
         None => write_lines(recording, &arguments.topic, std::io::stdout().lock())?,
         Some(path) => {
-            let file = NewFile::create(path, recording)?;
+            let file = NewFile::create(path, recording, arguments.overwrite)?;
             write_lines(recording, &arguments.topic, &file.file).with_context(|| path.display().to_string())?;
             file.finish()?;
         }
@@ -151,7 +154,7 @@ fn export_tables(arguments: &Arguments, recording: &Path) -> anyhow::Result<Outc
     };
     let mut files = Vec::new();
     for (topic, path) in paths_of_topics(out, shapes.keys())? {
-        let file = NewFile::create(&path, recording)?;
+        let file = NewFile::create(&path, recording, arguments.overwrite)?;
         let to = file.file.try_clone().with_context(|| path.display().to_string())?;
         let to: Box<dyn Write> = Box::new(BufWriter::new(to));
         let table = CsvTable::new(to, &shapes[&topic]).with_context(|| path.display().to_string())?;
@@ -227,11 +230,10 @@ struct NewFile {
 }
 
 impl NewFile {
-    fn create(path: &Path, input: &Path) -> anyhow::Result<NewFile> {
+    fn create(path: &Path, input: &Path, overwrite: bool) -> anyhow::Result<NewFile> {
         let partial = partial_path(path);
-        for written in [path, &partial] {
-            check_output(written, &[input.into()])?;
-        }
+        check_new(path, &[input.into()], overwrite)?;
+        check_new(&partial, &[input.into()], true)?;
         if path.exists() && !path.is_file() {
             anyhow::bail!("{}: expected a file that can be replaced; leave --out away for a pipe", path.display());
         }

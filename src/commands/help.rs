@@ -5,31 +5,27 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 
 /// The commands of each group, in the order of the help.
 const GROUPS: [(&str, &[&str]); 4] = [
-    ("Run", &["run", "ps", "top", "echo", "stop", "set", "swap", "logs", "doctor", "diagnostics"]),
+    ("Run", &["run", "ps", "top", "echo", "hz", "stop", "set", "param", "swap", "logs", "doctor", "diagnostics"]),
     ("Record", &["record", "replay", "test", "export", "info", "view"]),
-    ("Learn", &["simulate", "import", "train", "evaluate", "trials", "reproduce", "model", "sensors"]),
-    ("Describe", &["init", "new", "keys", "completions"]),
+    ("Learn", &["simulate", "import", "train", "evaluate", "predict", "trials", "reproduce", "model", "sensors"]),
+    ("Describe", &["init", "new", "keys", "schema", "completions"]),
 ];
 /// Words of earlier versions and of other tools, with the command that does it here.
-const HINTS: [(&str, &str); 18] = [
+const HINTS: [(&str, &str); 14] = [
     ("hand", "info HAND.yaml --joints NAME=VALUE"),
     ("objects", "simulate --list"),
     ("quality", "info CASES.json"),
     ("features", "export --features MODEL"),
     ("experience", "train --experience MODEL --out FILE"),
-    ("up", "run"),
-    ("start", "run"),
-    ("launch", "run"),
-    ("status", "ps"),
-    ("list", "ps"),
-    ("restart", "swap"),
-    ("down", "stop"),
     ("topic", "echo"),
-    ("hz", "top"),
-    ("get", "set"),
-    ("param", "set"),
-    ("play", "replay"),
+    ("node", "ps"),
+    ("get", "param get"),
     ("plot", "view"),
+    ("viz", "view"),
+    ("bag", "record"),
+    ("validate", "run --check"),
+    ("pub", "replay"),
+    ("monitor", "top"),
 ];
 const TEMPLATE: &str = "{about-with-newline}\n{usage-heading} {usage}\n\n{before-help}Options:\n{options}{after-help}";
 
@@ -87,7 +83,7 @@ mod tests {
 
     #[test]
     fn words_of_other_tools_are_answered_with_the_command_here() {
-        for (word, expected) in [("status", "use 'blindgrasp ps'"), ("quality", "use 'blindgrasp info CASES.json'")] {
+        for (word, expected) in [("plot", "use 'blindgrasp view'"), ("quality", "use 'blindgrasp info CASES.json'")] {
             let error = grouped(Cli::command()).try_get_matches_from(["blindgrasp", word]).expect_err("no command");
             let text = with_hint(error).to_string();
             assert!(text.contains(expected), "{text}");

@@ -6,7 +6,7 @@ use anyhow::bail;
 use clap::{Args, ValueEnum};
 
 use super::hand_cells::joint;
-use super::{Outcome, check_output, number_in, percent, print_line};
+use super::{Outcome, check_new, number_in, percent, print_line};
 use blindgrasp_learning::import::{AngleUnit, Day, ImportOptions, ImportReport, Joints, import_table};
 use blindgrasp_stages::hand::{CellUnit, Hand};
 
@@ -86,8 +86,11 @@ pub(super) struct Arguments {
     #[arg(long)]
     skip_bad_rows: bool,
     /// Where to write the recording (MCAP).
-    #[arg(long)]
+    #[arg(short, long)]
     out: PathBuf,
+    /// Replace a file of this name
+    #[arg(long)]
+    overwrite: bool,
     /// Print the report as JSON.
     #[arg(long)]
     json: bool,
@@ -109,7 +112,7 @@ enum JointUnit {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let hand = Hand::load(&arguments.hand)?;
-    check_output(&arguments.out, std::slice::from_ref(&arguments.table))?;
+    check_new(&arguments.out, std::slice::from_ref(&arguments.table), arguments.overwrite)?;
     let options = ImportOptions {
         cells: arguments.cells.iter().map(|pattern| pattern.trim().into()).collect(),
         joints: joints(arguments, &hand)?,

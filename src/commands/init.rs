@@ -6,6 +6,7 @@ use anyhow::{Context, bail};
 use clap::Args;
 use serde_json::json;
 
+use super::schema::schema;
 use super::{Outcome, print_line};
 
 /// Write a new project that runs at once
@@ -22,8 +23,10 @@ pub(super) struct Arguments {
 }
 
 /// The project's files: those that this repository's own default graph consists of.
-pub(super) const FILES: [(&str, &[u8]); 11] = [
+pub(super) const FILES: [(&str, &[u8]); 13] = [
     ("dataflow.yaml", include_bytes!("../../dataflow.yaml")),
+    ("dataflow-live.yaml", include_bytes!("../../dataflow-live.yaml")),
+    ("tactile_bridge.py", include_bytes!("../../examples/tactile_bridge.py")),
     ("dataflow-machines.yaml", include_bytes!("../../dataflow-machines.yaml")),
     ("dataflow-trials.yaml", include_bytes!("../../dataflow-trials.yaml")),
     ("dataflow-regrasp.yaml", include_bytes!("../../dataflow-regrasp.yaml")),
@@ -39,6 +42,8 @@ pub(super) const FILES: [(&str, &[u8]); 11] = [
     ("README.md", README.as_bytes()),
 ];
 
+const SCHEMA: &str = "docs/dataflow.schema.json";
+
 const README: &str = "\
 # A blindgrasp project
 
@@ -52,12 +57,15 @@ blindgrasp stop
 | here | is |
 |---|---|
 | `dataflow.yaml` | the graph: which operators run, what they read, their parameters |
+| `dataflow-live.yaml` | the same graph for a real hand: a bridge sends its frames |
+| `tactile_bridge.py` | a bridge to begin with: `blindgrasp export recordings/held-out.mcap --topic /tactile \\| ./tactile_bridge.py` |
 | `dataflow-machines.yaml` | the same graph on two machines |
 | `dataflow-trials.yaml` | the same graph with a simulated hand that lifts what the graph says: `blindgrasp trials` |
 | `dataflow-regrasp.yaml` | that with advice how to grasp again: `blindgrasp trials --dataflow dataflow-regrasp.yaml` |
 | `hands/` | the Barrett hand BH8-280: kinematics (URDF) and pad layout; describe your own beside it |
 | `models/` | the model that says stable or not, trained on simulated grasps of that hand |
 | `recordings/` | 240 simulated grasps of objects that the model has not been trained on |
+| `docs/` | the schema of the dataflow files, with which an editor completes and checks them |
 
 Next: `blindgrasp new operator NAME` makes an operator of your own, `blindgrasp train RECORDING --out models/mine.json`
 a model; `blindgrasp --help` lists the rest.
@@ -65,14 +73,16 @@ a model; `blindgrasp --help` lists the rest.
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let folder = &arguments.folder;
-    let taken: Vec<&str> = FILES.iter().map(|(name, _)| *name).filter(|name| folder.join(name).exists()).collect();
+    let taken: Vec<&str> = FILES.iter().map(|(name, _)| *name).chain([SCHEMA]).filter(|name| folder.join(name).exists()).collect();
     if !taken.is_empty() {
         bail!("{} has {} already: choose a new folder, or move them away", folder.display(), taken.join(", "));
     }
     for (name, content) in FILES {
         write_new(&folder.join(name), content)?;
     }
-    let names: Vec<&str> = FILES.iter().map(|(name, _)| *name).collect();
+    // The dataflow files name it, for editors.
+    write_new(&folder.join(SCHEMA), schema().as_bytes())?;
+    let names: Vec<&str> = FILES.iter().map(|(name, _)| *name).chain([SCHEMA]).collect();
     print_line(&match arguments.json {
         true => json!({ "folder": folder, "files": names }).to_string(),
         false => format!(

@@ -31,7 +31,7 @@ pub(super) struct Arguments {
     #[arg(short = 'n', long, default_value_t = 100)]
     lines: usize,
     /// Graph, or its part (GRAPH@MACHINE) [default: the only one running, or the latest]
-    #[arg(long)]
+    #[arg(short, long)]
     graph: Option<String>,
     /// Print JSON, one object a line
     ///

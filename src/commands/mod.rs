@@ -13,6 +13,7 @@ mod export;
 mod grid;
 mod hand_cells;
 mod help;
+mod hz;
 mod import;
 mod info;
 mod init;
@@ -22,12 +23,15 @@ mod model;
 mod new;
 mod object_list;
 mod operator;
+mod param;
+mod predict;
 mod ps;
 mod record;
 mod replay;
 mod reproduce;
 mod ros2_network;
 mod run;
+mod schema;
 mod sensors;
 mod set;
 mod simulate;
@@ -65,16 +69,23 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Init(init::Arguments),
+    #[command(visible_aliases = ["up", "start", "launch"])]
     Run(run::Arguments),
     Record(record::Arguments),
+    #[command(visible_alias = "play")]
     Replay(replay::Arguments),
     Test(test::Arguments),
+    #[command(visible_aliases = ["status", "list"])]
     Ps(ps::Arguments),
     Top(top::Arguments),
     Echo(echo::Arguments),
+    Hz(hz::Arguments),
+    #[command(visible_alias = "down")]
     Stop(stop::Arguments),
     Logs(logs::Arguments),
     Set(set::Arguments),
+    Param(param::Arguments),
+    #[command(visible_alias = "restart")]
     Swap(swap::Arguments),
     #[command(hide = true)]
     Check(check::Arguments),
@@ -82,6 +93,7 @@ enum Command {
     Import(import::Arguments),
     Train(train::Arguments),
     Evaluate(evaluate::Arguments),
+    Predict(predict::Arguments),
     Trials(trials::Arguments),
     Reproduce(reproduce::Arguments),
     Model(model::Arguments),
@@ -95,6 +107,7 @@ enum Command {
     Doctor(doctor::Arguments),
     Diagnostics(diagnostics::Arguments),
     Completions(completions::Arguments),
+    Schema(schema::Arguments),
     Operator(operator::Arguments),
 }
 
@@ -148,15 +161,18 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Ps(arguments) => ps::run(&arguments),
         Command::Top(arguments) => top::run(&arguments),
         Command::Echo(arguments) => echo::run(&arguments),
+        Command::Hz(arguments) => hz::run(&arguments),
         Command::Stop(arguments) => stop::run(&arguments),
         Command::Logs(arguments) => logs::run(&arguments),
         Command::Set(arguments) => set::run(&arguments),
+        Command::Param(arguments) => param::run(&arguments),
         Command::Swap(arguments) => swap::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Import(arguments) => import::run(&arguments),
         Command::Train(arguments) => train::run(&arguments),
         Command::Evaluate(arguments) => evaluate::run(&arguments),
+        Command::Predict(arguments) => predict::run(&arguments),
         Command::Trials(arguments) => trials::run(&arguments),
         Command::Reproduce(arguments) => reproduce::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),
@@ -169,6 +185,7 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Diagnostics(arguments) => diagnostics::run(&arguments),
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
+        Command::Schema(arguments) => schema::run(&arguments),
         // `main` has run it.
         Command::Operator(_) => Ok(Outcome::Done),
     }
@@ -221,6 +238,15 @@ fn stop_signals() -> Vec<i32> {
     signals.into_iter().filter(|signal| *signal != signal_hook::consts::SIGHUP || !is_ignored(signal)).collect()
 }
 
+/// As [`check_output`]. It also refuses to replace a file, unless the user has asked for that.
+fn check_new(out: &Path, inputs: &[PathBuf], overwrite: bool) -> anyhow::Result<()> {
+    check_output(out, inputs)?;
+    if !overwrite && out.is_file() {
+        anyhow::bail!("{}: the file exists; choose another name, or replace it with --overwrite", out.display());
+    }
+    Ok(())
+}
+
 /// Refuses to write where one of the inputs lies.
 fn check_output(out: &Path, inputs: &[PathBuf]) -> anyhow::Result<()> {
     // By device and number: a file may have several names.
@@ -241,6 +267,19 @@ fn number_in(text: &str, range: RangeInclusive<f64>) -> Result<f64, String> {
     match text.parse() {
         Ok(number) if range.contains(&number) => Ok(number),
         _ => Err(format!("expected a number from {} to {}", range.start(), range.end())),
+    }
+}
+
+/// A length of time in seconds, within `range`: a number of seconds, or with units, as 500ms, 1m 30s.
+fn secs_in(text: &str, range: RangeInclusive<f64>) -> Result<f64, String> {
+    let with_unit = || humantime::parse_duration(text).ok().map(|time| time.as_secs_f64());
+    match text.parse().ok().or_else(with_unit) {
+        Some(secs) if range.contains(&secs) => Ok(secs),
+        _ => Err(format!(
+            "expected a time from {} to {} seconds, like 2.5, 500ms or 1m",
+            range.start(),
+            range.end()
+        )),
     }
 }
 

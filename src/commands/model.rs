@@ -7,7 +7,7 @@ use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 
 use super::train::{guarantee_line, probe_lines, threshold_line};
-use super::{Outcome, check_output, percent, print_line};
+use super::{Outcome, check_new, percent, print_line};
 use blindgrasp_learning::dataset::{hand_of, label_line};
 use blindgrasp_learning::training::recalibrate;
 use blindgrasp_messages::files::partial_path;
@@ -59,8 +59,11 @@ struct ExportArguments {
     #[arg(long, value_enum, default_value = "libsvm")]
     format: Format,
     /// Where to write it.
-    #[arg(long)]
+    #[arg(short, long)]
     out: PathBuf,
+    /// Replace a file of this name
+    #[arg(long)]
+    overwrite: bool,
 }
 
 /// Make a model of another program's SVM.
@@ -84,8 +87,11 @@ struct ImportArguments {
     #[arg(long)]
     keep_calibration: bool,
     /// Where to write the model.
-    #[arg(long)]
+    #[arg(short, long)]
     out: PathBuf,
+    /// Replace a file of this name
+    #[arg(long)]
+    overwrite: bool,
 }
 
 /// Correct a model for one day, by labelled grasps of that day.
@@ -105,8 +111,11 @@ struct RecalibrateArguments {
     #[arg(long)]
     hand: Option<PathBuf>,
     /// Where to write the model.
-    #[arg(long)]
+    #[arg(short, long)]
     out: PathBuf,
+    /// Replace a file of this name
+    #[arg(long)]
+    overwrite: bool,
 }
 
 /// Print what a model is made of: all but its support vectors and the identities of its training grasps.
@@ -131,7 +140,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 }
 
 fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
-    check_output(&arguments.out, std::slice::from_ref(&arguments.model))?;
+    check_new(&arguments.out, std::slice::from_ref(&arguments.model), arguments.overwrite)?;
     let Model { classifier, training, .. } = Model::load(&arguments.model)?;
     let Format::Libsvm = arguments.format;
     let Predictor::Svm(svm) = &classifier.predictor else {
@@ -163,7 +172,7 @@ pub(super) fn write_at_once(path: &Path, text: &str) -> anyhow::Result<()> {
 
 fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
     let ImportArguments { file, like, out, .. } = arguments;
-    check_output(out, &[file.clone(), like.clone()])?;
+    check_new(out, &[file.clone(), like.clone()], arguments.overwrite)?;
     let mut model = Model::load(like)?;
     let Format::Libsvm = arguments.format;
     let text = std::fs::read_to_string(file).with_context(|| format!("{}", file.display()))?;
@@ -208,7 +217,8 @@ fn recalibrate_model(arguments: &RecalibrateArguments) -> anyhow::Result<Outcome
     let recordings = recordings_in(&arguments.recordings)?;
     let first = recordings.first().context("expected a recording")?;
     let hand = hand_of(first, arguments.hand.as_deref())?;
-    check_output(&arguments.out, &[recordings.as_slice(), std::slice::from_ref(&arguments.model)].concat())?;
+    let inputs = [recordings.as_slice(), std::slice::from_ref(&arguments.model)].concat();
+    check_new(&arguments.out, &inputs, arguments.overwrite)?;
     let model = recalibrate(&hand, &Model::load(&arguments.model)?, &recordings)?;
     model.save(&arguments.out)?;
     print_line(&format!("{}: {}", arguments.out.display(), recalibration_line(&model).unwrap_or_default()))?;

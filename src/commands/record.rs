@@ -12,7 +12,7 @@ use serde_json::json;
 
 use super::run::recorder::{RecordOptions, Recorded, Recorder};
 use super::text_table::TextTable;
-use super::{Outcome, check_output, number_in, print_line, stop_signal};
+use super::{Outcome, check_output, secs_in, print_line, stop_signal};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, can_observe};
@@ -42,13 +42,13 @@ pub(super) struct Arguments {
     /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
     graph: Option<String>,
     /// File to write
-    #[arg(long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE")]
     out: PathBuf,
     /// Record only the edges from these outputs, separated by commas
     #[arg(long, value_name = "NODE/PORT", value_delimiter = ',')]
     edges: Vec<String>,
     /// End after so many seconds
-    #[arg(long = "for", value_name = "SECS", value_parser = |text: &str| number_in(text, 0.01..=1e8))]
+    #[arg(long = "for", value_name = "TIME", value_parser = |text: &str| secs_in(text, 0.01..=1e8))]
     for_secs: Option<f64>,
     #[command(flatten)]
     options: RecordOptions,

@@ -31,7 +31,7 @@ const POLL: Duration = Duration::from_millis(50);
                         are not repeated.")]
 pub(super) struct Arguments {
     /// The folder; made if it is not there.
-    #[arg(long)]
+    #[arg(short, long)]
     out: PathBuf,
     /// Number of simulated grasps: a third is tested, fold by fold.
     #[arg(long, default_value_t = N_PAPER_GRASPS, value_parser = clap::value_parser!(u64).range(60..=10_000_000))]

@@ -7,7 +7,7 @@ use clap::{Args, Subcommand};
 use indicatif::ProgressBar;
 use serde_json::json;
 
-use super::{Outcome, check_output, print_line};
+use super::{Outcome, check_new, print_line};
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::sensors::{alarms, learn, read};
 use blindgrasp_recording::recordings_in;
@@ -43,8 +43,11 @@ struct LearnArguments {
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Where to write the sensor check.
-    #[arg(long)]
+    #[arg(short, long)]
     out: PathBuf,
+    /// Replace a file of this name
+    #[arg(long)]
+    overwrite: bool,
 }
 
 /// Look for sensor faults in recordings: exit code 1 if there are some.
@@ -74,7 +77,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 fn learn_check(arguments: &LearnArguments) -> anyhow::Result<Outcome> {
     let recordings = recordings_in(&arguments.recordings)?;
     let hand = hand_of(recordings.first().context("expected a recording")?, arguments.hand.as_deref())?;
-    check_output(&arguments.out, &recordings)?;
+    check_new(&arguments.out, &recordings, arguments.overwrite)?;
     let grasps = read(&hand, &recordings)?;
     let bar = ProgressBar::new(0);
     let check = learn(&hand, &grasps, &recordings, arguments.seed, |n, of| {

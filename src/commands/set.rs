@@ -22,7 +22,7 @@ pub(super) struct Arguments {
     /// NODE.PARAM=VALUE; the value is a number, true, false or a text
     assignment: Assignment,
     /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
-    #[arg(long)]
+    #[arg(short, long)]
     graph: Option<String>,
     /// Print JSON
     #[arg(long)]

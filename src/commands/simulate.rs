@@ -11,7 +11,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
 use super::object_list::list;
-use super::{Outcome, check_output, number_in, percent, print_line};
+use super::{Outcome, check_new, number_in, percent, print_line};
 use blindgrasp_learning::dataset::REPORT_METADATA;
 use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
 use blindgrasp_objects::{objects_id, objects_named};
@@ -78,8 +78,11 @@ pub(super) struct Arguments {
     #[arg(long, conflicts_with_all = ["print_options", "shard", "grasps"])]
     list: bool,
     /// Output: a recording (a name that ends in .mcap), or a folder, in which each part becomes a recording.
-    #[arg(long, required_unless_present_any = ["print_options", "list"])]
+    #[arg(short, long, required_unless_present_any = ["print_options", "list"])]
     out: Option<PathBuf>,
+    /// Replace a recording of this name; a folder of parts is completed
+    #[arg(long)]
+    overwrite: bool,
     /// Make only the parts of shard I of N (0/N to N-1/N) of a folder; all shards together complete it.
     #[arg(long, value_parser = shard, value_name = "I/N")]
     shard: Option<Shard>,
@@ -122,7 +125,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     let simulation = Simulation { hand: &hand, objects: &objects, options: &options };
     let job = Job { simulation, info: &info, stop: &stop };
-    let report = if is_file { job.to_file(out)? } else { job.to_folder(out, arguments)? };
+    let report = if is_file { job.to_file(out, arguments.overwrite)? } else { job.to_folder(out, arguments)? };
     match report {
         Some(report) => print_report(arguments.json, out, &report)?,
         None if arguments.json => print_line("null")?,
@@ -153,8 +156,8 @@ struct Job<'a> {
 
 impl Job<'_> {
     /// Makes one recording of all parts.
-    fn to_file(&self, out: &Path) -> anyhow::Result<Option<SimulationReport>> {
-        check_output(out, &[])?;
+    fn to_file(&self, out: &Path, overwrite: bool) -> anyhow::Result<Option<SimulationReport>> {
+        check_new(out, &[], overwrite)?;
         let mut writer = GraspWriter::create(out, self.info)?;
         let bar = progress_bar(self.simulation.options.n_grasps);
         let mut report = SimulationReport::default();

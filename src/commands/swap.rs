@@ -9,7 +9,7 @@ use anyhow::{Context, anyhow, bail};
 use clap::Args;
 use serde::Serialize;
 
-use super::{Outcome, number_in, percent, print_line, stop_signal};
+use super::{Outcome, number_in, percent, print_line, secs_in, stop_signal};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, ShadowOutput, SwapRequest, SwappedNode};
 use blindgrasp_graph::describe::program_to_run;
@@ -58,21 +58,21 @@ pub(super) struct Arguments {
     ///
     /// Without a limit below, the comparison is printed and the old operator goes on. Only on the machine where the
     /// node runs.
-    #[arg(long, value_name = "SECS", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    #[arg(long, value_name = "TIME", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
     shadow: Option<f64>,
     #[command(flatten)]
     promote: Promote,
     /// Let the old operator stand by for so many seconds after the swap
-    #[arg(long, value_name = "SECS", default_value = "2", value_parser = |text: &str| number_in(text, 0.0..=3600.0))]
+    #[arg(long, value_name = "TIME", default_value = "2", value_parser = |text: &str| secs_in(text, 0.0..=3600.0))]
     probation: f64,
     /// Give up if the replacement is not ready after so many seconds
-    #[arg(long, value_name = "SECS", default_value = "20", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    #[arg(long, value_name = "TIME", default_value = "20", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
     ready_limit: f64,
     /// Swap even if the replacement is made for another hand or model
     #[arg(long)]
     allow_mismatch: bool,
     /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
-    #[arg(long)]
+    #[arg(short, long)]
     graph: Option<String>,
     /// Print JSON
     #[arg(long)]

@@ -9,7 +9,7 @@ use serde_json::json;
 
 use super::evaluate::print_label;
 use super::grid::{GridArguments, search};
-use super::{Outcome, check_output, number_in, percent, print_line};
+use super::{Outcome, check_new, number_in, percent, print_line};
 use blindgrasp_learning::collect::collect;
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::training::{Aim, Method, ThresholdOptions, TrainingOptions, WrongCall, train};
@@ -34,8 +34,11 @@ pub(super) struct Arguments {
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
     /// Where to write the model (JSON), or the experience.
-    #[arg(long)]
+    #[arg(short, long)]
     out: PathBuf,
+    /// Replace a file of this name
+    #[arg(long)]
+    overwrite: bool,
     /// Write the experience of lifted grasps (recordings of simulate --label lift), with the features of this model: the
     /// operator regrasp proposes better grasps from it. A graph runs with both; another model needs another experience.
     #[arg(long, value_name = "MODEL", conflicts_with_all = [
@@ -132,7 +135,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let recordings = recordings_in(&arguments.recordings)?;
     let first = recordings.first().context("expected a recording")?;
     let hand = hand_of(first, arguments.hand.as_deref())?;
-    check_output(&arguments.out, &recordings)?;
+    check_new(&arguments.out, &recordings, arguments.overwrite)?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     if let Some(model) = &arguments.experience {
         return write_experience(arguments, &hand, model, &recordings);
@@ -198,7 +201,7 @@ fn write_experience(
     recordings: &[PathBuf],
 ) -> anyhow::Result<Outcome> {
     let out = &arguments.out;
-    check_output(out, &[model.to_path_buf()])?;
+    check_new(out, &[model.to_path_buf()], arguments.overwrite)?;
     let model = Model::load(model)?;
     let bar = ProgressBar::new(recordings.len() as u64);
     let collected = collect(hand, &model, recordings, |n_done, _| bar.set_position(n_done as u64));

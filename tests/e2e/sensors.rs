@@ -14,9 +14,9 @@ fn faults(check: &str, recording: &str, exit_code: i32) -> Vec<Value> {
 
 /// The default graph on a recording, with watched sensors.
 fn watched(folder: &std::path::Path, recording: &str) -> std::path::PathBuf {
-    let contacts = "    params: {hand: hands/barrett-bh8-280.yaml}\n";
+    let contacts = "    inputs: {tactile: recorded_source/tactile}\n";
     let checked =
-        format!("    run: checked_contacts\n    params: {{hand: hands/barrett-bh8-280.yaml, sensors: {CHECK}}}\n");
+        format!("    run: checked_contacts\n    params: {{sensors: {CHECK}}}\n{contacts}");
     let source = ("recordings/held-out.mcap".to_string(), recording.to_string());
     dataflow_with(folder, &[(contacts.into(), checked), source])
 }

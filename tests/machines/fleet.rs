@@ -133,7 +133,9 @@ fn one_brain_serves_two_robots_and_neither_disturbs_the_other() {
     let robot_end = stop(one, robot_one);
     robot_end.assert_undisturbed("robot one");
     assert_eq!(robot_end.summary["restarts"], 0, "{}", robot_end.stderr);
-    assert_lost_nothing("brain one", &stop(brain, brain_one));
+    // It may be between two sessions.
+    wait_until(|| command(brain, &["stop", &brain_one.name]).0 == Some(0), || brain_one.said());
+    assert_lost_nothing("brain one", &brain_one.finish());
 }
 
 /// The rights of the machines of [`commands_go_from_machine_to_machine_where_the_file_allows`].

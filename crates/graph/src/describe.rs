@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::io::{ErrorKind, Read};
+use std::os::unix::fs::PermissionsExt;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -69,17 +70,31 @@ pub fn link_program() -> std::io::Result<Program> {
     Ok(shipped_operator(&own_path()?, LINK_OPERATOR))
 }
 
-/// What `--run RUN --args ARGS` of a swap starts: a shipped operator, or a program by its path, relative to `folder`.
+/// What `--run RUN --args ARGS` of a swap starts: a shipped operator, a program by its path, relative to `folder`, or one on
+/// PATH.
 ///
 /// # Errors
 /// The path of a file that is not there.
 pub fn program_to_run(run: &Path, args: &[String], folder: &Path) -> Result<Program, PathBuf> {
     let shipped = run.to_str().and_then(|name| shipped().ok()?.remove(present_name(name)));
-    let program = shipped.unwrap_or_else(|| folder.join(run).into());
+    let file = folder.join(run);
+    let on_path = || run.to_str().filter(|_| !file.exists()).and_then(program_on_path).map(Program::from);
+    let program = shipped.or_else(on_path).unwrap_or_else(|| file.into());
     if !program.path.is_file() {
         return Err(program.path);
     }
     Ok(Program { args: program.args_with(args), ..program })
+}
+
+/// The program that a shell would run for a name without '/'.
+pub(super) fn program_on_path(name: &str) -> Option<PathBuf> {
+    let is_program = |path: &PathBuf| {
+        path.metadata().is_ok_and(|found| found.is_file() && found.permissions().mode() & 0o111 != 0)
+    };
+    // An empty entry means the current folder, which must not decide what runs.
+    let folders = std::env::var_os("PATH")?;
+    let mut folders = std::env::split_paths(&folders).filter(|folder| folder.is_absolute());
+    (!name.contains('/')).then(|| folders.find_map(|folder| Some(folder.join(name)).filter(is_program)))?
 }
 
 /// Whether [`program_to_run`] takes this for a shipped operator.

@@ -53,10 +53,11 @@ impl Feed<'_> {
     /// The recording does not fit the graph, or no grasp of it is selected.
     pub(in crate::commands) fn into_graph(self, graph: &Graph, overrides: &[Override]) -> anyhow::Result<Fed> {
         let replaced = Replaced::find(graph, self.replace)?;
-        if let Some(set) =
-            overrides.iter().find(|set| set.node == replaced.node || !replaced.running.contains(&set.node))
-        {
-            bail!("--set {set}: node '{}' does not run, the recording replaces it", set.node);
+        let of_one_node = overrides.iter().filter_map(|set| Some((set, set.node.as_ref()?)));
+        for (set, node) in of_one_node {
+            if *node == replaced.node || !replaced.running.contains(node) {
+                bail!("--set {set}: node '{node}' does not run, the recording replaces it");
+            }
         }
         let reader = RecordingReader::open(self.recording)?;
         compare_hands(graph, &reader, self.recording)?;

@@ -66,7 +66,7 @@ pub(super) struct Arguments {
     #[command(flatten)]
     record_options: RecordOptions,
     /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
-    #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
+    #[arg(long = "set", value_name = "[NODE.]PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
     /// Print JSON: one line per decision, and a last one with "summary"; with --step, one line per sample as well.
     #[arg(long)]

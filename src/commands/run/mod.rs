@@ -16,7 +16,7 @@ use clap::{Args, ValueEnum};
 pub(super) use self::recorder::RecordOptions;
 pub(super) use self::session::{Session, Tap};
 use super::view::Rights;
-use super::{Outcome, background, check, number_in, stop_requests};
+use super::{Outcome, background, check, secs_in, stop_requests};
 use blindgrasp_bridge::local::{Placement, local_graph};
 use blindgrasp_graph::dataflow::{self, Graph, Override, Scope};
 use blindgrasp_graph::describe::{describe, link_program, shipped};
@@ -49,15 +49,18 @@ pub(super) struct Arguments {
     /// Set a parameter; repeatable
     ///
     /// The value takes the place of the file's. A path is relative to the current folder.
-    #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
+    #[arg(long = "set", value_name = "[NODE.]PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
     /// Print JSON, one line a decision, and a last one with "summary"
     #[arg(long)]
     json: bool,
+    /// Print warnings and errors only
+    #[arg(short, long)]
+    quiet: bool,
     /// Run in the background, see ps, logs, swap and stop
     ///
     /// Returns as soon as the graph runs.
-    #[arg(long)]
+    #[arg(short, long)]
     detach: bool,
     /// Answer Prometheus on this port of 127.0.0.1 (0: a free one)
     ///
@@ -102,20 +105,20 @@ pub(super) struct Arguments {
 }
 
 #[derive(Debug, Args)]
-#[command(next_help_heading = "Time limits, in seconds")]
+#[command(next_help_heading = "Time limits")]
 struct Limits {
     /// Operators must be ready within this time, also after a restart
-    #[arg(long, value_name = "SECS", default_value = "20", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    #[arg(long, value_name = "TIME", default_value = "20", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
     startup_limit: f64,
     /// Kill operators that have not drained, or exited, after this time
     ///
     /// When the graph stops, the operators answer the samples that are left, and then exit.
-    #[arg(long, value_name = "SECS", default_value = "10", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    #[arg(long, value_name = "TIME", default_value = "10", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
     grace: f64,
     /// A writer on a lossless edge that waits longer for a reader fails
     ///
     /// It must be longer than the slowest operator takes to come back.
-    #[arg(long, value_name = "SECS", default_value = "5", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    #[arg(long, value_name = "TIME", default_value = "5", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
     wait_limit: f64,
 }
 
@@ -282,7 +285,7 @@ fn session(arguments: &Arguments) -> Session {
         rights: arguments.rights,
         report: arguments.report.clone(),
         json: arguments.json,
-        is_quiet: false,
+        is_quiet: arguments.quiet,
         tap: None,
     }
 }

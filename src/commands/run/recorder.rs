@@ -34,7 +34,7 @@ pub(in crate::commands) struct RecordOptions {
     /// Begin another file after this time (90s, 10m, 1h)
     #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration)]
     pub(in crate::commands) rotate_every: Option<Duration>,
-    /// Replace an existing file
+    /// Replace existing files
     #[arg(long)]
     pub(in crate::commands) overwrite: bool,
 }

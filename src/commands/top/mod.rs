@@ -19,7 +19,7 @@ use ratatui::crossterm::event::{self, Event};
 use self::poller::Poller;
 use self::sample::{Look, Window, measure};
 use self::view::{Condition, Then, View};
-use super::{Outcome, number_in, print_line};
+use super::{Outcome, secs_in, print_line};
 use blindgrasp_graph::client::{ClientError, pick_graph, running_graphs};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
@@ -32,7 +32,7 @@ pub(super) struct Arguments {
     /// Graph [default: the only one running]
     graph: Option<String>,
     /// Update every so many seconds
-    #[arg(long, value_name = "SECS", default_value = "1", value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    #[arg(long, value_name = "TIME", default_value = "1", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
     interval: f64,
     /// Print JSON, one object a line and interval
     #[arg(long)]

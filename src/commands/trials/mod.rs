@@ -84,7 +84,7 @@ pub(super) struct Arguments {
     #[arg(long)]
     name: Option<String>,
     /// Replace a param of the file; a path is relative to the current folder. Can be repeated.
-    #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
+    #[arg(long = "set", value_name = "[NODE.]PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
     /// Record every edge to this file (MCAP); neither --lift-policy nor --regrasp may be both.
     #[arg(long, value_name = "FILE")]

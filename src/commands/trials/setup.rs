@@ -55,9 +55,9 @@ impl Setup {
                 arguments.dataflow.display()
             )
         })?;
-        let set = |node: &str, param: &str, text: String| Override { node: node.into(), param: param.into(), text };
+        let set = |node: &str, param: &str, text: String| Override { node: Some(node.into()), param: param.into(), text };
         let mut overrides = arguments.overrides.clone();
-        if let Some(set) = overrides.iter().find(|set| set.node == node.id && own_option(&set.param).is_some()) {
+        if let Some(set) = overrides.iter().find(|set| set.is_of(&node.id) && own_option(&set.param).is_some()) {
             bail!("--set {set}: use {} instead", own_option(&set.param).unwrap_or_default());
         }
         for (param, text) in [
@@ -84,7 +84,7 @@ impl Setup {
             let path = path.to_str().context("--model: the path is not UTF-8")?;
             let is_other = std::fs::canonicalize(path).ok() != std::fs::canonicalize(&model).ok();
             if let Some(adviser) = adviser.as_ref().filter(|_| is_other && regrasp != Regrasp::Off) {
-                let has_experience = overrides.iter().any(|set| set.node == *adviser && set.param == "experience");
+                let has_experience = overrides.iter().any(|set| set.is_of(adviser) && set.param == "experience");
                 if graph.node(adviser).is_some_and(|node| node.params.contains_key("experience")) && !has_experience {
                     bail!(
                         "--model {path}: the experience of node '{adviser}' belongs to the file's model; make one for this \
@@ -143,7 +143,7 @@ impl Setup {
     pub(super) fn graph(&self, way: Way) -> anyhow::Result<Graph> {
         let mut overrides = self.overrides.clone();
         let text = if way.obeys { "on" } else { "off" };
-        overrides.push(Override { node: self.node.clone(), param: "gate".into(), text: text.into() });
+        overrides.push(Override { node: Some(self.node.clone()), param: "gate".into(), text: text.into() });
         let shipped = shipped()?;
         let mut graph = dataflow::check(&self.file, &shipped, &overrides, Scope::Everything, describe)?;
         if way.regrasp {
@@ -164,7 +164,7 @@ impl Setup {
         let decides =
             |node: &&mut Node| node.outputs().iter().any(|output| output.type_name == LiftDecision::TYPE_NAME);
         for node in graph.nodes.iter_mut().filter(decides) {
-            let is_set = overrides.iter().any(|set| set.node == node.id && set.param == "regrasp");
+            let is_set = overrides.iter().any(|set| set.is_of(&node.id) && set.param == "regrasp");
             if let Some(regrasp) = node.params.get_mut("regrasp").filter(|_| !is_set) {
                 *regrasp = true.into();
             }

@@ -16,7 +16,7 @@ use blindgrasp_graph::dataflow::Override;
 use clap::{Args, ValueEnum};
 
 use super::hand_cells::joint;
-use super::{Outcome, number_in};
+use super::{Outcome, secs_in};
 
 /// Show a graph or a recording in a browser; draw it, or a hand.
 ///
@@ -36,7 +36,7 @@ pub(super) struct Arguments {
     #[arg(default_value = "dataflow.yaml")]
     file: PathBuf,
     /// Write to this file: .svg, .mmd or .dot for a graph, .svg or .html for a grasp or a hand
-    #[arg(long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Port of the page of a running graph or a recording, on 127.0.0.1 [default: any free one]
     #[arg(long, value_name = "PORT", conflicts_with = "out")]
@@ -95,7 +95,7 @@ struct GraphArguments {
     /// Give a param another value than the file does
     ///
     /// A path is relative to the current folder. Can be repeated.
-    #[arg(long = "set", value_name = "NODE.PARAM=VALUE", value_parser = Override::parse)]
+    #[arg(long = "set", value_name = "[NODE.]PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
     /// Check the file as this machine would
     ///
@@ -106,8 +106,8 @@ struct GraphArguments {
     #[arg(long, value_enum, conflicts_with = "json")]
     format: Option<Format>,
     /// Seconds over which a running graph is measured
-    #[arg(long, value_name = "SECS", default_value = "1", requires = "running",
-          value_parser = |text: &str| number_in(text, 0.1..=3600.0))]
+    #[arg(long, value_name = "TIME", default_value = "1", requires = "running",
+          value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
     interval: f64,
     /// Print nodes and edges as JSON
     #[arg(long)]

@@ -16,9 +16,9 @@ use crate::dataflow::order::levels;
 use crate::dataflow::process_options::PROCESS_KEYS;
 use crate::dataflow::program::Program;
 use crate::dataflow::scope::{Scope, UNKNOWN_VERSION, make_up, without_files};
-use crate::dataflow::settings::{Override, absolute, check_overrides, check_params};
+use crate::dataflow::settings::{Override, absolute, check_overrides, check_params, check_shared};
 use crate::dataflow::yaml::Text;
-use crate::describe::GROUPABLE;
+use crate::describe::{GROUPABLE, program_on_path};
 use crate::pins::{PinError, Pins, RUN};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::param::{ParamDescription, ParamKind};
@@ -71,9 +71,14 @@ pub fn check(
         let inputs = check_inputs(node, &resolved, &mut diagnostics);
         if let Some(Operator { program, description }) = &node.operator {
             let params = match (scope.elsewhere(entry), description.version.as_str()) {
-                (None, _) => check_params(entry, &description.params, overrides, folder, &mut diagnostics),
+                (None, _) => {
+                    check_params(entry, &description.params, &file.params, overrides, folder, &mut diagnostics)
+                }
                 (Some(_), UNKNOWN_VERSION) => Map::new(),
-                (Some(_), _) => check_params(entry, &without_files(&description.params), &[], folder, &mut diagnostics),
+                (Some(_), _) => {
+                    let params = without_files(&description.params);
+                    check_params(entry, &params, &file.params, &[], folder, &mut diagnostics)
+                }
             };
             let pins = match scope.elsewhere(entry) {
                 None => check_pins(entry, description, &params, &mut diagnostics),
@@ -97,6 +102,12 @@ pub fn check(
         }
     }
     check_overrides(overrides, &file.nodes, &mut diagnostics);
+    let descriptions: Option<Vec<&OperatorDescription>> =
+        resolved.iter().map(|node| node.operator.as_ref().map(|operator| &operator.description)).collect();
+    // An operator that is not known may have any param.
+    if let Some(descriptions) = descriptions.filter(|all| all.iter().all(|of| of.version != UNKNOWN_VERSION)) {
+        check_shared(&file.params, overrides, &descriptions, &mut diagnostics);
+    }
     scope.check_overrides(overrides, &file.nodes, &mut diagnostics);
     check_crossings(file, &nodes, &mut diagnostics);
     check_polling(file, scope, &mut diagnostics);
@@ -259,9 +270,15 @@ fn find_program(
             // The id stands in for a 'run' that may be the key that was misspelled.
             return None;
         }
+        if let Some(program) = program_on_path(&run.text) {
+            return Some(program.into());
+        }
         let known = || shipped.keys().map(String::as_str);
         let similar = did_you_mean(&run.text, known()).map_or(String::new(), |similar| format!("{similar} "));
-        let help = format!("{similar}{}; a path to a program has a '/'", list("operators", known()));
+        let help = format!(
+            "{similar}{}; no program of this name is on PATH; a path to a program has a '/'",
+            list("operators", known())
+        );
         diagnostics.push_with_help(run.at, format!("unknown operator {}", quote(&run.text)), Some(help));
         return None;
     }

@@ -9,6 +9,7 @@ use crate::dataflow::form::{check_name, entries_or_nothing, unknown_key};
 use crate::dataflow::machines_entry::{
     LinkEntry, MachinesEntry, check_no_places, check_places, check_security, read_link, read_machines,
 };
+use crate::dataflow::environment::fill_in;
 use crate::dataflow::node::{NodeEntry, read_node};
 use crate::dataflow::yaml::{self, Content, Entry, Text, Value};
 use blindgrasp_operator::text::did_you_mean;
@@ -18,7 +19,7 @@ const MAX_FILE_BYTES: usize = 1 << 20;
 /// Each node is a process. The bound also keeps the searches over all nodes short.
 const MAX_NODES: usize = 256;
 
-const FILE_KEYS: [&str; 5] = ["version", "name", "machines", "link", "operators"];
+pub(super) const FILE_KEYS: [&str; 6] = ["version", "name", "params", "machines", "link", "operators"];
 
 /// A dataflow file that was read. It keeps mistakes of form that leave the rest readable, so that `check` can report
 /// all mistakes together.
@@ -27,6 +28,8 @@ pub struct DataflowFile {
     path: PathBuf,
     pub(super) absolute_path: PathBuf,
     pub(super) name: String,
+    /// For each node that has a param of the name and gives it no value.
+    pub(super) params: Vec<Entry>,
     pub(super) nodes: Vec<NodeEntry>,
     pub(super) machines: Option<MachinesEntry>,
     pub(super) link: LinkEntry,
@@ -38,6 +41,7 @@ pub struct DataflowFile {
 struct Written {
     absolute_path: PathBuf,
     name: String,
+    params: Vec<Entry>,
     nodes: Vec<NodeEntry>,
     machines: Option<MachinesEntry>,
     link: LinkEntry,
@@ -82,11 +86,12 @@ pub fn parse(path: &Path, content: &[u8]) -> Result<DataflowFile, DataflowError>
     let mut diagnostics = Diagnostics::new(path);
     match read_file(path, content, &mut diagnostics) {
         Some(content) => {
-            let Written { absolute_path, name, nodes, machines, link, is_for_one_machine } = content;
+            let Written { absolute_path, name, params, nodes, machines, link, is_for_one_machine } = content;
             Ok(DataflowFile {
                 path: path.to_owned(),
                 absolute_path,
                 name,
+                params,
                 nodes,
                 machines,
                 link,
@@ -116,7 +121,11 @@ fn read_file(path: &Path, content: &[u8], diagnostics: &mut Diagnostics) -> Opti
     let text = std::str::from_utf8(content)
         .map_err(|error| diagnostics.push(position_after(&content[..error.valid_up_to()]), "not UTF-8 text"))
         .ok()?;
-    let root = yaml::parse(text, diagnostics)?;
+    let mut root = yaml::parse(text, diagnostics)?;
+    fill_in(&mut root, &|name| std::env::var(name).ok(), diagnostics);
+    if diagnostics.len() > 0 {
+        return None;
+    }
     let start = root.at;
     let Content::Mapping(entries) = root.content else {
         let help = format!("it begins with 'version: 1' and has the keys {}", FILE_KEYS.join(", "));
@@ -141,6 +150,7 @@ fn read_file(path: &Path, content: &[u8], diagnostics: &mut Diagnostics) -> Opti
     }
 
     let mut name = None;
+    let mut params = Vec::new();
     let mut nodes = None;
     let mut machines = None;
     // A key that was meant to be 'machines' is mistake enough.
@@ -150,6 +160,7 @@ fn read_file(path: &Path, content: &[u8], diagnostics: &mut Diagnostics) -> Opti
         match entry.key.text.as_str() {
             "version" => {}
             "name" => name = Some(read_name(&entry.value, diagnostics)),
+            "params" => params = entries_or_nothing(entry.value, "params", diagnostics).unwrap_or_default(),
             "operators" => nodes = Some(read_nodes(entry, diagnostics)),
             "machines" => {
                 has_machines = true;
@@ -186,6 +197,7 @@ fn read_file(path: &Path, content: &[u8], diagnostics: &mut Diagnostics) -> Opti
     Some(Written {
         absolute_path,
         name: name.unwrap_or_default(),
+        params,
         nodes,
         machines,
         link,

@@ -13,15 +13,15 @@ use crate::dataflow::yaml::{Content, Entry, Text, Value};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::text::quote;
 
-const MACHINE_KEYS: [&str; 7] = ["listen", "read", "control", "set", "swap", "run", "stop"];
-const LINK_KEYS: [&str; 5] = ["router", "keys", "insecure", "deadline_ms", "buffer"];
+pub(super) const MACHINE_KEYS: [&str; 7] = ["listen", "read", "control", "set", "swap", "run", "stop"];
+pub(super) const LINK_KEYS: [&str; 5] = ["router", "keys", "insecure", "deadline_ms", "buffer"];
 /// Each machine is linked to each that it shares an edge with.
 const MAX_MACHINES: usize = 64;
 /// With a shorter deadline, the scheduling of a busy machine would look like a cut.
-const MIN_DEADLINE_MILLIS: i64 = 20;
-const MAX_DEADLINE_MILLIS: i64 = 60_000;
+pub(super) const MIN_DEADLINE_MILLIS: i64 = 20;
+pub(super) const MAX_DEADLINE_MILLIS: i64 = 60_000;
 /// About as many of the largest frames fit into a machine's memory.
-const MAX_BUFFER: i64 = 1_000_000;
+pub(super) const MAX_BUFFER: i64 = 1_000_000;
 /// Ids that a machine's part needs for itself: the link, and the launching command.
 const RESERVED_IDS: [(&str, &str); 2] =
     [("link", "the process that links the machines"), ("run", "the launching command")];

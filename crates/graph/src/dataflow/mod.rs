@@ -8,9 +8,10 @@
 //! ```yaml
 //! version: 1
 //! name: grasp_gate                 # letters, digits, _ and -, at most 32
+//! params: {model: models/a.json}   # for each node that has the param and does not say otherwise
 //! operators:
 //!   recorded_source:
-//!     run: recorded_source         # the default is the node's id; with a '/' it is a path to a program
+//!     run: recorded_source         # the default is the node's id: an operator, or a program on PATH; with a '/' a path
 //!     args: []                     # what it is started with
 //!     params: {recording: recordings/a.mcap, rate: max}
 //!   contacts:
@@ -41,6 +42,8 @@
 //!   contacts: {on: robot, …}
 //! ```
 //!
+//! `${NAME}` in a value is the variable of the environment, `${NAME:-TEXT}` with a default, and `$${` is `${`.
+//!
 //! An input may also be only `node/output port`; all keys of a node have a default.
 //!
 //! An **operator** is a program; a **node** is one instance of it in the graph. Relative paths are relative to the
@@ -54,6 +57,7 @@ mod check;
 mod crossing;
 mod diagnostic;
 mod endpoint;
+mod environment;
 mod file;
 mod form;
 mod graph;
@@ -64,6 +68,7 @@ mod old_names;
 mod order;
 mod process_options;
 mod program;
+mod schema;
 mod scope;
 mod settings;
 #[cfg(test)]
@@ -85,5 +90,6 @@ pub use graph::{
 pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines, Right};
 pub use process_options::{ProcessOptions, Scheduling, SchedulingPolicy};
 pub use program::Program;
+pub use schema::schema;
 pub use scope::{Scope, UNKNOWN_TYPE, UNKNOWN_VERSION};
 pub use settings::{Override, accept_param, accept_param_value, live_param};

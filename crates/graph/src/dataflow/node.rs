@@ -12,7 +12,7 @@ use blindgrasp_operator::text::is_name;
 use blindgrasp_operator::text::{did_you_mean, quote};
 use blindgrasp_operator::wiring::{EdgePolicy, OnLate, Sandbox};
 
-const NODE_KEYS: [&str; 16] = [
+pub(super) const NODE_KEYS: [&str; 16] = [
     "run",
     "on",
     "args",
@@ -30,25 +30,25 @@ const NODE_KEYS: [&str; 16] = [
     PROCESS_KEYS[4],
     PROCESS_KEYS[5],
 ];
-const INPUT_KEYS: [&str; 7] =
+pub(super) const INPUT_KEYS: [&str; 7] =
     ["from", "policy", "capacity", "deadline_ms", "on_late", "tolerance_ms", "partner_wait_ms"];
-const RESTART_KEYS: [&str; 4] = ["policy", "limit", "within_s", "backoff_ms"];
+pub(super) const RESTART_KEYS: [&str; 4] = ["policy", "limit", "within_s", "backoff_ms"];
 
 /// All samples that wait on an edge are in shared memory at once.
-const MAX_CAPACITY: i64 = 4096;
+pub(super) const MAX_CAPACITY: i64 = 4096;
 /// A reader of the latest samples gets the newest only, unless it says otherwise.
 const LATEST_CAPACITY: usize = 1;
-const MAX_RESTARTS: i64 = 1000;
+pub(super) const MAX_RESTARTS: i64 = 1000;
 /// Operators have a heartbeat every 100 ms. With a shorter limit, the scheduling of a busy machine would look like a
 /// hang.
-const MIN_HEARTBEAT_MILLIS: f64 = 250.0;
-const HOUR_MILLIS: f64 = 3.6e6;
-const DAY_SECS: f64 = 86_400.0;
+pub(super) const MIN_HEARTBEAT_MILLIS: f64 = 250.0;
+pub(super) const HOUR_MILLIS: f64 = 3.6e6;
+pub(super) const DAY_SECS: f64 = 86_400.0;
 /// An operator that does nothing has about this much.
-const MIN_MEMORY_MIB: i64 = 16;
-const MAX_MEMORY_MIB: i64 = 1 << 20;
+pub(super) const MIN_MEMORY_MIB: i64 = 16;
+pub(super) const MAX_MEMORY_MIB: i64 = 1 << 20;
 /// Supervision counts in milliseconds, so a shorter window would be empty.
-const MIN_WINDOW_SECS: f64 = 0.001;
+pub(super) const MIN_WINDOW_SECS: f64 = 0.001;
 
 #[derive(Debug, Clone)]
 pub(super) struct NodeEntry {

@@ -13,10 +13,10 @@ use blindgrasp_operator::text::quote;
 use blindgrasp_operator::wiring::WaitMode;
 
 pub(super) const PROCESS_KEYS: [&str; 6] = ["group", "wait", "scheduling", "cpus", "lock_memory", "nice"];
-const SCHEDULING_KEYS: [&str; 2] = ["policy", "priority"];
-const MAX_POLL_MICROS: i64 = 1_000_000;
+pub(super) const SCHEDULING_KEYS: [&str; 2] = ["policy", "priority"];
+pub(super) const MAX_POLL_MICROS: i64 = 1_000_000;
 /// Linux numbers at most so many CPUs.
-const MAX_CPUS: i64 = 8192;
+pub(super) const MAX_CPUS: i64 = 8192;
 
 /// The options of a node's processes. The default asks the kernel for nothing.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]

@@ -54,9 +54,9 @@ impl Scope<'_> {
     /// Params of nodes that run elsewhere are set there.
     pub(super) fn check_overrides(&self, overrides: &[Override], nodes: &[NodeEntry], diagnostics: &mut Diagnostics) {
         for set in overrides {
-            let node = nodes.iter().find(|node| node.id.text == set.node);
-            if let Some(machine) = node.and_then(|node| self.elsewhere(node)) {
-                let message = format!("node {} runs on machine {}", quote(&set.node), quote(machine));
+            let node = nodes.iter().find(|node| set.node.as_ref() == Some(&node.id.text));
+            if let Some((node, machine)) = node.and_then(|node| Some((node, self.elsewhere(node)?))) {
+                let message = format!("node {} runs on machine {}", quote(&node.id.text), quote(machine));
                 diagnostics.push_of_setting(set, message, Some("give --set there".to_owned()));
             }
         }

@@ -1,5 +1,6 @@
 //! The values of a node's params, from the file, `--set` on the command line, or a running graph.
 
+use std::collections::BTreeSet;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
@@ -13,34 +14,46 @@ use blindgrasp_operator::param::{ParamDescription, ParamKind};
 use blindgrasp_operator::text::is_name;
 use blindgrasp_operator::text::{did_you_mean, quote};
 
-/// A param with another value than the file's, `node.param=value`.
+/// A param with another value than the file's: `node.param=value`, or `param=value` for each node that has the param.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Override {
-    pub node: String,
+    /// `None` for all nodes that have the param.
+    pub node: Option<String>,
     pub param: String,
     /// The value, in the form of the param's kind. A path is relative to the current folder.
     pub text: String,
 }
 
 impl Override {
-    /// Reads `node.param=value`, as it stands after `--set`.
+    /// Reads `node.param=value` or `param=value`, as it stands after `--set`.
     ///
     /// # Errors
     /// The form is wrong, or a name is not one of a node or param.
     pub fn parse(text: &str) -> Result<Self, String> {
-        let parts = text.split_once('=').and_then(|(place, value)| Some((place.split_once('.')?, value)));
-        match parts {
-            Some(((node, param), value)) if is_name(node) && is_name(param) => {
-                Ok(Self { node: node.to_owned(), param: param.to_owned(), text: value.to_owned() })
-            }
-            _ => Err(format!("expected node.param=value, like lift_arbiter.votes=5, found {}", quote(text))),
+        let wrong = || {
+            format!("expected node.param=value, like lift_arbiter.votes=5, or param=value, found {}", quote(text))
+        };
+        let (place, value) = text.split_once('=').ok_or_else(wrong)?;
+        let (node, param) = place.split_once('.').map_or((None, place), |(node, param)| (Some(node), param));
+        if !is_name(param) || node.is_some_and(|node| !is_name(node)) {
+            return Err(wrong());
         }
+        Ok(Self { node: node.map(str::to_owned), param: param.to_owned(), text: value.to_owned() })
+    }
+
+    /// Whether it sets a param of this node, if the node has the param.
+    #[must_use]
+    pub fn is_of(&self, node: &str) -> bool {
+        self.node.as_deref().is_none_or(|own| own == node)
     }
 }
 
 impl fmt::Display for Override {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}.{}={}", self.node, self.param, self.text)
+        if let Some(node) = &self.node {
+            write!(f, "{node}.")?;
+        }
+        write!(f, "{}={}", self.param, self.text)
     }
 }
 
@@ -116,10 +129,12 @@ impl From<Refusal> for String {
     }
 }
 
-/// The params of a node as the file and then the overrides say, with defaults filled in and paths absolute.
+/// The params of a node as the overrides, the node, or the file for all nodes say, with defaults filled in and paths
+/// absolute.
 pub(super) fn check_params(
     entry: &NodeEntry,
     descriptions: &[ParamDescription],
+    shared: &[Entry],
     overrides: &[Override],
     folder: &Path,
     diagnostics: &mut Diagnostics,
@@ -132,8 +147,11 @@ pub(super) fn check_params(
             misspelled.push(key.text.as_str());
         }
     }
-    let overrides = || overrides.iter().filter(|set| set.node == entry.id.text);
-    for set in overrides() {
+    // Of this node alone before those of all nodes.
+    let own = || overrides.iter().filter(|set| set.node.as_ref() == Some(&entry.id.text));
+    let overrides = || own().chain(overrides.iter().filter(|set| set.node.is_none()));
+    let given = || entry.params.iter().chain(shared);
+    for set in own() {
         if let Err(Refusal { message, help }) = find_param(descriptions, &set.param, &of) {
             diagnostics.push_of_setting(set, message, help);
             misspelled.push(set.param.as_str());
@@ -145,7 +163,7 @@ pub(super) fn check_params(
         let value = if let Some(set) = overrides().find(|set| set.param == param.name) {
             let accepted = accept_text(param, &set.text, &of, Path::new(""));
             accepted.map_err(|Refusal { message, help }| diagnostics.push_of_setting(set, message, help)).ok()
-        } else if let Some(Entry { value, .. }) = entry.params.iter().find(|given| given.key.text == param.name) {
+        } else if let Some(Entry { value, .. }) = given().find(|given| given.key.text == param.name) {
             let accepted = match &value.content {
                 Content::Scalar { text, plain } => param.kind.accept_scalar(text, *plain).ok_or_else(|| {
                     let help = param.kind.help(text, *plain);
@@ -178,13 +196,40 @@ pub(super) fn check_params(
 pub(super) fn check_overrides(overrides: &[Override], nodes: &[NodeEntry], diagnostics: &mut Diagnostics) {
     for (set_idx, set) in overrides.iter().enumerate() {
         // In a file without nodes, only that is the mistake.
-        if !nodes.is_empty() && !nodes.iter().any(|node| node.id.text == set.node) {
-            let help = did_you_mean_or_list(&set.node, "nodes", nodes.iter().map(|node| node.id.text.as_str()));
-            diagnostics.push_of_setting(set, format!("there is no node {}", quote(&set.node)), help);
+        if let Some(id) = set.node.as_deref().filter(|id| !nodes.iter().any(|node| node.id.text == *id))
+            && !nodes.is_empty()
+        {
+            let help = did_you_mean_or_list(id, "nodes", nodes.iter().map(|node| node.id.text.as_str()));
+            diagnostics.push_of_setting(set, format!("there is no node {}", quote(id)), help);
         }
         let is_same = |other: &&Override| other.node == set.node && other.param == set.param;
         if let Some(first) = overrides[..set_idx].iter().find(is_same) {
             diagnostics.push_of_setting(set, format!("given twice, first as {}", quote(&first.to_string())), None);
+        }
+    }
+}
+
+/// Params for all nodes that no node has. `descriptions` are those of all nodes.
+pub(super) fn check_shared(
+    shared: &[Entry],
+    overrides: &[Override],
+    descriptions: &[&OperatorDescription],
+    diagnostics: &mut Diagnostics,
+) {
+    let known = || descriptions.iter().flat_map(|of| &of.params).map(|param| param.name.as_str());
+    let mistake = |name: &str| {
+        let names: BTreeSet<&str> = known().collect();
+        let help = did_you_mean_or_list(name, "params", names.iter().copied());
+        (!names.contains(name)).then(|| (format!("no node has the param {}", quote(name)), help))
+    };
+    for Entry { key, .. } in shared {
+        if let Some((message, help)) = mistake(&key.text) {
+            diagnostics.push_with_help(key.at, message, help);
+        }
+    }
+    for set in overrides.iter().filter(|set| set.node.is_none()) {
+        if let Some((message, help)) = mistake(&set.param) {
+            diagnostics.push_of_setting(set, message, help);
         }
     }
 }

@@ -124,11 +124,35 @@ pub fn evaluate(
 }
 
 /// A grasp of a recording, decided.
-struct Decided {
-    decision: LiftDecision,
+#[derive(Debug, Clone)]
+pub struct Decided {
+    pub decision: LiftDecision,
     /// Of its first settled frame.
     reading_id: Option<ReadingId>,
-    truth: Option<GraspTruth>,
+    pub truth: Option<GraspTruth>,
+}
+
+/// Decides every grasp of a recording in order, as a graph that begins with it. A grasp without a decision is held.
+///
+/// # Errors
+/// The recording cannot be used, or the model is of another hand.
+pub fn decide(hand: &Hand, model: &Model, recording: &Path) -> Result<Vec<Decided>, DatasetError> {
+    let model = (model, model.dictionary_id());
+    decide_recording(hand, model, recording, &ArbiterOptions::default(), &mut Memory::default())
+}
+
+/// As [`decide`], for frames that are numbered without gaps (`seq`).
+pub fn decide_frames(hand: &Hand, model: &Model, frames: &[Stamped<TactileFrame>]) -> Vec<LiftDecision> {
+    let (mut arbiter, mut memory) = (LiftArbiter::new(ArbiterOptions::default()), Memory::default());
+    let model = (model, model.dictionary_id());
+    let mut decisions = Vec::new();
+    for frame in frames {
+        let prediction = predict(hand, model, &mut memory, frame);
+        arbiter.on_prediction(&frame.header, &prediction, 0, &mut decisions);
+    }
+    decisions.extend(arbiter.on_end());
+    decisions.retain(|decision| !decision.action.is_probe());
+    decisions
 }
 
 fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> DecidedGrasp {

@@ -6,14 +6,17 @@ use super::*;
 fn overrides_are_read() {
     let read = |text: &str| Override::parse(text);
     let of = |node: &str, param: &str, text: &str| {
-        Ok(Override { node: node.into(), param: param.into(), text: text.into() })
+        Ok(Override { node: Some(node.into()), param: param.into(), text: text.into() })
     };
+    let for_all = Override { node: None, param: "votes".into(), text: "5".into() };
+    assert_eq!(for_all.to_string(), "votes=5");
+    assert_eq!(read("votes=5"), Ok(for_all));
     assert_eq!(read("lift_arbiter.votes=5"), of("lift_arbiter", "votes", "5"));
     assert_eq!(read("a.b=./x.y=z"), of("a", "b", "./x.y=z"));
     assert_eq!(read("a.b="), of("a", "b", ""));
     assert_eq!(read("a.b=5").expect("good").to_string(), "a.b=5");
-    for wrong in ["", "votes=5", "a.votes", ".votes=5", "a.=5", "a.b.c=5", "a b.c=5", "=.", "a=b.c"] {
-        let expected = format!("expected node.param=value, like lift_arbiter.votes=5, found '{wrong}'");
+    for wrong in ["", "votes", "a.votes", ".votes=5", "a.=5", "a.b.c=5", "a b.c=5", "=.", "=5"] {
+        let expected = format!("expected node.param=value, like lift_arbiter.votes=5, or param=value, found '{wrong}'");
         assert_eq!(read(wrong), Err(expected));
     }
 }
@@ -102,6 +105,46 @@ fn mistakes_in_overrides() {
 /x.yaml:3:37: param 'rate' of node 'source' must be a number above 0 or 'max', found '-1'
 --set source.recordin=a: unknown param 'recordin' of node 'source'; did you mean 'recording'?"
     );
+}
+
+#[test]
+fn params_of_the_file_serve_each_node_that_has_them() {
+    let folder = Folder::new();
+    let yaml = |params: &str| {
+        format!(
+            "version: 1\nname: g\nparams: {params}\noperators:\n  source: {{params: {{loops: 2}}}}\n  other: {{run: source}}\n"
+        )
+    };
+    let path = folder.0.join("recordings/a.mcap");
+    let graph = folder.check(yaml("{recording: recordings/a.mcap, loops: 3}")).expect("good");
+    let loops = |graph: &Graph| graph.nodes.iter().map(|node| node.params["loops"].clone()).collect::<Vec<_>>();
+    assert!(graph.nodes.iter().all(|node| node.params["recording"] == json!(path)));
+    assert_eq!(loops(&graph), [json!(2), json!(3)]);
+    // --set for all nodes counts more than the file, and --set for one node counts most.
+    let file = parse(&folder.0.join("dataflow.yaml"), yaml("{recording: recordings/a.mcap}").as_bytes()).expect("form");
+    let set: Vec<Override> = ["other.loops=5", "loops=4"].map(|text| Override::parse(text).expect("good")).into();
+    assert_eq!(loops(&check(&file, &shipped(), &set, Scope::Everything, describe).expect("good")), [json!(4), json!(5)]);
+    let set = [Override::parse("lops=4").expect("good")];
+    let error = check(&file, &shipped(), &set, Scope::Everything, describe).expect_err("no such param");
+    assert_eq!(error.to_string(), "--set lops=4: no node has the param 'lops'; did you mean 'loops'?");
+    let error = folder.check(yaml("{recording: recordings/a.mcap, lops: 3}")).expect_err("no such param");
+    let expected = ":3:41: no node has the param 'lops'; did you mean 'loops'?";
+    assert!(error.to_string().ends_with(expected) && error.diagnostics.len() == 1, "{error}");
+}
+
+#[test]
+fn variables_of_the_environment_are_filled_in() {
+    let folder = Folder::new();
+    let yaml = |value: &str| {
+        format!("version: 1\nname: g\noperators:\n  source: {{params: {{recording: recordings/a.mcap, loops: {value}}}}}\n")
+    };
+    let loops = |value: &str| Ok::<_, DataflowError>(folder.check(yaml(value))?.nodes[0].params["loops"].clone());
+    assert_eq!(loops("'${BLINDGRASP_NO_SUCH_VARIABLE:-7}'").expect_err("a string").diagnostics.len(), 1);
+    assert_eq!(loops("${BLINDGRASP_NO_SUCH_VARIABLE:-7}").expect("good"), json!(7));
+    let error = folder.check(yaml("${BLINDGRASP_NO_SUCH_VARIABLE}")).expect_err("not set");
+    let expected = "the variable 'BLINDGRASP_NO_SUCH_VARIABLE' is not set in the environment; set it, or give it a \
+                    default: ${BLINDGRASP_NO_SUCH_VARIABLE:-DEFAULT}";
+    assert!(error.to_string().contains(expected), "{error}");
 }
 
 #[test]
