@@ -8,7 +8,7 @@ use anyhow::{Context, bail};
 use clap::Args;
 
 use super::export::json_line;
-use super::{Outcome, secs_in, stop_signal};
+use super::{Outcome, completions, secs_in, stop_signal};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, machine_of, pick_graph};
 use blindgrasp_graph::control::{Attachment, Reply, Request};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
@@ -27,7 +27,7 @@ const MAX_UNREAD_LINES: usize = 1 << 14;
                         lines that are left out for that reason are counted. blindgrasp top shows rates.")]
 pub(super) struct Arguments {
     /// Outputs to read [default: all]
-    #[arg(value_name = "NODE/PORT")]
+    #[arg(value_name = "NODE/PORT", add = completions::outputs())]
     edges: Vec<String>,
     /// End after so many samples
     #[arg(short = 'n', long, value_parser = clap::value_parser!(u64).range(1..))]
@@ -36,7 +36,7 @@ pub(super) struct Arguments {
     #[arg(long = "for", value_name = "TIME", value_parser = |text: &str| secs_in(text, 0.01..=1e8))]
     for_secs: Option<f64>,
     /// Graph [default: the only one running]
-    #[arg(short, long)]
+    #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
 }
 

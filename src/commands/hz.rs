@@ -9,7 +9,7 @@ use super::text_table::TextTable;
 use super::top::poller::Poller;
 use super::top::sample::{MeasuredEdge, Quantiles, Window, measure};
 use super::top::screen::short_time;
-use super::{Outcome, print_line, secs_in};
+use super::{Outcome, completions, print_line, secs_in};
 use blindgrasp_graph::client::pick_graph;
 
 /// Measure rates and ages on the edges of a running graph
@@ -17,13 +17,13 @@ use blindgrasp_graph::client::pick_graph;
 #[command(after_help = "Example: blindgrasp hz lift_arbiter/decision --for 5s")]
 pub(super) struct Arguments {
     /// Outputs to measure [default: all]
-    #[arg(value_name = "NODE/PORT")]
+    #[arg(value_name = "NODE/PORT", add = completions::outputs())]
     edges: Vec<String>,
     /// Measure for this time
     #[arg(long = "for", value_name = "TIME", default_value = "2", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
     for_secs: f64,
     /// Graph [default: the only one running]
-    #[arg(short, long)]
+    #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
     /// Print JSON, one object an edge, as in top --json
     #[arg(long)]
@@ -33,7 +33,9 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let graph = pick_graph(arguments.graph.as_deref())?;
     let (mut poller, first) = Poller::connect(&graph)?;
-    if let Some(unknown) = arguments.edges.iter().find(|edge| first.status.edges.iter().all(|known| known.from != **edge)) {
+    if let Some(unknown) =
+        arguments.edges.iter().find(|edge| first.status.edges.iter().all(|known| known.from != **edge))
+    {
         let mut known: Vec<&str> = first.status.edges.iter().map(|edge| edge.from.as_str()).collect();
         known.dedup();
         bail!("graph '{graph}' has no output {unknown}; its outputs: {}", known.join(", "));
@@ -51,9 +53,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     let mut table = TextTable::new(["edge", "rate/s", "p50", "p90", "p99", "dropped", "missing"], 1);
     for edge in edges {
-        let age = |of: fn(&Quantiles) -> u64| {
-            edge.age_nanos.as_ref().map_or("-".into(), |ages| short_time(of(ages)))
-        };
+        let age = |of: fn(&Quantiles) -> u64| edge.age_nanos.as_ref().map_or("-".into(), |ages| short_time(of(ages)));
         table.row([
             format!("{} → {}", edge.from, edge.to),
             format!("{:.1}", edge.rate_hz),

@@ -73,7 +73,8 @@ a model; `blindgrasp --help` lists the rest.
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let folder = &arguments.folder;
-    let taken: Vec<&str> = FILES.iter().map(|(name, _)| *name).chain([SCHEMA]).filter(|name| folder.join(name).exists()).collect();
+    let taken: Vec<&str> =
+        FILES.iter().map(|(name, _)| *name).chain([SCHEMA]).filter(|name| folder.join(name).exists()).collect();
     if !taken.is_empty() {
         bail!("{} has {} already: choose a new folder, or move them away", folder.display(), taken.join(", "));
     }

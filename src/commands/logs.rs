@@ -5,7 +5,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use clap::Args;
 
-use super::{Outcome, print_line};
+use super::{Outcome, completions, print_line};
 use blindgrasp_graph::audit::AUDIT;
 use blindgrasp_graph::client::{
     ANSWER_LIMIT, ClientError, Connection, is_graph_name, locate, machine_of, pick_graph, status,
@@ -23,6 +23,7 @@ const POLL: Duration = Duration::from_millis(200);
                         The log of an operator on another machine is read there, while it is linked.")]
 pub(super) struct Arguments {
     /// Node id of the operator, run for the launching command, or audit for who has changed or recorded what
+    #[arg(add = completions::nodes())]
     operator: Option<String>,
     /// Follow the logs
     #[arg(short, long)]
@@ -31,7 +32,7 @@ pub(super) struct Arguments {
     #[arg(short = 'n', long, default_value_t = 100)]
     lines: usize,
     /// Graph, or its part (GRAPH@MACHINE) [default: the only one running, or the latest]
-    #[arg(short, long)]
+    #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
     /// Print JSON, one object a line
     ///

@@ -19,6 +19,7 @@ mod info;
 mod init;
 mod keys;
 mod logs;
+mod man;
 mod model;
 mod new;
 mod object_list;
@@ -108,7 +109,25 @@ enum Command {
     Diagnostics(diagnostics::Arguments),
     Completions(completions::Arguments),
     Schema(schema::Arguments),
+    Man(man::Arguments),
     Operator(operator::Arguments),
+}
+
+/// The running graph that a command is about, by its place or by its option, as other commands have it.
+#[derive(Debug, clap::Args)]
+struct GraphArgument {
+    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running; ps: all]
+    #[arg(add = completions::graphs())]
+    graph: Option<String>,
+    /// The same by name
+    #[arg(short, long = "graph", value_name = "GRAPH", conflicts_with = "graph", add = completions::graphs())]
+    named: Option<String>,
+}
+
+impl GraphArgument {
+    fn name(&self) -> Option<&str> {
+        self.graph.as_deref().or(self.named.as_deref())
+    }
 }
 
 /// How a command ended that did not fail.
@@ -133,6 +152,7 @@ impl Outcome {
 impl Cli {
     /// Parses the command line. A mistake ends the process with its explanation and code 2.
     pub(crate) fn read() -> Cli {
+        completions::answer_shell();
         let matches = help::grouped(Cli::command()).try_get_matches();
         let parsed = matches.and_then(|matches| Cli::from_arg_matches(&matches));
         parsed.unwrap_or_else(|error| help::with_hint(error).exit())
@@ -186,6 +206,7 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Doctor(arguments) => doctor::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
         Command::Schema(arguments) => schema::run(&arguments),
+        Command::Man(arguments) => man::run(&arguments),
         // `main` has run it.
         Command::Operator(_) => Ok(Outcome::Done),
     }
@@ -275,11 +296,7 @@ fn secs_in(text: &str, range: RangeInclusive<f64>) -> Result<f64, String> {
     let with_unit = || humantime::parse_duration(text).ok().map(|time| time.as_secs_f64());
     match text.parse().ok().or_else(with_unit) {
         Some(secs) if range.contains(&secs) => Ok(secs),
-        _ => Err(format!(
-            "expected a time from {} to {} seconds, like 2.5, 500ms or 1m",
-            range.start(),
-            range.end()
-        )),
+        _ => Err(format!("expected a time from {} to {} seconds, like 2.5, 500ms or 1m", range.start(), range.end())),
     }
 }
 

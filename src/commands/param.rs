@@ -5,7 +5,7 @@ use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 
 use super::text_table::TextTable;
-use super::{Outcome, print_line, set};
+use super::{Outcome, completions, print_line, set};
 use blindgrasp_graph::client::{ANSWER_LIMIT, Connection, locate, pick_graph};
 use blindgrasp_graph::control::{NodeStatus, Reply, Request};
 use blindgrasp_graph::describe::describe;
@@ -33,9 +33,10 @@ enum ParamCommand {
 #[derive(Debug, Args)]
 struct ListArguments {
     /// Only those of this node
+    #[arg(add = completions::nodes())]
     node: Option<String>,
     /// Graph [default: the only one running]
-    #[arg(short, long)]
+    #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
     /// Print JSON, one object a parameter: node, param, value, live
     #[arg(long)]
@@ -45,9 +46,10 @@ struct ListArguments {
 #[derive(Debug, Args)]
 struct GetArguments {
     /// NODE.PARAM
+    #[arg(add = completions::params())]
     param: String,
     /// Graph [default: the only one running]
-    #[arg(short, long)]
+    #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
 }
 
@@ -84,8 +86,7 @@ fn list(arguments: &ListArguments) -> anyhow::Result<Outcome> {
 }
 
 fn get(arguments: &GetArguments) -> anyhow::Result<Outcome> {
-    let (node, param) =
-        arguments.param.split_once('.').context("expected NODE.PARAM, as in lift_arbiter.votes")?;
+    let (node, param) = arguments.param.split_once('.').context("expected NODE.PARAM, as in lift_arbiter.votes")?;
     let nodes = nodes(arguments.graph.as_deref(), Some(node))?;
     let params = &nodes.first().context("the graph has no such node")?.params;
     let Some(value) = params.get(param) else {

@@ -84,7 +84,8 @@ fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<Vec<Stamped<TactileFr
             continue;
         }
         let seq = frames.len() as u64;
-        let frame = read_frame(&line, seq, hand).with_context(|| format!("{}, line {}", file.display(), line_idx + 1))?;
+        let frame =
+            read_frame(&line, seq, hand).with_context(|| format!("{}, line {}", file.display(), line_idx + 1))?;
         frames.extend(frame);
     }
     if frames.is_empty() {
@@ -125,10 +126,7 @@ fn print(json: bool, file: &Path, decision: &LiftDecision, truth: Option<&GraspT
     let truth = truth.map_or(String::new(), |truth| {
         format!("  truth: {} ({})", if truth.stable { "stable" } else { "unstable" }, truth.object)
     });
-    let line = format!(
-        "grasp {grasp_id:>5}  {}  p {probability_stable:.3}  {:<14}{truth}",
-        action.shown(),
-        reason.as_str()
-    );
+    let line =
+        format!("grasp {grasp_id:>5}  {}  p {probability_stable:.3}  {:<14}{truth}", action.shown(), reason.as_str());
     print_line(line.trim_end())
 }

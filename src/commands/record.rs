@@ -12,7 +12,7 @@ use serde_json::json;
 
 use super::run::recorder::{RecordOptions, Recorded, Recorder};
 use super::text_table::TextTable;
-use super::{Outcome, check_output, secs_in, print_line, stop_signal};
+use super::{GraphArgument, Outcome, check_output, print_line, secs_in, stop_signal};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request};
 use blindgrasp_graph::observer::{ObservedEdge, Observer, can_observe};
@@ -39,8 +39,8 @@ const POLL: Duration = Duration::from_millis(50);
                         GRAPH@MACHINE, or if --edges names edges of operators there.\n\
                         Exit code 3 if samples are missing, or if the disk was full.")]
 pub(super) struct Arguments {
-    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
-    graph: Option<String>,
+    #[command(flatten)]
+    graph: GraphArgument,
     /// File to write
     #[arg(short, long, value_name = "FILE")]
     out: PathBuf,
@@ -75,7 +75,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     arguments.options.check(&arguments.out)?;
     let stop = stop_signal()?;
     let is_interrupted = || stop.load(Ordering::Relaxed);
-    let mut graph = pick_graph(arguments.graph.as_deref())?;
+    let mut graph = pick_graph(arguments.graph.name())?;
     let writer = |edge: &String| edge.split_once('/').map_or(edge.clone(), |(node, _)| node.into());
     let mut writers: Vec<String> = arguments.edges.iter().map(writer).collect();
     writers.dedup();

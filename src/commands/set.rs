@@ -6,7 +6,7 @@ use std::time::Duration;
 use clap::Args;
 use serde_json::{Value, json};
 
-use super::{Outcome, print_line};
+use super::{Outcome, completions, print_line};
 use blindgrasp_graph::client::{Connection, locate, pick_graph};
 use blindgrasp_graph::control::{Reply, Request};
 
@@ -20,9 +20,10 @@ const LIMIT: Duration = Duration::from_secs(10);
                         An operator may run on another machine, which must allow it (control).")]
 pub(super) struct Arguments {
     /// NODE.PARAM=VALUE; the value is a number, true, false or a text
+    #[arg(add = completions::assignments())]
     assignment: Assignment,
     /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
-    #[arg(short, long)]
+    #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
     /// Print JSON
     #[arg(long)]

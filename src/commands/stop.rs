@@ -4,7 +4,7 @@ use anyhow::bail;
 use clap::Args;
 use serde_json::json;
 
-use super::{Outcome, print_line};
+use super::{GraphArgument, Outcome, print_line};
 use blindgrasp_graph::client::{
     ANSWER_LIMIT, ClientError, Connection, machine_of, part_name, pick_graph, running_graphs,
 };
@@ -17,8 +17,8 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
                         Samples in flight are decided first. Ctrl-C ends the wait only; the graph still stops.\n\
                         Of a graph on several machines, only the part here, or the part that is named, is stopped.")]
 pub(super) struct Arguments {
-    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
-    graph: Option<String>,
+    #[command(flatten)]
+    graph: GraphArgument,
     /// Stop the part on this other machine; the part here goes on
     #[arg(long, conflicts_with = "all")]
     machine: Option<String>,
@@ -33,9 +33,9 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let graphs = match (arguments.all, &arguments.machine) {
         (true, _) => running_graphs()?,
-        (false, None) => vec![pick_graph(arguments.graph.as_deref())?],
+        (false, None) => vec![pick_graph(arguments.graph.name())?],
         (false, Some(machine)) => {
-            let graph = arguments.graph.clone().map_or_else(|| pick_graph(None), Ok)?;
+            let graph = pick_graph(arguments.graph.name())?;
             if machine_of(&graph).is_some() {
                 bail!("{graph} already names a machine: leave --machine {machine} out, or name the graph alone");
             }

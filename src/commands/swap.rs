@@ -9,7 +9,7 @@ use anyhow::{Context, anyhow, bail};
 use clap::Args;
 use serde::Serialize;
 
-use super::{Outcome, number_in, percent, print_line, secs_in, stop_signal};
+use super::{Outcome, completions, number_in, percent, print_line, secs_in, stop_signal};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, ShadowOutput, SwapRequest, SwappedNode};
 use blindgrasp_graph::describe::program_to_run;
@@ -44,7 +44,7 @@ const MAX_PRINTED: usize = 20;
                         Ctrl-C abandons the swap. Exit code 1 if the old operator goes on or came back.")]
 pub(super) struct Arguments {
     /// Nodes to swap; several are handed over at one sample
-    #[arg(required = true)]
+    #[arg(required = true, add = completions::nodes())]
     nodes: Vec<String>,
     /// Replacement: a shipped operator or a path [default: the same program]
     ///
@@ -72,7 +72,7 @@ pub(super) struct Arguments {
     #[arg(long)]
     allow_mismatch: bool,
     /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
-    #[arg(short, long)]
+    #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
     /// Print JSON
     #[arg(long)]

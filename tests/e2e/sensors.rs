@@ -15,8 +15,7 @@ fn faults(check: &str, recording: &str, exit_code: i32) -> Vec<Value> {
 /// The default graph on a recording, with watched sensors.
 fn watched(folder: &std::path::Path, recording: &str) -> std::path::PathBuf {
     let contacts = "    inputs: {tactile: recorded_source/tactile}\n";
-    let checked =
-        format!("    run: checked_contacts\n    params: {{sensors: {CHECK}}}\n{contacts}");
+    let checked = format!("    run: checked_contacts\n    params: {{sensors: {CHECK}}}\n{contacts}");
     let source = ("recordings/held-out.mcap".to_string(), recording.to_string());
     dataflow_with(folder, &[(contacts.into(), checked), source])
 }

@@ -2,7 +2,8 @@
 
 use std::process::Command;
 
-use crate::common::{assert_nothing_left, blindgrasp, json_lines, run, text, unique_name};
+use crate::common::{assert_nothing_left, blindgrasp, dataflow, json_lines, run, text, unique_name};
+use crate::processes::Graph;
 
 #[test]
 fn a_new_project_runs_and_is_never_overwritten() {
@@ -95,16 +96,31 @@ fn the_doctor_finds_what_a_dead_graph_left_and_removes_only_that() {
 fn completions_know_the_commands_and_bash_takes_them() {
     for shell in ["bash", "zsh", "fish"] {
         let script = text(&run(&["completions", shell], 0).stdout);
-        assert!(["simulate", "doctor", "--detach"].iter().all(|word| script.contains(word)), "{shell}");
+        assert!(script.contains("BLINDGRASP_COMPLETE"), "{shell}: {script}");
     }
     let script = run(&["completions", "bash"], 0).stdout;
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("completions");
     std::fs::write(&path, script).expect("written");
-    let complete = "source \"$1\"; COMP_WORDS=(blindgrasp sw); COMP_CWORD=1; _blindgrasp blindgrasp sw blindgrasp; \
-                    echo \"${COMPREPLY[@]}\"";
-    let output = Command::new("bash").args(["-c", complete, "-"]).arg(&path).output().expect("bash");
-    assert_eq!(text(&output.stdout).trim(), "swap", "{}", text(&output.stderr));
+    // In bash the function is found by the command's name, which is on PATH.
+    let completed = |words: &[&str]| {
+        let complete = "source \"$1\"; shift; COMP_TYPE=9; COMP_WORDS=(blindgrasp \"$@\"); COMP_CWORD=$#; \
+                        $(complete -p blindgrasp | grep -o '_[a-z_]*' | head -1) blindgrasp; echo \"${COMPREPLY[@]}\"";
+        let program = std::path::Path::new(env!("CARGO_BIN_EXE_blindgrasp")).parent().expect("a folder");
+        let mut command = Command::new("bash");
+        command.env("PATH", format!("{}:/usr/bin:/bin", program.display()));
+        let output = command.args(["-c", complete, "-"]).arg(&path).args(words).output().expect("bash");
+        text(&output.stdout).trim().to_owned() + &text(&output.stderr)
+    };
+    assert_eq!(completed(&["sw"]), "swap");
+    // Words of a running graph.
+    let graph = Graph::start(&dataflow(folder.path(), &[]), &["--set", "recorded_source.repeat=forever"]);
+    graph.wait_for_decisions(1);
+    let found = completed(&["set", "lift_arbiter.vo"]);
+    assert!(found.contains("lift_arbiter.votes="), "{found}");
+    assert!(completed(&["stop", &graph.name]).contains(&graph.name));
+    assert!(completed(&["echo", "contacts/"]).contains("contacts/contacts"));
+    graph.stop();
 }
 
 #[test]

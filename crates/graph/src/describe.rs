@@ -88,9 +88,8 @@ pub fn program_to_run(run: &Path, args: &[String], folder: &Path) -> Result<Prog
 
 /// The program that a shell would run for a name without '/'.
 pub(super) fn program_on_path(name: &str) -> Option<PathBuf> {
-    let is_program = |path: &PathBuf| {
-        path.metadata().is_ok_and(|found| found.is_file() && found.permissions().mode() & 0o111 != 0)
-    };
+    let is_program =
+        |path: &PathBuf| path.metadata().is_ok_and(|found| found.is_file() && found.permissions().mode() & 0o111 != 0);
     // An empty entry means the current folder, which must not decide what runs.
     let folders = std::env::var_os("PATH")?;
     let mut folders = std::env::split_paths(&folders).filter(|folder| folder.is_absolute());

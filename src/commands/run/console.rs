@@ -1,5 +1,7 @@
 //! What a command does with the samples of a run: it prints decisions and outcomes, and records.
 
+use std::io::IsTerminal;
+
 use serde::Serialize;
 
 use super::recorder::Recorder;
@@ -13,9 +15,20 @@ use blindgrasp_recording::Record;
 /// This many lines wait for the reader of stdout.
 const MAX_UNREAD_LINES: usize = 1 << 16;
 
+/// Colours of a terminal (ECMA-48, Select Graphic Rendition).
+const RED: u8 = 31;
+const GREEN: u8 = 32;
+const YELLOW: u8 = 33;
+
+fn paint(text: &str, colour: u8) -> String {
+    format!("\x1b[{colour}m{text}\x1b[0m")
+}
+
 pub(super) struct Console {
     json: bool,
     is_quiet: bool,
+    /// Actions and mistakes have colours: stdout is a terminal, and NO_COLOR is not set.
+    is_coloured: bool,
     /// Decisions are made and recorded whether or not stdout is read.
     pub(super) printer: LinePrinter,
     pub(super) recorder: Option<Recorder>,
@@ -51,7 +64,8 @@ impl Console {
         tap: Option<Tap>,
     ) -> Console {
         let printer = LinePrinter::new(std::io::stdout(), MAX_UNREAD_LINES);
-        Console { json, is_quiet, printer, recorder, report, tap }
+        let is_coloured = std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|no| no.is_empty());
+        Console { json, is_quiet, is_coloured, printer, recorder, report, tap }
     }
 }
 
@@ -92,11 +106,15 @@ impl RunSink for Console {
             })?
         } else {
             let latency = latency_nanos.map_or("-".into(), |nanos| format!("{:.0} µs", nanos as f64 / 1e3));
+            let painted = |text: &str, colour| if self.is_coloured { paint(text, colour) } else { text.to_owned() };
             let truth = truth.map_or(String::new(), |truth| {
-                format!("  truth: {} ({})", if truth.stable { "stable" } else { "unstable" }, truth.object)
+                let text = format!("truth: {} ({})", if truth.stable { "stable" } else { "unstable" }, truth.object);
+                let is_false_positive = action == Action::Lift && !truth.stable;
+                format!("  {}", if is_false_positive { painted(&text, RED) } else { text })
             });
             let (grasp_id, p) = (decision.grasp_id, decision.probability_stable);
-            format!("grasp {grasp_id:>5}  {}  p {p:.3}  {reason:<14} {latency:>9}{truth}", action.shown())
+            let action = painted(action.shown(), if action == Action::Lift { GREEN } else { YELLOW });
+            format!("grasp {grasp_id:>5}  {action}  p {p:.3}  {reason:<14} {latency:>9}{truth}")
         };
         self.printer.print(line);
         Ok(())

@@ -19,7 +19,7 @@ use ratatui::crossterm::event::{self, Event};
 use self::poller::Poller;
 use self::sample::{Look, Window, measure};
 use self::view::{Condition, Then, View};
-use super::{Outcome, secs_in, print_line};
+use super::{GraphArgument, Outcome, print_line, secs_in};
 use blindgrasp_graph::client::{ClientError, pick_graph, running_graphs};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
@@ -29,8 +29,8 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
                         Keys: ? shows them, q quits. For scripts: --json, or blindgrasp ps.\n\
                         Exit code 1 if no graph runs, or it does not answer.")]
 pub(super) struct Arguments {
-    /// Graph [default: the only one running]
-    graph: Option<String>,
+    #[command(flatten)]
+    graph: GraphArgument,
     /// Update every so many seconds
     #[arg(long, value_name = "TIME", default_value = "1", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
     interval: f64,
@@ -55,7 +55,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if !arguments.json && !std::io::stdout().is_terminal() {
         anyhow::bail!("stdout is no terminal to draw on; use blindgrasp top --json, or blindgrasp ps for one look");
     }
-    let graph = pick_graph(arguments.graph.as_deref())?;
+    let graph = pick_graph(arguments.graph.name())?;
     let (poller, first) = Poller::connect(&graph)?;
     let interval = Duration::from_secs_f64(arguments.interval);
     if arguments.json {

@@ -55,7 +55,8 @@ impl Setup {
                 arguments.dataflow.display()
             )
         })?;
-        let set = |node: &str, param: &str, text: String| Override { node: Some(node.into()), param: param.into(), text };
+        let set =
+            |node: &str, param: &str, text: String| Override { node: Some(node.into()), param: param.into(), text };
         let mut overrides = arguments.overrides.clone();
         if let Some(set) = overrides.iter().find(|set| set.is_of(&node.id) && own_option(&set.param).is_some()) {
             bail!("--set {set}: use {} instead", own_option(&set.param).unwrap_or_default());

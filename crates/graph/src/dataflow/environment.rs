@@ -5,11 +5,7 @@ use crate::dataflow::yaml::{Content, Value};
 use blindgrasp_operator::text::quote;
 
 /// Replaces the variables in all scalars. Keys stay as they are. `variable` looks a variable up.
-pub(super) fn fill_in(
-    value: &mut Value,
-    variable: &dyn Fn(&str) -> Option<String>,
-    diagnostics: &mut Diagnostics,
-) {
+pub(super) fn fill_in(value: &mut Value, variable: &dyn Fn(&str) -> Option<String>, diagnostics: &mut Diagnostics) {
     match &mut value.content {
         Content::Scalar { text, .. } if text.contains("${") => match filled_in(text, variable) {
             Ok(filled) => *text = filled,

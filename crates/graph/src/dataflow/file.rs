@@ -5,11 +5,11 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use crate::dataflow::diagnostic::{DataflowError, Diagnostics, Position};
+use crate::dataflow::environment::fill_in;
 use crate::dataflow::form::{check_name, entries_or_nothing, unknown_key};
 use crate::dataflow::machines_entry::{
     LinkEntry, MachinesEntry, check_no_places, check_places, check_security, read_link, read_machines,
 };
-use crate::dataflow::environment::fill_in;
 use crate::dataflow::node::{NodeEntry, read_node};
 use crate::dataflow::yaml::{self, Content, Entry, Text, Value};
 use blindgrasp_operator::text::did_you_mean;

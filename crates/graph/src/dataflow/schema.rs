@@ -21,17 +21,26 @@ pub fn schema(operators: &[OperatorDescription]) -> Value {
     let name = |operator: &OperatorDescription| operator.operator.clone();
     // The key of a node is its operator unless `run` names another.
     let by_key = operators.iter().map(|operator| {
-        let of_key = json!({"if": {"required": ["run"]}, "else": of_operator(operator)});
-        (name(operator), json!({"description": operator.summary, "allOf": [{"$ref": "#/$defs/node"}, of_key]}))
+        let of_key = json!({"if": {"required": ["run"]}, "else": reference(&operator.operator)});
+        (name(operator), json!({"description": operator.summary, "allOf": [{"$ref": "#/$defs/NODE"}, of_key]}))
     });
     let by_run = operators.iter().map(|operator| {
         json!({
             "if": {"properties": {"run": {"const": operator.operator}}, "required": ["run"]},
-            "then": of_operator(operator),
+            "then": reference(&operator.operator),
         })
     });
+    let mut definitions: Map<_, _> = operators.iter().map(|operator| (name(operator), of_operator(operator))).collect();
+    definitions.insert("VARIABLE".into(), json!({"type": "string", "pattern": "[$][{]"}));
     let mut node = node_keys();
     node["run"]["examples"] = operators.iter().map(name).collect();
+    let node = json!({
+        "type": ["object", "null"],
+        "additionalProperties": false,
+        "properties": node,
+        "allOf": by_run.collect::<Vec<_>>(),
+    });
+    definitions.insert("NODE".into(), node);
     json!({
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "Dataflow file of blindgrasp",
@@ -52,18 +61,10 @@ pub fn schema(operators: &[OperatorDescription]) -> Value {
                 "minProperties": 1,
                 "description": "The nodes of the graph by their ids",
                 "properties": by_key.collect::<Map<_, _>>(),
-                "additionalProperties": {"$ref": "#/$defs/node"},
+                "additionalProperties": {"$ref": "#/$defs/NODE"},
             },
         },
-        "$defs": {
-            "variable": {"type": "string", "pattern": "[$][{]"},
-            "node": {
-                "type": ["object", "null"],
-                "additionalProperties": false,
-                "properties": node,
-                "allOf": by_run.collect::<Vec<_>>(),
-            },
-        },
+        "$defs": definitions,
     })
 }
 
@@ -284,8 +285,13 @@ fn number(min: f64, max: f64) -> Value {
     of_kind(&ParamKind::Number { above: None, min: Some(min), max: Some(max), words: Vec::new() })
 }
 
+/// To a definition: one of the file's own has capitals, which no shipped operator has.
+fn reference(definition: &str) -> Value {
+    json!({"$ref": format!("#/$defs/{definition}")})
+}
+
 fn or_variable(value: Value) -> Value {
-    json!({"anyOf": [value, {"$ref": "#/$defs/variable"}]})
+    json!({"anyOf": [value, reference("VARIABLE")]})
 }
 
 fn described(mut schema: Value, description: &str) -> Value {
@@ -306,7 +312,7 @@ mod tests {
     #[test]
     fn the_schema_has_the_keys_of_the_file() {
         let schema = schema(&[]);
-        let node = &schema["$defs"]["node"]["properties"];
+        let node = &schema["$defs"]["NODE"]["properties"];
         for (place, known) in [
             (&schema["properties"], &FILE_KEYS[..]),
             (node, &NODE_KEYS),

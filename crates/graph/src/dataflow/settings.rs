@@ -30,9 +30,8 @@ impl Override {
     /// # Errors
     /// The form is wrong, or a name is not one of a node or param.
     pub fn parse(text: &str) -> Result<Self, String> {
-        let wrong = || {
-            format!("expected node.param=value, like lift_arbiter.votes=5, or param=value, found {}", quote(text))
-        };
+        let wrong =
+            || format!("expected node.param=value, like lift_arbiter.votes=5, or param=value, found {}", quote(text));
         let (place, value) = text.split_once('=').ok_or_else(wrong)?;
         let (node, param) = place.split_once('.').map_or((None, place), |(node, param)| (Some(node), param));
         if !is_name(param) || node.is_some_and(|node| !is_name(node)) {

@@ -123,7 +123,10 @@ fn params_of_the_file_serve_each_node_that_has_them() {
     // --set for all nodes counts more than the file, and --set for one node counts most.
     let file = parse(&folder.0.join("dataflow.yaml"), yaml("{recording: recordings/a.mcap}").as_bytes()).expect("form");
     let set: Vec<Override> = ["other.loops=5", "loops=4"].map(|text| Override::parse(text).expect("good")).into();
-    assert_eq!(loops(&check(&file, &shipped(), &set, Scope::Everything, describe).expect("good")), [json!(4), json!(5)]);
+    assert_eq!(
+        loops(&check(&file, &shipped(), &set, Scope::Everything, describe).expect("good")),
+        [json!(4), json!(5)]
+    );
     let set = [Override::parse("lops=4").expect("good")];
     let error = check(&file, &shipped(), &set, Scope::Everything, describe).expect_err("no such param");
     assert_eq!(error.to_string(), "--set lops=4: no node has the param 'lops'; did you mean 'loops'?");
@@ -136,7 +139,9 @@ fn params_of_the_file_serve_each_node_that_has_them() {
 fn variables_of_the_environment_are_filled_in() {
     let folder = Folder::new();
     let yaml = |value: &str| {
-        format!("version: 1\nname: g\noperators:\n  source: {{params: {{recording: recordings/a.mcap, loops: {value}}}}}\n")
+        format!(
+            "version: 1\nname: g\noperators:\n  source: {{params: {{recording: recordings/a.mcap, loops: {value}}}}}\n"
+        )
     };
     let loops = |value: &str| Ok::<_, DataflowError>(folder.check(yaml(value))?.nodes[0].params["loops"].clone());
     assert_eq!(loops("'${BLINDGRASP_NO_SUCH_VARIABLE:-7}'").expect_err("a string").diagnostics.len(), 1);
