@@ -133,7 +133,7 @@ def paper_model():
     model = FOLDER / "paper.json"
     if not model.exists():
         recording = PROJECT / "recordings" / "held-out.mcap"
-        blindgrasp("train", recording, "--recipe", "paper", "--out", model)
+        blindgrasp("train", recording, "--recipe", "paper", "--overwrite", "--out", model)
     return model
 
 
@@ -144,7 +144,7 @@ def problem(n_samples):
         recording = FOLDER / f"grasps-{n_samples}.mcap"
         # Some 17 % of blind grasps are not felt and have no feature.
         n_grasps = n_samples * 5 // 4 + 100
-        blindgrasp("simulate", "--objects", "train", "--grasps", n_grasps, "--seed", 1, "--out", recording)
+        blindgrasp("simulate", "--objects", "train", "--grasps", n_grasps, "--seed", 1, "--overwrite", "--out", recording)
         written = ours("features", recording, paper_model(), n_samples, path)
         if written["n_samples"] != n_samples:
             path.unlink()

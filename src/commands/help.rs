@@ -90,6 +90,62 @@ mod tests {
         }
     }
 
+    /// The words of a command line of a shell, up to a pipe, a comment or another command.
+    fn words(line: &str) -> Vec<String> {
+        let (mut words, mut word, mut quote) = (Vec::new(), None::<String>, None);
+        for char in line.chars() {
+            match (quote, char) {
+                (Some(open), _) if char == open => quote = None,
+                (None, '\'' | '"') => {
+                    quote = Some(char);
+                    word.get_or_insert_default();
+                }
+                (None, '|' | '&' | ';' | ')' | '>' | '<') => break,
+                (None, '#') if word.is_none() => break,
+                (None, ' ') => words.extend(word.take()),
+                _ => word.get_or_insert_default().push(char),
+            }
+        }
+        words.into_iter().chain(word).collect()
+    }
+
+    /// Names, options and numbers of arguments; `…` stands for any further options.
+    #[test]
+    fn each_command_in_the_docs_is_accepted() {
+        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+        let folders = ["", "docs", "hands"].map(|folder| root.join(folder));
+        let pages = folders.iter().flat_map(|folder| std::fs::read_dir(folder).expect("a folder").flatten());
+        let (mut n, mut mistakes) = (0, Vec::new());
+        for page in pages.map(|page| page.path()).filter(|path| path.extension().is_some_and(|it| it == "md")) {
+            let text = std::fs::read_to_string(&page).expect("a page").replace("\\\n", " ");
+            let mut is_shell = false;
+            for line in text.lines() {
+                let line = line.trim_start();
+                if line.starts_with("```") {
+                    is_shell = line == "```sh";
+                    continue;
+                }
+                for (at, name) in line.match_indices("blindgrasp ").filter(|_| is_shell) {
+                    let before = &line[..at];
+                    let words = words(&line[at + name.len()..]);
+                    let is_command = before.is_empty() || before.ends_with([' ', '(']);
+                    let is_complete = !words.iter().any(|word| word.contains(['…', '$']));
+                    if !is_command || !is_complete || words.is_empty() || before.contains('#') {
+                        continue;
+                    }
+                    n += 1;
+                    let words = std::iter::once("blindgrasp".to_owned()).chain(words);
+                    if let Err(error) = grouped(Cli::command()).try_get_matches_from(words)
+                        && error.kind() != ErrorKind::DisplayHelp
+                    {
+                        mistakes.push(format!("{}: {line}: {error}", page.display()));
+                    }
+                }
+            }
+        }
+        assert!(mistakes.is_empty() && n > 120, "{n} commands\n{}", mistakes.join("\n"));
+    }
+
     #[test]
     fn no_hint_hides_a_command() {
         let command = Cli::command();

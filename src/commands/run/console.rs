@@ -64,7 +64,8 @@ impl Console {
         tap: Option<Tap>,
     ) -> Console {
         let printer = LinePrinter::new(std::io::stdout(), MAX_UNREAD_LINES);
-        let is_coloured = std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|no| no.is_empty());
+        let is_coloured =
+            std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|no| no.is_empty());
         Console { json, is_quiet, is_coloured, printer, recorder, report, tap }
     }
 }
