@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 import struct
+import zlib
 from collections import defaultdict
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, Iterator, Sequence
+from typing import Any, BinaryIO, Iterator, Sequence
 
 import mcap.exceptions
 import numpy as np
@@ -24,6 +25,8 @@ from numpy.typing import NDArray
 from ._types import Decision, Label
 
 MAGIC = b"\x89MCAP0\r\n"
+# The footer: operation code, length, start of the summary, start of its offsets, checksum.
+FOOTER = "<BQQQI"
 
 # The codes of crates/messages, as operators/blindgrasp_messages.py has them.
 PHASES = (
@@ -99,12 +102,9 @@ class Recording:
         with self.path.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise RecordingError(f"{self.path} is not a recording: expected an MCAP file")
-            size = stream.seek(0, 2)
-            stream.seek(max(size - len(MAGIC), 0))
-            if size < 2 * len(MAGIC) or stream.read() != MAGIC:
-                raise self._damaged("it does not end as MCAP does")
-            stream.seek(0)
             try:
+                _check_summary(stream)
+                stream.seek(0)
                 reader = make_reader(stream)
                 summary = reader.get_summary()
                 found = {metadata.name: metadata.metadata for metadata in reader.iter_metadata()}
@@ -114,11 +114,10 @@ class Recording:
             raise self._damaged("it has no summary")
         self.metadata: dict[str, dict[str, str]] = found
         """The metadata by name, as the table of docs/recording.md has it."""
-        self.topics: dict[str, int] = {
-            channel.topic: summary.statistics.channel_message_counts.get(idx, 0)
-            for idx, channel in summary.channels.items()
-        }
+        self.topics: dict[str, int] = {channel.topic: 0 for channel in summary.channels.values()}
         """The number of samples of each topic."""
+        for idx, channel in summary.channels.items():
+            self.topics[channel.topic] += summary.statistics.channel_message_counts.get(idx, 0)
         if topic not in self.topics:
             there = ", ".join(sorted(self.topics)) or "no topic"
             raise RecordingError(f"{self.path} has no topic {topic}: it has {there}")
@@ -207,6 +206,25 @@ class Recording:
             f"{self.path} was cut off or is damaged ({reason}): `blindgrasp info {self.path} --repair` recovers what is "
             "whole in it"
         )
+
+
+def _check_summary(stream: BinaryIO) -> None:
+    """Checks the summary at the end of an MCAP file, as no reader does: https://mcap.dev/spec#footer-op0x02.
+
+    Raises ValueError if the file does not end as MCAP does, or if the summary's checksum is wrong.
+    """
+    n_bytes = struct.calcsize(FOOTER) + len(MAGIC)
+    end = stream.seek(0, 2)
+    stream.seek(max(end - n_bytes, 0))
+    tail = stream.read()
+    if len(tail) < n_bytes or not tail.endswith(MAGIC):
+        raise ValueError("it does not end as MCAP does")
+    _, _, summary_start, _, checksum = struct.unpack_from(FOOTER, tail)
+    # The checksum covers all of the footer but itself.
+    n_covered = end - n_bytes + struct.calcsize(FOOTER) - 4 - summary_start
+    stream.seek(min(summary_start, end))
+    if n_covered < 0 or checksum and zlib.crc32(stream.read(n_covered)) != checksum:
+        raise ValueError("its summary has a wrong checksum")
 
 
 def read(path: str | PathLike[str]) -> list[Grasp]:
