@@ -79,6 +79,7 @@ class Process:
             process_group=0,
         )
         self.pid = self._process.pid
+        self._said = ""
         self._may_fail = True
 
     def __enter__(self) -> Process:
@@ -109,8 +110,11 @@ class Process:
 
     def stderr(self) -> str:
         """What it has printed to stderr so far."""
-        # The position is the program's too: pread leaves it where the program writes.
-        return os.pread(self._stderr.fileno(), os.fstat(self._stderr.fileno()).st_size, 0).decode(errors="replace")
+        if not self._stderr.closed:
+            # The program writes at the file's position, which pread leaves where it is.
+            n_bytes = os.fstat(self._stderr.fileno()).st_size
+            self._said = os.pread(self._stderr.fileno(), n_bytes, 0).decode(errors="replace")
+        return self._said
 
     def end(self) -> list[dict[str, Any]]:
         """Asks it to end (SIGINT) and waits; returns the objects that were not read. It is killed after END_LIMIT_SECS."""
@@ -125,6 +129,8 @@ class Process:
         finally:
             killer.cancel()
         self._process.stdout.close()
+        self.stderr()
+        self._stderr.close()
         return [json.loads(line) for line in unread if line.endswith(b"\n")]
 
 

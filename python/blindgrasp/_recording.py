@@ -13,15 +13,15 @@ import zlib
 from collections import defaultdict
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, BinaryIO, Iterator, Sequence
+from typing import Any, BinaryIO, Callable, Iterator, Sequence
 
 import mcap.exceptions
 import numpy as np
 import zstandard
-from mcap.reader import McapReader, make_reader
-from mcap_ros2.decoder import DecoderFactory
+from mcap.reader import make_reader
 from numpy.typing import NDArray
 
+from ._cdr import decoder
 from ._types import Decision, Label
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -82,6 +82,11 @@ class Grasp:
     """What is known to be true of the grasp; None if nothing was recorded."""
     decisions: tuple[Decision, ...] = ()
     """The recorded decisions. Several are recorded of a grasp that was probed."""
+
+    def __repr__(self) -> str:
+        (n_frames, n_cells), n_joints = self.cells_newtons.shape, self.joints_rad.shape[1]
+        sizes = f"{n_frames} frames of {n_joints} joints and {n_cells} cells"
+        return f"Grasp({self.grasp_id}: {sizes}, label={self.label}, decision={self.decision})"
 
     @property
     def decision(self) -> Decision | None:
@@ -154,16 +159,19 @@ class Recording:
     def _messages(self, topics: Sequence[str]) -> Iterator[tuple[str, Any]]:
         """The topics and messages in the order of the file, which is the order in which they came."""
         with self.path.open("rb") as stream:
-            reader: McapReader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
-            messages = reader.iter_decoded_messages(topics, log_time_order=False)
+            decoders: dict[str, Callable[[bytes], Any]] = {}
+            messages = make_reader(stream, validate_crcs=True).iter_messages(topics, log_time_order=False)
             while True:
                 try:
-                    item = next(messages, None)
+                    schema, channel, message = next(messages, (None, None, None))
+                    if channel is None:
+                        return
+                    if channel.topic not in decoders:
+                        decoders[channel.topic] = decoder(schema.data.decode() if schema else "")
+                    decoded = decoders[channel.topic](message.data)
                 except DAMAGE as error:
                     raise self._damaged(error) from error
-                if item is None:
-                    return
-                yield item.channel.topic, item.decoded_message
+                yield channel.topic, decoded
 
     def _labels_and_decisions(self) -> tuple[dict[Key, Label], dict[Key, list[Decision]]]:
         labels: dict[Key, Label] = {}
