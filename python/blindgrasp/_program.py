@@ -124,7 +124,7 @@ class Process:
         killer = threading.Timer(END_LIMIT_SECS, self._process.kill)
         killer.start()
         try:
-            unread = [] if self._process.stdout.closed else self._process.stdout.readlines()
+            unread = self._process.stdout.readlines()
             self._process.wait()
         finally:
             killer.cancel()
