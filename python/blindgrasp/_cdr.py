@@ -7,8 +7,9 @@ What is not read: types that blindgrasp's frames, labels and decisions do not ha
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, Callable
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +32,7 @@ def decoder(definition: str) -> Callable[[bytes], Any]:
 
     def read(fields: list[tuple[str, str]], body: memoryview, at: int) -> tuple[SimpleNamespace, int]:
         message = SimpleNamespace()
+        value: Any
         for kind, name in fields:
             if kind in nested:
                 value, at = read(nested[kind], body, at)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator, Mapping
 from os import PathLike, fspath
-from typing import Any, Iterator, Mapping
+from typing import Any, Self
 
 from ._program import Process, answer_of
 from ._types import Decision
@@ -24,7 +25,7 @@ class Run:
         self.summary: dict[str, Any] | None = None
         """The sums at the end, as `blindgrasp run --json` prints them; None before."""
 
-    def __enter__(self) -> Run:
+    def __enter__(self) -> Self:
         self._process = Process(self._arguments)
         try:
             self._wait_until_it_runs(self._process)
@@ -74,11 +75,12 @@ def run(
 ) -> Run:
     """A context manager that starts a graph (`blindgrasp run`), waits until it runs, and ends it.
 
-    `set` has values of parameters in the place of the file's, like `{"recorded_source.rate": "max"}`. `name` is the name of
-    the running graph. `recording` is a new file to which every edge is recorded.
+    `set` has values of parameters in the place of the file's, like `{"recorded_source.rate": "max"}`. `name` is the
+    name of the running graph. `recording` is a new file to which every edge is recorded.
 
-    At the end of the block the graph is asked to end (SIGINT), decides what is in flight, and is waited for. Decisions that
-    were not read are left out. A graph that does not start, fails or loses samples raises ProgramError with its stderr.
+    At the end of the block the graph is asked to end (SIGINT), decides what is in flight, and is waited for. Decisions
+    that were not read are left out. A graph that does not start, fails or loses samples raises ProgramError with its
+    stderr.
     """
     arguments = ["run", fspath(dataflow), "--json"]
     for parameter, value in (set or {}).items():
@@ -92,10 +94,10 @@ def run(
 
 
 def echo(graph: str, *edges: str, samples: int | None = None) -> Iterator[dict[str, Any]]:
-    """The samples of a running graph as they come, as `blindgrasp export` writes them: topic, seq, stamp_nanos, data.
+    """The samples of a running graph as they come: topic, seq, stamp_nanos and data, as `blindgrasp export` has them.
 
-    `edges` are outputs, like `lift_arbiter/decision`; without any, all are read. It ends after so many `samples`, or with
-    the graph. The graph does not wait for a reader that is too slow.
+    `edges` are outputs, like `lift_arbiter/decision`; without any, all are read. It ends after so many `samples`, or
+    with the graph. The graph does not wait for a reader that is too slow.
 
     Raises ProgramError if there is no such graph or edge, and at the end if samples were left out.
     """
@@ -104,5 +106,3 @@ def echo(graph: str, *edges: str, samples: int | None = None) -> Iterator[dict[s
         arguments += ["--samples", str(samples)]
     with Process(arguments) as process:
         yield from process.lines()
-
-

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import tempfile
+from collections.abc import Iterable, Iterator
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, Iterable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +51,10 @@ class Predictions:
     @property
     def is_lifted(self) -> NDArray[np.bool_]:
         """(n_grasps,): whether the action is `lift`."""
-        return self.action == "lift"
+        return np.equal(self.action, "lift")
+
+
+Source = str | PathLike[str] | Recording | Grasp
 
 
 class Model:
@@ -82,66 +86,53 @@ class Model:
     def __repr__(self) -> str:
         return f"Model({str(self.path)!r}, hand={self.hand!r}, recipe={self.recipe!r})"
 
-    def predict(self, source: Source) -> Predictions:
+    def predict(self, source: Source | Iterable[Source]) -> Predictions:
         """Decides grasps as a graph with this model would (`blindgrasp predict`).
 
-        `source` is a recording's path, a Recording, several paths, or grasps: one Grasp, or any number of them. Grasps may
-        be made by hand from arrays of your own.
+        `source` is a recording (its path or a Recording), a Grasp, or several of one kind. A Grasp may be made by hand
+        from arrays of your own. Recordings are read by the program, one grasp at a time.
 
         Raises ProgramError if a recording cannot be read or is of another hand.
         """
-        if isinstance(source, Recording):
-            source = source.path
-        if isinstance(source, (str, PathLike)):
-            source = [source]
-        elif isinstance(source, Grasp):
-            source = [source]
-        items = iter(source)
-        first = next(items, None)
-        if first is None:
-            return _predictions([], [])
-        command = ["predict", "--json", str(self.path.absolute())]
-        if isinstance(first, (str, PathLike)):
-            paths = [str(Path(fspath(path)).absolute()) for path in [first, *items]]
-            with Process([*command, *paths]) as process:
-                return _predictions(process.lines(), [])
-        # A file and not a pipe: the program may print answers before it has read all frames.
+        sources = [source] if isinstance(source, (str, PathLike, Recording, Grasp)) else list(source)
+        grasps = [source for source in sources if isinstance(source, Grasp)]
+        others = [source for source in sources if not isinstance(source, Grasp)]
+        paths = [source.path if isinstance(source, Recording) else Path(source) for source in others]
+        if grasps and paths:
+            raise TypeError("predict takes recordings or grasps, not both at once")
+        if not sources:
+            return _predictions([], None)
+        files = ["-"] if grasps else [str(path.absolute()) for path in paths]
+        # The frames are in a file and not in a pipe: the program may answer before it has read all of them.
         with tempfile.TemporaryFile() as frames:
-            labels = []
-            for grasp in (first, *items):
-                frames.writelines(_frame_lines(grasp))
-                labels.append(grasp.label)
+            frames.writelines(line for grasp in grasps for line in _frame_lines(grasp))
             frames.seek(0)
-            with Process([*command, "-"], stdin=frames) as process:
-                return _predictions(process.lines(), labels)
+            with Process(["predict", "--json", str(self.path.absolute()), *files], stdin=frames) as process:
+                return _predictions(list(process.lines()), [grasp.label for grasp in grasps] if grasps else None)
 
 
-Source = str | PathLike[str] | Recording | Grasp | Iterable[str] | Iterable[PathLike[str]] | Iterable[Grasp]
-
-
-def _predictions(lines: Iterable[dict[str, Any]], labels: list[Label | None]) -> Predictions:
-    """The lines of `predict`; `labels` are those of grasps that were given as arrays, one for each line, else empty."""
-    found = list(lines)
-    if labels and len(labels) != len(found):
-        raise ValueError(f"{len(found)} predictions of {len(labels)} grasps: neighbours need different grasp_ids")
+def _predictions(lines: list[dict[str, Any]], labels: list[Label | None] | None) -> Predictions:
+    """The lines of `predict` as arrays; `labels` are those of grasps that were given as arrays."""
+    if labels is not None and len(labels) != len(lines):
+        raise ValueError(f"{len(lines)} predictions of {len(labels)} grasps: neighbours need different grasp_ids")
     return Predictions(
-        file=np.array([line["file"] for line in found], str),
-        grasp_id=np.array([line["grasp_id"] for line in found], np.int64),
-        probability_stable=np.array([line["probability_stable"] for line in found], np.float64),
-        action=np.array([line["action"] for line in found], str),
-        reason=np.array([line["reason"] for line in found], str),
-        labels=labels or [Label.from_json(line.get("label")) for line in found],
+        file=np.array([line["file"] for line in lines], str),
+        grasp_id=np.array([line["grasp_id"] for line in lines], np.int64),
+        probability_stable=np.array([line["probability_stable"] for line in lines], np.float64),
+        action=np.array([line["action"] for line in lines], str),
+        reason=np.array([line["reason"] for line in lines], str),
+        labels=[Label.from_json(line.get("label")) for line in lines] if labels is None else labels,
     )
 
 
 def _frame_lines(grasp: Grasp) -> Iterator[bytes]:
     """The frames of a grasp as `blindgrasp export --topic /tactile` writes them."""
     lists = ("joints_rad", "cells_newtons", "gravity_m_per_s2", "wrist_wrench", "joint_torques")
-    for idx in range(len(grasp.seq)):
-        data = {name: _numbers(getattr(grasp, name)[idx]) for name in lists}
-        data |= {"grasp_id": int(grasp.grasp_id), "phase": str(grasp.phase[idx]), "day": int(grasp.day)}
-        line = {"topic": "/tactile", "seq": int(grasp.seq[idx]), "stamp_nanos": int(grasp.stamp_nanos[idx]), "data": data}
-        yield json.dumps(line).encode() + b"\n"
+    for idx, phase in enumerate(grasp.phase):
+        data: dict[str, Any] = {name: _numbers(getattr(grasp, name)[idx]) for name in lists}
+        data |= {"grasp_id": int(grasp.grasp_id), "phase": str(phase), "day": int(grasp.day)}
+        header = {"topic": "/tactile", "seq": int(grasp.seq[idx]), "stamp_nanos": int(grasp.stamp_nanos[idx])}
+        yield json.dumps(header | {"data": data}).encode() + b"\n"
 
 
 def _numbers(row: NDArray[np.float64]) -> list[float | None]:

@@ -9,13 +9,14 @@ import signal
 import subprocess
 import tempfile
 import threading
+from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any, Iterator
+from typing import IO, Any, Self
 
 PROGRAM_VARIABLE = "BLINDGRASP_PROGRAM"
 
-# A program that is asked to end gets this long. It is longer than `blindgrasp run` itself waits for its operators: twice
-# its default for --grace, 10 s.
+# A program that is asked to end gets this long: three times what `blindgrasp run` gives its operators to drain and then
+# to exit (--grace, 10 s each).
 END_LIMIT_SECS = 60.0
 
 
@@ -43,7 +44,7 @@ def program() -> Path:
     named = os.environ.get(PROGRAM_VARIABLE)
     if named:
         if not _is_executable(Path(named)):
-            raise ProgramNotFoundError(f"{PROGRAM_VARIABLE} is {named}, which is no executable file: correct or unset it")
+            raise ProgramNotFoundError(f"{PROGRAM_VARIABLE} is {named}, which is no executable file")
         return Path(named).absolute()
     packaged = Path(__file__).parent / "bin" / "blindgrasp"
     if _is_executable(packaged):
@@ -51,8 +52,8 @@ def program() -> Path:
     found = shutil.which("blindgrasp")
     if found is None:
         raise ProgramNotFoundError(
-            f"the program blindgrasp was not found: {PROGRAM_VARIABLE} is not set, this package has no copy of it, and it "
-            f"is not on PATH; build it (cargo build --release) and set {PROGRAM_VARIABLE}=target/release/blindgrasp"
+            f"the program blindgrasp was not found: {PROGRAM_VARIABLE} is not set, this package has no copy of it, and "
+            f"it is not on PATH; build it (cargo build --release) and set {PROGRAM_VARIABLE}=target/release/blindgrasp"
         )
     return Path(found).absolute()
 
@@ -64,7 +65,7 @@ def _is_executable(path: Path) -> bool:
 class Process:
     """A run of the program that prints a JSON object a line. As a context manager it ends the program.
 
-    The program has a process group of its own: Ctrl-C reaches it once, from here, and not a second time from the terminal.
+    The program has a process group of its own: Ctrl-C reaches it once, from here, and not also from the terminal.
     """
 
     def __init__(self, arguments: list[str], stdin: IO[bytes] | None = None) -> None:
@@ -82,7 +83,7 @@ class Process:
         self._said = ""
         self._may_fail = True
 
-    def __enter__(self) -> Process:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -117,7 +118,7 @@ class Process:
         return self._said
 
     def end(self) -> list[dict[str, Any]]:
-        """Asks it to end (SIGINT) and waits; returns the objects that were not read. It is killed after END_LIMIT_SECS."""
+        """Asks it to end (SIGINT), and kills it after END_LIMIT_SECS. Returns the objects that were not read."""
         assert self._process.stdout is not None
         if self._process.poll() is None:
             self._process.send_signal(signal.SIGINT)
@@ -140,7 +141,8 @@ def answer_of(arguments: list[str]) -> dict[str, Any]:
     Raises ProgramError if the command fails.
     """
     command = [str(program()), *arguments]
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True)
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
     if done.returncode:
         raise ProgramError(command, done.returncode, done.stderr.decode(errors="replace"))
-    return json.loads(done.stdout)
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer

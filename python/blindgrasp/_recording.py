@@ -11,9 +11,10 @@ import dataclasses
 import struct
 import zlib
 from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, BinaryIO, Callable, Iterator, Sequence
+from typing import Any, BinaryIO
 
 import mcap.exceptions
 import numpy as np
@@ -73,7 +74,7 @@ class Grasp:
     gravity_m_per_s2: NDArray[np.float64]
     """(n_frames, 3): m/s² in the palm frame; (n_frames, 0) where the robot does not sense it."""
     wrist_wrench: NDArray[np.float64]
-    """(n_frames, 6): force in newtons and torque in newton metres, in the palm frame; (n_frames, 0) without a sensor."""
+    """(n_frames, 6): force (N) and torque (N m) in the palm frame; (n_frames, 0) without a sensor."""
     joint_torques: NDArray[np.float64]
     """(n_frames, n_joints): newton metres; (n_frames, 0) without sensors."""
     day: int = 0
@@ -163,9 +164,10 @@ class Recording:
             messages = make_reader(stream, validate_crcs=True).iter_messages(topics, log_time_order=False)
             while True:
                 try:
-                    schema, channel, message = next(messages, (None, None, None))
-                    if channel is None:
+                    item = next(messages, None)
+                    if item is None:
                         return
+                    schema, channel, message = item
                     if channel.topic not in decoders:
                         decoders[channel.topic] = decoder(schema.data.decode() if schema else "")
                     decoded = decoders[channel.topic](message.data)
@@ -191,19 +193,16 @@ class Recording:
 
     def _grasp(self, frames: list[Any], labels: dict[Key, Label], decisions: dict[Key, list[Decision]]) -> Grasp:
         key = _key(frames[0])
+        names = ("joints_rad", "cells_newtons", "gravity_m_per_s2", "wrist_wrench", "joint_torques")
         # Recordings of an earlier version lack some fields.
-        table = lambda name: _table([getattr(frame, name, ()) for frame in frames])  # noqa: E731
+        tables = {name: _table([getattr(frame, name, ()) for frame in frames]) for name in names}
         return Grasp(
             grasp_id=key[1],
             epoch=key[0],
             seq=np.array([frame.header.seq for frame in frames], np.uint64),
             stamp_nanos=np.array([frame.header.stamp_nanos for frame in frames], np.int64),
             phase=np.array([_word(PHASES, frame.phase) for frame in frames]),
-            joints_rad=table("joints_rad"),
-            cells_newtons=table("cells_newtons"),
-            gravity_m_per_s2=table("gravity_m_per_s2"),
-            wrist_wrench=table("wrist_wrench"),
-            joint_torques=table("joint_torques"),
+            **tables,
             day=getattr(frames[0], "day", 0),
             label=labels.get(key),
             decisions=tuple(decisions.get(key, ())),
@@ -211,8 +210,8 @@ class Recording:
 
     def _damaged(self, reason: object) -> RecordingError:
         return RecordingError(
-            f"{self.path} was cut off or is damaged ({reason}): `blindgrasp info {self.path} --repair` recovers what is "
-            "whole in it"
+            f"{self.path} was cut off or is damaged ({reason}): `blindgrasp info {self.path} --repair` recovers what "
+            "is whole in it"
         )
 
 

@@ -27,11 +27,11 @@ class Label:
         """The label as `run` (`stable`, `object`) and `predict` (`is_stable`, `object_id`) print it; None for null."""
         if fields is None:
             return None
-        number = lambda name: math.nan if fields.get(name) is None else float(fields[name])  # noqa: E731
+        epsilon, volume = (fields.get(name) for name in ("epsilon", "volume"))
         return cls(
-            is_stable=bool(fields["is_stable"] if "is_stable" in fields else fields["stable"]),
-            epsilon=number("epsilon"),
-            volume=number("volume"),
+            is_stable=fields["is_stable"] if "is_stable" in fields else fields["stable"],
+            epsilon=math.nan if epsilon is None else epsilon,
+            volume=math.nan if volume is None else volume,
             object_id=fields.get("object_id") or fields.get("object") or "",
             object_class=fields.get("class") or "",
         )

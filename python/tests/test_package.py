@@ -1,4 +1,4 @@
-"""Tests of the Python package with the repository's recordings and models, and the program that `blindgrasp.program()` finds.
+"""Tests of the Python package, with the repository's recordings and models and the program that it finds.
 
     PYTHONPATH=python BLINDGRASP_PROGRAM=target/release/blindgrasp python -m unittest discover python/tests
 """
@@ -34,7 +34,7 @@ FAST = {"recorded_source.rate": "max", "lift_arbiter.max_age_ms": 600000}
 def exported(path, *topics):
     """The lines that `blindgrasp export` writes of these topics."""
     command = [blindgrasp.program(), "export", path, *(word for topic in topics for word in ("--topic", topic))]
-    return [json.loads(line) for line in subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout.splitlines()]
+    return list(map(json.loads, subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout.splitlines()))
 
 
 def unique_name():
@@ -86,7 +86,8 @@ class Recordings(Folder):
             found = (grasp.decision.action, grasp.decision.reason, grasp.decision.probability_stable)
             data = decision["data"]
             self.assertEqual(found, (data["action"], data["reason"], data["probability_stable"]))
-            self.assertEqual((grasp.decision.seq, grasp.decision.stamp_nanos), (decision["seq"], decision["stamp_nanos"]))
+            found = (grasp.decision.seq, grasp.decision.stamp_nanos)
+            self.assertEqual(found, (decision["seq"], decision["stamp_nanos"]))
         return grasps
 
     def test_grasps_are_those_of_export(self):
@@ -198,6 +199,8 @@ class Models(Folder):
         self.assertEqual(model.predict(grasps[3]).action[0], of_path.action[3])
         self.assertEqual(len(model.predict([ORDINARY, ORDINARY])), 24)
         self.assertEqual(len(model.predict([])), 0)
+        with self.assertRaises(TypeError):
+            model.predict([ORDINARY, grasps[0]])
         with self.assertRaisesRegex(blindgrasp.ProgramError, "none.mcap"):
             model.predict(self.folder / "none.mcap")
         return of_path
@@ -285,7 +288,8 @@ class Graphs(Folder):
                 list(graph)
 
     def test_only_a_live_lift_may_be_acted_upon(self):
-        live = {"grasp_id": 1, "action": "lift", "reason": "stable", "probability_stable": 0.9, "seq": 1, "stamp_nanos": 2}
+        live = {"grasp_id": 1, "action": "lift", "reason": "stable", "probability_stable": 0.9}
+        live |= {"seq": 1, "stamp_nanos": 2}
         far = {"valid_until_nanos": 1 << 62}
         self.assertTrue(blindgrasp.Decision.from_json(live | far).may_lift())
         self.assertFalse(blindgrasp.Decision.from_json(live | far | {"action": "squeeze"}).may_lift())
