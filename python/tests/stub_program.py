@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Stands for the program `blindgrasp` in tests: it answers `predict` by a rule, and leaves all else to STUB_FOR.
 
-The rule: a grasp is lifted if its settled cells feel more than 10 N together, in the first settled frame.
+The rule: a grasp is lifted if its settled cells feel more than 2 N together, in the first settled frame.
 """
 
 import json
@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 
-LIMIT_NEWTONS = 10.0
+LIMIT_NEWTONS = 2.0
 
 if sys.argv[1] != "predict":
     os.execv(os.environ["STUB_FOR"], [os.environ["STUB_FOR"], *sys.argv[1:]])
