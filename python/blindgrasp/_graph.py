@@ -24,6 +24,10 @@ class Run:
         """The graph's name, for `echo` and the commands; None if the graph ended before it was seen running."""
         self.summary: dict[str, Any] | None = None
         """The sums at the end, as `blindgrasp run --json` prints them; None before."""
+        self.outcomes: list[dict[str, Any]] = []
+        """The outcomes of lifts (LiftOutcome of docs/messages.md) that have come, of a graph that reports them."""
+        self.stderr = ""
+        """All that the program printed to stderr; empty before the block has ended."""
 
     def __enter__(self) -> Self:
         self._process = Process(self._arguments)
@@ -46,22 +50,31 @@ class Run:
     def __iter__(self) -> Iterator[Decision]:
         """The decisions as they come, until the graph ends.
 
+        The graph does not wait. It leaves decisions out if more than 65,536 wait to be read, and says so in `stderr`.
+
         Raises ProgramError if the graph fails (exit code 1) or loses samples (exit code 3).
         """
         if self._process is None:
             raise RuntimeError("the graph does not run: iterate within `with blindgrasp.run(…) as graph:`")
         for line in self._process.lines():
-            if "summary" in line:
-                self.summary = line["summary"]
-            else:
+            if not self._is_taken(line):
                 yield Decision.from_json(line)
+
+    def _is_taken(self, line: dict[str, Any]) -> bool:
+        """Takes a line that is no decision."""
+        if "summary" in line:
+            self.summary = line["summary"]
+        elif "outcome" in line:
+            self.outcomes.append(line["outcome"])
+        return "grasp_id" not in line
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         process, self._process = self._process, None
         if process is None:
             return
         for line in process.end():
-            self.summary = line.get("summary", self.summary)
+            self._is_taken(line)
+        self.stderr = process.stderr()
         if kind is None:
             process.check(process.exit_code() or 0)
 

@@ -29,6 +29,10 @@ MAGIC = b"\x89MCAP0\r\n"
 # The footer: operation code, length, start of the summary, start of its offsets, checksum.
 FOOTER = "<BQQQI"
 
+FRAMES = "blindgrasp_msgs/msg/TactileFrame"
+LABELS = "blindgrasp_msgs/msg/GraspTruth"
+DECISIONS = "blindgrasp_msgs/msg/LiftDecision"
+
 # The codes of crates/messages, as operators/blindgrasp_messages.py has them.
 PHASES = (
     "open", "closing", "settled", "ended", "squeezing", "squeezed", "test_lifting", "test_lifted", "kept", "dropped",
@@ -98,8 +102,9 @@ class Grasp:
 class Recording:
     """A recording: its metadata at once, and its grasps by iteration, as often as wanted.
 
-    `topic` is the topic of the frames. Raises FileNotFoundError if there is no file, and RecordingError if it is no
-    recording, was cut off or has no such topic. Damage inside is found, and raised, when the grasps are read.
+    `topic` is the topic of the frames; labels are read from `/truth` and decisions from `/decision`. Raises
+    FileNotFoundError if there is no file, and RecordingError if it is no recording, was cut off, or has no frames on
+    that topic. Damage inside is found, and raised, when the grasps are read.
     """
 
     def __init__(self, path: str | PathLike[str], topic: str = "/tactile") -> None:
@@ -124,9 +129,13 @@ class Recording:
         """The number of samples of each topic."""
         for idx, channel in summary.channels.items():
             self.topics[channel.topic] += summary.statistics.channel_message_counts.get(idx, 0)
-        if topic not in self.topics:
-            there = ", ".join(sorted(self.topics)) or "no topic"
-            raise RecordingError(f"{self.path} has no topic {topic}: it has {there}")
+        self._types = {
+            channel.topic: summary.schemas[channel.schema_id].name if channel.schema_id in summary.schemas else ""
+            for channel in summary.channels.values()
+        }
+        if self._types.get(topic) != FRAMES:
+            there = ", ".join(name for name, kind in sorted(self._types.items()) if kind == FRAMES) or "none"
+            raise RecordingError(f"{self.path} has no frames on the topic {topic}: topics with frames: {there}")
         ours = found.get("blindgrasp", {})
         self.hand: str = ours.get("hand", "unknown")
         """The hand's name."""
@@ -178,7 +187,8 @@ class Recording:
     def _labels_and_decisions(self) -> tuple[dict[Key, Label], dict[Key, list[Decision]]]:
         labels: dict[Key, Label] = {}
         decisions: dict[Key, list[Decision]] = defaultdict(list)
-        topics = [topic for topic in ("/truth", "/decision") if topic in self.topics]
+        wanted = (("/truth", LABELS), ("/decision", DECISIONS))
+        topics = [topic for topic, kind in wanted if self._types.get(topic) == kind]
         for topic, message in self._messages(topics) if topics else ():
             key = _key(message)
             if topic == "/decision":

@@ -151,8 +151,9 @@ class Recordings(Folder):
             path.write_bytes(content)
             with self.assertRaisesRegex(blindgrasp.RecordingError, words):
                 blindgrasp.read(path)
-        with self.assertRaisesRegex(blindgrasp.RecordingError, "has no topic /touch: it has /scene, /tactile, /truth"):
-            blindgrasp.Recording(HELD_OUT, topic="/touch")
+        for topic in ("/touch", "/truth"):
+            with self.assertRaisesRegex(blindgrasp.RecordingError, f"the topic {topic}: topics with frames: /tactile"):
+                blindgrasp.Recording(HELD_OUT, topic=topic)
 
     def test_a_cut_recording_is_read_after_its_repair(self):
         path = self.folder / "cut.mcap"
@@ -235,6 +236,23 @@ class Graphs(Folder):
             found = (grasp.decision.action, grasp.decision.reason, grasp.decision.probability_stable)
             self.assertEqual(found, (decision.action, decision.reason, decision.probability_stable))
 
+    def test_lift_trials_have_outcomes_senses_and_several_decisions_of_a_grasp(self):
+        recorded, given = self.folder / "trials.mcap", {"simulated_hand.trials": 2, "lift_arbiter.max_age_ms": 600000}
+        flow = REPOSITORY / "dataflow-trials.yaml"
+        with blindgrasp.run(flow, set=given, name=unique_name(), recording=recorded) as graph:
+            decisions = list(graph)
+        grasps = blindgrasp.read(recorded)
+        of_grasps = [decision for grasp in grasps for decision in grasp.decisions]
+        words = lambda decision: (decision.grasp_id, decision.action, decision.reason)  # noqa: E731
+        self.assertEqual([words(decision) for decision in of_grasps], [words(decision) for decision in decisions])
+        self.assertIn("test_lift", [decision.action for decision in decisions])
+        self.assertEqual([outcome["grasp_id"] for outcome in graph.outcomes], [grasp.grasp_id for grasp in grasps])
+        for grasp, outcome in zip(grasps, graph.outcomes, strict=True):
+            self.assertEqual(outcome["lifted"], grasp.decision.action == "lift")
+            self.assertEqual(grasp.label and grasp.label.is_stable, outcome["held"] if outcome["lifted"] else None)
+            self.assertEqual((grasp.gravity_m_per_s2.shape[1], grasp.wrist_wrench.shape[1]), (3, 6))
+            self.assertAlmostEqual(np.linalg.norm(grasp.gravity_m_per_s2[0]), 9.81, delta=0.5)
+
     def test_a_graph_is_ended_with_its_block(self):
         forever = {"recorded_source.repeat": "forever", "lift_arbiter.max_age_ms": 600000}
         name = unique_name()
@@ -251,6 +269,7 @@ class Graphs(Folder):
             with self.assertRaisesRegex(blindgrasp.ProgramError, "no_node"):
                 list(blindgrasp.echo(graph.name, "no_node/decision"))
         self.assertEqual(graph.summary["samples_lost"], 0)
+        self.assertIn(name, graph.stderr)
         with self.assertRaisesRegex(blindgrasp.ProgramError, name):
             list(blindgrasp.echo(name))
 
