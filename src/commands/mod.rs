@@ -70,23 +70,23 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Init(init::Arguments),
-    #[command(visible_aliases = ["up", "start", "launch"])]
+    #[command(aliases = ["up", "start", "launch"])]
     Run(run::Arguments),
     Record(record::Arguments),
-    #[command(visible_alias = "play")]
+    #[command(alias = "play")]
     Replay(replay::Arguments),
     Test(test::Arguments),
-    #[command(visible_aliases = ["status", "list"])]
+    #[command(aliases = ["status", "list"])]
     Ps(ps::Arguments),
     Top(top::Arguments),
     Echo(echo::Arguments),
     Hz(hz::Arguments),
-    #[command(visible_alias = "down")]
+    #[command(alias = "down")]
     Stop(stop::Arguments),
     Logs(logs::Arguments),
     Set(set::Arguments),
     Param(param::Arguments),
-    #[command(visible_alias = "restart")]
+    #[command(alias = "restart")]
     Swap(swap::Arguments),
     #[command(hide = true)]
     Check(check::Arguments),

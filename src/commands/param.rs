@@ -31,6 +31,7 @@ enum ParamCommand {
 }
 
 #[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp param list lift_arbiter")]
 struct ListArguments {
     /// Only those of this node
     #[arg(add = completions::nodes())]
@@ -44,6 +45,7 @@ struct ListArguments {
 }
 
 #[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp param get lift_arbiter.votes")]
 struct GetArguments {
     /// NODE.PARAM
     #[arg(add = completions::params())]

@@ -55,7 +55,7 @@ fn a_table_goes_to_stdout_a_file_or_a_folder() {
     assert!(text(&made).contains(&format!("{}: 3360 rows\n", at("all/tactile.csv").display())), "{}", text(&made));
     // Into a folder that is there, over what is there.
     std::fs::write(at("all/truth.csv"), "of yesterday").expect("written");
-    run(&[&csv[..], &["--topic", "/truth", "--out", utf8(&at("all"))]].concat(), 0);
+    run(&[&csv[..], &["--topic", "/truth", "--overwrite", "--out", utf8(&at("all"))]].concat(), 0);
     assert_eq!(std::fs::read(at("all/truth.csv")).expect("written"), stdout);
 }
 
@@ -104,8 +104,11 @@ fn a_damaged_recording_leaves_what_was_there() {
     std::fs::write(at("damaged.mcap"), bytes).expect("written");
     std::fs::write(at("t"), "of yesterday").expect("written");
     for format in ["jsonl", "csv"] {
-        refused(&[&at("damaged.mcap"), "--format", format, "--topic", "/truth", "--out", &at("t")], &["damaged.mcap"]);
-        assert_eq!(std::fs::read_to_string(at("t")).expect("there"), "of yesterday");
+        let (damaged, out) = (at("damaged.mcap"), at("t"));
+        let arguments = [damaged.as_str(), "--format", format, "--topic", "/truth", "--out", &out];
+        refused(&arguments, &["t: the file exists", "--overwrite"]);
+        refused(&[&arguments[..], &["--overwrite"]].concat(), &["damaged.mcap"]);
+        assert_eq!(std::fs::read_to_string(&out).expect("there"), "of yesterday");
     }
     assert_eq!(names_in(folder.path()), ["damaged.mcap", "t"]);
 }

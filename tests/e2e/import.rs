@@ -81,6 +81,7 @@ impl Folder {
             }
         }
         arguments.extend(more.iter().map(|argument| (*argument).to_string()));
+        arguments.push("--overwrite".into());
         arguments
     }
 
@@ -510,6 +511,7 @@ fn the_biotac_set_is_4682_grasps_of_41_objects() {
                 "object",
                 "--grasp-id-start",
                 &first,
+                "--overwrite",
                 "--out",
                 &out,
                 "--json",

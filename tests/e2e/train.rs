@@ -26,7 +26,7 @@ fn every_recipe_makes_a_model_that_says_how_it_was_made() {
     ] {
         let out = folder.path().join(format!("{recipe}.json"));
         let out = out.to_str().expect("UTF-8");
-        run(&["train", RECORDING, "--recipe", recipe, "--out", out], 0);
+        run(&["train", RECORDING, "--recipe", recipe, "--overwrite", "--out", out], 0);
         let shown: Value = serde_json::from_slice(&run(&["model", "show", out, "--json"], 0).stdout).expect("JSON");
         assert_eq!((&shown["recipe"]["name"], &shown["machine"]["kind"]), (&recipe.into(), &kind.into()));
         run(&["evaluate", out, OTHER_RECORDING], 0);
@@ -34,7 +34,7 @@ fn every_recipe_makes_a_model_that_says_how_it_was_made() {
     // The same again is the same to the byte. Every kind of learner is in these two.
     for recipe in ["blend", "paper"] {
         let [first, again] = [recipe, "again"].map(|name| folder.path().join(format!("{name}.json")));
-        run(&["train", RECORDING, "--recipe", recipe, "--out", again.to_str().expect("UTF-8")], 0);
+        run(&["train", RECORDING, "--recipe", recipe, "--overwrite", "--out", again.to_str().expect("UTF-8")], 0);
         assert_eq!(std::fs::read(again).expect("a model"), std::fs::read(first).expect("a model"), "{recipe}");
     }
     let boosted = folder.path().join("boosted.json");
@@ -52,7 +52,7 @@ fn equal_readings_count_once() {
     std::fs::copy(crate::common::project().join(RECORDING), &copy).expect("a copy");
     let (copy, out) = (copy.to_str().expect("UTF-8"), out.to_str().expect("UTF-8"));
     let once = text(&run(&["train", RECORDING, "--out", out], 0).stdout);
-    let twice = text(&run(&["train", RECORDING, copy, "--out", out], 0).stdout);
+    let twice = text(&run(&["train", RECORDING, copy, "--overwrite", "--out", out], 0).stdout);
     let n_grasps = |output: &str| output.split(": ").nth(1).and_then(|rest| rest.split(' ').next().map(String::from));
     assert_eq!(n_grasps(&once), n_grasps(&twice));
     let n = n_grasps(&once).expect("a number of grasps");
@@ -68,7 +68,7 @@ fn several_frictions_give_a_probability_over_them() {
     let model = |name: &str, more: &[&str]| {
         let out = folder.path().join(name);
         let out = out.to_str().expect("UTF-8");
-        run(&[&["train", RECORDING, "--out", out], more].concat(), 0);
+        run(&[&["train", RECORDING, "--overwrite", "--out", out], more].concat(), 0);
         let evaluation: Value =
             serde_json::from_slice(&run(&["evaluate", out, judged, "--json"], 0).stdout).expect("JSON");
         evaluation["score"]["n_lift"].as_u64().expect("a count")
@@ -173,7 +173,7 @@ fn a_promise_about_drops_holds_for_new_objects_or_nothing_is_lifted() {
     let (known, new, model) = (lifts(folder.path(), "known", 1), lifts(folder.path(), "new", 2), at("model.json"));
     let hand = at("pincer.yaml");
     let train = |more: &[&str], code: i32| {
-        run(&[&["train", &known, "--hand", &hand, "--words", "2", "--out", &model], more].concat(), code)
+        run(&[&["train", &known, "--hand", &hand, "--words", "2", "--overwrite", "--out", &model], more].concat(), code)
     };
     for (flags, most) in [(["--drop-secs", "120"], 1.0), (["--max-drops", "0.25"], 0.25)] {
         let trained = train(&flags, 0);
@@ -228,7 +228,8 @@ fn a_look_that_cannot_keep_the_promise_never_lifts() {
     let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_string();
     let (known, new) = (squeezed_lifts(folder.path(), "known", 3), squeezed_lifts(folder.path(), "new", 4));
     let (hand, model) = (at("pincer.yaml"), at("model.json"));
-    let train = ["train", &known, "--hand", &hand, "--words", "2", "--max-drops", "0.12", "--out", &model];
+    let train =
+        ["train", &known, "--hand", &hand, "--words", "2", "--max-drops", "0.12", "--overwrite", "--out", &model];
     let trained = run(&train, 0);
     let (stdout, stderr) = (text(&trained.stdout), text(&trained.stderr));
     assert!(stderr.contains("not lifted: when the hand is settled, the strictest threshold promises"), "{stderr}");

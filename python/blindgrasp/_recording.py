@@ -1,0 +1,281 @@
+"""Recordings (MCAP) as grasps in numpy arrays.
+
+A recording is read in order, one chunk at a time, so that memory holds the frames of one grasp, and the labels and
+decisions of all. What is not done here: repair (`blindgrasp info --repair`), contacts, features and predictions
+(`blindgrasp export`), and recordings in several files, which are read one by one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+import zlib
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import mcap.exceptions
+import numpy as np
+import zstandard
+from mcap.reader import make_reader
+from numpy.typing import NDArray
+
+from ._cdr import decoder
+from ._types import Decision, Label
+
+MAGIC = b"\x89MCAP0\r\n"
+# The footer: operation code, length, start of the summary, start of its offsets, checksum.
+FOOTER = "<BQQQI"
+
+FRAMES = "blindgrasp_msgs/msg/TactileFrame"
+LABELS = "blindgrasp_msgs/msg/GraspTruth"
+DECISIONS = "blindgrasp_msgs/msg/LiftDecision"
+
+# The codes of crates/messages, as operators/blindgrasp_messages.py has them.
+PHASES = (
+    "open", "closing", "settled", "ended", "squeezing", "squeezed", "test_lifting", "test_lifted", "kept", "dropped",
+)  # fmt: skip
+ACTIONS = ("hold", "lift", "regrasp", "squeeze", "test_lift")
+REASONS = (
+    "stable", "unstable", "no_agreement", "missing", "out_of_order", "stale", "no_contact", "invalid", "self_collision",
+    "wrong_hand", "wrong_model", "out_of_distribution", "unsure", "link_down", "promising", "missing_reading",
+    "no_baseline", "unlike_day", "sensor_fault", "promise_withdrawn",
+)  # fmt: skip
+
+# The errors of the readers of MCAP and of CDR about content that is not as it should be.
+DAMAGE = (mcap.exceptions.McapError, zstandard.ZstdError, struct.error, ValueError, KeyError, IndexError, EOFError)
+
+Key = tuple[int, int]
+"""The epoch and number of a grasp."""
+
+
+class RecordingError(ValueError):
+    """A file is no recording, is damaged, or has grasps that cannot be told apart."""
+
+
+@dataclasses.dataclass
+class Grasp:
+    """The frames of one grasp in the order in which they were recorded, its label, and the decisions about it.
+
+    A frame that lacks numbers that other frames of the grasp have, holds NaN in their place.
+    """
+
+    grasp_id: int
+    epoch: int
+    """The generation of the source."""
+    seq: NDArray[np.uint64]
+    """(n_frames,): the frames' numbers. A jump is a frame that was lost."""
+    stamp_nanos: NDArray[np.int64]
+    """(n_frames,): when the source took the frames, nanoseconds of its clock."""
+    phase: NDArray[np.str_]
+    """(n_frames,): `open`, `closing`, `settled`, `ended` and others (docs/messages.md)."""
+    joints_rad: NDArray[np.float64]
+    """(n_frames, n_joints): radians in the hand's order; metres for a joint that slides."""
+    cells_newtons: NDArray[np.float64]
+    """(n_frames, n_cells): newtons, pad after pad; raw counts for a hand with `cell_unit: counts`."""
+    gravity_m_per_s2: NDArray[np.float64]
+    """(n_frames, 3): m/s² in the palm frame; (n_frames, 0) where the robot does not sense it."""
+    wrist_wrench: NDArray[np.float64]
+    """(n_frames, 6): force (N) and torque (N m) in the palm frame; (n_frames, 0) without a sensor."""
+    joint_torques: NDArray[np.float64]
+    """(n_frames, n_joints): newton metres; (n_frames, 0) without sensors."""
+    day: int = 0
+    """The recording day, like 20261124; 0 if it is not known."""
+    label: Label | None = None
+    """What is known to be true of the grasp; None if nothing was recorded."""
+    decisions: tuple[Decision, ...] = ()
+    """The recorded decisions. Several are recorded of a grasp that was probed."""
+
+    def __repr__(self) -> str:
+        (n_frames, n_cells), n_joints = self.cells_newtons.shape, self.joints_rad.shape[1]
+        sizes = f"{n_frames} frames of {n_joints} joints and {n_cells} cells"
+        return f"Grasp({self.grasp_id}: {sizes}, label={self.label}, decision={self.decision})"
+
+    @property
+    def decision(self) -> Decision | None:
+        """The last decision about the grasp; None if none was recorded."""
+        return self.decisions[-1] if self.decisions else None
+
+
+class Recording:
+    """A recording: its metadata at once, and its grasps by iteration, as often as wanted.
+
+    `topic` is the topic of the frames; labels are read from `/truth` and decisions from `/decision`. Raises
+    FileNotFoundError if there is no file, and RecordingError if it is no recording, was cut off, or has no frames on
+    that topic. Damage inside is found, and raised, when the grasps are read.
+    """
+
+    def __init__(self, path: str | PathLike[str], topic: str = "/tactile") -> None:
+        self.path = Path(fspath(path))
+        self.topic = topic
+        with self.path.open("rb") as stream:
+            if stream.read(len(MAGIC)) != MAGIC:
+                raise RecordingError(f"{self.path} is not a recording: expected an MCAP file")
+            try:
+                _check_summary(stream)
+                stream.seek(0)
+                reader = make_reader(stream)
+                summary = reader.get_summary()
+                found = {metadata.name: metadata.metadata for metadata in reader.iter_metadata()}
+            except DAMAGE as error:
+                raise self._damaged(error) from error
+        if summary is None or summary.statistics is None:
+            raise self._damaged("it has no summary")
+        self.metadata: dict[str, dict[str, str]] = found
+        """The metadata by name, as the table of docs/recording.md has it."""
+        self.topics: dict[str, int] = {channel.topic: 0 for channel in summary.channels.values()}
+        """The number of samples of each topic."""
+        for idx, channel in summary.channels.items():
+            self.topics[channel.topic] += summary.statistics.channel_message_counts.get(idx, 0)
+        self._types = {
+            channel.topic: summary.schemas[channel.schema_id].name if channel.schema_id in summary.schemas else ""
+            for channel in summary.channels.values()
+        }
+        if self._types.get(topic) != FRAMES:
+            there = ", ".join(name for name, kind in sorted(self._types.items()) if kind == FRAMES) or "none"
+            raise RecordingError(f"{self.path} has no frames on the topic {topic}: topics with frames: {there}")
+        ours = found.get("blindgrasp", {})
+        self.hand: str = ours.get("hand", "unknown")
+        """The hand's name."""
+        self.hand_id: str = ours.get("hand_id", "")
+        """The identity of the hand's layout, 16 hexadecimal digits."""
+
+    def __repr__(self) -> str:
+        return f"Recording({str(self.path)!r}, hand={self.hand!r}, n_frames={self.topics[self.topic]})"
+
+    def __iter__(self) -> Iterator[Grasp]:
+        """The grasps in order. The file is read twice: for labels and decisions, then for the frames.
+
+        Raises RecordingError if the file is damaged, or if frames of a grasp lie on both sides of another grasp.
+        """
+        labels, decisions = self._labels_and_decisions()
+        frames: list[Any] = []
+        key: Key | None = None
+        seen: set[Key] = set()
+        for _, frame in self._messages([self.topic]):
+            if _key(frame) != key:
+                if frames:
+                    yield self._grasp(frames, labels, decisions)
+                key, frames = _key(frame), []
+                if key in seen:
+                    raise RecordingError(f"{self.path}: frames of another grasp lie between those of grasp {key[1]}")
+                seen.add(key)
+            frames.append(frame)
+        if frames:
+            yield self._grasp(frames, labels, decisions)
+
+    def _messages(self, topics: Sequence[str]) -> Iterator[tuple[str, Any]]:
+        """The topics and messages in the order of the file, which is the order in which they came."""
+        with self.path.open("rb") as stream:
+            decoders: dict[str, Callable[[bytes], Any]] = {}
+            messages = make_reader(stream, validate_crcs=True).iter_messages(topics, log_time_order=False)
+            while True:
+                try:
+                    item = next(messages, None)
+                    if item is None:
+                        return
+                    schema, channel, message = item
+                    if channel.topic not in decoders:
+                        decoders[channel.topic] = decoder(schema.data.decode() if schema else "")
+                    decoded = decoders[channel.topic](message.data)
+                except DAMAGE as error:
+                    raise self._damaged(error) from error
+                yield channel.topic, decoded
+
+    def _labels_and_decisions(self) -> tuple[dict[Key, Label], dict[Key, list[Decision]]]:
+        labels: dict[Key, Label] = {}
+        decisions: dict[Key, list[Decision]] = defaultdict(list)
+        wanted = (("/truth", LABELS), ("/decision", DECISIONS))
+        topics = [topic for topic, kind in wanted if self._types.get(topic) == kind]
+        for topic, message in self._messages(topics) if topics else ():
+            key = _key(message)
+            if topic == "/decision":
+                decisions[key].append(_decision(message))
+            elif key in labels:
+                raise RecordingError(f"{self.path}: grasp {key[1]} has two labels (/truth)")
+            else:
+                labels[key] = Label(
+                    message.stable, message.epsilon, message.volume, message.object, getattr(message, "class")
+                )
+        return labels, decisions
+
+    def _grasp(self, frames: list[Any], labels: dict[Key, Label], decisions: dict[Key, list[Decision]]) -> Grasp:
+        key = _key(frames[0])
+        names = ("joints_rad", "cells_newtons", "gravity_m_per_s2", "wrist_wrench", "joint_torques")
+        # Recordings of an earlier version lack some fields.
+        tables = {name: _table([getattr(frame, name, ()) for frame in frames]) for name in names}
+        return Grasp(
+            grasp_id=key[1],
+            epoch=key[0],
+            seq=np.array([frame.header.seq for frame in frames], np.uint64),
+            stamp_nanos=np.array([frame.header.stamp_nanos for frame in frames], np.int64),
+            phase=np.array([_word(PHASES, frame.phase) for frame in frames]),
+            **tables,
+            day=getattr(frames[0], "day", 0),
+            label=labels.get(key),
+            decisions=tuple(decisions.get(key, ())),
+        )
+
+    def _damaged(self, reason: object) -> RecordingError:
+        return RecordingError(
+            f"{self.path} was cut off or is damaged ({reason}): `blindgrasp info {self.path} --repair` recovers what "
+            "is whole in it"
+        )
+
+
+def _check_summary(stream: BinaryIO) -> None:
+    """Checks the summary at the end of an MCAP file, as no reader does: https://mcap.dev/spec#footer-op0x02.
+
+    Raises ValueError if the file does not end as MCAP does, or if the summary's checksum is wrong.
+    """
+    n_bytes = struct.calcsize(FOOTER) + len(MAGIC)
+    end = stream.seek(0, 2)
+    stream.seek(max(end - n_bytes, 0))
+    tail = stream.read()
+    if len(tail) < n_bytes or not tail.endswith(MAGIC):
+        raise ValueError("it does not end as MCAP does")
+    _, _, summary_start, _, checksum = struct.unpack_from(FOOTER, tail)
+    # The checksum covers all of the footer but itself.
+    n_covered = end - n_bytes + struct.calcsize(FOOTER) - 4 - summary_start
+    stream.seek(min(summary_start, end))
+    if n_covered < 0 or checksum and zlib.crc32(stream.read(n_covered)) != checksum:
+        raise ValueError("its summary has a wrong checksum")
+
+
+def read(path: str | PathLike[str]) -> list[Grasp]:
+    """All grasps of a recording, in order. `Recording` takes less memory: it reads one grasp at a time.
+
+    Raises FileNotFoundError or RecordingError, as `Recording` does.
+    """
+    return list(Recording(path))
+
+
+def _key(message: Any) -> Key:
+    return message.header.epoch, message.grasp_id
+
+
+def _word(words: Sequence[str], code: int) -> str:
+    """The word of a code; a code that this version does not know is its number."""
+    return words[code] if code < len(words) else str(code)
+
+
+def _decision(message: Any) -> Decision:
+    return Decision(
+        grasp_id=message.grasp_id,
+        action=_word(ACTIONS, message.action),
+        reason=_word(REASONS, message.reason),
+        probability_stable=message.probability_stable,
+        seq=message.header.seq,
+        stamp_nanos=message.header.stamp_nanos,
+        epoch=message.header.epoch,
+    )
+
+
+def _table(rows: Sequence[Sequence[float]]) -> NDArray[np.float64]:
+    """Rows of numbers as an array; a row that is shorter than the longest one ends with NaN."""
+    table = np.full((len(rows), max(map(len, rows))), np.nan)
+    for row, values in zip(table, rows):
+        row[: len(values)] = values
+    return table

@@ -1,0 +1,360 @@
+"""Tests of the Python package, with the repository's recordings and models and the program that it finds.
+
+    PYTHONPATH=python BLINDGRASP_PROGRAM=target/release/blindgrasp python -m unittest discover python/tests
+"""
+
+import contextlib
+import importlib.util
+import io
+import json
+import math
+import os
+import re
+import subprocess
+import tempfile
+import unittest
+from pathlib import Path
+from unittest import mock
+
+import blindgrasp
+import numpy as np
+from blindgrasp import _recording
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+HELD_OUT = REPOSITORY / "recordings/held-out.mcap"
+ORDINARY = REPOSITORY / "recordings/ordinary.mcap"
+MODEL = REPOSITORY / "models/barrett-bh8-280.json"
+DATAFLOW = REPOSITORY / "dataflow.yaml"
+STUB = Path(__file__).with_name("stub_program.py")
+
+# A graph that replays as fast as it can on a busy machine.
+FAST = {"recorded_source.rate": "max", "lift_arbiter.max_age_ms": 600000}
+
+
+def exported(path, *topics):
+    """The lines that `blindgrasp export` writes of these topics."""
+    command = [blindgrasp.program(), "export", path, *(word for topic in topics for word in ("--topic", topic))]
+    return list(map(json.loads, subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout.splitlines()))
+
+
+def unique_name():
+    return f"python-{os.getpid()}-{os.urandom(4).hex()}"
+
+
+def has_predict():
+    found = subprocess.run([blindgrasp.program(), "predict", "--help"], capture_output=True)
+    return found.returncode == 0
+
+
+def stub():
+    """The environment in which the stub stands for the program, and asks the real one for all but `predict`."""
+    return mock.patch.dict(os.environ, BLINDGRASP_PROGRAM=str(STUB), STUB_FOR=str(blindgrasp.program()))
+
+
+class Folder(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.folder = Path(folder.name)
+
+
+class Recordings(Folder):
+    def compare(self, path):
+        """Compares each number of each grasp with the program's export."""
+        grasps = blindgrasp.read(path)
+        frames = [(grasp, idx) for grasp in grasps for idx in range(len(grasp.seq))]
+        lines = exported(path, "/tactile")
+        self.assertEqual(len(frames), len(lines))
+        for (grasp, idx), line in zip(frames, lines):
+            data = line["data"]
+            self.assertEqual((grasp.grasp_id, grasp.phase[idx]), (data["grasp_id"], data["phase"]))
+            self.assertEqual((grasp.seq[idx], grasp.stamp_nanos[idx]), (line["seq"], line["stamp_nanos"]))
+            for name in ("joints_rad", "cells_newtons", "gravity_m_per_s2", "wrist_wrench", "joint_torques"):
+                row = getattr(grasp, name)[idx]
+                # NaN is null in JSON.
+                np.testing.assert_array_equal(row[: len(data[name])], np.array(data[name], float))
+                self.assertTrue(np.isnan(row[len(data[name]) :]).all())
+        by_topic = {topic: {} for topic in ("/truth", "/decision") if topic in blindgrasp.Recording(path).topics}
+        for line in exported(path, *by_topic):
+            by_topic[line["topic"]][line["data"]["grasp_id"]] = line
+        for grasp in grasps:
+            label, decision = (by_topic.get(topic, {}).get(grasp.grasp_id) for topic in ("/truth", "/decision"))
+            self.assertEqual(grasp.label, label and blindgrasp.Label.from_json(label["data"]))
+            if decision is None:
+                self.assertIsNone(grasp.decision)
+                continue
+            found = (grasp.decision.action, grasp.decision.reason, grasp.decision.probability_stable)
+            data = decision["data"]
+            self.assertEqual(found, (data["action"], data["reason"], data["probability_stable"]))
+            found = (grasp.decision.seq, grasp.decision.stamp_nanos)
+            self.assertEqual(found, (decision["seq"], decision["stamp_nanos"]))
+        return grasps
+
+    def test_grasps_are_those_of_export(self):
+        grasps = self.compare(HELD_OUT)
+        self.assertEqual(len(grasps), 240)
+        self.assertEqual(grasps[0].cells_newtons.shape, (14, 96))
+        self.assertEqual(grasps[0].joints_rad.shape, (14, 7))
+        self.assertEqual(grasps[0].gravity_m_per_s2.shape, (14, 0))
+        self.assertEqual(sum(grasp.label.is_stable for grasp in grasps), 115)
+        self.assertEqual((grasps[0].label.object_id, grasps[0].label.object_class), ("vase-20", "vase"))
+        self.assertIsNone(grasps[0].decision)
+
+    def test_recordings_of_graphs_faults_and_earlier_versions_are_read(self):
+        paths = sorted((REPOSITORY / "recordings").glob("*.mcap"))
+        self.assertGreater(len(paths), 5)
+        for path in paths:
+            with self.subTest(path.name):
+                if path != HELD_OUT:
+                    self.assertTrue(all(grasp.decision for grasp in self.compare(path)))
+
+    def test_frames_that_lack_cells_end_with_nan(self):
+        grasps = blindgrasp.read(REPOSITORY / "recordings/drop-outs.mcap")
+        missing = [np.isnan(grasp.cells_newtons).sum(axis=1) for grasp in grasps]
+        # Some frames have 90 of 96 cells, and in others one cell is NaN.
+        self.assertEqual(set(np.concatenate(missing)), {0, 1, 6})
+
+    def test_a_recording_is_read_again_and_in_part(self):
+        recording = blindgrasp.Recording(ORDINARY)
+        self.assertEqual(recording.hand, "barrett-bh8-280")
+        self.assertEqual(next(iter(recording)).grasp_id, 0)
+        self.assertEqual([grasp.grasp_id for grasp in recording], list(range(12)))
+        self.assertEqual(recording.topics["/tactile"], sum(len(grasp.seq) for grasp in recording))
+
+    def test_codes_are_those_of_the_messages(self):
+        path = REPOSITORY / "operators/blindgrasp_messages.py"
+        spec = importlib.util.spec_from_file_location("blindgrasp_messages", path)
+        messages = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(messages)
+        for name in ("Phase", "Action", "Reason"):
+            words = getattr(_recording, f"{name.upper()}S")
+            self.assertEqual(list(words), [code.name.lower() for code in getattr(messages, name)])
+
+    def test_what_cannot_be_read_is_said(self):
+        with self.assertRaises(FileNotFoundError):
+            blindgrasp.read(self.folder / "none.mcap")
+        whole = HELD_OUT.read_bytes()
+        end_changed = bytearray(whole)
+        end_changed[-300] ^= 1
+        chunk_changed = bytearray(whole)
+        chunk_changed[300_000] ^= 1
+        for content, words in (
+            (b"", "is not a recording: expected an MCAP file"),
+            (b"no recording", "is not a recording: expected an MCAP file"),
+            (whole[:5], "is not a recording: expected an MCAP file"),
+            (whole[:8], "was cut off or is damaged"),
+            (whole[:300_000], "was cut off or is damaged"),
+            (end_changed, "its summary has a wrong checksum"),
+            (chunk_changed, "was cut off or is damaged"),
+        ):
+            path = self.folder / "file.mcap"
+            path.write_bytes(content)
+            with self.assertRaisesRegex(blindgrasp.RecordingError, words):
+                blindgrasp.read(path)
+        for topic in ("/touch", "/truth"):
+            with self.assertRaisesRegex(blindgrasp.RecordingError, f"the topic {topic}: topics with frames: /tactile"):
+                blindgrasp.Recording(HELD_OUT, topic=topic)
+
+    def test_a_cut_recording_is_read_after_its_repair(self):
+        path = self.folder / "cut.mcap"
+        path.write_bytes(HELD_OUT.read_bytes()[:500_000])
+        with self.assertRaises(blindgrasp.RecordingError) as raised:
+            blindgrasp.read(path)
+        command = re.search("`blindgrasp (.*)`", str(raised.exception))[1].split()
+        self.assertEqual(subprocess.run([blindgrasp.program(), *command], capture_output=True).returncode, 3)
+        n_grasps = len(blindgrasp.read(self.folder / "cut.repaired.mcap"))
+        self.assertTrue(0 < n_grasps < 240, n_grasps)
+
+
+class Models(Folder):
+    def test_a_model_is_described(self):
+        model = blindgrasp.Model(MODEL)
+        self.assertEqual((model.hand, model.recipe, model.threshold_probability), ("barrett-bh8-280", "boosted", 0.5))
+        self.assertEqual(model.hand_id, blindgrasp.Recording(HELD_OUT).hand_id)
+        self.assertEqual(len(model.objects), 480)
+        with self.assertRaises(FileNotFoundError):
+            blindgrasp.Model(self.folder / "none.json")
+        (self.folder / "none.json").write_text("{}")
+        with self.assertRaises(blindgrasp.ProgramError) as raised:
+            blindgrasp.Model(self.folder / "none.json")
+        self.assertEqual(raised.exception.exit_code, 1)
+        self.assertIn("none.json", str(raised.exception))
+
+    def check_predictions(self, model):
+        """Predicts a recording in each form that `predict` takes, and compares them."""
+        recording = blindgrasp.Recording(ORDINARY)
+        grasps = list(recording)
+        of_path = model.predict(ORDINARY)
+        self.assertEqual(of_path.grasp_id.tolist(), list(range(12)))
+        self.assertEqual(set(of_path.file), {str(ORDINARY)})
+        self.assertTrue(((of_path.probability_stable >= 0) & (of_path.probability_stable <= 1)).all())
+        self.assertEqual(of_path.is_stable.tolist(), [grasp.label.is_stable for grasp in grasps])
+        self.assertEqual([label.object_id for label in of_path.labels], [grasp.label.object_id for grasp in grasps])
+        self.assertTrue(of_path.is_labelled.all())
+        self.assertEqual(of_path.is_lifted.tolist(), [action == "lift" for action in of_path.action])
+        for source in (str(ORDINARY), recording, grasps, iter(grasps)):
+            other = model.predict(source)
+            for name in ("grasp_id", "probability_stable", "action", "reason", "is_stable"):
+                np.testing.assert_array_equal(getattr(other, name), getattr(of_path, name), name)
+        self.assertEqual(len(model.predict(grasps[3])), 1)
+        self.assertEqual(model.predict(grasps[3]).action[0], of_path.action[3])
+        self.assertEqual(len(model.predict([ORDINARY, ORDINARY])), 24)
+        self.assertEqual(len(model.predict([])), 0)
+        with self.assertRaises(TypeError):
+            model.predict([ORDINARY, grasps[0]])
+        with self.assertRaisesRegex(blindgrasp.ProgramError, "none.mcap"):
+            model.predict(self.folder / "none.mcap")
+        return of_path
+
+    def test_predictions_are_read(self):
+        with stub():
+            found = self.check_predictions(blindgrasp.Model(MODEL))
+        settled = [grasp.cells_newtons[grasp.phase == "settled"][0].sum() for grasp in blindgrasp.Recording(ORDINARY)]
+        self.assertEqual(found.is_lifted.tolist(), [newtons > 2.0 for newtons in settled])
+        self.assertEqual(len(set(found.is_lifted)), 2)
+
+    def test_the_program_predicts(self):
+        if not has_predict():
+            self.skipTest("the program has no command predict")
+        found = self.check_predictions(blindgrasp.Model(MODEL))
+        recorded = [grasp.decision for grasp in blindgrasp.Recording(ORDINARY)]
+        self.assertEqual(found.action.tolist(), [decision.action for decision in recorded])
+
+
+class Graphs(Folder):
+    def test_a_graph_is_run_to_its_end_and_recorded(self):
+        recorded = self.folder / "run.mcap"
+        with blindgrasp.run(DATAFLOW, set=FAST, name=unique_name(), recording=recorded) as graph:
+            decisions = list(graph)
+        self.assertEqual([decision.grasp_id for decision in decisions], list(range(240)))
+        self.assertEqual((graph.summary["grasps"], graph.summary["samples_lost"]), (240, 0))
+        n_right = sum((decision.action == "lift") == decision.label.is_stable for decision in decisions)
+        self.assertAlmostEqual(n_right / 240, graph.summary["accuracy"])
+        grasps = blindgrasp.read(recorded)
+        for grasp, decision in zip(grasps, decisions, strict=True):
+            self.assertEqual(grasp.label, decision.label)
+            found = (grasp.decision.action, grasp.decision.reason, grasp.decision.probability_stable)
+            self.assertEqual(found, (decision.action, decision.reason, decision.probability_stable))
+
+    def test_lift_trials_have_outcomes_senses_and_several_decisions_of_a_grasp(self):
+        recorded, given = self.folder / "trials.mcap", {"simulated_hand.trials": 2, "lift_arbiter.max_age_ms": 600000}
+        flow = REPOSITORY / "dataflow-trials.yaml"
+        with blindgrasp.run(flow, set=given, name=unique_name(), recording=recorded) as graph:
+            decisions = list(graph)
+        grasps = blindgrasp.read(recorded)
+        of_grasps = [decision for grasp in grasps for decision in grasp.decisions]
+        words = lambda decision: (decision.grasp_id, decision.action, decision.reason)  # noqa: E731
+        self.assertEqual([words(decision) for decision in of_grasps], [words(decision) for decision in decisions])
+        self.assertIn("test_lift", [decision.action for decision in decisions])
+        self.assertEqual([outcome["grasp_id"] for outcome in graph.outcomes], [grasp.grasp_id for grasp in grasps])
+        for grasp, outcome in zip(grasps, graph.outcomes, strict=True):
+            self.assertEqual(outcome["lifted"], grasp.decision.action == "lift")
+            self.assertEqual(grasp.label and grasp.label.is_stable, outcome["held"] if outcome["lifted"] else None)
+            self.assertEqual((grasp.gravity_m_per_s2.shape[1], grasp.wrist_wrench.shape[1]), (3, 6))
+            self.assertAlmostEqual(np.linalg.norm(grasp.gravity_m_per_s2[0]), 9.81, delta=0.5)
+
+    def test_a_graph_is_ended_with_its_block(self):
+        forever = {"recorded_source.repeat": "forever", "lift_arbiter.max_age_ms": 600000}
+        name = unique_name()
+        with blindgrasp.run(DATAFLOW, set=forever, name=name) as graph:
+            self.assertEqual(graph.name, name)
+            samples = list(blindgrasp.echo(graph.name, "lift_arbiter/decision", "classifier/prediction", samples=30))
+            topics = {sample["topic"] for sample in samples}
+            self.assertEqual((len(samples), topics), (30, {"/decision", "/prediction"}))
+            decision = next(iter(graph))
+            self.assertEqual((decision.grasp_id, decision.action), (0, "lift"))
+            for sample in blindgrasp.echo(graph.name, "recorded_source/tactile"):
+                self.assertEqual(len(sample["data"]["cells_newtons"]), 96)
+                break
+            with self.assertRaisesRegex(blindgrasp.ProgramError, "no_node"):
+                list(blindgrasp.echo(graph.name, "no_node/decision"))
+        self.assertEqual(graph.summary["samples_lost"], 0)
+        self.assertIn(name, graph.stderr)
+        with self.assertRaisesRegex(blindgrasp.ProgramError, name):
+            list(blindgrasp.echo(name))
+
+    def test_an_exception_ends_the_graph(self):
+        name = unique_name()
+        with self.assertRaisesRegex(ZeroDivisionError, "mine"):
+            with blindgrasp.run(DATAFLOW, name=name, set={"recorded_source.repeat": "forever"}):
+                raise ZeroDivisionError("mine")
+        with self.assertRaisesRegex(blindgrasp.ProgramError, name):
+            list(blindgrasp.echo(name))
+
+    def test_a_graph_that_does_not_start_raises_what_the_program_said(self):
+        for dataflow, given, words in (
+            (self.folder / "none.yaml", {}, "none.yaml: cannot read the file"),
+            (DATAFLOW, {"lift_arbiter.votes": -1}, "votes"),
+        ):
+            with self.assertRaisesRegex(blindgrasp.ProgramError, words) as raised:
+                with blindgrasp.run(dataflow, set=given, name=unique_name()):
+                    self.fail("the graph runs")
+            self.assertGreater(raised.exception.exit_code, 0)
+
+    def test_a_graph_that_fails_raises(self):
+        flow = self.folder / "dataflow.yaml"
+        text = DATAFLOW.read_text()
+        for folder in ("recordings", "models", "hands"):
+            text = text.replace(f": {folder}/", f": {REPOSITORY}/{folder}/")
+        flow.write_text(text.replace("  classifier:\n", "  classifier:\n    restart: never\n"))
+        with self.assertRaisesRegex(blindgrasp.ProgramError, "classifier"):
+            with blindgrasp.run(flow, name=unique_name(), set={"recorded_source.repeat": "forever"}) as graph:
+                shown = subprocess.run(
+                    [blindgrasp.program(), "ps", graph.name, "--json"], stdout=subprocess.PIPE, check=True
+                )
+                nodes = json.loads(shown.stdout)["graphs"][0]["nodes"]
+                os.kill(next(node["pid"] for node in nodes if node["node"] == "classifier"), 9)
+                list(graph)
+
+    def test_only_a_live_lift_may_be_acted_upon(self):
+        live = {"grasp_id": 1, "action": "lift", "reason": "stable", "probability_stable": 0.9}
+        live |= {"seq": 1, "stamp_nanos": 2}
+        far = {"valid_until_nanos": 1 << 62}
+        self.assertTrue(blindgrasp.Decision.from_json(live | far).may_lift())
+        self.assertFalse(blindgrasp.Decision.from_json(live | far | {"action": "squeeze"}).may_lift())
+        self.assertFalse(blindgrasp.Decision.from_json(live | {"valid_until_nanos": 1}).may_lift())
+        self.assertFalse(blindgrasp.Decision.from_json(live).may_lift())
+        label = blindgrasp.Decision.from_json(live | {"truth": {"stable": True, "epsilon": None}}).label
+        self.assertTrue(label.is_stable and math.isnan(label.epsilon) and label.object_id == "")
+
+
+class Program(Folder):
+    def test_the_program_is_found_or_missed_in_words(self):
+        there = str(blindgrasp.program())
+        self.assertTrue(os.access(there, os.X_OK))
+        with mock.patch.dict(os.environ, BLINDGRASP_PROGRAM=str(self.folder / "none")):
+            with self.assertRaisesRegex(blindgrasp.ProgramNotFoundError, "BLINDGRASP_PROGRAM is .*none"):
+                blindgrasp.program()
+        with mock.patch.dict(os.environ, PATH=str(self.folder)):
+            os.environ.pop("BLINDGRASP_PROGRAM", None)
+            package = Path(blindgrasp.__file__).parent
+            if not (package / "bin/blindgrasp").exists():
+                with self.assertRaisesRegex(blindgrasp.ProgramNotFoundError, "not on PATH"):
+                    blindgrasp.program()
+                (self.folder / "blindgrasp").symlink_to(there)
+                self.assertEqual(blindgrasp.program(), self.folder / "blindgrasp")
+
+
+class Notebook(Folder):
+    def test_the_notebook_runs(self):
+        path = REPOSITORY / "docs/notebook.ipynb"
+        self.assertLess(path.stat().st_size, 100_000)
+        cells = json.loads(path.read_text())["cells"]
+        codes = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+        self.assertGreater(len(codes), 3)
+        self.assertTrue(all(cell["outputs"] == [] for cell in cells if cell["cell_type"] == "code"))
+        names, printed = {"__name__": "__main__"}, io.StringIO()
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(contextlib.chdir(path.parent))
+            stack.enter_context(contextlib.redirect_stdout(printed))
+            stack.enter_context(mock.patch.dict(os.environ, MPLBACKEND="agg"))
+            if not has_predict():
+                stack.enter_context(stub())
+            for idx, code in enumerate(codes):
+                exec(compile(code, f"{path.name}, code cell {idx}", "exec"), names)
+        self.assertIn("240 grasps", printed.getvalue())
+        self.assertIn("accuracy", printed.getvalue())
+
+
+if __name__ == "__main__":
+    unittest.main()
