@@ -121,7 +121,7 @@ def _predictions(lines: list[dict[str, Any]], labels: list[Label | None] | None)
         probability_stable=np.array([line["probability_stable"] for line in lines], np.float64),
         action=np.array([line["action"] for line in lines], str),
         reason=np.array([line["reason"] for line in lines], str),
-        labels=[Label.from_json(line.get("label")) for line in lines] if labels is None else labels,
+        labels=[Label.from_json(line.get("truth")) for line in lines] if labels is None else labels,
     )
 
 

@@ -24,15 +24,15 @@ class Label:
 
     @classmethod
     def from_json(cls, fields: dict[str, Any] | None) -> Label | None:
-        """The label as `run` (`stable`, `object`) and `predict` (`is_stable`, `object_id`) print it; None for null."""
+        """The label as `run --json` and `predict --json` print it (`truth`); None for null."""
         if fields is None:
             return None
         epsilon, volume = (fields.get(name) for name in ("epsilon", "volume"))
         return cls(
-            is_stable=fields["is_stable"] if "is_stable" in fields else fields["stable"],
+            is_stable=fields["stable"],
             epsilon=math.nan if epsilon is None else epsilon,
             volume=math.nan if volume is None else volume,
-            object_id=fields.get("object_id") or fields.get("object") or "",
+            object_id=fields.get("object") or "",
             object_class=fields.get("class") or "",
         )
 

@@ -25,7 +25,6 @@ HELD_OUT = REPOSITORY / "recordings/held-out.mcap"
 ORDINARY = REPOSITORY / "recordings/ordinary.mcap"
 MODEL = REPOSITORY / "models/barrett-bh8-280.json"
 DATAFLOW = REPOSITORY / "dataflow.yaml"
-STUB = Path(__file__).with_name("stub_program.py")
 
 # A graph that replays as fast as it can on a busy machine.
 FAST = {"recorded_source.rate": "max", "lift_arbiter.max_age_ms": 600000}
@@ -39,16 +38,6 @@ def exported(path, *topics):
 
 def unique_name():
     return f"python-{os.getpid()}-{os.urandom(4).hex()}"
-
-
-def has_predict():
-    found = subprocess.run([blindgrasp.program(), "predict", "--help"], capture_output=True)
-    return found.returncode == 0
-
-
-def stub():
-    """The environment in which the stub stands for the program, and asks the real one for all but `predict`."""
-    return mock.patch.dict(os.environ, BLINDGRASP_PROGRAM=str(STUB), STUB_FOR=str(blindgrasp.program()))
 
 
 class Folder(unittest.TestCase):
@@ -206,16 +195,7 @@ class Models(Folder):
             model.predict(self.folder / "none.mcap")
         return of_path
 
-    def test_predictions_are_read(self):
-        with stub():
-            found = self.check_predictions(blindgrasp.Model(MODEL))
-        settled = [grasp.cells_newtons[grasp.phase == "settled"][0].sum() for grasp in blindgrasp.Recording(ORDINARY)]
-        self.assertEqual(found.is_lifted.tolist(), [newtons > 2.0 for newtons in settled])
-        self.assertEqual(len(set(found.is_lifted)), 2)
-
     def test_the_program_predicts(self):
-        if not has_predict():
-            self.skipTest("the program has no command predict")
         found = self.check_predictions(blindgrasp.Model(MODEL))
         recorded = [grasp.decision for grasp in blindgrasp.Recording(ORDINARY)]
         self.assertEqual(found.action.tolist(), [decision.action for decision in recorded])
@@ -348,8 +328,6 @@ class Notebook(Folder):
             stack.enter_context(contextlib.chdir(path.parent))
             stack.enter_context(contextlib.redirect_stdout(printed))
             stack.enter_context(mock.patch.dict(os.environ, MPLBACKEND="agg"))
-            if not has_predict():
-                stack.enter_context(stub())
             for idx, code in enumerate(codes):
                 exec(compile(code, f"{path.name}, code cell {idx}", "exec"), names)
         self.assertIn("240 grasps", printed.getvalue())

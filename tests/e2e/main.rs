@@ -28,6 +28,7 @@ mod picture;
 mod pins;
 mod processes;
 mod python;
+mod python_package;
 mod quality;
 mod readers;
 mod record;
