@@ -224,7 +224,7 @@ pub(crate) fn of_node(node: &str, lines: &[&str]) -> (String, String) {
 pub(crate) fn classifier_runs(program: &Path, params: &str) -> (String, String) {
     let inputs = "    inputs: {feature: encoder/feature}\n";
     (
-        format!("  classifier:\n{inputs}    params: {{model: {MODEL}}}\n"),
+        format!("  classifier:\n{inputs}"),
         format!("  classifier:\n    run: {}\n{inputs}    params: {params}\n", program.display()),
     )
 }

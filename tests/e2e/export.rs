@@ -106,7 +106,8 @@ fn a_damaged_recording_leaves_what_was_there() {
     for format in ["jsonl", "csv"] {
         let (damaged, out) = (at("damaged.mcap"), at("t"));
         let arguments = [damaged.as_str(), "--format", format, "--topic", "/truth", "--out", &out];
-        refused(&arguments, &["t: the file exists", "--overwrite"]);
+        let of_whole = [&[RECORDING], &arguments[1..]].concat();
+        refused(&of_whole, &["t: the file exists", "--overwrite"]);
         refused(&[&arguments[..], &["--overwrite"]].concat(), &["damaged.mcap"]);
         assert_eq!(std::fs::read_to_string(&out).expect("there"), "of yesterday");
     }

@@ -362,8 +362,8 @@ fn a_feature_of_another_model_never_lifts() {
     let folder = tempfile::tempdir().expect("a folder");
     let model = folder.path().join("other.json").to_str().expect("UTF-8").to_string();
     run(&["train", RECORDING, "--out", &model], 0);
-    let both = format!("params: {{model: {MODEL}}}\n    sandbox: on\n  classifier:");
-    let split = format!("params: {{model: {model}}}\n    sandbox: on\n  classifier:");
+    let both = "inputs: {contacts: contacts/contacts}\n";
+    let split = format!("{both}    params: {{model: {model}}}\n");
     let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), (&both, &split)]);
     let output = run(&["run", "--json", "--name", &unique_name(), flow.to_str().expect("UTF-8")], 0);
     let summary = json_lines(&output.stdout).pop().expect("a summary")["summary"].clone();

@@ -117,8 +117,8 @@ fn every_scaffold_builds_and_runs() {
                     let replace = [
                         ("  contacts:\n", filter.as_str()),
                         (
-                            "tactile: recorded_source/tactile}\n    params: {hand",
-                            "tactile: filter/tactile}\n    params: {hand",
+                            "tactile: recorded_source/tactile}\n    sandbox: on\n  encoder:",
+                            "tactile: filter/tactile}\n    sandbox: on\n  encoder:",
                         ),
                     ];
                     dataflow(folder, &replace)

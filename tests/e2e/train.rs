@@ -38,7 +38,9 @@ fn every_recipe_makes_a_model_that_says_how_it_was_made() {
         assert_eq!(std::fs::read(again).expect("a model"), std::fs::read(first).expect("a model"), "{recipe}");
     }
     let boosted = folder.path().join("boosted.json");
-    let errors = text(&run(&["train", RECORDING, "--c", "3", "--out", boosted.to_str().expect("UTF-8")], 1).stderr);
+    let errors = text(
+        &run(&["train", RECORDING, "--c", "3", "--overwrite", "--out", boosted.to_str().expect("UTF-8")], 1).stderr,
+    );
     assert!(errors.contains("--c is the SVM's"), "{errors}");
     let exported = ["model", "export", boosted.to_str().expect("UTF-8"), "--out", "never"];
     let errors = text(&run(&exported, 1).stderr);
