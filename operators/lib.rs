@@ -28,6 +28,10 @@ use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, TactileFrame};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 
+/// The module for operators in Python, and the messages that it knows.
+pub const PYTHON_OPERATOR: &str = include_str!("blindgrasp_operator.py");
+pub const PYTHON_MESSAGES: &str = include_str!("blindgrasp_messages.py");
+
 /// An operator that comes with blindgrasp.
 #[derive(Debug, Clone, Copy)]
 pub struct Shipped {

@@ -23,6 +23,7 @@ mod main_job;
 mod many_cells;
 mod meshes;
 mod metrics;
+mod package;
 mod partners;
 mod picture;
 mod pins;

@@ -37,8 +37,8 @@ fn systemd_is_told_when_a_graph_runs_lives_and_stops() {
 #[test]
 fn the_unit_is_valid_and_has_few_rights() {
     let folder = tempfile::tempdir().expect("a folder");
-    let unit = std::fs::read_to_string(project().join("docs/blindgrasp@.service")).expect("the unit");
-    let installed = "ExecStart=/usr/local/bin/blindgrasp";
+    let unit = std::fs::read_to_string(project().join("packaging/blindgrasp@.service")).expect("the unit");
+    let installed = "ExecStart=blindgrasp";
     assert!(unit.contains(installed), "{unit}");
     let path = folder.path().join("blindgrasp@robot7.service");
     let here = format!("ExecStart={}", env!("CARGO_BIN_EXE_blindgrasp"));

@@ -5,6 +5,7 @@ mod hand;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
+use blindgrasp_operators::{PYTHON_MESSAGES, PYTHON_OPERATOR};
 use clap::{Args, Subcommand};
 
 use super::{Outcome, print_line};
@@ -51,8 +52,6 @@ struct OperatorArguments {
     blindgrasp: Option<PathBuf>,
 }
 
-const OPERATOR_PY: &str = include_str!("../../../operators/blindgrasp_operator.py");
-const MESSAGES_PY: &str = include_str!("../../../operators/blindgrasp_messages.py");
 /// The versions that blindgrasp is tested with: the new operator is built with the same.
 const CARGO_LOCK: &str = include_str!("../../../Cargo.lock");
 const REQUIREMENTS: &str = "iceoryx2==0.10.0\nnumpy>=1.26\n";
@@ -299,8 +298,8 @@ fn python_files(kind: &Kind) -> Vec<File> {
     vec![
         ("main.py", kind.python, true),
         ("test_main.py", kind.python_test, false),
-        ("blindgrasp_operator.py", OPERATOR_PY, false),
-        ("blindgrasp_messages.py", MESSAGES_PY, false),
+        ("blindgrasp_operator.py", PYTHON_OPERATOR, false),
+        ("blindgrasp_messages.py", PYTHON_MESSAGES, false),
         ("requirements.txt", REQUIREMENTS, false),
         ("README.md", include_str!("../templates/README-python.md.in"), false),
         (".gitignore", "/.venv\n__pycache__/\n", false),
@@ -312,7 +311,7 @@ fn write_files(folder: &Path, files: &[File], words: &[(&str, String)]) -> anyho
     std::fs::create_dir(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
     let written = files.iter().try_for_each(|(path, text, is_program)| {
         let path = folder.join(path);
-        let is_template = ![OPERATOR_PY, MESSAGES_PY, CARGO_LOCK].contains(text);
+        let is_template = ![PYTHON_OPERATOR, PYTHON_MESSAGES, CARGO_LOCK].contains(text);
         let words = words.iter().filter(|_| is_template);
         let filled = words.fold(text.to_string(), |text, (word, by)| text.replace(word, by));
         if let Some(parent) = path.parent() {

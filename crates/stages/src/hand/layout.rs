@@ -405,8 +405,8 @@ mod tests {
         LayoutCell { at_m, normal, along, size_m, noise_threshold_newtons: None, grid: None, pitch_m: None }.build(0.1)
     }
 
-    const GRIPPER_URDF: &str = include_str!("../../../../hands/parallel-gripper.urdf");
-    const GRIPPER: &str = include_str!("../../../../hands/parallel-gripper.yaml");
+    const GRIPPER_URDF: &str = include_str!("../../hands/parallel-gripper.urdf");
+    const GRIPPER: &str = include_str!("../../hands/parallel-gripper.yaml");
 
     fn gripper(layout: &str, urdf: &str) -> Result<Hand, String> {
         Hand::parse(Path::new("gripper.yaml"), layout, |_| Ok(urdf.into())).map_err(|error| error.to_string())

@@ -336,8 +336,8 @@ macro_rules! builtin {
     ($name:literal) => {
         (
             $name,
-            include_str!(concat!("../../../../hands/", $name, ".yaml")),
-            include_str!(concat!("../../../../hands/", $name, ".urdf")),
+            include_str!(concat!("../../hands/", $name, ".yaml")),
+            include_str!(concat!("../../hands/", $name, ".urdf")),
         )
     };
 }

@@ -1,0 +1,130 @@
+//! The packages of a release, and the package of cargo.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+use crate::common::{project, skipped, text};
+
+/// The tools of `scripts/release` that a machine with Rust may lack.
+const TOOLS: [&str; 4] = ["git", "python3", "readelf", "dpkg-deb"];
+
+#[test]
+fn the_same_program_is_packed_into_the_same_bytes_and_runs_from_them() {
+    if let Some(tool) = TOOLS.iter().find(|tool| output(Command::new(tool).arg("--version")).is_none()) {
+        return skipped(&format!("{tool} is missing"));
+    }
+    if !project().join(".git").exists() {
+        return skipped("the source is no clone of git");
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let (first, second) = (folder.path().join("first"), folder.path().join("second"));
+    release(&first);
+    release(&second);
+    let names = file_names(&first);
+    assert_eq!(names, file_names(&second));
+    for name in &names {
+        let bytes = std::fs::read(first.join(name)).expect("readable");
+        assert!(bytes == std::fs::read(second.join(name)).expect("readable"), "{name} has other bytes the second time");
+    }
+    succeed(Command::new("sha256sum").args(["--check", "--strict", "SHA256SUMS"]).current_dir(&first));
+
+    let version = format!("blindgrasp {}\n", env!("CARGO_PKG_VERSION"));
+    let package = first.join(one(&names, ".deb"));
+    let field = |name: &str| succeed(Command::new("dpkg-deb").arg("--field").arg(&package).arg(name)).trim().to_owned();
+    assert_eq!(field("Package"), "blindgrasp");
+    assert_eq!(field("Version"), env!("CARGO_PKG_VERSION"));
+    assert!(field("Depends").contains("libc6 (>= 2."), "{}", field("Depends"));
+    let root = folder.path().join("root");
+    succeed(Command::new("dpkg-deb").arg("--extract").arg(&package).arg(&root));
+    for file in [
+        "usr/lib/systemd/system/blindgrasp@.service",
+        "usr/share/bash-completion/completions/blindgrasp",
+        "usr/share/doc/blindgrasp/README.md",
+        "usr/share/doc/blindgrasp/changelog.gz",
+        "usr/share/doc/blindgrasp/copyright",
+        "usr/share/doc/blindgrasp/docs/install.md",
+        "usr/share/doc/blindgrasp/third-party-licences.txt.gz",
+        "usr/share/fish/vendor_completions.d/blindgrasp.fish",
+        "usr/share/man/man1/blindgrasp.1.gz",
+        "usr/share/zsh/vendor-completions/_blindgrasp",
+    ] {
+        assert!(root.join(file).is_file(), "{file} is missing in {}", package.display());
+    }
+    assert_eq!(succeed(Command::new(root.join("usr/bin/blindgrasp")).arg("--version")), version);
+
+    let tarball = first.join(one(&names, ".tar.gz"));
+    succeed(Command::new("tar").arg("-xf").arg(&tarball).arg("-C").arg(folder.path()));
+    let name = one(&names, ".tar.gz").trim_end_matches(".tar.gz");
+    let unpacked = folder.path().join(name);
+    assert_eq!(succeed(Command::new(unpacked.join("bin/blindgrasp")).arg("--version")), version);
+    assert!(unpacked.join("LICENSE").is_file() && unpacked.join("share/man/man1/blindgrasp.1").is_file());
+
+    let sbom = std::fs::read_to_string(first.join(one(&names, ".cdx.json"))).expect("readable");
+    let sbom: serde_json::Value = serde_json::from_str(&sbom).expect("JSON");
+    let components = sbom["components"].as_array().expect("a list");
+    let has = |name: &str| components.iter().any(|component| component["name"] == name);
+    assert!(has("iceoryx2") && has("zenoh") && has("blindgrasp-stages") && has("three"), "{components:?}");
+    // It is a dependency of tests alone.
+    assert!(!has("vt100"), "{components:?}");
+}
+
+#[test]
+fn the_package_of_cargo_has_all_files_that_init_writes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let demo = folder.path().join("demo");
+    crate::common::run(&["init", demo.to_str().expect("UTF-8")], 0);
+    let mut cargo = Command::new(env!("CARGO"));
+    cargo.args(["package", "--list", "--allow-dirty", "--offline", "--package", "blindgrasp"]).current_dir(project());
+    let listed = succeed(&mut cargo);
+    for file in files_below(&demo) {
+        let name = file.strip_prefix(&demo).expect("below").to_str().expect("UTF-8").to_owned();
+        assert!(listed.lines().any(|line| line == name), "Cargo.toml's include has no {name}");
+    }
+}
+
+/// Packs the program of this build.
+fn release(out: &Path) {
+    let mut command = Command::new(project().join("scripts/release"));
+    command.arg("--program").arg(env!("CARGO_BIN_EXE_blindgrasp")).arg("--out").arg(out).arg("--fast");
+    succeed(&mut command);
+}
+
+/// Runs a program that must succeed, and returns its stdout.
+fn succeed(command: &mut Command) -> String {
+    let output = output(command).unwrap_or_else(|| panic!("{command:?} does not start"));
+    assert!(output.status.success(), "{command:?}\n{}\n{}", text(&output.stdout), text(&output.stderr));
+    text(&output.stdout)
+}
+
+fn output(command: &mut Command) -> Option<Output> {
+    command.stdin(Stdio::null()).output().ok()
+}
+
+fn file_names(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> = files_below(folder)
+        .iter()
+        .map(|path| path.file_name().expect("a name").to_string_lossy().into_owned())
+        .collect();
+    names.sort();
+    names
+}
+
+/// The one file whose name ends like this.
+fn one<'a>(names: &'a [String], end: &str) -> &'a str {
+    let found: Vec<&String> = names.iter().filter(|name| name.ends_with(end)).collect();
+    assert_eq!(found.len(), 1, "{end}: {names:?}");
+    found[0]
+}
+
+fn files_below(folder: &Path) -> Vec<PathBuf> {
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(folder).expect("readable") {
+        let path = entry.expect("readable").path();
+        if path.is_dir() {
+            files.extend(files_below(&path));
+        } else {
+            files.push(path);
+        }
+    }
+    files
+}
