@@ -128,7 +128,9 @@ mod tests {
                 for (at, name) in line.match_indices("blindgrasp ").filter(|_| is_shell) {
                     let before = &line[..at];
                     let words = words(&line[at + name.len()..]);
-                    let is_command = before.is_empty() || before.ends_with([' ', '(']);
+                    // Behind an option it is a name, as in `sudo -u blindgrasp`.
+                    let is_value = before.split_whitespace().last().is_some_and(|word| word.starts_with('-'));
+                    let is_command = (before.is_empty() || before.ends_with([' ', '('])) && !is_value;
                     let is_complete = !words.iter().any(|word| word.contains(['…', '$']));
                     if !is_command || !is_complete || words.is_empty() || before.contains('#') {
                         continue;
@@ -136,7 +138,7 @@ mod tests {
                     n += 1;
                     let words = std::iter::once("blindgrasp".to_owned()).chain(words);
                     if let Err(error) = grouped(Cli::command()).try_get_matches_from(words)
-                        && error.kind() != ErrorKind::DisplayHelp
+                        && !matches!(error.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion)
                     {
                         mistakes.push(format!("{}: {line}: {error}", page.display()));
                     }
