@@ -120,7 +120,7 @@ struct GraphArgument {
     #[arg(add = completions::graphs())]
     graph: Option<String>,
     /// The same by name
-    #[arg(short, long = "graph", value_name = "GRAPH", conflicts_with = "graph", add = completions::graphs())]
+    #[arg(short = 'g', long = "graph", value_name = "GRAPH", conflicts_with = "graph", add = completions::graphs())]
     named: Option<String>,
 }
 

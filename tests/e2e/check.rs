@@ -131,7 +131,7 @@ fn mistakes() {
     assert_eq!(errors["errors"][0]["line"], Value::Null);
     assert!(errors["errors"][0]["message"].as_str().is_some_and(|message| message.contains("cannot read the file")));
 
-    let output = run(&["check", "--set", "votes=5"], 2);
+    let output = run(&["check", "--set", "votes"], 2);
     assert!(text(&output.stderr).contains("expected node.param=value"), "{}", text(&output.stderr));
 }
 

@@ -181,7 +181,7 @@ fn labelled_grasps_of_a_day_correct_a_model_for_it() {
     let later = lab.import(&table(&[("c", [2.0, 2.0, 1.0])], 6, 10, 6), "later.mcap", &["--day", "20261124"]);
     let recalibrated = lab.at("today.json");
     let recalibrate = |recordings: &[&str], exit_code| {
-        let fixed = ["--hand", &lab.hand, "--out", &recalibrated];
+        let fixed = ["--hand", &lab.hand, "--overwrite", "--out", &recalibrated];
         run(&[&["model", "recalibrate", &model], recordings, &fixed].concat(), exit_code)
     };
     let said = text(&recalibrate(&[&today], 0).stdout).to_string();

@@ -135,6 +135,7 @@ fn train(folder: &Path, more: &[&str]) -> (Model, String, String) {
     let model = folder.join("model.json");
     let mut arguments = vec![
         "train",
+        "--overwrite",
         RECORDING,
         "--recipe",
         "paper",

@@ -22,8 +22,9 @@ fn blindgrasp(arguments: &[&Path]) -> Output {
 }
 
 fn import(file: &Path, like: &Path, out: &Path, more: &[&Path]) -> Output {
-    let arguments = [Path::new("import"), file, Path::new("--like"), like, Path::new("--out"), out];
-    blindgrasp(&[&arguments, more].concat())
+    let fixed = ["import", "--overwrite", "--like"].map(Path::new);
+    let arguments = [&fixed[..], &[like, Path::new("--out"), out, file]].concat();
+    blindgrasp(&[arguments.as_slice(), more].concat())
 }
 
 #[test]

@@ -129,7 +129,7 @@ fn the_best_of_several_planned_approaches_is_better_than_the_first() {
             "simulate --objects box,ball,mug --grasps 100 --seed 1 --stable-fraction natural --json --protocol planned";
         let (options, out) = (at("options.yaml"), at("planned.mcap"));
         let arguments: Vec<&str> =
-            arguments.split(' ').chain(["--options", options.as_str(), "--out", out.as_str()]).collect();
+            arguments.split(' ').chain(["--options", options.as_str(), "--overwrite", "--out", out.as_str()]).collect();
         let report: Value = serde_json::from_slice(&run(&arguments, 0).stdout).expect("JSON");
         report["n_stable"].as_u64().expect("a count")
     };
