@@ -23,7 +23,7 @@ pub(super) struct Arguments {
     #[arg(long, conflicts_with = "all")]
     machine: Option<String>,
     /// Stop all graphs of this user
-    #[arg(long, conflicts_with = "graph")]
+    #[arg(long, conflicts_with_all = ["graph", "named"])]
     all: bool,
     /// Print JSON
     #[arg(long)]
@@ -35,7 +35,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         (true, _) => running_graphs()?,
         (false, None) => vec![pick_graph(arguments.graph.name())?],
         (false, Some(machine)) => {
-            let graph = pick_graph(arguments.graph.name())?;
+            let graph = arguments.graph.name().map_or_else(|| pick_graph(None), |name| Ok(name.to_owned()))?;
             if machine_of(&graph).is_some() {
                 bail!("{graph} already names a machine: leave --machine {machine} out, or name the graph alone");
             }

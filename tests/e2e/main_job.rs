@@ -364,7 +364,7 @@ fn a_feature_of_another_model_never_lifts() {
     run(&["train", RECORDING, "--out", &model], 0);
     let both = "inputs: {contacts: contacts/contacts}\n";
     let split = format!("{both}    params: {{model: {model}}}\n");
-    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), (&both, &split)]);
+    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), (both, &split)]);
     let output = run(&["run", "--json", "--name", &unique_name(), flow.to_str().expect("UTF-8")], 0);
     let summary = json_lines(&output.stdout).pop().expect("a summary")["summary"].clone();
     assert_eq!((&summary["lift"], &summary["reasons"]["wrong_model"]), (&0.into(), &240.into()), "{summary}");
