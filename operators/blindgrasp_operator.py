@@ -1305,6 +1305,9 @@ class _Store:
         the last one that was answered.
         """
         board = self.operator.board
+        # The places come first: for a standby, the active instance goes on meanwhile, and what it has saved is never behind them.
+        answered = {entry.port: self._answered(entry) for entry in self.inputs}
+        sent = {output.port: output.publisher.last() for output in self.outputs}
         content = board.state(self.region)
         is_ours = content is not None and content[: len(self.MAGIC)] == self.MAGIC
         if content is not None and not is_ours and self.inputs:
@@ -1315,7 +1318,7 @@ class _Store:
         if is_ours:
             n_head, at = struct.unpack_from("<Q", content, 8)[0], 16 + struct.unpack_from("<Q", content, 8)[0]
             saved = json.loads(content[16 : 16 + n_head])
-            if not self._is_old(saved):
+            if not self._is_old(saved, {port: key for port, (key, _) in answered.items()}, sent):
                 for entry in self.inputs:
                     epoch, seq, *counts = saved["inputs"].get(entry.port, [None, None, 0, 0, 0, 0, 0])
                     entry.last, entry.counts = _key(epoch, seq), counts
@@ -1331,29 +1334,28 @@ class _Store:
                 return content[at:], saved["done"]
             log.info("the saved state is older than the last samples of this node: it begins anew")
         for entry in self.inputs:
-            if entry.subscriber.cell is not None:
-                entry.last, entry.counts = board.answered(entry.subscriber.cell)
+            entry.last, entry.counts = answered[entry.port]
         for output in self.outputs:
-            output.restore([], output.publisher.last(), None)
+            output.restore([], sent[output.port], None)
         return None, False
 
-    def _is_old(self, saved: dict[str, Any]) -> bool:
+    def _answered(self, entry: _Input) -> tuple[Key | None, Sequence[int]]:
+        cell = entry.subscriber.cell
+        return (None, [0] * 5) if cell is None else self.operator.board.answered(cell)
+
+    def _is_old(self, saved: dict[str, Any], answered: dict[str, Key | None], sent: dict[str, Key | None]) -> bool:
         """Whether another operator was active since, which does not save like this one."""
-        board = self.operator.board
         for entry in self.inputs:
-            if entry.subscriber.cell is None:
-                continue
             epoch, seq, *_ = saved["inputs"].get(entry.port, [None, None])
-            last, answered = _key(epoch, seq), board.answered(entry.subscriber.cell)[0]
-            sent = board.sent(entry.subscriber.writer_cell)
-            if answered is not None and not _is_at_most(answered, last):
+            last, place = _key(epoch, seq), answered[entry.port]
+            if place is not None and not _is_at_most(place, last):
                 # A sample of the next epoch may have been saved and not marked as answered yet.
-                if last is None or answered[0] == last[0] or (sent is not None and sent[0] != last[0]):
+                written = self.operator.board.sent(entry.subscriber.writer_cell)
+                if last is None or place[0] == last[0] or (written is not None and written[0] != last[0]):
                     return True
-        for output in [] if self.inputs else self.outputs:
-            epoch, seq, *_ = saved["outputs"].get(output.port, [None, None])
-            sent = output.publisher.last()
-            if sent is not None and not _is_at_most(sent, _key(epoch, seq)):
+        for port, place in () if self.inputs else sent.items():
+            epoch, seq, *_ = saved["outputs"].get(port, [None, None])
+            if place is not None and not _is_at_most(place, _key(epoch, seq)):
                 return True
         return False
 
