@@ -1,4 +1,4 @@
-"""An operator of blindgrasp in Python: takes samples from one input, answers each on one output.
+"""An operator of blindgrasp in Python: a stage that answers samples, or a source that has samples of its own.
 
     DESCRIPTION = Description("mine", "Judges each frame", ("feature", GraspFeature), ("prediction", Prediction))
 
@@ -9,10 +9,14 @@
 
     run(DESCRIPTION, start)
 
+With several inputs, `answer` gets the name of the input first. With several outputs, it returns a dict with an answer by
+output. A source has no input, and `start` returns a `Source` whose `next` returns samples.
+
 `run` does what an operator in Rust does: it can be killed, stopped, restarted and swapped without a sample being lost,
 repeated or re-ordered. The protocol is described in docs/operators.md. Needs `iceoryx2` (requirements.txt), and gives items as
-numpy arrays if numpy is there. What it does not do: sources, operators with several inputs or outputs, answers when nothing
-comes. If there is a folder `.venv` beside the program and no environment is active, the program runs in it.
+numpy arrays if numpy is there. What it does not do: partner inputs, optional inputs, feedback, operators without an output,
+answers when nothing comes. If there is a folder `.venv` beside the program and no environment is active, the program runs in
+it.
 """
 
 from __future__ import annotations
@@ -38,7 +42,7 @@ import time
 import traceback
 from collections import deque
 from pathlib import Path
-from typing import Any, Callable, Iterator, Sequence
+from typing import Any, Callable, Iterable, Iterator, Sequence
 
 from blindgrasp_messages import Fault, Message
 
@@ -61,6 +65,8 @@ LONGEST_TRY_NANOS = 5_000_000
 ORPHAN_LIMIT_SECS = 3
 # A standby reports that it is warm after so many samples.
 N_WARM = 8
+# The largest saved state of a node, with the samples that readers may still need.
+STATE_BYTES = 64 << 10
 
 log = logging.getLogger("blindgrasp")
 
@@ -98,18 +104,50 @@ class Param:
 
 @dataclasses.dataclass
 class Description:
-    """The description of an operator."""
+    """The description of an operator. A port is its name and its message.
+
+    Give `input` and `output`, or lists: `inputs`, which is empty for a source, and `outputs`. The name of an input may follow
+    the message of an output, like `("tactile", TactileFrame, "hand")`: that output answers each sample of this input under the
+    number of the sample. All other outputs of an operator with several ports are numbered one by one, and need not answer
+    each sample.
+    """
 
     operator: str
     summary: str
-    input: tuple[str, type[Message]]
-    """The input port's name and message."""
-    output: tuple[str, type[Message]]
-    """The output port's name and message."""
+    input: tuple[str, type[Message]] | None = None
+    output: tuple[str, type[Message]] | None = None
     params: Sequence[Param] = ()
     version: str = "0.1.0"
-    answers_each: bool = True
-    """It answers each sample with one of the same number and has no state. Set it to False for a stage with `state`."""
+    answers_each: bool | None = None
+    """It answers each sample with one of the same number on each output, and has no state. The default is True for an operator
+    with one input. Set it to False for a stage with `state`."""
+    inputs: Sequence[tuple[str, type[Message]]] = ()
+    outputs: Sequence[tuple[str, type[Message]] | tuple[str, type[Message], str]] = ()
+
+    def __post_init__(self) -> None:
+        if (self.input and self.inputs) or (self.output and self.outputs):
+            raise ValueError("a Description has both one port and a list of them: expected `input` or `inputs`, `output` or `outputs`")
+        self.inputs = [self.input] if self.input else list(self.inputs)
+        outputs = [self.output] if self.output else list(self.outputs)
+        self.outputs = [output[:2] for output in outputs]
+        self.answered_inputs: dict[str, str | None] = {output[0]: output[2] if len(output) > 2 else None for output in outputs}
+        """By output, the input that it answers each sample of."""
+        if not self.outputs:
+            raise ValueError(f"{self.operator} has no output: expected at least one")
+        for ports in (self.inputs, self.outputs):
+            names = [name for name, _ in ports]
+            if len(set(names)) < len(names):
+                raise ValueError(f"{self.operator} has two ports of one name, expected different names: {', '.join(names)}")
+        for output, answered in self.answered_inputs.items():
+            if answered is not None and answered not in [name for name, _ in self.inputs]:
+                raise ValueError(f"output {output} answers the input {answered}, which {self.operator} does not have")
+        if self.answers_each is None:
+            self.answers_each = len(self.inputs) == 1
+        if self.answers_each and len(self.inputs) != 1:
+            raise ValueError(
+                f"{self.operator} has {len(self.inputs)} inputs and answers_each=True: expected one input, because the nodes before "
+                "it would take the numbers of one input for those of another; leave answers_each out"
+            )
 
     def to_json(self) -> dict[str, Any]:
         port = lambda name, message: {"name": name, "type": message.TYPE_NAME}  # noqa: E731
@@ -120,8 +158,8 @@ class Description:
             "operator": self.operator,
             "version": self.version,
             "summary": self.summary,
-            "inputs": [port(*self.input)],
-            "outputs": [port(*self.output)],
+            "inputs": [port(*one) for one in self.inputs],
+            "outputs": [port(*one) for one in self.outputs],
             "params": params,
         } | ({"answers_each": True} if self.answers_each else {})
 
@@ -132,25 +170,81 @@ class Stage:
 
     `answer` gets a sample's head and items, both its own copies, and returns the answer's head, or head and items. The
     answer's `header` is filled in. It must answer a sample the same whenever it is asked: after a restart, some are asked again.
+
+    With several inputs, `answer` gets the name of the sample's input before head and items. With several outputs, it returns a
+    dict of answers by output, and may leave out outputs that need not answer each sample.
     """
 
-    answer: Callable[[Any, Any], Any] | None = None
+    answer: Callable[..., Any] | None = None
     answer_many: Callable[[list[Any], list[Any]], list[Any]] | None = None
     """Instead of `answer`, for models that judge many samples in about the time of one: it gets all samples that have come, and
-    returns as many answers in the same order."""
+    returns as many answers in the same order. For operators with one input."""
     max_batch: int = 32
     """The most samples that `answer_many` gets."""
-    max_items: int = 0
-    """The most items that an answer has."""
+    max_items: int | dict[str, int] = 0
+    """The most items that an answer has; of several outputs, a number for all or a dict."""
     identity: dict[str, str] = dataclasses.field(default_factory=dict)
     """Its neighbours, and an instance that takes its place, must have the same values, like {"hand": "0123456789abcdef"}."""
     set: Callable[[dict[str, Any]], None] | None = None
     """Called with the new values of live parameters before `start`'s params are updated; an exception refuses them."""
     state: Callable[[], bytes] | None = None
-    """With state: the bytes on which the next answer depends, saved after each sample; at most 64 KiB. `answer` may then
-    return None for no answer, and numbers the headers of its answers itself."""
+    """With state: the bytes on which the next answer depends, saved after each sample. With the answers that readers may still
+    need, they may take 64 KiB. `answer` may then return None for no answer, and with one input and one output it numbers the
+    headers of its answers itself."""
     restore: Callable[[bytes | None], None] | None = None
     """With state: takes over the bytes that `state` returned, here or in another process, or begins anew."""
+
+
+@dataclasses.dataclass
+class Source:
+    """The samples of an operator without an input.
+
+    `next` returns a head, or head and items, or a dict of these by output; None if it has nothing yet; and raises
+    StopIteration at the end, like the `__next__` of a generator. It is asked from one thread and must not take longer than the
+    node's heartbeat. The time at which a sample is sent is filled in.
+
+    A source is one of two kinds:
+
+    * With `resume` it can give its samples again, like a recording. It numbers them itself: `header.seq` grows within an
+      `epoch`. It has to give the same samples again, and those that readers have are dropped.
+    * Without `resume`, its samples come once, like those of a device. They are numbered one by one, and each is saved before
+      it is sent, until all readers have answered it. An instance that takes over goes on after the last number.
+    """
+
+    next: Callable[[], Any]
+    resume: Callable[[dict[str, Key | None]], None] | None = None
+    """Goes back, before the first call of `next` and whenever another instance was active: it gets the epoch and number of the
+    last sample of each output that readers have, or None, and `next` goes on with that sample or any before it."""
+    state: Callable[[], bytes] | None = None
+    """Without `resume`: the bytes on which the next sample depends, saved with each sample. With the samples that readers may
+    still need, they may take 64 KiB."""
+    restore: Callable[[bytes | None], None] | None = None
+    """Takes over the bytes that `state` returned, here or in another process, or begins anew."""
+    open: Callable[[], None] | None = None
+    """Called before anything else when the instance becomes active: opens a device, for example."""
+    close: Callable[[], None] | None = None
+    """Lets go of what another instance needs, such as a device: called when another instance takes over, and at the end."""
+    max_items: int | dict[str, int] = 0
+    """The most items that a sample has; of several outputs, a number for all or a dict."""
+    identity: dict[str, str] = dataclasses.field(default_factory=dict)
+    """As of a Stage."""
+    set: Callable[[dict[str, Any]], None] | None = None
+    """As of a Stage."""
+    pause_secs: float = 0.005
+    """After None, `next` is called again after so long."""
+
+    def __post_init__(self) -> None:
+        self._n_lost: dict[str | None, int] = {}
+        if self.resume is not None and (self.state is not None or self.restore is not None):
+            raise ValueError("a Source has `resume` and a state: expected one of them, because `resume` says where it goes on")
+        if (self.state is None) != (self.restore is None):
+            raise ValueError("a Source has one of `state` and `restore`: expected both or neither")
+
+    def lost(self, n: int = 1, port: str | None = None) -> None:
+        """Leaves out numbers before the next sample of an output, or of all: readings were lost, and readers find a gap."""
+        if self.resume is not None:
+            raise RuntimeError("a source with `resume` numbers its samples itself: leave out a number for what was lost")
+        self._n_lost[port] = self._n_lost.get(port, 0) + n
 
 
 def fault_of(head: Any) -> Fault:
@@ -228,7 +322,7 @@ class _Board:
     leaves the record before or the record after.
     """
 
-    HEADER_BYTES, CELL_BYTES, STATE_BYTES, SLOTS_AT = 4096, 128, 64 << 10, 4096
+    HEADER_BYTES, CELL_BYTES, SLOTS_AT = 4096, 128, 4096
     REGION_BYTES = SLOTS_AT + 2 * STATE_BYTES
     MAGIC, LAYOUT = int.from_bytes(b"bg-board", "big"), 4
     N_AGE_BUCKETS = 384
@@ -351,12 +445,12 @@ class _Board:
         os.posix_fallocate(self.file.fileno(), self._region(region), self.REGION_BYTES)
 
     def save_state(self, region: int, state: bytes) -> None:
-        if len(state) > self.STATE_BYTES:
-            raise RuntimeError(f"its state takes {len(state)} bytes, more than the {self.STATE_BYTES} that are there")
+        if len(state) > STATE_BYTES:
+            raise RuntimeError(f"its state takes {len(state)} bytes, more than the {STATE_BYTES} that are there")
         at = self._region(region)
         n_saved = self.words[at // 8] + 1
         slot = n_saved % 2
-        slot_at = at + self.SLOTS_AT + slot * self.STATE_BYTES
+        slot_at = at + self.SLOTS_AT + slot * STATE_BYTES
         self.bytes[slot_at : slot_at + len(state)] = state
         self.words[at // 8 + 1 + slot] = len(state)
         self.words[at // 8] = n_saved
@@ -368,8 +462,8 @@ class _Board:
             if n_saved == 0:
                 return None
             slot = n_saved % 2
-            slot_at = at + self.SLOTS_AT + slot * self.STATE_BYTES
-            state = self.bytes[slot_at : slot_at + min(self.words[at // 8 + 1 + slot], self.STATE_BYTES)]
+            slot_at = at + self.SLOTS_AT + slot * STATE_BYTES
+            state = self.bytes[slot_at : slot_at + min(self.words[at // 8 + 1 + slot], STATE_BYTES)]
             if self.words[at // 8] == n_saved:
                 return state
 
@@ -798,7 +892,7 @@ class _Sender:
     def send(self, head: Any, raw_items: bytes) -> None:
         n_items = len(raw_items) // ctypes.sizeof(self.service.message.Item)
         if n_items > self.max_items:
-            raise RuntimeError(f"an answer has {n_items} items, more than Stage(max_items={self.max_items}) says")
+            raise RuntimeError(f"a sample has {n_items} items, more than max_items={self.max_items} says")
         sample = self.publisher.loan_slice_uninit(n_items)
         ctypes.memmove(sample.user_header_ptr, ctypes.addressof(head), ctypes.sizeof(head))
         ctypes.memmove(sample.payload_ptr, raw_items, len(raw_items))
@@ -911,6 +1005,19 @@ class _Publisher:
                 for cell in guest_cells:
                     self.board.give_up(cell)
 
+    def give_up_guests_alone_at(self, key: Key, waited_nanos: int) -> bool:
+        """Whether guests alone have not answered a sample that was sent. They are given up after their time."""
+        last = self.last()
+        is_behind = lambda place: not _is_at_most(key, place) and (place is None or last is None or place[0] != last[0] or place[0] == key[0])  # noqa: E731
+        behind = [consumer for consumer in self.consumers if any(map(is_behind, self._places([consumer])))]
+        if not behind or not all(consumer.get("guest_cells") for consumer in behind):
+            return False
+        for consumer in behind:
+            if waited_nanos > consumer.get("guest_limit_millis", 0) * 1_000_000:
+                for cell in consumer["guest_cells"]:
+                    self.board.give_up(cell)
+        return True
+
     def _wait_for_room(self, key: Key) -> bool:
         start = last_look = last_try = _now_nanos()
         waited = 0
@@ -937,42 +1044,350 @@ class _Publisher:
         return True
 
 
-class _Worker:
-    """A stage between its ports, active or standby."""
+class _Input:
+    """An input of a stage: its reader, and how far the stage has come."""
+
+    def __init__(self, operator: _Operator, port: str, message: type[Message], is_standby: bool) -> None:
+        self.port, self.message = port, message
+        wiring = operator.wiring["inputs"][port]
+        self.subscriber = _Subscriber(operator, wiring, message, is_onlooker=False)
+        self.onlooker = _Subscriber(operator, wiring, message, is_onlooker=True) if is_standby else None
+        # The last sample that the stage has answered, with the counts of that time.
+        self.last: Key | None = None
+        self.counts: Sequence[int] = [0] * 5
+
+    def has_answered(self, sample: _Sample) -> None:
+        # A sample that goes back in order is answered, but does not move the cursor.
+        self.last = self.last if _is_at_most(sample.key, self.last) else sample.key
+        self.counts = sample.counts
+
+
+class _Output:
+    """An output: its publisher, and the samples that were saved before they were sent, until all readers have answered them."""
+
+    def __init__(
+        self, operator: _Operator, port: str, message: type[Message], max_items: int | dict[str, int], is_standby: bool
+    ) -> None:
+        self.port, self.message = port, message
+        wiring = operator.wiring["outputs"][port]
+        n_items = max_items.get(port, 0) if isinstance(max_items, dict) else max_items
+        self.publisher = _Publisher(operator, wiring, message, n_items)
+        self.shadow = _Sender(operator, wiring["shadow"], [COMPARE_BELL], message, n_items) if is_standby else None
+        self.max_bytes = _ENTRY.size + ctypes.sizeof(message.Head) + self.publisher.sender.max_items * ctypes.sizeof(message.Item)
+        # Up to this sample, readers have all that an earlier instance has sent.
+        self.known: Key | None = None
+        # The last sample that was saved.
+        self.last: Key | None = None
+        self.saved: deque[tuple[Key, bytes]] = deque()
+        self.n_sent = 0
+
+    def known_at(self, is_handed_over: bool) -> Key | None:
+        """The last sample that need not be sent again."""
+        return self.publisher.last() if is_handed_over else self.publisher.answered()
+
+    def keep(self, head: Any, raw_items: bytes) -> None:
+        """Takes a sample that is to be saved and then sent."""
+        raw_head = bytes(head)
+        self.last = (head.header.epoch, head.header.seq)
+        self.saved.append((self.last, _ENTRY.pack(len(raw_head), len(raw_items)) + raw_head + raw_items))
+
+    def send_saved(self) -> bool:
+        """Sends the saved samples that were not sent; false if it was asked to give way meanwhile."""
+        while self.n_sent < len(self.saved):
+            packed = self.saved[self.n_sent][1]
+            items_at = _ENTRY.size + _ENTRY.unpack_from(packed)[0]
+            if not self.publisher.send(self.message.Head.from_buffer_copy(packed, _ENTRY.size), packed[items_at:]):
+                return False
+            self.n_sent += 1
+        return True
+
+    def forget(self) -> bool:
+        """Drops the samples that were sent and that all readers have answered; true if there was one."""
+        if not self.n_sent:
+            return False
+        has_readers, answered = self.publisher.answered_by_readers()
+        n_forgotten = min(self.n_sent, self._n_up_to(answered) if has_readers else self.n_sent)
+        for _ in range(n_forgotten):
+            self.saved.popleft()
+        self.n_sent -= n_forgotten
+        return n_forgotten > 0
+
+    def restore(self, saved: Sequence[bytes], last: Key | None, known: Key | None) -> None:
+        """Takes over saved samples; those up to `known` need not be sent again."""
+        header = lambda packed: self.message.Head.from_buffer_copy(packed, _ENTRY.size).header  # noqa: E731
+        self.saved = deque(((header(packed).epoch, header(packed).seq), packed) for packed in saved)
+        self.last, self.n_sent = last, self._n_up_to(known)
+
+    def _n_up_to(self, key: Key | None) -> int:
+        """The number of saved samples up to that one. They are in order, and one that is not there is older than all."""
+        for n in range(len(self.saved), 0, -1):
+            if self.saved[n - 1][0] == key:
+                return n
+        return 0
+
+
+# Of a saved sample, the length of its head and of its items.
+_ENTRY = struct.Struct("<2Q")
+
+
+class _Instance:
+    """An operator between its ports, active or standby."""
+
+    def __init__(self, operator: _Operator, description: Description, work: Stage | Source, params: dict[str, Any]) -> None:
+        self.operator, self.description, self.work, self.params = operator, description, work, params
+        is_standby = operator.wiring["standby"]
+        self.inputs = [_Input(operator, port, message, is_standby) for port, message in description.inputs]
+        # A source that stands by sends nothing for comparison.
+        is_compared = is_standby and bool(self.inputs)
+        outputs = [_Output(operator, port, message, work.max_items, is_compared) for port, message in description.outputs]
+        self.outputs = {output.port: output for output in outputs}
+        self.is_active = not is_standby
+
+    def obey(self, command: dict[str, Any]) -> None:
+        if command["command"] == "take_over":
+            for entry in self.inputs:
+                if entry.onlooker is not None:
+                    entry.onlooker.close()
+                    entry.onlooker = None
+            for output in self.outputs.values():
+                if output.shadow is not None:
+                    output.shadow.close()
+                    output.shadow = None
+            self.take_over(command["is_handed_over"])
+            self.is_active = True
+            _report("took_over")
+        elif command["command"] == "hand_over":
+            self.is_active = False
+            self.hand_over()
+            _report("handed_over")
+        elif command["command"] == "set":
+            from_seq, error = self.next_seq(), None
+            try:
+                if self.work.set is not None:
+                    self.work.set(command["params"])
+                self.params.update(command["params"])
+                self.operator.has_params(command["params"])
+            except Exception as refusal:
+                error = _in_words(refusal)
+            _report("set", id=command["id"], from_seq=from_seq, error=error)
+
+    def take_over(self, is_handed_over: bool) -> None:
+        raise NotImplementedError
+
+    def hand_over(self) -> None:
+        pass
+
+    def next_seq(self) -> int | None:
+        raise NotImplementedError
+
+    def look(self) -> None:
+        """Lets the publishers look for readers that have come back, and the subscribers for their writers."""
+        for output in self.outputs.values():
+            output.publisher.sender.look_for_readers()
+        for entry in self.inputs:
+            entry.subscriber.connect()
+
+    def is_interrupted(self) -> bool:
+        return self.operator.has_command() or self.operator.is_to_quit
+
+    def by_output(self, said: Any) -> list[tuple[_Output, Any, bytes]]:
+        """What a stage or a source has returned, as output, copy of the head, bytes of the items."""
+        if said is None:
+            return []
+        if not isinstance(said, dict):
+            if len(self.outputs) > 1:
+                names = ", ".join(self.outputs)
+                raise RuntimeError(f"it returned {type(said).__name__}, expected a dict with a sample by output: {names}")
+            said = dict.fromkeys(self.outputs, said)
+        samples = []
+        for port, sample in said.items():
+            output = self.outputs.get(port)
+            if output is None:
+                raise RuntimeError(f"it returned a sample for the output {port!r}, expected one of {', '.join(self.outputs)}")
+            if sample is None:
+                continue
+            head, items = sample if isinstance(sample, tuple) else (sample, None)
+            expected = output.message.Head
+            if not isinstance(head, expected):
+                raise RuntimeError(f"a head for the output {port} is {type(head).__name__}, expected {expected.__name__}")
+            samples.append((output, expected.from_buffer_copy(head), _raw(output.message.Item, items)))
+        return samples
+
+
+class _Store:
+    """What an instance saves for the one that takes over: how far it has come, samples that readers may still need, its state.
+
+    It is saved as a whole, before the samples are sent: a kill at any moment neither loses a sample nor makes another one
+    under its number.
+    """
+
+    MAGIC = b"bg-py-1\0"
+    # The part of fixed length has so many bytes for each port: the name, the numbers, the counts.
+    PORT_BYTES = 320
+
+    def __init__(self, instance: _Instance, state: Callable[[], bytes] | None) -> None:
+        self.operator, self.state = instance.operator, state
+        self.inputs, self.outputs = instance.inputs, list(instance.outputs.values())
+        self.region: int = self.operator.wiring["state_region"]
+        self.n_head_bytes = 64 + self.PORT_BYTES * (len(self.inputs) + len(self.outputs))
+        self.operator.board.reserve_state(self.region)
+
+    def save(self, is_done: bool = False) -> bool:
+        """Saves all; false if it was asked to give way while it waited for readers of samples that must stay saved."""
+        own = b"" if self.state is None else bytes(self.state())
+        while True:
+            for output in self.outputs:
+                output.forget()
+            inputs = {entry.port: [*(entry.last or (None, None)), *entry.counts] for entry in self.inputs}
+            outputs = {output.port: [*(output.last or (None, None)), len(output.saved)] for output in self.outputs}
+            head = json.dumps({"inputs": inputs, "outputs": outputs, "done": is_done}).encode().ljust(self.n_head_bytes)
+            samples = [packed for output in self.outputs for _, packed in output.saved]
+            content = b"".join([self.MAGIC, struct.pack("<Q", len(head)), head, *samples, own])
+            if len(content) <= STATE_BYTES:
+                self.operator.board.save_state(self.region, content)
+                return True
+            if not any(output.n_sent for output in self.outputs):
+                raise RuntimeError(
+                    f"its state takes {len(own)} bytes and the answers to one sample {sum(map(len, samples))}, expected at most "
+                    f"{STATE_BYTES - self.n_head_bytes - 16} together"
+                )
+            if not self.wait_for_readers():
+                return False
+
+    def wait_for_room(self, n_bytes: int) -> bool:
+        """Waits until samples of so many bytes may be saved; false if it was asked to give way or to stop meanwhile."""
+        while True:
+            n_saved = sum(len(packed) for output in self.outputs for _, packed in output.saved)
+            if self.n_head_bytes + 16 + n_saved + n_bytes <= STATE_BYTES or not any(output.n_sent for output in self.outputs):
+                return True
+            if not self.wait_for_readers(may_stop=True):
+                return False
+
+    def wait_for_readers(self, may_stop: bool = False) -> bool:
+        """Waits until all readers have answered one of the saved samples; false if it was asked to give way meanwhile."""
+        start = last_look = last_try = _now_nanos()
+        slow = [output for output in self.outputs if output.n_sent]
+        waited = [0] * len(slow)
+        limit_millis = slow[0].publisher.wait_limit_millis
+        try:
+            while not any([output.forget() for output in slow]):
+                if self.operator.is_to_give_way() or (may_stop and self.operator.should_stop()):
+                    return False
+                now = _now_nanos()
+                for idx, output in enumerate(slow):
+                    is_guest = output.publisher.give_up_guests_alone_at(output.saved[0][0], waited[idx])
+                    waited[idx] = waited[idx] + min(now - last_try, LONGEST_TRY_NANOS) if is_guest else 0
+                last_try = now
+                if now - start > limit_millis * 1_000_000:
+                    names = ", ".join(output.publisher.sender.service.name for output in slow)
+                    raise RuntimeError(
+                        f"port {names}: no saved sample was answered within {limit_millis} ms: a reader is stopped or too slow"
+                    )
+                if now - last_look > LOOK_PAUSE_NANOS:
+                    last_look = now
+                    for output in slow:
+                        output.publisher.sender.look_for_readers()
+                time.sleep(RETRY_PAUSE_SECS)
+        finally:
+            for output in slow:
+                output.publisher.board.add_blocked(output.publisher.cell, _now_nanos() - start)
+        return True
+
+    def send(self) -> bool:
+        """Sends the saved samples that were not sent; false if it was asked to give way meanwhile."""
+        return all(output.send_saved() for output in self.outputs)
+
+    def restore(self, is_handed_over: bool) -> tuple[bytes | None, bool]:
+        """Takes over what the node's active instance has saved last. Returns the bytes of its state, None if there are none,
+        and whether its source had ended.
+
+        What another operator has saved says nothing: a source then goes on after the last sample that was sent, a stage after
+        the last one that was answered.
+        """
+        board = self.operator.board
+        # The places come first: for a standby, the active instance goes on meanwhile, and what it has saved is never behind them.
+        answered = {entry.port: self._answered(entry) for entry in self.inputs}
+        sent = {output.port: output.publisher.last() for output in self.outputs}
+        content = board.state(self.region)
+        is_ours = content is not None and content[: len(self.MAGIC)] == self.MAGIC
+        if content is not None and not is_ours and self.inputs:
+            raise RuntimeError(
+                "the node's state was saved by an operator in another language or of another version, expected one of this module: "
+                "start the graph with this operator instead"
+            )
+        if is_ours:
+            n_head, at = struct.unpack_from("<Q", content, 8)[0], 16 + struct.unpack_from("<Q", content, 8)[0]
+            saved = json.loads(content[16 : 16 + n_head])
+            if not self._is_old(saved, {port: key for port, (key, _) in answered.items()}, sent):
+                for entry in self.inputs:
+                    epoch, seq, *counts = saved["inputs"].get(entry.port, [None, None, 0, 0, 0, 0, 0])
+                    entry.last, entry.counts = _key(epoch, seq), counts
+                outputs = {output.port: output for output in self.outputs}
+                for port, (epoch, seq, n_samples) in saved["outputs"].items():
+                    samples = []
+                    for _ in range(n_samples):
+                        end = at + _ENTRY.size + sum(_ENTRY.unpack_from(content, at))
+                        samples.append(content[at:end])
+                        at = end
+                    if port in outputs:
+                        outputs[port].restore(samples, _key(epoch, seq), outputs[port].known_at(is_handed_over))
+                return content[at:], saved["done"]
+            log.info("the saved state is older than the last samples of this node: it begins anew")
+        for entry in self.inputs:
+            entry.last, entry.counts = answered[entry.port]
+        for output in self.outputs:
+            output.restore([], sent[output.port], None)
+        return None, False
+
+    def _answered(self, entry: _Input) -> tuple[Key | None, Sequence[int]]:
+        cell = entry.subscriber.cell
+        return (None, [0] * 5) if cell is None else self.operator.board.answered(cell)
+
+    def _is_old(self, saved: dict[str, Any], answered: dict[str, Key | None], sent: dict[str, Key | None]) -> bool:
+        """Whether another operator was active since, which does not save like this one."""
+        for entry in self.inputs:
+            epoch, seq, *_ = saved["inputs"].get(entry.port, [None, None])
+            last, place = _key(epoch, seq), answered[entry.port]
+            if place is not None and not _is_at_most(place, last):
+                # A sample of the next epoch may have been saved and not marked as answered yet.
+                written = self.operator.board.sent(entry.subscriber.writer_cell)
+                if last is None or place[0] == last[0] or (written is not None and written[0] != last[0]):
+                    return True
+        for port, place in () if self.inputs else sent.items():
+            epoch, seq, *_ = saved["outputs"].get(port, [None, None])
+            if place is not None and not _is_at_most(place, _key(epoch, seq)):
+                return True
+        return False
+
+
+def _key(epoch: int | None, seq: int | None) -> Key | None:
+    return None if epoch is None or seq is None else (epoch, seq)
+
+
+class _StageInstance(_Instance):
+    """A stage between its ports."""
+
+    work: Stage
 
     def __init__(self, operator: _Operator, description: Description, stage: Stage, params: dict[str, Any]) -> None:
-        self.operator, self.stage, self.params = operator, stage, params
-        (input_port, self.message_in), (output_port, self.message_out) = description.input, description.output
-        self.input_wiring = operator.wiring["inputs"][input_port]
-        self.output_wiring = operator.wiring["outputs"][output_port]
-        self.subscriber = _Subscriber(operator, self.input_wiring, self.message_in, is_onlooker=False)
-        self.publisher = _Publisher(operator, self.output_wiring, self.message_out, stage.max_items)
-        self.shadow: tuple[_Subscriber, _Sender] | None = None
+        super().__init__(operator, description, stage, params)
         self.n_looked_on = 0
         self.last: Key | None = None
-        # The answers of a stage with state, as head and items: they are saved with it until all readers have answered them.
-        self.outbox: deque[tuple[bytes, bytes]] = deque()
-        self.n_sent = 0
-        self.region: int = operator.wiring["state_region"]
-        self.has_state = stage.state is not None
-        if self.has_state:
-            operator.board.reserve_state(self.region)
         self.skip = {(sample["epoch"], sample["seq"]) for sample in operator.wiring.get("skip", [])}
         """Samples that have killed earlier instances again and again."""
-        self.is_active = not operator.wiring["standby"]
+
+    def begin(self) -> None:
         if self.is_active:
             self.take_over(is_handed_over=False)
         else:
-            onlooker = _Subscriber(operator, self.input_wiring, self.message_in, is_onlooker=True)
-            last, _, _ = self.restore()
-            if last is not None:
-                onlooker.begin_with(_Sequencer(onlooker.may_hold).resume(last, last, [0] * 5))
-            self.shadow = (onlooker, _Sender(operator, self.output_wiring["shadow"], [COMPARE_BELL], self.message_out, stage.max_items))
-        self.subscriber.connect()
+            self.stand_by()
+        for entry in self.inputs:
+            entry.subscriber.connect()
 
     def work_until_stopped(self) -> None:
         operator = self.operator
-        _report("ready", identity=self.stage.identity, has_state=self.has_state)
+        self.begin()
+        _report("ready", identity=self.work.identity, has_state=self.has_state)
         next_look = 0
         while True:
             # The request is read before the input: samples that were sent before the request are still answered.
@@ -980,188 +1395,399 @@ class _Worker:
             while operator.has_command():
                 self.obey(operator.commands.popleft())
             if self.is_active:
-                self.work()
-            elif self.shadow is not None:
-                self.look_on(*self.shadow)
-            if operator.is_to_quit or (stop and (not self.is_active or self.subscriber.is_caught_up())):
+                self.answer_all()
+            else:
+                self.look_on()
+            is_caught_up = not self.is_active or all(entry.subscriber.is_caught_up() for entry in self.inputs)
+            if operator.is_to_quit or (stop and is_caught_up):
                 break
             if _now_nanos() >= next_look:
                 next_look = _now_nanos() + TICK_NANOS
-                self.publisher.sender.look_for_readers()
-                self.subscriber.connect()
-            operator.wait(self.subscriber.sequencer.deadline() if self.is_active else None)
-        operator.drained(self.publisher.sender.look_for_readers)
+                self.look()
+            deadlines = [entry.subscriber.sequencer.deadline() for entry in self.inputs] if self.is_active else []
+            operator.wait(min((deadline for deadline in deadlines if deadline is not None), default=None))
+        operator.drained(self.look)
 
-    def obey(self, command: dict[str, Any]) -> None:
-        if command["command"] == "take_over":
-            if self.shadow is not None:
-                for port in self.shadow:
-                    port.close()
-                self.shadow = None
-            self.take_over(command["is_handed_over"])
-            self.is_active = True
-            _report("took_over")
-        elif command["command"] == "hand_over":
-            self.is_active = False
-            _report("handed_over")
-        elif command["command"] == "set":
-            error = None
-            try:
-                if self.stage.set is not None:
-                    self.stage.set(command["params"])
-                self.params.update(command["params"])
-                self.operator.has_params(command["params"])
-            except Exception as refusal:
-                error = _in_words(refusal)
-            from_seq = None if self.last is None else self.last[1] + 1
-            _report("set", id=command["id"], from_seq=from_seq, error=error)
+    has_state = False
 
-    def work(self) -> None:
+    def stand_by(self) -> None:
+        pass
+
+    def answer_all(self) -> None:
         """Answers the samples that are there."""
-        operator = self.operator
-        if not self.send_outbox():
-            return
-        while not operator.has_command() and not operator.is_to_quit and (samples := self.take(self.subscriber)):
-            operator.beat()
-            for idx, (sample, answers) in enumerate(self.answers(samples)):
-                if self.has_state:
-                    # Saved first: a kill at any moment neither loses an answer nor makes another one under its number.
-                    self.outbox.extend((bytes(head), raw_items) for head, raw_items in answers)
-                    self.save(sample)
-                    if not self.send_outbox():
-                        return
-                for head, raw_items in [] if self.has_state else answers:
-                    if not self.publisher.send(head, raw_items):
-                        # Another instance finds the sample in its own queue; this one finds it here if it is active again.
-                        self.subscriber.put_back = samples[idx:]
-                        return
-                self.last = sample.key
-                self.subscriber.commit(sample)
+        raise NotImplementedError
 
-    def look_on(self, subscriber: _Subscriber, sender: _Sender) -> None:
+    def answers(self, entry: _Input, samples: list[_Sample]) -> Iterator[tuple[_Sample, list[tuple[_Output, Any, bytes]]]]:
+        """Each sample with the answers of the stage."""
+        raise NotImplementedError
+
+    def next_seq(self) -> int | None:
+        return None if self.last is None else self.last[1] + 1
+
+    def look_on(self) -> None:
         """Computes live samples beside the active instance."""
         operator = self.operator
-        while not operator.has_command() and not operator.should_stop() and (samples := self.take(subscriber)):
-            operator.beat()
-            for _, answers in self.answers(samples):
-                for head, raw_items in answers:
-                    sender.send(head, raw_items)
-                self.n_looked_on += 1
-                if self.n_looked_on == N_WARM:
-                    _report("warm", n_samples=N_WARM)
+        is_over = lambda: operator.has_command() or operator.should_stop()  # noqa: E731
+        for entry in self.inputs:
+            while entry.onlooker is not None and not is_over() and (samples := self.take(entry.onlooker)):
+                operator.beat()
+                for _, answers in self.answers(entry, samples):
+                    for output, head, raw_items in answers:
+                        if output.shadow is not None:
+                            output.shadow.send(head, raw_items)
+                    self.n_looked_on += 1
+                    if self.n_looked_on == N_WARM:
+                        _report("warm", n_samples=N_WARM)
 
     def take(self, subscriber: _Subscriber) -> list[_Sample]:
         """The samples that are there, as many as are answered at once."""
-        max_batch = self.stage.max_batch if self.stage.answer_many and not self.has_state else 1
+        max_batch = self.work.max_batch if self.work.answer_many and not self.has_state else 1
         samples: list[_Sample] = []
         while len(samples) < max_batch and (sample := subscriber.receive()) is not None:
             samples.append(sample)
         return samples
 
-    def said(self, samples: list[_Sample], heads: list[Any], items: list[Any]) -> list[Any]:
+    def name_of(self, entry: _Input, sample: _Sample) -> Key:
+        """The name of a sample for the launcher, which knows nothing of inputs: two inputs may have samples of one number."""
+        if len(self.inputs) == 1:
+            return sample.key
+        return sample.key[0] ^ _identity_of(entry.port), sample.key[1]
+
+    def said(self, entry: _Input, samples: list[_Sample], heads: list[Any], items: list[Any]) -> list[Any]:
         """The answers of the stage to samples. The launcher learns on which of them the process dies."""
         cell = self.operator.wiring["instance_cell"]
-        self.operator.board.works_on(cell, samples[0].key)
+        self.operator.board.works_on(cell, self.name_of(entry, samples[0]))
+        port = [entry.port] if len(self.inputs) > 1 else []
         try:
-            if self.stage.answer_many is None:
-                said = [self.stage.answer(head, values) for head, values in zip(heads, items)]  # type: ignore[misc]
+            if self.work.answer_many is None:
+                said = [self.work.answer(*port, head, values) for head, values in zip(heads, items)]  # type: ignore[misc]
             else:
-                said = self.stage.answer_many(heads, items)
+                said = self.work.answer_many(heads, items)
         except Exception:
             if len(samples) == 1:
                 raise
             # One by one, to find the one that it fails on.
-            one_by_one = [self.said([sample], [head], [values]) for sample, head, values in zip(samples, heads, items)]
+            one_by_one = [self.said(entry, [sample], [head], [values]) for sample, head, values in zip(samples, heads, items)]
             return [answer for answers in one_by_one for answer in answers]
         if len(said) != len(samples):
             raise RuntimeError(f"answer_many returned {len(said)} answers to {len(samples)} samples")
         self.operator.board.works_on(cell, None)
         return said
 
-    def answers(self, samples: list[_Sample]) -> Iterator[tuple[_Sample, list[tuple[Any, bytes]]]]:
-        """Each sample with the answer of the stage."""
+    def said_of_each(self, entry: _Input, samples: list[_Sample]) -> Iterator[tuple[_Sample, bool, Any]]:
+        """Each sample, whether it is to be left without an answer, and what the stage said."""
         # These are copies: a change of a head by the user must not change the number of its answer.
-        asked = [sample for sample in samples if sample.key not in self.skip]
+        asked = [sample for sample in samples if self.name_of(entry, sample) not in self.skip]
         heads = [type(sample.head).from_buffer_copy(sample.head) for sample in asked]
-        items = [_items(self.message_in.Item, sample.raw_items) for sample in asked]
-        said = iter(self.said(asked, heads, items) if asked else [])
+        items = [_items(entry.message.Item, sample.raw_items) for sample in asked]
+        said = iter(self.said(entry, asked, heads, items) if asked else [])
         for sample in samples:
-            if sample.key in self.skip:
+            is_skipped = self.name_of(entry, sample) in self.skip
+            if is_skipped:
                 # Readers find a gap: nothing is lifted on it.
                 log.error("sample %d is not answered: it has killed this operator again and again", sample.key[1])
-                yield sample, []
-                continue
-            answer = next(said)
-            if answer is None:
-                if not self.has_state:
-                    raise RuntimeError("a stage without state answers every sample, with a fault where it has nothing to say")
-                yield sample, []
-                continue
-            head, items_out = answer if isinstance(answer, tuple) else (answer, None)
-            if not isinstance(head, self.message_out.Head):
-                raise RuntimeError(f"an answer's head is {type(head).__name__}, expected {self.message_out.Head.__name__}")
-            if not self.has_state:
-                head.header = sample.head.header
-            head.header.made_by = self.operator.made_by(sample.head.header.made_by)
-            yield sample, [(head, _raw(self.message_out.Item, items_out))]
+            yield sample, is_skipped, None if is_skipped else next(said)
 
-    def send_outbox(self) -> bool:
-        """Sends the saved answers that were not sent; false if it was asked to give way meanwhile."""
-        while self.n_sent < len(self.outbox):
-            raw_head, raw_items = self.outbox[self.n_sent]
-            if not self.publisher.send(self.message_out.Head.from_buffer_copy(raw_head), raw_items):
-                return False
-            self.n_sent += 1
-        return True
 
-    def _n_up_to(self, key: Key | None) -> int:
-        """The number of saved answers up to that one. Answers are in order, and one that is not there is older than all."""
-        for n in range(len(self.outbox), 0, -1):
-            header = self.message_out.Head.from_buffer_copy(self.outbox[n - 1][0]).header
-            if key == (header.epoch, header.seq):
-                return n
-        return 0
-
-    def save(self, sample: _Sample) -> None:
-        """Saves the state that includes this sample, and the answers that readers may still need."""
-        has_readers, answered = self.publisher.answered_by_readers()
-        for _ in range(min(self.n_sent, self._n_up_to(answered) if has_readers else self.n_sent)):
-            self.outbox.popleft()
-            self.n_sent -= 1
-        state = self.stage.state()  # type: ignore[misc]
-        parts = [struct.pack("<2Q5QQ", *sample.key, *sample.counts, len(self.outbox))]
-        for raw_head, raw_items in self.outbox:
-            parts += [struct.pack("<2Q", len(raw_head), len(raw_items)), raw_head, raw_items]
-        self.operator.board.save_state(self.region, b"".join([*parts, state]))
+class _AlikeStage(_StageInstance):
+    """A stage without state and with one input: it answers each sample on each output, under the number of the sample."""
 
     def take_over(self, is_handed_over: bool) -> None:
-        known = self.publisher.last() if is_handed_over else self.publisher.answered()
-        if self.has_state:
-            self.last, counts, self.outbox = self.restore()
-            self.subscriber.take_over_at(self.last, counts)
-            self.n_sent = self._n_up_to(known)
-        else:
-            self.last = known
-            self.subscriber.take_over(self.last)
+        entry = self.inputs[0]
+        for output in self.outputs.values():
+            output.known = output.known_at(is_handed_over)
+        self.last = self._least_known(entry)
+        entry.subscriber.take_over(self.last)
 
-    def restore(self) -> tuple[Key | None, Sequence[int], deque[tuple[bytes, bytes]]]:
-        """Takes over the saved state; returns the last sample that it includes, the counts of that time, and the answers that
-        readers may still need."""
-        saved = self.operator.board.state(self.region) if self.has_state else None
-        last, counts, outbox = None, [0] * 5, deque()
-        state = None
-        if saved is not None:
-            epoch, seq, *counts, n_answers = struct.unpack_from("<8Q", saved)
-            last, at = (epoch, seq), 64
-            for _ in range(n_answers):
-                n_head, n_items = struct.unpack_from("<2Q", saved, at)
-                at += 16
-                outbox.append((saved[at : at + n_head], saved[at + n_head : at + n_head + n_items]))
-                at += n_head + n_items
-            state = saved[at:]
-        if self.stage.restore is not None:
-            self.stage.restore(state)
-        return last, counts, outbox
+    def _least_known(self, entry: _Input) -> Key | None:
+        """The last sample whose answers all readers of all outputs have."""
+        known = [output.known for output in self.outputs.values()]
+        if None in known:
+            return None
+        # An output in an earlier epoch is behind.
+        sent = self.operator.board.sent(entry.subscriber.writer_cell)
+        behind = [key for key in known if sent is None or key[0] != sent[0]]  # type: ignore[index]
+        return min(behind or known)  # type: ignore[type-var]
+
+    def answer_all(self) -> None:
+        operator, entry = self.operator, self.inputs[0]
+        while not self.is_interrupted() and (samples := self.take(entry.subscriber)):
+            operator.beat()
+            for idx, (sample, answers) in enumerate(self.answers(entry, samples)):
+                for output, head, raw_items in answers:
+                    # One output may be ahead of another: its readers have this answer.
+                    if len(self.outputs) > 1 and _is_at_most(sample.key, output.known):
+                        continue
+                    if not output.publisher.send(head, raw_items):
+                        # Another instance finds the sample in its own queue; this one finds it here if it is active again.
+                        entry.subscriber.put_back = samples[idx:]
+                        return
+                    output.known = None
+                self.last = sample.key
+                entry.subscriber.commit(sample)
+
+    def answers(self, entry: _Input, samples: list[_Sample]) -> Iterator[tuple[_Sample, list[tuple[_Output, Any, bytes]]]]:
+        for sample, is_skipped, said in self.said_of_each(entry, samples):
+            answers = self.by_output(said)
+            if not is_skipped and len(answers) < len(self.outputs):
+                raise RuntimeError(
+                    "a stage without state answers every sample on every output, with a fault where it has nothing to say"
+                )
+            for _, head, _ in answers:
+                head.header = sample.head.header
+                head.header.made_by = self.operator.made_by(sample.head.header.made_by)
+            yield sample, answers
+
+
+class _KeepingStage(_StageInstance):
+    """A stage whose answers are saved before they are sent, together with its state and the places of all its inputs."""
+
+    has_state = True
+
+    def __init__(self, operator: _Operator, description: Description, stage: Stage, params: dict[str, Any]) -> None:
+        super().__init__(operator, description, stage, params)
+        # With one input and one output, such a stage numbers its answers itself.
+        self.numbers_itself = len(self.inputs) == len(self.outputs) == 1
+        self.store = _Store(self, stage.state)
+
+    def stand_by(self) -> None:
+        self.restore(is_handed_over=False)
+        for entry in self.inputs:
+            if entry.onlooker is not None and entry.last is not None:
+                entry.onlooker.begin_with(_Sequencer(entry.onlooker.may_hold).resume(entry.last, entry.last, [0] * 5))
+
+    def take_over(self, is_handed_over: bool) -> None:
+        self.restore(is_handed_over)
+        for entry in self.inputs:
+            entry.subscriber.take_over_at(entry.last, entry.counts)
+
+    def restore(self, is_handed_over: bool) -> None:
+        state, _ = self.store.restore(is_handed_over)
+        if self.work.restore is not None:
+            self.work.restore(state)
+
+    def answer_all(self) -> None:
+        operator = self.operator
+        if not self.store.send():
+            return
+        n_idle = 0
+        while not self.is_interrupted() and n_idle < len(self.inputs):
+            # In turn, so that no input waits for another.
+            entry = self.inputs[0]
+            self.inputs.append(self.inputs.pop(0))
+            samples = self.take(entry.subscriber)
+            n_idle = 0 if samples else n_idle + 1
+            operator.beat()
+            for sample, answers in self.answers(entry, samples):
+                for output, head, raw_items in answers:
+                    output.keep(head, raw_items)
+                entry.has_answered(sample)
+                # Saved first: a kill at any moment neither loses an answer nor makes another one under its number.
+                if not (self.store.save() and self.store.send()):
+                    # If it was not saved, this instance answers it again if it is active again.
+                    entry.subscriber.put_back = [sample]
+                    return
+                self.last = sample.key
+                entry.subscriber.commit(sample)
+
+    def answers(self, entry: _Input, samples: list[_Sample]) -> Iterator[tuple[_Sample, list[tuple[_Output, Any, bytes]]]]:
+        answered = self.description.answered_inputs
+        for sample, is_skipped, said in self.said_of_each(entry, samples):
+            answers = self.by_output(said)
+            has_gap = is_skipped or sample.counts[1] > entry.counts[1]
+            has_answer = {output.port for output, _, _ in answers}
+            for port, output in self.outputs.items():
+                of_input = answered[port]
+                if of_input == entry.port and not is_skipped and port not in has_answer:
+                    raise RuntimeError(f"it did not answer on the output {port}, expected an answer to each sample of {of_input}")
+                if of_input not in (None, entry.port) and port in has_answer:
+                    raise RuntimeError(f"it answered a sample of {entry.port} on the output {port}, which answers those of {of_input}")
+                if has_gap and of_input is None and output.last is not None and not self.numbers_itself:
+                    # Readers of an output that counts must find the gap as well.
+                    output.last = (output.last[0], output.last[1] + 1)
+            made_by = self.operator.made_by(sample.head.header.made_by)
+            for output, head, _ in answers:
+                if answered[output.port] is not None:
+                    head.header = sample.head.header
+                elif not self.numbers_itself:
+                    output.last = _next_key(output, self.outputs.values())
+                    head.header = sample.head.header
+                    head.header.epoch, head.header.seq = output.last
+                head.header.made_by = made_by
+            yield sample, answers
+
+
+def _next_key(output: _Output, outputs: Iterable[_Output]) -> Key:
+    """The number of the next sample of an output that counts."""
+    if output.last is not None:
+        return output.last[0], output.last[1] + 1
+    # The first one of a node begins its epoch.
+    return next((other.last[0] for other in outputs if other.last is not None), time.time_ns()), 0
+
+
+class _SourceInstance(_Instance):
+    """A source, active or standby."""
+
+    work: Source
+
+    def __init__(self, operator: _Operator, description: Description, source: Source, params: dict[str, Any]) -> None:
+        super().__init__(operator, description, source, params)
+        self.is_placed = self.is_done = self.is_handed_over = False
+        self.has_reported_end = False
+        # With `resume`: the last sample of each output that came from it, and the one after which it goes on.
+        self.came: dict[str, Key] = {}
+        self.store = None if source.resume else _Store(self, source.state)
+        self.n_next_bytes = sum(output.max_bytes for output in self.outputs.values())
+        if self.store is not None and self.store.n_head_bytes + 16 + self.n_next_bytes > STATE_BYTES:
+            raise RuntimeError(
+                f"its samples may take {self.n_next_bytes} bytes, expected at most {STATE_BYTES - self.store.n_head_bytes - 16}: more "
+                "cannot be saved until readers have them; give a smaller max_items, or a `resume` that can give samples again"
+            )
+
+    def work_until_stopped(self) -> None:
+        operator, source = self.operator, self.work
+        if self.is_active and source.open is not None:
+            source.open()
+        may_go, next_look = False, 0
+        _report("ready", identity=source.identity, has_state=False)
+        while not operator.should_stop():
+            while operator.has_command():
+                command = operator.commands.popleft()
+                may_go |= command["command"] == "go"
+                self.obey(command)
+            operator.beat()
+            # When to take the next step, if nothing happens before.
+            until: int | None = None
+            if self.is_active and may_go:
+                if not self.is_placed:
+                    self.place()
+                until = self.step()
+            if _now_nanos() >= next_look:
+                next_look = _now_nanos() + TICK_NANOS
+                self.look()
+            if until != 0:
+                operator.wait(until)
+        if source.close is not None:
+            source.close()
+        operator.drained(self.look)
+
+    def take_over(self, is_handed_over: bool) -> None:
+        if self.work.open is not None:
+            self.work.open()
+        self.is_handed_over, self.is_placed = is_handed_over, False
+
+    def hand_over(self) -> None:
+        self.is_placed = False
+        if self.work.close is not None:
+            self.work.close()
+
+    def next_seq(self) -> int | None:
+        last = next(iter(self.outputs.values())).publisher.last()
+        return None if last is None else last[1] + 1
+
+    def place(self) -> None:
+        """Finds the place at which to go on."""
+        self.is_done, self.came = False, {}
+        if self.store is None:
+            for output in self.outputs.values():
+                output.known = output.known_at(self.is_handed_over)
+            self.work.resume({port: output.known for port, output in self.outputs.items()})  # type: ignore[misc]
+        else:
+            state, self.is_done = self.store.restore(self.is_handed_over)
+            if self.work.restore is not None:
+                self.work.restore(state)
+        self.is_placed = True
+
+    def step(self) -> int | None:
+        """Sends the next sample. Returns when to take the next step: 0 for at once, None for when something happens."""
+        source, store = self.work, self.store
+        if store is not None and not (store.send() and (self.is_done or store.wait_for_room(self.n_next_bytes))):
+            return 0
+        if self.is_done:
+            if not self.has_reported_end:
+                self.has_reported_end = True
+                _report("finished")
+            return None
+        try:
+            said = source.next()
+        except StopIteration:
+            if store is None:
+                self.check_end()
+            elif not store.save(is_done=True):
+                self.is_placed = False
+                return 0
+            self.is_done, self.has_reported_end = True, False
+            return 0
+        if said is None:
+            return _now_nanos() + int(source.pause_secs * 1e9)
+        samples = self.by_output(said)
+        if store is None:
+            self.is_placed = all(self.send_again(*sample) for sample in samples)
+        else:
+            self.is_placed = self.save_and_send(store, samples)
+        return 0
+
+    def save_and_send(self, store: _Store, samples: list[tuple[_Output, Any, bytes]]) -> bool:
+        """Numbers samples, saves and sends them; false if they are not saved because it was asked to give way."""
+        n_lost, self.work._n_lost = self.work._n_lost, {}
+        for port, output in self.outputs.items():
+            n_left_out = n_lost.get(None, 0) + n_lost.get(port, 0)
+            if output.last is not None:
+                output.last = (output.last[0], output.last[1] + n_left_out)
+        for output, head, raw_items in samples:
+            if len(raw_items) > output.publisher.sender.max_items * ctypes.sizeof(output.message.Item):
+                raise RuntimeError(f"a sample has more items than max_items={output.publisher.sender.max_items} says")
+            head.header.epoch, head.header.seq = _next_key(output, self.outputs.values())
+            head.header.origin_nanos = _now_nanos()
+            output.keep(head, raw_items)
+        if not store.save():
+            # Only a state that has grown gets here: the saved one is older, and gives these samples again.
+            return False
+        store.send()
+        return True
+
+    def send_again(self, output: _Output, head: Any, raw_items: bytes) -> bool:
+        """Sends a sample unless readers have it; false if it was asked to give way."""
+        key, before = (head.header.epoch, head.header.seq), self.came.get(output.port)
+        if _is_at_most(key, before):
+            raise RuntimeError(f"sample {key[1]} of the output {output.port} came after {before[1]}, expected a greater number")  # type: ignore[index]
+        self.came[output.port] = key
+        if output.known is not None:
+            is_past = key[0] == output.known[0] and key[1] >= output.known[1]
+            is_known = not is_past or key == output.known
+            output.known = None if is_past else output.known
+            if is_known:
+                return True
+        head.header.origin_nanos = _now_nanos()
+        return output.publisher.send(head, raw_items)
+
+    def check_end(self) -> None:
+        """Refuses an end before the sample after which it was to go on: it is not the same stream."""
+        for port, output in self.outputs.items():
+            if output.known is not None:
+                raise RuntimeError(
+                    f"it ended without sample {output.known[1]} of epoch {output.known[0]} of the output {port}, which readers have: "
+                    "expected that after `resume`, `next` gives that sample or one before it, and then the same samples again"
+                )
+
+
+def _instance(operator: _Operator, description: Description, work: Stage | Source, params: dict[str, Any]) -> _Instance:
+    """The operator that a `start` function has described. A combination that cannot keep its promises is refused."""
+    n_inputs = len(description.inputs)
+    if isinstance(work, Source):
+        if n_inputs:
+            raise RuntimeError(f"start returned a Source, and the operator has {n_inputs} inputs: expected a Stage, or no input")
+        return _SourceInstance(operator, description, work, params)
+    if not n_inputs:
+        raise RuntimeError("the operator has no input: expected that start returns a Source")
+    if work.answer is None and work.answer_many is None:
+        raise RuntimeError("the Stage has neither `answer` nor `answer_many`: expected one of them")
+    if n_inputs > 1 and work.answer_many is not None:
+        raise RuntimeError(f"answer_many is for one input, and the operator has {n_inputs}: expected `answer`")
+    if work.state is not None and description.answers_each:
+        raise RuntimeError("its stage has a state: its Description needs answers_each=False")
+    is_alike = work.state is None and n_inputs == 1 and (description.answers_each or len(description.outputs) == 1)
+    return (_AlikeStage if is_alike else _KeepingStage)(operator, description, work, params)
 
 
 def _join_and_work(description: Description, start: Callable[[dict[str, Any]], Stage]) -> None:
@@ -1169,10 +1795,7 @@ def _join_and_work(description: Description, start: Callable[[dict[str, Any]], S
     wiring = json.loads(os.environ[WIRING_VARIABLE])
     operator = _Operator(wiring, description)
     params = wiring["params"]
-    stage = start(params)
-    if stage.state is not None and description.answers_each:
-        raise RuntimeError("its stage has a state: its Description needs answers_each=False")
-    worker = _Worker(operator, description, stage, params)
+    worker = _instance(operator, description, start(params), params)
     # The objects that exist by now stay: the collector need not look through them.
     gc.collect()
     gc.freeze()

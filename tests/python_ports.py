@@ -1,0 +1,73 @@
+#!/usr/bin/env python3
+"""Operators in Python with several ports for the tests. Each fails if a sample does not come once and in order.
+
+split: gives each frame twice. join: takes both streams and the truths, passes on the frames of one, and counts the truths.
+check: reads what join has counted.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "operators"))
+from blindgrasp_messages import ContactSet, ContactSetHead, GraspFeature, GraspTruth, TactileFrame
+from blindgrasp_operator import Description, Stage, run
+
+SPLIT = Description("split", "Gives each frame twice", ("tactile", TactileFrame), outputs=[("a", TactileFrame), ("b", TactileFrame)])
+JOIN = Description(
+    "join",
+    "Passes on one of two streams and counts truths",
+    inputs=[("a", TactileFrame), ("b", TactileFrame), ("truth", GraspTruth)],
+    outputs=[("tactile", TactileFrame, "a"), ("counted", ContactSet)],
+)
+CHECK = Description("check", "Checks what was counted", ("counted", ContactSet), ("feature", GraspFeature), answers_each=False)
+
+
+class Numbers:
+    """The number of samples of each port so far, as the state of a stage."""
+
+    def __init__(self):
+        self.next = {}
+
+    def check(self, port, seq):
+        expected = self.next.get(port, 0)
+        if seq != expected:
+            raise RuntimeError(f"port {port}: sample {seq} came, expected {expected}")
+        self.next[port] = seq + 1
+
+    def state(self):
+        return json.dumps(self.next).encode()
+
+    def restore(self, state):
+        self.next = json.loads(state or b"{}")
+
+
+def split(_params):
+    return Stage(lambda head, items: {"a": (head, items), "b": (head, items[: head.n_joints])}, max_items=160)
+
+
+def join(_params):
+    numbers = Numbers()
+
+    def answer(port, head, items):
+        numbers.check(port, head.header.seq)
+        if port == "truth":
+            return {"counted": ContactSetHead(grasp_id=head.grasp_id, n_pads_in_contact=numbers.next[port])}
+        return {"tactile": (head, items)} if port == "a" else None
+
+    return Stage(answer, state=numbers.state, restore=numbers.restore, max_items={"tactile": 160})
+
+
+def check(_params):
+    numbers = Numbers()
+
+    def answer(head, _items):
+        numbers.check("counted", head.header.seq)
+        if head.n_pads_in_contact != head.header.seq + 1:
+            raise RuntimeError(f"sample {head.header.seq} counts {head.n_pads_in_contact} truths")
+
+    return Stage(answer, state=numbers.state, restore=numbers.restore)
+
+
+if __name__ == "__main__":
+    run(*{"split": (SPLIT, split), "join": (JOIN, join), "check": (CHECK, check)}[sys.argv[1]])
