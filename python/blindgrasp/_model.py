@@ -55,6 +55,8 @@ class Predictions:
 
 
 Source = str | PathLike[str] | Recording | Grasp
+# Between two grasps that were given as arrays.
+PAUSE_NANOS = 1_000_000_000
 
 
 class Model:
@@ -90,7 +92,8 @@ class Model:
         """Decides grasps as a graph with this model would (`blindgrasp predict`).
 
         `source` is a recording (its path or a Recording), a Grasp, or several of one kind. A Grasp may be made by hand
-        from arrays of your own. Recordings are read by the program, one grasp at a time.
+        from arrays of your own. Recordings are read by the program, one grasp at a time. Grasps are decided as if each
+        followed the one before it; a frame that is missing inside a grasp holds it, and so does another `hand_id`.
 
         Raises ProgramError if a recording cannot be read or is of another hand.
         """
@@ -105,7 +108,7 @@ class Model:
         files = ["-"] if grasps else [str(path.absolute()) for path in paths]
         # The frames are in a file and not in a pipe: the program may answer before it has read all of them.
         with tempfile.TemporaryFile() as frames:
-            frames.writelines(line for grasp in grasps for line in _frame_lines(grasp))
+            frames.writelines(_frame_lines(grasps))
             frames.seek(0)
             with Process(["predict", "--json", str(self.path.absolute()), *files], stdin=frames) as process:
                 return _predictions(list(process.lines()), [grasp.label for grasp in grasps] if grasps else None)
@@ -125,14 +128,23 @@ def _predictions(lines: list[dict[str, Any]], labels: list[Label | None] | None)
     )
 
 
-def _frame_lines(grasp: Grasp) -> Iterator[bytes]:
-    """The frames of a grasp as `blindgrasp export --topic /tactile` writes them."""
+def _frame_lines(grasps: list[Grasp]) -> Iterator[bytes]:
+    """The frames of the grasps as `blindgrasp export --topic /tactile` writes them, each grasp after the one before."""
     lists = ("joints_rad", "cells_newtons", "gravity_m_per_s2", "wrist_wrench", "joint_torques")
-    for idx, phase in enumerate(grasp.phase):
-        data: dict[str, Any] = {name: _numbers(getattr(grasp, name)[idx]) for name in lists}
-        data |= {"grasp_id": int(grasp.grasp_id), "phase": str(phase), "day": int(grasp.day)}
-        header = {"topic": "/tactile", "seq": int(grasp.seq[idx]), "stamp_nanos": int(grasp.stamp_nanos[idx])}
-        yield json.dumps(header | {"data": data}).encode() + b"\n"
+    next_seq, next_stamp = 0, 0
+    for grasp in grasps:
+        if len(grasp.phase) == 0:
+            raise ValueError(f"grasp {grasp.grasp_id} has no frames: there is nothing to decide on")
+        for idx, phase in enumerate(grasp.phase):
+            data: dict[str, Any] = {name: _numbers(getattr(grasp, name)[idx]) for name in lists}
+            data |= {"grasp_id": int(grasp.grasp_id), "phase": str(phase), "day": int(grasp.day)}
+            seq = next_seq + int(grasp.seq[idx]) - int(grasp.seq[0])
+            stamp_nanos = next_stamp + int(grasp.stamp_nanos[idx]) - int(grasp.stamp_nanos[0])
+            line: dict[str, Any] = {"topic": "/tactile", "seq": seq, "stamp_nanos": stamp_nanos, "data": data}
+            if grasp.hand_id:
+                line["hand_id"] = grasp.hand_id
+            yield json.dumps(line).encode() + b"\n"
+        next_seq, next_stamp = seq + 1, stamp_nanos + PAUSE_NANOS
 
 
 def _numbers(row: NDArray[np.float64]) -> list[float | None]:

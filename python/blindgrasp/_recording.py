@@ -81,6 +81,8 @@ class Grasp:
     """(n_frames, 6): force (N) and torque (N m) in the palm frame; (n_frames, 0) without a sensor."""
     joint_torques: NDArray[np.float64]
     """(n_frames, n_joints): newton metres; (n_frames, 0) without sensors."""
+    hand_id: str = ""
+    """The identity of the hand, 16 hexadecimal digits; empty if it is not known."""
     day: int = 0
     """The recording day, like 20261124; 0 if it is not known."""
     label: Label | None = None
@@ -213,6 +215,7 @@ class Recording:
             stamp_nanos=np.array([frame.header.stamp_nanos for frame in frames], np.int64),
             phase=np.array([_word(PHASES, frame.phase) for frame in frames]),
             **tables,
+            hand_id=f"{frames[0].header.hand_id:016x}",
             day=getattr(frames[0], "day", 0),
             label=labels.get(key),
             decisions=tuple(decisions.get(key, ())),

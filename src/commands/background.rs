@@ -31,9 +31,9 @@ pub(super) fn detach(name: &str, json: bool) -> anyhow::Result<Outcome> {
     let mut log = LogReader::new(&folder, "run");
     // What is there is of earlier runs.
     let _ = log.read();
-    let arguments = std::env::args_os().skip(1).filter(|argument| argument != "--detach");
     let mut command = Command::new(std::env::current_exe().context("this program's own path is unknown")?);
-    command.args(arguments).arg("--in-background");
+    // It counts more than --detach.
+    command.args(std::env::args_os().skip(1)).arg("--in-background");
     command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
     // SAFETY: between fork and exec the closure makes one system call.
     unsafe { command.pre_exec(|| Ok(rustix::process::setsid().map(drop)?)) };

@@ -24,7 +24,8 @@ const MAX_UNREAD_LINES: usize = 1 << 14;
 #[command(after_help = "Examples: blindgrasp echo lift_arbiter/decision\n          \
                         blindgrasp echo -n 1 classifier/prediction contacts/contacts\n\n\
                         The lines are those of blindgrasp export. The graph does not wait for a reader of stdout that is too slow:\n\
-                        lines that are left out for that reason are counted. blindgrasp top shows rates.")]
+                        lines that are left out for that reason are counted. blindgrasp hz measures rates.\n\
+                        Two commands can read a graph at once: echo, record and view --foxglove.")]
 pub(super) struct Arguments {
     /// Outputs to read [default: all]
     #[arg(value_name = "NODE/PORT", add = completions::outputs())]
@@ -94,6 +95,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             Err(error) => return Err(error.into()),
         }
     };
+    if is_over && arguments.samples.is_some() {
+        print_diagnostic(&format!("graph '{graph}' has ended"));
+    }
     let finished = if is_over { observer.finish() } else { observer.leave() };
     drop(connection);
     let (mut echo, _) = finished.context("cannot read the graph's edges any more")?;

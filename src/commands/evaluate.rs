@@ -7,7 +7,7 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::model::write_at_once;
-use super::{Outcome, check_output, percent, print_line};
+use super::{Outcome, check_page, percent, print_line};
 use blindgrasp_learning::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::looks::{Look, looks};
@@ -96,7 +96,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let model = model.map(|path| Ok::<_, anyhow::Error>((path, Model::load(path)?))).transpose()?;
     let recordings = recordings_in(recordings)?;
     if let Some(report) = &arguments.report {
-        check_output(report, &[recordings.as_slice(), &arguments.inputs].concat())?;
+        check_page(report, &[recordings.as_slice(), &arguments.inputs].concat())?;
     }
     let first = recordings.first().context("expected a recording")?;
     let hand = hand_of(first, arguments.hand.as_deref())?;

@@ -260,5 +260,13 @@ impl Drop for NewFile {
 pub(super) fn json_line(topic: &str, record: &Record) -> serde_json::Result<String> {
     let header = record.header();
     let data = record.to_json()?;
-    Ok(json!({"topic": topic, "seq": header.seq, "stamp_nanos": header.stamp_nanos, "data": data}).to_string())
+    Ok(json!({
+        "topic": topic,
+        "seq": header.seq,
+        "stamp_nanos": header.stamp_nanos,
+        "epoch": header.epoch,
+        "hand_id": format!("{:016x}", header.hand_id),
+        "data": data,
+    })
+    .to_string())
 }

@@ -7,7 +7,7 @@ use anyhow::{Context, bail};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{check_output, number_in, percent, print_line};
+use super::{check_new, number_in, percent, print_line, train};
 use blindgrasp_learning::training::grid::{GridReport, Search, axes_around, with_values};
 use blindgrasp_learning::training::{Examples, TrainingOptions, folds_by_object};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -43,12 +43,18 @@ pub(super) fn search(
     arguments: &GridArguments,
     hand: &Hand,
     recordings: &[PathBuf],
+    training: &train::Arguments,
     options: &mut TrainingOptions,
 ) -> anyhow::Result<Option<GridSummary>> {
     if !arguments.grid {
         return Ok(None);
     }
-    arguments.grid_report.iter().try_for_each(|path| check_output(path, recordings))?;
+    for path in &arguments.grid_report {
+        check_new(path, recordings, training.overwrite)?;
+        if *path == training.out {
+            bail!("{} is given for --out and for --grid-report: choose two files", path.display());
+        }
+    }
     let mut axes = axes_around(&options.recipe);
     let given = [
         ("--grid-c", "c", &arguments.grid_c),

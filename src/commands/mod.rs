@@ -116,10 +116,10 @@ enum Command {
 /// The running graph that a command is about, by its place or by its option, as other commands have it.
 #[derive(Debug, clap::Args)]
 struct GraphArgument {
-    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running; ps: all]
+    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
     #[arg(add = completions::graphs())]
     graph: Option<String>,
-    /// The same by name
+    /// The same, as other commands have it
     #[arg(short = 'g', long = "graph", value_name = "GRAPH", conflicts_with = "graph", add = completions::graphs())]
     named: Option<String>,
 }
@@ -259,11 +259,29 @@ fn stop_signals() -> Vec<i32> {
     signals.into_iter().filter(|signal| *signal != signal_hook::consts::SIGHUP || !is_ignored(signal)).collect()
 }
 
-/// As [`check_output`]. It also refuses to replace a file, unless the user has asked for that.
+/// As [`check_output`], for a file that another one takes the place of once it is complete. It also refuses to replace a
+/// file, unless the user has asked for that, and anything else that bears the name.
 fn check_new(out: &Path, inputs: &[PathBuf], overwrite: bool) -> anyhow::Result<()> {
     check_output(out, inputs)?;
-    if !overwrite && out.is_file() {
-        anyhow::bail!("{}: the file exists; choose another name, or replace it with --overwrite", out.display());
+    match std::fs::symlink_metadata(out).map(|found| found.file_type()) {
+        Ok(found) if found.is_symlink() => {
+            anyhow::bail!("{} is a link, which would be replaced: name the file that it leads to", out.display())
+        }
+        Ok(found) if !found.is_file() => {
+            anyhow::bail!("{} is a device or a pipe, which would be replaced: name a file", out.display())
+        }
+        Ok(_) if !overwrite => {
+            anyhow::bail!("{}: the file exists; choose another name, or replace it with --overwrite", out.display())
+        }
+        _ => Ok(()),
+    }
+}
+
+/// As [`check_output`], for a page, which takes the place of an earlier page and of nothing else.
+fn check_page(out: &Path, inputs: &[PathBuf]) -> anyhow::Result<()> {
+    check_output(out, inputs)?;
+    if !out.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("html")) {
+        anyhow::bail!("{} (--report): expected a name that ends in .html", out.display());
     }
     Ok(())
 }

@@ -7,7 +7,7 @@ use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 
 use super::train::{guarantee_line, probe_lines, threshold_line};
-use super::{Outcome, check_new, percent, print_line};
+use super::{Outcome, check_new, check_output, percent, print_line};
 use blindgrasp_learning::dataset::{hand_of, label_line};
 use blindgrasp_learning::training::recalibrate;
 use blindgrasp_messages::files::partial_path;
@@ -140,7 +140,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 }
 
 fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
-    check_new(&arguments.out, std::slice::from_ref(&arguments.model), arguments.overwrite)?;
+    let inputs = std::slice::from_ref(&arguments.model);
+    // A pipe or a device is written to.
+    match arguments.out.is_file() {
+        true => check_new(&arguments.out, inputs, arguments.overwrite)?,
+        false => check_output(&arguments.out, inputs)?,
+    }
     let Model { classifier, training, .. } = Model::load(&arguments.model)?;
     let Format::Libsvm = arguments.format;
     let Predictor::Svm(svm) = &classifier.predictor else {

@@ -53,6 +53,9 @@ struct GetArguments {
     /// Graph [default: the only one running]
     #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
+    /// Print JSON: the value
+    #[arg(long)]
+    json: bool,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
@@ -95,7 +98,7 @@ fn get(arguments: &GetArguments) -> anyhow::Result<Outcome> {
         let known: Vec<&str> = params.keys().map(String::as_str).collect();
         bail!("node '{node}' has no parameter '{param}' with a value; its parameters: {}", known.join(", "));
     };
-    print_line(&shown(value))?;
+    print_line(&if arguments.json { value.to_string() } else { shown(value) })?;
     Ok(Outcome::Done)
 }
 

@@ -5,12 +5,14 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use clap::Args;
+use serde::Deserialize;
 use serde_json::{Value, json};
 
 use super::{Outcome, print_line};
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::evaluation::{decide, decide_frames};
-use blindgrasp_messages::{GraspTruth, Header, LiftDecision, Stamped, TactileFrame};
+use blindgrasp_messages::{GraspTruth, Header, LiftDecision, Phase, Stamped, TactileFrame};
+use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 
@@ -24,11 +26,13 @@ const PERIOD_NANOS: u64 = 10_000_000;
 #[derive(Debug, Args)]
 #[command(after_help = "Examples: blindgrasp predict models/barrett-bh8-280.json recordings/held-out.mcap\n          \
                         blindgrasp export a.mcap --topic /tactile | blindgrasp predict model.json --hand hand.yaml -\n\n\
-                        A line of frames is one of blindgrasp export, or one of a bridge (docs/hardware.md) with its grasp_id.")]
+                        A line of frames is one of blindgrasp export, or one of a bridge (docs/hardware.md) with its grasp_id. All \
+                        lines are read before the first decision is printed. As in a graph, a grasp is held if a seq is missing, or if \
+                        the hand_id is another.")]
 pub(super) struct Arguments {
     /// The model (JSON)
     model: PathBuf,
-    /// Recordings (MCAP), or frames as lines of JSON (.jsonl; - for stdin)
+    /// Recordings (MCAP), folders of them, or frames as lines of JSON (- for stdin)
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// Pad layout of the hand [default: the built-in hand of the model]
@@ -41,7 +45,14 @@ pub(super) struct Arguments {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let model = Model::load(&arguments.model)?;
+    let mut files = Vec::new();
     for file in &arguments.files {
+        match file.is_dir() {
+            true => files.extend(recordings_in(std::slice::from_ref(file))?),
+            false => files.push(file.clone()),
+        }
+    }
+    for file in &files {
         let is_recording = file.extension().is_some_and(|extension| extension == "mcap");
         if is_recording {
             let hand = hand_of(file, arguments.hand.as_deref())?;
@@ -95,17 +106,56 @@ fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<Vec<Stamped<TactileFr
 }
 
 /// A frame by itself, or in a line of `blindgrasp export`; `None` for a sample of another topic.
-fn read_frame(line: &str, seq: u64, hand: &Hand) -> anyhow::Result<Option<Stamped<TactileFrame>>> {
+fn read_frame(line: &str, next_seq: u64, hand: &Hand) -> anyhow::Result<Option<Stamped<TactileFrame>>> {
     let mut value: Value = serde_json::from_str(line).context("not a line of JSON")?;
     if value.get("topic").is_some_and(|topic| topic != "/tactile") {
         return Ok(None);
     }
-    let stamp_nanos = value["stamp_nanos"].as_u64().unwrap_or(seq * PERIOD_NANOS);
+    let number = |name: &str| value.get(name).and_then(Value::as_u64);
+    let seq = number("seq").unwrap_or(next_seq);
+    let stamp_nanos = number("stamp_nanos").unwrap_or(seq.wrapping_mul(PERIOD_NANOS));
+    let hand_id = match value.get("hand_id").and_then(Value::as_str) {
+        Some(id) => u64::from_str_radix(id, 16).context("hand_id: expected 16 hexadecimal digits")?,
+        None => hand.id(),
+    };
+    let header = Header { hand_id, seq, stamp_nanos, epoch: number("epoch").unwrap_or(0), ..Header::default() };
     let data = value.get_mut("data").map(Value::take).unwrap_or(value);
-    let message = serde_json::from_value(data)
-        .context("not a tactile frame: expected grasp_id, phase, joints_rad and cells_newtons")?;
-    let header = Header { hand_id: hand.id(), seq, stamp_nanos, ..Header::default() };
+    let FrameLine { grasp_id, phase, joints_rad, cells_newtons, gravity_m_per_s2, wrist_wrench, joint_torques, day } =
+        serde_json::from_value(data)
+            .context("not a tactile frame: expected grasp_id, phase, joints_rad and cells_newtons")?;
+    let [joints_rad, cells_newtons, gravity_m_per_s2, wrist_wrench, joint_torques] =
+        [joints_rad, cells_newtons, gravity_m_per_s2, wrist_wrench, joint_torques].map(numbers);
+    let message = TactileFrame {
+        grasp_id,
+        phase,
+        joints_rad,
+        cells_newtons,
+        gravity_m_per_s2,
+        wrist_wrench,
+        joint_torques,
+        day: day.unwrap_or(0),
+    };
     Ok(Some(Stamped { header, message }))
+}
+
+/// A frame as lines of JSON have it: a number that is not finite is null there.
+#[derive(Deserialize)]
+struct FrameLine {
+    grasp_id: u64,
+    phase: Phase,
+    joints_rad: Vec<Option<f64>>,
+    cells_newtons: Vec<Option<f64>>,
+    #[serde(default)]
+    gravity_m_per_s2: Vec<Option<f64>>,
+    #[serde(default)]
+    wrist_wrench: Vec<Option<f64>>,
+    #[serde(default)]
+    joint_torques: Vec<Option<f64>>,
+    day: Option<u32>,
+}
+
+fn numbers(values: Vec<Option<f64>>) -> Vec<f64> {
+    values.into_iter().map(|value| value.unwrap_or(f64::NAN)).collect()
 }
 
 fn print(json: bool, file: &Path, decision: &LiftDecision, truth: Option<&GraspTruth>) -> std::io::Result<()> {

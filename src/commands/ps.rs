@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::text_table::TextTable;
 use super::top::screen::short_time;
-use super::{GraphArgument, Outcome, print_line};
+use super::{Outcome, completions, print_line};
 use blindgrasp_graph::client::{machine_of, part_name, pick_graph, running_graphs, status};
 use blindgrasp_graph::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus};
 use blindgrasp_graph::log::printable;
@@ -23,8 +23,12 @@ use blindgrasp_operator::wiring::EdgePolicy;
                         The other machines of a graph are asked, too; GRAPH@MACHINE is the part on one of them.\n\
                         Exit code 1 if the graph that is named does not run or does not answer.")]
 pub(super) struct Arguments {
-    #[command(flatten)]
-    graph: GraphArgument,
+    /// Show only this graph
+    #[arg(add = completions::graphs())]
+    graph: Option<String>,
+    /// The same, as other commands have it
+    #[arg(short = 'g', long = "graph", value_name = "GRAPH", conflicts_with = "graph", add = completions::graphs())]
+    named: Option<String>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -64,7 +68,7 @@ struct Silent {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let listing = match &arguments.graph.name() {
+    let listing = match arguments.graph.as_ref().or(arguments.named.as_ref()) {
         Some(graph) => {
             let status = status(&pick_graph(Some(graph))?)?;
             Listing { graphs: vec![completed(status)], not_answering: Vec::new() }

@@ -35,10 +35,10 @@ pub(super) struct Arguments {
     recordings: Vec<PathBuf>,
     /// Where to write the model (JSON), or the experience.
     #[arg(short, long)]
-    out: PathBuf,
-    /// Replace a file of this name
+    pub(super) out: PathBuf,
+    /// Replace files of these names
     #[arg(long)]
-    overwrite: bool,
+    pub(super) overwrite: bool,
     /// Write the experience of lifted grasps (recordings of simulate --label lift), with the features of this model: the
     /// operator regrasp proposes better grasps from it. A graph runs with both; another model needs another experience.
     #[arg(long, value_name = "MODEL", conflicts_with_all = [
@@ -148,7 +148,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         seed: arguments.seed,
         ..TrainingOptions::default()
     };
-    let grid = search(&arguments.grid, &hand, &recordings, &mut options)?;
+    let grid = search(&arguments.grid, &hand, &recordings, arguments, &mut options)?;
     let mut model = train(&hand, &recordings, &options, |what| print_diagnostic(&format!("{what} …")))?;
     model.training.grid = grid;
     model.save(&arguments.out)?;

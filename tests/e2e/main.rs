@@ -27,6 +27,7 @@ mod package;
 mod partners;
 mod picture;
 mod pins;
+mod predict;
 mod processes;
 mod python;
 mod python_package;

@@ -45,7 +45,11 @@ fn the_schema_accepts_good_files_and_names_mistakes() {
         })
         .collect();
     let other_good = [
-        good.replace("rate: 10", "rate: ${RATE:-10}").replace("votes: 3", "votes: ${VOTES}"),
+        good.replace("rate: 10", "rate: ${RATE:-10}").replace("votes: 3", "votes: ${VOTES}").replacen(
+            "    sandbox: on",
+            "    sandbox: \"${S:-on}\"",
+            1,
+        ),
         good.replace("  classifier:\n", "  judge:\n    run: classifier\n").replace("classifier/", "judge/"),
         good.replace("  classifier:\n", "  judge:\n    run: ./mine.py\n    restart: {policy: always, limit: 3}\n"),
     ];

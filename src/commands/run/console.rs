@@ -27,7 +27,7 @@ fn paint(text: &str, colour: u8) -> String {
 pub(super) struct Console {
     json: bool,
     is_quiet: bool,
-    /// Actions and mistakes have colours: stdout is a terminal, and NO_COLOR is not set.
+    /// Actions and mistakes have colours: stdout is a terminal, and the environment does not say no.
     is_coloured: bool,
     /// Decisions are made and recorded whether or not stdout is read.
     pub(super) printer: LinePrinter,
@@ -64,8 +64,9 @@ impl Console {
         tap: Option<Tap>,
     ) -> Console {
         let printer = LinePrinter::new(std::io::stdout(), MAX_UNREAD_LINES);
+        let variable = |name| std::env::var_os(name).unwrap_or_default();
         let is_coloured =
-            std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|no| no.is_empty());
+            std::io::stdout().is_terminal() && variable("NO_COLOR").is_empty() && variable("TERM") != "dumb";
         Console { json, is_quiet, is_coloured, printer, recorder, report, tap }
     }
 }

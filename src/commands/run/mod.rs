@@ -182,11 +182,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let name = name.as_str();
     // Every mistake is reported before the graph goes into the background.
     graph_here(arguments, &graph, name)?;
-    if arguments.detach {
-        return background::detach(name, arguments.json);
-    }
     if arguments.in_background {
         return background::into_log(name, arguments.log_format.into(), || run_graph(arguments, &graph, name));
+    }
+    if arguments.detach {
+        return background::detach(name, arguments.json);
     }
     run_graph(arguments, &graph, name)
 }

@@ -13,7 +13,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::super::view::Rights;
-use super::super::{Outcome, check_new, check_output};
+use super::super::{Outcome, check_new, check_output, check_page};
 use super::console::Console;
 use super::recorder::{RecordOptions, Recorded, Recorder};
 use super::report::RunReport;
@@ -90,12 +90,10 @@ impl Session {
             self.record_options.check(path)?;
         }
         if let Some(path) = &self.report {
+            check_page(path, &inputs)?;
             check_new(path, &inputs, self.record_options.overwrite)?;
             if self.record.as_ref() == Some(path) {
                 bail!("{} is given for --record and for --report: choose two files", path.display());
-            }
-            if !path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("html")) {
-                bail!("{} (--report): expected a name that ends in .html", path.display());
             }
         }
         let listen = |port| metrics::listen(port).with_context(|| format!("cannot answer on port {port} (--metrics)"));

@@ -58,6 +58,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(junit) = &arguments.junit {
         let expectations = recordings.iter().map(|recording| expectations::path_of(recording));
         check_output(junit, &recordings.iter().cloned().chain(expectations).collect::<Vec<_>>())?;
+        if junit.is_file() && junit.extension().is_none_or(|extension| extension != "xml") {
+            anyhow::bail!("{} (--junit): the file exists, and only a file .xml is replaced", junit.display());
+        }
     }
     let n_stops = stop_requests()?;
     let runner = Runner {

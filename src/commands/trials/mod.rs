@@ -17,7 +17,7 @@ use super::evaluate::command_line;
 use super::model::write_at_once;
 use super::run::{RecordOptions, Session};
 use super::view::Rights;
-use super::{Outcome, check_output, print_line, stop_requests};
+use super::{Outcome, check_page, print_line, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_learning::trials::late_decisions::LateDecisions;
@@ -89,6 +89,9 @@ pub(super) struct Arguments {
     /// Record every edge to this file (MCAP); neither --lift-policy nor --regrasp may be both.
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
+    /// Replace an existing recording.
+    #[arg(long, requires = "record")]
+    overwrite: bool,
     /// Write a report with the tables and pictures of some of the trials (HTML).
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
@@ -183,7 +186,7 @@ fn check_arguments(arguments: &Arguments) -> anyhow::Result<()> {
     if arguments.lift_policy == LiftPolicy::Always && matches!(arguments.regrasp, Some(Regrasp::On | Regrasp::Both)) {
         bail!("--lift-policy always never holds, and --regrasp is for grasps after a hold: use --lift-policy decision");
     }
-    arguments.report.as_ref().map_or(Ok(()), |report| check_output(report, &[]))
+    arguments.report.as_ref().map_or(Ok(()), |report| check_page(report, &[]))
 }
 
 fn empty_report(arguments: &Arguments, setup: &Setup) -> TrialsReport {
@@ -246,7 +249,7 @@ fn run_way(
         launch: LaunchOptions { startup_limit: Duration::from_secs(60), ..LaunchOptions::default() },
         clock: Clock::Machine,
         record: arguments.record.clone(),
-        record_options: RecordOptions::default(),
+        record_options: RecordOptions { overwrite: arguments.overwrite, ..RecordOptions::default() },
         metrics: None,
         view: None,
         rights: Rights::default(),

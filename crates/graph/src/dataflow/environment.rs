@@ -7,8 +7,9 @@ use blindgrasp_operator::text::quote;
 /// Replaces the variables in all scalars. Keys stay as they are. `variable` looks a variable up.
 pub(super) fn fill_in(value: &mut Value, variable: &dyn Fn(&str) -> Option<String>, diagnostics: &mut Diagnostics) {
     match &mut value.content {
-        Content::Scalar { text, .. } if text.contains("${") => match filled_in(text, variable) {
-            Ok(filled) => *text = filled,
+        // In braces of YAML a variable needs quotes, and they do not make its value a text.
+        Content::Scalar { text, plain } if text.contains("${") => match filled_in(text, variable) {
+            Ok(filled) => (*text, *plain) = (filled, true),
             Err((message, help)) => diagnostics.push_with_help(value.at, message, Some(help)),
         },
         Content::Scalar { .. } => {}

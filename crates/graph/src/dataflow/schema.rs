@@ -173,10 +173,10 @@ fn node_keys() -> Value {
                 "additionalProperties": false,
                 "properties": {
                     "from": source(),
-                    "policy": {"enum": ["lossless", "latest"]},
+                    "policy": words(&["lossless", "latest"]),
                     "capacity": integer(1, MAX_CAPACITY),
                     "deadline_ms": or_variable(json!({"type": "number", "exclusiveMinimum": 0, "maximum": HOUR_MILLIS})),
-                    "on_late": {"enum": ["count", "hold", "stop"]},
+                    "on_late": words(&["count", "hold", "stop"]),
                     "tolerance_ms": number(0.0, HOUR_MILLIS),
                     "partner_wait_ms": number(0.0, HOUR_MILLIS),
                 },
@@ -188,7 +188,7 @@ fn node_keys() -> Value {
             "description": "The digests that files may have, by param; 'run' is the program",
             "additionalProperties": {"anyOf": [digest(), {"type": "array", "items": digest()}]},
         },
-        "sandbox": {"enum": ["off", "on", "required"]},
+        "sandbox": words(&["off", "on", "required"]),
         "memory_max_mib": integer(MIN_MEMORY_MIB, MAX_MEMORY_MIB),
         "restart": {"anyOf": [restart_policy(), {
             "type": "object",
@@ -202,7 +202,7 @@ fn node_keys() -> Value {
         }]},
         "heartbeat_ms": {"anyOf": [number(MIN_HEARTBEAT_MILLIS, HOUR_MILLIS), {"const": "off"}]},
         "group": described(name_schema(), "Nodes of the same group share a process"),
-        "wait": {"anyOf": [{"enum": ["event", "poll"]}, {
+        "wait": {"anyOf": [words(&["event", "poll"]), {
             "type": "object",
             "required": ["poll_us"],
             "additionalProperties": false,
@@ -212,7 +212,7 @@ fn node_keys() -> Value {
             "type": "object",
             "required": ["policy", "priority"],
             "additionalProperties": false,
-            "properties": {"policy": {"enum": ["fifo", "round_robin"]}, "priority": integer(1, 99)},
+            "properties": {"policy": words(&["fifo", "round_robin"]), "priority": integer(1, 99)},
         },
         "cpus": {"type": "array", "items": integer(0, MAX_CPUS - 1)},
         "lock_memory": or_variable(json!({"type": "boolean"})),
@@ -257,7 +257,11 @@ fn link() -> Value {
 }
 
 fn restart_policy() -> Value {
-    json!({"enum": ["on-failure", "always", "never"]})
+    words(&["on-failure", "always", "never"])
+}
+
+fn words(words: &[&str]) -> Value {
+    or_variable(json!({"enum": words}))
 }
 
 fn source() -> Value {
@@ -269,7 +273,9 @@ fn digest() -> Value {
 }
 
 fn name_schema() -> Value {
-    or_variable(json!({"type": "string", "pattern": format!("^[A-Za-z0-9_-]{{1,{MAX_NAME_CHARS}}}$")}))
+    // A number is a name, too.
+    let pattern = format!("^[A-Za-z0-9_-]{{1,{MAX_NAME_CHARS}}}$");
+    or_variable(json!({"type": ["string", "integer"], "pattern": pattern}))
 }
 
 fn texts(description: &str) -> Value {

@@ -47,6 +47,7 @@ pub(super) struct Text {
 
 struct Reader<'a, 'd> {
     parser: Parser<'a, StrInput<'a>>,
+    text: &'a str,
     diagnostics: &'d mut Diagnostics,
 }
 
@@ -80,7 +81,7 @@ pub(super) fn parse(text: &str, diagnostics: &mut Diagnostics) -> Option<Value> 
         block_nesting_limit: MAX_DEPTH,
     };
     options.set_emit_comments(false);
-    let mut reader = Reader { parser: Parser::new_from_str_with_options(text, options), diagnostics };
+    let mut reader = Reader { parser: Parser::new_from_str_with_options(text, options), text, diagnostics };
     reader.document()
 }
 
@@ -111,7 +112,10 @@ impl<'a> Reader<'a, '_> {
             Some(Ok(event)) => Some(event),
             Some(Err(error)) => {
                 let at = Position { line: error.marker().line(), column: error.marker().col() + 1 };
-                self.diagnostics.push(at, format!("not valid YAML: {}", error.info()));
+                let line = self.text.lines().nth(at.line - 1).unwrap_or_default();
+                let help = (line.contains("${") && line.contains('{'))
+                    .then(|| "in braces, a value with ${ needs quotes: {rate: \"${RATE:-10}\"}".to_owned());
+                self.diagnostics.push_with_help(at, format!("not valid YAML: {}", error.info()), help);
                 None
             }
             // The parser ends with `StreamEnd` or an error, and this is not called afterwards.

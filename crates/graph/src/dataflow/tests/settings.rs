@@ -144,9 +144,10 @@ fn variables_of_the_environment_are_filled_in() {
         )
     };
     let loops = |value: &str| Ok::<_, DataflowError>(folder.check(yaml(value))?.nodes[0].params["loops"].clone());
-    assert_eq!(loops("'${BLINDGRASP_NO_SUCH_VARIABLE:-7}'").expect_err("a string").diagnostics.len(), 1);
-    assert_eq!(loops("${BLINDGRASP_NO_SUCH_VARIABLE:-7}").expect("good"), json!(7));
-    let error = folder.check(yaml("${BLINDGRASP_NO_SUCH_VARIABLE}")).expect_err("not set");
+    assert_eq!(loops("'${BLINDGRASP_NO_SUCH_VARIABLE:-7}'").expect("good"), json!(7));
+    let without_quotes = loops("${BLINDGRASP_NO_SUCH_VARIABLE:-7}").expect_err("no YAML").to_string();
+    assert!(without_quotes.contains("in braces, a value with ${ needs quotes"), "{without_quotes}");
+    let error = folder.check(yaml("\"${BLINDGRASP_NO_SUCH_VARIABLE}\"")).expect_err("not set");
     let expected = "the variable 'BLINDGRASP_NO_SUCH_VARIABLE' is not set in the environment; set it, or give it a \
                     default: ${BLINDGRASP_NO_SUCH_VARIABLE:-DEFAULT}";
     assert!(error.to_string().contains(expected), "{error}");
