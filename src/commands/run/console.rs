@@ -133,7 +133,7 @@ impl RunSink for Console {
             format!(
                 "grasp {:>5}  {}  slip {:.1} mm  turn {:.1}°  ({})",
                 outcome.grasp_id,
-                if outcome.held { "held   " } else { "DROPPED" },
+                if outcome.held { "kept   " } else { "DROPPED" },
                 outcome.slip_m * 1e3,
                 outcome.turn_rad.to_degrees(),
                 outcome.thing

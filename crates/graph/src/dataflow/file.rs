@@ -122,8 +122,10 @@ fn read_file(path: &Path, content: &[u8], diagnostics: &mut Diagnostics) -> Opti
         .map_err(|error| diagnostics.push(position_after(&content[..error.valid_up_to()]), "not UTF-8 text"))
         .ok()?;
     let mut root = yaml::parse(text, diagnostics)?;
+    let n_before = diagnostics.len();
     fill_in(&mut root, &|name| std::env::var(name).ok(), diagnostics);
-    if diagnostics.len() > 0 {
+    if diagnostics.len() > n_before {
+        // A value that is not known would be a second mistake.
         return None;
     }
     let start = root.at;

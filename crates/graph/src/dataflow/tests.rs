@@ -306,7 +306,7 @@ fn not_the_yaml_we_read() {
             yaml,
             &format!(
                 "1:1: a dataflow file is a mapping, found {found}; \
-                 it begins with 'version: 1' and has the keys version, name, machines, link, operators"
+                 it begins with 'version: 1' and has the keys version, name, params, machines, link, operators"
             ),
         );
     }
@@ -352,7 +352,7 @@ fn the_top_level() {
     );
     check_err(
         format!("version: 1\nname: g\nrobots: {{}}\n{nodes}"),
-        "3:1: unknown key 'robots'; known keys: version, name, machines, link, operators",
+        "3:1: unknown key 'robots'; known keys: version, name, params, machines, link, operators",
     );
     check_err(format!("version: 1\nname: g\nname: h\n{nodes}"), "3:1: duplicate key 'name', first given in line 2");
     check_err(format!("version: 1\nname: [g]\n{nodes}"), "2:7: name must be text, found a list");
@@ -399,7 +399,7 @@ fn the_form_of_a_node() {
 #[test]
 fn programs() {
     let known = "known operators: arbiter, broken, contacts, crooked, filter, newer, nonsense, source; \
-                 a path to a program has a '/'";
+                 no program of this name is on PATH; a path to a program has a '/'";
     check_nodes_err("  robot:\n", &format!("4:3: unknown operator 'robot'; {known}"));
     check_nodes_err("  a: {run: sorce}\n", &format!("4:12: unknown operator 'sorce'; did you mean 'source'? {known}"));
     check_nodes_err(

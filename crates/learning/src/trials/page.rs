@@ -168,12 +168,12 @@ fn moments_of_a_drop(snapshots: &[Snapshot]) -> Vec<&Snapshot> {
 fn caption(record: &TrialRecord) -> String {
     let what = match (record.lifted, record.held) {
         (true, true) => format!(
-            "lifted and held; it slipped {:.1} mm and turned {:.1}° in the hand",
+            "lifted and kept; it slipped {:.1} mm and turned {:.1}° in the hand",
             1000.0 * record.slip_m,
             record.turn_rad.to_degrees()
         ),
         (true, false) => "lifted and dropped".into(),
-        (false, _) => "held back".into(),
+        (false, _) => "held".into(),
     };
     let epsilon = record.epsilon.map_or(String::new(), |epsilon| format!("; epsilon {epsilon:.3}"));
     format!("{}: {what} (trial {}, attempt {}{epsilon})", record.thing, record.trial, record.attempt)
@@ -200,7 +200,7 @@ fn lead(report: &TrialsReport) -> String {
     ] {
         if let Some(total) = tallies.as_ref().map(|tallies| &tallies.total) {
             parts.push(format!(
-                "{name}, {} of {} lifts held ({} attempts, {} of {} trials given up).",
+                "{name}, {} of {} lifts kept ({} attempts, {} of {} trials given up).",
                 total.n_held, total.n_lifts, total.n_attempts, total.n_given_up, total.n_trials
             ));
         }
@@ -265,11 +265,11 @@ mod tests {
             .collect();
         let page = trials_page(&report, &strips);
         for expected in [
-            "2 of 3 lifts held (8 attempts, 1 of 4 trials given up)",
+            "2 of 3 lifts kept (8 attempts, 1 of 4 trials given up)",
             "Of 2 drops, 2 were avoided.",
             "<td class=\"number\">2 of 2, 100 % (34-100)</td>",
             "Table IV: the mug by mass",
-            "decorative rock: held back (trial 3, attempt 0; epsilon -0.100)",
+            "decorative rock: held (trial 3, attempt 0; epsilon -0.100)",
             "models/&lt;any&gt;.json",
             "src=\"data:image/png;base64,",
         ] {

@@ -104,16 +104,16 @@ impl RegraspEffect {
         let second = [&self.second_advised, &self.second_at_random];
         let all = [&self.next_advised, &self.next_at_random];
         let rows = [
-            ("trials that held", trials(|totals| totals.n_held)),
+            ("trials that kept the object", trials(|totals| totals.n_held)),
             ("trials that dropped", trials(|totals| totals.n_dropped)),
             ("trials given up", trials(|totals| totals.n_given_up)),
             ("attempts", of_both(&|totals| totals.n_attempts.to_string())),
-            ("attempts per held lift", of_both(&|totals| number(totals.attempts_per_held))),
-            ("attempts per held lift, for each at random", [number(self.attempts_per_held_ratio), String::new()]),
+            ("attempts per kept object", of_both(&|totals| number(totals.attempts_per_held))),
+            ("attempts per kept object, for each at random", [number(self.attempts_per_held_ratio), String::new()]),
             ("second attempts of the same trials lifted", next(|next| next.n_lifted, second)),
-            ("second attempts of the same trials held", next(|next| next.n_held, second)),
+            ("second attempts of the same trials that kept it", next(|next| next.n_held, second)),
             ("all next attempts lifted", next(|next| next.n_lifted, all)),
-            ("all next attempts held", next(|next| next.n_held, all)),
+            ("all next attempts that kept it", next(|next| next.n_held, all)),
         ];
         Table {
             title: "What advice changed, in the same trials".into(),

@@ -137,7 +137,7 @@ fn table_2(report: &TrialsReport) -> Table {
     let ways = report.ways();
     let has_paper = ways.iter().any(|(_, tallies)| tallies.groups.iter().any(|group| group.paper.is_some()));
     let mut head = vec!["object".to_string(), "mass, kg".into()];
-    head.extend(ways.iter().map(|(name, _)| format!("held, {name}")));
+    head.extend(ways.iter().map(|(name, _)| format!("kept, {name}")));
     head.extend(has_paper.then(|| "paper".to_string()));
     let row = |tally: &Tally, find: &dyn Fn(&Tallies) -> Option<Tally>| {
         let mut row = vec![tally.name.clone(), range(tally.mass_kg)];
@@ -154,7 +154,7 @@ fn table_2(report: &TrialsReport) -> Table {
     if let Some((_, tallies)) = ways.first() {
         rows.push(row(&tallies.total, &|tallies| Some(tallies.total.clone())));
     }
-    Table { title: "Table II: lifts that held (95 % interval)".into(), head, rows }
+    Table { title: "Table II: lifts that kept the object (95 % interval)".into(), head, rows }
 }
 
 /// The canteen: two surfaces, two masses.
@@ -211,10 +211,10 @@ fn attempts(report: &TrialsReport) -> Table {
         "attempts",
         "advised",
         "lifts",
-        "held",
+        "kept",
         "given up",
         "attempts per lift",
-        "attempts per held lift",
+        "attempts per kept object",
     ];
     let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
     let row = |tally: &Tally| {
@@ -247,7 +247,7 @@ fn cost(report: &TrialsReport) -> Table {
         ]
     };
     let head =
-        ["", "attempts per lift", "attempts per held lift", "given up", "with a probe", "disturbed", "held per hour"];
+        ["", "attempts per lift", "attempts per kept object", "given up", "with a probe", "disturbed", "kept per hour"];
     Table {
         title: "Cost, in the robot's time".into(),
         head: head.map(String::from).into(),
@@ -311,8 +311,8 @@ fn closure(report: &TrialsReport) -> Table {
         std::iter::once(name).chain(found).collect()
     });
     let rows = if ways.is_empty() { Vec::new() } else { rows.collect() };
-    let head = std::iter::once("grasp".into()).chain(ways.iter().map(|(name, _)| format!("held, {name}"))).collect();
-    Table { title: "Lifts that held, by what the wrench space of the grasp says".into(), head, rows }
+    let head = std::iter::once("grasp".into()).chain(ways.iter().map(|(name, _)| format!("kept, {name}"))).collect();
+    Table { title: "Lifts that kept the object, by what the wrench space of the grasp says".into(), head, rows }
 }
 
 /// Names of all ways, each once.
@@ -394,7 +394,7 @@ pub(super) mod tests {
     fn the_papers_tables_have_its_figures_beside() {
         let text: Vec<String> = tables(&both()).iter().flat_map(Table::to_text).collect();
         let text = text.join("\n");
-        assert!(text.starts_with("Table II: lifts that held (95 % interval)\nobject    mass, kg"), "{text}");
+        assert!(text.starts_with("Table II: lifts that kept the object (95 % interval)\nobject    mass, kg"), "{text}");
         for line in [
             "mug      0.43-0.93  2 of 2, 100 % (34-100)",
             "20 of 20, 100 %",
@@ -426,9 +426,9 @@ pub(super) mod tests {
             text.iter().map(|line| line.split_whitespace().collect::<Vec<_>>().join(" ")).collect();
         let text = words.join("\n");
         for line in [
-            "held, with the gate, at random",
-            "attempts per held lift 2.50 6.00",
-            "attempts per held lift, for each at random 0.42",
+            "kept, with the gate, at random",
+            "attempts per kept object 2.50 6.00",
+            "attempts per kept object, for each at random 0.42",
             "second attempts of the same trials held 1 of 2, 50 % 0 of 2, 0 %",
         ] {
             assert!(text.contains(line), "no '{line}' in\n{text}");
@@ -450,7 +450,7 @@ pub(super) mod tests {
         let alone = report(records(&[("box-02", "box", 0.1, "-h")]), Vec::new());
         let tables = tables(&alone);
         assert_eq!(tables.len(), 5, "{tables:?}");
-        assert_eq!(tables[0].head, ["object", "mass, kg", "held, with the gate"]);
+        assert_eq!(tables[0].head, ["object", "mass, kg", "kept, with the gate"]);
         assert_eq!(tables[0].rows[0][2], "1 of 1, 100 % (21-100)");
     }
 

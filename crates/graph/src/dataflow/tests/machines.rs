@@ -12,10 +12,10 @@ machines:
   laptop: {read: robot, control: brain}
 link: {keys: ./keys, deadline_ms: 50, buffer: 100}
 operators:
-  touch: {on: robot}
+  sense: {on: robot}
   judge:
     on: brain
-    inputs: {tactile: touch/tactile}
+    inputs: {tactile: sense/tactile}
     params: {model: models/a.json}
   gate: {on: robot, inputs: {prediction: judge/prediction}}
 ";
@@ -26,7 +26,7 @@ fn describe(program: &Path, _: &[String]) -> Result<OperatorDescription, String>
     let operator = OperatorDescription::new(name, "");
     let path = || ParamKind::Path { must_exist: true };
     Ok(match name {
-        "touch" => operator.output("tactile", TactileFrame::TYPE_NAME, "").output("raw", "t/Raw/1", ""),
+        "sense" => operator.output("tactile", TactileFrame::TYPE_NAME, "").output("raw", "t/Raw/1", ""),
         "arm" => operator.feedback_input("decision", LiftDecision::TYPE_NAME, "").output(
             "tactile",
             TactileFrame::TYPE_NAME,
@@ -56,7 +56,7 @@ fn check_in(folder: &Folder, yaml: &str, scope: Scope, names: &[&str], set: &[&s
     checked.map_err(|error| error.to_string().replace(&format!("{}/", folder.0.display()), ""))
 }
 
-const ALL: [&str; 5] = ["touch", "arm", "judge", "gate", "peek"];
+const ALL: [&str; 5] = ["sense", "arm", "judge", "gate", "peek"];
 
 /// Expects these diagnostics of the whole graph, one a line, each without the file's name.
 fn check_split_err(yaml: &str, expected: &str) {
@@ -102,7 +102,7 @@ fn machines_become_part_of_the_graph() {
     };
     assert_eq!(graph.machines, Some(expected));
     let places: Vec<_> = graph.nodes.iter().map(|node| (node.id.as_str(), node.machine.as_deref())).collect();
-    assert_eq!(places, [("touch", Some("robot")), ("judge", Some("brain")), ("gate", Some("robot"))]);
+    assert_eq!(places, [("sense", Some("robot")), ("judge", Some("brain")), ("gate", Some("robot"))]);
     let crossings: Vec<_> = graph.edges().map(|edge| graph.crossing(&edge)).collect();
     assert_eq!(crossings, [Some(("robot", "brain")), Some(("brain", "robot"))]);
 
@@ -133,8 +133,8 @@ fn one_machine_and_a_router_need_no_listener() {
         ("machines: {one: {listen: [unix/gate, unix/gate_2]}, other: {}}\n", "other"),
     ] {
         let yaml = format!(
-            "version: 1\nname: g\n{machines}operators:\n  touch: {{on: {on}}}\n  judge: {{on: one, params: {{model: \
-             recordings/a.mcap}}, inputs: {{tactile: touch/tactile}}}}\n"
+            "version: 1\nname: g\n{machines}operators:\n  sense: {{on: {on}}}\n  judge: {{on: one, params: {{model: \
+             recordings/a.mcap}}, inputs: {{tactile: sense/tactile}}}}\n"
         );
         let graph = check_in(&folder, &yaml, Scope::Everything, &ALL, &[]).expect(&yaml);
         assert_eq!(graph.machines.map(|machines| machines.machines.len()), Some(2));
@@ -143,7 +143,7 @@ fn one_machine_and_a_router_need_no_listener() {
 
 #[test]
 fn the_form_of_machines() {
-    let file = |machines: &str| format!("version: 1\nname: g\n{machines}operators: {{touch: {{on: a}}}}\n");
+    let file = |machines: &str| format!("version: 1\nname: g\n{machines}operators: {{sense: {{on: a}}}}\n");
     for (machines, expected) in [
         (
             "machines:\n",
@@ -330,18 +330,18 @@ fn where_nodes_run() {
     let folder = Folder::new();
     folder.check("version: 1\nname: g\noperators: {link: {run: ops/own}, run: {run: ops/own}}").expect("good");
     check_split_err(
-        "version: 1\nname: g\noperators:\n  touch: {on: robot}\n  gate: {on: brain, inputs: {prediction: judge/prediction}}\n  \
-         judge: {on: robot, inputs: {tactile: touch/tactile}, params: {model: /}}\n",
-        "4:15: node 'touch' is on 'robot', but the file names no machines; leave 'on' out, or name them, like 'machines: \
+        "version: 1\nname: g\noperators:\n  sense: {on: robot}\n  gate: {on: brain, inputs: {prediction: judge/prediction}}\n  \
+         judge: {on: robot, inputs: {tactile: sense/tactile}, params: {model: /}}\n",
+        "4:15: node 'sense' is on 'robot', but the file names no machines; leave 'on' out, or name them, like 'machines: \
          {robot: {}}'",
     );
     check_split_err(
-        "version: 1\nname: g\nlink: {buffer: 1}\noperators: {touch: }\n",
+        "version: 1\nname: g\nlink: {buffer: 1}\noperators: {sense: }\n",
         "3:1: 'link' has no meaning without the key 'machines'; leave it out, or name the machines that it links",
     );
     // A misspelled key is mistake enough.
     check_split_err(
-        "version: 1\nname: g\nmachine: {robot: {}}\nlink: {buffer: 1}\noperators: {touch: {on: robot}}\n",
+        "version: 1\nname: g\nmachine: {robot: {}}\nlink: {buffer: 1}\noperators: {sense: {on: robot}}\n",
         "3:1: unknown key 'machine'; did you mean 'machines'?",
     );
 }
@@ -352,7 +352,7 @@ fn of_two_machines_with_an_edge_one_listens() {
     check_instead(
         brain,
         "  brain: {}\n",
-        "3:1: no machine listens, but edges cross: touch/tactile → judge/tactile goes from robot to brain; let one \
+        "3:1: no machine listens, but edges cross: sense/tactile → judge/tactile goes from robot to brain; let one \
          listen, like 'brain: {listen: tls/192.168.1.10:7447}', or name a 'router' in 'link'",
     );
     let laptop = "  laptop: {read: robot, control: brain}\n";
@@ -360,7 +360,7 @@ fn of_two_machines_with_an_edge_one_listens() {
     // Only once for both directions.
     check_split_err(
         &yaml,
-        "12:23: touch/tactile → judge/tactile goes from robot to brain, but neither of them listens; let one listen, \
+        "12:23: sense/tactile → judge/tactile goes from robot to brain, but neither of them listens; let one listen, \
          like 'brain: {listen: tls/192.168.1.10:7447}', or name a 'router' in 'link'",
     );
     // One that cannot be read was meant to be one.
@@ -374,15 +374,15 @@ fn of_two_machines_with_an_edge_one_listens() {
 
 #[test]
 fn a_loop_may_cross_but_not_its_feedback() {
-    let arm = "  touch: {run: arm, on: robot, inputs: {decision: gate/decision}}\n";
+    let arm = "  sense: {run: arm, on: robot, inputs: {decision: gate/decision}}\n";
     let folder = Folder::new();
-    let yaml = SPLIT.replace("models/a.json", "hands/a.yaml").replace("  touch: {on: robot}\n", arm);
+    let yaml = SPLIT.replace("models/a.json", "hands/a.yaml").replace("  sense: {on: robot}\n", arm);
     let graph = check_in(&folder, &yaml, Scope::Everything, &ALL, &[]).expect("feedback on one machine");
-    assert_eq!(graph.nodes.iter().map(|node| node.id.as_str()).collect::<Vec<_>>(), ["touch", "judge", "gate"]);
+    assert_eq!(graph.nodes.iter().map(|node| node.id.as_str()).collect::<Vec<_>>(), ["sense", "judge", "gate"]);
     check_instead(
-        "  touch: {on: robot}\n",
+        "  sense: {on: robot}\n",
         &arm.replace("robot", "brain"),
-        "9:51: gate/decision → touch/decision goes from robot to brain, but feedback cannot go between machines; let \
+        "9:51: gate/decision → sense/decision goes from robot to brain, but feedback cannot go between machines; let \
          both nodes run on one machine",
     );
 }
@@ -393,15 +393,15 @@ fn only_messages_of_blindgrasp_cross() {
     let types = MESSAGE_TYPES.join(", ");
     check_instead(
         peek,
-        &format!("  peek: {{on: brain, inputs: {{raw: touch/raw}}}}\n{peek}"),
+        &format!("  peek: {{on: brain, inputs: {{raw: sense/raw}}}}\n{peek}"),
         &format!(
-            "14:35: touch/raw → peek/raw goes from robot to brain, but 't/Raw/1' cannot go between machines; let both \
+            "14:35: sense/raw → peek/raw goes from robot to brain, but 't/Raw/1' cannot go between machines; let both \
              nodes run on one machine; known types that can: {types}"
         ),
     );
     let folder = Folder::new();
     let yaml = SPLIT.replace("models/a.json", "hands/a.yaml");
-    let here = yaml.replace(peek, &format!("  peek: {{on: robot, inputs: {{raw: touch/raw}}}}\n{peek}"));
+    let here = yaml.replace(peek, &format!("  peek: {{on: robot, inputs: {{raw: sense/raw}}}}\n{peek}"));
     check_in(&folder, &here, Scope::Everything, &ALL, &[]).expect("an edge that does not cross");
     assert!(MESSAGE_TYPES.contains(&ContactSet::TYPE_NAME));
 }
@@ -418,7 +418,7 @@ fn a_machine_needs_its_own_programs_and_files_only() {
     assert_eq!(judge.params["model"], json!(folder.0.join("models/a.json")));
     assert_eq!((&judge.params["k"], judge.description.version.as_str()), (&json!(3), env!("CARGO_PKG_VERSION")));
 
-    let graph = check_in(&folder, SPLIT, robot, &["touch", "gate"], &[]).expect("good");
+    let graph = check_in(&folder, SPLIT, robot, &["sense", "gate"], &[]).expect("good");
     let judge = graph.node("judge").expect("there");
     assert_eq!((judge.machine.as_deref(), judge.program.as_path()), (Some("brain"), Path::new("judge")));
     assert_eq!((judge.description.operator.as_str(), judge.description.version.as_str()), ("judge", UNKNOWN_VERSION));
@@ -439,17 +439,17 @@ fn a_machine_needs_its_own_programs_and_files_only() {
         &[],
     );
     let graph = graph.expect("good");
-    assert_eq!(types(graph.node("touch").expect("there").outputs()), [format!("tactile: {}", TactileFrame::TYPE_NAME)]);
+    assert_eq!(types(graph.node("sense").expect("there").outputs()), [format!("tactile: {}", TactileFrame::TYPE_NAME)]);
     assert_eq!(graph.node("gate").expect("there").inputs[0].type_name, Prediction::TYPE_NAME);
     // A machine without operators needs no program at all.
     let graph = check_in(&folder, SPLIT, Scope::Machine("laptop"), &[], &[]).expect("good");
-    assert_eq!(types(graph.node("touch").expect("there").outputs()), [format!("tactile: {UNKNOWN_TYPE}")]);
+    assert_eq!(types(graph.node("sense").expect("there").outputs()), [format!("tactile: {UNKNOWN_TYPE}")]);
     assert_eq!(graph.edges().map(|edge| edge.type_name).collect::<Vec<_>>(), [UNKNOWN_TYPE; 2]);
 
     // A program by its path, which is not there or not for this computer.
     for run in ["./ops/absent", "./ops/text", "./ops/own"] {
         let yaml = SPLIT.replace("    on: brain\n", &format!("    on: brain\n    run: {run}\n"));
-        let graph = check_in(&folder, &yaml, robot, &["touch", "gate"], &[]).expect(run);
+        let graph = check_in(&folder, &yaml, robot, &["sense", "gate"], &[]).expect(run);
         assert_eq!(graph.node("judge").map(|judge| judge.program.clone()), Some(folder.0.join(&run[2..])));
     }
 }
@@ -458,7 +458,7 @@ fn a_machine_needs_its_own_programs_and_files_only() {
 fn mistakes_that_a_machine_sees() {
     let folder = Folder::new();
     let robot = Scope::Machine("robot");
-    let here = ["touch", "gate"];
+    let here = ["sense", "gate"];
     for (piece, by, expected) in [
         (
             "{on: robot, inputs: {prediction",
@@ -466,20 +466,20 @@ fn mistakes_that_a_machine_sees() {
             "dataflow.yaml:14:30: unknown input 'predictoin' of node 'gate'; did you mean 'prediction'?",
         ),
         (
-            "touch/tactile",
-            "touch/tactil",
-            "dataflow.yaml:12:23: node 'touch' has no output 'tactil'; did you mean 'tactile'?",
+            "sense/tactile",
+            "sense/tactil",
+            "dataflow.yaml:12:23: node 'sense' has no output 'tactil'; did you mean 'tactile'?",
         ),
-        ("touch/tactile", "tuoch/tactile", "dataflow.yaml:12:23: there is no node 'tuoch'; did you mean 'touch'?"),
+        ("sense/tactile", "snese/tactile", "dataflow.yaml:12:23: there is no node 'snese'; did you mean 'sense'?"),
         (
             "    on: brain\n",
             "    on: brain\n    args: x\n",
             "dataflow.yaml:12:11: 'args' of node 'judge' must be a list of texts, found 'x'; write [x]",
         ),
         (
-            "touch: {on",
-            "touch: {run: tuch, on",
-            "dataflow.yaml:9:16: unknown operator 'tuch'; did you mean 'touch'? known operators: gate, touch; a path to \
+            "sense: {on",
+            "sense: {run: snse, on",
+            "dataflow.yaml:9:16: unknown operator 'snse'; did you mean 'sense'? known operators: gate, sense; no program of this name is on PATH; a path to \
              a program has a '/'",
         ),
     ] {
@@ -489,7 +489,7 @@ fn mistakes_that_a_machine_sees() {
     // What the first reader expects is held against the others.
     let peek = "gate: {on: robot,";
     let yaml = SPLIT.replace(peek, &format!("peek: {{on: robot, inputs: {{raw: judge/prediction}}}}\n  {peek}"));
-    let error = check_in(&folder, &yaml, robot, &["touch", "gate", "peek"], &[]).expect_err("two types");
+    let error = check_in(&folder, &yaml, robot, &["sense", "gate", "peek"], &[]).expect_err("two types");
     let expected = format!(
         "input 'prediction' of node 'gate' takes {}, but judge/prediction gives t/Raw/1",
         Prediction::TYPE_NAME
@@ -500,7 +500,7 @@ fn mistakes_that_a_machine_sees() {
         of_machine("brian", SPLIT).starts_with("dataflow.yaml: there is no machine 'brian'; did you mean 'brain'?")
     );
     assert_eq!(
-        of_machine("brain", "version: 1\nname: g\noperators: {touch: }"),
+        of_machine("brain", "version: 1\nname: g\noperators: {sense: }"),
         "dataflow.yaml: there is no machine 'brain': the file names none; leave --machine out"
     );
 
@@ -522,7 +522,7 @@ fn damaged_machines_give_errors_not_panics() {
             changed[at] = byte;
             for scope in [Scope::Everything, Scope::Machine("robot")] {
                 let checked = parse(&folder.0.join("dataflow.yaml"), &changed)
-                    .and_then(|file| check(&file, &shipped_with(&["touch", "gate"]), &[], scope, describe));
+                    .and_then(|file| check(&file, &shipped_with(&["sense", "gate"]), &[], scope, describe));
                 if let Err(error) = checked {
                     assert_eq!(error.to_string().lines().count(), error.diagnostics.len(), "{error}");
                 }

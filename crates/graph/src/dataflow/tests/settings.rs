@@ -131,7 +131,7 @@ fn params_of_the_file_serve_each_node_that_has_them() {
     let error = check(&file, &shipped(), &set, Scope::Everything, describe).expect_err("no such param");
     assert_eq!(error.to_string(), "--set lops=4: no node has the param 'lops'; did you mean 'loops'?");
     let error = folder.check(yaml("{recording: recordings/a.mcap, lops: 3}")).expect_err("no such param");
-    let expected = ":3:41: no node has the param 'lops'; did you mean 'loops'?";
+    let expected = ":3:40: no node has the param 'lops'; did you mean 'loops'?";
     assert!(error.to_string().ends_with(expected) && error.diagnostics.len() == 1, "{error}");
 }
 
