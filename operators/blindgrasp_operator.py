@@ -255,7 +255,7 @@ def fault_of(head: Any) -> Fault:
         return Fault.MALFORMED
 
 
-def run(description: Description, start: Callable[[dict[str, Any]], Stage]) -> None:
+def run(description: Description, start: Callable[[dict[str, Any]], Stage | Source]) -> None:
     """The `main` of an operator: answers `--describe`, or joins the graph and works until it is asked to end."""
     if "--describe" in sys.argv[1:]:
         print(json.dumps(description.to_json()))
@@ -1790,7 +1790,7 @@ def _instance(operator: _Operator, description: Description, work: Stage | Sourc
     return (_AlikeStage if is_alike else _KeepingStage)(operator, description, work, params)
 
 
-def _join_and_work(description: Description, start: Callable[[dict[str, Any]], Stage]) -> None:
+def _join_and_work(description: Description, start: Callable[[dict[str, Any]], Stage | Source]) -> None:
     threading.Thread(target=_end_with_launcher, args=[os.getppid()], daemon=True).start()
     wiring = json.loads(os.environ[WIRING_VARIABLE])
     operator = _Operator(wiring, description)
