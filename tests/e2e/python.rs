@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use crate::common::python::{assert_each_once, python, python_operator, shell, utf8};
 use crate::common::{
-    Ended, FAST_FOREVER, Graph, MODEL, RECORDING, classifier_runs, dataflow, dataflow_with, json_lines, of_node, project,
-    run, shared_folder, signal, swap, text, unique_name, wait_until,
+    Ended, FAST_FOREVER, Graph, MODEL, RECORDING, classifier_runs, dataflow, dataflow_with, json_lines, of_node,
+    project, run, shared_folder, signal, swap, text, unique_name, wait_until,
 };
 use rustix::process::Signal;
 use serde_json::Value;
@@ -207,14 +207,8 @@ const KINDS_OF_SOURCE: [&str; 2] = ["recording", "device"];
 /// A node may be killed often, and comes back at once.
 const PATIENT: &str = "    restart: {policy: on-failure, limit: 1000, within_s: 60, backoff_ms: 1}\n";
 /// Arguments of `run` for a graph with the source of [`with_source`], which plays the recording over and over.
-const PLAY_ON: [&str; 6] = [
-    "--set",
-    "recorded_source.repeat=100000",
-    "--set",
-    "lift_arbiter.max_age_ms=600000",
-    "--wait-limit",
-    "60",
-];
+const PLAY_ON: [&str; 6] =
+    ["--set", "recorded_source.repeat=100000", "--set", "lift_arbiter.max_age_ms=600000", "--wait-limit", "60"];
 
 /// The frames and labels of the project's recording as lines of JSON.
 fn exported() -> &'static Path {
@@ -258,22 +252,29 @@ fn with_ports(folder: &Path) -> Vec<(String, String)> {
     ]
 }
 
+/// The process of a node, once it has one again.
+fn pid_of(graph: &Graph, node: &str) -> i32 {
+    wait_until(|| graph.node(node)["pid"].is_i64(), || graph.said());
+    graph.pid_of(node)
+}
+
 /// Kills, hangs and swaps a node, alone and with one of its readers, with decisions in between.
 fn disturb(graph: &Graph, node: &str, reader: &str) {
     let is_alone = node == reader;
     for _ in 0..3 {
+        pid_of(graph, node);
         graph.kill(node);
         graph.wait_for_decisions(A_FEW_GRASPS);
     }
     swap(graph, &[node, "--probation", "0.3"], 0);
     graph.wait_for_decisions(A_FEW_GRASPS);
     if !is_alone {
-        for pid in [graph.pid_of(node), graph.pid_of(reader)] {
+        for pid in [pid_of(graph, node), pid_of(graph, reader)] {
             signal(pid, Signal::KILL);
         }
         graph.wait_for_decisions(A_FEW_GRASPS);
         // Its reader stands still meanwhile.
-        let (slow, killed) = (graph.pid_of(reader), graph.pid_of(node));
+        let (slow, killed) = (pid_of(graph, reader), pid_of(graph, node));
         signal(slow, Signal::STOP);
         std::thread::sleep(Duration::from_millis(300));
         signal(killed, Signal::KILL);
@@ -282,7 +283,7 @@ fn disturb(graph: &Graph, node: &str, reader: &str) {
         graph.wait_for_decisions(A_FEW_GRASPS);
     }
     // It is found to hang.
-    let stopped = graph.pid_of(node);
+    let stopped = pid_of(graph, node);
     signal(stopped, Signal::STOP);
     wait_until(|| graph.node(node)["pid"].as_i64().is_some_and(|pid| pid as i32 != stopped), || graph.said());
     graph.wait_for_decisions(A_FEW_GRASPS);
@@ -346,8 +347,9 @@ fn a_graph_with_a_source_and_several_ports_in_python_is_disturbed_anywhere_witho
 fn a_source_in_python_whose_samples_cannot_be_saved_is_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let flow = dataflow_with(folder.path(), &with_source(folder.path(), "device"));
-    let large = ["run", "--name", &unique_name(), "--set", "recorded_source.max_items=16384", utf8(&flow)];
-    let stderr = text(&run(&large, 1).stderr);
+    let name = unique_name();
+    let stderr =
+        text(&run(&["run", "--name", &name, "--set", "recorded_source.max_items=16384", utf8(&flow)], 1).stderr);
     assert!(stderr.contains("expected at most") && stderr.contains("give a smaller max_items"), "{stderr}");
 }
 
