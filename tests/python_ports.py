@@ -13,7 +13,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "operators"))
 from blindgrasp_messages import ContactSet, GraspFeature, GraspFeatureHead, GraspTruth, TactileFrame
 from blindgrasp_operator import Description, Stage, run
 
-SPLIT = Description("split", "Gives each frame twice", ("tactile", TactileFrame), outputs=[("a", TactileFrame), ("b", TactileFrame)])
+SPLIT = Description(
+    "split", "Gives each frame twice", ("tactile", TactileFrame), outputs=[("a", TactileFrame), ("b", TactileFrame)]
+)
 JOIN = Description(
     "join",
     "Passes on one of two streams and counts truths",
