@@ -126,7 +126,7 @@ class Description:
 
     def __post_init__(self) -> None:
         if (self.input and self.inputs) or (self.output and self.outputs):
-            raise ValueError("a Description has both one port and a list of them: expected `input` or `inputs`, `output` or `outputs`")
+            raise ValueError("a Description has one port and a list of them: expected `input` or `inputs`, `output` or `outputs`")
         self.inputs = [self.input] if self.input else list(self.inputs)
         outputs = [self.output] if self.output else list(self.outputs)
         self.outputs = [output[:2] for output in outputs]
@@ -145,8 +145,8 @@ class Description:
             self.answers_each = len(self.inputs) == 1
         if self.answers_each and len(self.inputs) != 1:
             raise ValueError(
-                f"{self.operator} has {len(self.inputs)} inputs and answers_each=True: expected one input, because the nodes before "
-                "it would take the numbers of one input for those of another; leave answers_each out"
+                f"{self.operator} has {len(self.inputs)} inputs and answers_each=True: expected one input, because the nodes "
+                "before it would take the numbers of one input for those of another; leave answers_each out"
             )
 
     def to_json(self) -> dict[str, Any]:
@@ -255,7 +255,7 @@ def fault_of(head: Any) -> Fault:
         return Fault.MALFORMED
 
 
-def run(description: Description, start: Callable[[dict[str, Any]], Stage]) -> None:
+def run(description: Description, start: Callable[[dict[str, Any]], Stage | Source]) -> None:
     """The `main` of an operator: answers `--describe`, or joins the graph and works until it is asked to end."""
     if "--describe" in sys.argv[1:]:
         print(json.dumps(description.to_json()))
@@ -1008,7 +1008,13 @@ class _Publisher:
     def give_up_guests_alone_at(self, key: Key, waited_nanos: int) -> bool:
         """Whether guests alone have not answered a sample that was sent. They are given up after their time."""
         last = self.last()
-        is_behind = lambda place: not _is_at_most(key, place) and (place is None or last is None or place[0] != last[0] or place[0] == key[0])  # noqa: E731
+
+        def is_behind(place: Key | None) -> bool:
+            if place is None or place[0] == key[0]:
+                return not _is_at_most(key, place)
+            # A reader in an earlier epoch is behind.
+            return last is None or place[0] != last[0]
+
         behind = [consumer for consumer in self.consumers if any(map(is_behind, self._places([consumer])))]
         if not behind or not all(consumer.get("guest_cells") for consumer in behind):
             return False
@@ -1601,7 +1607,7 @@ class _KeepingStage(_StageInstance):
                 if of_input == entry.port and not is_skipped and port not in has_answer:
                     raise RuntimeError(f"it did not answer on the output {port}, expected an answer to each sample of {of_input}")
                 if of_input not in (None, entry.port) and port in has_answer:
-                    raise RuntimeError(f"it answered a sample of {entry.port} on the output {port}, which answers those of {of_input}")
+                    raise RuntimeError(f"it answered a sample of {entry.port} on the output {port}, expected one of {of_input}")
                 if has_gap and of_input is None and output.last is not None and not self.numbers_itself:
                     # Readers of an output that counts must find the gap as well.
                     output.last = (output.last[0], output.last[1] + 1)
@@ -1640,8 +1646,8 @@ class _SourceInstance(_Instance):
         self.n_next_bytes = sum(output.max_bytes for output in self.outputs.values())
         if self.store is not None and self.store.n_head_bytes + 16 + self.n_next_bytes > STATE_BYTES:
             raise RuntimeError(
-                f"its samples may take {self.n_next_bytes} bytes, expected at most {STATE_BYTES - self.store.n_head_bytes - 16}: more "
-                "cannot be saved until readers have them; give a smaller max_items, or a `resume` that can give samples again"
+                f"its samples may take {self.n_next_bytes} bytes, expected at most {STATE_BYTES - self.store.n_head_bytes - 16}: "
+                "more cannot be saved until readers have them; give a smaller max_items, or a `resume` that can give samples again"
             )
 
     def work_until_stopped(self) -> None:
@@ -1749,8 +1755,8 @@ class _SourceInstance(_Instance):
     def send_again(self, output: _Output, head: Any, raw_items: bytes) -> bool:
         """Sends a sample unless readers have it; false if it was asked to give way."""
         key, before = (head.header.epoch, head.header.seq), self.came.get(output.port)
-        if _is_at_most(key, before):
-            raise RuntimeError(f"sample {key[1]} of the output {output.port} came after {before[1]}, expected a greater number")  # type: ignore[index]
+        if before is not None and _is_at_most(key, before):
+            raise RuntimeError(f"sample {key[1]} of the output {output.port} came after {before[1]}, expected a greater number")
         self.came[output.port] = key
         if output.known is not None:
             is_past = key[0] == output.known[0] and key[1] >= output.known[1]
@@ -1766,8 +1772,8 @@ class _SourceInstance(_Instance):
         for port, output in self.outputs.items():
             if output.known is not None:
                 raise RuntimeError(
-                    f"it ended without sample {output.known[1]} of epoch {output.known[0]} of the output {port}, which readers have: "
-                    "expected that after `resume`, `next` gives that sample or one before it, and then the same samples again"
+                    f"it ended without sample {output.known[1]} of epoch {output.known[0]} of the output {port}, which readers "
+                    "have: expected that after `resume`, `next` gives that sample or one before it, and then the same samples again"
                 )
 
 
@@ -1790,7 +1796,7 @@ def _instance(operator: _Operator, description: Description, work: Stage | Sourc
     return (_AlikeStage if is_alike else _KeepingStage)(operator, description, work, params)
 
 
-def _join_and_work(description: Description, start: Callable[[dict[str, Any]], Stage]) -> None:
+def _join_and_work(description: Description, start: Callable[[dict[str, Any]], Stage | Source]) -> None:
     threading.Thread(target=_end_with_launcher, args=[os.getppid()], daemon=True).start()
     wiring = json.loads(os.environ[WIRING_VARIABLE])
     operator = _Operator(wiring, description)

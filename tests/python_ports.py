@@ -10,17 +10,19 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "operators"))
-from blindgrasp_messages import ContactSet, ContactSetHead, GraspFeature, GraspTruth, TactileFrame
+from blindgrasp_messages import ContactSet, GraspFeature, GraspFeatureHead, GraspTruth, TactileFrame
 from blindgrasp_operator import Description, Stage, run
 
-SPLIT = Description("split", "Gives each frame twice", ("tactile", TactileFrame), outputs=[("a", TactileFrame), ("b", TactileFrame)])
+SPLIT = Description(
+    "split", "Gives each frame twice", ("tactile", TactileFrame), outputs=[("a", TactileFrame), ("b", TactileFrame)]
+)
 JOIN = Description(
     "join",
     "Passes on one of two streams and counts truths",
     inputs=[("a", TactileFrame), ("b", TactileFrame), ("truth", GraspTruth)],
-    outputs=[("tactile", TactileFrame, "a"), ("counted", ContactSet)],
+    outputs=[("tactile", TactileFrame, "a"), ("counted", GraspFeature)],
 )
-CHECK = Description("check", "Checks what was counted", ("counted", ContactSet), ("feature", GraspFeature), answers_each=False)
+CHECK = Description("check", "Checks what was counted", ("counted", GraspFeature), ("contacts", ContactSet), answers_each=False)
 
 
 class Numbers:
@@ -52,7 +54,7 @@ def join(_params):
     def answer(port, head, items):
         numbers.check(port, head.header.seq)
         if port == "truth":
-            return {"counted": ContactSetHead(grasp_id=head.grasp_id, n_pads_in_contact=numbers.next[port])}
+            return {"counted": GraspFeatureHead(grasp_id=head.grasp_id, dictionary_id=numbers.next[port])}
         return {"tactile": (head, items)} if port == "a" else None
 
     return Stage(answer, state=numbers.state, restore=numbers.restore, max_items={"tactile": 160})
@@ -63,8 +65,8 @@ def check(_params):
 
     def answer(head, _items):
         numbers.check("counted", head.header.seq)
-        if head.n_pads_in_contact != head.header.seq + 1:
-            raise RuntimeError(f"sample {head.header.seq} counts {head.n_pads_in_contact} truths")
+        if head.dictionary_id != head.header.seq + 1:
+            raise RuntimeError(f"sample {head.header.seq} counts {head.dictionary_id} truths")
 
     return Stage(answer, state=numbers.state, restore=numbers.restore)
 

@@ -24,6 +24,7 @@ DESCRIPTION = Description(
         Param("like", "choice", values=["recording", "device"]),
         Param("period_ms", "number", default=1.0, min=0, live=True),
         Param("repeat", "number", default=1, min=1),
+        Param("max_items", "integer", default=160),
     ],
 )
 
@@ -82,7 +83,7 @@ def start(params):
         nonlocal place
         place = int(state or 0)
 
-    common = {"identity": {"hand": params["hand_id"]}, "max_items": {"tactile": 160, "truth": 128}}
+    common = {"identity": {"hand": params["hand_id"]}, "max_items": {"tactile": params["max_items"], "truth": 128}}
     if params["like"] == "recording":
         return Source(next_sample, resume=resume, **common)
     return Source(next_sample, state=lambda: str(place).encode(), restore=restore, **common)

@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use crate::common::python::{assert_each_once, python, python_operator, shell, utf8};
 use crate::common::{
-    FAST_FOREVER, Graph, MODEL, RECORDING, classifier_runs, dataflow, dataflow_with, json_lines, of_node, project, run,
-    shared_folder, signal, swap, wait_until,
+    Ended, FAST_FOREVER, Graph, MODEL, RECORDING, classifier_runs, dataflow, dataflow_with, json_lines, of_node,
+    project, run, shared_folder, signal, swap, text, unique_name, wait_until,
 };
 use rustix::process::Signal;
 use serde_json::Value;
@@ -200,6 +200,162 @@ fn models_that_do_not_fit_are_refused_in_words() {
     let ended = graph.stop();
     assert_eq!(ended.summary["samples_lost"], 0);
     assert!(ended.summary["reasons"]["wrong_model"].as_u64() > Some(3), "{}", ended.summary);
+}
+
+/// The kinds of sources in Python: one that can give its samples again, and one whose samples come once.
+const KINDS_OF_SOURCE: [&str; 2] = ["recording", "device"];
+/// A node may be killed often, and comes back at once.
+const PATIENT: &str = "    restart: {policy: on-failure, limit: 1000, within_s: 60, backoff_ms: 1}\n";
+/// Arguments of `run` for a graph with the source of [`with_source`], which plays the recording over and over.
+const PLAY_ON: [&str; 6] =
+    ["--set", "recorded_source.repeat=100000", "--set", "lift_arbiter.max_age_ms=600000", "--wait-limit", "60"];
+
+/// The frames and labels of the project's recording as lines of JSON.
+fn exported() -> &'static Path {
+    static LINES: OnceLock<PathBuf> = OnceLock::new();
+    LINES.get_or_init(|| {
+        let path = shared_folder("python_source").join("lines.jsonl");
+        let exported = run(&["export", RECORDING, "--topic", "/tactile", "--topic", "/truth"], 0);
+        std::fs::write(&path, exported.stdout).expect("written");
+        path
+    })
+}
+
+/// Replacements for [`dataflow`]: `tests/python_source.py` plays the recording.
+fn with_source(folder: &Path, kind: &str) -> Vec<(String, String)> {
+    let recording = blindgrasp_recording::RecordingReader::open(&project().join(RECORDING)).expect("readable");
+    let hand_id = recording.info().hand_id;
+    let program = python_operator(folder, &project().join("tests/python_source.py"));
+    let at = "  recorded_source:\n    params:\n      recording: recordings/held-out.mcap\n";
+    let params = format!("{{lines: {}, hand_id: '{hand_id:016x}', like: {kind}}}", exported().display());
+    let node = format!("  recorded_source:\n    run: {}\n{PATIENT}    params: {params}\n", program.display());
+    let rest = "      rate: 10                       # times the recorded speed, or max\n    sandbox: on\n";
+    vec![(at.into(), node), (rest.into(), String::new())]
+}
+
+/// Replacements for [`dataflow`]: frames go through operators with several ports, `tests/python_ports.py`.
+fn with_ports(folder: &Path) -> Vec<(String, String)> {
+    let program = python_operator(folder, &project().join("tests/python_ports.py"));
+    let node = |id: &str, inputs: &str| {
+        format!("  {id}:\n    run: {}\n    args: [{id}]\n    inputs: {{{inputs}}}\n{PATIENT}", program.display())
+    };
+    let split = node("split", "tactile: recorded_source/tactile");
+    let join = node("join", "a: split/a, b: split/b, truth: recorded_source/truth");
+    let check = node("check", "counted: join/counted");
+    let end = "    sandbox: on\n  encoder:";
+    vec![
+        ("  contacts:\n".into(), format!("{split}{join}{check}  contacts:\n")),
+        (
+            format!("    inputs: {{tactile: recorded_source/tactile}}\n{end}"),
+            format!("    inputs: {{tactile: join/tactile}}\n{end}"),
+        ),
+    ]
+}
+
+/// The process of a node, once it has one again.
+fn pid_of(graph: &Graph, node: &str) -> i32 {
+    wait_until(|| graph.node(node)["pid"].is_i64(), || graph.said());
+    graph.pid_of(node)
+}
+
+/// Kills, hangs and swaps a node, alone and with one of its readers, with decisions in between.
+fn disturb(graph: &Graph, node: &str, reader: &str) {
+    let is_alone = node == reader;
+    for _ in 0..3 {
+        pid_of(graph, node);
+        graph.kill(node);
+        graph.wait_for_decisions(A_FEW_GRASPS);
+    }
+    swap(graph, &[node, "--probation", "0.3"], 0);
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    if !is_alone {
+        for pid in [pid_of(graph, node), pid_of(graph, reader)] {
+            signal(pid, Signal::KILL);
+        }
+        graph.wait_for_decisions(A_FEW_GRASPS);
+        // Its reader stands still meanwhile.
+        let (slow, killed) = (pid_of(graph, reader), pid_of(graph, node));
+        signal(slow, Signal::STOP);
+        std::thread::sleep(Duration::from_millis(300));
+        signal(killed, Signal::KILL);
+        std::thread::sleep(Duration::from_millis(300));
+        signal(slow, Signal::CONT);
+        graph.wait_for_decisions(A_FEW_GRASPS);
+    }
+    // It is found to hang.
+    let stopped = pid_of(graph, node);
+    signal(stopped, Signal::STOP);
+    wait_until(|| graph.node(node)["pid"].as_i64().is_some_and(|pid| pid as i32 != stopped), || graph.said());
+    graph.wait_for_decisions(A_FEW_GRASPS);
+}
+
+fn assert_as_if_undisturbed(ended: &Ended, what: &str) {
+    ended.assert_undisturbed(what);
+    assert_each_once(ended);
+}
+
+#[test]
+fn a_source_in_python_decides_as_the_recorded_source_does() {
+    for kind in KINDS_OF_SOURCE {
+        let folder = tempfile::tempdir().expect("a folder");
+        let flow = dataflow_with(folder.path(), &with_source(folder.path(), kind));
+        let fast = ["--set", "recorded_source.period_ms=0", "--set", "lift_arbiter.max_age_ms=600000"];
+        let ended = Graph::launch(&unique_name(), &flow, &fast).finish();
+        assert_as_if_undisturbed(&ended, kind);
+        assert_eq!((ended.decisions.len(), &ended.summary["end"]), (240, &"finished".into()), "{kind}");
+        // Each label belongs to its grasp.
+        assert!(ended.summary["accuracy"].as_f64() > Some(0.85), "{}", ended.summary);
+    }
+}
+
+#[test]
+fn a_source_in_python_is_killed_stopped_and_swapped_without_a_loss() {
+    for kind in KINDS_OF_SOURCE {
+        let folder = tempfile::tempdir().expect("a folder");
+        let flow = dataflow_with(folder.path(), &with_source(folder.path(), kind));
+        let graph = Graph::start(&flow, &PLAY_ON);
+        disturb(&graph, "recorded_source", "contacts");
+        run(&["set", "--graph", &graph.name, "recorded_source.period_ms=0"], 0);
+        disturb(&graph, "recorded_source", "contacts");
+        assert_as_if_undisturbed(&graph.stop(), kind);
+    }
+}
+
+#[test]
+fn operators_in_python_with_several_ports_are_killed_stopped_and_swapped_without_a_loss() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = dataflow_with(folder.path(), &with_ports(folder.path()));
+    let graph = start(&flow);
+    for (node, reader) in [("split", "join"), ("join", "contacts"), ("join", "check"), ("check", "check")] {
+        disturb(&graph, node, reader);
+    }
+    assert_as_if_undisturbed(&graph.stop(), "several ports");
+}
+
+#[test]
+fn a_graph_with_a_source_and_several_ports_in_python_is_disturbed_anywhere_without_a_loss() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let replace = [with_source(folder.path(), "device"), with_ports(folder.path())].concat();
+    let graph = Graph::start(&dataflow_with(folder.path(), &replace), &PLAY_ON);
+    for (node, reader) in [("recorded_source", "split"), ("split", "join"), ("join", "check")] {
+        disturb(&graph, node, reader);
+    }
+    assert_as_if_undisturbed(&graph.stop(), "source and several ports");
+}
+
+#[test]
+fn a_source_in_python_whose_samples_cannot_be_saved_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = dataflow_with(folder.path(), &with_source(folder.path(), "device"));
+    let name = unique_name();
+    let stderr =
+        text(&run(&["run", "--name", &name, "--set", "recorded_source.max_items=16384", utf8(&flow)], 1).stderr);
+    assert!(stderr.contains("expected at most") && stderr.contains("give a smaller max_items"), "{stderr}");
+}
+
+#[test]
+fn the_python_module_keeps_its_promises_without_a_graph() {
+    shell(project(), python(), &["tests/operator_module.py"], 0);
 }
 
 #[test]
