@@ -1,5 +1,8 @@
 #!/usr/bin/env python3
-"""Operators in Python with several ports for the tests. Each fails if a sample does not come once and in order.
+"""Operators in Python with several ports for the tests. Each notices if a sample does not come once and in order.
+
+A standby may miss samples before it takes over, so that the active instance alone counts: an instance that takes over
+what it has saved fails if a sample was missing there.
 
 split: gives each frame twice. join: takes both streams and the truths, passes on the frames of one, and counts the truths.
 check: reads what join has counted.
@@ -26,22 +29,24 @@ CHECK = Description("check", "Checks what was counted", ("counted", GraspFeature
 
 
 class Numbers:
-    """The number of samples of each port so far, as the state of a stage."""
+    """The number of samples of each port so far, and what was irregular, as the state of a stage."""
 
     def __init__(self):
-        self.next = {}
+        self.next, self.irregular = {}, ""
 
     def check(self, port, seq):
         expected = self.next.get(port, 0)
         if seq != expected:
-            raise RuntimeError(f"port {port}: sample {seq} came, expected {expected}")
+            self.irregular = f"port {port}: sample {seq} came, expected {expected}"
         self.next[port] = seq + 1
 
     def state(self):
-        return json.dumps(self.next).encode()
+        return json.dumps([self.next, self.irregular]).encode()
 
     def restore(self, state):
-        self.next = json.loads(state or b"{}")
+        self.next, self.irregular = json.loads(state) if state else ({}, "")
+        if self.irregular:
+            raise RuntimeError(self.irregular)
 
 
 def split(_params):
@@ -54,7 +59,8 @@ def join(_params):
     def answer(port, head, items):
         numbers.check(port, head.header.seq)
         if port == "truth":
-            return {"counted": GraspFeatureHead(grasp_id=head.grasp_id, dictionary_id=numbers.next[port])}
+            counted = 0 if numbers.irregular else numbers.next[port]
+            return {"counted": GraspFeatureHead(grasp_id=head.grasp_id, dictionary_id=counted)}
         return {"tactile": (head, items)} if port == "a" else None
 
     return Stage(answer, state=numbers.state, restore=numbers.restore, max_items={"tactile": 160})

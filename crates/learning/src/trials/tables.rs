@@ -429,7 +429,7 @@ pub(super) mod tests {
             "kept, with the gate, at random",
             "attempts per kept object 2.50 6.00",
             "attempts per kept object, for each at random 0.42",
-            "second attempts of the same trials held 1 of 2, 50 % 0 of 2, 0 %",
+            "second attempts of the same trials that kept it 1 of 2, 50 % 0 of 2, 0 %",
         ] {
             assert!(text.contains(line), "no '{line}' in\n{text}");
         }
