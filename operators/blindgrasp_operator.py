@@ -552,7 +552,8 @@ class _Operator:
     def is_to_give_way(self) -> bool:
         """Whether a writer that waits for its readers should give up."""
         self.beat()
-        return self.is_to_quit or any(command["command"] == "hand_over" for command in self.commands)
+        # A copy: the thread that listens may add one meanwhile.
+        return self.is_to_quit or any(command["command"] == "hand_over" for command in list(self.commands))
 
     def should_stop(self) -> bool:
         return self.is_to_stop or self.is_to_quit
@@ -1238,7 +1239,7 @@ class _Store:
         self.n_head_bytes = 64 + self.PORT_BYTES * (len(self.inputs) + len(self.outputs))
         self.operator.board.reserve_state(self.region)
 
-    def save(self, is_done: bool = False) -> bool:
+    def save(self, is_done: bool = False, may_give_way: bool = True) -> bool:
         """Saves all; false if it was asked to give way while it waited for readers of samples that must stay saved."""
         own = b"" if self.state is None else bytes(self.state())
         while True:
@@ -1257,7 +1258,7 @@ class _Store:
                     f"its state takes {len(own)} bytes and the answers to one sample {sum(map(len, samples))}, expected at most "
                     f"{STATE_BYTES - self.n_head_bytes - 16} together"
                 )
-            if not self.wait_for_readers():
+            if not self.wait_for_readers(may_give_way=may_give_way):
                 return False
 
     def wait_for_room(self, n_bytes: int) -> bool:
@@ -1269,7 +1270,7 @@ class _Store:
             if not self.wait_for_readers(may_stop=True):
                 return False
 
-    def wait_for_readers(self, may_stop: bool = False) -> bool:
+    def wait_for_readers(self, may_stop: bool = False, may_give_way: bool = True) -> bool:
         """Waits until all readers have answered one of the saved samples; false if it was asked to give way meanwhile."""
         start = last_look = last_try = _now_nanos()
         slow = [output for output in self.outputs if output.n_sent]
@@ -1277,7 +1278,8 @@ class _Store:
         limit_millis = slow[0].publisher.wait_limit_millis
         try:
             while not any([output.forget() for output in slow]):
-                if self.operator.is_to_give_way() or (may_stop and self.operator.should_stop()):
+                gives_way = self.operator.is_to_give_way() and (may_give_way or self.operator.is_to_quit)
+                if gives_way or (may_stop and self.operator.should_stop()):
                     return False
                 now = _now_nanos()
                 for idx, output in enumerate(slow):
@@ -1638,7 +1640,7 @@ class _SourceInstance(_Instance):
 
     def __init__(self, operator: _Operator, description: Description, source: Source, params: dict[str, Any]) -> None:
         super().__init__(operator, description, source, params)
-        self.is_placed = self.is_done = self.is_handed_over = False
+        self.is_placed = self.is_done = self.is_handed_over = self.is_open = False
         self.has_reported_end = False
         # With `resume`: the last sample of each output that came from it, and the one after which it goes on.
         self.came: dict[str, Key] = {}
@@ -1652,8 +1654,8 @@ class _SourceInstance(_Instance):
 
     def work_until_stopped(self) -> None:
         operator, source = self.operator, self.work
-        if self.is_active and source.open is not None:
-            source.open()
+        if self.is_active:
+            self.open()
         may_go, next_look = False, 0
         _report("ready", identity=source.identity, has_state=False)
         while not operator.should_stop():
@@ -1673,19 +1675,28 @@ class _SourceInstance(_Instance):
                 self.look()
             if until != 0:
                 operator.wait(until)
-        if source.close is not None:
-            source.close()
+        self.close()
         operator.drained(self.look)
 
+    def open(self) -> None:
+        if not self.is_open:
+            self.is_open = True
+            if self.work.open is not None:
+                self.work.open()
+
+    def close(self) -> None:
+        if self.is_open:
+            self.is_open = False
+            if self.work.close is not None:
+                self.work.close()
+
     def take_over(self, is_handed_over: bool) -> None:
-        if self.work.open is not None:
-            self.work.open()
+        self.open()
         self.is_handed_over, self.is_placed = is_handed_over, False
 
     def hand_over(self) -> None:
         self.is_placed = False
-        if self.work.close is not None:
-            self.work.close()
+        self.close()
 
     def next_seq(self) -> int | None:
         last = next(iter(self.outputs.values())).publisher.last()
@@ -1707,8 +1718,10 @@ class _SourceInstance(_Instance):
     def step(self) -> int | None:
         """Sends the next sample. Returns when to take the next step: 0 for at once, None for when something happens."""
         source, store = self.work, self.store
-        if store is not None and not (store.send() and (self.is_done or store.wait_for_room(self.n_next_bytes))):
-            return 0
+        if store is not None:
+            n_state_bytes = 0 if source.state is None else len(source.state())
+            if not (store.send() and (self.is_done or store.wait_for_room(self.n_next_bytes + n_state_bytes))):
+                return 0
         if self.is_done:
             if not self.has_reported_end:
                 self.has_reported_end = True
@@ -1734,7 +1747,7 @@ class _SourceInstance(_Instance):
         return 0
 
     def save_and_send(self, store: _Store, samples: list[tuple[_Output, Any, bytes]]) -> bool:
-        """Numbers samples, saves and sends them; false if they are not saved because it was asked to give way."""
+        """Numbers samples, saves and sends them; false if they are not saved because the graph ends."""
         n_lost, self.work._n_lost = self.work._n_lost, {}
         for port, output in self.outputs.items():
             n_left_out = n_lost.get(None, 0) + n_lost.get(port, 0)
@@ -1746,8 +1759,8 @@ class _SourceInstance(_Instance):
             head.header.epoch, head.header.seq = _next_key(output, self.outputs.values())
             head.header.origin_nanos = _now_nanos()
             output.keep(head, raw_items)
-        if not store.save():
-            # Only a state that has grown gets here: the saved one is older, and gives these samples again.
+        # A device cannot give a reading again: it is saved before another instance takes over, which then sends it.
+        if not store.save(may_give_way=False):
             return False
         store.send()
         return True

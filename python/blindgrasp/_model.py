@@ -135,16 +135,18 @@ def _frame_lines(grasps: list[Grasp]) -> Iterator[bytes]:
     for grasp in grasps:
         if len(grasp.phase) == 0:
             raise ValueError(f"grasp {grasp.grasp_id} has no frames: there is nothing to decide on")
+        seqs, stamps = ([int(number) for number in numbers] for numbers in (grasp.seq, grasp.stamp_nanos))
         for idx, phase in enumerate(grasp.phase):
             data: dict[str, Any] = {name: _numbers(getattr(grasp, name)[idx]) for name in lists}
             data |= {"grasp_id": int(grasp.grasp_id), "phase": str(phase), "day": int(grasp.day)}
-            seq = next_seq + int(grasp.seq[idx]) - int(grasp.seq[0])
-            stamp_nanos = next_stamp + int(grasp.stamp_nanos[idx]) - int(grasp.stamp_nanos[0])
+            seq = next_seq + seqs[idx] - min(seqs)
+            stamp_nanos = next_stamp + stamps[idx] - min(stamps)
             line: dict[str, Any] = {"topic": "/tactile", "seq": seq, "stamp_nanos": stamp_nanos, "data": data}
             if grasp.hand_id:
                 line["hand_id"] = grasp.hand_id
             yield json.dumps(line).encode() + b"\n"
-        next_seq, next_stamp = seq + 1, stamp_nanos + PAUSE_NANOS
+        next_seq += max(seqs) - min(seqs) + 1
+        next_stamp += max(stamps) - min(stamps) + PAUSE_NANOS
 
 
 def _numbers(row: NDArray[np.float64]) -> list[float | None]:

@@ -51,7 +51,7 @@ pub(super) fn search(
     }
     for path in &arguments.grid_report {
         check_new(path, recordings, training.overwrite)?;
-        if *path == training.out {
+        if std::path::absolute(path).ok() == std::path::absolute(&training.out).ok() {
             bail!("{} is given for --out and for --grid-report: choose two files", path.display());
         }
     }

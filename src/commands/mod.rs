@@ -277,11 +277,14 @@ fn check_new(out: &Path, inputs: &[PathBuf], overwrite: bool) -> anyhow::Result<
     }
 }
 
-/// As [`check_output`], for a page, which takes the place of an earlier page and of nothing else.
+/// As [`check_output`], for a page, which takes the place of a file of its name.
 fn check_page(out: &Path, inputs: &[PathBuf]) -> anyhow::Result<()> {
     check_output(out, inputs)?;
     if !out.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("html")) {
         anyhow::bail!("{} (--report): expected a name that ends in .html", out.display());
+    }
+    if out.is_symlink() {
+        anyhow::bail!("{} is a link, which would be replaced: name the file that it leads to", out.display());
     }
     Ok(())
 }

@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 
 use super::text_table::TextTable;
 use super::{Outcome, completions, print_line, set};
-use blindgrasp_graph::client::{ANSWER_LIMIT, Connection, locate, pick_graph};
+use blindgrasp_graph::client::{ANSWER_LIMIT, Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{NodeStatus, Reply, Request};
 use blindgrasp_graph::describe::describe;
 
@@ -67,11 +67,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 }
 
 fn list(arguments: &ListArguments) -> anyhow::Result<Outcome> {
-    let nodes = nodes(arguments.graph.as_deref(), arguments.node.as_deref())?;
+    let (graph, nodes) = nodes(arguments.graph.as_deref(), arguments.node.as_deref())?;
+    // The programs of another machine cannot be asked from here.
+    let is_here = machine_of(&graph).is_none();
     let mut table = TextTable::of_texts(["parameter", "value", ""]);
     for node in &nodes {
-        // Of a program on another machine it is not known.
-        let description = describe(&node.program, &node.args).ok();
+        let description = is_here.then(|| describe(&node.program, &node.args).ok()).flatten();
         for (name, value) in &node.params {
             let live = description
                 .as_ref()
@@ -92,7 +93,7 @@ fn list(arguments: &ListArguments) -> anyhow::Result<Outcome> {
 
 fn get(arguments: &GetArguments) -> anyhow::Result<Outcome> {
     let (node, param) = arguments.param.split_once('.').context("expected NODE.PARAM, as in lift_arbiter.votes")?;
-    let nodes = nodes(arguments.graph.as_deref(), Some(node))?;
+    let (_, nodes) = nodes(arguments.graph.as_deref(), Some(node))?;
     let params = &nodes.first().context("the graph has no such node")?.params;
     let Some(value) = params.get(param) else {
         let known: Vec<&str> = params.keys().map(String::as_str).collect();
@@ -102,8 +103,8 @@ fn get(arguments: &GetArguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// The nodes of a graph, or one of them, wherever it runs.
-fn nodes(graph: Option<&str>, node: Option<&str>) -> anyhow::Result<Vec<NodeStatus>> {
+/// The nodes of a graph, or one of them, wherever it runs, and the name of the graph or of its part there.
+fn nodes(graph: Option<&str>, node: Option<&str>) -> anyhow::Result<(String, Vec<NodeStatus>)> {
     let mut graph = pick_graph(graph)?;
     if let Some(node) = node {
         graph = locate(&graph, &[node.into()])?;
@@ -121,7 +122,7 @@ fn nodes(graph: Option<&str>, node: Option<&str>) -> anyhow::Result<Vec<NodeStat
             bail!("graph '{graph}' has no node '{node}'; its nodes: {}", known.join(", "));
         }
     }
-    Ok(nodes)
+    Ok((graph, nodes))
 }
 
 /// A text without quotes.

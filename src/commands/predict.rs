@@ -11,10 +11,11 @@ use serde_json::{Value, json};
 use super::{Outcome, print_line};
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::evaluation::{decide, decide_frames};
-use blindgrasp_messages::{GraspTruth, Header, LiftDecision, Phase, Stamped, TactileFrame};
+use blindgrasp_messages::{GraspTruth, Header, LiftDecision, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
+use blindgrasp_tactile::line_protocol;
 
 /// The time between two frames that have no stamp.
 const PERIOD_NANOS: u64 = 10_000_000;
@@ -89,15 +90,25 @@ fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<Vec<Stamped<TactileFr
         _ => Box::new(BufReader::new(std::fs::File::open(file).with_context(|| file.display().to_string())?)),
     };
     let mut frames: Vec<Stamped<TactileFrame>> = Vec::new();
+    // Of lines of a bridge: whether they have numbers.
+    let mut has_seq = None;
     for (line_idx, line) in input.lines().enumerate() {
         let line = line.with_context(|| file.display().to_string())?;
         if line.trim().is_empty() {
             continue;
         }
-        let seq = frames.len() as u64;
         let frame =
-            read_frame(&line, seq, hand).with_context(|| format!("{}, line {}", file.display(), line_idx + 1))?;
+            read_frame(&line, &frames, hand).with_context(|| format!("{}, line {}", file.display(), line_idx + 1))?;
+        let has_seq_here = line.contains("\"seq\"");
+        if !line.contains("\"data\"") && *has_seq.get_or_insert(has_seq_here) != has_seq_here {
+            bail!("{}, line {}: expected seq in all lines or in none", file.display(), line_idx + 1);
+        }
         frames.extend(frame);
+    }
+    if has_seq.is_some()
+        && let Some(first) = frames.first().map(|frame| frame.header.seq)
+    {
+        frames.iter_mut().for_each(|frame| frame.header.seq = frame.header.seq.wrapping_sub(first));
     }
     if frames.is_empty() {
         bail!("{}: expected lines with tactile frames, found none", file.display());
@@ -105,37 +116,72 @@ fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<Vec<Stamped<TactileFr
     Ok(frames)
 }
 
-/// A frame by itself, or in a line of `blindgrasp export`; `None` for a sample of another topic.
-fn read_frame(line: &str, next_seq: u64, hand: &Hand) -> anyhow::Result<Option<Stamped<TactileFrame>>> {
-    let mut value: Value = serde_json::from_str(line).context("not a line of JSON")?;
-    if value.get("topic").is_some_and(|topic| topic != "/tactile") {
+/// A line of `blindgrasp export`, or of a bridge; `None` for a sample of another topic.
+fn read_frame(
+    line: &str,
+    earlier: &[Stamped<TactileFrame>],
+    hand: &Hand,
+) -> anyhow::Result<Option<Stamped<TactileFrame>>> {
+    let value: Value = serde_json::from_str(line).context("not a line of JSON")?;
+    if value.get("data").is_none() {
+        return of_bridge(line, earlier, hand).map(Some);
+    }
+    let line: ExportedLine = serde_json::from_value(value.clone())
+        .context("not a line of 'blindgrasp export': expected topic, seq, stamp_nanos and data")?;
+    if line.topic != TactileFrame::TOPIC {
         return Ok(None);
     }
-    let number = |name: &str| value.get(name).and_then(Value::as_u64);
-    let seq = number("seq").unwrap_or(next_seq);
-    let stamp_nanos = number("stamp_nanos").unwrap_or(seq.wrapping_mul(PERIOD_NANOS));
-    let hand_id = match value.get("hand_id").and_then(Value::as_str) {
+    let hand_id = match &line.hand_id {
         Some(id) => u64::from_str_radix(id, 16).context("hand_id: expected 16 hexadecimal digits")?,
         None => hand.id(),
     };
-    let header = Header { hand_id, seq, stamp_nanos, epoch: number("epoch").unwrap_or(0), ..Header::default() };
-    let data = value.get_mut("data").map(Value::take).unwrap_or(value);
-    let FrameLine { grasp_id, phase, joints_rad, cells_newtons, gravity_m_per_s2, wrist_wrench, joint_torques, day } =
-        serde_json::from_value(data)
-            .context("not a tactile frame: expected grasp_id, phase, joints_rad and cells_newtons")?;
-    let [joints_rad, cells_newtons, gravity_m_per_s2, wrist_wrench, joint_torques] =
-        [joints_rad, cells_newtons, gravity_m_per_s2, wrist_wrench, joint_torques].map(numbers);
+    let header =
+        Header { hand_id, seq: line.seq, stamp_nanos: line.stamp_nanos, epoch: line.epoch, ..Header::default() };
+    let frame: FrameLine = serde_json::from_value(line.data)
+        .context("not a tactile frame: expected grasp_id, phase, joints_rad and cells_newtons")?;
     let message = TactileFrame {
-        grasp_id,
-        phase,
-        joints_rad,
-        cells_newtons,
-        gravity_m_per_s2,
-        wrist_wrench,
-        joint_torques,
-        day: day.unwrap_or(0),
+        grasp_id: frame.grasp_id,
+        phase: frame.phase,
+        joints_rad: numbers(frame.joints_rad),
+        cells_newtons: numbers(frame.cells_newtons),
+        gravity_m_per_s2: numbers(frame.gravity_m_per_s2),
+        wrist_wrench: numbers(frame.wrist_wrench),
+        joint_torques: numbers(frame.joint_torques),
+        day: frame.day,
     };
     Ok(Some(Stamped { header, message }))
+}
+
+/// As a graph's source numbers the frames of a bridge: from 0, with the bridge's gaps.
+fn of_bridge(line: &str, earlier: &[Stamped<TactileFrame>], hand: &Hand) -> anyhow::Result<Stamped<TactileFrame>> {
+    let reading = line_protocol::parse(line.as_bytes()).map_err(|refusal| anyhow::anyhow!("{}", refusal.why))?;
+    let grasp_id = reading.grasp_id.context("the frame lacks grasp_id")?;
+    // Without the bridge's numbers, no frame is missed.
+    let seq = reading.seq.unwrap_or(earlier.last().map_or(0, |frame| frame.header.seq + 1));
+    let stamp_nanos = reading.stamp_nanos.unwrap_or(seq.wrapping_mul(PERIOD_NANOS));
+    let message = TactileFrame {
+        grasp_id,
+        phase: reading.phase,
+        joints_rad: reading.joints_rad,
+        cells_newtons: reading.cells_newtons,
+        gravity_m_per_s2: reading.gravity_m_per_s2,
+        wrist_wrench: reading.wrist_wrench,
+        joint_torques: reading.joint_torques,
+        day: reading.day.unwrap_or(0),
+    };
+    Ok(Stamped { header: Header { hand_id: hand.id(), seq, stamp_nanos, ..Header::default() }, message })
+}
+
+/// A line of `blindgrasp export`.
+#[derive(Deserialize)]
+struct ExportedLine {
+    topic: String,
+    seq: u64,
+    stamp_nanos: u64,
+    #[serde(default)]
+    epoch: u64,
+    hand_id: Option<String>,
+    data: Value,
 }
 
 /// A frame as lines of JSON have it: a number that is not finite is null there.
@@ -151,7 +197,8 @@ struct FrameLine {
     wrist_wrench: Vec<Option<f64>>,
     #[serde(default)]
     joint_torques: Vec<Option<f64>>,
-    day: Option<u32>,
+    #[serde(default)]
+    day: u32,
 }
 
 fn numbers(values: Vec<Option<f64>>) -> Vec<f64> {
@@ -163,7 +210,7 @@ fn print(json: bool, file: &Path, decision: &LiftDecision, truth: Option<&GraspT
     if json {
         return print_line(
             &json!({
-                "file": file,
+                "file": file.display().to_string(),
                 "grasp_id": grasp_id,
                 "action": action,
                 "reason": reason.as_str(),

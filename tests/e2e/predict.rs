@@ -35,6 +35,25 @@ fn predictions_are_the_decisions_of_a_graph() {
     assert!(said.starts_with("grasp     0  LIFT  p 0.762  stable          truth: stable (vase-20)\n"), "{said}");
 }
 
+/// The lines of a bridge have numbers of its own.
+#[test]
+fn the_lines_of_a_bridge_are_decided_as_a_source_numbers_them() {
+    let exported = json_lines(&run(&["export", RECORDING, "--topic", "/tactile"], 0).stdout);
+    let lines = |left_out: std::ops::Range<usize>| {
+        let of_bridge =
+            exported.iter().take(14).enumerate().filter(|(idx, _)| !left_out.contains(idx)).map(|(_, line)| {
+                let mut frame = line["data"].clone();
+                frame["seq"] = (3041 + line["seq"].as_u64().expect("a number")).into();
+                frame["stamp_nanos"] = line["stamp_nanos"].clone();
+                frame.as_object_mut().expect("a frame").retain(|key, _| !["day"].contains(&key.as_str()));
+                frame.to_string()
+            });
+        of_bridge.collect::<Vec<_>>().join("\n")
+    };
+    assert_eq!(of_lines(lines(0..0).as_bytes())[0]["action"], "lift");
+    assert_eq!(of_lines(lines(3..10).as_bytes())[0]["action"], "hold");
+}
+
 /// Frames that are out of order, that lack cells, or that are of another hand are held as in the recording.
 #[test]
 fn lines_of_frames_are_decided_as_their_recording() {
@@ -71,7 +90,12 @@ fn input_that_is_no_frame_is_named() {
     };
     refused("", "expected lines with tactile frames, found none");
     refused("{", "-, line 1: not a line of JSON");
-    refused("{}\n", "-, line 1: not a tactile frame: expected grasp_id, phase, joints_rad and cells_newtons");
+    refused("{}\n", "-, line 1: not a frame: missing field `joints_rad`");
+    let frame = r#""data": {"grasp_id": 0, "phase": "settled", "joints_rad": [], "cells_newtons": []}"#;
+    let with = |seq: &str| format!("{{\"topic\": \"/tactile\", \"stamp_nanos\": 0, {seq}{frame}}}\n");
+    for seq in ["", "\"seq\": 1.5, ", "\"seq\": \"1\", ", "\"seq\": -1, ", "\"seq\": 1, \"hand_id\": 170, "] {
+        refused(&with(seq), "-, line 1: not a line of 'blindgrasp export': expected topic, seq, stamp_nanos and data");
+    }
     assert!(text(&run(&["predict", MODEL, "none.mcap"], 1).stderr).contains("none.mcap"));
     assert!(text(&run(&["predict", MODEL], 2).stderr).contains("FILE"));
 }

@@ -59,6 +59,14 @@ impl Feed<'_> {
                 bail!("--set {set}: node '{node}' does not run, the recording replaces it");
             }
         }
+        let has_param = |id: &String, set: &Override| {
+            graph.node(id).is_some_and(|node| node.description.params.iter().any(|param| param.name == set.param))
+        };
+        let without_node =
+            |set: &&Override| set.node.is_none() && !replaced.running.iter().any(|id| has_param(id, set));
+        if let Some(set) = overrides.iter().find(without_node) {
+            bail!("--set {set}: no node that runs has this param, the recording replaces node '{}'", replaced.node);
+        }
         let reader = RecordingReader::open(self.recording)?;
         compare_hands(graph, &reader, self.recording)?;
         let topics = observed_topics(graph, true);

@@ -270,15 +270,15 @@ fn find_program(
             // The id stands in for a 'run' that may be the key that was misspelled.
             return None;
         }
-        if let Some(program) = program_on_path(&run.text) {
+        // The id alone starts no program: a node may have the name of any.
+        let is_written = run.at != entry.id.at;
+        if let Some(program) = program_on_path(&run.text).filter(|_| is_written) {
             return Some(program.into());
         }
         let known = || shipped.keys().map(String::as_str);
         let similar = did_you_mean(&run.text, known()).map_or(String::new(), |similar| format!("{similar} "));
-        let help = format!(
-            "{similar}{}; no program of this name is on PATH; a path to a program has a '/'",
-            list("operators", known())
-        );
+        let on_path = if is_written { "; no program of this name is on PATH" } else { "" };
+        let help = format!("{similar}{}{on_path}; a path to a program has a '/'", list("operators", known()));
         diagnostics.push_with_help(run.at, format!("unknown operator {}", quote(&run.text)), Some(help));
         return None;
     }

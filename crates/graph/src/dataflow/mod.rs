@@ -11,7 +11,7 @@
 //! params: {model: models/a.json}   # for each node that has the param and does not say otherwise
 //! operators:
 //!   recorded_source:
-//!     run: recorded_source         # the default is the node's id: an operator, or a program on PATH; with a '/' a path
+//!     run: recorded_source         # an operator, a program on PATH, with a '/' a path; default: the id's operator
 //!     args: []                     # what it is started with
 //!     params: {recording: recordings/a.mcap, rate: max}
 //!   contacts:

@@ -221,7 +221,7 @@ fn node_keys() -> Value {
 }
 
 fn machines() -> Value {
-    let names = || json!({"type": "array", "items": name_schema()});
+    let names = || json!({"anyOf": [name_schema(), {"type": "array", "items": name_schema()}]});
     json!({
         "type": "object",
         "description": "The machines of the graph",

@@ -400,7 +400,9 @@ fn the_form_of_a_node() {
 fn programs() {
     let known = "known operators: arbiter, broken, contacts, crooked, filter, newer, nonsense, source; \
                  no program of this name is on PATH; a path to a program has a '/'";
-    check_nodes_err("  robot:\n", &format!("4:3: unknown operator 'robot'; {known}"));
+    // An id alone is looked for among the operators, not on PATH.
+    let of_id = known.replace("no program of this name is on PATH; ", "");
+    check_nodes_err("  ls:\n", &format!("4:3: unknown operator 'ls'; {of_id}"));
     check_nodes_err("  a: {run: sorce}\n", &format!("4:12: unknown operator 'sorce'; did you mean 'source'? {known}"));
     check_nodes_err(
         "  a: {run: ops/absent}\n",

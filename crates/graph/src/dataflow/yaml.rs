@@ -113,7 +113,7 @@ impl<'a> Reader<'a, '_> {
             Some(Err(error)) => {
                 let at = Position { line: error.marker().line(), column: error.marker().col() + 1 };
                 let line = self.text.lines().nth(at.line - 1).unwrap_or_default();
-                let help = (line.contains("${") && line.contains('{'))
+                let help = (line.contains("${") && line.replace("${", "").contains('{'))
                     .then(|| "in braces, a value with ${ needs quotes: {rate: \"${RATE:-10}\"}".to_owned());
                 self.diagnostics.push_with_help(at, format!("not valid YAML: {}", error.info()), help);
                 None
