@@ -48,7 +48,7 @@ pub(super) struct Arguments {
     /// Read all of it, however large, and sum up the grasps.
     #[arg(long)]
     full: bool,
-    /// Write what is whole in a recording that was cut off or damaged to NAME.repaired.mcap beside it; the recording
+    /// Write the undamaged samples of a cut or damaged recording to NAME.repaired.mcap beside it; the recording
     /// stays as it is.
     #[arg(long, conflicts_with_all = ["full", "hand"])]
     repair: bool,

@@ -22,7 +22,7 @@ const POLL: Duration = Duration::from_millis(200);
                         Without an operator, the logs of all are merged by time. Ctrl-C ends -f.\n\
                         The log of an operator on another machine is read there, while it is linked.")]
 pub(super) struct Arguments {
-    /// Node id of the operator, run for the launching command, or audit for who has changed or recorded what
+    /// Node id of an operator; run: the launching command; audit: requests for changes, with their clients
     #[arg(add = completions::nodes())]
     operator: Option<String>,
     /// Follow the logs

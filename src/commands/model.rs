@@ -76,7 +76,7 @@ struct ExportArguments {
 struct ImportArguments {
     /// The file to read.
     file: PathBuf,
-    /// What it is.
+    /// The format of the file.
     #[arg(long, value_enum, default_value = "libsvm")]
     format: Format,
     /// The model that all but the SVM comes from.

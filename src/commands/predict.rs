@@ -105,10 +105,13 @@ fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<Vec<Stamped<TactileFr
         }
         frames.extend(frame);
     }
-    if has_seq.is_some()
-        && let Some(first) = frames.first().map(|frame| frame.header.seq)
-    {
-        frames.iter_mut().for_each(|frame| frame.header.seq = frame.header.seq.wrapping_sub(first));
+    if let (Some(has_seq), Some(first)) = (has_seq, frames.first()) {
+        // As the source of a graph numbers them: if the first frames are missing, so is number 0, and the grasp is held.
+        let first_seq = first.header.seq;
+        let is_whole = first.message.phase == Phase::Open || (has_seq && first_seq == 0);
+        for frame in &mut frames {
+            frame.header.seq = frame.header.seq.wrapping_sub(first_seq).wrapping_add(u64::from(!is_whole));
+        }
     }
     if frames.is_empty() {
         bail!("{}: expected lines with tactile frames, found none", file.display());

@@ -52,6 +52,8 @@ fn the_lines_of_a_bridge_are_decided_as_a_source_numbers_them() {
     };
     assert_eq!(of_lines(lines(0..0).as_bytes())[0]["action"], "lift");
     assert_eq!(of_lines(lines(3..10).as_bytes())[0]["action"], "hold");
+    // It begins amid a grasp.
+    assert_eq!(of_lines(lines(0..4).as_bytes())[0]["action"], "hold");
 }
 
 /// Frames that are out of order, that lack cells, or that are of another hand are held as in the recording.

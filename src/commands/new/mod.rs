@@ -37,7 +37,7 @@ struct OperatorArguments {
     /// In Python, not in Rust.
     #[arg(long)]
     python: bool,
-    /// What it does to begin with: judge each frame's feature, or filter the frames of the hand.
+    /// Its first task: to judge the feature of each frame, or to filter the frames of the hand.
     #[arg(long, value_parser = ["classifier", "filter"], conflicts_with_all = ["from", "to"])]
     like: Option<String>,
     /// The type of its input: TactileFrame, ContactSet or GraspFeature.

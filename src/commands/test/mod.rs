@@ -39,7 +39,7 @@ pub(super) struct Arguments {
     /// Write a report (JUnit XML).
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
-    /// Write the recordings anew with the results of the replay; expectations stay as they are.
+    /// Replace the results in the recordings by those of the replay; expectations stay as they are.
     #[arg(long)]
     update: bool,
     /// Keep the recording of each replay in this folder, under the recording's name.

@@ -36,7 +36,7 @@ const MAX_STRIPS: usize = 18;
 
 /// Lift objects in simulated physics, as the paper did
 ///
-/// Repeat the paper's robot experiment in simulated physics: lift when the graph decides so, and count what is kept.
+/// Repeat the paper's robot experiment in simulated physics: lift when the graph decides so, and count the kept objects.
 ///
 /// A simulated hand takes the robot's place. Its samples go through the same processes as a robot's would, and it obeys the
 /// arbiter: it lifts, or lets go and tries again. With --lift-policy both the same trials are made a second time with

@@ -1,7 +1,7 @@
 //! A JSON Schema of the dataflow file, made from the descriptions of the operators: an editor completes and checks with it.
 //!
-//! It is more lenient than [`check()`](super::check()): it knows no programs of one's own, compares no types of ports, and
-//! takes `${NAME}` for any value.
+//! It is more lenient than [`check()`](super::check()): it knows the shipped operators only, does not compare the types of
+//! ports, and takes `${NAME}` for any value.
 
 use serde_json::{Map, Value, json};
 
