@@ -9,9 +9,9 @@ use clap::Args;
 
 use super::export::json_line;
 use super::{Outcome, completions, secs_in, stop_signal};
+use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, machine_of, pick_graph};
 use blindgrasp_graph::control::{Attachment, Reply, Request};
-use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_messages::Record;
 use blindgrasp_operator::diagnostics::{LinePrinter, print_diagnostic};
 

@@ -6,11 +6,11 @@ use anyhow::{Context, bail};
 use clap::Args;
 
 use super::{Outcome, completions, print_line};
-use blindgrasp_graph::audit::AUDIT;
 use blindgrasp_graph::client::{
     ANSWER_LIMIT, ClientError, Connection, is_graph_name, locate, machine_of, pick_graph, status,
 };
 use blindgrasp_graph::control::{Reply, Request};
+use blindgrasp_graph::log::AUDIT;
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 

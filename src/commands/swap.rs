@@ -10,14 +10,14 @@ use clap::Args;
 use serde::Serialize;
 
 use super::{Outcome, completions, number_in, percent, print_line, secs_in, stop_signal};
+use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_observe};
+use blindgrasp_graph::client::shadow_comparison::{
+    ComparisonReport, Latency, PromotionLimits, Saying, ShadowComparison, Side, objections,
+};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, ShadowOutput, SwapRequest, SwappedNode};
 use blindgrasp_graph::describe::program_to_run;
 use blindgrasp_graph::log::printable;
-use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
-use blindgrasp_graph::shadow_comparison::{
-    ComparisonReport, Latency, PromotionLimits, Saying, ShadowComparison, Side, objections,
-};
 use blindgrasp_messages::Record;
 use blindgrasp_operator::cursors::COMPARE_BELL;
 use blindgrasp_operator::diagnostics::print_diagnostic;

@@ -122,7 +122,7 @@ pub fn origin_of_answer(key: &SampleId, sent: &Origins, on_arrival: impl FnOnce(
 
 /// The origin times of the samples that were sent lately. A sample that comes back as an answer to one of them has
 /// exactly its origin time. Only for types with the source's sequence number
-/// ([`bears_source_number`](blindgrasp_graph::observer::bears_source_number)).
+/// ([`bears_source_number`](blindgrasp_graph::client::observer::bears_source_number)).
 #[derive(Debug, Clone)]
 pub struct Origins {
     nanos_by_key: BTreeMap<SampleId, u64>,

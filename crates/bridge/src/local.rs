@@ -13,7 +13,7 @@ use blindgrasp_graph::dataflow::{
     DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Graph, Input, LINK, LocalView, Machine, Machines, Node, Program, Restart,
     RestartPolicy,
 };
-use blindgrasp_graph::pins::Pins;
+use blindgrasp_graph::launcher::pins::Pins;
 use blindgrasp_messages::{LiftDecision, Prediction, Recorded};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::wiring::{EdgePolicy, Sandbox};

@@ -22,7 +22,7 @@ use super::session;
 use super::tunnel::{DescribeRecording, Tunnels, random};
 use super::uplink::Uplink;
 use super::wire::{Body, Frame, Rejected, SampleFrame, WireError, encode_refusal};
-use blindgrasp_graph::observer::bears_source_number;
+use blindgrasp_graph::client::observer::bears_source_number;
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::{LinkStatus, PeerState};
 use blindgrasp_operator::monotonic_nanos;

@@ -7,7 +7,7 @@ use super::clock::Origins;
 use super::config::{Channel, LinkConfig};
 use super::outgoing::{Outgoing, OutgoingOptions};
 use super::sample;
-use blindgrasp_graph::observer::bears_source_number;
+use blindgrasp_graph::client::observer::bears_source_number;
 use blindgrasp_messages::{Header, Message};
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::monotonic_nanos;

@@ -176,7 +176,7 @@ pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, 
     if !status.success() {
         let said = last_words.recv_timeout(LIMIT).unwrap_or_default();
         let said: Vec<String> = String::from_utf8_lossy(&said).lines().map(crate::log::printable).collect();
-        let said = crate::launcher::log_tail(&said);
+        let said = crate::log::log_tail(&said);
         return Err(format!("it failed at --describe ({status}){said}"));
     }
     OperatorDescription::from_json(&text).map_err(|error| format!("--describe: {error}"))

@@ -17,6 +17,8 @@ use serde_json::{Map, Value};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::{LogEntry, LogLevel};
 
+/// The name of the audit log. No node may have it.
+pub const AUDIT: &str = "audit";
 /// A file that has reached this size makes room for a new one.
 const MAX_FILE_BYTES: u64 = 8 << 20;
 /// The number of old files: `NAME.log.1`, the newest, to `NAME.log.3`.
@@ -491,6 +493,14 @@ fn parse_line(name: &str, line: &str) -> LogLine {
         }
         _ => whole(),
     }
+}
+
+/// The last lines of a node's log, as the end of a message.
+pub(crate) fn log_tail(log: &[String]) -> String {
+    if log.is_empty() {
+        return String::new();
+    }
+    format!("; its last words:\n  {}", log.join("\n  "))
 }
 
 #[cfg(test)]

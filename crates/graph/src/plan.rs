@@ -4,7 +4,6 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::control::{EdgeStatus, ShadowOutput};
 use crate::dataflow::{DEFAULT_PARTNER_WAIT_MILLIS, DEFAULT_TOLERANCE_MILLIS, EdgeOptions, Graph, Node};
-use crate::run::is_needed;
 use blindgrasp_operator::cursors::{COMPARE_BELL, CursorsError, N_AGE_SLOTS, N_COMMAND_BELLS, RUN_BELL, SharedCursors};
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_operator::wiring::{
@@ -433,4 +432,9 @@ fn nanos(millis: f64) -> u64 {
 /// The service on which a standby publishes its answers while another instance is active.
 fn shadow_of(service: &ServiceWiring) -> ServiceWiring {
     ServiceWiring { name: format!("{}~shadow", service.name), ..service.clone() }
+}
+
+/// Whether every run reads edges of this type: decisions and the summary come from them.
+pub fn is_needed(type_name: &str) -> bool {
+    [LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME, LiftOutcome::TYPE_NAME].contains(&type_name)
 }

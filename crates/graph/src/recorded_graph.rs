@@ -3,6 +3,9 @@
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
+use serde_json::json;
+
+use crate::dataflow::Node;
 
 /// When a recording began.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -47,4 +50,30 @@ pub struct RecordedGraph {
     pub joint_names: Vec<String>,
     /// MCAP's metadata, by name, then by key.
     pub metadata: BTreeMap<String, BTreeMap<String, String>>,
+}
+
+/// A graph as it runs, for the metadata of a recording: its nodes with programs, arguments, parameters and inputs.
+pub fn describe_graph<'a>(name: &str, nodes: impl Iterator<Item = &'a Node>) -> serde_json::Value {
+    let node = |node: &Node| {
+        let inputs = node.inputs.iter().map(|input| {
+            json!({
+                "port": input.port,
+                "from": format!("{}/{}", input.from_node, input.from_port),
+                "policy": input.edge.policy,
+                "capacity": input.edge.capacity,
+                "deadline_ms": input.edge.deadline_millis,
+            })
+        });
+        json!({
+            "id": node.id,
+            "operator": node.description.operator,
+            "version": node.description.version,
+            "program": node.program,
+            "args": node.args,
+            "params": node.params,
+            "inputs": inputs.collect::<Vec<_>>(),
+            "outputs": node.outputs().iter().map(|output| json!({"port": output.name, "type": output.type_name})).collect::<Vec<_>>(),
+        })
+    };
+    json!({"name": name, "nodes": nodes.map(node).collect::<Vec<_>>()})
 }

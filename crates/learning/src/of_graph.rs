@@ -17,7 +17,7 @@ use blindgrasp_stages::model::Model;
 /// The name of the metadata about the graph.
 const GRAPH_METADATA: &str = "graph";
 
-/// What is to be recorded of a graph, as [`describe_graph`](blindgrasp_graph::attached::describe_graph) describes it. The hand
+/// What is to be recorded of a graph, as [`describe_graph`](blindgrasp_graph::recorded_graph::describe_graph) describes it. The hand
 /// is the one that a node has as its parameter `hand`.
 ///
 /// # Errors

@@ -11,8 +11,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use serde::Serialize;
 
 use super::super::run::recorder::{Recorded, Recorder};
+use blindgrasp_graph::client::observer::{Sink, bears_source_number};
 use blindgrasp_graph::control::AttachedEdge;
-use blindgrasp_graph::observer::{Sink, bears_source_number};
 use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_messages::{Header, LiftDecision, Recorded as _, RegraspAdvice};
 use blindgrasp_operator::cursors::{SampleId, SharedCursors};

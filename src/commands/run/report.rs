@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::time::Instant;
 
-use blindgrasp_graph::audit::AUDIT;
+use blindgrasp_graph::log::AUDIT;
 use blindgrasp_graph::log::{LogFolder, LogTail};
 use blindgrasp_graph::run::{SeenDecision, Summary};
 use blindgrasp_messages::{Action, GraspTruth, LiftDecision, Phase, Record, Stamped, TactileFrame};

@@ -6,8 +6,8 @@ use std::time::Instant;
 use serde::Serialize;
 
 use blindgrasp_graph::client::machine_of;
+use blindgrasp_graph::client::usage::{ProcessUsage, usage};
 use blindgrasp_graph::control::{DecidedGrasp, EdgeStatus, GraphState, GraphStatus, NodeState};
-use blindgrasp_graph::usage::{ProcessUsage, usage};
 use blindgrasp_operator::ages::Ages;
 use blindgrasp_operator::link_status::LinkStatus;
 use blindgrasp_operator::wiring::EdgePolicy;

@@ -19,7 +19,7 @@ use blindgrasp_graph::control::NodeState;
 use blindgrasp_graph::dataflow::{self, EdgeOptions, Graph, Machines, Override, Restart, RestartPolicy, Scope};
 use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_graph::log::printable;
-use blindgrasp_graph::run::is_needed;
+use blindgrasp_graph::plan::is_needed;
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_pictures::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid};
 

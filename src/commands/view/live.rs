@@ -7,10 +7,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
+use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, machine_of};
 use blindgrasp_graph::control::{Attachment, Reply, Request};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
-use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_learning::evaluation::Judge;
 use blindgrasp_messages::{
     ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Record, TactileFrame,

@@ -6,9 +6,9 @@ use std::time::{Duration, Instant};
 
 use super::DescribeRecording;
 use super::serve::Replies;
+use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection};
 use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request, SampleBatch, Sampling};
-use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::recorded_graph::Beginning;
 use blindgrasp_graph::sample_batch;
 use blindgrasp_messages::Record;

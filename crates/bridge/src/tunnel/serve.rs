@@ -14,10 +14,10 @@ use tokio::task::JoinHandle;
 use super::end::{End, FromPeer, ToPeer};
 use super::frame::MAX_CHUNK_BYTES;
 use super::{Peer, Shared, end_of, samples};
-use blindgrasp_graph::audit::summary;
 use blindgrasp_graph::client::{Connection, status};
 use blindgrasp_graph::control::{Reply, Request, SwapRequest};
 use blindgrasp_graph::describe::program_to_run;
+use blindgrasp_graph::launcher::audit::summary;
 use blindgrasp_graph::log::{LogFolder, LogTail};
 
 /// Maximum length of a request in bytes.

@@ -19,7 +19,7 @@ use crate::dataflow::scope::{Scope, UNKNOWN_VERSION, make_up, without_files};
 use crate::dataflow::settings::{Override, absolute, check_overrides, check_params, check_shared};
 use crate::dataflow::yaml::Text;
 use crate::describe::{GROUPABLE, program_on_path};
-use crate::pins::{PinError, Pins, RUN};
+use crate::launcher::pins::{PinError, Pins, RUN};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::param::{ParamDescription, ParamKind};
 use blindgrasp_operator::text::{did_you_mean, quote};

@@ -9,10 +9,10 @@ use super::summary::{
     OperatorPid, Ran, Summary, edges, latency, lost_to_machines, missing_from_machines, skipped_by_stages,
 };
 use super::{RunSink, SeenDecision};
+use crate::client::observer::Sink;
 use crate::control::{DecidedGrasp, DecisionStatus};
 use crate::dataflow::EdgePolicy;
 use crate::launcher::{End, LaunchError};
-use crate::observer::Sink;
 use blindgrasp_messages::Record;
 use blindgrasp_messages::score::Evaluation;
 use blindgrasp_messages::{Action, GraspTruth, LiftDecision, LiftOutcome, Stamped};

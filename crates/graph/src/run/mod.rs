@@ -17,13 +17,13 @@ pub use self::summary::{Latency, OperatorPid, Summary};
 
 use self::log::RunLog;
 use self::summary::Ran;
-use crate::attached::describe_graph;
+use crate::client::metrics;
+use crate::client::observer::{ObservedEdge, Observer, can_observe};
 use crate::control::DecisionStatus;
 use crate::dataflow::{Graph, Node};
 use crate::launcher::{End, LaunchError, LaunchOptions, Launcher};
-use crate::metrics;
-use crate::observer::{ObservedEdge, Observer, can_observe};
-use crate::plan::{Plan, PlanOptions, Port, topic_of};
+use crate::plan::{Plan, PlanOptions, Port, is_needed, topic_of};
+use crate::recorded_graph::describe_graph;
 use blindgrasp_messages::Record;
 use blindgrasp_messages::{GraspTruth, Header, LiftDecision, LiftOutcome, Recorded};
 use blindgrasp_operator::cursors::RUN_BELL;
@@ -218,9 +218,4 @@ fn is_partner_alone(graph: &Graph, node: &str) -> bool {
     let mut inputs =
         graph.nodes.iter().flat_map(|reader| &reader.inputs).filter(|input| input.from_node == node).peekable();
     inputs.peek().is_some() && inputs.all(|input| input.partner)
-}
-
-/// Whether every run reads edges of this type: decisions and the summary come from them.
-pub fn is_needed(type_name: &str) -> bool {
-    [LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME, LiftOutcome::TYPE_NAME].contains(&type_name)
 }

@@ -6,11 +6,9 @@
 use std::collections::VecDeque;
 
 use crate::control::{Reply, Request, SwapRequest};
-use crate::log_writer::Log;
+use crate::launcher::log_writer::Log;
 use blindgrasp_operator::wiring::{LogEntry, LogLevel};
 
-/// The name of the log. No node may have it.
-pub const AUDIT: &str = "audit";
 /// The most characters of a request or of its outcome in a line.
 const MAX_CHARS: usize = 300;
 
@@ -132,8 +130,8 @@ mod tests {
 
     use super::*;
     use crate::launcher::Event;
-    use crate::log::{LogFolder, LogFormat, LogReader};
-    use crate::log_writer::LogWriter;
+    use crate::launcher::log_writer::LogWriter;
+    use crate::log::{AUDIT, LogFolder, LogFormat, LogReader};
 
     #[test]
     fn each_request_for_a_change_leaves_a_line_with_its_client_and_its_outcome() {
@@ -144,8 +142,8 @@ mod tests {
         let writer = LogWriter::new(folder.clone(), LogFormat::Text);
         let listener = UnixListener::bind(temporary.path().join("socket")).expect("bound");
         let (events, asked) = sync_channel(8);
-        let server =
-            crate::server::serve(&listener, BTreeMap::new(), &events, writer.log_if_written(AUDIT)).expect("served");
+        let server = crate::launcher::server::serve(&listener, BTreeMap::new(), &events, writer.log_if_written(AUDIT))
+            .expect("served");
         // The launcher: it refuses a second vote.
         let launcher = std::thread::spawn(move || {
             while let Ok(event) = asked.recv() {

@@ -4,7 +4,8 @@ use std::time::{Duration, Instant};
 
 use crate::control::{GraphState, NodeState};
 use crate::dataflow::RestartPolicy;
-use crate::launcher::{LaunchError, Launcher, Member, RUNNING, log_tail};
+use crate::launcher::{LaunchError, Launcher, Member, RUNNING};
+use crate::log::log_tail;
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::wiring::Command;
 use blindgrasp_operator::{monotonic_nanos, namespace};

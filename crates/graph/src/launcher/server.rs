@@ -8,12 +8,12 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
-use crate::audit::Trail;
 use crate::control::{Reply, Request, SwapRequest};
 use crate::describe::describe;
 use crate::launcher::Event;
-use crate::log_writer::Log;
-use crate::pins::Pins;
+use crate::launcher::audit::Trail;
+use crate::launcher::log_writer::Log;
+use crate::launcher::pins::Pins;
 use blindgrasp_operator::description::OperatorDescription;
 
 /// Longer requests are refused.

@@ -4,13 +4,13 @@ use std::collections::{BTreeMap, VecDeque};
 use std::os::unix::net::UnixListener;
 use std::sync::mpsc::SyncSender;
 
-use crate::attached::AttachedReader;
 use crate::control::Reply;
 use crate::launcher::Event;
-use crate::log_writer::Log;
-use crate::pins::Pins;
+use crate::launcher::attached::AttachedReader;
+use crate::launcher::log_writer::Log;
+use crate::launcher::pins::Pins;
+use crate::launcher::server::{self, Ask, Server};
 use crate::plan::N_ATTACHED;
-use crate::server::{self, Ask, Server};
 
 #[derive(Default)]
 pub(super) struct Clients {

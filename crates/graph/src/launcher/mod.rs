@@ -10,6 +10,19 @@
 //!
 //! If the launcher dies, its operators end: their stdin closes, and the kernel sends them SIGTERM.
 
+pub(crate) mod attached;
+pub mod audit;
+mod clients;
+mod link_book;
+mod log_writer;
+pub mod pins;
+mod process;
+mod server;
+mod service;
+mod slow_nodes;
+mod supervision;
+mod swap;
+
 use std::collections::{BTreeMap, VecDeque};
 use std::os::unix::net::UnixListener;
 use std::path::PathBuf;
@@ -19,20 +32,20 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use crate::audit::AUDIT;
-use crate::clients::Clients;
 use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
 use crate::dataflow::{Graph, Node};
-use crate::link_book::LinkBook;
-use crate::log::{LogFolder, LogFormat};
-use crate::log_writer::{Log, LogWriter};
-use crate::pins::PinError;
+use crate::launcher::clients::Clients;
+use crate::launcher::link_book::LinkBook;
+use crate::launcher::log_writer::{Log, LogWriter};
+use crate::launcher::pins::PinError;
+use crate::launcher::process::{LineSink, Process, ProcessOutput, Start};
+use crate::launcher::server::Ask;
+use crate::launcher::service::Service;
+use crate::launcher::slow_nodes::SlowNodes;
+use crate::launcher::swap::Swap;
+use crate::log::AUDIT;
+use crate::log::{LogFolder, LogFormat, log_tail};
 use crate::plan::{Plan, Port};
-use crate::process::{LineSink, Process, ProcessOutput, Start};
-use crate::server::Ask;
-use crate::service::Service;
-use crate::slow_nodes::SlowNodes;
-use crate::swap::Swap;
 use blindgrasp_operator::cursors::{CursorsError, SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::monotonic_nanos;
@@ -989,11 +1002,4 @@ impl Member {
     pub(super) fn is_given_up(&self) -> bool {
         self.state == NodeState::Failed
     }
-}
-
-pub(super) fn log_tail(log: &[String]) -> String {
-    if log.is_empty() {
-        return String::new();
-    }
-    format!("; its last words:\n  {}", log.join("\n  "))
 }

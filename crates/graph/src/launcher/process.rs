@@ -18,8 +18,8 @@ use rustix::thread::{CpuSet, sched_setaffinity, set_no_new_privs};
 
 use crate::dataflow::{Node, ProcessOptions, Scheduling, SchedulingPolicy};
 use crate::launcher::Event;
-use crate::log_writer::Log;
-use crate::service;
+use crate::launcher::log_writer::Log;
+use crate::launcher::service;
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::wiring::{
     Addressed, Command, Enforcement, GroupMemberWiring, GroupWiring, LogEntry, REPORT_PREFIX, Report, Sandbox,

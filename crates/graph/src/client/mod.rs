@@ -1,5 +1,10 @@
 //! The clients' end of [`control`](crate::control): finds running graphs and sends requests to them.
 
+pub mod metrics;
+pub mod observer;
+pub mod shadow_comparison;
+pub mod usage;
+
 use std::io::{Read, Write};
 use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;

@@ -18,8 +18,8 @@ use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::registry::{Registry, Unit};
 
 use crate::client;
+use crate::client::usage::{ProcessUsage, usage};
 use crate::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus};
-use crate::usage::{ProcessUsage, usage};
 use blindgrasp_operator::ages::Ages;
 use blindgrasp_operator::link_status::{ChannelStatus, LinkStatus, PeerState, PeerStatus};
 

@@ -16,9 +16,10 @@ use std::time::{Duration, Instant};
 
 use crate::control::{GraphState, NodeState, Reply, SwapRequest, SwappedNode};
 use crate::dataflow::{Node, accept_param, accept_param_value};
-use crate::launcher::{Launcher, Leaving, log_tail};
+use crate::launcher::process::Process;
+use crate::launcher::{Launcher, Leaving};
+use crate::log::log_tail;
 use crate::plan::Port;
-use crate::process::Process;
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::wiring::Command;

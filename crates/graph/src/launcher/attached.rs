@@ -8,12 +8,10 @@
 use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
 
-use serde_json::json;
-
 use crate::control::{AttachedEdge, Attachment, GraphState, Reply};
-use crate::dataflow::Node;
 use crate::launcher::Launcher;
 use crate::plan::{N_ATTACHED, Port};
+use crate::recorded_graph::describe_graph;
 
 /// A graph that ends waits this long until its attached readers have read all samples.
 const SEE_OFF_LIMIT: Duration = Duration::from_secs(2);
@@ -104,30 +102,4 @@ impl Launcher {
             self.kill_hung();
         }
     }
-}
-
-/// A graph as it runs, for the metadata of a recording: its nodes with programs, arguments, parameters and inputs.
-pub fn describe_graph<'a>(name: &str, nodes: impl Iterator<Item = &'a Node>) -> serde_json::Value {
-    let node = |node: &Node| {
-        let inputs = node.inputs.iter().map(|input| {
-            json!({
-                "port": input.port,
-                "from": format!("{}/{}", input.from_node, input.from_port),
-                "policy": input.edge.policy,
-                "capacity": input.edge.capacity,
-                "deadline_ms": input.edge.deadline_millis,
-            })
-        });
-        json!({
-            "id": node.id,
-            "operator": node.description.operator,
-            "version": node.description.version,
-            "program": node.program,
-            "args": node.args,
-            "params": node.params,
-            "inputs": inputs.collect::<Vec<_>>(),
-            "outputs": node.outputs().iter().map(|output| json!({"port": output.name, "type": output.type_name})).collect::<Vec<_>>(),
-        })
-    };
-    json!({"name": name, "nodes": nodes.map(node).collect::<Vec<_>>()})
 }
