@@ -14,7 +14,7 @@ const MAX_CHARS: usize = 300;
 
 /// The requests of one connection.
 pub(super) struct Trail {
-    log: Option<Log>,
+    log: Log,
     client: String,
     machine: Option<String>,
     /// Requests without an outcome yet.
@@ -22,7 +22,7 @@ pub(super) struct Trail {
 }
 
 impl Trail {
-    pub(super) fn new(log: Option<Log>, client: String) -> Trail {
+    pub(super) fn new(log: Log, client: String) -> Trail {
         Trail { log, client, machine: None, pending: VecDeque::new() }
     }
 
@@ -67,9 +67,7 @@ impl Trail {
             if beginning.len() < text.len() { beginning + " …" } else { beginning }
         };
         let text = format!("{who}: {}: {}", short(what), short(outcome));
-        if let Some(log) = &self.log {
-            log.write_patiently(LogEntry { level: Some(level), ..LogEntry::plain(text) });
-        }
+        self.log.write_patiently(LogEntry { level: Some(level), ..LogEntry::plain(text) });
     }
 }
 

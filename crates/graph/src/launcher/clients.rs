@@ -34,7 +34,7 @@ impl Clients {
         control: &UnixListener,
         pins: BTreeMap<String, Pins>,
         events: &SyncSender<Event>,
-        audit: Option<Log>,
+        audit: Log,
     ) -> std::io::Result<()> {
         self.server = Some(server::serve(control, pins, events, audit)?);
         Ok(())

@@ -21,9 +21,18 @@ const RETRY_PAUSE: Duration = Duration::from_millis(1);
 /// At the end, the disk gets this long for the lines that wait.
 const FLUSH_LIMIT: Duration = Duration::from_secs(1);
 
+/// What waits for the disk.
+#[derive(Debug)]
+enum Queued {
+    /// A line of the log of this name.
+    Line(Arc<str>, LogEntry),
+    /// The graph has ended. Logs that outlive it, of a client's thread, write nothing more.
+    End,
+}
+
 /// The logs of a graph. Dropping it writes the lines that wait, for a bounded time.
 pub(super) struct LogWriter {
-    sender: Option<SyncSender<(Arc<str>, LogEntry)>>,
+    sender: SyncSender<Queued>,
     state: Arc<State>,
     thread: JoinHandle<()>,
 }
@@ -32,7 +41,7 @@ pub(super) struct LogWriter {
 #[derive(Debug, Clone)]
 pub(super) struct Log {
     name: Arc<str>,
-    sender: SyncSender<(Arc<str>, LogEntry)>,
+    sender: SyncSender<Queued>,
     state: Arc<State>,
 }
 
@@ -45,34 +54,37 @@ struct State {
 
 impl LogWriter {
     pub(super) fn new(folder: LogFolder, format: LogFormat) -> LogWriter {
-        let (sender, lines) = sync_channel(MAX_WAITING);
+        let (sender, queue) = sync_channel(MAX_WAITING);
         let state = Arc::new(State::default());
         let thread = std::thread::spawn({
             let state = Arc::clone(&state);
-            move || write_lines(&folder, format, &lines, &state)
+            move || write_lines(&folder, format, &queue, &state)
         });
-        LogWriter { sender: Some(sender), state, thread }
+        LogWriter { sender, state, thread }
     }
 
     /// The log of an operator; the run is marked in it.
-    pub(super) fn log(&self, name: &str) -> Option<Log> {
-        let log = self.log_if_written(name)?;
+    pub(super) fn log(&self, name: &str) -> Log {
+        let log = self.log_if_written(name);
         log.write(LogEntry::plain(""));
-        Some(log)
+        log
     }
 
     /// A log whose file is made, and the run marked in it, with the first line.
-    pub(super) fn log_if_written(&self, name: &str) -> Option<Log> {
-        Some(Log { name: name.into(), sender: self.sender.clone()?, state: Arc::clone(&self.state) })
+    pub(super) fn log_if_written(&self, name: &str) -> Log {
+        Log { name: name.into(), sender: self.sender.clone(), state: Arc::clone(&self.state) }
     }
 }
 
 impl Drop for LogWriter {
     fn drop(&mut self) {
-        self.sender = None;
         let start = Instant::now();
+        let mut has_asked = false;
         // A thread that waits for the disk ends with the process.
         while !self.thread.is_finished() && start.elapsed() < FLUSH_LIMIT {
+            if !has_asked {
+                has_asked = self.sender.try_send(Queued::End).is_ok();
+            }
             std::thread::sleep(RETRY_PAUSE);
         }
     }
@@ -81,7 +93,7 @@ impl Drop for LogWriter {
 impl Log {
     /// Writes an entry, soon. It does not wait.
     pub(super) fn write(&self, entry: LogEntry) {
-        if self.sender.try_send((Arc::clone(&self.name), entry)).is_err() {
+        if self.sender.try_send(Queued::Line(Arc::clone(&self.name), entry)).is_err() {
             self.state.n_dropped.fetch_add(1, Ordering::Relaxed);
         }
     }
@@ -89,7 +101,7 @@ impl Log {
     /// As [`Log::write`]; if the queue is full, it waits a little for room.
     pub(super) fn write_patiently(&self, entry: LogEntry) {
         let start = Instant::now();
-        let mut line = (Arc::clone(&self.name), entry);
+        let mut line = Queued::Line(Arc::clone(&self.name), entry);
         loop {
             match self.sender.try_send(line) {
                 Ok(()) => return,
@@ -109,9 +121,9 @@ impl Log {
     }
 }
 
-fn write_lines(folder: &LogFolder, format: LogFormat, lines: &Receiver<(Arc<str>, LogEntry)>, state: &State) {
+fn write_lines(folder: &LogFolder, format: LogFormat, queue: &Receiver<Queued>, state: &State) {
     let mut files: BTreeMap<Arc<str>, LogFile> = BTreeMap::new();
-    for (name, entry) in lines {
+    while let Ok(Queued::Line(name, entry)) = queue.recv() {
         // Opening a log marks the run. An empty line does only that.
         let file = files.entry(Arc::clone(&name)).or_insert_with(|| LogFile::open(folder, &name, format));
         if entry.text.is_empty() && entry.fields.is_empty() {
@@ -140,7 +152,7 @@ mod tests {
         let made = std::process::Command::new("mkfifo").arg(&pipe).status().expect("mkfifo is there");
         assert!(made.success());
         let writer = LogWriter::new(LogFolder::at(folder.path().into()), LogFormat::Text);
-        let log = writer.log("stuck").expect("a log");
+        let log = writer.log("stuck");
         for _ in 0..MAX_WAITING + 10 {
             log.write_patiently(LogEntry::plain("a line"));
         }
@@ -154,5 +166,22 @@ mod tests {
             content.contains("a line") && content.contains("lines of the graph's operators were dropped"),
             "{content}"
         );
+    }
+
+    /// A client's thread holds the audit log for as long as its client likes.
+    #[test]
+    fn the_end_does_not_wait_for_logs_that_outlive_it() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let writer = LogWriter::new(LogFolder::at(folder.path().into()), LogFormat::Text);
+        let log = writer.log("node");
+        log.write(LogEntry::plain("a line"));
+        let state = Arc::clone(&writer.state);
+        drop(writer);
+        // The thread is over: it holds the state no more. Without a message to end, it would wait for `log`.
+        assert_eq!(Arc::strong_count(&state), 2);
+        log.write(LogEntry::plain("too late"));
+        assert_eq!(log.state.n_dropped.load(Ordering::Relaxed), 1);
+        let content = std::fs::read_to_string(folder.path().join("node.log")).expect("read");
+        assert!(content.contains("a line") && !content.contains("too late"), "{content}");
     }
 }

@@ -205,7 +205,7 @@ pub(super) struct Member {
     pub(super) state: NodeState,
     pub(super) n_instances: usize,
     pub(super) n_swaps: u32,
-    log: Option<Log>,
+    log: Log,
     pub(super) n_restarts: u32,
     /// When it was restarted, within its window.
     pub(super) restarts: VecDeque<Instant>,
@@ -244,7 +244,7 @@ impl Launcher {
         let log_folder = LogFolder::of_graph(name);
         let logs = LogWriter::new(log_folder.clone(), options.log_format);
         let mut launcher = Launcher {
-            own_log: if options.is_on_terminal { logs.log("run") } else { None },
+            own_log: if options.is_on_terminal { Some(logs.log("run")) } else { None },
             log_folder,
             logs,
             printer: Arc::new(Mutex::new(LinePrinter::new(std::io::stderr(), MAX_UNREAD_LINES))),
@@ -337,7 +337,7 @@ impl Launcher {
             self.members[*idx].n_instances = n_before + 1;
             let sink = LineSink {
                 node: node.id.clone(),
-                log: self.members[*idx].log.clone(),
+                log: Some(self.members[*idx].log.clone()),
                 printer: self.options.is_on_terminal.then(|| Arc::clone(&self.printer)),
             };
             starts.push(Start { id: self.n_processes, node, wiring, sink });
@@ -757,7 +757,7 @@ impl Launcher {
                 match &report {
                     Report::Failed { message } => {
                         let entry = LogEntry { level: Some(LogLevel::Error), ..LogEntry::plain(message) };
-                        log.iter().for_each(|log| log.write(entry.clone()));
+                        log.write(entry);
                     }
                     Report::Counts { counts } => {
                         for (name, count) in counts {
@@ -964,7 +964,7 @@ impl Leaving {
 }
 
 impl Member {
-    fn new(node: &Node, log: Option<Log>) -> Member {
+    fn new(node: &Node, log: Log) -> Member {
         Member {
             node: node.clone(),
             active: None,

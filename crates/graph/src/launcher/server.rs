@@ -59,7 +59,7 @@ pub(super) fn serve(
     listener: &UnixListener,
     pins: BTreeMap<String, Pins>,
     events: &SyncSender<Event>,
-    audit: Option<Log>,
+    audit: Log,
 ) -> std::io::Result<Server> {
     let pins = Arc::new(pins);
     let accepting = listener.try_clone()?;
