@@ -28,6 +28,7 @@ mod param;
 mod predict;
 mod ps;
 mod record;
+mod recording_arguments;
 mod replay;
 mod reproduce;
 mod ros2_network;
@@ -39,7 +40,6 @@ mod simulate;
 mod stop;
 mod swap;
 mod test;
-mod text_table;
 mod top;
 mod train;
 mod trials;
@@ -47,14 +47,15 @@ mod view;
 
 use std::io::Write;
 use std::ops::RangeInclusive;
-use std::os::unix::fs::MetadataExt;
-use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use anyhow::Context;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+
+use blindgrasp_session::output::{check_new, check_output, check_page};
+use blindgrasp_session::text_table::{self, percent};
 
 /// Decides from touch and joint angles whether a grasp will hold before the lift.
 ///
@@ -140,6 +141,11 @@ pub(crate) enum Outcome {
 }
 
 impl Outcome {
+    /// The outcome of a run that ended well.
+    fn of(is_lossy: bool) -> Outcome {
+        if is_lossy { Outcome::FinishedWithLoss } else { Outcome::Done }
+    }
+
     /// 0 or 3.
     pub(crate) fn exit_code(self) -> ExitCode {
         match self {
@@ -259,51 +265,6 @@ fn stop_signals() -> Vec<i32> {
     signals.into_iter().filter(|signal| *signal != signal_hook::consts::SIGHUP || !is_ignored(signal)).collect()
 }
 
-/// As [`check_output`], for a file that another one takes the place of once it is complete. It also refuses to replace a
-/// file, unless the user has asked for that, and anything else that bears the name.
-fn check_new(out: &Path, inputs: &[PathBuf], overwrite: bool) -> anyhow::Result<()> {
-    check_output(out, inputs)?;
-    match std::fs::symlink_metadata(out).map(|found| found.file_type()) {
-        Ok(found) if found.is_symlink() => {
-            anyhow::bail!("{} is a link, which would be replaced: name the file that it leads to", out.display())
-        }
-        Ok(found) if !found.is_file() => {
-            anyhow::bail!("{} is a device or a pipe, which would be replaced: name a file", out.display())
-        }
-        Ok(_) if !overwrite => {
-            anyhow::bail!("{}: the file exists; choose another name, or replace it with --overwrite", out.display())
-        }
-        _ => Ok(()),
-    }
-}
-
-/// As [`check_output`], for a page, which takes the place of a file of its name.
-fn check_page(out: &Path, inputs: &[PathBuf]) -> anyhow::Result<()> {
-    check_output(out, inputs)?;
-    if !out.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("html")) {
-        anyhow::bail!("{} (--report): expected a name that ends in .html", out.display());
-    }
-    if out.is_symlink() {
-        anyhow::bail!("{} is a link, which would be replaced: name the file that it leads to", out.display());
-    }
-    Ok(())
-}
-
-/// Refuses to write where one of the inputs lies.
-fn check_output(out: &Path, inputs: &[PathBuf]) -> anyhow::Result<()> {
-    // By device and number: a file may have several names.
-    let place = |path: &Path| std::fs::metadata(path).ok().map(|found| (found.dev(), found.ino()));
-    match inputs.iter().find(|input| place(out).is_some_and(|out| place(input) == Some(out))) {
-        Some(input) => anyhow::bail!("{} is an input: writing there would destroy it", input.display()),
-        None if out.parent().is_some_and(|folder| folder != Path::new("") && !folder.is_dir()) => anyhow::bail!(
-            "{}: there is no such folder to write to; make it first",
-            out.parent().unwrap_or(out).display()
-        ),
-        None if out.is_dir() => anyhow::bail!("{} is a folder: expected the name of a file to write", out.display()),
-        None => Ok(()),
-    }
-}
-
 /// A number that clap takes only within `range`.
 fn number_in(text: &str, range: RangeInclusive<f64>) -> Result<f64, String> {
     match text.parse() {
@@ -319,9 +280,4 @@ fn secs_in(text: &str, range: RangeInclusive<f64>) -> Result<f64, String> {
         Some(secs) if range.contains(&secs) => Ok(secs),
         _ => Err(format!("expected a time from {} to {} seconds, like 2.5, 500ms or 1m", range.start(), range.end())),
     }
-}
-
-/// A share as a percentage.
-fn percent(share: Option<f64>) -> String {
-    share.map_or("n/a".into(), |share| format!("{:.1} %", 100.0 * share))
 }

@@ -10,16 +10,17 @@ use clap::Args;
 use serde::Serialize;
 use serde_json::json;
 
-use super::run::recorder::{RecordOptions, Recorded, Recorder};
+use super::recording_arguments::RecordingArguments;
 use super::text_table::TextTable;
 use super::{GraphArgument, Outcome, check_output, print_line, secs_in, stop_signal};
 use blindgrasp_graph::client::observer::{ObservedEdge, Observer, can_observe};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request};
 use blindgrasp_graph::recorded_graph::{Beginning, Ending};
-use blindgrasp_learning::of_graph::{self};
 use blindgrasp_operator::cursors::SharedCursors;
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_session::of_graph::of_graph;
+use blindgrasp_session::recorder::{Recorded, Recorder};
 
 use self::span::{EdgeSpan, Span, SpanOfEdge};
 
@@ -51,7 +52,7 @@ pub(super) struct Arguments {
     #[arg(long = "for", value_name = "TIME", value_parser = |text: &str| secs_in(text, 0.01..=1e8))]
     for_secs: Option<f64>,
     #[command(flatten)]
-    options: RecordOptions,
+    recording: RecordingArguments,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -72,7 +73,7 @@ struct Summary {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     check_output(&arguments.out, &[])?;
-    arguments.options.check(&arguments.out)?;
+    arguments.recording.options().check(&arguments.out)?;
     let stop = stop_signal()?;
     let is_interrupted = || stop.load(Ordering::Relaxed);
     let mut graph = pick_graph(arguments.graph.name())?;
@@ -122,8 +123,8 @@ fn record_here(
         params.flat_map(|params| params.values()).filter_map(|value| value.as_str()).map(PathBuf::from).collect();
     check_output(&arguments.out, &inputs)?;
     let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
-    let about = of_graph::of_graph(&graph, beginning)?;
-    let recorder = Recorder::create(&arguments.out, about, &arguments.options)?;
+    let about = of_graph(&graph, beginning)?;
+    let recorder = Recorder::create(&arguments.out, about, &arguments.recording.options())?;
     let cursors = SharedCursors::open(std::path::Path::new(&domain.cursors))?;
     let observed = edges.iter().map(|edge| ObservedEdge {
         topic: edge.topic.clone(),

@@ -16,9 +16,9 @@ use blindgrasp_bridge::config::{Endpoints, KeyKind, LinkConfig, PeerConfig};
 use blindgrasp_bridge::tunnel::Tunnels;
 use blindgrasp_graph::client::{ClientError, Connection, part_name, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, SwapRequest};
-use blindgrasp_learning::of_graph::of_graph;
 use blindgrasp_operator::control_socket::{ControlSocket, path_of};
 use blindgrasp_recording::{Record, RecordingReader};
+use blindgrasp_session::of_graph::of_graph;
 use serde_json::{Value, json};
 use zenoh::Wait;
 

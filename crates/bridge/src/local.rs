@@ -9,11 +9,11 @@ use sha2::{Digest, Sha256};
 use super::certificates::key_files;
 use super::config::{Channel, Endpoints, LinkConfig, PeerConfig};
 use blindgrasp_graph::dataflow::ProcessOptions;
+use blindgrasp_graph::dataflow::pins::Pins;
 use blindgrasp_graph::dataflow::{
     DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Graph, Input, LINK, LocalView, Machine, Machines, Node, Program, Restart,
     RestartPolicy,
 };
-use blindgrasp_graph::launcher::pins::Pins;
 use blindgrasp_messages::{LiftDecision, Prediction, Recorded};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::wiring::{EdgePolicy, Sandbox};

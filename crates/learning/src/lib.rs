@@ -3,13 +3,11 @@
 //! * [`dataset`] - recordings as data sets. [`import`] - tables of tactile readings as recordings.
 //! * [`training`] - the model. [`collect`] - experience of lifts.
 //! * [`evaluation`] - decisions compared with labels. [`promise`] - bounds for the drops to come. [`trials`] - lift trials counted and shown.
-//! * [`of_graph`] - what a recording of a running graph says about the graph.
 
 pub mod collect;
 pub mod dataset;
 pub mod evaluation;
 pub mod import;
-pub mod of_graph;
 pub mod promise;
 pub mod sensors;
 pub mod training;

@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use serde_json::{Map, Value};
 
 use super::played::PLAYED;
+use blindgrasp_graph::dataflow::pins::Pins;
 use blindgrasp_graph::dataflow::{EdgeOptions, Graph, Input, Node, Program, Restart, RestartPolicy};
-use blindgrasp_graph::launcher::pins::Pins;
 use blindgrasp_messages::{GraspTruth, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::wiring::EdgePolicy;

@@ -9,7 +9,6 @@ use anyhow::{anyhow, bail};
 
 use super::span::{EdgeSpan, Places, Span};
 use super::{Arguments, POLL, Summary};
-use crate::commands::run::recorder::Recorder;
 use blindgrasp_graph::client::observer::Sink;
 use blindgrasp_graph::client::{ClientError, Connection};
 use blindgrasp_graph::control::{Reply, Request, SampleBatch, Sampling};
@@ -17,6 +16,7 @@ use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_graph::sample_batch;
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_session::recorder::Recorder;
 
 /// The other machine must begin to read its edges within this time.
 const BEGIN_LIMIT: Duration = Duration::from_secs(10);
@@ -64,7 +64,7 @@ pub(super) fn record(
     if edges.is_empty() {
         bail!("graph '{}' has no edge that can be recorded", connection.graph());
     }
-    let recorder = Recorder::create(&arguments.out, about, &arguments.options)?;
+    let recorder = Recorder::create(&arguments.out, about, &arguments.recording.options())?;
     let failed = Arc::new(AtomicBool::new(false));
     let mut span = Span::new(Told::default(), edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
     span.begin(&places);

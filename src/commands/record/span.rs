@@ -10,7 +10,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
 
-use super::super::run::recorder::{Recorded, Recorder};
 use blindgrasp_graph::client::observer::{Sink, bears_source_number};
 use blindgrasp_graph::control::AttachedEdge;
 use blindgrasp_graph::recorded_graph::Ending;
@@ -19,6 +18,7 @@ use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::port::sample_id;
 use blindgrasp_recording::Record;
+use blindgrasp_session::recorder::{Recorded, Recorder};
 
 /// The first gaps of an edge are printed one by one.
 const N_GAPS_TOLD: u64 = 5;

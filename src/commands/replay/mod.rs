@@ -11,14 +11,14 @@ use clap::Args;
 use serde_json::{Value, json};
 
 pub(super) use self::feed::{Fed, Feed};
-use super::run::{RecordOptions, Session};
-use super::view::Rights;
+use super::recording_arguments::RecordingArguments;
 use super::{Outcome, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_replay::selection::{GraspIds, Selection};
+use blindgrasp_session::run::Session;
 
 /// Play a recording in the place of a graph's source or stage
 ///
@@ -64,7 +64,7 @@ pub(super) struct Arguments {
     #[arg(long)]
     record: Option<PathBuf>,
     #[command(flatten)]
-    record_options: RecordOptions,
+    recording_options: RecordingArguments,
     /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
     #[arg(long = "set", value_name = "[NODE.]PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
@@ -104,16 +104,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         launch: LaunchOptions { startup_limit: Duration::from_secs(60), ..LaunchOptions::default() },
         clock: Clock::Recording,
         record: arguments.record.clone(),
-        record_options: arguments.record_options.clone(),
-        metrics: None,
-        view: None,
-        rights: Rights::default(),
-        report: None,
+        record_options: arguments.recording_options.options(),
         json: arguments.json,
-        is_quiet: false,
         tap,
+        ..Session::default()
     };
-    Ok(session.run(&fed.graph, name, &n_stops)?.outcome)
+    Ok(Outcome::of(session.run(&fed.graph, name, &n_stops)?.is_lossy))
 }
 
 /// Parses the player's param.

@@ -12,7 +12,6 @@ use serde_json::{Value, json};
 
 use super::Fed;
 use crate::commands::print_line;
-use crate::commands::run::Tap;
 use blindgrasp_graph::client::Connection;
 use blindgrasp_graph::control::{Reply, Request};
 use blindgrasp_graph::run::observed_topics;
@@ -25,6 +24,7 @@ use blindgrasp_recording::{Reach, Record};
 use blindgrasp_replay::playback::{Next, Playback};
 use blindgrasp_replay::played::Played;
 use blindgrasp_replay::selection::Selection;
+use blindgrasp_session::run::Tap;
 
 /// The limit for the graph to start, and to answer a step.
 const LIMIT: Duration = Duration::from_secs(60);

@@ -1,10 +1,6 @@
 //! `blindgrasp run`
 
-mod console;
-pub(super) mod recorder;
-mod report;
-mod session;
-mod table;
+mod page;
 
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
@@ -13,8 +9,8 @@ use std::time::Duration;
 use anyhow::bail;
 use clap::{Args, ValueEnum};
 
-pub(super) use self::recorder::RecordOptions;
-pub(super) use self::session::{Session, Tap};
+use self::page::Page;
+use super::recording_arguments::RecordingArguments;
 use super::view::Rights;
 use super::{Outcome, background, check, secs_in, stop_requests};
 use blindgrasp_bridge::local::{Placement, local_graph};
@@ -24,6 +20,7 @@ use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_graph::log::LogFormat;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Clock;
+use blindgrasp_session::run::Session;
 
 /// Run a graph and print its decisions
 ///
@@ -94,7 +91,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "FILE", help_heading = "Recording")]
     record: Option<PathBuf>,
     #[command(flatten)]
-    record_options: RecordOptions,
+    recording: RecordingArguments,
     #[command(flatten)]
     limits: Limits,
     #[command(flatten)]
@@ -258,10 +255,12 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
     let n_stops = stop_requests()?;
     loop {
         // Each round is a run of its own to the other machines.
-        let ended = session(arguments).run(&graph_here(arguments, graph, name)?, name, &n_stops)?;
+        let graph_here = graph_here(arguments, graph, name)?;
+        let _page = arguments.view.map(|port| Page::start(name, port, arguments.rights)).transpose()?;
+        let ended = session(arguments).run(&graph_here, name, &n_stops)?;
         let is_stopped = n_stops.load(Ordering::Relaxed) > 0 || !arguments.machines.stay;
         if is_stopped || ended.summary.run.end != "finished" {
-            return Ok(ended.outcome);
+            return Ok(Outcome::of(ended.is_lossy));
         }
         print_diagnostic(&format!("graph '{name}' has ended; it begins again and waits for the other machines"));
     }
@@ -279,10 +278,8 @@ fn session(arguments: &Arguments) -> Session {
         },
         clock: Clock::Machine,
         record: arguments.record.clone(),
-        record_options: arguments.record_options.clone(),
+        record_options: arguments.recording.options(),
         metrics: arguments.metrics,
-        view: arguments.view,
-        rights: arguments.rights,
         report: arguments.report.clone(),
         json: arguments.json,
         is_quiet: arguments.quiet,

@@ -8,11 +8,9 @@ use anyhow::bail;
 use serde::Serialize;
 use serde_json::json;
 
-use super::super::view::Rights;
 use super::scratch::Scratch;
 use super::settings;
 use crate::commands::replay::{Fed, Feed};
-use crate::commands::run::{RecordOptions, Session};
 use blindgrasp_graph::dataflow::{self, Graph};
 use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_graph::launcher::LaunchOptions;
@@ -25,6 +23,8 @@ use blindgrasp_replay::comparison::{ComparedEdge, Coverage, compare_edge};
 use blindgrasp_replay::expectations::{self, Expectations};
 use blindgrasp_replay::selection::Selection;
 use blindgrasp_replay::update::update;
+use blindgrasp_session::recorder::RecordOptions;
+use blindgrasp_session::run::Session;
 
 /// The options that all recordings have in common.
 pub(super) struct Runner<'a> {
@@ -133,13 +133,8 @@ impl Runner<'_> {
             clock: Clock::Recording,
             record: Some(found.to_path_buf()),
             record_options: RecordOptions { overwrite: true, ..RecordOptions::default() },
-            metrics: None,
-            view: None,
-            rights: Rights::default(),
-            report: None,
-            json: false,
             is_quiet: true,
-            tap: None,
+            ..Session::default()
         };
         let ended = session.run(&fed.graph, &name, self.n_stops)?;
         self.check_stop()?;

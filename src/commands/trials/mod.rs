@@ -15,8 +15,6 @@ use self::setup::Setup;
 use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
 use super::model::write_at_once;
-use super::run::{RecordOptions, Session};
-use super::view::Rights;
 use super::{Outcome, check_page, print_line, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
@@ -24,7 +22,8 @@ use blindgrasp_learning::trials::late_decisions::LateDecisions;
 use blindgrasp_learning::trials::page::{Made, Strip, strip, telling_records, trials_page};
 use blindgrasp_learning::trials::tables::{Table, TrialsReport, tables};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operator::wiring::Clock;
+use blindgrasp_session::recorder::RecordOptions;
+use blindgrasp_session::run::Session;
 use blindgrasp_simulator::trial::LiftTarget;
 use blindgrasp_simulator::trial::targets::{check_approaches, targets_and_warnings};
 
@@ -247,16 +246,11 @@ fn run_way(
     let watch = Watch::new(arguments.trials, arguments.attempts, way.name);
     let session = Session {
         launch: LaunchOptions { startup_limit: Duration::from_secs(60), ..LaunchOptions::default() },
-        clock: Clock::Machine,
         record: arguments.record.clone(),
         record_options: RecordOptions { overwrite: arguments.overwrite, ..RecordOptions::default() },
-        metrics: None,
-        view: None,
-        rights: Rights::default(),
-        report: None,
-        json: false,
         is_quiet: true,
         tap: Some(watch.tap()),
+        ..Session::default()
     };
     let ended = session.run(&graph, name, n_stops);
     let Watched { records, decisions } = watch.finish();
@@ -275,7 +269,7 @@ fn run_way(
         let n_left_out = counts.and_then(|counts| counts.get(LEFT_OUT)).copied().unwrap_or(0);
         report.n_left_out = report.n_left_out.max(n_left_out);
         report.end = ended.summary.run.end.into();
-        ended.outcome
+        Outcome::of(ended.is_lossy)
     }))
 }
 

@@ -5,11 +5,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::commands::run::Tap;
 use blindgrasp_learning::trials::tally::TrialRecord;
 use blindgrasp_messages::LiftDecision;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::Record;
+use blindgrasp_session::run::Tap;
 
 /// Trials between two lines of progress where no bar can be shown.
 const N_TRIALS_A_LINE: u64 = 10;

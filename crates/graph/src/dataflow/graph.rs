@@ -1,6 +1,6 @@
 //! A checked graph: what the launcher starts.
 
-use crate::launcher::pins::Pins;
+use crate::dataflow::pins::Pins;
 use blindgrasp_operator::wiring::{EdgePolicy, OnLate, Sandbox};
 use std::fmt;
 use std::path::PathBuf;

@@ -66,6 +66,7 @@ mod machines_entry;
 mod node;
 mod old_names;
 mod order;
+pub mod pins;
 mod process_options;
 mod program;
 mod schema;

@@ -3,9 +3,9 @@
 use crate::dataflow::diagnostic::{Diagnostics, Position};
 use crate::dataflow::form::{accept, check_name, entries_or_nothing, unknown_key};
 use crate::dataflow::graph::{DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Restart, RestartPolicy};
+use crate::dataflow::pins::Pins;
 use crate::dataflow::process_options::{PROCESS_KEYS, ProcessOptions, read_option};
 use crate::dataflow::yaml::{Content, Entry, Text, Value};
-use crate::launcher::pins::Pins;
 use crate::log::AUDIT;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::text::is_name;
@@ -81,7 +81,7 @@ pub(super) struct NodeEntry {
 /// The digests that a file of the node may have.
 #[derive(Debug, Clone)]
 pub(super) struct PinEntry {
-    /// A param, or [`RUN`](crate::launcher::pins::RUN).
+    /// A param, or [`RUN`](crate::dataflow::pins::RUN).
     pub(super) of: Text,
     pub(super) digests: Vec<String>,
 }

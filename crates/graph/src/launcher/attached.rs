@@ -9,6 +9,7 @@ use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
 
 use crate::control::{AttachedEdge, Attachment, GraphState, Reply};
+use crate::dataflow::Node;
 use crate::launcher::Launcher;
 use crate::plan::{N_ATTACHED, Port};
 use crate::recorded_graph::describe_graph;

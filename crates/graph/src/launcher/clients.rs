@@ -5,10 +5,10 @@ use std::os::unix::net::UnixListener;
 use std::sync::mpsc::SyncSender;
 
 use crate::control::Reply;
+use crate::dataflow::pins::Pins;
 use crate::launcher::Event;
 use crate::launcher::attached::AttachedReader;
 use crate::launcher::log_writer::Log;
-use crate::launcher::pins::Pins;
 use crate::launcher::server::{self, Ask, Server};
 use crate::plan::N_ATTACHED;
 

@@ -15,7 +15,6 @@ pub mod audit;
 mod clients;
 mod link_book;
 mod log_writer;
-pub mod pins;
 mod process;
 mod server;
 mod service;
@@ -33,11 +32,11 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 
 use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
+use crate::dataflow::pins::PinError;
 use crate::dataflow::{Graph, Node};
 use crate::launcher::clients::Clients;
 use crate::launcher::link_book::LinkBook;
 use crate::launcher::log_writer::{Log, LogWriter};
-use crate::launcher::pins::PinError;
 use crate::launcher::process::{LineSink, Process, ProcessOutput, Start};
 use crate::launcher::server::Ask;
 use crate::launcher::service::Service;
@@ -52,7 +51,7 @@ use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::wiring::{Clock, Command, LogEntry, LogLevel, Report};
 
 /// The status of a graph without trouble.
-pub(super) const RUNNING: &str = "running";
+const RUNNING: &str = "running";
 /// The launcher checks the stop request and heartbeats this often. Output and ends of its children wake it at once.
 const POLL: Duration = Duration::from_millis(50);
 /// An ended process may take this long to be heard: the machine may be busy.
@@ -135,7 +134,7 @@ pub enum End {
 }
 
 /// What wakes the launcher's loop.
-pub(super) enum Event {
+enum Event {
     /// Output of the process with this id.
     Output(u64, ProcessOutput),
     /// A client asks for something.
@@ -146,23 +145,23 @@ pub(super) enum Event {
 
 /// A graph's processes. The processes that are left are killed when it is dropped.
 pub struct Launcher {
-    pub(super) options: LaunchOptions,
-    pub(super) name: String,
+    options: LaunchOptions,
+    name: String,
     file: PathBuf,
     /// The folder of the dataflow file, for relative paths in it.
-    pub(super) folder: PathBuf,
-    pub(super) plan: Plan,
-    pub(super) cursors: SharedCursors,
-    pub(super) members: Vec<Member>,
-    pub(super) swap: Option<Swap>,
-    pub(super) clients: Clients,
-    pub(super) link: LinkBook,
+    folder: PathBuf,
+    plan: Plan,
+    cursors: SharedCursors,
+    members: Vec<Member>,
+    swap: Option<Swap>,
+    clients: Clients,
+    link: LinkBook,
     /// Old instances of swapped nodes on their way out.
-    pub(super) leaving: Vec<Leaving>,
-    pub(super) state: GraphState,
-    pub(super) degraded: Option<String>,
+    leaving: Vec<Leaving>,
+    state: GraphState,
+    degraded: Option<String>,
     /// The failure of a node that must not be started again, found while the launcher waited for another one.
-    pub(super) failure: Option<LaunchError>,
+    failure: Option<LaunchError>,
     events: Receiver<Event>,
     sender: SyncSender<Event>,
     log_folder: LogFolder,
@@ -174,55 +173,55 @@ pub struct Launcher {
     /// The decisions that the launching command has read.
     decisions: Arc<Mutex<DecisionStatus>>,
     /// The sources have been told to go.
-    pub(super) has_gone: bool,
+    has_gone: bool,
     n_processes: u64,
     n_sets: u64,
-    pub(super) service: Service,
+    service: Service,
     is_to_begin_again: bool,
     /// No sample is on its way any more: a sample that was sent and not received is lost.
     has_ended: bool,
     started: Instant,
     slow_nodes: SlowNodes,
     /// When heartbeats were looked at last ([`monotonic_nanos`]).
-    pub(super) last_look_nanos: u64,
+    last_look_nanos: u64,
 }
 
 /// An old instance of a swapped node. It stays until its samples are answered, because its memory goes with it.
-pub(super) struct Leaving {
-    pub(super) process: Process,
-    pub(super) since: Instant,
+struct Leaving {
+    process: Process,
+    since: Instant,
     /// The last sample that it has sent at each output.
-    pub(super) sent: Vec<(Port, SampleId)>,
-    pub(super) is_let_go: bool,
+    sent: Vec<(Port, SampleId)>,
+    is_let_go: bool,
 }
 
 /// A node and its processes.
-pub(super) struct Member {
-    pub(super) node: Node,
+struct Member {
+    node: Node,
     /// The process that answers samples; `None` before the restart of one that has died.
-    pub(super) active: Option<Process>,
-    pub(super) standby: Option<Process>,
-    pub(super) state: NodeState,
-    pub(super) n_instances: usize,
-    pub(super) n_swaps: u32,
+    active: Option<Process>,
+    standby: Option<Process>,
+    state: NodeState,
+    n_instances: usize,
+    n_swaps: u32,
     log: Log,
-    pub(super) n_restarts: u32,
+    n_restarts: u32,
     /// When it was restarted, within its window.
-    pub(super) restarts: VecDeque<Instant>,
-    pub(super) restart_at: Option<Instant>,
+    restarts: VecDeque<Instant>,
+    restart_at: Option<Instant>,
     /// When it was found dead, until it is ready again.
-    pub(super) died: Option<Instant>,
+    died: Option<Instant>,
     /// The sample on which its last process has died.
-    pub(super) deadly: Option<SampleId>,
+    deadly: Option<SampleId>,
     /// Samples on which it has died twice in a row. They are left without an answer.
-    pub(super) quarantine: Vec<SampleId>,
+    quarantine: Vec<SampleId>,
     /// The reason for which its last process failed before it was ready.
-    pub(super) start_failure: Option<String>,
+    start_failure: Option<String>,
     /// It has ended, and with it the graph: it is not started again.
-    pub(super) is_over: bool,
+    is_over: bool,
     is_source: bool,
     /// What its processes have counted besides their samples, together.
-    pub(super) counts: BTreeMap<String, u64>,
+    counts: BTreeMap<String, u64>,
 }
 
 impl Launcher {
@@ -291,7 +290,7 @@ impl Launcher {
     }
 
     /// The members that share the process of a member, itself included, in the graph's order.
-    pub(super) fn together(&self, idx: usize) -> Vec<usize> {
+    fn together(&self, idx: usize) -> Vec<usize> {
         match &self.members[idx].node.process.group {
             None => vec![idx],
             group => {
@@ -301,7 +300,7 @@ impl Launcher {
     }
 
     /// Starts the process of a member, and of those that share it.
-    pub(super) fn spawn_active(&mut self, idx: usize) -> Result<(), LaunchError> {
+    fn spawn_active(&mut self, idx: usize) -> Result<(), LaunchError> {
         let idxs = self.together(idx);
         let nodes: Vec<(usize, Node)> = idxs.iter().map(|idx| (*idx, self.members[*idx].node.clone())).collect();
         for (idx, process) in idxs.into_iter().zip(self.spawn(&nodes, false)?) {
@@ -311,7 +310,7 @@ impl Launcher {
     }
 
     /// Starts a process for a node, or for all nodes of a group.
-    pub(super) fn spawn(&mut self, nodes: &[(usize, Node)], standby: bool) -> Result<Vec<Process>, LaunchError> {
+    fn spawn(&mut self, nodes: &[(usize, Node)], standby: bool) -> Result<Vec<Process>, LaunchError> {
         let mut starts = Vec::with_capacity(nodes.len());
         // The instances of a group's nodes live and end together, so a place that is free for one is free for all.
         let n_before = nodes.first().map_or(0, |(idx, _)| self.make_room_for_instance(*idx));
@@ -350,7 +349,7 @@ impl Launcher {
 
     /// The number of a node's next instance: the first whose heartbeat cell is free. `None` if too many old instances are on
     /// their way out.
-    pub(super) fn free_instance(&self, idx: usize) -> Option<usize> {
+    fn free_instance(&self, idx: usize) -> Option<usize> {
         let member = &self.members[idx];
         let leaving = self.leaving.iter().map(|leaving| &leaving.process);
         let living: Vec<usize> =
@@ -698,7 +697,7 @@ impl Launcher {
     }
 
     /// Takes in the output of processes and the requests of clients, for up to `limit` until the first.
-    pub(super) fn listen(&mut self, limit: Duration) {
+    fn listen(&mut self, limit: Duration) {
         self.service.beat();
         let mut next = self.events.recv_timeout(limit);
         let start = Instant::now();
@@ -779,7 +778,7 @@ impl Launcher {
     }
 
     /// Prints and logs a line of the launcher's own.
-    pub(super) fn say(&mut self, line: &str) {
+    fn say(&mut self, line: &str) {
         self.printer.lock().unwrap_or_else(PoisonError::into_inner).print(line.into());
         if let Some(log) = &self.own_log {
             log.write(LogEntry::plain(line));
@@ -788,7 +787,7 @@ impl Launcher {
 
     /// Listens to an ended process until it has said why it failed, or half a second has passed: its last lines may still
     /// be on their way.
-    pub(super) fn hear_last_words(&mut self, process: impl Fn(&Self) -> Option<&Process>) {
+    fn hear_last_words(&mut self, process: impl Fn(&Self) -> Option<&Process>) {
         let start = Instant::now();
         while process(self).is_some_and(|process| process.failure().is_none()) && start.elapsed() < LAST_WORDS {
             self.listen(POLL);
@@ -796,7 +795,7 @@ impl Launcher {
     }
 
     /// The error of a node whose active process has failed.
-    pub(super) fn failed(&self, id: &str, is_early: bool) -> LaunchError {
+    fn failed(&self, id: &str, is_early: bool) -> LaunchError {
         let process = self.members.iter().find(|member| member.node.id == id).and_then(|member| member.active.as_ref());
         let (what, log) = process.map_or_else(
             || ("has no process".into(), Vec::new()),
@@ -908,7 +907,7 @@ impl Launcher {
         }
     }
 
-    pub(super) fn member_idx(&self, id: &str) -> Result<usize, String> {
+    fn member_idx(&self, id: &str) -> Result<usize, String> {
         let found = self.members.iter().position(|member| member.node.id == id);
         found.ok_or_else(|| {
             let known: Vec<_> = self.members.iter().map(|member| member.node.id.as_str()).collect();
@@ -991,7 +990,7 @@ impl Member {
     }
 
     /// The active process, and the one that stands by during a swap.
-    pub(super) fn processes(&mut self) -> impl Iterator<Item = &mut Process> {
+    fn processes(&mut self) -> impl Iterator<Item = &mut Process> {
         self.active.iter_mut().chain(self.standby.iter_mut())
     }
 
@@ -999,7 +998,7 @@ impl Member {
         self.active.as_ref().is_some_and(|process| process.is_done)
     }
 
-    pub(super) fn is_given_up(&self) -> bool {
+    fn is_given_up(&self) -> bool {
         self.state == NodeState::Failed
     }
 }

@@ -9,11 +9,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
 use crate::control::{Reply, Request, SwapRequest};
+use crate::dataflow::pins::Pins;
 use crate::describe::describe;
 use crate::launcher::Event;
 use crate::launcher::audit::Trail;
 use crate::launcher::log_writer::Log;
-use crate::launcher::pins::Pins;
 use blindgrasp_operator::description::OperatorDescription;
 
 /// Longer requests are refused.

@@ -25,7 +25,7 @@ use crate::launcher::{End, LaunchError, LaunchOptions, Launcher};
 use crate::plan::{Plan, PlanOptions, Port, is_needed, topic_of};
 use crate::recorded_graph::describe_graph;
 use blindgrasp_messages::Record;
-use blindgrasp_messages::{GraspTruth, Header, LiftDecision, LiftOutcome, Recorded};
+use blindgrasp_messages::{GraspTruth, Header, LiftDecision, LiftOutcome};
 use blindgrasp_operator::cursors::RUN_BELL;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::namespace::Namespace;

@@ -1,31 +1,31 @@
 //! Tables in text: columns as wide as their longest entry.
 
 /// A table with a row of titles. The first columns are texts, aligned left; the others are numbers, aligned right.
-pub(super) struct TextTable {
+pub struct TextTable {
     rows: Vec<Vec<String>>,
     n_text_columns: usize,
 }
 
 impl TextTable {
-    pub(super) fn new<T: Into<String>>(titles: impl IntoIterator<Item = T>, n_text_columns: usize) -> TextTable {
+    pub fn new<T: Into<String>>(titles: impl IntoIterator<Item = T>, n_text_columns: usize) -> TextTable {
         TextTable { rows: vec![titles.into_iter().map(Into::into).collect()], n_text_columns }
     }
 
     /// A table of texts only.
-    pub(super) fn of_texts<T: Into<String>>(titles: impl IntoIterator<Item = T>) -> TextTable {
+    pub fn of_texts<T: Into<String>>(titles: impl IntoIterator<Item = T>) -> TextTable {
         TextTable::new(titles, usize::MAX)
     }
 
-    pub(super) fn row(&mut self, entries: impl IntoIterator<Item = String>) {
+    pub fn row(&mut self, entries: impl IntoIterator<Item = String>) {
         self.rows.push(entries.into_iter().collect());
     }
 
-    pub(super) fn is_empty(&self) -> bool {
+    pub fn is_empty(&self) -> bool {
         self.rows.len() == 1
     }
 
     /// The lines of the table, without space at their ends.
-    pub(super) fn lines(&self) -> Vec<String> {
+    pub fn lines(&self) -> Vec<String> {
         let n_columns = self.rows.iter().map(Vec::len).max().unwrap_or(0);
         let width = |column: usize| {
             self.rows.iter().filter_map(|row| row.get(column)).map(|entry| entry.chars().count()).max().unwrap_or(0)
@@ -39,4 +39,9 @@ impl TextTable {
         };
         self.rows.iter().map(line).collect()
     }
+}
+
+/// A share as a percentage.
+pub fn percent(share: Option<f64>) -> String {
+    share.map_or("n/a".into(), |share| format!("{:.1} %", 100.0 * share))
 }

@@ -4,9 +4,9 @@ use std::io::IsTerminal;
 
 use serde::Serialize;
 
-use super::recorder::Recorder;
-use super::report::RunReport;
-use super::session::Tap;
+use crate::recorder::Recorder;
+use crate::report::RunReport;
+use crate::run::Tap;
 use blindgrasp_graph::run::{RunSink, SeenDecision};
 use blindgrasp_messages::{Action, GraspTruth, LiftOutcome};
 use blindgrasp_operator::diagnostics::LinePrinter;

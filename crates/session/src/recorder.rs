@@ -8,7 +8,6 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use clap::Args;
 use serde::Serialize;
 
 use blindgrasp_graph::recorded_graph::{Ending, RecordedGraph};
@@ -23,25 +22,20 @@ const POLL: Duration = Duration::from_millis(20);
 /// The graph waits this long for a stuck disk before samples are left out.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-#[derive(Debug, Clone, Default, Args)]
-#[command(next_help_heading = "Recording")]
-pub(in crate::commands) struct RecordOptions {
-    /// Begin another file at this size (500MB, 2GiB)
-    ///
-    /// The files are FILE-00000.mcap, FILE-00001.mcap and so on, split between grasps.
-    #[arg(long, value_name = "SIZE", value_parser = bytes)]
-    pub(in crate::commands) rotate_size: Option<u64>,
-    /// Begin another file after this time (90s, 10m, 1h)
-    #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration)]
-    pub(in crate::commands) rotate_every: Option<Duration>,
-    /// Replace existing files
-    #[arg(long)]
-    pub(in crate::commands) overwrite: bool,
+/// How a recording is divided into files.
+#[derive(Debug, Clone, Default)]
+pub struct RecordOptions {
+    /// Another file is begun at this size (bytes), between grasps.
+    pub rotate_size: Option<u64>,
+    /// Another file is begun after this time, between grasps.
+    pub rotate_every: Option<Duration>,
+    /// Existing files are replaced.
+    pub overwrite: bool,
 }
 
 impl RecordOptions {
     /// Refuses to replace an existing file; parts of a split recording are checked when they begin.
-    pub(in crate::commands) fn check(&self, path: &Path) -> anyhow::Result<()> {
+    pub fn check(&self, path: &Path) -> anyhow::Result<()> {
         let is_split = self.rotate_size.is_some() || self.rotate_every.is_some();
         if !self.overwrite && !is_split && path.exists() {
             anyhow::bail!("{}: the file exists; choose another name, or replace it with --overwrite", path.display());
@@ -51,19 +45,19 @@ impl RecordOptions {
 }
 
 #[derive(Debug, Clone, Default, Serialize)]
-pub(in crate::commands) struct Recorded {
-    pub(in crate::commands) files: Vec<PathBuf>,
+pub struct Recorded {
+    pub files: Vec<PathBuf>,
     /// Samples in the files, by topic.
-    pub(in crate::commands) samples: BTreeMap<String, u64>,
+    pub samples: BTreeMap<String, u64>,
     /// Samples that came and are not in the files.
-    pub(in crate::commands) n_not_recorded: u64,
+    pub n_not_recorded: u64,
     /// The error that ended it early.
-    pub(in crate::commands) error: Option<String>,
+    pub error: Option<String>,
 }
 
 impl Recorded {
     /// Removes empty files, of a graph that did not start.
-    pub(in crate::commands) fn remove_if_empty(&mut self) {
+    pub fn remove_if_empty(&mut self) {
         if self.samples.values().all(|n| *n == 0) {
             for file in self.files.drain(..) {
                 let _ = std::fs::remove_file(file);
@@ -73,7 +67,7 @@ impl Recorded {
 }
 
 /// An open recording. A recorder that is dropped completes it, or removes it if it is empty.
-pub(in crate::commands) struct Recorder {
+pub struct Recorder {
     shared: Arc<Shared>,
     topics: Vec<String>,
     thread: Option<JoinHandle<Recorded>>,
@@ -107,11 +101,7 @@ impl Recorder {
     ///
     /// # Errors
     /// The file cannot be written, or is there already.
-    pub(in crate::commands) fn create(
-        path: &Path,
-        graph: RecordedGraph,
-        options: &RecordOptions,
-    ) -> Result<Recorder, RecordingError> {
+    pub fn create(path: &Path, graph: RecordedGraph, options: &RecordOptions) -> Result<Recorder, RecordingError> {
         let info = RecordingInfo {
             hand: graph.hand,
             hand_id: graph.hand_id,
@@ -142,7 +132,7 @@ impl Recorder {
     }
 
     /// Queues a sample. Waits only for a slow disk.
-    pub(in crate::commands) fn push(&mut self, topic: &str, record: Record) {
+    pub fn push(&mut self, topic: &str, record: Record) {
         let known = self.topics.iter().position(|known| known == topic);
         let mut queue = self.shared.lock();
         let topic_idx = known.unwrap_or_else(|| {
@@ -171,12 +161,12 @@ impl Recorder {
     }
 
     /// Whether the recording has ended early.
-    pub(in crate::commands) fn has_failed(&self) -> bool {
+    pub fn has_failed(&self) -> bool {
         self.shared.lock().has_failed
     }
 
     /// Writes what is left and completes the recording.
-    pub(in crate::commands) fn finish(mut self, ending: Ending) -> Recorded {
+    pub fn finish(mut self, ending: Ending) -> Recorded {
         let mut recorded = self.end(ending);
         recorded.n_not_recorded += self.n_left_out;
         recorded
@@ -257,38 +247,5 @@ fn keep(shared: &Shared, recorded: &mut Recorded, outcome: Result<(), RecordingE
         print_diagnostic(&format!("blindgrasp: recording has ended, the graph goes on: {text}"));
         recorded.error = Some(text);
         shared.lock().has_failed = true;
-    }
-}
-
-/// A size with its unit: `500MB`, `2GiB`.
-fn bytes(text: &str) -> Result<u64, String> {
-    let expected = || "expected a size of at least 1MB like 500MB, 1GB or 2GiB".to_string();
-    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
-    let number: f64 = digits.trim().parse().map_err(|_| expected())?;
-    let unit = match text[digits.len()..].to_ascii_lowercase().as_str() {
-        "mb" => 1e6,
-        "gb" => 1e9,
-        "tb" => 1e12,
-        "mib" => f64::from(1 << 20),
-        "gib" => f64::from(1 << 30),
-        "tib" => 1024.0 * f64::from(1 << 30),
-        _ => return Err(expected()),
-    };
-    let n_bytes = number * unit;
-    if (1e6..=1e15).contains(&n_bytes) { Ok(n_bytes as u64) } else { Err(expected()) }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn sizes_have_a_unit() {
-        assert_eq!(bytes("1GB"), Ok(1_000_000_000));
-        assert_eq!(bytes("1.5 MiB"), Ok(1_572_864));
-        assert_eq!(bytes("2gib"), Ok(2_147_483_648));
-        for text in ["", "1000000", "GB", "-1GB", "1kB", "1XB", "NaNMB", "1e99GB"] {
-            assert!(bytes(text).is_err(), "{text}");
-        }
     }
 }

@@ -1,7 +1,6 @@
 //! The summary of a run, for a person.
 
-use super::super::percent;
-use super::super::text_table::TextTable;
+use crate::text_table::{TextTable, percent};
 use blindgrasp_graph::run::{Latency, Summary};
 use blindgrasp_operator::link_status::{ChannelStatus, PeerStatus};
 

@@ -1,80 +1,70 @@
 //! A run of a graph as a command does it: with decisions on stdout, a recording, and the summary at the end.
 
 use std::collections::BTreeMap;
-use std::io::{BufRead, BufReader};
-use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use serde::Serialize;
 use serde_json::json;
 
-use super::super::view::Rights;
-use super::super::{Outcome, check_new, check_output, check_page};
-use super::console::Console;
-use super::recorder::{RecordOptions, Recorded, Recorder};
-use super::report::RunReport;
-use super::table::table;
+use crate::console::Console;
+use crate::of_graph::of_graph;
+use crate::output::{check_new, check_output, check_page};
+use crate::recorder::{RecordOptions, Recorded, Recorder};
+use crate::report::RunReport;
+use crate::table::table;
 use blindgrasp_graph::client::metrics;
 use blindgrasp_graph::dataflow::Graph;
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_graph::recorded_graph::{Beginning, Ending};
 use blindgrasp_graph::run::{self, Run, RunOptions};
-use blindgrasp_learning::of_graph::of_graph;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_recording::Record;
 use blindgrasp_stages::hand::Hand;
 
-/// The page of a graph that ends has this time to show its end.
-const PAGE_LIMIT: Duration = Duration::from_secs(3);
-
 /// Receives every sample of a run: its topic and content, and the time of its receipt (CLOCK_BOOTTIME).
-pub(in crate::commands) type Tap = Box<dyn FnMut(&str, &Record, u64) -> anyhow::Result<()> + Send>;
+pub type Tap = Box<dyn FnMut(&str, &Record, u64) -> anyhow::Result<()> + Send>;
 
-/// How a command runs a graph.
-pub(in crate::commands) struct Session {
-    pub(in crate::commands) launch: LaunchOptions,
-    pub(in crate::commands) clock: Clock,
+/// How a graph is run. The default prints decisions and the summary, and records nothing.
+#[derive(Default)]
+pub struct Session {
+    pub launch: LaunchOptions,
+    pub clock: Clock,
     /// Every edge is recorded to this file.
-    pub(in crate::commands) record: Option<PathBuf>,
-    pub(in crate::commands) record_options: RecordOptions,
+    pub record: Option<PathBuf>,
+    pub record_options: RecordOptions,
     /// Prometheus is answered on this port.
-    pub(in crate::commands) metrics: Option<u16>,
-    /// Port of the page in a browser.
-    pub(in crate::commands) view: Option<u16>,
-    /// The abilities of the page beside showing the graph.
-    pub(in crate::commands) rights: Rights,
+    pub metrics: Option<u16>,
     /// The report is written to this file (HTML) at the end.
-    pub(in crate::commands) report: Option<PathBuf>,
+    pub report: Option<PathBuf>,
     /// Decisions and summary are printed as JSON.
-    pub(in crate::commands) json: bool,
+    pub json: bool,
     /// Neither decisions nor the summary go to stdout; warnings and errors still go to stderr.
-    pub(in crate::commands) is_quiet: bool,
-    pub(in crate::commands) tap: Option<Tap>,
+    pub is_quiet: bool,
+    pub tap: Option<Tap>,
 }
 
 /// The summary of a run, and of its recording if there is one.
 #[derive(Serialize)]
-pub(in crate::commands) struct Summary {
+pub struct SessionSummary {
     #[serde(flatten)]
-    pub(in crate::commands) run: run::Summary,
+    pub run: run::Summary,
     #[serde(rename = "recorded")]
     recorded_samples: Option<BTreeMap<String, u64>>,
     recorded_files: Vec<PathBuf>,
     /// Why the recording ended before the graph.
-    pub(in crate::commands) recording_error: Option<String>,
+    pub recording_error: Option<String>,
     /// Samples that were received and are not in the recording.
-    pub(in crate::commands) samples_not_recorded: u64,
+    pub samples_not_recorded: u64,
 }
 
 /// A graph that has run.
-pub(in crate::commands) struct Ended {
-    pub(in crate::commands) summary: Summary,
-    pub(in crate::commands) outcome: Outcome,
+pub struct Ended {
+    pub summary: SessionSummary,
+    /// Samples were lost, or are not in the recording.
+    pub is_lossy: bool,
 }
 
 impl Session {
@@ -82,7 +72,7 @@ impl Session {
     ///
     /// # Errors
     /// The graph cannot start, or an operator failed; the summary has been printed then.
-    pub(in crate::commands) fn run(self, graph: &Graph, name: &str, n_stops: &AtomicUsize) -> anyhow::Result<Ended> {
+    pub fn run(self, graph: &Graph, name: &str, n_stops: &AtomicUsize) -> anyhow::Result<Ended> {
         let params = graph.nodes.iter().flat_map(|node| node.params.values());
         let inputs: Vec<PathBuf> = params.filter_map(|param| Some(PathBuf::from(param.as_str()?))).collect();
         if let Some(path) = &self.record {
@@ -112,7 +102,6 @@ impl Session {
             }
             None => None,
         };
-        let _page = self.view.map(|port| Page::start(name, port, self.rights)).transpose()?;
         let is_recorded = recorder.is_some();
         let report = self.report.as_ref().map(|_| RunReport::begin(hand_of(graph)));
         let run::Ended { summary, sink, outcome } =
@@ -125,18 +114,21 @@ impl Session {
         if outcome.is_err() {
             recorded.remove_if_empty();
         }
-        let summary = Summary {
+        let summary = SessionSummary {
             run: summary,
             recorded_samples: is_recorded.then_some(recorded.samples),
             recorded_files: recorded.files,
             recording_error: recorded.error,
             samples_not_recorded: recorded.n_not_recorded,
         };
-        let lines = match self.json {
-            _ if self.is_quiet => Vec::new(),
-            true => vec![json!({ "summary": summary }).to_string()],
-            false if outcome.is_ok() || summary.run.grasps > 0 => table(&summary.run),
-            false => Vec::new(),
+        let lines = if self.is_quiet {
+            Vec::new()
+        } else if self.json {
+            vec![json!({ "summary": summary }).to_string()]
+        } else if outcome.is_ok() || summary.run.grasps > 0 {
+            table(&summary.run)
+        } else {
+            Vec::new()
         };
         lines.into_iter().for_each(|line| printer.print(line));
         printer.flush(&|| n_stops.load(Ordering::Relaxed) > n_seen);
@@ -161,7 +153,7 @@ impl Session {
         }
         let is_recording_lossy = summary.recording_error.is_some() || summary.samples_not_recorded > 0;
         let is_lossy = summary.run.is_lossy(self.clock) || is_recording_lossy;
-        Ok(Ended { summary, outcome: if is_lossy { Outcome::FinishedWithLoss } else { Outcome::Done } })
+        Ok(Ended { summary, is_lossy })
     }
 }
 
@@ -171,44 +163,7 @@ fn hand_of(graph: &Graph) -> Option<Hand> {
     Hand::load(Path::new(paths.into_iter().next()?)).ok()
 }
 
-/// The process that serves the page of the graph. It ends when its stdin does, also if this process is killed.
-struct Page(Child);
-
-impl Page {
-    /// Starts it, and waits until the page is served.
-    fn start(graph: &str, port: u16, rights: Rights) -> anyhow::Result<Page> {
-        let program = std::env::current_exe().context("the program of the page is not known")?;
-        let mut command = Command::new(program);
-        command.args(["view", graph, "--wait", "--port", &port.to_string()]);
-        command.args(rights.options());
-        // Ctrl-C is for the graph: the page shows its end.
-        command.stdin(Stdio::piped()).stdout(Stdio::piped()).process_group(0);
-        let mut page = Page(command.spawn().context("cannot start the page (--view)")?);
-        let mut address = String::new();
-        if let Some(stdout) = page.0.stdout.take() {
-            BufReader::new(stdout).read_line(&mut address).context("the page does not answer (--view)")?;
-        }
-        if address.is_empty() {
-            bail!("the page cannot be served (--view)");
-        }
-        Ok(page)
-    }
-}
-
-impl Drop for Page {
-    fn drop(&mut self) {
-        drop(self.0.stdin.take());
-        let limit = Instant::now() + PAGE_LIMIT;
-        while matches!(self.0.try_wait(), Ok(None)) && Instant::now() < limit {
-            std::thread::sleep(Duration::from_millis(10));
-        }
-        // It may have ended by itself.
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-impl Summary {
+impl SessionSummary {
     fn print_recording(&self) {
         if let Some(samples) = self.recorded_samples.as_ref().filter(|_| !self.recorded_files.is_empty()) {
             let topics: Vec<_> = samples.iter().map(|(topic, n)| format!("{topic} {n}")).collect();

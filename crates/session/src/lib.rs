@@ -1,0 +1,15 @@
+//! A run of a graph as the commands `run`, `trials`, `replay` and `test` have it: with decisions on stdout, a recording, a
+//! report and a summary.
+//!
+//! * [`run`] - the run itself. [`recorder`] - records samples beside it. [`mod@report`] - its page. [`table`] - its summary.
+//! * [`of_graph`] - the facts about a graph that its recording holds.
+//! * [`output`] - files to write, checked before the work begins. [`text_table`] - tables for people.
+
+mod console;
+pub mod of_graph;
+pub mod output;
+pub mod recorder;
+pub mod report;
+pub mod run;
+pub mod table;
+pub mod text_table;

@@ -1,0 +1,49 @@
+//! Files that a command is to write, checked before the work begins.
+
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+/// As [`check_output`], for a file that another one takes the place of once it is complete. It also refuses to replace a
+/// file, unless the user has asked for that, and anything else that bears the name.
+pub fn check_new(out: &Path, inputs: &[PathBuf], overwrite: bool) -> anyhow::Result<()> {
+    check_output(out, inputs)?;
+    match std::fs::symlink_metadata(out).map(|found| found.file_type()) {
+        Ok(found) if found.is_symlink() => {
+            anyhow::bail!("{} is a link, which would be replaced: name the file that it leads to", out.display())
+        }
+        Ok(found) if !found.is_file() => {
+            anyhow::bail!("{} is a device or a pipe, which would be replaced: name a file", out.display())
+        }
+        Ok(_) if !overwrite => {
+            anyhow::bail!("{}: the file exists; choose another name, or replace it with --overwrite", out.display())
+        }
+        _ => Ok(()),
+    }
+}
+
+/// As [`check_output`], for a page, which takes the place of a file of its name.
+pub fn check_page(out: &Path, inputs: &[PathBuf]) -> anyhow::Result<()> {
+    check_output(out, inputs)?;
+    if !out.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("html")) {
+        anyhow::bail!("{} (--report): expected a name that ends in .html", out.display());
+    }
+    if out.is_symlink() {
+        anyhow::bail!("{} is a link, which would be replaced: name the file that it leads to", out.display());
+    }
+    Ok(())
+}
+
+/// Refuses to write where one of the inputs lies.
+pub fn check_output(out: &Path, inputs: &[PathBuf]) -> anyhow::Result<()> {
+    // By device and number: a file may have several names.
+    let place = |path: &Path| std::fs::metadata(path).ok().map(|found| (found.dev(), found.ino()));
+    match inputs.iter().find(|input| place(out).is_some_and(|out| place(input) == Some(out))) {
+        Some(input) => anyhow::bail!("{} is an input: writing there would destroy it", input.display()),
+        None if out.parent().is_some_and(|folder| folder != Path::new("") && !folder.is_dir()) => anyhow::bail!(
+            "{}: there is no such folder to write to; make it first",
+            out.parent().unwrap_or(out).display()
+        ),
+        None if out.is_dir() => anyhow::bail!("{} is a folder: expected the name of a file to write", out.display()),
+        None => Ok(()),
+    }
+}
