@@ -35,7 +35,6 @@ pub mod plan;
 mod process;
 pub mod recorded_graph;
 pub mod run;
-pub mod sample_batch;
 mod server;
 mod service;
 pub mod shadow_comparison;

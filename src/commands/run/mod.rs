@@ -181,7 +181,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let name = running_name(arguments, &graph)?;
     let name = name.as_str();
     // Every mistake is reported before the graph goes into the background.
-    graph_here(arguments, &graph, name)?;
+    graph_here(arguments, &graph)?;
     if arguments.in_background {
         return background::into_log(name, arguments.log_format.into(), || run_graph(arguments, &graph, name));
     }
@@ -212,9 +212,9 @@ fn running_name(arguments: &Arguments, graph: &Graph) -> anyhow::Result<String> 
 }
 
 /// The part of a graph that runs here.
-fn graph_here(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result<Graph> {
+fn graph_here(arguments: &Arguments, graph: &Graph) -> anyhow::Result<Graph> {
     match &arguments.machines.machine {
-        Some(machine) => part_of(arguments, graph, machine, name),
+        Some(machine) => part_of(arguments, graph, machine),
         None => whole(arguments, graph.clone()),
     }
 }
@@ -235,11 +235,10 @@ fn whole(arguments: &Arguments, graph: Graph) -> anyhow::Result<Graph> {
     Ok(graph)
 }
 
-fn part_of(arguments: &Arguments, graph: &Graph, machine: &str, name: &str) -> anyhow::Result<Graph> {
+fn part_of(arguments: &Arguments, graph: &Graph, machine: &str) -> anyhow::Result<Graph> {
     let placement = Placement {
         machine: machine.into(),
         namespace: arguments.machines.namespace.clone(),
-        running_graph: name.into(),
         run: run_number(),
         listen: arguments.machines.listen.clone(),
         connect: arguments.machines.connect.clone(),
@@ -258,7 +257,7 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
     let n_stops = stop_requests()?;
     loop {
         // Each round is a run of its own to the other machines.
-        let ended = session(arguments).run(&graph_here(arguments, graph, name)?, name, &n_stops)?;
+        let ended = session(arguments).run(&graph_here(arguments, graph)?, name, &n_stops)?;
         let is_stopped = n_stops.load(Ordering::Relaxed) > 0 || !arguments.machines.stay;
         if is_stopped || ended.summary.run.end != "finished" {
             return Ok(ended.outcome);
