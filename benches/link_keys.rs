@@ -44,7 +44,6 @@ fn main() -> anyhow::Result<()> {
     let protection = |machine: &str, peer: &str| -> anyhow::Result<Protection> {
         let config = LinkConfig {
             graph: "g".into(),
-            running_graph: "g".into(),
             namespace: None,
             machine: machine.into(),
             run: 1,

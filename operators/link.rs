@@ -10,5 +10,5 @@ pub(crate) fn describe() -> OperatorDescription {
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
-    blindgrasp_bridge::operator::work(operator, blindgrasp_session::of_graph::of_graph)
+    blindgrasp_bridge::operator::work(operator)
 }

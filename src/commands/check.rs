@@ -123,9 +123,9 @@ fn print_graph(graph: &Graph) -> std::io::Result<()> {
 fn print_machines(machines: &Machines) -> std::io::Result<()> {
     let listed = |texts: &[String]| if texts.is_empty() { "-".into() } else { texts.join(", ") };
     let row = |machine: &Machine| {
-        vec![machine.name.clone(), listed(&machine.listen), listed(&machine.read), listed(&controllers(machine))]
+        vec![machine.name.clone(), listed(&machine.listen), machine.ssh.clone().unwrap_or_else(|| machine.name.clone())]
     };
-    let titles = ["machine", "listens at", "seen by", "controlled by"].map(String::from).to_vec();
+    let titles = ["machine", "listens at", "for ssh"].map(String::from).to_vec();
     print_table(titles, machines.machines.iter().map(row))?;
     let link = &machines.link;
     let mut said =
@@ -140,12 +140,6 @@ fn print_machines(machines: &Machines) -> std::io::Result<()> {
         said.push("INSECURE: no TLS needed beyond this computer".into());
     }
     print_line(&format!("link: {}\n", said.join(", ")))
-}
-
-/// The machines that may change one's operators, with their rights if they have not all.
-fn controllers(machine: &Machine) -> Vec<String> {
-    let some = machine.allows.iter().map(|(right, names)| format!("{} ({})", names.join(", "), right.key()));
-    machine.control.iter().cloned().chain(some).collect()
 }
 
 fn restart(restart: &Restart) -> String {

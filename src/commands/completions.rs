@@ -43,6 +43,14 @@ pub(super) fn graphs() -> ArgValueCandidates {
     ArgValueCandidates::new(|| candidates(running_graphs().unwrap_or_default()))
 }
 
+/// The other machines of the running graphs.
+pub(super) fn machines() -> ArgValueCandidates {
+    of_status(|status| {
+        let peers = status.link.iter().flat_map(|link| &link.peers);
+        peers.map(|peer| peer.machine.clone()).collect()
+    })
+}
+
 pub(super) fn nodes() -> ArgValueCandidates {
     of_status(|status| status.nodes.iter().map(|node| node.node.clone()).collect())
 }

@@ -4,13 +4,14 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use clap::Args;
 
+use super::elsewhere::MachineArgument;
 use super::export::json_line;
 use super::{Outcome, completions, secs_in, stop_signal};
 use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_observe};
-use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, machine_of, pick_graph};
+use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
 use blindgrasp_graph::control::{Attachment, Reply, Request};
 use blindgrasp_messages::Record;
 use blindgrasp_operator::diagnostics::{LinePrinter, print_diagnostic};
@@ -39,6 +40,8 @@ pub(super) struct Arguments {
     /// Graph [default: the only one running]
     #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
+    #[command(flatten)]
+    machine: MachineArgument,
 }
 
 /// Prints samples until there are enough.
@@ -62,13 +65,11 @@ impl Sink for Echo {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if let Some(destination) = arguments.machine.destination()? {
+        return destination.run();
+    }
     let stop: Arc<AtomicBool> = stop_signal()?;
     let graph = pick_graph(arguments.graph.as_deref())?;
-    if machine_of(&graph).is_some() {
-        bail!(
-            "{graph}: echo reads graphs of this machine; run it there, or record the part with blindgrasp record {graph}"
-        );
-    }
     let mut connection = Connection::open(&graph)?;
     let attachment = match connection.ask(&Request::Attach { ports: arguments.edges.clone() }, ANSWER_LIMIT)? {
         Reply::Attached(attachment) => attachment,

@@ -5,11 +5,9 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use clap::Args;
 
+use super::elsewhere::MachineArgument;
 use super::{Outcome, completions, print_line};
-use blindgrasp_graph::client::{
-    ANSWER_LIMIT, ClientError, Connection, is_graph_name, locate, machine_of, pick_graph, status,
-};
-use blindgrasp_graph::control::{Reply, Request};
+use blindgrasp_graph::client::{ClientError, is_graph_name, pick_graph, status};
 use blindgrasp_graph::log::AUDIT;
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -19,8 +17,7 @@ const POLL: Duration = Duration::from_millis(200);
 /// Print the logs of a graph, also after it has ended
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp logs classifier -f\n\n\
-                        Without an operator, the logs of all are merged by time. Ctrl-C ends -f.\n\
-                        The log of an operator on another machine is read there, while it is linked.")]
+                        Without an operator, the logs of all are merged by time. Ctrl-C ends -f.")]
 pub(super) struct Arguments {
     /// Node id of an operator; run: the launching command; audit: requests for changes, with their clients
     #[arg(add = completions::nodes())]
@@ -31,7 +28,7 @@ pub(super) struct Arguments {
     /// Begin with so many lines
     #[arg(short = 'n', long, default_value_t = 100)]
     lines: usize,
-    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running, or the latest]
+    /// Graph [default: the only one running, or the latest]
     #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
     /// Print JSON, one object a line
@@ -39,11 +36,13 @@ pub(super) struct Arguments {
     /// {"time", "operator", "level", "text", "fields"}
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    machine: MachineArgument,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    if let Some(part) = part_elsewhere(arguments) {
-        return logs_of_part(arguments, &part);
+    if let Some(destination) = arguments.machine.destination()? {
+        return destination.run();
     }
     let folder = log_folder(arguments.graph.as_deref())?;
     let (mut tail, lines) = LogTail::open(folder, arguments.operator.as_deref(), arguments.lines, u64::MAX)?;
@@ -54,40 +53,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     loop {
         std::thread::sleep(POLL);
         print(&tail.more().context("the logs cannot be read any more")?, arguments.json)?;
-    }
-}
-
-/// The part of the graph on another machine, if its logs are asked for.
-fn part_elsewhere(arguments: &Arguments) -> Option<String> {
-    let graph = pick_graph(arguments.graph.as_deref()).ok()?;
-    // A node that no part knows may have logs here, of an earlier run.
-    let node = arguments.operator.as_ref().filter(|operator| !["run", AUDIT].contains(&operator.as_str()));
-    let part = node.map_or(Ok(graph.clone()), |node| locate(&graph, std::slice::from_ref(node)));
-    part.ok().filter(|part| machine_of(part).is_some())
-}
-
-/// Prints the logs that the link on the other machine reads.
-fn logs_of_part(arguments: &Arguments, part: &str) -> anyhow::Result<Outcome> {
-    let mut connection = Connection::open(part)?;
-    let (operator, n_lines, follow) = (arguments.operator.clone(), arguments.lines, arguments.follow);
-    connection.send(&Request::Logs { operator, n_lines, follow })?;
-    let mut has_all = false;
-    loop {
-        let reply = match has_all {
-            false => Some(connection.receive(ANSWER_LIMIT, &|| false)?),
-            true => connection.receive_within(POLL)?,
-        };
-        match reply {
-            Some(Reply::LogLines { lines, is_all }) => {
-                print(&lines, arguments.json)?;
-                has_all |= is_all;
-            }
-            Some(other) => return Err(connection.unexpected(&other).into()),
-            None => {}
-        }
-        if has_all && !arguments.follow {
-            return Ok(Outcome::Done);
-        }
     }
 }
 

@@ -8,6 +8,7 @@ mod completions;
 mod diagnostics;
 mod doctor;
 mod echo;
+mod elsewhere;
 mod evaluate;
 mod export;
 mod grid;
@@ -117,7 +118,7 @@ enum Command {
 /// The running graph that a command is about, by its place or by its option, as other commands have it.
 #[derive(Debug, clap::Args)]
 struct GraphArgument {
-    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
+    /// Graph [default: the only one running]
     #[arg(add = completions::graphs())]
     graph: Option<String>,
     /// The same, as other commands have it
@@ -138,6 +139,8 @@ pub(crate) enum Outcome {
     Done,
     /// It ran to its end, but samples were lost.
     FinishedWithLoss,
+    /// It ran on another machine and ended with this exit code. What failed was told there.
+    OfOtherMachine(u8),
 }
 
 impl Outcome {
@@ -146,11 +149,12 @@ impl Outcome {
         if is_lossy { Outcome::FinishedWithLoss } else { Outcome::Done }
     }
 
-    /// 0 or 3.
+    /// 0 or 3, or that of the other machine.
     pub(crate) fn exit_code(self) -> ExitCode {
         match self {
             Outcome::Done => ExitCode::SUCCESS,
             Outcome::FinishedWithLoss => ExitCode::from(3),
+            Outcome::OfOtherMachine(code) => ExitCode::from(code),
         }
     }
 }
@@ -159,6 +163,7 @@ impl Cli {
     /// Parses the command line. A mistake ends the process with its explanation and code 2.
     pub(crate) fn read() -> Cli {
         completions::answer_shell();
+        elsewhere::answer_caller();
         let matches = help::grouped(Cli::command()).try_get_matches();
         let parsed = matches.and_then(|matches| Cli::from_arg_matches(&matches));
         parsed.unwrap_or_else(|error| help::with_hint(error).exit())

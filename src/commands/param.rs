@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 
 use super::text_table::TextTable;
 use super::{Outcome, completions, print_line, set};
-use blindgrasp_graph::client::{ANSWER_LIMIT, Connection, locate, machine_of, pick_graph};
+use blindgrasp_graph::client::{ANSWER_LIMIT, Connection, pick_graph};
 use blindgrasp_graph::control::{NodeStatus, Reply, Request};
 use blindgrasp_graph::describe::describe;
 
@@ -67,12 +67,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 }
 
 fn list(arguments: &ListArguments) -> anyhow::Result<Outcome> {
-    let (graph, nodes) = nodes(arguments.graph.as_deref(), arguments.node.as_deref())?;
-    // The programs of another machine cannot be asked from here.
-    let is_here = machine_of(&graph).is_none();
+    let (_, nodes) = nodes(arguments.graph.as_deref(), arguments.node.as_deref())?;
     let mut table = TextTable::of_texts(["parameter", "value", ""]);
     for node in &nodes {
-        let description = is_here.then(|| describe(&node.program, &node.args).ok()).flatten();
+        let description = describe(&node.program, &node.args).ok();
         for (name, value) in &node.params {
             let live = description
                 .as_ref()
@@ -105,10 +103,7 @@ fn get(arguments: &GetArguments) -> anyhow::Result<Outcome> {
 
 /// The nodes of a graph, or one of them, wherever it runs, and the name of the graph or of its part there.
 fn nodes(graph: Option<&str>, node: Option<&str>) -> anyhow::Result<(String, Vec<NodeStatus>)> {
-    let mut graph = pick_graph(graph)?;
-    if let Some(node) = node {
-        graph = locate(&graph, &[node.into()])?;
-    }
+    let graph = pick_graph(graph)?;
     let mut connection = Connection::open(&graph)?;
     let status = match connection.ask(&Request::Status, ANSWER_LIMIT)? {
         Reply::Status(status) => status,

@@ -6,11 +6,12 @@ use std::time::Duration;
 use clap::Args;
 use serde::Serialize;
 
+use super::elsewhere::MachineArgument;
 use super::text_table::TextTable;
 use super::top::screen::short_time;
 use super::{Outcome, completions, print_line};
 use blindgrasp_graph::client::usage::{ProcessUsage, usage};
-use blindgrasp_graph::client::{machine_of, part_name, pick_graph, running_graphs, status};
+use blindgrasp_graph::client::{pick_graph, running_graphs, status};
 use blindgrasp_graph::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus};
 use blindgrasp_graph::log::printable;
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -20,7 +21,6 @@ use blindgrasp_operator::wiring::EdgePolicy;
 /// Show running graphs with their operators and edges
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp ps grasp_gate\n\n\
-                        The other machines of a graph are asked, too; GRAPH@MACHINE is the part on one of them.\n\
                         Exit code 1 if the graph that is named does not run or does not answer.")]
 pub(super) struct Arguments {
     /// Show only this graph
@@ -32,6 +32,8 @@ pub(super) struct Arguments {
     /// Print JSON
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    machine: MachineArgument,
 }
 
 #[derive(Serialize)]
@@ -46,18 +48,6 @@ struct RunningGraph {
     status: GraphStatus,
     /// The use of the active processes, by node.
     usage: BTreeMap<String, ProcessUsage>,
-    /// The parts on other machines.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    machines: Vec<Part>,
-}
-
-/// The part of a graph on another machine.
-#[derive(Serialize)]
-struct Part {
-    machine: String,
-    status: Option<GraphStatus>,
-    /// The reason why there is no status.
-    message: Option<String>,
 }
 
 /// A graph that holds its name and does not answer.
@@ -68,6 +58,9 @@ struct Silent {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if let Some(destination) = arguments.machine.destination()? {
+        return destination.run();
+    }
     let listing = match arguments.graph.as_ref().or(arguments.named.as_ref()) {
         Some(graph) => {
             let status = status(&pick_graph(Some(graph))?)?;
@@ -107,35 +100,14 @@ fn listing() -> anyhow::Result<Listing> {
     Ok(listing)
 }
 
-/// Adds the use of processes here, and the parts on other machines.
+/// Adds the use of the processes.
 fn completed(status: GraphStatus) -> RunningGraph {
-    if machine_of(&status.graph).is_some() {
-        // Its processes run on the other machine.
-        return RunningGraph { status, usage: BTreeMap::new(), machines: Vec::new() };
-    }
     let usage = status.nodes.iter().filter_map(|node| Some((node.node.clone(), usage(node.pid?)?))).collect();
-    let peers = status.link.as_ref().map_or(&[][..], |link| &link.peers);
-    // All are asked at once: each may take its time.
-    let machines = std::thread::scope(|scope| {
-        let asked: Vec<_> = peers.iter().map(|peer| scope.spawn(|| part(&status.graph, peer))).collect();
-        asked.into_iter().filter_map(|part| part.join().ok()).collect()
-    });
-    RunningGraph { status, usage, machines }
-}
-
-fn part(graph: &str, peer: &PeerStatus) -> Part {
-    let machine = peer.machine.clone();
-    if peer.state != PeerState::Up {
-        return Part { message: trouble(peer), machine, status: None };
-    }
-    match status(&part_name(graph, &machine)) {
-        Ok(status) => Part { machine, status: Some(status), message: None },
-        Err(error) => Part { machine, status: None, message: Some(format!("{:#}", anyhow::anyhow!(error))) },
-    }
+    RunningGraph { status, usage }
 }
 
 fn formatted(graph: &RunningGraph) -> Vec<String> {
-    let RunningGraph { status, usage, machines } = graph;
+    let RunningGraph { status, usage } = graph;
     let uptime = humantime::format_duration(Duration::from_secs(status.uptime_secs.max(0.0) as u64));
     let on = status.link.as_ref().map_or(String::new(), |link| match &link.namespace {
         Some(namespace) => format!(" on {} of {namespace}", link.machine),
@@ -149,41 +121,15 @@ fn formatted(graph: &RunningGraph) -> Vec<String> {
         status.file.display()
     )];
     lines.extend(warnings(status).into_iter().map(|warning| format!("  {}", printable(&warning))));
-    let troubles: Vec<String> = status.link.iter().flat_map(|link| &link.peers).filter_map(trouble).collect();
-    for Part { machine, status, message } in machines {
-        // The trouble with a machine is printed already, unless the machine should answer.
-        let unsaid = message.iter().filter(|message| !troubles.contains(message));
-        lines.extend(
-            unsaid.map(|message| format!("  nothing is known of the part on {machine}: {}", printable(message))),
-        );
-        let warnings = status.iter().flat_map(warnings_of_its_own);
-        lines.extend(warnings.map(|warning| format!("  {machine}: {}", printable(&warning))));
-    }
     if let Some(link) = &status.link {
         lines.extend(link_tables(link));
     }
-
-    let here = status.link.as_ref().map(|link| link.machine.as_str());
-    let parts = machines.iter().filter_map(|part| Some((Some(part.machine.as_str()), part.status.as_ref()?)));
-    let parts: Vec<(Option<&str>, &GraphStatus)> = std::iter::once((here, status)).chain(parts).collect();
-    let with_machine = |machine: Option<&str>, mut row: Vec<String>| {
-        if here.is_some() {
-            row.insert(1, machine.unwrap_or_default().into());
-        }
-        row
-    };
-    let titles = ["node", "state", "pid", "restarts", "swaps", "heartbeat", "cpu", "memory"].map(String::from);
-    let n_text_columns = if here.is_some() { 3 } else { 2 };
-    let mut nodes = TextTable::new(with_machine(Some("machine"), titles.into()), n_text_columns);
+    let titles = ["node", "state", "pid", "restarts", "swaps", "heartbeat", "cpu", "memory"];
+    let mut nodes = TextTable::new(titles, 2);
+    status.nodes.iter().for_each(|node| nodes.row(node_row(node, usage.get(&node.node))));
     let titles = "edge policy sent received p50 p99 dropped missing late repeated reordered blocked".split(' ');
-    let mut edges = TextTable::new(with_machine(Some("machine"), titles.map(String::from).collect()), 2);
-    for (machine, part) in &parts {
-        for node in &part.nodes {
-            let used = usage.get(&node.node).filter(|_| std::ptr::eq(*part, status));
-            nodes.row(with_machine(*machine, node_row(node, used)));
-        }
-        part.edges.iter().for_each(|edge| edges.row(with_machine(*machine, edge_row(edge))));
-    }
+    let mut edges = TextTable::new(titles, 2);
+    status.edges.iter().for_each(|edge| edges.row(edge_row(edge)));
     lines.extend(indented(&nodes).chain(indented(&edges)));
     lines
 }
@@ -302,11 +248,6 @@ pub(super) fn warnings(status: &GraphStatus) -> Vec<String> {
     warnings
 }
 
-/// The troubles without those of its links: this machine sees the links from its own end.
-fn warnings_of_its_own(status: &GraphStatus) -> Vec<String> {
-    warnings(&GraphStatus { link: None, ..status.clone() })
-}
-
 /// The reason why another machine takes no part.
 fn trouble(peer: &PeerStatus) -> Option<String> {
     let machine = &peer.machine;
@@ -369,7 +310,7 @@ mod tests {
     fn made() -> RunningGraph {
         let usage = ProcessUsage { cpu_secs: 1.25, resident_bytes: 3 << 20 };
         let usage = [("contacts".to_string(), usage)].into();
-        RunningGraph { status: made_status("gate"), usage, machines: Vec::new() }
+        RunningGraph { status: made_status("gate"), usage }
     }
 
     fn linked() -> LinkStatus {
@@ -410,41 +351,22 @@ mod tests {
     }
 
     #[test]
-    fn the_other_machines_stand_beside_this_one() {
+    fn the_links_to_other_machines_are_shown() {
         let mut graph = made();
-        let link = linked();
-        let laptop = part("gate", &link.peers[1]);
-        graph.status.link = Some(link);
-        let mut status = made_status("gate@brain");
-        status.nodes.truncate(1);
-        status.nodes[0].node = "encoder".into();
-        graph.machines = vec![Part { machine: "brain".into(), status: Some(status), message: None }, laptop];
-        let silent = Part { machine: "arm".into(), status: None, message: Some("no answer".into()) };
-        graph.machines.push(silent);
+        graph.status.link = Some(linked());
         let spaced = |line: &String| line.split_whitespace().collect::<Vec<_>>().join(" ");
         let found = formatted(&graph).iter().map(spaced).collect::<Vec<_>>().join("\n");
         for expected in [
             "graph 'gate' on robot of robot7 DEGRADED",
             "machine 'laptop' and this one do not fit: it runs version 9",
-            "nothing is known of the part on arm: no answer",
             "brain up -1.2ms ±35µs 210µs 12 ms ago 2× 0.1.0 3.0 MiB 0.0 MiB",
             "contacts/contacts → brain 1000 5 2 0 1.5 ms",
             "messages dropped unread: 3 malformed\n",
-            "brain: classifier was given up after 5 restarts",
         ] {
             assert!(found.contains(expected), "{expected}\n{found}");
         }
         assert_eq!(found.matches("machine 'laptop'").count(), 1, "{found}");
-        let row = |begin: [&str; 3]| {
-            let is_it = |line: &&str| line.split_whitespace().take(3).eq(begin);
-            found.lines().find(is_it).unwrap_or_else(|| panic!("no {begin:?} in\n{found}")).to_string()
-        };
-        row(["node", "machine", "state"]);
-        // What a process here has used is not what one of that number there has.
-        assert!(row(["contacts", "robot", "running"]).ends_with("3.0 MiB"), "{found}");
-        assert!(row(["encoder", "brain", "running"]).ends_with(" -"), "{found}");
         let json = serde_json::to_value(&graph).expect("JSON");
-        assert_eq!(json["machines"][0]["status"]["nodes"][0]["node"], "encoder");
         assert_eq!(json["link"]["peers"][0]["uncertainty_nanos"], 35_000);
     }
 

@@ -1,6 +1,6 @@
 //! `blindgrasp record`: records a graph that runs, from a process of its own.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -10,11 +10,12 @@ use clap::Args;
 use serde::Serialize;
 use serde_json::json;
 
+use super::elsewhere::{MachineArgument, is_over_ssh};
 use super::recording_arguments::RecordingArguments;
 use super::text_table::TextTable;
 use super::{GraphArgument, Outcome, check_output, print_line, secs_in, stop_signal};
 use blindgrasp_graph::client::observer::{ObservedEdge, Observer, can_observe};
-use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
+use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
 use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request};
 use blindgrasp_graph::recorded_graph::{Beginning, Ending};
 use blindgrasp_operator::cursors::SharedCursors;
@@ -24,7 +25,7 @@ use blindgrasp_session::recorder::{Recorded, Recorder};
 
 use self::span::{EdgeSpan, Span, SpanOfEdge};
 
-mod elsewhere;
+mod over_ssh;
 mod span;
 
 /// The command checks this often whether it was interrupted or its time is over.
@@ -36,8 +37,7 @@ const POLL: Duration = Duration::from_millis(50);
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp record grasp_gate --out /tmp/robot.mcap --rotate-size 1GB\n\n\
                         Ctrl-C ends the recording; the graph goes on. The graph does not wait for a recorder that is too slow.\n\
-                        Of a graph on several machines, the part here is recorded; the part on another machine with \
-                        GRAPH@MACHINE, or if --edges names edges of operators there.\n\
+                        With --machine, the files are written there and copied to --out at the end.\n\
                         Exit code 3 if samples are missing, or if the disk was full.")]
 pub(super) struct Arguments {
     #[command(flatten)]
@@ -56,6 +56,8 @@ pub(super) struct Arguments {
     /// Print JSON
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    machine: MachineArgument,
 }
 
 #[derive(Debug, Serialize)]
@@ -72,32 +74,30 @@ struct Summary {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if is_over_ssh() {
+        return over_ssh::record_for_caller(arguments);
+    }
     check_output(&arguments.out, &[])?;
     arguments.recording.options().check(&arguments.out)?;
-    let stop = stop_signal()?;
-    let is_interrupted = || stop.load(Ordering::Relaxed);
-    let mut graph = pick_graph(arguments.graph.name())?;
-    let writer = |edge: &String| edge.split_once('/').map_or(edge.clone(), |(node, _)| node.into());
-    let mut writers: Vec<String> = arguments.edges.iter().map(writer).collect();
-    writers.dedup();
-    if !writers.is_empty() {
-        graph = locate(&graph, &writers)?;
+    if let Some(destination) = arguments.machine.destination()? {
+        return over_ssh::record_there(arguments, &destination);
     }
-    let connection = Connection::open(&graph)?;
-    let summary = match machine_of(&graph) {
-        Some(_) => elsewhere::record(arguments, connection, &is_interrupted)?,
-        None => record_here(arguments, connection, &is_interrupted)?,
-    };
-    let lines = if arguments.json { vec![json!(summary).to_string()] } else { table(&summary) };
+    let summary = record(arguments, &arguments.out)?;
     // The exit code tells of a loss, even if stdout is closed.
-    let printed = lines.iter().try_for_each(|line| print_line(line));
-    let is_lossy = summary.missing > 0 || summary.recorded.n_not_recorded > 0 || summary.recorded.error.is_some();
-    printed?;
-    Ok(if is_lossy { Outcome::FinishedWithLoss } else { Outcome::Done })
+    summary.lines(arguments.json).iter().try_for_each(|line| print_line(line))?;
+    Ok(summary.outcome())
 }
 
-fn record_here(
+/// Records a graph of this machine to `out`.
+fn record(arguments: &Arguments, out: &Path) -> anyhow::Result<Summary> {
+    let stop = stop_signal()?;
+    let connection = Connection::open(&pick_graph(arguments.graph.name())?)?;
+    record_from(arguments, out, connection, &|| stop.load(Ordering::Relaxed))
+}
+
+fn record_from(
     arguments: &Arguments,
+    out: &Path,
     mut connection: Connection,
     is_interrupted: &dyn Fn() -> bool,
 ) -> anyhow::Result<Summary> {
@@ -121,10 +121,10 @@ fn record_here(
     let params = graph["nodes"].as_array().into_iter().flatten().filter_map(|node| node["params"].as_object());
     let inputs: Vec<PathBuf> =
         params.flat_map(|params| params.values()).filter_map(|value| value.as_str()).map(PathBuf::from).collect();
-    check_output(&arguments.out, &inputs)?;
+    check_output(out, &inputs)?;
     let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
     let about = of_graph(&graph, beginning)?;
-    let recorder = Recorder::create(&arguments.out, about, &arguments.recording.options())?;
+    let recorder = Recorder::create(out, about, &arguments.recording.options())?;
     let cursors = SharedCursors::open(std::path::Path::new(&domain.cursors))?;
     let observed = edges.iter().map(|edge| ObservedEdge {
         topic: edge.topic.clone(),
@@ -165,6 +165,18 @@ fn record_here(
     let (edges, recorded) = finished.context("cannot read the graph's edges any more")?.0.finish(ending);
     let missing = edges.iter().map(|edge| edge.missing).sum();
     Ok(Summary { graph, ended: ending.word(), secs, edges, missing, recorded })
+}
+
+impl Summary {
+    fn lines(&self, json: bool) -> Vec<String> {
+        if json { vec![json!(self).to_string()] } else { table(self) }
+    }
+
+    fn outcome(&self) -> Outcome {
+        let recorded = &self.recorded;
+        let is_lossy = self.missing > 0 || recorded.n_not_recorded > 0 || recorded.error.is_some();
+        if is_lossy { Outcome::FinishedWithLoss } else { Outcome::Done }
+    }
 }
 
 /// The summary for a person.

@@ -6,8 +6,9 @@ use std::time::Duration;
 use clap::Args;
 use serde_json::{Value, json};
 
+use super::elsewhere::MachineArgument;
 use super::{Outcome, completions, print_line};
-use blindgrasp_graph::client::{Connection, locate, pick_graph};
+use blindgrasp_graph::client::{Connection, pick_graph};
 use blindgrasp_graph::control::{Reply, Request};
 
 /// The operator checks the value, and applies it between two samples.
@@ -16,18 +17,19 @@ const LIMIT: Duration = Duration::from_secs(10);
 /// Change a live parameter of a running operator
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp set lift_arbiter.votes=5\n\n\
-                        PROGRAM --describe tells which parameters are live. Change others with: blindgrasp swap NODE --set NAME=VALUE\n\
-                        An operator may run on another machine, which must allow it (control).")]
+                        PROGRAM --describe tells which parameters are live. Change others with: blindgrasp swap NODE --set NAME=VALUE")]
 pub(super) struct Arguments {
     /// NODE.PARAM=VALUE; the value is a number, true, false or a text
     #[arg(add = completions::assignments())]
     assignment: Assignment,
-    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
+    /// Graph [default: the only one running]
     #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
     /// Print JSON
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    machine: MachineArgument,
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -38,9 +40,12 @@ struct Assignment {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if let Some(destination) = arguments.machine.destination()? {
+        return destination.run();
+    }
     let Assignment { node, param, value } = arguments.assignment.clone();
     let graph = pick_graph(arguments.graph.as_deref())?;
-    let mut connection = Connection::open(&locate(&graph, std::slice::from_ref(&node))?)?;
+    let mut connection = Connection::open(&graph)?;
     let request = Request::Set { node: node.clone(), param: param.clone(), value };
     let (old, new, from_seq) = match connection.ask(&request, LIMIT)? {
         Reply::Set { old, new, from_seq } => (old, new, from_seq),

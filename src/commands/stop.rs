@@ -4,10 +4,9 @@ use anyhow::bail;
 use clap::Args;
 use serde_json::json;
 
+use super::elsewhere::MachineArgument;
 use super::{GraphArgument, Outcome, print_line};
-use blindgrasp_graph::client::{
-    ANSWER_LIMIT, ClientError, Connection, machine_of, part_name, pick_graph, running_graphs,
-};
+use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph, running_graphs};
 use blindgrasp_graph::control::{Reply, Request};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
@@ -15,33 +14,25 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp stop grasp_gate\n\n\
                         Samples in flight are decided first. Ctrl-C ends the wait only; the graph still stops.\n\
-                        Of a graph on several machines, only the part here, or the part that is named, is stopped.")]
+                        Of a graph on several machines, the part here is stopped, and with --machine another one.")]
 pub(super) struct Arguments {
     #[command(flatten)]
     graph: GraphArgument,
-    /// Stop the part on this other machine; the part here goes on
-    #[arg(long, conflicts_with = "all")]
-    machine: Option<String>,
     /// Stop all graphs of this user
     #[arg(long, conflicts_with_all = ["graph", "named"])]
     all: bool,
     /// Print JSON
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    machine: MachineArgument,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let graphs = match (arguments.all, &arguments.machine) {
-        (true, _) => running_graphs()?,
-        (false, None) => vec![pick_graph(arguments.graph.name())?],
-        (false, Some(machine)) => {
-            let graph = arguments.graph.name().map_or_else(|| pick_graph(None), |name| Ok(name.to_owned()))?;
-            if machine_of(&graph).is_some() {
-                bail!("{graph} already names a machine: leave --machine {machine} out, or name the graph alone");
-            }
-            vec![pick_graph(Some(&part_name(&graph, machine)))?]
-        }
-    };
+    if let Some(destination) = arguments.machine.destination()? {
+        return destination.run();
+    }
+    let graphs = if arguments.all { running_graphs()? } else { vec![pick_graph(arguments.graph.name())?] };
     if graphs.is_empty() {
         print_diagnostic("no graph is running");
     }

@@ -1,7 +1,7 @@
 //! `blindgrasp swap`
 
 use std::collections::{BTreeMap, HashMap};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
@@ -9,12 +9,13 @@ use anyhow::{Context, anyhow, bail};
 use clap::Args;
 use serde::Serialize;
 
+use super::elsewhere::{MachineArgument, is_over_ssh};
 use super::{Outcome, completions, number_in, percent, print_line, secs_in, stop_signal};
 use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::client::shadow_comparison::{
     ComparisonReport, Latency, PromotionLimits, Saying, ShadowComparison, Side, objections,
 };
-use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
+use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph, status};
 use blindgrasp_graph::control::{Reply, Request, ShadowOutput, SwapRequest, SwappedNode};
 use blindgrasp_graph::describe::program_to_run;
 use blindgrasp_graph::log::printable;
@@ -39,16 +40,13 @@ const MAX_PRINTED: usize = 20;
 #[command(after_help = "Examples: blindgrasp swap classifier --set model=models/new.json\n          \
                         blindgrasp swap classifier --run ./my_classifier --shadow 30 \
                         --min-agreement 0.99 --max-latency-p99-us 500\n\n\
-                        A node may run on another machine, which must allow it (control). Paths in --run and --set are then \
-                        paths there, relative to its dataflow file's folder.\n\
+                        With --machine, paths in --run and --set are paths there, relative to the dataflow file's folder.\n\
                         Ctrl-C abandons the swap. Exit code 1 if the old operator goes on or came back.")]
 pub(super) struct Arguments {
     /// Nodes to swap; several are handed over at one sample
     #[arg(required = true, add = completions::nodes())]
     nodes: Vec<String>,
     /// Replacement: a shipped operator or a path [default: the same program]
-    ///
-    /// The path is one on the machine where the node runs.
     #[arg(long)]
     run: Option<PathBuf>,
     /// Change a parameter of each node that has it; repeatable
@@ -56,8 +54,7 @@ pub(super) struct Arguments {
     set: Vec<(String, String)>,
     /// Compare both on live samples for so many seconds first
     ///
-    /// Without a limit below, the comparison is printed and the old operator goes on. Only on the machine where the
-    /// node runs.
+    /// Without a limit below, the comparison is printed and the old operator goes on.
     #[arg(long, value_name = "TIME", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
     shadow: Option<f64>,
     #[command(flatten)]
@@ -71,7 +68,7 @@ pub(super) struct Arguments {
     /// Swap even if the replacement is made for another hand or model
     #[arg(long)]
     allow_mismatch: bool,
-    /// Graph, or its part (GRAPH@MACHINE) [default: the only one running]
+    /// Graph [default: the only one running]
     #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
     /// Print JSON
@@ -80,6 +77,8 @@ pub(super) struct Arguments {
     /// Arguments for the program of --run; takes all that follows
     #[arg(long, value_name = "ARG", num_args = 0.., allow_hyphen_values = true, requires = "run")]
     args: Option<Vec<String>>,
+    #[command(flatten)]
+    machine: MachineArgument,
 }
 
 /// With one of these limits, a shadow comparison that keeps all of them at every output ends in the swap.
@@ -126,12 +125,16 @@ struct Comparison {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let request = request(arguments)?;
-    let graph = locate(&pick_graph(arguments.graph.as_deref())?, &arguments.nodes)?;
-    let request = match machine_of(&graph) {
-        Some(machine) => elsewhere(arguments, request, machine)?,
-        None => found_here(request)?,
-    };
+    let mut request = request(arguments)?;
+    if let Some(destination) = arguments.machine.destination()? {
+        return destination.run();
+    }
+    let graph = pick_graph(arguments.graph.as_deref())?;
+    if is_over_ssh() {
+        // The caller knows the dataflow file, not the folder in which ssh starts a command.
+        request.folder = status(&graph)?.file.parent().unwrap_or(Path::new("/")).to_path_buf();
+    }
+    let request = found_here(request)?;
     let stop = stop_signal()?;
     let mut connection = Connection::open(&graph)?;
     let ended = swap(arguments, request, &mut connection, &|| stop.load(Ordering::Relaxed)).map_err(explained)?;
@@ -174,7 +177,7 @@ fn request(arguments: &Arguments) -> anyhow::Result<SwapRequest> {
     })
 }
 
-/// A swap on this machine, with a program of this machine.
+/// The swap with the program as it is found here.
 fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
     let Some(run) = &request.program else {
         return Ok(request);
@@ -183,18 +186,6 @@ fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
     let program = program_to_run(run, args, &request.folder)
         .map_err(|missing| anyhow!("--run {}: there is no such program ({})", run.display(), missing.display()))?;
     Ok(SwapRequest { program: Some(program.path), args: Some(program.args), ..request })
-}
-
-/// A swap on another machine: only that machine can check the paths.
-fn elsewhere(arguments: &Arguments, request: SwapRequest, machine: &str) -> anyhow::Result<SwapRequest> {
-    if arguments.shadow.is_some() {
-        bail!(
-            "--shadow compares in the shared memory of machine '{machine}', where {} runs: run this command there, or \
-             leave --shadow out",
-            arguments.nodes.join(", ")
-        );
-    }
-    Ok(SwapRequest { folder: PathBuf::new(), ..request })
 }
 
 fn swap(
@@ -494,12 +485,6 @@ mod tests {
         let missing = parsed(&["a", "--run", "no/such/program"]).expect("accepted");
         let found = found_here(request(&missing).expect("consistent")).expect_err("missing");
         assert!(found.to_string().contains("there is no such program"), "{found}");
-        // On another machine, paths are that machine's.
-        let there = elsewhere(&missing, request(&missing).expect("consistent"), "brain").expect("sent as it is");
-        assert_eq!((there.program, there.folder), (Some("no/such/program".into()), PathBuf::new()));
-        let shadowed = parsed(&["a", "--shadow", "1"]).expect("accepted");
-        let refused = elsewhere(&shadowed, request(&shadowed).expect("consistent"), "brain").expect_err("no memory");
-        assert!(refused.to_string().contains("machine 'brain'"), "{refused}");
     }
 
     #[test]

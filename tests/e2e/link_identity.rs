@@ -66,14 +66,13 @@ impl Link {
             is_eager_until_nanos: u64::MAX,
         };
         let (agreement, protection) = protection(&config, machine, peer, instance);
-        let peer = config.peer(peer).expect("a peer").clone();
         // Silence is not what this is about.
-        let peer = Peer::new(peer, Vec::new(), Vec::new(), u64::MAX / 2, Some(agreement));
+        let peer = Peer::new(peer.into(), Vec::new(), Vec::new(), u64::MAX / 2, Some(agreement));
         Link { own, peer, protection, config, session, inbox, n_taken: 0, n_forged: 0, n_others: 0 }
     }
 
     fn key(&self) -> String {
-        self.config.key(&self.own.machine, &self.peer.config.machine, KeyKind::Link)
+        self.config.key(&self.own.machine, &self.peer.machine, KeyKind::Link)
     }
 
     fn say(&mut self, body: Body<'_>) {

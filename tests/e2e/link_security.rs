@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use blindgrasp_bridge::access;
 use blindgrasp_bridge::certificates::{self, key_files};
-use blindgrasp_bridge::config::{Endpoints, KeyFiles, KeyKind, LinkConfig, PeerConfig};
+use blindgrasp_bridge::config::{Endpoints, KeyFiles, KeyKind, LinkConfig};
 use blindgrasp_bridge::keys::{KeyRequest, list, make};
 use blindgrasp_bridge::session::{SessionError, open, warning};
 use blindgrasp_operator::control_socket::link_path;
@@ -54,20 +54,17 @@ pub(crate) fn keys(machines: &[&str]) -> tempfile::TempDir {
 
 /// One of the machines robot, brain and laptop.
 pub(crate) fn config(machine: &str, endpoints: Endpoints, keys: Option<&Path>) -> LinkConfig {
-    let peer = |machine: &&str| PeerConfig {
-        machine: machine.to_string(),
-        may_read: true,
-        may_control: false,
-        may: Vec::new(),
-    };
     LinkConfig {
         run: 1,
         graph: "grasp_gate".into(),
-        running_graph: "grasp_gate".into(),
         namespace: None,
         machine: machine.into(),
         fingerprint: 0,
-        peers: ["robot", "brain", "laptop"].iter().filter(|other| **other != machine).map(peer).collect(),
+        peers: ["robot", "brain", "laptop"]
+            .iter()
+            .filter(|other| **other != machine)
+            .map(ToString::to_string)
+            .collect(),
         exports: Vec::new(),
         imports: Vec::new(),
         endpoints,
@@ -462,9 +459,6 @@ fn endpoints_beyond_this_machine_need_tls_or_an_open_word() {
         assert_eq!(warning(&config), None);
         config.insecure = true;
         assert!(warning(&config).is_some_and(|warning| warning.contains("without TLS") && warning.contains(endpoint)));
-        config.peers[0].may_control = true;
-        let refused = refusal(&config);
-        assert!(refused.contains("may control") && refused.contains("without TLS"), "{endpoint}: {refused}");
         config.keys = Some(key_files(folder.path(), "robot"));
         assert_eq!(warning(&config), None, "links with keys protect what they send");
     }

@@ -4,12 +4,13 @@ use std::fs::File;
 use std::io::{Read, Write};
 use std::os::fd::OwnedFd;
 use std::os::unix::process::CommandExt;
-use std::process::{Child, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
 
 use crate::common::{
     FAST_FOREVER, Graph, NODES, blindgrasp, json_lines, project, run, signal, text, unique_name, wait_until,
 };
+use crate::over_ssh::Sshd;
 use rustix::process::Signal;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{Termios, Winsize, tcgetattr, tcsetwinsize};
@@ -26,7 +27,11 @@ struct OnTerminal {
 
 impl OnTerminal {
     fn start(arguments: &[&str], rows: u16, columns: u16) -> OnTerminal {
-        let (terminal, line, before, child) = start(arguments, rows, columns);
+        OnTerminal::of(blindgrasp(), arguments, rows, columns)
+    }
+
+    fn of(command: Command, arguments: &[&str], rows: u16, columns: u16) -> OnTerminal {
+        let (terminal, line, before, child) = start(command, arguments, rows, columns);
         let screen = Arc::new(Mutex::new(vt100::Parser::new(cells(rows), cells(columns), 0)));
         let (mut reader, written) = (terminal.try_clone().expect("cloned"), Arc::clone(&screen));
         std::thread::spawn(move || {
@@ -82,7 +87,7 @@ impl Drop for OnTerminal {
 }
 
 /// `top` on a new terminal: its two sides, the settings that it began with, and the process.
-fn start(arguments: &[&str], rows: u16, columns: u16) -> (File, OwnedFd, Termios, Child) {
+fn start(mut command: Command, arguments: &[&str], rows: u16, columns: u16) -> (File, OwnedFd, Termios, Child) {
     let terminal = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).expect("a terminal");
     grantpt(&terminal).expect("granted");
     unlockpt(&terminal).expect("unlocked");
@@ -91,7 +96,6 @@ fn start(arguments: &[&str], rows: u16, columns: u16) -> (File, OwnedFd, Termios
     tcsetwinsize(&line, size(rows, columns)).expect("sized");
     let before = tcgetattr(&line).expect("settings");
     let stdio = || Stdio::from(line.try_clone().expect("cloned"));
-    let mut command = blindgrasp();
     command.arg("top").args(arguments).env("TERM", "xterm-256color").env_remove("NO_COLOR");
     command.stdin(stdio()).stdout(stdio()).stderr(stdio());
     // SAFETY: both calls are safe between fork and exec.
@@ -234,7 +238,7 @@ fn top_ends_with_its_terminal() {
     let graph = graph();
     // Before it has begun to draw, and while it does.
     for millis in [0, 100, 600] {
-        let (terminal, line, _, mut child) = start(&[&graph.name, "--interval", "0.1"], 24, 80);
+        let (terminal, line, _, mut child) = start(blindgrasp(), &[&graph.name, "--interval", "0.1"], 24, 80);
         std::thread::sleep(std::time::Duration::from_millis(millis));
         drop((terminal, line));
         let pid = child.id() as i32;
@@ -320,4 +324,20 @@ fn a_script_sees_the_graph_end() {
     assert_eq!(ended.status.code(), Some(0), "{}", text(&ended.stderr));
     assert_eq!(text(&ended.stderr), format!("graph '{name}' has ended\n"));
     assert!(!ended.stdout.is_empty());
+}
+
+#[test]
+fn a_person_watches_a_graph_over_ssh() {
+    let Some(sshd) = Sshd::start() else { return };
+    let graph = graph();
+    let there = [&graph.name, "--machine", "brain", "--interval", "0.2"];
+    let mut top = OnTerminal::of(sshd.blindgrasp(), &there, 24, 80);
+    top.wait_for("LIFT");
+    top.resize(30, 100);
+    // A key, and Ctrl-C: on the terminal of the other machine.
+    top.press("?");
+    top.wait_for("q Esc Ctrl-C");
+    top.press("\x03");
+    top.finish(Some(0));
+    graph.stop();
 }

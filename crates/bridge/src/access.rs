@@ -2,8 +2,7 @@
 //!
 //! A machine may send only under keys with its own name as FROM, and receive only keys with its own name as TO.
 //! Everything else is denied. That is a second wall: links prove who they are to each other
-//! ([`identity`](super::identity)). The link itself checks the rights to read and control a machine's part of the graph
-//! ([`PeerConfig`](super::config::PeerConfig)).
+//! ([`identity`](super::identity)).
 
 use serde_json::{Value, json};
 
@@ -16,7 +15,6 @@ pub(super) fn for_machine(config: &LinkConfig) -> Value {
     let me = &config.machine;
     let mut acl = AccessControl::default();
     for peer in &config.peers {
-        let peer = &peer.machine;
         // A router passes the machines' messages on, and checks their names.
         let names = match config.endpoints.router.is_empty() {
             true => accepted_names(peer, config.namespace.as_deref()),

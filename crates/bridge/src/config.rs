@@ -5,15 +5,12 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::certificates::REVOKED_FILE;
-use blindgrasp_graph::dataflow::Right;
 use blindgrasp_operator::wiring::EdgePolicy;
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LinkConfig {
     /// The graph's name in its file.
     pub graph: String,
-    /// The running graph's name on this machine, as in the name of its launcher's control socket.
-    pub running_graph: String,
     /// The name that tells this graph from others with the same file, one for each robot. Machines of other namespaces
     /// are not connected.
     pub namespace: Option<String>,
@@ -23,8 +20,8 @@ pub struct LinkConfig {
     pub run: u64,
     /// A hash of the parts of the file that all machines must have in common: nodes, their machines and their inputs.
     pub fingerprint: u64,
-    /// The other machines of the graph.
-    pub peers: Vec<PeerConfig>,
+    /// The names of the other machines of the graph.
+    pub peers: Vec<String>,
     /// The channels that this machine sends.
     pub exports: Vec<Channel>,
     /// The channels that this machine receives.
@@ -50,31 +47,6 @@ pub struct Endpoints {
     pub connect: Vec<String>,
     /// The endpoints of Zenoh routers to which this machine connects instead.
     pub router: Vec<String>,
-}
-
-/// Another machine of the graph.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct PeerConfig {
-    pub machine: String,
-    /// Whether it may read the status, the logs and the samples of this machine's part of the graph.
-    pub may_read: bool,
-    /// Whether it may make every change of this machine's part of the graph.
-    pub may_control: bool,
-    /// The changes that it may make besides.
-    #[serde(default)]
-    pub may: Vec<Right>,
-}
-
-impl PeerConfig {
-    /// Whether it has a right to a change; `None` is the right to read.
-    pub fn may(&self, right: Option<Right>) -> bool {
-        match right {
-            None => self.may_read,
-            // Any program: the shipped ones as well.
-            Some(Right::Swap) if self.may.contains(&Right::Run) => true,
-            Some(right) => self.may_control || self.may.contains(&right),
-        }
-    }
 }
 
 /// An output port whose samples go from one machine to another.
@@ -144,10 +116,6 @@ impl LinkConfig {
     pub fn key(&self, from: &str, to: &str, kind: KeyKind) -> String {
         format!("{}/{from}/{to}/{}", self.key_prefix(), kind.word())
     }
-
-    pub fn peer(&self, machine: &str) -> Option<&PeerConfig> {
-        self.peers.iter().find(|peer| peer.machine == machine)
-    }
 }
 
 /// The kind of messages under a key.
@@ -156,45 +124,19 @@ pub enum KeyKind {
     /// Messages between links, and urgent samples.
     Link,
     Data,
-    /// Commands for the other machine's part of the graph, and their replies: see [`tunnel`](super::tunnel).
-    Ask,
     /// A liveliness token.
     Alive,
 }
 
 impl KeyKind {
-    pub const ALL: [KeyKind; 4] = [KeyKind::Link, KeyKind::Data, KeyKind::Ask, KeyKind::Alive];
+    pub const ALL: [KeyKind; 3] = [KeyKind::Link, KeyKind::Data, KeyKind::Alive];
 
     /// The last part of the key.
     pub fn word(self) -> &'static str {
         match self {
             KeyKind::Link => "link",
             KeyKind::Data => "data",
-            KeyKind::Ask => "ask",
             KeyKind::Alive => "alive",
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_right_to_one_change_is_none_to_another_and_control_is_all() {
-        let peer = |may_control: bool, may: &[Right]| PeerConfig {
-            machine: "robot".into(),
-            may_read: false,
-            may_control,
-            may: may.to_vec(),
-        };
-        let changes =
-            |peer: PeerConfig| Right::ALL.into_iter().filter(|right| peer.may(Some(*right))).collect::<Vec<_>>();
-        assert_eq!(changes(peer(false, &[])), []);
-        assert_eq!(changes(peer(false, &[Right::Set])), [Right::Set]);
-        assert_eq!(changes(peer(false, &[Right::Swap, Right::Stop])), [Right::Swap, Right::Stop]);
-        assert_eq!(changes(peer(false, &[Right::Run])), [Right::Swap, Right::Run]);
-        assert_eq!(changes(peer(true, &[])), Right::ALL);
-        assert!(!peer(true, &Right::ALL).may(None));
     }
 }

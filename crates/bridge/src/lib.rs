@@ -14,7 +14,6 @@
 //! * [`session`] - Zenoh's configuration: endpoints, TLS. [`access`] - its access control. [`keys`] - makes
 //!   certificates. [`certificates`] - reads and checks certificates.
 //! * [`identity`] - signs and verifies hellos. [`agreement`] - agrees on keys. [`protection`] - applies both to frames.
-//! * [`tunnel`] - commands for a graph's part on another machine.
 //! * [`peer`] - the state of another machine's link. `uplink`, `downlink` - the local ports of a channel.
 //!   `peer_connection` - the Zenoh side.
 //! * [`operator`] - the process.
@@ -38,6 +37,5 @@ mod peer_connection;
 pub mod protection;
 pub mod sample;
 pub mod session;
-pub mod tunnel;
 mod uplink;
 pub mod wire;

@@ -7,7 +7,7 @@ use serde_json::json;
 use sha2::{Digest, Sha256};
 
 use super::certificates::key_files;
-use super::config::{Channel, Endpoints, LinkConfig, PeerConfig};
+use super::config::{Channel, Endpoints, LinkConfig};
 use blindgrasp_graph::dataflow::ProcessOptions;
 use blindgrasp_graph::dataflow::pins::Pins;
 use blindgrasp_graph::dataflow::{
@@ -24,8 +24,6 @@ pub struct Placement {
     pub machine: String,
     /// The name that tells this graph from others with the same file, one for each robot.
     pub namespace: Option<String>,
-    /// The running graph's name on this machine.
-    pub running_graph: String,
     /// A number for this run; no other run has it.
     pub run: u64,
     /// Endpoints to listen at, in place of those in the file if there are any.
@@ -62,7 +60,11 @@ pub fn local_graph(graph: &Graph, placement: &Placement, link_program: &Program)
         LocalError::Unknown { machine: placement.machine.clone(), known }
     })?;
     let mut nodes: Vec<Node> = graph.nodes.iter().filter(|node| is_on(node, &this.name)).cloned().collect();
-    let mut view = LocalView { machine: this.name.clone(), imports: Vec::new() };
+    let others = || machines.machines.iter().filter(|machine| machine.name != this.name);
+    let ssh_hosts = others().filter_map(|machine| Some((machine.name.clone(), machine.ssh.clone()?))).collect();
+    let elsewhere = graph.nodes.iter().filter(|node| !is_on(node, &this.name));
+    let elsewhere = elsewhere.filter_map(|node| Some((node.id.clone(), node.machine.clone()?))).collect();
+    let mut view = LocalView { machine: this.name.clone(), imports: Vec::new(), ssh_hosts, elsewhere };
     if machines.machines.len() > 1 {
         let config = link_config(graph, machines, this, placement)?;
         view.imports = config
@@ -93,24 +95,11 @@ fn link_config(
     let folder = placement.keys.as_ref().or(machines.link.keys.as_ref());
     Ok(LinkConfig {
         graph: graph.name.clone(),
-        running_graph: placement.running_graph.clone(),
         namespace: placement.namespace.clone(),
         machine: this.name.clone(),
         run: placement.run,
         fingerprint: fingerprint(graph),
-        peers: others()
-            .map(|machine| PeerConfig {
-                machine: machine.name.clone(),
-                may_read: this.read.contains(&machine.name),
-                may_control: this.control.contains(&machine.name),
-                may: this
-                    .allows
-                    .iter()
-                    .filter(|(_, machines)| machines.contains(&machine.name))
-                    .map(|(right, _)| *right)
-                    .collect(),
-            })
-            .collect(),
+        peers: others().map(|machine| machine.name.clone()).collect(),
         exports: channels.iter().filter(|channel| channel.from == this.name).cloned().collect(),
         imports: channels.iter().filter(|channel| channel.to == this.name).cloned().collect(),
         endpoints: endpoints(machines, this, placement)?,
@@ -244,7 +233,7 @@ fn link_node(config: &LinkConfig, machine: &str, program: &Program) -> Node {
         // A link that ends is always restarted. Meanwhile the arbiter holds, and samples are kept.
         restart: Restart { policy: RestartPolicy::Always, limit: 20, ..Restart::default() },
         heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
-        // It opens sockets, reads logs and asks the launcher: nothing would be left to give up.
+        // It opens sockets, and reads its keys again when they change.
         sandbox: Sandbox::Off,
         memory_max_mib: None,
         process: ProcessOptions::default(),
@@ -301,9 +290,7 @@ mod tests {
         let machine = |name: &str, listen: &[&str]| Machine {
             name: name.into(),
             listen: listen.iter().map(|endpoint| endpoint.to_string()).collect(),
-            read: vec!["robot".into(), "brain".into()],
-            control: vec!["robot".into()],
-            allows: BTreeMap::new(),
+            ssh: (name == "brain").then(|| "user@brain.local".into()),
         };
         Graph {
             name: "gate".into(),
@@ -324,7 +311,7 @@ mod tests {
     }
 
     fn placement(machine: &str) -> Placement {
-        Placement { machine: machine.into(), running_graph: "gate".into(), ..Placement::default() }
+        Placement { machine: machine.into(), ..Placement::default() }
     }
 
     fn config(graph: &Graph) -> LinkConfig {
@@ -344,7 +331,10 @@ mod tests {
         let ports: Vec<_> = link.output_ports().map(|(port, _)| port).collect();
         assert_eq!(ports, [("classifier".to_owned(), "prediction".to_owned())]);
         // The predictions depend on robot's own source: robot's part ends when this source ends.
-        assert_eq!(robot.local.expect("a view").imports, [("classifier/prediction".to_owned(), false)]);
+        let view = robot.local.expect("a view");
+        assert_eq!(view.imports, [("classifier/prediction".to_owned(), false)]);
+        assert_eq!(view.ssh_hosts, [("brain".to_owned(), "user@brain.local".to_owned())].into());
+        assert_eq!(view.elsewhere["histogram"], "brain");
 
         let brain = local_graph(&graph, &placement("brain"), &link_program()).expect("brain's part");
         assert_eq!(brain.local.clone().expect("a view").imports, [("contacts/contacts".to_owned(), true)]);
@@ -353,7 +343,7 @@ mod tests {
         assert_eq!(robot.imports, brain.exports);
         assert_eq!(robot.fingerprint, brain.fingerprint);
         assert_eq!((robot.endpoints.connect, robot.endpoints.listen), (brain.endpoints.listen.clone(), Vec::new()));
-        assert!(brain.peers[0].may_control && brain.peers[0].may_read);
+        assert_eq!((robot.peers, brain.peers.as_slice()), (vec!["brain".to_owned()], ["robot".to_owned()].as_slice()));
         assert!(brain.imports[0].policy == EdgePolicy::Lossless && !brain.imports[0].is_urgent);
         assert!(brain.exports[0].is_urgent);
     }

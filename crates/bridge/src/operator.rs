@@ -19,7 +19,6 @@ use super::peer::{Change, Own, Rejection};
 use super::peer_connection::PeerConnection;
 use super::protection::Opened;
 use super::session;
-use super::tunnel::{DescribeRecording, Tunnels, random};
 use super::uplink::Uplink;
 use super::wire::{Body, Frame, Rejected, SampleFrame, WireError, encode_refusal};
 use blindgrasp_graph::client::observer::bears_source_number;
@@ -60,7 +59,6 @@ struct Link<'a> {
     operator: &'a Operator,
     config: &'a Arc<LinkConfig>,
     own: Own,
-    describe: DescribeRecording,
     connections: Vec<PeerConnection>,
     opening: Opening,
     origins: Origins,
@@ -76,13 +74,13 @@ struct Link<'a> {
     has_said_waiting: bool,
 }
 
-pub fn work(operator: &Operator, describe: DescribeRecording) -> anyhow::Result<()> {
+pub fn work(operator: &Operator) -> anyhow::Result<()> {
     let config: LinkConfig = operator.params()?;
     if let Some(warning) = session::warning(&config) {
         tracing::warn!("{warning}");
     }
     let config = Arc::new(config);
-    let mut link = Link::open(operator, &config, describe)?;
+    let mut link = Link::open(operator, &config)?;
     // The ports exist now; operators need not wait until a router is reached.
     operator.ready(BTreeMap::new());
     link.run()?;
@@ -92,14 +90,10 @@ pub fn work(operator: &Operator, describe: DescribeRecording) -> anyhow::Result<
 }
 
 impl<'a> Link<'a> {
-    fn open(
-        operator: &'a Operator,
-        config: &'a Arc<LinkConfig>,
-        describe: DescribeRecording,
-    ) -> anyhow::Result<Link<'a>> {
+    fn open(operator: &'a Operator, config: &'a Arc<LinkConfig>) -> anyhow::Result<Link<'a>> {
         let identity = Identity::load(config, OffsetDateTime::now_utc());
         let identity = identity.with_context(|| format!("machine '{}'", config.machine))?.map(Arc::new);
-        let instance = random().map_err(|error| anyhow!(error))?;
+        let instance = getrandom::u64().context("the operating system gives no random numbers")?.max(1);
         let mut connections = Vec::new();
         for peer in &config.peers {
             connections.push(PeerConnection::open(operator, config, peer, instance, identity.as_ref())?);
@@ -120,7 +114,6 @@ impl<'a> Link<'a> {
             operator,
             config,
             own,
-            describe,
             connections,
             opening: Opening::start(config, operator)?,
             origins,
@@ -184,14 +177,10 @@ impl<'a> Link<'a> {
         let Some(session) = self.opening.session()? else {
             return Ok(());
         };
-        let protections: Vec<_> =
-            self.connections.iter().map(|connection| Arc::clone(&connection.protection)).collect();
-        let tunnels = Tunnels::start(session.clone(), Arc::clone(self.config), &protections, self.describe)
-            .context("cannot serve commands")?;
         for connection in &mut self.connections {
             connection.connect(self.operator, self.config, &session)?;
         }
-        self.opening = Opening::Open { tunnels, _session: session };
+        self.opening = Opening::Open(session);
         Ok(())
     }
 
@@ -267,7 +256,7 @@ impl<'a> Link<'a> {
                 Err(WireError::Refused(reason)) => {
                     let peer = &mut self.connections[idx].peer;
                     if peer.on_refusal(&reason) {
-                        tracing::error!("machine '{}' refuses this one: {reason}", peer.config.machine);
+                        tracing::error!("machine '{}' refuses this one: {reason}", peer.machine);
                     }
                 }
                 Err(error) => self.reject(idx, &error),
@@ -305,7 +294,7 @@ impl<'a> Link<'a> {
                 self.config.machine,
                 env!("CARGO_PKG_VERSION"),
                 super::wire::PROTOCOL,
-                peer.config.machine
+                peer.machine
             );
             self.refuse(idx, &reason);
         }
@@ -322,7 +311,7 @@ impl<'a> Link<'a> {
         let connection = &mut self.connections[idx];
         if connection.refusal_logged.is_none_or(|logged| logged.elapsed() > REFUSAL_PAUSE) {
             connection.refusal_logged = Some(Instant::now());
-            tracing::error!("machine '{}' is refused: {reason}", connection.peer.config.machine);
+            tracing::error!("machine '{}' is refused: {reason}", connection.peer.machine);
         }
         connection.put(KeyKind::Link, &encode_refusal(reason));
     }
@@ -415,7 +404,7 @@ impl<'a> Link<'a> {
             Body::Leaving => {
                 let change = connection.peer.on_leaving(PeerState::Left);
                 if change.is_some() {
-                    tracing::warn!("machine '{}' has left the graph", connection.peer.config.machine);
+                    tracing::warn!("machine '{}' has left the graph", connection.peer.machine);
                 }
                 self.apply(idx, change)?;
             }
@@ -458,7 +447,7 @@ impl<'a> Link<'a> {
                     tracing::warn!(
                         "machine '{}' has started again, and {port} repeats earlier sequence numbers, as a recording does \
                          that is played again: this machine's part of the graph ends; with run --stay it starts again too",
-                        connection.peer.config.machine
+                        connection.peer.machine
                     );
                     self.operator.ended(self.ended_ports.iter().cloned().collect());
                 }
@@ -470,7 +459,7 @@ impl<'a> Link<'a> {
     /// Applies a change of a peer to its channels.
     fn apply(&mut self, idx: usize, change: Option<Change>) -> anyhow::Result<()> {
         let connection = &mut self.connections[idx];
-        let machine = &connection.peer.config.machine;
+        let machine = &connection.peer.machine;
         match change {
             None => return Ok(()),
             Some(Change::CutOff) => {
@@ -544,7 +533,7 @@ impl<'a> Link<'a> {
     /// Logs that a peer has stalled, or answers again.
     fn log_stall(&mut self, idx: usize) {
         let connection = &mut self.connections[idx];
-        let machine = &connection.peer.config.machine;
+        let machine = &connection.peer.machine;
         match (connection.stall_reason(), connection.stall_logged) {
             (Some(reason), false) => tracing::warn!("machine '{machine}' is cut off: {reason}"),
             (None, true) => tracing::info!("machine '{machine}' is no longer cut off for answering no samples"),
@@ -627,7 +616,7 @@ impl<'a> Link<'a> {
                 self.has_said_waiting = true;
                 let missing: Vec<_> = needed()
                     .filter(|connection| !connection.peer.is_ready())
-                    .map(|connection| connection.peer.config.machine.as_str())
+                    .map(|connection| connection.peer.machine.as_str())
                     .collect();
                 tracing::warn!("waiting for machine {}", missing.join(", "));
             }
@@ -647,7 +636,6 @@ impl<'a> Link<'a> {
         self.last_status = Instant::now();
         let now_nanos = monotonic_nanos();
         let mut rejected = self.rejected.clone();
-        rejected.merge(&self.opening.rejected());
         let downlinks = self.connections.iter().flat_map(|connection| &connection.downlinks);
         rejected.add("stale", downlinks.map(|downlink| downlink.incoming.n_stale()).sum());
         let overrun = self.connections.iter().map(PeerConnection::n_overrun).sum();
@@ -667,10 +655,8 @@ impl<'a> Link<'a> {
 enum Opening {
     /// A thread opens the session. It waits for a router, if there is one, as long as that takes.
     Trying(Receiver<anyhow::Result<zenoh::Session>>),
-    Open {
-        tunnels: Tunnels,
-        _session: zenoh::Session,
-    },
+    /// The ports of a connection need the session for as long as the link runs.
+    Open(#[expect(dead_code, reason = "it is kept open")] zenoh::Session),
 }
 
 impl Opening {
@@ -704,14 +690,7 @@ impl Opening {
     fn session(&self) -> anyhow::Result<Option<zenoh::Session>> {
         match self {
             Opening::Trying(receiver) => receiver.try_recv().ok().transpose(),
-            Opening::Open { .. } => Ok(None),
-        }
-    }
-
-    fn rejected(&self) -> Rejected {
-        match self {
-            Opening::Trying(_) => Rejected::default(),
-            Opening::Open { tunnels, .. } => tunnels.rejected(),
+            Opening::Open(_) => Ok(None),
         }
     }
 }

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 
 use super::agreement::{Agreement, PublicKey};
 use super::clock::ClockOffset;
-use super::config::{Channel, KeyKind, PeerConfig};
+use super::config::{Channel, KeyKind};
 use super::sample::schema_id;
 use super::wire::{Body, ExportedChannel, Hello};
 use blindgrasp_operator::link_status::PeerState;
@@ -40,8 +40,8 @@ pub struct Own {
 /// Another machine as seen by this link.
 #[derive(Debug)]
 pub struct Peer {
-    /// Its name and its rights.
-    pub config: PeerConfig,
+    /// Its name.
+    pub machine: String,
     pub clock: ClockOffset,
     /// Its version of blindgrasp.
     pub version: Option<String>,
@@ -112,14 +112,14 @@ impl Peer {
     /// A peer that has not been found yet. `exports` go to it, `imports` come from it. With an agreement, callers hand
     /// over verified hellos only.
     pub fn new(
-        config: PeerConfig,
+        machine: String,
         exports: Vec<Channel>,
         imports: Vec<Channel>,
         deadline_nanos: u64,
         agreement: Option<Agreement>,
     ) -> Peer {
         Peer {
-            config,
+            machine,
             clock: ClockOffset::default(),
             version: None,
             state: PeerState::Waiting,
@@ -393,10 +393,10 @@ impl Peer {
 
     /// The reason why this hello is of another graph or version, if it is.
     fn difference(&self, own: &Own, hello: &Hello) -> Option<String> {
-        if hello.machine != self.config.machine {
+        if hello.machine != self.machine {
             return Some(format!(
                 "its hello names machine '{}', but came under the key of machine '{}'",
-                hello.machine, self.config.machine
+                hello.machine, self.machine
             ));
         }
         if hello.fingerprint != own.fingerprint {

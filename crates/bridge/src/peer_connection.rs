@@ -14,7 +14,7 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::sample::SampleKind;
 
 use super::agreement::Agreement;
-use super::config::{Channel, KeyKind, LinkConfig, PeerConfig};
+use super::config::{Channel, KeyKind, LinkConfig};
 use super::downlink::Downlink;
 use super::identity::Identity;
 use super::peer::Peer;
@@ -67,12 +67,12 @@ impl PeerConnection {
     pub(super) fn open(
         operator: &Operator,
         config: &LinkConfig,
-        peer: &PeerConfig,
+        machine: &str,
         instance: u64,
         identity: Option<&Arc<Identity>>,
     ) -> anyhow::Result<PeerConnection> {
         let own = |channels: &[Channel], is_its: fn(&Channel) -> &str| -> Vec<Channel> {
-            channels.iter().filter(|channel| is_its(channel) == peer.machine).cloned().collect()
+            channels.iter().filter(|channel| is_its(channel) == machine).cloned().collect()
         };
         let exports = own(&config.exports, |channel| &channel.to);
         let imports = own(&config.imports, |channel| &channel.from);
@@ -84,7 +84,6 @@ impl PeerConnection {
             let opened = with_message(&channel.type_name, OpenDownlink(operator, channel, instance));
             opened.unwrap_or_else(|| Err(cannot_cross(channel)))
         };
-        let machine = &peer.machine;
         let agreement = identity.map(|_| Agreement::new(&config.key_prefix(), &config.machine, machine, instance));
         let agreement = agreement.transpose()?;
         let protection = identity.zip(agreement.as_ref());
@@ -95,7 +94,7 @@ impl PeerConnection {
             protection: Arc::new(protection),
             uplinks: exports.iter().map(open_uplink).collect::<anyhow::Result<_>>()?,
             downlinks: imports.iter().map(open_downlink).collect::<anyhow::Result<_>>()?,
-            peer: Peer::new(peer.clone(), exports, imports, config.deadline_millis * 1_000_000, agreement),
+            peer: Peer::new(machine.into(), exports, imports, config.deadline_millis * 1_000_000, agreement),
             stall_logged: false,
             refusal_logged: None,
             inbox: Arc::default(),
@@ -110,7 +109,7 @@ impl PeerConnection {
         config: &LinkConfig,
         session: &zenoh::Session,
     ) -> anyhow::Result<()> {
-        let peer = &self.peer.config.machine;
+        let peer = &self.peer.machine;
         let own_key = |kind| config.key(&config.machine, peer, kind);
         let peers_key = |kind| config.key(peer, &config.machine, kind);
         let inbox = &self.inbox;
@@ -135,7 +134,7 @@ impl PeerConnection {
         let is_protected = match is_hello {
             true => self.protection.sign(frame).map_or_else(
                 |error| {
-                    tracing::error!("no hello for machine '{}': {error}", self.peer.config.machine);
+                    tracing::error!("no hello for machine '{}': {error}", self.peer.machine);
                     false
                 },
                 |()| true,
@@ -154,7 +153,7 @@ impl PeerConnection {
         };
         self.peer.bytes[0] += frame.len() as u64;
         if let Err(error) = zenoh.publishers[usize::from(kind == KeyKind::Data)].put(frame).wait() {
-            tracing::debug!("not sent to machine '{}': {error}", self.peer.config.machine);
+            tracing::debug!("not sent to machine '{}': {error}", self.peer.machine);
         }
     }
 
@@ -247,7 +246,7 @@ impl PeerConnection {
             ..downlink.incoming.status(&downlink.channel.port)
         });
         PeerStatus {
-            machine: peer.config.machine.clone(),
+            machine: peer.machine.clone(),
             state: if stall_reason.is_some() { PeerState::Down } else { peer.state },
             reason: stall_reason.or_else(|| peer.reason.clone()),
             version: peer.version.clone(),

@@ -111,14 +111,6 @@ impl Protection {
         };
         Ok(Opened { bytes, form, has_keys: self.0.is_some() })
     }
-
-    /// The plain frame of a tunnel.
-    ///
-    /// # Errors
-    /// As [`Protection::open`].
-    pub(super) fn open_command<'a>(&self, bytes: &'a [u8]) -> Result<Cow<'a, [u8]>, WireError> {
-        self.0.as_ref().map_or(Ok(bytes.into()), |keys| keys.decrypt(KeyKind::Ask, bytes).map(Cow::Owned))
-    }
 }
 
 impl Keys {

@@ -16,9 +16,6 @@ const QUEUE_BATCHES: usize = 16;
 /// A message that waits longer for the connection is dropped and requested again. This is well below the interval of
 /// pings.
 const DROP_MICROS: i64 = 15_000;
-/// Zenoh closes a connection when a message that must not be dropped waits longer. Only commands use such messages, and
-/// their tunnels end long before, so that a recording which is too large for the network does not cut off the samples.
-const BLOCK_MICROS: u64 = 60_000_000;
 /// Zenoh closes a connection after this silence. The link itself notices silence sooner: see
 /// [`LinkConfig::deadline_millis`].
 const LEASE_MILLIS: u64 = 2000;
@@ -31,8 +28,6 @@ const ROUTER_MILLIS: u64 = 2000;
 /// Zenoh drops longer messages. This is more than the maximum size of a frame, so that the link itself can count frames
 /// that are too long.
 const MAX_MESSAGE_BYTES: usize = 2 * MAX_FRAME_BYTES;
-/// Two machines that both listen and dial may have two links.
-const MAX_LINKS: usize = 2;
 /// Maximum number of connections beyond one for each other machine of the file: a restarted machine comes back before
 /// Zenoh has noticed the end of its old connection, and one certificate must not take all places.
 const MORE_SESSIONS: usize = 8;
@@ -129,19 +124,13 @@ fn checked(config: &LinkConfig) -> Result<Option<&KeyFiles>, SessionError> {
     for text in endpoints(config) {
         let endpoint = Endpoint::parse(text)
             .map_err(|help| refused(text, format!("expected tls/HOST:PORT, tcp/HOST:PORT or unix/NAME; {help}")))?;
-        let controller = config.peers.iter().find(|peer| peer.may_control || !peer.may.is_empty());
-        let message = match (&endpoint, controller) {
-            (Endpoint::Tcp { .. }, _) if !config.insecure => Some(
+        let message = match &endpoint {
+            Endpoint::Tcp { .. } if !config.insecure => Some(
                 "this endpoint has no TLS. Use tls/… with `link: {keys: DIR}` (`blindgrasp keys DIR` makes keys), or \
                  unix/NAME between machines that are one computer, or `link: {insecure: true}` if nobody else can reach it"
                     .to_owned(),
             ),
-            (Endpoint::Tcp { .. }, Some(peer)) if config.keys.is_none() => Some(format!(
-                "machine '{}' may control this one, and without TLS anybody could take its name. Use tls/… or unix/NAME, or \
-                 leave `control` out",
-                peer.machine
-            )),
-            (Endpoint::Tls { .. }, _) if config.keys.is_none() => Some(
+            Endpoint::Tls { .. } if config.keys.is_none() => Some(
                 "TLS needs this machine's certificate: `link: {keys: DIR}` or --keys DIR (`blindgrasp keys DIR` makes keys)"
                     .to_owned(),
             ),
@@ -201,10 +190,6 @@ fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> std::io::Result
                 "open_timeout": ATTEMPT_MILLIS,
                 "accept_timeout": ATTEMPT_MILLIS,
                 "max_sessions": config.peers.len() + MORE_SESSIONS,
-                // Zenoh looks at a certificate once per connection, and a connection is known by a number that is no secret:
-                // without this, a link of a stranger with that number joins it unseen. With it, all links of a connection
-                // must show one key, which the stranger has not.
-                "max_links": MAX_LINKS,
             },
             "link": {
                 "protocols": if keys.is_some() { vec!["tls"] } else { vec!["tcp", "unixsock-stream"] },
@@ -214,7 +199,6 @@ fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> std::io::Result
                         "size": {"interactive_high": QUEUE_BATCHES, "data": QUEUE_BATCHES},
                         "congestion_control": {
                             "drop": {"wait_before_drop": DROP_MICROS},
-                            "block": {"wait_before_close": BLOCK_MICROS},
                         },
                     },
                 },

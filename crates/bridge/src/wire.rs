@@ -92,8 +92,8 @@ pub struct Rejected(BTreeMap<&'static str, u64>);
 
 impl Rejected {
     /// The reasons that `ps --json` always shows, also with a count of 0.
-    const ALWAYS_SHOWN: [&'static str; 8] =
-        ["foreign", "forged", "malformed", "oversized", "replayed", "version", "unauthorised", "stale"];
+    const ALWAYS_SHOWN: [&'static str; 7] =
+        ["foreign", "forged", "malformed", "oversized", "replayed", "version", "stale"];
 
     /// A count of 0 for each reason that is always shown.
     pub fn with_zeros() -> Self {
@@ -110,10 +110,6 @@ impl Rejected {
     }
 
     /// Adds the counts of another part of the link.
-    pub fn merge(&mut self, other: &Rejected) {
-        other.0.iter().for_each(|(reason, count)| self.add(reason, *count));
-    }
-
     /// For [`LinkStatus::rejected`](blindgrasp_operator::link_status::LinkStatus::rejected).
     pub fn by_reason(&self) -> BTreeMap<String, u64> {
         self.0.iter().map(|(reason, count)| (reason.to_string(), *count)).collect()

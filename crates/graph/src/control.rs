@@ -9,13 +9,8 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::dataflow::Right;
-use crate::describe::is_shipped;
-use crate::log::LogLine;
-use crate::recorded_graph::RecordedGraph;
 use blindgrasp_messages::{Action, Reason};
 use blindgrasp_operator::ages::Ages;
-use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::LinkStatus;
 use blindgrasp_operator::wiring::{InputWiring, NamespaceWiring};
 
@@ -42,59 +37,23 @@ pub enum Request {
     /// Ends the replacement after [`Reply::Shadowing`]; the old operator goes on. Answered with [`Reply::Abandoned`].
     /// The end of the connection does the same.
     Abandon,
-    /// Reads edges from another machine: the link there attaches, as with [`Request::Attach`], and sends the samples.
-    /// Answered with [`Reply::Sampling`], then any number of [`Reply::Samples`], and [`Reply::Drained`] when the graph
-    /// ends. The end of the connection detaches the link.
-    Samples {
-        /// Output ports as `NODE/PORT`; all if empty.
-        ports: Vec<String>,
-    },
-    /// Reads the logs of a graph's part on another machine. Answered with [`Reply::LogLines`].
-    Logs {
-        /// Only the log of this operator; `run` is the launching command, `audit` the audit log.
-        operator: Option<String>,
-        n_lines: usize,
-        /// Whether new lines follow until the end of the connection.
-        follow: bool,
-    },
-    /// The link says for which machine the further requests of this connection are, for the audit log. Not answered.
-    Asker { machine: String },
-    /// The link has refused a request of that machine; for the audit log. Not answered.
-    Refused { what: String, message: String },
 }
 
 impl Request {
     /// Whether it changes the running graph; other requests only read.
     pub fn is_control(&self) -> bool {
-        self.right().is_some()
-    }
-
-    /// The right that another machine needs for this change.
-    pub fn right(&self) -> Option<Right> {
-        match self {
-            Request::Status | Request::Attach { .. } | Request::Samples { .. } | Request::Logs { .. } => None,
-            Request::Stop => Some(Right::Stop),
-            Request::Set { .. } => Some(Right::Set),
-            Request::Swap(SwapRequest { program: Some(program), .. }) if !is_shipped(program) => Some(Right::Run),
-            Request::Swap(_) | Request::Promote | Request::Abandon => Some(Right::Swap),
-            // The link says these itself, and no machine may.
-            Request::Asker { .. } | Request::Refused { .. } => None,
-        }
+        !matches!(self, Request::Status | Request::Attach { .. })
     }
 
     pub fn word(&self) -> &'static str {
         match self {
             Request::Status => "status",
             Request::Attach { .. } => "attach",
-            Request::Samples { .. } => "samples",
-            Request::Logs { .. } => "logs",
             Request::Stop => "stop",
             Request::Set { .. } => "set",
             Request::Swap(_) => "swap",
             Request::Promote => "promote",
             Request::Abandon => "abandon",
-            Request::Asker { .. } => "asker",
-            Request::Refused { .. } => "refused",
         }
     }
 }
@@ -103,15 +62,13 @@ impl Request {
 pub struct SwapRequest {
     /// The nodes, all handed over at one place in the stream.
     pub nodes: Vec<String>,
-    /// The program, absolute; `None` keeps the one that runs, and with several nodes each keeps its own. Another machine
-    /// gives what a dataflow file would: the name of a shipped operator, or a path on the machine that is asked.
+    /// The program, absolute; `None` keeps the one that runs, and with several nodes each keeps its own.
     pub program: Option<PathBuf>,
     /// The program's arguments; `None` for those of the one that runs.
     pub args: Option<Vec<String>>,
     /// Parameters to change in each of the nodes that has them, live or not.
     pub set: BTreeMap<String, String>,
-    /// Relative paths in `set` and `program` are relative to this folder. Asked from another machine, that is the
-    /// folder of the dataflow file there, whatever this says.
+    /// Relative paths in `set` and `program` are relative to this folder.
     pub folder: PathBuf,
     /// The client compares for at most this long before it promotes; 0 without a comparison.
     pub shadow_limit_millis: u64,
@@ -140,16 +97,6 @@ pub enum Reply {
     /// To [`Request::Attach`]: slots are reserved. Writers wait for the reader once it has begun, see
     /// [`Subscriber::begin_here`](blindgrasp_operator::port::Subscriber::begin_here).
     Attached(Attachment),
-    /// To [`Request::Samples`]: samples follow.
-    Sampling(Box<Sampling>),
-    Samples(SampleBatch),
-    /// To [`Request::Logs`].
-    LogLines {
-        /// By time, the latest last.
-        lines: Vec<LogLine>,
-        /// Whether all lines that there were at the request have been sent.
-        is_all: bool,
-    },
     /// To an attached client: the graph ends, and all its samples have been sent. It waits a little until the client
     /// has read them and closes the connection.
     Drained,
@@ -210,31 +157,6 @@ pub struct AttachedEdge {
     pub answered_cells: Vec<usize>,
 }
 
-/// The edges that a client on another machine reads.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Sampling {
-    /// The edges, in the graph's order.
-    pub edges: Vec<AttachedEdge>,
-    /// Edges of unknown types, as `NODE/PORT`.
-    pub unreadable: Vec<String>,
-    /// The last sample of each edge before the client attached.
-    pub places: Vec<Option<SampleId>>,
-    pub about: RecordedGraph,
-}
-
-/// Samples for a client on another machine, and the progress of the graph.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct SampleBatch {
-    /// See [`sample_batch`](crate::sample_batch).
-    pub samples: String,
-    /// The last sample answered, by slot of the inputs in [`AttachedEdge::answered_cells`].
-    pub answered: Vec<(usize, Option<SampleId>)>,
-    /// The last sample sent, by slot of the edges' writers; read after `answered`.
-    pub sent: Vec<(usize, Option<SampleId>)>,
-    /// Samples that were left out so far because this connection was too slow.
-    pub n_left_out: u64,
-}
-
 /// A node that was swapped.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SwappedNode {
@@ -266,6 +188,9 @@ pub struct GraphStatus {
     /// The link to the other machines, if the graph runs on several.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub link: Option<LinkStatus>,
+    /// Destinations of `ssh` of the other machines for which the dataflow file names one.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub ssh_hosts: BTreeMap<String, String>,
 }
 
 /// The decisions that the launching command has read.
@@ -381,34 +306,4 @@ pub struct EdgeStatus {
     pub blocked_nanos: u64,
     /// The ages of its samples on arrival, since their source published them.
     pub ages: Ages,
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_swap_to_a_program_that_is_not_shipped_needs_the_right_to_run_any() {
-        let right = |program: Option<&str>| {
-            let request = SwapRequest {
-                nodes: vec!["classifier".into()],
-                program: program.map(PathBuf::from),
-                args: None,
-                set: BTreeMap::new(),
-                folder: PathBuf::new(),
-                shadow_limit_millis: 0,
-                ready_limit_millis: 1,
-                probation_millis: 1,
-                allow_mismatch: false,
-            };
-            Request::Swap(request).right()
-        };
-        for shipped in [None, Some("classifier"), Some("histogram")] {
-            assert_eq!(right(shipped), Some(Right::Swap), "{shipped:?}");
-        }
-        for own in ["./classifier", "/bin/classifier", "classifiers", "sh", "link", ""] {
-            assert_eq!(right(Some(own)), Some(Right::Run), "{own}");
-        }
-        assert_eq!((Request::Stop.right(), Request::Status.right()), (Some(Right::Stop), None));
-    }
 }

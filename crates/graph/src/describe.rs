@@ -96,11 +96,6 @@ pub(super) fn program_on_path(name: &str) -> Option<PathBuf> {
     (!name.contains('/')).then(|| folders.find_map(|folder| Some(folder.join(name)).filter(is_program)))?
 }
 
-/// Whether [`program_to_run`] takes this for a shipped operator.
-pub(super) fn is_shipped(run: &Path) -> bool {
-    run.to_str().is_some_and(|name| SHIPPED.contains(&present_name(name)))
-}
-
 /// The encoder had another name before, as in dataflow files.
 fn present_name(name: &str) -> &str {
     if name == "histogram" { "encoder" } else { name }

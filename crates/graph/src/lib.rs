@@ -20,6 +20,5 @@ pub mod log;
 pub mod plan;
 pub mod recorded_graph;
 pub mod run;
-pub mod sample_batch;
 #[doc(hidden)]
 pub mod testing;

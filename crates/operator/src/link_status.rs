@@ -10,7 +10,7 @@ pub struct LinkStatus {
     pub machine: String,
     pub namespace: Option<String>,
     pub peers: Vec<PeerStatus>,
-    /// Messages that were dropped unread, by reason: `foreign`, `malformed`, `oversized`, `replayed`, `version`, `unauthorised`.
+    /// Messages that were dropped unread, by reason: `foreign`, `malformed`, `oversized`, `replayed`, `version`.
     pub rejected: BTreeMap<String, u64>,
 }
 

@@ -33,24 +33,6 @@ pub(super) struct SpanOfEdge {
     pub(super) missing: u64,
 }
 
-/// The progress of the graph, from its cursors or from another machine.
-pub(super) trait Places: Send + 'static {
-    /// The last sample that an input has answered.
-    fn answered(&self, cell: usize) -> Option<SampleId>;
-    /// The last sample that an output has sent, read after the answered samples.
-    fn sent(&self, cell: usize) -> Option<SampleId>;
-}
-
-impl Places for SharedCursors {
-    fn answered(&self, cell: usize) -> Option<SampleId> {
-        self.input(cell).key()
-    }
-
-    fn sent(&self, cell: usize) -> Option<SampleId> {
-        self.output(cell).key()
-    }
-}
-
 pub(super) struct EdgeSpan {
     topic: String,
     /// Whether it has the source's numbers.
@@ -75,8 +57,9 @@ pub(super) struct EdgeSpan {
 }
 
 /// The part of the stream that is recorded.
-pub(super) struct Span<P> {
-    places: P,
+pub(super) struct Span {
+    /// The progress of the graph.
+    cursors: SharedCursors,
     edges: Vec<EdgeSpan>,
     recorder: Recorder,
     /// Set when the recording has failed.
@@ -145,7 +128,7 @@ impl EdgeSpan {
     }
 
     /// Whether the edge has come as far as the end.
-    fn has_reached(&mut self, end: &SampleId, places: &impl Places) -> bool {
+    fn has_reached(&mut self, end: &SampleId, cursors: &SharedCursors) -> bool {
         let is_at = |seen: &Option<SampleId>, end: &SampleId| {
             seen.is_some_and(|seen| seen.epoch != end.epoch || seen.seq >= end.seq)
         };
@@ -157,20 +140,25 @@ impl EdgeSpan {
         }
         if self.until.is_none() {
             // Its answered samples are read before its sent samples, which then include the answers.
-            let has_answered = self.answered_cells.iter().all(|cell| is_at(&places.answered(*cell), end));
+            let has_answered = self.answered_cells.iter().all(|cell| is_at(&cursors.input(*cell).key(), end));
             if !has_answered {
                 return false;
             }
-            self.until = Some(places.sent(self.writer_cell));
+            self.until = Some(cursors.output(self.writer_cell).key());
         }
         self.until.flatten().is_none_or(|until| is_at(&self.seen.or(self.place), &until))
     }
 }
 
-impl<P: Places> Span<P> {
-    pub(super) fn new(places: P, edges: Vec<EdgeSpan>, recorder: Recorder, failed: Arc<AtomicBool>) -> Self {
+impl Span {
+    pub(super) fn new(
+        cursors: SharedCursors,
+        edges: Vec<EdgeSpan>,
+        recorder: Recorder,
+        failed: Arc<AtomicBool>,
+    ) -> Self {
         Span {
-            places,
+            cursors,
             edges,
             recorder,
             failed,
@@ -180,10 +168,6 @@ impl<P: Places> Span<P> {
             furthest: None,
             is_leaving: false,
         }
-    }
-
-    pub(super) fn places_mut(&mut self) -> &mut P {
-        &mut self.places
     }
 
     pub(super) fn finish(mut self, ending: Ending) -> (Vec<SpanOfEdge>, Recorded) {
@@ -226,7 +210,7 @@ impl<P: Places> Span<P> {
     }
 }
 
-impl<P: Places> Sink for Span<P> {
+impl Sink for Span {
     fn take(&mut self, topic: &str, record: Record, _received_nanos: u64) -> anyhow::Result<()> {
         let Some(edge_idx) = self.edges.iter().position(|edge| edge.topic == topic) else {
             return Ok(());
@@ -273,7 +257,7 @@ impl<P: Places> Sink for Span<P> {
 
     fn has_enough(&mut self) -> bool {
         let Some((end, _)) = self.end else { return true };
-        self.edges.iter_mut().all(|edge| edge.has_reached(&end, &self.places))
+        self.edges.iter_mut().all(|edge| edge.has_reached(&end, &self.cursors))
     }
 }
 

@@ -178,7 +178,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let name = running_name(arguments, &graph)?;
     let name = name.as_str();
     // Every mistake is reported before the graph goes into the background.
-    graph_here(arguments, &graph, name)?;
+    graph_here(arguments, &graph)?;
     if arguments.in_background {
         return background::into_log(name, arguments.log_format.into(), || run_graph(arguments, &graph, name));
     }
@@ -209,9 +209,9 @@ fn running_name(arguments: &Arguments, graph: &Graph) -> anyhow::Result<String> 
 }
 
 /// The part of a graph that runs here.
-fn graph_here(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result<Graph> {
+fn graph_here(arguments: &Arguments, graph: &Graph) -> anyhow::Result<Graph> {
     match &arguments.machines.machine {
-        Some(machine) => part_of(arguments, graph, machine, name),
+        Some(machine) => part_of(arguments, graph, machine),
         None => whole(arguments, graph.clone()),
     }
 }
@@ -232,11 +232,10 @@ fn whole(arguments: &Arguments, graph: Graph) -> anyhow::Result<Graph> {
     Ok(graph)
 }
 
-fn part_of(arguments: &Arguments, graph: &Graph, machine: &str, name: &str) -> anyhow::Result<Graph> {
+fn part_of(arguments: &Arguments, graph: &Graph, machine: &str) -> anyhow::Result<Graph> {
     let placement = Placement {
         machine: machine.into(),
         namespace: arguments.machines.namespace.clone(),
-        running_graph: name.into(),
         run: run_number(),
         listen: arguments.machines.listen.clone(),
         connect: arguments.machines.connect.clone(),
@@ -255,7 +254,7 @@ fn run_graph(arguments: &Arguments, graph: &Graph, name: &str) -> anyhow::Result
     let n_stops = stop_requests()?;
     loop {
         // Each round is a run of its own to the other machines.
-        let graph_here = graph_here(arguments, graph, name)?;
+        let graph_here = graph_here(arguments, graph)?;
         let _page = arguments.view.map(|port| Page::start(name, port, arguments.rights)).transpose()?;
         let ended = session(arguments).run(&graph_here, name, &n_stops)?;
         let is_stopped = n_stops.load(Ordering::Relaxed) > 0 || !arguments.machines.stay;

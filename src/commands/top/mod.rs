@@ -19,6 +19,7 @@ use ratatui::crossterm::event::{self, Event};
 use self::poller::Poller;
 use self::sample::{Look, Window, measure};
 use self::view::{Condition, Then, View};
+use super::elsewhere::MachineArgument;
 use super::{GraphArgument, Outcome, print_line, secs_in};
 use blindgrasp_graph::client::{ClientError, pick_graph, running_graphs};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -40,6 +41,8 @@ pub(super) struct Arguments {
     /// End after so many intervals
     #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     iterations: Option<u64>,
+    #[command(flatten)]
+    machine: MachineArgument,
 }
 
 /// Keys wait this long for an answer that is due; it usually comes at once.
@@ -54,6 +57,9 @@ const SILENT_AFTER: Duration = Duration::from_secs(1);
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if !arguments.json && !std::io::stdout().is_terminal() {
         anyhow::bail!("stdout is no terminal to draw on; use blindgrasp top --json, or blindgrasp ps for one look");
+    }
+    if let Some(destination) = arguments.machine.destination()? {
+        return if arguments.json { destination.run() } else { destination.run_on_terminal() };
     }
     let graph = pick_graph(arguments.graph.name())?;
     let (poller, first) = Poller::connect(&graph)?;

@@ -5,7 +5,6 @@ use std::time::Instant;
 
 use serde::Serialize;
 
-use blindgrasp_graph::client::machine_of;
 use blindgrasp_graph::client::usage::{ProcessUsage, usage};
 use blindgrasp_graph::control::{DecidedGrasp, EdgeStatus, GraphState, GraphStatus, NodeState};
 use blindgrasp_operator::ages::Ages;
@@ -110,12 +109,10 @@ pub(in crate::commands) struct MeasuredDecisions {
 
 impl Look {
     pub(in crate::commands) fn new(status: GraphStatus) -> Look {
-        // The processes of another machine are not here.
-        let is_here = machine_of(&status.graph).is_none();
         let nodes = status.nodes.iter().flat_map(|node| [node.pid, node.standby_pid]).flatten();
-        let pids = nodes.chain([status.pid]).filter(|_| is_here);
+        let pids = nodes.chain([status.pid]);
         let usage = pids.filter_map(|pid| Some((pid, usage(pid)?))).collect();
-        Look { status, usage, at: Instant::now(), load_average: load_average().filter(|_| is_here) }
+        Look { status, usage, at: Instant::now(), load_average: load_average() }
     }
 
     fn edge(&self, from: &str, to: &str) -> Option<&EdgeStatus> {

@@ -12,7 +12,6 @@ use super::sample::{Measured, MeasuredEdge, MeasuredNode, Quantiles, RUN};
 use super::table::{Cell, Column, table};
 use super::view::{Condition, Table, View};
 use crate::commands::ps;
-use blindgrasp_graph::client::machine_of;
 use blindgrasp_graph::control::{DecidedGrasp, GraphState, NodeState};
 use blindgrasp_graph::log::printable;
 use blindgrasp_messages::Action;
@@ -297,14 +296,13 @@ fn decision_table(view: &View, width: u16) -> (Line<'static>, Vec<Line<'static>>
         column("AGO", 6),
         left("TRUTH", 5),
     ];
-    // Another machine's clock is another.
-    let now_nanos = machine_of(&view.now.status.graph).is_none().then(monotonic_nanos);
+    let now_nanos = monotonic_nanos();
     let latest = view.now.status.decisions.latest.iter().rev();
     let rows: Vec<Vec<Cell>> = latest.map(|decided| decision_row(decided, now_nanos)).collect();
     table(&columns, &rows, width.into())
 }
 
-fn decision_row(decided: &DecidedGrasp, now_nanos: Option<u64>) -> Vec<Cell> {
+fn decision_row(decided: &DecidedGrasp, now_nanos: u64) -> Vec<Cell> {
     let is_wrong = decided.is_false_positive();
     let style = match decided.action {
         Action::Lift if is_wrong => LOUD,
@@ -323,7 +321,7 @@ fn decision_row(decided: &DecidedGrasp, now_nanos: Option<u64>) -> Vec<Cell> {
         Cell::new(decided.reason.as_str()),
         Cell::new(format!("{:.3}", decided.probability_stable)),
         Cell::new(decided.latency_nanos.map_or("-".into(), short_time)),
-        Cell::new(now_nanos.map_or("-".into(), |now| short_time(now.saturating_sub(decided.decided_nanos)))),
+        Cell::new(short_time(now_nanos.saturating_sub(decided.decided_nanos))),
         Cell::styled(truth, loud_if(is_wrong)),
     ]
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_observe};
-use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, machine_of};
+use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection};
 use blindgrasp_graph::control::{Attachment, Reply, Request};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_learning::evaluation::Judge;
@@ -60,9 +60,6 @@ pub(super) fn show(
 ) -> anyhow::Result<Outcome> {
     // A file that cannot be read is a mistake at the start only.
     shadow.map(Model::load).transpose()?;
-    if machine_of(graph).is_some() {
-        bail!("{graph}: the page shows graphs of this machine; run the command there, or use blindgrasp top {graph}");
-    }
     let stop = stop_signal()?;
     // A graph that does not run is a mistake at the start only.
     let mut connection = if waits { None } else { Some(Connection::open(graph)?) };

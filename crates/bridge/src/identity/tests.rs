@@ -36,7 +36,6 @@ fn keys(machines: &[&str]) -> tempfile::TempDir {
 fn config(folder: &Path, machine: &str, namespace: Option<&str>) -> LinkConfig {
     LinkConfig {
         graph: "g".into(),
-        running_graph: "g".into(),
         namespace: namespace.map(Into::into),
         machine: machine.into(),
         run: 1,

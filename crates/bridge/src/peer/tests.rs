@@ -29,10 +29,8 @@ fn pair() -> [Side; 2] {
         is_to_source: false,
         is_urgent: false,
     };
-    let config =
-        |machine: &str| PeerConfig { machine: machine.into(), may_read: true, may_control: false, may: Vec::new() };
-    let robot = Peer::new(config("brain"), vec![channel.clone()], vec![], DEADLINE_NANOS, None);
-    let brain = Peer::new(config("robot"), vec![], vec![channel], DEADLINE_NANOS, None);
+    let robot = Peer::new("brain".into(), vec![channel.clone()], vec![], DEADLINE_NANOS, None);
+    let brain = Peer::new("robot".into(), vec![], vec![channel], DEADLINE_NANOS, None);
     [Side { own: own("robot", 1), peer: robot }, Side { own: own("brain", 2), peer: brain }]
 }
 

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::*;
 use crate::certificates::key_files;
-use crate::config::{Endpoints, LinkConfig, PeerConfig};
+use crate::config::{Endpoints, LinkConfig};
 use crate::keys::{KeyRequest, make, revoke};
 use crate::peer::{Change, Own, Peer, Rejection};
 use blindgrasp_operator::link_status::PeerState;
@@ -45,7 +45,6 @@ fn keys(machines: &[&str]) -> tempfile::TempDir {
 fn end_as(folder: Option<&Path>, [machine, signer, peer]: [&str; 3], instance: u64) -> End {
     let config = LinkConfig {
         graph: "g".into(),
-        running_graph: "g".into(),
         namespace: None,
         machine: signer.into(),
         run: 1,
@@ -65,7 +64,6 @@ fn end_as(folder: Option<&Path>, [machine, signer, peer]: [&str; 3], instance: u
     let protection = identity.zip(agreement.as_ref());
     let protection =
         protection.map(|(identity, agreement)| Protection::new(identity, peer, agreement)).unwrap_or_default();
-    let peer = PeerConfig { machine: peer.into(), may_read: true, may_control: false, may: Vec::new() };
     let own = Own {
         instance,
         machine: machine.into(),
@@ -74,7 +72,12 @@ fn end_as(folder: Option<&Path>, [machine, signer, peer]: [&str; 3], instance: u
         is_ready: true,
         is_eager_until_nanos: 0,
     };
-    End { own, peer: Peer::new(peer, Vec::new(), Vec::new(), DEADLINE_NANOS, agreement), protection, now_nanos: 0 }
+    End {
+        own,
+        peer: Peer::new(peer.into(), Vec::new(), Vec::new(), DEADLINE_NANOS, agreement),
+        protection,
+        now_nanos: 0,
+    }
 }
 
 fn end(folder: Option<&Path>, machine: &str, peer: &str, instance: u64) -> End {

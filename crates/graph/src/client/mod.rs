@@ -11,7 +11,6 @@ use std::os::unix::net::UnixStream;
 use std::time::{Duration, Instant};
 
 use rustix::io::Errno;
-use serde_json::Value;
 
 use crate::control::{GraphStatus, Reply, Request};
 use blindgrasp_operator::control_socket;
@@ -22,15 +21,16 @@ pub const ANSWER_LIMIT: Duration = Duration::from_secs(3);
 
 /// A client checks this often whether it was interrupted or the graph has ended.
 const POLL: Duration = Duration::from_millis(50);
-/// Separates a graph and the machine of one of its parts.
-const MACHINE_MARK: char = '@';
 /// Longer lines are not replies.
 const MAX_LINE_BYTES: usize = 16 << 20;
 
 /// Why a graph could not be asked, or did not do what it was asked.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
-    #[error("graph name '{name}': expected letters, digits, _ and -, at most 32")]
+    #[error(
+        "graph name '{name}': expected letters, digits, _ and -, at most 32{}",
+        if name.contains('@') { "; for a graph on another machine, give --machine" } else { "" }
+    )]
     Name { name: String },
     #[error("no graph is running; start one with: blindgrasp run")]
     NoneRunning,
@@ -45,27 +45,6 @@ pub enum ClientError {
          hang (kill {pid})"
     )]
     NotAnswering { graph: String, pid: i32, limit_secs: f64 },
-    #[error(
-        "graph '{graph}' has not answered within {limit_secs} s: its machine is cut off or busy, see blindgrasp ps"
-    )]
-    CutOff {
-        /// The graph's part, `GRAPH@MACHINE`.
-        graph: String,
-        limit_secs: f64,
-    },
-    #[error("graph '{graph}' has no node '{node}'; its nodes: {}", known.join(", "))]
-    NoNode {
-        graph: String,
-        node: String,
-        /// The nodes on each machine, and the machines that do not answer.
-        known: Vec<String>,
-    },
-    #[error("{} run on different machines ({}): name the nodes of one machine at a time", nodes.join(", "), parts.join(", "))]
-    Apart {
-        nodes: Vec<String>,
-        /// The parts of the graph with these nodes.
-        parts: Vec<String>,
-    },
     #[error("graph '{graph}' does not answer: its queue of clients is full; its launcher may be stopped or hang")]
     QueueFull { graph: String },
     #[error("graph '{graph}' has ended before it answered")]
@@ -102,28 +81,6 @@ pub struct Connection {
 /// # Errors
 /// The kernel's list of sockets cannot be read.
 pub fn running_graphs() -> std::io::Result<Vec<String>> {
-    Ok(sockets()?.into_iter().filter(|name| !name.contains(MACHINE_MARK)).collect())
-}
-
-/// The parts of this user's running graphs that run on other machines, as `GRAPH@MACHINE`, whether or not they answer.
-///
-/// # Errors
-/// The kernel's list of sockets cannot be read.
-pub fn parts_elsewhere() -> std::io::Result<Vec<String>> {
-    Ok(sockets()?.into_iter().filter(|name| name.contains(MACHINE_MARK)).collect())
-}
-
-/// The name of a running graph's part on another machine, for commands on this one.
-pub fn part_name(graph: &str, machine: &str) -> String {
-    format!("{graph}{MACHINE_MARK}{machine}")
-}
-
-/// The machine in a name like `GRAPH@MACHINE`.
-pub fn machine_of(graph: &str) -> Option<&str> {
-    graph.split_once(MACHINE_MARK).map(|(_, machine)| machine)
-}
-
-fn sockets() -> std::io::Result<Vec<String>> {
     Ok(control_socket::names()?.into_iter().filter(|name| is_graph_name(name)).collect())
 }
 
@@ -132,14 +89,10 @@ fn sockets() -> std::io::Result<Vec<String>> {
 /// # Errors
 /// It is not running, or no graph is, or several are.
 pub fn pick_graph(asked_for: Option<&str>) -> Result<String, ClientError> {
-    let sockets = sockets().unwrap_or_default();
-    let running: Vec<String> = sockets.iter().filter(|name| !name.contains(MACHINE_MARK)).cloned().collect();
+    let running = running_graphs().unwrap_or_default();
     match (asked_for, running.as_slice()) {
         (Some(name), _) if !is_graph_name(name) => Err(ClientError::Name { name: name.into() }),
-        (Some(name), _) if sockets.iter().any(|graph| graph == name) => Ok(name.into()),
-        (Some(name), _) if machine_of(name).is_some() => {
-            own_part(name).ok_or_else(|| ClientError::NotRunning { graph: name.into(), running: sockets.clone() })
-        }
+        (Some(name), _) if running.iter().any(|graph| graph == name) => Ok(name.into()),
         (Some(name), running) => Err(ClientError::NotRunning { graph: name.into(), running: running.to_vec() }),
         (None, []) => Err(ClientError::NoneRunning),
         (None, [graph]) => Ok(graph.clone()),
@@ -147,68 +100,8 @@ pub fn pick_graph(asked_for: Option<&str>) -> Result<String, ClientError> {
     }
 }
 
-/// The part of a graph that has all of these nodes: the part here, or another machine's, as `GRAPH@MACHINE`. A name
-/// with a machine is returned as it is.
-///
-/// # Errors
-/// No part has the nodes, or they are on different machines.
-pub fn locate(graph: &str, nodes: &[String]) -> Result<String, ClientError> {
-    let elsewhere = parts_elsewhere().unwrap_or_default();
-    let elsewhere: Vec<String> = elsewhere
-        .into_iter()
-        .filter(|part| part.split_once(MACHINE_MARK).is_some_and(|(own, _)| own == graph))
-        .collect();
-    if elsewhere.is_empty() || machine_of(graph).is_some() {
-        return Ok(graph.into());
-    }
-    let mut parts = Vec::new();
-    let mut known = Vec::new();
-    let mut left: Vec<&String> = nodes.iter().collect();
-    for part in std::iter::once(graph.to_string()).chain(elsewhere) {
-        if left.is_empty() {
-            break;
-        }
-        match status(&part) {
-            Ok(status) => {
-                let has = |node: &String| status.nodes.iter().any(|own| own.node == *node);
-                let n_before = left.len();
-                left.retain(|node| !has(node));
-                if left.len() < n_before {
-                    parts.push(part);
-                } else {
-                    let names: Vec<&str> = status.nodes.iter().map(|node| node.node.as_str()).collect();
-                    let on = machine_of(&part).map_or_else(String::new, |machine| format!(" on {machine}"));
-                    known.push(format!("{}{on}", names.join(", ")));
-                }
-            }
-            // The part here must answer.
-            Err(error) if machine_of(&part).is_none() => return Err(error),
-            Err(error) => known.push(format!("unknown on {} ({error})", machine_of(&part).unwrap_or_default())),
-        }
-    }
-    match (left.first(), parts.as_slice()) {
-        (None, [part]) => Ok(part.clone()),
-        // The launcher reports the unknown node.
-        (None, []) => Ok(graph.into()),
-        (None, _) => Err(ClientError::Apart { nodes: nodes.to_vec(), parts }),
-        (Some(node), _) => Err(ClientError::NoNode { graph: graph.into(), node: node.to_string(), known }),
-    }
-}
-
-/// The graph here, if the machine of `GRAPH@MACHINE` is this one.
-fn own_part(name: &str) -> Option<String> {
-    let (graph, machine) = name.split_once(MACHINE_MARK)?;
-    let link = status(graph).ok()?.link?;
-    (link.machine == machine).then(|| graph.into())
-}
-
-/// Whether a running graph can have this name: a file's name, or that with a number behind it, or `GRAPH@MACHINE` for
-/// its part on another machine.
+/// Whether a running graph can have this name: a file's name, or that with a number behind it.
 pub fn is_graph_name(text: &str) -> bool {
-    let (text, machine) = text.split_once(MACHINE_MARK).map_or((text, None), |(text, machine)| (text, Some(machine)));
-    if machine.is_some_and(|machine| !is_name(machine)) {
-        return false;
-    }
     let is_numbered = |(name, number): (&str, &str)| is_name(name) && number.parse::<u32>().is_ok();
     is_name(text) || text.rsplit_once('-').is_some_and(is_numbered)
 }
@@ -313,9 +206,6 @@ impl Connection {
             if is_interrupted() {
                 return Err(ClientError::Interrupted);
             }
-            if left.is_zero() && machine_of(&self.graph).is_some() {
-                return Err(ClientError::CutOff { graph: self.graph.clone(), limit_secs: limit.as_secs_f64() });
-            }
             if left.is_zero() {
                 let (graph, pid) = (self.graph.clone(), self.launcher_pid);
                 return Err(ClientError::NotAnswering { graph, pid, limit_secs: limit.as_secs_f64() });
@@ -337,18 +227,12 @@ impl Connection {
     /// # Errors
     /// The connection failed.
     pub fn wait_until_ended(mut self) -> Result<(), ClientError> {
-        let is_elsewhere = machine_of(&self.graph).is_some();
         loop {
             match self.receive_within(Duration::from_secs(1)) {
-                Err(error @ ClientError::Refused { .. }) if is_elsewhere => return Err(error),
                 Ok(_) | Err(ClientError::Refused { .. }) => {}
                 Err(ClientError::Ended { .. }) => break,
                 Err(error) => return Err(error),
             }
-        }
-        if is_elsewhere {
-            // This machine's link listens under that name.
-            return Ok(());
         }
         // The launcher frees the name after it has cleaned up.
         loop {
@@ -364,11 +248,6 @@ impl Connection {
         &self.graph
     }
 
-    /// The bare connection, to pass on requests and replies.
-    pub fn into_stream(self) -> UnixStream {
-        self.stream
-    }
-
     /// The error for a reply that does not belong to the request.
     pub fn unexpected(&self, reply: &Reply) -> ClientError {
         let found = serde_json::to_string(reply).unwrap_or_else(|_| format!("{reply:?}"));
@@ -376,15 +255,7 @@ impl Connection {
     }
 
     fn reply(&self, line: &[u8]) -> Result<Reply, ClientError> {
-        let reply = match machine_of(&self.graph) {
-            Some(_) => reply_from_elsewhere(line),
-            None => serde_json::from_slice(line),
-        };
-        match reply {
-            Ok(Reply::Status(status)) if machine_of(&self.graph).is_some() => {
-                // It has another name there, maybe the name of a graph here.
-                Ok(Reply::Status(GraphStatus { graph: self.graph.clone(), ..status }))
-            }
+        match serde_json::from_slice(line) {
             Ok(Reply::Error { message, rolled_back }) => Err(ClientError::Refused { message, rolled_back }),
             Ok(reply) => Ok(reply),
             Err(_) => {
@@ -404,26 +275,6 @@ impl Connection {
     fn broken(&self, source: std::io::Error) -> ClientError {
         let graph = self.graph.clone();
         if has_hung_up(&source) { ClientError::Ended { graph } } else { ClientError::Io { graph, source } }
-    }
-}
-
-/// Another machine may have sent anything: characters that a terminal would obey are escaped.
-fn reply_from_elsewhere(line: &[u8]) -> serde_json::Result<Reply> {
-    if line.is_ascii() && !line.contains(&b'\\') {
-        return serde_json::from_slice(line);
-    }
-    serde_json::from_value(printable_json(serde_json::from_slice(line)?))
-}
-
-fn printable_json(value: Value) -> Value {
-    match value {
-        Value::String(text) => Value::String(crate::log::printable(&text)),
-        Value::Array(values) => Value::Array(values.into_iter().map(printable_json).collect()),
-        Value::Object(values) => {
-            let fit = |(key, value): (String, Value)| (crate::log::printable(&key), printable_json(value));
-            Value::Object(values.into_iter().map(fit).collect())
-        }
-        other => other,
     }
 }
 
@@ -452,7 +303,6 @@ fn shortened(text: &str) -> String {
 mod tests {
 
     use super::*;
-    use crate::control::NodeStatus;
     use crate::testing::{listen, made_status, serve};
 
     /// A name that no other test, and no test of another process, has.
@@ -563,64 +413,6 @@ mod tests {
             assert!(clients.len() < 10, "the queue has no end");
         };
         assert!(matches!(full, ClientError::QueueFull { .. }), "{full:?}");
-    }
-
-    #[test]
-    fn a_node_is_found_on_whichever_machine_it_runs() {
-        let graph = unique("located");
-        let brain = part_name(&graph, "brain");
-        let of = |graph: &str, nodes: &[&str]| {
-            let mut status = made_status(graph);
-            let node = status.nodes.remove(0);
-            status.nodes = nodes.iter().map(|id| NodeStatus { node: id.to_string(), ..node.clone() }).collect();
-            vec![(Request::Status, vec![Reply::Status(status)])]
-        };
-        let located = |nodes: &[&str], is_brain_asked: bool| {
-            let here = serve(&graph, of(&graph, &["contacts", "link"]));
-            // Another name there does not matter, nor does what it does to a terminal.
-            let there = serve(&brain, of("other", &["classifier", "his\u{1b}togram"]));
-            let nodes: Vec<String> = nodes.iter().map(|node| node.to_string()).collect();
-            let found = locate(&graph, &nodes);
-            here.join().expect("asked as expected");
-            if !is_brain_asked {
-                let status = status(&brain).expect("answered");
-                assert_eq!((status.graph, status.nodes[1].node.as_str()), (brain.clone(), "his\\u{1b}togram"));
-            }
-            there.join().expect("asked as expected");
-            found
-        };
-        assert_eq!(located(&["contacts"], false).expect("here"), graph);
-        assert_eq!(located(&["classifier"], true).expect("there"), brain);
-        let apart = located(&["classifier", "contacts"], true).expect_err("on two machines");
-        assert!(
-            matches!(&apart, ClientError::Apart { parts, .. } if *parts == [graph.clone(), brain.clone()]),
-            "{apart}"
-        );
-        let unknown = located(&["clasifier"], true).expect_err("nowhere").to_string();
-        let expected = "has no node 'clasifier'; its nodes: contacts, link, classifier, his\\u{1b}togram on brain";
-        assert!(unknown.ends_with(expected), "{unknown}");
-        // Without other machines nobody is asked; a name that says the machine is taken at its word.
-        assert_eq!(locate(&graph, &["x".into()]).expect("as it is"), graph);
-        assert_eq!(locate(&brain, &["x".into()]).expect("as it is"), brain);
-    }
-
-    #[test]
-    fn another_machines_part_is_no_other_graph() {
-        let graph = unique("parts");
-        let brain = part_name(&graph, "brain");
-        let (_own, part) = (listen(&graph), listen(&brain));
-        let running = running_graphs().expect("listed");
-        assert!(running.contains(&graph) && !running.contains(&brain), "{running:?}");
-        assert!(parts_elsewhere().expect("listed").contains(&brain));
-        assert_eq!(pick_graph(Some(&brain)).expect("reachable"), brain);
-        assert!(is_graph_name(&brain) && !is_graph_name("a@") && !is_graph_name("@b") && !is_graph_name("a@b@c"));
-        // Who does not answer is another machine, not a process of this one.
-        let mut connection = Connection::open(&brain).expect("connected");
-        let silent = connection.ask(&Request::Status, Duration::from_millis(60)).expect_err("no answer");
-        assert!(matches!(silent, ClientError::CutOff { .. }), "{silent:?}");
-        drop((connection, part));
-        let gone = pick_graph(Some(&part_name(&format!("{graph}-7"), "brain"))).expect_err("not there");
-        assert!(matches!(gone, ClientError::NotRunning { .. }), "{gone:?}");
     }
 
     #[test]

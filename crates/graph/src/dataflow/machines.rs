@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 /// The id of the node that carries a graph's edges to other machines.
 pub const LINK: &str = "link";
@@ -22,41 +22,9 @@ pub struct Machine {
     /// The Zenoh endpoints where it listens, like `tls/192.168.1.10:7447`. A machine without one connects to machines
     /// that listen.
     pub listen: Vec<String>,
-    /// The machines that may see the status, logs and samples of its part of the graph: those that the
-    /// file names, and those in `control`.
-    pub read: Vec<String>,
-    /// The machines that may make every change of its part of the graph; by default none.
-    pub control: Vec<String>,
-    /// The machines that may make one kind of change; those of `control` are not repeated.
-    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
-    pub allows: BTreeMap<Right, Vec<String>>,
-}
-
-/// A kind of change that a machine may allow another one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Right {
-    /// Change live params.
-    Set,
-    /// Replace an operator with a shipped one, or with itself and other params.
-    Swap,
-    /// Replace an operator with any program.
-    Run,
-    Stop,
-}
-
-impl Right {
-    pub const ALL: [Right; 4] = [Right::Set, Right::Swap, Right::Run, Right::Stop];
-
-    /// The key in the dataflow file.
-    pub fn key(self) -> &'static str {
-        match self {
-            Right::Set => "set",
-            Right::Swap => "swap",
-            Right::Run => "run",
-            Right::Stop => "stop",
-        }
-    }
+    /// Where `--machine` finds it: a destination of `ssh`, like `user@host`. Without one, that is its name.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ssh: Option<String>,
 }
 
 /// How the machines of a graph are linked.
@@ -87,4 +55,8 @@ pub struct LocalView {
     /// Output ports of other machines that are read here, as `NODE/PORT`, and whether a source on another machine is
     /// among those that they depend on: then this machine's part goes on until they end.
     pub imports: Vec<(String, bool)>,
+    /// Destinations of `ssh` of the other machines for which the file names one.
+    pub ssh_hosts: BTreeMap<String, String>,
+    /// The nodes that run on other machines, each with its machine.
+    pub elsewhere: BTreeMap<String, String>,
 }

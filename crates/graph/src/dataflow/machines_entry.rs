@@ -1,19 +1,18 @@
 //! The file's keys `machines` and `link`, and what `on` of a node refers to.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
 use crate::dataflow::diagnostic::{Diagnostics, Position, did_you_mean_or_list, list};
 use crate::dataflow::endpoint::Endpoint;
 use crate::dataflow::form::{accept, check_name, entries_or_nothing, unknown_key};
-use crate::dataflow::machines::{LinkSettings, Machine, Machines, Right};
+use crate::dataflow::machines::{LinkSettings, Machine, Machines};
 use crate::dataflow::node::NodeEntry;
 use crate::dataflow::settings::absolute;
 use crate::dataflow::yaml::{Content, Entry, Text, Value};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::text::quote;
 
-pub(super) const MACHINE_KEYS: [&str; 7] = ["listen", "read", "control", "set", "swap", "run", "stop"];
+pub(super) const MACHINE_KEYS: [&str; 2] = ["listen", "ssh"];
 pub(super) const LINK_KEYS: [&str; 5] = ["router", "keys", "insecure", "deadline_ms", "buffer"];
 /// Each machine is linked to each that it shares an edge with.
 const MAX_MACHINES: usize = 64;
@@ -38,9 +37,7 @@ pub(super) struct MachineEntry {
     listen: Vec<(Text, Endpoint)>,
     /// Whether the file wants it to listen, rightly written or not.
     pub(super) listens: bool,
-    read: Vec<Text>,
-    control: Vec<Text>,
-    allows: BTreeMap<Right, Vec<Text>>,
+    ssh: Option<String>,
 }
 
 #[derive(Debug, Clone, Default)]
@@ -66,16 +63,10 @@ impl MachinesEntry {
     pub(super) fn settle(&self, link: &LinkEntry, folder: &Path) -> Machines {
         let written =
             |endpoints: &[(Text, Endpoint)]| endpoints.iter().map(|(text, _)| text.text.clone()).collect::<Vec<_>>();
-        let machines = self.machines.iter().map(|machine| {
-            // A program that is swapped in can send away all that it sees.
-            let runners = machine.allows.get(&Right::Run).map(Vec::as_slice).unwrap_or_default();
-            Machine {
-                name: machine.name.text.clone(),
-                listen: written(&machine.listen),
-                read: named_once(&[machine.read.as_slice(), &machine.control, runners].concat()),
-                control: named_once(&machine.control),
-                allows: machine.allows.iter().map(|(right, names)| (*right, named_once(names))).collect(),
-            }
+        let machines = self.machines.iter().map(|machine| Machine {
+            name: machine.name.text.clone(),
+            listen: written(&machine.listen),
+            ssh: machine.ssh.clone(),
         });
         let link = LinkSettings {
             router: written(&link.router),
@@ -84,16 +75,6 @@ impl MachinesEntry {
         };
         Machines { machines: machines.collect(), link }
     }
-}
-
-fn named_once(names: &[Text]) -> Vec<String> {
-    let mut once: Vec<String> = Vec::new();
-    for name in names {
-        if !once.contains(&name.text) {
-            once.push(name.text.clone());
-        }
-    }
-    once
 }
 
 /// The machines of the file; `None` when they cannot be known.
@@ -112,7 +93,7 @@ pub(super) fn read_machines(entry: Entry, diagnostics: &mut Diagnostics) -> Opti
     }
     let machines = entries.into_iter().map(|entry| read_machine(entry, diagnostics)).collect();
     let machines = MachinesEntry { at, machines };
-    check_references(&machines, diagnostics);
+    check_endpoints(&machines, diagnostics);
     Some(machines)
 }
 
@@ -120,8 +101,7 @@ fn read_machine(entry: Entry, diagnostics: &mut Diagnostics) -> MachineEntry {
     let name = entry.key;
     check_name(&name, "machine", diagnostics);
     let machine_name = format!("machine {}", quote(&name.text));
-    let (listen, control) = (Vec::new(), Vec::new());
-    let mut machine = MachineEntry { listen, listens: false, read: Vec::new(), control, allows: BTreeMap::new(), name };
+    let mut machine = MachineEntry { listen: Vec::new(), listens: false, ssh: None, name };
     let Some(entries) = entries_or_nothing(entry.value, &machine_name, diagnostics) else {
         machine.listens = true;
         return machine;
@@ -134,11 +114,7 @@ fn read_machine(entry: Entry, diagnostics: &mut Diagnostics) -> MachineEntry {
                 machine.listens = texts.as_ref().is_none_or(|texts| !texts.is_empty());
                 machine.listen = read_endpoints(texts, &what, diagnostics);
             }
-            "read" => machine.read = read_texts(value, &what, "[brain]", diagnostics).unwrap_or_default(),
-            "control" => machine.control = read_texts(value, &what, "[brain]", diagnostics).unwrap_or_default(),
-            word if let Some(right) = Right::ALL.into_iter().find(|right| right.key() == word) => {
-                machine.allows.insert(right, read_texts(value, &what, "[brain]", diagnostics).unwrap_or_default());
-            }
+            "ssh" => machine.ssh = read_ssh(&value, &what, diagnostics),
             _ => {
                 unknown_key(&key, &format!(" in {machine_name}"), &MACHINE_KEYS, diagnostics);
                 // It may have been meant to be 'listen'.
@@ -192,6 +168,24 @@ pub(super) fn read_link(entry: Entry, diagnostics: &mut Diagnostics) -> LinkEntr
         }
     }
     link
+}
+
+/// A destination of `ssh`, which goes into its command line.
+fn read_ssh(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> Option<String> {
+    match &value.content {
+        Content::Scalar { text, .. } if !value.is_null() && is_ssh_host(text) => Some(text.clone()),
+        _ => {
+            let message = format!("{what} must be a destination of ssh, found {}", value.found());
+            let help = "write it like user@192.168.1.10, or as a host of ~/.ssh/config".to_owned();
+            diagnostics.push_with_help(value.at, message, Some(help));
+            None
+        }
+    }
+}
+
+/// Whether `ssh` takes a text for a destination: one that begins with '-' would be an option.
+pub fn is_ssh_host(text: &str) -> bool {
+    !text.is_empty() && !text.starts_with('-') && text.chars().all(|char| char.is_ascii_graphic())
 }
 
 /// A text, or a list of texts.
@@ -248,24 +242,10 @@ fn read_endpoints(texts: Option<Vec<Text>>, what: &str, diagnostics: &mut Diagno
     endpoints
 }
 
-/// Machines that rights name, and endpoints that two machines listen at.
-fn check_references(entry: &MachinesEntry, diagnostics: &mut Diagnostics) {
+/// Endpoints that two machines listen at.
+fn check_endpoints(entry: &MachinesEntry, diagnostics: &mut Diagnostics) {
     for (machine_idx, machine) in entry.machines.iter().enumerate() {
         let of = format!("of machine {}", quote(&machine.name.text));
-        let lists = [("read", machine.read.as_slice()), ("control", machine.control.as_slice())];
-        let allowed = machine.allows.iter().map(|(right, names)| (right.key(), names.as_slice()));
-        for (key, names) in lists.into_iter().chain(allowed) {
-            for name in names {
-                if name.text == machine.name.text {
-                    let help = Some("leave it out: a machine may always do so itself".to_owned());
-                    diagnostics.push_with_help(name.at, format!("'{key}' {of} names the machine itself"), help);
-                } else if entry.find(&name.text).is_none() {
-                    let help = did_you_mean_or_list(&name.text, "machines", entry.names());
-                    let message = format!("'{key}' {of}: there is no machine {}", quote(&name.text));
-                    diagnostics.push_with_help(name.at, message, help);
-                }
-            }
-        }
         let before = &entry.machines[..machine_idx];
         for (text, endpoint) in &machine.listen {
             let is_same =
@@ -311,21 +291,6 @@ pub(super) fn check_security(machines: &MachinesEntry, link: &LinkEntry, diagnos
                 Endpoint::Tls { host: host.clone(), port: *port }
             );
             diagnostics.push_with_help(text.at, message, Some(help));
-        }
-        let rights = machines.machines.iter().flat_map(|machine| {
-            let parts = machine.allows.iter().map(|(right, names)| (right.key(), names));
-            let lists = std::iter::once(("control", &machine.control)).chain(parts);
-            lists.filter_map(move |(key, names)| Some((machine, key, names.first()?)))
-        });
-        let controlled = rights.into_iter().next();
-        if let Some((machine, key, name)) = controlled.filter(|_| !link.has_keys) {
-            let (controlled, text) = (quote(&machine.name.text), quote(&text.text));
-            let message = format!("'{key}' of machine {controlled} needs keys, and {text} has no TLS");
-            let help = format!(
-                "anybody could take the name of a machine that may control; leave '{key}' out, or write 'link: {{keys: \
-                 FOLDER}}', or use unix/ endpoints"
-            );
-            diagnostics.push_with_help(name.at, message, Some(help));
         }
     }
 }

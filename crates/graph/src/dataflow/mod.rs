@@ -36,7 +36,7 @@
 //! ```yaml
 //! machines:
 //!   robot: {}                      # listens nowhere: it connects to those that do
-//!   brain: {listen: tls/192.168.1.10:7447, control: [robot]}    # robot may set, swap and stop brain's nodes
+//!   brain: {listen: tls/192.168.1.10:7447, ssh: user@192.168.1.10}          # ssh: where --machine brain finds it
 //! link: {keys: keys, deadline_ms: 150, buffer: 8192}            # or router: tls/gateway:7447; insecure: true
 //! operators:
 //!   contacts: {on: robot, …}
@@ -88,7 +88,8 @@ pub use graph::{
     DEFAULT_HEARTBEAT_MILLIS, DEFAULT_PARTNER_WAIT_MILLIS, DEFAULT_TOLERANCE_MILLIS, Edge, EdgeOptions, Graph, Input,
     Node, Restart, RestartPolicy,
 };
-pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines, Right};
+pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines};
+pub use machines_entry::is_ssh_host;
 pub use process_options::{ProcessOptions, Scheduling, SchedulingPolicy};
 pub use program::Program;
 pub use schema::schema;

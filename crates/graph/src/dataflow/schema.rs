@@ -221,7 +221,6 @@ fn node_keys() -> Value {
 }
 
 fn machines() -> Value {
-    let names = || json!({"anyOf": [name_schema(), {"type": "array", "items": name_schema()}]});
     json!({
         "type": "object",
         "description": "The machines of the graph",
@@ -231,12 +230,7 @@ fn machines() -> Value {
             "additionalProperties": false,
             "properties": {
                 "listen": texts("Its address for the others: tls/HOST:PORT, unix/NAME or tcp/HOST:PORT"),
-                "read": names(),
-                "control": names(),
-                "set": names(),
-                "swap": names(),
-                "run": names(),
-                "stop": names(),
+                "ssh": {"type": "string", "description": "Where --machine finds it: a destination of ssh, like user@host"},
             },
         },
     })

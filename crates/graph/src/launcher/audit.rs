@@ -1,7 +1,6 @@
 //! The audit log: the requests to change a running graph or to record it, with client and outcome.
 //!
-//! Each request leaves one line in `audit.log` beside the operators' logs. A request of another machine bears that
-//! machine's name, which the link says; other clients are known by their user and process.
+//! Each request leaves one line in `audit.log` beside the operators' logs. A client is known by its user and process.
 
 use std::collections::VecDeque;
 
@@ -16,29 +15,20 @@ const MAX_CHARS: usize = 300;
 pub(super) struct Trail {
     log: Log,
     client: String,
-    machine: Option<String>,
     /// Requests without an outcome yet.
     pending: VecDeque<String>,
 }
 
 impl Trail {
     pub(super) fn new(log: Log, client: String) -> Trail {
-        Trail { log, client, machine: None, pending: VecDeque::new() }
+        Trail { log, client, pending: VecDeque::new() }
     }
 
-    /// Takes a request; returns whether the launcher must hear of it.
-    pub(super) fn asked(&mut self, request: &Request) -> bool {
-        match request {
-            Request::Asker { machine } => self.machine = Some(machine.clone()),
-            Request::Refused { what, message } => self.write(what, &format!("refused: {message}"), LogLevel::Warn),
-            request => {
-                if request.is_control() || matches!(request, Request::Attach { .. }) {
-                    self.pending.push_back(summary(request));
-                }
-                return true;
-            }
+    /// Takes a request.
+    pub(super) fn asked(&mut self, request: &Request) {
+        if request.is_control() || matches!(request, Request::Attach { .. }) {
+            self.pending.push_back(summary(request));
         }
-        false
     }
 
     /// Takes a reply, which may be the outcome of the oldest request.
@@ -58,15 +48,11 @@ impl Trail {
     }
 
     fn write(&self, what: &str, outcome: &str, level: LogLevel) {
-        let who = match &self.machine {
-            Some(machine) => format!("machine {machine} ({})", self.client),
-            None => self.client.clone(),
-        };
         let short = |text: &str| {
             let beginning: String = text.replace('\n', " ").chars().take(MAX_CHARS).collect();
             if beginning.len() < text.len() { beginning + " …" } else { beginning }
         };
-        let text = format!("{who}: {}: {}", short(what), short(outcome));
+        let text = format!("{}: {}: {}", self.client, short(what), short(outcome));
         self.log.write_patiently(LogEntry { level: Some(level), ..LogEntry::plain(text) });
     }
 }
@@ -108,12 +94,7 @@ fn outcome(reply: &Reply) -> Option<(String, LogLevel)> {
             let word = if *rolled_back { "rolled back" } else { "refused" };
             Some((format!("{word}: {message}"), LogLevel::Warn))
         }
-        Reply::Status(_)
-        | Reply::Sampling(_)
-        | Reply::Samples(_)
-        | Reply::LogLines { .. }
-        | Reply::Drained
-        | Reply::Progress { .. } => None,
+        Reply::Status(_) | Reply::Drained | Reply::Progress { .. } => None,
     }
 }
 
@@ -168,8 +149,6 @@ mod tests {
         let set = |value| Request::Set { node: "arbiter".into(), param: "votes".into(), value };
         say(&set(json!(5)), true);
         say(&set(json!("x".repeat(1000))), true);
-        say(&Request::Asker { machine: "robot".into() }, false);
-        say(&Request::Refused { what: "swap contacts".into(), message: "no right".into() }, false);
         say(&Request::Stop, true);
         let swap = SwapRequest {
             nodes: vec!["a".into(), "b".into()],
@@ -191,14 +170,13 @@ mod tests {
         let lines = LogReader::new(&folder, AUDIT).read().expect("readable");
         let who = format!("uid {} pid {}", rustix::process::getuid().as_raw(), std::process::id());
         let texts: Vec<&str> = lines[1..].iter().map(|line| line.text.as_str()).collect();
-        assert_eq!(texts.len(), 5, "{texts:?}");
+        assert_eq!(texts.len(), 4, "{texts:?}");
         assert_eq!(texts[0], format!("{who}: set arbiter.votes=5: accepted: 3 became 5"));
         assert!(texts[1].starts_with(&format!("{who}: set arbiter.votes=\"xxx")) && texts[1].len() < 500);
         assert!(texts[1].ends_with(": refused: out of range"), "{}", texts[1]);
-        assert_eq!(texts[2], format!("machine robot ({who}): swap contacts: refused: no right"));
-        assert_eq!(texts[3], format!("machine robot ({who}): stop: accepted"));
+        assert_eq!(texts[2], format!("{who}: stop: accepted"));
         let swap = "swap a,b --run /bin/other -x --set model=m.json: the client left before the answer";
-        assert_eq!(texts[4], format!("machine robot ({who}): {swap}"));
+        assert_eq!(texts[3], format!("{who}: {swap}"));
         assert!(lines[1..].iter().all(|line| line.level.is_some() && !line.time.is_empty()), "{lines:?}");
     }
 }

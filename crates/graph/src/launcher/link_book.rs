@@ -1,6 +1,6 @@
 //! The launcher's knowledge of the other machines of its graph.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::dataflow::{LocalView, Node};
 use blindgrasp_operator::link_status::{LinkStatus, PeerState};
@@ -50,6 +50,16 @@ impl LinkBook {
     /// Whether this is one machine's part of a graph.
     pub(super) fn is_part(&self) -> bool {
         self.local.is_some()
+    }
+
+    /// Destinations of `ssh` of other machines.
+    pub(super) fn ssh_hosts(&self) -> BTreeMap<String, String> {
+        self.local.as_ref().map(|local| local.ssh_hosts.clone()).unwrap_or_default()
+    }
+
+    /// The other machine that runs a node.
+    pub(super) fn machine_of(&self, node: &str) -> Option<&String> {
+        self.local.as_ref()?.elsewhere.get(node)
     }
 
     /// Whether a source on another machine goes on, whose samples are awaited here.

@@ -835,8 +835,6 @@ impl Launcher {
         match ask.request {
             // Answered in `on_ask`.
             Request::Status | Request::Stop | Request::Attach { .. } => {}
-            // Only the audit log hears of them.
-            Request::Asker { .. } | Request::Refused { .. } => {}
             Request::Set { node, param, value } => {
                 let reply = match self.set(&node, &param, &value) {
                     Ok(reply) => reply,
@@ -845,13 +843,6 @@ impl Launcher {
                 let _ = ask.reply.try_send(reply);
             }
             Request::Swap(request) => self.begin_swap(request, ask.description, ask.client, ask.reply),
-            Request::Samples { .. } | Request::Logs { .. } => {
-                let message = format!(
-                    "{} is asked of another machine's part of a graph; on this machine there are shared memory and files",
-                    ask.request.word()
-                );
-                let _ = ask.reply.try_send(Reply::Error { message, rolled_back: false });
-            }
             Request::Promote => self.on_promote(true, ask.client, ask.reply),
             Request::Abandon => self.on_promote(false, ask.client, ask.reply),
         }
@@ -910,6 +901,9 @@ impl Launcher {
     fn member_idx(&self, id: &str) -> Result<usize, String> {
         let found = self.members.iter().position(|member| member.node.id == id);
         found.ok_or_else(|| {
+            if let Some(machine) = self.link.machine_of(id) {
+                return format!("node '{id}' runs on machine '{machine}': give --machine {machine}");
+            }
             let known: Vec<_> = self.members.iter().map(|member| member.node.id.as_str()).collect();
             format!("graph '{}' has no node '{id}'; its nodes: {}", self.name, known.join(", "))
         })
@@ -928,6 +922,7 @@ impl Launcher {
             edges: self.edges(),
             decisions: self.decisions.lock().unwrap_or_else(PoisonError::into_inner).clone(),
             link: self.link.status().cloned(),
+            ssh_hosts: self.link.ssh_hosts(),
         }
     }
 

@@ -121,9 +121,7 @@ fn attend(stream: UnixStream, client: u64, pins: &BTreeMap<String, Pins>, events
         }
         match serde_json::from_slice(&line) {
             Ok(request) => {
-                if !trail.lock().unwrap_or_else(PoisonError::into_inner).asked(&request) {
-                    continue;
-                }
+                trail.lock().unwrap_or_else(PoisonError::into_inner).asked(&request);
                 let reply = reply.clone();
                 let description = describe_replacement(&request, pins);
                 if events.send(Event::Ask(Box::new(Ask { client, request, description, reply }))).is_err() {

@@ -8,8 +8,8 @@ version: 1
 name: grasp_gate
 machines:
   robot: {}
-  brain: {listen: [tls/192.168.1.10:7447, 'tls/[fd00::1]:7447'], control: [robot, robot]}
-  laptop: {read: robot, control: brain}
+  brain: {listen: [tls/192.168.1.10:7447, 'tls/[fd00::1]:7447'], ssh: user@brain.local}
+  laptop: {}
 link: {keys: ./keys, deadline_ms: 50, buffer: 100}
 operators:
   sense: {on: robot}
@@ -80,18 +80,16 @@ fn machines_become_part_of_the_graph() {
     fs::create_dir_all(folder.0.join("models")).expect("folder");
     fs::write(folder.0.join("models/a.json"), "").expect("file");
     let graph = check_in(&folder, SPLIT, Scope::Everything, &ALL, &[]).expect("good");
-    let machine = |name: &str, listen: &[&str], read: &[&str], control: &[&str]| Machine {
+    let machine = |name: &str, listen: &[&str], ssh: Option<&str>| Machine {
         name: name.into(),
         listen: listen.iter().map(ToString::to_string).collect(),
-        read: read.iter().map(ToString::to_string).collect(),
-        control: control.iter().map(ToString::to_string).collect(),
-        allows: BTreeMap::new(),
+        ssh: ssh.map(str::to_owned),
     };
     let expected = Machines {
         machines: vec![
-            machine("robot", &[], &[], &[]),
-            machine("brain", &["tls/192.168.1.10:7447", "tls/[fd00::1]:7447"], &["robot"], &["robot"]),
-            machine("laptop", &[], &["robot", "brain"], &["brain"]),
+            machine("robot", &[], None),
+            machine("brain", &["tls/192.168.1.10:7447", "tls/[fd00::1]:7447"], Some("user@brain.local")),
+            machine("laptop", &[], None),
         ],
         link: LinkSettings {
             keys: Some(folder.0.join("keys")),
@@ -155,10 +153,7 @@ fn the_form_of_machines() {
         ("machines: {a: {}, b c: {}}\n", "3:19: machine 'b c' must be letters (a-z, A-Z), digits, _ and -, at most 32"),
         ("machines: {a: {}, a: {}}\n", "3:19: duplicate key 'a', first given in line 3"),
         ("machines: {a: {lisen: x}}\n", "3:16: unknown key 'lisen' in machine 'a'; did you mean 'listen'?"),
-        (
-            "machines: {a: {address: x}}\n",
-            "3:16: unknown key 'address' in machine 'a'; known keys: listen, read, control, set, swap, run, stop",
-        ),
+        ("machines: {a: {address: x}}\n", "3:16: unknown key 'address' in machine 'a'; known keys: listen, ssh"),
         (
             "machines: {a: {listen: }}\n",
             "3:16: 'listen' of machine 'a' must be a text or a list of texts, found nothing; write it like \
@@ -200,14 +195,16 @@ fn the_form_of_machines() {
             "3:48: 'listen' of machine 'b': machine 'a' listens at 'unix/gate' already",
         ),
         (
-            "machines: {brain: {}, a: {read: [brian], control: [a]}}\n",
-            "\
-3:34: 'read' of machine 'a': there is no machine 'brian'; did you mean 'brain'?
-3:52: 'control' of machine 'a' names the machine itself; leave it out: a machine may always do so itself",
+            "machines: {a: {ssh: -oProxyCommand=x}}
+",
+            "3:21: 'ssh' of machine 'a' must be a destination of ssh, found '-oProxyCommand=x'; write it like \
+             user@192.168.1.10, or as a host of ~/.ssh/config",
         ),
         (
-            "machines: {a: {control: everybody}}\n",
-            "3:25: 'control' of machine 'a': there is no machine 'everybody'; known machines: a",
+            "machines: {a: {ssh: [a]}}
+",
+            "3:21: 'ssh' of machine 'a' must be a destination of ssh, found a list; write it like user@192.168.1.10, or \
+             as a host of ~/.ssh/config",
         ),
     ] {
         check_split_err(&file(machines), expected);
@@ -271,10 +268,7 @@ fn what_goes_beyond_this_computer_needs_tls() {
              trust"
         )
     };
-    let yaml = SPLIT
-        .replace(keys, "")
-        .replace("control: [robot, robot]", "control: []")
-        .replace("control: brain", "control: []");
+    let yaml = SPLIT.replace(keys, "");
     for (endpoint, tls) in [
         ("tcp/192.168.1.10:7447", "tls/192.168.1.10:7447"),
         ("tcp/gateway:7447", "tls/gateway:7447"),
@@ -348,14 +342,14 @@ fn where_nodes_run() {
 
 #[test]
 fn of_two_machines_with_an_edge_one_listens() {
-    let brain = "  brain: {listen: [tls/192.168.1.10:7447, 'tls/[fd00::1]:7447'], control: [robot, robot]}\n";
+    let brain = "  brain: {listen: [tls/192.168.1.10:7447, 'tls/[fd00::1]:7447'], ssh: user@brain.local}\n";
     check_instead(
         brain,
         "  brain: {}\n",
         "3:1: no machine listens, but edges cross: sense/tactile → judge/tactile goes from robot to brain; let one \
          listen, like 'brain: {listen: tls/192.168.1.10:7447}', or name a 'router' in 'link'",
     );
-    let laptop = "  laptop: {read: robot, control: brain}\n";
+    let laptop = "  laptop: {}\n";
     let yaml = SPLIT.replace(brain, "  brain: {}\n").replace(laptop, "  laptop: {listen: tls/192.168.1.11:7447}\n");
     // Only once for both directions.
     check_split_err(
@@ -529,24 +523,4 @@ fn damaged_machines_give_errors_not_panics() {
             }
         }
     }
-}
-
-#[test]
-fn rights_to_some_changes() {
-    let folder = Folder::new();
-    let with = |brain: &str| {
-        format!(
-            "version: 1\nname: g\nmachines: {{robot: {{listen: tls/h:1}}, brain: {{{brain}}}}}\nlink: {{keys: k}}\noperators:\n  own: {{on: robot, run: ops/own}}\n"
-        )
-    };
-    let graph = folder.check(with("set: robot, stop: [robot, robot], swap: []")).expect("good");
-    let brain = &graph.machines.expect("machines").machines[1];
-    let robot = || vec!["robot".to_string()];
-    let expected = BTreeMap::from([(Right::Set, robot()), (Right::Swap, Vec::new()), (Right::Stop, robot())]);
-    assert_eq!((&brain.allows, &brain.control), (&expected, &Vec::new()));
-    let found = folder.errors(with("run: [robt]"));
-    assert!(found.contains("'run' of machine 'brain': there is no machine 'robt'; did you mean 'robot'?"), "{found}");
-    let open = with("stop: [robot]").replace("tls/h:1", "tcp/h:1").replace("keys: k", "insecure: true");
-    let found = folder.errors(open);
-    assert!(found.contains("'stop' of machine 'brain' needs keys, and 'tcp/h:1' has no TLS"), "{found}");
 }
