@@ -37,7 +37,7 @@ DECISIONS = "blindgrasp_msgs/msg/LiftDecision"
 PHASES = (
     "open", "closing", "settled", "ended", "squeezing", "squeezed", "test_lifting", "test_lifted", "kept", "dropped",
 )  # fmt: skip
-ACTIONS = ("hold", "lift", "regrasp", "squeeze", "test_lift")
+ACTIONS = {0: "hold", 1: "lift", 3: "squeeze", 4: "test_lift"}
 REASONS = (
     "stable", "unstable", "no_agreement", "missing", "out_of_order", "stale", "no_contact", "invalid", "self_collision",
     "wrong_hand", "wrong_model", "out_of_distribution", "unsure", "link_down", "promising", "missing_reading",
@@ -267,7 +267,7 @@ def _word(words: Sequence[str], code: int) -> str:
 def _decision(message: Any) -> Decision:
     return Decision(
         grasp_id=message.grasp_id,
-        action=_word(ACTIONS, message.action),
+        action=ACTIONS.get(message.action, str(message.action)),
         reason=_word(REASONS, message.reason),
         probability_stable=message.probability_stable,
         seq=message.header.seq,

@@ -14,7 +14,7 @@ use blindgrasp_operator::description::OperatorDescription;
 
 /// The operators that come with blindgrasp, by the name that `run:` gives. The package `blindgrasp-operators` has the
 /// same table with their functions.
-pub const SHIPPED: [&str; 14] = [
+pub const SHIPPED: [&str; 13] = [
     "recorded_source",
     "tactile_source",
     "simulated_hand",
@@ -26,12 +26,11 @@ pub const SHIPPED: [&str; 14] = [
     "probe_classifier",
     "day_classifier",
     "lift_arbiter",
-    "regrasp",
     "ros2",
     "zenoh",
 ];
 /// Those that can share a process: they answer samples, and have no source or device of their own.
-pub const GROUPABLE: [&str; 9] = [
+pub const GROUPABLE: [&str; 8] = [
     "senses",
     "contacts",
     "checked_contacts",
@@ -40,7 +39,6 @@ pub const GROUPABLE: [&str; 9] = [
     "probe_classifier",
     "day_classifier",
     "lift_arbiter",
-    "regrasp",
 ];
 /// The operator that carries edges to other machines. The launcher adds it; a dataflow file cannot name it.
 pub const LINK_OPERATOR: &str = "link";

@@ -43,8 +43,7 @@ pub fn samples(text: &str) -> Result<Vec<(u16, Record)>, String> {
 mod tests {
     use super::*;
     use blindgrasp_messages::{
-        ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Prediction, RegraspAdvice, Stamped,
-        TactileFrame,
+        ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Prediction, Stamped, TactileFrame,
     };
 
     #[test]
@@ -61,7 +60,6 @@ mod tests {
             Record::Decision(Stamped { header, message: LiftDecision::default() }),
             Record::Truth(Stamped { header, message: GraspTruth::default() }),
             Record::Outcome(Stamped { header, message: LiftOutcome::default() }),
-            Record::Advice(Stamped { header, message: RegraspAdvice::default() }),
         ];
         let mut batch = Vec::new();
         for (edge_idx, record) in records.iter().enumerate() {

@@ -83,7 +83,7 @@ mod tests {
     use super::*;
     use blindgrasp_messages::{
         Action, Contact, ContactSet, Fault, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome,
-        Phase, Prediction, Reason, RegraspAdvice, RegraspProposal, SceneContact, Stamped, TactileFrame,
+        Phase, Prediction, Reason, SceneContact, Stamped, TactileFrame,
     };
 
     pub(super) fn info() -> RecordingInfo {
@@ -96,8 +96,6 @@ mod tests {
             Stamped { header, message }
         }
         let contact = Contact { position_m: [0.1; 3], normal: [0.0, 0.0, 1.0], force_newtons: 2.5, pad: 1, cell: 23 };
-        let proposal =
-            RegraspProposal { open_joints_rad: vec![0.5, 0.0], probability_held: 0.75, ..Default::default() };
         vec![
             (
                 "/tactile",
@@ -173,7 +171,6 @@ mod tests {
                     LiftOutcome { attempt: 3, lifted: true, thing: "tasse".into(), ..Default::default() },
                 )),
             ),
-            ("/advice", Record::Advice(stamped(7, RegraspAdvice { grasp_id: 7, proposals: vec![proposal; 2] }))),
         ]
     }
 

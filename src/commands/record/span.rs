@@ -14,7 +14,7 @@ use super::super::run::recorder::{Recorded, Recorder};
 use blindgrasp_graph::control::AttachedEdge;
 use blindgrasp_graph::observer::{Sink, bears_source_number};
 use blindgrasp_graph::recorded_graph::Ending;
-use blindgrasp_messages::{Header, LiftDecision, Recorded as _, RegraspAdvice};
+use blindgrasp_messages::{Header, LiftDecision, Recorded as _};
 use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::port::sample_id;
@@ -98,7 +98,7 @@ impl EdgeSpan {
         EdgeSpan {
             topic: edge.topic.clone(),
             is_numbered: bears_source_number(type_name),
-            is_said_once: [LiftDecision::TYPE_NAME, RegraspAdvice::TYPE_NAME].contains(&type_name.as_str()),
+            is_said_once: type_name == LiftDecision::TYPE_NAME,
             answered_cells: edge.answered_cells.clone(),
             writer_cell: edge.input.writer_cell,
             place: None,
