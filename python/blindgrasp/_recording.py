@@ -206,8 +206,7 @@ class Recording:
     def _grasp(self, frames: list[Any], labels: dict[Key, Label], decisions: dict[Key, list[Decision]]) -> Grasp:
         key = _key(frames[0])
         names = ("joints_rad", "cells_newtons", "gravity_m_per_s2", "wrist_wrench", "joint_torques")
-        # Recordings of an earlier version lack some fields.
-        tables = {name: _table([getattr(frame, name, ()) for frame in frames]) for name in names}
+        tables = {name: _table([getattr(frame, name) for frame in frames]) for name in names}
         return Grasp(
             grasp_id=key[1],
             epoch=key[0],
@@ -216,7 +215,7 @@ class Recording:
             phase=np.array([_word(PHASES, frame.phase) for frame in frames]),
             **tables,
             hand_id=f"{frames[0].header.hand_id:016x}",
-            day=getattr(frames[0], "day", 0),
+            day=frames[0].day,
             label=labels.get(key),
             decisions=tuple(decisions.get(key, ())),
         )

@@ -244,7 +244,6 @@ pub struct SwappedNode {
     /// The last sequence number that the old one answered; `None` if there was none.
     pub last_seq: Option<u64>,
     /// The time without an active operator.
-    #[serde(rename = "gap_nanos")]
     pub handover_pause_nanos: u64,
 }
 
@@ -403,7 +402,7 @@ mod tests {
             };
             Request::Swap(request).right()
         };
-        for shipped in [None, Some("classifier"), Some("histogram")] {
+        for shipped in [None, Some("classifier"), Some("encoder")] {
             assert_eq!(right(shipped), Some(Right::Swap), "{shipped:?}");
         }
         for own in ["./classifier", "/bin/classifier", "classifiers", "sh", "link", ""] {

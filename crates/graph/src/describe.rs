@@ -74,7 +74,7 @@ pub fn link_program() -> std::io::Result<Program> {
 /// # Errors
 /// The path of a file that is not there.
 pub fn program_to_run(run: &Path, args: &[String], folder: &Path) -> Result<Program, PathBuf> {
-    let shipped = run.to_str().and_then(|name| shipped().ok()?.remove(present_name(name)));
+    let shipped = run.to_str().and_then(|name| shipped().ok()?.remove(name));
     let file = folder.join(run);
     let on_path = || run.to_str().filter(|_| !file.exists()).and_then(program_on_path).map(Program::from);
     let program = shipped.or_else(on_path).unwrap_or_else(|| file.into());
@@ -96,12 +96,7 @@ pub(super) fn program_on_path(name: &str) -> Option<PathBuf> {
 
 /// Whether [`program_to_run`] takes this for a shipped operator.
 pub(super) fn is_shipped(run: &Path) -> bool {
-    run.to_str().is_some_and(|name| SHIPPED.contains(&present_name(name)))
-}
-
-/// The encoder had another name before, as in dataflow files.
-fn present_name(name: &str) -> &str {
-    if name == "histogram" { "encoder" } else { name }
+    run.to_str().is_some_and(|name| SHIPPED.contains(&name))
 }
 
 fn shipped_operator(path: &Path, name: &str) -> Program {

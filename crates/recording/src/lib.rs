@@ -34,7 +34,6 @@ pub use parts::{Manifest, part_path, recordings_in};
 pub use problems::{Oddity, Problem, Problems};
 pub use reader::RecordingReader;
 pub use repair::{RepairReport, repair, repaired_path};
-pub use types::present_topic;
 pub use viewer::TOPICS_FOR_VIEWERS;
 pub use writer::RecordingWriter;
 
@@ -192,28 +191,6 @@ mod tests {
         let found: Vec<_> = reader.collect::<Result<_, _>>().expect("read");
         let expected: Vec<_> = records().into_iter().map(|(topic, record)| (topic.to_string(), record)).collect();
         assert_eq!(found, expected);
-    }
-
-    #[test]
-    fn features_on_the_topic_of_earlier_versions_are_read_as_features() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("earlier.mcap");
-        let mut writer = RecordingWriter::create(&path, &info()).expect("created");
-        let feature = Record::Feature(Stamped { header: Header::default(), message: GraspFeature::default() });
-        // Another type may have a topic of that name.
-        let prediction = Record::Prediction(Stamped { header: Header::default(), message: Prediction::default() });
-        writer.write_record("/histogram", &feature).expect("written");
-        writer.write_record("/histograms/histogram", &prediction).expect("written");
-        writer.finish().expect("finished");
-        let expected = [("/feature".to_string(), feature.clone()), ("/histograms/histogram".into(), prediction)];
-        let read = |reader: RecordingReader| reader.collect::<Result<Vec<_>, _>>().expect("read");
-        let reader = RecordingReader::open(&path).expect("opened");
-        assert_eq!(
-            reader.topics().keys().map(String::as_str).collect::<Vec<_>>(),
-            ["/feature", "/histograms/histogram"]
-        );
-        assert_eq!(read(reader), expected);
-        assert!(RecordingIndex::open(&path).expect("opened").topics["/feature"].is_ours);
     }
 
     #[test]

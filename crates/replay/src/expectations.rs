@@ -18,7 +18,6 @@ use serde::Deserialize;
 
 use super::comparison::Tolerance;
 use blindgrasp_messages::{Action, Reason};
-use blindgrasp_recording::present_topic;
 
 /// The keys of an expectations file.
 const KEYS: [&str; 7] =
@@ -126,11 +125,7 @@ impl Expectations {
             false_positives_at_most: written.false_positives_at_most,
             decisions: decisions.collect::<Result<_, String>>()?,
             reasons: written.reasons,
-            tolerances: written
-                .tolerances
-                .into_iter()
-                .map(|(topic, tolerance)| (present_topic(&topic).to_string(), tolerance))
-                .collect(),
+            tolerances: written.tolerances,
         })
     }
 
