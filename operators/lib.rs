@@ -13,7 +13,6 @@ mod lift_arbiter;
 mod link;
 mod publishing;
 mod recorded_source;
-mod regrasp;
 mod ros2;
 mod ros2_decision;
 mod ros2_markers;
@@ -44,7 +43,7 @@ pub struct Shipped {
 
 /// All of them, with their variants.
 #[rustfmt::skip]
-pub const SHIPPED: [Shipped; 19] = [
+pub const SHIPPED: [Shipped; 18] = [
     of("recorded_source", "", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "tactile", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
     of("recorded_source", "contacts", recorded_source::describe::<ContactSet>, recorded_source::work::<ContactSet>),
@@ -60,7 +59,6 @@ pub const SHIPPED: [Shipped; 19] = [
     of("probe_classifier", "", classifier::describe_with_probes, classifier::work_with_probes),
     of("day_classifier", "", classifier::describe_with_days, classifier::work_with_days),
     of("lift_arbiter", "", lift_arbiter::describe, lift_arbiter::work),
-    of("regrasp", "", regrasp::describe, regrasp::work),
     of("ros2", "", ros2::describe, ros2::work),
     of("zenoh", "", zenoh::describe, zenoh::work),
     of("link", "", link::describe, link::work),

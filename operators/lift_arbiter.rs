@@ -21,7 +21,6 @@ struct Params {
     min_probability_stable: f64,
     max_gap_ms: f64,
     max_age_ms: f64,
-    regrasp: bool,
     probe: Probe,
     promised_drops: f64,
 }
@@ -30,7 +29,7 @@ pub(crate) fn describe() -> OperatorDescription {
     let default = ArbiterOptions::default();
     let millis = || ParamKind::Number { above: Some(0.0), min: None, max: Some(3.6e6), words: vec![] };
     let share = ParamKind::Number { above: None, min: Some(0.0), max: Some(1.0), words: vec![] };
-    OperatorDescription::new("lift_arbiter", "Decides once per grasp: lift, hold or grasp again, with the reason")
+    OperatorDescription::new("lift_arbiter", "Decides once per grasp: lift or hold, with the reason")
         .input("prediction", Prediction::TYPE_NAME, "The prediction for each frame")
         .output("decision", LiftDecision::TYPE_NAME, "One decision per grasp, and before it the probe that it takes")
         .live_param(
@@ -56,13 +55,6 @@ pub(crate) fn describe() -> OperatorDescription {
             millis(),
             Some((default.max_age_nanos as f64 / 1e6).into()),
             "How old a prediction may be on arrival, and how long none may come while a grasp is open",
-        )
-        .live_param(
-            "regrasp",
-            ParamKind::Boolean {},
-            Some(default.regrasp.into()),
-            "Whether a grasp that is held for what it is, and not for a doubt about its samples, is decided regrasp: hold, and \
-             grasp again as the advice says",
         )
         .live_param(
             "probe",
@@ -103,7 +95,6 @@ impl Params {
             min_probability_stable: self.min_probability_stable,
             max_gap_nanos: (self.max_gap_ms * 1e6) as u64,
             max_age_nanos: (self.max_age_ms * 1e6) as u64,
-            regrasp: self.regrasp,
             probe: self.probe,
             promised_drops: self.promised_drops,
             ..ArbiterOptions::default()

@@ -203,7 +203,7 @@ pub(crate) fn definition_of(name: &str, file: Option<&Path>) -> anyhow::Result<D
 
 #[cfg(test)]
 mod tests {
-    use blindgrasp_messages::{GraspScene, GraspTruth, LiftOutcome, RegraspAdvice};
+    use blindgrasp_messages::{GraspScene, GraspTruth, LiftOutcome};
 
     use std::collections::BTreeMap;
 
@@ -228,7 +228,6 @@ mod tests {
         add(LiftDecision::SCHEMA, LiftDecision::definition());
         add(GraspTruth::SCHEMA, GraspTruth::definition());
         add(LiftOutcome::SCHEMA, LiftOutcome::definition());
-        add(RegraspAdvice::SCHEMA, RegraspAdvice::definition());
         add(GraspScene::SCHEMA, GraspScene::definition());
         files
     }

@@ -1,8 +1,8 @@
 //! A robot in simulation: tries to lift one object after another, and lets the graph decide whether it lifts.
 //!
 //! It is a source with feedback inputs: it sends the frames of the hand, waits for the decision about that grasp, lifts or
-//! tries again, and sends the outcome. What it sends depends on its parameters, the decisions and the advice alone, not on
-//! the speed of the machine.
+//! tries again, and sends the outcome. What it sends depends on its parameters and the decisions alone, not on the speed
+//! of the machine.
 //!
 //! After each attempt it saves how far it is, with the attempts whose samples may still be unread. An instance that takes
 //! over sends those again and goes on: nothing is lost, no trial has two numbers.
@@ -14,8 +14,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use blindgrasp_messages::{
-    Action, GraspTruth, Header, LiftDecision, LiftOutcome, MAX_NAME_BYTES, Message, Recorded, RegraspAdvice,
-    TactileFrame,
+    Action, GraspTruth, Header, LiftDecision, LiftOutcome, MAX_NAME_BYTES, Message, Recorded, TactileFrame,
 };
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::description::OperatorDescription;
@@ -36,8 +35,6 @@ use serde::{Deserialize, Serialize};
 const DEFAULT_HAND: &str = "barrett-bh8-280";
 /// The most attempts that are kept because they may be unread; that many fit into a node's state.
 const MAX_UNREAD: usize = 96;
-/// The attempts before that an attempt with advice remembers fit into a node's state as well.
-const MAX_ADVISED_ATTEMPTS: i64 = 16;
 
 #[derive(Deserialize)]
 struct Params {
@@ -48,7 +45,6 @@ struct Params {
     gate: String,
     attempts: u32,
     decision_timeout_s: f64,
-    advised_attempts: usize,
     friction: Option<f64>,
     options: Option<PathBuf>,
     model: Option<PathBuf>,
@@ -60,11 +56,6 @@ pub(crate) fn describe() -> OperatorDescription {
     let gate = ParamKind::Choice { values: vec!["on".into(), "off".into()] };
     OperatorDescription::new("simulated_hand", "Tries to lift things in simulated physics")
         .feedback_input("decision", LiftDecision::TYPE_NAME, "Whether to lift what the hand holds")
-        .optional_feedback_input(
-            "advice",
-            RegraspAdvice::TYPE_NAME,
-            "How to grasp again; without advice every attempt begins at random",
-        )
         .output("tactile", TactileFrame::TYPE_NAME, "The frames of the hand while it closes and holds still")
         .output("outcome", LiftOutcome::TYPE_NAME, "What became of each grasp")
         .output("truth", GraspTruth::TYPE_NAME, "Of each grasp that was lifted: whether the object stayed in the hand")
@@ -87,13 +78,7 @@ pub(crate) fn describe() -> OperatorDescription {
             "decision_timeout_s",
             number(3600.0),
             Some(30.0.into()),
-            "A grasp whose decision is later is not lifted; advice that is later is not followed",
-        )
-        .param(
-            "advised_attempts",
-            whole(0, MAX_ADVISED_ATTEMPTS),
-            Some(3.into()),
-            "After so many attempts in a row that followed advice and were not lifted, one begins at random; 0: all do",
+            "A grasp whose decision is later is not lifted",
         )
         .optional_param("friction", number(10.0), "Friction of all things on the hand instead of their own")
         .optional_param(
@@ -130,27 +115,18 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         Some(path) => Model::load(path)?.approach,
         None => None,
     };
-    let advice = operator.optional_subscriber::<RegraspAdvice>("advice")?;
     let options = RobotOptions {
         n_trials: params.trials,
         seed: params.seed,
         max_attempts: params.attempts,
         lifts_always: params.gate == "off",
-        max_advised_attempts: if advice.is_some() { params.advised_attempts } else { 0 },
     };
     let mut source = SimulatedHand {
         operator,
         frames: operator.publisher("tactile", TactileFrame::max_items(hand.joints.len(), hand.n_cells()))?,
         outcomes: operator.publisher("outcome", 2 * MAX_NAME_BYTES)?,
         truths: operator.publisher("truth", 2 * MAX_NAME_BYTES)?,
-        // A message that cannot be read says nothing about its grasp: hold, from no advice.
-        decisions: Inbox::new(operator.subscriber::<LiftDecision>("decision")?, |head| LiftDecision {
-            grasp_id: head.grasp_id,
-            ..LiftDecision::default()
-        }),
-        advice: advice.map(|advice| {
-            Inbox::new(advice, |head| RegraspAdvice { grasp_id: head.grasp_id, ..RegraspAdvice::default() })
-        }),
+        decisions: Inbox { subscriber: operator.subscriber("decision")?, last: None, received: Vec::new() },
         robot: Robot::new(&hand, things, trial_options, options).with_prior(prior),
         hand_id: hand.id(),
         timeout: Duration::from_secs_f64(params.decision_timeout_s),
@@ -168,8 +144,6 @@ struct Saved {
     course: Course,
     last_decision: Option<SampleId>,
     counts: InputCounts,
-    last_advice: Option<SampleId>,
-    advice_counts: InputCounts,
 }
 
 /// The last sample of each kind that need not be sent again.
@@ -185,13 +159,11 @@ struct SimulatedHand<'a> {
     frames: Publisher<TactileFrame>,
     outcomes: Publisher<LiftOutcome>,
     truths: Publisher<GraspTruth>,
-    decisions: Inbox<LiftDecision>,
-    /// `None` if no advice is connected.
-    advice: Option<Inbox<RegraspAdvice>>,
+    decisions: Inbox,
     robot: Robot<'a>,
     hand_id: u64,
     timeout: Duration,
-    /// When the robot stops waiting for the decision or the advice that it has asked for.
+    /// When the robot stops waiting for the decision that it has asked for.
     deadline: Option<Instant>,
     known: Known,
     /// What did not come in time, by name.
@@ -208,9 +180,6 @@ impl Source for SimulatedHand<'_> {
             None => Saved::default(),
         };
         self.decisions.resume(saved.last_decision, saved.counts);
-        if let Some(advice) = &mut self.advice {
-            advice.resume(saved.last_advice, saved.advice_counts);
-        }
         self.known = Known {
             frame: self.frames.known(is_handed_over),
             outcome: self.outcomes.known(is_handed_over),
@@ -232,26 +201,14 @@ impl Source for SimulatedHand<'_> {
                 Ok(send_unknown(self.operator, &mut self.frames, &frame.message, frame.header, known)?.into())
             }
             Doing::AsksForDecision { grasp_id, n_before } => {
-                self.hear()?;
+                self.decisions.receive()?;
                 let mut of_grasp = self.decisions.received.iter().filter(|decision| decision.grasp_id == grasp_id);
                 let action = of_grasp.nth(n_before).map(|decision| decision.action);
-                let Some(action) = self.or_timeout(action, Action::Hold, grasp_id, "undecided") else {
+                let Some(action) = self.or_hold_when_late(action, grasp_id) else {
                     return Ok(Step::Wait(self.deadline));
                 };
                 let robot = &mut self.robot;
                 beating(self.operator, || robot.decide(action));
-                Ok(Step::Next)
-            }
-            Doing::AsksForAdvice { grasp_id } => {
-                self.hear()?;
-                let mut advice = self.advice.iter().flat_map(|advice| &advice.received);
-                let proposals =
-                    advice.find(|advice| advice.grasp_id == grasp_id).map(|advice| advice.proposals.clone());
-                let Some(proposals) = self.or_timeout(proposals, Vec::new(), grasp_id, "unadvised") else {
-                    return Ok(Step::Wait(self.deadline));
-                };
-                let robot = &mut self.robot;
-                beating(self.operator, || robot.advise(&proposals))?;
                 Ok(Step::Next)
             }
             Doing::IsOver(finished) => {
@@ -269,7 +226,7 @@ impl Source for SimulatedHand<'_> {
                 Ok(Step::Next)
             }
             Doing::IsDone => {
-                if self.hear()? {
+                if self.decisions.receive()? {
                     self.save()?;
                 }
                 Ok(Step::Done)
@@ -282,9 +239,6 @@ impl Source for SimulatedHand<'_> {
         self.outcomes.look_for_readers()?;
         self.truths.look_for_readers()?;
         self.decisions.subscriber.connect()?;
-        if let Some(advice) = &self.advice {
-            advice.subscriber.connect()?;
-        }
         Ok(())
     }
 }
@@ -307,24 +261,18 @@ impl SimulatedHand<'_> {
         self.robot.course().finished.len() < MAX_UNREAD
     }
 
-    /// Whether something has come.
-    fn hear(&mut self) -> anyhow::Result<bool> {
-        let is_advised = self.advice.as_mut().map_or(Ok(false), Inbox::receive)?;
-        Ok(self.decisions.receive()? || is_advised)
-    }
-
-    /// An answer that came, or the one that stands for it when the time is over; `None` while there is time.
-    fn or_timeout<T>(&mut self, answer: Option<T>, otherwise: T, grasp_id: u64, count: &str) -> Option<T> {
+    /// The action that was decided, or hold when the time is over; `None` while there is time.
+    fn or_hold_when_late(&mut self, action: Option<Action>, grasp_id: u64) -> Option<Action> {
         let deadline = *self.deadline.get_or_insert_with(|| Instant::now() + self.timeout);
-        if answer.is_none() && Instant::now() < deadline {
+        if action.is_none() && Instant::now() < deadline {
             return None;
         }
         self.deadline = None;
-        if answer.is_none() {
-            tracing::warn!(grasp_id, "{count}: no answer within {} s", self.timeout.as_secs_f64());
-            self.count(count);
+        if action.is_none() {
+            tracing::warn!(grasp_id, "undecided: no answer within {} s", self.timeout.as_secs_f64());
+            self.count("undecided");
         }
-        Some(answer.unwrap_or(otherwise))
+        Some(action.unwrap_or(Action::Hold))
     }
 
     /// Sends the outcome of an attempt, and what is known to be true of it, as far as readers may not have them.
@@ -350,37 +298,27 @@ impl SimulatedHand<'_> {
     }
 
     fn save(&mut self) -> anyhow::Result<()> {
-        let advice = self.advice.as_ref();
         let saved = Saved {
             course: self.robot.course().clone(),
             last_decision: self.decisions.last,
             counts: self.decisions.subscriber.counts(),
-            last_advice: advice.and_then(|advice| advice.last),
-            advice_counts: advice.map_or_else(InputCounts::default, |advice| advice.subscriber.counts()),
         };
         self.operator.save_state(&bincode::serde::encode_to_vec(&saved, STATE_FORMAT)?)?;
         // An instance that takes over asks for whatever the saved state does not include: until now its sender had to keep it.
         self.decisions.commit();
-        self.advice.iter_mut().for_each(Inbox::commit);
         Ok(())
     }
 }
 
-/// An input whose messages matter until the attempt is over.
-struct Inbox<M: Message> {
-    subscriber: Subscriber<M>,
+/// The decisions, which matter until the attempt is over.
+struct Inbox {
+    subscriber: Subscriber<LiftDecision>,
     /// The last sample received.
     last: Option<SampleId>,
-    received: Vec<M>,
-    /// What stands for a message that cannot be read.
-    unreadable: fn(&M::Head) -> M,
+    received: Vec<LiftDecision>,
 }
 
-impl<M: Message> Inbox<M> {
-    fn new(subscriber: Subscriber<M>, unreadable: fn(&M::Head) -> M) -> Self {
-        Inbox { subscriber, last: None, received: Vec::new(), unreadable }
-    }
-
+impl Inbox {
     fn resume(&mut self, last: Option<SampleId>, counts: InputCounts) {
         self.last = last;
         self.received.clear();
@@ -392,12 +330,12 @@ impl<M: Message> Inbox<M> {
         let before = self.last;
         while let Some(sample) = self.subscriber.receive()? {
             let head = sample.user_header();
-            let header = *M::header(head);
-            self.received.push(M::from_parts(head, sample.payload()).unwrap_or_else(|error| {
-                tracing::warn!(seq = header.seq, "a {} cannot be read: {error}", M::TYPE_NAME);
-                (self.unreadable)(head)
-            }));
-            self.last = Some(sample_id(&header));
+            let decision = LiftDecision::from_parts(head, sample.payload()).unwrap_or_else(|error| {
+                tracing::warn!(seq = head.header.seq, "a decision cannot be read, so its grasp is held: {error}");
+                LiftDecision { grasp_id: head.grasp_id, ..LiftDecision::default() }
+            });
+            self.received.push(decision);
+            self.last = Some(sample_id(&head.header));
         }
         Ok(self.last != before)
     }

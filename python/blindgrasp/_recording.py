@@ -37,7 +37,7 @@ DECISIONS = "blindgrasp_msgs/msg/LiftDecision"
 PHASES = (
     "open", "closing", "settled", "ended", "squeezing", "squeezed", "test_lifting", "test_lifted", "kept", "dropped",
 )  # fmt: skip
-ACTIONS = ("hold", "lift", "regrasp", "squeeze", "test_lift")
+ACTIONS = {0: "hold", 1: "lift", 3: "squeeze", 4: "test_lift"}
 REASONS = (
     "stable", "unstable", "no_agreement", "missing", "out_of_order", "stale", "no_contact", "invalid", "self_collision",
     "wrong_hand", "wrong_model", "out_of_distribution", "unsure", "link_down", "promising", "missing_reading",
@@ -206,8 +206,7 @@ class Recording:
     def _grasp(self, frames: list[Any], labels: dict[Key, Label], decisions: dict[Key, list[Decision]]) -> Grasp:
         key = _key(frames[0])
         names = ("joints_rad", "cells_newtons", "gravity_m_per_s2", "wrist_wrench", "joint_torques")
-        # Recordings of an earlier version lack some fields.
-        tables = {name: _table([getattr(frame, name, ()) for frame in frames]) for name in names}
+        tables = {name: _table([getattr(frame, name) for frame in frames]) for name in names}
         return Grasp(
             grasp_id=key[1],
             epoch=key[0],
@@ -216,7 +215,7 @@ class Recording:
             phase=np.array([_word(PHASES, frame.phase) for frame in frames]),
             **tables,
             hand_id=f"{frames[0].header.hand_id:016x}",
-            day=getattr(frames[0], "day", 0),
+            day=frames[0].day,
             label=labels.get(key),
             decisions=tuple(decisions.get(key, ())),
         )
@@ -267,7 +266,7 @@ def _word(words: Sequence[str], code: int) -> str:
 def _decision(message: Any) -> Decision:
     return Decision(
         grasp_id=message.grasp_id,
-        action=_word(ACTIONS, message.action),
+        action=ACTIONS.get(message.action, str(message.action)),
         reason=_word(REASONS, message.reason),
         probability_stable=message.probability_stable,
         seq=message.header.seq,

@@ -43,7 +43,7 @@ class Decision:
 
     grasp_id: int
     action: str
-    """`lift`, `hold`, `regrasp`, `squeeze` or `test_lift`. Only `lift` allows a lift."""
+    """`lift`, `hold`, `squeeze` or `test_lift`. Only `lift` allows a lift."""
     reason: str
     """Why, like `stable` or `out_of_order`: the table of `docs/messages.md`."""
     probability_stable: float

@@ -14,7 +14,7 @@ use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::training::write_feature_table;
 use blindgrasp_messages::files::partial_path;
 use blindgrasp_recording::export::{CsvTable, ExportError, row, table_shapes};
-use blindgrasp_recording::{Record, RecordingReader, present_topic, recordings_in};
+use blindgrasp_recording::{Record, RecordingReader, recordings_in};
 use blindgrasp_stages::model::Model;
 
 /// Write a recording as JSON lines or CSV, or a table of features
@@ -36,7 +36,7 @@ pub(super) struct Arguments {
     #[arg(required = true, value_name = "RECORDING")]
     recordings: Vec<PathBuf>,
     /// Only this topic; may be given more than once.
-    #[arg(long, value_parser = |topic: &str| Ok::<_, String>(present_topic(topic).to_string()))]
+    #[arg(long)]
     topic: Vec<String>,
     /// The format of the output.
     #[arg(long, value_enum, default_value_t = Format::Jsonl)]

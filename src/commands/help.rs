@@ -10,13 +10,12 @@ const GROUPS: [(&str, &[&str]); 4] = [
     ("Learn", &["simulate", "import", "train", "evaluate", "predict", "trials", "reproduce", "model", "sensors"]),
     ("Describe", &["init", "new", "keys", "schema", "completions"]),
 ];
-/// Words of earlier versions and of other tools, with the command that does it here.
-const HINTS: [(&str, &str); 23] = [
+/// Words of other tools, with the command that does it here.
+const HINTS: [(&str, &str); 22] = [
     ("hand", "info HAND.yaml --joints NAME=VALUE"),
     ("objects", "simulate --list"),
     ("quality", "info CASES.json"),
     ("features", "export --features MODEL"),
-    ("experience", "train --experience MODEL --out FILE"),
     ("topic", "echo', 'blindgrasp hz' or 'blindgrasp ps"),
     ("node", "ps"),
     ("get", "param get"),

@@ -23,21 +23,16 @@ pub(super) struct Arguments {
 }
 
 /// The project's files: those that this repository's own default graph consists of.
-pub(super) const FILES: [(&str, &[u8]); 13] = [
+pub(super) const FILES: [(&str, &[u8]); 11] = [
     ("dataflow.yaml", include_bytes!("../../dataflow.yaml")),
     ("dataflow-live.yaml", include_bytes!("../../dataflow-live.yaml")),
     ("tactile_bridge.py", include_bytes!("../../examples/tactile_bridge.py")),
     ("dataflow-machines.yaml", include_bytes!("../../dataflow-machines.yaml")),
     ("dataflow-trials.yaml", include_bytes!("../../dataflow-trials.yaml")),
-    ("dataflow-regrasp.yaml", include_bytes!("../../dataflow-regrasp.yaml")),
     ("hands/barrett-bh8-280.yaml", include_bytes!("../../hands/barrett-bh8-280.yaml")),
     ("hands/barrett-bh8-280.urdf", include_bytes!("../../hands/barrett-bh8-280.urdf")),
     ("models/barrett-bh8-280.json", include_bytes!("../../models/barrett-bh8-280.json")),
     ("models/barrett-bh8-280-lifts.json", include_bytes!("../../models/barrett-bh8-280-lifts.json")),
-    (
-        "models/barrett-bh8-280-lifts.experience.json",
-        include_bytes!("../../models/barrett-bh8-280-lifts.experience.json"),
-    ),
     ("recordings/held-out.mcap", include_bytes!("../../recordings/held-out.mcap")),
     ("README.md", README.as_bytes()),
 ];
@@ -61,7 +56,6 @@ blindgrasp stop
 | `tactile_bridge.py` | a bridge to begin with: `blindgrasp export recordings/held-out.mcap --topic /tactile \\| ./tactile_bridge.py` |
 | `dataflow-machines.yaml` | the same graph on two machines |
 | `dataflow-trials.yaml` | the same graph with a simulated hand that lifts what the graph says: `blindgrasp trials` |
-| `dataflow-regrasp.yaml` | that with advice how to grasp again: `blindgrasp trials --dataflow dataflow-regrasp.yaml` |
 | `hands/` | the Barrett hand BH8-280: kinematics (URDF) and pad layout; describe your own beside it |
 | `models/` | the model that says stable or not, trained on simulated grasps of that hand |
 | `recordings/` | 240 simulated grasps of objects that the model has not been trained on |

@@ -1,54 +1,37 @@
 //! `blindgrasp train`
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Context;
 use clap::{Args, ValueEnum};
-use indicatif::ProgressBar;
-use serde_json::json;
 
 use super::evaluate::print_label;
 use super::grid::{GridArguments, search};
 use super::{Outcome, check_new, number_in, percent, print_line};
-use blindgrasp_learning::collect::collect;
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::training::{Aim, Method, ThresholdOptions, TrainingOptions, WrongCall, train};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::Classifier;
-use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 use blindgrasp_stages::training_summary::Guarantee;
 
 /// Train a model on recordings with labels
-///
-/// Train a model on recordings with labels, or keep the experience of lifted grasps.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                   blindgrasp train train.mcap --out mine.json\n  \
-                  blindgrasp train train.mcap --recipe paper --grid --grid-report grid.json --grid-report grid.svg --out mine.json\n  \
-                  blindgrasp train lifts.mcap --experience mine.json --out experience.json")]
+                  blindgrasp train train.mcap --recipe paper --grid --grid-report grid.json --grid-report grid.svg --out mine.json")]
 pub(super) struct Arguments {
     /// Recordings (MCAP), simulated or a robot's own, or folders of them.
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
-    /// Where to write the model (JSON), or the experience.
+    /// Where to write the model (JSON).
     #[arg(short, long)]
     pub(super) out: PathBuf,
     /// Replace files of these names
     #[arg(long)]
     pub(super) overwrite: bool,
-    /// Write the experience of lifted grasps (recordings of simulate --label lift), with the features of this model: the
-    /// operator regrasp proposes better grasps from it. A graph runs with both; another model needs another experience.
-    #[arg(long, value_name = "MODEL", conflicts_with_all = [
-        "recipe", "day_baseline", "words", "sigma_m", "c", "gamma", "tolerance", "frictions", "label", "seed", "ThresholdArguments",
-        "GridArguments",
-    ])]
-    experience: Option<PathBuf>,
-    /// Print the numbers of the experience as JSON.
-    #[arg(long, requires = "experience")]
-    json: bool,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
@@ -137,9 +120,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let hand = hand_of(first, arguments.hand.as_deref())?;
     check_new(&arguments.out, &recordings, arguments.overwrite)?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
-    if let Some(model) = &arguments.experience {
-        return write_experience(arguments, &hand, model, &recordings);
-    }
     let mut options = TrainingOptions {
         recipe: recipe(arguments)?,
         thresholds: thresholds(&arguments.thresholds)?,
@@ -190,54 +170,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     probe_lines(&model).iter().try_for_each(|line| print_line(line))?;
     for guarantee in &training.guarantees {
         print_line(&guarantee_line(guarantee))?;
-    }
-    Ok(Outcome::Done)
-}
-
-fn write_experience(
-    arguments: &Arguments,
-    hand: &Hand,
-    model: &Path,
-    recordings: &[PathBuf],
-) -> anyhow::Result<Outcome> {
-    let out = &arguments.out;
-    check_new(out, &[model.to_path_buf()], arguments.overwrite)?;
-    let model = Model::load(model)?;
-    let bar = ProgressBar::new(recordings.len() as u64);
-    let collected = collect(hand, &model, recordings, |n_done, _| bar.set_position(n_done as u64));
-    bar.finish_and_clear();
-    let collected = collected?;
-    let experience = &collected.experience;
-    experience.save(out)?;
-    let n_bytes = std::fs::metadata(out).map_or(0, |found| found.len());
-    let (n_grasps, n_objects) = (experience.grasps.len(), experience.objects.len());
-    if arguments.json {
-        print_line(&serde_json::to_string_pretty(&json!({
-            "out": out,
-            "n_grasps": n_grasps,
-            "n_objects": n_objects,
-            "share_held": experience.share_held(),
-            "n_out_of_distribution": collected.n_out_of_distribution,
-            "n_excluded": collected.n_excluded,
-            "n_bytes": n_bytes,
-            "dictionary_id": format!("{:016x}", experience.dictionary_id),
-        }))?)?;
-        return Ok(Outcome::Done);
-    }
-    print_line(&format!(
-        "{}: {n_grasps} lifted grasps of {n_objects} objects, {} held, {} bytes a grasp",
-        out.display(),
-        percent(Some(experience.share_held())),
-        n_bytes / n_grasps.max(1) as u64
-    ))?;
-    if collected.n_out_of_distribution > 0 {
-        print_line(&format!(
-            "{} of them are unlike those that the model was trained on: where the graph feels such a grasp, it gives no advice",
-            collected.n_out_of_distribution
-        ))?;
-    }
-    for (reason, n) in &collected.n_excluded {
-        print_line(&format!("left out: {n} with {reason}"))?;
     }
     Ok(Outcome::Done)
 }

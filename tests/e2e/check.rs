@@ -51,26 +51,6 @@ fn a_right_file_is_shown_with_everything_filled_in() {
     );
 }
 
-/// The encoder and its feature had other names at first.
-#[test]
-fn a_file_with_the_old_names_decides_the_same_and_says_so_once() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let old_names = [
-        ("  encoder:\n", "  histogram:\n"),
-        ("feature: encoder/feature", "histogram: histogram/histogram"),
-        ("rate: 10", "rate: max"),
-    ];
-    let path = dataflow(folder.path(), &old_names);
-    let output = run(&["run", "--json", "--name", &unique_name(), path.to_str().expect("UTF-8")], 0);
-    let lines = json_lines(&output.stdout);
-    let decided = lines.iter().filter_map(|line| Some((line["action"].as_str()?, line["reason"].as_str()?)));
-    let expected = undisturbed().iter().map(|(action, reason)| (action.as_str(), reason.as_str()));
-    assert!(decided.eq(expected), "{}", text(&output.stdout));
-    let stderr = text(&output.stderr);
-    let notices: Vec<&str> = stderr.lines().filter(|line| line.contains("'histogram'")).collect();
-    assert!(matches!(notices[..], [notice] if notice.contains("encoder")), "{stderr}");
-}
-
 #[test]
 fn json_holds_the_graph_with_what_was_set() {
     let recording = project().join("recordings/held-out.mcap");

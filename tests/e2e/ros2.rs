@@ -404,7 +404,7 @@ class Time:
     @staticmethod
     def from_msg(nanos): return Time(nanos)
 class Decision:
-    HOLD, LIFT, REGRASP, SQUEEZE, TEST_LIFT = range(5)
+    HOLD, LIFT, SQUEEZE, TEST_LIFT = 0, 1, 3, 4
     def __init__(self, grasp_id, action, left_secs):
         self.grasp_id, self.action, self.reason, self.probability_stable = grasp_id, action, 'stable', 0.9
         self.valid_until = time.time_ns() + int(left_secs * 1e9)
@@ -419,7 +419,7 @@ spec.loader.exec_module(gate)
 node, lifted = gate.LiftGate(), []
 node.lift = lambda decision: lifted.append(decision.grasp_id)
 for decision in [Decision(1, Decision.HOLD, 60), Decision(2, Decision.LIFT, -1), Decision(3, Decision.LIFT, 0),
-                 Decision(4, Decision.LIFT, 60), Decision(4, Decision.LIFT, 60), Decision(5, Decision.REGRASP, 60),
+                 Decision(4, Decision.LIFT, 60), Decision(4, Decision.LIFT, 60), Decision(5, Decision.SQUEEZE, 60),
                  Decision(6, Decision.TEST_LIFT, 60), Decision(7, Decision.LIFT, 60)]:
     node.on_decision(decision)
 print(node.topic, lifted)

@@ -10,7 +10,7 @@ use blindgrasp_bridge::wire::{
 };
 use blindgrasp_messages::{
     Contact, ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded,
-    RegraspAdvice, RegraspProposal, TactileFrame, WithMessage, with_message,
+    TactileFrame, WithMessage, with_message,
 };
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -57,7 +57,7 @@ fn counted<T>(n_bytes: usize, decode: impl FnOnce() -> T) -> T {
     decoded
 }
 
-const TYPES: [&str; 8] = [
+const TYPES: [&str; 7] = [
     TactileFrame::TYPE_NAME,
     ContactSet::TYPE_NAME,
     GraspFeature::TYPE_NAME,
@@ -65,7 +65,6 @@ const TYPES: [&str; 8] = [
     LiftDecision::TYPE_NAME,
     GraspTruth::TYPE_NAME,
     LiftOutcome::TYPE_NAME,
-    RegraspAdvice::TYPE_NAME,
 ];
 
 fn samples(rng: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
@@ -89,8 +88,6 @@ fn samples(rng: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
     let contacts = vec![Contact { force_newtons: 1.0, ..Contact::default() }; rng.random_range(0..20)];
     let truth = GraspTruth { object: "bücher".into(), class: "book".into(), ..GraspTruth::default() };
     let outcome = LiftOutcome { thing: "bücher".into(), group: "book".into(), ..LiftOutcome::default() };
-    let proposal = RegraspProposal { open_joints_rad: vec![0.5; 7], ..RegraspProposal::default() };
-    let advice = RegraspAdvice { grasp_id: 1, proposals: vec![proposal; rng.random_range(0..9)] };
     vec![
         encoded(rng, &TactileFrame { joints_rad: joints_rad.clone(), cells_newtons, ..TactileFrame::default() }),
         encoded(rng, &ContactSet { joints_rad, contacts, ..ContactSet::default() }),
@@ -99,7 +96,6 @@ fn samples(rng: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
         encoded(rng, &LiftDecision::default()),
         encoded(rng, &truth),
         encoded(rng, &outcome),
-        encoded(rng, &advice),
     ]
 }
 

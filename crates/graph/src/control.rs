@@ -166,7 +166,6 @@ pub struct SwappedNode {
     /// The last sequence number that the old one answered; `None` if there was none.
     pub last_seq: Option<u64>,
     /// The time without an active operator.
-    #[serde(rename = "gap_nanos")]
     pub handover_pause_nanos: u64,
 }
 

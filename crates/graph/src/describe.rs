@@ -14,7 +14,7 @@ use blindgrasp_operator::description::OperatorDescription;
 
 /// The operators that come with blindgrasp, by the name that `run:` gives. The package `blindgrasp-operators` has the
 /// same table with their functions.
-pub const SHIPPED: [&str; 14] = [
+pub const SHIPPED: [&str; 13] = [
     "recorded_source",
     "tactile_source",
     "simulated_hand",
@@ -26,12 +26,11 @@ pub const SHIPPED: [&str; 14] = [
     "probe_classifier",
     "day_classifier",
     "lift_arbiter",
-    "regrasp",
     "ros2",
     "zenoh",
 ];
 /// Those that can share a process: they answer samples, and have no source or device of their own.
-pub const GROUPABLE: [&str; 9] = [
+pub const GROUPABLE: [&str; 8] = [
     "senses",
     "contacts",
     "checked_contacts",
@@ -40,7 +39,6 @@ pub const GROUPABLE: [&str; 9] = [
     "probe_classifier",
     "day_classifier",
     "lift_arbiter",
-    "regrasp",
 ];
 /// The operator that carries edges to other machines. The launcher adds it; a dataflow file cannot name it.
 pub const LINK_OPERATOR: &str = "link";
@@ -76,7 +74,7 @@ pub fn link_program() -> std::io::Result<Program> {
 /// # Errors
 /// The path of a file that is not there.
 pub fn program_to_run(run: &Path, args: &[String], folder: &Path) -> Result<Program, PathBuf> {
-    let shipped = run.to_str().and_then(|name| shipped().ok()?.remove(present_name(name)));
+    let shipped = run.to_str().and_then(|name| shipped().ok()?.remove(name));
     let file = folder.join(run);
     let on_path = || run.to_str().filter(|_| !file.exists()).and_then(program_on_path).map(Program::from);
     let program = shipped.or_else(on_path).unwrap_or_else(|| file.into());
@@ -96,10 +94,6 @@ pub(super) fn program_on_path(name: &str) -> Option<PathBuf> {
     (!name.contains('/')).then(|| folders.find_map(|folder| Some(folder.join(name)).filter(is_program)))?
 }
 
-/// The encoder had another name before, as in dataflow files.
-fn present_name(name: &str) -> &str {
-    if name == "histogram" { "encoder" } else { name }
-}
 
 fn shipped_operator(path: &Path, name: &str) -> Program {
     Program { path: path.into(), args: vec!["operator".into(), name.into()] }

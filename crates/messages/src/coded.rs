@@ -149,9 +149,6 @@ coded_enums! {
         Hold = 0, "hold";
         /// The grasp will keep the object: lift.
         Lift = 1, "lift";
-        /// Do not lift; grasp anew as the advice for this grasp says. A reader without advice treats it as
-        /// [`Action::Hold`].
-        Regrasp = 2, "regrasp";
         /// Tighten to the force of a lift, do not move the arm, and send frames: the decision follows. A reader that
         /// cannot do this treats it as [`Action::Hold`].
         Squeeze = 3, "squeeze";
@@ -240,7 +237,6 @@ impl Action {
         match self {
             Action::Hold => "HOLD",
             Action::Lift => "LIFT",
-            Action::Regrasp => "REGRASP",
             Action::Squeeze => "SQUEEZE",
             Action::TestLift => "TEST LIFT",
         }

@@ -25,7 +25,6 @@ mod layout;
 mod lift_decision;
 mod lift_outcome;
 mod prediction;
-mod regrasp_advice;
 mod ros;
 pub mod score;
 mod serialized;
@@ -42,7 +41,6 @@ pub use header::{Header, Stamped};
 pub use lift_decision::{LiftDecision, LiftDecisionHead};
 pub use lift_outcome::{LiftOutcome, LiftOutcomeHead};
 pub use prediction::{Prediction, PredictionHead};
-pub use regrasp_advice::{MAX_PROPOSALS, RegraspAdvice, RegraspAdviceHead, RegraspProposal};
 pub use ros::{first_difference, signature};
 pub use serialized::{hex_id, read_list};
 pub use tactile_frame::{FrameParts, Senses, TactileFrame, TactileFrameHead};
@@ -186,7 +184,6 @@ messages! { $
         Decision(LiftDecision),
         Truth(GraspTruth),
         Outcome(LiftOutcome),
-        Advice(RegraspAdvice),
     }
     only_recorded {
         Scene(GraspScene),
@@ -205,7 +202,7 @@ impl Record {
     /// Whether a stage sends one sample per grasp and numbers these samples itself. Such a sample does not bear the
     /// number of a frame.
     pub fn is_said_once(&self) -> bool {
-        matches!(self, Record::Decision(_) | Record::Advice(_))
+        matches!(self, Record::Decision(_))
     }
 
     /// [`Recorded::TYPE_NAME`] of its message.

@@ -6,7 +6,6 @@ message! {
     /// The arbiter's decision, one per grasp. The header's sequence counts decisions.
     pub struct LiftDecision = "blindgrasp/LiftDecision/3" on "/decision" {
         pub grasp_id: u64,
-        #[ros = "regrasp: hold, and grasp as the advice says"]
         pub action: Action,
         pub reason: Reason,
         /// The lowest probability among the predictions that decided; 0 where none did.

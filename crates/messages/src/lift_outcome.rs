@@ -5,7 +5,7 @@ use crate::{MAX_NAME_BYTES, ZeroCopySend};
 message! {
     /// What became of a grasp that a hand tried: whether the hand lifted, and whether the object was kept. The header's
     /// sequence counts outcomes.
-    pub struct LiftOutcome = "blindgrasp/LiftOutcome/3" on "/outcome" {
+    pub struct LiftOutcome = "blindgrasp/LiftOutcome/4" on "/outcome" {
         pub grasp_id: u64,
         /// Number of the trial, from 0.
         pub trial: u64,
@@ -17,8 +17,6 @@ message! {
         pub held: bool,
         #[ros = "Whether epsilon and volume are known."]
         pub has_quality: bool,
-        /// Whether the attempt began as the advice for the grasp before it said, and not at random.
-        pub advised: bool,
         /// How far the object's centre of mass moved in the hand since the hand had settled; of a dropped object, until it
         /// was lost; after a test lift without a lift, until it was set down; otherwise 0 if it was not lifted.
         pub slip_m: f64,
@@ -46,10 +44,10 @@ message! {
     }
 
     /// The items are the UTF-8 bytes of the thing's name, then of its group.
-    pub struct LiftOutcomeHead = "blindgrasp/LiftOutcomeHead/3" {
+    pub struct LiftOutcomeHead = "blindgrasp/LiftOutcomeHead/4" {
         grasp_id: u64, trial: u64, slip_m: f64, turn_rad: f64, epsilon: f64, volume: f64, mass_kg: f64, friction: f64,
-        attempt: u32, lifted: u32, held: u32, has_quality: u32, n_thing_bytes: u32 => thing, advised: u32,
-        probed: u32, disturbed: u32,
+        attempt: u32, lifted: u32, held: u32, has_quality: u32, n_thing_bytes: u32 => thing, probed: u32,
+        disturbed: u32,
     }
     items: u8 => group;
 }

@@ -52,12 +52,6 @@ fn sent<M: Message + PartialEq>(message: &M) -> Map<String, Value> {
 fn shapes() -> Vec<Map<String, Value>> {
     let contact =
         Contact { position_m: [0.1, 0.2, -0.3], normal: [0.0, 0.6, 0.8], force_newtons: 2.5, pad: 1, cell: 23 };
-    let proposal = |first: f64| RegraspProposal {
-        palm_position_m: [first, 0.2, 0.3],
-        palm_rotation_xyzw: [0.0, 0.6, 0.0, 0.8],
-        open_joints_rad: vec![0.5, -0.5, 0.25],
-        probability_held: 0.75,
-    };
     let scene_contact = SceneContact {
         link: 4,
         other_link: -1,
@@ -113,7 +107,7 @@ fn shapes() -> Vec<Map<String, Value>> {
         }),
         sent(&LiftDecision {
             grasp_id: 11,
-            action: Action::Regrasp,
+            action: Action::TestLift,
             reason: Reason::LinkDown,
             probability_stable: 0.75,
         }),
@@ -132,7 +126,6 @@ fn shapes() -> Vec<Map<String, Value>> {
             lifted: true,
             held: false,
             has_quality: true,
-            advised: true,
             slip_m: 0.01,
             turn_rad: 0.5,
             epsilon: 0.125,
@@ -144,7 +137,6 @@ fn shapes() -> Vec<Map<String, Value>> {
             probed: true,
             disturbed: false,
         }),
-        sent(&RegraspAdvice { grasp_id: 11, proposals: vec![proposal(0.1), proposal(-0.1)] }),
         recorded(&GraspScene {
             grasp_id: 11,
             candidate: 42,

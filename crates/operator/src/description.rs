@@ -150,14 +150,6 @@ impl OperatorDescription {
         self
     }
 
-    /// As [`OperatorDescription::feedback_input`], for an input that may be left unconnected.
-    #[must_use]
-    pub fn optional_feedback_input(mut self, name: &str, type_name: &str, summary: &str) -> Self {
-        let port = PortDescription::new(name, type_name, summary);
-        self.inputs.push(PortDescription { feedback: true, optional: true, ..port });
-        self
-    }
-
     /// With one more required input, whose samples are found by the stamps of those of the first input.
     #[must_use]
     pub fn partner_input(mut self, name: &str, type_name: &str, summary: &str) -> Self {

@@ -2,10 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use blindgrasp_messages::{GraspFeature, Recorded, first_difference};
+use blindgrasp_messages::first_difference;
 use mcap::records::{Channel, Record as McapRecord, SchemaHeader, op};
 
-use super::types::{Decoder, MESSAGE_ENCODING, SCHEMA_ENCODING, our_type, present_topic};
+use super::types::{MESSAGE_ENCODING, OurType, SCHEMA_ENCODING, our_type};
 
 /// The schemas and channels of a file, as far as it was read.
 #[derive(Default)]
@@ -16,8 +16,6 @@ pub(super) struct Channels {
     checked: BTreeSet<(u8, u16)>,
     /// How often a schema or a channel took the place of another.
     n_replaced: u64,
-    /// Whether a topic had the name of an earlier version, and has the present one here.
-    has_earlier_topic: bool,
 }
 
 #[derive(PartialEq)]
@@ -29,8 +27,8 @@ pub(super) struct Schema {
 
 pub(super) struct KnownChannel {
     pub(super) channel: Channel,
-    /// `None` if its messages are not of one of our types.
-    pub(super) decoder: Option<Decoder>,
+    /// The type of its messages; `None` if it is not one of ours.
+    pub(super) ours: Option<&'static OurType>,
     /// How its type differs from our type of the same name.
     pub(super) other_version: Option<String>,
 }
@@ -119,11 +117,6 @@ impl Channels {
         self.schemas.get(&channel.schema_id)
     }
 
-    /// Whether a topic had the name of an earlier version, and has the present one here.
-    pub(super) fn has_earlier_topic(&self) -> bool {
-        self.has_earlier_topic
-    }
-
     /// How a channel's type differs from ours, if one does.
     pub(super) fn other_version(&self) -> Option<&str> {
         self.iter().find_map(|known| known.other_version.as_deref())
@@ -138,12 +131,7 @@ impl Channels {
         }
     }
 
-    fn add_channel(&mut self, mut channel: Channel) -> Result<(), String> {
-        let is_feature = self.schemas.get(&channel.schema_id).is_some_and(|schema| schema.name == GraspFeature::SCHEMA);
-        if is_feature && present_topic(&channel.topic) != channel.topic {
-            self.has_earlier_topic = true;
-            channel.topic = present_topic(&channel.topic).into();
-        }
+    fn add_channel(&mut self, channel: Channel) -> Result<(), String> {
         if let Some(known) = self.channels.get(&channel.id) {
             let is_same = known.channel == channel;
             return if is_same { Ok(()) } else { Err(format!("two channels have the number {}", channel.id)) };
@@ -152,16 +140,12 @@ impl Channels {
         if schema.is_none() && channel.schema_id != 0 {
             return Err(format!("{} has a schema that is not there", channel.topic));
         }
-        let mut known = KnownChannel { channel, decoder: None, other_version: None };
-        if let Some((schema, ours)) = schema.and_then(|schema| Some((schema, our_type(&schema.name)?))) {
-            known.decoder = Some(ours.decoder());
+        let mut known = KnownChannel { channel, ours: None, other_version: None };
+        if let Some(schema) = schema
+            && let Some(ours) = our_type(&schema.name)
+        {
+            known.ours = Some(ours);
             known.other_version = difference(&known.channel, schema, &ours.definition);
-            if known.other_version.is_some() {
-                let is_it = |earlier: &str| difference(&known.channel, schema, earlier).is_none();
-                if let Some(decoder) = ours.earlier_decoder(is_it) {
-                    (known.decoder, known.other_version) = (Some(decoder), None);
-                }
-            }
         }
         self.channels.insert(known.channel.id, known);
         Ok(())

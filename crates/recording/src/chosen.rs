@@ -8,7 +8,7 @@ use std::path::Path;
 use blindgrasp_messages::{Header, Record};
 
 use super::reader::{RecordingReader, undecodable};
-use super::types::Decoder;
+use super::types::OurType;
 use super::{RecordingError, RecordingInfo};
 
 /// Says of a topic and the name of its schema, like `blindgrasp_msgs/msg/TactileFrame`, whether it is chosen.
@@ -41,7 +41,7 @@ pub struct RawSample {
     /// The name of the message's schema, like `blindgrasp_msgs/msg/TactileFrame`.
     pub schema: &'static str,
     pub(super) sequence: u32,
-    pub(super) decoder: Decoder,
+    pub(super) ours: &'static OurType,
     pub(super) data: Vec<u8>,
 }
 
@@ -62,9 +62,9 @@ impl ChosenSamples {
         for index in &indices {
             let is_chosen = |channel_id: &u16| {
                 let known = reader.channels().get(*channel_id);
-                let is_it = |decoder: Decoder, topic| choice(topic, decoder.schema);
+                let is_it = |ours: &OurType, topic| choice(topic, ours.schema);
                 // The summary may lack a channel that the chunk declares.
-                known.is_none_or(|known| known.decoder.is_some_and(|decoder| is_it(decoder, &known.channel.topic)))
+                known.is_none_or(|known| known.ours.is_some_and(|ours| is_it(ours, &known.channel.topic)))
             };
             let bytes = index.chunk_start_offset..index.chunk_start_offset + index.chunk_length;
             // A file may have an index of its chunks without an index of their messages.
@@ -102,8 +102,8 @@ impl ChosenSamples {
     /// The file is damaged, or holds something else than expected.
     pub fn advance(&mut self) -> Result<Option<RawSample>, RecordingError> {
         let choice = &self.choice;
-        self.reader.next_with(|(topic, sequence, decoder, data)| {
-            choice(topic, decoder.schema).then(|| RawSample::new(topic, sequence, decoder, data))
+        self.reader.next_with(|(topic, sequence, ours, data)| {
+            choice(topic, ours.schema).then(|| RawSample::new(topic, sequence, ours, data))
         })
     }
 
@@ -112,21 +112,21 @@ impl ChosenSamples {
     /// # Errors
     /// It is not of its schema.
     pub fn decode(&self, sample: &RawSample) -> Result<Record, RecordingError> {
-        let RawSample { topic, sequence, decoder, data, .. } = sample;
-        decoder.decode(data).map_err(|what| self.reader.damaged(undecodable(topic, *sequence, &what)))
+        let RawSample { topic, sequence, ours, data, .. } = sample;
+        ours.decode(data).map_err(|what| self.reader.damaged(undecodable(topic, *sequence, &what)))
     }
 }
 
 impl RawSample {
-    fn new(topic: &str, sequence: u32, decoder: Decoder, data: &[u8]) -> Result<Self, String> {
-        let (header, grasp_id) = decoder.decode_start(data).map_err(|what| undecodable(topic, sequence, &what))?;
+    fn new(topic: &str, sequence: u32, ours: &'static OurType, data: &[u8]) -> Result<Self, String> {
+        let (header, grasp_id) = ours.decode_start(data).map_err(|what| undecodable(topic, sequence, &what))?;
         Ok(RawSample {
             header,
             grasp_id,
             topic: topic.into(),
-            schema: decoder.schema,
+            schema: ours.schema,
             sequence,
-            decoder,
+            ours,
             data: data.into(),
         })
     }

@@ -56,7 +56,7 @@ impl RecordingIndex {
             let topic = topics.entry(known.channel.topic.clone()).or_insert(IndexedTopic {
                 schema,
                 n_messages: Some(0),
-                is_ours: known.decoder.is_some(),
+                is_ours: known.ours.is_some(),
             });
             topic.n_messages = topic.n_messages.zip(n_messages).map(|(sum, more)| sum.saturating_add(more));
         }

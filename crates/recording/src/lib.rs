@@ -34,7 +34,6 @@ pub use parts::{Manifest, part_path, recordings_in};
 pub use problems::{Oddity, Problem, Problems};
 pub use reader::RecordingReader;
 pub use repair::{RepairReport, repair, repaired_path};
-pub use types::present_topic;
 pub use viewer::TOPICS_FOR_VIEWERS;
 pub use writer::RecordingWriter;
 
@@ -83,7 +82,7 @@ mod tests {
     use super::*;
     use blindgrasp_messages::{
         Action, Contact, ContactSet, Fault, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome,
-        Phase, Prediction, Reason, RegraspAdvice, RegraspProposal, SceneContact, Stamped, TactileFrame,
+        Phase, Prediction, Reason, SceneContact, Stamped, TactileFrame,
     };
 
     pub(super) fn info() -> RecordingInfo {
@@ -96,8 +95,6 @@ mod tests {
             Stamped { header, message }
         }
         let contact = Contact { position_m: [0.1; 3], normal: [0.0, 0.0, 1.0], force_newtons: 2.5, pad: 1, cell: 23 };
-        let proposal =
-            RegraspProposal { open_joints_rad: vec![0.5, 0.0], probability_held: 0.75, ..Default::default() };
         vec![
             (
                 "/tactile",
@@ -173,7 +170,6 @@ mod tests {
                     LiftOutcome { attempt: 3, lifted: true, thing: "tasse".into(), ..Default::default() },
                 )),
             ),
-            ("/advice", Record::Advice(stamped(7, RegraspAdvice { grasp_id: 7, proposals: vec![proposal; 2] }))),
         ]
     }
 
@@ -195,28 +191,6 @@ mod tests {
         let found: Vec<_> = reader.collect::<Result<_, _>>().expect("read");
         let expected: Vec<_> = records().into_iter().map(|(topic, record)| (topic.to_string(), record)).collect();
         assert_eq!(found, expected);
-    }
-
-    #[test]
-    fn features_on_the_topic_of_earlier_versions_are_read_as_features() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("earlier.mcap");
-        let mut writer = RecordingWriter::create(&path, &info()).expect("created");
-        let feature = Record::Feature(Stamped { header: Header::default(), message: GraspFeature::default() });
-        // Another type may have a topic of that name.
-        let prediction = Record::Prediction(Stamped { header: Header::default(), message: Prediction::default() });
-        writer.write_record("/histogram", &feature).expect("written");
-        writer.write_record("/histograms/histogram", &prediction).expect("written");
-        writer.finish().expect("finished");
-        let expected = [("/feature".to_string(), feature.clone()), ("/histograms/histogram".into(), prediction)];
-        let read = |reader: RecordingReader| reader.collect::<Result<Vec<_>, _>>().expect("read");
-        let reader = RecordingReader::open(&path).expect("opened");
-        assert_eq!(
-            reader.topics().keys().map(String::as_str).collect::<Vec<_>>(),
-            ["/feature", "/histograms/histogram"]
-        );
-        assert_eq!(read(reader), expected);
-        assert!(RecordingIndex::open(&path).expect("opened").topics["/feature"].is_ours);
     }
 
     #[test]

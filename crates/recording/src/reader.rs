@@ -13,7 +13,7 @@ use super::channels::Channels;
 use super::chosen::Reach;
 use super::source::{Growth, Input, MAX_RECORD_BYTES, read_records, with_cause};
 use super::summary;
-use super::types::Decoder;
+use super::types::OurType;
 use super::{RecordingError, RecordingInfo};
 
 /// Bytes of a message before its data: channel, number, two times.
@@ -39,8 +39,8 @@ pub struct RecordingReader {
     done: bool,
 }
 
-/// A message's topic, its number in MCAP's header, its decoder and its data.
-type OurMessage<'a> = (&'a str, u32, Decoder, &'a [u8]);
+/// A message's topic, its number in MCAP's header, its type and its data.
+type OurMessage<'a> = (&'a str, u32, &'static OurType, &'a [u8]);
 
 /// Why a message is refused.
 enum Refusal {
@@ -171,8 +171,8 @@ impl Iterator for RecordingReader {
         if self.done {
             return None;
         }
-        let next = self.next_with(|(topic, sequence, decoder, data)| {
-            let decoded = decoder.decode(data).map(|record| (topic.to_owned(), record));
+        let next = self.next_with(|(topic, sequence, ours, data)| {
+            let decoded = ours.decode(data).map(|record| (topic.to_owned(), record));
             Some(decoded.map_err(|what| undecodable(topic, sequence, &what)))
         });
         let next = next.transpose();
@@ -206,5 +206,5 @@ fn our_message<'a>(channels: &'a Channels, record: &'a [u8]) -> Option<Result<Ou
     let Some(known) = channels.get(channel_id) else {
         return Some(Err(format!("message {sequence} is of channel {channel_id}, which is not declared")));
     };
-    Some(Ok((&known.channel.topic, sequence, known.decoder?, data)))
+    Some(Ok((&known.channel.topic, sequence, known.ours?, data)))
 }

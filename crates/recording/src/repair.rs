@@ -428,7 +428,7 @@ impl Salvage {
         };
         let topic = &known.channel.topic;
         let is_whole =
-            known.other_version.is_none() && known.decoder.is_none_or(|decoder| decoder.decode(data).is_ok());
+            known.other_version.is_none() && known.ours.is_none_or(|ours| ours.decode(data).is_ok());
         if !is_whole {
             *report.n_lost.entry(topic.clone()).or_default() += 1;
             return;

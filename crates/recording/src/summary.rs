@@ -1,18 +1,15 @@
 //! The summary at the end of a file.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{Read, Seek, SeekFrom, Write};
-use std::path::{Path, PathBuf};
-use std::sync::Mutex;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::Path;
 
-use blindgrasp_messages::{GraspFeature, Recorded};
 use mcap::records::{ChunkIndex, MetadataIndex, Record as McapRecord, Statistics, op};
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
 
 use super::channels::Channels;
 use super::source::{Growth, MAX_RECORD_BYTES, read_records};
-use super::types::EARLIER_FEATURE_TOPIC;
 use super::{METADATA_NAME, RecordingError, RecordingInfo};
 
 /// Bytes of the footer: opcode and length, its 20 bytes, and MCAP's mark behind it.
@@ -72,9 +69,6 @@ pub(super) fn open(path: &Path) -> Result<(File, Summary), RecordingError> {
     let info = info.ok_or_else(|| {
         invalid(format!("it has no '{METADATA_NAME}' metadata: expected a recording made by blindgrasp"))
     })?;
-    if raw.channels.has_earlier_topic() {
-        note_earlier_topic(path);
-    }
     if let Some(difference) = raw.channels.other_version() {
         return Err(invalid(other_version(difference, &info)));
     }
@@ -104,18 +98,6 @@ pub(super) fn open_mcap(path: &Path) -> Result<File, RecordingError> {
 /// Whether a recorder has the file locked.
 pub(super) fn is_being_written(file: &File) -> bool {
     matches!(file.try_lock_shared(), Err(std::fs::TryLockError::WouldBlock))
-}
-
-/// Says on stderr, once per file, that a topic is read under its present name.
-fn note_earlier_topic(path: &Path) {
-    static NOTED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
-    let is_new = NOTED.lock().is_ok_and(|mut noted| noted.insert(path.into()));
-    if is_new {
-        let (earlier, present) = (EARLIER_FEATURE_TOPIC, GraspFeature::TOPIC);
-        let line = format!("{}: its topic {earlier} of an earlier version is read as {present}\n", path.display());
-        // Unlike `eprintln!`, it does not panic when stderr is closed.
-        let _ = std::io::stderr().lock().write_all(line.as_bytes());
-    }
 }
 
 /// A summary as it stands in the file.

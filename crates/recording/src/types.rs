@@ -5,9 +5,7 @@ use std::sync::LazyLock;
 use cdr_encoding::{from_bytes, to_writer};
 use serde::Serialize;
 
-use blindgrasp_messages::{
-    ContactSet, GraspFeature, Header, LiftOutcome, Record, Recorded, Stamped, TactileFrame, of_each_type,
-};
+use blindgrasp_messages::{Header, Record, Recorded, Stamped, of_each_type};
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
 const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
@@ -15,53 +13,24 @@ const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
 pub(super) const MESSAGE_ENCODING: &str = "cdr";
 pub(super) const SCHEMA_ENCODING: &str = "ros2msg";
 
-/// The topic of features in recordings of version 0.1 and before.
-pub(super) const EARLIER_FEATURE_TOPIC: &str = "/histogram";
-
-/// Makes samples of the recorded messages of a channel.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Decoder {
-    /// The name of the messages' schema.
-    pub(super) schema: &'static str,
-    decode: fn(&[u8]) -> Result<Record, String>,
-    /// Bytes of the fields that the messages lack, because an earlier version wrote them: they are 0, or empty lists.
-    n_later_bytes: usize,
-}
-
-impl Decoder {
-    pub(super) fn decode(self, data: &[u8]) -> Result<Record, String> {
-        match self.n_later_bytes {
-            0 => (self.decode)(data),
-            n_later_bytes => (self.decode)(&[data, &vec![0; n_later_bytes]].concat()),
-        }
-    }
-
-    /// Reads the header and the grasp's number, with which every message of ours begins.
-    pub(super) fn decode_start(self, data: &[u8]) -> Result<(Header, u64), String> {
-        let start = from_bytes::<(Header, u64), byteorder::LittleEndian>(body(data)?);
-        start.map(|(start, _)| start).map_err(|error| format!("not a {}: {error}", self.schema))
-    }
-}
-
-/// One of our message types.
+/// One of our message types: its definition, and what makes samples of recorded messages.
+#[derive(Debug)]
 pub(super) struct OurType {
-    schema: &'static str,
+    /// Its name as a schema.
+    pub(super) schema: &'static str,
     pub(super) definition: String,
     decode: fn(&[u8]) -> Result<Record, String>,
-    /// The definitions of earlier versions, each with the number of bytes that the fields take which it lacks.
-    earlier: Vec<(String, usize)>,
 }
 
 impl OurType {
-    /// Reads messages of this version.
-    pub(super) fn decoder(&self) -> Decoder {
-        Decoder { schema: self.schema, decode: self.decode, n_later_bytes: 0 }
+    pub(super) fn decode(&self, data: &[u8]) -> Result<Record, String> {
+        (self.decode)(data)
     }
 
-    /// Reads messages of the earlier version whose definition `is_it`.
-    pub(super) fn earlier_decoder(&self, is_it: impl Fn(&str) -> bool) -> Option<Decoder> {
-        let (_, n_later_bytes) = self.earlier.iter().find(|(definition, _)| is_it(definition))?;
-        Some(Decoder { schema: self.schema, decode: self.decode, n_later_bytes: *n_later_bytes })
+    /// Reads the header and the grasp's number, with which every message of ours begins.
+    pub(super) fn decode_start(&self, data: &[u8]) -> Result<(Header, u64), String> {
+        let start = from_bytes::<(Header, u64), byteorder::LittleEndian>(body(data)?);
+        start.map(|(start, _)| start).map_err(|error| format!("not a {}: {error}", self.schema))
     }
 }
 
@@ -72,35 +41,7 @@ pub(super) fn our_type(schema: &str) -> Option<&'static OurType> {
 }
 
 fn our<M: Recorded>() -> OurType {
-    let definition = M::definition();
-    // The fields that each earlier version lacked, which are the last ones, and their bytes.
-    let lacking: &[(&[&str], usize)] = match M::SCHEMA {
-        // `advised` lies where messages without it have a byte of padding, which is 0.
-        LiftOutcome::SCHEMA => {
-            &[(&["bool advised", "bool probed", "bool disturbed"], 2), (&["bool probed", "bool disturbed"], 2)]
-        }
-        TactileFrame::SCHEMA | ContactSet::SCHEMA => &[
-            (&["float64[] gravity_m_per_s2", "float64[] wrist_wrench", "float64[] joint_torques", "uint32 day"], 16),
-            (&["uint32 day"], 4),
-        ],
-        GraspFeature::SCHEMA => &[(&["uint32 day"], 4)],
-        _ => &[],
-    };
-    let without = |text: String, field: &&str| text.replace(&format!("{field}\n"), "");
-    OurType {
-        schema: M::SCHEMA,
-        earlier: lacking
-            .iter()
-            .map(|(fields, n_bytes)| (fields.iter().fold(definition.clone(), without), *n_bytes))
-            .collect(),
-        definition,
-        decode: |data| decode::<M>(data).map(M::record),
-    }
-}
-
-/// The topic as this version names it.
-pub fn present_topic(topic: &str) -> &str {
-    if topic == EARLIER_FEATURE_TOPIC { GraspFeature::TOPIC } else { topic }
+    OurType { schema: M::SCHEMA, definition: M::definition(), decode: |data| decode::<M>(data).map(M::record) }
 }
 
 /// Puts a message, or anything else, into `data` as CDR, in place of what was there.
@@ -127,92 +68,27 @@ pub(super) fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
 
 #[cfg(test)]
 mod tests {
-    use serde::Serialize;
-
     use super::*;
-    use blindgrasp_messages::{Phase, first_difference};
-
-    /// A [`LiftOutcome`] as it was before it had `advised`.
-    #[derive(Serialize)]
-    struct EarlierOutcome {
-        header: Header,
-        grasp_id: u64,
-        trial: u64,
-        attempt: u32,
-        lifted: bool,
-        held: bool,
-        has_quality: bool,
-        numbers: [f64; 6],
-        thing: String,
-        group: String,
-    }
+    use blindgrasp_messages::{Phase, TactileFrame};
 
     #[test]
-    fn outcomes_of_an_earlier_version_are_read_as_not_advised() {
-        let earlier = EarlierOutcome {
-            header: Header { seq: 3, ..Header::default() },
-            grasp_id: 3,
-            trial: 1,
-            attempt: 2,
-            lifted: true,
-            held: true,
-            has_quality: true,
-            numbers: [0.001, 0.5, 0.1, 0.2, 0.3, 0.9],
-            thing: "rock".into(),
-            group: "stone".into(),
+    fn a_message_is_read_whole_or_refused() {
+        let message = TactileFrame {
+            grasp_id: 7,
+            phase: Phase::Settled,
+            joints_rad: vec![0.5, 0.25],
+            cells_newtons: vec![1.0, 0.0, 2.0],
+            ..TactileFrame::default()
         };
+        let sample = Stamped { header: Header { seq: 3, ..Header::default() }, message };
         let mut data = Vec::new();
-        encode(&earlier, &mut data).expect("encoded");
-        let ours = our_type("blindgrasp_msgs/msg/LiftOutcome").expect("a type");
-        let (earliest, _) = &ours.earlier[0];
-        assert_eq!(first_difference(earliest, &ours.definition).map(|(_, ours)| ours), Some("bool advised".into()));
-        let found = ours.earlier_decoder(|definition| definition == earliest).expect("known").decode(&data);
-        let expected = LiftOutcome {
-            grasp_id: 3,
-            trial: 1,
-            attempt: 2,
-            lifted: true,
-            held: true,
-            has_quality: true,
-            advised: false,
-            slip_m: 0.001,
-            turn_rad: 0.5,
-            epsilon: 0.1,
-            volume: 0.2,
-            mass_kg: 0.3,
-            friction: 0.9,
-            thing: "rock".into(),
-            group: "stone".into(),
-            probed: false,
-            disturbed: false,
-        };
-        assert_eq!(found, Ok(Stamped { header: earlier.header, message: expected }.into()));
-    }
-
-    /// A [`TactileFrame`] as it was before it had senses beside joints and cells.
-    #[derive(Serialize)]
-    struct EarlierFrame {
-        header: Header,
-        grasp_id: u64,
-        phase: u32,
-        joints_rad: Vec<f64>,
-        cells_newtons: Vec<f64>,
-    }
-
-    #[test]
-    fn frames_of_an_earlier_version_have_no_other_senses_and_are_whole_or_refused() {
-        let (joints_rad, cells_newtons) = (vec![0.5, 0.25], vec![1.0, 0.0, 2.0]);
-        let (header, phase) = (Header { seq: 3, ..Header::default() }, Phase::Settled);
-        let earlier = EarlierFrame { header, grasp_id: 7, phase: 2, joints_rad, cells_newtons };
-        let mut data = Vec::new();
-        encode(&earlier, &mut data).expect("encoded");
+        encode(&sample, &mut data).expect("encoded");
         let ours = our_type(TactileFrame::SCHEMA).expect("a type");
-        let decoder = ours.earlier_decoder(|definition| !definition.contains("gravity")).expect("known");
-        let EarlierFrame { joints_rad, cells_newtons, .. } = earlier;
-        let message = TactileFrame { grasp_id: 7, phase, joints_rad, cells_newtons, ..TactileFrame::default() };
-        assert_eq!(decoder.decode(&data), Ok(Stamped { header, message }.into()));
+        assert_eq!(ours.decode(&data), Ok(sample.into()));
         for n_bytes in 0..data.len() {
-            decoder.decode(&data[..n_bytes]).expect_err("cut off");
+            ours.decode(&data[..n_bytes]).expect_err("cut off");
         }
+        data.push(0);
+        ours.decode(&data).expect_err("a byte too many");
     }
 }

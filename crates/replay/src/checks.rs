@@ -214,8 +214,7 @@ impl Decisions {
         let Some(found) = self.decisions.get(grasp_id) else {
             return Some(format!("grasp {grasp_id}: expected {expected}, found no decision"));
         };
-        // A regrasp holds the object as well.
-        let is_action = found.action == *action || (*action, found.action) == (Action::Hold, Action::Regrasp);
+        let is_action = found.action == *action;
         let is_right = is_action && reason.is_none_or(|reason| found.reason == reason);
         let (action, reason) = (found.action.as_str(), found.reason.as_str());
         (!is_right).then(|| format!("grasp {grasp_id}: expected {expected}, found {action} {reason}"))

@@ -357,7 +357,7 @@ impl Sides<'_> {
         Ok(())
     }
 
-    /// Decision and advice of the grasp in which the recording begins depend on frames that were not recorded.
+    /// The decision about the grasp in which the recording begins depends on frames that were not recorded.
     fn is_uncovered(&self, record: &Record, grasp_id: u64) -> bool {
         self.coverage.is_attached && record.is_said_once() && grasp_id == self.coverage.first_grasp_id
     }
@@ -383,7 +383,7 @@ impl Sides<'_> {
     fn pop_found(&mut self) {
         if let Some(sample) = self.found.window.pop_front() {
             let seq = match sample.record {
-                Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Advice(_) => {
+                Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) => {
                     sample.record.header().seq
                 }
                 _ => self.coverage.recorded_seq(&sample.header),
@@ -465,7 +465,6 @@ fn encoded(record: &Record) -> Result<Vec<u8>, CompareError> {
         Record::Decision(sample) => encode(&sample.message),
         Record::Truth(sample) => encode(&sample.message),
         Record::Outcome(sample) => encode(&sample.message),
-        Record::Advice(sample) => encode(&sample.message),
         Record::Scene(sample) => encode(&sample.message),
     }?)
 }
@@ -475,7 +474,6 @@ fn grasp_id(record: &Record) -> u64 {
         Record::Decision(sample) => sample.message.grasp_id,
         Record::Truth(sample) => sample.message.grasp_id,
         Record::Outcome(sample) => sample.message.grasp_id,
-        Record::Advice(sample) => sample.message.grasp_id,
         Record::Scene(sample) => sample.message.grasp_id,
         record => played(record).map_or(0, |(grasp_id, _)| grasp_id),
     }

@@ -18,7 +18,6 @@ use serde::Deserialize;
 
 use super::comparison::Tolerance;
 use blindgrasp_messages::{Action, Reason};
-use blindgrasp_recording::present_topic;
 
 /// The keys of an expectations file.
 const KEYS: [&str; 7] =
@@ -126,11 +125,7 @@ impl Expectations {
             false_positives_at_most: written.false_positives_at_most,
             decisions: decisions.collect::<Result<_, String>>()?,
             reasons: written.reasons,
-            tolerances: written
-                .tolerances
-                .into_iter()
-                .map(|(topic, tolerance)| (present_topic(&topic).to_string(), tolerance))
-                .collect(),
+            tolerances: written.tolerances,
         })
     }
 
@@ -146,7 +141,7 @@ fn given<'de, T: Deserialize<'de>, D: serde::Deserializer<'de>>(deserializer: D)
     T::deserialize(deserializer).map(Some)
 }
 
-/// Parses `lift`, `hold` or `regrasp`, perhaps with a reason behind it.
+/// Parses `lift` or `hold`, perhaps with a reason behind it.
 fn decision(text: &str) -> Result<(Action, Option<Reason>), String> {
     let (action, reason) = match text.split_once(' ') {
         Some((action, reason)) => (action, Some(reason_named(reason.trim())?)),
@@ -155,7 +150,7 @@ fn decision(text: &str) -> Result<(Action, Option<Reason>), String> {
     let action = Action::ALL.iter().find(|known| known.as_str() == action);
     action
         .map(|action| (*action, reason))
-        .ok_or_else(|| format!("'{text}': expected lift, hold or regrasp, or like 'hold no_contact'"))
+        .ok_or_else(|| format!("'{text}': expected lift or hold, or like 'hold no_contact'"))
 }
 
 fn reason_named(word: &str) -> Result<Reason, String> {
@@ -216,7 +211,7 @@ mod tests {
             ("accuracy_at_least: 0.9\n", "version"),
             ("version: 1\naccuracy_at_least: 90\n", "accuracy_at_least must be from 0 to 1, found 90"),
             ("version: 1\nreasons: {out_of_odrer: 1}\n", "did you mean 'out_of_order'?"),
-            ("version: 1\ndecisions: {3: lfit}\n", "grasp 3: 'lfit': expected lift, hold or regrasp"),
+            ("version: 1\ndecisions: {3: lfit}\n", "grasp 3: 'lfit': expected lift or hold"),
             ("version: 1\ndecisions: {3: hold stabel}\n", "did you mean 'stable'?"),
             ("version: 1\ntolerances: {prediction: {absolute: 1}}\n", "expected one like /prediction"),
             ("version: 1\ntolerances: {/prediction: {absolute: -1}}\n", "expected numbers from 0 on"),

@@ -56,6 +56,6 @@ pub fn played(record: &Record) -> Option<(u64, &'static str)> {
         Record::Contacts(sample) => Some((sample.message.grasp_id, ContactSet::TYPE_NAME)),
         Record::Feature(sample) => Some((sample.message.grasp_id, GraspFeature::TYPE_NAME)),
         Record::Prediction(sample) => Some((sample.message.grasp_id, Prediction::TYPE_NAME)),
-        Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Advice(_) | Record::Scene(_) => None,
+        Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Scene(_) => None,
     }
 }

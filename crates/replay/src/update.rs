@@ -97,7 +97,7 @@ fn with_recorded_number(mut record: Record, coverage: &Coverage) -> Record {
         Record::Feature(sample) => &mut sample.header,
         Record::Prediction(sample) => &mut sample.header,
         // These messages have numbers of their own.
-        Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Advice(_) | Record::Scene(_) => {
+        Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Scene(_) => {
             return record;
         }
     };

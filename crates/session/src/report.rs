@@ -150,7 +150,7 @@ impl RunReport {
         let point = [secs, decision.probability_stable];
         let wrong = match (decision.action, truth.stable) {
             (Action::Lift, false) => &mut self.wrong_lifts,
-            (Action::Hold | Action::Regrasp, true) => &mut self.wrong_holds,
+            (Action::Hold, true) => &mut self.wrong_holds,
             _ => return self.add(point),
         };
         wrong.n += 1;

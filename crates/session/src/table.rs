@@ -16,12 +16,11 @@ pub(super) fn table(summary: &Summary) -> Vec<String> {
 }
 
 fn figures(summary: &Summary) -> Vec<(&'static str, String)> {
-    let regrasp = if summary.regrasp > 0 { format!(", {} of them REGRASP", summary.regrasp) } else { String::new() };
     let probes = if summary.probes > 0 { format!(", after {} probes", summary.probes) } else { String::new() };
     let end = if summary.end == "finished" { String::new() } else { format!("; the graph was {}", summary.end) };
     let (grasps, lift, hold, undecided) = (summary.grasps, summary.lift, summary.hold, summary.undecided);
     let mut figures =
-        vec![("grasps", format!("{grasps} ({lift} LIFT, {hold} HOLD{regrasp}{probes}), {undecided} undecided{end}"))];
+        vec![("grasps", format!("{grasps} ({lift} LIFT, {hold} HOLD{probes}), {undecided} undecided{end}"))];
     // Live grasps have no truth to be measured by.
     if summary.with_truth > 0 {
         let (accuracy, majority) = (percent(summary.accuracy), percent(summary.majority_class));

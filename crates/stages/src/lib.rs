@@ -5,7 +5,6 @@
 //! * [`out_of_distribution`] - whether a grasp is like those that the model was trained on.
 //! * [`model`] - the model file. [`recipe`] and [`training_summary`] - how a model was trained, as the file says.
 //! * [`promise_monitor`] - whether lifts drop more often than was promised.
-//! * [`regrasp`] - proposals of better grasps, from experience of lifts.
 //!
 //! Units are SI and `f64` throughout. Frames are named target first: `palm_from_link`. Every contact is in the
 //! **palm frame**: its origin the centre of the palm pad's surface, +z out of the palm.
@@ -26,6 +25,5 @@ pub mod out_of_distribution;
 pub mod probe;
 pub mod promise_monitor;
 pub mod recipe;
-pub mod regrasp;
 pub mod sensors;
 pub mod training_summary;

@@ -10,10 +10,9 @@
 //!   the grasp's end, when it is not decided by then.
 //!
 //! A wrong "stable" drops the object. So there is one path to LIFT, an `Ok(Vote::Stable)` of `OpenGrasp::assess`, and every
-//! other path ends in HOLD with its reason. With the option `regrasp`, a grasp that is held only because of the grasp itself
-//! is decided REGRASP, which is no lift either. With the option `probe`, settled predictions that are not unstable ask for
-//! a probe, which decides nothing: the grasp stays open, and only the frames after the probe can lead to a LIFT. If the outcomes
-//! of lifts refute [`ArbiterOptions::promised_drops`], every later grasp is held.
+//! other path ends in HOLD with its reason. With the option `probe`, settled predictions that are not unstable ask for a
+//! probe, which decides nothing: the grasp stays open, and only the frames after the probe can lead to a LIFT. If the
+//! outcomes of lifts refute [`ArbiterOptions::promised_drops`], every later grasp is held.
 
 use serde::{Deserialize, Serialize};
 
@@ -31,9 +30,6 @@ pub struct ArbiterOptions {
     pub max_gap_nanos: u64,
     /// Greatest age of a prediction on arrival, since its source published it on this machine.
     pub max_age_nanos: u64,
-    /// Whether a grasp that is held because of the grasp itself, and not because of a doubt about sensors, order, clocks or
-    /// hands, is decided [`Action::Regrasp`].
-    pub regrasp: bool,
     /// The probe that the robot can do. A settled grasp that is not unstable is then decided by this probe's frames.
     pub probe: Probe,
     /// The promised share of the lifts that drop the object; 1 promises nothing.
@@ -66,15 +62,6 @@ impl Probe {
     }
 }
 
-impl ArbiterOptions {
-    /// The action for a grasp that is not lifted for this reason alone.
-    fn not_lifted(&self, reason: Reason) -> Action {
-        let is_of_the_grasp =
-            matches!(reason, Reason::Unstable | Reason::Unsure | Reason::NoAgreement | Reason::OutOfDistribution);
-        if self.regrasp && is_of_the_grasp { Action::Regrasp } else { Action::Hold }
-    }
-}
-
 impl Default for ArbiterOptions {
     fn default() -> Self {
         ArbiterOptions {
@@ -86,7 +73,6 @@ impl Default for ArbiterOptions {
             max_gap_nanos: 100_000_000,
             // Twice the gap: a prediction that waited longer may be of a hand that has moved since.
             max_age_nanos: 200_000_000,
-            regrasp: false,
             probe: Probe::None,
             // A promise is a model's for objects like its own, which an arbiter does not know.
             promised_drops: 1.0,
@@ -290,17 +276,15 @@ impl LiftArbiter {
         let votes = prediction.phase == open.awaited;
         let has_begun = Phase::Settled.is_before(prediction.phase) && !prediction.phase.is_over();
         open.is_probe_pending &= !has_begun;
-        let unsound = break_in_order
-            .or((!is_valid).then_some(Reason::Invalid))
-            .or((age_nanos > options.max_age_nanos).then_some(Reason::Stale));
-        open.doubt = open.doubt.or(break_in_order).or(reason_of(prediction.fault, votes)).or(unsound);
-        // A prediction that cannot be trusted says nothing of the grasp itself.
-        let hold_or_regrasp = |reason| if unsound.is_none() { options.not_lifted(reason) } else { Action::Hold };
+        let invalid = (!is_valid).then_some(Reason::Invalid);
+        let stale = (age_nanos > options.max_age_nanos).then_some(Reason::Stale);
+        let faulty = reason_of(prediction.fault, votes);
+        open.doubt = open.doubt.or(break_in_order).or(faulty).or(invalid).or(stale);
         match prediction.phase {
             _ if votes => {
                 open.n_settled += 1;
                 match open.assess(prediction, &options) {
-                    Err(reason) => decisions.extend(self.decide(hold_or_regrasp(reason), reason, 0.0)),
+                    Err(reason) => decisions.extend(self.decide(Action::Hold, reason, 0.0)),
                     // It has no vote, but if it contradicts the votes, they don't count either.
                     Ok(vote) if !is_new_reading => {
                         let is_by_same = open.made_by == header.made_by;
@@ -318,7 +302,7 @@ impl LiftArbiter {
                                 }
                                 return;
                             }
-                            let action = if vote == Vote::Stable { Action::Lift } else { options.not_lifted(reason) };
+                            let action = if vote == Vote::Stable { Action::Lift } else { Action::Hold };
                             decisions.extend(self.decide(action, reason, lowest));
                         }
                     }
@@ -326,12 +310,8 @@ impl LiftArbiter {
             }
             // The source did not know yet that a probe was asked for.
             Phase::Ended if open.is_probe_pending => {}
-            Phase::Ended => {
-                let reason = open.reason_at_end();
-                decisions.extend(self.decide(hold_or_regrasp(reason), reason, 0.0));
-            }
-            // The robot has lifted although the grasp was not decided.
-            Phase::Kept | Phase::Dropped => {
+            // If its outcome comes, the robot has lifted although the grasp was not decided.
+            Phase::Ended | Phase::Kept | Phase::Dropped => {
                 let reason = open.reason_at_end();
                 decisions.extend(self.decide(Action::Hold, reason, 0.0));
             }
@@ -513,18 +493,17 @@ mod tests {
     }
 
     #[test]
-    fn with_regrasp_only_what_is_wrong_with_the_grasp_itself_is_grasped_anew() {
-        use Action::{Hold, Lift, Regrasp};
+    fn each_reason_not_to_lift_holds() {
+        use Action::{Hold, Lift};
         let unsure = Prediction { unsure: true, ..settled(0.4) };
         let fault = |fault| Prediction { fault, ..settled(0.9) };
-        let ended = || Prediction { phase: Phase::Ended, ..settled(0.5) };
+        let ended = Prediction { phase: Phase::Ended, ..settled(0.5) };
         for (predictions, age_nanos, expected) in [
-            (vec![settled(0.1); 3], 0, (Regrasp, Reason::Unstable)),
-            (vec![unsure; 3], 0, (Regrasp, Reason::Unsure)),
-            (vec![settled(0.9), settled(0.1), ended()], 0, (Regrasp, Reason::NoAgreement)),
-            // Only its source knows that nothing more comes.
+            (vec![settled(0.1); 3], 0, (Hold, Reason::Unstable)),
+            (vec![unsure; 3], 0, (Hold, Reason::Unsure)),
+            (vec![settled(0.9), settled(0.1), ended], 0, (Hold, Reason::NoAgreement)),
             (vec![settled(0.9), settled(0.1)], 0, (Hold, Reason::NoAgreement)),
-            (vec![fault(Fault::OutOfDistribution)], 0, (Regrasp, Reason::OutOfDistribution)),
+            (vec![fault(Fault::OutOfDistribution)], 0, (Hold, Reason::OutOfDistribution)),
             (vec![settled(0.9); 3], 0, (Lift, Reason::Stable)),
             (vec![], 0, (Hold, Reason::Missing)),
             (vec![fault(Fault::NoContact)], 0, (Hold, Reason::NoContact)),
@@ -532,33 +511,16 @@ mod tests {
             (vec![fault(Fault::InvalidValue)], 0, (Hold, Reason::Invalid)),
             (vec![fault(Fault::WrongModel)], 0, (Hold, Reason::WrongModel)),
             (vec![settled(0.1)], u64::MAX, (Hold, Reason::Stale)),
-            // The prediction says that of the grasp, but is not to be relied on.
             (vec![fault(Fault::OutOfDistribution)], u64::MAX, (Hold, Reason::OutOfDistribution)),
         ] {
-            for regrasp in [true, false] {
-                let mut s = stream();
-                s.arbiter.set_options(ArbiterOptions { regrasp, ..ArbiterOptions::default() });
-                s.push(Prediction { phase: Phase::Closing, ..settled(0.5) });
-                for prediction in &predictions {
-                    s.push_aged(prediction.clone(), age_nanos);
-                }
-                let action = if regrasp || expected.0 == Lift { expected.0 } else { Hold };
-                assert_eq!(s.end(), [(0, action, expected.1)], "regrasp {regrasp}");
+            let mut s = stream();
+            s.push(Prediction { phase: Phase::Closing, ..settled(0.5) });
+            for prediction in &predictions {
+                s.push_aged(prediction.clone(), age_nanos);
             }
+            let (action, reason) = expected;
+            assert_eq!(s.end(), [(0, action, reason)]);
         }
-        let mut s = stream();
-        s.arbiter.set_options(ArbiterOptions { regrasp: true, ..ArbiterOptions::default() });
-        s.push(settled(0.1));
-        s.header.seq += 1;
-        s.push(Prediction { grasp_id: 7, ..ended() });
-        let found: Vec<Action> = s.decisions.drain(..).map(|decision| decision.action).collect();
-        assert_eq!(found, [Hold, Hold], "samples are missing between the two");
-        let mut s = stream();
-        s.arbiter.set_options(ArbiterOptions { regrasp: true, ..ArbiterOptions::default() });
-        s.push(settled(0.1));
-        assert_eq!(s.arbiter.on_silence().map(|decision| decision.action), Some(Hold));
-        s.push(Prediction { grasp_id: 1, ..settled(0.1) });
-        assert_eq!(s.arbiter.on_cut_off().map(|decision| decision.action), Some(Hold));
     }
 
     #[test]
@@ -634,7 +596,6 @@ mod tests {
     fn an_outcome_before_the_decision_holds() {
         for phase in [Phase::Kept, Phase::Dropped] {
             let mut s = stream();
-            s.arbiter.set_options(ArbiterOptions { regrasp: true, ..ArbiterOptions::default() });
             s.push(settled(0.9)).push(settled(0.9)).push(Prediction { phase, ..settled(0.9) }).push(settled(0.9));
             assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement)]);
         }

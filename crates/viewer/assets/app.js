@@ -194,7 +194,7 @@ const player = (() => {
   function verdict({ action, truth }) {
     if (action === null || truth === null) return "other";
     if (action === "lift") return truth ? "right" : "false-positive";
-    if (action !== "hold" && action !== "regrasp") return "other";
+    if (action !== "hold") return "other";
     return truth ? "false-negative" : "right";
   }
   const colourOf = { right: "--lift", "false-positive": "--hold", "false-negative": "--probe", other: "--soft" };

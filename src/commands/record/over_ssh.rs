@@ -129,7 +129,7 @@ fn receive_file(arguments: &Arguments, sent: &SentFile, stdout: &mut impl Read) 
         bail!("the other machine sends a file '{}', which is none of this recording", sent.name.escape_debug());
     }
     let path = arguments.out.with_file_name(&sent.name);
-    if !arguments.options.overwrite && path.exists() {
+    if !arguments.recording.options().overwrite && path.exists() {
         bail!("{}: the file exists", path.display());
     }
     let part = arguments.out.with_file_name(format!("{}.part", sent.name));

@@ -13,7 +13,7 @@ use serde::Serialize;
 use blindgrasp_graph::client::observer::{Sink, bears_source_number};
 use blindgrasp_graph::control::AttachedEdge;
 use blindgrasp_graph::recorded_graph::Ending;
-use blindgrasp_messages::{Header, LiftDecision, Recorded as _, RegraspAdvice};
+use blindgrasp_messages::{Header, LiftDecision, Recorded as _};
 use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::port::sample_id;
@@ -81,7 +81,7 @@ impl EdgeSpan {
         EdgeSpan {
             topic: edge.topic.clone(),
             is_numbered: bears_source_number(type_name),
-            is_said_once: [LiftDecision::TYPE_NAME, RegraspAdvice::TYPE_NAME].contains(&type_name.as_str()),
+            is_said_once: type_name == LiftDecision::TYPE_NAME,
             answered_cells: edge.answered_cells.clone(),
             writer_cell: edge.input.writer_cell,
             place: None,

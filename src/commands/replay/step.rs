@@ -16,7 +16,7 @@ use blindgrasp_graph::client::Connection;
 use blindgrasp_graph::control::{Reply, Request};
 use blindgrasp_graph::run::observed_topics;
 use blindgrasp_messages::{
-    ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, RegraspAdvice,
+    ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded,
     TactileFrame,
 };
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -52,7 +52,7 @@ pub(super) fn start(
         .flat_map(|node| node.output_ports().map(|(port, output)| (port, output.type_name.as_str())));
     let types: BTreeMap<_, _> = types.collect();
     let is_per_frame = |type_name: &&str| {
-        ![LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME, LiftOutcome::TYPE_NAME, RegraspAdvice::TYPE_NAME]
+        ![LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME, LiftOutcome::TYPE_NAME]
             .contains(type_name)
     };
     let topics = observed_topics(&fed.graph, true);
@@ -269,12 +269,6 @@ fn show(topic: &str, record: &Record, is_json: bool) -> anyhow::Result<()> {
             let truth = &sample.message;
             let word = if truth.stable { "stable" } else { "unstable" };
             format!("grasp {}  {word} ({})", truth.grasp_id, truth.object)
-        }
-        Record::Advice(sample) => {
-            let advice = &sample.message;
-            let best =
-                advice.proposals.first().map_or(String::new(), |best| format!(", best p {:.4}", best.probability_held));
-            format!("grasp {}  {} proposals{best}", advice.grasp_id, advice.proposals.len())
         }
         Record::Decision(_) | Record::Outcome(_) | Record::Scene(_) => return Ok(()),
     };

@@ -39,13 +39,11 @@ const MAX_STRIPS: usize = 18;
 ///
 /// A simulated hand takes the robot's place. Its samples go through the same processes as a robot's would, and it obeys the
 /// arbiter: it lifts, or lets go and tries again. With --lift-policy both the same trials are made a second time with
-/// every settled grasp lifted, which shows the worth of the decision. If the graph gives advice how to grasp again, the
-/// hand follows it; with --regrasp both it also tries at random, which shows the worth of the advice.
+/// every settled grasp lifted, which shows the worth of the decision.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                         blindgrasp trials                                           the paper's 110 trials, with and without the decision\n  \
                         blindgrasp trials --trials 11 --lift-policy decision        each of its objects once\n  \
-                        blindgrasp trials --lift-policy decision --regrasp both     with advice, and at random\n  \
                         blindgrasp trials --objects held-out --trials 240 --report trials.html\n  \
                         blindgrasp trials --objects box-02@0.3kg@mu0.5,paper/mug --trials 40 --json\n\n\
                         Ctrl-C ends the run; the trials made so far are shown. The same seed gives the same trials.")]
@@ -66,10 +64,6 @@ pub(super) struct Arguments {
     /// When the hand lifts: decision, as the graph decides; always, every settled grasp; both, one after the other.
     #[arg(long, alias = "gate", default_value = "both")]
     lift_policy: LiftPolicy,
-    /// How the hand tries again after a hold: on, as the graph's advice says; off, at random; both, one after the other.
-    /// Default: on, if the dataflow file connects advice to the hand.
-    #[arg(long)]
-    regrasp: Option<Regrasp>,
     /// The model instead of the dataflow file's.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
@@ -85,7 +79,7 @@ pub(super) struct Arguments {
     /// Replace a param of the file; a path is relative to the current folder. Can be repeated.
     #[arg(long = "set", value_name = "[NODE.]PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
-    /// Record every edge to this file (MCAP); neither --lift-policy nor --regrasp may be both.
+    /// Record every edge to this file (MCAP); --lift-policy may not be both.
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
     /// Replace an existing recording.
@@ -108,20 +102,11 @@ enum LiftPolicy {
     Both,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Regrasp {
-    On,
-    Off,
-    Both,
-}
-
 /// One way to make the trials.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Way {
     /// The hand lifts only if the decision is to lift.
     obeys: bool,
-    /// Attempts follow advice.
-    regrasp: bool,
     /// Name in tables.
     name: &'static str,
 }
@@ -140,7 +125,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let mut report = empty_report(arguments, &setup);
     let mut is_lossy = false;
     let mut failed = None;
-    for way in ways(arguments.lift_policy, setup.regrasp) {
+    for way in ways(arguments.lift_policy) {
         match run_way(arguments, &setup, way, &mut report, &n_stops)? {
             Ok(outcome) => is_lossy |= outcome == Outcome::FinishedWithLoss,
             // The trials made so far are shown all the same.
@@ -177,14 +162,6 @@ fn check_arguments(arguments: &Arguments) -> anyhow::Result<()> {
              --lift-policy always"
         );
     }
-    if arguments.record.is_some() && arguments.regrasp == Some(Regrasp::Both) {
-        bail!(
-            "--record makes one recording, and --regrasp both runs the graph twice: use --regrasp on or --regrasp off"
-        );
-    }
-    if arguments.lift_policy == LiftPolicy::Always && matches!(arguments.regrasp, Some(Regrasp::On | Regrasp::Both)) {
-        bail!("--lift-policy always never holds, and --regrasp is for grasps after a hold: use --lift-policy decision");
-    }
     arguments.report.as_ref().map_or(Ok(()), |report| check_page(report, &[]))
 }
 
@@ -197,35 +174,25 @@ fn empty_report(arguments: &Arguments, setup: &Setup) -> TrialsReport {
         seed: arguments.seed,
         options: setup.options.clone(),
         model: setup.model.clone(),
-        regrasp: setup.regrasp.to_possible_value().map_or(String::new(), |value| value.get_name().into()),
         end: "finished".into(),
         with_gate: None,
-        with_gate_at_random: None,
         without_gate: None,
         late: None,
         n_left_out: 0,
         effect: None,
-        regrasp_effect: None,
         records_with_gate: Vec::new(),
-        records_with_gate_at_random: Vec::new(),
         records_without_gate: Vec::new(),
     }
 }
 
 /// The ways to make the trials, in the order in which they are run.
-fn ways(policy: LiftPolicy, regrasp: Regrasp) -> Vec<Way> {
+fn ways(policy: LiftPolicy) -> Vec<Way> {
     let mut ways = Vec::new();
     if policy != LiftPolicy::Always {
-        if regrasp != Regrasp::Off {
-            ways.push(Way { obeys: true, regrasp: true, name: "with the gate" });
-        }
-        if regrasp != Regrasp::On {
-            let name = if regrasp == Regrasp::Both { "with the gate, at random" } else { "with the gate" };
-            ways.push(Way { obeys: true, regrasp: false, name });
-        }
+        ways.push(Way { obeys: true, name: "with the gate" });
     }
     if policy != LiftPolicy::Decision {
-        ways.push(Way { obeys: false, regrasp: false, name: "every grasp lifted" });
+        ways.push(Way { obeys: false, name: "every grasp lifted" });
     }
     ways
 }
@@ -255,15 +222,11 @@ fn run_way(
     let ended = session.run(&graph, name, n_stops);
     let Watched { records, decisions } = watch.finish();
     if way.obeys {
-        let late = report.late.get_or_insert_default();
-        late.add(&LateDecisions::new(&records, &decisions));
-        late.n_unadvised += ended.as_ref().map_or(0, |ended| setup.n_unadvised(&ended.summary.run.counts));
+        report.late = Some(LateDecisions::new(&records, &decisions));
+        report.records_with_gate = records;
+    } else {
+        report.records_without_gate = records;
     }
-    *match way {
-        Way { obeys: false, .. } => &mut report.records_without_gate,
-        Way { regrasp: false, .. } if setup.regrasp == Regrasp::Both => &mut report.records_with_gate_at_random,
-        _ => &mut report.records_with_gate,
-    } = records;
     Ok(ended.map(|ended| {
         let counts = ended.summary.run.counts.get(&setup.node);
         let n_left_out = counts.and_then(|counts| counts.get(LEFT_OUT)).copied().unwrap_or(0);
@@ -312,7 +275,7 @@ fn print_report(arguments: &Arguments, report: &TrialsReport) -> anyhow::Result<
         }
         table.iter().try_for_each(|line| print_line(line))?;
     }
-    let unfinished = [&report.with_gate, &report.with_gate_at_random, &report.without_gate].into_iter().flatten();
+    let unfinished = [&report.with_gate, &report.without_gate].into_iter().flatten();
     let n_unfinished: usize = unfinished.map(|tallies| tallies.n_unfinished).sum();
     if report.end != "finished" {
         print_line(&format!(
@@ -348,7 +311,6 @@ mod tests {
         let arguments = parsed("blindgrasp trials").expect("a command");
         assert_eq!((arguments.objects.as_str(), arguments.trials, arguments.seed), ("paper", 110, 1));
         assert_eq!((arguments.lift_policy, arguments.attempts), (LiftPolicy::Both, 20));
-        assert_eq!(arguments.regrasp, None);
         assert!(!arguments.json && arguments.record.is_none() && arguments.report.is_none());
     }
 
@@ -359,8 +321,6 @@ mod tests {
         }
         for (line, expected) in [
             ("--record a.mcap", "--lift-policy decision"),
-            ("--record a.mcap --gate on --regrasp both", "use --regrasp on or --regrasp off"),
-            ("--lift-policy always --regrasp on", "use --lift-policy decision"),
         ] {
             let arguments = parsed(&format!("blindgrasp trials {line}")).expect("a command");
             let error = run(&arguments).expect_err("contradictory").to_string();
@@ -370,12 +330,9 @@ mod tests {
 
     #[test]
     fn each_way_is_run_once() {
-        let made = |policy, regrasp| -> Vec<(bool, bool)> {
-            ways(policy, regrasp).iter().map(|way| (way.obeys, way.regrasp)).collect()
-        };
-        assert_eq!(made(LiftPolicy::Both, Regrasp::Both), [(true, true), (true, false), (false, false)]);
-        assert_eq!(made(LiftPolicy::Both, Regrasp::On), [(true, true), (false, false)]);
-        assert_eq!(made(LiftPolicy::Decision, Regrasp::Off), [(true, false)]);
-        assert_eq!(made(LiftPolicy::Always, Regrasp::On), [(false, false)]);
+        let obeys = |policy| ways(policy).iter().map(|way| way.obeys).collect::<Vec<_>>();
+        assert_eq!(obeys(LiftPolicy::Both), [true, false]);
+        assert_eq!(obeys(LiftPolicy::Decision), [true]);
+        assert_eq!(obeys(LiftPolicy::Always), [false]);
     }
 }

@@ -1,14 +1,13 @@
 //! The graph of trials: the node that lifts, and the params of the nodes.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-use super::{Arguments, Regrasp, Way};
+use super::{Arguments, Way};
 use blindgrasp_graph::dataflow::{self, DataflowFile, Graph, Node, Override, Scope};
 use blindgrasp_graph::describe::{describe, shipped};
-use blindgrasp_messages::{LiftDecision, LiftOutcome, Recorded, RegraspAdvice};
+use blindgrasp_messages::{LiftOutcome, Recorded};
 use blindgrasp_simulator::trial::{Probe, TrialOptions};
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
@@ -23,9 +22,6 @@ pub(super) struct Setup {
     overrides: Vec<Override>,
     /// The node that lifts.
     pub(super) node: String,
-    /// The node that gives it advice, if there is one.
-    adviser: Option<String>,
-    pub(super) regrasp: Regrasp,
     /// The hand of the node that lifts.
     pub(super) hand: Hand,
     /// The friction that the node gives to all objects, if any.
@@ -69,31 +65,9 @@ impl Setup {
         ] {
             overrides.push(set(&node.id, param, text));
         }
-        let adviser = node.inputs.iter().find(|input| input.type_name == RegraspAdvice::TYPE_NAME);
-        let adviser = adviser.map(|input| input.from_node.clone());
-        let regrasp = match (arguments.regrasp, &adviser) {
-            (Some(Regrasp::On | Regrasp::Both), None) => bail!(
-                "--regrasp: nothing gives node '{}' of {} advice; expected an edge like 'advice: regrasp/advice', or \
-                 --regrasp off",
-                node.id,
-                arguments.dataflow.display()
-            ),
-            (asked, _) => asked.unwrap_or(if adviser.is_some() { Regrasp::On } else { Regrasp::Off }),
-        };
         let mut model = text_param(&graph, "model").unwrap_or_default();
         if let Some(path) = &arguments.model {
             let path = path.to_str().context("--model: the path is not UTF-8")?;
-            let is_other = std::fs::canonicalize(path).ok() != std::fs::canonicalize(&model).ok();
-            if let Some(adviser) = adviser.as_ref().filter(|_| is_other && regrasp != Regrasp::Off) {
-                let has_experience = overrides.iter().any(|set| set.is_of(adviser) && set.param == "experience");
-                if graph.node(adviser).is_some_and(|node| node.params.contains_key("experience")) && !has_experience {
-                    bail!(
-                        "--model {path}: the experience of node '{adviser}' belongs to the file's model; make one for this \
-                         model ('blindgrasp train LIFTS.mcap --experience {path} --out EXPERIENCE.json') and say \
-                         --set {adviser}.experience=EXPERIENCE.json, or say --regrasp off"
-                    );
-                }
-            }
             let judges = graph.nodes.iter().filter(|node| node.params.contains_key("model"));
             overrides.extend(judges.map(|node| set(&node.id, "model", path.into())));
             model = path.into();
@@ -127,8 +101,6 @@ impl Setup {
         let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());
         Ok(Setup {
             node: node.id.clone(),
-            adviser,
-            regrasp,
             file,
             overrides,
             hand,
@@ -140,46 +112,12 @@ impl Setup {
         })
     }
 
-    /// The checked graph of a way. Without advice, the node that gives it is left out if no other node reads from it.
+    /// The checked graph of a way.
     pub(super) fn graph(&self, way: Way) -> anyhow::Result<Graph> {
         let mut overrides = self.overrides.clone();
         let text = if way.obeys { "on" } else { "off" };
         overrides.push(Override { node: Some(self.node.clone()), param: "gate".into(), text: text.into() });
-        let shipped = shipped()?;
-        let mut graph = dataflow::check(&self.file, &shipped, &overrides, Scope::Everything, describe)?;
-        if way.regrasp {
-            self.let_regrasp(&mut graph, &overrides);
-        } else {
-            self.remove_adviser(&mut graph);
-        }
-        Ok(graph)
-    }
-
-    /// Number of times that the hand waited for advice in vain.
-    pub(super) fn n_unadvised(&self, counts: &BTreeMap<String, BTreeMap<String, u64>>) -> usize {
-        counts.get(&self.node).and_then(|counts| counts.get("unadvised")).map_or(0, |n| *n as usize)
-    }
-
-    /// Lets the deciding nodes ask for another grasp, unless an override sets that.
-    fn let_regrasp(&self, graph: &mut Graph, overrides: &[Override]) {
-        let decides =
-            |node: &&mut Node| node.outputs().iter().any(|output| output.type_name == LiftDecision::TYPE_NAME);
-        for node in graph.nodes.iter_mut().filter(decides) {
-            let is_set = overrides.iter().any(|set| set.is_of(&node.id) && set.param == "regrasp");
-            if let Some(regrasp) = node.params.get_mut("regrasp").filter(|_| !is_set) {
-                *regrasp = true.into();
-            }
-        }
-    }
-
-    fn remove_adviser(&self, graph: &mut Graph) {
-        let Some(adviser) = &self.adviser else { return };
-        for node in graph.nodes.iter_mut().filter(|node| node.id == self.node) {
-            node.inputs.retain(|input| input.type_name != RegraspAdvice::TYPE_NAME);
-        }
-        if !graph.edges().any(|edge| edge.from_node == adviser) {
-            graph.nodes.retain(|node| node.id != *adviser);
-        }
+        Ok(dataflow::check(&self.file, &shipped()?, &overrides, Scope::Everything, describe)?)
     }
 }
 

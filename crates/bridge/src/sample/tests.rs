@@ -4,8 +4,7 @@ use rand_chacha::ChaCha8Rng;
 use super::*;
 use blindgrasp_messages::{
     Action, Contact, ContactSet, Fault, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome,
-    MAX_CELLS, MAX_FEATURES, MAX_JOINTS, MAX_PROPOSALS, MESSAGE_TYPES, Phase, Prediction, Reason, Recorded,
-    RegraspAdvice, RegraspProposal, TactileFrame,
+    MAX_CELLS, MAX_FEATURES, MAX_JOINTS, MESSAGE_TYPES, Phase, Prediction, Reason, Recorded, TactileFrame,
 };
 
 /// Any bits: NaNs with payloads, subnormals, negative zeros.
@@ -148,7 +147,6 @@ fn every_message_arrives_bit_by_bit() {
             lifted: rng.random(),
             held: rng.random(),
             has_quality: rng.random(),
-            advised: rng.random(),
             slip_m: any_f64(rng),
             turn_rad: any_f64(rng),
             epsilon: any_f64(rng),
@@ -161,15 +159,6 @@ fn every_message_arrives_bit_by_bit() {
             disturbed: rng.random(),
         };
         check(rng, &outcome);
-        let (n_proposals, n_joints) = (rng.random_range(0..=MAX_PROPOSALS), rng.random_range(0..=MAX_JOINTS));
-        let proposal = |rng: &mut ChaCha8Rng| RegraspProposal {
-            palm_position_m: [(); 3].map(|()| any_f64(rng)),
-            palm_rotation_xyzw: [(); 4].map(|()| any_f64(rng)),
-            open_joints_rad: (0..n_joints).map(|_| any_f64(rng)).collect(),
-            probability_held: any_f64(rng),
-        };
-        let proposals = (0..n_proposals).map(|_| proposal(rng)).collect();
-        check(rng, &RegraspAdvice { grasp_id, proposals });
     }
     // The comparison is one of bits.
     assert_ne!(bits(&f64::NAN), bits(&f64::from_bits(f64::NAN.to_bits() | 1)));

@@ -11,7 +11,6 @@ use crate::dataflow::diagnostic::{DataflowError, Diagnostics, did_you_mean_or_li
 use crate::dataflow::file::DataflowFile;
 use crate::dataflow::graph::{Graph, Input, Node};
 use crate::dataflow::node::{NodeEntry, PinEntry, Source};
-use crate::dataflow::old_names::with_new_names;
 use crate::dataflow::order::levels;
 use crate::dataflow::pins::{PinError, Pins, RUN};
 use crate::dataflow::process_options::PROCESS_KEYS;
@@ -57,8 +56,6 @@ pub fn check(
     scope: Scope<'_>,
     describe: impl FnMut(&Path, &[String]) -> Result<OperatorDescription, String>,
 ) -> Result<Graph, DataflowError> {
-    let renamed = with_new_names(file, shipped);
-    let file = renamed.as_ref().unwrap_or(file);
     let mut diagnostics = file.diagnostics.clone();
     scope.check(file, &mut diagnostics);
     // The parent of a file is a folder; of "/" it is nothing, but that was not read as a file.

@@ -64,7 +64,6 @@ mod graph;
 mod machines;
 mod machines_entry;
 mod node;
-mod old_names;
 mod order;
 pub mod pins;
 mod process_options;

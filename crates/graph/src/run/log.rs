@@ -34,7 +34,6 @@ pub(super) struct RunLog<S> {
     status: Arc<Mutex<DecisionStatus>>,
     evaluation: Evaluation,
     n_lift: usize,
-    n_regrasp: usize,
     n_probes: usize,
     n_decisions: usize,
     n_undecided: usize,
@@ -68,7 +67,6 @@ impl<S: RunSink> RunLog<S> {
             status,
             evaluation: Evaluation::default(),
             n_lift: 0,
-            n_regrasp: 0,
             n_probes: 0,
             n_decisions: 0,
             n_undecided: 0,
@@ -86,7 +84,7 @@ impl<S: RunSink> RunLog<S> {
         let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
         match decided.action {
             Action::Lift => status.n_lift += 1,
-            Action::Hold | Action::Regrasp => status.n_hold += 1,
+            Action::Hold => status.n_hold += 1,
             Action::Squeeze | Action::TestLift => {}
         }
         status.n_false_positives += u64::from(decided.is_false_positive());
@@ -158,7 +156,6 @@ impl<S: RunSink> RunLog<S> {
         }
         self.n_decisions += 1;
         self.n_lift += usize::from(message.action == Action::Lift);
-        self.n_regrasp += usize::from(message.action == Action::Regrasp);
         if truth.is_some() {
             self.evaluation.add(message, truth.as_ref());
             return Ok(());
@@ -202,7 +199,6 @@ impl<S: RunSink> RunLog<S> {
             grasps: self.n_decisions,
             lift: self.n_lift,
             hold: self.n_decisions - self.n_lift,
-            regrasp: self.n_regrasp,
             probes: self.n_probes,
             with_truth: score.n_grasps,
             accuracy: score.accuracy,

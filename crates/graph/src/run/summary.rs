@@ -22,8 +22,6 @@ pub struct Summary {
     pub grasps: usize,
     pub lift: usize,
     pub hold: usize,
-    /// The part of `hold` that is to be grasped anew.
-    pub regrasp: usize,
     /// Probes that were asked for before decisions.
     pub probes: usize,
     pub with_truth: usize,

@@ -14,8 +14,6 @@ pub struct LateDecisions {
     pub n_stale: usize,
     /// Attempts without a decision in time: none came, or it came after the hand had let go.
     pub n_undecided: usize,
-    /// Attempts at random because advice did not come in time. [`LateDecisions::new`] does not count these.
-    pub n_unadvised: usize,
 }
 
 impl LateDecisions {
@@ -38,32 +36,20 @@ impl LateDecisions {
         late
     }
 
-    /// Adds what another run came to.
-    pub fn add(&mut self, other: &LateDecisions) {
-        self.n_stale += other.n_stale;
-        self.n_undecided += other.n_undecided;
-        self.n_unadvised += other.n_unadvised;
-    }
-
     /// A warning in a line; `None` if nothing was late.
     pub fn advice(&self) -> Option<String> {
-        let LateDecisions { n_stale, n_undecided, n_unadvised } = *self;
-        let raise: Vec<&str> = [
-            (n_stale > 0).then_some("lift_arbiter.max_age_ms"),
-            (n_undecided + n_unadvised > 0).then_some("simulated_hand.decision_timeout_s"),
-        ]
-        .into_iter()
-        .flatten()
-        .collect();
-        (!raise.is_empty()).then(|| {
-            format!(
-                "{} attempts were not lifted, or did not follow advice, because this machine was too slow ({n_stale} stale, \
-                 {n_undecided} without a decision in time, {n_unadvised} without advice), so the results depend on it: \
-                 raise {} (--set)",
-                n_stale + n_undecided + n_unadvised,
-                raise.join(" and ")
-            )
-        })
+        let LateDecisions { n_stale, n_undecided } = *self;
+        let raise = match (n_stale > 0, n_undecided > 0) {
+            (false, false) => return None,
+            (true, false) => "lift_arbiter.max_age_ms",
+            (false, true) => "simulated_hand.decision_timeout_s",
+            (true, true) => "lift_arbiter.max_age_ms and simulated_hand.decision_timeout_s",
+        };
+        Some(format!(
+            "{} attempts were not lifted because this machine was too slow ({n_stale} stale, {n_undecided} without a decision \
+             in time), so the results depend on it: raise {raise} (--set)",
+            n_stale + n_undecided
+        ))
     }
 }
 
@@ -86,14 +72,11 @@ mod tests {
             decision(4, Action::Lift, Reason::Stable),
         ]);
         let late = LateDecisions::new(&records, &decisions);
-        assert_eq!(late, LateDecisions { n_stale: 1, n_undecided: 2, n_unadvised: 0 });
-        let mut late = late;
-        late.add(&LateDecisions { n_unadvised: 4, ..LateDecisions::default() });
+        assert_eq!(late, LateDecisions { n_stale: 1, n_undecided: 2 });
         let advice = late.advice().expect("late");
         for expected in [
-            "7 attempts",
+            "3 attempts",
             "1 stale, 2 without",
-            "4 without advice",
             "lift_arbiter.max_age_ms and simulated_hand.decision_timeout_s",
         ] {
             assert!(advice.contains(expected), "{advice}");

@@ -2,6 +2,5 @@
 
 pub mod late_decisions;
 pub mod page;
-pub mod regrasp_effect;
 pub mod tables;
 pub mod tally;

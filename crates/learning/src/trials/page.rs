@@ -81,13 +81,13 @@ pub fn trials_page(report: &TrialsReport, strips: &[Strip]) -> String {
 }
 
 /// Of each group, with the gate (or without, if there was none), the first grasp that held, the first that was dropped
-/// and the first that was held back. Attempts that followed advice are left out, because they depend on it.
+/// and the first that was held back.
 pub fn telling_records(report: &TrialsReport) -> Vec<&TrialRecord> {
     let records =
         if report.records_with_gate.is_empty() { &report.records_without_gate } else { &report.records_with_gate };
     let mut seen: Vec<(&str, bool, bool)> = Vec::new();
     let mut telling: Vec<&TrialRecord> = Vec::new();
-    for record in records.iter().filter(|record| !record.advised) {
+    for record in records {
         let kind = (record.group.as_str(), record.lifted, record.held);
         if !seen.contains(&kind) {
             seen.push(kind);
@@ -195,7 +195,6 @@ fn lead(report: &TrialsReport) -> String {
     let mut parts = Vec::new();
     for (name, tallies) in [
         ("With the gate", &report.with_gate),
-        ("With the gate and attempts at random", &report.with_gate_at_random),
         ("With every settled grasp lifted", &report.without_gate),
     ] {
         if let Some(total) = tallies.as_ref().map(|tallies| &tallies.total) {

@@ -3,7 +3,6 @@
 use serde::Serialize;
 
 use super::late_decisions::LateDecisions;
-use super::regrasp_effect::RegraspEffect;
 use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
 use crate::evaluation::statistics::Estimate;
 use blindgrasp_simulator::trial::TrialOptions;
@@ -28,12 +27,8 @@ pub struct TrialsReport {
     pub model: String,
     /// `finished`, or `stopped` before all was done.
     pub end: String,
-    /// Whether attempts that follow a grasp that was not lifted are made as advice says: `on`, `off`, or `both`.
-    pub regrasp: String,
-    /// With the gate: lifted when the graph said so; unless `regrasp` is `off`, attempts follow advice.
+    /// With the gate: lifted when the graph said so.
     pub with_gate: Option<Tallies>,
-    /// With the gate, and all attempts at random; only if `regrasp` is `both`.
-    pub with_gate_at_random: Option<Tallies>,
     /// Every settled grasp lifted.
     pub without_gate: Option<Tallies>,
     /// Attempts that were not lifted because the host was slow. `None` without trials by decision.
@@ -42,12 +37,8 @@ pub struct TrialsReport {
     pub n_left_out: u64,
     /// The effect of the decision; only if there are trials both ways.
     pub effect: Option<GateEffect>,
-    /// The effect of advice; only if there are trials with it and without.
-    pub regrasp_effect: Option<RegraspEffect>,
     /// All attempts with the gate.
     pub records_with_gate: Vec<TrialRecord>,
-    /// All attempts with the gate and at random, if `regrasp` is `both`.
-    pub records_with_gate_at_random: Vec<TrialRecord>,
     /// All attempts without.
     pub records_without_gate: Vec<TrialRecord>,
 }
@@ -60,10 +51,6 @@ impl TrialsReport {
         (self.with_gate, self.without_gate) = (tallies(with), tallies(without));
         let both = !with.is_empty() && !without.is_empty();
         self.effect = both.then(|| GateEffect::new(with, without, self.max_attempts));
-        let at_random = &self.records_with_gate_at_random;
-        self.with_gate_at_random = tallies(at_random);
-        let both = !with.is_empty() && !at_random.is_empty();
-        self.regrasp_effect = both.then(|| RegraspEffect::new(with, at_random, self.max_attempts));
     }
 
     /// How many trials were left out and why, in a line; `None` if none was.
@@ -78,7 +65,6 @@ impl TrialsReport {
     fn ways(&self) -> Vec<(&'static str, &Tallies)> {
         let ways = [
             ("with the gate", &self.with_gate),
-            ("with the gate, at random", &self.with_gate_at_random),
             ("every grasp lifted", &self.without_gate),
         ];
         ways.into_iter().filter_map(|(name, tallies)| Some((name, tallies.as_ref()?))).collect()
@@ -126,7 +112,6 @@ pub fn tables(report: &TrialsReport) -> Vec<Table> {
         Some(cost(report)),
         promises(report),
         gate(report),
-        report.regrasp_effect.as_ref().map(RegraspEffect::table),
         Some(closure(report)),
     ];
     tables.into_iter().flatten().collect()
@@ -209,7 +194,6 @@ fn attempts(report: &TrialsReport) -> Table {
         "object",
         "trials",
         "attempts",
-        "advised",
         "lifts",
         "kept",
         "given up",
@@ -218,8 +202,8 @@ fn attempts(report: &TrialsReport) -> Table {
     ];
     let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
     let row = |tally: &Tally| {
-        let Tally { n_trials, n_attempts, n_advised, n_lifts, n_held, n_given_up, .. } = *tally;
-        let counts = [n_trials, n_attempts, n_advised, n_lifts, n_held, n_given_up];
+        let Tally { n_trials, n_attempts, n_lifts, n_held, n_given_up, .. } = *tally;
+        let counts = [n_trials, n_attempts, n_lifts, n_held, n_given_up];
         let counts = counts.into_iter().map(|count| count.to_string());
         let rates = [tally.attempts_per_lift, tally.attempts_per_held].map(number);
         std::iter::once(tally.name.clone()).chain(counts).chain(rates).collect()
@@ -359,17 +343,13 @@ pub(super) mod tests {
             seed: 1,
             options: TrialOptions::default(),
             model: "models/<any>.json".into(),
-            regrasp: "off".into(),
             end: "finished".into(),
             with_gate: None,
-            with_gate_at_random: None,
             without_gate: None,
             late: None,
             n_left_out: 0,
             effect: None,
-            regrasp_effect: None,
             records_with_gate: with,
-            records_with_gate_at_random: Vec::new(),
             records_without_gate: without,
         };
         report.count();
@@ -412,27 +392,6 @@ pub(super) mod tests {
             assert!(text.contains(line), "no '{line}' in\n{text}");
         }
         assert!(!text.contains("canteen without cover"), "{text}");
-    }
-
-    #[test]
-    fn advice_is_held_against_chance() {
-        let rock = |attempts| ("decorative rock", "rock", 0.28, attempts);
-        let mut report = report(records(&[rock("-A"), rock("-+A")]), Vec::new());
-        report.records_with_gate_at_random = records(&[rock("--h"), rock("--d")]);
-        report.regrasp = "both".into();
-        report.count();
-        let text: Vec<String> = tables(&report).iter().flat_map(Table::to_text).collect();
-        let words: Vec<String> =
-            text.iter().map(|line| line.split_whitespace().collect::<Vec<_>>().join(" ")).collect();
-        let text = words.join("\n");
-        for line in [
-            "kept, with the gate, at random",
-            "attempts per kept object 2.50 6.00",
-            "attempts per kept object, for each at random 0.42",
-            "second attempts of the same trials that kept it 1 of 2, 50 % 0 of 2, 0 %",
-        ] {
-            assert!(text.contains(line), "no '{line}' in\n{text}");
-        }
     }
 
     #[test]

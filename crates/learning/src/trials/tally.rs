@@ -35,8 +35,6 @@ pub struct TrialRecord {
     pub lifted: bool,
     /// Whether the object was kept: in the hand and off the stand at the end. False if it was not lifted.
     pub held: bool,
-    /// Whether the attempt followed advice; otherwise it began at random.
-    pub advised: bool,
     /// Movement of the object in the hand.
     pub slip_m: f64,
     /// Turn of the object in the hand.
@@ -58,7 +56,7 @@ impl From<Stamped<LiftOutcome>> for TrialRecord {
         let end_secs = outcome.header.stamp_nanos as f64 * 1e-9;
         let outcome = outcome.message;
         let LiftOutcome { probed, disturbed, .. } = outcome;
-        let LiftOutcome { grasp_id, trial, attempt, lifted, held, has_quality, advised, .. } = outcome;
+        let LiftOutcome { grasp_id, trial, attempt, lifted, held, has_quality, .. } = outcome;
         let LiftOutcome { slip_m, turn_rad, epsilon, volume, mass_kg, friction, thing, group, .. } = outcome;
         let [epsilon, volume] = [epsilon, volume].map(|value| has_quality.then_some(value));
         TrialRecord {
@@ -71,7 +69,6 @@ impl From<Stamped<LiftOutcome>> for TrialRecord {
             friction,
             lifted,
             held,
-            advised,
             slip_m,
             turn_rad,
             epsilon,
@@ -94,8 +91,6 @@ pub struct Tally {
     pub n_trials: usize,
     /// Attempts in these trials.
     pub n_attempts: usize,
-    /// Of these, attempts that followed advice.
-    pub n_advised: usize,
     /// Trials that ended in a lift.
     pub n_lifts: usize,
     /// Lifts that held.
@@ -167,7 +162,6 @@ enum Ending {
 pub(super) struct Trial<'a> {
     last: &'a TrialRecord,
     n_attempts: usize,
-    n_advised: usize,
     ending: Ending,
 }
 
@@ -256,9 +250,8 @@ pub(super) fn trials(records: &[TrialRecord], max_attempts: u32) -> (BTreeMap<u6
                 (false, _) => return None,
             };
             // Attempts are numbered without gaps.
-            let n_advised = attempts.values().filter(|record| record.advised).count();
             let n_attempts = last_attempt as usize + 1;
-            Some((number, Trial { last, n_attempts, n_advised, ending }))
+            Some((number, Trial { last, n_attempts, ending }))
         })
         .collect();
     let n_unfinished = n_begun - ended.len();
@@ -292,7 +285,6 @@ fn tally<'t, 'a: 't>(name: &str, trials: impl Iterator<Item = &'t Trial<'a>>) ->
         mass_kg: [masses.clone().reduce(f64::min).unwrap_or(0.0), masses.reduce(f64::max).unwrap_or(0.0)],
         n_trials: trials.len(),
         n_attempts,
-        n_advised: trials.iter().map(|trial| trial.n_advised).sum(),
         n_lifts,
         n_held,
         n_given_up,
@@ -310,8 +302,7 @@ fn tally<'t, 'a: 't>(name: &str, trials: impl Iterator<Item = &'t Trial<'a>>) ->
 pub(super) mod tests {
     use super::*;
 
-    /// Trials, each with its thing and what became of its attempts: `-` held back, `h` held, `d` dropped; `+`, `A` and `a` the same of
-    /// attempts that followed advice.
+    /// Trials, each with its thing and what became of its attempts: `-` held back, `h` held, `d` dropped.
     pub(in crate::trials) fn records(trials: &[(&str, &str, f64, &str)]) -> Vec<TrialRecord> {
         let mut records = Vec::new();
         for (number, (thing, group, mass_kg, attempts)) in trials.iter().enumerate() {
@@ -324,12 +315,11 @@ pub(super) mod tests {
                     group: (*group).into(),
                     mass_kg: *mass_kg,
                     friction: 1.0,
-                    lifted: !"-+".contains(what),
-                    held: "hA".contains(what),
-                    advised: "+Aa".contains(what),
+                    lifted: what != '-',
+                    held: what == 'h',
                     slip_m: 0.0,
                     turn_rad: 0.0,
-                    epsilon: Some(if "hA".contains(what) { 0.1 } else { -0.1 }),
+                    epsilon: Some(if what == 'h' { 0.1 } else { -0.1 }),
                     volume: Some(0.2),
                     probed: false,
                     disturbed: false,

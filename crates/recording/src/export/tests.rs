@@ -4,7 +4,7 @@ use super::*;
 use crate::{Record, RecordingInfo, RecordingWriter};
 use blindgrasp_messages::{
     Contact, ContactSet, Fault, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome, Phase,
-    Prediction, RegraspAdvice, SceneContact, Stamped, TactileFrame,
+    Prediction, SceneContact, Stamped, TactileFrame,
 };
 
 fn stamped<M>(seq: u64, message: M) -> Stamped<M> {
@@ -30,7 +30,6 @@ fn of_each_type() -> Vec<Record> {
         Record::Decision(stamped(0, LiftDecision::default())),
         Record::Truth(stamped(0, GraspTruth::default())),
         Record::Outcome(stamped(0, LiftOutcome::default())),
-        Record::Advice(stamped(0, RegraspAdvice::default())),
         Record::Scene(stamped(0, GraspScene::default())),
     ]
 }

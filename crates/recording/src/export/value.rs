@@ -63,7 +63,6 @@ macro_rules! of_any_type {
             Record::Decision(sample) => $function(sample),
             Record::Truth(sample) => $function(sample),
             Record::Outcome(sample) => $function(sample),
-            Record::Advice(sample) => $function(sample),
             Record::Scene(sample) => $function(sample),
         }
     };

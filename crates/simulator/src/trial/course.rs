@@ -1,15 +1,13 @@
 //! The course of many trials: the order of attempts, the numbers of their samples, and the state from which a process goes
 //! on after a crash with the same samples.
 //!
-//! An attempt is a pure function of seed, trial and attempt, and of its start if advice said where that is; so all that is
-//! kept of one is where it stands and how it ended.
+//! An attempt is a pure function of seed, trial and attempt, so all that is kept of one is where it stands and how it ended.
 
 use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use super::advised_start::Grasped;
-use super::{Probe, Start};
+use super::Probe;
 use blindgrasp_messages::{GraspTruth, LiftOutcome};
 
 /// The numbers of an attempt in a run.
@@ -25,8 +23,6 @@ pub struct Place {
     pub begin_nanos: u64,
     /// Number of grasps that were lifted before, which is the number of its label if it is lifted.
     pub n_lifted: u64,
-    /// Where it begins, if advice said so; otherwise that is drawn.
-    pub advised_start: Option<Start>,
 }
 
 /// A finished attempt.
@@ -69,34 +65,14 @@ pub struct Course {
     pub next: Place,
     /// Finished attempts that a reader may have to hear of again, in order.
     pub finished: VecDeque<Finished>,
-    /// The grasps that led to the next attempt: the last that began at random, and those that followed advice since.
-    /// Empty if the next attempt begins at random.
-    pub grasped: Vec<Grasped>,
 }
 
 impl Course {
     /// Goes on to the attempt after one that is over: of the same trial, unless that one was lifted or was the last of
-    /// `max_attempts`. `pause_nanos` of simulated time lie between. `advised` is where it begins as advice says, and what was
-    /// grasped in the one that is over.
-    pub fn finish(
-        &mut self,
-        finished: Finished,
-        max_attempts: u32,
-        pause_nanos: u64,
-        advised: Option<(Start, Grasped)>,
-    ) {
+    /// `max_attempts`. `pause_nanos` of simulated time lie between.
+    pub fn finish(&mut self, finished: Finished, max_attempts: u32, pause_nanos: u64) {
         let Place { grasp_id, trial, attempt, n_lifted, .. } = finished.place;
         let is_last = finished.outcome.lifted || attempt.saturating_add(1) >= max_attempts;
-        let advised_start = match advised.filter(|_| !is_last) {
-            Some((start, grasped)) => {
-                self.grasped.push(grasped);
-                Some(start)
-            }
-            None => {
-                self.grasped.clear();
-                None
-            }
-        };
         self.next = Place {
             grasp_id: grasp_id + 1,
             trial: trial + u64::from(is_last),
@@ -104,7 +80,6 @@ impl Course {
             first_seq: finished.place.first_seq + finished.n_frames,
             begin_nanos: finished.end_nanos.saturating_add(pause_nanos),
             n_lifted: n_lifted + u64::from(finished.outcome.lifted),
-            advised_start,
         };
         self.finished.push_back(finished);
     }
@@ -124,8 +99,6 @@ impl Course {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Isometry3;
-
     use super::*;
 
     fn over(course: &Course, lifted: bool) -> Finished {
@@ -141,28 +114,6 @@ mod tests {
     }
 
     #[test]
-    fn advice_is_followed_within_a_trial_only() {
-        let start = Start {
-            world_from_palm_xyzw: [0.0, 0.0, 0.0, 1.0],
-            lateral_offset_m: [0.0, 0.0],
-            open_joints_rad: vec![0.0; 3],
-            yaw_rad: 0.5,
-        };
-        let grasped = Grasped { target_from_palm: Isometry3::identity(), open_joints_rad: vec![0.0; 3] };
-        let mut course = Course::default();
-        let mut seen = Vec::new();
-        for (lifted, is_advised) in [(false, true), (false, true), (false, false), (false, true), (true, true)] {
-            let finished = over(&course, lifted);
-            course.finish(finished, 4, 10, is_advised.then(|| (start.clone(), grasped.clone())));
-            let place = &course.next;
-            assert!(place.advised_start.as_ref().is_none_or(|it| *it == start));
-            seen.push((place.trial, place.attempt, place.advised_start.is_some(), course.grasped.len()));
-        }
-        // The fourth attempt is the last one, and a lift ends a trial.
-        assert_eq!(seen, [(0, 1, true, 1), (0, 2, true, 2), (0, 3, false, 0), (1, 0, false, 0), (2, 0, false, 0)]);
-    }
-
-    #[test]
     fn a_trial_goes_on_until_a_lift_or_its_last_attempt() {
         let mut course = Course::default();
         let mut places = Vec::new();
@@ -170,7 +121,7 @@ mod tests {
             let Place { grasp_id, trial, attempt, first_seq, n_lifted, .. } = course.next.clone();
             places.push((grasp_id, trial, attempt, first_seq, n_lifted));
             let finished = over(&course, lifted);
-            course.finish(finished, 3, 10, None);
+            course.finish(finished, 3, 10);
         }
         assert_eq!(
             places,
@@ -186,7 +137,7 @@ mod tests {
     fn a_trial_that_is_left_out_leaves_no_gap_in_any_number_but_its_own() {
         let mut course = Course::default();
         let finished = over(&course, false);
-        course.finish(finished, 3, 10, None);
+        course.finish(finished, 3, 10);
         let before = course.next.clone();
         course.leave_out();
         assert_eq!(course.next, Place { trial: 1, attempt: 0, ..before });

@@ -7,7 +7,6 @@
 //! [`targets`] are the six objects of the paper's experiment (Dang & Allen, section IV-E). [`lift_label`] labels simulated
 //! grasps by a lift.
 
-pub mod advised_start;
 mod attempt;
 pub mod course;
 mod hand_body;

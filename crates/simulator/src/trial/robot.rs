@@ -1,15 +1,14 @@
 //! A robot that tries to lift one thing after another: what it feels, what it asks for, and what becomes of each attempt.
 //!
-//! The caller sends what the robot has to say and tells it the decisions. What the robot does depends on its options, the
-//! decisions and the advice alone; it reads no clock and waits for nobody.
+//! The caller sends what the robot has to say and tells it the decisions. What the robot does depends on its options and the
+//! decisions alone; it reads no clock and waits for nobody.
 
 use std::collections::VecDeque;
 
-use super::advised_start::{Grasped, first_advised_start};
 use super::course::{Course, Finished, Place};
 use super::targets::target_of_trial;
-use super::{Attempt, LiftTarget, Probe, Start, TrialError, TrialOptions, choose_start, sensor_seed};
-use blindgrasp_messages::{Action, Header, LiftOutcome, Phase, RegraspProposal, Stamped, TactileFrame};
+use super::{Attempt, LiftTarget, Probe, TrialError, TrialOptions, choose_start, sensor_seed};
+use blindgrasp_messages::{Action, Header, LiftOutcome, Phase, Stamped, TactileFrame};
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
 
@@ -28,8 +27,6 @@ pub struct RobotOptions {
     pub max_attempts: u32,
     /// Every settled grasp is lifted, whatever is decided.
     pub lifts_always: bool,
-    /// After so many attempts in a row that followed advice and were not lifted, one begins at random. 0: no advice is asked for.
-    pub max_advised_attempts: usize,
 }
 
 /// What the robot does next.
@@ -40,8 +37,6 @@ pub enum Doing {
     /// It waits for the decision about a grasp, or for the probe that it takes: see [`Robot::decide`]. `n_before` answers
     /// about this grasp have been acted upon.
     AsksForDecision { grasp_id: u64, n_before: usize },
-    /// It waits for advice how to do a grasp anew: see [`Robot::advise`].
-    AsksForAdvice { grasp_id: u64 },
     /// An attempt is over: its outcome is to be told, then [`Robot::conclude`] called.
     IsOver(Finished),
     /// A trial is left out, because the hand cannot come to the thing as it stands.
@@ -72,24 +67,18 @@ enum State<'a> {
     Between,
     Feeling(Box<Grasp<'a>>),
     Deciding(Box<Grasp<'a>>),
-    Advising(Box<Grasp<'a>>),
     Over {
         finished: Finished,
         /// The frame that says how a lift ended, if it is to be sent.
         told: Option<Box<Stamped<TactileFrame>>>,
-        next: Option<Advised>,
         is_again: bool,
     },
 }
-
-/// Where an attempt begins that follows advice, and what was grasped before it.
-type Advised = (Start, Grasped);
 
 /// An attempt under way.
 struct Grasp<'a> {
     place: Place,
     thing: LiftTarget,
-    start: Start,
     attempt: Attempt<'a>,
     n_frames: u64,
     /// Simulated time from its beginning to the last frame.
@@ -152,17 +141,12 @@ impl<'a> Robot<'a> {
                 self.state = State::Deciding(grasp);
                 Ok(Doing::AsksForDecision { grasp_id, n_before })
             }
-            State::Advising(grasp) => {
-                let grasp_id = grasp.place.grasp_id;
-                self.state = State::Advising(grasp);
-                Ok(Doing::AsksForAdvice { grasp_id })
-            }
-            State::Over { finished, told: Some(told), next, is_again } => {
-                self.state = State::Over { finished, told: None, next, is_again };
+            State::Over { finished, told: Some(told), is_again } => {
+                self.state = State::Over { finished, told: None, is_again };
                 Ok(Doing::Feels(*told))
             }
-            State::Over { finished, told: None, next, is_again } => {
-                self.state = State::Over { finished: finished.clone(), told: None, next, is_again };
+            State::Over { finished, told: None, is_again } => {
+                self.state = State::Over { finished: finished.clone(), told: None, is_again };
                 Ok(Doing::IsOver(finished))
             }
         }
@@ -178,53 +162,24 @@ impl<'a> Robot<'a> {
                         grasp.begin_probe(probe);
                         self.state = State::Feeling(grasp);
                     }
-                    None => self.finish(*grasp, false, None),
+                    None => self.finish(*grasp, false),
                 }
             }
             State::Deciding(grasp) => {
                 let lifts = action == Action::Lift || self.options.lifts_always;
-                let is_last = grasp.place.attempt.saturating_add(1) >= self.options.max_attempts;
-                let may_follow = !is_last && self.course.grasped.len() < self.options.max_advised_attempts;
-                if action == Action::Regrasp && !lifts && may_follow {
-                    self.state = State::Advising(grasp);
-                } else {
-                    self.finish(*grasp, lifts, None);
-                }
+                self.finish(*grasp, lifts);
             }
             other => self.state = other,
         }
-    }
-
-    /// Takes the advice that the robot has asked for: proposals, the best one first. If none can be followed, the next
-    /// attempt begins at random.
-    ///
-    /// # Errors
-    /// A hand that cannot be simulated.
-    pub fn advise(&mut self, proposals: &[RegraspProposal]) -> Result<(), TrialError> {
-        match std::mem::replace(&mut self.state, State::Between) {
-            State::Advising(grasp) => {
-                let grasped = Grasped {
-                    target_from_palm: grasp.attempt.palm_from_target().inverse(),
-                    open_joints_rad: grasp.start.open_joints_rad.clone(),
-                };
-                let mut all = self.course.grasped.clone();
-                all.push(grasped.clone());
-                let (options, yaw_rad) = (&self.trial_options, grasp.start.yaw_rad);
-                let next = first_advised_start(self.hand, &grasp.thing, options, &all, proposals, yaw_rad)?;
-                self.finish(*grasp, false, next.map(|next| (next, grasped)));
-            }
-            other => self.state = other,
-        }
-        Ok(())
     }
 
     /// Goes on after an attempt whose outcome was told.
     pub fn conclude(&mut self) {
         match std::mem::replace(&mut self.state, State::Between) {
             State::Over { is_again: true, .. } => {}
-            State::Over { finished, next, .. } => {
+            State::Over { finished, .. } => {
                 let pause_nanos = self.trial_options.protocol.frame_nanos;
-                self.course.finish(finished, self.options.max_attempts, pause_nanos, next);
+                self.course.finish(finished, self.options.max_attempts, pause_nanos);
             }
             other => self.state = other,
         }
@@ -233,54 +188,47 @@ impl<'a> Robot<'a> {
     fn begin(&mut self) -> Result<Doing, TrialError> {
         if let Some(finished) = self.again.pop_front() {
             if self.known_seq.is_some_and(|seq| seq >= finished.last_seq()) {
-                self.state = State::Over { finished, told: None, next: None, is_again: true };
+                self.state = State::Over { finished, told: None, is_again: true };
                 return self.advance();
             }
-            let (thing, start) = self.thing_and_start(&finished.place)?;
-            return self.grasp(finished.place.clone(), thing, start, Some(finished));
+            let (thing, attempt) = self.thing_and_attempt(&finished.place)?;
+            return self.grasp(finished.place.clone(), thing, attempt, Some(finished));
         }
         let place = self.course.next.clone();
         if place.trial >= self.options.n_trials {
             return Ok(Doing::IsDone);
         }
-        match self.thing_and_start(&place) {
+        match self.thing_and_attempt(&place) {
             Err(why @ TrialError::NoApproach { .. }) => {
                 self.course.leave_out();
                 Ok(Doing::LeavesOut { trial: place.trial, why })
             }
             drawn => {
-                let (thing, start) = drawn?;
-                self.grasp(place, thing, start, None)
+                let (thing, attempt) = drawn?;
+                self.grasp(place, thing, attempt, None)
             }
         }
     }
 
-    fn thing_and_start(&self, place: &Place) -> Result<(LiftTarget, Start), TrialError> {
+    fn thing_and_attempt(&self, place: &Place) -> Result<(LiftTarget, Attempt<'a>), TrialError> {
         let Some(thing) = target_of_trial(&self.things, place.trial) else {
             let reason = "there is nothing to lift: expected at least one thing".into();
             return Err(TrialError::Target { name: String::new(), reason });
         };
-        let start = match &place.advised_start {
-            Some(start) => start.clone(),
-            None => {
-                let (options, prior, seed) = (&self.trial_options, self.prior.as_ref(), self.options.seed);
-                choose_start(self.hand, thing, options, prior, seed, place.trial, place.attempt)?
-            }
-        };
-        Ok((thing.clone(), start))
+        let (options, prior, seed) = (&self.trial_options, self.prior.as_ref(), self.options.seed);
+        let start = choose_start(self.hand, thing, options, prior, seed, place.trial, place.attempt)?;
+        let sensors = sensor_seed(seed, place.trial, place.attempt);
+        Ok((thing.clone(), Attempt::begin(self.hand, thing, options, &start, sensors)?))
     }
 
     fn grasp(
         &mut self,
         place: Place,
         thing: LiftTarget,
-        start: Start,
+        attempt: Attempt<'a>,
         outcome: Option<Finished>,
     ) -> Result<Doing, TrialError> {
-        let seed = sensor_seed(self.options.seed, place.trial, place.attempt);
-        let attempt = Attempt::begin(self.hand, &thing, &self.trial_options, &start, seed)?;
-        let grasp =
-            Grasp { place, thing, start, attempt, n_frames: 0, elapsed_nanos: 0, last: None, probe: None, outcome };
+        let grasp = Grasp { place, thing, attempt, n_frames: 0, elapsed_nanos: 0, last: None, probe: None, outcome };
         self.feel(Box::new(grasp))
     }
 
@@ -320,7 +268,7 @@ impl<'a> Robot<'a> {
         self.state = match grasp.outcome.take_if(|_| is_last) {
             Some(finished) => {
                 let told = told_frame(&finished, grasp.last.take(), self.hand.id());
-                State::Over { finished, told, next: None, is_again: true }
+                State::Over { finished, told, is_again: true }
             }
             None if is_last => State::Deciding(grasp),
             None => State::Feeling(grasp),
@@ -329,7 +277,7 @@ impl<'a> Robot<'a> {
     }
 
     /// Lifts, or lets go.
-    fn finish(&mut self, mut grasp: Grasp<'a>, lifts: bool, next: Option<Advised>) {
+    fn finish(&mut self, mut grasp: Grasp<'a>, lifts: bool) {
         let quality = grasp.attempt.quality().filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
         let lift = lifts.then(|| grasp.attempt.lift(|_| {}));
         let is_set_down = !lifts && grasp.probe == Some(Probe::TestLift);
@@ -345,7 +293,6 @@ impl<'a> Robot<'a> {
             lifted: lift.is_some(),
             held: lift.is_some_and(|lift| lift.held),
             has_quality: quality.is_some(),
-            advised: place.advised_start.is_some(),
             slip_m: lift.map_or(moved_m, |lift| lift.slip_m),
             turn_rad: lift.map_or(turned_rad, |lift| lift.turn_rad),
             epsilon,
@@ -360,7 +307,7 @@ impl<'a> Robot<'a> {
         let end_nanos = place.begin_nanos + attempt.snapshot().elapsed_nanos.max(elapsed_nanos);
         let finished = Finished { place, n_frames, end_nanos, probe, outcome };
         let told = told_frame(&finished, last, self.hand.id());
-        self.state = State::Over { finished, told, next, is_again: false };
+        self.state = State::Over { finished, told, is_again: false };
     }
 }
 
@@ -377,7 +324,7 @@ fn probe_of(action: Action) -> Option<Probe> {
     match action {
         Action::Squeeze => Some(Probe::Squeeze),
         Action::TestLift => Some(Probe::TestLift),
-        Action::Hold | Action::Lift | Action::Regrasp => None,
+        Action::Hold | Action::Lift => None,
     }
 }
 
@@ -401,8 +348,7 @@ mod tests {
     use super::*;
     use crate::trial::targets::targets_named;
 
-    const OPTIONS: RobotOptions =
-        RobotOptions { n_trials: 1, seed: 0, max_attempts: 2, lifts_always: false, max_advised_attempts: 0 };
+    const OPTIONS: RobotOptions = RobotOptions { n_trials: 1, seed: 0, max_attempts: 2, lifts_always: false };
 
     /// Runs the robot to its end, with an action for each grasp and number of answers before. Returns its frames and its
     /// attempts.
@@ -420,7 +366,7 @@ mod tests {
                     robot.conclude();
                 }
                 Doing::IsDone => return (frames, finished),
-                Doing::AsksForAdvice { .. } | Doing::LeavesOut { .. } => panic!("nobody advises, and it can approach"),
+                Doing::LeavesOut { .. } => panic!("it can approach"),
             }
         }
     }
