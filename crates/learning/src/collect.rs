@@ -179,7 +179,7 @@ fn felt(hand: &Hand, model: &Model, frames: &[Stamped<TactileFrame>]) -> Option<
     let (joints_rad, cells_newtons) = (&settled.message.joints_rad, &settled.message.cells_newtons);
     let (mut contacts, mut values) = (Vec::new(), Vec::new());
     let summary = contacts_from_frame(hand, settled.header.hand_id, joints_rad, cells_newtons, &mut contacts);
-    let senses = settled.message.senses();
+    let senses = settled.message.senses.view();
     let reading = Reading { joints_rad, contacts: &contacts, senses };
     let outcome = match summary.fault {
         Fault::None => model.features.extract(&reading, &mut values),

@@ -18,13 +18,17 @@ class Lists:
     Each can be set. A head that came with a sample has its `items`; give a head of your own its items first.
     """
 
-    LISTS: tuple[str, ...]
+    n_joints: int
+    has_senses: int
     items: typing.Any
 
     def _spans(self) -> dict[str, slice]:
-        spans, end = {}, 0
-        for name in self.LISTS:
-            start, end = end, end + getattr(self, f"n_{name}")
+        if self.has_senses >> len(SENSES):
+            raise ValueError(f"a frame has the unknown senses {self.has_senses}: expected at most {len(SENSES)} bits")
+        spans, end = {"joints": slice(0, self.n_joints)}, self.n_joints
+        for bit, (name, n_values) in enumerate(SENSES.items()):
+            is_there = self.has_senses >> bit & 1
+            start, end = end, end + is_there * (n_values or self.n_joints)
             spans[name] = slice(start, end)
         if end > len(self.items):
             raise ValueError(f"a frame of {len(self.items)} items says that it has {end} beside its cells: expected at most as many")
@@ -38,12 +42,16 @@ class Lists:
                 self.items[spans[name]] = values
             return
         parts = {name: lists.get(name, self.items[span]) for name, span in spans.items()}
+        for name, n_values in SENSES.items():
+            n_expected = n_values or len(parts["joints"])
+            if len(parts[name]) not in (0, n_expected):
+                raise ValueError(f"{name} has {len(parts[name])} values: expected {n_expected}, or none at all")
         values = [value for part in parts.values() for value in part]
         is_numpy = hasattr(self.items, "astype")
         self.items = type(self.items)(len(values)) if is_numpy else (ctypes.c_double * len(values))()
         self.items[:] = values
-        for name in self.LISTS:
-            setattr(self, f"n_{name}", len(parts[name]))
+        self.n_joints = len(parts["joints"])
+        self.has_senses = sum(1 << bit for bit, name in enumerate(SENSES) if len(parts[name]))
 
     @property
     def joints(self) -> typing.Any:
@@ -71,7 +79,10 @@ class Lists:
 
     @senses.setter
     def senses(self, lists: dict[str, typing.Any]) -> None:
-        self._set({name: lists.get(name, ()) for name in self.LISTS if name != "joints"})
+        unknown = lists.keys() - SENSES.keys()
+        if unknown:
+            raise ValueError(f"{', '.join(unknown)}: no such sense, expected some of {', '.join(SENSES)}")
+        self._set({name: lists.get(name, ()) for name in SENSES})
 "#;
 
 /// A field's type in Python: as it is written there, and its name in the comparison.
@@ -179,6 +190,12 @@ fn python_text() -> String {
     for (name, limit) in LIMITS {
         let _ = writeln!(text, "{name} = {limit}");
     }
+    text += "\n# The senses of a frame in order, each with the number of its values; None: one for each joint.\n";
+    let senses = Sense::ALL.map(|sense| {
+        let n_values = sense.n_values().map_or("None".into(), |n_values| n_values.to_string());
+        format!("\"{}\": {n_values}", sense.name())
+    });
+    let _ = writeln!(text, "SENSES: dict[str, int | None] = {{{}}}", senses.join(", "));
     for Codes { name, words, .. } in coded_enums() {
         let _ = writeln!(text, "\n\nclass {name}(enum.IntEnum):");
         for (word, code) in words {
@@ -187,14 +204,9 @@ fn python_text() -> String {
     }
     text += LISTS;
     for Struct { name, doc, type_name, fields, .. } in structs() {
-        let lists: Vec<String> = fields.iter().filter_map(|field| field.name.strip_prefix("n_")).map(quoted).collect();
         let has_lists = name == "TactileFrameHead";
         let bases = if has_lists { "Lists, ctypes.Structure" } else { "ctypes.Structure" };
-        let _ = write!(text, "\n\nclass {name}({bases}):\n    \"\"\"{doc}\"\"\"\n\n");
-        if has_lists {
-            let _ = writeln!(text, "    LISTS = ({})", lists.join(", "));
-        }
-        text += "    _fields_ = [\n";
+        let _ = write!(text, "\n\nclass {name}({bases}):\n    \"\"\"{doc}\"\"\"\n\n    _fields_ = [\n");
         for Field { name, python, .. } in fields {
             let _ = writeln!(text, "        (\"{name}\", {python}),");
         }
@@ -210,10 +222,6 @@ fn python_text() -> String {
         );
     }
     text + "\n\nMESSAGES: dict[str, type[Message]] = {message.TYPE_NAME: message for message in Message.__subclasses__()}\n"
-}
-
-fn quoted(name: &str) -> String {
-    format!("\"{name}\"")
 }
 
 fn python_file() -> PathBuf {

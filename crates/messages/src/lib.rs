@@ -13,6 +13,8 @@
 
 #[macro_use]
 mod declare;
+#[macro_use]
+mod senses;
 mod coded;
 mod contact_set;
 pub mod files;
@@ -44,8 +46,9 @@ pub use lift_outcome::{LiftOutcome, LiftOutcomeHead};
 pub use prediction::{Prediction, PredictionHead};
 pub use regrasp_advice::{MAX_PROPOSALS, RegraspAdvice, RegraspAdviceHead, RegraspProposal};
 pub use ros::{first_difference, signature};
+pub use senses::{OwnedSenses, Sense, Senses};
 pub use serialized::{hex_id, read_list};
-pub use tactile_frame::{FrameParts, Senses, TactileFrame, TactileFrameHead};
+pub use tactile_frame::{FrameParts, FramePartsMut, TactileFrame, TactileFrameHead};
 
 use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};

@@ -30,6 +30,7 @@ declared! {
 
 message! {
     /// How to grasp better than in one grasp; one advice per grasp. The header's sequence counts advice.
+    #[derive(serde::Serialize)]
     pub struct RegraspAdvice = "blindgrasp/RegraspAdvice/1" on "/advice" {
         pub grasp_id: u64,
         /// No proposals where nothing better is known. All have the same number of joints.

@@ -6,7 +6,7 @@ use cdr_encoding::{from_bytes, to_writer};
 use serde::Serialize;
 
 use blindgrasp_messages::{
-    ContactSet, GraspFeature, Header, LiftOutcome, Record, Recorded, Stamped, TactileFrame, of_each_type,
+    ContactSet, GraspFeature, Header, LiftOutcome, Record, Recorded, Sense, Stamped, TactileFrame, of_each_type,
 };
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
@@ -24,16 +24,25 @@ pub(super) struct Decoder {
     /// The name of the messages' schema.
     pub(super) schema: &'static str,
     decode: fn(&[u8]) -> Result<Record, String>,
-    /// Bytes of the fields that the messages lack, because an earlier version wrote them: they are 0, or empty lists.
-    n_later_bytes: usize,
+    lacking: Lacking,
+}
+
+/// The fields that a message lacks because an earlier version wrote it: their bytes, which are 0 or empty lists.
+#[derive(Debug, Clone, Copy, Default)]
+struct Lacking {
+    n_bytes: usize,
+    /// Bytes of the fields behind them.
+    n_bytes_after: usize,
 }
 
 impl Decoder {
     pub(super) fn decode(self, data: &[u8]) -> Result<Record, String> {
-        match self.n_later_bytes {
-            0 => (self.decode)(data),
-            n_later_bytes => (self.decode)(&[data, &vec![0; n_later_bytes]].concat()),
+        let Lacking { n_bytes, n_bytes_after } = self.lacking;
+        if n_bytes == 0 {
+            return (self.decode)(data);
         }
+        let (before, after) = data.split_at(data.len().saturating_sub(n_bytes_after));
+        (self.decode)(&[before, &vec![0; n_bytes], after].concat())
     }
 
     /// Reads the header and the grasp's number, with which every message of ours begins.
@@ -48,20 +57,20 @@ pub(super) struct OurType {
     schema: &'static str,
     pub(super) definition: String,
     decode: fn(&[u8]) -> Result<Record, String>,
-    /// The definitions of earlier versions, each with the number of bytes that the fields take which it lacks.
-    earlier: Vec<(String, usize)>,
+    /// The definitions of earlier versions, each with what it lacks.
+    earlier: Vec<(String, Lacking)>,
 }
 
 impl OurType {
     /// Reads messages of this version.
     pub(super) fn decoder(&self) -> Decoder {
-        Decoder { schema: self.schema, decode: self.decode, n_later_bytes: 0 }
+        Decoder { schema: self.schema, decode: self.decode, lacking: Lacking::default() }
     }
 
     /// Reads messages of the earlier version whose definition `is_it`.
     pub(super) fn earlier_decoder(&self, is_it: impl Fn(&str) -> bool) -> Option<Decoder> {
-        let (_, n_later_bytes) = self.earlier.iter().find(|(definition, _)| is_it(definition))?;
-        Some(Decoder { schema: self.schema, decode: self.decode, n_later_bytes: *n_later_bytes })
+        let (_, lacking) = self.earlier.iter().find(|(definition, _)| is_it(definition))?;
+        Some(Decoder { schema: self.schema, decode: self.decode, lacking: *lacking })
     }
 }
 
@@ -73,26 +82,35 @@ pub(super) fn our_type(schema: &str) -> Option<&'static OurType> {
 
 fn our<M: Recorded>() -> OurType {
     let definition = M::definition();
-    // The fields that each earlier version lacked, which are the last ones, and their bytes.
-    let lacking: &[(&[&str], usize)] = match M::SCHEMA {
-        // `advised` lies where messages without it have a byte of padding, which is 0.
-        LiftOutcome::SCHEMA => {
-            &[(&["bool advised", "bool probed", "bool disturbed"], 2), (&["bool probed", "bool disturbed"], 2)]
-        }
-        TactileFrame::SCHEMA | ContactSet::SCHEMA => &[
-            (&["float64[] gravity_m_per_s2", "float64[] wrist_wrench", "float64[] joint_torques", "uint32 day"], 16),
-            (&["uint32 day"], 4),
-        ],
-        GraspFeature::SCHEMA => &[(&["uint32 day"], 4)],
-        _ => &[],
+    // The fields that earlier versions lacked, and their bytes.
+    let mut earlier = Vec::new();
+    let mut without = |fields: &[&str], n_bytes, n_bytes_after| {
+        let remove = |text: String, field: &&str| text.replace(&format!("{field}\n"), "");
+        earlier.push((fields.iter().fold(definition.clone(), remove), Lacking { n_bytes, n_bytes_after }));
     };
-    let without = |text: String, field: &&str| text.replace(&format!("{field}\n"), "");
+    match M::SCHEMA {
+        LiftOutcome::SCHEMA => {
+            // `advised` lies where messages without it have a byte of padding, which is 0.
+            without(&["bool advised", "bool probed", "bool disturbed"], 2, 0);
+            without(&["bool probed", "bool disturbed"], 2, 0);
+        }
+        TactileFrame::SCHEMA | ContactSet::SCHEMA => {
+            let senses = Sense::ALL.map(|sense| format!("float64[] {}", sense.name()));
+            let mut later: Vec<&str> = senses.iter().map(String::as_str).collect();
+            // The last senses: an empty list is its length, and `day` follows.
+            for n_senses in 0..later.len() {
+                without(&later[n_senses..], 4 * (later.len() - n_senses), 4);
+            }
+            later.push("uint32 day");
+            without(&later, 4 * later.len(), 0);
+            without(&["uint32 day"], 4, 0);
+        }
+        GraspFeature::SCHEMA => without(&["uint32 day"], 4, 0),
+        _ => {}
+    }
     OurType {
         schema: M::SCHEMA,
-        earlier: lacking
-            .iter()
-            .map(|(fields, n_bytes)| (fields.iter().fold(definition.clone(), without), *n_bytes))
-            .collect(),
+        earlier,
         definition,
         decode: |data| decode::<M>(data).map(M::record),
     }
@@ -130,7 +148,7 @@ mod tests {
     use serde::Serialize;
 
     use super::*;
-    use blindgrasp_messages::{Phase, first_difference};
+    use blindgrasp_messages::{OwnedSenses, Phase, first_difference};
 
     /// A [`LiftOutcome`] as it was before it had `advised`.
     #[derive(Serialize)]
@@ -214,5 +232,27 @@ mod tests {
         for n_bytes in 0..data.len() {
             decoder.decode(&data[..n_bytes]).expect_err("cut off");
         }
+    }
+
+    #[test]
+    fn frames_from_before_the_last_sense_lack_it() {
+        let [first, .., last] = Sense::ALL;
+        let message = TactileFrame {
+            grasp_id: 7,
+            phase: Phase::Settled,
+            joints_rad: vec![0.5],
+            cells_newtons: vec![1.0, 0.0],
+            senses: OwnedSenses::default().with(first, &vec![-9.75; first.len(1)]),
+            day: 20_261_124,
+        };
+        let sample = Stamped { header: Header { seq: 3, ..Header::default() }, message };
+        let mut data = Vec::new();
+        encode(&sample, &mut data).expect("encoded");
+        // The last sense is an empty list, and the day follows.
+        data.drain(data.len() - 8..data.len() - 4);
+        let ours = our_type(TactileFrame::SCHEMA).expect("a type");
+        let before = ours.definition.replace(&format!("float64[] {}\n", last.name()), "");
+        let decoder = ours.earlier_decoder(|definition| definition == before).expect("known");
+        assert_eq!(decoder.decode(&data), Ok(sample.into()));
     }
 }
