@@ -16,9 +16,6 @@ import sys
 import threading
 import time
 
-# A hand sends those that it has; the others are left out.
-SENSES = ("gravity_m_per_s2", "wrist_wrench", "joint_torques")
-
 
 def frames(rate):
     """Yields what a hand would: joint angles, forces, phase and grasp, each at its time."""
@@ -67,9 +64,8 @@ def main():
     n_frames = 0
     for data in frames(arguments.rate):
         frame = {
-            "joints_rad": data["joints_rad"],
-            "cells_newtons": data["cells_newtons"],
-            **{sense: data[sense] for sense in SENSES if data.get(sense)},
+            # Joints, cells, and the senses that the hand has; the others are left out.
+            **{name: values for name, values in data.items() if isinstance(values, list) and values},
             "phase": data["phase"],
             "grasp_id": next_grasp_id + data["grasp_id"],
             "seq": n_frames,

@@ -6,6 +6,7 @@ Needs nothing but Python.
 
 import ctypes
 import enum
+import typing
 
 MAX_JOINTS = 32
 MAX_PADS = 32
@@ -13,6 +14,9 @@ MAX_CELLS = 16384
 MAX_FEATURES = 4096
 MAX_NAME_BYTES = 64
 MAX_PROPOSALS = 32
+
+# The senses of a frame in order, each with the number of its values; None: one for each joint.
+SENSES: dict[str, int | None] = {"gravity_m_per_s2": 3, "wrist_wrench": 6, "joint_torques": None}
 
 
 class Phase(enum.IntEnum):
@@ -75,6 +79,79 @@ class Reason(enum.IntEnum):
     PROMISE_WITHDRAWN = 19
 
 
+class Lists:
+    """The lists among the items of a frame: `joints`, `cells`, and by name the `senses` that are there.
+
+    Each can be set. A head that came with a sample has its `items`; give a head of your own its items first.
+    """
+
+    n_joints: int
+    has_senses: int
+    items: typing.Any
+
+    def _spans(self) -> dict[str, slice]:
+        if self.has_senses >> len(SENSES):
+            raise ValueError(f"a frame has the unknown senses {self.has_senses}: expected at most {len(SENSES)} bits")
+        spans, end = {"joints": slice(0, self.n_joints)}, self.n_joints
+        for bit, (name, n_values) in enumerate(SENSES.items()):
+            is_there = self.has_senses >> bit & 1
+            start, end = end, end + is_there * (n_values or self.n_joints)
+            spans[name] = slice(start, end)
+        if end > len(self.items):
+            raise ValueError(f"a frame of {len(self.items)} items says that it has {end} beside its cells: expected at most as many")
+        spans["cells"] = slice(end, len(self.items))
+        return spans
+
+    def _set(self, lists: dict[str, typing.Any]) -> None:
+        spans = self._spans()
+        if all(len(values) == len(range(*spans[name].indices(len(self.items)))) for name, values in lists.items()):
+            for name, values in lists.items():
+                self.items[spans[name]] = values
+            return
+        parts = {name: lists.get(name, self.items[span]) for name, span in spans.items()}
+        for name, n_values in SENSES.items():
+            n_expected = n_values or len(parts["joints"])
+            if len(parts[name]) not in (0, n_expected):
+                raise ValueError(f"{name} has {len(parts[name])} values: expected {n_expected}, or none at all")
+        values = [value for part in parts.values() for value in part]
+        is_numpy = hasattr(self.items, "astype")
+        self.items = type(self.items)(len(values)) if is_numpy else (ctypes.c_double * len(values))()
+        self.items[:] = values
+        self.n_joints = len(parts["joints"])
+        self.has_senses = sum(1 << bit for bit, name in enumerate(SENSES) if len(parts[name]))
+
+    @property
+    def joints(self) -> typing.Any:
+        """The joints' positions, in the hand's order: radians, and metres of joints that slide."""
+        return self.items[self._spans()["joints"]]
+
+    @joints.setter
+    def joints(self, values: typing.Any) -> None:
+        self._set({"joints": values})
+
+    @property
+    def cells(self) -> typing.Any:
+        """The force on each cell, pad after pad."""
+        return self.items[self._spans()["cells"]]
+
+    @cells.setter
+    def cells(self, values: typing.Any) -> None:
+        self._set({"cells": values})
+
+    @property
+    def senses(self) -> dict[str, typing.Any]:
+        """The lists of the other senses that the frame has, by name."""
+        named = ((name, self.items[span]) for name, span in self._spans().items() if name not in ("joints", "cells"))
+        return {name: values for name, values in named if len(values)}
+
+    @senses.setter
+    def senses(self, lists: dict[str, typing.Any]) -> None:
+        unknown = lists.keys() - SENSES.keys()
+        if unknown:
+            raise ValueError(f"{', '.join(unknown)}: no such sense, expected some of {', '.join(SENSES)}")
+        self._set({name: lists.get(name, ()) for name in SENSES})
+
+
 class Header(ctypes.Structure):
     """On each sample: which one it is and where it comes from."""
 
@@ -109,27 +186,25 @@ class Contact(ctypes.Structure):
         return "blindgrasp/Contact/1"
 
 
-class TactileFrameHead(ctypes.Structure):
-    """The items are the joint angles, gravity, the wrench, the joints' torques, and then the cells' forces."""
+class TactileFrameHead(Lists, ctypes.Structure):
+    """The items are the joints, the senses that `has_senses` names, and then the cells' forces."""
 
     _fields_ = [
         ("header", Header),
         ("grasp_id", ctypes.c_uint64),
         ("phase", ctypes.c_uint32),
         ("n_joints", ctypes.c_uint32),
-        ("n_gravity", ctypes.c_uint32),
-        ("n_wrench", ctypes.c_uint32),
-        ("n_torques", ctypes.c_uint32),
+        ("has_senses", ctypes.c_uint32),
         ("day", ctypes.c_uint32),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/TactileFrameHead/4"
+        return "blindgrasp/TactileFrameHead/5"
 
 
 class ContactSetHead(ctypes.Structure):
-    """The items are the contacts."""
+    """The items are the contacts. The first values of `senses` are those of the senses that `has_senses` names."""
 
     _fields_ = [
         ("header", Header),
@@ -140,19 +215,15 @@ class ContactSetHead(ctypes.Structure):
         ("n_self_contacts", ctypes.c_uint32),
         ("fault", ctypes.c_uint32),
         ("n_joints", ctypes.c_uint32),
-        ("joints_rad", ctypes.c_double * 32),
-        ("n_gravity", ctypes.c_uint32),
-        ("n_wrench", ctypes.c_uint32),
-        ("n_torques", ctypes.c_uint32),
+        ("has_senses", ctypes.c_uint32),
         ("day", ctypes.c_uint32),
-        ("gravity_m_per_s2", ctypes.c_double * 3),
-        ("wrist_wrench", ctypes.c_double * 6),
-        ("joint_torques", ctypes.c_double * 32),
+        ("joints_rad", ctypes.c_double * 32),
+        ("senses", ctypes.c_double * 8 * 6),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/ContactSetHead/6"
+        return "blindgrasp/ContactSetHead/7"
 
 
 class GraspFeatureHead(ctypes.Structure):
@@ -277,13 +348,13 @@ class Message:
 
 
 class TactileFrame(Message):
-    TYPE_NAME = "blindgrasp/TactileFrame/4"
+    TYPE_NAME = "blindgrasp/TactileFrame/5"
     Head = TactileFrameHead
     Item = ctypes.c_double
 
 
 class ContactSet(Message):
-    TYPE_NAME = "blindgrasp/ContactSet/6"
+    TYPE_NAME = "blindgrasp/ContactSet/7"
     Head = ContactSetHead
     Item = Contact
 

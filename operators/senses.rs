@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use blindgrasp_messages::{FrameParts, Recorded, Senses, TactileFrame, TactileFrameHead};
+use blindgrasp_messages::{FrameParts, Recorded, Sense, Senses, TactileFrame, TactileFrameHead};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
@@ -48,55 +48,59 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         }
         // It is of another hand, and its reader says so.
         merged.clear();
-        TactileFrameHead { n_joints: 0, n_gravity: 0, n_wrench: 0, n_torques: 0, ..head }
+        TactileFrameHead { n_joints: 0, has_senses: 0, ..head }
     });
     stage::run(operator, "tactile", "tactile", max_items, identity, stage)
 }
 
-/// A frame with these senses in place of its own, where they are there. Torques of another number of joints are left out, and a
-/// frame that cannot be read stays as it is.
+/// A frame with these senses in place of its own, where they are there. Senses of another number of joints are left out, and
+/// a frame that cannot be read stays as it is.
 fn with_senses(head: &TactileFrameHead, items: &[f64], other: Senses<'_>, merged: &mut Vec<f64>) -> TactileFrameHead {
     let Ok(FrameParts { joints_rad, senses: own, cells_newtons }) = head.split(items) else {
         merged.extend_from_slice(items);
         return *head;
     };
-    let is_of_this_hand = other.joint_torques.len() == joints_rad.len();
-    let senses = Senses {
-        gravity_m_per_s2: first_given(other.gravity_m_per_s2, own.gravity_m_per_s2),
-        wrist_wrench: first_given(other.wrist_wrench, own.wrist_wrench),
-        joint_torques: if is_of_this_hand { other.joint_torques } else { own.joint_torques },
-    };
-    let lists = [joints_rad, senses.gravity_m_per_s2, senses.wrist_wrench, senses.joint_torques, cells_newtons];
-    lists.iter().for_each(|list| merged.extend_from_slice(list));
-    TactileFrameHead {
-        n_gravity: senses.gravity_m_per_s2.len() as u32,
-        n_wrench: senses.wrist_wrench.len() as u32,
-        n_torques: senses.joint_torques.len() as u32,
-        ..*head
+    let n_joints = joints_rad.len();
+    let mut has_senses = 0;
+    merged.extend_from_slice(joints_rad);
+    for sense in Sense::ALL {
+        let is_there = !other.get(sense).is_empty() && other.get(sense).len() == sense.len(n_joints);
+        let values = if is_there { other.get(sense) } else { own.get(sense) };
+        if !values.is_empty() {
+            has_senses |= sense.bit();
+        }
+        merged.extend_from_slice(values);
     }
-}
-
-fn first_given<'a>(list: &'a [f64], otherwise: &'a [f64]) -> &'a [f64] {
-    if list.is_empty() { otherwise } else { list }
+    merged.extend_from_slice(cells_newtons);
+    TactileFrameHead { has_senses, ..*head }
 }
 
 #[cfg(test)]
 mod tests {
-    use blindgrasp_messages::{Header, Message, Phase};
+    use blindgrasp_messages::{Header, Message, OwnedSenses, Phase};
 
     use super::*;
 
-    fn frame(n_joints: usize, wrench: &[f64], gravity: &[f64], torques: &[f64]) -> TactileFrame {
+    const GRAVITY: [f64; 3] = [0.0, 0.0, -9.8];
+    const WRENCH: [f64; 6] = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
+
+    fn frame(senses: OwnedSenses) -> TactileFrame {
         TactileFrame {
             grasp_id: 3,
             phase: Phase::Settled,
-            joints_rad: vec![0.5; n_joints],
+            joints_rad: vec![0.5; 2],
             cells_newtons: vec![1.0, 2.0, 3.0],
-            gravity_m_per_s2: gravity.to_vec(),
-            wrist_wrench: wrench.to_vec(),
-            joint_torques: torques.to_vec(),
+            senses,
             day: 20261125,
         }
+    }
+
+    /// Gravity, a wrench and these torques.
+    fn senses(torques: &[f64]) -> OwnedSenses {
+        OwnedSenses::default()
+            .with(Sense::Gravity, &GRAVITY)
+            .with(Sense::WristWrench, &WRENCH)
+            .with(Sense::JointTorques, torques)
     }
 
     fn merged(frame: &TactileFrame, senses: Senses<'_>) -> TactileFrame {
@@ -108,18 +112,18 @@ mod tests {
 
     #[test]
     fn senses_of_the_other_source_replace_those_of_the_frame() {
-        let (gravity, wrench) = ([0.0, 0.0, -9.8], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
-        let plain = frame(2, &[], &[], &[]);
-        let other = Senses { gravity_m_per_s2: &gravity, wrist_wrench: &wrench, joint_torques: &[7.0, 8.0] };
-        assert_eq!(merged(&plain, other), frame(2, &wrench, &gravity, &[7.0, 8.0]));
-        let of_its_own = frame(2, &[0.0; 6], &[], &[]);
-        assert_eq!(merged(&of_its_own, other), frame(2, &wrench, &gravity, &[7.0, 8.0]));
+        let other = senses(&[7.0, 8.0]);
+        assert_eq!(merged(&frame(OwnedSenses::default()), other.view()), frame(other.clone()));
+        let own = OwnedSenses::default().with(Sense::WristWrench, &[0.0; 6]);
+        assert_eq!(merged(&frame(own), other.view()), frame(other));
     }
 
     #[test]
     fn senses_that_are_absent_or_do_not_fit_leave_the_frame_as_it_is() {
-        let own = frame(2, &[0.5; 6], &[], &[1.0, 1.0]);
+        let own = OwnedSenses::default().with(Sense::WristWrench, &[0.5; 6]).with(Sense::JointTorques, &[1.0, 1.0]);
+        let own = frame(own);
         assert_eq!(merged(&own, Senses::default()), own);
-        assert_eq!(merged(&own, Senses { joint_torques: &[1.0, 2.0, 3.0], ..Senses::default() }), own);
+        let other = OwnedSenses::default().with(Sense::JointTorques, &[1.0, 2.0, 3.0]);
+        assert_eq!(merged(&own, other.view()), own);
     }
 }

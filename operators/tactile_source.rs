@@ -526,9 +526,7 @@ impl TactileSource<'_> {
             phase: reading.phase,
             joints_rad: reading.joints_rad,
             cells_newtons: reading.cells_newtons,
-            gravity_m_per_s2: reading.gravity_m_per_s2,
-            wrist_wrench: reading.wrist_wrench,
-            joint_torques: reading.joint_torques,
+            senses: reading.senses,
             day: reading.day.unwrap_or(self.day),
         };
         let (epoch, hand_id) = (self.epoch, self.hand_id);

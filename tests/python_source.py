@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "operators"))
-from blindgrasp_messages import GraspTruth, GraspTruthHead, Phase, TactileFrame, TactileFrameHead
+from blindgrasp_messages import SENSES, GraspTruth, GraspTruthHead, Phase, TactileFrame, TactileFrameHead
 from blindgrasp_operator import Description, Param, Source, run
 
 DESCRIPTION = Description(
@@ -37,8 +37,8 @@ def sample_of(line):
         fields = {key: data[key] for key in ("grasp_id", "epsilon", "volume", "stable")}
         port, head, items = "truth", GraspTruthHead(n_object_bytes=len(names[0]), **fields), b"".join(names)
     else:
-        lists = [data[key] for key in ("joints_rad", "gravity_m_per_s2", "wrist_wrench", "joint_torques", "cells_newtons")]
-        lengths = dict(zip(("n_joints", "n_gravity", "n_wrench", "n_torques"), map(len, lists)))
+        lists = [data[key] for key in ("joints_rad", *SENSES, "cells_newtons")]
+        lengths = {"n_joints": len(lists[0]), "has_senses": sum(1 << bit for bit, key in enumerate(SENSES) if data[key])}
         phase = Phase[data["phase"].upper()]
         values = [float("nan") if value is None else value for values in lists for value in values]
         head = TactileFrameHead(grasp_id=data["grasp_id"], phase=phase, day=data["day"], **lengths)

@@ -130,14 +130,14 @@ def _predictions(lines: list[dict[str, Any]], labels: list[Label | None] | None)
 
 def _frame_lines(grasps: list[Grasp]) -> Iterator[bytes]:
     """The frames of the grasps as `blindgrasp export --topic /tactile` writes them, each grasp after the one before."""
-    lists = ("joints_rad", "cells_newtons", "gravity_m_per_s2", "wrist_wrench", "joint_torques")
     next_seq, next_stamp = 0, 0
     for grasp in grasps:
         if len(grasp.phase) == 0:
             raise ValueError(f"grasp {grasp.grasp_id} has no frames: there is nothing to decide on")
         seqs, stamps = ([int(number) for number in numbers] for numbers in (grasp.seq, grasp.stamp_nanos))
         for idx, phase in enumerate(grasp.phase):
-            data: dict[str, Any] = {name: _numbers(getattr(grasp, name)[idx]) for name in lists}
+            lists = {"joints_rad": grasp.joints_rad, "cells_newtons": grasp.cells_newtons} | grasp.senses
+            data: dict[str, Any] = {name: _numbers(rows[idx]) for name, rows in lists.items()}
             data |= {"grasp_id": int(grasp.grasp_id), "phase": str(phase), "day": int(grasp.day)}
             seq = next_seq + seqs[idx] - min(seqs)
             stamp_nanos = next_stamp + stamps[idx] - min(stamps)

@@ -75,12 +75,9 @@ class Grasp:
     """(n_frames, n_joints): radians in the hand's order; metres for a joint that slides."""
     cells_newtons: NDArray[np.float64]
     """(n_frames, n_cells): newtons, pad after pad; raw counts for a hand with `cell_unit: counts`."""
-    gravity_m_per_s2: NDArray[np.float64]
-    """(n_frames, 3): m/s² in the palm frame; (n_frames, 0) where the robot does not sense it."""
-    wrist_wrench: NDArray[np.float64]
-    """(n_frames, 6): force (N) and torque (N m) in the palm frame; (n_frames, 0) without a sensor."""
-    joint_torques: NDArray[np.float64]
-    """(n_frames, n_joints): newton metres; (n_frames, 0) without sensors."""
+    senses: dict[str, NDArray[np.float64]] = dataclasses.field(default_factory=dict)
+    """What the robot senses beside joints and cells, by the name that docs/messages.md gives it, like `gravity_m_per_s2`:
+    (n_frames, n_values), in the palm frame. A sense that no frame of the grasp has is not there."""
     hand_id: str = ""
     """The identity of the hand, 16 hexadecimal digits; empty if it is not known."""
     day: int = 0
@@ -205,15 +202,18 @@ class Recording:
 
     def _grasp(self, frames: list[Any], labels: dict[Key, Label], decisions: dict[Key, list[Decision]]) -> Grasp:
         key = _key(frames[0])
-        names = ("joints_rad", "cells_newtons", "gravity_m_per_s2", "wrist_wrench", "joint_torques")
-        tables = {name: _table([getattr(frame, name) for frame in frames]) for name in names}
+        lists = [name for name, value in vars(frames[0]).items() if isinstance(value, np.ndarray)]
+        tables = {name: _table([getattr(frame, name) for frame in frames]) for name in lists}
+        joints_rad, cells_newtons = tables.pop("joints_rad"), tables.pop("cells_newtons")
         return Grasp(
             grasp_id=key[1],
             epoch=key[0],
             seq=np.array([frame.header.seq for frame in frames], np.uint64),
             stamp_nanos=np.array([frame.header.stamp_nanos for frame in frames], np.int64),
             phase=np.array([_word(PHASES, frame.phase) for frame in frames]),
-            **tables,
+            joints_rad=joints_rad,
+            cells_newtons=cells_newtons,
+            senses={name: table for name, table in tables.items() if table.shape[1] > 0},
             hand_id=f"{frames[0].header.hand_id:016x}",
             day=frames[0].day,
             label=labels.get(key),

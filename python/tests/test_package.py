@@ -58,8 +58,10 @@ class Recordings(Folder):
             data = line["data"]
             self.assertEqual((grasp.grasp_id, grasp.phase[idx]), (data["grasp_id"], data["phase"]))
             self.assertEqual((grasp.seq[idx], grasp.stamp_nanos[idx]), (line["seq"], line["stamp_nanos"]))
-            for name in ("joints_rad", "cells_newtons", "gravity_m_per_s2", "wrist_wrench", "joint_torques"):
-                row = getattr(grasp, name)[idx]
+            lists = {"joints_rad": grasp.joints_rad, "cells_newtons": grasp.cells_newtons} | grasp.senses
+            self.assertLessEqual({name for name, value in data.items() if value and isinstance(value, list)}, lists.keys())
+            for name, rows in lists.items():
+                row = rows[idx]
                 # NaN is null in JSON.
                 np.testing.assert_array_equal(row[: len(data[name])], np.array(data[name], float))
                 self.assertTrue(np.isnan(row[len(data[name]) :]).all())
@@ -84,7 +86,7 @@ class Recordings(Folder):
         self.assertEqual(len(grasps), 240)
         self.assertEqual(grasps[0].cells_newtons.shape, (14, 96))
         self.assertEqual(grasps[0].joints_rad.shape, (14, 7))
-        self.assertEqual(grasps[0].gravity_m_per_s2.shape, (14, 0))
+        self.assertEqual(grasps[0].senses, {})
         self.assertEqual(sum(grasp.label.is_stable for grasp in grasps), 115)
         self.assertEqual((grasps[0].label.object_id, grasps[0].label.object_class), ("vase-20", "vase"))
         self.assertIsNone(grasps[0].decision)
@@ -230,8 +232,10 @@ class Graphs(Folder):
         for grasp, outcome in zip(grasps, graph.outcomes, strict=True):
             self.assertEqual(outcome["lifted"], grasp.decision.action == "lift")
             self.assertEqual(grasp.label and grasp.label.is_stable, outcome["held"] if outcome["lifted"] else None)
-            self.assertEqual((grasp.gravity_m_per_s2.shape[1], grasp.wrist_wrench.shape[1]), (3, 6))
-            self.assertAlmostEqual(np.linalg.norm(grasp.gravity_m_per_s2[0]), 9.81, delta=0.5)
+            n_values = {name: rows.shape[1] for name, rows in grasp.senses.items()}
+            n_joints = grasp.joints_rad.shape[1]
+            self.assertEqual(n_values, {"gravity_m_per_s2": 3, "wrist_wrench": 6, "joint_torques": n_joints})
+            self.assertAlmostEqual(np.linalg.norm(grasp.senses["gravity_m_per_s2"][0]), 9.81, delta=0.5)
 
     def test_a_graph_is_ended_with_its_block(self):
         forever = {"recorded_source.repeat": "forever", "lift_arbiter.max_age_ms": 600000}

@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use super::{Outcome, print_line};
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::evaluation::{decide, decide_frames};
-use blindgrasp_messages::{GraspTruth, Header, LiftDecision, Phase, Recorded, Stamped, TactileFrame};
+use blindgrasp_messages::{GraspTruth, Header, LiftDecision, OwnedSenses, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
@@ -147,9 +147,7 @@ fn read_frame(
         phase: frame.phase,
         joints_rad: numbers(frame.joints_rad),
         cells_newtons: numbers(frame.cells_newtons),
-        gravity_m_per_s2: numbers(frame.gravity_m_per_s2),
-        wrist_wrench: numbers(frame.wrist_wrench),
-        joint_torques: numbers(frame.joint_torques),
+        senses: frame.senses,
         day: frame.day,
     };
     Ok(Some(Stamped { header, message }))
@@ -167,9 +165,7 @@ fn of_bridge(line: &str, earlier: &[Stamped<TactileFrame>], hand: &Hand) -> anyh
         phase: reading.phase,
         joints_rad: reading.joints_rad,
         cells_newtons: reading.cells_newtons,
-        gravity_m_per_s2: reading.gravity_m_per_s2,
-        wrist_wrench: reading.wrist_wrench,
-        joint_torques: reading.joint_torques,
+        senses: reading.senses,
         day: reading.day.unwrap_or(0),
     };
     Ok(Stamped { header: Header { hand_id: hand.id(), seq, stamp_nanos, ..Header::default() }, message })
@@ -194,12 +190,8 @@ struct FrameLine {
     phase: Phase,
     joints_rad: Vec<Option<f64>>,
     cells_newtons: Vec<Option<f64>>,
-    #[serde(default)]
-    gravity_m_per_s2: Vec<Option<f64>>,
-    #[serde(default)]
-    wrist_wrench: Vec<Option<f64>>,
-    #[serde(default)]
-    joint_torques: Vec<Option<f64>>,
+    #[serde(flatten)]
+    senses: OwnedSenses,
     #[serde(default)]
     day: u32,
 }

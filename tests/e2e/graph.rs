@@ -25,8 +25,8 @@ flowchart LR
   n3["classifier"]
   n4["lift_arbiter"]
   n5(["run"])
-  n0 -->|"tactile<br/>TactileFrame/4"| n1
-  n1 -->|"contacts<br/>ContactSet/6"| n2
+  n0 -->|"tactile<br/>TactileFrame/5"| n1
+  n1 -->|"contacts<br/>ContactSet/7"| n2
   n2 -->|"feature<br/>GraspFeature/4"| n3
   n3 -->|"prediction<br/>Prediction/4"| n4
   n0 -->|"truth<br/>GraspTruth/1"| n5
@@ -42,7 +42,7 @@ fn the_default_graph_as_dot() {
     assert_eq!((lines[0], lines[lines.len() - 1]), ("digraph \"grasp_gate\" {", "}"));
     for expected in [
         "n0 [label=\"recorded_source\"];",
-        "n0 -> n1 [label=\"tactile\\nTactileFrame/4\"];",
+        "n0 -> n1 [label=\"tactile\\nTactileFrame/5\"];",
         "n4 -> n5 [label=\"decision\\nLiftDecision/3\"];",
     ] {
         assert!(lines.contains(&expected), "no '{expected}' in\n{found}");
@@ -154,7 +154,7 @@ fn a_running_graph_has_states_rates_and_restarts() {
     assert!(found.contains("style n2 stroke:"), "{found}");
     let edge = found.lines().find(|line| line.trim().starts_with("n0 -->") && line.ends_with("n1")).expect("an edge");
     assert!(
-        edge.contains("|\"tactile<br/>TactileFrame/4<br/>") && edge.contains("/s, ") && edge.contains(" old\""),
+        edge.contains("|\"tactile<br/>TactileFrame/5<br/>") && edge.contains("/s, ") && edge.contains(" old\""),
         "{edge}"
     );
 
@@ -195,8 +195,8 @@ flowchart LR
     n2["encoder"]
     n3["classifier"]
   end
-  n0 -->|"tactile<br/>TactileFrame/4"| n1
-  n1 -.->|"contacts<br/>ContactSet/6<br/>Zenoh"| n2
+  n0 -->|"tactile<br/>TactileFrame/5"| n1
+  n1 -.->|"contacts<br/>ContactSet/7<br/>Zenoh"| n2
   n2 -->|"feature<br/>GraspFeature/4"| n3
   n3 -.->|"prediction<br/>Prediction/4<br/>Zenoh"| n4
   n0 -->|"truth<br/>GraspTruth/1"| n5

@@ -99,7 +99,7 @@ fn every_scaffold_builds_and_runs() {
         ("frames", &["--from", "TactileFrame"][..], "tactile: recorded_source/tactile", "min_newtons"),
         (
             "felt",
-            &["--from", "blindgrasp/ContactSet/6", "--to", "Prediction"],
+            &["--from", "blindgrasp/ContactSet/7", "--to", "Prediction"],
             "contacts: contacts/contacts",
             "min_newtons",
         ),

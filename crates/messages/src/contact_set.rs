@@ -2,9 +2,11 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::declare::Raw as _;
+use crate::declare::{Raw as _, at_most};
+use crate::senses::MAX_SENSE_VALUES;
 use crate::{
-    Fault, Header, MAX_CELLS, MAX_JOINTS, MAX_PADS, Message, MessageError, Phase, Recorded as _, Senses, ZeroCopySend,
+    Fault, Header, MAX_CELLS, MAX_JOINTS, MAX_PADS, Message, MessageError, OwnedSenses, Phase, Recorded as _, Senses,
+    ZeroCopySend,
 };
 
 declared! { shared
@@ -25,9 +27,12 @@ declared! { shared
     }
 }
 
+/// The senses in a head lie in rows of so many values: an array of more than 32 values has no default.
+const ROW: usize = 8;
+
 message! {
     /// A frame's contacts: its active cells in the palm frame (Dang & Allen, Eq. 1).
-    pub struct ContactSet = "blindgrasp/ContactSet/6" on "/contacts" {
+    pub struct ContactSet = "blindgrasp/ContactSet/7" on "/contacts" {
         pub grasp_id: u64,
         pub phase: Phase,
         #[ros = "Radians, in the hand's order."]
@@ -48,28 +53,22 @@ message! {
         /// Why there is no result.
         pub fault: Fault,
         /// The frame's.
-        #[ros = "Palm frame, m/s^2; empty if it is not known."]
-        #[serde(default, deserialize_with = "crate::serialized::any_list")]
-        pub gravity_m_per_s2: Vec<f64>,
-        #[ros = "Palm frame, newtons and newton metres; empty without a sensor."]
-        #[serde(default, deserialize_with = "crate::serialized::any_list")]
-        pub wrist_wrench: Vec<f64>,
-        #[ros = "Newton metres, in the hand's order; empty without sensors."]
-        #[serde(default, deserialize_with = "crate::serialized::any_list")]
-        pub joint_torques: Vec<f64>,
+        pub senses: OwnedSenses,
         #[ros = "The frame's."]
         #[serde(default)]
         pub day: u32,
     }
     also check check_senses;
 
-    /// The items are the contacts.
-    pub struct ContactSetHead = "blindgrasp/ContactSetHead/6" {
+    /// The items are the contacts. The first values of `senses` are those of the senses that `has_senses` names.
+    pub struct ContactSetHead = "blindgrasp/ContactSetHead/7" {
         grasp_id: u64, phase: u32, n_pads_in_contact: u32, self_collision: u32, n_self_contacts: u32, fault: u32,
-        n_joints: u32, joints_rad: [f64; MAX_JOINTS],
-        n_gravity: u32, n_wrench: u32, n_torques: u32, day: u32,
-        gravity_m_per_s2: [f64; 3], wrist_wrench: [f64; 6], joint_torques: [f64; MAX_JOINTS],
+        n_joints: u32, has_senses: u32, day: u32,
+        joints_rad: [f64; MAX_JOINTS], senses: [[f64; ROW]; MAX_SENSE_VALUES.div_ceil(ROW)],
     }
+}
+serialize_with_senses! {
+    ContactSet: grasp_id phase joints_rad contacts n_pads_in_contact self_collision n_self_contacts fault, senses, day
 }
 
 impl Message for ContactSet {
@@ -94,20 +93,15 @@ impl Message for ContactSet {
             n_self_contacts: self.n_self_contacts,
             fault: self.fault.code(),
             day: self.day,
-            n_joints: self.joints_rad.len() as u32,
-            joints_rad: filled(&self.joints_rad),
             ..ContactSetHead::default()
         }
-        .with_senses(&self.senses());
+        .with_joints(&self.joints_rad)
+        .with_senses(&self.senses.view());
         (head, self.contacts.clone())
     }
 
     fn from_parts(head: &ContactSetHead, items: &[Contact]) -> Result<Self, MessageError> {
-        let senses = head.senses()?;
         let message = ContactSet {
-            gravity_m_per_s2: senses.gravity_m_per_s2.to_vec(),
-            wrist_wrench: senses.wrist_wrench.to_vec(),
-            joint_torques: senses.joint_torques.to_vec(),
             grasp_id: head.grasp_id,
             phase: Phase::from_code(head.phase)?,
             joints_rad: head.joints_rad()?.to_vec(),
@@ -116,6 +110,7 @@ impl Message for ContactSet {
             self_collision: bool::from_raw("self_collision", head.self_collision)?,
             n_self_contacts: head.n_self_contacts,
             fault: Fault::from_code(head.fault)?,
+            senses: head.senses()?.into(),
             day: head.day,
         };
         message.check()?;
@@ -123,68 +118,46 @@ impl Message for ContactSet {
     }
 }
 
-impl ContactSet {
-    fn senses(&self) -> Senses<'_> {
-        Senses {
-            gravity_m_per_s2: &self.gravity_m_per_s2,
-            wrist_wrench: &self.wrist_wrench,
-            joint_torques: &self.joint_torques,
-        }
-    }
-}
-
 fn check_senses(contacts: &ContactSet) -> Result<(), MessageError> {
-    contacts.senses().check(contacts.joints_rad.len())
-}
-
-/// The first `N` of a list; 0 beyond its last.
-fn filled<const N: usize>(list: &[f64]) -> [f64; N] {
-    std::array::from_fn(|idx| list.get(idx).copied().unwrap_or_default())
+    contacts.senses.view().check(contacts.joints_rad.len())
 }
 
 impl ContactSetHead {
-    /// With these joint angles, at most [`MAX_JOINTS`].
-    pub fn with_joints(self, joints_rad: &[f64]) -> Self {
-        ContactSetHead { n_joints: joints_rad.len() as u32, joints_rad: filled(joints_rad), ..self }
+    /// With these joints, at most [`MAX_JOINTS`].
+    pub fn with_joints(mut self, joints_rad: &[f64]) -> Self {
+        self.n_joints = joints_rad.len() as u32;
+        fill(&mut self.joints_rad, joints_rad);
+        self
     }
 
-    /// With these senses.
-    pub fn with_senses(self, senses: &Senses<'_>) -> Self {
-        ContactSetHead {
-            n_gravity: senses.gravity_m_per_s2.len() as u32,
-            n_wrench: senses.wrist_wrench.len() as u32,
-            n_torques: senses.joint_torques.len() as u32,
-            gravity_m_per_s2: filled(senses.gravity_m_per_s2),
-            wrist_wrench: filled(senses.wrist_wrench),
-            joint_torques: filled(senses.joint_torques),
-            ..self
-        }
+    /// With these senses of a hand with its joints.
+    pub fn with_senses(mut self, senses: &Senses<'_>) -> Self {
+        self.has_senses = senses.mask(self.n_joints as usize);
+        fill(self.senses.as_flattened_mut(), senses.values());
+        self
     }
 
-    /// The joint angles, radians.
+    /// The joints: radians, or metres for a joint that slides.
     ///
     /// # Errors
     /// More joints than a hand can have.
     pub fn joints_rad(&self) -> Result<&[f64], MessageError> {
-        first("joints_rad", self.n_joints, &self.joints_rad)
+        at_most("joints_rad", self.n_joints as usize, MAX_JOINTS)?;
+        Ok(&self.joints_rad[..self.n_joints as usize])
     }
 
     /// The frame's senses.
     ///
     /// # Errors
-    /// A list that is neither empty nor complete.
+    /// A sense that is not known, or more joints than a hand can have.
     pub fn senses(&self) -> Result<Senses<'_>, MessageError> {
-        let senses = Senses {
-            gravity_m_per_s2: first("gravity_m_per_s2", self.n_gravity, &self.gravity_m_per_s2)?,
-            wrist_wrench: first("wrist_wrench", self.n_wrench, &self.wrist_wrench)?,
-            joint_torques: first("joint_torques", self.n_torques, &self.joint_torques)?,
-        };
-        senses.check(self.n_joints as usize)?;
-        Ok(senses)
+        Senses::first_of(self.has_senses, self.n_joints as usize, self.senses.as_flattened())
     }
 }
 
-fn first<'a>(field: &'static str, n: u32, list: &'a [f64]) -> Result<&'a [f64], MessageError> {
-    crate::declare::at_most(field, n as usize, list.len())?;
-    Ok(&list[..n as usize])
+/// Puts the values at the beginning; those for which there is no room are left out.
+fn fill(room: &mut [f64], values: &[f64]) {
+    for (place, value) in room.iter_mut().zip(values) {
+        *place = *value;
+    }
 }

@@ -7,7 +7,7 @@
 //! A field of the head has the owned field's name and its type in shared memory ([`Raw`]). `n: u32 => list` is the
 //! number of items that belong to a list or a text of the message, and `name: u32 = 0` is always that number. The last
 //! line names the type of the items and the list or text that gets the items behind the counted ones. Without that
-//! line, the file implements [`Message`](crate::Message) by hand.
+//! line, the file implements [`Message`](crate::Message) by hand; and `Serialize` without `#[derive(serde::Serialize)]`.
 
 use crate::MessageError;
 
@@ -173,8 +173,7 @@ macro_rules! declared {
                 let mut text = String::new();
                 $(
                     $(text += concat!("# ", $ros, "\n");)*
-                    text += &<$type>::ros_comment();
-                    text += &format!("{} {}\n", <$type>::ros_name(), stringify!($field));
+                    text += &<$type>::ros_lines(stringify!($field));
                 )+
                 text
             }
@@ -204,6 +203,7 @@ macro_rules! declared {
 macro_rules! message {
     (
         $(#[doc = $doc:literal])+
+        $(#[derive($derive:path)])?
         pub struct $name:ident = $type_name:literal on $topic:literal { $($fields:tt)+ }
         $(also check $check:path;)?
         $(
@@ -214,7 +214,8 @@ macro_rules! message {
     ) => {
         declared! {
             $(#[doc = $doc])+
-            #[derive(Debug, Clone, PartialEq, Default, serde::Serialize, serde::Deserialize)]
+            #[derive(Debug, Clone, PartialEq, Default, serde::Deserialize)]
+            $(#[derive($derive)])?
             pub struct $name { $($fields)+ }
         }
 

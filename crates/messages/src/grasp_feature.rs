@@ -5,6 +5,7 @@ use crate::{Fault, MAX_FEATURES, MAX_PADS, Phase, ZeroCopySend};
 message! {
     /// A frame's feature: the blocks of the model's recipe, the paper's histogram over the dictionary (Eq. 2-4) among
     /// them.
+    #[derive(serde::Serialize)]
     pub struct GraspFeature = "blindgrasp/GraspFeature/4" on "/feature" {
         pub grasp_id: u64,
         pub phase: Phase,

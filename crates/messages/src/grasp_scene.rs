@@ -9,6 +9,7 @@ message! {
     ///
     /// Everything is in the palm frame. The contacts hold all that the grasp's quality depends on, so that the quality
     /// can be computed anew, for another friction say, without another simulation.
+    #[derive(serde::Serialize)]
     pub struct GraspScene = "blindgrasp/GraspScene/1" on "/scene" {
         pub grasp_id: u64,
         /// Number of the candidate.

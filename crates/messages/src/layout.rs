@@ -9,6 +9,82 @@ use serde_json::{Map, Value, json};
 
 use crate::*;
 
+/// In Python, a head whose items are several lists finds them by these names.
+const LISTS: &str = r#"
+
+class Lists:
+    """The lists among the items of a frame: `joints`, `cells`, and by name the `senses` that are there.
+
+    Each can be set. A head that came with a sample has its `items`; give a head of your own its items first.
+    """
+
+    n_joints: int
+    has_senses: int
+    items: typing.Any
+
+    def _spans(self) -> dict[str, slice]:
+        if self.has_senses >> len(SENSES):
+            raise ValueError(f"a frame has the unknown senses {self.has_senses}: expected at most {len(SENSES)} bits")
+        spans, end = {"joints": slice(0, self.n_joints)}, self.n_joints
+        for bit, (name, n_values) in enumerate(SENSES.items()):
+            is_there = self.has_senses >> bit & 1
+            start, end = end, end + is_there * (n_values or self.n_joints)
+            spans[name] = slice(start, end)
+        if end > len(self.items):
+            raise ValueError(f"a frame of {len(self.items)} items says that it has {end} beside its cells: expected at most as many")
+        spans["cells"] = slice(end, len(self.items))
+        return spans
+
+    def _set(self, lists: dict[str, typing.Any]) -> None:
+        spans = self._spans()
+        if all(len(values) == len(range(*spans[name].indices(len(self.items)))) for name, values in lists.items()):
+            for name, values in lists.items():
+                self.items[spans[name]] = values
+            return
+        parts = {name: lists.get(name, self.items[span]) for name, span in spans.items()}
+        for name, n_values in SENSES.items():
+            n_expected = n_values or len(parts["joints"])
+            if len(parts[name]) not in (0, n_expected):
+                raise ValueError(f"{name} has {len(parts[name])} values: expected {n_expected}, or none at all")
+        values = [value for part in parts.values() for value in part]
+        is_numpy = hasattr(self.items, "astype")
+        self.items = type(self.items)(len(values)) if is_numpy else (ctypes.c_double * len(values))()
+        self.items[:] = values
+        self.n_joints = len(parts["joints"])
+        self.has_senses = sum(1 << bit for bit, name in enumerate(SENSES) if len(parts[name]))
+
+    @property
+    def joints(self) -> typing.Any:
+        """The joints' positions, in the hand's order: radians, and metres of joints that slide."""
+        return self.items[self._spans()["joints"]]
+
+    @joints.setter
+    def joints(self, values: typing.Any) -> None:
+        self._set({"joints": values})
+
+    @property
+    def cells(self) -> typing.Any:
+        """The force on each cell, pad after pad."""
+        return self.items[self._spans()["cells"]]
+
+    @cells.setter
+    def cells(self, values: typing.Any) -> None:
+        self._set({"cells": values})
+
+    @property
+    def senses(self) -> dict[str, typing.Any]:
+        """The lists of the other senses that the frame has, by name."""
+        named = ((name, self.items[span]) for name, span in self._spans().items() if name not in ("joints", "cells"))
+        return {name: values for name, values in named if len(values)}
+
+    @senses.setter
+    def senses(self, lists: dict[str, typing.Any]) -> None:
+        unknown = lists.keys() - SENSES.keys()
+        if unknown:
+            raise ValueError(f"{', '.join(unknown)}: no such sense, expected some of {', '.join(SENSES)}")
+        self._set({name: lists.get(name, ()) for name in SENSES})
+"#;
+
 /// A field's type in Python: as it is written there, and its name in the comparison.
 pub(crate) trait Portable {
     fn python() -> String;
@@ -109,19 +185,28 @@ fn python_text() -> String {
         "\"\"\"The samples of blindgrasp as they lie in shared memory: heads, items, enums' codes.\n\n\
          Generated from crates/messages; do not edit. What each field means is said there and in docs/messages.md.\n\
          Needs nothing but Python.\n\"\"\"\n\n\
-         import ctypes\nimport enum\n\n",
+         import ctypes\nimport enum\nimport typing\n\n",
     );
     for (name, limit) in LIMITS {
         let _ = writeln!(text, "{name} = {limit}");
     }
+    text += "\n# The senses of a frame in order, each with the number of its values; None: one for each joint.\n";
+    let senses = Sense::ALL.map(|sense| {
+        let n_values = sense.n_values().map_or("None".into(), |n_values| n_values.to_string());
+        format!("\"{}\": {n_values}", sense.name())
+    });
+    let _ = writeln!(text, "SENSES: dict[str, int | None] = {{{}}}", senses.join(", "));
     for Codes { name, words, .. } in coded_enums() {
         let _ = writeln!(text, "\n\nclass {name}(enum.IntEnum):");
         for (word, code) in words {
             let _ = writeln!(text, "    {} = {code}", word.to_uppercase());
         }
     }
+    text += LISTS;
     for Struct { name, doc, type_name, fields, .. } in structs() {
-        let _ = write!(text, "\n\nclass {name}(ctypes.Structure):\n    \"\"\"{doc}\"\"\"\n\n    _fields_ = [\n");
+        let has_lists = name == "TactileFrameHead";
+        let bases = if has_lists { "Lists, ctypes.Structure" } else { "ctypes.Structure" };
+        let _ = write!(text, "\n\nclass {name}({bases}):\n    \"\"\"{doc}\"\"\"\n\n    _fields_ = [\n");
         for Field { name, python, .. } in fields {
             let _ = writeln!(text, "        (\"{name}\", {python}),");
         }

@@ -13,6 +13,8 @@
 
 #[macro_use]
 mod declare;
+#[macro_use]
+mod senses;
 mod coded;
 mod contact_set;
 pub mod files;
@@ -42,8 +44,9 @@ pub use lift_decision::{LiftDecision, LiftDecisionHead};
 pub use lift_outcome::{LiftOutcome, LiftOutcomeHead};
 pub use prediction::{Prediction, PredictionHead};
 pub use ros::{first_difference, signature};
+pub use senses::{OwnedSenses, Sense, Senses};
 pub use serialized::{hex_id, read_list};
-pub use tactile_frame::{FrameParts, Senses, TactileFrame, TactileFrameHead};
+pub use tactile_frame::{FrameParts, FramePartsMut, TactileFrame, TactileFrameHead};
 
 use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};

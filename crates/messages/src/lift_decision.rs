@@ -4,6 +4,7 @@ use crate::{Action, Reason, ZeroCopySend};
 
 message! {
     /// The arbiter's decision, one per grasp. The header's sequence counts decisions.
+    #[derive(serde::Serialize)]
     pub struct LiftDecision = "blindgrasp/LiftDecision/3" on "/decision" {
         pub grasp_id: u64,
         pub action: Action,

@@ -5,6 +5,7 @@ use crate::{MAX_NAME_BYTES, ZeroCopySend};
 message! {
     /// What became of a grasp that a hand tried: whether the hand lifted, and whether the object was kept. The header's
     /// sequence counts outcomes.
+    #[derive(serde::Serialize)]
     pub struct LiftOutcome = "blindgrasp/LiftOutcome/4" on "/outcome" {
         pub grasp_id: u64,
         /// Number of the trial, from 0.

@@ -4,6 +4,7 @@ use crate::{Fault, Phase, ZeroCopySend};
 
 message! {
     /// The classifier's verdict on a frame.
+    #[derive(serde::Serialize)]
     pub struct Prediction = "blindgrasp/Prediction/4" on "/prediction" {
         pub grasp_id: u64,
         pub phase: Phase,

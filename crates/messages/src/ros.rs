@@ -15,6 +15,11 @@ pub(crate) trait RosType {
         String::new()
     }
 
+    /// The lines of a field of this type.
+    fn ros_lines(name: &str) -> String {
+        format!("{}{} {name}\n", Self::ros_comment(), Self::ros_name())
+    }
+
     /// The definition of the struct that it consists of; empty for other types.
     fn ros_part() -> String {
         String::new()

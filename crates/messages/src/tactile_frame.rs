@@ -1,10 +1,14 @@
 //! What the tactile source sends.
 
-use crate::{MAX_CELLS, MAX_JOINTS, MessageError, Phase, ZeroCopySend};
+use crate::declare::at_most;
+use crate::{
+    Header, MAX_CELLS, MAX_JOINTS, Message, MessageError, OwnedSenses, Phase, Recorded as _, Sense, Senses,
+    ZeroCopySend,
+};
 
 message! {
     /// One reading of all joints and cells.
-    pub struct TactileFrame = "blindgrasp/TactileFrame/4" on "/tactile" {
+    pub struct TactileFrame = "blindgrasp/TactileFrame/5" on "/tactile" {
         pub grasp_id: u64,
         pub phase: Phase,
         /// Radians, and metres of joints that slide.
@@ -17,18 +21,8 @@ message! {
         #[serde(deserialize_with = "crate::serialized::any_list")]
         #[max(MAX_CELLS)]
         pub cells_newtons: Vec<f64>,
-        /// Gravity, x, y, z; empty if it is not known.
-        #[ros = "Palm frame, m/s^2."]
-        #[serde(default, deserialize_with = "crate::serialized::any_list")]
-        pub gravity_m_per_s2: Vec<f64>,
-        /// Force and torque of the load on the wrist: x, y, z each; empty without a sensor.
-        #[ros = "Palm frame, newtons and newton metres."]
-        #[serde(default, deserialize_with = "crate::serialized::any_list")]
-        pub wrist_wrench: Vec<f64>,
-        /// The torque of each joint, positive if its motor closes; empty without sensors.
-        #[ros = "Newton metres, in the hand's order."]
-        #[serde(default, deserialize_with = "crate::serialized::any_list")]
-        pub joint_torques: Vec<f64>,
+        /// What the robot senses beside joints and cells.
+        pub senses: OwnedSenses,
         /// 0 if the source does not say it. Sensors drift from day to day: grasps of one day have one baseline.
         #[ros = "Number of the recording day, like 20261124; 0 if it is not known."]
         #[serde(default)]
@@ -36,60 +30,62 @@ message! {
     }
     also check check_senses;
 
-    /// The items are the joint angles, gravity, the wrench, the joints' torques, and then the cells' forces.
-    pub struct TactileFrameHead = "blindgrasp/TactileFrameHead/4" {
-        grasp_id: u64, phase: u32, n_joints: u32 => joints_rad, n_gravity: u32 => gravity_m_per_s2,
-        n_wrench: u32 => wrist_wrench, n_torques: u32 => joint_torques, day: u32,
+    /// The items are the joints, the senses that `has_senses` names, and then the cells' forces.
+    pub struct TactileFrameHead = "blindgrasp/TactileFrameHead/5" {
+        grasp_id: u64, phase: u32, n_joints: u32, has_senses: u32, day: u32,
     }
-    items: f64 => cells_newtons;
+}
+serialize_with_senses! { TactileFrame: grasp_id phase joints_rad cells_newtons, senses, day }
+
+impl Message for TactileFrame {
+    type Head = TactileFrameHead;
+    type Item = f64;
+
+    fn header(head: &TactileFrameHead) -> &Header {
+        &head.header
+    }
+
+    fn header_mut(head: &mut TactileFrameHead) -> &mut Header {
+        &mut head.header
+    }
+
+    fn to_parts(&self, header: Header) -> (TactileFrameHead, Vec<f64>) {
+        let senses = self.senses.view();
+        let head = TactileFrameHead {
+            header,
+            grasp_id: self.grasp_id,
+            phase: self.phase.code(),
+            n_joints: self.joints_rad.len() as u32,
+            has_senses: senses.mask(self.joints_rad.len()),
+            day: self.day,
+        };
+        (head, [&self.joints_rad, senses.values(), &self.cells_newtons].concat())
+    }
+
+    fn from_parts(head: &TactileFrameHead, items: &[f64]) -> Result<Self, MessageError> {
+        let FrameParts { joints_rad, senses, cells_newtons } = head.split(items)?;
+        let message = TactileFrame {
+            grasp_id: head.grasp_id,
+            phase: Phase::from_code(head.phase)?,
+            joints_rad: joints_rad.to_vec(),
+            cells_newtons: cells_newtons.to_vec(),
+            senses: senses.into(),
+            day: head.day,
+        };
+        message.check()?;
+        Ok(message)
+    }
 }
 
 impl TactileFrame {
     /// The most items of a frame of a hand with so many joints and cells.
     pub fn max_items(n_joints: usize, n_cells: usize) -> usize {
-        2 * n_joints + 3 + 6 + n_cells
-    }
-
-    /// What the frame has beside joint angles and cells.
-    pub fn senses(&self) -> Senses<'_> {
-        Senses {
-            gravity_m_per_s2: &self.gravity_m_per_s2,
-            wrist_wrench: &self.wrist_wrench,
-            joint_torques: &self.joint_torques,
-        }
+        n_joints + Sense::max_values(n_joints) + n_cells
     }
 }
 
 fn check_senses(frame: &TactileFrame) -> Result<(), MessageError> {
-    frame.senses().check(frame.joints_rad.len())
-}
-
-/// What a hand or an arm may sense beside joint angles and cells. An empty list is a sense that is absent.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Senses<'a> {
-    /// Gravity in the palm frame: x, y, z.
-    pub gravity_m_per_s2: &'a [f64],
-    /// Force (newtons) and torque (newton metres) of the load on the wrist, in the palm frame.
-    pub wrist_wrench: &'a [f64],
-    /// The torque of each joint, newton metres, in the hand's order.
-    pub joint_torques: &'a [f64],
-}
-
-impl Senses<'_> {
-    /// # Errors
-    /// A list that is neither empty nor as long as it must be for a hand with `n_joints`.
-    pub(crate) fn check(&self, n_joints: usize) -> Result<(), MessageError> {
-        for (field, found, expected) in [
-            ("gravity_m_per_s2", self.gravity_m_per_s2.len(), 3),
-            ("wrist_wrench", self.wrist_wrench.len(), 6),
-            ("joint_torques", self.joint_torques.len(), n_joints),
-        ] {
-            if found != 0 && found != expected {
-                return Err(MessageError::Length { field, found, expected: format!("0 or {expected}") });
-            }
-        }
-        Ok(())
-    }
+    frame.senses.view().check(frame.joints_rad.len())
 }
 
 /// The lists of a frame among its items.
@@ -100,27 +96,71 @@ pub struct FrameParts<'a> {
     pub cells_newtons: &'a [f64],
 }
 
+/// [`FrameParts`], of which joints and cells can be changed.
+#[derive(Debug, PartialEq)]
+pub struct FramePartsMut<'a> {
+    pub joints_rad: &'a mut [f64],
+    pub senses: Senses<'a>,
+    pub cells_newtons: &'a mut [f64],
+}
+
 impl TactileFrameHead {
-    /// The joint angles, the senses and the cells' forces among the frame's items.
+    /// The joints, the senses and the cells' forces among the frame's items.
     ///
     /// # Errors
     /// More of them than items, or more than a hand can have.
     pub fn split<'a>(&self, items: &'a [f64]) -> Result<FrameParts<'a>, MessageError> {
-        let mut rest = items;
-        let mut take = |field, n: u32, most: usize| {
-            crate::declare::at_most(field, n as usize, most.min(rest.len()))?;
-            let (first, others) = rest.split_at(n as usize);
-            rest = others;
-            Ok(first)
-        };
-        let joints_rad = take("joints_rad", self.n_joints, MAX_JOINTS)?;
-        let senses = Senses {
-            gravity_m_per_s2: take("gravity_m_per_s2", self.n_gravity, 3)?,
-            wrist_wrench: take("wrist_wrench", self.n_wrench, 6)?,
-            joint_torques: take("joint_torques", self.n_torques, MAX_JOINTS)?,
-        };
-        senses.check(joints_rad.len())?;
-        crate::declare::at_most("cells_newtons", rest.len(), MAX_CELLS)?;
-        Ok(FrameParts { joints_rad, senses, cells_newtons: rest })
+        let n_joints = self.n_joints as usize;
+        at_most("joints_rad", n_joints, MAX_JOINTS.min(items.len()))?;
+        let (joints_rad, rest) = items.split_at(n_joints);
+        let senses = Senses::first_of(self.has_senses, n_joints, rest)?;
+        let cells_newtons = &rest[senses.values().len()..];
+        at_most("cells_newtons", cells_newtons.len(), MAX_CELLS)?;
+        Ok(FrameParts { joints_rad, senses, cells_newtons })
+    }
+
+    /// As [`TactileFrameHead::split`], to change joints or cells.
+    ///
+    /// # Errors
+    /// As [`TactileFrameHead::split`].
+    pub fn split_mut<'a>(&self, items: &'a mut [f64]) -> Result<FramePartsMut<'a>, MessageError> {
+        let FrameParts { joints_rad, senses, .. } = self.split(items)?;
+        let (n_joints, n_values) = (joints_rad.len(), senses.values().len());
+        let (joints_rad, rest) = items.split_at_mut(n_joints);
+        let (values, cells_newtons) = rest.split_at_mut(n_values);
+        let senses = Senses::first_of(self.has_senses, n_joints, values)?;
+        Ok(FramePartsMut { joints_rad, senses, cells_newtons })
+    }
+
+    /// The joints among the frame's items.
+    ///
+    /// # Errors
+    /// As [`TactileFrameHead::split`].
+    pub fn joints<'a>(&self, items: &'a [f64]) -> Result<&'a [f64], MessageError> {
+        Ok(self.split(items)?.joints_rad)
+    }
+
+    /// The senses among the frame's items.
+    ///
+    /// # Errors
+    /// As [`TactileFrameHead::split`].
+    pub fn senses<'a>(&self, items: &'a [f64]) -> Result<Senses<'a>, MessageError> {
+        Ok(self.split(items)?.senses)
+    }
+
+    /// The cells' forces among the frame's items.
+    ///
+    /// # Errors
+    /// As [`TactileFrameHead::split`].
+    pub fn cells<'a>(&self, items: &'a [f64]) -> Result<&'a [f64], MessageError> {
+        Ok(self.split(items)?.cells_newtons)
+    }
+
+    /// As [`TactileFrameHead::cells`], to change them.
+    ///
+    /// # Errors
+    /// As [`TactileFrameHead::split`].
+    pub fn cells_mut<'a>(&self, items: &'a mut [f64]) -> Result<&'a mut [f64], MessageError> {
+        Ok(self.split_mut(items)?.cells_newtons)
     }
 }

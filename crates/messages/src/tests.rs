@@ -49,6 +49,13 @@ fn sent<M: Message + PartialEq>(message: &M) -> Map<String, Value> {
     shapes
 }
 
+fn senses() -> OwnedSenses {
+    OwnedSenses::default()
+        .with(Sense::JointTorques, &[0.75, 0.0625])
+        .with(Sense::Gravity, &[0.0, -9.75, 0.5])
+        .with(Sense::WristWrench, &[0.5, 1.0, 1.5, 0.125, 0.25, 0.375])
+}
+
 fn shapes() -> Vec<Map<String, Value>> {
     let contact =
         Contact { position_m: [0.1, 0.2, -0.3], normal: [0.0, 0.6, 0.8], force_newtons: 2.5, pad: 1, cell: 23 };
@@ -68,9 +75,7 @@ fn shapes() -> Vec<Map<String, Value>> {
             phase: Phase::Settled,
             joints_rad: vec![0.25, -0.5],
             cells_newtons: vec![1.5, 0.0, 2.25],
-            gravity_m_per_s2: vec![0.0, -9.75, 0.5],
-            wrist_wrench: vec![0.5, 1.0, 1.5, 0.125, 0.25, 0.375],
-            joint_torques: vec![0.75, 0.0625],
+            senses: senses(),
             day: 20_261_124,
         }),
         sent(&ContactSet {
@@ -82,9 +87,7 @@ fn shapes() -> Vec<Map<String, Value>> {
             self_collision: true,
             n_self_contacts: 3,
             fault: Fault::SelfCollision,
-            gravity_m_per_s2: vec![0.0, -9.75, 0.5],
-            wrist_wrench: vec![0.5, 1.0, 1.5, 0.125, 0.25, 0.375],
-            joint_torques: vec![0.75, 0.0625],
+            senses: senses(),
             day: 20_261_124,
         }),
         sent(&GraspFeature {
@@ -185,6 +188,41 @@ fn the_list_has_every_type_once() {
 
 fn type_name<M: Recorded>() -> &'static str {
     M::TYPE_NAME
+}
+
+#[test]
+fn the_lists_of_a_frame_are_found_and_can_be_changed() {
+    let frame = TactileFrame {
+        joints_rad: vec![0.25, -0.5],
+        cells_newtons: vec![1.5, 2.5],
+        senses: OwnedSenses::default().with(Sense::JointTorques, &[0.75, 1.0]).with(Sense::Gravity, &[0.0, 0.0, 9.75]),
+        ..TactileFrame::default()
+    };
+    let (head, mut items) = frame.to_parts(Header::default());
+    assert_eq!(items, [0.25, -0.5, 0.0, 0.0, 9.75, 0.75, 1.0, 1.5, 2.5]);
+    assert_eq!(head.joints(&items), Ok(&[0.25, -0.5][..]));
+    assert_eq!(head.senses(&items), Ok(frame.senses.view()));
+    let lists: Vec<_> = frame.senses.view().iter().map(|(_, values)| values).collect();
+    assert_eq!(lists, [&[0.0, 0.0, 9.75][..], &[], &[0.75, 1.0]]);
+    let parts = head.split_mut(&mut items).expect("a frame");
+    parts.joints_rad[0] = 0.5;
+    assert_eq!(parts.senses.get(Sense::JointTorques), [0.75, 1.0]);
+    head.cells_mut(&mut items).expect("a frame").fill(0.0);
+    assert_eq!(items, [0.5, -0.5, 0.0, 0.0, 9.75, 0.75, 1.0, 0.0, 0.0]);
+    assert_eq!(frame.senses.clone().with(Sense::Gravity, &[]).get(Sense::JointTorques), [0.75, 1.0]);
+}
+
+#[test]
+fn senses_that_cannot_be_are_refused() {
+    let short = TactileFrame { senses: OwnedSenses::default().with(Sense::Gravity, &[1.0]), ..Default::default() };
+    let error = short.check().expect_err("one value").to_string();
+    assert_eq!(error, "gravity_m_per_s2 has length 1, expected 0 or 3");
+    let (head, items) = short.to_parts(Header::default());
+    let error = head.split(&items).expect_err("one value").to_string();
+    assert_eq!(error, "has_senses has the unknown code 4294967295");
+    let head = TactileFrameHead { n_joints: 2, has_senses: Sense::JointTorques.bit(), ..Default::default() };
+    let error = head.split(&[0.0; 3]).expect_err("one torque").to_string();
+    assert_eq!(error, "the senses' list has length 2, expected 0 to 1");
 }
 
 #[test]

@@ -17,7 +17,7 @@ pub const PROTOCOL: u32 = 3;
 /// ```json
 /// {
 ///   "protocol": 3, "operator": "contacts", "version": "0.1.0", "summary": "Contacts from tactile cells",
-///   "inputs": [{"name": "tactile", "type": "blindgrasp/TactileFrame/4"}],
+///   "inputs": [{"name": "tactile", "type": "blindgrasp/TactileFrame/5"}],
 ///   "outputs": [{"name": "contacts", "type": "blindgrasp/ContactSet/2"}],
 ///   "params": [{"name": "hand", "kind": "path"},
 ///              {"name": "threshold_newtons", "kind": "number", "above": 0, "default": 0.2}],
@@ -56,7 +56,7 @@ pub struct OperatorDescription {
 pub struct PortDescription {
     /// Unique among the inputs or outputs.
     pub name: String,
-    /// The name of the type of its samples, like `blindgrasp/TactileFrame/4`. An edge joins equal names.
+    /// The name of the type of its samples, like `blindgrasp/TactileFrame/5`. An edge joins equal names.
     #[serde(rename = "type")]
     pub type_name: String,
     /// A node may leave this input unconnected.

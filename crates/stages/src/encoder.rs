@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::dictionary::Dictionary;
 use crate::hand::{Coupling, Hand};
 use crate::histogram::histogram;
-use blindgrasp_messages::{Contact, Fault, MAX_FEATURES, Senses};
+use blindgrasp_messages::{Contact, Fault, MAX_FEATURES, Sense, Senses};
 
 /// Values of [`Block::Pads`] for each pad.
 pub(crate) const N_PAD_VALUES: usize = 15;
@@ -193,10 +193,13 @@ impl FeatureExtractor {
                 Block::Pads => self.write_pads(contacts, values),
                 Block::Gravity => values.extend(down(&senses)?),
                 Block::Wrist => values.extend(wrist_values(&senses)?),
-                Block::JointTorques if senses.joint_torques.len() == joints_rad.len() => {
-                    values.extend_from_slice(senses.joint_torques);
+                Block::JointTorques => {
+                    let torques = senses.get(Sense::JointTorques);
+                    if torques.len() != joints_rad.len() {
+                        return Err(Fault::MissingReading);
+                    }
+                    values.extend_from_slice(torques);
                 }
-                Block::JointTorques => return Err(Fault::MissingReading),
             }
         }
         values.drain(..n_words);
@@ -298,7 +301,7 @@ impl FeatureExtractor {
 
 /// The direction of gravity in the palm frame.
 fn down(senses: &Senses<'_>) -> Result<[f64; 3], Fault> {
-    let [x, y, z] = *senses.gravity_m_per_s2 else { return Err(Fault::MissingReading) };
+    let [x, y, z] = *senses.get(Sense::Gravity) else { return Err(Fault::MissingReading) };
     let norm = (x * x + y * y + z * z).sqrt();
     if norm > 0.0 { Ok([x / norm, y / norm, z / norm]) } else { Err(Fault::InvalidValue) }
 }
@@ -309,7 +312,7 @@ fn down(senses: &Senses<'_>) -> Result<[f64; 3], Fault> {
 /// [`Fault::MissingReading`] without gravity or wrench, [`Fault::InvalidValue`] for a gravity of 0.
 pub fn wrist_values(senses: &Senses<'_>) -> Result<[f64; N_WRIST_VALUES], Fault> {
     let down = down(senses)?;
-    let [fx, fy, fz, tx, ty, tz] = *senses.wrist_wrench else { return Err(Fault::MissingReading) };
+    let [fx, fy, fz, tx, ty, tz] = *senses.get(Sense::WristWrench) else { return Err(Fault::MissingReading) };
     let along = fx * down[0] + fy * down[1] + fz * down[2];
     let across = (fx * fx + fy * fy + fz * fz - along * along).max(0.0).sqrt();
     Ok([along, across, tx, ty, tz, (tx * tx + ty * ty + tz * tz).sqrt()])

@@ -25,7 +25,7 @@
 use std::collections::BTreeMap;
 
 use super::{Arrival, Place, Reading, Refusal, RefusalKind};
-use blindgrasp_messages::Phase;
+use blindgrasp_messages::{Phase, Sense};
 
 /// Nanoseconds of steady readings by a new clock before it is accepted.
 pub const RESET_NANOS: u64 = 2_000_000_000;
@@ -168,9 +168,7 @@ struct Keys {
     grasp_id: bool,
     seq: bool,
     stamp_nanos: bool,
-    gravity_m_per_s2: bool,
-    wrist_wrench: bool,
-    joint_torques: bool,
+    senses: [bool; Sense::ALL.len()],
 }
 
 /// The least delay known, and the time when it was measured.
@@ -379,9 +377,7 @@ impl FrameFilter {
             grasp_id: reading.grasp_id.is_some(),
             seq: reading.seq.is_some(),
             stamp_nanos: reading.stamp_nanos.is_some(),
-            gravity_m_per_s2: !reading.gravity_m_per_s2.is_empty(),
-            wrist_wrench: !reading.wrist_wrench.is_empty(),
-            joint_torques: !reading.joint_torques.is_empty(),
+            senses: Sense::ALL.map(|sense| !reading.senses.get(sense).is_empty()),
         };
         if let Some(first) = self.connection.keys {
             check_keys(first, keys).map_err(malformed)?;
@@ -575,16 +571,12 @@ fn check_values(reading: &Reading, shape: Shape) -> Result<(), String> {
     {
         return Err(format!("cells_newtons[{idx}] is {force}: expected a force, which is not negative"));
     }
-    let senses = [
-        ("gravity_m_per_s2", &reading.gravity_m_per_s2, 3),
-        ("wrist_wrench", &reading.wrist_wrench, 6),
-        ("joint_torques", &reading.joint_torques, shape.n_joints),
-    ];
-    for (name, sense, expected) in senses {
-        if !sense.is_empty() && sense.len() != expected {
-            return Err(format!("{name} has {} numbers: expected {expected}, or none at all", sense.len()));
+    for (sense, values) in reading.senses.view().iter() {
+        let (name, expected) = (sense.name(), sense.len(shape.n_joints));
+        if !values.is_empty() && values.len() != expected {
+            return Err(format!("{name} has {} numbers: expected {expected}, or none at all", values.len()));
         }
-        if let Some((idx, number)) = sense.iter().enumerate().find(|(_, number)| !number.is_finite()) {
+        if let Some((idx, number)) = values.iter().enumerate().find(|(_, number)| !number.is_finite()) {
             return Err(format!("{name}[{idx}] is {number}: expected a finite number"));
         }
     }
@@ -593,17 +585,19 @@ fn check_values(reading: &Reading, shape: Shape) -> Result<(), String> {
 
 /// Optional keys must be in all frames of a connection or in none: a frame without one would go unchecked.
 fn check_keys(first: Keys, found: Keys) -> Result<(), String> {
-    let keys = [
+    let numbers = [
         ("grasp_id", first.grasp_id, found.grasp_id),
         ("seq", first.seq, found.seq),
         ("stamp_nanos", first.stamp_nanos, found.stamp_nanos),
-        ("gravity_m_per_s2", first.gravity_m_per_s2, found.gravity_m_per_s2),
-        ("wrist_wrench", first.wrist_wrench, found.wrist_wrench),
-        ("joint_torques", first.joint_torques, found.joint_torques),
     ];
-    match keys.into_iter().find(|(_, first, found)| first != found) {
-        Some((key, true, _)) => Err(format!("{key} is missing, which the connection's first frame had")),
-        Some((key, false, _)) => Err(format!("{key} is given, which the connection's first frame did not have")),
-        None => Ok(()),
+    let senses = Sense::ALL.map(|sense| (sense.name(), first.senses[sense as usize], found.senses[sense as usize]));
+    for (key, was_given, is_given) in numbers.into_iter().chain(senses) {
+        if was_given && !is_given {
+            return Err(format!("{key} is missing, which the connection's first frame had"));
+        }
+        if is_given && !was_given {
+            return Err(format!("{key} is given, which the connection's first frame did not have"));
+        }
     }
+    Ok(())
 }

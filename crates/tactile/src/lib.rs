@@ -30,7 +30,7 @@ pub mod zenoh_key;
 use rustix::event::PollFd;
 use serde::{Deserialize, Serialize};
 
-use blindgrasp_messages::Phase;
+use blindgrasp_messages::{OwnedSenses, Phase};
 use blindgrasp_stages::hand::Hand;
 
 /// Reads a hand's frames: from a socket, a device, a vendor's library.
@@ -80,22 +80,15 @@ pub enum Event {
 
 /// One reading of all joints and cells.
 #[derive(Debug, Clone, PartialEq, Default, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Reading {
     /// Joint angles in the hand's order, radians.
     pub joints_rad: Vec<f64>,
     /// Force on each cell, pad after pad in the hand's order, newtons (or the unit of the hand's layout).
     pub cells_newtons: Vec<f64>,
     pub phase: Phase,
-    /// Gravity in the palm frame: x, y, z; empty if it is not known.
-    #[serde(default)]
-    pub gravity_m_per_s2: Vec<f64>,
-    /// Force (newtons) and torque (newton metres) of the load on the wrist, in the palm frame; empty without a sensor.
-    #[serde(default)]
-    pub wrist_wrench: Vec<f64>,
-    /// The torque of each joint in the hand's order, newton metres; empty without sensors.
-    #[serde(default)]
-    pub joint_torques: Vec<f64>,
+    /// Each sense under its own name in a line. A key that is unknown is refused here.
+    #[serde(flatten, deserialize_with = "OwnedSenses::of_all_keys")]
+    pub senses: OwnedSenses,
     /// The grasp; without it, the phases tell where a grasp begins.
     #[serde(default)]
     pub grasp_id: Option<u64>,

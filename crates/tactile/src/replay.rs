@@ -57,9 +57,7 @@ impl Replay {
                 self.next = Some(Reading {
                     joints_rad: message.joints_rad,
                     cells_newtons: message.cells_newtons,
-                    gravity_m_per_s2: message.gravity_m_per_s2,
-                    wrist_wrench: message.wrist_wrench,
-                    joint_torques: message.joint_torques,
+                    senses: message.senses,
                     phase: message.phase,
                     grasp_id: Some(message.grasp_id),
                     seq: Some(frame.header.seq),

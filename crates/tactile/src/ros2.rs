@@ -14,7 +14,7 @@ use super::phases::PhaseFinder;
 use super::ros2_cells::cells;
 use super::transforms::Transforms;
 use super::{Arrival, DriverError, Event, Place, Reading, Refusal, RefusalKind, TactileDriver};
-use blindgrasp_messages::Phase;
+use blindgrasp_messages::{OwnedSenses, Phase, Sense};
 use blindgrasp_ros::cdr::{self, Value};
 use blindgrasp_ros::definition::Definition;
 use blindgrasp_ros::node::{MAX_RECEIVED_BYTES, MessageType, Network, Quality, Received, RosNode};
@@ -265,20 +265,28 @@ impl Ros2 {
         let (phase, _) = self
             .phase
             .ok_or_else(|| format!("no phase has come on {}", self.topics.phase.as_deref().unwrap_or_default()))?;
+        let gravity_topic = self.topics.imu.as_ref().or(self.topics.gravity.as_ref().map(|(topic, _)| topic));
+        let named = [
+            (Sense::Gravity, gravity_topic, &self.gravity),
+            (Sense::WristWrench, self.topics.wrench.as_ref(), &self.wrench),
+        ];
+        let mut senses = OwnedSenses::default();
         // A frame has all senses that the parameters name: a model must not decide without one.
-        let sense = |topic: &Option<String>, sense: &Option<(Vec<f64>, u64)>| match (topic, sense) {
-            (None, _) => Ok(Vec::new()),
-            (Some(_), Some((values, at))) if is_near(*at) => Ok(values.clone()),
-            (Some(topic), _) => Err(format!("no message of {topic} has come that is near the cells in time")),
-        };
-        let gravity_topic = self.topics.imu.as_ref().or(self.topics.gravity.as_ref().map(|(topic, _)| topic)).cloned();
+        for (sense, topic, last) in named {
+            match (topic, last) {
+                (None, _) => {}
+                (Some(_), Some((values, at))) if is_near(*at) => senses.set(sense, values),
+                (Some(topic), _) => {
+                    return Err(format!("no message of {topic} has come that is near the cells in time"));
+                }
+            }
+        }
         let seq = received.seq.and_then(|seq| u64::try_from(i128::from(seq) + self.offset).ok());
         let reading = Reading {
             joints_rad,
             cells_newtons,
             phase,
-            gravity_m_per_s2: sense(&gravity_topic, &self.gravity)?,
-            wrist_wrench: sense(&self.topics.wrench, &self.wrench)?,
+            senses,
             seq,
             stamp_nanos: stamp,
             ..Reading::default()
@@ -459,8 +467,8 @@ mod tests {
             panic!("no frame");
         };
         assert_eq!((reading.joints_rad, reading.cells_newtons), (vec![0.1, 0.2], vec![1.0, 2.0]));
-        assert_eq!(reading.wrist_wrench, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
-        assert_eq!(reading.gravity_m_per_s2, [0.0, 0.0, -9.8]);
+        assert_eq!(reading.senses.get(Sense::WristWrench), [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+        assert_eq!(reading.senses.get(Sense::Gravity), [0.0, 0.0, -9.8]);
         assert_eq!((reading.phase, reading.seq, reading.stamp_nanos), (Phase::Settled, Some(8), Some(t)));
         // A frame without a sense that the parameters name is refused.
         driver.wrench = None;
@@ -497,7 +505,7 @@ mod tests {
             let cells = floats(driver, &[1.0], nanos, nanos);
             let event = take(driver, Topic::Cells, cells, nanos, None);
             match driver.pending.take().or(event) {
-                Some(Event::Frame(reading, _)) => Ok(reading.gravity_m_per_s2),
+                Some(Event::Frame(reading, _)) => Ok(reading.senses.get(Sense::Gravity).to_vec()),
                 refused => Err(why(refused)),
             }
         };

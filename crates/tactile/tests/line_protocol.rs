@@ -1,6 +1,6 @@
 //! The line protocol and the gate behind it: cases by hand, and random streams.
 
-use blindgrasp_messages::Phase;
+use blindgrasp_messages::{Phase, Sense};
 use blindgrasp_tactile::gate::{FrameFilter, RESET_NANOS, Shape};
 use blindgrasp_tactile::line_protocol::{LineSplitter, Piece, parse};
 use blindgrasp_tactile::{Arrival, Place, Reading, RefusalKind};
@@ -128,18 +128,16 @@ fn other_senses_are_whole_and_in_all_frames_or_in_none() {
     let line = br#"{"joints_rad":[0.5],"cells_newtons":[0,1.0],"phase":"open","gravity_m_per_s2":[0,0,-9.8],
         "wrist_wrench":[0,0,1,0,0,0.5],"joint_torques":[0.25]}"#;
     let felt = parse(line).expect("a frame");
-    assert_eq!((felt.gravity_m_per_s2.len(), felt.wrist_wrench.len(), felt.joint_torques.len()), (3, 6, 1));
+    assert_eq!(Sense::ALL.map(|sense| felt.senses.get(sense).len()), [3, 6, 1]);
     let mut gate = gate();
     take(&mut gate, &felt, at(0)).expect("accepted");
-    for (changed, said) in [
-        (Reading { gravity_m_per_s2: vec![0.0; 2], ..felt.clone() }, "gravity_m_per_s2 has 2 numbers: expected 3"),
-        (
-            Reading { wrist_wrench: vec![f64::NAN; 6], ..felt.clone() },
-            "wrist_wrench[0] is NaN: expected a finite number",
-        ),
-        (Reading { joint_torques: vec![0.0; 2], ..felt.clone() }, "joint_torques has 2 numbers: expected 1"),
-        (Reading { gravity_m_per_s2: vec![], ..felt.clone() }, "gravity_m_per_s2 is missing"),
+    for (sense, values, said) in [
+        (Sense::Gravity, &[0.0; 2][..], "gravity_m_per_s2 has 2 numbers: expected 3"),
+        (Sense::WristWrench, &[f64::NAN; 6], "wrist_wrench[0] is NaN: expected a finite number"),
+        (Sense::JointTorques, &[0.0; 2], "joint_torques has 2 numbers: expected 1"),
+        (Sense::Gravity, &[], "gravity_m_per_s2 is missing"),
     ] {
+        let changed = Reading { senses: felt.senses.clone().with(sense, values), ..felt.clone() };
         let refusal = gate.take(&changed, &at(10 * MS)).expect_err("refused");
         assert!(refusal.kind == RefusalKind::Malformed && refusal.why.contains(said), "{}", refusal.why);
     }

@@ -13,7 +13,7 @@ use blindgrasp_graph::control::{Attachment, Reply, Request};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_learning::evaluation::Judge;
 use blindgrasp_messages::{
-    ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Record, TactileFrame,
+    ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Record, Sense, TactileFrame,
 };
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, link_poses};
@@ -426,7 +426,8 @@ pub(super) fn add_frame(event: &mut Value, hand: &Hand, frame: &TactileFrame, co
     // JSON has no NaN: null stands for it.
     event["cells"] = json!(frame.cells_newtons);
     event["contacts"] = contacts.collect::<Vec<_>>().into();
-    event["gravity"] = if frame.gravity_m_per_s2.is_empty() { Value::Null } else { json!(frame.gravity_m_per_s2) };
+    let gravity = frame.senses.get(Sense::Gravity);
+    event["gravity"] = if gravity.is_empty() { Value::Null } else { json!(gravity) };
 }
 
 fn graph_event(now: &Look, before: Option<&Look>) -> anyhow::Result<String> {

@@ -4,7 +4,8 @@ use rand_chacha::ChaCha8Rng;
 use super::*;
 use blindgrasp_messages::{
     Action, Contact, ContactSet, Fault, GraspFeature, GraspScene, GraspTruth, Header, LiftDecision, LiftOutcome,
-    MAX_CELLS, MAX_FEATURES, MAX_JOINTS, MESSAGE_TYPES, Phase, Prediction, Reason, Recorded, TactileFrame,
+    MAX_CELLS, MAX_FEATURES, MAX_JOINTS, MESSAGE_TYPES, OwnedSenses, Phase, Prediction, Reason, Recorded, Sense,
+    TactileFrame,
 };
 
 /// Any bits: NaNs with payloads, subnormals, negative zeros.
@@ -78,17 +79,15 @@ fn every_message_arrives_bit_by_bit() {
             let n = if rng.random() { n } else { 0 };
             (0..n).map(|_| any_f64(rng)).collect::<Vec<f64>>()
         };
-        let (gravity_m_per_s2, wrist_wrench) = (sense(rng, 3), sense(rng, 6));
-        let joint_torques = sense(rng, joints_rad.len());
+        let mut senses = OwnedSenses::default();
+        Sense::ALL.into_iter().for_each(|one| senses.set(one, &sense(rng, one.len(joints_rad.len()))));
         let day = rng.next_u32();
         let frame = TactileFrame {
             grasp_id,
             phase,
             joints_rad: joints_rad.clone(),
             cells_newtons,
-            gravity_m_per_s2: gravity_m_per_s2.clone(),
-            wrist_wrench: wrist_wrench.clone(),
-            joint_torques: joint_torques.clone(),
+            senses: senses.clone(),
             day,
         };
         check(rng, &frame);
@@ -109,9 +108,7 @@ fn every_message_arrives_bit_by_bit() {
             self_collision: rng.random(),
             n_self_contacts: rng.random_range(0..=1024),
             fault,
-            gravity_m_per_s2,
-            wrist_wrench,
-            joint_torques,
+            senses,
             day,
         };
         check(rng, &contacts);
@@ -173,7 +170,7 @@ fn what_cannot_be_is_refused_on_both_ends() {
     let error = encode::<TactileFrame>(&head, &items, &mut out).expect_err("no such phase");
     assert_eq!(
         (error.to_string().as_str(), out),
-        ("a blindgrasp/TactileFrame/4 whose phase has the unknown code 10", vec![])
+        ("a blindgrasp/TactileFrame/5 whose phase has the unknown code 10", vec![])
     );
 
     let too_long = TactileFrame { cells_newtons: vec![0.0; MAX_CELLS + 1], ..TactileFrame::default() };

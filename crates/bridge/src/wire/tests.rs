@@ -6,7 +6,7 @@ fn bodies(message: &[u8]) -> Vec<Body<'_>> {
     let key = WireKey { epoch: u64::MAX, seq: 7 };
     let channel = ExportedChannel {
         port: "contacts/contacts".into(),
-        type_name: "blindgrasp/ContactSet/6".into(),
+        type_name: "blindgrasp/ContactSet/7".into(),
         schema_id: u32::MAX,
     };
     let hello = Hello {

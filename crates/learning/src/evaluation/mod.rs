@@ -292,7 +292,7 @@ fn predict(
     let summary = contacts_from_frame(hand, header.hand_id, joints_rad, cells_newtons, &mut contacts);
     let feature = match summary.fault {
         Fault::None => {
-            let reading = Reading { joints_rad, contacts: &contacts, senses: message.senses() };
+            let reading = Reading { joints_rad, contacts: &contacts, senses: message.senses.view() };
             model.extract(*phase, &reading, &mut values).map(|_| values.as_slice())
         }
         fault => Err(fault),

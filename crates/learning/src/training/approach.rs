@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 
 use super::{Example, TrainingError, calibrate};
 use crate::evaluation::measures::{area_under_roc, curve};
+use blindgrasp_messages::Sense;
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::classifier::booster::train_boosted;
 use blindgrasp_stages::classifier::boosting::BoostingParams;
@@ -29,7 +30,7 @@ pub(super) fn learn(
 ) -> Result<Option<ApproachPrior>, TrainingError> {
     let preshape_idxs: Vec<usize> = (0..hand.joints.len()).filter(|idx| hand.joints[*idx].is_preshape).collect();
     let row = |example: &&Example| {
-        let gravity = example.senses.gravity_m_per_s2[..].try_into().ok()?;
+        let gravity = example.senses.get(Sense::Gravity).try_into().ok()?;
         ApproachPrior::values(&preshape_idxs, gravity, &example.joints_rad)
     };
     let Some(rows) = examples.iter().map(row).collect::<Option<Vec<Vec<f64>>>>() else { return Ok(None) };

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use super::TrainingError;
 use super::friction::{Judged, stable_by_friction};
 use crate::dataset::{DatasetError, label_of, read_grasps};
-use blindgrasp_messages::{Contact, Fault, Phase, Senses, Stamped, TactileFrame};
+use blindgrasp_messages::{Contact, Fault, OwnedSenses, Phase, Stamped, TactileFrame};
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use blindgrasp_stages::contacts::contacts_from_frame;
@@ -73,38 +73,12 @@ pub struct Felt {
     pub senses: OwnedSenses,
 }
 
-/// As [`Senses`].
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct OwnedSenses {
-    pub gravity_m_per_s2: Vec<f64>,
-    pub wrist_wrench: Vec<f64>,
-    pub joint_torques: Vec<f64>,
-}
-
-impl OwnedSenses {
-    fn of(frame: &TactileFrame) -> OwnedSenses {
-        OwnedSenses {
-            gravity_m_per_s2: frame.gravity_m_per_s2.clone(),
-            wrist_wrench: frame.wrist_wrench.clone(),
-            joint_torques: frame.joint_torques.clone(),
-        }
-    }
-
-    fn view(&self) -> Senses<'_> {
-        Senses {
-            gravity_m_per_s2: &self.gravity_m_per_s2,
-            wrist_wrench: &self.wrist_wrench,
-            joint_torques: &self.joint_torques,
-        }
-    }
-}
-
 impl Felt {
     fn of(hand: &Hand, frame: &Stamped<TactileFrame>) -> Felt {
         let message = &frame.message;
         let mut contacts = Vec::new();
         contacts_from_frame(hand, frame.header.hand_id, &message.joints_rad, &message.cells_newtons, &mut contacts);
-        Felt { joints_rad: message.joints_rad.clone(), contacts, senses: OwnedSenses::of(message) }
+        Felt { joints_rad: message.joints_rad.clone(), contacts, senses: message.senses.clone() }
     }
 
     pub fn reading(&self) -> Reading<'_> {
@@ -201,8 +175,7 @@ impl Examples {
             let reading = (ReadingId::of(joints, cells), frame.message.day);
             let mut contacts = Vec::new();
             let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells, &mut contacts);
-            let senses = OwnedSenses::of(&frame.message);
-            let felt = Felt { joints_rad: frame.message.joints_rad, contacts, senses };
+            let felt = Felt { joints_rad: frame.message.joints_rad, contacts, senses: frame.message.senses };
             Some((felt, ([squeezed, test_lifted], moving), summary.fault, reading))
         })?;
         let mut exclude = |reason: &str| *self.n_excluded.entry(reason.into()).or_default() += 1;

@@ -19,7 +19,7 @@ use std::path::{Path, PathBuf};
 
 pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 pub use blindgrasp_stages::training_summary::{Guarantee, Method, PolicySummary, TrainingSummary, WrongCall};
-pub use examples::{Example, Examples, Felt, OwnedSenses, Relabelling, Signals};
+pub use examples::{Example, Examples, Felt, Relabelling, Signals};
 pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
 pub(crate) use probes::composed;
 pub use recalibration::recalibrate;

@@ -17,7 +17,7 @@ use crate::mechanism::Mechanism;
 use crate::options::check_hand;
 use crate::tactile_sensor::{Sensor, read_torques, read_wrench};
 use crate::wrench_space::{GraspCase, quality};
-use blindgrasp_messages::{Phase, TactileFrame};
+use blindgrasp_messages::{OwnedSenses, Phase, Sense, TactileFrame};
 use blindgrasp_stages::hand::Hand;
 
 /// An approach that has gone so far beyond the expected touch ends there: the target has given way.
@@ -205,16 +205,16 @@ impl<'a> Attempt<'a> {
         }
         let sensor = &self.options.sensor;
         let (force, torque) = &moment.load_on_wrist;
+        let gravity = self.world_from_palm.rotation.inverse() * Vector3::new(0.0, 0.0, -GRAVITY);
         let frame = TactileFrame {
             grasp_id,
             phase: moment.phase,
             joints_rad: self.sensor.read_joints(hand, &moment.motors_rad, sensor),
             cells_newtons: self.sensor.read_cells(hand, &cells_newtons, sensor, &mut self.rng),
-            gravity_m_per_s2: (self.world_from_palm.rotation.inverse() * Vector3::new(0.0, 0.0, -GRAVITY))
-                .as_slice()
-                .into(),
-            wrist_wrench: read_wrench(force, torque, sensor, &mut self.rng),
-            joint_torques: read_torques(&moment.torques, sensor, &mut self.rng),
+            senses: OwnedSenses::default()
+                .with(Sense::Gravity, gravity.as_slice())
+                .with(Sense::WristWrench, &read_wrench(force, torque, sensor, &mut self.rng))
+                .with(Sense::JointTorques, &read_torques(&moment.torques, sensor, &mut self.rng)),
             day: 0,
         };
         TimedFrame { offset_nanos: moment.offset_nanos, frame }
@@ -492,7 +492,8 @@ mod tests {
         assert_eq!((n_of(Phase::Squeezed), n_of(Phase::TestLifted)), (6, 6));
         // What hangs on the wrist is the cup's weight, within a few times the sensor's noise.
         let last = &frames[frames.len() - 1].frame;
-        let borne: f64 = last.wrist_wrench.iter().zip(&last.gravity_m_per_s2).map(|(f, g)| f * g / GRAVITY).sum();
+        let (wrench, gravity) = (last.senses.get(Sense::WristWrench), last.senses.get(Sense::Gravity));
+        let borne: f64 = wrench.iter().zip(gravity).map(|(f, g)| f * g / GRAVITY).sum();
         let weight = targets[0].mass_kg * GRAVITY;
         assert!((borne - weight).abs() < 0.5, "{borne} N of {weight} N");
         assert!((attempt.snapshot().palm_position_m[2] - closed().snapshot().palm_position_m[2] - 0.01).abs() < 1e-9);
