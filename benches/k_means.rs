@@ -1,4 +1,4 @@
-//! Times K-means over contact positions, for `scripts/bench-k-means`, which times scikit-learn's beside it.
+//! Times K-means over contact positions, for `scripts/benchsuite k-means`, which times scikit-learn's beside it.
 //!
 //! `cargo bench --bench k_means -- contacts N OUT RECORDING …` writes the first N contact positions of the grasps of
 //! recordings, taken as training takes them, as little-endian doubles x, y, z; `-- learn POSITIONS N_CLUSTERS N_INIT
@@ -31,7 +31,7 @@ fn main() -> Result<(), Failure> {
             time_learning(positions, &params)
         }
         [] => {
-            eprintln!("run by scripts/bench-k-means");
+            eprintln!("run by scripts/benchsuite k-means");
             Ok(())
         }
         _ => Err(format!("unknown arguments {arguments:?}: see the top of benches/k_means.rs").into()),

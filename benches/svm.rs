@@ -1,4 +1,4 @@
-//! Times training and prediction of our support vector machine, for `scripts/bench-svm`, which times LIBSVM beside it.
+//! Times training and prediction of our support vector machine, for `scripts/benchsuite svm`, which times LIBSVM beside it.
 //!
 //! `cargo bench --bench svm -- features RECORDING MODEL N OUT` writes the features of N grasps, by the model's
 //! dictionary, as LIBSVM's problem file; `-- train PROBLEM C GAMMA TOLERANCE OUT` trains on one and writes LIBSVM's
@@ -38,7 +38,7 @@ fn main() -> Result<(), Failure> {
         }
         ["predict", model, problem] => time_prediction(model, problem),
         [] => {
-            eprintln!("run by scripts/bench-svm");
+            eprintln!("run by scripts/benchsuite svm");
             Ok(())
         }
         _ => Err(format!("unknown arguments {arguments:?}: see the top of benches/svm.rs").into()),

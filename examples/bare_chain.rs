@@ -1,9 +1,9 @@
 //! What the transport alone costs: five processes that pass samples along as bare iceoryx2 code does, for
-//! `scripts/bench-runtime`, which runs the graph beside it.
+//! `scripts/benchsuite runtime`, which runs the graph beside it.
 //!
 //! `bare_chain --rate HZ --secs S [--json]` starts itself as source, three stages and sink. The samples have the types
 //! and sizes of the graph's, and a simulated recording's rhythm: 14 frames at `--rate`, then a pause of ten frames' time.
-//! `bare_chain --rate max --grasps N` sends as fast as the chain takes it, for `scripts/bench-recording`.
+//! `bare_chain --rate max --grasps N` sends as fast as the chain takes it, for `scripts/benchsuite recording`.
 //! Nothing is computed. As in the graph, the launcher reads one decision per grasp.
 
 use std::io::{BufRead, BufReader, Read, Write};

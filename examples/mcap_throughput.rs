@@ -1,4 +1,4 @@
-//! What writing and reading recordings costs beside the mcap crate alone, for `scripts/bench-mcap`.
+//! What writing and reading recordings costs beside the mcap crate alone, for `scripts/benchsuite mcap`.
 //!
 //! `mcap_throughput RECORDING FOLDER SAMPLES REPEATS` prints JSON. Our side makes messages of samples and samples of
 //! messages; the other side writes the same messages as bytes, with the same compression and chunks, and reads them as

@@ -1,4 +1,4 @@
-//! What the stages alone cost: times their functions on a recording's frames, for `scripts/bench-runtime`.
+//! What the stages alone cost: times their functions on a recording's frames, for `scripts/benchsuite runtime`.
 //!
 //! `stage_times RECORDING MODEL RATE_HZ` prints JSON: over the frames at which the arbiter decides, the median of each
 //! stage's time and of their sum, frames being RATE_HZ apart as in a graph at that rate: what a stage costs depends on how

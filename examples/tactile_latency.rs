@@ -1,4 +1,4 @@
-//! An operator that reads tactile frames and says how long they took, for `scripts/bench-tactile-source`: from the stamp
+//! An operator that reads tactile frames and says how long they took, for `scripts/benchsuite tactile-source`: from the stamp
 //! that the bridge gave them, which must be this machine's CLOCK_BOOTTIME, and from the source's publishing.
 
 use std::collections::BTreeMap;

@@ -1,4 +1,4 @@
-//! The size of a recording's tactile frames between machines, for `scripts/bench-machines`.
+//! The size of a recording's tactile frames between machines, for `scripts/benchsuite machines`.
 //!
 //!     wire_bytes RECORDING      prints the median size of a sample in bincode and of its frame, and the number of samples
 //!

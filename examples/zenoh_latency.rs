@@ -1,4 +1,4 @@
-//! The latency of bare Zenoh between two machines, from a put to the callback, for `scripts/bench-machines`.
+//! The latency of bare Zenoh between two machines, from a put to the callback, for `scripts/benchsuite machines`.
 //!
 //!     zenoh_latency receive CONFIG N            prints p50, p90, p99 in nanoseconds, and the number of messages
 //!     zenoh_latency send CONFIG N RATE_HZ BYTES

@@ -1,10 +1,9 @@
 //! `blindgrasp import`: tables of tactile readings become recordings, and unfit tables are refused.
 
 use std::path::Path;
-use std::process::Command;
 
-use crate::common::python::python;
-use crate::common::{HAND, RECORDING, blindgrasp, json_lines, project, reference, run, text};
+use crate::benchsuite::benchsuite;
+use crate::common::{HAND, RECORDING, json_lines, reference, run, text};
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::hand::Hand;
 use rand::{RngExt, SeedableRng};
@@ -467,14 +466,11 @@ fn a_fingertip_that_slides_is_told_by_its_movement_and_not_by_one_reading() {
         }
     }
     folder.write("csvs/t/short0.csv", "ff_e1\n1\n");
-    let measured = Command::new(python())
-        .arg(project().join("scripts/measure-slip"))
-        .args([&folder.at("csvs"), "--json", "--program", blindgrasp().get_program().to_str().expect("UTF-8")])
-        .output()
-        .expect("started");
+    let measured = benchsuite(&["slip", "--sequences", &folder.at("csvs"), "--no-build", "--json"]);
     let (stdout, stderr) = (text(&measured.stdout), text(&measured.stderr));
     assert!(measured.status.success() && stderr.contains("short0.csv: 1 readings"), "{stderr}");
-    let measured: Value = serde_json::from_str(&stdout).expect("JSON");
+    let found: Value = serde_json::from_str(&stdout).expect("JSON");
+    let measured = &found["results"]["slip"];
     assert_eq!((&measured["n_grasps"], &measured["n_objects"]), (&json!(144), &json!(12)));
     let area = |look: &str| measured["roc_area"][look].as_f64().expect("an area");
     assert!(area("with_movement") > 0.95 && area("earlier_alone") < 0.9 && area("later_alone") < 0.9, "{measured}");

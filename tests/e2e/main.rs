@@ -4,6 +4,7 @@
 mod common;
 
 mod bad_input;
+mod benchsuite;
 mod check;
 mod days;
 mod docs;

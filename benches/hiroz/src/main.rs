@@ -1,4 +1,4 @@
-//! Nodes of hiroz for `scripts/bench-ros2`.
+//! Nodes of hiroz for `scripts/benchsuite ros2`.
 //!
 //! * `router tcp/127.0.0.1:PORT` - the router of the others.
 //! * `echo ENDPOINT` - answers as blindgrasp would, without a look at the frame: the bare loop.

@@ -75,7 +75,7 @@ const showDecision = (decision) => {
   const wrong = decision.action === "lift" && decision.truth === false ? " This lift is wrong: the grasp is known to be unstable." : "";
   byId("why").textContent = `Grasp ${decision.grasp_id}: ${decision.reason.replaceAll("_", " ")}, probability ` +
     `${decision.probability_stable.toFixed(2)}.${decision.why ?? wrong}`;
-  // When it was on the screen, which scripts/bench-view reads.
+  // When it was on the screen, which scripts/benchsuite view reads.
   requestAnimationFrame(() => setTimeout(() => {
     shown.painted.push([decision.grasp_id, Date.now()]);
     if (shown.painted.length > 100) shown.painted.shift();

@@ -513,7 +513,7 @@ mod tests {
         assert_eq!(train(1), train(3));
     }
 
-    /// Objective and rho of LIBSVM 3.24 at tolerance 1e-5, as `scripts/check-libsvm --oracle` prints them.
+    /// Objective and rho of LIBSVM 3.24 at tolerance 1e-5, as `scripts/benchsuite libsvm` prints them.
     #[test]
     fn agrees_with_libsvm() {
         let n_samples = 1500_u64;
