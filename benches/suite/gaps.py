@@ -28,7 +28,7 @@ def at_rate(rate, options):
         running.wait_until_decided()
         for node in graphs.default_nodes():
             swaps = [swap(running, node) for _ in range(options.rounds)]
-            swap_millis[node] = [one["gap_nanos"] / 1e6 for one in swaps]
+            swap_millis[node] = [one["handover_pause_nanos"] / 1e6 for one in swaps]
             for _ in range(options.rounds):
                 os.kill(running.node(node)["pid"], signal.SIGKILL)
                 time.sleep(1)

@@ -52,7 +52,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let model = Model::load(&arguments.model)?;
     let n_joints = model.features.couplings.len();
     let prior = model.approach.with_context(|| {
-        format!("{path} knows nothing of approaches: expected a model that was trained on lifts with gravity (docs/trials.md)")
+        format!("{path} knows nothing of approaches: expected a model that was trained on lifts with gravity (docs/simulator.md)")
     })?;
     for (idx, line) in std::io::stdin().lock().lines().enumerate() {
         let line = line.context("the standard input")?;

@@ -38,7 +38,7 @@ const MAX_READ_BYTES: u64 = 256 << 20;
 pub(super) struct Arguments {
     /// Recordings (MCAP) or folders of them; or one pad layout, or one file of cases
     ///
-    /// A pad layout is a YAML file, or the name of a built-in hand. Grasp cases are a JSON file (docs/quality.md), - for
+    /// A pad layout is a YAML file, or the name of a built-in hand. Grasp cases are a JSON file (docs/simulator.md), - for
     /// stdin.
     #[arg(required = true)]
     recordings: Vec<PathBuf>,

@@ -42,6 +42,7 @@ fn the_same_program_is_packed_into_the_same_bytes_and_runs_from_them() {
         "usr/share/doc/blindgrasp/README.md",
         "usr/share/doc/blindgrasp/changelog.gz",
         "usr/share/doc/blindgrasp/copyright",
+        "usr/share/doc/blindgrasp/docs/command-line.md",
         "usr/share/doc/blindgrasp/docs/install.md",
         "usr/share/doc/blindgrasp/third-party-licences.txt.gz",
         "usr/share/fish/vendor_completions.d/blindgrasp.fish",

@@ -24,7 +24,7 @@ use blindgrasp_learning::trials::tables::{Table, TrialsReport, tables};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_session::recorder::RecordOptions;
 use blindgrasp_session::run::Session;
-use blindgrasp_simulator::trial::LiftTarget;
+use blindgrasp_simulator::trial::{LiftTarget, TrialOptions};
 use blindgrasp_simulator::trial::targets::{check_approaches, targets_and_warnings};
 
 /// Counter of simulated_hand for trials that no approach led to.
@@ -67,9 +67,12 @@ pub(super) struct Arguments {
     /// The model instead of the dataflow file's.
     #[arg(long, value_name = "FILE")]
     model: Option<PathBuf>,
-    /// File of options (YAML or JSON) that replace the defaults in docs/trials.md.
+    /// File of options (YAML or JSON) that replace the defaults; --print-options prints them all.
     #[arg(long, value_name = "FILE")]
     options: Option<PathBuf>,
+    /// Print all options with their defaults and what they mean, as YAML, and stop.
+    #[arg(long)]
+    print_options: bool,
     /// The dataflow file. One of its nodes reports the outcomes of lifts, as simulated_hand does.
     #[arg(long, default_value = "dataflow-trials.yaml")]
     dataflow: PathBuf,
@@ -112,6 +115,10 @@ struct Way {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if arguments.print_options {
+        print_line(TrialOptions::DEFAULTS.trim_end())?;
+        return Ok(Outcome::Done);
+    }
     check_arguments(arguments)?;
     let (mut targets, warnings) = targets_and_warnings(&arguments.objects)?;
     warnings.iter().for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
