@@ -8,7 +8,6 @@ use clap::Args;
 use super::elsewhere::MachineArgument;
 use super::{Outcome, completions, print_line};
 use blindgrasp_graph::client::{ClientError, is_graph_name, pick_graph, status};
-use blindgrasp_graph::log::AUDIT;
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 

@@ -94,7 +94,6 @@ pub(super) fn program_on_path(name: &str) -> Option<PathBuf> {
     (!name.contains('/')).then(|| folders.find_map(|folder| Some(folder.join(name)).filter(is_program)))?
 }
 
-
 fn shipped_operator(path: &Path, name: &str) -> Program {
     Program { path: path.into(), args: vec!["operator".into(), name.into()] }
 }

@@ -3,9 +3,9 @@
 
 use std::fmt;
 
+use serde::Deserialize;
 use serde::de::{Deserializer, Error as _, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde::ser::SerializeStruct;
-use serde::Deserialize;
 
 use crate::declare::at_most;
 use crate::ros::RosType;
@@ -251,7 +251,9 @@ impl<'de> Visitor<'de> for OfFields {
             let Some(sense) = Sense::ALL.into_iter().find(|sense| sense.name() == name) else {
                 fields.next_value::<IgnoredAny>()?;
                 let names = NAMES.join(", ");
-                return Err(A::Error::custom(format!("unknown field `{name}`: it is none of a frame's, nor a sense ({names})")));
+                return Err(A::Error::custom(format!(
+                    "unknown field `{name}`: it is none of a frame's, nor a sense ({names})"
+                )));
             };
             if !senses.get(sense).is_empty() {
                 return Err(A::Error::duplicate_field(sense.name()));

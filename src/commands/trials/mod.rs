@@ -24,8 +24,8 @@ use blindgrasp_learning::trials::tables::{Table, TrialsReport, tables};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_session::recorder::RecordOptions;
 use blindgrasp_session::run::Session;
-use blindgrasp_simulator::trial::{LiftTarget, TrialOptions};
 use blindgrasp_simulator::trial::targets::{check_approaches, targets_and_warnings};
+use blindgrasp_simulator::trial::{LiftTarget, TrialOptions};
 
 /// Counter of simulated_hand for trials that no approach led to.
 const LEFT_OUT: &str = "left_out";
@@ -326,9 +326,7 @@ mod tests {
         for line in ["--trials 0", "--attempts 0", "--lift-policy maybe", "--seed -1", "--set trials"] {
             parsed(&format!("blindgrasp trials {line}")).expect_err(line);
         }
-        for (line, expected) in [
-            ("--record a.mcap", "--lift-policy decision"),
-        ] {
+        for (line, expected) in [("--record a.mcap", "--lift-policy decision")] {
             let arguments = parsed(&format!("blindgrasp trials {line}")).expect("a command");
             let error = run(&arguments).expect_err("contradictory").to_string();
             assert!(error.contains(expected), "{error}");
