@@ -46,7 +46,10 @@ struct Adviser {
 impl Stage for Adviser {
     type In = GraspFeature;
     type Out = RegraspAdvice;
-    const HAS_STATE: bool = true;
+
+    fn has_state(&self) -> bool {
+        true
+    }
 
     fn answer(&mut self, head: &GraspFeatureHead, _values: &[f64], _now: u64, answers: &mut Answers<RegraspAdvice>) {
         if head.phase != Phase::Ended.code() || self.is_silent {

@@ -1,7 +1,7 @@
 //! The edges of a graph that cross to other machines.
 
+use blindgrasp_graph::operators::running_program;
 use blindgrasp_operator::description::OperatorDescription;
-
 use blindgrasp_operator::operator::Operator;
 
 pub(crate) fn describe() -> OperatorDescription {
@@ -10,5 +10,6 @@ pub(crate) fn describe() -> OperatorDescription {
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
-    blindgrasp_bridge::operator::work(operator, blindgrasp_learning::of_graph::of_graph)
+    let operators = crate::operators_of(&running_program()?);
+    blindgrasp_bridge::operator::work(operator, blindgrasp_learning::of_graph::of_graph, operators)
 }

@@ -69,7 +69,10 @@ struct Regrasp {
 impl Stage for Regrasp {
     type In = GraspFeature;
     type Out = RegraspAdvice;
-    const HAS_STATE: bool = true;
+
+    fn has_state(&self) -> bool {
+        true
+    }
 
     fn answer(&mut self, head: &GraspFeatureHead, values: &[f64], _: u64, answers: &mut Answers<RegraspAdvice>) {
         self.last = head.header;

@@ -10,6 +10,7 @@ mod doctor;
 mod echo;
 mod evaluate;
 mod export;
+mod graph_file;
 mod grid;
 mod hand_cells;
 mod help;

@@ -6,8 +6,9 @@ use std::time::Duration;
 use clap::Args;
 use serde_json::{Value, json};
 
+use super::graph_file::warn_of_misfit;
 use super::{Outcome, completions, print_line};
-use blindgrasp_graph::client::{Connection, locate, pick_graph};
+use blindgrasp_graph::client::{Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{Reply, Request};
 
 /// The operator checks the value, and applies it between two samples.
@@ -40,7 +41,11 @@ struct Assignment {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let Assignment { node, param, value } = arguments.assignment.clone();
     let graph = pick_graph(arguments.graph.as_deref())?;
-    let mut connection = Connection::open(&locate(&graph, std::slice::from_ref(&node))?)?;
+    let graph = locate(&graph, std::slice::from_ref(&node))?;
+    if machine_of(&graph).is_none() {
+        warn_of_misfit(&graph, &node, &param, &value)?;
+    }
+    let mut connection = Connection::open(&graph)?;
     let request = Request::Set { node: node.clone(), param: param.clone(), value };
     let (old, new, from_seq) = match connection.ask(&request, LIMIT)? {
         Reply::Set { old, new, from_seq } => (old, new, from_seq),

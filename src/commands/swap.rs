@@ -9,10 +9,10 @@ use anyhow::{Context, anyhow, bail};
 use clap::Args;
 use serde::Serialize;
 
+use super::graph_file::{refuse_misfit, shipped};
 use super::{Outcome, completions, number_in, percent, print_line, secs_in, stop_signal};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, locate, machine_of, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, ShadowOutput, SwapRequest, SwappedNode};
-use blindgrasp_graph::describe::program_to_run;
 use blindgrasp_graph::log::printable;
 use blindgrasp_graph::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::shadow_comparison::{
@@ -130,7 +130,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let graph = locate(&pick_graph(arguments.graph.as_deref())?, &arguments.nodes)?;
     let request = match machine_of(&graph) {
         Some(machine) => elsewhere(arguments, request, machine)?,
-        None => found_here(request)?,
+        None => {
+            refuse_misfit(&graph, &request)?;
+            found_here(request)?
+        }
     };
     let stop = stop_signal()?;
     let mut connection = Connection::open(&graph)?;
@@ -180,7 +183,8 @@ fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
         return Ok(request);
     };
     let args = request.args.as_deref().unwrap_or_default();
-    let program = program_to_run(run, args, &request.folder)
+    let program = shipped()?
+        .program_to_run(run, args, &request.folder)
         .map_err(|missing| anyhow!("--run {}: there is no such program ({})", run.display(), missing.display()))?;
     Ok(SwapRequest { program: Some(program.path), args: Some(program.args), ..request })
 }

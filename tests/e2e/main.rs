@@ -23,6 +23,7 @@ mod main_job;
 mod many_cells;
 mod meshes;
 mod metrics;
+mod own_program;
 mod package;
 mod partners;
 mod picture;

@@ -16,6 +16,7 @@ use blindgrasp_bridge::config::{Endpoints, KeyKind, LinkConfig, PeerConfig};
 use blindgrasp_bridge::tunnel::Tunnels;
 use blindgrasp_graph::client::{ClientError, Connection, part_name, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, SwapRequest};
+use blindgrasp_graph::operators::Operators;
 use blindgrasp_learning::of_graph::of_graph;
 use blindgrasp_operator::control_socket::{ControlSocket, path_of};
 use blindgrasp_recording::{Record, RecordingReader};
@@ -104,8 +105,11 @@ impl Pair {
         let robot_config = config(&graph, &robot_graph, "robot", peer("brain", false, false));
         let brain_config = config(&graph, brain_graph, "brain", peer("robot", may_read, may_control));
         let brain =
-            Tunnels::start(brain_session, Arc::clone(&brain_config), &[Arc::default()], of_graph).expect("started");
-        let robot = Tunnels::start(robot_session.clone(), robot_config, &[Arc::default()], of_graph).expect("started");
+            Tunnels::start(brain_session, Arc::clone(&brain_config), &[Arc::default()], of_graph, Operators::default())
+                .expect("started");
+        let robot =
+            Tunnels::start(robot_session.clone(), robot_config, &[Arc::default()], of_graph, Operators::default())
+                .expect("started");
         let part = part_name(&robot_graph, "brain");
         wait_until(|| pick_graph(Some(&part)).is_ok(), || format!("nobody listens for {part}"));
         let pair = Pair { robot_graph, part, robot, brain: Some(brain), robot_session, brain_config };

@@ -23,6 +23,7 @@ use super::tunnel::{DescribeRecording, Tunnels, random};
 use super::uplink::Uplink;
 use super::wire::{Body, Frame, Rejected, SampleFrame, WireError, encode_refusal};
 use blindgrasp_graph::observer::bears_source_number;
+use blindgrasp_graph::operators::Operators;
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::{LinkStatus, PeerState};
 use blindgrasp_operator::monotonic_nanos;
@@ -61,6 +62,7 @@ struct Link<'a> {
     config: &'a Arc<LinkConfig>,
     own: Own,
     describe: DescribeRecording,
+    operators: Operators,
     connections: Vec<PeerConnection>,
     opening: Opening,
     origins: Origins,
@@ -76,13 +78,14 @@ struct Link<'a> {
     has_said_waiting: bool,
 }
 
-pub fn work(operator: &Operator, describe: DescribeRecording) -> anyhow::Result<()> {
+/// The work of the link. `operators` are those that a swap asked by another machine can name.
+pub fn work(operator: &Operator, describe: DescribeRecording, operators: Operators) -> anyhow::Result<()> {
     let config: LinkConfig = operator.params()?;
     if let Some(warning) = session::warning(&config) {
         tracing::warn!("{warning}");
     }
     let config = Arc::new(config);
-    let mut link = Link::open(operator, &config, describe)?;
+    let mut link = Link::open(operator, &config, describe, operators)?;
     // The ports exist now; operators need not wait until a router is reached.
     operator.ready(BTreeMap::new());
     link.run()?;
@@ -96,6 +99,7 @@ impl<'a> Link<'a> {
         operator: &'a Operator,
         config: &'a Arc<LinkConfig>,
         describe: DescribeRecording,
+        operators: Operators,
     ) -> anyhow::Result<Link<'a>> {
         let identity = Identity::load(config, OffsetDateTime::now_utc());
         let identity = identity.with_context(|| format!("machine '{}'", config.machine))?.map(Arc::new);
@@ -121,6 +125,7 @@ impl<'a> Link<'a> {
             config,
             own,
             describe,
+            operators,
             connections,
             opening: Opening::start(config, operator)?,
             origins,
@@ -186,8 +191,14 @@ impl<'a> Link<'a> {
         };
         let protections: Vec<_> =
             self.connections.iter().map(|connection| Arc::clone(&connection.protection)).collect();
-        let tunnels = Tunnels::start(session.clone(), Arc::clone(self.config), &protections, self.describe)
-            .context("cannot serve commands")?;
+        let tunnels = Tunnels::start(
+            session.clone(),
+            Arc::clone(self.config),
+            &protections,
+            self.describe,
+            self.operators.clone(),
+        )
+        .context("cannot serve commands")?;
         for connection in &mut self.connections {
             connection.connect(self.operator, self.config, &session)?;
         }

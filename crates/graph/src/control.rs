@@ -10,8 +10,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use crate::dataflow::Right;
-use crate::describe::is_shipped;
 use crate::log::LogLine;
+use crate::operators::Operators;
 use crate::recorded_graph::RecordedGraph;
 use blindgrasp_messages::{Action, Reason};
 use blindgrasp_operator::ages::Ages;
@@ -66,16 +66,16 @@ pub enum Request {
 impl Request {
     /// Whether it changes the running graph; other requests only read.
     pub fn is_control(&self) -> bool {
-        self.right().is_some()
+        self.right(&Operators::default()).is_some()
     }
 
-    /// The right that another machine needs for this change.
-    pub fn right(&self) -> Option<Right> {
+    /// The right that another machine needs for this change, where these operators can be named.
+    pub fn right(&self, operators: &Operators) -> Option<Right> {
         match self {
             Request::Status | Request::Attach { .. } | Request::Samples { .. } | Request::Logs { .. } => None,
             Request::Stop => Some(Right::Stop),
             Request::Set { .. } => Some(Right::Set),
-            Request::Swap(SwapRequest { program: Some(program), .. }) if !is_shipped(program) => Some(Right::Run),
+            Request::Swap(SwapRequest { program: Some(program), .. }) if !operators.has(program) => Some(Right::Run),
             Request::Swap(_) | Request::Promote | Request::Abandon => Some(Right::Swap),
             // The link says these itself, and no machine may.
             Request::Asker { .. } | Request::Refused { .. } => None,
@@ -389,6 +389,7 @@ mod tests {
 
     #[test]
     fn a_swap_to_a_program_that_is_not_shipped_needs_the_right_to_run_any() {
+        let operators = Operators::of_program("/bin/blindgrasp".as_ref(), ["classifier", "encoder"]);
         let right = |program: Option<&str>| {
             let request = SwapRequest {
                 nodes: vec!["classifier".into()],
@@ -401,7 +402,7 @@ mod tests {
                 probation_millis: 1,
                 allow_mismatch: false,
             };
-            Request::Swap(request).right()
+            Request::Swap(request).right(&operators)
         };
         for shipped in [None, Some("classifier"), Some("histogram")] {
             assert_eq!(right(shipped), Some(Right::Swap), "{shipped:?}");
@@ -409,6 +410,6 @@ mod tests {
         for own in ["./classifier", "/bin/classifier", "classifiers", "sh", "link", ""] {
             assert_eq!(right(Some(own)), Some(Right::Run), "{own}");
         }
-        assert_eq!((Request::Stop.right(), Request::Status.right()), (Some(Right::Stop), None));
+        assert_eq!((Request::Stop.right(&operators), Request::Status.right(&operators)), (Some(Right::Stop), None));
     }
 }

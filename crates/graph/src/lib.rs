@@ -2,7 +2,7 @@
 //!
 //! It knows messages and the graph, not the science.
 //!
-//! * [`describe`] - asks programs what they are.
+//! * [`operators`] - the operators that come with a program. [`describe`] - asks programs what they are.
 //! * [`plan`] - the readers and writers of a graph, and their cursor slots.
 //! * [`pins`] - files whose content the dataflow file fixes.
 //! * [`launcher`] - starts, supervises, swaps and stops a graph's processes. It never touches samples.
@@ -30,6 +30,7 @@ pub mod log;
 mod log_writer;
 pub mod metrics;
 pub mod observer;
+pub mod operators;
 pub mod pins;
 pub mod plan;
 mod process;

@@ -26,6 +26,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
+use blindgrasp_graph::operators::Operators;
 use blindgrasp_graph::recorded_graph::{Beginning, RecordedGraph};
 use tokio::sync::{mpsc, watch};
 use zenoh::Wait;
@@ -75,6 +76,7 @@ pub struct Tunnels {
 struct Shared {
     config: Arc<LinkConfig>,
     describe: DescribeRecording,
+    operators: Operators,
     rejected: Mutex<Rejected>,
 }
 
@@ -126,6 +128,7 @@ impl Tunnels {
         config: Arc<LinkConfig>,
         protections: &[Arc<Protection>],
         describe: DescribeRecording,
+        operators: Operators,
     ) -> anyhow::Result<Tunnels> {
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(2)
@@ -133,7 +136,7 @@ impl Tunnels {
             .enable_all()
             .build()
             .context("cannot start threads for commands to other machines")?;
-        let shared = Arc::new(Shared { config: Arc::clone(&config), describe, rejected: Mutex::default() });
+        let shared = Arc::new(Shared { config: Arc::clone(&config), describe, operators, rejected: Mutex::default() });
         let (stop, stopped) = watch::channel(false);
         // Each end holds a sender; the channel closes when all of them have ended.
         let (busy, mut all_done) = mpsc::channel::<()>(1);

@@ -17,7 +17,6 @@ use super::{Peer, Shared, end_of, samples};
 use blindgrasp_graph::audit::summary;
 use blindgrasp_graph::client::{Connection, status};
 use blindgrasp_graph::control::{Reply, Request, SwapRequest};
-use blindgrasp_graph::describe::program_to_run;
 use blindgrasp_graph::log::{LogFolder, LogTail};
 
 /// Maximum length of a request in bytes.
@@ -235,7 +234,7 @@ impl Served {
     /// Checks that the dataflow file gives the other machine the right to make this request.
     fn check_right(&self, request: &Request) -> Result<(), String> {
         let (asker, here) = (&self.peer.config.machine, &self.shared.config.machine);
-        let right = request.right();
+        let right = request.right(&self.shared.operators);
         if self.peer.config.may(right) {
             return Ok(());
         }
@@ -265,7 +264,11 @@ impl Served {
         let Some(run) = &request.program else {
             return Ok(SwapRequest { folder, ..request });
         };
-        let program = program_to_run(run, request.args.as_deref().unwrap_or_default(), &folder).map_err(|missing| {
+        let program = self
+            .shared
+            .operators
+            .program_to_run(run, request.args.as_deref().unwrap_or_default(), &folder)
+            .map_err(|missing| {
             format!("--run {}: there is no such program on machine '{here}' ({})", run.display(), missing.display())
         })?;
         Ok(SwapRequest { folder, program: Some(program.path), args: Some(program.args), ..request })

@@ -57,10 +57,11 @@ impl Raw {
             deadline_millis: 200,
             buffer: 8,
         });
-        let brain = Tunnels::start(session("listen", port), Arc::clone(&config), &[Arc::default()], |_, _| {
-            anyhow::bail!("no recording here")
-        })
-        .expect("started");
+        let describe = |_: &serde_json::Value, _| anyhow::bail!("no recording here");
+        let operators = blindgrasp_graph::operators::Operators::default();
+        let listening = session("listen", port);
+        let brain =
+            Tunnels::start(listening, Arc::clone(&config), &[Arc::default()], describe, operators).expect("started");
         let session = session("connect", port);
         let (tell, heard) = channel();
         let key = config.key("brain", "robot", KeyKind::Ask);

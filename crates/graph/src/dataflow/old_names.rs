@@ -1,12 +1,12 @@
 //! Reads files from before the shipped operator `histogram` was renamed to `encoder`, and its output to `feature`.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 
 use super::file::DataflowFile;
 use super::node::NodeEntry;
-use super::program::Program;
+use crate::operators::Operators;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
 const OLD_OPERATOR: &str = "histogram";
@@ -17,10 +17,10 @@ const NEW_PORT: &str = "feature";
 const READERS: [&str; 2] = ["classifier", "regrasp"];
 
 /// The file with the new names in the place of the old; `None` if it has no old names. A note is printed once a file.
-pub(super) fn with_new_names(file: &DataflowFile, shipped: &BTreeMap<String, Program>) -> Option<DataflowFile> {
+pub(super) fn with_new_names(file: &DataflowFile, operators: &Operators) -> Option<DataflowFile> {
     static TOLD: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
     // An operator of one's own may have the old name.
-    if shipped.contains_key(OLD_OPERATOR) || !shipped.contains_key(NEW_OPERATOR) {
+    if operators.get(OLD_OPERATOR).is_some() || operators.get(NEW_OPERATOR).is_none() {
         return None;
     }
     let mut renamed = file.clone();
@@ -74,6 +74,7 @@ mod tests {
     use blindgrasp_operator::description::OperatorDescription;
 
     use super::super::{Graph, Scope, check, parse};
+    use crate::operators::Operators;
 
     fn describe(program: &Path, _: &[String]) -> Result<OperatorDescription, String> {
         let json = match program.file_name().and_then(|name| name.to_str()) {
@@ -94,8 +95,8 @@ mod tests {
     fn checked(nodes: &str, shipped: &[&str]) -> Result<Graph, String> {
         let yaml = format!("version: 1\nname: g\noperators:\n{nodes}");
         let file = parse(Path::new("/tmp/dataflow.yaml"), yaml.as_bytes()).expect("form");
-        let shipped = shipped.iter().map(|name| (name.to_string(), Path::new("/bin").join(name).into())).collect();
-        check(&file, &shipped, &[], Scope::Everything, describe).map_err(|error| error.to_string())
+        let operators = Operators::in_folder(Path::new("/bin"), shipped);
+        check(&file, &operators, &[], Scope::Everything, describe).map_err(|error| error.to_string())
     }
 
     fn edges(nodes: &str) -> Vec<String> {

@@ -50,7 +50,7 @@ impl LateDecisions {
         let LateDecisions { n_stale, n_undecided, n_unadvised } = *self;
         let raise: Vec<&str> = [
             (n_stale > 0).then_some("lift_arbiter.max_age_ms"),
-            (n_undecided + n_unadvised > 0).then_some("simulated_hand.decision_timeout_s"),
+            (n_undecided + n_unadvised > 0).then_some("decision_timeout_s"),
         ]
         .into_iter()
         .flatten()
@@ -90,12 +90,9 @@ mod tests {
         let mut late = late;
         late.add(&LateDecisions { n_unadvised: 4, ..LateDecisions::default() });
         let advice = late.advice().expect("late");
-        for expected in [
-            "7 attempts",
-            "1 stale, 2 without",
-            "4 without advice",
-            "lift_arbiter.max_age_ms and simulated_hand.decision_timeout_s",
-        ] {
+        for expected in
+            ["7 attempts", "1 stale, 2 without", "4 without advice", "lift_arbiter.max_age_ms and decision_timeout_s"]
+        {
             assert!(advice.contains(expected), "{advice}");
         }
         let stale = LateDecisions { n_stale: 1, ..LateDecisions::default() };
