@@ -8,7 +8,6 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use blindgrasp_graph::dataflow::{self, Scope};
-use blindgrasp_graph::describe::shipped;
 use blindgrasp_graph::plan::{Plan, PlanOptions};
 use blindgrasp_messages::{LiftDecision, TactileFrame};
 use blindgrasp_operator::cursors::SharedCursors;
@@ -21,7 +20,7 @@ use blindgrasp_operator::wiring::Clock;
 use blindgrasp_replay::player::{Player, Playing, Program};
 use blindgrasp_replay::selection::Selection;
 
-use crate::{SHIPPED, Shipped};
+use crate::{Form, SHIPPED, operators_of};
 
 thread_local! {
     static N_ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
@@ -47,8 +46,8 @@ unsafe impl GlobalAlloc for Counting {
     }
 }
 
-fn of_args(args: &[String]) -> &'static Shipped {
-    SHIPPED.iter().find(|shipped| args.last().is_some_and(|name| name == shipped.name)).expect("shipped")
+fn of_args(args: &[String]) -> Form {
+    SHIPPED.iter().find(|shipped| args.last().is_some_and(|name| name == shipped.name)).expect("shipped").form
 }
 
 fn describe(_program: &Path, args: &[String]) -> Result<OperatorDescription, String> {
@@ -71,8 +70,8 @@ fn no_stage_allocates_for_a_sample_once_it_is_warm() {
         .fold(text, |text, shared| text.replace(&format!(" {shared}/"), &format!(" {}/{shared}/", project.display())));
     std::fs::write(folder.path().join("dataflow.yaml"), text).expect("written");
     let file = dataflow::load(&folder.path().join("dataflow.yaml")).expect("read");
-    let shipped = shipped().expect("this program");
-    let graph = dataflow::check(&file, &shipped, &[], Scope::Everything, describe).expect("a graph");
+    let graph = dataflow::check(&file, &operators_of(Path::new("blindgrasp")), &[], Scope::Everything, describe)
+        .expect("a graph");
 
     let namespace = Namespace::reserve(&format!("allocations-{}", std::process::id())).expect("reserved");
     let port = ("lift_arbiter".to_owned(), "decision".to_owned());

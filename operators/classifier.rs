@@ -18,89 +18,41 @@ struct Params {
 }
 
 pub(crate) fn describe() -> OperatorDescription {
-    let summary = "Predicts from each frame's feature whether the grasp is stable";
-    description("classifier", summary).answers_each()
-}
-
-/// It is an operator of its own because it has a state: other nodes do not rely on answers that depend on one sample alone.
-pub(crate) fn describe_with_probes() -> OperatorDescription {
-    description("probe_classifier", "As classifier, and predicts after a probe what the lift will come to")
-}
-
-/// Its state is the day's statistics.
-pub(crate) fn describe_with_days() -> OperatorDescription {
-    description("day_classifier", "As classifier, and judges a grasp by the earlier ones of its day")
-}
-
-fn description(name: &str, summary: &str) -> OperatorDescription {
-    OperatorDescription::new(name, summary)
+    OperatorDescription::new("classifier", "Predicts from each frame's feature whether the grasp is stable")
+        .answers_each()
         .input("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
         .output("prediction", Prediction::TYPE_NAME, "The prediction for each frame")
-        .param("model", ParamKind::Path { must_exist: true }, None, "The model file")
+        .param(
+            "model",
+            ParamKind::Path { must_exist: true },
+            None,
+            "The model file. It says what is judged: settled grasps, and with a memory of earlier frames also probes, and grasps \
+             by the earlier ones of their day",
+        )
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let model = Model::load(&params.model)?;
-    if model.day.is_some() {
-        anyhow::bail!(
-            "{}: the model judges a grasp by the earlier ones of its day, which this operator does not remember: expected \
-             the operator day_classifier",
-            params.model.display()
-        );
-    }
     let (identity, dictionary_id) = (model.identity(), model.dictionary_id());
-    let without_memory = Memory::default();
-    let classify = stage::from_fn::<GraspFeature, Prediction, _>(move |head, values, _| {
-        let (values, phase) = (checked(&model, dictionary_id, head, values), Phase::from_code(head.phase));
-        let verdict = values.and_then(|values| model.classify(phase.unwrap_or_default(), values, 0, &without_memory));
-        prediction(head, verdict)
-    });
+    let classify = Classify { model, dictionary_id, memory: Memory::default() };
     stage::run(operator, "feature", "prediction", 0, identity, classify)
 }
 
-pub(crate) fn work_with_probes(operator: &Operator) -> anyhow::Result<()> {
-    let params: Params = operator.params()?;
-    let model = Model::load(&params.model)?;
-    if !model.has_probes() {
-        anyhow::bail!(
-            "{}: the model judges no probes: expected one of lifts with probes (blindgrasp train), or the operator classifier",
-            params.model.display()
-        );
-    }
-    run_with_memory(operator, model)
-}
-
-pub(crate) fn work_with_days(operator: &Operator) -> anyhow::Result<()> {
-    let params: Params = operator.params()?;
-    let model = Model::load(&params.model)?;
-    if model.day.is_none() {
-        anyhow::bail!(
-            "{}: the model does not look at the day: expected one that was trained on recordings with days (blindgrasp import \
-             --day), or the operator classifier",
-            params.model.display()
-        );
-    }
-    run_with_memory(operator, model)
-}
-
-fn run_with_memory(operator: &Operator, model: Model) -> anyhow::Result<()> {
-    let (identity, dictionary_id) = (model.identity(), model.dictionary_id());
-    let stage = WithMemory { model, dictionary_id, memory: Memory::default() };
-    stage::run(operator, "feature", "prediction", 0, identity, stage)
-}
-
-/// A classifier whose model judges a frame by earlier ones too: of the open grasp, or of the day.
-struct WithMemory {
+struct Classify {
     model: Model,
     dictionary_id: u64,
+    /// Earlier frames of the open grasp, or of the day. It stays empty if the model judges each frame alone.
     memory: Memory,
 }
 
-impl Stage for WithMemory {
+impl Stage for Classify {
     type In = GraspFeature;
     type Out = Prediction;
-    const HAS_STATE: bool = true;
+
+    fn has_state(&self) -> bool {
+        self.model.has_memory()
+    }
 
     fn answer(&mut self, head: &GraspFeatureHead, values: &[f64], _now_nanos: u64, answers: &mut Answers<Prediction>) {
         let place = GraspPlace { epoch: head.header.epoch, grasp_id: head.grasp_id, day: head.day };
@@ -112,14 +64,19 @@ impl Stage for WithMemory {
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
-        encode_state(&self.memory, bytes)
+        encode_state((self.dictionary_id, &self.memory), bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
-        self.memory = match state {
-            Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
-            None => Memory::default(),
-        };
+        self.memory = Memory::default();
+        if let Some(bytes) = state {
+            let ((dictionary_id, memory), _) =
+                bincode::serde::decode_from_slice::<(u64, Memory), _>(bytes, STATE_FORMAT)?;
+            // Features of another model say nothing to this one.
+            if dictionary_id == self.dictionary_id {
+                self.memory = memory;
+            }
+        }
         Ok(())
     }
 }

@@ -20,55 +20,34 @@ use serde::Deserialize;
 #[derive(Deserialize)]
 struct Params {
     hand: PathBuf,
-}
-
-#[derive(Deserialize)]
-struct CheckedParams {
-    hand: PathBuf,
-    sensors: PathBuf,
+    sensors: Option<PathBuf>,
 }
 
 pub(crate) fn describe() -> OperatorDescription {
-    description("contacts", "Finds the active cells and where they are in the palm frame").answers_each()
-}
-
-pub(crate) fn describe_checked() -> OperatorDescription {
-    description("checked_contacts", "As contacts, and holds while joints or cells are faulty").param(
-        "sensors",
-        ParamKind::Path { must_exist: true },
-        None,
-        "The sensor check (blindgrasp sensors learn)",
-    )
-}
-
-fn description(name: &str, summary: &str) -> OperatorDescription {
-    OperatorDescription::new(name, summary)
+    OperatorDescription::new("contacts", "Finds the active cells and where they are in the palm frame")
+        .answers_each()
         .input("tactile", TactileFrame::TYPE_NAME, "Frames of the hand")
         .output("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
         .param("hand", ParamKind::Path { must_exist: true }, None, "The hand's pad layout (YAML)")
+        .optional_param(
+            "sensors",
+            ParamKind::Path { must_exist: true },
+            "The sensor check (blindgrasp sensors learn): frames are faulty while it finds that joints or cells are",
+        )
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
-    let (hand, identity) = hand_of(&params.hand)?;
-    let (hand_id, max_contacts) = (hand.id(), hand.n_cells());
-    let mut finder = ContactFinder::default();
-    let find = stage::from_fn::<TactileFrame, ContactSet, _>(move |head, items, contacts| {
-        let (summary, parts) = found(&hand, &mut finder, head, items, contacts);
-        contact_set(head, hand_id, summary, parts.as_ref())
-    });
-    stage::run(operator, "tactile", "contacts", max_contacts, identity, find)
-}
-
-pub(crate) fn work_checked(operator: &Operator) -> anyhow::Result<()> {
-    let params: CheckedParams = operator.params()?;
     let (hand, mut identity) = hand_of(&params.hand)?;
-    let check = SensorCheck::load(&params.sensors, &hand)?;
-    identity.insert("sensors".into(), format!("{:016x}", check.id()));
+    let mut watch = None;
+    if let Some(sensors) = &params.sensors {
+        let check = SensorCheck::load(sensors, &hand)?;
+        identity.insert("sensors".into(), format!("{:016x}", check.id()));
+        let (memory, reported) = (SensorMemory::default(), Reported::default());
+        watch = Some(Watch { operator: operator.clone(), check, memory, reported });
+    }
     let max_contacts = hand.n_cells();
-    let finder = ContactFinder::default();
-    let (memory, reported) = (SensorMemory::default(), Reported::default());
-    let stage = Checked { operator: operator.clone(), hand, finder, check, memory, reported };
+    let stage = FindContacts { hand, finder: ContactFinder::default(), watch };
     stage::run(operator, "tactile", "contacts", max_contacts, identity, stage)
 }
 
@@ -117,17 +96,22 @@ fn contact_set(
     .with_senses(&parts.map_or(Senses::default(), |parts| parts.senses))
 }
 
-/// Contacts of a hand whose sensors are watched.
-struct Checked {
-    operator: Operator,
+struct FindContacts {
     hand: Hand,
     finder: ContactFinder,
+    /// The watch over the sensors, which remembers their readings.
+    watch: Option<Watch>,
+}
+
+/// Finds faulty sensors.
+struct Watch {
+    operator: Operator,
     check: SensorCheck,
     memory: SensorMemory,
     reported: Reported,
 }
 
-/// What this instance has said of faults.
+/// The faults that this instance has reported.
 #[derive(Default)]
 struct Reported {
     fault: Option<SensorFault>,
@@ -138,13 +122,29 @@ struct Reported {
     has_counted: bool,
 }
 
-impl Checked {
+impl Watch {
+    /// Whether the sensors are faulty at this frame.
+    fn finds_fault(
+        &mut self,
+        hand: &Hand,
+        head: &TactileFrameHead,
+        phase: Phase,
+        parts: &FrameParts<'_>,
+        contacts: &[Contact],
+    ) -> bool {
+        let place = GraspPlace { epoch: head.header.epoch, grasp_id: head.grasp_id, day: head.day };
+        let readings = (parts.joints_rad, parts.cells_newtons);
+        let fault = self.check.watch(hand, &mut self.memory, (place, phase), readings, contacts);
+        self.report(hand, fault, place);
+        fault.is_some()
+    }
+
     /// Says a fault once when it is found and once when it is over, and counts the grasps that it holds.
-    fn report(&mut self, fault: Option<SensorFault>, place: GraspPlace) {
+    fn report(&mut self, hand: &Hand, fault: Option<SensorFault>, place: GraspPlace) {
         let reported = &mut self.reported;
         if reported.fault != fault {
             match fault {
-                Some(fault) => tracing::warn!("{}; grasps are held until it works again", Described(fault, &self.hand)),
+                Some(fault) => tracing::warn!("{}; grasps are held until it works again", Described(fault, hand)),
                 None => tracing::info!("the sensors read as those of a healthy hand again"),
             }
             reported.fault = fault;
@@ -153,49 +153,56 @@ impl Checked {
             && reported.grasp != Some(place)
         {
             reported.grasp = Some(place);
-            let name = format!("sensor_fault/{}/{}", fault.kind(), fault.part(&self.hand));
+            let name = format!("sensor_fault/{}/{}", fault.kind(), fault.part(hand));
             *reported.counts.entry(name).or_default() += 1;
             reported.has_counted = true;
         }
     }
 }
 
-impl Stage for Checked {
+impl Stage for FindContacts {
     type In = TactileFrame;
     type Out = ContactSet;
-    const HAS_STATE: bool = true;
+
+    fn has_state(&self) -> bool {
+        self.watch.is_some()
+    }
 
     fn answer(&mut self, head: &TactileFrameHead, items: &[f64], _now_nanos: u64, answers: &mut Answers<ContactSet>) {
         let (mut summary, parts) = found(&self.hand, &mut self.finder, head, items, answers.items());
         let phase = Phase::from_code(head.phase).ok().filter(|phase| !phase.is_over());
-        if let (Some(parts), Some(phase), Fault::None | Fault::NoContact) = (&parts, phase, summary.fault) {
-            let place = GraspPlace { epoch: head.header.epoch, grasp_id: head.grasp_id, day: head.day };
-            let readings = (parts.joints_rad, parts.cells_newtons);
-            let found = self.check.watch(&self.hand, &mut self.memory, (place, phase), readings, answers.items());
-            self.report(found, place);
-            if found.is_some() {
-                summary = ContactSummary { fault: Fault::SensorFault, ..ContactSummary::default() };
-                answers.items().clear();
-            }
+        if let (Some(watch), Some(parts), Some(phase)) = (&mut self.watch, &parts, phase)
+            && matches!(summary.fault, Fault::None | Fault::NoContact)
+            && watch.finds_fault(&self.hand, head, phase, parts, answers.items())
+        {
+            summary = ContactSummary { fault: Fault::SensorFault, ..ContactSummary::default() };
+            answers.items().clear();
         }
         answers.push(contact_set(head, self.hand.id(), summary, parts.as_ref()));
     }
 
     fn look(&mut self) {
-        if std::mem::take(&mut self.reported.has_counted) {
-            self.operator.has_counted(self.reported.counts.clone());
+        if let Some(watch) = &mut self.watch
+            && std::mem::take(&mut watch.reported.has_counted)
+        {
+            watch.operator.has_counted(watch.reported.counts.clone());
         }
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
-        encode_state(&self.memory, bytes)
+        match &self.watch {
+            Some(watch) => encode_state(&watch.memory, bytes),
+            None => Ok(()),
+        }
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
-        self.memory = match state {
-            Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
-            None => SensorMemory::default(),
-        };
+        if let Some(watch) = &mut self.watch {
+            watch.memory = match state {
+                Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
+                None => SensorMemory::default(),
+            };
+        }
         Ok(())
     }
 }

@@ -9,6 +9,7 @@ mod classifier;
 pub mod connection;
 mod contacts;
 mod encoder;
+pub mod fit;
 mod lift_arbiter;
 mod link;
 mod publishing;
@@ -23,7 +24,9 @@ mod zenoh;
 
 pub use ros2_markers::hand_markers;
 
-use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, TactileFrame};
+use std::path::Path;
+
+use blindgrasp_graph::operators::{LINK_OPERATOR, Operators};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 
@@ -35,72 +38,99 @@ pub const PYTHON_MESSAGES: &str = include_str!("blindgrasp_messages.py");
 #[derive(Debug, Clone, Copy)]
 pub struct Shipped {
     pub name: &'static str,
-    /// The argument after the name; empty if there is none.
-    pub variant: &'static str,
+    pub form: Form,
+    /// Whether several can run in one process: they answer samples, and have no source or device of their own.
+    pub can_share_process: bool,
+    /// Other forms, by the argument after the name.
+    pub variants: &'static [(&'static str, Form)],
+}
+
+/// What an operator is and does.
+#[derive(Debug, Clone, Copy)]
+pub struct Form {
     pub describe: fn() -> OperatorDescription,
     pub work: fn(&Operator) -> anyhow::Result<()>,
 }
 
-/// All of them, with their variants.
-#[rustfmt::skip]
-pub const SHIPPED: [Shipped; 18] = [
-    of("recorded_source", "", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
-    of("recorded_source", "tactile", recorded_source::describe::<TactileFrame>, recorded_source::work::<TactileFrame>),
-    of("recorded_source", "contacts", recorded_source::describe::<ContactSet>, recorded_source::work::<ContactSet>),
-    of("recorded_source", "feature", recorded_source::describe::<GraspFeature>, recorded_source::work::<GraspFeature>),
-    of("recorded_source", "prediction", recorded_source::describe::<Prediction>, recorded_source::work::<Prediction>),
-    of("tactile_source", "", tactile_source::describe, tactile_source::work),
-    of("simulated_hand", "", simulated_hand::describe, simulated_hand::work),
-    of("senses", "", senses::describe, senses::work),
-    of("contacts", "", contacts::describe, contacts::work),
-    of("checked_contacts", "", contacts::describe_checked, contacts::work_checked),
-    of("encoder", "", encoder::describe, encoder::work),
-    of("classifier", "", classifier::describe, classifier::work),
-    of("probe_classifier", "", classifier::describe_with_probes, classifier::work_with_probes),
-    of("day_classifier", "", classifier::describe_with_days, classifier::work_with_days),
-    of("lift_arbiter", "", lift_arbiter::describe, lift_arbiter::work),
-    of("ros2", "", ros2::describe, ros2::work),
-    of("zenoh", "", zenoh::describe, zenoh::work),
-    of("link", "", link::describe, link::work),
+/// All of them. A new one is its file and a line here.
+pub const SHIPPED: [Shipped; 11] = [
+    recorded_source::SHIPPED,
+    Shipped::new("tactile_source", tactile_source::describe, tactile_source::work),
+    Shipped::new("simulated_hand", simulated_hand::describe, simulated_hand::work),
+    Shipped::new("senses", senses::describe, senses::work).sharing_process(),
+    Shipped::new("contacts", contacts::describe, contacts::work).sharing_process(),
+    Shipped::new("encoder", encoder::describe, encoder::work).sharing_process(),
+    Shipped::new("classifier", classifier::describe, classifier::work).sharing_process(),
+    Shipped::new("lift_arbiter", lift_arbiter::describe, lift_arbiter::work).sharing_process(),
+    Shipped::new("ros2", ros2::describe, ros2::work),
+    Shipped::new("zenoh", zenoh::describe, zenoh::work),
+    Shipped::new(LINK_OPERATOR, link::describe, link::work),
 ];
 
-const fn of(
-    name: &'static str,
-    variant: &'static str,
-    describe: fn() -> OperatorDescription,
-    work: fn(&Operator) -> anyhow::Result<()>,
-) -> Shipped {
-    Shipped { name, variant, describe, work }
+/// Names for which people look, and what does it.
+const ADVICE: [(&str, &str); 3] = [
+    ("checked_contacts", "contacts does it, with its param 'sensors'"),
+    ("probe_classifier", "classifier does it: the model says what it can judge"),
+    ("day_classifier", "classifier does it: the model says what it can judge"),
+];
+
+/// These operators as a dataflow file can name them. `program` must run each as `PROGRAM operator NAME`, as blindgrasp does.
+pub fn operators_of(program: &Path) -> Operators {
+    let in_files = || SHIPPED.iter().filter(|shipped| shipped.name != LINK_OPERATOR);
+    let sharing = in_files().filter(|shipped| shipped.can_share_process);
+    Operators::of_program(program, in_files().map(|shipped| shipped.name))
+        .sharing(sharing.map(|shipped| shipped.name))
+        .advising(ADVICE)
+}
+
+impl Shipped {
+    const fn new(
+        name: &'static str,
+        describe: fn() -> OperatorDescription,
+        work: fn(&Operator) -> anyhow::Result<()>,
+    ) -> Shipped {
+        Shipped { name, form: Form { describe, work }, can_share_process: false, variants: &[] }
+    }
+
+    const fn sharing_process(self) -> Shipped {
+        Shipped { can_share_process: true, ..self }
+    }
+
+    /// Its form with these arguments after its name, if there is one.
+    pub fn with_arguments(&self, arguments: &[&str]) -> Option<Form> {
+        match arguments {
+            [] => Some(self.form),
+            [argument] => self.variants.iter().find(|(known, _)| known == argument).map(|(_, form)| *form),
+            _ => None,
+        }
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    #[test]
-    fn the_launcher_knows_the_same_operators() {
-        let names = SHIPPED.iter().filter(|operator| operator.variant.is_empty()).map(|operator| operator.name);
-        let known = blindgrasp_graph::describe::SHIPPED.into_iter().chain([blindgrasp_graph::describe::LINK_OPERATOR]);
-        assert!(names.eq(known));
-    }
-
     /// A source would not let the others of its group have a turn.
     #[test]
     fn the_operators_that_can_share_a_process_answer_samples() {
-        for name in blindgrasp_graph::describe::GROUPABLE {
-            let operator = SHIPPED.iter().find(|operator| operator.name == name).expect("shipped");
-            let inputs = (operator.describe)().inputs;
-            assert!(inputs.iter().any(|input| !input.feedback), "{name}");
+        for operator in SHIPPED.iter().filter(|operator| operator.can_share_process) {
+            let inputs = (operator.form.describe)().inputs;
+            assert!(inputs.iter().any(|input| !input.feedback), "{}", operator.name);
         }
     }
 
     #[test]
     fn every_operator_describes_itself_under_its_own_name() {
         for operator in SHIPPED {
-            let description = (operator.describe)();
-            assert_eq!(description.operator, operator.name);
-            description.validate().expect("a description without contradictions");
-            assert!(operator.variant.is_empty() || description.outputs[0].name == operator.variant);
+            let described = (operator.form.describe)();
+            let variants = operator.variants.iter().map(|(_, form)| (form.describe)());
+            for description in variants.chain([described]) {
+                assert_eq!(description.operator, operator.name);
+                description.validate().expect("a description without contradictions");
+            }
+            for (argument, form) in operator.variants {
+                assert_eq!((form.describe)().outputs[0].name, *argument);
+            }
         }
     }
 }

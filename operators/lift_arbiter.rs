@@ -119,7 +119,10 @@ struct Arbiter {
 impl Stage for Arbiter {
     type In = Prediction;
     type Out = LiftDecision;
-    const HAS_STATE: bool = true;
+
+    fn has_state(&self) -> bool {
+        true
+    }
 
     fn answer(&mut self, head: &PredictionHead, items: &[u8], now_nanos: u64, answers: &mut Answers<LiftDecision>) {
         self.last_arrival_nanos = now_nanos;

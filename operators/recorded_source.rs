@@ -12,7 +12,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
-use blindgrasp_messages::{GraspTruth, MAX_NAME_BYTES, Recorded};
+use blindgrasp_messages::{ContactSet, GraspFeature, GraspTruth, MAX_NAME_BYTES, Prediction, Recorded, TactileFrame};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
@@ -23,6 +23,8 @@ use blindgrasp_replay::player::{Player, Playing, Program};
 use blindgrasp_replay::selection::Selection;
 use serde::Deserialize;
 use serde_json::{Map, Value};
+
+use crate::{Form, Shipped};
 
 /// Clocks jump, and robots are switched off overnight.
 const LONGEST_PAUSE: Duration = Duration::from_secs(10);
@@ -47,7 +49,21 @@ enum Amount {
     Unlimited(#[expect(dead_code, reason = "each param has one word only")] String),
 }
 
-pub(crate) fn describe<M: Played>() -> OperatorDescription {
+pub(crate) const SHIPPED: Shipped = Shipped {
+    variants: &[
+        ("tactile", form::<TactileFrame>()),
+        ("contacts", form::<ContactSet>()),
+        ("feature", form::<GraspFeature>()),
+        ("prediction", form::<Prediction>()),
+    ],
+    ..Shipped::new("recorded_source", describe::<TactileFrame>, work::<TactileFrame>)
+};
+
+const fn form<M: Played>() -> Form {
+    Form { describe: describe::<M>, work: work::<M> }
+}
+
+fn describe<M: Played>() -> OperatorDescription {
     let number = |above, min, max, word: &str| ParamKind::Number { above, min, max, words: vec![word.into()] };
     let rate = number(Some(0.0), None, None, "max");
     let repeat = number(None, Some(1.0), Some(1e9), "forever");
@@ -67,7 +83,7 @@ pub(crate) fn describe<M: Played>() -> OperatorDescription {
         .optional_param("topic", ParamKind::String {}, "Which topic to play, if several are of this type")
 }
 
-pub(crate) fn work<M: Played>(operator: &Operator) -> anyhow::Result<()> {
+fn work<M: Played>(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let player = Player::<M>::open(params.program()?)?;
     let identity = match player.hand_id() {

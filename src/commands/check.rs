@@ -5,12 +5,12 @@ use std::path::PathBuf;
 use clap::Args;
 use serde_json::json;
 
+use super::graph_file::{OnMisfit, fitting};
 use super::text_table::TextTable;
 use super::{Outcome, print_line};
 use blindgrasp_graph::dataflow::{
     self, DataflowError, Edge, Graph, Input, Machine, Machines, Node, Override, Restart, RestartPolicy, Scope,
 };
-use blindgrasp_graph::describe::{describe, shipped};
 
 /// Check a dataflow file: the same as run --check
 ///
@@ -26,6 +26,9 @@ pub(super) struct Arguments {
     /// Check the file for this machine only
     #[arg(long)]
     pub(super) machine: Option<String>,
+    /// Warn of a graph with which nothing can be lifted, as in run
+    #[arg(long)]
+    pub(super) allow_mismatch: bool,
     /// Print JSON
     #[arg(long)]
     pub(super) json: bool,
@@ -34,16 +37,19 @@ pub(super) struct Arguments {
 /// Prints the graph with every value filled in, or its mistakes. With --json: {"graph": …}, with "crossing" edges where
 /// the file names machines, or {"errors": […]}.
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let shipped = shipped()?;
+    let on_misfit = if arguments.allow_mismatch { OnMisfit::Warn } else { OnMisfit::Refuse };
     let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
-    let checked = dataflow::load(&arguments.dataflow)
-        .and_then(|file| dataflow::check(&file, &shipped, &arguments.overrides, scope, describe));
+    let file = dataflow::load(&arguments.dataflow).map_err(anyhow::Error::from);
+    let checked = file.and_then(|file| fitting(&file, &arguments.overrides, scope, on_misfit));
     match &checked {
         Ok(graph) if arguments.json => print_line(&serde_json::to_string_pretty(&as_json(graph))?)?,
         Ok(graph) => print_graph(graph)?,
-        // The mistakes go to stderr as well.
-        Err(error) if arguments.json => print_line(&serde_json::to_string_pretty(&errors(error))?)?,
-        Err(_) => {}
+        Err(error) => {
+            // The mistakes go to stderr as well.
+            if let Some(error) = error.downcast_ref::<DataflowError>().filter(|_| arguments.json) {
+                print_line(&serde_json::to_string_pretty(&errors(error))?)?;
+            }
+        }
     }
     checked?;
     Ok(Outcome::Done)

@@ -3,6 +3,7 @@
 use clap::Args;
 use serde_json::json;
 
+use super::graph_file::shipped;
 use super::{Outcome, print_line};
 use blindgrasp_graph::doctor::{Measurement, Verdict, examine};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -40,7 +41,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display()));
         }
     }
-    let findings = examine(if arguments.quick { Measurement::Skipped } else { Measurement::TwoSeconds });
+    let measurement = if arguments.quick { Measurement::Skipped } else { Measurement::TwoSeconds };
+    let findings = examine(measurement, &shipped()?);
     let verdict = findings.iter().map(|finding| finding.verdict).max().unwrap_or(Verdict::Ok);
     if arguments.json {
         print_line(&json!({ "verdict": verdict, "removed": removed, "findings": findings }).to_string())?;

@@ -28,7 +28,6 @@ pub(super) const FILES: [(&str, &[u8]); 11] = [
     ("dataflow-live.yaml", include_bytes!("../../dataflow-live.yaml")),
     ("tactile_bridge.py", include_bytes!("../../examples/tactile_bridge.py")),
     ("dataflow-machines.yaml", include_bytes!("../../dataflow-machines.yaml")),
-    ("dataflow-trials.yaml", include_bytes!("../../dataflow-trials.yaml")),
     ("hands/barrett-bh8-280.yaml", include_bytes!("../../hands/barrett-bh8-280.yaml")),
     ("hands/barrett-bh8-280.urdf", include_bytes!("../../hands/barrett-bh8-280.urdf")),
     ("models/barrett-bh8-280.json", include_bytes!("../../models/barrett-bh8-280.json")),
@@ -52,12 +51,11 @@ blindgrasp stop
 | here | is |
 |---|---|
 | `dataflow.yaml` | the graph: which operators run, what they read, their parameters |
-| `dataflow-live.yaml` | the same graph for a real hand: a bridge sends its frames |
+| `dataflow-live.yaml` | the graph for a hand that lifts, with its model: a bridge sends the frames; `blindgrasp trials` tries it in simulated physics |
 | `tactile_bridge.py` | a bridge to begin with: `blindgrasp export recordings/held-out.mcap --topic /tactile \\| ./tactile_bridge.py` |
 | `dataflow-machines.yaml` | the same graph on two machines |
-| `dataflow-trials.yaml` | the same graph with a simulated hand that lifts what the graph says: `blindgrasp trials` |
 | `hands/` | the Barrett hand BH8-280: kinematics (URDF) and pad layout; describe your own beside it |
-| `models/` | the model that says stable or not, trained on simulated grasps of that hand |
+| `models/` | models of that hand: by the paper's label for `dataflow.yaml`, and of lifts (`…-lifts.json`) for an arm |
 | `recordings/` | 240 simulated grasps of objects that the model has not been trained on |
 | `docs/` | the schema of the dataflow files, with which an editor completes and checks them |
 

@@ -11,6 +11,7 @@ mod echo;
 mod elsewhere;
 mod evaluate;
 mod export;
+mod graph_file;
 mod grid;
 mod hand_cells;
 mod help;

@@ -4,7 +4,7 @@ use std::process::ExitCode;
 
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::operator::{self, GroupMember, name_process};
-use blindgrasp_operators::SHIPPED;
+use blindgrasp_operators::{Form, SHIPPED};
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 
@@ -41,27 +41,31 @@ pub(crate) fn run(arguments: &Arguments) -> ExitCode {
     }
     let given: Vec<&str> =
         arguments.arguments.iter().map(String::as_str).filter(|text| *text != "--describe").collect();
-    let given = given.join(" ");
-    let variants = || SHIPPED.iter().filter(|shipped| shipped.name == name);
-    let Some(shipped) = variants().find(|shipped| shipped.variant == given) else {
-        let known: Vec<&str> = variants().map(|shipped| shipped.variant).filter(|text| !text.is_empty()).collect();
+    let Some(form) = form(name, &given) else {
+        let variants = SHIPPED.iter().filter(|shipped| shipped.name == name).flat_map(|shipped| shipped.variants);
+        let known: Vec<&str> = variants.map(|(argument, _)| *argument).collect();
         let known =
             if known.is_empty() { "no argument".into() } else { format!("one of {}, or nothing", known.join(", ")) };
+        let given = given.join(" ");
         print_diagnostic(&format!("blindgrasp operator {name}: unknown argument '{given}': expected {known}"));
         return ExitCode::from(2);
     };
     name_process(name);
-    operator::run(&(shipped.describe)(), shipped.work)
+    operator::run(&(form.describe)(), form.work)
 }
 
 /// An operator of a group by the arguments that a dataflow file gives it.
 fn member(args: &[String]) -> Option<GroupMember> {
-    let (name, variant) = args.split_first()?;
-    let shipped = SHIPPED.iter().find(|shipped| shipped.name == name && shipped.variant == variant.join(" "))?;
-    Some(((shipped.describe)(), shipped.work))
+    let (name, arguments) = args.split_first()?;
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let form = form(name, &arguments)?;
+    Some(((form.describe)(), form.work))
+}
+
+fn form(name: &str, arguments: &[&str]) -> Option<Form> {
+    SHIPPED.iter().find(|shipped| shipped.name == name)?.with_arguments(arguments)
 }
 
 fn names() -> PossibleValuesParser {
-    let shipped = SHIPPED.iter().filter(|shipped| shipped.variant.is_empty()).map(|shipped| shipped.name);
-    PossibleValuesParser::new(shipped.chain([GROUP]))
+    PossibleValuesParser::new(SHIPPED.iter().map(|shipped| shipped.name).chain([GROUP]))
 }

@@ -1,6 +1,7 @@
 //! `blindgrasp schema`
 
 use blindgrasp_graph::dataflow;
+use blindgrasp_graph::operators::LINK_OPERATOR;
 use blindgrasp_operators::SHIPPED;
 use clap::Args;
 
@@ -20,9 +21,8 @@ pub(super) fn run(_: &Arguments) -> anyhow::Result<Outcome> {
 
 /// The schema as a file holds it, with the operators that come with blindgrasp.
 pub(super) fn schema() -> String {
-    let names = blindgrasp_graph::describe::SHIPPED;
-    let of = |name: &&str| SHIPPED.iter().find(|shipped| shipped.name == *name).map(|shipped| (shipped.describe)());
-    let operators: Vec<_> = names.iter().filter_map(of).collect();
+    let in_files = SHIPPED.iter().filter(|shipped| shipped.name != LINK_OPERATOR);
+    let operators: Vec<_> = in_files.map(|shipped| (shipped.form.describe)()).collect();
     format!("{:#}\n", dataflow::schema(&operators))
 }
 

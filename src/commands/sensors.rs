@@ -28,8 +28,8 @@ enum Command {
 
 /// Learn how joints and cells of a healthy hand read.
 ///
-/// Labels are not needed; objects are, so that grasps of one object are not taken for a fault. The operator checked_contacts
-/// watches the hand by the file.
+/// Labels are not needed; objects are, so that grasps of one object are not taken for a fault. The operator contacts watches
+/// the hand by the file (params: sensors).
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp sensors learn healthy.mcap --out sensors.json")]
 struct LearnArguments {

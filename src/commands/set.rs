@@ -7,6 +7,7 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use super::elsewhere::MachineArgument;
+use super::graph_file::warn_of_misfit;
 use super::{Outcome, completions, print_line};
 use blindgrasp_graph::client::{Connection, pick_graph};
 use blindgrasp_graph::control::{Reply, Request};
@@ -45,6 +46,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     let Assignment { node, param, value } = arguments.assignment.clone();
     let graph = pick_graph(arguments.graph.as_deref())?;
+    warn_of_misfit(&graph, &node, &param, &value)?;
     let mut connection = Connection::open(&graph)?;
     let request = Request::Set { node: node.clone(), param: param.clone(), value };
     let (old, new, from_seq) = match connection.ask(&request, LIMIT)? {

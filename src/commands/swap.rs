@@ -10,6 +10,7 @@ use clap::Args;
 use serde::Serialize;
 
 use super::elsewhere::{MachineArgument, is_over_ssh};
+use super::graph_file::{refuse_misfit, shipped};
 use super::{Outcome, completions, number_in, percent, print_line, secs_in, stop_signal};
 use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::client::shadow_comparison::{
@@ -17,7 +18,6 @@ use blindgrasp_graph::client::shadow_comparison::{
 };
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph, status};
 use blindgrasp_graph::control::{Reply, Request, ShadowOutput, SwapRequest, SwappedNode};
-use blindgrasp_graph::describe::program_to_run;
 use blindgrasp_graph::log::printable;
 use blindgrasp_messages::Record;
 use blindgrasp_operator::cursors::COMPARE_BELL;
@@ -134,6 +134,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         // The caller knows the dataflow file, not the folder in which ssh starts a command.
         request.folder = status(&graph)?.file.parent().unwrap_or(Path::new("/")).to_path_buf();
     }
+    refuse_misfit(&graph, &request)?;
     let request = found_here(request)?;
     let stop = stop_signal()?;
     let mut connection = Connection::open(&graph)?;
@@ -183,7 +184,8 @@ fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
         return Ok(request);
     };
     let args = request.args.as_deref().unwrap_or_default();
-    let program = program_to_run(run, args, &request.folder)
+    let program = shipped()?
+        .program_to_run(run, args, &request.folder)
         .map_err(|missing| anyhow!("--run {}: there is no such program ({})", run.display(), missing.display()))?;
     Ok(SwapRequest { program: Some(program.path), args: Some(program.args), ..request })
 }

@@ -218,3 +218,36 @@ fn a_machine_needs_no_files_of_the_others() {
     let refused = text(&run(&["check", path, "--machine", "brian"], 1).stderr);
     assert!(refused.contains("there is no machine 'brian'; did you mean 'brain'?"), "{refused}");
 }
+
+#[test]
+fn a_graph_that_could_never_lift_is_refused() {
+    let probe = ["--set", "lift_arbiter.probe=test_lift"];
+    let expected = "node 'lift_arbiter': probe is test_lift, and the model of node 'classifier'";
+    let shown = run(&[&["run", "dataflow.yaml", "--check", "--json"], &probe[..]].concat(), 1);
+    let errors: Value = serde_json::from_slice(&shown.stdout).expect("JSON");
+    let error = &errors["errors"][0];
+    assert!(error["message"].as_str().is_some_and(|message| message.starts_with(expected)), "{errors}");
+    assert!(error["line"].as_u64() > Some(10) && error["help"].as_str().is_some(), "{errors}");
+    let name = unique_name();
+    let refused = run(&[&["run", "dataflow.yaml", "--name", &name], &probe[..]].concat(), 1);
+    assert!(text(&refused.stderr).contains(expected), "{}", text(&refused.stderr));
+    let warned = run(&[&["run", "dataflow.yaml", "--check", "--allow-mismatch"], &probe[..]].concat(), 0);
+    assert!(text(&warned.stderr).contains(expected), "{}", text(&warned.stderr));
+    let warned = run(&[&["replay", "recordings/ordinary.mcap", "--name", &name], &probe[..]].concat(), 0);
+    assert!(text(&warned.stderr).contains(expected), "{}", text(&warned.stderr));
+}
+
+#[test]
+fn names_of_operators_that_are_part_of_others_get_advice() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for (name, operator, advice) in [
+        ("checked_contacts", "  contacts:\n", "contacts does it, with its param 'sensors'"),
+        ("probe_classifier", "  classifier:\n", "classifier does it: the model says what it can judge"),
+        ("day_classifier", "  classifier:\n", "classifier does it: the model says what it can judge"),
+    ] {
+        let path = dataflow(folder.path(), &[(operator, &format!("{operator}    run: {name}\n"))]);
+        let refused = run(&["check", path.to_str().expect("UTF-8")], 1);
+        let said = text(&refused.stderr);
+        assert!(said.contains(&format!("unknown operator '{name}'; {advice}")), "{said}");
+    }
+}

@@ -25,6 +25,7 @@ mod many_cells;
 mod meshes;
 mod metrics;
 mod over_ssh;
+mod own_program;
 mod package;
 mod partners;
 mod picture;

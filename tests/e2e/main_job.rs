@@ -365,7 +365,14 @@ fn a_feature_of_another_model_never_lifts() {
     let both = "inputs: {contacts: contacts/contacts}\n";
     let split = format!("{both}    params: {{model: {model}}}\n");
     let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), (both, &split)]);
-    let output = run(&["run", "--json", "--name", &unique_name(), flow.to_str().expect("UTF-8")], 0);
+    let flow = flow.to_str().expect("UTF-8");
+    let refused = run(&["run", "--name", &unique_name(), flow], 1);
+    assert!(
+        text(&refused.stderr).contains("judges other features than node 'encoder' makes"),
+        "{}",
+        text(&refused.stderr)
+    );
+    let output = run(&["run", "--allow-mismatch", "--json", "--name", &unique_name(), flow], 0);
     let summary = json_lines(&output.stdout).pop().expect("a summary")["summary"].clone();
     assert_eq!((&summary["lift"], &summary["reasons"]["wrong_model"]), (&0.into(), &240.into()), "{summary}");
 }
@@ -384,7 +391,10 @@ fn a_model_of_another_hand_never_lifts() {
     run(&["simulate", "--hand", &hand, "--grasps", "120", "--out", &recording], 0);
     run(&["train", &recording, "--hand", &hand, "--words", "8", "--out", &model], 0);
     let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), (MODEL, &model)]);
-    let output = run(&["run", "--json", "--name", &unique_name(), flow.to_str().expect("UTF-8")], 0);
+    let flow = flow.to_str().expect("UTF-8");
+    let refused = run(&["run", "--name", &unique_name(), flow], 1);
+    assert!(text(&refused.stderr).contains("is not the one that the model of node"), "{}", text(&refused.stderr));
+    let output = run(&["run", "--allow-mismatch", "--json", "--name", &unique_name(), flow], 0);
     let lines = json_lines(&output.stdout);
     let summary = &lines.last().expect("a summary")["summary"];
     assert_eq!((&summary["lift"], &summary["hold"]), (&0.into(), &240.into()));

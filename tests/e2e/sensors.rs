@@ -15,7 +15,7 @@ fn faults(check: &str, recording: &str, exit_code: i32) -> Vec<Value> {
 /// The default graph on a recording, with watched sensors.
 fn watched(folder: &std::path::Path, recording: &str) -> std::path::PathBuf {
     let contacts = "    inputs: {tactile: recorded_source/tactile}\n";
-    let checked = format!("    run: checked_contacts\n    params: {{sensors: {CHECK}}}\n{contacts}");
+    let checked = format!("    params: {{sensors: {CHECK}}}\n{contacts}");
     let source = ("recordings/held-out.mcap".to_string(), recording.to_string());
     dataflow_with(folder, &[(contacts.into(), checked), source])
 }
@@ -88,8 +88,25 @@ fn a_graph_holds_while_a_pad_is_dead_and_says_which() {
     graph.kill("contacts");
     swap(&graph, &["contacts", "--probation", "0"], 0);
     graph.wait_for_decisions(30);
+    // Without the sensor check, and so without a state, while its neighbours go on; and with it again.
+    let n_watched = graph.n_decisions();
+    swap(&graph, &["contacts", "--set", "sensors=", "--probation", "0"], 0);
+    assert_eq!(graph.node("contacts")["params"].get("sensors"), None);
+    graph.wait_for_decisions(30);
+    graph.kill("contacts");
+    graph.wait_for_decisions(30);
+    let n_unwatched = graph.n_decisions();
+    swap(&graph, &["contacts", "--set", &format!("sensors={CHECK}"), "--probation", "0"], 0);
+    graph.wait_for_decisions(30);
+    graph.kill("contacts");
+    graph.wait_for_decisions(30);
     let ended = graph.stop();
-    assert!(ended.decisions.iter().all(|line| line["reason"] == "sensor_fault"), "{:?}", ended.decisions);
+    assert_eq!((ended.code, &ended.summary["samples_lost"]), (Some(0), &0.into()), "{}", ended.stderr);
+    let is_held = |line: &Value| line["reason"] == "sensor_fault";
+    let lines = &ended.decisions;
+    assert!(lines[..n_watched].iter().all(is_held), "{lines:?}");
+    assert!(lines[n_watched + 10..n_unwatched].iter().all(|line| !is_held(line)), "{lines:?}");
+    assert!(lines[lines.len() - 10..].iter().all(is_held), "{lines:?}");
 
     let healthy = folder.path().join("healthy");
     std::fs::create_dir(&healthy).expect("a folder");

@@ -411,3 +411,69 @@ fn ctrl_c_in_the_shadow_abandons_the_swap() {
     graph.wait_for_decisions(A_FEW_GRASPS);
     graph.stop().assert_undisturbed("an abandoned swap");
 }
+
+/// A model that judges probes, for which the classifier remembers earlier frames.
+const LIFTS: &str = "models/barrett-bh8-280-lifts.json";
+
+/// `--set` of a model of the project.
+fn set_model(model: &str) -> String {
+    format!("model={}", project().join(model).display())
+}
+
+#[test]
+fn a_model_with_a_memory_takes_the_place_of_one_without_and_back() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    for model in [LIFTS, MODEL, LIFTS, LIFTS, MODEL] {
+        swap(&graph, &["encoder", "classifier", "--set", &set_model(model), "--probation", "0"], 0);
+        graph.wait_for_decisions(A_FEW_GRASPS);
+        // Whoever comes back begins where its readers are, with a saved state or without one.
+        for node in ["classifier", "encoder", "lift_arbiter"] {
+            graph.kill(node);
+        }
+        graph.wait_for_decisions(A_FEW_GRASPS);
+    }
+    let ended = graph.stop();
+    assert_each_once(&ended);
+    assert_eq!((ended.code, &ended.summary["swaps"]), (Some(0), &10.into()), "{}", ended.stderr);
+}
+
+/// At full speed the instance that hands over has an answer that it could not send, saved or not.
+#[test]
+fn a_memory_comes_and_goes_under_back_pressure_and_failed_swaps() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), ("max_age_ms: 5000", "max_age_ms: 600000")]);
+    let graph = Graph::start(&flow, &["--set", "recorded_source.repeat=forever"]);
+    let stubborn = utf8(&stubborn_classifier());
+    for model in [LIFTS, MODEL, LIFTS] {
+        swap(&graph, &["encoder", "classifier", "--set", &set_model(model), "--probation", "0"], 0);
+        // One without a state answers some samples, and the old one comes back.
+        for fault in ["die_after=1", "die_after=300"] {
+            let arguments = ["classifier", "--run", &stubborn, "--set", fault, "--probation", "10"];
+            let (_, stderr) = swap(&graph, &arguments, 1);
+            assert!(stderr.contains("the old one"), "{stderr}");
+        }
+        for node in NODES {
+            swap(&graph, &[node, "--probation", "0"], 0);
+        }
+    }
+    let ended = graph.stop();
+    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+    assert_each_once(&ended);
+}
+
+#[test]
+fn a_model_that_does_not_judge_the_probe_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let lifts = project().join(LIFTS).display().to_string();
+    let flow = dataflow(folder.path(), &[(MODEL, &lifts), ("votes: 3", "votes: 3\n      probe: test_lift")]);
+    let graph = Graph::start(&flow, &FAST_FOREVER);
+    let reasons = ["probe is test_lift", "judges no test_lifted grasps", "--allow-mismatch"];
+    assert_refused(&graph, &["classifier", "--set", &set_model(MODEL)], &reasons);
+    let warned = run(&["set", "lift_arbiter.probe=none", "--graph", &graph.name], 0);
+    assert_eq!(text(&warned.stderr), "");
+    swap(&graph, &["encoder", "classifier", "--set", &set_model(MODEL), "--probation", "0"], 0);
+    let warned = run(&["set", "lift_arbiter.probe=squeeze", "--graph", &graph.name], 0);
+    assert!(text(&warned.stderr).contains("judges no squeezed grasps"), "{}", text(&warned.stderr));
+    assert_eq!(graph.stop().code, Some(0));
+}

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use crate::common::{
-    Graph, RECORDING, assert_nothing_left, dataflow, decisions_of, project, run, signal, text, undisturbed,
-    unique_name, wait_until,
+    Graph, MODEL, RECORDING, assert_nothing_left, blindgrasp, dataflow, decisions_of, project, run, signal, text,
+    undisturbed, unique_name, wait_until,
 };
 use blindgrasp_messages::{Phase, Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingReader};
@@ -21,13 +21,20 @@ const PATIENT: &str = "max_delay_ms: 20000";
 /// The project's live graph, its source with these parameters.
 pub(crate) fn live_dataflow(folder: &Path, params: &str) -> PathBuf {
     let text = std::fs::read_to_string(project().join("dataflow-live.yaml")).expect("dataflow-live.yaml");
-    let mut lines: Vec<&str> = text.lines().collect();
-    let at = lines.iter().position(|line| line.contains("driver: listen")).expect("a driver");
-    lines[at] = "      DRIVER";
-    let mut text = lines.join("\n").replace("DRIVER", params);
-    // The recordings were decided by the model of dataflow.yaml.
-    text = text.replace("barrett-bh8-280-lifts.json", "barrett-bh8-280.json");
-    text = text.replace("{votes: 3, min_probability_stable: 0.75}", "{votes: 3, max_age_ms: 20000, max_gap_ms: 1000}");
+    let source = format!("  tactile_source:\n    params:\n      {params}\n");
+    let mut text = text.clone();
+    for (what, by) in [
+        ("  source:\n", source.as_str()),
+        ("    run: ${SOURCE:-tactile_source}\n", ""),
+        ("source/tactile}", "tactile_source/tactile}"),
+        // The recordings were decided by the model of dataflow.yaml.
+        ("${MODEL:-models/barrett-bh8-280-lifts.json}", "models/barrett-bh8-280.json"),
+        ("${PROBE:-test_lift}", "none"),
+        ("${MAX_AGE_MS:-200}", "20000\n      max_gap_ms: 1000"),
+    ] {
+        assert!(text.contains(what), "dataflow-live.yaml has no '{what}'");
+        text = text.replace(what, by);
+    }
     for shared in ["models", "hands"] {
         text = text.replace(&format!(" {shared}/"), &format!(" {}/{shared}/", project().display()));
     }
@@ -543,5 +550,14 @@ fn a_driver_without_what_it_needs_is_refused_by_name() {
 #[test]
 fn the_live_graph_that_comes_with_the_project_is_sound() {
     let output = run(&["check", "dataflow-live.yaml"], 0);
-    assert!(text(&output.stdout).contains("tactile_source/tactile"), "{}", text(&output.stdout));
+    assert!(text(&output.stdout).contains("source/tactile"), "{}", text(&output.stdout));
+    // The same graph with a simulated hand, to which the decisions come back.
+    let simulated = blindgrasp().args(["check", "dataflow-live.yaml"]).env("SOURCE", "simulated_hand").output();
+    let shown = text(&simulated.expect("started").stdout);
+    assert!(shown.contains("lift_arbiter/decision → source/decision"), "{shown}");
+    // The paper's label says nothing of lifts.
+    let paper = [("MODEL", MODEL), ("PROBE", "none")];
+    let warned = blindgrasp().args(["check", "dataflow-live.yaml"]).envs(paper).output().expect("started");
+    let said = text(&warned.stderr);
+    assert!(warned.status.success() && said.contains("learned the paper's label"), "{said}");
 }

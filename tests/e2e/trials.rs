@@ -11,7 +11,7 @@ const THINGS: &str = "paper/pencil-cup,paper/candle-box";
 
 /// The command with the project's dataflow. No grasp is stale, even on a busy machine.
 fn arguments<'a>(flow: &'a str, name: &'a str, more: &[&'a str]) -> Vec<&'a str> {
-    let patient = ["--set", "lift_arbiter.max_age_ms=600000", "--set", "simulated_hand.decision_timeout_s=600"];
+    let patient = ["--set", "lift_arbiter.max_age_ms=600000", "--set", "source.decision_timeout_s=600"];
     let mut arguments = vec!["trials", "--dataflow", flow, "--name", name, "--objects", THINGS];
     arguments.extend(patient);
     arguments.extend_from_slice(more);
@@ -19,7 +19,7 @@ fn arguments<'a>(flow: &'a str, name: &'a str, more: &[&'a str]) -> Vec<&'a str>
 }
 
 fn flow() -> String {
-    project().join("dataflow-trials.yaml").to_str().expect("UTF-8").to_owned()
+    project().join("dataflow-live.yaml").to_str().expect("UTF-8").to_owned()
 }
 
 fn trials(records: &Value) -> BTreeSet<u64> {
@@ -126,7 +126,7 @@ fn options_that_do_not_fit_are_refused_before_the_start() {
         (["--options", options.to_str().expect("UTF-8")], "option physics.stand_friction is 1.5, expected a number"),
         (["--model", "nosuch.json"], "does not exist"),
         (["--objects", "paper/pan"], "expected paper, paper/pencil-cup"),
-        (["--set", "simulated_hand.seed=2"], "use --seed instead"),
+        (["--set", "source.seed=2"], "use --seed instead"),
         (["--record", "both.mcap"], "--lift-policy decision"),
     ] {
         let output = run(&["trials", "--dataflow", &flow, more[0], more[1]], 1);

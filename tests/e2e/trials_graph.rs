@@ -10,47 +10,41 @@ use crate::common::{
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// The line that makes the classifier judge probes.
-const PROBE_CLASSIFIER: &str =
-    "    run: probe_classifier            # it judges the grasp before the test lift and after it\n";
-
 /// The project's trials on two light objects, with a slow classifier that calls every felt grasp stable.
 fn flow(folder: &Path) -> PathBuf {
-    let mut text = std::fs::read_to_string(project().join("dataflow-trials.yaml")).expect("dataflow-trials.yaml");
-    let classifier = "    params: {model: models/barrett-bh8-280-lifts.json}\n    sandbox: on\n  lift_arbiter:";
+    let classifier = "    inputs: {feature: encoder/feature}\n";
     let stubborn = format!(
-        "    run: {}\n    params: {{pause_ms: 5, knows_all: true}}\n    sandbox: on\n  lift_arbiter:",
+        "    run: {}\n{classifier}    params: {{pause_ms: 5, knows_all: true}}\n",
         stubborn_classifier().display()
     );
-    for (what, by) in [
-        (PROBE_CLASSIFIER, ""),
-        ("probe: test_lift", "probe: none"),
-        (classifier, stubborn.as_str()),
-        ("things: paper ", "things: paper/pencil-cup,paper/candle-box "),
-        ("trials: 110", "trials: 6\n      attempts: 2\n      decision_timeout_s: 600"),
-    ] {
-        assert!(text.contains(what), "dataflow-trials.yaml has no '{what}'");
-        text = text.replace(what, by);
-    }
-    patient(folder, text)
+    let probe = "${PROBE:-test_lift}";
+    trial_flow(folder, "trials: 6, attempts: 2", &[(probe, "none"), (classifier, &stubborn)])
 }
 
 /// The project's trials as they are, with their probes, on the same objects.
 fn probing_flow(folder: &Path) -> PathBuf {
-    let text = std::fs::read_to_string(project().join("dataflow-trials.yaml")).expect("dataflow-trials.yaml");
-    let text = text.replace("things: paper ", "things: paper/pencil-cup,paper/candle-box ");
-    patient(folder, text.replace("trials: 110", "trials: 4\n      decision_timeout_s: 600"))
+    trial_flow(folder, "trials: 4", &[])
 }
 
-/// Writes a graph whose nodes may be killed often, and in which no grasp is stale, even on a busy machine.
-fn patient(folder: &Path, mut text: String) -> PathBuf {
+/// The project's live graph with a simulated hand, whose nodes may be killed often, and in which no grasp is stale, even on a
+/// busy machine.
+fn trial_flow(folder: &Path, trials: &str, replace: &[(&str, &str)]) -> PathBuf {
     const RESTART: &str = "    restart: {policy: on-failure, limit: 1000, within_s: 60, backoff_ms: 1}\n";
-    for node in ["  simulated_hand:\n", "  classifier:\n", "  lift_arbiter:\n"] {
-        assert!(text.contains(node), "dataflow-trials.yaml has no '{node}'");
+    let mut text = std::fs::read_to_string(project().join("dataflow-live.yaml")).expect("dataflow-live.yaml");
+    let run = "    run: ${SOURCE:-tactile_source}\n";
+    let hand = format!(
+        "    run: simulated_hand\n    params: {{things: 'paper/pencil-cup,paper/candle-box', decision_timeout_s: 600, {trials}}}\n"
+    );
+    let fixed = [(run, hand.as_str()), ("${MAX_AGE_MS:-200}", "600000")];
+    for (what, by) in fixed.iter().chain(replace) {
+        assert!(text.contains(what), "dataflow-live.yaml has no '{what}'");
+        text = text.replace(what, by);
+    }
+    text = text.replace("${MODEL:-", "").replace(".json}", ".json");
+    for node in ["  source:\n", "  classifier:\n", "  lift_arbiter:\n"] {
+        assert!(text.contains(node), "dataflow-live.yaml has no '{node}'");
         text = text.replace(node, &format!("{node}{RESTART}"));
     }
-    assert!(text.contains("max_age_ms: 5000"), "{text}");
-    text = text.replace("max_age_ms: 5000", "max_age_ms: 600000");
     for shared in ["models", "hands"] {
         text = text.replace(&format!(" {shared}/"), &format!(" {}/{shared}/", project().display()));
     }
@@ -92,16 +86,16 @@ pub(super) fn assert_killed_hand_goes_on(
     others: &[&str],
 ) {
     // However fast the hand is, it goes on until all kills are done.
-    let graph = Graph::launch(&unique_name(), flow, &["--set", "simulated_hand.trials=1000000"]);
+    let graph = Graph::launch(&unique_name(), flow, &["--set", "source.trials=1000000"]);
     let wait_for = |n: usize| {
         crate::common::wait_until(|| outcomes(&graph.lines()).len() >= n, || format!("{n} outcomes: {}", graph.said()));
     };
     for n in 1..=n_kills {
         wait_for(n as usize * n_between_kills);
         // The others die as well, before the hand has carried out its last decision or after that.
-        signal(graph.pid_of("simulated_hand"), Signal::STOP);
+        signal(graph.pid_of("source"), Signal::STOP);
         others.iter().for_each(|node| graph.kill(node));
-        graph.kill("simulated_hand");
+        graph.kill("source");
     }
     wait_for(expected.len());
     let ended = graph.stop();
@@ -157,7 +151,7 @@ fn decisions_are_carried_out_and_the_same_seed_gives_the_same_outcomes() {
         assert_eq!(outcome["thing"], thing, "{outcome}");
     }
     assert_eq!(run_to_end(flow, &[]).outcomes, *first);
-    let other = run_to_end(flow, &["--set", "simulated_hand.seed=1"]);
+    let other = run_to_end(flow, &["--set", "source.seed=1"]);
     assert_ne!(other.outcomes, *first);
 }
 
@@ -166,7 +160,7 @@ fn without_the_gate_every_grasp_is_lifted() {
     // Nothing is ever voted stable.
     let arguments = [
         "--set",
-        "simulated_hand.gate=off",
+        "source.gate=off",
         "--set",
         "lift_arbiter.min_probability_stable=1",
         "--set",
@@ -204,7 +198,7 @@ fn a_hand_that_is_killed_with_its_classifier_and_arbiter_amid_probes_goes_on_whe
 #[test]
 fn a_graph_that_is_stopped_amid_a_trial_ends_cleanly() {
     let folder = tempfile::tempdir().expect("a folder");
-    let graph = Graph::launch(&unique_name(), &flow(folder.path()), &["--set", "simulated_hand.trials=100000"]);
+    let graph = Graph::launch(&unique_name(), &flow(folder.path()), &["--set", "source.trials=100000"]);
     graph.wait_for_decisions(2);
     let ended = graph.stop();
     assert_eq!((ended.code, &ended.summary["samples_lost"]), (Some(0), &Value::from(0)), "{}", ended.stderr);

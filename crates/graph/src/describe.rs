@@ -1,6 +1,5 @@
-//! The programs of operators: which ones come with blindgrasp, and what a program says about itself at `--describe`.
+//! Asks the programs of operators what they are (`--describe`).
 
-use std::collections::BTreeMap;
 use std::io::{ErrorKind, Read};
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::process::CommandExt;
@@ -9,39 +8,8 @@ use std::process::{Command, Stdio};
 use std::sync::mpsc::channel;
 use std::time::{Duration, Instant};
 
-use crate::dataflow::Program;
 use blindgrasp_operator::description::OperatorDescription;
 
-/// The operators that come with blindgrasp, by the name that `run:` gives. The package `blindgrasp-operators` has the
-/// same table with their functions.
-pub const SHIPPED: [&str; 13] = [
-    "recorded_source",
-    "tactile_source",
-    "simulated_hand",
-    "senses",
-    "contacts",
-    "checked_contacts",
-    "encoder",
-    "classifier",
-    "probe_classifier",
-    "day_classifier",
-    "lift_arbiter",
-    "ros2",
-    "zenoh",
-];
-/// Those that can share a process: they answer samples, and have no source or device of their own.
-pub const GROUPABLE: [&str; 8] = [
-    "senses",
-    "contacts",
-    "checked_contacts",
-    "encoder",
-    "classifier",
-    "probe_classifier",
-    "day_classifier",
-    "lift_arbiter",
-];
-/// The operator that carries edges to other machines. The launcher adds it; a dataflow file cannot name it.
-pub const LINK_OPERATOR: &str = "link";
 /// The longest time that a program may take to describe itself.
 const LIMIT: Duration = Duration::from_secs(10);
 /// The pause between two looks at whether the program has ended.
@@ -51,39 +19,6 @@ const MAX_LAST_WORDS: usize = 2048;
 /// The longest description.
 const MAX_BYTES: u64 = 1 << 20;
 
-/// How the shipped operators are started: each one is `blindgrasp operator NAME`, by the program that is running.
-///
-/// # Errors
-/// The path of the running program is unknown.
-pub fn shipped() -> std::io::Result<BTreeMap<String, Program>> {
-    let path = own_path()?;
-    Ok(SHIPPED.iter().map(|name| (name.to_string(), shipped_operator(&path, name))).collect())
-}
-
-/// How the link to other machines is started.
-///
-/// # Errors
-/// The path of the running program is unknown.
-pub fn link_program() -> std::io::Result<Program> {
-    Ok(shipped_operator(&own_path()?, LINK_OPERATOR))
-}
-
-/// What `--run RUN --args ARGS` of a swap starts: a shipped operator, a program by its path, relative to `folder`, or one on
-/// PATH.
-///
-/// # Errors
-/// The path of a file that is not there.
-pub fn program_to_run(run: &Path, args: &[String], folder: &Path) -> Result<Program, PathBuf> {
-    let shipped = run.to_str().and_then(|name| shipped().ok()?.remove(name));
-    let file = folder.join(run);
-    let on_path = || run.to_str().filter(|_| !file.exists()).and_then(program_on_path).map(Program::from);
-    let program = shipped.or_else(on_path).unwrap_or_else(|| file.into());
-    if !program.path.is_file() {
-        return Err(program.path);
-    }
-    Ok(Program { args: program.args_with(args), ..program })
-}
-
 /// The program that a shell would run for a name without '/'.
 pub(super) fn program_on_path(name: &str) -> Option<PathBuf> {
     let is_program =
@@ -92,18 +27,6 @@ pub(super) fn program_on_path(name: &str) -> Option<PathBuf> {
     let folders = std::env::var_os("PATH")?;
     let mut folders = std::env::split_paths(&folders).filter(|folder| folder.is_absolute());
     (!name.contains('/')).then(|| folders.find_map(|folder| Some(folder.join(name)).filter(is_program)))?
-}
-
-fn shipped_operator(path: &Path, name: &str) -> Program {
-    Program { path: path.into(), args: vec!["operator".into(), name.into()] }
-}
-
-/// The path of the running program, also after a new build has taken its place.
-fn own_path() -> std::io::Result<PathBuf> {
-    let path = std::env::current_exe()?;
-    // Linux says so of a file that was replaced while it runs.
-    let replaced = path.to_str().and_then(|path| path.strip_suffix(" (deleted)")).map(PathBuf::from);
-    Ok(replaced.unwrap_or(path))
 }
 
 /// Starts a program with these arguments and `--describe`, and reads its ports and parameters.

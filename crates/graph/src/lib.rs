@@ -2,7 +2,8 @@
 //!
 //! It knows messages and the graph, not the science.
 //!
-//! * [`dataflow`] - the dataflow file, checked; it starts nothing. [`describe`] - asks programs what they are.
+//! * [`dataflow`] - the dataflow file, checked; it starts nothing. [`operators`] - the operators that come with a program.
+//!   [`describe`] - asks programs what they are.
 //! * [`plan`] - the readers and writers of a graph, and their cursor slots.
 //! * [`launcher`] - starts, supervises, swaps and stops a graph's processes. It never touches samples.
 //! * [`run`] - a graph from its start to its end in this process.
@@ -17,6 +18,7 @@ pub mod describe;
 pub mod doctor;
 pub mod launcher;
 pub mod log;
+pub mod operators;
 pub mod plan;
 pub mod recorded_graph;
 pub mod run;

@@ -362,6 +362,11 @@ impl Plan {
         cells
     }
 
+    /// Whether the nodes before this one count on its answering each sample under the same number.
+    pub fn relies_on_each_answer(&self, node: &str) -> bool {
+        self.answer_each.contains(node)
+    }
+
     /// The readers of the answers of an edge's reader, if it answers each sample under the same number.
     fn behind(&self, edge: &PlannedEdge) -> Vec<ReaderWiring> {
         // Answers have the numbers of the main input, and not those of a partner.

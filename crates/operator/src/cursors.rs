@@ -333,6 +333,17 @@ impl SharedCursors {
         }
     }
 
+    /// Drops a node's state; only its active instance may.
+    pub fn forget_state(&self, region: usize) {
+        let offset = self.region_offset(region);
+        // A region that was never used takes no memory, and a look at it through the mapping would take some.
+        let mut n_saved = [0; 8];
+        let is_used = rustix::io::pread(&self.file, &mut n_saved, offset as u64) != Ok(8) || n_saved != [0; 8];
+        if is_used {
+            self.word(offset).store(0, Ordering::Release);
+        }
+    }
+
     /// One half of a state region.
     fn half(&self, region_offset: usize, half: usize) -> &[AtomicU64; STATE_BYTES / 8] {
         self.at(region_offset + 4096 + half * STATE_BYTES)
@@ -502,6 +513,11 @@ mod tests {
         assert_eq!(theirs.state(0), None);
         assert!(!mine.save_state(1, &vec![0; STATE_BYTES + 1]));
         assert_eq!(theirs.state(1).as_deref(), Some(&b"three"[..]));
+        mine.forget_state(0);
+        mine.forget_state(1);
+        assert_eq!((theirs.state(0), theirs.state(1)), (None, None));
+        assert!(mine.save_state(1, b"four"));
+        assert_eq!(theirs.state(1).as_deref(), Some(&b"four"[..]));
     }
 
     loom::thread_local! {

@@ -41,8 +41,9 @@ pub struct OperatorDescription {
     pub outputs: Vec<PortDescription>,
     #[serde(default)]
     pub params: Vec<ParamDescription>,
-    /// It answers each sample with one of the same number, and an answer depends on its sample alone. If it is killed together
-    /// with its neighbours, the node before it keeps the samples that must be answered again.
+    /// It answers each sample of its first input with one of the same number, whether it has a state or not. The node before
+    /// it keeps the samples that readers behind it have not answered: so an instance with a state can take the place of one
+    /// without, and the other way round, and it can be killed together with its neighbours.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub answers_each: bool,
     /// It opens sockets of the network while it runs: its sandbox leaves it those.
@@ -116,7 +117,7 @@ impl OperatorDescription {
         }
     }
 
-    /// Of an operator that answers each sample with one of the same number and has no state.
+    /// Of an operator that answers each sample with one of the same number.
     #[must_use]
     pub fn answers_each(self) -> Self {
         Self { answers_each: true, ..self }

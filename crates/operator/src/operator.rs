@@ -278,6 +278,11 @@ impl Operator {
         self.0.cursors.state(self.0.wiring.state_region)
     }
 
+    /// Drops the node's saved state, because its active instance has none.
+    pub(crate) fn forget_state(&self) {
+        self.0.cursors.forget_state(self.0.wiring.state_region);
+    }
+
     /// Reports that its ports are open and that it could answer at once. Its neighbours, and an instance that takes its
     /// place, must have the same `identity`, such as that of the hand under `hand`.
     pub fn ready(&self, identity: BTreeMap<String, String>) {

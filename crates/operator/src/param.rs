@@ -144,6 +144,11 @@ impl ParamKind {
         self.accept(&value?)
     }
 
+    /// Whether this text (`--set NAME=`) leaves out an optional param: nothing, where nothing is no value.
+    pub fn is_left_out(&self, text: &str) -> bool {
+        text.is_empty() && self.accept_scalar(text, false).is_none()
+    }
+
     /// A hint about a scalar that was not accepted.
     pub fn help(&self, text: &str, plain: bool) -> Option<String> {
         if !plain && self.accept_scalar(text, true).is_some() {

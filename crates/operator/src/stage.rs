@@ -44,10 +44,12 @@ pub trait Stage {
     type In: Message;
     type Out: Message;
 
-    /// Whether its answers depend on earlier samples. A stage without state answers each sample with one of the same number,
-    /// and would answer it the same way again. The state of a stage that has one is saved after each sample, with its answers
-    /// and before they are sent.
-    const HAS_STATE: bool = false;
+    /// Whether its answers depend on earlier samples, which it knows from its parameters and files when it starts. A stage
+    /// without state answers each sample with one of the same number, and would answer it the same way again. The state of a
+    /// stage that has one is saved after each sample, with its answers and before they are sent.
+    fn has_state(&self) -> bool {
+        false
+    }
 
     /// Answers a sample that arrived at `now_nanos` (CLOCK_BOOTTIME).
     fn answer(
@@ -166,7 +168,7 @@ where
 
 /// The saved part of an instance: the last sample that its state includes, and the answers that readers may still need. The
 /// bytes of the stage's own state follow.
-#[derive(Default, Deserialize)]
+#[derive(Deserialize)]
 struct Snapshot {
     last: Option<SampleId>,
     counts: InputCounts,
@@ -178,6 +180,8 @@ struct Instance<S: Stage> {
     operator: Operator,
     identity: BTreeMap<String, String>,
     stage: S,
+    /// [`Stage::has_state`] at the start.
+    has_state: bool,
     subscriber: Subscriber<S::In>,
     partners: Partners,
     publisher: Publisher<S::Out>,
@@ -282,10 +286,12 @@ pub fn run<S: Stage + 'static>(
     identity: BTreeMap<String, String>,
     stage: S,
 ) -> anyhow::Result<()> {
+    let has_state = stage.has_state();
     let mut instance = Instance {
         operator: operator.clone(),
         identity,
         stage,
+        has_state,
         subscriber: operator.subscriber(input)?,
         partners: Partners { inputs: operator.partners(), waiting: None, n_without: 0 },
         publisher: operator.publisher(output, max_items)?,
@@ -300,7 +306,7 @@ pub fn run<S: Stage + 'static>(
         last_look: Instant::now(),
         is_drained: false,
     };
-    if S::HAS_STATE {
+    if has_state {
         operator.reserve_state()?;
     }
     if instance.is_active {
@@ -323,7 +329,7 @@ impl<S: Stage> Task for Instance<S> {
     }
 
     fn begin(&mut self) {
-        self.operator.ready_with(std::mem::take(&mut self.identity), S::HAS_STATE);
+        self.operator.ready_with(std::mem::take(&mut self.identity), self.has_state);
     }
 
     fn step(&mut self) -> anyhow::Result<Turn> {
@@ -453,9 +459,10 @@ impl<S: Stage> Instance<S> {
             if self.publish(Some(header))? == Sent::GaveWay {
                 // Another instance finds the sample in its own queue; this one finds it here if it is active again, or
                 // still is. A saved state includes the sample.
-                match S::HAS_STATE {
-                    true => self.uncommitted = Some(header),
-                    false => self.subscriber.put_back(sample),
+                if self.has_state {
+                    self.uncommitted = Some(header);
+                } else {
+                    self.subscriber.put_back(sample);
                 }
                 return Ok(Sent::GaveWay);
             }
@@ -500,7 +507,7 @@ impl<S: Stage> Instance<S> {
     fn skip(&mut self, header: &Header) -> anyhow::Result<()> {
         tracing::error!("sample {} is not answered: it has killed this operator again and again", header.seq);
         self.last = Some(sample_id(header));
-        if S::HAS_STATE {
+        if self.has_state {
             self.save()?;
         }
         self.subscriber.commit(header);
@@ -518,7 +525,7 @@ impl<S: Stage> Instance<S> {
             let header = S::Out::header_mut(head);
             header.made_by = self.operator.made_by(answered.map_or(header.made_by, |answered| answered.made_by));
         }
-        if S::HAS_STATE {
+        if self.has_state {
             self.last = answered.as_ref().map(sample_id).or(self.last);
             for (head, items) in self.answers.iter() {
                 self.outbox.push(&head, items)?;
@@ -560,7 +567,7 @@ impl<S: Stage> Instance<S> {
     fn stand_by(&mut self, input: &str, output: &str, max_items: usize) -> anyhow::Result<()> {
         let snapshot = self.restore()?;
         let (mut subscriber, publisher) = (self.operator.onlooker(input)?, self.operator.shadow(output, max_items)?);
-        if let Some(last) = snapshot.last {
+        if let Some(last) = snapshot.and_then(|snapshot| snapshot.last) {
             subscriber.look_on_from(last);
         }
         self.shadow = Some(Shadow { subscriber, publisher, n_samples: 0 });
@@ -600,27 +607,34 @@ impl<S: Stage> Instance<S> {
         self.uncommitted = None;
         self.partners.take_over();
         let known = self.publisher.known(is_handed_over);
-        self.last = if S::HAS_STATE {
-            let snapshot = self.restore()?;
+        if !self.has_state {
+            // Whoever has a state after this instance must not go on with an older one.
+            self.operator.forget_state();
+        }
+        if let Some(snapshot) = self.restore()? {
             self.subscriber.take_over_at(snapshot.last, snapshot.counts);
             self.outbox.restore(snapshot.outbox, known);
-            snapshot.last
+            self.last = snapshot.last;
         } else {
+            // The instance before had no state, and has answered each sample under its number.
             self.subscriber.take_over(known);
-            known
-        };
+            self.outbox = Outbox::new();
+            self.last = known;
+        }
         Ok(())
     }
 
-    fn restore(&mut self) -> anyhow::Result<Snapshot> {
-        let Some(bytes) = self.operator.saved_state().filter(|_| S::HAS_STATE) else {
+    /// Takes over the saved state; `None` if the stage has none or no state was saved, so that it begins anew.
+    fn restore(&mut self) -> anyhow::Result<Option<Snapshot>> {
+        let saved = if self.has_state { self.operator.saved_state() } else { None };
+        let Some(bytes) = saved else {
             self.stage.restore(None)?;
-            return Ok(Snapshot::default());
+            return Ok(None);
         };
         let (snapshot, n_bytes) = bincode::serde::decode_from_slice::<Snapshot, _>(&bytes, STATE_FORMAT)
             .context("the node's saved state cannot be read")?;
         self.stage.restore(Some(&bytes[n_bytes..]))?;
-        Ok(snapshot)
+        Ok(Some(snapshot))
     }
 }
 

@@ -303,8 +303,8 @@ pub enum Report {
         /// under `hand`.
         #[serde(default)]
         identity: BTreeMap<String, String>,
-        /// Its answers depend on earlier samples, so that it cannot take the place of an operator that declares
-        /// [`answers_each`](crate::description::OperatorDescription::answers_each).
+        /// Its answers depend on earlier samples. It may take the place of an operator that
+        /// [answers each](crate::description::OperatorDescription::answers_each) sample only if it does so as well.
         #[serde(default)]
         has_state: bool,
         /// How far it is restricted, where the wiring asks for a sandbox.

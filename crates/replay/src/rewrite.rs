@@ -215,10 +215,11 @@ fn ids<'a>(nodes: impl IntoIterator<Item = &'a Node>) -> String {
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeMap;
-    use std::path::{Path, PathBuf};
+    use std::path::Path;
 
     use super::*;
     use blindgrasp_graph::dataflow;
+    use blindgrasp_graph::operators::Operators;
     use blindgrasp_messages::{ContactSet, LiftDecision, Prediction, TactileFrame};
 
     const CHAIN: &str = "  camera:\n  contacts:\n    inputs: {in: {from: camera/frames, policy: latest}}\n  \
@@ -228,8 +229,7 @@ mod tests {
         let text = format!("version: 1\nname: g\noperators:\n{nodes}");
         let file = dataflow::parse(Path::new("g.yaml"), text.as_bytes()).expect("a file");
         let programs = ["camera", "other_camera", "robot", "contacts", "judge", "arbiter", "fusion"];
-        let shipped: BTreeMap<String, Program> =
-            programs.iter().map(|name| (name.to_string(), PathBuf::from(name).into())).collect();
+        let shipped = Operators::in_folder(Path::new(""), &programs);
         let describe = |program: &Path, _: &[String]| {
             let name = program.to_str().expect("UTF-8");
             let it = OperatorDescription::new(name, "");

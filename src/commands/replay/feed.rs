@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use serde_json::{Map, Value, json};
 
+use super::super::graph_file::shipped;
 use blindgrasp_graph::dataflow::{Graph, Node, Override, Program, accept_param_value};
-use blindgrasp_graph::describe::{describe, shipped};
+use blindgrasp_graph::describe::describe;
 use blindgrasp_graph::plan::Port;
 use blindgrasp_graph::run::observed_topics;
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, TactileFrame};
@@ -82,7 +83,7 @@ impl Feed<'_> {
     }
 
     fn player(&self, replaced: &Replaced, topic: &str) -> anyhow::Result<Player> {
-        let program = shipped()?.remove(PLAYER).context("the operator recorded_source is missing")?;
+        let program = shipped()?.get(PLAYER).cloned().context("the operator recorded_source is missing")?;
         let program = Program { args: program.args_with(&[replaced.played_port.to_string()]), ..program };
         let description = describe(&program.path, &program.args)
             .map_err(|error| anyhow::anyhow!("the operator {PLAYER} cannot be used: {error}"))?;

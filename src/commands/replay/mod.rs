@@ -11,10 +11,10 @@ use clap::Args;
 use serde_json::{Value, json};
 
 pub(super) use self::feed::{Fed, Feed};
+use super::graph_file::{OnMisfit, fitting};
 use super::recording_arguments::RecordingArguments;
 use super::{Outcome, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};
-use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_replay::selection::{GraspIds, Selection};
@@ -81,7 +81,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         bail!("--from is {} s and --to {} s: expected an earlier --from", from as f64 / 1e9, to as f64 / 1e9);
     }
     let file = dataflow::load(&arguments.dataflow)?;
-    let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, dataflow::Scope::Everything, describe)?;
+    let graph = fitting(&file, &arguments.overrides, dataflow::Scope::Everything, OnMisfit::Warn)?;
     let name = arguments.name.as_deref().unwrap_or(&graph.name);
     if !dataflow::is_name(name) {
         bail!("--name '{name}': expected letters, digits, _ and -, at most 32");

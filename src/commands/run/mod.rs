@@ -6,16 +6,16 @@ use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 
 use self::page::Page;
+use super::graph_file::{OnMisfit, fitting, shipped};
 use super::recording_arguments::RecordingArguments;
 use super::view::Rights;
 use super::{Outcome, background, check, secs_in, stop_requests};
 use blindgrasp_bridge::local::{Placement, local_graph};
 use blindgrasp_graph::dataflow::{self, Graph, Override, Scope};
-use blindgrasp_graph::describe::{describe, link_program, shipped};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_graph::log::LogFormat;
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -48,6 +48,12 @@ pub(super) struct Arguments {
     /// The value takes the place of the file's. A path is relative to the current folder.
     #[arg(long = "set", value_name = "[NODE.]PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
+    /// Start although nothing can be lifted
+    ///
+    /// A graph is refused if arbiter, model and hand do not fit together: the model does not judge the arbiter's probe, or was
+    /// trained for another hand, or encoder and classifier have different models. With this it is a warning.
+    #[arg(long)]
+    allow_mismatch: bool,
     /// Print JSON, one line a decision, and a last one with "summary"
     #[arg(long)]
     json: bool,
@@ -170,11 +176,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if arguments.check {
         let (dataflow, overrides) = (arguments.dataflow.clone(), arguments.overrides.clone());
         let (machine, json) = (arguments.machines.machine.clone(), arguments.json);
-        return check::run(&check::Arguments { dataflow, overrides, machine, json });
+        let allow_mismatch = arguments.allow_mismatch;
+        return check::run(&check::Arguments { dataflow, overrides, machine, allow_mismatch, json });
     }
     let file = dataflow::load(&arguments.dataflow)?;
     let scope = arguments.machines.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
-    let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, scope, describe)?;
+    let on_misfit = if arguments.allow_mismatch { OnMisfit::Warn } else { OnMisfit::Refuse };
+    let graph = fitting(&file, &arguments.overrides, scope, on_misfit)?;
     let name = running_name(arguments, &graph)?;
     let name = name.as_str();
     // Every mistake is reported before the graph goes into the background.
@@ -241,7 +249,9 @@ fn part_of(arguments: &Arguments, graph: &Graph, machine: &str) -> anyhow::Resul
         connect: arguments.machines.connect.clone(),
         keys: arguments.machines.keys.as_deref().map(std::path::absolute).transpose()?,
     };
-    Ok(local_graph(graph, &placement, &link_program()?)?)
+    let operators = shipped()?;
+    let link = operators.link().context("this program has no link to other machines")?;
+    Ok(local_graph(graph, &placement, link)?)
 }
 
 /// Two runs on a machine begin at different times; runs on two machines may have the same number.

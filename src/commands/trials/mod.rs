@@ -73,8 +73,8 @@ pub(super) struct Arguments {
     /// Print all options with their defaults and what they mean, as YAML, and stop.
     #[arg(long)]
     print_options: bool,
-    /// The dataflow file. One of its nodes reports the outcomes of lifts, as simulated_hand does.
-    #[arg(long, default_value = "dataflow-trials.yaml")]
+    /// The dataflow file. Its variable SOURCE is simulated_hand; one of its nodes must report the outcomes of lifts, as that does.
+    #[arg(long, default_value = "dataflow-live.yaml")]
     dataflow: PathBuf,
     /// Name of the running graph; default: the file's.
     #[arg(long)]

@@ -4,14 +4,19 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
+use super::super::graph_file::{OnMisfit, checked, fitting};
 use super::{Arguments, Way};
 use blindgrasp_graph::dataflow::{self, DataflowFile, Graph, Node, Override, Scope};
-use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_messages::{LiftOutcome, Recorded};
 use blindgrasp_simulator::trial::{Probe, TrialOptions};
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
+
+/// The source of trials, where a file has the variable `SOURCE`.
+const SOURCE: &str = "simulated_hand";
+/// While the hand waits for a decision nothing moves, and a simulation on a busy machine may take its time.
+const LEAST_MAX_AGE_MS: f64 = 5000.0;
 
 /// The hand of a node that names none.
 const DEFAULT_HAND: &str = "barrett-bh8-280";
@@ -38,22 +43,28 @@ pub(super) struct Setup {
 impl Setup {
     /// Reads the file and finds the node whose outcomes are counted.
     pub(super) fn new(arguments: &Arguments) -> anyhow::Result<Setup> {
-        let file = dataflow::load(&arguments.dataflow)?;
-        let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, Scope::Everything, describe)?;
+        let file = dataflow::load_with(&arguments.dataflow, &[("SOURCE", SOURCE)])?;
+        let graph = checked(&file, &arguments.overrides, Scope::Everything)?;
         if graph.machines.is_some() {
             bail!("{}: trials run on one machine, and the file names several", arguments.dataflow.display());
         }
         let tries = |node: &&Node| node.outputs().iter().any(|output| output.type_name == LiftOutcome::TYPE_NAME);
         let node = graph.nodes.iter().find(tries).with_context(|| {
             format!(
-                "{}: no node reports the outcomes of lifts; expected a node like simulated_hand in dataflow-trials.yaml, \
-                 which 'blindgrasp init DIR' writes",
+                "{}: no node reports the outcomes of lifts; expected a source with run: ${{SOURCE:-…}} and the input \
+                 decision?, as in the dataflow-live.yaml that 'blindgrasp init DIR' writes",
                 arguments.dataflow.display()
             )
         })?;
         let set =
             |node: &str, param: &str, text: String| Override { node: Some(node.into()), param: param.into(), text };
         let mut overrides = arguments.overrides.clone();
+        for judge in &graph.nodes {
+            let is_short = judge.params.get("max_age_ms").is_some_and(|age| age.as_f64() < Some(LEAST_MAX_AGE_MS));
+            if is_short && !overrides.iter().any(|set| set.is_of(&judge.id) && set.param == "max_age_ms") {
+                overrides.push(set(&judge.id, "max_age_ms", LEAST_MAX_AGE_MS.to_string()));
+            }
+        }
         if let Some(set) = overrides.iter().find(|set| set.is_of(&node.id) && own_option(&set.param).is_some()) {
             bail!("--set {set}: use {} instead", own_option(&set.param).unwrap_or_default());
         }
@@ -107,7 +118,7 @@ impl Setup {
         let mut overrides = self.overrides.clone();
         let text = if way.obeys { "on" } else { "off" };
         overrides.push(Override { node: Some(self.node.clone()), param: "gate".into(), text: text.into() });
-        Ok(dataflow::check(&self.file, &shipped()?, &overrides, Scope::Everything, describe)?)
+        fitting(&self.file, &overrides, Scope::Everything, OnMisfit::Refuse)
     }
 }
 

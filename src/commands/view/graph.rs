@@ -17,7 +17,6 @@ use super::{Format, GraphArguments};
 use blindgrasp_graph::client::pick_graph;
 use blindgrasp_graph::control::NodeState;
 use blindgrasp_graph::dataflow::{self, EdgeOptions, Graph, Machines, Override, Restart, RestartPolicy, Scope};
-use blindgrasp_graph::describe::{describe, shipped};
 use blindgrasp_graph::log::printable;
 use blindgrasp_graph::plan::is_needed;
 use blindgrasp_operator::wiring::EdgePolicy;
@@ -131,7 +130,7 @@ fn svg(dot: &str) -> anyhow::Result<String> {
 
 fn checked(file: &Path, overrides: &[Override], scope: Scope) -> anyhow::Result<Graph> {
     let file = dataflow::load(file)?;
-    Ok(dataflow::check(&file, &shipped()?, overrides, scope, describe)?)
+    super::super::graph_file::checked(&file, overrides, scope)
 }
 
 fn file_picture(graph: &Graph) -> Picture {

@@ -1,6 +1,6 @@
 //! Checks the file against the descriptions of its operators: programs, edges, params, cycles.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
@@ -18,7 +18,8 @@ use crate::dataflow::program::Program;
 use crate::dataflow::scope::{Scope, UNKNOWN_VERSION, make_up, without_files};
 use crate::dataflow::settings::{Override, absolute, check_overrides, check_params, check_shared};
 use crate::dataflow::yaml::Text;
-use crate::describe::{GROUPABLE, program_on_path};
+use crate::describe::program_on_path;
+use crate::operators::Operators;
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::param::{ParamDescription, ParamKind};
 use blindgrasp_operator::text::{did_you_mean, quote};
@@ -41,7 +42,7 @@ pub(super) struct Operator {
 
 /// Checks a dataflow file against its operators' descriptions.
 ///
-/// `shipped` are the operators that a bare name can mean, with their programs. `overrides` take the place of values in
+/// `operators` are those that a bare name can mean. `overrides` take the place of values in
 /// the file. `scope` says whether all programs and files must be there, or those of one machine's nodes. `describe`
 /// asks a program with its arguments for its description (`--describe` after them, then
 /// [`OperatorDescription::from_json`]) and is called once for each program with the same arguments; its error follows
@@ -51,7 +52,7 @@ pub(super) struct Operator {
 /// Every mistake of the file and the overrides that does not follow from another mistake.
 pub fn check(
     file: &DataflowFile,
-    shipped: &BTreeMap<String, Program>,
+    operators: &Operators,
     overrides: &[Override],
     scope: Scope<'_>,
     describe: impl FnMut(&Path, &[String]) -> Result<OperatorDescription, String>,
@@ -60,7 +61,7 @@ pub fn check(
     scope.check(file, &mut diagnostics);
     // The parent of a file is a folder; of "/" it is nothing, but that was not read as a file.
     let folder = file.absolute_path.parent().unwrap_or(Path::new("/"));
-    let resolved = resolve(file, shipped, scope, folder, describe, &mut diagnostics);
+    let resolved = resolve(file, operators, scope, folder, describe, &mut diagnostics);
 
     let mut nodes = Vec::with_capacity(resolved.len());
     for node in &resolved {
@@ -108,7 +109,7 @@ pub fn check(
     scope.check_overrides(overrides, &file.nodes, &mut diagnostics);
     check_crossings(file, &nodes, &mut diagnostics);
     check_polling(file, scope, &mut diagnostics);
-    check_groups(file, &nodes, shipped, &mut diagnostics);
+    check_groups(file, &nodes, operators, &mut diagnostics);
     let levels = levels(&resolved, &mut diagnostics);
 
     if diagnostics.len() > 0 {
@@ -121,25 +122,18 @@ pub fn check(
 
 /// The nodes of a group share a process: blindgrasp must know their operators, and what holds for the process must be said of
 /// all of them.
-fn check_groups(
-    file: &DataflowFile,
-    nodes: &[Node],
-    shipped: &BTreeMap<String, Program>,
-    diagnostics: &mut Diagnostics,
-) {
+fn check_groups(file: &DataflowFile, nodes: &[Node], operators: &Operators, diagnostics: &mut Diagnostics) {
     for node in nodes {
         let Some(group) = &node.process.group else {
             continue;
         };
         let at = file.nodes.iter().find(|entry| entry.id.text == node.id).map(|entry| entry.group_at);
-        let is_known = GROUPABLE.contains(&node.description.operator.as_str())
-            && shipped.values().any(|program| program.path == node.program);
         let mut others =
             nodes.iter().filter(|other| other.process.group.as_ref() == Some(group) && other.id != node.id);
         let of_process = |node: &Node| (node.process.clone(), node.sandbox, node.memory_max_mib, node.machine.clone());
-        if !is_known {
+        if !operators.can_share_process(&node.program, &node.args) {
             let message = format!("node {}: its operator cannot share a process with others", quote(&node.id));
-            let help = format!("the operators that can: {}", GROUPABLE.join(", "));
+            let help = format!("the operators that can: {}", operators.sharing_names());
             diagnostics.push_with_help(at, message, Some(help));
         } else if let Some(other) = others.clone().find(|other| of_process(other) != of_process(node)) {
             let message = format!(
@@ -180,7 +174,7 @@ fn check_polling(file: &DataflowFile, scope: Scope<'_>, diagnostics: &mut Diagno
 /// Finds the program of each node and asks it for its description.
 fn resolve<'a>(
     file: &'a DataflowFile,
-    shipped: &BTreeMap<String, Program>,
+    operators: &Operators,
     scope: Scope<'_>,
     folder: &Path,
     mut describe: impl FnMut(&Path, &[String]) -> Result<OperatorDescription, String>,
@@ -194,7 +188,7 @@ fn resolve<'a>(
         let is_elsewhere = scope.elsewhere(entry).is_some();
         let diagnostics = if is_elsewhere { &mut unreported } else { &mut *diagnostics };
         let operator = entry.run.as_ref().and_then(|run| {
-            let program = find_program(run, entry, folder, shipped, diagnostics)?;
+            let program = find_program(run, entry, folder, operators, diagnostics)?;
             let program = Program { args: program.args_with(&entry.args), ..program };
             // Before it runs for the first time, at `--describe`.
             if let (false, Err(error)) = (is_elsewhere, entry.pins().check_program(&program.path)) {
@@ -256,11 +250,11 @@ fn find_program(
     run: &Text,
     entry: &NodeEntry,
     folder: &Path,
-    shipped: &BTreeMap<String, Program>,
+    operators: &Operators,
     diagnostics: &mut Diagnostics,
 ) -> Option<Program> {
     if !run.text.contains('/') {
-        if let Some(program) = shipped.get(&run.text) {
+        if let Some(program) = operators.get(&run.text) {
             return Some(program.clone());
         }
         if entry.is_damaged && run.at == entry.id.at {
@@ -272,10 +266,8 @@ fn find_program(
         if let Some(program) = program_on_path(&run.text).filter(|_| is_written) {
             return Some(program.into());
         }
-        let known = || shipped.keys().map(String::as_str);
-        let similar = did_you_mean(&run.text, known()).map_or(String::new(), |similar| format!("{similar} "));
         let on_path = if is_written { "; no program of this name is on PATH" } else { "" };
-        let help = format!("{similar}{}{on_path}; a path to a program has a '/'", list("operators", known()));
+        let help = format!("{}{on_path}; a path to a program has a '/'", operators.help_for(&run.text));
         diagnostics.push_with_help(run.at, format!("unknown operator {}", quote(&run.text)), Some(help));
         return None;
     }
@@ -303,7 +295,7 @@ fn check_inputs(node: &ResolvedNode, resolved: &[ResolvedNode], diagnostics: &mu
     let mut connected = HashMap::new();
     for input in &entry.inputs {
         let port = ports.and_then(|ports| find_port(ports, &input.port.text));
-        if let (Some(ports), None) = (ports, port) {
+        if let (Some(ports), None, false) = (ports, port, input.is_left_out_without_port) {
             let help = did_you_mean_or_list(&input.port.text, "inputs", port_names(ports));
             let message = format!("unknown input {} of {node_name}", quote(&input.port.text));
             diagnostics.push_with_help(input.port.at, message, help);

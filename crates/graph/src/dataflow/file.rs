@@ -54,6 +54,11 @@ impl DataflowFile {
         &self.path
     }
 
+    /// Where a node stands in it.
+    pub fn position_of(&self, node: &str) -> Option<Position> {
+        self.nodes.iter().find(|entry| entry.id.text == node).map(|entry| entry.id.at)
+    }
+
     /// The machines that it names, in its order; none if all operators run on one.
     pub fn machines(&self) -> Vec<&str> {
         self.machines.iter().flat_map(MachinesEntry::names).collect()
@@ -66,8 +71,16 @@ impl DataflowFile {
 /// When the file cannot be read, is larger than 1 MiB, is not UTF-8, is not YAML without anchors, aliases and tags, is
 /// of another version, or is no mapping. Other mistakes are left to [`crate::dataflow::check()`].
 pub fn load(path: &Path) -> Result<DataflowFile, DataflowError> {
+    load_with(path, &[])
+}
+
+/// As [`load`], with these variables, which come before those of the environment.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_with(path: &Path, variables: &[(&str, &str)]) -> Result<DataflowFile, DataflowError> {
     match read(path) {
-        Ok(bytes) => parse(path, &bytes),
+        Ok(bytes) => parse_with(path, &bytes, variables),
         Err(error) => {
             let mut diagnostics = Diagnostics::new(path);
             let is_absent = error.kind() == std::io::ErrorKind::NotFound;
@@ -83,8 +96,12 @@ pub fn load(path: &Path) -> Result<DataflowFile, DataflowError> {
 /// # Errors
 /// As [`load`].
 pub fn parse(path: &Path, content: &[u8]) -> Result<DataflowFile, DataflowError> {
+    parse_with(path, content, &[])
+}
+
+fn parse_with(path: &Path, content: &[u8], variables: &[(&str, &str)]) -> Result<DataflowFile, DataflowError> {
     let mut diagnostics = Diagnostics::new(path);
-    match read_file(path, content, &mut diagnostics) {
+    match read_file(path, content, variables, &mut diagnostics) {
         Some(content) => {
             let Written { absolute_path, name, params, nodes, machines, link, is_for_one_machine } = content;
             Ok(DataflowFile {
@@ -110,7 +127,12 @@ fn read(path: &Path) -> std::io::Result<Vec<u8>> {
     Ok(content)
 }
 
-fn read_file(path: &Path, content: &[u8], diagnostics: &mut Diagnostics) -> Option<Written> {
+fn read_file(
+    path: &Path,
+    content: &[u8],
+    variables: &[(&str, &str)],
+    diagnostics: &mut Diagnostics,
+) -> Option<Written> {
     if content.len() > MAX_FILE_BYTES {
         diagnostics.push(None, "larger than 1 MiB, so it is not a dataflow file");
         return None;
@@ -123,7 +145,11 @@ fn read_file(path: &Path, content: &[u8], diagnostics: &mut Diagnostics) -> Opti
         .ok()?;
     let mut root = yaml::parse(text, diagnostics)?;
     let n_before = diagnostics.len();
-    fill_in(&mut root, &|name| std::env::var(name).ok(), diagnostics);
+    let variable = |name: &str| match variables.iter().find(|(known, _)| *known == name) {
+        Some((_, value)) => Some((*value).to_owned()),
+        None => std::env::var(name).ok(),
+    };
+    fill_in(&mut root, &variable, diagnostics);
     if diagnostics.len() > n_before {
         // A value that is not known would be a second mistake.
         return None;

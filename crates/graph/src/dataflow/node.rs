@@ -89,6 +89,8 @@ pub(super) struct PinEntry {
 #[derive(Debug, Clone)]
 pub(super) struct InputEntry {
     pub(super) port: Text,
+    /// Written with a '?' behind the port: it is left out if the operator has no such input.
+    pub(super) is_left_out_without_port: bool,
     /// `None` without the form node/port.
     pub(super) source: Option<Source>,
     pub(super) edge: EdgeOptions,
@@ -160,10 +162,7 @@ pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntr
             "inputs" => {
                 node.inputs_at = key.at;
                 match entries_or_nothing(value, &what, diagnostics) {
-                    Some(entries) => {
-                        let inputs = entries.into_iter().map(|entry| read_input(entry, &node_name, diagnostics));
-                        node.inputs = inputs.collect();
-                    }
+                    Some(entries) => node.inputs = read_inputs(entries, &node_name, diagnostics),
                     None => node.is_damaged = true,
                 }
             }
@@ -290,14 +289,32 @@ fn read_args(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Option<
     is_right.then_some(args)
 }
 
+fn read_inputs(entries: Vec<Entry>, node_name: &str, diagnostics: &mut Diagnostics) -> Vec<InputEntry> {
+    let mut inputs: Vec<InputEntry> = Vec::with_capacity(entries.len());
+    for entry in entries {
+        let input = read_input(entry, node_name, diagnostics);
+        let port = &input.port;
+        if inputs.iter().any(|other| other.port.text == port.text) {
+            let message = format!("input {} of {node_name} is given with a '?' and without", quote(&port.text));
+            diagnostics.push_with_help(port.at, message, Some("leave one of them out".to_owned()));
+        }
+        inputs.push(input);
+    }
+    inputs
+}
+
 /// `node/port`, or a mapping with `from` and the edge's options.
 fn read_input(entry: Entry, node_name: &str, diagnostics: &mut Diagnostics) -> InputEntry {
-    let Entry { key: port, value } = entry;
+    let Entry { key: mut port, value } = entry;
+    let is_left_out_without_port = port.text.ends_with('?');
+    if is_left_out_without_port {
+        port.text.pop();
+    }
     let what = format!("input {} of {node_name}", quote(&port.text));
     let at = value.at;
     let Content::Mapping(entries) = value.content else {
         let source = read_source(&value, &port.text, &what, diagnostics);
-        return InputEntry { port, source, edge: EdgeOptions::default() };
+        return InputEntry { port, is_left_out_without_port, source, edge: EdgeOptions::default() };
     };
     let mut source = None;
     let mut edge = EdgeOptions::default();
@@ -352,7 +369,7 @@ fn read_input(entry: Entry, node_name: &str, diagnostics: &mut Diagnostics) -> I
         (None, EdgePolicy::Latest) => edge.capacity = LATEST_CAPACITY,
         (None, EdgePolicy::Lossless) => {}
     }
-    InputEntry { port, source, edge }
+    InputEntry { port, is_left_out_without_port, source, edge }
 }
 
 fn millis_from_zero(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> Option<f64> {

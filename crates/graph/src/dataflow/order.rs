@@ -37,9 +37,13 @@ pub(super) fn levels<'a>(nodes: &'a [ResolvedNode<'a>], diagnostics: &mut Diagno
 
 /// The inputs that are no feedback, as far as that is known.
 fn forward<'a>(node: &'a ResolvedNode<'a>) -> impl Iterator<Item = &'a InputEntry> {
-    let ports = node.operator.iter().flat_map(|operator| &operator.description.inputs);
-    let is_feedback = move |name: &str| ports.clone().any(|port| port.feedback && port.name == name);
-    node.entry.inputs.iter().filter(move |input| !is_feedback(&input.port.text))
+    node.entry.inputs.iter().filter(|input| match &node.operator {
+        None => true,
+        Some(operator) => match operator.description.inputs.iter().find(|port| port.name == input.port.text) {
+            None => !input.is_left_out_without_port,
+            Some(port) => !port.feedback,
+        },
+    })
 }
 
 impl<'a> Search<'a, '_> {

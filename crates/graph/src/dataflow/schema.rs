@@ -83,7 +83,12 @@ fn of_operator(operator: &OperatorDescription) -> Value {
     let mut of = json!({
         "properties": {
             "params": {"properties": params.collect::<Map<_, _>>(), "additionalProperties": false},
-            "inputs": {"properties": inputs.collect::<Map<_, _>>(), "additionalProperties": false, "required": required},
+            "inputs": {
+                "properties": inputs.collect::<Map<_, _>>(),
+                "patternProperties": {"[?]$": {"description": "An input that is left out if the operator has none of the name"}},
+                "additionalProperties": false,
+                "required": required,
+            },
         },
     });
     if !required.is_empty() {

@@ -159,7 +159,11 @@ pub(super) fn check_params(
 
     let mut params = Map::new();
     for param in descriptions {
-        let value = if let Some(set) = overrides().find(|set| set.param == param.name) {
+        let set = overrides().find(|set| set.param == param.name);
+        if param.optional && set.is_some_and(|set| param.kind.is_left_out(&set.text)) {
+            continue;
+        }
+        let value = if let Some(set) = set {
             let accepted = accept_text(param, &set.text, &of, Path::new(""));
             accepted.map_err(|Refusal { message, help }| diagnostics.push_of_setting(set, message, help)).ok()
         } else if let Some(Entry { value, .. }) = given().find(|given| given.key.text == param.name) {

@@ -1,6 +1,5 @@
 //! Every mistake that a dataflow file can have, with the place and words in which it is reported.
 
-use std::collections::BTreeMap;
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
@@ -9,6 +8,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use serde_json::json;
 
 use super::*;
+use crate::operators::Operators;
 
 mod machines;
 mod settings;
@@ -123,10 +123,9 @@ impl Drop for Folder {
     }
 }
 
-fn shipped() -> BTreeMap<String, Program> {
-    ["source", "contacts", "arbiter", "filter", "broken", "nonsense", "newer", "crooked"]
-        .map(|name| (name.to_owned(), Path::new("/bin").join(name).into()))
-        .into()
+fn shipped() -> Operators {
+    let names = ["source", "contacts", "arbiter", "filter", "broken", "nonsense", "newer", "crooked"];
+    Operators::in_folder(Path::new("/bin"), &names)
 }
 
 fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, String> {
@@ -739,4 +738,19 @@ fn damaged_files_give_errors_not_panics() {
         }
         attempt(text.as_bytes());
     }
+}
+
+#[test]
+fn an_input_with_a_question_mark_is_left_out_if_the_operator_has_none() {
+    let folder = Folder::new();
+    let nodes = "  source:\n    inputs: {veto?: filter/out}\n  filter:\n    inputs: {in?: source/tactile}\n";
+    let yaml = |nodes: &str| format!("version: 1\nname: g\noperators:\n{nodes}");
+    let graph = folder.check(yaml(nodes)).expect("a graph");
+    let edges: Vec<String> = graph.edges().map(|edge| format!("{} -> {}", edge.from_node, edge.to_node)).collect();
+    assert_eq!((edges, graph.nodes[0].is_source()), (vec!["source -> filter".to_owned()], true));
+    let twice = nodes.replace("{in?: source/tactile}", "{in?: source/tactile, in: source/tactile}");
+    let error = folder.errors(yaml(&twice));
+    assert!(error.contains("input 'in' of node 'filter' is given with a '?' and without"), "{error}");
+    let nowhere = nodes.replace("filter/out", "nobody/out");
+    assert!(folder.errors(yaml(&nowhere)).contains("there is no node 'nobody'"));
 }

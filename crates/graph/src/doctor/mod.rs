@@ -12,8 +12,9 @@ use rustix::process::{Resource, getrlimit};
 use serde::Serialize;
 
 use crate::client::{running_graphs, status};
-use crate::describe::{describe, shipped};
+use crate::describe::describe;
 use crate::log::LogFolder;
+use crate::operators::Operators;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::namespace::{LEAST_FREE_BYTES, SHARED_MEMORY_FOLDER, left_over};
 use blindgrasp_operator::sandbox::supported;
@@ -87,13 +88,13 @@ impl Finding {
 }
 
 /// Runs all checks, in a fraction of a second and the time of the measurement.
-pub fn examine(measurement: Measurement) -> Vec<Finding> {
+pub fn examine(measurement: Measurement, operators: &Operators) -> Vec<Finding> {
     let n_cores = std::thread::available_parallelism().map_or(1, usize::from);
     let mut findings = vec![shared_memory()];
     findings.extend(folders());
     findings.push(leftovers());
     findings.push(graphs());
-    findings.push(operators());
+    findings.push(shipped(operators));
     findings.push(cores(n_cores));
     findings.push(clock(&read("/sys/devices/system/clocksource/clocksource0/current_clocksource"), clock_cost()));
     if measurement == Measurement::TwoSeconds {
@@ -196,15 +197,9 @@ fn graphs() -> Finding {
     }
 }
 
-fn operators() -> Finding {
+fn shipped(operators: &Operators) -> Finding {
     let check = "operators";
-    let programs = match shipped() {
-        Ok(programs) => programs,
-        Err(error) => {
-            return Finding::failure(check, format!("{error}"), "start blindgrasp by a path that /proc can tell");
-        }
-    };
-    let wrong = programs.iter().filter_map(|(name, program)| {
+    let wrong = operators.iter().filter_map(|(name, program)| {
         let found = match describe(&program.path, &program.args) {
             Ok(description) if description.version == env!("CARGO_PKG_VERSION") => return None,
             Ok(description) => format!("is of version {}", description.version),
@@ -214,7 +209,7 @@ fn operators() -> Finding {
     });
     let wrong: Vec<String> = wrong.collect();
     if wrong.is_empty() {
-        return Finding::ok(check, format!("{} of version {}", programs.len(), env!("CARGO_PKG_VERSION")));
+        return Finding::ok(check, format!("{} of version {}", operators.iter().count(), env!("CARGO_PKG_VERSION")));
     }
     Finding::failure(check, wrong.join("; "), "install blindgrasp again: its program was replaced or removed")
 }
@@ -361,7 +356,7 @@ mod tests {
 
     #[test]
     fn this_machine_is_looked_at_without_leaving_anything() {
-        let findings = examine(Measurement::Skipped);
+        let findings = examine(Measurement::Skipped, &Operators::default());
         let checks: Vec<&str> = findings.iter().map(|finding| finding.check.as_str()).collect();
         for check in
             ["shared memory", "leftovers of dead graphs", "clock", "processor", "real-time kernel", "locked memory"]

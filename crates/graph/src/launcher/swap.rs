@@ -9,7 +9,8 @@
 //! 4. For its probation the old one stands by. If the new one fails, the old one takes over in the same way.
 //!
 //! The place in the stream and the saved state, if there is one, are handed over: both are with the cursors, so that
-//! handing over does not differ from coming back after a crash.
+//! handing over does not differ from coming back after a crash. A replacement with a state in the place of an operator
+//! without one begins with an empty state, at the same place in the stream; one without drops the state.
 
 use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
@@ -179,7 +180,12 @@ impl Launcher {
             }
             let mut params = serde_json::Map::new();
             for param in &node.description.params {
-                let value = match (request.set.get(&param.name), member.node.params.get(&param.name), &param.default) {
+                let asked = request.set.get(&param.name);
+                if param.optional && asked.is_some_and(|text| param.kind.is_left_out(text)) {
+                    unused.retain(|name| **name != param.name);
+                    continue;
+                }
+                let value = match (asked, member.node.params.get(&param.name), &param.default) {
                     (Some(text), _, _) => {
                         unused.retain(|name| **name != param.name);
                         accept_param(&node.description, &param.name, text, &request.folder)?
@@ -290,13 +296,12 @@ impl Launcher {
     /// that it replaces.
     fn find_mismatch(&self) -> Option<String> {
         for target in self.swap.iter().flat_map(|swap| &swap.targets) {
-            let member = &self.members[target.idx];
-            if member.node.description.answers_each && member.standby.as_ref().is_some_and(|process| process.has_state)
-            {
+            let id = &target.node.id;
+            // Without a state it answers each sample by definition.
+            let has_state = self.members[target.idx].standby.as_ref().is_some_and(|process| process.has_state);
+            if has_state && !target.node.description.answers_each && self.plan.relies_on_each_answer(id) {
                 return Some(format!(
-                    "the replacement of '{}' has a state, expected one without: other nodes rely on an answer to each sample \
-                     that depends on that sample alone; start the graph with it instead",
-                    target.node.id
+                    "the replacement of '{id}' has a state and does not say that it answers each sample, expected                      \"answers_each\": true in its description: the nodes before '{id}' rely on an answer to each sample,                      under its number; start the graph with it instead"
                 ));
             }
         }

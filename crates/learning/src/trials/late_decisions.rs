@@ -42,8 +42,8 @@ impl LateDecisions {
         let raise = match (n_stale > 0, n_undecided > 0) {
             (false, false) => return None,
             (true, false) => "lift_arbiter.max_age_ms",
-            (false, true) => "simulated_hand.decision_timeout_s",
-            (true, true) => "lift_arbiter.max_age_ms and simulated_hand.decision_timeout_s",
+            (false, true) => "decision_timeout_s",
+            (true, true) => "lift_arbiter.max_age_ms and decision_timeout_s",
         };
         Some(format!(
             "{} attempts were not lifted because this machine was too slow ({n_stale} stale, {n_undecided} without a decision \
@@ -74,9 +74,7 @@ mod tests {
         let late = LateDecisions::new(&records, &decisions);
         assert_eq!(late, LateDecisions { n_stale: 1, n_undecided: 2 });
         let advice = late.advice().expect("late");
-        for expected in
-            ["3 attempts", "1 stale, 2 without", "lift_arbiter.max_age_ms and simulated_hand.decision_timeout_s"]
-        {
+        for expected in ["3 attempts", "1 stale, 2 without", "lift_arbiter.max_age_ms and decision_timeout_s"] {
             assert!(advice.contains(expected), "{advice}");
         }
         let stale = LateDecisions { n_stale: 1, ..LateDecisions::default() };

@@ -1,5 +1,7 @@
 //! Graphs on several machines: where nodes run, how the machines are linked, what must be there on one of them.
 
+use std::collections::BTreeMap;
+
 use super::*;
 use blindgrasp_messages::{ContactSet, LiftDecision, MESSAGE_TYPES, Prediction, Recorded, TactileFrame};
 
@@ -45,8 +47,8 @@ fn describe(program: &Path, _: &[String]) -> Result<OperatorDescription, String>
     })
 }
 
-fn shipped_with(names: &[&str]) -> BTreeMap<String, Program> {
-    names.iter().map(|name| ((*name).to_owned(), Path::new("/bin").join(name).into())).collect()
+fn shipped_with(names: &[&str]) -> Operators {
+    Operators::in_folder(Path::new("/bin"), names)
 }
 
 fn check_in(folder: &Folder, yaml: &str, scope: Scope, names: &[&str], set: &[&str]) -> Result<Graph, String> {

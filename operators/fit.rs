@@ -1,0 +1,361 @@
+//! Whether arbiter, model and hand of a graph fit together, as far as params and files tell before it starts. A graph that does
+//! not fit runs and holds every grasp, and nobody would know why.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+
+use blindgrasp_graph::control::GraphStatus;
+use blindgrasp_graph::dataflow::Graph;
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::label::Label;
+use blindgrasp_stages::lift_arbiter::Probe;
+use blindgrasp_stages::model::Model;
+use serde_json::{Map, Value};
+
+/// A node, its operator, and where its samples come from.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Part {
+    pub node: String,
+    /// The name of a shipped operator; empty for a program of somebody's own.
+    pub operator: String,
+    pub params: Map<String, Value>,
+    /// The nodes that its inputs read, by input.
+    pub inputs: BTreeMap<String, String>,
+}
+
+/// The nodes of a graph.
+pub fn parts_of(graph: &Graph) -> Vec<Part> {
+    let part = |node: &blindgrasp_graph::dataflow::Node| Part {
+        node: node.id.clone(),
+        operator: shipped_operator(&node.args).into(),
+        params: node.params.clone(),
+        inputs: node.inputs.iter().map(|input| (input.port.clone(), input.from_node.clone())).collect(),
+    };
+    graph.nodes.iter().map(part).collect()
+}
+
+/// The nodes of a running graph.
+pub fn running_parts(status: &GraphStatus) -> Vec<Part> {
+    let inputs = |node: &str| {
+        let edges = status.edges.iter().filter_map(|edge| {
+            let (reader, port) = edge.to.split_once('/')?;
+            let (writer, _) = edge.from.split_once('/')?;
+            (reader == node).then(|| (port.to_owned(), writer.to_owned()))
+        });
+        edges.collect()
+    };
+    let part = |node: &blindgrasp_graph::control::NodeStatus| Part {
+        node: node.node.clone(),
+        operator: shipped_operator(&node.args).into(),
+        params: node.params.clone(),
+        inputs: inputs(&node.node),
+    };
+    status.nodes.iter().map(part).collect()
+}
+
+/// The name after `operator`, with which a program starts one that it ships.
+fn shipped_operator(args: &[String]) -> &str {
+    match args {
+        [word, name, ..] if word == "operator" => name,
+        _ => "",
+    }
+}
+
+/// A reason for which nothing would be lifted, or something by the wrong measure.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Misfit {
+    pub kind: MisfitKind,
+    pub node: String,
+    pub message: String,
+    /// What to do about it.
+    pub help: String,
+}
+
+/// What does not fit the model.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MisfitKind {
+    /// The arbiter's probe.
+    Probe,
+    /// The encoder's features.
+    Features,
+    Hand,
+    /// The source: the model's label says nothing of its lifts.
+    Label,
+}
+
+/// The outcome of the check.
+#[derive(Debug, Default)]
+pub struct Fit {
+    /// With these nothing can be lifted.
+    pub errors: Vec<Misfit>,
+    pub warnings: Vec<Misfit>,
+}
+
+/// Compares each lift arbiter with the model, the hand and the source behind it. Files that cannot be read are left to the
+/// operators, which say so; programs of somebody's own may do anything.
+pub fn check_fit(parts: &[Part]) -> Fit {
+    let mut check = Check { parts, models: BTreeMap::new(), fit: Fit::default() };
+    for arbiter in parts.iter().filter(|part| part.operator == "lift_arbiter") {
+        check.arbiter(arbiter);
+    }
+    check.fit
+}
+
+struct Check<'a> {
+    parts: &'a [Part],
+    /// By path; `None` for a file that cannot be read.
+    models: BTreeMap<PathBuf, Option<Rc<Model>>>,
+    fit: Fit,
+}
+
+impl<'a> Check<'a> {
+    fn arbiter(&mut self, arbiter: &'a Part) {
+        let Some(classifier) = self.before(arbiter, "prediction", "classifier") else {
+            return;
+        };
+        let Some(model) = self.model(classifier) else {
+            return;
+        };
+        self.probe(arbiter, classifier, &model);
+        let Some(encoder) = self.before(classifier, "feature", "encoder") else {
+            return;
+        };
+        if let Some(other) = self.model(encoder)
+            && other.dictionary_id() != model.dictionary_id()
+        {
+            self.refuse(
+                MisfitKind::Features,
+                classifier,
+                format!("its model judges other features than node '{}' makes: nothing would be lifted", encoder.node),
+                "give both the same model (params: {model: …} of the file, or --set model=…)".into(),
+            );
+        }
+        let Some(contacts) = self.before(encoder, "contacts", "contacts") else {
+            return;
+        };
+        self.hand(contacts, classifier, &model);
+        let mut source = self.part_before(contacts, "tactile");
+        while let Some(part) = source {
+            self.hand(part, classifier, &model);
+            self.label(part, classifier, &model);
+            source = if part.operator == "senses" { self.part_before(part, "tactile") } else { None };
+        }
+    }
+
+    /// The probe that the arbiter asks for, and what the model can judge.
+    fn probe(&mut self, arbiter: &Part, classifier: &Part, model: &Model) {
+        let name = arbiter.params.get("probe").and_then(Value::as_str).unwrap_or("none");
+        let Ok(probe) = serde_json::from_value::<Probe>(name.into()) else {
+            return;
+        };
+        let (phase, judge) = match probe {
+            Probe::None => ("settled", Some(&model.classifier)),
+            Probe::Squeeze => ("squeezed", model.squeezed.as_ref().map(|probe| &probe.classifier)),
+            Probe::TestLift => ("test_lifted", model.test_lifted.as_ref().map(|probe| &probe.classifier)),
+        };
+        let of = format!("the model of node '{}' ({})", classifier.node, path_of(classifier, "model").display());
+        let instead = probes_of(model);
+        match judge {
+            None => self.refuse(
+                MisfitKind::Probe,
+                arbiter,
+                format!("probe is {name}, and {of} judges no {phase} grasps: nothing would be lifted"),
+                format!("expected {instead}, or a model that was trained on lifts with that probe"),
+            ),
+            Some(judge) if judge.threshold_probability >= 1.0 => self.refuse(
+                MisfitKind::Probe,
+                arbiter,
+                format!("probe is {name}, and {of} never calls {phase} grasps stable: nothing would be lifted"),
+                format!(
+                    "expected {instead}, or a model with a threshold below 1 (blindgrasp train --threshold-probability)"
+                ),
+            ),
+            Some(_) => {}
+        }
+    }
+
+    fn hand(&mut self, part: &Part, classifier: &Part, model: &Model) {
+        if !part.params.contains_key("hand") {
+            return;
+        }
+        let path = path_of(part, "hand");
+        let Ok(hand) = Hand::load(&path) else {
+            return;
+        };
+        if hand.id() != model.hand.id {
+            self.refuse(
+                MisfitKind::Hand,
+                part,
+                format!(
+                    "its hand ({}) is not the one that the model of node '{}' was trained for, '{}': nothing would be lifted",
+                    path.display(),
+                    classifier.node,
+                    model.hand.name
+                ),
+                "expected the same hand file, unchanged, or a model trained for this hand".into(),
+            );
+        }
+    }
+
+    /// A live hand may lift an object, which the paper's label says nothing of.
+    fn label(&mut self, source: &Part, classifier: &Part, model: &Model) {
+        let is_live = source.operator == "tactile_source" && source.params.get("driver") != Some(&"recording".into());
+        if is_live && learned_from_wrench_space(model) {
+            self.fit.warnings.push(Misfit {
+                kind: MisfitKind::Label,
+                node: source.node.clone(),
+                message: format!(
+                    "its hand is real, and the model of node '{}' ({}) learned the paper's label, which does not say whether \
+                     a lifted object stays in the hand",
+                    classifier.node,
+                    path_of(classifier, "model").display()
+                ),
+                help: "expected a model that was trained on lifts (simulate --label lift)".into(),
+            });
+        }
+    }
+
+    fn refuse(&mut self, kind: MisfitKind, part: &Part, message: String, help: String) {
+        self.fit.errors.push(Misfit { kind, node: part.node.clone(), message, help });
+    }
+
+    /// The node that an input reads, if it runs this operator.
+    fn before(&self, part: &Part, input: &str, operator: &str) -> Option<&'a Part> {
+        self.part_before(part, input).filter(|before| before.operator == operator)
+    }
+
+    fn part_before(&self, part: &Part, input: &str) -> Option<&'a Part> {
+        let node = part.inputs.get(input)?;
+        self.parts.iter().find(|before| before.node == *node)
+    }
+
+    fn model(&mut self, part: &Part) -> Option<Rc<Model>> {
+        let path = path_of(part, "model");
+        let read = |path: &Path| Model::load(path).ok().map(Rc::new);
+        self.models.entry(path.clone()).or_insert_with(|| read(&path)).clone()
+    }
+}
+
+fn path_of(part: &Part, param: &str) -> PathBuf {
+    part.params.get(param).and_then(Value::as_str).unwrap_or_default().into()
+}
+
+/// The values of `probe` with which grasps can be lifted by this model.
+fn probes_of(model: &Model) -> String {
+    let mut probes = Vec::new();
+    if model.classifier.threshold_probability < 1.0 {
+        probes.push("none");
+    }
+    for (name, judge) in [("squeeze", &model.squeezed), ("test_lift", &model.test_lifted)] {
+        if judge.as_ref().is_some_and(|judge| judge.classifier.threshold_probability < 1.0) {
+            probes.push(name);
+        }
+    }
+    if probes.is_empty() { "another model".into() } else { format!("probe: {}", probes.join(" or ")) }
+}
+
+/// Whether simulated grasps taught it, labelled by the wrench space. Models of the paper's label alone do not name it.
+fn learned_from_wrench_space(model: &Model) -> bool {
+    let training = &model.training;
+    let is_simulated = training.made_by.iter().any(|made_by| made_by.starts_with("simulation of "));
+    training.labels.contains_key(&Label::WrenchSpace) || (training.labels.is_empty() && is_simulated)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn project(path: &str) -> String {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the project");
+        root.join(path).to_str().expect("UTF-8").into()
+    }
+
+    fn part(node: &str, params: &[(&str, &str)], inputs: &[(&str, &str)]) -> Part {
+        Part {
+            node: node.into(),
+            operator: node.into(),
+            params: params.iter().map(|(name, value)| (name.to_string(), Value::from(*value))).collect(),
+            inputs: inputs.iter().map(|(port, from)| (port.to_string(), from.to_string())).collect(),
+        }
+    }
+
+    /// The nodes of a gate behind a live hand.
+    fn gate(hand: &str, model: &str, probe: &str) -> Vec<Part> {
+        let (hand, model) = (project(hand), project(model));
+        vec![
+            part("tactile_source", &[("hand", &hand), ("driver", "listen")], &[]),
+            part("contacts", &[("hand", &hand)], &[("tactile", "tactile_source")]),
+            part("encoder", &[("model", &model)], &[("contacts", "contacts")]),
+            part("classifier", &[("model", &model)], &[("feature", "encoder")]),
+            part("lift_arbiter", &[("probe", probe)], &[("prediction", "classifier")]),
+        ]
+    }
+
+    const HAND: &str = "hands/barrett-bh8-280.yaml";
+    const LIFTS: &str = "models/barrett-bh8-280-lifts.json";
+    const PAPER: &str = "models/barrett-bh8-280.json";
+
+    fn only_error(parts: &[Part]) -> Misfit {
+        let mut errors = check_fit(parts).errors;
+        assert_eq!(errors.len(), 1, "{errors:?}");
+        errors.remove(0)
+    }
+
+    #[test]
+    fn graphs_that_can_lift_fit() {
+        for probe in ["none", "squeeze", "test_lift"] {
+            let fit = check_fit(&gate(HAND, LIFTS, probe));
+            assert!(fit.errors.is_empty() && fit.warnings.is_empty(), "{probe}: {fit:?}");
+        }
+        // Programs of somebody's own, and files that are not there.
+        let mut own = gate(HAND, PAPER, "test_lift");
+        own[3].operator = String::new();
+        assert!(check_fit(&own).errors.is_empty());
+        assert!(check_fit(&gate(HAND, "models/none.json", "test_lift")).errors.is_empty());
+    }
+
+    #[test]
+    fn a_probe_that_the_model_does_not_judge_is_refused() {
+        for (probe, phase) in [("squeeze", "squeezed"), ("test_lift", "test_lifted")] {
+            let Misfit { node, message, help, .. } = only_error(&gate(HAND, PAPER, probe));
+            assert_eq!(node, "lift_arbiter");
+            assert!(message.contains(&format!("judges no {phase} grasps: nothing would be lifted")), "{message}");
+            assert!(help.starts_with("expected probe: none, or a model"), "{help}");
+        }
+    }
+
+    #[test]
+    fn a_model_that_never_says_stable_without_a_probe_is_refused() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("careful.json");
+        let mut model = Model::load(Path::new(&project(LIFTS))).expect("a model");
+        model.classifier.threshold_probability = 1.0;
+        model.save(&path).expect("saved");
+        let path = path.to_str().expect("UTF-8");
+        assert!(check_fit(&gate(HAND, path, "test_lift")).errors.is_empty());
+        let Misfit { message, help, .. } = only_error(&gate(HAND, path, "none"));
+        assert!(message.contains("never calls settled grasps stable"), "{message}");
+        assert!(help.contains("probe: squeeze or test_lift"), "{help}");
+    }
+
+    #[test]
+    fn another_hand_or_another_model_of_the_encoder_is_refused() {
+        let errors = check_fit(&gate("hands/parallel-gripper.yaml", LIFTS, "test_lift")).errors;
+        let nodes: Vec<&str> = errors.iter().map(|misfit| misfit.node.as_str()).collect();
+        assert_eq!(nodes, ["contacts", "tactile_source"], "{errors:?}");
+        let mut mixed = gate(HAND, LIFTS, "test_lift");
+        mixed[2].params.insert("model".into(), project(PAPER).into());
+        assert!(only_error(&mixed).message.contains("other features than node 'encoder'"));
+    }
+
+    #[test]
+    fn the_papers_label_behind_a_live_hand_is_warned_of() {
+        let mut parts = gate(HAND, PAPER, "none");
+        let fit = check_fit(&parts);
+        assert_eq!((fit.errors.len(), fit.warnings.len()), (0, 1), "{fit:?}");
+        assert!(fit.warnings[0].message.contains("learned the paper's label"), "{fit:?}");
+        parts[0].operator = "recorded_source".into();
+        assert!(check_fit(&parts).warnings.is_empty());
+    }
+}

@@ -1,0 +1,116 @@
+//! Dataflow files with the operators of this program, checked.
+
+use anyhow::{Context, bail};
+use serde_json::Value;
+
+use blindgrasp_graph::client::status;
+use blindgrasp_graph::control::SwapRequest;
+use blindgrasp_graph::dataflow::{self, DataflowError, DataflowFile, Diagnostic, Graph, Override, Scope};
+use blindgrasp_graph::describe::describe;
+use blindgrasp_graph::operators::{Operators, running_program};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operators::fit::{Fit, Misfit, MisfitKind, Part, check_fit, parts_of, running_parts};
+use blindgrasp_operators::{SHIPPED, operators_of};
+
+/// What becomes of a graph with which nothing can be lifted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum OnMisfit {
+    Refuse,
+    Warn,
+}
+
+/// The operators that come with this program.
+pub(super) fn shipped() -> anyhow::Result<Operators> {
+    Ok(operators_of(&running_program().context("the path of this program is unknown")?))
+}
+
+/// The graph of a file, which need not be able to lift.
+pub(super) fn checked(file: &DataflowFile, overrides: &[Override], scope: Scope<'_>) -> anyhow::Result<Graph> {
+    Ok(dataflow::check(file, &shipped()?, overrides, scope, describe)?)
+}
+
+/// As [`checked`]; arbiter, model and hand are compared as well.
+pub(super) fn fitting(
+    file: &DataflowFile,
+    overrides: &[Override],
+    scope: Scope<'_>,
+    on_misfit: OnMisfit,
+) -> anyhow::Result<Graph> {
+    let graph = checked(file, overrides, scope)?;
+    let Fit { mut errors, mut warnings } = check_fit(&parts_of(&graph));
+    if on_misfit == OnMisfit::Warn {
+        warnings.append(&mut errors);
+    }
+    warnings.iter().for_each(warn);
+    let diagnostics: Vec<Diagnostic> = errors.into_iter().map(|misfit| diagnostic(file, misfit)).collect();
+    if diagnostics.is_empty() {
+        return Ok(graph);
+    }
+    Err(DataflowError { diagnostics }.into())
+}
+
+fn diagnostic(file: &DataflowFile, misfit: Misfit) -> Diagnostic {
+    let Misfit { node, message, help, .. } = misfit;
+    Diagnostic {
+        file: file.path().into(),
+        at: file.position_of(&node),
+        setting: None,
+        message: format!("node '{node}': {message}"),
+        help: Some(help),
+    }
+}
+
+/// Refuses a swap after which the arbiter could not lift any more. The launcher itself compares hands and features.
+///
+/// # Errors
+/// The graph does not answer, or the reasons.
+pub(super) fn refuse_misfit(graph: &str, request: &SwapRequest) -> anyhow::Result<()> {
+    let before = running_parts(&status(graph)?);
+    let mut after = before.clone();
+    for part in after.iter_mut().filter(|part| request.nodes.contains(&part.node)) {
+        if let Some(run) = &request.program {
+            let shipped = SHIPPED.iter().find(|shipped| run.to_str() == Some(shipped.name));
+            part.operator = shipped.map_or(String::new(), |shipped| shipped.name.into());
+        }
+        for (name, text) in &request.set {
+            let value = if name == "model" { request.folder.join(text).display().to_string() } else { text.clone() };
+            part.params.insert(name.clone(), value.into());
+        }
+    }
+    let Some(misfit) = new_misfits(&before, &after).into_iter().next() else {
+        return Ok(());
+    };
+    if request.allow_mismatch {
+        warn(&misfit);
+        return Ok(());
+    }
+    let Misfit { node, message, help, .. } = misfit;
+    bail!("not swapped: node '{node}': {message}; {help}; or say --allow-mismatch")
+}
+
+/// Warns if a node's new param keeps the arbiter from lifting.
+///
+/// # Errors
+/// The graph does not answer.
+pub(super) fn warn_of_misfit(graph: &str, node: &str, param: &str, value: &Value) -> anyhow::Result<()> {
+    let before = running_parts(&status(graph)?);
+    let mut after = before.clone();
+    for part in after.iter_mut().filter(|part| part.node == node) {
+        part.params.insert(param.into(), value.clone());
+    }
+    new_misfits(&before, &after).iter().for_each(warn);
+    Ok(())
+}
+
+/// What keeps an arbiter from lifting after a change, and did not before.
+fn new_misfits(before: &[Part], after: &[Part]) -> Vec<Misfit> {
+    let old = check_fit(before).errors;
+    let mut new = check_fit(after).errors;
+    new.retain(|misfit| misfit.kind == MisfitKind::Probe && !old.contains(misfit));
+    new
+}
+
+fn warn(misfit: &Misfit) {
+    let Misfit { node, message, help, .. } = misfit;
+    print_diagnostic(&format!("warning: node '{node}': {message}; {help}"));
+}
