@@ -1,8 +1,7 @@
 //! `blindgrasp run --check`
 
-use std::path::PathBuf;
+use std::path::Path;
 
-use clap::Args;
 use serde_json::json;
 
 use super::text_table::TextTable;
@@ -12,37 +11,16 @@ use blindgrasp_graph::dataflow::{
 };
 use blindgrasp_graph::describe::{describe, shipped};
 
-/// Check a dataflow file: the same as run --check
-///
-/// The programs of the file are run with --describe: a foreign dataflow file is code.
-#[derive(Debug, Args)]
-pub(super) struct Arguments {
-    /// Dataflow file
-    #[arg(default_value = "dataflow.yaml")]
-    pub(super) dataflow: PathBuf,
-    /// Set a parameter, as in run
-    #[arg(long = "set", value_name = "[NODE.]PARAM=VALUE", value_parser = Override::parse)]
-    pub(super) overrides: Vec<Override>,
-    /// Check the file for this machine only
-    #[arg(long)]
-    pub(super) machine: Option<String>,
-    /// Print JSON
-    #[arg(long)]
-    pub(super) json: bool,
-}
-
 /// Prints the graph with every value filled in, or its mistakes. With --json: {"graph": …}, with "crossing" edges where
 /// the file names machines, or {"errors": […]}.
-pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+pub(super) fn run(file: &Path, overrides: &[Override], scope: Scope<'_>, is_json: bool) -> anyhow::Result<Outcome> {
     let shipped = shipped()?;
-    let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
-    let checked = dataflow::load(&arguments.dataflow)
-        .and_then(|file| dataflow::check(&file, &shipped, &arguments.overrides, scope, describe));
+    let checked = dataflow::load(file).and_then(|file| dataflow::check(&file, &shipped, overrides, scope, describe));
     match &checked {
-        Ok(graph) if arguments.json => print_line(&serde_json::to_string_pretty(&as_json(graph))?)?,
+        Ok(graph) if is_json => print_line(&serde_json::to_string_pretty(&as_json(graph))?)?,
         Ok(graph) => print_graph(graph)?,
         // The mistakes go to stderr as well.
-        Err(error) if arguments.json => print_line(&serde_json::to_string_pretty(&errors(error))?)?,
+        Err(error) if is_json => print_line(&serde_json::to_string_pretty(&errors(error))?)?,
         Err(_) => {}
     }
     checked?;

@@ -542,6 +542,6 @@ fn a_driver_without_what_it_needs_is_refused_by_name() {
 
 #[test]
 fn the_live_graph_that_comes_with_the_project_is_sound() {
-    let output = run(&["check", "dataflow-live.yaml"], 0);
+    let output = run(&["run", "--check", "dataflow-live.yaml"], 0);
     assert!(text(&output.stdout).contains("tactile_source/tactile"), "{}", text(&output.stdout));
 }

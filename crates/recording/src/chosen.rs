@@ -120,15 +120,7 @@ impl ChosenSamples {
 impl RawSample {
     fn new(topic: &str, sequence: u32, ours: &'static OurType, data: &[u8]) -> Result<Self, String> {
         let (header, grasp_id) = ours.decode_start(data).map_err(|what| undecodable(topic, sequence, &what))?;
-        Ok(RawSample {
-            header,
-            grasp_id,
-            topic: topic.into(),
-            schema: ours.schema,
-            sequence,
-            ours,
-            data: data.into(),
-        })
+        Ok(RawSample { header, grasp_id, topic: topic.into(), schema: ours.schema, sequence, ours, data: data.into() })
     }
 }
 

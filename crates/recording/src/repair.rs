@@ -427,8 +427,7 @@ impl Salvage {
             return;
         };
         let topic = &known.channel.topic;
-        let is_whole =
-            known.other_version.is_none() && known.ours.is_none_or(|ours| ours.decode(data).is_ok());
+        let is_whole = known.other_version.is_none() && known.ours.is_none_or(|ours| ours.decode(data).is_ok());
         if !is_whole {
             *report.n_lost.entry(topic.clone()).or_default() += 1;
             return;

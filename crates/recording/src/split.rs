@@ -36,9 +36,7 @@ impl Split {
                     record.header().epoch == *epoch && record.header().seq < *seq
                 }
                 // The grasp goes on, and these samples belong to its end.
-                Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Scene(_) => {
-                    false
-                }
+                Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Scene(_) => false,
             },
         }
     }

@@ -383,9 +383,7 @@ impl Sides<'_> {
     fn pop_found(&mut self) {
         if let Some(sample) = self.found.window.pop_front() {
             let seq = match sample.record {
-                Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) => {
-                    sample.record.header().seq
-                }
+                Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) => sample.record.header().seq,
                 _ => self.coverage.recorded_seq(&sample.header),
             };
             self.add(sample.grasp_id, seq, What::Extra);

@@ -17,8 +17,7 @@ use blindgrasp_graph::client::Connection;
 use blindgrasp_graph::control::{Reply, Request};
 use blindgrasp_graph::run::observed_topics;
 use blindgrasp_messages::{
-    ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded,
-    TactileFrame,
+    ContactSet, Fault, GraspFeature, GraspTruth, LiftDecision, LiftOutcome, Prediction, Recorded, TactileFrame,
 };
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::{Reach, Record};
@@ -52,8 +51,7 @@ pub(super) fn start(
         .flat_map(|node| node.output_ports().map(|(port, output)| (port, output.type_name.as_str())));
     let types: BTreeMap<_, _> = types.collect();
     let is_per_frame = |type_name: &&str| {
-        ![LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME, LiftOutcome::TYPE_NAME]
-            .contains(type_name)
+        ![LiftDecision::TYPE_NAME, GraspTruth::TYPE_NAME, LiftOutcome::TYPE_NAME].contains(type_name)
     };
     let topics = observed_topics(&fed.graph, true);
     let counts: BTreeMap<String, u64> = topics

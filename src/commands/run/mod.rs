@@ -170,13 +170,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         let message = "--view-control and --foxglove are for the page of the graph: add --view\n";
         clap::Error::raw(clap::error::ErrorKind::MissingRequiredArgument, message).exit();
     }
+    let scope = arguments.machines.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
     if arguments.check {
-        let (dataflow, overrides) = (arguments.dataflow.clone(), arguments.overrides.clone());
-        let (machine, json) = (arguments.machines.machine.clone(), arguments.json);
-        return check::run(&check::Arguments { dataflow, overrides, machine, json });
+        return check::run(&arguments.dataflow, &arguments.overrides, scope, arguments.json);
     }
     let file = dataflow::load(&arguments.dataflow)?;
-    let scope = arguments.machines.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
     let graph = dataflow::check(&file, &shipped()?, &arguments.overrides, scope, describe)?;
     let name = running_name(arguments, &graph)?;
     let name = name.as_str();

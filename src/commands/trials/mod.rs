@@ -63,7 +63,7 @@ pub(super) struct Arguments {
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(0..=i64::MAX as u64))]
     seed: u64,
     /// When the hand lifts: decision, as the graph decides; always, every settled grasp; both, one after the other.
-    #[arg(long, alias = "gate", default_value = "both")]
+    #[arg(long, default_value = "both")]
     lift_policy: LiftPolicy,
     /// The model instead of the dataflow file's.
     #[arg(long, value_name = "FILE")]
@@ -96,9 +96,7 @@ pub(super) struct Arguments {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum LiftPolicy {
-    #[value(alias = "on")]
     Decision,
-    #[value(alias = "off")]
     Always,
     Both,
 }
@@ -325,9 +323,7 @@ mod tests {
         for line in ["--trials 0", "--attempts 0", "--lift-policy maybe", "--seed -1", "--set trials"] {
             parsed(&format!("blindgrasp trials {line}")).expect_err(line);
         }
-        for (line, expected) in [
-            ("--record a.mcap", "--lift-policy decision"),
-        ] {
+        for (line, expected) in [("--record a.mcap", "--lift-policy decision")] {
             let arguments = parsed(&format!("blindgrasp trials {line}")).expect("a command");
             let error = run(&arguments).expect_err("contradictory").to_string();
             assert!(error.contains(expected), "{error}");

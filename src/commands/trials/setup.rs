@@ -99,17 +99,7 @@ impl Setup {
             _ => None,
         };
         let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());
-        Ok(Setup {
-            node: node.id.clone(),
-            file,
-            overrides,
-            hand,
-            friction,
-            options,
-            model,
-            prior,
-            probe,
-        })
+        Ok(Setup { node: node.id.clone(), file, overrides, hand, friction, options, model, prior, probe })
     }
 
     /// The checked graph of a way.

@@ -74,11 +74,9 @@ mod tests {
         let late = LateDecisions::new(&records, &decisions);
         assert_eq!(late, LateDecisions { n_stale: 1, n_undecided: 2 });
         let advice = late.advice().expect("late");
-        for expected in [
-            "3 attempts",
-            "1 stale, 2 without",
-            "lift_arbiter.max_age_ms and simulated_hand.decision_timeout_s",
-        ] {
+        for expected in
+            ["3 attempts", "1 stale, 2 without", "lift_arbiter.max_age_ms and simulated_hand.decision_timeout_s"]
+        {
             assert!(advice.contains(expected), "{advice}");
         }
         let stale = LateDecisions { n_stale: 1, ..LateDecisions::default() };

@@ -193,10 +193,9 @@ fn scene(snapshot: &Snapshot) -> PosedScene {
 /// The result in one paragraph.
 fn lead(report: &TrialsReport) -> String {
     let mut parts = Vec::new();
-    for (name, tallies) in [
-        ("With the gate", &report.with_gate),
-        ("With every settled grasp lifted", &report.without_gate),
-    ] {
+    for (name, tallies) in
+        [("With the gate", &report.with_gate), ("With every settled grasp lifted", &report.without_gate)]
+    {
         if let Some(total) = tallies.as_ref().map(|tallies| &tallies.total) {
             parts.push(format!(
                 "{name}, {} of {} lifts kept ({} attempts, {} of {} trials given up).",

@@ -63,10 +63,7 @@ impl TrialsReport {
 
     /// What there is to show: the ways that were run, with what columns call them.
     fn ways(&self) -> Vec<(&'static str, &Tallies)> {
-        let ways = [
-            ("with the gate", &self.with_gate),
-            ("every grasp lifted", &self.without_gate),
-        ];
+        let ways = [("with the gate", &self.with_gate), ("every grasp lifted", &self.without_gate)];
         ways.into_iter().filter_map(|(name, tallies)| Some((name, tallies.as_ref()?))).collect()
     }
 }
@@ -190,16 +187,8 @@ fn by_thing<const N: usize>(
 
 /// What lifting cost, with the gate if it was run.
 fn attempts(report: &TrialsReport) -> Table {
-    let head = [
-        "object",
-        "trials",
-        "attempts",
-        "lifts",
-        "kept",
-        "given up",
-        "attempts per lift",
-        "attempts per kept object",
-    ];
+    let head =
+        ["object", "trials", "attempts", "lifts", "kept", "given up", "attempts per lift", "attempts per kept object"];
     let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.2}"));
     let row = |tally: &Tally| {
         let Tally { n_trials, n_attempts, n_lifts, n_held, n_given_up, .. } = *tally;
