@@ -13,7 +13,6 @@ MAX_PADS = 32
 MAX_CELLS = 16384
 MAX_FEATURES = 4096
 MAX_NAME_BYTES = 64
-MAX_PROPOSALS = 32
 
 # The senses of a frame in order, each with the number of its values; None: one for each joint.
 SENSES: dict[str, int | None] = {"gravity_m_per_s2": 3, "wrist_wrench": 6, "joint_torques": None}
@@ -51,7 +50,6 @@ class Fault(enum.IntEnum):
 class Action(enum.IntEnum):
     HOLD = 0
     LIFT = 1
-    REGRASP = 2
     SQUEEZE = 3
     TEST_LIFT = 4
 
@@ -314,29 +312,13 @@ class LiftOutcomeHead(ctypes.Structure):
         ("held", ctypes.c_uint32),
         ("has_quality", ctypes.c_uint32),
         ("n_thing_bytes", ctypes.c_uint32),
-        ("advised", ctypes.c_uint32),
         ("probed", ctypes.c_uint32),
         ("disturbed", ctypes.c_uint32),
     ]
 
     @staticmethod
     def type_name() -> str:
-        return "blindgrasp/LiftOutcomeHead/3"
-
-
-class RegraspAdviceHead(ctypes.Structure):
-    """The items are the proposals: position, rotation, probability, `n_joints` joint angles each."""
-
-    _fields_ = [
-        ("header", Header),
-        ("grasp_id", ctypes.c_uint64),
-        ("n_proposals", ctypes.c_uint32),
-        ("n_joints", ctypes.c_uint32),
-    ]
-
-    @staticmethod
-    def type_name() -> str:
-        return "blindgrasp/RegraspAdviceHead/1"
+        return "blindgrasp/LiftOutcomeHead/4"
 
 
 class Message:
@@ -384,15 +366,9 @@ class GraspTruth(Message):
 
 
 class LiftOutcome(Message):
-    TYPE_NAME = "blindgrasp/LiftOutcome/3"
+    TYPE_NAME = "blindgrasp/LiftOutcome/4"
     Head = LiftOutcomeHead
     Item = ctypes.c_uint8
-
-
-class RegraspAdvice(Message):
-    TYPE_NAME = "blindgrasp/RegraspAdvice/1"
-    Head = RegraspAdviceHead
-    Item = ctypes.c_double
 
 
 MESSAGES: dict[str, type[Message]] = {message.TYPE_NAME: message for message in Message.__subclasses__()}

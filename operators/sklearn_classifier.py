@@ -80,8 +80,6 @@ def start(params):
                 answer.probability_stable = probability = next(probabilities)
                 answer.decision_value = logit(probability)
                 answer.stable = probability >= threshold
-                # As in blindgrasp's own models: neither high enough for stable nor low enough for unstable.
-                answer.unsure = model["unsure_from_probability"] <= probability < threshold
             answers.append(answer)
         return answers
 

@@ -26,18 +26,15 @@ def main():
     options.add_argument("--classifier", default="sklearn.ensemble.HistGradientBoostingClassifier")
     options.add_argument("--param", action="append", default=[], metavar="NAME=VALUE", help="a parameter of the classifier")
     options.add_argument("--calibration", choices=["sigmoid", "isotonic", "none"], default="sigmoid")
-    options.add_argument("--threshold-probability", type=float, default=0.5, help="stable from here on (0.5)")
-    options.add_argument("--unsure-from", type=float, help="unsure from here on, up to the threshold [default: never]")
+    options.add_argument("--threshold", type=float, default=0.5, help="stable from here on (0.5)")
     options.add_argument("--folds", type=int, default=5)
     options.add_argument("--seed", type=int, default=0)
     options.add_argument("--json", action="store_true", help="print JSON")
     arguments = options.parse_args()
-    threshold = arguments.threshold_probability
-    unsure_from = threshold if arguments.unsure_from is None else arguments.unsure_from
-    if not 0 < threshold <= 1 or not 0 <= unsure_from <= threshold or arguments.folds < 2:
-        options.error("expected 0 < --threshold-probability <= 1, --unsure-from from 0 up to it, --folds at least 2")
+    if not 0 < arguments.threshold <= 1 or arguments.folds < 2:
+        options.error("expected 0 < --threshold <= 1, --folds at least 2")
     try:
-        summary = train(arguments, threshold, unsure_from)
+        summary = train(arguments)
     except (OSError, ValueError, TypeError, ImportError, AttributeError) as error:
         sys.exit(f"train_sklearn.py: {error}")
     if arguments.json:
@@ -97,7 +94,7 @@ def number_or_text(text):
         return text
 
 
-def train(arguments, threshold, unsure_from):
+def train(arguments):
     # Threads that wait for each other by spinning make it many times slower on a machine that has other work.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     import joblib
@@ -119,7 +116,7 @@ def train(arguments, threshold, unsure_from):
         machine = build(arguments, folds_of(train_idx)).fit(values[train_idx], stable[train_idx])
         probabilities[test_idx] = machine.predict_proba(values[test_idx])[:, 1]
     machine = build(arguments, folds_of(everything)).fit(values, stable)
-    called = probabilities >= threshold
+    called = probabilities >= arguments.threshold
     summary = {
         "classifier": arguments.classifier,
         "n_grasps": len(stable),
@@ -134,8 +131,7 @@ def train(arguments, threshold, unsure_from):
         "hand_id": hand_id,
         "dictionary_id": dictionary_id,
         "n_values": values.shape[1],
-        "threshold_probability": threshold,
-        "unsure_from_probability": unsure_from,
+        "threshold_probability": arguments.threshold,
         "sklearn_version": sklearn.__version__,
         "training": summary,
     }

@@ -1,8 +1,7 @@
 //! `blindgrasp run --check`
 
-use std::path::PathBuf;
+use std::path::Path;
 
-use clap::Args;
 use serde_json::json;
 
 use super::graph_file::{OnMisfit, fitting};
@@ -12,41 +11,23 @@ use blindgrasp_graph::dataflow::{
     self, DataflowError, Edge, Graph, Input, Machine, Machines, Node, Override, Restart, RestartPolicy, Scope,
 };
 
-/// Check a dataflow file: the same as run --check
-///
-/// The programs of the file are run with --describe: a foreign dataflow file is code.
-#[derive(Debug, Args)]
-pub(super) struct Arguments {
-    /// Dataflow file
-    #[arg(default_value = "dataflow.yaml")]
-    pub(super) dataflow: PathBuf,
-    /// Set a parameter, as in run
-    #[arg(long = "set", value_name = "[NODE.]PARAM=VALUE", value_parser = Override::parse)]
-    pub(super) overrides: Vec<Override>,
-    /// Check the file for this machine only
-    #[arg(long)]
-    pub(super) machine: Option<String>,
-    /// Warn of a graph with which nothing can be lifted, as in run
-    #[arg(long)]
-    pub(super) allow_mismatch: bool,
-    /// Print JSON
-    #[arg(long)]
-    pub(super) json: bool,
-}
-
 /// Prints the graph with every value filled in, or its mistakes. With --json: {"graph": …}, with "crossing" edges where
 /// the file names machines, or {"errors": […]}.
-pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let on_misfit = if arguments.allow_mismatch { OnMisfit::Warn } else { OnMisfit::Refuse };
-    let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
-    let file = dataflow::load(&arguments.dataflow).map_err(anyhow::Error::from);
-    let checked = file.and_then(|file| fitting(&file, &arguments.overrides, scope, on_misfit));
+pub(super) fn run(
+    file: &Path,
+    overrides: &[Override],
+    scope: Scope<'_>,
+    on_misfit: OnMisfit,
+    is_json: bool,
+) -> anyhow::Result<Outcome> {
+    let file = dataflow::load(file).map_err(anyhow::Error::from);
+    let checked = file.and_then(|file| fitting(&file, overrides, scope, on_misfit));
     match &checked {
-        Ok(graph) if arguments.json => print_line(&serde_json::to_string_pretty(&as_json(graph))?)?,
+        Ok(graph) if is_json => print_line(&serde_json::to_string_pretty(&as_json(graph))?)?,
         Ok(graph) => print_graph(graph)?,
         Err(error) => {
             // The mistakes go to stderr as well.
-            if let Some(error) = error.downcast_ref::<DataflowError>().filter(|_| arguments.json) {
+            if is_json && let Some(error) = error.downcast_ref::<DataflowError>() {
                 print_line(&serde_json::to_string_pretty(&errors(error))?)?;
             }
         }

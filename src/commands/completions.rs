@@ -60,19 +60,12 @@ pub(super) fn outputs() -> ArgValueCandidates {
     of_status(|status| status.edges.iter().map(|edge| edge.from.clone()).collect())
 }
 
-/// NODE.PARAM
-pub(super) fn params() -> ArgValueCandidates {
-    of_status(|status| names_of_params(status, ""))
-}
-
 /// NODE.PARAM=
 pub(super) fn assignments() -> ArgValueCandidates {
-    of_status(|status| names_of_params(status, "="))
-}
-
-fn names_of_params(status: &GraphStatus, end: &str) -> Vec<String> {
-    let of = status.nodes.iter().flat_map(|node| node.params.keys().map(move |param| (&node.node, param)));
-    of.map(|(node, param)| format!("{node}.{param}{end}")).collect()
+    of_status(|status| {
+        let of = status.nodes.iter().flat_map(|node| node.params.keys().map(move |param| (&node.node, param)));
+        of.map(|(node, param)| format!("{node}.{param}=")).collect()
+    })
 }
 
 /// Words of all running graphs: the others of the command line are not known here.

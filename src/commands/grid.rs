@@ -1,7 +1,7 @@
 //! `blindgrasp train --grid`
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, bail};
 use clap::Args;
@@ -9,9 +9,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{check_new, number_in, percent, print_line, train};
 use blindgrasp_learning::training::grid::{GridReport, Search, axes_around, with_values};
-use blindgrasp_learning::training::{Examples, TrainingOptions, folds_by_object};
+use blindgrasp_learning::training::{Example, Examples, TrainingOptions, folds_by_object};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_pictures::{HeatMap, HeatMapAxis, HeatMapCell, heat_map_svg};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::training_summary::GridSummary;
 
@@ -33,9 +32,9 @@ pub(super) struct GridArguments {
     /// Depths of trees to try [default: up to two more or less than the recipe's own].
     #[arg(long, requires = "grid", value_delimiter = ',', value_parser = |text: &str| number_in(text, 1.0..=20.0))]
     grid_depth: Vec<f64>,
-    /// Where to write the result of the search: a table (.json) or a heat map (.svg). May be given twice for both.
+    /// Where to write the result of the search (JSON).
     #[arg(long, requires = "grid", value_parser = report_path)]
-    grid_report: Vec<PathBuf>,
+    grid_report: Option<PathBuf>,
 }
 
 /// Searches the grid if `--grid` is given, puts the best pair into the recipe, and returns the summary for the model.
@@ -49,7 +48,7 @@ pub(super) fn search(
     if !arguments.grid {
         return Ok(None);
     }
-    for path in &arguments.grid_report {
+    if let Some(path) = &arguments.grid_report {
         check_new(path, recordings, training.overwrite)?;
         if std::path::absolute(path).ok() == std::path::absolute(&training.out).ok() {
             bail!("{} is given for --out and for --grid-report: choose two files", path.display());
@@ -71,13 +70,15 @@ pub(super) fn search(
         axis.values.dedup();
     }
     let read = Examples::read(hand, recordings, &options.relabelling(), |_, _| {})?;
-    // The objects that the thresholds are guaranteed by must not influence the choice.
-    let (examples, _) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
+    let examples: Vec<&Example> = read.examples.iter().collect();
     let folds = folds_by_object(&examples, options.n_folds)?;
     let search =
         Search { hand, recipe: &options.recipe, axes: &axes, examples: &examples, folds: &folds, seed: options.seed };
     let report = run(&search)?;
-    arguments.grid_report.iter().try_for_each(|path| write_report(&report, path))?;
+    if let Some(path) = &arguments.grid_report {
+        let text = serde_json::to_string_pretty(&report)? + "\n";
+        std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))?;
+    }
     for point in &report.points {
         print_line(&format!(
             "{} {:<8} {} {:<8} accuracy {} ± {}, false positives {}{}{}",
@@ -120,39 +121,10 @@ fn run(search: &Search<'_>) -> anyhow::Result<GridReport> {
     Ok(report?)
 }
 
-fn write_report(report: &GridReport, path: &Path) -> anyhow::Result<()> {
-    let text = match path.extension() {
-        Some(extension) if extension == "json" => serde_json::to_string_pretty(report)? + "\n",
-        _ => heat_map_svg(&heat_map(report)),
-    };
-    std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))
-}
-
-fn heat_map(report: &GridReport) -> HeatMap {
-    let axis =
-        |idx: usize| HeatMapAxis { name: report.axes[idx].name.clone(), values: report.axes[idx].values.clone() };
-    let cells = report.points.iter().map(|point| HeatMapCell {
-        at: point.values,
-        share: point.accuracy,
-        note: format!("FP {:.1}", 100.0 * point.false_positive_share),
-        is_marked: report.best == *point,
-    });
-    HeatMap {
-        title: format!("{}: accuracy by {} and {}", report.recipe, report.axes[0].name, report.axes[1].name),
-        about: format!(
-            "{} grasps, {} folds of objects; FP: unstable grasps above decision value 0, % of all",
-            report.n_examples, report.n_folds
-        ),
-        quantity: "accuracy, %".into(),
-        axes: [axis(0), axis(1)],
-        cells: cells.collect(),
-    }
-}
-
 fn report_path(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
     match path.extension() {
-        Some(extension) if extension == "json" || extension == "svg" => Ok(path),
-        _ => Err("expected a name that ends in .json or .svg".into()),
+        Some(extension) if extension == "json" => Ok(path),
+        _ => Err("expected a name that ends in .json".into()),
     }
 }

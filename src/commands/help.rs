@@ -5,20 +5,29 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 
 /// The commands of each group, in the order of the help.
 const GROUPS: [(&str, &[&str]); 4] = [
-    ("Run", &["run", "ps", "top", "echo", "hz", "stop", "set", "param", "swap", "logs", "doctor", "diagnostics"]),
+    ("Run", &["run", "ps", "top", "echo", "stop", "set", "swap", "logs", "doctor", "diagnostics"]),
     ("Record", &["record", "replay", "test", "export", "info", "view"]),
     ("Learn", &["simulate", "import", "train", "evaluate", "predict", "trials", "reproduce", "model", "sensors"]),
     ("Describe", &["init", "new", "keys", "schema", "completions"]),
 ];
-/// Words of other tools, with the command that does it here.
-const HINTS: [(&str, &str); 22] = [
-    ("hand", "info HAND.yaml --joints NAME=VALUE"),
+/// Words that people type, with the command that does it here.
+const HINTS: [(&str, &str); 32] = [
+    ("check", "run --check"),
+    ("param", "set"),
+    ("get", "set NODE.PARAM"),
+    ("hz", "top --json -n 1"),
+    ("compare", "test"),
+    ("diff", "test"),
+    ("convert", "export"),
+    ("inspect", "info"),
+    ("serve", "view"),
+    ("ui", "view"),
+    ("dashboard", "view"),
+    ("hands", "simulate --list"),
     ("objects", "simulate --list"),
     ("quality", "info CASES.json"),
-    ("features", "export --features MODEL"),
-    ("topic", "echo', 'blindgrasp hz' or 'blindgrasp ps"),
+    ("topic", "echo', 'blindgrasp top' or 'blindgrasp ps"),
     ("node", "ps"),
-    ("get", "param get"),
     ("plot", "view"),
     ("viz", "view"),
     ("bag", "record' or 'blindgrasp replay"),
@@ -34,7 +43,27 @@ const HINTS: [(&str, &str); 22] = [
     ("validate", "run --check"),
     ("pub", "replay"),
     ("monitor", "top"),
+    ("demo", "init DIR"),
 ];
+/// Options that people type, with what does it here.
+const OPTION_HINTS: [(&str, &str); 15] = [
+    ("--dry-run", "use 'blindgrasp run --check'"),
+    ("--speed", "use 'blindgrasp replay --rate 2' for a recording, --set recorded_source.rate=2 in a graph"),
+    ("--rate", "use --set recorded_source.rate=2, or 'blindgrasp replay --rate 2' for a recording"),
+    ("-v", "set the environment variable RUST_LOG=debug"),
+    ("--verbose", "set the environment variable RUST_LOG=debug"),
+    ("--data", RECORDING_HINT),
+    ("--dataset", RECORDING_HINT),
+    ("--input", RECORDING_HINT),
+    ("--recording", RECORDING_HINT),
+    ("--model", "give the model's file without an option: blindgrasp predict MODEL RECORDING"),
+    ("--n", "use --grasps N"),
+    ("--gate", "use --lift-policy decision, always or both"),
+    ("--running", "give the graph's name without an option: blindgrasp view GRAPH --format mermaid"),
+    ("--threshold-probability", "use --threshold PROBABILITY"),
+    ("--max-false-positive-rate", "use --max-drops SHARE, for labels of lifts, or --drop-secs SECONDS"),
+];
+const RECORDING_HINT: &str = "give the recording's file without an option: blindgrasp train RECORDING --out MODEL";
 const TEMPLATE: &str = "{about-with-newline}\n{usage-heading} {usage}\n\n{before-help}Options:\n{options}{after-help}";
 
 /// The command with its subcommands listed in groups.
@@ -53,18 +82,46 @@ pub(super) fn grouped(command: Command) -> Command {
     command.help_template(TEMPLATE).before_help(list.trim_end().to_owned())
 }
 
-/// The error, with the command that is probably meant.
+/// The error, with the command or the option that is probably meant.
 pub(super) fn with_hint(mut error: clap::Error) -> clap::Error {
-    let word = match error.get(ContextKind::InvalidSubcommand) {
-        Some(ContextValue::String(word)) if error.kind() == ErrorKind::InvalidSubcommand => word.clone(),
-        _ => return error,
+    let hint = match error.kind() {
+        ErrorKind::InvalidSubcommand => command_hint(&error),
+        ErrorKind::UnknownArgument => {
+            // Clap advises to pass the option as a value, '-- --x', which is never what is meant here.
+            error.remove(ContextKind::Suggested);
+            option_hint(&error)
+        }
+        _ => None,
     };
-    if let Some((_, instead)) = HINTS.iter().find(|(other, _)| *other == word) {
+    if let Some(hint) = hint {
         error.remove(ContextKind::SuggestedSubcommand);
-        let hint = format!("use 'blindgrasp {instead}'").into();
-        error.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![hint]));
+        error.remove(ContextKind::SuggestedArg);
+        error.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![hint.into()]));
     }
     error
+}
+
+fn command_hint(error: &clap::Error) -> Option<String> {
+    let word = text_of(error, ContextKind::InvalidSubcommand)?;
+    if text_of(error, ContextKind::Usage)?.contains("blindgrasp new ") {
+        return Some(format!("use 'blindgrasp init {word}' for a project of that name"));
+    }
+    let (_, instead) = HINTS.iter().find(|(other, _)| *other == word)?;
+    Some(format!("use 'blindgrasp {instead}'"))
+}
+
+fn option_hint(error: &clap::Error) -> Option<String> {
+    let option = text_of(error, ContextKind::InvalidArg)?;
+    let (_, hint) = OPTION_HINTS.iter().find(|(other, _)| *other == option)?;
+    Some((*hint).into())
+}
+
+fn text_of(error: &clap::Error, kind: ContextKind) -> Option<String> {
+    match error.get(kind)? {
+        ContextValue::String(text) => Some(text.clone()),
+        ContextValue::StyledStr(text) => Some(text.to_string()),
+        _ => None,
+    }
 }
 
 #[cfg(test)]
@@ -90,12 +147,30 @@ mod tests {
     }
 
     #[test]
-    fn words_of_other_tools_are_answered_with_the_command_here() {
-        for (word, expected) in [("plot", "use 'blindgrasp view'"), ("quality", "use 'blindgrasp info CASES.json'")] {
-            let error = grouped(Cli::command()).try_get_matches_from(["blindgrasp", word]).expect_err("no command");
+    fn words_that_people_type_are_answered_with_the_command_here() {
+        for (line, expected) in [
+            ("plot", "use 'blindgrasp view'"),
+            ("compare", "use 'blindgrasp test'"),
+            ("param list", "use 'blindgrasp set'"),
+            ("check dataflow.yaml", "use 'blindgrasp run --check'"),
+            ("new demo", "use 'blindgrasp init demo'"),
+            ("run --dry-run", "use 'blindgrasp run --check'"),
+            ("run --speed 2", "recorded_source.rate"),
+            ("run -v", "RUST_LOG"),
+            ("train --data train.mcap", "blindgrasp train RECORDING"),
+            ("predict --model m.json", "blindgrasp predict MODEL"),
+            ("trials --gate on", "--lift-policy"),
+        ] {
+            let words = std::iter::once("blindgrasp").chain(line.split(' '));
+            let error = grouped(Cli::command()).try_get_matches_from(words).expect_err("a mistake");
             let text = with_hint(error).to_string();
-            assert!(text.contains(expected), "{text}");
+            assert!(text.contains(expected), "{line}: {text}");
+            assert!(!text.contains("as a value") && !text.contains("similar"), "{line}: {text}");
         }
+        let error =
+            grouped(Cli::command()).try_get_matches_from(["blindgrasp", "run", "--chek"]).expect_err("a mistake");
+        let text = with_hint(error).to_string();
+        assert!(text.contains("--check") && !text.contains("as a value"), "{text}");
     }
 
     /// The words of a command line of a shell, up to a pipe, a comment or another command.
@@ -160,5 +235,7 @@ mod tests {
     fn no_hint_hides_a_command() {
         let command = Cli::command();
         assert!(HINTS.iter().all(|(word, _)| command.find_subcommand(word).is_none()));
+        // A command with such an option is not asked for a hint.
+        assert!(OPTION_HINTS.iter().all(|(option, _)| option.starts_with('-')));
     }
 }

@@ -15,7 +15,6 @@ mod graph_file;
 mod grid;
 mod hand_cells;
 mod help;
-mod hz;
 mod import;
 mod info;
 mod init;
@@ -26,7 +25,6 @@ mod model;
 mod new;
 mod object_list;
 mod operator;
-mod param;
 mod predict;
 mod ps;
 mod record;
@@ -83,16 +81,12 @@ enum Command {
     Ps(ps::Arguments),
     Top(top::Arguments),
     Echo(echo::Arguments),
-    Hz(hz::Arguments),
     #[command(alias = "down")]
     Stop(stop::Arguments),
     Logs(logs::Arguments),
     Set(set::Arguments),
-    Param(param::Arguments),
     #[command(alias = "restart")]
     Swap(swap::Arguments),
-    #[command(hide = true)]
-    Check(check::Arguments),
     Simulate(simulate::Arguments),
     Import(import::Arguments),
     Train(train::Arguments),
@@ -193,13 +187,10 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Ps(arguments) => ps::run(&arguments),
         Command::Top(arguments) => top::run(&arguments),
         Command::Echo(arguments) => echo::run(&arguments),
-        Command::Hz(arguments) => hz::run(&arguments),
         Command::Stop(arguments) => stop::run(&arguments),
         Command::Logs(arguments) => logs::run(&arguments),
         Command::Set(arguments) => set::run(&arguments),
-        Command::Param(arguments) => param::run(&arguments),
         Command::Swap(arguments) => swap::run(&arguments),
-        Command::Check(arguments) => check::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Import(arguments) => import::run(&arguments),
         Command::Train(arguments) => train::run(&arguments),

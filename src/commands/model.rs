@@ -6,11 +6,11 @@ use anyhow::Context;
 use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 
-use super::train::{guarantee_line, probe_lines, threshold_line};
+use super::train::{probe_lines, threshold_line};
 use super::{Outcome, check_new, check_output, percent, print_line};
 use blindgrasp_learning::dataset::{hand_of, label_line};
 use blindgrasp_learning::training::recalibrate;
-use blindgrasp_messages::files::partial_path;
+use blindgrasp_messages::files::write_whole;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::boosting::BoostedTrees;
@@ -168,11 +168,7 @@ pub(super) fn write_at_once(path: &Path, text: &str) -> anyhow::Result<()> {
     if std::fs::metadata(path).is_ok_and(|found| !found.is_file()) {
         return std::fs::write(path, text).with_context(|| format!("{}", path.display()));
     }
-    let partial = partial_path(path);
-    std::fs::write(&partial, text).and_then(|()| std::fs::rename(&partial, path)).map_err(|error| {
-        let _ = std::fs::remove_file(&partial);
-        anyhow::Error::from(error).context(format!("{}", path.display()))
-    })
+    write_whole(path, text).with_context(|| format!("{}", path.display()))
 }
 
 fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
@@ -272,15 +268,15 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
             "recipe": training.recipe,
             "sigma_m": model.features.sigma_m,
             "dictionary_m": model.features.dictionary.words_m,
-            "machine": predictor_json(&model.classifier.predictor),
+            "predictor": predictor_json(&model.classifier.predictor),
             "calibration": { "method": "platt", "a": calibration.a, "b": calibration.b },
             "threshold_probability": model.classifier.threshold_probability,
             "unsure_from_probability": model.classifier.unsure_from_probability,
-            "domain": model.training_range,
+            "training_range": model.training_range,
             "squeezed": model.squeezed.as_ref().map(probe_json),
             "test_lifted": model.test_lifted.as_ref().map(probe_json),
             "approach": model.approach.as_ref().map(|prior| json!({
-                "machine": trees_json(&prior.trees),
+                "predictor": trees_json(&prior.trees),
                 "cross_validated_roc_area": prior.cross_validated_roc_area,
             })),
             "day": model.day,
@@ -298,11 +294,11 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
             "dictionary",
             format!("{} words, sigma {} m", model.features.dictionary.words_m.len(), model.features.sigma_m),
         ),
-        ("machine", model.classifier.predictor.summary()),
+        ("predictor", model.classifier.predictor.summary()),
         ("calibration", format!("Platt, a {:.4}, b {:.4}", calibration.a, calibration.b)),
         ("threshold", threshold_line(&model.classifier)),
         (
-            "domain",
+            "training range",
             format!(
                 "{} quantities have limits; those of other objects' grasps flag {} of the training grasps",
                 model.training_range.limits.len(),
@@ -347,9 +343,6 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
         line.map_or(Ok(()), |line| print_line(&format!("{what:<16} {line}")))?;
     }
     probe_lines(&model).iter().try_for_each(|line| print_line(line))?;
-    for guarantee in &training.guarantees {
-        print_line(&guarantee_line(guarantee))?;
-    }
     Ok(Outcome::Done)
 }
 
@@ -369,11 +362,11 @@ fn predictor_json(predictor: &Predictor) -> serde_json::Value {
 
 fn probe_json(probe: &ProbeModel) -> serde_json::Value {
     json!({
-        "machine": predictor_json(&probe.classifier.predictor),
+        "predictor": predictor_json(&probe.classifier.predictor),
         "calibration": { "method": "platt", "a": probe.classifier.calibration.a, "b": probe.classifier.calibration.b },
         "threshold_probability": probe.classifier.threshold_probability,
         "unsure_from_probability": probe.classifier.unsure_from_probability,
-        "domain": probe.training_range,
+        "training_range": probe.training_range,
         "cross_validated_roc_area": probe.cross_validated_roc_area,
         "cross_validated_ece": probe.cross_validated_ece,
     })

@@ -3,34 +3,51 @@
 use std::str::FromStr;
 use std::time::Duration;
 
+use anyhow::bail;
 use clap::Args;
 use serde_json::{Value, json};
 
 use super::elsewhere::MachineArgument;
 use super::graph_file::warn_of_misfit;
+use super::text_table::TextTable;
 use super::{Outcome, completions, print_line};
-use blindgrasp_graph::client::{Connection, pick_graph};
-use blindgrasp_graph::control::{Reply, Request};
+use blindgrasp_graph::client::{Connection, pick_graph, status};
+use blindgrasp_graph::control::{NodeStatus, Reply, Request};
+use blindgrasp_graph::describe::describe;
 
 /// The operator checks the value, and applies it between two samples.
 const LIMIT: Duration = Duration::from_secs(10);
 
-/// Change a live parameter of a running operator
+/// Change a live parameter of a running graph, or show parameters
+///
+/// Without a value it shows: all parameters, those of a node, or the value of one.
 #[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp set lift_arbiter.votes=5\n\n\
-                        PROGRAM --describe tells which parameters are live. Change others with: blindgrasp swap NODE --set NAME=VALUE")]
+#[command(
+    after_help = "Examples: blindgrasp set                        all parameters, and which are live\n          \
+                        blindgrasp set lift_arbiter           those of a node\n          \
+                        blindgrasp set lift_arbiter.votes     the value of one\n          \
+                        blindgrasp set lift_arbiter.votes=5   change it from the next sample on\n\n\
+                        Change parameters that are not live with: blindgrasp swap NODE --set NAME=VALUE"
+)]
 pub(super) struct Arguments {
-    /// NODE.PARAM=VALUE; the value is a number, true, false or a text
-    #[arg(add = completions::assignments())]
-    assignment: Assignment,
+    /// NODE.PARAM=VALUE to change it, NODE.PARAM or NODE to show it; the value is a number, true, false or a text
+    #[arg(value_name = "NODE[.PARAM[=VALUE]]", add = completions::assignments())]
+    what: Option<What>,
     /// Graph [default: the only one running]
     #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
-    /// Print JSON
+    /// Print JSON: what was changed; the value; or one object a parameter, with node, param, value, live
     #[arg(long)]
     json: bool,
     #[command(flatten)]
     machine: MachineArgument,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+enum What {
+    Node(String),
+    Param { node: String, param: String },
+    Assignment(Assignment),
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -44,7 +61,70 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(destination) = arguments.machine.destination()? {
         return destination.run();
     }
-    let Assignment { node, param, value } = arguments.assignment.clone();
+    match &arguments.what {
+        None => list(arguments, None),
+        Some(What::Node(node)) => list(arguments, Some(node)),
+        Some(What::Param { node, param }) => get(arguments, node, param),
+        Some(What::Assignment(assignment)) => assign(arguments, assignment.clone()),
+    }
+}
+
+fn list(arguments: &Arguments, node: Option<&str>) -> anyhow::Result<Outcome> {
+    let nodes = nodes(arguments.graph.as_deref(), node)?;
+    let mut table = TextTable::of_texts(["parameter", "value", ""]);
+    for node in &nodes {
+        let description = describe(&node.program, &node.args).ok();
+        let live_params: Option<Vec<String>> = description.map(|description| {
+            description.params.into_iter().filter(|param| param.live).map(|param| param.name).collect()
+        });
+        for (name, value) in &node.params {
+            let live = live_params.as_ref().map(|live| live.contains(name));
+            if arguments.json {
+                let line = json!({"node": node.node, "param": name, "value": value, "live": live});
+                print_line(&line.to_string())?;
+            }
+            let live = if live == Some(true) { "live" } else { "" };
+            table.row([format!("{}.{name}", node.node), shown(value), live.into()]);
+        }
+    }
+    if !arguments.json {
+        table.lines().iter().try_for_each(|line| print_line(line))?;
+    }
+    Ok(Outcome::Done)
+}
+
+fn get(arguments: &Arguments, node: &str, param: &str) -> anyhow::Result<Outcome> {
+    let nodes = nodes(arguments.graph.as_deref(), Some(node))?;
+    let Some(value) = nodes.iter().find_map(|node| node.params.get(param)) else {
+        let known: Vec<&str> = nodes.iter().flat_map(|node| node.params.keys().map(String::as_str)).collect();
+        bail!("node '{node}' has no parameter '{param}' with a value; its parameters: {}", known.join(", "));
+    };
+    print_line(&if arguments.json { value.to_string() } else { shown(value) })?;
+    Ok(Outcome::Done)
+}
+
+/// The nodes of a graph, or one of them.
+fn nodes(graph: Option<&str>, node: Option<&str>) -> anyhow::Result<Vec<NodeStatus>> {
+    let graph = pick_graph(graph)?;
+    let status = status(&graph)?;
+    let mut nodes = status.nodes.clone();
+    if let Some(node) = node {
+        let known: Vec<&str> = status.nodes.iter().map(|node| node.node.as_str()).collect();
+        nodes.retain(|found| found.node == node);
+        if nodes.is_empty() {
+            bail!("graph '{graph}' has no node '{node}'; its nodes: {}", known.join(", "));
+        }
+    }
+    Ok(nodes)
+}
+
+/// A text without quotes.
+fn shown(value: &Value) -> String {
+    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
+}
+
+fn assign(arguments: &Arguments, assignment: Assignment) -> anyhow::Result<Outcome> {
+    let Assignment { node, param, value } = assignment;
     let graph = pick_graph(arguments.graph.as_deref())?;
     warn_of_misfit(&graph, &node, &param, &value)?;
     let mut connection = Connection::open(&graph)?;
@@ -66,16 +146,23 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-impl FromStr for Assignment {
+impl FromStr for What {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let parts = text.split_once('=').and_then(|(target, value)| Some((target.split_once('.')?, value)));
-        match parts {
-            Some(((node, param), value)) if !node.is_empty() && !param.is_empty() => {
-                Ok(Assignment { node: node.into(), param: param.into(), value: value_of(value) })
+        let (target, value) = match text.split_once('=') {
+            Some((target, value)) => (target, Some(value)),
+            None => (text, None),
+        };
+        match (target.split_once('.'), value) {
+            (Some((node, param)), Some(value)) if !node.is_empty() && !param.is_empty() => {
+                Ok(What::Assignment(Assignment { node: node.into(), param: param.into(), value: value_of(value) }))
             }
-            _ => Err("expected NODE.PARAM=VALUE, as in lift_arbiter.votes=5".into()),
+            (Some((node, param)), None) if !node.is_empty() && !param.is_empty() => {
+                Ok(What::Param { node: node.into(), param: param.into() })
+            }
+            (None, None) if !text.is_empty() => Ok(What::Node(text.into())),
+            _ => Err("expected NODE.PARAM=VALUE, as in lift_arbiter.votes=5, or NODE.PARAM, or NODE".into()),
         }
     }
 }
@@ -107,10 +194,16 @@ mod tests {
         ];
         for (text, value) in cases {
             let expected = Assignment { node: "lift_arbiter".into(), param: "votes".into(), value };
-            assert_eq!(format!("lift_arbiter.votes={text}").parse(), Ok(expected), "{text}");
+            assert_eq!(format!("lift_arbiter.votes={text}").parse(), Ok(What::Assignment(expected)), "{text}");
         }
-        for text in ["votes=5", "a.b", ".b=1", "a.=1", ""] {
-            text.parse::<Assignment>().expect_err(text);
+        for text in ["votes=5", ".b=1", "a.=1", ".b", "a.", "=1", ""] {
+            text.parse::<What>().expect_err(text);
         }
+    }
+
+    #[test]
+    fn without_a_value_a_parameter_or_a_node_is_shown() {
+        assert_eq!("a.b".parse(), Ok(What::Param { node: "a".into(), param: "b".into() }));
+        assert_eq!("a".parse(), Ok(What::Node("a".into())));
     }
 }

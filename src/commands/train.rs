@@ -9,19 +9,18 @@ use super::evaluate::print_label;
 use super::grid::{GridArguments, search};
 use super::{Outcome, check_new, number_in, percent, print_line};
 use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::training::{Aim, Method, ThresholdOptions, TrainingOptions, WrongCall, train};
+use blindgrasp_learning::training::{Aim, TrainingOptions, train};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::Classifier;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
-use blindgrasp_stages::training_summary::Guarantee;
 
 /// Train a model on recordings with labels
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                   blindgrasp train train.mcap --out mine.json\n  \
-                  blindgrasp train train.mcap --recipe paper --grid --grid-report grid.json --grid-report grid.svg --out mine.json")]
+                  blindgrasp train train.mcap --recipe paper --grid --grid-report grid.json --out mine.json")]
 pub(super) struct Arguments {
     /// Recordings (MCAP), simulated or a robot's own, or folders of them.
     #[arg(required = true)]
@@ -70,7 +69,7 @@ pub(super) struct Arguments {
     label: TrainingLabel,
     #[command(flatten)]
     thresholds: ThresholdArguments,
-    /// The seed of K-means, boosting and the choice of objects set aside.
+    /// The seed of K-means and boosting.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
     #[command(flatten)]
@@ -84,33 +83,23 @@ enum TrainingLabel {
     WrenchSpace,
 }
 
-/// The probabilities from which a grasp counts as stable, and below which as unstable; between them it is unsure.
+/// The probabilities from which a grasp counts as stable: one that is given, or those that are chosen.
 #[derive(Debug, Args)]
 struct ThresholdArguments {
-    /// A grasp counts as stable from this probability on.
-    #[arg(long, default_value_t = ThresholdOptions::default().threshold_probability, value_parser = |text: &str| number_in(text, 1e-6..=1.0))]
+    /// A grasp counts as stable from this probability on; from 1 minus it on it is unsure, which holds as well. For
+    /// experiments: it promises nothing. The model of the paper's label has 0.5.
+    #[arg(long = "threshold", value_name = "PROBABILITY", default_value_t = TrainingOptions::default().threshold_probability,
+          value_parser = |text: &str| number_in(text, 1e-6..=1.0))]
     threshold_probability: f64,
-    /// Choose the lowest threshold that keeps the share of unstable grasps called stable at this, in expectation over new
-    /// objects like those recorded (conformal risk control on objects set aside).
-    #[arg(long, conflicts_with = "threshold_probability", value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
-    max_false_positive_rate: Option<f64>,
-    /// Call as much unstable as keeps the share of stable grasps called so at this, in the same sense; unsure from there.
-    #[arg(long, conflicts_with = "unsure_from", value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
-    max_false_negative_rate: Option<f64>,
-    /// Unsure from this probability on, up to the threshold. Default: 1 - threshold, or the threshold if that is lower.
-    #[arg(long, value_parser = |text: &str| number_in(text, 0.0..=1.0))]
-    unsure_from: Option<f64>,
-    /// The share of the objects that is set aside for calibration, not trained on, when a rate is asked for.
-    #[arg(long, default_value_t = ThresholdOptions::default().calibration_objects, value_parser = |text: &str| number_in(text, 0.01..=0.9))]
-    calibration_objects: f64,
-    /// Choose the thresholds for trials, in which a hand grasps again until it lifts: those that take the least time for each
-    /// kept object if a dropped one costs so many seconds, judged by folds of objects. Recordings with probes get a threshold for
-    /// each probe. 120 is cautious; 0 is for objects that may fall.
-    #[arg(long, conflicts_with_all = ["threshold_probability", "max_false_positive_rate", "max_false_negative_rate", "unsure_from"], value_parser = |text: &str| number_in(text, 0.0..=1e6))]
+    /// Choose the thresholds by the price of a drop: those that take the least time for each kept object, if a drop costs so
+    /// many seconds and the hand grasps again until it lifts, judged by folds of objects. Recordings with probes get a
+    /// threshold for each probe. 120 is cautious, and what the models of lifts were trained with; 0 is for objects that may
+    /// fall.
+    #[arg(long, value_name = "SECONDS", conflicts_with = "threshold_probability", value_parser = |text: &str| number_in(text, 0.0..=1e6))]
     drop_secs: Option<f64>,
-    /// Choose the thresholds for trials so that at most this share of the lifts drops, with 95 % confidence, for new objects like
-    /// those recorded. A look whose strictest threshold cannot promise this never lifts.
-    #[arg(long, conflicts_with_all = ["drop_secs", "threshold_probability", "max_false_positive_rate", "max_false_negative_rate", "unsure_from"], value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
+    /// Choose the thresholds by a bound on drops: at most this share of the lifts drops, with 95 % confidence, for new objects
+    /// like those recorded. A look whose strictest threshold cannot promise this never lifts.
+    #[arg(long, value_name = "SHARE", conflicts_with_all = ["drop_secs", "threshold_probability"], value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
     max_drops: Option<f64>,
 }
 
@@ -122,7 +111,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let mut options = TrainingOptions {
         recipe: recipe(arguments)?,
-        thresholds: thresholds(&arguments.thresholds)?,
+        threshold_probability: arguments.thresholds.threshold_probability,
+        aim: arguments.thresholds.aim(),
         frictions: arguments.frictions.clone(),
         by_wrench_space: arguments.label == TrainingLabel::WrenchSpace,
         seed: arguments.seed,
@@ -168,28 +158,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     ))?;
     print_line(&threshold_line(&model.classifier))?;
     probe_lines(&model).iter().try_for_each(|line| print_line(line))?;
-    for guarantee in &training.guarantees {
-        print_line(&guarantee_line(guarantee))?;
-    }
     Ok(Outcome::Done)
 }
 
-fn thresholds(arguments: &ThresholdArguments) -> anyhow::Result<ThresholdOptions> {
-    let options = ThresholdOptions {
-        threshold_probability: arguments.threshold_probability,
-        max_false_positive_rate: arguments.max_false_positive_rate,
-        max_false_negative_rate: arguments.max_false_negative_rate,
-        unsure_from_probability: arguments.unsure_from,
-        calibration_objects: arguments.calibration_objects,
-        aim: arguments.drop_secs.map(Aim::DropSecs).or(arguments.max_drops.map(Aim::MaxDrops)),
-    };
-    if arguments.calibration_objects != ThresholdOptions::default().calibration_objects && !options.ask_for_a_rate() {
-        anyhow::bail!(
-            "--calibration-objects sets objects aside for --max-false-positive-rate or \
-                       --max-false-negative-rate: give one of them, too"
-        );
+impl ThresholdArguments {
+    fn aim(&self) -> Option<Aim> {
+        self.drop_secs.map(Aim::DropSecs).or(self.max_drops.map(Aim::MaxDrops))
     }
-    Ok(options)
 }
 
 /// A classifier's thresholds, for people.
@@ -235,23 +210,6 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
         lines.extend(policy.promise.map(|promise| format!("promised for new objects: {promise}")));
     }
     lines
-}
-
-/// A guarantee, for people.
-pub(super) fn guarantee_line(guarantee: &Guarantee) -> String {
-    let Guarantee { max_rate, n_objects, n_grasps, rate, rate_of_grasps, .. } = guarantee;
-    let (kind, called) = match guarantee.of {
-        WrongCall::FalsePositive => ("unstable", "stable"),
-        WrongCall::FalseNegative => ("stable", "unstable"),
-    };
-    let Method::ConformalRiskControlByObject = guarantee.method;
-    format!(
-        "guaranteed: at most {} of {kind} grasps called {called}, in expectation over new objects (conformal risk control; \
-         {n_objects} objects set aside: {}, {} of their {n_grasps} {kind} grasps)",
-        percent(Some(*max_rate)),
-        percent(Some(*rate)),
-        percent(Some(*rate_of_grasps)),
-    )
 }
 
 /// The named recipe with the values of the command line.

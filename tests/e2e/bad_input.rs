@@ -148,7 +148,7 @@ fn training_data() {
     check(&["train", RECORDING, "--words", "2000", "--out", &model], 1, &["dictionary", "2000"]);
     check(&["train", RECORDING, "--gamma", "0", "--out", &model], 2, &["--gamma"]);
     check(&["train", RECORDING, "--sigma-m", "0", "--out", &model], 2, &["--sigma-m"]);
-    check(&["train", RECORDING, "--threshold-probability", "nan", "--out", &model], 2, &["--threshold-probability"]);
+    check(&["train", RECORDING, "--threshold", "nan", "--out", &model], 2, &["--threshold"]);
     check(&["train", "--out", &model], 2, &["RECORDING"]);
     assert!(!Path::new(&model).exists());
 }

@@ -1,6 +1,6 @@
 //! A dataflow file is checked against the real operators, without starting the graph.
 
-use crate::common::{ON_TWO_MACHINES, dataflow, json_lines, operator, project, run, text, undisturbed, unique_name};
+use crate::common::{ON_TWO_MACHINES, dataflow, operator, project, run, text};
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};
 use serde_json::{Value, json};
 
@@ -18,7 +18,7 @@ fn a_right_file_is_shown_with_everything_filled_in() {
             ("inputs: {feature: encoder/feature}", "inputs: {feature: encoder/feature}\n    restart: always"),
         ],
     );
-    let output = run(&["check", path.to_str().expect("UTF-8")], 0);
+    let output = run(&["run", "--check", path.to_str().expect("UTF-8")], 0);
     assert!(output.stderr.is_empty(), "{}", text(&output.stderr));
     let shown: Vec<Vec<String>> = text(&output.stdout)
         .lines()
@@ -57,8 +57,6 @@ fn json_holds_the_graph_with_what_was_set() {
     let set =
         ["--set", "lift_arbiter.votes=5", "--set", "recorded_source.recording=recordings/../recordings/held-out.mcap"];
     let output = run(&[&["run", "--check", "dataflow.yaml", "--json"], &set[..]].concat(), 0);
-    let by_alias = run(&[&["check", "dataflow.yaml", "--json"], &set[..]].concat(), 0);
-    assert_eq!(text(&by_alias.stdout), text(&output.stdout));
     let checked: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     let nodes = checked["graph"]["nodes"].as_array().expect("nodes");
     let found = nodes[0]["params"]["recording"].as_str().expect("a path");
@@ -89,7 +87,7 @@ fn mistakes() {
         "{path}:{line}:7: {message}; did you mean 'votes'?\n\
          --set clasifier.model=x: {set_message}; did you mean 'classifier'?\n"
     );
-    let wrong = ["check", path, "--set", "clasifier.model=x"];
+    let wrong = ["run", "--check", path, "--set", "clasifier.model=x"];
     let output = run(&wrong, 1);
     assert_eq!(text(&output.stderr), lines);
     assert!(output.stdout.is_empty(), "{}", text(&output.stdout));
@@ -106,12 +104,12 @@ fn mistakes() {
         ]})
     );
 
-    let output = run(&["check", "absent.yaml", "--json"], 1);
+    let output = run(&["run", "--check", "absent.yaml", "--json"], 1);
     let errors: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(errors["errors"][0]["line"], Value::Null);
     assert!(errors["errors"][0]["message"].as_str().is_some_and(|message| message.contains("cannot read the file")));
 
-    let output = run(&["check", "--set", "votes"], 2);
+    let output = run(&["run", "--check", "--set", "votes"], 2);
     assert!(text(&output.stderr).contains("expected node.param=value"), "{}", text(&output.stderr));
 }
 
@@ -130,14 +128,14 @@ fn arguments_come_before_describe() {
         std::fs::write(&path, yaml).expect("written");
     };
     write("--fast, 'x y'");
-    let output = run(&["check", &path, "--json"], 0);
+    let output = run(&["run", "--check", &path, "--json"], 0);
     let checked: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(checked["graph"]["nodes"][0]["params"]["a"], "--fast,x y");
-    let output = run(&["check", &path], 0);
+    let output = run(&["run", "--check", &path], 0);
     let shown = text(&output.stdout);
     assert!(shown.ends_with(&format!("  /bin/sh {} --fast \"x y\"\n", at("own.sh"))), "{shown}");
     write("--fast");
-    let output = run(&["check", &path], 1);
+    let output = run(&["run", "--check", &path], 1);
     let shown = text(&output.stderr);
     for part in ["program '/bin/sh' with the arguments '", "cannot be used: it failed at --describe"] {
         assert!(shown.contains(part), "{shown}");
@@ -149,7 +147,7 @@ fn machines_and_the_edges_between_them_are_shown() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = dataflow(folder.path(), &ON_TWO_MACHINES);
     let path = path.to_str().expect("UTF-8");
-    let shown = text(&run(&["check", path], 0).stdout);
+    let shown = text(&run(&["run", "--check", path], 0).stdout);
     let lines: Vec<Vec<&str>> =
         shown.lines().map(|line| line.split("  ").map(str::trim).filter(|entry| !entry.is_empty()).collect()).collect();
     for expected in [
@@ -176,7 +174,7 @@ fn machines_and_the_edges_between_them_are_shown() {
     let node = |name: &str| lines.iter().find(|line| line.first() == Some(&name)).map(|line| line[1]);
     assert_eq!((node("contacts"), node("classifier")), (Some("robot"), Some("brain")));
 
-    let checked: Value = serde_json::from_slice(&run(&["check", path, "--json"], 0).stdout).expect("JSON");
+    let checked: Value = serde_json::from_slice(&run(&["run", "--check", path, "--json"], 0).stdout).expect("JSON");
     assert_eq!(checked["graph"]["nodes"][2]["machine"], "brain");
     assert_eq!(checked["graph"]["machines"]["machines"][1]["listen"], json!(["unix/gate"]));
     let crossing = json!([
@@ -186,7 +184,7 @@ fn machines_and_the_edges_between_them_are_shown() {
          "to_machine": "robot", "type_name": Prediction::TYPE_NAME},
     ]);
     assert_eq!(checked["crossing"], crossing);
-    let whole: Value = serde_json::from_slice(&run(&["check", "--json"], 0).stdout).expect("JSON");
+    let whole: Value = serde_json::from_slice(&run(&["run", "--check", "--json"], 0).stdout).expect("JSON");
     assert_eq!((&whole["crossing"], &whole["graph"]["machines"]), (&Value::Null, &Value::Null));
 }
 
@@ -203,19 +201,19 @@ fn a_machine_needs_no_files_of_the_others() {
     .concat();
     let path = dataflow(folder.path(), &replace);
     let path = path.to_str().expect("UTF-8");
-    let refused = text(&run(&["check", path], 1).stderr);
+    let refused = text(&run(&["run", "--check", path], 1).stderr);
     assert!(
         refused.contains("brain/own' cannot be used") && refused.contains("'/on/the/brain.json' does not exist"),
         "{refused}"
     );
-    run(&["check", path, "--machine", "brain"], 1);
-    let shown = text(&run(&["check", path, "--machine", "robot"], 0).stdout);
+    run(&["run", "--check", path, "--machine", "brain"], 1);
+    let shown = text(&run(&["run", "--check", path, "--machine", "robot"], 0).stdout);
     let of_type = format!("classifier/prediction → lift_arbiter/prediction  brain → robot  {}", Prediction::TYPE_NAME);
     assert!(shown.contains(&of_type), "{shown}");
-    let refused = run(&["check", path, "--machine", "robot", "--set", "classifier.model=x"], 1);
+    let refused = run(&["run", "--check", path, "--machine", "robot", "--set", "classifier.model=x"], 1);
     let refused = text(&refused.stderr);
     assert!(refused.contains("node 'classifier' runs on machine 'brain'; give --set there"), "{refused}");
-    let refused = text(&run(&["check", path, "--machine", "brian"], 1).stderr);
+    let refused = text(&run(&["run", "--check", path, "--machine", "brian"], 1).stderr);
     assert!(refused.contains("there is no machine 'brian'; did you mean 'brain'?"), "{refused}");
 }
 

@@ -127,10 +127,10 @@ fn another_day_is_judged_by_its_own_baseline_or_held() {
     assert!(share_right(&evaluation) > 0.85, "{} {}", evaluation["by_reason"], evaluation["score_judged"]);
 
     let out = lab.at("never.json");
-    let rate = ["--day-baseline", "--max-false-positive-rate", "0.1"];
+    let bound = ["--day-baseline", "--max-drops", "0.1"];
     let fixed = ["train", &training, "--hand", &lab.hand, "--recipe", "raw", "--words", "3", "--out", &out];
-    let refused = run(&[&fixed[..], &rate].concat(), 1);
-    assert!(text(&refused.stderr).contains("not for other days"), "{}", text(&refused.stderr));
+    let refused = run(&[&fixed[..], &bound].concat(), 1);
+    assert!(text(&refused.stderr).contains("without --day-baseline"), "{}", text(&refused.stderr));
 
     // A model without a baseline that knows days holds on this one.
     let plain = lab.train(&[&training], "plain.json", &[]);

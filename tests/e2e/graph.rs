@@ -107,7 +107,7 @@ fn settings_other_than_the_defaults_are_drawn() {
 #[test]
 fn json_agrees_with_check() {
     let found = json(&[]);
-    let check = run(&["check", "--json"], 0);
+    let check = run(&["run", "--check", "--json"], 0);
     let check: Value = serde_json::from_str(&text(&check.stdout)).expect("JSON");
     let graph = &check["graph"];
     assert_eq!(found["graph"], graph["name"]);
@@ -134,20 +134,22 @@ fn mistakes_are_reported_as_by_check() {
     let folder = tempfile::tempdir().expect("a folder");
     let file = dataflow(folder.path(), &[("votes", "vots")]);
     let file = file.to_str().expect("UTF-8");
-    let [graph, check] = ["graph", "check"].map(|command| text(&run(&[command, file], 1).stderr));
+    let graph = text(&run(&["graph", file], 1).stderr);
+    let check = text(&run(&["run", "--check", file], 1).stderr);
     assert_eq!(graph, check);
     assert!(graph.contains("did you mean 'votes'?"), "{graph}");
     let name = unique_name();
-    let missing = run(&["graph", "--running", &name], 1);
+    let missing = run(&["graph", &name, "--json"], 1);
     assert!(text(&missing.stderr).contains(&format!("no graph '{name}' is running")), "{}", text(&missing.stderr));
-    run(&["graph", "dataflow.yaml", "--running"], 2);
+    run(&["graph", "dataflow.yaml", "--interval", "1"], 2);
+    run(&["graph", &name, "--interval", "1"], 2);
 }
 
 #[test]
 fn a_running_graph_has_states_rates_and_restarts() {
     let graph = Graph::start(&project().join("dataflow.yaml"), &FAST_FOREVER);
     graph.kill("encoder");
-    let running = ["--running", &graph.name, "--interval", "0.5"];
+    let running = [graph.name.as_str(), "--interval", "0.5"];
     let found = drawn(&[&running[..], &["--format", "mermaid"]].concat());
     assert!(found.contains("n1[\"contacts<br/>running\"]"), "{found}");
     assert!(found.contains("n2[\"encoder<br/>running<br/>restarts: 1\"]"), "{found}");
@@ -166,13 +168,6 @@ fn a_running_graph_has_states_rates_and_restarts() {
     }
     let dot = drawn(&[&running[..], &["--format", "dot"]].concat());
     assert!(dot.contains("restarts: 1\", fillcolor"), "{dot}");
-    // The only running graph need not be named. Other tests' graphs may run, too.
-    let unnamed = blindgrasp().args(["graph", "--running", "--format", "dot"]).output().expect("started");
-    let (stdout, stderr) = (text(&unnamed.stdout), text(&unnamed.stderr));
-    match unnamed.status.code() {
-        Some(0) => assert!(stdout.contains(&graph.name), "{stdout}"),
-        _ => assert!(stderr.contains("several graphs are running") && stderr.contains(&graph.name), "{stderr}"),
-    }
     graph.stop();
 }
 

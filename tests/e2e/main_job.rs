@@ -91,8 +91,8 @@ fn every_edge_can_be_recomputed_from_outside() {
     }
     let shown: Value = serde_json::from_slice(&run(&["model", "show", model_path, "--json"], 0).stdout).expect("JSON");
     let model: Value = serde_json::from_str(&std::fs::read_to_string(model_path).expect("a model")).expect("JSON");
-    let svm = &model["classifier"]["machine"]["svm"];
-    let (sigma, gamma, rho) = (f(&shown["sigma_m"]), f(&shown["machine"]["gamma"]), f(&shown["machine"]["rho"]));
+    let svm = &model["classifier"]["predictor"]["svm"];
+    let (sigma, gamma, rho) = (f(&shown["sigma_m"]), f(&shown["predictor"]["gamma"]), f(&shown["predictor"]["rho"]));
     let words: Vec<Vec<f64>> = shown["dictionary_m"].as_array().expect("words").iter().map(floats).collect();
     let (coefficients, vectors) = (floats(&svm["dual_coefficients"]), floats(&svm["support_vectors"]));
     let (a, b) = (f(&shown["calibration"]["a"]), f(&shown["calibration"]["b"]));

@@ -152,7 +152,7 @@ fn a_group_that_cannot_be_is_refused_in_words() {
     let refused = |nodes: &[(&str, &[&str])]| {
         let replace: Vec<(String, String)> = nodes.iter().map(|(node, lines)| of_node(node, lines)).collect();
         let flow = dataflow_with(folder.path(), &replace);
-        text(&run(&["check", flow.to_str().expect("UTF-8")], 1).stderr)
+        text(&run(&["run", "--check", flow.to_str().expect("UTF-8")], 1).stderr)
     };
     let said = refused(&[("recorded_source", &[GROUP]), ("contacts", &[GROUP])]);
     assert!(said.contains("node 'recorded_source': its operator cannot share a process with others"), "{said}");

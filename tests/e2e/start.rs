@@ -24,7 +24,7 @@ fn a_new_project_runs_and_is_never_overwritten() {
     assert_eq!((summary["grasps"].as_u64(), summary["samples_lost"].as_u64()), (Some(240), Some(0)));
     assert_nothing_left(&name);
 
-    let checked = run(&["check", project.join("dataflow-machines.yaml").to_str().expect("UTF-8")], 0);
+    let checked = run(&["run", "--check", project.join("dataflow-machines.yaml").to_str().expect("UTF-8")], 0);
     let checked = text(&checked.stdout);
     assert!(["robot", "brain", "contacts/contacts"].iter().all(|word| checked.contains(word)), "{checked}");
 

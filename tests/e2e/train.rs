@@ -28,7 +28,7 @@ fn every_recipe_makes_a_model_that_says_how_it_was_made() {
         let out = out.to_str().expect("UTF-8");
         run(&["train", RECORDING, "--recipe", recipe, "--overwrite", "--out", out], 0);
         let shown: Value = serde_json::from_slice(&run(&["model", "show", out, "--json"], 0).stdout).expect("JSON");
-        assert_eq!((&shown["recipe"]["name"], &shown["machine"]["kind"]), (&recipe.into(), &kind.into()));
+        assert_eq!((&shown["recipe"]["name"], &shown["predictor"]["kind"]), (&recipe.into(), &kind.into()));
         run(&["evaluate", out, OTHER_RECORDING], 0);
     }
     // The same again is the same to the byte. Every kind of learner is in these two.

@@ -171,13 +171,12 @@ fn structs() -> Vec<Struct> {
     [Header::layout(), Contact::layout()].into_iter().chain(layouts().into_iter().map(|message| message.head)).collect()
 }
 
-const LIMITS: [(&str, usize); 6] = [
+const LIMITS: [(&str, usize); 5] = [
     ("MAX_JOINTS", MAX_JOINTS),
     ("MAX_PADS", MAX_PADS),
     ("MAX_CELLS", MAX_CELLS),
     ("MAX_FEATURES", MAX_FEATURES),
     ("MAX_NAME_BYTES", MAX_NAME_BYTES),
-    ("MAX_PROPOSALS", MAX_PROPOSALS),
 ];
 
 fn python_text() -> String {

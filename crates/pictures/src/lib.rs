@@ -7,14 +7,13 @@
 //! * [`animation_svg`] - grasps as a moving picture, with the probability and the decision.
 //! * [`HandScene`], [`link_poses`] - a hand for a page that draws it frame by frame, with [`STAGE_JS`] and [`THREE_JS`].
 //! * [`posed_scene_images`] - a hand and a thing on a post, moment by moment, by one camera.
-//! * [`heat_map_svg`] - a search's scores over two parameters.
 //! * [`dictionary_svg`] - a contact dictionary over the hand.
 //! * [`graph_mermaid`], [`graph_dot`] - a graph of processes.
 //! * [`chart`] - lines, points and bars over axes.
 //! * [`ReportPage`] - a page of text, tables and pictures.
 //!
 //! Surfaces are rendered here, by a small z-buffered rasteriser (no graphics card, no fonts), and embedded as PNG; what
-//! must be sharp or read (arrows, numbers, heat maps, text) lies over them as vectors. The same input gives the same
+//! must be sharp or read (arrows, numbers, text) lies over them as vectors. The same input gives the same
 //! bytes.
 //!
 //! Not here: reading recordings or object files, which is the caller's. Links are drawn as their collision shapes, the
@@ -28,7 +27,6 @@ mod geometry;
 mod graph;
 mod grasp;
 mod grasp_picture;
-mod heat_map;
 mod html;
 mod pads;
 mod png_image;
@@ -47,7 +45,6 @@ pub use dictionary_picture::{DrawnWord, dictionary_svg};
 pub use graph::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid};
 pub use grasp::{ObjectSurface, RecordedGrasp};
 pub use grasp_picture::grasp_svg;
-pub use heat_map::{HeatMap, HeatMapAxis, HeatMapCell, heat_map_svg};
 pub use html::grasp_html;
 pub use posed_scene::{PosedScene, posed_scene_images};
 pub use report::{ReportPage, report_table};

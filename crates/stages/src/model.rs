@@ -17,7 +17,7 @@ use crate::encoder::{FeatureExtractor, Reading};
 use crate::out_of_distribution::TrainingRange;
 use crate::probe::{GraspHistory, ProbeModel, signals};
 use crate::training_summary::TrainingSummary;
-use blindgrasp_messages::files::partial_path;
+use blindgrasp_messages::files::write_whole;
 use blindgrasp_messages::{Fault, Phase};
 
 /// The format that this program writes and reads.
@@ -39,7 +39,6 @@ pub struct Model {
     pub features: FeatureExtractor,
     pub classifier: Classifier,
     /// What grasps look like that it was trained on.
-    #[serde(rename = "domain")]
     pub training_range: TrainingRange,
     /// The judgement of the tight hand, before the arm moves; the classifier then judges which grasps are worth a probe.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -155,11 +154,7 @@ impl Model {
         if text.len() as u64 > MAX_BYTES {
             return Err(ModelError::Invalid { path: path.into(), message: too_large() });
         }
-        let partial = partial_path(path);
-        std::fs::write(&partial, text).and_then(|()| std::fs::rename(&partial, path)).map_err(|error| {
-            let _ = std::fs::remove_file(&partial);
-            io(error)
-        })
+        write_whole(path, text).map_err(io)
     }
 
     /// Identifies what makes features: hand, dictionary, σ, blocks, scaling, the limits of what it was trained on. A

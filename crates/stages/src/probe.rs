@@ -22,7 +22,6 @@ pub struct ProbeModel {
     /// It takes the values of [`GraspHistory::compose`].
     pub classifier: Classifier,
     /// What the frames look like that decide.
-    #[serde(rename = "domain")]
     pub training_range: TrainingRange,
     /// Area under the ROC curve over folds of objects.
     pub cross_validated_roc_area: f64,

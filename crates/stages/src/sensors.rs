@@ -19,7 +19,7 @@ use crate::classifier::boosting::BoostedTrees;
 use crate::day::GraspPlace;
 use crate::hand::{Hand, Motion};
 use crate::model::ModelHand;
-use blindgrasp_messages::files::partial_path;
+use blindgrasp_messages::files::write_whole;
 use blindgrasp_messages::{Contact, Phase};
 
 /// The format that this program writes and reads.
@@ -180,11 +180,7 @@ impl SensorCheck {
     pub fn save(&self, path: &Path) -> Result<(), SensorCheckError> {
         let failed = |message: String| SensorCheckError { path: path.into(), message };
         let text = serde_json::to_string(self).map_err(|error| failed(error.to_string()))? + "\n";
-        let partial = partial_path(path);
-        std::fs::write(&partial, text).and_then(|()| std::fs::rename(&partial, path)).map_err(|error| {
-            let _ = std::fs::remove_file(&partial);
-            failed(error.to_string())
-        })
+        write_whole(path, text).map_err(|error| failed(error.to_string()))
     }
 
     /// Identifies its contents.

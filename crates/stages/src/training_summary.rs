@@ -48,12 +48,10 @@ pub struct TrainingSummary {
     pub cross_validated_brier: f64,
     /// Expected calibration error of the same probabilities, over 10 bins of equally many grasps.
     pub cross_validated_ece: f64,
-    /// Guarantees of the thresholds, from grasps of objects that were set aside.
-    pub guarantees: Vec<Guarantee>,
     /// What to expect of trials with each of the thresholds, over folds of objects, if they were chosen for trials.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub policies: Vec<PolicySummary>,
-    /// The seed of K-means, boosting and the choice of objects set aside.
+    /// The seed of K-means and boosting.
     pub seed: u64,
     /// The version of the program that trained.
     pub version: String,
@@ -67,9 +65,8 @@ pub struct TrainingSummary {
 }
 
 impl TrainingSummary {
-    /// Removes the guarantees and promises, because the model has other probabilities from now on.
+    /// Removes the promises, because the model has other probabilities from now on.
     pub fn withdraw_promises(&mut self) {
-        self.guarantees.clear();
         self.policies.iter_mut().for_each(|policy| policy.promise = None);
     }
 }
@@ -195,45 +192,4 @@ pub struct CellSummary {
     pub accuracy: f64,
     /// Unstable examples called stable, as a share of all examples.
     pub false_positive_share: f64,
-}
-
-/// The wrong calls that a guarantee limits.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum WrongCall {
-    /// Unstable grasps called stable.
-    FalsePositive,
-    /// Stable grasps called unstable.
-    FalseNegative,
-}
-
-/// How a guarantee was reached.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Method {
-    /// Conformal risk control with exchangeable objects.
-    ConformalRiskControlByObject,
-}
-
-/// The guarantee of a threshold.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Guarantee {
-    /// Which calls.
-    pub of: WrongCall,
-    /// Limit of the rate in expectation over objects: the share of unstable grasps called stable for false positives,
-    /// of stable grasps called unstable for false negatives.
-    pub max_rate: f64,
-    /// How the guarantee was reached.
-    pub method: Method,
-    /// The threshold: called stable from there on, or unstable below.
-    pub probability: f64,
-    /// Objects set aside.
-    pub n_objects: usize,
-    /// Grasps of them that could be called wrongly.
-    pub n_grasps: usize,
-    /// The rate among these, each object weighing the same: what the promise is about.
-    pub rate: f64,
-    /// The rate among these, each grasp weighing the same.
-    pub rate_of_grasps: f64,
 }

@@ -173,15 +173,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         let message = "--view-control and --foxglove are for the page of the graph: add --view\n";
         clap::Error::raw(clap::error::ErrorKind::MissingRequiredArgument, message).exit();
     }
-    if arguments.check {
-        let (dataflow, overrides) = (arguments.dataflow.clone(), arguments.overrides.clone());
-        let (machine, json) = (arguments.machines.machine.clone(), arguments.json);
-        let allow_mismatch = arguments.allow_mismatch;
-        return check::run(&check::Arguments { dataflow, overrides, machine, allow_mismatch, json });
-    }
-    let file = dataflow::load(&arguments.dataflow)?;
     let scope = arguments.machines.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
     let on_misfit = if arguments.allow_mismatch { OnMisfit::Warn } else { OnMisfit::Refuse };
+    if arguments.check {
+        return check::run(&arguments.dataflow, &arguments.overrides, scope, on_misfit, arguments.json);
+    }
+    let file = dataflow::load(&arguments.dataflow)?;
     let graph = fitting(&file, &arguments.overrides, scope, on_misfit)?;
     let name = running_name(arguments, &graph)?;
     let name = name.as_str();

@@ -62,7 +62,7 @@ pub(super) struct Arguments {
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(0..=i64::MAX as u64))]
     seed: u64,
     /// When the hand lifts: decision, as the graph decides; always, every settled grasp; both, one after the other.
-    #[arg(long, alias = "gate", default_value = "both")]
+    #[arg(long, default_value = "both")]
     lift_policy: LiftPolicy,
     /// The model instead of the dataflow file's.
     #[arg(long, value_name = "FILE")]
@@ -98,9 +98,7 @@ pub(super) struct Arguments {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum LiftPolicy {
-    #[value(alias = "on")]
     Decision,
-    #[value(alias = "off")]
     Always,
     Both,
 }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
@@ -68,22 +68,32 @@ struct PictureEdge {
     running: Option<MeasuredEdge>,
 }
 
-pub(super) fn draw(file: &Path, out: Option<&Path>, arguments: &GraphArguments) -> anyhow::Result<Outcome> {
+pub(super) fn draw_file(file: &Path, out: Option<&Path>, arguments: &GraphArguments) -> anyhow::Result<Outcome> {
+    let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
+    draw(out, arguments, &[file.to_owned()], || Ok(file_picture(&checked(file, &arguments.overrides, scope)?)))
+}
+
+pub(super) fn draw_running(name: &str, out: Option<&Path>, arguments: &GraphArguments) -> anyhow::Result<Outcome> {
+    let interval = Duration::from_secs_f64(arguments.interval.unwrap_or(1.0));
+    draw(out, arguments, &[], || running_picture(name, interval))
+}
+
+/// Draws a picture, once it is clear that the drawing can be written. It must not take the place of one of the `inputs`.
+fn draw(
+    out: Option<&Path>,
+    arguments: &GraphArguments,
+    inputs: &[PathBuf],
+    picture: impl FnOnce() -> anyhow::Result<Picture>,
+) -> anyhow::Result<Outcome> {
     let format = match (arguments.format, out) {
         (Some(format), _) => format,
         (None, Some(out)) if !arguments.json => format_of(out)?,
         (None, _) => Format::Mermaid,
     };
     if let Some(out) = out {
-        check_output(out, &[file.to_owned()])?;
+        check_output(out, inputs)?;
     }
-    let picture = match &arguments.running {
-        Some(name) => running_picture(name.as_deref(), Duration::from_secs_f64(arguments.interval))?,
-        None => {
-            let scope = arguments.machine.as_deref().map_or(Scope::Everything, Scope::Machine);
-            file_picture(&checked(file, &arguments.overrides, scope)?)
-        }
-    };
+    let picture = picture()?;
     let text = match format {
         _ if arguments.json => serde_json::to_string_pretty(&picture)?,
         Format::Mermaid => graph_mermaid(&drawn(&picture)),
@@ -179,8 +189,8 @@ fn file_picture(graph: &Graph) -> Picture {
     }
 }
 
-fn running_picture(asked_for: Option<&str>, interval: Duration) -> anyhow::Result<Picture> {
-    let (mut poller, before) = Poller::connect(&pick_graph(asked_for)?)?;
+fn running_picture(name: &str, interval: Duration) -> anyhow::Result<Picture> {
+    let (mut poller, before) = Poller::connect(&pick_graph(Some(name))?)?;
     std::thread::sleep(interval);
     let now = poller.look()?;
     let window = Window { previous: &before, rates_since: Some(&before), counts_since: None };

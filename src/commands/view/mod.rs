@@ -25,7 +25,7 @@ use super::{Outcome, secs_in};
 #[command(after_help = "Example: blindgrasp view grasp_gate\n         \
                         blindgrasp view recordings/paper-recipe.mcap\n         \
                         blindgrasp view dataflow.yaml --out graph.svg\n         \
-                        blindgrasp view --running --format mermaid\n         \
+                        blindgrasp view grasp_gate --format mermaid\n         \
                         blindgrasp view recordings/held-out.mcap --grasp 3 --out grasp.html\n         \
                         blindgrasp view hands/allegro.yaml --out hand.html\n\n\
                         In a graph, 'run' is the launching command: it reads the decisions, and the label where a source knows it.\n\
@@ -87,11 +87,6 @@ impl Rights {
 #[derive(Debug, Args)]
 #[command(next_help_heading = "A graph")]
 struct GraphArguments {
-    /// Draw a running graph, with its rates, ages and losses
-    ///
-    /// The name may be left out where only one graph runs.
-    #[arg(long, value_name = "GRAPH", num_args = 0..=1, conflicts_with_all = ["file", "overrides"])]
-    running: Option<Option<String>>,
     /// Give a param another value than the file does
     ///
     /// A path is relative to the current folder. Can be repeated.
@@ -100,16 +95,15 @@ struct GraphArguments {
     /// Check the file as this machine would
     ///
     /// Programs and files of the other machines need not be here.
-    #[arg(long, conflicts_with = "running")]
+    #[arg(long)]
     machine: Option<String>,
     /// Format of the picture [default: as the name of --out says, else mermaid]
     #[arg(long, value_enum, conflicts_with = "json")]
     format: Option<Format>,
-    /// Seconds over which a running graph is measured
-    #[arg(long, value_name = "TIME", default_value = "1", requires = "running",
-          value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
-    interval: f64,
-    /// Print nodes and edges as JSON
+    /// Measure the running graph that is drawn for this time [default: 1]
+    #[arg(long, value_name = "TIME", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
+    interval: Option<f64>,
+    /// Print nodes and edges as JSON; of a running graph, with its rates, ages and losses
     #[arg(long)]
     json: bool,
 }
@@ -156,8 +150,24 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if arguments.wait {
         return live::show(&arguments.file.to_string_lossy(), port, true, arguments.rights, shadow);
     }
+    let is_drawn = arguments.out.is_some() || graph.format.is_some() || graph.json;
     if let Some(name) = graph_name(arguments) {
-        return live::show(name, port, false, arguments.rights, shadow);
+        if !graph.overrides.is_empty() || graph.machine.is_some() {
+            refuse("--set and --machine are for a dataflow file: name one (.yaml)");
+        }
+        if is_drawn && (arguments.port.is_some() || arguments.rights.is_any() || shadow.is_some()) {
+            refuse(
+                "--port, --view-control, --foxglove and --shadow are for the page: leave out --out, --format and --json",
+            );
+        }
+        return match is_drawn {
+            true => graph::draw_running(name, arguments.out.as_deref(), graph),
+            false if graph.interval.is_some() => refuse("--interval is for a drawing: add --out, --format or --json"),
+            false => live::show(name, port, false, arguments.rights, shadow),
+        };
+    }
+    if graph.interval.is_some() {
+        refuse("--interval is for a running graph: name one");
     }
     if arguments.rights.is_any() {
         refuse("--view-control and --foxglove are for the page of a running graph: name one");
@@ -169,7 +179,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if shadow.is_some() && !is_recording {
         refuse("--shadow is for the page of a running graph or a recording: name one");
     }
-    if graph.running.is_none() && hand::is_hand(&arguments.file) {
+    if hand::is_hand(&arguments.file) {
         let Some(out) = &arguments.out else {
             refuse("--out is missing: name the picture of the hand, .svg or .html");
         };
@@ -181,11 +191,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if !arguments.alone.joints.is_empty() {
         refuse("--joints is for hands: name a pad layout (.yaml) or a built-in hand");
     }
-    if graph.running.is_some() || is_dataflow(&arguments.file) {
+    if is_dataflow(&arguments.file) {
         if !grasp.grasp.is_empty() || grasp.hand.is_some() || grasp.objects.is_some() || grasp.animate.is_some() {
             refuse("--grasp, --hand, --objects and --animate are for recordings: name an .mcap file");
         }
-        return graph::draw(&arguments.file, arguments.out.as_deref(), graph);
+        return graph::draw_file(&arguments.file, arguments.out.as_deref(), graph);
     }
     if !graph.overrides.is_empty() || graph.machine.is_some() || graph.format.is_some() || graph.json {
         refuse("--set, --machine, --format and --json are for graphs: name a dataflow file (.yaml)");
@@ -203,8 +213,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 /// The name of a running graph, if the argument is one.
 fn graph_name(arguments: &Arguments) -> Option<&str> {
     let name = arguments.file.to_str().filter(|name| is_graph_name(name))?;
-    let is_other = arguments.file.exists() || arguments.graph.running.is_some() || hand::is_hand(&arguments.file);
-    (arguments.out.is_none() && !is_other).then_some(name)
+    if arguments.file.exists() || hand::is_hand(&arguments.file) {
+        return None;
+    }
+    Some(name)
 }
 
 /// Ends the process with a usage error.

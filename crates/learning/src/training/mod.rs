@@ -12,18 +12,16 @@ mod friction;
 pub mod grid;
 mod probes;
 mod recalibration;
-mod threshold;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
-pub use blindgrasp_stages::training_summary::{Guarantee, Method, PolicySummary, TrainingSummary, WrongCall};
+pub use blindgrasp_stages::training_summary::{PolicySummary, TrainingSummary};
 pub use examples::{Example, Examples, Felt, Relabelling, Signals};
 pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
 pub(crate) use probes::composed;
 pub use recalibration::recalibrate;
-pub use threshold::{Aim, Judged, ThresholdError, ThresholdOptions, Thresholds, guarantee};
 
 use crate::dataset::DatasetError;
 use crate::evaluation::measures::{area_under_roc, curve};
@@ -48,15 +46,26 @@ pub struct TrainingOptions {
     pub recipe: Recipe,
     /// Folds, grouped by object, for calibration and cross-validated figures.
     pub n_folds: usize,
-    /// The probabilities from which a grasp counts as stable, and below which as unstable.
-    pub thresholds: ThresholdOptions,
+    /// A grasp counts as stable from this probability on, and as unstable below 1 minus it; between them it is unsure.
+    pub threshold_probability: f64,
+    /// What the thresholds of all looks are chosen for, in place of that probability.
+    pub aim: Option<Aim>,
     /// Friction coefficients, equally probable, for which the grasps are labelled again from their scenes. The target
     /// is then the probability that a grasp is stable. Empty: the recordings' own labels.
     pub frictions: Vec<f64>,
     /// Whether grasps are labelled by epsilon and volume, whatever the recordings say.
     pub by_wrench_space: bool,
-    /// Seeds K-means, boosting and the choice of objects set aside.
+    /// Seeds K-means and boosting.
     pub seed: u64,
+}
+
+/// The aim of thresholds that are chosen for trials, in which a hand grasps again until it lifts.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Aim {
+    /// The least time for each kept object if a drop takes so many seconds more.
+    DropSecs(f64),
+    /// At most this share of the lifts drops.
+    MaxDrops(f64),
 }
 
 impl Default for TrainingOptions {
@@ -64,7 +73,8 @@ impl Default for TrainingOptions {
         TrainingOptions {
             recipe: Recipe::default(),
             n_folds: 5,
-            thresholds: ThresholdOptions::default(),
+            threshold_probability: 0.5,
+            aim: None,
             frictions: Vec::new(),
             by_wrench_space: false,
             seed: 1,
@@ -92,9 +102,6 @@ pub enum TrainingError {
     Boosting(#[from] BoostingError),
     #[error("the calibration")]
     Calibration(#[from] CalibrationError),
-    /// The thresholds.
-    #[error(transparent)]
-    Threshold(#[from] ThresholdError),
     /// Recordings or options that cannot be trained with.
     #[error("{0}")]
     Data(String),
@@ -129,7 +136,7 @@ pub fn train(
         progress(&format!("read recording {n_read} of {n}"));
     })?;
     check_examples(&read, recordings, &options.frictions)?;
-    let (examples, aside) = options.thresholds.set_aside(&read.examples.iter().collect::<Vec<_>>(), options.seed);
+    let examples: Vec<&Example> = read.examples.iter().collect();
     let folds = folds_by_object(&examples, options.n_folds)?;
     let mut cross_validating = |fold| progress(&format!("cross-validating, fold {} of {}", fold + 1, options.n_folds));
     let judged = match recipe.day_baseline {
@@ -147,8 +154,8 @@ pub fn train(
     if recipe.day_baseline {
         training_range = training_range.for_other_days(&fitted.features);
     }
-    let thresholds = options.thresholds.choose(&judge(&fitted, &calibration, &aside)?)?;
-    let validated = CrossValidated::of(&judged, &calibration, thresholds.threshold_probability)?;
+    let threshold_probability = options.threshold_probability;
+    let validated = CrossValidated::of(&judged, &calibration, threshold_probability)?;
     let day = day::learn(recipe, &fitted.features, &examples, options.seed)?;
     if day.is_none() && examples.iter().any(|example| example.day != 0) {
         progress(
@@ -158,8 +165,9 @@ pub fn train(
     let mut classifier = Classifier {
         predictor: fitted.predictor,
         calibration,
-        threshold_probability: thresholds.threshold_probability,
-        unsure_from_probability: thresholds.unsure_from_probability,
+        threshold_probability,
+        // "Unstable" is to be as certain as "stable".
+        unsure_from_probability: threshold_probability.min(1.0 - threshold_probability),
     };
     let mut learned = Vec::new();
     for phase in [Phase::Squeezed, Phase::TestLifted] {
@@ -178,14 +186,13 @@ pub fn train(
             progress(&format!("not learned: frames of {} hands say nothing of objects not seen", phase.as_str()));
         }
         if let Some(learned) = &mut probe {
-            let threshold = options.thresholds.threshold_probability;
-            (learned.probe.classifier.threshold_probability, learned.probe.classifier.unsure_from_probability) =
-                (threshold, threshold);
+            learned.probe.classifier.threshold_probability = threshold_probability;
+            learned.probe.classifier.unsure_from_probability = threshold_probability;
         }
         learned.push(probe);
     }
     let mut policies = Vec::new();
-    if let Some(aim) = options.thresholds.aim {
+    if let Some(aim) = options.aim {
         progress("choosing thresholds for trials");
         let of_lifts = !options.by_wrench_space && !read.labels.contains_key(&Label::WrenchSpace);
         let promises = of_lifts && !recipe.day_baseline;
@@ -216,7 +223,6 @@ pub fn train(
         cross_validated_false_positive_share: validated.false_positive_share,
         cross_validated_brier: validated.brier,
         cross_validated_ece: validated.ece,
-        guarantees: thresholds.guarantees,
         seed: options.seed,
         version: env!("CARGO_PKG_VERSION").into(),
         grid: None,
@@ -376,21 +382,6 @@ fn choose_policies(
     Ok(summaries)
 }
 
-/// The calibrated probability and each outcome of the grasps set aside.
-fn judge<'a>(
-    fitted: &Fitted,
-    calibration: &PlattCalibration,
-    aside: &[&'a Example],
-) -> Result<Vec<Judged<'a>>, TrainingError> {
-    let decision_values = if aside.is_empty() { Vec::new() } else { fitted.decision_values(aside)? };
-    let judged = aside.iter().zip(decision_values).flat_map(|(example, decision_value)| {
-        let probability_stable = calibration.probability(decision_value);
-        let judged = move |stable: &bool| Judged { probability_stable, stable: *stable, object: &example.object };
-        example.outcomes().iter().map(judged)
-    });
-    Ok(judged.collect())
-}
-
 /// Examples that were judged by a machine that had not seen their fold: each with its decision value and its fold.
 #[derive(Debug, Default)]
 struct OutOfFold<'a> {
@@ -483,11 +474,9 @@ fn check_options(options: &TrainingOptions) -> Result<(), TrainingError> {
     if recipe.n_words > MAX_FEATURES {
         return Err(TrainingError::Data(format!("{} words, expected at most {MAX_FEATURES}", recipe.n_words)));
     }
-    options.thresholds.validate()?;
-    if recipe.day_baseline && options.thresholds.ask_for_a_rate() {
-        return Err(TrainingError::Data(
-            "a rate can be promised for new objects, not for other days: leave out the rate, or the baseline of the day".into(),
-        ));
+    let threshold = options.threshold_probability;
+    if !(threshold > 0.0 && threshold <= 1.0) {
+        return Err(TrainingError::Data(format!("the threshold is {threshold}, expected more than 0, at most 1")));
     }
     if !options.frictions.is_empty() && !matches!(recipe.learner, Learner::Boosting(_)) {
         return Err(TrainingError::Data(format!(

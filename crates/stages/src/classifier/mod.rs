@@ -133,7 +133,6 @@ impl Predictor {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Classifier {
-    #[serde(rename = "machine")]
     pub predictor: Predictor,
     pub calibration: PlattCalibration,
     /// A grasp counts as stable when its probability is at least this; 1 is never reached.
