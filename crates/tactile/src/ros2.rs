@@ -282,15 +282,8 @@ impl Ros2 {
             }
         }
         let seq = received.seq.and_then(|seq| u64::try_from(i128::from(seq) + self.offset).ok());
-        let reading = Reading {
-            joints_rad,
-            cells_newtons,
-            phase,
-            senses,
-            seq,
-            stamp_nanos: stamp,
-            ..Reading::default()
-        };
+        let reading =
+            Reading { joints_rad, cells_newtons, phase, senses, seq, stamp_nanos: stamp, ..Reading::default() };
         Ok(Event::Frame(reading, Arrival { at_nanos, waited_nanos: 0 }))
     }
 }
