@@ -244,7 +244,7 @@ fn names_of_operators_that_are_part_of_others_get_advice() {
         ("day_classifier", "  classifier:\n", "classifier does it: the model says what it can judge"),
     ] {
         let path = dataflow(folder.path(), &[(operator, &format!("{operator}    run: {name}\n"))]);
-        let refused = run(&["check", path.to_str().expect("UTF-8")], 1);
+        let refused = run(&["run", "--check", path.to_str().expect("UTF-8")], 1);
         let said = text(&refused.stderr);
         assert!(said.contains(&format!("unknown operator '{name}'; {advice}")), "{said}");
     }

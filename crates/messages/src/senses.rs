@@ -4,7 +4,7 @@
 use std::fmt;
 
 use serde::Deserialize;
-use serde::de::{Deserializer, Error as _, IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde::de::{Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 use serde::ser::SerializeStruct;
 
 use crate::declare::at_most;
@@ -184,15 +184,6 @@ impl OwnedSenses {
         self.set(sense, values);
         self
     }
-
-    /// Reads what is left of a JSON object, as `#[serde(flatten, deserialize_with)]`: any other key is an error, where
-    /// [`OwnedSenses::deserialize`] leaves it to others.
-    ///
-    /// # Errors
-    /// A key that is no sense, or a value that is no list of numbers.
-    pub fn of_all_keys<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_map(OfFields)
-    }
 }
 
 impl From<Senses<'_>> for OwnedSenses {
@@ -207,24 +198,17 @@ fn span(lens: &[u32; N_SENSES], sense: Sense) -> (usize, usize) {
     (start, start + lens[sense as usize] as usize)
 }
 
-/// The names of all senses.
-const NAMES: [&str; N_SENSES] = {
-    let mut names = [""; N_SENSES];
-    let mut idx = 0;
-    while idx < N_SENSES {
-        names[idx] = Sense::ALL[idx].name();
-        idx += 1;
-    }
-    names
-};
-
+/// In JSON the senses are fields of their message (`#[serde(flatten)]`), which leaves them every key that it does not know
+/// itself; elsewhere they are lists, one after the other.
 impl<'de> Deserialize<'de> for OwnedSenses {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_struct("Senses", &NAMES, OfFields)
+        if deserializer.is_human_readable() {
+            return deserializer.deserialize_map(OfFields);
+        }
+        deserializer.deserialize_tuple(N_SENSES, OfFields)
     }
 }
 
-/// Reads senses as the fields of a struct.
 struct OfFields;
 
 impl<'de> Visitor<'de> for OfFields {
@@ -249,8 +233,7 @@ impl<'de> Visitor<'de> for OfFields {
         let mut senses = OwnedSenses::default();
         while let Some(name) = fields.next_key::<String>()? {
             let Some(sense) = Sense::ALL.into_iter().find(|sense| sense.name() == name) else {
-                fields.next_value::<IgnoredAny>()?;
-                let names = NAMES.join(", ");
+                let names = Sense::ALL.map(Sense::name).join(", ");
                 return Err(A::Error::custom(format!(
                     "unknown field `{name}`: it is none of a frame's, nor a sense ({names})"
                 )));

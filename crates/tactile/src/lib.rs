@@ -86,8 +86,8 @@ pub struct Reading {
     /// Force on each cell, pad after pad in the hand's order, newtons (or the unit of the hand's layout).
     pub cells_newtons: Vec<f64>,
     pub phase: Phase,
-    /// Each sense under its own name in a line. A key that is unknown is refused here.
-    #[serde(flatten, deserialize_with = "OwnedSenses::of_all_keys")]
+    /// Each sense under its own name in a line. They refuse a key that is unknown.
+    #[serde(flatten)]
     pub senses: OwnedSenses,
     /// The grasp; without it, the phases tell where a grasp begins.
     #[serde(default)]
