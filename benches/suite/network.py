@@ -69,7 +69,10 @@ class Host:
     def __init__(self, network, idx):
         self.network = network
         self.address = f"10.77.0.{idx}"
-        prepare = "mount -t tmpfs tmpfs /dev/shm && mkdir /dev/shm/tmp && ip link set lo up && echo $$ && exec cat"
+        # The sockets of graphs are in /tmp, whatever TMPDIR says.
+        sockets = f"/tmp/blindgrasp-{os.getuid()}"
+        own = f"mount -t tmpfs tmpfs /dev/shm && mkdir -p {sockets} && mount -t tmpfs -o mode=700 tmpfs {sockets}"
+        prepare = f"{own} && mkdir /dev/shm/tmp && ip link set lo up && echo $$ && exec cat"
         command = ["unshare", "--net", "--mount", "--kill-child", "--fork", "sh", "-c", prepare]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         # Ctrl-C is for this program, not for the processes that it has started.

@@ -125,7 +125,7 @@ def loop(peer, robot, folder, is_group):
     with Router(peer) as router:
         topics = {"cells_topic": "/cells", "phase_topic": "/phase"}
         params = {"driver": "ros2", "hand": str(programs.HAND), "connect": router.endpoint, **topics}
-        more = {"group": "gate"} if is_group else {}
+        more = {"sandbox": "on"} | ({"group": "gate"} if is_group else {})
         operators = {"tactile_source": {"params": params}, **graphs.judging_nodes("tactile_source", **more)}
         operators["ros2"] = publisher(router, {"decision": "lift_arbiter/decision"})
         with graphs.Graph(graphs.write_flow(folder / "loop.yaml", operators), ["lift_arbiter.votes=1"]) as running:
@@ -139,11 +139,12 @@ def cost(peer, published, folder, options):
     with Router(peer) as router:
         edges = {"decision": "lift_arbiter/decision", "tactile": "recorded_source/tactile", "contacts": "contacts/contacts"}
         params = {"recording": str(programs.HELD_OUT)}
-        operators = {"recorded_source": {"params": params}, **graphs.judging_nodes("recorded_source")}
+        operators = {"recorded_source": {"params": params}, **graphs.judging_nodes("recorded_source", sandbox="on")}
         if published:
             operators["ros2"] = publisher(router, {port: edges[port] for port in published})
         flow = graphs.write_flow(folder / "cost.yaml", operators)
-        with graphs.Graph(flow, graphs.played(programs.HELD_OUT, options.rate, "forever")) as running:
+        settings = [*graphs.played(programs.HELD_OUT, options.rate, "forever"), "lift_arbiter.votes=3"]
+        with graphs.Graph(flow, settings) as running:
             wait_for_router(running)
             time.sleep(options.secs)
             running.stop()

@@ -3,12 +3,13 @@
 "server" is `blindgrasp view` without a browser, "20 readers" are curl processes that read its events, "1000 connections"
 are opened and ask for events, and "browser" is headless Chromium that renders in software on the same machine
 (tests/browser.py). Of the browser: the time from the request of the page to its first frame, and from a decision's line
-on the launcher's stdout to its picture.
+on the launcher's stdout to its picture. Without chromedriver the browser is left out.
 """
 
 import contextlib
 import json
 import resource
+import shutil
 import socket
 import subprocess
 import time
@@ -41,8 +42,11 @@ def measure(options):
         "server": no_reader,
         f"{N_READERS} readers": readers,
         f"{N_CONNECTIONS} connections": connections,
-        "browser": lambda address: Browser(python, address),
     }
+    if shutil.which("chromedriver"):
+        watchers["browser"] = lambda address: Browser(python, address)
+    else:
+        figures.progress("no chromedriver: the browser is left out")
     sides = {name: lambda watcher=watcher: measured(watcher, options.secs) for name, watcher in watchers.items()}
     runs = figures.in_turn(options.rounds, sides)
     return {"medians": figures.medians(runs), "ratios": figures.ratios(runs, "alone"), "rounds": runs}
