@@ -8,9 +8,9 @@ use std::path::Path;
 use std::time::Instant;
 
 use blindgrasp_learning::dataset::{hand_of, read_grasps};
+use blindgrasp_learning::learners::k_means::{KMeansParams, learn_dictionary};
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::contacts::contacts_from_frame;
-use blindgrasp_stages::dictionary::{KMeansParams, learn_dictionary};
 use serde_json::json;
 
 type Failure = Box<dyn std::error::Error>;

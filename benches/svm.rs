@@ -9,9 +9,10 @@ use std::path::Path;
 use std::time::Instant;
 
 use blindgrasp_learning::dataset::{hand_of, read_grasps};
+use blindgrasp_learning::learners::libsvm_format::{parse_libsvm, write_libsvm};
+use blindgrasp_learning::learners::svm::train_svm;
 use blindgrasp_messages::Phase;
-use blindgrasp_stages::classifier::libsvm_format::{parse_libsvm, write_libsvm};
-use blindgrasp_stages::classifier::svm::{PreparedSvm, SvmParams, train_svm};
+use blindgrasp_stages::classifier::svm::{PreparedSvm, SvmParams};
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::encoder::Reading;
 use blindgrasp_stages::model::Model;

@@ -2,14 +2,13 @@
 
 use std::path::PathBuf;
 
-use blindgrasp_messages::{Fault, GraspFeature, GraspFeatureHead, Phase, Prediction, PredictionHead, Recorded};
+use blindgrasp_messages::{GraspFeature, GraspFeatureHead, Prediction, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
-use blindgrasp_stages::classifier::Verdict;
-use blindgrasp_stages::day::GraspPlace;
 use blindgrasp_stages::model::{Memory, Model};
+use blindgrasp_stages::steps;
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -55,12 +54,7 @@ impl Stage for Classify {
     }
 
     fn answer(&mut self, head: &GraspFeatureHead, values: &[f64], _now_nanos: u64, answers: &mut Answers<Prediction>) {
-        let place = GraspPlace { epoch: head.header.epoch, grasp_id: head.grasp_id, day: head.day };
-        let values = checked(&self.model, self.dictionary_id, head, values);
-        let verdict = Phase::from_code(head.phase)
-            .map_err(|_| Fault::Malformed)
-            .and_then(|phase| self.model.judge(&mut self.memory, self.dictionary_id, place, phase, values));
-        answers.push(prediction(head, verdict));
+        answers.push(steps::classify(&self.model, self.dictionary_id, &mut self.memory, head, values));
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
@@ -78,35 +72,5 @@ impl Stage for Classify {
             }
         }
         Ok(())
-    }
-}
-
-/// The values of a feature that the model can judge.
-fn checked<'a>(
-    model: &Model,
-    dictionary_id: u64,
-    head: &GraspFeatureHead,
-    values: &'a [f64],
-) -> Result<&'a [f64], Fault> {
-    match Fault::from_code(head.fault) {
-        Err(_) => Err(Fault::Malformed),
-        _ if Phase::from_code(head.phase).is_err() => Err(Fault::Malformed),
-        _ if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
-        _ if head.dictionary_id != dictionary_id => Err(Fault::WrongModel),
-        Ok(Fault::None) => Ok(values),
-        Ok(fault) => Err(fault),
-    }
-}
-
-fn prediction(head: &GraspFeatureHead, verdict: Result<Verdict, Fault>) -> PredictionHead {
-    PredictionHead {
-        header: head.header,
-        grasp_id: head.grasp_id,
-        decision_value: verdict.map_or(0.0, |verdict| verdict.decision_value),
-        probability_stable: verdict.map_or(0.0, |verdict| verdict.probability_stable),
-        phase: head.phase,
-        stable: verdict.is_ok_and(|verdict| verdict.stable).into(),
-        fault: verdict.err().unwrap_or_default().code(),
-        unsure: verdict.is_ok_and(|verdict| verdict.unsure).into(),
     }
 }

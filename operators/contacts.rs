@@ -3,10 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use blindgrasp_messages::{
-    Contact, ContactSet, ContactSetHead, Fault, FrameParts, Header, Phase, Recorded, Senses, TactileFrame,
-    TactileFrameHead,
-};
+use blindgrasp_messages::{ContactSet, Fault, Phase, Recorded, TactileFrame, TactileFrameHead};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
@@ -15,6 +12,7 @@ use blindgrasp_stages::contacts::{ContactFinder, ContactSummary};
 use blindgrasp_stages::day::GraspPlace;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::sensors::{Described, SensorCheck, SensorFault, SensorMemory};
+use blindgrasp_stages::steps::{contact_set, find_contacts};
 use serde::Deserialize;
 
 #[derive(Deserialize)]
@@ -56,44 +54,6 @@ pub(crate) fn hand_of(path: &Path) -> anyhow::Result<(Hand, BTreeMap<String, Str
     hand.warnings().iter().for_each(|warning| tracing::warn!("{warning}"));
     let identity = BTreeMap::from([("hand".into(), format!("{:016x}", hand.id()))]);
     Ok((hand, identity))
-}
-
-/// The contacts of a frame and, if it can be read, its parts.
-fn found<'a>(
-    hand: &Hand,
-    finder: &mut ContactFinder,
-    head: &TactileFrameHead,
-    items: &'a [f64],
-    contacts: &mut Vec<Contact>,
-) -> (ContactSummary, Option<FrameParts<'a>>) {
-    match head.split(items) {
-        Ok(parts) => {
-            let FrameParts { joints_rad, cells_newtons, .. } = parts;
-            (finder.find(hand, head.header.hand_id, joints_rad, cells_newtons, contacts), Some(parts))
-        }
-        Err(_) => (ContactSummary { fault: Fault::Malformed, ..ContactSummary::default() }, None),
-    }
-}
-
-fn contact_set(
-    head: &TactileFrameHead,
-    hand_id: u64,
-    summary: ContactSummary,
-    parts: Option<&FrameParts<'_>>,
-) -> ContactSetHead {
-    ContactSetHead {
-        header: Header { hand_id, ..head.header },
-        grasp_id: head.grasp_id,
-        phase: head.phase,
-        n_pads_in_contact: summary.n_pads_in_contact,
-        self_collision: summary.self_collision.into(),
-        n_self_contacts: summary.n_self_contacts,
-        fault: summary.fault.code(),
-        day: head.day,
-        ..ContactSetHead::default()
-    }
-    .with_joints(parts.map_or(&[], |parts| parts.joints_rad))
-    .with_senses(&parts.map_or(Senses::default(), |parts| parts.senses))
 }
 
 struct FindContacts {
@@ -169,7 +129,7 @@ impl Stage for FindContacts {
     }
 
     fn answer(&mut self, head: &TactileFrameHead, items: &[f64], _now_nanos: u64, answers: &mut Answers<ContactSet>) {
-        let (mut summary, parts) = found(&self.hand, &mut self.finder, head, items, answers.items());
+        let (mut summary, parts) = find_contacts(&self.hand, &mut self.finder, head, items, answers.items());
         let phase = Phase::from_code(head.phase).ok().filter(|phase| !phase.is_over());
         if let (Some(watch), Some(parts), Some(phase)) = (&mut self.watch, &parts, phase)
             && matches!(summary.fault, Fault::None | Fault::NoContact)

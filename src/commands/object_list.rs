@@ -7,7 +7,7 @@ use anyhow::{Context, bail};
 use serde::Serialize;
 
 use super::{Outcome, print_line};
-use blindgrasp_objects::mesh::write_off;
+use blindgrasp_mesh::write_off;
 use blindgrasp_objects::{Object, objects_named};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_simulator::trial::targets::targets_named;

@@ -13,8 +13,7 @@ use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::evaluation::{decide, decide_frames};
 use blindgrasp_messages::{GraspTruth, Header, LiftDecision, OwnedSenses, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::recordings_in;
-use blindgrasp_stages::hand::Hand;
-use blindgrasp_stages::model::Model;
+use blindgrasp_stages::{Hand, Judge, Model};
 use blindgrasp_tactile::line_protocol;
 
 /// The time between two frames that have no stamp.
@@ -57,13 +56,15 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         let is_recording = file.extension().is_some_and(|extension| extension == "mcap");
         if is_recording {
             let hand = hand_of(file, arguments.hand.as_deref())?;
-            for decided in decide(&hand, &model, file)? {
+            let mut judge = Judge::new(hand, model.clone())?;
+            for decided in decide(&mut judge, file)? {
                 print(arguments.json, file, &decided.decision, decided.truth.as_ref())?;
             }
         } else {
             let hand = hand_of_model(&model, arguments.hand.as_deref())?;
             let frames = read_frames(file, &hand)?;
-            for decision in decide_frames(&hand, &model, &frames) {
+            let mut judge = Judge::new(hand, model.clone())?;
+            for decision in decide_frames(&mut judge, &frames) {
                 print(arguments.json, file, &decision, None)?;
             }
         }
@@ -78,9 +79,7 @@ fn hand_of_model(model: &Model, path: Option<&Path>) -> anyhow::Result<Hand> {
             format!("the model is for the hand '{}': name its pad layout with --hand", model.hand.name)
         })?,
     };
-    if hand.id() != model.hand.id {
-        bail!("the model is for the hand '{}', not for '{}' as it is here", model.hand.name, hand.name);
-    }
+    model.check_hand(&hand)?;
     Ok(hand)
 }
 

@@ -3,10 +3,10 @@
 use std::collections::HashSet;
 use std::time::{Duration, Instant};
 
-use blindgrasp_objects::mesh::check::{check_size, repair};
-use blindgrasp_objects::mesh::folder::read_folder;
-use blindgrasp_objects::mesh::mass::{Basis, solid_properties};
-use blindgrasp_objects::mesh::read::read_mesh;
+use blindgrasp_mesh::check::{check_size, repair};
+use blindgrasp_mesh::mass::{Basis, solid_properties};
+use blindgrasp_mesh::read::read_mesh;
+use blindgrasp_objects::folder::read_folder;
 
 use crate::common::reference;
 

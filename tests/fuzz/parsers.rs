@@ -5,10 +5,10 @@ use std::path::Path;
 
 use blindgrasp_graph::control::Request;
 use blindgrasp_graph::dataflow;
-use blindgrasp_objects::mesh::read::read_mesh;
-use blindgrasp_objects::mesh::{Mesh, write_off};
+use blindgrasp_learning::learners::libsvm_format::parse_libsvm;
+use blindgrasp_mesh::read::read_mesh;
+use blindgrasp_mesh::{Mesh, write_off};
 use blindgrasp_simulator::case_file::parse_cases;
-use blindgrasp_stages::classifier::libsvm_format::parse_libsvm;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 use blindgrasp_tactile::line_protocol;

@@ -139,7 +139,7 @@ pub(crate) fn keys(folder: &Path, arguments: &[&str]) -> PathBuf {
     keys
 }
 
-/// `examples/link_attacker.rs` at work on a host; killed with -9 if it is dropped before its end.
+/// `tests/doubles/link_attacker.rs` at work on a host; killed with -9 if it is dropped before its end.
 pub(crate) struct Attacker(Child);
 
 impl Attacker {

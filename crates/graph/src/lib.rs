@@ -1,5 +1,14 @@
 //! The online half: operators as processes, their ports over iceoryx2, and the launcher.
 //!
+//! A dataflow file is read and checked before anything starts, and a mistake says where it stands:
+//!
+//! ```
+//! use blindgrasp_graph::dataflow;
+//!
+//! let error = dataflow::parse("two.yaml".as_ref(), b"name: *a").expect_err("there is no a");
+//! assert!(error.to_string().contains("two.yaml:1:7"), "{error}");
+//! ```
+//!
 //! It knows messages and the graph, not the science.
 //!
 //! * [`dataflow`] - the dataflow file, checked; it starts nothing. [`operators`] - the operators that come with a program.

@@ -7,6 +7,7 @@ use serde::Deserialize;
 
 use blindgrasp_messages::{GraspTruth, Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingError, RecordingReader};
+use blindgrasp_stages::OtherHand;
 use blindgrasp_stages::hand::{Hand, HandError};
 use blindgrasp_stages::label::Label;
 
@@ -32,6 +33,8 @@ pub enum DatasetError {
     Recording(#[from] RecordingError),
     #[error(transparent)]
     Hand(#[from] HandError),
+    #[error(transparent)]
+    OtherHand(#[from] OtherHand),
     #[error("recording {}: {message}", path.display())]
     Unusable { path: PathBuf, message: String },
 }

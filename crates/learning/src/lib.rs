@@ -1,12 +1,27 @@
 //! From recordings to a model, and what a model is worth on recordings.
 //!
+//! ```
+//! use blindgrasp_learning::evaluation::evaluate;
+//! use blindgrasp_stages::{ArbiterOptions, Hand, Model};
+//!
+//! let hand = Hand::load("barrett-bh8-280".as_ref())?;
+//! let model = Model::load("../../models/barrett-bh8-280.json".as_ref())?;
+//! let recordings = ["../../recordings/held-out.mcap".into()];
+//! let evaluated = evaluate(&hand, &model, &recordings, &ArbiterOptions::default())?;
+//! assert!(evaluated.evaluation.score.accuracy > Some(0.85));
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
+//! [`training::train`] makes such a model of recordings, and [`training::train_on`] of grasps in memory.
+//!
 //! * [`dataset`] - recordings as data sets. [`import`] - tables of tactile readings as recordings.
-//! * [`training`] - the model.
+//! * [`training`] - the model, by the [`learners`].
 //! * [`evaluation`] - decisions compared with labels. [`promise`] - bounds for the drops to come. [`trials`] - lift trials counted and shown.
 
 pub mod dataset;
 pub mod evaluation;
 pub mod import;
+pub mod learners;
 pub mod promise;
 pub mod sensors;
 pub mod training;

@@ -9,8 +9,8 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::dataset::{DatasetError, read_grasps};
+use crate::learners::booster::train_boosted;
 use blindgrasp_messages::{Contact, Fault, Phase, TactileFrame};
-use blindgrasp_stages::classifier::booster::train_boosted;
 use blindgrasp_stages::classifier::boosting::{BoostedTrees, BoostingError, BoostingParams};
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::day::GraspPlace;

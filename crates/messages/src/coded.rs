@@ -86,6 +86,15 @@ macro_rules! coded_enums {
     };
 }
 
+/// The fault in plain words.
+impl std::fmt::Display for Fault {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(formatter, "no result for the frame: {}", self.as_str().replace('_', " "))
+    }
+}
+
+impl std::error::Error for Fault {}
+
 coded_enums! {
     /// Where in a grasp a frame was taken.
     Phase in "phase" {

@@ -12,7 +12,7 @@ use crate::{
 declared! { shared
     /// One active cell, in the palm frame.
     #[derive(PartialEq, Serialize, Deserialize)]
-    #[type_name("blindgrasp/Contact/1")]
+    #[cfg_attr(feature = "ipc", type_name("blindgrasp/Contact/1"))]
     pub struct Contact {
         /// The cell's centre.
         #[ros = "Palm frame, metres."]

@@ -116,7 +116,8 @@ macro_rules! shared {
     }) => {
         #[doc = $doc]
         #[repr(C)]
-        #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
+        #[derive(Debug, Clone, Copy, Default)]
+        #[cfg_attr(feature = "ipc", derive(ZeroCopySend))]
         $(#[$($meta)*])*
         pub struct $name { $($(#[$($field_meta)*])* pub $field: $type,)+ }
 
@@ -127,7 +128,7 @@ macro_rules! shared {
 /// Writes down the layout of a struct in shared memory, from which the Python file is made and tested.
 macro_rules! layout {
     ($name:ident, $doc:literal, $($field:ident: $type:ty,)+) => {
-        #[cfg(test)]
+        #[cfg(all(test, feature = "ipc"))]
         impl crate::layout::Shared for $name {
             fn layout() -> crate::layout::Struct {
                 let fields = vec![$(crate::layout::field::<$type>(stringify!($field), std::mem::offset_of!($name, $field))),+];
@@ -145,7 +146,8 @@ macro_rules! declared {
         declared! {
             #[doc = $doc]
             #[repr(C)]
-            #[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
+            #[derive(Debug, Clone, Copy, Default)]
+            #[cfg_attr(feature = "ipc", derive(ZeroCopySend))]
             $(#[$($meta)*])*
             pub struct $name { $($(#[$($field_meta)*])* pub $field: $type,)+ }
         }
@@ -251,7 +253,7 @@ macro_rules! message {
     }) => {
         shared! {
             #[doc = $doc]
-            #[type_name($head_name)]
+            #[cfg_attr(feature = "ipc", type_name($head_name))]
             pub struct $head { pub header: crate::Header, $(pub $field: $raw,)+ }
         }
     };

@@ -7,7 +7,7 @@ use crate::{Recorded, ZeroCopySend};
 declared! { shared
     /// On each sample: which one it is and where it comes from.
     #[derive(PartialEq, Eq, Serialize, Deserialize)]
-    #[type_name("blindgrasp/Header/2")]
+    #[cfg_attr(feature = "ipc", type_name("blindgrasp/Header/2"))]
     pub struct Header {
         /// Counts the samples of the source, from 0, without gaps. A stage gives its output the number of the input.
         #[ros = "Which sample it is and where it comes from."]

@@ -1,5 +1,21 @@
 //! The samples that travel along the graph's edges, each declared once in a file of its own.
 //!
+//! ```
+//! use blindgrasp_messages::{Header, Message, Phase, TactileFrame};
+//!
+//! let frame = TactileFrame {
+//!     grasp_id: 7,
+//!     phase: Phase::Settled,
+//!     joints_rad: vec![0.1, 0.9],
+//!     cells_newtons: vec![0.0, 1.5, 0.2],
+//!     ..TactileFrame::default()
+//! };
+//! let (head, items) = frame.to_parts(Header { seq: 3, ..Header::default() });
+//! assert_eq!(TactileFrame::header(&head).seq, 3);
+//! assert_eq!(TactileFrame::from_parts(&head, &items)?, frame);
+//! # Ok::<(), blindgrasp_messages::MessageError>(())
+//! ```
+//!
 //! A declaration gives a message all its shapes. In shared memory a message is a fixed-size `…Head` (`repr(C)`,
 //! iceoryx2's user header, beginning with [`Header`]) and a slice of [`Message::Item`]s (the payload), so that the
 //! memory taken is that of the hand in use and not that of the largest one. Elsewhere it is an owned struct: recordings
@@ -10,6 +26,9 @@
 //! such: enums travel as integer codes, and [`Message::from_parts`] checks the codes and every length.
 //!
 //! A new message type is a file with its `message!`, which this file names as a module, and a line in the list below.
+
+// Files of messages import the condition on shared memory, which only the feature makes use of.
+#![cfg_attr(not(feature = "ipc"), allow(unused_imports))]
 
 #[macro_use]
 mod declare;
@@ -22,7 +41,7 @@ mod grasp_feature;
 mod grasp_scene;
 mod grasp_truth;
 mod header;
-#[cfg(test)]
+#[cfg(all(test, feature = "ipc"))]
 mod layout;
 mod lift_decision;
 mod lift_outcome;
@@ -48,8 +67,8 @@ pub use senses::{OwnedSenses, Sense, Senses};
 pub use serialized::{hex_id, read_list};
 pub use tactile_frame::{FrameParts, FramePartsMut, TactileFrame, TactileFrameHead};
 
-use iceoryx2::prelude::ZeroCopySend;
 use serde::{Deserialize, Serialize};
+use shared_memory::ZeroCopySend;
 
 /// The most joints that a message carries.
 pub const MAX_JOINTS: usize = 32;
@@ -82,6 +101,18 @@ pub trait Recorded: Serialize + for<'de> Deserialize<'de> + Clone + std::fmt::De
     /// # Errors
     /// The first length that is too large.
     fn check(&self) -> Result<(), MessageError>;
+}
+
+/// The condition on what lies in shared memory: iceoryx2's with the feature `ipc`, none without.
+#[allow(unreachable_pub, reason = "it bounds the associated types of a public trait")]
+mod shared_memory {
+    #[cfg(feature = "ipc")]
+    pub use iceoryx2::prelude::ZeroCopySend;
+
+    #[cfg(not(feature = "ipc"))]
+    pub trait ZeroCopySend {}
+    #[cfg(not(feature = "ipc"))]
+    impl<T> ZeroCopySend for T {}
 }
 
 /// A message that can travel along an edge.
@@ -171,7 +202,7 @@ macro_rules! messages {
             };
         }
 
-        #[cfg(test)]
+        #[cfg(all(test, feature = "ipc"))]
         pub(crate) fn layouts() -> Vec<layout::MessageLayout> {
             vec![$(layout::of_message::<$sent>()),+]
         }

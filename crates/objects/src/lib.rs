@@ -1,5 +1,15 @@
 //! Objects to grasp: a built-in catalogue of everyday things, and objects from meshes.
 //!
+//! ```
+//! use blindgrasp_objects::select;
+//!
+//! let mugs = select("mug")?;
+//! assert_eq!(mugs.iter().filter(|mug| mug.held_out).count(), 10);
+//! let mesh = mugs[0].to_mesh();
+//! assert!(!mesh.triangles.is_empty());
+//! # Ok::<(), blindgrasp_objects::SelectionError>(())
+//! ```
+//!
 //! The catalogue has 24 classes of thirty objects, built from a few sizes each: vessels are hollow, mugs have handles
 //! that fingers go through. It is the same everywhere. Objects are metres, upright along +z or (tools, cutlery) long
 //! along z with the working end up; they stand on z = 0, but exact boxes, books and balls, which have their centre at the
@@ -8,10 +18,11 @@
 //! third object of a class (`-02`, `-05`, ... `-29`) is held out: it is never used for training.
 
 mod classes;
-pub mod mesh;
+pub mod folder;
 mod named;
 mod outline;
 mod paper;
+pub mod shape;
 mod solid;
 
 use nalgebra::Point3;
@@ -19,9 +30,9 @@ use parry3d_f64::math::Vector;
 use parry3d_f64::shape::{Shape, SharedShape};
 use rayon::prelude::*;
 
-use crate::mesh::mass::{SolidProperties, solid_properties};
-use crate::mesh::shape::mesh_of_shape;
-use crate::mesh::{Mesh, MeshError};
+use crate::shape::mesh_of_shape;
+use blindgrasp_mesh::mass::{SolidProperties, solid_properties};
+use blindgrasp_mesh::{Mesh, MeshError};
 use classes::{CLASSES, Class, Draw, Made};
 
 pub use named::{MeshObjectError, NamedError, find_mesh, object_of_mesh, objects_id, objects_named};

@@ -6,11 +6,11 @@ use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 
 use super::{Object, ObjectError, SelectionError, select};
-use crate::mesh::check::{check_size, repair};
-use crate::mesh::folder::{FolderError, MeshEntry, read_folder};
-use crate::mesh::mass::solid_properties;
-use crate::mesh::read::read_mesh;
-use crate::mesh::{Mesh, MeshError};
+use crate::folder::{FolderError, MeshEntry, read_folder};
+use blindgrasp_mesh::check::{check_size, repair};
+use blindgrasp_mesh::mass::solid_properties;
+use blindgrasp_mesh::read::read_mesh;
+use blindgrasp_mesh::{Mesh, MeshError};
 
 /// Density of a mesh without known mass or density. 500 kg/m³: assumed, a light wood.
 const DENSITY_KG_PER_M3: f64 = 500.0;

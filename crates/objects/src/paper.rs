@@ -20,11 +20,11 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::classes::loop_handle;
-use crate::mesh::Mesh;
-use crate::mesh::mass::solid_properties;
 use crate::outline::{Point, ellipse, fillet, superellipse};
 use crate::solid::{Assembly, Solid};
 use crate::{Object, ObjectError};
+use blindgrasp_mesh::Mesh;
+use blindgrasp_mesh::mass::solid_properties;
 
 /// The shape of one of the paper's six objects.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -235,7 +235,7 @@ fn rock() -> Assembly {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mesh::check::repair;
+    use blindgrasp_mesh::check::repair;
 
     /// Masses as in the paper's tables.
     const MASSES_KG: [(PaperShape, f64); 6] = [

@@ -5,8 +5,8 @@
 
 use nalgebra::{Point3, Rotation3, Unit, Vector3};
 
-use crate::mesh::Mesh;
 use crate::outline::{Point, n_around, offset};
+use blindgrasp_mesh::Mesh;
 
 /// How far down a vessel's inner side is as fine as its outer side.
 const REACH_MM: f64 = 25.0;

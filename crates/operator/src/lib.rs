@@ -1,6 +1,34 @@
 //! What an operator process of a graph needs: its ports over iceoryx2, how it starts, takes over and hands over, its
 //! parameters and what it says about itself.
 //!
+//! An operator is a program whose `main` calls [`run`] with a description and its work:
+//!
+//! ```no_run
+//! use std::collections::BTreeMap;
+//! use std::process::ExitCode;
+//!
+//! use blindgrasp_messages::{GraspFeature, Prediction, PredictionHead, Recorded};
+//! use blindgrasp_operator::{Operator, OperatorDescription, run, stage};
+//!
+//! fn main() -> ExitCode {
+//!     let description = OperatorDescription::new("pessimist", "Calls every grasp unstable")
+//!         .answers_each()
+//!         .input("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
+//!         .output("prediction", Prediction::TYPE_NAME, "Unstable, always");
+//!     run(&description, work)
+//! }
+//!
+//! fn work(operator: &Operator) -> anyhow::Result<()> {
+//!     let answer = stage::from_fn::<GraspFeature, Prediction, _>(|head, _values, _items| PredictionHead {
+//!         header: head.header,
+//!         grasp_id: head.grasp_id,
+//!         phase: head.phase,
+//!         ..PredictionHead::default()
+//!     });
+//!     stage::run(operator, "feature", "prediction", 0, BTreeMap::new(), answer)
+//! }
+//! ```
+//!
 //! * [`operator`] - what all operator processes have in common.
 //! * [`stage`] - an operator that answers samples. [`source`] - an operator that has samples of its own.
 //! * [`description`] and [`param`] - what an operator says about itself (`--describe`).

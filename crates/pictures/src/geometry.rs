@@ -2,8 +2,8 @@
 
 use std::collections::HashMap;
 
-use blindgrasp_objects::mesh::Mesh;
-use blindgrasp_objects::mesh::shape::mesh_of_shape;
+use blindgrasp_mesh::Mesh;
+use blindgrasp_objects::shape::mesh_of_shape;
 use blindgrasp_stages::hand::{Hand, Link};
 use nalgebra::{Point3, Vector3};
 

@@ -3,8 +3,8 @@
 use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
 
 use super::PictureError;
+use blindgrasp_mesh::Mesh;
 use blindgrasp_messages::{GraspScene, GraspTruth, LiftDecision, Phase, Prediction, Stamped, TactileFrame};
-use blindgrasp_objects::mesh::Mesh;
 use blindgrasp_stages::hand::Hand;
 
 /// The object's surface, as far as whoever asks for the picture has it.

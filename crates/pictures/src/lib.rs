@@ -1,5 +1,18 @@
 //! Pictures: what people would rather look at than read.
 //!
+//! ```
+//! use blindgrasp_pictures::{DrawnEdge, DrawnGraph, DrawnNode, graph_mermaid};
+//!
+//! let node = |name: &str| DrawnNode { name: name.into(), ..DrawnNode::default() };
+//! let graph = DrawnGraph {
+//!     title: "two".into(),
+//!     nodes: vec![node("source"), node("contacts")],
+//!     edges: vec![DrawnEdge { from: 0, to: 1, ..DrawnEdge::default() }],
+//!     ..DrawnGraph::default()
+//! };
+//! assert!(graph_mermaid(&graph).contains("contacts"));
+//! ```
+//!
 //! * [`grasp_svg`] - a grasp: the hand on the object from two sides, its contacts with their normals and forces, what
 //!   each pad feels, and what is known of the grasp. One file, no script, a light card that dark pages show as it is.
 //! * [`grasp_html`] - the same, and the grasp in three dimensions to turn by hand, with a slider over its frames. One

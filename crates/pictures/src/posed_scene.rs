@@ -9,8 +9,8 @@ use super::colour::{HAND, OBJECT, Rgb, lit};
 use super::geometry::link_mesh;
 use super::png_image::{Image, data_uri};
 use super::raster::{Camera, SAMPLES_PER_SIDE, Samples};
-use blindgrasp_objects::mesh::Mesh;
-use blindgrasp_objects::mesh::shape::mesh_of_shape;
+use blindgrasp_mesh::Mesh;
+use blindgrasp_objects::shape::mesh_of_shape;
 use blindgrasp_stages::hand::{Hand, JointError};
 
 /// The place of everything at one moment. The post's top is z = 0 of the world.

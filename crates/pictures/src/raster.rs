@@ -3,7 +3,7 @@
 use nalgebra::{Isometry3, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
 use super::geometry::corner_normals;
-use blindgrasp_objects::mesh::Mesh;
+use blindgrasp_mesh::Mesh;
 
 /// Samples along each side of a pixel. 3: edges look smooth.
 pub(super) const SAMPLES_PER_SIDE: usize = 3;

@@ -6,8 +6,8 @@ use serde::Serialize;
 use super::colour::{HAND, OBJECT, Rgb, SILENT_CELL, bytes, force_colour};
 use super::geometry::{cells_in_link, link_mesh};
 use super::grasp::palm_from_object;
+use blindgrasp_mesh::Mesh;
 use blindgrasp_messages::GraspScene;
-use blindgrasp_objects::mesh::Mesh;
 use blindgrasp_stages::hand::{Hand, JointError};
 
 /// The parts of three.js that pages use, as a module.

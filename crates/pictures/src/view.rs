@@ -9,7 +9,7 @@ use super::grasp::{ContactKind, ContactMark, Placed};
 use super::png_image::{Image, data_uri};
 use super::raster::{Camera, SAMPLES_PER_SIDE, Samples};
 use super::svg::{Anchor, Svg, px};
-use blindgrasp_objects::mesh::Mesh;
+use blindgrasp_mesh::Mesh;
 use blindgrasp_stages::hand::{Hand, Motion};
 
 /// Pixels of the rendered image a pixel of the picture: sharp on fine screens.

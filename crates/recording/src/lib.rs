@@ -1,6 +1,20 @@
 //! Recordings: MCAP files with zstd chunks, profile `ros2`, CDR messages and `ros2msg` schemas, so that Foxglove,
 //! rosbag2 and PlotJuggler open them. They are also the data sets: the simulator writes them, training reads them.
 //!
+//! ```
+//! use blindgrasp_recording::{Record, RecordingReader};
+//!
+//! let reader = RecordingReader::open("../../recordings/ordinary.mcap".as_ref())?;
+//! assert_eq!(reader.info().hand, "barrett-bh8-280");
+//! let mut n_frames = 0;
+//! for record in reader {
+//!     let (_topic, record) = record?;
+//!     n_frames += usize::from(matches!(record, Record::Tactile(_)));
+//! }
+//! assert!(n_frames > 0);
+//! # Ok::<(), blindgrasp_recording::RecordingError>(())
+//! ```
+//!
 //! Not here: what the messages mean. A recording that was cut off or damaged is an error that names the file, never a
 //! shorter recording; [`repair()`] makes a recording of the whole samples in it.
 

@@ -269,7 +269,7 @@ fn frames(hand: &Hand, grasp: &Grasp, options: &SimulatorOptions, grasp_id: u64)
 #[cfg(test)]
 mod tests {
     use super::*;
-    use blindgrasp_objects::mesh::mass::solid_properties;
+    use blindgrasp_mesh::mass::solid_properties;
     use blindgrasp_stages::hand::pose_from_isometry;
     use nalgebra::{Isometry3, Point3, Reflection3, Rotation3, UnitQuaternion, Vector3};
     use parry3d_f64::math::Vector;

@@ -1,5 +1,22 @@
 //! The simulator of grasps, their contacts, tactile readings and quality.
 //!
+//! ```
+//! use blindgrasp_objects::select;
+//! use blindgrasp_simulator::options::SimulatorOptions;
+//! use blindgrasp_simulator::simulator::simulate_all;
+//! use blindgrasp_stages::hand::Hand;
+//!
+//! let hand = Hand::load("barrett-bh8-280".as_ref())?;
+//! let options = SimulatorOptions { n_grasps: 2, ..SimulatorOptions::default() };
+//! let mut grasps = Vec::new();
+//! let report = simulate_all(&hand, &select("bottle-00")?, &options, |grasp| {
+//!     grasps.push(grasp);
+//!     Ok::<(), std::convert::Infallible>(())
+//! })?;
+//! assert_eq!((report.n_grasps, grasps.len()), (2, 2));
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
 //! The path of a candidate: an object of [`blindgrasp_objects`] and a random start (or the [`planner`]'s)
 //! -> [`protocol`] (the palm comes, the fingers close; by the distances of [`distance`] and the joints of [`mechanism`]) ->
 //! [`contact_points`] -> [`loaded_contacts`] ([`soft_finger`] patches, cell forces) -> [`wrench_space`] (over [`hull`]) ->

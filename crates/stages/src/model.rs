@@ -14,6 +14,7 @@ use crate::approach::ApproachPrior;
 use crate::classifier::{Classifier, Verdict};
 use crate::day::{DayMemory, DayModel, GraspPlace};
 use crate::encoder::{FeatureExtractor, Reading};
+use crate::hand::Hand;
 use crate::out_of_distribution::TrainingRange;
 use crate::probe::{GraspHistory, ProbeModel, signals};
 use crate::training_summary::TrainingSummary;
@@ -85,6 +86,19 @@ pub struct ModelHand {
     pub id: u64,
 }
 
+/// A model and a hand that do not belong together.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "the model is for the hand '{model_hand}' ({model_hand_id:016x}), not for '{hand}' ({hand_id:016x}): take a model of \
+     this hand, or train one (blindgrasp train)"
+)]
+pub struct OtherHand {
+    pub model_hand: String,
+    pub model_hand_id: u64,
+    pub hand: String,
+    pub hand_id: u64,
+}
+
 /// Why a model could not be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
@@ -92,12 +106,35 @@ pub enum ModelError {
     #[error("model {}", path.display())]
     Io { path: PathBuf, source: std::io::Error },
     /// The file is not a model that this program can run.
-    #[error("model {}: {message}", path.display())]
-    Invalid {
-        path: PathBuf,
-        /// The problem, what was expected, what to do.
-        message: String,
-    },
+    #[error("model {}: {reason}", path.display())]
+    Invalid { path: PathBuf, reason: InvalidModel },
+}
+
+/// Why a text is not a model that this program can run.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum InvalidModel {
+    #[error(
+        "more than {} MiB: expected a model made by blindgrasp train; train it with fewer words or on fewer grasps",
+        MAX_BYTES >> 20
+    )]
+    TooLarge,
+    #[error("not a model (not UTF-8): expected JSON made by blindgrasp train")]
+    NotUtf8,
+    #[error("not a model, or cut off: {0}")]
+    NotAModel(String),
+    /// It has the format, but not what belongs to it.
+    #[error("not a valid model: {0}")]
+    Malformed(String),
+    #[error("format '{found}', expected '{FORMAT}': train it again with this version (blindgrasp train)")]
+    OtherFormat { found: String },
+    #[error(
+        "its checksum does not match its contents: it was damaged or edited; restore it, or train it again (blindgrasp \
+         train)"
+    )]
+    Checksum,
+    /// Its parts do not fit each other. The text names the part, what was found and what was expected.
+    #[error("{0}")]
+    Inconsistent(String),
 }
 
 impl Model {
@@ -110,31 +147,28 @@ impl Model {
         std::fs::File::open(path)
             .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
             .map_err(|source| ModelError::Io { path: path.into(), source })?;
-        let invalid = |message: &str| ModelError::Invalid { path: path.into(), message: message.into() };
+        let invalid = |reason| ModelError::Invalid { path: path.into(), reason };
         if bytes.len() as u64 > MAX_BYTES {
-            return Err(invalid(&too_large()));
+            return Err(invalid(InvalidModel::TooLarge));
         }
-        let text = String::from_utf8(bytes)
-            .map_err(|_| invalid("not a model (not UTF-8): expected JSON made by blindgrasp train"))?;
-        Model::parse(&text).map_err(|message| ModelError::Invalid { path: path.into(), message })
+        let text = String::from_utf8(bytes).map_err(|_| invalid(InvalidModel::NotUtf8))?;
+        Model::parse(&text).map_err(invalid)
     }
 
     /// Reads and verifies a model's text.
     ///
     /// # Errors
     /// What is wrong with it.
-    pub fn parse(text: &str) -> Result<Model, String> {
+    pub fn parse(text: &str) -> Result<Model, InvalidModel> {
         let model: Model = serde_json::from_str(text).map_err(|error| why_not_a_model(text, &error))?;
         if model.format != FORMAT {
-            return Err(other_format(&model.format));
+            return Err(InvalidModel::OtherFormat { found: model.format });
         }
         let expected = checksum(text, &model.checksum);
         if model.checksum != expected {
-            return Err("its checksum does not match its contents: it was damaged or edited; restore it, or train it \
-                        again (blindgrasp train)"
-                .into());
+            return Err(InvalidModel::Checksum);
         }
-        model.validate()?;
+        model.validate().map_err(InvalidModel::Inconsistent)?;
         Ok(model)
     }
 
@@ -144,17 +178,34 @@ impl Model {
     /// The model is inconsistent, or the file could not be written.
     pub fn save(&self, path: &Path) -> Result<(), ModelError> {
         let io = |source| ModelError::Io { path: path.into(), source };
+        let invalid = |reason| ModelError::Invalid { path: path.into(), reason };
         // What could not be read again must not take the place of what can.
-        self.validate().map_err(|message| ModelError::Invalid { path: path.into(), message })?;
+        self.validate().map_err(|message| invalid(InvalidModel::Inconsistent(message)))?;
         let unsigned = Model { checksum: String::new(), ..self.clone() };
         let mut text = serde_json::to_string(&unsigned).map_err(|error| io(error.into()))? + "\n";
         if let Some(at) = text.find(UNSIGNED) {
             text.insert_str(at + UNSIGNED.len() - 1, &digest(&[&text]));
         }
         if text.len() as u64 > MAX_BYTES {
-            return Err(ModelError::Invalid { path: path.into(), message: too_large() });
+            return Err(invalid(InvalidModel::TooLarge));
         }
         write_whole(path, text).map_err(io)
+    }
+
+    /// Checks that the model was trained for this hand.
+    ///
+    /// # Errors
+    /// It was trained for another one.
+    pub fn check_hand(&self, hand: &Hand) -> Result<(), OtherHand> {
+        if self.hand.id == hand.id() {
+            return Ok(());
+        }
+        Err(OtherHand {
+            model_hand: self.hand.name.clone(),
+            model_hand_id: self.hand.id,
+            hand: hand.name.clone(),
+            hand_id: hand.id(),
+        })
     }
 
     /// Identifies what makes features: hand, dictionary, σ, blocks, scaling, the limits of what it was trained on. A
@@ -272,27 +323,16 @@ impl Model {
     }
 }
 
-fn too_large() -> String {
-    format!(
-        "more than {} MiB: expected a model made by blindgrasp train; train it with fewer words or on fewer grasps",
-        MAX_BYTES >> 20
-    )
-}
-
-fn other_format(found: &str) -> String {
-    format!("format '{found}', expected '{FORMAT}': train it again with this version (blindgrasp train)")
-}
-
 /// What a text is that could not be read as a model. A model of another version is not one that is damaged.
-fn why_not_a_model(text: &str, error: &serde_json::Error) -> String {
+fn why_not_a_model(text: &str, error: &serde_json::Error) -> InvalidModel {
     #[derive(Deserialize)]
     struct AnyModel {
         format: String,
     }
     match serde_json::from_str::<AnyModel>(text) {
-        Err(error) => format!("not a model, or cut off: {error}"),
-        Ok(any) if any.format != FORMAT => other_format(&any.format),
-        Ok(_) => format!("not a valid model: {error}"),
+        Err(error) => InvalidModel::NotAModel(error.to_string()),
+        Ok(any) if any.format != FORMAT => InvalidModel::OtherFormat { found: any.format },
+        Ok(_) => InvalidModel::Malformed(error.to_string()),
     }
 }
 
@@ -339,7 +379,7 @@ mod tests {
             model.save(&path).expect("saved");
             assert_eq!(std::fs::read_to_string(&path).expect("read"), text);
             let edited = text.replacen("0.5", "0.6", 1);
-            assert!(Model::parse(&edited).expect_err("edited").contains("its checksum does not match"));
+            assert_eq!(Model::parse(&edited), Err(InvalidModel::Checksum));
         }
     }
 
@@ -350,7 +390,7 @@ mod tests {
             ("{\"format\": \"blindgrasp-model/1\"}", "format 'blindgrasp-model/1', expected 'blindgrasp-model/2'"),
             ("{\"format\": \"blindgrasp-model/2\"}", "not a valid model"),
         ] {
-            let error = Model::parse(text).expect_err("no model");
+            let error = Model::parse(text).expect_err("no model").to_string();
             assert!(error.contains(expected), "{error}");
         }
     }

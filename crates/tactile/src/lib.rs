@@ -1,5 +1,15 @@
 //! Drivers that bring a hand's live tactile frames into the graph.
 //!
+//! ```
+//! use blindgrasp_tactile::line_protocol;
+//!
+//! let line = br#"{"phase": "settled", "grasp_id": 4, "joints_rad": [0.1, 0.9], "cells_newtons": [0, 1.5]}"#;
+//! let reading = line_protocol::parse(line).expect("a frame");
+//! assert_eq!(reading.grasp_id, Some(4));
+//! let refusal = line_protocol::parse(br#"{"phase": "settled"}"#).expect_err("a frame without readings");
+//! assert!(refusal.why.contains("joints_rad"));
+//! ```
+//!
 //! A [`TactileDriver`] reads frames from the hand; the [`gate`] accepts and numbers them, and the operator
 //! `tactile_source` publishes them. Malformed, late and out-of-order frames are counted and dropped. Each leaves a gap in the
 //! numbers, so that the arbiter holds its grasp.

@@ -3,19 +3,18 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 
 use super::super::{Outcome, check_output, print_line};
 use super::GraspArguments;
 use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::evaluation::Judge;
+use blindgrasp_learning::evaluation::decide_alone;
 use blindgrasp_messages::{Fault, Phase, Prediction};
 use blindgrasp_objects::find_mesh;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{AnimatedGrasp, ObjectSurface, RecordedGrasp, animation_svg, grasp_html, grasp_svg};
 use blindgrasp_recording::{Record, RecordingReader};
-use blindgrasp_stages::hand::Hand;
-use blindgrasp_stages::model::Model;
+use blindgrasp_stages::{Hand, Judge, Model};
 
 /// The kind of picture, by the file's extension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -56,7 +55,7 @@ pub(super) fn animate(recording: &Path, out: &Path, arguments: &GraspArguments) 
     for id in wanted {
         let mut grasp = read_grasp(recording, id)?;
         grasp.object = surface(&grasp, arguments.objects.as_deref())?;
-        let alone = judge.decide_alone(&grasp.frames);
+        let alone = decide_alone(&mut judge, &grasp.frames);
         grasp.decision = alone.decision;
         let probability = |it: &Prediction| (it.fault == Fault::None).then_some(it.probability_stable);
         animated.push(AnimatedGrasp {
@@ -75,7 +74,7 @@ pub(super) fn animate(recording: &Path, out: &Path, arguments: &GraspArguments) 
 /// Judges grasps of this hand by a model.
 pub(super) fn judge_of(model: &Path, hand: &Hand) -> anyhow::Result<Judge> {
     let judge = Judge::new(hand.clone(), Model::load(model)?);
-    judge.map_err(|message| anyhow::anyhow!("{}: {message}", model.display()))
+    judge.with_context(|| model.display().to_string())
 }
 
 pub(super) fn format_of(out: &Path) -> anyhow::Result<Format> {

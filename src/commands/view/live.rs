@@ -11,14 +11,12 @@ use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_obser
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection};
 use blindgrasp_graph::control::{Attachment, Reply, Request};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
-use blindgrasp_learning::evaluation::Judge;
 use blindgrasp_messages::{
     ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Record, Sense, TactileFrame,
 };
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, link_poses};
-use blindgrasp_stages::hand::Hand;
-use blindgrasp_stages::model::Model;
+use blindgrasp_stages::{Hand, Judge, Judged, Model};
 use blindgrasp_viewer::{Abilities, Viewer};
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -338,15 +336,15 @@ impl Sink for Reader {
             streams.send(topic, &record, is_shown(record.header().hand_id));
         }
         let judged = match (&mut self.shadow, &record) {
-            (Some(judge), Record::Tactile(sample)) if is_shown(sample.header.hand_id) => Some(judge.take(sample)),
+            (Some(judge), Record::Tactile(sample)) if is_shown(sample.header.hand_id) => Some(judge.sample(sample)),
             _ => None,
         };
         let mut latest = self.latest.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((prediction, decision)) = judged {
+        if let Some(Judged { prediction, decisions }) = judged {
             if latest.shadow_probabilities.len() < MAX_PROBABILITIES {
                 latest.shadow_probabilities.push(prediction.probability_stable);
             }
-            latest.shadow_decision = decision.or(latest.shadow_decision.take());
+            latest.shadow_decision = decisions.into_iter().last().or(latest.shadow_decision.take());
         }
         match record {
             Record::Tactile(sample) if is_shown(sample.header.hand_id) => latest.frame = Some(sample.message),

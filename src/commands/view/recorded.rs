@@ -7,13 +7,13 @@ use std::time::Duration;
 
 use anyhow::bail;
 use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::evaluation::Judge;
+use blindgrasp_learning::evaluation::decide_alone;
 use blindgrasp_messages::{Action, ContactSet, GraspTruth, LiftDecision, Recorded as _, Stamped, TactileFrame};
 use blindgrasp_objects::find_mesh;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, ObjectScene};
 use blindgrasp_recording::{ChosenSamples, Reach, Record};
-use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::{Hand, Judge};
 use blindgrasp_viewer::{Abilities, Grasps, Viewer};
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -155,7 +155,7 @@ impl Reading {
         let step = listed.n_frames.div_ceil(most).max(1);
         let Samples { frames, contacts, probabilities, object } = self.samples(*id, listed, step)?;
         // Of a thinned out grasp, the gaps would decide.
-        let shadow = self.shadow.as_mut().filter(|_| step == 1).map(|judge| judge.decide_alone(&frames));
+        let shadow = self.shadow.as_mut().filter(|_| step == 1).map(|judge| decide_alone(judge, &frames));
         let start_nanos = frames.first().map_or(0, |frame| frame.header.stamp_nanos);
         let events = frames.iter().enumerate().map(|(idx, Stamped { header, message })| {
             let mut event = json!({

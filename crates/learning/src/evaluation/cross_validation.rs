@@ -12,8 +12,8 @@ use serde::Serialize;
 
 use super::EvaluationError;
 use super::split::{Split, check_disjoint, shuffle, split_into_folds};
+use crate::learners::platt::fit_platt;
 use crate::training::{Example, Fitted, TrainingError, cross_validate, fit};
-use blindgrasp_stages::classifier::calibration::fit_platt;
 use blindgrasp_stages::dictionary::Dictionary;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::recipe::Recipe;

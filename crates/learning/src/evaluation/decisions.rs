@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::Serialize;
 
 use super::measures::{Counts, CurvePoint, Share, area_under_roc, average_precision, curve, thinned};
+use super::reliability::{N_RELIABILITY_BINS, Reliability, reliability};
 use super::statistics::{Estimate, Interval, bootstrap, wilson_interval};
-use blindgrasp_stages::classifier::reliability::{N_RELIABILITY_BINS, Reliability, reliability};
 
 /// A labelled grasp and the decision on it.
 #[derive(Debug, Clone, PartialEq)]

@@ -3,10 +3,10 @@
 use serde::Serialize;
 
 use super::measures::{area_under_roc, curve};
+use super::reliability::{N_RELIABILITY_BINS, reliability};
 use crate::training::{Example, composed};
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::Classifier;
-use blindgrasp_stages::classifier::reliability::{N_RELIABILITY_BINS, reliability};
 use blindgrasp_stages::model::Model;
 
 /// The judgement of the grasps that have this look.

@@ -14,6 +14,7 @@ pub mod looks;
 pub mod measures;
 pub mod page;
 pub mod paper_label;
+pub mod reliability;
 pub mod report;
 pub mod split;
 pub mod statistics;
@@ -27,16 +28,9 @@ use crate::dataset::{DatasetError, Grasp, read_grasps};
 use crate::training::TrainingError;
 use blindgrasp_messages::score::is_judged;
 pub use blindgrasp_messages::score::{Evaluation, Score};
-use blindgrasp_messages::{
-    Action, Fault, GraspTruth, Header, LiftDecision, Phase, Prediction, Reason, Stamped, TactileFrame,
-};
-use blindgrasp_stages::contacts::contacts_from_frame;
-use blindgrasp_stages::day::GraspPlace;
-use blindgrasp_stages::encoder::Reading;
-use blindgrasp_stages::hand::Hand;
-use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter};
-use blindgrasp_stages::model::{Memory, Model};
+use blindgrasp_messages::{Action, GraspTruth, Header, LiftDecision, Phase, Prediction, Reason, Stamped, TactileFrame};
 use blindgrasp_stages::training_summary::ReadingId;
+use blindgrasp_stages::{ArbiterOptions, Hand, Judge, Model};
 use decisions::DecidedGrasp;
 use split::SplitError;
 
@@ -87,15 +81,13 @@ pub fn evaluate(
     let trained_on = model.training.trained_on.as_ref();
     let mut evaluated = Evaluated { trained: trained_on.map(|_| Trained::default()), ..Evaluated::default() };
     let mut canonical = BTreeSet::new();
-    let (mut memory, dictionary_id) = (Memory::default(), model.dictionary_id());
+    let mut judge = Judge::with_options(hand.clone(), model.clone(), *options)?;
     for path in recordings {
         if !canonical.insert(path.canonicalize().unwrap_or(path.clone())) {
             let message = "it is given twice: its grasps would count twice".into();
             return Err(DatasetError::Unusable { path: path.clone(), message });
         }
-        for Decided { decision, reading_id, truth } in
-            decide_recording(hand, (model, dictionary_id), path, options, &mut memory)?
-        {
+        for Decided { decision, reading_id, truth } in decide_recording(&mut judge, path)? {
             if let (Some(trained), Some(trained_on)) = (&mut evaluated.trained, trained_on) {
                 if reading_id.is_some_and(|id| trained_on.grasps.contains(&id)) {
                     trained.n_left_out += 1;
@@ -135,22 +127,17 @@ pub struct Decided {
 /// Decides every grasp of a recording in order, as a graph that begins with it. A grasp without a decision is held.
 ///
 /// # Errors
-/// The recording cannot be used, or the model is of another hand.
-pub fn decide(hand: &Hand, model: &Model, recording: &Path) -> Result<Vec<Decided>, DatasetError> {
-    let model = (model, model.dictionary_id());
-    decide_recording(hand, model, recording, &ArbiterOptions::default(), &mut Memory::default())
+/// The recording cannot be used.
+pub fn decide(judge: &mut Judge, recording: &Path) -> Result<Vec<Decided>, DatasetError> {
+    judge.reset();
+    decide_recording(judge, recording)
 }
 
 /// As [`decide`], for frames that are numbered without gaps (`seq`).
-pub fn decide_frames(hand: &Hand, model: &Model, frames: &[Stamped<TactileFrame>]) -> Vec<LiftDecision> {
-    let (mut arbiter, mut memory) = (LiftArbiter::new(ArbiterOptions::default()), Memory::default());
-    let model = (model, model.dictionary_id());
-    let mut decisions = Vec::new();
-    for frame in frames {
-        let prediction = predict(hand, model, &mut memory, frame);
-        arbiter.on_prediction(&frame.header, &prediction, 0, &mut decisions);
-    }
-    decisions.extend(arbiter.on_end());
+pub fn decide_frames(judge: &mut Judge, frames: &[Stamped<TactileFrame>]) -> Vec<LiftDecision> {
+    judge.reset();
+    let mut decisions: Vec<LiftDecision> = frames.iter().flat_map(|frame| judge.sample(frame).decisions).collect();
+    decisions.extend(judge.end());
     decisions.retain(|decision| !decision.action.is_probe());
     decisions
 }
@@ -169,38 +156,21 @@ fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> DecidedGrasp {
 }
 
 /// Decides every grasp of a recording, in order.
-fn decide_recording(
-    hand: &Hand,
-    (model, dictionary_id): (&Model, u64),
-    path: &Path,
-    options: &ArbiterOptions,
-    memory: &mut Memory,
-) -> Result<Vec<Decided>, DatasetError> {
-    let unusable = |message| DatasetError::Unusable { path: path.into(), message };
-    if model.hand.id != hand.id() {
-        return Err(unusable(format!(
-            "it is for the hand '{}' ({:016x}), the model for '{}' ({:016x}): train a model for this hand",
-            hand.name,
-            hand.id(),
-            model.hand.name,
-            model.hand.id
-        )));
-    }
-    // One arbiter for the whole recording, as in the graph: it sees missing samples between two grasps.
-    let mut arbiter = LiftArbiter::new(*options);
-    memory.begin_recording();
+fn decide_recording(judge: &mut Judge, path: &Path) -> Result<Vec<Decided>, DatasetError> {
+    judge.begin_recording();
     let mut decisions = Vec::new();
-    let grasps = read_grasps(path, hand, |_, frames| {
+    let hand = judge.hand().clone();
+    let grasps = read_grasps(path, &hand, |_, frames| {
         for frame in &frames {
-            let prediction = predict(hand, (model, dictionary_id), memory, frame);
-            arbiter.on_prediction(&frame.header, &prediction, 0, &mut decisions);
+            decisions.extend(judge.sample(frame).decisions);
         }
         let settled = frames.iter().map(|frame| &frame.message).find(|frame| frame.phase == Phase::Settled);
         settled.map(|frame| ReadingId::of(&frame.joints_rad, &frame.cells_newtons))
     })?;
-    decisions.extend(arbiter.on_end());
+    decisions.extend(judge.end());
     if grasps.is_empty() {
-        return Err(unusable("it holds no tactile frames to decide on".into()));
+        let message = "it holds no tactile frames to decide on".into();
+        return Err(DatasetError::Unusable { path: path.into(), message });
     }
     let mut by_grasp: BTreeMap<u64, LiftDecision> = decisions
         .into_iter()
@@ -228,88 +198,20 @@ pub struct DecidedAlone {
     pub decided_at: Option<usize>,
 }
 
-/// Judges frames one after the other as the stages of a graph do, with an arbiter that has the default options.
-pub struct Judge {
-    hand: Hand,
-    model: Model,
-    dictionary_id: u64,
-    memory: Memory,
-    arbiter: LiftArbiter,
-}
-
-impl Judge {
-    /// # Errors
-    /// The model is of another hand.
-    pub fn new(hand: Hand, model: Model) -> Result<Judge, String> {
-        if model.hand.id != hand.id() {
-            return Err(format!("the model is for the hand '{}', expected one for '{}'", model.hand.name, hand.name));
+/// Decides a grasp by its frames as a graph would that sees no other.
+pub fn decide_alone(judge: &mut Judge, frames: &[Stamped<TactileFrame>]) -> DecidedAlone {
+    judge.reset();
+    let mut alone = DecidedAlone { predictions: Vec::new(), decision: None, decided_at: None };
+    for (idx, frame) in frames.iter().enumerate() {
+        // Its first frame is the first of all.
+        let header = Header { seq: idx as u64, ..frame.header };
+        let judged = judge.sample(&Stamped { header, message: frame.message.clone() });
+        alone.predictions.push(judged.prediction);
+        if alone.decision.is_none() && !judged.decisions.is_empty() {
+            (alone.decision, alone.decided_at) = (judged.decisions.into_iter().last(), Some(idx));
         }
-        let (dictionary_id, memory) = (model.dictionary_id(), Memory::default());
-        Ok(Judge { hand, model, dictionary_id, memory, arbiter: LiftArbiter::new(ArbiterOptions::default()) })
     }
-
-    pub fn model(&self) -> &Model {
-        &self.model
-    }
-
-    /// The prediction for a frame, and the decision, if it comes with this frame. Frames are numbered without gaps.
-    pub fn take(&mut self, frame: &Stamped<TactileFrame>) -> (Prediction, Option<LiftDecision>) {
-        let prediction = predict(&self.hand, (&self.model, self.dictionary_id), &mut self.memory, frame);
-        let mut decisions = Vec::new();
-        self.arbiter.on_prediction(&frame.header, &prediction, 0, &mut decisions);
-        (prediction, decisions.into_iter().rfind(|decision| !decision.action.is_probe()))
-    }
-
-    /// Decides a grasp by its frames as a graph would that sees no other.
-    pub fn decide_alone(&mut self, frames: &[Stamped<TactileFrame>]) -> DecidedAlone {
-        self.memory = Memory::default();
-        self.arbiter = LiftArbiter::new(ArbiterOptions::default());
-        let mut alone = DecidedAlone { predictions: Vec::new(), decision: None, decided_at: None };
-        for (idx, frame) in frames.iter().enumerate() {
-            // Its first frame is the first of all.
-            let header = Header { seq: idx as u64, ..frame.header };
-            let (prediction, decision) = self.take(&Stamped { header, message: frame.message.clone() });
-            alone.predictions.push(prediction);
-            if let (None, Some(decision)) = (&alone.decision, decision) {
-                (alone.decision, alone.decided_at) = (Some(decision), Some(idx));
-            }
-        }
-        alone
-    }
-}
-
-/// Runs the stages between a frame and the arbiter.
-fn predict(
-    hand: &Hand,
-    (model, dictionary_id): (&Model, u64),
-    memory: &mut Memory,
-    frame: &Stamped<TactileFrame>,
-) -> Prediction {
-    let Stamped { header, message } = frame;
-    let TactileFrame { grasp_id, phase, joints_rad, cells_newtons, day, .. } = message;
-    let mut contacts = Vec::new();
-    let mut values = Vec::new();
-    let summary = contacts_from_frame(hand, header.hand_id, joints_rad, cells_newtons, &mut contacts);
-    let feature = match summary.fault {
-        Fault::None => {
-            let reading = Reading { joints_rad, contacts: &contacts, senses: message.senses.view() };
-            model.extract(*phase, &reading, &mut values).map(|_| values.as_slice())
-        }
-        fault => Err(fault),
-    };
-    let place = GraspPlace { epoch: header.epoch, grasp_id: *grasp_id, day: *day };
-    let verdict = model.judge(memory, dictionary_id, place, *phase, feature);
-    let prediction = Prediction { grasp_id: *grasp_id, phase: *phase, ..Prediction::default() };
-    match verdict {
-        Ok(verdict) => Prediction {
-            decision_value: verdict.decision_value,
-            probability_stable: verdict.probability_stable,
-            stable: verdict.stable,
-            unsure: verdict.unsure,
-            ..prediction
-        },
-        Err(fault) => Prediction { fault, ..prediction },
-    }
+    alone
 }
 
 #[cfg(test)]

@@ -11,13 +11,14 @@ use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
 use super::{Example, Fitted, OutOfFold, TrainingError, fit};
+use crate::learners::decision_values;
+use crate::learners::training_range::FALSE_ALARM_SHARE;
 use blindgrasp_stages::day::{
     Baseline, DayMethod, DayModel, DayStatistics, MIN_BASELINE_GRASPS, MIN_NOVELTY_GRASPS, TrainingDays, day_distance,
     root_mean_square,
 };
 use blindgrasp_stages::encoder::{FeatureExtractor, Scaling};
 use blindgrasp_stages::hand::Hand;
-use blindgrasp_stages::out_of_distribution::FALSE_ALARM_SHARE;
 use blindgrasp_stages::recipe::Recipe;
 
 /// Grasps of a pseudo-day: those of the baseline, and at most three times as many after it.
@@ -196,7 +197,7 @@ pub(super) fn cross_validate<'a>(
 /// An example without a feature.
 fn judge<'a>(fitted: &Fitted, examples: &[&'a Example], seed: u64) -> Result<OutOfFold<'a>, TrainingError> {
     let (examples, rows) = pseudo_days(&fitted.features, examples, seed)?;
-    let decision_values = fitted.predictor.decision_values(&rows)?;
+    let decision_values = decision_values(&fitted.predictor, &rows)?;
     Ok(OutOfFold { examples, decision_values, folds: Vec::new() })
 }
 

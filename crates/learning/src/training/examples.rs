@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 use super::TrainingError;
 use super::friction::{Judged, stable_by_friction};
-use crate::dataset::{DatasetError, label_of, read_grasps};
-use blindgrasp_messages::{Contact, Fault, OwnedSenses, Phase, Stamped, TactileFrame};
+use crate::dataset::{DatasetError, Grasp, label_of, read_grasps};
+use blindgrasp_messages::{Contact, Fault, GraspTruth, OwnedSenses, Phase, Stamped, TactileFrame};
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use blindgrasp_stages::contacts::contacts_from_frame;
@@ -83,6 +83,37 @@ impl Felt {
 
     pub fn reading(&self) -> Reading<'_> {
         Reading { joints_rad: &self.joints_rad, contacts: &self.contacts, senses: self.senses.view() }
+    }
+}
+
+/// The frames of a grasp that are learned from.
+struct FeltGrasp {
+    settled: Felt,
+    /// Why the settled frame has no feature.
+    fault: Fault,
+    reading_id: ReadingId,
+    day: u32,
+    squeezed: Option<Felt>,
+    test_lifted: Option<Felt>,
+    moving: [Vec<Signals>; 2],
+}
+
+impl FeltGrasp {
+    /// `None` if the hand never settled.
+    fn of(hand: &Hand, frames: Vec<Stamped<TactileFrame>>) -> Option<FeltGrasp> {
+        let is_of = |phase: Phase| move |frame: &&Stamped<TactileFrame>| frame.message.phase == phase;
+        let squeezed = frames.iter().rev().find(is_of(Phase::Squeezed)).map(|frame| Felt::of(hand, frame));
+        let test_lifted = frames.iter().find(is_of(Phase::TestLifted)).map(|frame| Felt::of(hand, frame));
+        let moving = [Phase::Squeezing, Phase::TestLifting]
+            .map(|phase| frames.iter().filter(is_of(phase)).map(|frame| Signals::of(hand, frame)).collect::<Vec<_>>());
+        let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
+        let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
+        let reading_id = ReadingId::of(joints, cells);
+        let mut contacts = Vec::new();
+        let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells, &mut contacts);
+        let settled = Felt { joints_rad: frame.message.joints_rad, contacts, senses: frame.message.senses };
+        let (fault, day) = (summary.fault, frame.message.day);
+        Some(FeltGrasp { settled, fault, reading_id, day, squeezed, test_lifted, moving })
     }
 }
 
@@ -163,26 +194,44 @@ impl Examples {
             [] => None,
             _ => Some(stable_by_friction(path, frictions).map_err(DatasetError::from)?),
         };
-        let grasps = read_grasps(path, hand, |_, frames| {
-            let is_of = |phase: Phase| move |frame: &&Stamped<TactileFrame>| frame.message.phase == phase;
-            let squeezed = frames.iter().rev().find(is_of(Phase::Squeezed)).map(|frame| Felt::of(hand, frame));
-            let test_lifted = frames.iter().find(is_of(Phase::TestLifted)).map(|frame| Felt::of(hand, frame));
-            let moving = [Phase::Squeezing, Phase::TestLifting].map(|phase| {
-                frames.iter().filter(is_of(phase)).map(|frame| Signals::of(hand, frame)).collect::<Vec<_>>()
-            });
-            let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
-            let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
-            let reading = (ReadingId::of(joints, cells), frame.message.day);
-            let mut contacts = Vec::new();
-            let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells, &mut contacts);
-            let felt = Felt { joints_rad: frame.message.joints_rad, contacts, senses: frame.message.senses };
-            Some((felt, ([squeezed, test_lifted], moving), summary.fault, reading))
-        })?;
+        let grasps = read_grasps(path, hand, |_, frames| FeltGrasp::of(hand, frames))?;
+        self.add_grasps(grasps, recording_idx, *by_wrench_space, by_friction.as_mut(), seen);
+        Ok(())
+    }
+
+    /// Takes grasps out of memory, each with its frames in order and what became of it. A grasp whose reading equals that
+    /// of an earlier one is left out as a duplicate.
+    ///
+    /// # Errors
+    /// An object of two classes.
+    pub fn of_grasps(
+        hand: &Hand,
+        grasps: impl IntoIterator<Item = (Vec<Stamped<TactileFrame>>, GraspTruth)>,
+    ) -> Result<Examples, TrainingError> {
+        let felt = grasps.into_iter().map(|(frames, truth)| Grasp {
+            grasp_id: truth.grasp_id,
+            value: FeltGrasp::of(hand, frames),
+            truth: Some(truth),
+        });
+        let mut examples = Examples::default();
+        examples.add_grasps(felt, 0, false, None, &mut Seen::new());
+        examples.check_classes()?;
+        Ok(examples)
+    }
+
+    fn add_grasps(
+        &mut self,
+        grasps: impl IntoIterator<Item = Grasp<Option<FeltGrasp>>>,
+        recording_idx: usize,
+        by_wrench_space: bool,
+        mut by_friction: Option<&mut BTreeMap<u64, Judged>>,
+        seen: &mut Seen,
+    ) {
         let mut exclude = |reason: &str| *self.n_excluded.entry(reason.into()).or_default() += 1;
         for grasp in grasps {
             let grasp_id = grasp.grasp_id;
             let mut truth = grasp.truth;
-            if let Some(truth) = truth.as_mut().filter(|_| *by_wrench_space) {
+            if let Some(truth) = truth.as_mut().filter(|_| by_wrench_space) {
                 if truth.epsilon.is_nan() || truth.volume.is_nan() {
                     exclude("no epsilon and volume in its truth");
                     continue;
@@ -192,23 +241,23 @@ impl Examples {
             match (grasp.value, truth) {
                 (_, None) => exclude("no truth"),
                 (None, _) => exclude("no settled frame"),
-                (Some((felt, ([squeezed, test_lifted], moving), Fault::None, (reading, day))), Some(truth)) => {
-                    let outcomes = friction_outcomes(by_friction.as_mut(), grasp_id).and_then(|outcomes| {
-                        note_reading(seen, reading, recording_idx, truth.stable).map(|()| outcomes)
+                (Some(felt), Some(truth)) if felt.fault == Fault::None => {
+                    let outcomes = friction_outcomes(by_friction.as_deref_mut(), grasp_id).and_then(|outcomes| {
+                        note_reading(seen, felt.reading_id, recording_idx, truth.stable).map(|()| outcomes)
                     });
                     match outcomes {
                         Err(reason) => exclude(reason),
                         Ok(stable_by_friction) => self.examples.push(Example {
                             recording_idx,
                             grasp_id,
-                            reading_id: reading,
-                            day,
-                            joints_rad: felt.joints_rad,
-                            contacts: felt.contacts,
-                            senses: felt.senses,
-                            squeezed,
-                            test_lifted,
-                            moving,
+                            reading_id: felt.reading_id,
+                            day: felt.day,
+                            joints_rad: felt.settled.joints_rad,
+                            contacts: felt.settled.contacts,
+                            senses: felt.settled.senses,
+                            squeezed: felt.squeezed,
+                            test_lifted: felt.test_lifted,
+                            moving: felt.moving,
                             stable: truth.stable,
                             stable_by_friction,
                             object: truth.object,
@@ -216,17 +265,16 @@ impl Examples {
                         }),
                     }
                 }
-                (Some((_, _, fault, (reading, _))), Some(truth)) => {
-                    exclude(fault.as_str());
+                (Some(felt), Some(truth)) => {
+                    exclude(felt.fault.as_str());
                     // Two grasps of one recording may have equal readings. In two recordings it is the same grasp.
-                    let first = seen.entry(reading).or_insert((recording_idx, truth.stable)).0;
-                    if fault == Fault::NoContact && first == recording_idx {
+                    let first = seen.entry(felt.reading_id).or_insert((recording_idx, truth.stable)).0;
+                    if felt.fault == Fault::NoContact && first == recording_idx {
                         self.unfelt.push((truth.object, truth.class, truth.stable));
                     }
                 }
             }
         }
-        Ok(())
     }
 
     /// What a model has learned from that was trained on them.
@@ -303,6 +351,18 @@ fn note_reading(seen: &mut Seen, reading: ReadingId, recording_idx: usize, stabl
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn grasps_in_memory_are_the_examples_of_their_recording() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../recordings/held-out.mcap");
+        let grasps = read_grasps(&path, &hand, |_, frames| frames).expect("readable");
+        let labelled = grasps.into_iter().filter_map(|grasp| Some((grasp.value, grasp.truth?)));
+        let of_memory = Examples::of_grasps(&hand, labelled).expect("examples");
+        let of_file = Examples::read(&hand, &[path], &Relabelling::default(), |_, _| {}).expect("readable");
+        assert_eq!(of_memory.examples, of_file.examples);
+        assert_eq!((&of_memory.unfelt, &of_memory.n_excluded), (&of_file.unfelt, &of_file.n_excluded));
+    }
 
     #[test]
     fn the_paper_label_of_recordings_that_have_it_is_their_own() {

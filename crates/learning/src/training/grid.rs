@@ -13,8 +13,10 @@ use std::time::Instant;
 use serde::Serialize;
 
 use super::{BlendParams, Example, Learner, Prepared, Recipe, TrainingError, prepare, rows};
-use blindgrasp_stages::classifier::booster::train_boosted;
-use blindgrasp_stages::classifier::svm::{PreparedSvm, SvmParams, train_svm_path};
+use crate::learners::booster::train_boosted;
+use crate::learners::decision_values;
+use crate::learners::svm::train_svm_path;
+use blindgrasp_stages::classifier::svm::{PreparedSvm, SvmParams};
 use blindgrasp_stages::classifier::{Blend, Predictor};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::training_summary::{CellSummary, GridSummary};
@@ -195,7 +197,7 @@ impl Search<'_> {
         let Prepared { features, rows, labels, targets, .. } = &fold.kept;
         let mut start = Instant::now();
         let mut add = |first_idx, predictor: Predictor, n_iterations, converged| {
-            let decision_values = predictor.decision_values(&fold.rows)?;
+            let decision_values = decision_values(&predictor, &fold.rows)?;
             let secs = std::mem::replace(&mut start, Instant::now()).elapsed().as_secs_f64();
             on_score(first_idx, FoldScore { n_iterations, converged, secs, ..fold.score(&decision_values) });
             Ok::<(), TrainingError>(())

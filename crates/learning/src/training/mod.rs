@@ -25,19 +25,22 @@ pub use recalibration::recalibrate;
 
 use crate::dataset::DatasetError;
 use crate::evaluation::measures::{area_under_roc, curve};
+use crate::evaluation::reliability::{N_RELIABILITY_BINS, reliability};
+use crate::learners::booster::train_boosted;
+use crate::learners::decision_values;
+use crate::learners::k_means::{DictionaryError, KMeansParams, learn_dictionary};
+use crate::learners::platt::{PlattError, fit_platt};
+use crate::learners::svm::train_svm;
+use crate::learners::training_range::{learn_training_range, widened_for_other_days};
 use blindgrasp_messages::{MAX_FEATURES, Phase};
-use blindgrasp_stages::classifier::booster::train_boosted;
 use blindgrasp_stages::classifier::boosting::BoostingError;
-use blindgrasp_stages::classifier::calibration::{CalibrationError, PlattCalibration, fit_platt};
-use blindgrasp_stages::classifier::reliability::{N_RELIABILITY_BINS, reliability};
-use blindgrasp_stages::classifier::svm::{SvmError, train_svm};
+use blindgrasp_stages::classifier::calibration::PlattCalibration;
+use blindgrasp_stages::classifier::svm::SvmError;
 use blindgrasp_stages::classifier::{Blend, Classifier, Predictor};
-use blindgrasp_stages::dictionary::{DictionaryError, KMeansParams, learn_dictionary};
 use blindgrasp_stages::encoder::{FeatureExtractor, Reading, Scaling};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::{FORMAT, Model, ModelHand};
-use blindgrasp_stages::out_of_distribution::TrainingRange;
 use blindgrasp_stages::training_summary::{Bounded, Promise};
 
 /// How a model is trained.
@@ -101,7 +104,7 @@ pub enum TrainingError {
     #[error(transparent)]
     Boosting(#[from] BoostingError),
     #[error("the calibration")]
-    Calibration(#[from] CalibrationError),
+    Calibration(#[from] PlattError),
     /// Recordings or options that cannot be trained with.
     #[error("{0}")]
     Data(String),
@@ -131,11 +134,27 @@ pub fn train(
     mut progress: impl FnMut(&str),
 ) -> Result<Model, TrainingError> {
     check_options(options)?;
-    let recipe = &options.recipe;
     let read = Examples::read(hand, recordings, &options.relabelling(), |n_read, n| {
         progress(&format!("read recording {n_read} of {n}"));
     })?;
-    check_examples(&read, recordings, &options.frictions)?;
+    train_on(hand, &read, recordings, options, progress)
+}
+
+/// Trains a model on examples. `recordings` names the files that they are from; it is empty for examples out of memory
+/// ([`Examples::of_grasps`]), which have the labels that they came with.
+///
+/// # Errors
+/// As of [`train`].
+pub fn train_on(
+    hand: &Hand,
+    read: &Examples,
+    recordings: &[PathBuf],
+    options: &TrainingOptions,
+    mut progress: impl FnMut(&str),
+) -> Result<Model, TrainingError> {
+    check_options(options)?;
+    let recipe = &options.recipe;
+    check_examples(read, recordings, &options.frictions)?;
     let examples: Vec<&Example> = read.examples.iter().collect();
     let folds = folds_by_object(&examples, options.n_folds)?;
     let mut cross_validating = |fold| progress(&format!("cross-validating, fold {} of {}", fold + 1, options.n_folds));
@@ -150,9 +169,9 @@ pub fn train(
     let calibration = calibrate(&judged.examples, &judged.decision_values)?;
     progress("training on all grasps");
     let fitted = fit(hand, recipe, &examples, options.seed)?;
-    let mut training_range = TrainingRange::learn(&fitted.features, &readings(&examples), &folds);
+    let mut training_range = learn_training_range(&fitted.features, &readings(&examples), &folds);
     if recipe.day_baseline {
-        training_range = training_range.for_other_days(&fitted.features);
+        training_range = widened_for_other_days(training_range, &fitted.features);
     }
     let threshold_probability = options.threshold_probability;
     let validated = CrossValidated::of(&judged, &calibration, threshold_probability)?;
@@ -429,7 +448,7 @@ fn by_outcome(examples: &[&Example], numbers: &[f64]) -> (Vec<f64>, Vec<bool>) {
 }
 
 /// Platt's calibration. An example with labels for several frictions counts once for each.
-fn calibrate(examples: &[&Example], decision_values: &[f64]) -> Result<PlattCalibration, CalibrationError> {
+fn calibrate(examples: &[&Example], decision_values: &[f64]) -> Result<PlattCalibration, PlattError> {
     let (values, outcomes) = by_outcome(examples, decision_values);
     fit_platt(&values, &outcomes)
 }
@@ -449,7 +468,7 @@ fn check_skill(calibration: &PlattCalibration, outcomes: &[bool], brier: f64) ->
 }
 
 /// The probability of each example from a decision value and a calibration that were made without its fold.
-fn out_of_fold_probabilities(judged: &OutOfFold<'_>) -> Result<Vec<f64>, CalibrationError> {
+fn out_of_fold_probabilities(judged: &OutOfFold<'_>) -> Result<Vec<f64>, PlattError> {
     let OutOfFold { examples, decision_values, folds } = judged;
     let mut probabilities = vec![0.0; examples.len()];
     for fold in folds.iter().copied().collect::<BTreeSet<_>>() {
@@ -495,7 +514,7 @@ fn check_examples(read: &Examples, recordings: &[PathBuf], frictions: &[f64]) ->
         let names: Vec<_> = recordings.iter().map(|path| file_name(path)).collect();
         return Err(TrainingError::Data(format!(
             "no grasp to train on in {}: expected settled frames with contact, and truth (left out: {n_excluded:?})",
-            names.join(", ")
+            if names.is_empty() { "memory".into() } else { names.join(", ") }
         )));
     }
     if n_stable == 0 || n_stable == n {
@@ -600,7 +619,7 @@ impl Fitted {
     /// # Errors
     /// An example without a feature.
     pub fn decision_values(&self, examples: &[&Example]) -> Result<Vec<f64>, TrainingError> {
-        Ok(self.predictor.decision_values(&rows(&self.features, examples)?)?)
+        Ok(decision_values(&self.predictor, &rows(&self.features, examples)?)?)
     }
 }
 

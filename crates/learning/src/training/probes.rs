@@ -10,15 +10,15 @@ use rayon::prelude::*;
 
 use super::{Example, Felt, OutOfFold, Signals, TrainingError, calibrate, out_of_fold_probabilities, prepare};
 use crate::evaluation::measures::{area_under_roc, curve};
+use crate::evaluation::reliability::{N_RELIABILITY_BINS, reliability};
+use crate::learners::booster::train_boosted;
+use crate::learners::training_range::learn_training_range;
 use crate::promise::{ObjectTrials, promise};
 use blindgrasp_messages::Phase;
-use blindgrasp_stages::classifier::booster::train_boosted;
 use blindgrasp_stages::classifier::boosting::BoostingParams;
-use blindgrasp_stages::classifier::reliability::{N_RELIABILITY_BINS, reliability};
 use blindgrasp_stages::classifier::{Classifier, Predictor};
 use blindgrasp_stages::encoder::{Block, FeatureExtractor, Reading};
 use blindgrasp_stages::hand::Hand;
-use blindgrasp_stages::out_of_distribution::TrainingRange;
 use blindgrasp_stages::probe::{GraspHistory, ProbeModel, n_values, signals};
 use blindgrasp_stages::recipe::{Learner, Recipe};
 use blindgrasp_stages::training_summary::Promise;
@@ -119,7 +119,7 @@ pub(super) fn learn(
             threshold_probability: 1.0,
             unsure_from_probability: 1.0,
         },
-        training_range: TrainingRange::learn(features, &readings, &kept.folds),
+        training_range: learn_training_range(features, &readings, &kept.folds),
         cross_validated_roc_area: area_under_roc(&curve(&judged, &stable)).unwrap_or(0.5),
         cross_validated_ece: reliability(&judged, &stable, N_RELIABILITY_BINS).ece,
     };

@@ -6,6 +6,7 @@
 use std::path::PathBuf;
 
 use super::{Example, Examples, Relabelling, TrainingError};
+use crate::learners::decision_values;
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::calibration::PlattCalibration;
 use blindgrasp_stages::day::{DayMethod, DayStatistics, Recalibration};
@@ -92,7 +93,7 @@ fn judged(
     if matches!(method, DayMethod::Baseline(_)) && !rows.is_empty() {
         statistics.scaling().apply(&mut rows);
     }
-    let decision_values = model.classifier.predictor.decision_values(&rows)?;
+    let decision_values = decision_values(&model.classifier.predictor, &rows)?;
     let PlattCalibration { a, b } = model.classifier.calibration;
     Ok((decision_values.iter().map(|value| -(a * value + b)).collect(), stable, statistics))
 }

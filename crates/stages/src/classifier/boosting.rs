@@ -1,5 +1,5 @@
 //! Gradient-boosted decision trees: they decide better than the paper's SVM on features of mixed units.
-//! `super::booster` grows them.
+//! They are grown by the crate `learning`.
 
 use serde::{Deserialize, Serialize};
 
@@ -45,7 +45,7 @@ impl BoostingParams {
     ///
     /// # Errors
     /// [`BoostingError::Params`].
-    pub(super) fn validate(&self) -> Result<(), BoostingError> {
+    pub fn validate(&self) -> Result<(), BoostingError> {
         let share = |value: f64| value > 0.0 && value <= 1.0;
         let not_negative = |value: f64| value.is_finite() && value >= 0.0;
         let checks = [
@@ -162,7 +162,8 @@ pub enum BoostingError {
 
 impl Tree {
     /// The sample's contribution to the decision value.
-    pub(super) fn value(&self, sample: &[f64]) -> f32 {
+    #[inline]
+    pub fn value(&self, sample: &[f64]) -> f32 {
         let mut node = self.nodes[0];
         while node.left != 0 {
             node = self.next(node, sample);
@@ -171,6 +172,7 @@ impl Tree {
     }
 
     /// The child of a split that a sample goes to.
+    #[inline]
     fn next(&self, split: TreeNode, sample: &[f64]) -> TreeNode {
         // Trees are grown on values in single precision.
         let is_right = sample[usize::from(split.feature)] as f32 >= split.threshold;

@@ -3,11 +3,8 @@
 //! The paper uses an RBF support vector machine (Dang & Allen, section IV-D); boosted trees decide better. A Platt
 //! calibration turns the decision value of either into a probability.
 
-pub mod booster;
 pub mod boosting;
 pub mod calibration;
-pub mod libsvm_format;
-pub mod reliability;
 pub mod svm;
 
 use serde::{Deserialize, Serialize};

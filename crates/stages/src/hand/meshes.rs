@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use blindgrasp_objects::mesh::read::read_mesh;
+use blindgrasp_mesh::read::read_mesh;
 use nalgebra::Vector3;
 use parry3d_f64::math::Vector;
 use parry3d_f64::shape::SharedShape;

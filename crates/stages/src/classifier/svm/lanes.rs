@@ -5,17 +5,18 @@
 //! fused multiply-add.
 
 /// Numbers that are computed side by side: two AVX2 registers.
-pub(super) const LANES: usize = 8;
+pub const LANES: usize = 8;
 
 /// [`LANES`] numbers in memory, aligned for vector loads.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[repr(align(64))]
-pub(super) struct Aligned(pub(super) [f64; LANES]);
+pub struct Aligned(pub [f64; LANES]);
 
 /// [`LANES`] numbers in registers. `FUSED`: multiply-add is one instruction.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Lanes<const FUSED: bool>([f64; LANES]);
+pub struct Lanes<const FUSED: bool>([f64; LANES]);
 
+#[allow(clippy::should_implement_trait, reason = "the operations are named alike, and not all have an operator")]
 impl<const FUSED: bool> Lanes<FUSED> {
     #[inline(always)]
     fn each(operation: impl Fn(usize) -> f64) -> Self {
@@ -27,71 +28,71 @@ impl<const FUSED: bool> Lanes<FUSED> {
     }
 
     #[inline(always)]
-    pub(super) fn splat(value: f64) -> Self {
+    pub fn splat(value: f64) -> Self {
         Self([value; LANES])
     }
 
     #[inline(always)]
-    pub(super) fn load(values: &[f64; LANES]) -> Self {
+    pub fn load(values: &[f64; LANES]) -> Self {
         Self(*values)
     }
 
     #[inline(always)]
-    pub(super) fn store(self, values: &mut [f64; LANES]) {
+    pub fn store(self, values: &mut [f64; LANES]) {
         *values = self.0;
     }
 
     #[inline(always)]
-    pub(super) fn load_f32(values: &[f32; LANES]) -> Self {
+    pub fn load_f32(values: &[f32; LANES]) -> Self {
         Self::each(|lane| values[lane].into())
     }
 
     #[inline(always)]
-    pub(super) fn store_f32(self, values: &mut [f32; LANES]) {
+    pub fn store_f32(self, values: &mut [f32; LANES]) {
         *values = self.0.map(|value| value as f32);
     }
 
     #[inline(always)]
-    pub(super) fn add(self, other: Self) -> Self {
+    pub fn add(self, other: Self) -> Self {
         Self::each(|lane| self.0[lane] + other.0[lane])
     }
 
     #[inline(always)]
-    pub(super) fn subtract(self, other: Self) -> Self {
+    pub fn subtract(self, other: Self) -> Self {
         Self::each(|lane| self.0[lane] - other.0[lane])
     }
 
     #[inline(always)]
-    pub(super) fn multiply(self, other: Self) -> Self {
+    pub fn multiply(self, other: Self) -> Self {
         Self::each(|lane| self.0[lane] * other.0[lane])
     }
 
     #[inline(always)]
-    pub(super) fn divide(self, other: Self) -> Self {
+    pub fn divide(self, other: Self) -> Self {
         Self::each(|lane| self.0[lane] / other.0[lane])
     }
 
     /// `self · factor + addend`.
     #[inline(always)]
-    pub(super) fn multiply_add(self, factor: Self, addend: Self) -> Self {
+    pub fn multiply_add(self, factor: Self, addend: Self) -> Self {
         Self::each(|lane| multiply_add::<FUSED>(self.0[lane], factor.0[lane], addend.0[lane]))
     }
 
     /// `addend - self · factor`.
     #[inline(always)]
-    pub(super) fn negated_multiply_add(self, factor: Self, addend: Self) -> Self {
+    pub fn negated_multiply_add(self, factor: Self, addend: Self) -> Self {
         Self::each(|lane| multiply_add::<FUSED>(-self.0[lane], factor.0[lane], addend.0[lane]))
     }
 
     /// The larger of each two; `other` where `self` is NaN.
     #[inline(always)]
-    pub(super) fn max(self, other: Self) -> Self {
+    pub fn max(self, other: Self) -> Self {
         Self::each(|lane| if self.0[lane] > other.0[lane] { self.0[lane] } else { other.0[lane] })
     }
 
     /// `chosen` where `self >= limit`, else `otherwise`; `otherwise` where `self` is NaN.
     #[inline(always)]
-    pub(super) fn if_at_least(self, limit: Self, chosen: Self, otherwise: Self) -> Self {
+    pub fn if_at_least(self, limit: Self, chosen: Self, otherwise: Self) -> Self {
         Self::each(|lane| if self.0[lane] >= limit.0[lane] { chosen.0[lane] } else { otherwise.0[lane] })
     }
 
@@ -111,12 +112,12 @@ fn multiply_add<const FUSED: bool>(a: f64, b: f64, c: f64) -> f64 {
 /// The instructions that functions are compiled for. Only [`InstructionSet::detect`] (and tests) make one, so a value
 /// is proof that the processor has them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct InstructionSet {
+pub struct InstructionSet {
     has_avx2: bool,
 }
 
 impl InstructionSet {
-    pub(super) fn detect() -> Self {
+    pub fn detect() -> Self {
         #[cfg(target_arch = "x86_64")]
         let has_avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
         #[cfg(not(target_arch = "x86_64"))]
@@ -124,13 +125,12 @@ impl InstructionSet {
         Self { has_avx2 }
     }
 
-    pub(super) fn has_avx2(self) -> bool {
+    pub fn has_avx2(self) -> bool {
         self.has_avx2
     }
 
-    /// All that the processor has.
-    #[cfg(test)]
-    pub(super) fn available() -> Vec<Self> {
+    /// All that the processor has, for tests.
+    pub fn available() -> Vec<Self> {
         let mut all = vec![Self { has_avx2: false }, Self::detect()];
         all.dedup();
         all
@@ -139,6 +139,8 @@ impl InstructionSet {
 
 /// `fn name(instruction_set, arguments)`, which runs `body::<FUSED>(arguments)` compiled for the instruction set. The
 /// body and all that it calls with lanes must be `#[inline(always)]`, or it is compiled for the baseline.
+#[doc(hidden)]
+#[macro_export]
 macro_rules! for_instruction_set {
     ($(#[$attribute:meta])* fn $name:ident($($argument:ident: $kind:ty),* $(,)?) = $body:ident) => {
         $(#[$attribute])*
@@ -159,7 +161,7 @@ macro_rules! for_instruction_set {
         }
     };
 }
-pub(super) use for_instruction_set;
+pub use for_instruction_set;
 
 /// Below this, [`exp`] is 0: its true values are no normal numbers any more.
 const SMALLEST_EXPONENT: f64 = -708.0;
@@ -187,13 +189,13 @@ const TAYLOR: [f64; 12] = [
 
 /// e^x for x <= 0, with an error below 1 ulp; 0 below x = -708 (where the true value is below 3.4e-308) and for NaN.
 #[inline(always)]
-pub(super) fn exp<const FUSED: bool>(x: Lanes<FUSED>) -> Lanes<FUSED> {
+pub fn exp<const FUSED: bool>(x: Lanes<FUSED>) -> Lanes<FUSED> {
     exp_of_degree::<FUSED, 13>(x)
 }
 
 /// As [`exp`] with a relative error below 1e-9, enough for what is rounded to single precision.
 #[inline(always)]
-pub(super) fn rough_exp<const FUSED: bool>(x: Lanes<FUSED>) -> Lanes<FUSED> {
+pub fn rough_exp<const FUSED: bool>(x: Lanes<FUSED>) -> Lanes<FUSED> {
     exp_of_degree::<FUSED, 8>(x)
 }
 

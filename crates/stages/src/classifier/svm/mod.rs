@@ -1,26 +1,16 @@
 //! Support vector classification with an RBF kernel, the classifier of Dang & Allen, section IV-D.
 //!
-//! The paper uses LIBSVM; this is the same problem under the same parameter names, solved by
-//! sequential minimal optimisation. It trains one binary classifier with one penalty for both
-//! classes. It does not scale features, choose parameters, or turn decision values into
-//! probabilities (see [`super::calibration`]), and its solver does not shrink.
-//!
-//! The same samples give the same bytes on any number of threads: only kernel rows are computed in
-//! parallel, each of their values by itself.
+//! It evaluates a machine that was trained; it does not scale features or turn decision values into probabilities (see
+//! [`super::calibration`]).
 
-mod kernel;
-mod lanes;
+#[doc(hidden)]
+pub mod lanes;
 mod prepared;
-mod solver;
-
-use std::ops::ControlFlow;
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use kernel::Kernel;
 pub use prepared::PreparedSvm;
-use solver::solve;
 
 /// Parameters of the training, named as in LIBSVM and scikit-learn.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -46,7 +36,7 @@ fn default_cache_bytes() -> usize {
 }
 
 impl Default for SvmParams {
-    /// LIBSVM's `c`, `tolerance` and weights, and 1 GB of cache; `gamma` is 0, which [`train_svm`] refuses, because it
+    /// LIBSVM's `c`, `tolerance` and weights, and 1 GB of cache; `gamma` is 0, which the training refuses, because it
     /// depends on the features.
     fn default() -> Self {
         Self {
@@ -138,18 +128,6 @@ impl RbfSvm {
     }
 }
 
-/// How the training went.
-#[derive(Debug, Clone, PartialEq)]
-pub struct SvmReport {
-    /// Value of the dual problem's objective, `½ αᵀQα - eᵀα`, below 0.
-    pub objective: f64,
-    /// Pairs of α that were optimised.
-    pub n_iterations: usize,
-    /// Whether the optimality conditions hold to `tolerance`; false when the iterations ran out or
-    /// rounding stopped them.
-    pub converged: bool,
-}
-
 /// Why a classifier could not be trained, read or asked.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum SvmError {
@@ -202,175 +180,13 @@ pub enum SvmError {
     Model { problem: String },
 }
 
-/// Trains a C-SVC with RBF kernel on samples (row-major, n_samples × n_features) and labels
-/// (`true` = the positive class).
-///
-/// The dual problem, with y_i = ±1 for the labels and Q_ij = y_i y_j K(x_i, x_j), K(x, z) =
-/// exp(-gamma ‖x - z‖²):
-///
-/// ```text
-/// minimise    ½ αᵀQα - eᵀα
-/// subject to  yᵀα = 0,   0 ≤ α_i ≤ c
-/// ```
-///
-/// The solver works with β_i = y_i α_i, in which the classes differ only by their bounds (0 ≤ β_i ≤
-/// c for positive and -c ≤ β_i ≤ 0 for negative samples), the constraint is Σ β_i = 0, and the
-/// gradient is g_i = Σ_j K_ij β_j - y_i. That is the decision value before rho, minus the label. β
-/// is optimal if and only if some rho has g_i ≥ rho wherever β_i can still grow and g_i ≤ rho
-/// wherever it can still shrink; the training stops when these are violated by less than
-/// `tolerance` (LIBSVM's rule). Each step moves one pair, β_i up and β_j down by the same amount: i
-/// has the smallest gradient of those that can grow, j brings the largest decrease of the objective
-/// to second order ("WSS 2" of Fan, Chen and Lin, "Working set selection using second order
-/// information for training support vector machines", 2005).
-///
-/// Not converging is not an error: see [`SvmReport::converged`]. Kernel rows are kept in single
-/// precision, like LIBSVM's, so a `tolerance` below about 1e-6 makes the solution more exact than
-/// the kernel it is the solution for.
-///
-/// # Errors
-/// When a parameter is not above 0, the shapes disagree, a feature is not finite, or a class is
-/// missing.
-pub fn train_svm(
-    features: &[f64],
-    n_features: usize,
-    labels: &[bool],
-    params: &SvmParams,
-) -> Result<(RbfSvm, SvmReport), SvmError> {
-    train_within(features, n_features, labels, params, MAX_ITERATIONS)
-}
-
-/// Trains a machine for each penalty of `cs`, which takes the place of `params.c`, in rising order, and hands each to
-/// `each` with its index; stops when that breaks off.
-///
-/// The kernel's rows are computed once for all of them, and each training begins where the last one ended, with every α
-/// grown as the penalty did. So it ends elsewhere within `tolerance` than [`train_svm`] does. On 8,000 histograms in
-/// five folds, c = 1, 10, 100 at gamma = 0.1 and 0.3 took 1.36 instead of 1.71 million steps; with α as they were left
-/// rather than grown, it would be 1.74 million.
-///
-/// # Errors
-/// As of [`train_svm`], and penalties that do not rise or leap beyond the range of an f64.
-pub fn train_svm_path(
-    features: &[f64],
-    n_features: usize,
-    labels: &[bool],
-    params: &SvmParams,
-    cs: &[f64],
-    mut each: impl FnMut(usize, RbfSvm, SvmReport) -> ControlFlow<()>,
-) -> Result<(), SvmError> {
-    for (c, next) in cs.iter().zip(&cs[1.min(cs.len())..]) {
-        if next <= c || !(next / c).is_finite() {
-            return Err(SvmError::Parameter { name: "c", value: *next });
-        }
-    }
-    let Some(&first) = cs.first() else { return Ok(()) };
-    let mut trainer = Trainer::new(features, n_features, labels, &SvmParams { c: first, ..params.clone() })?;
-    for (idx, c) in cs.iter().enumerate() {
-        let (svm, report) = trainer.train(*c, MAX_ITERATIONS)?;
-        if each(idx, svm, report).is_break() {
-            break;
-        }
-    }
-    Ok(())
-}
-
-/// Iterations after which training gives up, LIBSVM's cap for as many samples.
-const MAX_ITERATIONS: usize = 10_000_000;
-
-fn train_within(
-    features: &[f64],
-    n_features: usize,
-    labels: &[bool],
-    params: &SvmParams,
-    max_iterations: usize,
-) -> Result<(RbfSvm, SvmReport), SvmError> {
-    Trainer::new(features, n_features, labels, params)?.train(params.c, max_iterations)
-}
-
-/// What trainings share that differ in their penalty only.
-struct Trainer<'a> {
-    features: &'a [f64],
-    n_features: usize,
-    labels: &'a [bool],
-    params: SvmParams,
-    kernel: Kernel,
-    /// The last solution; all 0 before the first.
-    beta: Vec<f64>,
-}
-
-impl<'a> Trainer<'a> {
-    fn new(features: &'a [f64], n_features: usize, labels: &'a [bool], params: &SvmParams) -> Result<Self, SvmError> {
-        for (name, value) in [
-            ("c", params.c),
-            ("gamma", params.gamma),
-            ("tolerance", params.tolerance),
-            ("weight_positive", params.weight_positive),
-            ("weight_negative", params.weight_negative),
-        ] {
-            check_positive(name, value)?;
-        }
-        if n_features == 0 || labels.len().checked_mul(n_features) != Some(features.len()) {
-            return Err(SvmError::Shape { n_values: features.len(), n_labels: labels.len(), n_features });
-        }
-        check_finite(features, n_features)?;
-        let n_positive = labels.iter().filter(|&&positive| positive).count();
-        let n_negative = labels.len() - n_positive;
-        if n_positive == 0 || n_negative == 0 {
-            return Err(SvmError::OneClass { n_positive, n_negative });
-        }
-        let kernel = Kernel::new(features, n_features, params.gamma, params.cache_bytes);
-        if !kernel.is_finite() {
-            return Err(SvmError::Model { problem: "the features are so large that their squares overflow".into() });
-        }
-        Ok(Self { features, n_features, labels, params: params.clone(), kernel, beta: vec![0.0; labels.len()] })
-    }
-
-    /// Trains with a penalty that is not below the last one.
-    fn train(&mut self, c: f64, max_iterations: usize) -> Result<(RbfSvm, SvmReport), SvmError> {
-        check_positive("c", c)?;
-        self.grow_to(c);
-        let beta = std::mem::take(&mut self.beta);
-        let solution = solve(&mut self.kernel, self.labels, &self.params, max_iterations, beta);
-        self.beta = solution.beta;
-        let support = || (0..self.labels.len()).filter(|&sample_idx| self.beta[sample_idx] != 0.0);
-        let model = RbfSvm {
-            gamma: self.params.gamma,
-            rho: solution.rho,
-            n_features: self.n_features,
-            dual_coefficients: support().map(|sample_idx| self.beta[sample_idx]).collect(),
-            support_vectors: support()
-                .flat_map(|sample_idx| &self.features[sample_idx * self.n_features..][..self.n_features])
-                .copied()
-                .collect(),
-        };
-        // Parameters near the limits of f64 can overflow on the way, and a tolerance above 2 leaves no
-        // support vector.
-        model.validate()?;
-        Ok((model, solution.report))
-    }
-
-    /// Multiplies every β with the growth of the penalty to `c`: it stays within its bounds, all still add up to 0, and
-    /// one at a bound stays there.
-    fn grow_to(&mut self, c: f64) {
-        let growth = c / self.params.c;
-        for (beta, &positive) in self.beta.iter_mut().zip(self.labels) {
-            let weight = if positive { self.params.weight_positive } else { -self.params.weight_negative };
-            let is_at_bound = *beta == self.params.c * weight;
-            *beta = if is_at_bound { c * weight } else { *beta * growth };
-        }
-        self.kernel.scale_sums(growth);
-        self.params.c = c;
-    }
-}
-
-fn check_positive(name: &'static str, value: f64) -> Result<(), SvmError> {
-    if is_positive(value) { Ok(()) } else { Err(SvmError::Parameter { name, value }) }
-}
-
 fn is_positive(value: f64) -> bool {
     value.is_finite() && value > 0.0
 }
 
-fn check_finite(features: &[f64], n_features: usize) -> Result<(), SvmError> {
+/// # Errors
+/// [`SvmError::NonFiniteFeature`] for the first feature that is not finite.
+pub fn check_finite(features: &[f64], n_features: usize) -> Result<(), SvmError> {
     match features.iter().position(|value| !value.is_finite()) {
         None => Ok(()),
         Some(index) => Err(SvmError::NonFiniteFeature {
@@ -406,309 +222,18 @@ fn squared_distance(left: &[f64], right: &[f64]) -> f64 {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, clippy::expect_used)]
 mod tests {
-    use rand_chacha::ChaCha8Rng;
-    use rand_chacha::rand_core::{Rng, SeedableRng};
-
     use super::*;
-
-    fn params(c: f64, gamma: f64, tolerance: f64) -> SvmParams {
-        SvmParams { c, gamma, tolerance, ..SvmParams::default() }
-    }
-
-    /// Overlapping classes: positive where the first two features agree in sign, 10 % of labels
-    /// flipped.
-    fn random_problem(n_samples: usize, n_features: usize) -> (Vec<f64>, Vec<bool>) {
-        let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let mut uniform = || f64::from(rng.next_u32()) / f64::from(u32::MAX) * 2.0 - 1.0;
-        let features: Vec<f64> = (0..n_samples * n_features).map(|_| uniform()).collect();
-        let labels = features.chunks_exact(n_features).map(|x| (x[0] * x[1] > 0.0) != (uniform() > 0.8)).collect();
-        (features, labels)
-    }
-
-    fn decision_values(model: &RbfSvm, features: &[f64]) -> Vec<f64> {
-        features.chunks_exact(model.n_features).map(|sample| model.decision_value(sample).unwrap()).collect()
-    }
-
-    fn largest_difference(left: &[f64], right: &[f64]) -> f64 {
-        assert_eq!(left.len(), right.len());
-        left.iter().zip(right).map(|(l, r)| (l - r).abs()).fold(0.0, f64::max)
-    }
-
-    #[test]
-    fn two_points_in_closed_form() {
-        // α² (1 - k) - 2 α is least at α = 1 / (1 - k), k the kernel between the points; rho is 0
-        // by symmetry.
-        let features = [0.25, -1.0, 1.0, 1.0];
-        let k = (-0.3 * (0.75_f64.powi(2) + 4.0)).exp();
-        let alpha = 1.0 / (1.0 - k);
-        let (model, report) = train_svm(&features, 2, &[false, true], &params(10.0, 0.3, 1e-9)).unwrap();
-        assert!(report.converged);
-        assert!(largest_difference(&model.dual_coefficients, &[-alpha, alpha]) < 1e-6, "{model:?}");
-        assert!(model.rho.abs() < 1e-9, "{model:?}");
-        assert!((report.objective + alpha).abs() < 1e-6, "{report:?}");
-        assert!(largest_difference(&decision_values(&model, &features), &[-1.0, 1.0]) < 1e-6);
-
-        // The same, with α held at c = 1/2.
-        let (model, report) = train_svm(&features, 2, &[false, true], &params(0.5, 0.3, 1e-9)).unwrap();
-        assert_eq!(model.dual_coefficients, [-0.5, 0.5]);
-        assert!(model.rho.abs() < 1e-9, "{model:?}");
-        assert!((report.objective - (0.25 * (1.0 - k) - 1.0)).abs() < 1e-6, "{report:?}");
-    }
-
-    #[test]
-    fn xor_in_closed_form() {
-        let features = [1.0, 1.0, -1.0, -1.0, 1.0, -1.0, -1.0, 1.0];
-        let labels = [true, true, false, false];
-        // Neighbours are 2 apart: k = exp(-4 gamma), across k²; α (1 + k² - 2 k) = 1 puts each on
-        // its margin.
-        let k = (-4.0 * 0.1_f64).exp();
-        let alpha = 1.0 / (1.0 - k).powi(2);
-        let (model, report) = train_svm(&features, 2, &labels, &params(100.0, 0.1, 1e-9)).unwrap();
-        assert!(report.converged);
-        assert!(largest_difference(&model.dual_coefficients, &[alpha, alpha, -alpha, -alpha]) < 1e-4, "{model:?}");
-        assert!(model.decision_value(&[0.9, 0.8]).unwrap() > 0.0);
-        assert!(model.decision_value(&[-0.9, 0.8]).unwrap() < 0.0);
-        assert!(model.decision_value(&[0.0, 0.5]).unwrap().abs() < 1e-5);
-    }
-
-    #[test]
-    fn optimality_conditions_hold_on_a_random_problem() {
-        let (features, labels) = random_problem(300, 5);
-        for (c, tolerance) in [(0.1, 1e-3), (1.0, 1e-3), (50.0, 1e-2), (1.0, 1e-8)] {
-            let (model, report) = train_svm(&features, 5, &labels, &params(c, 0.7, tolerance)).unwrap();
-            assert!(report.converged);
-            assert!(model.dual_coefficients.iter().sum::<f64>().abs() < 1e-9);
-            // Find each sample's α again: the support vectors are in the order of the samples.
-            let mut support = model.support_vectors.chunks_exact(5).zip(&model.dual_coefficients).peekable();
-            let (mut linear, mut quadratic) = (0.0, 0.0);
-            for (sample, &positive) in features.chunks_exact(5).zip(&labels) {
-                let y = if positive { 1.0 } else { -1.0 };
-                let alpha = y * support.next_if(|(vector, _)| *vector == sample).map_or(0.0, |(_, beta)| *beta);
-                assert!((0.0..=c).contains(&alpha), "{alpha}");
-                let f = model.decision_value(sample).unwrap();
-                let margin = y * f;
-                // Single precision of the kernel adds some 1e-7 per unit of Σ α.
-                let slack = tolerance + 1e-6 * c.max(1.0);
-                assert!(alpha == c || margin >= 1.0 - slack, "alpha {alpha}, margin {margin}");
-                assert!(alpha == 0.0 || margin <= 1.0 + slack, "alpha {alpha}, margin {margin}");
-                linear += alpha;
-                quadratic += alpha * y * (f + model.rho);
-            }
-            assert!(support.next().is_none());
-            let objective = 0.5 * quadratic - linear;
-            assert!((report.objective - objective).abs() < 1e-6 * objective.abs(), "{report:?} {objective}");
-        }
-    }
-
-    #[test]
-    fn number_of_threads_changes_no_bit() {
-        let (features, labels) = random_problem(2 * 1024 + 33, 11);
-        let train = |n_threads| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().unwrap();
-            pool.install(|| train_svm(&features, 11, &labels, &params(1.0, 0.3, 1e-3))).unwrap()
-        };
-        assert_eq!(train(1), train(2));
-        assert_eq!(train(1), train(3));
-    }
-
-    /// Objective and rho of LIBSVM 3.24 at tolerance 1e-5, as `scripts/benchsuite libsvm` prints them.
-    #[test]
-    fn agrees_with_libsvm() {
-        let n_samples = 1500_u64;
-        let feature =
-            |i: u64, column: u64| ((i * i * (column + 1) * 37 + i * 101 * (column + 2)) % 1009) as f64 / 1009.0;
-        let features: Vec<f64> = (0..n_samples).flat_map(|i| (0..6).map(move |column| feature(i, column))).collect();
-        let labels: Vec<bool> =
-            (0..n_samples).map(|i| ((feature(i, 0) - 0.5) * (feature(i, 1) - 0.5) > 0.0) != (i % 10 == 5)).collect();
-        for (c, gamma, weight_positive, objective, rho) in [
-            (1.0, 0.5, 1.0, -794.516808, 1.658594),
-            (100.0, 3.0, 1.0, -33458.031602, 1.081805),
-            (10.0, 2.0, 2.5, -6771.969983, -0.48394),
-        ] {
-            let (model, report) =
-                train_svm(&features, 6, &labels, &SvmParams { weight_positive, ..params(c, gamma, 1e-5) }).unwrap();
-            assert!(report.converged);
-            assert!((report.objective / objective - 1.0).abs() < 1e-5, "{report:?}, expected {objective}");
-            assert!((model.rho - rho).abs() < 1e-3, "rho {}, expected {rho}", model.rho);
-        }
-    }
-
-    #[test]
-    fn size_of_the_cache_changes_no_bit() {
-        // More samples than a working set holds, and so more rows than one.
-        let (features, labels) = random_problem(1500, 5);
-        let train = |cache_bytes| {
-            train_svm(&features, 5, &labels, &SvmParams { cache_bytes, ..params(1.0, 0.3, 1e-3) }).unwrap()
-        };
-        let reference = train(SvmParams::default().cache_bytes);
-        for n_rows in [0, 1, 2, 3, 50, 600] {
-            assert_eq!(train(n_rows * 1504 * size_of::<f32>()), reference);
-        }
-    }
-
-    #[test]
-    fn along_a_path_each_machine_is_as_if_trained_alone() {
-        let (features, labels) = random_problem(1500, 5);
-        let cs = [0.01, 0.3, 1.0, 40.0];
-        let weighted = SvmParams { weight_positive: 3.0, weight_negative: 0.5, ..params(7.0, 0.5, 1e-5) };
-        let mut n_trained = 0;
-        train_svm_path(&features, 5, &labels, &weighted, &cs, |idx, along, report| {
-            let alone = SvmParams { c: cs[idx], ..weighted.clone() };
-            let (alone, alone_report) = train_svm(&features, 5, &labels, &alone).unwrap();
-            assert!(report.converged);
-            assert!((report.objective / alone_report.objective - 1.0).abs() < 1e-6, "{report:?} {alone_report:?}");
-            assert!(along.dual_coefficients.iter().sum::<f64>().abs() < 1e-9 * cs[idx] * 1500.0);
-            let bounds = (-0.5 * cs[idx], 3.0 * cs[idx]);
-            assert!(along.dual_coefficients.iter().all(|beta| (bounds.0..=bounds.1).contains(beta)));
-            let [along, alone] = [along, alone].map(|model| decision_values(&model, &features));
-            assert!(largest_difference(&along, &alone) < 1e-3, "{}", largest_difference(&along, &alone));
-            // The first begins from nothing, as alone.
-            assert_eq!(idx == 0, report == alone_report);
-            n_trained += 1;
-            ControlFlow::Continue(())
-        })
-        .unwrap();
-        assert_eq!(n_trained, cs.len());
-    }
-
-    #[test]
-    fn a_path_rises_and_ends_where_it_is_told() {
-        let (features, labels) = random_problem(50, 2);
-        let walk = |cs: &[f64]| {
-            let mut walked = Vec::new();
-            let outcome = train_svm_path(&features, 2, &labels, &params(1.0, 0.5, 1e-3), cs, |idx, _, _| {
-                walked.push(cs[idx]);
-                if idx == 1 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-            });
-            (walked, outcome)
-        };
-        assert_eq!(walk(&[0.5, 1.0, 2.0]), (vec![0.5, 1.0], Ok(())));
-        assert_eq!(walk(&[]), (vec![], Ok(())));
-        assert_eq!(walk(&[1.0, 1.0]), (vec![], Err(SvmError::Parameter { name: "c", value: 1.0 })));
-        assert_eq!(walk(&[-1.0, 1.0]), (vec![], Err(SvmError::Parameter { name: "c", value: -1.0 })));
-        assert_eq!(walk(&[1e-300, 1e300]), (vec![], Err(SvmError::Parameter { name: "c", value: 1e300 })));
-    }
-
-    #[test]
-    fn a_weight_is_a_penalty_of_its_class() {
-        let (features, labels) = random_problem(300, 3);
-        let train = |params: &SvmParams| train_svm(&features, 3, &labels, params).unwrap().0;
-        let weighted = SvmParams { weight_positive: 3.0, weight_negative: 0.5, ..params(2.0, 0.5, 1e-3) };
-        let model = train(&weighted);
-        let largest = model.dual_coefficients.iter().fold(0.0, |most: f64, beta| most.max(*beta));
-        let smallest = model.dual_coefficients.iter().fold(0.0, |least: f64, beta| least.min(*beta));
-        assert_eq!((largest, smallest), (6.0, -1.0));
-        // Both weights together are nothing but another c.
-        let doubled = SvmParams { weight_positive: 2.0, weight_negative: 2.0, ..params(1.0, 0.5, 1e-3) };
-        assert_eq!(train(&doubled), train(&params(2.0, 0.5, 1e-3)));
-    }
-
-    #[test]
-    fn far_from_the_origin_the_result_is_the_same() {
-        let (features, labels) = random_problem(200, 4);
-        let far: Vec<f64> = features.iter().map(|x| x + 1024.0).collect();
-        let strict = params(1.0, 0.3, 1e-8);
-        let (model, _) = train_svm(&features, 4, &labels, &strict).unwrap();
-        let (far_model, _) = train_svm(&far, 4, &labels, &strict).unwrap();
-        assert!(largest_difference(&decision_values(&model, &features), &decision_values(&far_model, &far)) < 1e-5);
-    }
-
-    #[test]
-    fn order_of_samples_and_features_changes_no_decision() {
-        let (features, labels) = random_problem(150, 9);
-        let strict = params(1.0, 0.3, 1e-8);
-        let (model, _) = train_svm(&features, 9, &labels, &strict).unwrap();
-        let backwards: Vec<f64> = features.iter().rev().copied().collect();
-        let labels_backwards: Vec<bool> = labels.iter().rev().copied().collect();
-        let (permuted, _) = train_svm(&backwards, 9, &labels_backwards, &strict).unwrap();
-        let mut decisions = decision_values(&permuted, &backwards);
-        decisions.reverse();
-        assert!(largest_difference(&decision_values(&model, &features), &decisions) < 1e-5);
-    }
-
-    #[test]
-    fn swapped_labels_swap_the_sign() {
-        let (features, labels) = random_problem(150, 4);
-        let strict = params(2.0, 0.5, 1e-8);
-        let (model, _) = train_svm(&features, 4, &labels, &strict).unwrap();
-        let swapped: Vec<bool> = labels.iter().map(|positive| !positive).collect();
-        let (mirrored, _) = train_svm(&features, 4, &swapped, &strict).unwrap();
-        let negated: Vec<f64> = decision_values(&mirrored, &features).iter().map(|f| -f).collect();
-        assert!(largest_difference(&decision_values(&model, &features), &negated) < 1e-5);
-    }
-
-    #[test]
-    fn a_sample_with_both_labels_is_undecided() {
-        let (model, report) = train_svm(&[1.0; 2], 1, &[true, false], &params(1.0, 1.0, 1e-3)).unwrap();
-        assert!(report.converged);
-        assert_eq!(model.dual_coefficients, [1.0, -1.0]);
-        assert_eq!(model.decision_value(&[1.0]), Ok(0.0));
-    }
-
-    #[test]
-    fn running_out_of_iterations_is_reported() {
-        let (features, labels) = random_problem(100, 4);
-        let (_, report) = train_within(&features, 4, &labels, &params(1.0, 0.5, 1e-3), 5).unwrap();
-        assert_eq!((report.converged, report.n_iterations), (false, 5));
-    }
-
-    #[test]
-    fn extreme_parameters_neither_panic_nor_yield_an_invalid_model() {
-        let (features, labels) = random_problem(20, 2);
-        for c in [f64::MIN_POSITIVE, 1e-300, 1e300, f64::MAX] {
-            for gamma in [f64::MIN_POSITIVE, 1e300] {
-                for scale in [1e-300, 1.0, 1e300] {
-                    let scaled: Vec<f64> = features.iter().map(|x| x * scale).collect();
-                    match train_within(&scaled, 2, &labels, &params(c, gamma, 1e-3), 10_000) {
-                        Ok((model, _)) => assert!(model.validate().is_ok()),
-                        Err(error) => assert!(matches!(error, SvmError::Model { .. }), "{error}"),
-                    }
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn training_errors_say_what_is_wrong() {
-        let features = [0.0, 1.0, 2.0, 3.0];
-        let labels = [true, false];
-        let good = params(1.0, 0.5, 1e-3);
-        for (name, value) in [("c", 0.0), ("gamma", -1.0), ("tolerance", f64::NAN), ("c", f64::INFINITY)] {
-            let mut bad = good.clone();
-            match name {
-                "c" => bad.c = value,
-                "gamma" => bad.gamma = value,
-                _ => bad.tolerance = value,
-            }
-            let error = train_svm(&features, 2, &labels, &bad).unwrap_err();
-            assert!(matches!(error, SvmError::Parameter { name: found, .. } if found == name), "{error}");
-        }
-        assert!(matches!(
-            train_svm(&features, 2, &labels, &SvmParams::default()),
-            Err(SvmError::Parameter { name: "gamma", .. })
-        ));
-        for (n_features, n_labels) in [(3, 2), (2, 1), (0, 0), (usize::MAX, 2)] {
-            assert_eq!(
-                train_svm(&features, n_features, &labels[..n_labels], &good),
-                Err(SvmError::Shape { n_values: 4, n_labels, n_features })
-            );
-        }
-        assert_eq!(train_svm(&[], 2, &[], &good), Err(SvmError::OneClass { n_positive: 0, n_negative: 0 }));
-        assert_eq!(
-            train_svm(&features, 2, &[true; 2], &good),
-            Err(SvmError::OneClass { n_positive: 2, n_negative: 0 })
-        );
-        assert_eq!(
-            train_svm(&[0.0, 1.0, f64::INFINITY, 3.0], 2, &labels, &good),
-            Err(SvmError::NonFiniteFeature { row: 1, column: 0, value: f64::INFINITY })
-        );
-    }
 
     #[test]
     fn models_and_samples_are_checked() {
-        let (model, _) = train_svm(&[0.0, 1.0, 2.0, 3.0], 2, &[true, false], &params(1.0, 0.5, 1e-3)).unwrap();
+        let model = RbfSvm {
+            gamma: 0.5,
+            rho: 0.0,
+            n_features: 2,
+            dual_coefficients: vec![1.0, -1.0],
+            support_vectors: vec![0.0, 1.0, 2.0, 3.0],
+        };
         assert_eq!(model.validate(), Ok(()));
         assert_eq!(model.n_support_vectors(), 2);
         assert_eq!(model.decision_value(&[0.0]), Err(SvmError::FeatureCount { expected: 2, found: 1 }));

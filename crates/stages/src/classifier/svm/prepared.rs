@@ -5,7 +5,6 @@
 
 use std::ops::Deref;
 
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::lanes::{Aligned, InstructionSet, LANES, Lanes, exp, for_instruction_set};
@@ -17,8 +16,6 @@ const GROUPS: usize = 4;
 const WIDTH: usize = GROUPS * LANES;
 /// Samples that share a pass over the support vectors, when there are several.
 const SAMPLES_PER_PASS: usize = 8;
-/// Samples of a unit of parallel work.
-const SAMPLES_PER_TASK: usize = 4 * SAMPLES_PER_PASS;
 
 /// A consistent machine, prepared for decision values.
 ///
@@ -88,8 +85,7 @@ impl PreparedSvm {
         Ok(value[0] - self.svm.rho)
     }
 
-    /// Decision values of many samples (row-major, n_samples × n_features), on all threads; the same bits as one by
-    /// one.
+    /// Decision values of many samples (row-major, n_samples × n_features); the same bits as one by one.
     ///
     /// # Errors
     /// [`SvmError::FeatureCount`] when the last sample is incomplete, or [`SvmError::NonFiniteFeature`].
@@ -101,12 +97,8 @@ impl PreparedSvm {
         }
         check_finite(samples, n_features)?;
         let mut values = vec![0.0; samples.len() / n_features];
-        values.par_chunks_mut(SAMPLES_PER_TASK).zip(samples.par_chunks(SAMPLES_PER_TASK * n_features)).for_each(
-            |(values, samples)| {
-                kernel_sums(self.layout.instruction_set, &self.layout, samples, values);
-                values.iter_mut().for_each(|value| *value -= self.svm.rho);
-            },
-        );
+        kernel_sums(self.layout.instruction_set, &self.layout, samples, &mut values);
+        values.iter_mut().for_each(|value| *value -= self.svm.rho);
         Ok(values)
     }
 }
@@ -253,7 +245,7 @@ mod tests {
     #[test]
     fn many_samples_are_the_same_as_one_by_one() {
         let svm = PreparedSvm::try_from(random_svm(70, 5)).unwrap();
-        let samples = random_svm(SAMPLES_PER_TASK + 3, 5).support_vectors;
+        let samples = random_svm(4 * SAMPLES_PER_PASS + 3, 5).support_vectors;
         let one_by_one: Vec<f64> = samples.chunks_exact(5).map(|sample| svm.decision_value(sample).unwrap()).collect();
         assert_eq!(svm.decision_values(&samples), Ok(one_by_one));
         assert_eq!(svm.decision_values(&[]), Ok(Vec::new()));

@@ -23,8 +23,8 @@ pub enum MeshError {
     /// The object is too large or too small to be grasped. `suggestion` names scales that would do; it may be empty.
     #[error(
         "the object is {longest_side_m} m long at scale {scale}, expected {} to {} m{suggestion}",
-        super::check::LEAST_SIZE_M,
-        super::check::GREATEST_SIZE_M
+        crate::check::LEAST_SIZE_M,
+        crate::check::GREATEST_SIZE_M
     )]
     Size { longest_side_m: f64, scale: f64, suggestion: String },
     #[error("the mesh has no surface: expected triangles with an area, found {n_triangles} triangles without")]

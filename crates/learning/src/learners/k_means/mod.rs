@@ -1,4 +1,4 @@
-//! The contact dictionary: K-means over contact positions (Dang & Allen, section III-A).
+//! Learns the contact dictionary: K-means over contact positions (Dang & Allen, section III-A).
 //!
 //! Only positions are clustered, by Euclidean distance in the palm frame: a hand's reachable
 //! contacts leave each position little choice of orientation. This module does not decide which
@@ -12,41 +12,13 @@
 mod blocks;
 mod seeding;
 
+use blindgrasp_stages::dictionary::{Dictionary, nearest_word, squared_distance};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
-use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use blocks::{Block, Clusters, assign, blocks_of, inertia, squared_distance};
+use blocks::{Block, Clusters, assign, blocks_of, inertia};
 use seeding::seed_words;
-
-/// The representative contacts ĉ_1 .. ĉ_k of Dang & Allen, section III-A.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Dictionary {
-    /// Cluster centres, metres in the palm frame; learned ones are sorted by x, then y, then z.
-    pub words_m: Vec<[f64; 3]>,
-}
-
-impl Dictionary {
-    pub fn len(&self) -> usize {
-        self.words_m.len()
-    }
-
-    /// Whether there is no word at all.
-    pub fn is_empty(&self) -> bool {
-        self.words_m.is_empty()
-    }
-
-    /// Index of the word nearest to a point in the palm frame (metres), and its distance in metres.
-    ///
-    /// Of words equally near, the first. `None` when the dictionary is empty or no distance is
-    /// finite.
-    pub fn nearest(&self, point_m: [f64; 3]) -> Option<(usize, f64)> {
-        let (word_idx, squared) = nearest_word(&self.words_m, &point_m);
-        squared.is_finite().then(|| (word_idx, squared.sqrt()))
-    }
-}
 
 /// Parameters of K-means, named as in scikit-learn's `KMeans`.
 #[derive(Debug, Clone, PartialEq)]
@@ -158,18 +130,6 @@ pub fn learn_dictionary(positions_m: &[[f64; 3]], params: &KMeansParams) -> Resu
 /// squares stay far from overflowing.
 const MAX_COORDINATE_M: f64 = 1e3;
 
-/// Index and squared distance of the nearest word; an infinite distance when there is none.
-fn nearest_word(words: &[[f64; 3]], point: &[f64; 3]) -> (usize, f64) {
-    let mut nearest = (0, f64::INFINITY);
-    for (word_idx, word) in words.iter().enumerate() {
-        let squared = squared_distance(word, point);
-        if squared < nearest.1 {
-            nearest = (word_idx, squared);
-        }
-    }
-    nearest
-}
-
 fn mean_variance(blocks: &[Block]) -> f64 {
     let n = blocks.iter().map(Block::len).sum::<usize>() as f64;
     let mean_over =
@@ -258,17 +218,6 @@ mod tests {
         }
         // 2 * 0.1² in the first blob; 0 + 2 * 0.2² in the second.
         assert!((learned.inertia - 0.1).abs() < 1e-12, "{}", learned.inertia);
-    }
-
-    #[test]
-    fn nearest_word_and_its_distance() {
-        let dictionary = Dictionary { words_m: vec![[0.0; 3], [0.3, 0.0, 0.0], [0.3, 0.0, 0.0]] };
-        assert_eq!((dictionary.len(), dictionary.is_empty()), (3, false));
-        let (word_idx, distance_m) = dictionary.nearest([0.3, 0.4, 0.0]).unwrap();
-        assert_eq!(word_idx, 1);
-        assert!((distance_m - 0.4).abs() < 1e-15);
-        assert_eq!(dictionary.nearest([f64::NAN, 0.0, 0.0]), None);
-        assert_eq!(Dictionary { words_m: Vec::new() }.nearest([0.0; 3]), None);
     }
 
     #[test]

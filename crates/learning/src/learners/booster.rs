@@ -12,7 +12,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-use super::boosting::{BoostedTrees, BoostingError, BoostingParams, Tree, TreeNode};
+use blindgrasp_stages::classifier::boosting::{BoostedTrees, BoostingError, BoostingParams, Tree, TreeNode};
 
 /// Bins of a column. An index of a bin fits into a byte.
 const MAX_BINS: usize = 256;
@@ -294,7 +294,8 @@ mod tests {
         let trees = train_boosted(&features, 2, &targets, &stump(), 1).unwrap();
         assert_eq!(trees.base, 0.0);
         let third = 1.0_f32 / 3.0;
-        let expected = Tree::stump(1, 2.5, [-third, third]);
+        let [left, right] = [-third, third].map(TreeNode::leaf);
+        let expected = Tree { nodes: vec![TreeNode { threshold: 2.5, left: 1, feature: 1 }, left, right] };
         assert_eq!(trees.trees, [expected]);
         // Each side has the weight 0.5, which is too little here.
         let params = BoostingParams { min_child_weight: 0.6, ..stump() };

@@ -1,13 +1,13 @@
 //! Wavefront OBJ: the lines `v` and `f`.
 
-use super::read::{Problem, Soup, coordinates, lines, quoted};
+use crate::read::{Problem, Soup, coordinates, lines, quoted};
 
 /// Reads OBJ. All objects and groups of the file become one mesh. A fourth coordinate (a weight, for curves), colours,
 /// texture coordinates, normals, points, lines and curves are ignored.
 ///
 /// # Errors
 /// Vertices without three coordinates; faces with fewer than three vertices, or with a vertex that is not there.
-pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
+pub(crate) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
     let mut soup = Soup::counted_from(1);
     let mut idxs = Vec::new();
     let mut lines = lines(bytes);

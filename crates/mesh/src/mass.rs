@@ -9,8 +9,8 @@
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 use serde::Serialize;
 
-use super::topology::{caps, determinant};
-use super::{Mesh, MeshError};
+use crate::topology::{caps, determinant};
+use crate::{Mesh, MeshError};
 
 /// Number of columns along either side of the mesh's box, a power of two.
 const N_COLUMNS: i64 = 128;
@@ -59,7 +59,7 @@ impl SolidProperties {
     }
 }
 
-/// Volume, centre of mass and greatest radius of a mesh that [`super::check::repair`] has repaired.
+/// Volume, centre of mass and greatest radius of a mesh that [`crate::check::repair`] has repaired.
 ///
 /// Holes count as closed by flat caps: a cup whose wall is a single surface counts as full.
 ///
@@ -252,9 +252,9 @@ mod tests {
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
-    use super::super::check::repair;
-    use super::super::tests::{block, random_motion};
     use super::*;
+    use crate::check::repair;
+    use crate::tests::{block, random_motion};
 
     fn solid(mesh: Mesh) -> SolidProperties {
         solid_properties(&repair(mesh).0).expect("a solid")

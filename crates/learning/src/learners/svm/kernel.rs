@@ -11,7 +11,9 @@
 
 use rayon::prelude::*;
 
-use super::lanes::{Aligned, InstructionSet, LANES, Lanes, for_instruction_set, rough_exp};
+use blindgrasp_stages::classifier::svm::lanes::{
+    Aligned, InstructionSet, LANES, Lanes, for_instruction_set, rough_exp,
+};
 
 /// Lanes of samples that a unit of work holds: two registers' worth.
 const GROUPS: usize = 2;

@@ -11,6 +11,7 @@
 
 use std::cmp::Ordering;
 
+use blindgrasp_stages::dictionary::squared_distance;
 use rayon::prelude::*;
 
 /// Positions in a block.
@@ -100,11 +101,6 @@ pub(super) fn inertia(blocks: &[Block], words: &[[f64; 3]]) -> f64 {
         })
         .collect();
     chunk_sums.iter().sum()
-}
-
-pub(super) fn squared_distance(left: &[f64; 3], right: &[f64; 3]) -> f64 {
-    let (dx, dy, dz) = (left[0] - right[0], left[1] - right[1], left[2] - right[2]);
-    dx * dx + dy * dy + dz * dz
 }
 
 /// The sum in a fixed order that vector instructions can follow.

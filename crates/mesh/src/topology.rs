@@ -4,20 +4,20 @@ use std::collections::BTreeMap;
 
 use nalgebra::{Point3, Vector3};
 
-use super::Mesh;
+use crate::Mesh;
 
 /// A triangle's use of one of its edges.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct EdgeUse {
+pub(crate) struct EdgeUse {
     /// The edge: its vertices, the lower index first.
-    pub(super) ends: [u32; 2],
-    pub(super) triangle_idx: usize,
+    pub(crate) ends: [u32; 2],
+    pub(crate) triangle_idx: usize,
     /// Whether the triangle runs from the lower to the higher index.
-    pub(super) is_upwards: bool,
+    pub(crate) is_upwards: bool,
 }
 
 /// All edges of triangles, sorted, so that the uses of one edge are neighbours.
-pub(super) fn edge_uses(triangles: impl IntoIterator<Item = [u32; 3]>) -> Vec<EdgeUse> {
+pub(crate) fn edge_uses(triangles: impl IntoIterator<Item = [u32; 3]>) -> Vec<EdgeUse> {
     let of_triangle = |(triangle_idx, [a, b, c]): (usize, [u32; 3])| {
         [[a, b], [b, c], [c, a]].map(|[from, to]| EdgeUse {
             ends: [from.min(to), from.max(to)],
@@ -31,12 +31,12 @@ pub(super) fn edge_uses(triangles: impl IntoIterator<Item = [u32; 3]>) -> Vec<Ed
 }
 
 /// The uses, edge by edge.
-pub(super) fn by_edge(uses: &[EdgeUse]) -> impl Iterator<Item = &[EdgeUse]> {
+pub(crate) fn by_edge(uses: &[EdgeUse]) -> impl Iterator<Item = &[EdgeUse]> {
     uses.chunk_by(|a, b| a.ends == b.ends)
 }
 
 /// How often more an edge is run through upwards than downwards. Around a closed surface every edge has 0.
-pub(super) fn balance(uses_of_edge: &[EdgeUse]) -> i64 {
+pub(crate) fn balance(uses_of_edge: &[EdgeUse]) -> i64 {
     uses_of_edge.iter().map(|edge_use| if edge_use.is_upwards { 1 } else { -1 }).sum()
 }
 
@@ -44,7 +44,7 @@ pub(super) fn balance(uses_of_edge: &[EdgeUse]) -> i64 {
 ///
 /// The edges that do not cancel form closed rims for any surface (a boundary has no boundary), so that surface and
 /// caps together always wind around each point a whole number of times, also for edges shared by many triangles.
-pub(super) fn caps(mesh: &Mesh, triangles: impl IntoIterator<Item = [u32; 3]>) -> Vec<[Point3<f64>; 3]> {
+pub(crate) fn caps(mesh: &Mesh, triangles: impl IntoIterator<Item = [u32; 3]>) -> Vec<[Point3<f64>; 3]> {
     let uses = edge_uses(triangles);
     let rim: Vec<([u32; 2], i64)> = by_edge(&uses)
         .filter_map(|uses| Some((uses.first()?.ends, balance(uses))).filter(|(_, balance)| *balance != 0))
@@ -76,20 +76,20 @@ pub(super) fn caps(mesh: &Mesh, triangles: impl IntoIterator<Item = [u32; 3]>) -
 }
 
 /// Six times the signed volume of the tetrahedron from `origin` to a triangle.
-pub(super) fn determinant([a, b, c]: &[Point3<f64>; 3], origin: &Point3<f64>) -> f64 {
+pub(crate) fn determinant([a, b, c]: &[Point3<f64>; 3], origin: &Point3<f64>) -> f64 {
     (a - origin).dot(&(b - origin).cross(&(c - origin)))
 }
 
 /// Numbers joined into groups (union-find).
-pub(super) struct Groups(Vec<usize>);
+pub(crate) struct Groups(Vec<usize>);
 
 impl Groups {
-    pub(super) fn new(n: usize) -> Self {
+    pub(crate) fn new(n: usize) -> Self {
         Groups((0..n).collect())
     }
 
     /// The number of one member stands for the group.
-    pub(super) fn of(&mut self, mut member: usize) -> usize {
+    pub(crate) fn of(&mut self, mut member: usize) -> usize {
         while self.0[member] != member {
             self.0[member] = self.0[self.0[member]];
             member = self.0[member];
@@ -97,7 +97,7 @@ impl Groups {
         member
     }
 
-    pub(super) fn join(&mut self, a: usize, b: usize) {
+    pub(crate) fn join(&mut self, a: usize, b: usize) {
         let [a, b] = [self.of(a), self.of(b)];
         self.0[a.max(b)] = a.min(b);
     }

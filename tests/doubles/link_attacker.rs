@@ -44,7 +44,7 @@ fn main() -> anyhow::Result<()> {
                 std::thread::park();
             }
         }
-        _ => bail!("see the top of examples/link_attacker.rs"),
+        _ => bail!("see the top of this program"),
     };
     println!("{report}");
     Ok(())

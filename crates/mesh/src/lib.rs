@@ -1,20 +1,34 @@
-//! Triangle meshes, which objects are made of.
+//! Triangle meshes: read from files, checked, repaired and weighed.
 //!
-//! The path of a user's object: [`folder`] (files with class and scale) -> [`read`] (OFF, OBJ, STL, PLY) -> [`check`]
-//! (size, faults of the surface, repair) -> [`mass`] (volume, centre of mass).
+//! The path of a mesh: [`read`] (OFF, OBJ, STL, PLY) -> [`check`] (size, faults of the surface, repair) -> [`mass`]
+//! (volume, centre of mass). Colours, normals, textures and materials of the files are not read; shapes are not
+//! simplified.
 //!
-//! Colours, normals, textures and materials of the files are not read; shapes are not simplified.
+//! ```
+//! use blindgrasp_mesh::{Mesh, check::repair, mass::solid_properties};
+//! use nalgebra::Point3;
+//!
+//! // A corner of a cube of 60 mm. The last triangle faces inwards.
+//! let corners = [[0.0, 0.0, 0.0], [0.06, 0.0, 0.0], [0.0, 0.06, 0.0], [0.0, 0.0, 0.06]];
+//! let triangles = vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [3, 2, 1]];
+//! let mesh = Mesh { vertices_m: corners.map(Point3::from).to_vec(), triangles };
+//!
+//! let (mesh, survey) = repair(mesh);
+//! assert_eq!(survey.n_misoriented, 1);
+//! let solid = solid_properties(&mesh)?;
+//! assert!((solid.volume_m3 - 36e-6).abs() < 1e-12);
+//! assert!((solid.centre_of_mass_m - Point3::new(0.015, 0.015, 0.015)).norm() < 1e-9);
+//! # Ok::<(), blindgrasp_mesh::MeshError>(())
+//! ```
 
 pub mod check;
 mod error;
-pub mod folder;
 mod format;
 pub mod mass;
 mod obj;
 mod off;
 mod ply;
 pub mod read;
-pub mod shape;
 mod stl;
 #[cfg(test)]
 mod tests;

@@ -1,13 +1,13 @@
 //! The Polygon File Format (Stanford PLY), as text and binary of both byte orders.
 
-use super::read::{Problem, Soup, quoted};
+use crate::read::{Problem, Soup, quoted};
 
 /// Reads PLY: the element `vertex` with `x`, `y` and `z`, and the element `face` with a list of indices. Other elements
 /// and properties are skipped.
 ///
 /// # Errors
 /// A damaged file, or one without these elements.
-pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
+pub(crate) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
     let mut file = File { rest: bytes, n_lines: 0 };
     let (encoding, elements) = read_header(&mut file)?;
     check_header(&elements)?;

@@ -6,11 +6,11 @@ use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::read::read_mesh;
-use super::{Mesh, MeshError, write_off};
+use crate::read::read_mesh;
+use crate::{Mesh, MeshError, write_off};
 
 /// A box of 12 triangles that face outwards.
-pub(super) fn block(least: [f64; 3], most: [f64; 3]) -> Mesh {
+pub(crate) fn block(least: [f64; 3], most: [f64; 3]) -> Mesh {
     let vertices_m = (0..8)
         .map(|idx: usize| Point3::from(std::array::from_fn(|axis| [least, most][idx >> axis & 1][axis])))
         .collect();
@@ -20,7 +20,7 @@ pub(super) fn block(least: [f64; 3], most: [f64; 3]) -> Mesh {
 }
 
 /// A turn and a shift.
-pub(super) fn random_motion(random: &mut ChaCha8Rng) -> Isometry3<f64> {
+pub(crate) fn random_motion(random: &mut ChaCha8Rng) -> Isometry3<f64> {
     let mut vector = || Vector3::from_fn(|_, _| random.random_range(-1.0..1.0));
     Isometry3::from_parts(Translation3::from(vector()), UnitQuaternion::from_scaled_axis(vector() * 3.0))
 }
@@ -351,8 +351,8 @@ fn damaged_files_do_not_panic() {
     let check = |name: &str, bytes: &[u8]| match read_mesh(&folder.file(name, bytes), 1.0) {
         Ok(mesh) => {
             assert!(mesh.triangles.iter().flatten().all(|idx| (*idx as usize) < mesh.vertices_m.len()));
-            let (mesh, _) = super::check::repair(mesh);
-            let _ = super::mass::solid_properties(&mesh);
+            let (mesh, _) = crate::check::repair(mesh);
+            let _ = crate::mass::solid_properties(&mesh);
             true
         }
         Err(error) => {

@@ -3,14 +3,14 @@
 use std::fmt::Write;
 use std::path::Path;
 
-use super::read::{Problem, Soup, coordinates, lines, quoted};
-use super::{Mesh, MeshError};
+use crate::read::{Problem, Soup, coordinates, lines, quoted};
+use crate::{Mesh, MeshError};
 
 /// Reads OFF. Colours, normals and texture coordinates behind a vertex' coordinates or a face's indices are ignored.
 ///
 /// # Errors
 /// A file whose vertices and faces differ from its counts.
-pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
+pub(crate) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
     let mut n_lines = 0;
     let mut lines = lines(bytes).map(|(number, line)| (number, line.split('#').next().unwrap_or_default().to_string()));
     // Blank lines and lines with nothing but a comment don't count.

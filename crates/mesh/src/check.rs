@@ -1,14 +1,14 @@
 //! Checks a mesh, and repairs its triangles where that is unambiguous.
 //!
-//! The repair moves no vertex, fills no hole and cuts no overlap: [`super::mass`] copes with holes and overlaps.
+//! The repair moves no vertex, fills no hole and cuts no overlap: [`crate::mass`] copes with holes and overlaps.
 
 use std::collections::HashSet;
 
 use nalgebra::Point3;
 use serde::Serialize;
 
-use super::topology::{EdgeUse, balance, by_edge, caps, determinant, edge_uses};
-use super::{Mesh, MeshError};
+use crate::topology::{EdgeUse, balance, by_edge, caps, determinant, edge_uses};
+use crate::{Mesh, MeshError};
 
 /// Least length of an object's longest side, metres.
 pub const LEAST_SIZE_M: f64 = 0.005;
@@ -220,8 +220,8 @@ fn rounded(value: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::block;
     use super::*;
+    use crate::tests::block;
 
     fn cube() -> Mesh {
         block([0.0; 3], [1.0; 3])

@@ -10,8 +10,8 @@ use std::fmt::Write;
 
 use thiserror::Error;
 
-use super::calibration::PlattCalibration;
-use super::svm::{RbfSvm, SvmError};
+use blindgrasp_stages::classifier::calibration::PlattCalibration;
+use blindgrasp_stages::classifier::svm::{RbfSvm, SvmError};
 
 /// The label of stable grasps; the other one is -1 (written) or 0 (also read).
 const STABLE: i64 = 1;

@@ -1,6 +1,6 @@
 //! STL: triangles without shared corners, as text or binary.
 
-use super::read::{Problem, Soup, coordinates, lines, quoted};
+use crate::read::{Problem, Soup, coordinates, lines, quoted};
 
 /// Length of a comment of 80 bytes and the number of triangles.
 const HEADER_BYTES: usize = 84;
@@ -11,7 +11,7 @@ const TRIANGLE_BYTES: usize = 50;
 ///
 /// # Errors
 /// A file that is neither text nor binary STL, is damaged, or is shorter or longer than its header says.
-pub(super) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
+pub(crate) fn parse(bytes: &[u8]) -> Result<Soup, Problem> {
     // Binary files may begin with "solid" too (some programs put their name there), so their length decides first.
     if binary_len(bytes).is_some_and(|expected| expected == bytes.len() as u64) || !looks_like_text(bytes) {
         parse_binary(bytes)

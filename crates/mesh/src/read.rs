@@ -8,8 +8,8 @@ use std::path::Path;
 
 use nalgebra::Point3;
 
-use super::format::Format;
-use super::{Mesh, MeshError, obj, off, ply, stl};
+use crate::format::Format;
+use crate::{Mesh, MeshError, obj, off, ply, stl};
 
 /// Greatest size of a mesh file: scans of a million triangles take 50 to 100 MiB.
 const MAX_BYTES: u64 = 256 << 20;
@@ -45,6 +45,11 @@ pub fn read_mesh(path: &Path, scale: f64) -> Result<Mesh, MeshError> {
     Ok(mesh)
 }
 
+/// Whether a file's extension is that of a format that can be read.
+pub fn is_mesh_file(path: &Path) -> bool {
+    Format::of(path).is_ok()
+}
+
 /// Refuses pipes and devices, which may never end, and files that would take all memory.
 fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
     if !std::fs::metadata(path)?.is_file() {
@@ -61,25 +66,25 @@ fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
 
 /// A fault of a file, and its place.
 #[derive(Debug)]
-pub(super) struct Problem {
-    pub(super) line: Option<usize>,
-    pub(super) expected: String,
-    pub(super) found: String,
+pub(crate) struct Problem {
+    pub(crate) line: Option<usize>,
+    pub(crate) expected: String,
+    pub(crate) found: String,
 }
 
 impl Problem {
-    pub(super) fn new(line: Option<usize>, expected: impl Into<String>, found: impl Into<String>) -> Self {
+    pub(crate) fn new(line: Option<usize>, expected: impl Into<String>, found: impl Into<String>) -> Self {
         Problem { line, expected: expected.into(), found: found.into() }
     }
 
-    pub(super) fn cut_off(line: Option<usize>, expected: impl Into<String>) -> Self {
+    pub(crate) fn cut_off(line: Option<usize>, expected: impl Into<String>) -> Self {
         Problem::new(line, expected, "the end of the file (is it cut off?)")
     }
 }
 
 /// Vertices and triangles as a file lists them, not merged and with unchecked indices.
 #[derive(Debug, Default)]
-pub(super) struct Soup {
+pub(crate) struct Soup {
     /// In the file's unit, with the line.
     vertices: Vec<(Point3<f64>, Option<usize>)>,
     /// Indices into the vertices, from 0, with the line.
@@ -89,15 +94,15 @@ pub(super) struct Soup {
 }
 
 impl Soup {
-    pub(super) fn counted_from(first_idx: i64) -> Soup {
+    pub(crate) fn counted_from(first_idx: i64) -> Soup {
         Soup { first_idx, ..Soup::default() }
     }
 
-    pub(super) fn n_vertices(&self) -> usize {
+    pub(crate) fn n_vertices(&self) -> usize {
         self.vertices.len()
     }
 
-    pub(super) fn push_vertex(&mut self, position: [f64; 3], line: Option<usize>) {
+    pub(crate) fn push_vertex(&mut self, position: [f64; 3], line: Option<usize>) {
         self.vertices.push((position.into(), line));
     }
 
@@ -105,7 +110,7 @@ impl Soup {
     ///
     /// # Errors
     /// Fewer than three corners.
-    pub(super) fn push_polygon(&mut self, idxs: &[i64], line: Option<usize>) -> Result<(), Problem> {
+    pub(crate) fn push_polygon(&mut self, idxs: &[i64], line: Option<usize>) -> Result<(), Problem> {
         let [first, rest @ ..] = idxs else {
             return Err(Problem::new(line, "a face of at least 3 vertices", "none"));
         };
@@ -151,12 +156,12 @@ impl Soup {
 }
 
 /// The lines of a text file, numbered from 1, without byte order mark and line ends. Bytes that are no text become `�`.
-pub(super) fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, std::borrow::Cow<'_, str>)> {
+pub(crate) fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, std::borrow::Cow<'_, str>)> {
     let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
     bytes.split(|byte| *byte == b'\n').map(String::from_utf8_lossy).enumerate().map(|(idx, line)| (idx + 1, line))
 }
 
-pub(super) fn coordinates<'a>(words: &mut impl Iterator<Item = &'a str>, line: usize) -> Result<[f64; 3], Problem> {
+pub(crate) fn coordinates<'a>(words: &mut impl Iterator<Item = &'a str>, line: usize) -> Result<[f64; 3], Problem> {
     let mut coordinates = [0.0; 3];
     for (coordinate, axis) in coordinates.iter_mut().zip(["x", "y", "z"]) {
         let expected = || format!("a vertex' {axis} coordinate");
@@ -167,7 +172,7 @@ pub(super) fn coordinates<'a>(words: &mut impl Iterator<Item = &'a str>, line: u
 }
 
 /// A word of a file for a message, in quotes and shortened.
-pub(super) fn quoted(word: &str) -> String {
+pub(crate) fn quoted(word: &str) -> String {
     const MAX_CHARS: usize = 40;
     let shown: String = word.chars().take(MAX_CHARS).collect();
     let dots = if word.chars().nth(MAX_CHARS).is_some() { "…" } else { "" };

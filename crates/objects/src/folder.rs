@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Component, Path, PathBuf};
 
-use super::format::Format;
+use blindgrasp_mesh::read::is_mesh_file;
 use blindgrasp_messages::MAX_NAME_BYTES;
 
 /// The catalogue's name within the folder.
@@ -65,7 +65,9 @@ pub enum FolderError {
 pub fn read_folder(path: &Path) -> Result<Vec<MeshEntry>, FolderError> {
     let failed = |source| FolderError::Read { path: path.into(), source };
     if !std::fs::metadata(path).map_err(failed)?.is_dir() {
-        Format::of(path).map_err(|_| FolderError::NoMeshFile { path: path.into() })?;
+        if !is_mesh_file(path) {
+            return Err(FolderError::NoMeshFile { path: path.into() });
+        }
         let row = Row { file: PathBuf::from(path.file_name().unwrap_or_default()), ..Row::default() };
         return entries(path.parent().unwrap_or(Path::new("")), path, vec![row], Vec::new());
     }
@@ -128,7 +130,7 @@ fn collect_files(folder: &Path, relative: &Path, files: &mut Vec<PathBuf>) -> Re
         // Links to folders are not followed: they may lead in a circle.
         if item.file_type().map_err(failed)?.is_dir() {
             collect_files(folder, &inner, files)?;
-        } else if Format::of(&inner).is_ok() && folder.join(&inner).is_file() {
+        } else if is_mesh_file(&inner) && folder.join(&inner).is_file() {
             files.push(inner);
         }
     }
@@ -195,7 +197,7 @@ fn read_row(
             "file: expected a path without .., found {found}: move the file into the catalogue's folder"
         ));
     }
-    if Format::of(&file).is_err() {
+    if !is_mesh_file(&file) {
         return Err(format!("file: expected a name that ends in .off, .obj, .stl or .ply, found {}", file.display()));
     }
     if !folder.join(&file).is_file() {

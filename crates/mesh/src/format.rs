@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
-use super::MeshError;
+use crate::MeshError;
 
 /// A format of mesh files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Format {
+pub(crate) enum Format {
     Off,
     Obj,
     Stl,
@@ -18,7 +18,7 @@ impl Format {
     ///
     /// # Errors
     /// An extension of no known format.
-    pub(super) fn of(path: &Path) -> Result<Format, MeshError> {
+    pub(crate) fn of(path: &Path) -> Result<Format, MeshError> {
         let extension = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         match extension.as_str() {
             "off" => Ok(Format::Off),

@@ -6,9 +6,10 @@
 //! the many small steps cost as much as the working set is large rather than as there are samples, and kernel rows
 //! become products of matrices.
 
+use super::SvmReport;
 use super::kernel::Kernel;
-use super::lanes::{InstructionSet, LANES, Lanes, for_instruction_set};
-use super::{SvmParams, SvmReport};
+use blindgrasp_stages::classifier::svm::SvmParams;
+use blindgrasp_stages::classifier::svm::lanes::{InstructionSet, LANES, Lanes, for_instruction_set};
 
 /// Samples of a working set. On 24,640 samples of 64 features at c = 100, 256, 512, 1024 and 2048 took 48, 11, 4.0 and
 /// 3.9 s of processor time; at c = 1, where most samples only move to their bound once, 2.9 to 4.3 s.

@@ -1,0 +1,180 @@
+//! Learns which grasps are like the training grasps: the limits of
+//! [`blindgrasp_stages::out_of_distribution::TrainingRange`].
+
+use std::collections::BTreeSet;
+
+use blindgrasp_stages::encoder::{FeatureExtractor, Reading};
+use blindgrasp_stages::out_of_distribution::{Limits, TrainingRange, for_each_quantity, quantity_names};
+
+/// Share of the grasps of new objects that the margin flags. A flagged grasp is held. That costs one lift in 200, which
+/// is little beside the errors of a classifier.
+pub const FALSE_ALARM_SHARE: f64 = 0.005;
+
+/// Learns limits from grasps, so that at most the share [`FALSE_ALARM_SHARE`] of a fold's
+/// grasps is outside the range of all other folds. All grasps of an object should be in one fold. Grasps without a
+/// feature are ignored.
+pub fn learn_training_range(features: &FeatureExtractor, grasps: &[Reading<'_>], folds: &[usize]) -> TrainingRange {
+    let names = quantity_names(features);
+    let mut values = Vec::new();
+    let mut rows: Vec<(usize, Vec<f64>)> = Vec::new();
+    for (reading, fold) in grasps.iter().zip(folds) {
+        let Reading { joints_rad, contacts, .. } = *reading;
+        if features.extract(reading, &mut values).is_ok() {
+            let mut row = Vec::with_capacity(names.len());
+            for_each_quantity(features, joints_rad, contacts, |quantity| row.push(quantity));
+            rows.push((*fold, row));
+        }
+    }
+    let units: Vec<f64> = names.iter().enumerate().map(|(idx, (_, least))| deviation(&rows, idx).max(*least)).collect();
+    let fold_names: BTreeSet<usize> = rows.iter().map(|(fold, _)| *fold).collect();
+    let mut excesses: Vec<f64> = Vec::new();
+    for fold in fold_names {
+        let ranges = ranges(rows.iter().filter(|row| row.0 != fold).map(|row| &row.1), names.len());
+        let excess = |row: &Vec<f64>| {
+            let beyond = row.iter().zip(&ranges).zip(&units);
+            beyond.map(|((value, (lower, upper)), unit)| (lower - value).max(value - upper) / unit).fold(0.0, f64::max)
+        };
+        excesses.extend(rows.iter().filter(|row| row.0 == fold).map(|row| excess(&row.1)));
+    }
+    excesses.sort_by(f64::total_cmp);
+    let n_flagged = (FALSE_ALARM_SHARE * excesses.len() as f64) as usize;
+    let margin = excesses.len().checked_sub(n_flagged + 1).map_or(0.0, |idx| excesses[idx]);
+    let share_flagged =
+        excesses.iter().filter(|excess| **excess > margin).count() as f64 / excesses.len().max(1) as f64;
+    let limits = names
+        .into_iter()
+        .zip(ranges(rows.iter().map(|row| &row.1), units.len()))
+        .zip(&units)
+        .map(|(((quantity, _), (lower, upper)), unit)| Limits {
+            quantity,
+            lower: lower - margin * unit,
+            upper: upper + margin * unit,
+        })
+        .collect();
+    TrainingRange { limits, share_flagged }
+}
+
+/// The same limits for postures, and wider ones for cells, by the range on both sides: the cells of another day may read
+/// more or less, and are judged relative to that day (see [`blindgrasp_stages::day`]).
+#[must_use]
+pub fn widened_for_other_days(mut range: TrainingRange, features: &FeatureExtractor) -> TrainingRange {
+    let n_of_posture = features.couplings.len() + features.couplings.iter().flatten().count();
+    for limits in range.limits.iter_mut().skip(n_of_posture) {
+        let width = limits.upper - limits.lower;
+        (limits.lower, limits.upper) = (limits.lower - width, limits.upper + width);
+    }
+    range
+}
+
+/// Least and greatest value of each quantity.
+fn ranges<'a>(rows: impl Iterator<Item = &'a Vec<f64>>, n_quantities: usize) -> Vec<(f64, f64)> {
+    let mut ranges: Option<Vec<(f64, f64)>> = None;
+    for row in rows {
+        let ranges = ranges.get_or_insert_with(|| row.iter().map(|value| (*value, *value)).collect());
+        for ((lower, upper), value) in ranges.iter_mut().zip(row) {
+            (*lower, *upper) = (lower.min(*value), upper.max(*value));
+        }
+    }
+    ranges.unwrap_or_else(|| vec![(0.0, 0.0); n_quantities])
+}
+
+fn deviation(rows: &[(usize, Vec<f64>)], idx: usize) -> f64 {
+    let mean = |of: &dyn Fn(f64) -> f64| rows.iter().map(|row| of(row.1[idx])).sum::<f64>() / rows.len().max(1) as f64;
+    let centre = mean(&|value| value);
+    mean(&|value| (value - centre).powi(2)).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use blindgrasp_messages::{Contact, Fault};
+    use blindgrasp_stages::dictionary::Dictionary;
+    use blindgrasp_stages::encoder::Block;
+    use blindgrasp_stages::hand::Hand;
+
+    /// A contact of the Barrett hand's pad 1, in the palm frame at x.
+    fn contact(cell: u32, x_m: f64, force_newtons: f64) -> Contact {
+        Contact { position_m: [x_m, 0.0, 0.0], normal: [0.0, 0.0, 1.0], force_newtons, pad: 1, cell }
+    }
+
+    fn extractor() -> FeatureExtractor {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let dictionary = Dictionary { words_m: vec![[0.0; 3], [0.04, 0.0, 0.0]] };
+        FeatureExtractor::new(&hand, &[Block::Histogram], dictionary, 0.02)
+    }
+
+    /// A posture whose first finger has closed by `angle_rad`, its distal joint `breakaway_rad` further.
+    fn posture(angle_rad: f64, breakaway_rad: f64) -> [f64; 7] {
+        [0.0, angle_rad, 1.0, 1.0, 45.0 / 140.0 * angle_rad + breakaway_rad, 0.4, 0.4]
+    }
+
+    /// Grasps of 100 objects, two each.
+    fn grasps() -> Vec<([f64; 7], Vec<Contact>)> {
+        (0..200)
+            .map(|idx| {
+                let share = f64::from(idx) / 199.0;
+                (posture(0.5 + share, 0.3 * share), vec![contact(0, 0.01 * share, 1.0 + share), contact(3, 0.0, 1.0)])
+            })
+            .collect()
+    }
+
+    fn range(features: &FeatureExtractor) -> TrainingRange {
+        let grasps = grasps();
+        let views: Vec<Reading<'_>> = grasps.iter().map(|(joints, contacts)| Reading::new(joints, contacts)).collect();
+        let folds: Vec<usize> = (0..200).map(|idx| idx / 2 % 5).collect();
+        learn_training_range(features, &views, &folds)
+    }
+
+    #[test]
+    fn what_was_trained_on_passes_and_strangers_are_named() {
+        let features = extractor();
+        let range = range(&features);
+        assert_eq!(range.validate(&features), Ok(()));
+        assert!(range.share_flagged <= FALSE_ALARM_SHARE);
+        for (joints, contacts) in grasps() {
+            assert_eq!(range.check(&features, &joints, &contacts), Ok(()));
+        }
+        let usual = || vec![contact(0, 0.005, 1.5), contact(3, 0.0, 1.0)];
+        let stuck = vec![contact(0, 0.005, 1.5), contact(3, 0.0, 15.0)];
+        let far = vec![contact(0, 0.1, 1.5), contact(3, 0.0, 1.0)];
+        for (joints, contacts, named) in [
+            (posture(2.4, 0.1), usual(), "angle of joint 1"),
+            (posture(1.0, -0.2), usual(), "breakaway of joint 4"),
+            (posture(1.0, 0.1), stuck, "greatest force on a cell of pad 1"),
+            (posture(1.0, 0.1), far, "greatest distance"),
+            (posture(1.0, 0.1), vec![Contact { pad: 2, ..contact(0, 0.005, 1.5) }], "load of pad 2"),
+        ] {
+            assert_eq!(range.check(&features, &joints, &contacts), Err(Fault::OutOfDistribution));
+            let violations = range.violations(&features, &joints, &contacts);
+            assert!(violations.iter().any(|(limits, _)| limits.quantity.contains(named)), "{named}: {violations:?}");
+        }
+    }
+
+    #[test]
+    fn order_of_contacts_does_not_matter_and_a_range_fits_its_features() {
+        let features = extractor();
+        let range = range(&features);
+        let contacts = [contact(0, 0.005, 1.5), contact(3, 0.0, 1.0)];
+        let reversed = [contacts[1], contacts[0]];
+        for joints in [posture(1.0, 0.1), posture(2.4, 0.1)] {
+            assert_eq!(range.check(&features, &joints, &contacts), range.check(&features, &joints, &reversed));
+        }
+        let cut_off = TrainingRange { limits: range.limits[1..].to_vec(), ..range.clone() };
+        assert!(cut_off.validate(&features).is_err());
+        assert_eq!(cut_off.check(&features, &posture(1.0, 0.1), &contacts), Err(Fault::OutOfDistribution));
+        let mut damaged = range;
+        damaged.limits[0].upper = f64::NAN;
+        assert!(damaged.validate(&features).is_err());
+    }
+
+    #[test]
+    fn nothing_to_learn_from_lets_nothing_pass() {
+        let features = extractor();
+        let range = learn_training_range(&features, &[], &[]);
+        assert_eq!(range.validate(&features), Ok(()));
+        let outcome = range.check(&features, &posture(1.0, 0.1), &[contact(0, 0.0, 1.0)]);
+        assert_eq!(outcome, Err(Fault::OutOfDistribution));
+    }
+}

@@ -1,0 +1,182 @@
+//! [`Judge`] decides grasps from frames, as the stages of a graph do, within one object.
+
+use blindgrasp_messages::{Contact, Fault, Header, LiftDecision, Message, Prediction, Stamped, TactileFrame};
+
+use crate::contacts::ContactFinder;
+use crate::hand::Hand;
+use crate::lift_arbiter::{ArbiterOptions, LiftArbiter};
+use crate::model::{Memory, Model, OtherHand};
+use crate::steps;
+
+/// Judges the frames of a hand one after the other, and decides each grasp once.
+///
+/// It is the contacts, encoder and classifier of a graph with the lift arbiter behind them, and decides as a graph with
+/// this model and these options would. It has no clock: a frame bears its time, and counts as fresh.
+pub struct Judge {
+    hand: Hand,
+    hand_id: u64,
+    model: Model,
+    dictionary_id: u64,
+    finder: ContactFinder,
+    memory: Memory,
+    arbiter: LiftArbiter,
+    /// The number of the next frame of [`Judge::frame`].
+    next_seq: u64,
+    contacts: Vec<Contact>,
+    values: Vec<f64>,
+}
+
+/// The judgement of a frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Judged {
+    pub prediction: Prediction,
+    /// The decisions that come with this frame, mostly none. There are two if the frame ends a grasp that was not
+    /// decided, which is held, and decides the next one at once.
+    pub decisions: Vec<LiftDecision>,
+}
+
+impl Judge {
+    /// A judge with the default options of the arbiter.
+    ///
+    /// # Errors
+    /// The model is of another hand.
+    pub fn new(hand: Hand, model: Model) -> Result<Judge, OtherHand> {
+        Judge::with_options(hand, model, ArbiterOptions::default())
+    }
+
+    /// A judge that waits for other votes, say, or asks for a probe.
+    ///
+    /// # Errors
+    /// The model is of another hand.
+    pub fn with_options(hand: Hand, model: Model, options: ArbiterOptions) -> Result<Judge, OtherHand> {
+        model.check_hand(&hand)?;
+        Ok(Judge {
+            hand_id: hand.id(),
+            dictionary_id: model.dictionary_id(),
+            hand,
+            model,
+            finder: ContactFinder::default(),
+            memory: Memory::default(),
+            arbiter: LiftArbiter::new(options),
+            next_seq: 0,
+            contacts: Vec::new(),
+            values: Vec::new(),
+        })
+    }
+
+    pub fn hand(&self) -> &Hand {
+        &self.hand
+    }
+
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
+    /// Takes the next frame, and returns the decision if it comes with this frame. `stamp_nanos` is the time of the
+    /// reading by the source's clock: frames of one time are one reading and have one vote, and a grasp whose frames
+    /// come more than 100 ms apart (see [`ArbiterOptions`]) is held.
+    pub fn frame(&mut self, stamp_nanos: u64, frame: &TactileFrame) -> Option<LiftDecision> {
+        let header = Header { seq: self.next_seq, stamp_nanos, hand_id: self.hand_id, ..Header::default() };
+        self.judge(header, frame).decisions.pop()
+    }
+
+    /// As [`Judge::frame`], for a sample that bears its source's number and time. A number that is missing is a doubt,
+    /// as in a graph: the grasp is held.
+    pub fn sample(&mut self, sample: &Stamped<TactileFrame>) -> Judged {
+        self.judge(sample.header, &sample.message)
+    }
+
+    fn judge(&mut self, header: Header, frame: &TactileFrame) -> Judged {
+        self.next_seq = header.seq.wrapping_add(1);
+        let (head, items) = frame.to_parts(header);
+        let (summary, parts) = steps::find_contacts(&self.hand, &mut self.finder, &head, &items, &mut self.contacts);
+        let contacts = steps::contact_set(&head, self.hand_id, summary, parts.as_ref());
+        let feature = steps::encode(&self.model, self.dictionary_id, &contacts, &self.contacts, &mut self.values);
+        let head = steps::classify(&self.model, self.dictionary_id, &mut self.memory, &feature, &self.values);
+        let mut decisions = Vec::new();
+        // The phase is a frame's and the fault a step's, so the prediction can be read.
+        let unreadable = Prediction { grasp_id: frame.grasp_id, fault: Fault::Malformed, ..Prediction::default() };
+        let prediction = Prediction::from_parts(&head, &[]).unwrap_or(unreadable);
+        self.arbiter.on_prediction(&head.header, &prediction, 0, &mut decisions);
+        Judged { prediction, decisions }
+    }
+
+    /// Holds the open grasp, if any, because no more frames come.
+    pub fn end(&mut self) -> Option<LiftDecision> {
+        self.arbiter.on_end()
+    }
+
+    /// Begins with another recording or run of a source. Only what the model keeps of a recording day remains, if both
+    /// name the same day.
+    pub fn begin_recording(&mut self) {
+        self.memory.begin_recording();
+        self.forget_grasps();
+    }
+
+    /// Begins anew, as if it had seen nothing.
+    pub fn reset(&mut self) {
+        self.memory = Memory::default();
+        self.forget_grasps();
+    }
+
+    fn forget_grasps(&mut self) {
+        self.arbiter = LiftArbiter::new(*self.arbiter.options());
+        self.next_seq = 0;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use blindgrasp_messages::{Action, Phase, Reason};
+
+    fn hand(name: &str) -> Hand {
+        Hand::load(Path::new(name)).expect("built in")
+    }
+
+    fn judge() -> Judge {
+        let model = Model::parse(include_str!("../../../models/barrett-bh8-280.json")).expect("a model");
+        Judge::new(hand("barrett-bh8-280"), model).expect("of one hand")
+    }
+
+    /// A frame of a hand that feels nothing.
+    fn frame(phase: Phase) -> TactileFrame {
+        let hand = hand("barrett-bh8-280");
+        let (joints_rad, cells_newtons) = (vec![0.5; hand.joints.len()], vec![0.0; hand.n_cells()]);
+        TactileFrame { grasp_id: 1, phase, joints_rad, cells_newtons, ..TactileFrame::default() }
+    }
+
+    #[test]
+    fn a_model_of_another_hand_is_refused() {
+        let model = judge().model.clone();
+        let error = Judge::new(hand("shadow-biotac-sp"), model).err().expect("refused").to_string();
+        assert!(error.contains("the model is for the hand 'barrett-bh8-280'"), "{error}");
+        assert!(error.contains("not for 'shadow-biotac-sp'"), "{error}");
+    }
+
+    #[test]
+    fn frames_are_numbered_without_gaps_and_a_gap_of_samples_is_a_doubt() {
+        let mut judge = judge();
+        assert_eq!(judge.frame(0, &frame(Phase::Closing)), None);
+        let decision = judge.frame(10_000_000, &frame(Phase::Settled)).expect("decided");
+        assert_eq!((decision.action, decision.reason), (Action::Hold, Reason::NoContact));
+        assert_eq!(judge.end(), None);
+
+        judge.reset();
+        let sample = |seq, phase| Stamped { header: Header { seq, ..Header::default() }, message: frame(phase) };
+        assert_eq!(judge.sample(&sample(0, Phase::Closing)).decisions, []);
+        let judged = judge.sample(&sample(2, Phase::Settled));
+        assert_eq!(judged.prediction.fault, Fault::NoContact);
+        assert_eq!(judged.decisions.first().map(|decision| decision.reason), Some(Reason::OutOfOrder));
+    }
+
+    #[test]
+    fn a_grasp_without_a_decision_is_held_in_the_end() {
+        let mut judge = judge();
+        assert_eq!(judge.frame(0, &frame(Phase::Closing)), None);
+        let decision = judge.end().expect("held");
+        assert_eq!((decision.grasp_id, decision.action, decision.reason), (1, Action::Hold, Reason::Missing));
+    }
+}

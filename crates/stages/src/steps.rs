@@ -1,0 +1,137 @@
+//! The steps from a frame to its prediction, each from the message before it: the operators `contacts`, `encoder` and
+//! `classifier` of a graph take them one by one, and [`Judge`](crate::Judge) takes them all.
+//!
+//! Messages may come from another process. A step that cannot use its message answers with the fault.
+
+use blindgrasp_messages::{
+    Contact, ContactSetHead, Fault, FrameParts, GraspFeatureHead, Header, Phase, PredictionHead, Senses,
+    TactileFrameHead,
+};
+
+use crate::contacts::{ContactFinder, ContactSummary};
+use crate::day::GraspPlace;
+use crate::encoder::Reading;
+use crate::hand::Hand;
+use crate::model::{Memory, Model};
+
+/// Finds the contacts of a frame. It also returns the frame's parts, if they can be read.
+pub fn find_contacts<'a>(
+    hand: &Hand,
+    finder: &mut ContactFinder,
+    head: &TactileFrameHead,
+    items: &'a [f64],
+    contacts: &mut Vec<Contact>,
+) -> (ContactSummary, Option<FrameParts<'a>>) {
+    match head.split(items) {
+        Ok(parts) => {
+            let FrameParts { joints_rad, cells_newtons, .. } = parts;
+            (finder.find(hand, head.header.hand_id, joints_rad, cells_newtons, contacts), Some(parts))
+        }
+        Err(_) => {
+            contacts.clear();
+            (ContactSummary { fault: Fault::Malformed, ..ContactSummary::default() }, None)
+        }
+    }
+}
+
+/// The head of the contacts that [`find_contacts`] found, for a hand with the identity `hand_id`.
+pub fn contact_set(
+    head: &TactileFrameHead,
+    hand_id: u64,
+    summary: ContactSummary,
+    parts: Option<&FrameParts<'_>>,
+) -> ContactSetHead {
+    ContactSetHead {
+        header: Header { hand_id, ..head.header },
+        grasp_id: head.grasp_id,
+        phase: head.phase,
+        n_pads_in_contact: summary.n_pads_in_contact,
+        self_collision: summary.self_collision.into(),
+        n_self_contacts: summary.n_self_contacts,
+        fault: summary.fault.code(),
+        day: head.day,
+        ..ContactSetHead::default()
+    }
+    .with_joints(parts.map_or(&[], |parts| parts.joints_rad))
+    .with_senses(&parts.map_or(Senses::default(), |parts| parts.senses))
+}
+
+/// Writes the feature of a frame's contacts to `values`. `dictionary_id` is [`Model::dictionary_id`].
+pub fn encode(
+    model: &Model,
+    dictionary_id: u64,
+    head: &ContactSetHead,
+    contacts: &[Contact],
+    values: &mut Vec<f64>,
+) -> GraspFeatureHead {
+    let outcome = match Fault::from_code(head.fault) {
+        Err(_) => Err(Fault::Malformed),
+        Ok(_) if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
+        Ok(Fault::None) => extract(model, head, contacts, values),
+        Ok(fault) => Err(fault),
+    };
+    if outcome.is_err() {
+        values.clear();
+    }
+    GraspFeatureHead {
+        header: head.header,
+        grasp_id: head.grasp_id,
+        phase: head.phase,
+        dictionary_id,
+        n_pads_in_contact: outcome.unwrap_or(head.n_pads_in_contact),
+        fault: outcome.err().unwrap_or_default().code(),
+        day: head.day,
+    }
+}
+
+fn extract(model: &Model, head: &ContactSetHead, contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
+    let (Ok(joints_rad), Ok(senses), Ok(phase)) = (head.joints_rad(), head.senses(), Phase::from_code(head.phase))
+    else {
+        return Err(Fault::Malformed);
+    };
+    model.extract(phase, &Reading { joints_rad, contacts, senses }, values)
+}
+
+/// Judges the feature of a frame, and keeps in `memory` what the model needs for later frames. `dictionary_id` is
+/// [`Model::dictionary_id`].
+pub fn classify(
+    model: &Model,
+    dictionary_id: u64,
+    memory: &mut Memory,
+    head: &GraspFeatureHead,
+    values: &[f64],
+) -> PredictionHead {
+    let place = GraspPlace { epoch: head.header.epoch, grasp_id: head.grasp_id, day: head.day };
+    let values = usable_values(model, dictionary_id, head, values);
+    let verdict = match Phase::from_code(head.phase) {
+        Ok(phase) => model.judge(memory, dictionary_id, place, phase, values),
+        Err(_) => Err(Fault::Malformed),
+    };
+    PredictionHead {
+        header: head.header,
+        grasp_id: head.grasp_id,
+        decision_value: verdict.map_or(0.0, |verdict| verdict.decision_value),
+        probability_stable: verdict.map_or(0.0, |verdict| verdict.probability_stable),
+        phase: head.phase,
+        stable: verdict.is_ok_and(|verdict| verdict.stable).into(),
+        fault: verdict.err().unwrap_or_default().code(),
+        unsure: verdict.is_ok_and(|verdict| verdict.unsure).into(),
+    }
+}
+
+/// The values of a feature, if the model can judge them.
+fn usable_values<'a>(
+    model: &Model,
+    dictionary_id: u64,
+    head: &GraspFeatureHead,
+    values: &'a [f64],
+) -> Result<&'a [f64], Fault> {
+    match Fault::from_code(head.fault) {
+        Err(_) => Err(Fault::Malformed),
+        _ if Phase::from_code(head.phase).is_err() => Err(Fault::Malformed),
+        _ if head.header.hand_id != model.hand.id => Err(Fault::WrongHand),
+        _ if head.dictionary_id != dictionary_id => Err(Fault::WrongModel),
+        Ok(Fault::None) => Ok(values),
+        Ok(fault) => Err(fault),
+    }
+}
