@@ -6,6 +6,7 @@ Needs nothing but Python.
 
 import ctypes
 import enum
+import typing
 
 MAX_JOINTS = 32
 MAX_PADS = 32
@@ -75,6 +76,68 @@ class Reason(enum.IntEnum):
     PROMISE_WITHDRAWN = 19
 
 
+class Lists:
+    """The lists among the items of a frame: `joints`, `cells`, and by name the `senses` that are there.
+
+    Each can be set. A head that came with a sample has its `items`; give a head of your own its items first.
+    """
+
+    LISTS: tuple[str, ...]
+    items: typing.Any
+
+    def _spans(self) -> dict[str, slice]:
+        spans, end = {}, 0
+        for name in self.LISTS:
+            start, end = end, end + getattr(self, f"n_{name}")
+            spans[name] = slice(start, end)
+        if end > len(self.items):
+            raise ValueError(f"a frame of {len(self.items)} items says that it has {end} beside its cells: expected at most as many")
+        spans["cells"] = slice(end, len(self.items))
+        return spans
+
+    def _set(self, lists: dict[str, typing.Any]) -> None:
+        spans = self._spans()
+        if all(len(values) == len(range(*spans[name].indices(len(self.items)))) for name, values in lists.items()):
+            for name, values in lists.items():
+                self.items[spans[name]] = values
+            return
+        parts = {name: lists.get(name, self.items[span]) for name, span in spans.items()}
+        values = [value for part in parts.values() for value in part]
+        is_numpy = hasattr(self.items, "astype")
+        self.items = type(self.items)(len(values)) if is_numpy else (ctypes.c_double * len(values))()
+        self.items[:] = values
+        for name in self.LISTS:
+            setattr(self, f"n_{name}", len(parts[name]))
+
+    @property
+    def joints(self) -> typing.Any:
+        """The joints' positions, in the hand's order: radians, and metres of joints that slide."""
+        return self.items[self._spans()["joints"]]
+
+    @joints.setter
+    def joints(self, values: typing.Any) -> None:
+        self._set({"joints": values})
+
+    @property
+    def cells(self) -> typing.Any:
+        """The force on each cell, pad after pad."""
+        return self.items[self._spans()["cells"]]
+
+    @cells.setter
+    def cells(self, values: typing.Any) -> None:
+        self._set({"cells": values})
+
+    @property
+    def senses(self) -> dict[str, typing.Any]:
+        """The lists of the other senses that the frame has, by name."""
+        named = ((name, self.items[span]) for name, span in self._spans().items() if name not in ("joints", "cells"))
+        return {name: values for name, values in named if len(values)}
+
+    @senses.setter
+    def senses(self, lists: dict[str, typing.Any]) -> None:
+        self._set({name: lists.get(name, ()) for name in self.LISTS if name != "joints"})
+
+
 class Header(ctypes.Structure):
     """On each sample: which one it is and where it comes from."""
 
@@ -109,9 +172,10 @@ class Contact(ctypes.Structure):
         return "blindgrasp/Contact/1"
 
 
-class TactileFrameHead(ctypes.Structure):
+class TactileFrameHead(Lists, ctypes.Structure):
     """The items are the joint angles, gravity, the wrench, the joints' torques, and then the cells' forces."""
 
+    LISTS = ("joints", "gravity", "wrench", "torques")
     _fields_ = [
         ("header", Header),
         ("grasp_id", ctypes.c_uint64),

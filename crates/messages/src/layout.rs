@@ -9,6 +9,71 @@ use serde_json::{Map, Value, json};
 
 use crate::*;
 
+/// In Python, a head whose items are several lists finds them by these names.
+const LISTS: &str = r#"
+
+class Lists:
+    """The lists among the items of a frame: `joints`, `cells`, and by name the `senses` that are there.
+
+    Each can be set. A head that came with a sample has its `items`; give a head of your own its items first.
+    """
+
+    LISTS: tuple[str, ...]
+    items: typing.Any
+
+    def _spans(self) -> dict[str, slice]:
+        spans, end = {}, 0
+        for name in self.LISTS:
+            start, end = end, end + getattr(self, f"n_{name}")
+            spans[name] = slice(start, end)
+        if end > len(self.items):
+            raise ValueError(f"a frame of {len(self.items)} items says that it has {end} beside its cells: expected at most as many")
+        spans["cells"] = slice(end, len(self.items))
+        return spans
+
+    def _set(self, lists: dict[str, typing.Any]) -> None:
+        spans = self._spans()
+        if all(len(values) == len(range(*spans[name].indices(len(self.items)))) for name, values in lists.items()):
+            for name, values in lists.items():
+                self.items[spans[name]] = values
+            return
+        parts = {name: lists.get(name, self.items[span]) for name, span in spans.items()}
+        values = [value for part in parts.values() for value in part]
+        is_numpy = hasattr(self.items, "astype")
+        self.items = type(self.items)(len(values)) if is_numpy else (ctypes.c_double * len(values))()
+        self.items[:] = values
+        for name in self.LISTS:
+            setattr(self, f"n_{name}", len(parts[name]))
+
+    @property
+    def joints(self) -> typing.Any:
+        """The joints' positions, in the hand's order: radians, and metres of joints that slide."""
+        return self.items[self._spans()["joints"]]
+
+    @joints.setter
+    def joints(self, values: typing.Any) -> None:
+        self._set({"joints": values})
+
+    @property
+    def cells(self) -> typing.Any:
+        """The force on each cell, pad after pad."""
+        return self.items[self._spans()["cells"]]
+
+    @cells.setter
+    def cells(self, values: typing.Any) -> None:
+        self._set({"cells": values})
+
+    @property
+    def senses(self) -> dict[str, typing.Any]:
+        """The lists of the other senses that the frame has, by name."""
+        named = ((name, self.items[span]) for name, span in self._spans().items() if name not in ("joints", "cells"))
+        return {name: values for name, values in named if len(values)}
+
+    @senses.setter
+    def senses(self, lists: dict[str, typing.Any]) -> None:
+        self._set({name: lists.get(name, ()) for name in self.LISTS if name != "joints"})
+"#;
+
 /// A field's type in Python: as it is written there, and its name in the comparison.
 pub(crate) trait Portable {
     fn python() -> String;
@@ -109,7 +174,7 @@ fn python_text() -> String {
         "\"\"\"The samples of blindgrasp as they lie in shared memory: heads, items, enums' codes.\n\n\
          Generated from crates/messages; do not edit. What each field means is said there and in docs/messages.md.\n\
          Needs nothing but Python.\n\"\"\"\n\n\
-         import ctypes\nimport enum\n\n",
+         import ctypes\nimport enum\nimport typing\n\n",
     );
     for (name, limit) in LIMITS {
         let _ = writeln!(text, "{name} = {limit}");
@@ -120,8 +185,16 @@ fn python_text() -> String {
             let _ = writeln!(text, "    {} = {code}", word.to_uppercase());
         }
     }
+    text += LISTS;
     for Struct { name, doc, type_name, fields, .. } in structs() {
-        let _ = write!(text, "\n\nclass {name}(ctypes.Structure):\n    \"\"\"{doc}\"\"\"\n\n    _fields_ = [\n");
+        let lists: Vec<String> = fields.iter().filter_map(|field| field.name.strip_prefix("n_")).map(quoted).collect();
+        let has_lists = name == "TactileFrameHead";
+        let bases = if has_lists { "Lists, ctypes.Structure" } else { "ctypes.Structure" };
+        let _ = write!(text, "\n\nclass {name}({bases}):\n    \"\"\"{doc}\"\"\"\n\n");
+        if has_lists {
+            let _ = writeln!(text, "    LISTS = ({})", lists.join(", "));
+        }
+        text += "    _fields_ = [\n";
         for Field { name, python, .. } in fields {
             let _ = writeln!(text, "        (\"{name}\", {python}),");
         }
@@ -137,6 +210,10 @@ fn python_text() -> String {
         );
     }
     text + "\n\nMESSAGES: dict[str, type[Message]] = {message.TYPE_NAME: message for message in Message.__subclasses__()}\n"
+}
+
+fn quoted(name: &str) -> String {
+    format!("\"{name}\"")
 }
 
 fn python_file() -> PathBuf {
