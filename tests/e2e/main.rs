@@ -13,6 +13,7 @@ mod export;
 mod graph;
 mod grid;
 mod hands;
+mod hosted;
 mod import;
 mod launcher;
 mod libsvm;

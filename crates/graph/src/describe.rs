@@ -111,7 +111,7 @@ fn shipped_operator(path: &Path, name: &str) -> Program {
 }
 
 /// The path of the running program, also after a new build has taken its place.
-fn own_path() -> std::io::Result<PathBuf> {
+pub(super) fn own_path() -> std::io::Result<PathBuf> {
     let path = std::env::current_exe()?;
     // Linux says so of a file that was replaced while it runs.
     let replaced = path.to_str().and_then(|path| path.strip_suffix(" (deleted)")).map(PathBuf::from);

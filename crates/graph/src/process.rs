@@ -17,6 +17,7 @@ use rustix::process::{
 use rustix::thread::{CpuSet, sched_setaffinity, set_no_new_privs};
 
 use crate::dataflow::{Node, ProcessOptions, Scheduling, SchedulingPolicy};
+use crate::describe;
 use crate::launcher::Event;
 use crate::log_writer::Log;
 use crate::service;
@@ -28,6 +29,8 @@ use blindgrasp_operator::wiring::{
 
 /// The arguments of the program that runs the operators of a group.
 const GROUP_ARGS: [&str; 2] = ["operator", "group"];
+/// The arguments of the program that has the ports of another one, before that program and its arguments.
+const HOST_ARGS: [&str; 2] = ["operator", "host"];
 
 /// A longer line is split.
 const MAX_LINE_BYTES: u64 = 64 << 10;
@@ -140,7 +143,13 @@ impl Process {
     pub(super) fn spawn(starts: Vec<Start<'_>>, events: &SyncSender<Event>) -> std::io::Result<Vec<Process>> {
         let launcher_pid = rustix::process::getpid();
         let node = starts.first().ok_or(std::io::ErrorKind::InvalidInput)?.node;
-        let mut command = Program::new(&node.program);
+        let mut command = if node.description.hosted {
+            let mut host = Program::new(describe::own_path()?);
+            host.args(HOST_ARGS).arg(&node.program);
+            host
+        } else {
+            Program::new(&node.program)
+        };
         let wiring = match starts.as_slice() {
             [start] => {
                 command.args(&start.node.args);
@@ -506,7 +515,10 @@ fn lacking(sandbox: Enforcement) -> &'static str {
         Enforcement::None => {
             "it is not restricted: the kernel has no Landlock (blindgrasp doctor tells), or its program does not use it"
         }
-        Enforcement::Partial => "it is restricted in part only: the kernel is older than Linux 6.12",
+        Enforcement::Partial => {
+            "it is restricted in part only: the kernel is older than Linux 6.12, or its program is not blindgrasp's own and may \
+             read files and run programs"
+        }
         Enforcement::Full => "it is restricted in full",
     }
 }
