@@ -1,38 +1,44 @@
-"""The parts of operators/blindgrasp_operator.py that need no running graph: python3 tests/operator_module.py"""
+"""operators/blindgrasp_operator.py without a running graph: python3 tests/operator_module.py"""
 
+import ctypes
+import json
+import os
 import struct
+import subprocess
 import sys
-import tempfile
-import types
 import unittest
-from collections import deque
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "operators"))
+OPERATORS = Path(__file__).resolve().parent.parent / "operators"
+sys.path.insert(0, str(OPERATORS))
 import blindgrasp_operator as module
-from blindgrasp_messages import GraspTruth, Prediction, PredictionHead, TactileFrame, TactileFrameHead
+from blindgrasp_messages import Prediction, PredictionHead, TactileFrame, TactileFrameHead
 from blindgrasp_operator import Description, Source, Stage
 
 LEFT, RIGHT, OUT = ("left", TactileFrame), ("right", TactileFrame), ("out", Prediction)
 
 
 class Descriptions(unittest.TestCase):
-    def test_one_input_and_one_output_are_described_as_before(self):
+    def test_one_input_and_one_output_are_described_as_lists_of_one(self):
         one = Description("mine", "Judges", LEFT, OUT)
         self.assertEqual(one.to_json(), Description("mine", "Judges", inputs=[LEFT], outputs=[OUT]).to_json())
-        self.assertTrue(one.to_json()["answers_each"])
-        self.assertNotIn("answers_each", Description("mine", "Judges", LEFT, OUT, answers_each=False).to_json())
+        self.assertTrue(one.to_json()["answers_each"] and one.to_json()["hosted"])
+        self.assertFalse(Description("mine", "Judges", LEFT, OUT, answers_each=False).to_json()["answers_each"])
 
     def test_sources_and_several_inputs_do_not_answer_each(self):
-        for inputs in ([], [LEFT, RIGHT]):
+        for inputs in ([], [LEFT, RIGHT], [(*LEFT, "feedback")]):
             said = Description("mine", "Judges", inputs=inputs, outputs=[OUT]).to_json()
-            self.assertEqual([port["name"] for port in said["inputs"]], [name for name, _ in inputs])
-            self.assertNotIn("answers_each", said)
+            self.assertEqual([port["name"] for port in said["inputs"]], [port[0] for port in inputs])
+            self.assertFalse(said["answers_each"])
+        self.assertFalse(Description("mine", "Judges", LEFT).to_json()["answers_each"])
+        partner = Description("mine", "Judges", inputs=[LEFT, (*RIGHT, "partner", "optional")], output=OUT).to_json()
+        self.assertTrue(partner["answers_each"])
+        self.assertEqual(partner["inputs"][1], {"name": "right", "type": TactileFrame.TYPE_NAME, "partner": True, "optional": True})
 
     def test_wrong_ports_are_refused(self):
         for wrong in (
-            {"inputs": [LEFT], "outputs": []},
             {"inputs": [LEFT, LEFT], "outputs": [OUT]},
+            {"inputs": [(*LEFT, "feedbakc")], "outputs": [OUT]},
             {"inputs": [LEFT], "outputs": [(*OUT, "right")]},
             {"inputs": [LEFT, RIGHT], "outputs": [OUT], "answers_each": True},
             {"inputs": [], "outputs": [OUT], "answers_each": True},
@@ -43,20 +49,12 @@ class Descriptions(unittest.TestCase):
 
 
 class Combinations(unittest.TestCase):
-    """What cannot keep the promises is refused before a port is opened."""
+    """Others are refused by the host: crates/operator/src/host/mod.rs."""
 
-    def refused(self, reason, description, work):
-        with self.assertRaisesRegex(RuntimeError, reason):
-            module._instance(None, description, work, {})
-
-    def test_stages_and_sources_that_do_not_fit_their_ports_are_refused(self):
-        many = Stage(answer_many=lambda heads, items: [])
-        stateful = Stage(lambda head, items: None, state=bytes, restore=lambda state: None)
-        self.refused("expected `answer`", Description("mine", "", inputs=[LEFT, RIGHT], outputs=[OUT]), many)
-        self.refused("answers_each=False", Description("mine", "", LEFT, OUT), stateful)
-        self.refused("neither", Description("mine", "", LEFT, OUT), Stage())
-        self.refused("expected a Stage", Description("mine", "", LEFT, OUT), Source(lambda: None))
-        self.refused("returns a Source", Description("mine", "", outputs=[OUT]), many)
+    def test_a_stage_has_one_function_and_a_whole_state(self):
+        for wrong in ({}, {"answer": print, "answer_many": print}, {"answer": print, "state": bytes}):
+            with self.assertRaisesRegex(ValueError, "expected"):
+                Stage(**wrong)
 
     def test_a_source_goes_on_in_one_way(self):
         with self.assertRaisesRegex(ValueError, "resume"):
@@ -67,205 +65,159 @@ class Combinations(unittest.TestCase):
             Source(lambda: None, resume=lambda last: None).lost()
 
 
-class Publisher:
-    """A publisher whose readers have answered up to `answered`."""
+class Frames(unittest.TestCase):
+    """The lists of a frame, with and without numpy."""
 
-    def __init__(self):
-        self.sent, self.answered_up_to = [], None
+    def frames(self):
+        values = [0.5, 0.7, 0.0, 0.0, 9.8, 0.3]
+        kinds = [(ctypes.c_double * 6)(*values)]
+        if (numpy := module._numpy()) is not None:
+            kinds.append(numpy.array(values))
+        for items in kinds:
+            frame = TactileFrameHead(n_joints=2, n_gravity=3)
+            frame.items = items
+            yield frame
 
-    def last(self):
-        return self.sent[-1] if self.sent else None
+    def test_gravity_is_not_touch(self):
+        for frame in self.frames():
+            self.assertEqual((list(frame.joints), list(frame.cells)), ([0.5, 0.7], [0.3]))
+            self.assertEqual({name: list(values) for name, values in frame.senses.items()}, {"gravity": [0.0, 0.0, 9.8]})
+
+    def test_lists_are_set_whether_or_not_their_length_changes(self):
+        for frame in self.frames():
+            frame.cells = [1.0]
+            frame.joints = [0.1, 0.2]
+            self.assertEqual(list(frame.items), [0.1, 0.2, 0.0, 0.0, 9.8, 1.0])
+            frame.senses = {"torques": [3.0, 4.0]}
+            frame.cells = [5.0, 6.0]
+            self.assertEqual(list(frame.items), [0.1, 0.2, 3.0, 4.0, 5.0, 6.0])
+            self.assertEqual((frame.n_joints, frame.n_gravity, frame.n_torques), (2, 0, 2))
+
+    def test_a_frame_that_says_too_much_is_refused(self):
+        frame = TactileFrameHead(n_joints=5)
+        frame.items = [0.7]
+        with self.assertRaisesRegex(ValueError, "expected at most as many"):
+            frame.cells
+
+
+PROGRAM = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from blindgrasp_messages import Prediction, PredictionHead, TactileFrame
+from blindgrasp_operator import Description, Param, Stage, counted, run
+
+def start(params):
+    def answer_many(heads, items):
+        print("hello")
+        if any(head.grasp_id == 13 for head in heads):
+            raise ValueError("an unlucky grasp")
+        return [PredictionHead(grasp_id=head.grasp_id, decision_value=float(sum(head.cells)) + params["more"]) for head in heads]
+    def check(params):
+        if params["more"] < 0:
+            raise ValueError("more is less")
+    counted(n_started=1)
+    return Stage(answer_many=answer_many, set=check, max_items=0)
+
+run(Description("p", "", ("tactile", TactileFrame), ("out", Prediction), [Param("more", "number", live=True)]), start)
+"""
+
+
+class Pipes(unittest.TestCase):
+    """A program, and this test as its host."""
+
+    def setUp(self):
+        (its_input, self.to), (self.input, its_output) = os.pipe(), os.pipe()
+        environment = {**os.environ, module.PIPES_VARIABLE: f"{its_input},{its_output}"}
+        command = [sys.executable, "-B", "-c", PROGRAM, str(OPERATORS)]
+        self.program = subprocess.Popen(command, env=environment, pass_fds=(its_input, its_output), stdout=subprocess.PIPE)
+        os.close(its_input)
+        os.close(its_output)
+        self.input = open(self.input, "rb")
+        self.send(module.START, json.dumps({"params": {"more": 1.0}}).encode())
+        self.assertEqual(self.receive(), (module.COUNTS, b'{"n_started": 1}'))
+        kind, body = self.receive()
+        self.assertEqual((kind, json.loads(body)["batch"], json.loads(body)["max_items"]), (module.READY, 32, {"out": 0}))
+
+    def tearDown(self):
+        os.close(self.to)
+        self.program.wait()
+        self.program.stdout.close()
+        self.input.close()
+
+    def send(self, kind, body):
+        os.write(self.to, struct.pack("=II", len(body), kind) + body)
+
+    def receive(self):
+        n_bytes, kind = struct.unpack("=II", self.input.read(8))
+        return kind, self.input.read(n_bytes)
+
+    def ask(self, grasp_id, flags=0):
+        head, items = bytes(TactileFrameHead(grasp_id=grasp_id, n_joints=1)), struct.pack("=3d", 9.0, 0.5, 0.25)
+        self.send(module.SAMPLE, struct.pack("=QII4I", 0, flags, 0, 0, 0, len(head), len(items)) + head + items)
 
     def answered(self):
-        return self.answered_up_to
+        kind, body = self.receive()
+        self.assertEqual(kind, module.DONE)
+        head = PredictionHead.from_buffer_copy(body, 16 + 16)
+        return head.grasp_id, head.decision_value
 
-    def answered_by_readers(self):
-        return True, self.answered_up_to
+    def test_samples_are_answered_together_and_params_change(self):
+        self.ask(1, module.MORE)
+        self.ask(2)
+        self.assertEqual([self.answered(), self.answered()], [(1, 1.75), (2, 1.75)])
+        self.send(module.SET, b'{"more": -1}')
+        self.assertEqual(self.receive(), (module.REFUSED, b"ValueError: more is less"))
+        self.send(module.SET, b'{"more": 2}')
+        self.assertEqual(self.receive()[0], module.DONE)
+        self.ask(3)
+        self.assertEqual(self.answered(), (3, 2.75))
 
-    def send(self, head, raw_items):
-        self.sent.append((head.header.epoch, head.header.seq))
-        self.items = raw_items
-        return True
+    def test_a_sample_that_fails_is_found_and_its_reason_told(self):
+        self.ask(1, module.MORE)
+        self.ask(13)
+        self.assertEqual(self.receive()[0], module.ONE_BY_ONE)
+        self.ask(13)
+        kind, line = self.receive()
+        self.assertEqual(kind, module.LOG)
+        self.assertIn("in answer_many", json.loads(line)["message"])
+        self.assertEqual(self.receive(), (module.FAILED, b"ValueError: an unlucky grasp"))
+        self.assertEqual(self.program.wait(), 1)
 
-
-class Board:
-    """The part of a board that a store uses."""
-
-    def __init__(self):
-        self.saved, self.places = None, {}
-
-    def reserve_state(self, region):
-        pass
-
-    def save_state(self, region, content):
-        self.saved = content
-
-    def state(self, region):
-        return self.saved
-
-    def answered(self, cell):
-        return self.places.get(cell, (None, [0] * 5))
-
-    def sent(self, cell):
-        return self.places.get(cell, (None,))[0]
-
-
-def port(cls, name, message, **fields):
-    made = object.__new__(cls)
-    made.port, made.message, made.last = name, message, None
-    for key, value in fields.items():
-        setattr(made, key, value)
-    return made
-
-
-def instance(board, inputs, outputs):
-    reader = lambda cell: types.SimpleNamespace(cell=cell, writer_cell=100 + cell)  # noqa: E731
-    made = object.__new__(module._Instance)
-    made.operator = types.SimpleNamespace(board=board, wiring={"state_region": 0}, is_to_give_way=lambda: True)
-    made.inputs = [
-        port(module._Input, name, TactileFrame, counts=[0] * 5, subscriber=reader(cell)) for cell, name in enumerate(inputs)
-    ]
-    outputs = [
-        port(module._Output, name, message, publisher=publisher, saved=deque(), n_sent=0) for name, message, publisher in outputs
-    ]
-    made.outputs = {output.port: output for output in outputs}
-    return made
-
-
-class Stores(unittest.TestCase):
-    def setUp(self):
-        self.board, self.a, self.b = Board(), Publisher(), Publisher()
-
-    def made(self, inputs=("left", "right"), state=None):
-        made = instance(self.board, inputs, [("a", Prediction, self.a), ("b", TactileFrame, self.b)])
-        return made, module._Store(made, state)
-
-    def keep(self, made, name, seq, items=b""):
-        head = made.outputs[name].message.Head()
-        head.header.epoch, head.header.seq = 3, seq
-        made.outputs[name].keep(head, items)
-
-    def test_the_next_instance_sends_what_readers_lack_as_it_was(self):
-        before, store = self.made(state=lambda: b"mine")
-        before.inputs[0].last, before.inputs[0].counts = (3, 7), (8, 0, 0, 0, 0)
-        for seq in range(4):
-            self.keep(before, "a", seq)
-        self.keep(before, "b", 0, struct.pack("<2d", 1.5, 2.5))
-        self.assertTrue(store.save())
-        # It is killed after it has sent two of them, of which readers have one.
-        self.a.sent, self.a.answered_up_to = [(3, 0), (3, 1)], (3, 0)
-        after, store = self.made(state=lambda: b"")
-        self.assertEqual(store.restore(is_handed_over=False), (b"mine", False))
-        self.assertEqual((after.inputs[0].last, list(after.inputs[0].counts)), ((3, 7), [8, 0, 0, 0, 0]))
-        self.assertEqual(after.inputs[1].last, None)
-        self.assertTrue(store.send())
-        self.assertEqual(self.a.sent[2:], [(3, 1), (3, 2), (3, 3)])
-        self.assertEqual((self.b.sent, self.b.items), ([(3, 0)], struct.pack("<2d", 1.5, 2.5)))
-        self.assertEqual(module._next_key(after.outputs["a"], after.outputs.values()), (3, 4))
-        # Handed over, all that was sent arrives.
-        after, store = self.made()
-        store.restore(is_handed_over=True)
-        self.assertTrue(store.send())
-        self.assertEqual(self.a.sent[5:], [])
-
-    def test_samples_that_all_readers_have_are_saved_no_more(self):
-        made, store = self.made()
-        for seq in range(3):
-            self.keep(made, "a", seq)
-        store.save()
-        store.send()
-        n_bytes = len(self.board.saved)
-        self.a.answered_up_to = (3, 1)
-        store.save()
-        self.assertEqual(len(made.outputs["a"].saved), 1)
-        self.assertLess(len(self.board.saved), n_bytes)
-
-    def test_what_does_not_fit_waits_for_readers_or_is_refused(self):
-        made, store = self.made(state=lambda: bytes(64 << 10))
-        with self.assertRaisesRegex(RuntimeError, "its state takes 65536 bytes"):
-            store.save()
-        made, store = self.made()
-        made.outputs["b"].publisher.wait_limit_millis = 1000
-        made.outputs["b"].publisher.board = types.SimpleNamespace(add_blocked=lambda cell, nanos: None)
-        made.outputs["b"].publisher.cell = 0
-        self.keep(made, "b", 0, bytes(40 << 10))
-        self.assertTrue(store.save() and store.send())
-        saved = self.board.saved
-        self.keep(made, "b", 1, bytes(40 << 10))
-        # It is asked to give way meanwhile: nothing new is saved.
-        self.assertFalse(store.save())
-        self.assertEqual(self.board.saved, saved)
-        self.b.answered_up_to = (3, 0)
-        self.assertTrue(store.save())
-        self.assertNotEqual(self.board.saved, saved)
-
-    def test_a_state_of_another_operator_does_not_count(self):
-        made, store = self.made()
-        made.inputs[0].last = (3, 7)
-        store.save()
-        # A stage without state has answered since.
-        self.board.places = {0: ((3, 9), [10, 0, 0, 0, 0])}
-        after, store = self.made()
-        with self.assertLogs("blindgrasp"):
-            self.assertEqual(store.restore(is_handed_over=True), (None, False))
-        self.assertEqual((after.inputs[0].last, after.inputs[0].counts), ((3, 9), [10, 0, 0, 0, 0]))
-        self.board.saved = b"of a stage in Rust"
-        with self.assertRaisesRegex(RuntimeError, "another language"):
-            self.made()[1].restore(is_handed_over=True)
-        # A source goes on after the last sample that was sent.
-        self.a.sent = [(3, 9)]
-        after, store = self.made(inputs=())
-        self.assertEqual(store.restore(is_handed_over=True), (None, False))
-        self.assertEqual(after.outputs["a"].last, (3, 9))
-
-    def test_the_end_of_a_source_is_saved(self):
-        made, store = self.made(inputs=())
-        store.save(is_done=True)
-        self.assertEqual(self.made(inputs=())[1].restore(is_handed_over=False), (b"", True))
+    def test_the_program_ends_with_its_host(self):
+        os.close(self.to)
+        self.assertEqual(self.program.wait(), 0)
+        self.to = os.open(os.devnull, os.O_RDONLY)
 
 
 class Answers(unittest.TestCase):
-    def setUp(self):
-        self.made = instance(Board(), ["left"], [("a", Prediction, None), ("b", TactileFrame, None)])
+    def packed(self, outputs, said):
+        description = Description("mine", "", LEFT, outputs=outputs)
+        return module._Operator(None, description, Stage(print), {}).packed(said)
 
     def test_a_dict_has_an_answer_by_output(self):
-        head = PredictionHead(grasp_id=4)
-        said = self.made.by_output({"a": head, "b": None})
-        self.assertEqual([(output.port, copy.grasp_id) for output, copy, _ in said], [("a", 4)])
-        said[0][1].grasp_id = 5
-        self.assertEqual(head.grasp_id, 4, "a copy")
-        self.assertEqual(self.made.by_output({"b": (TactileFrameHead(), [1.0, 2.0])})[0][2], struct.pack("<2d", 1, 2))
+        outputs = [("a", Prediction), ("b", TactileFrame)]
+        packed = self.packed(outputs, {"b": (TactileFrameHead(n_joints=1), [1.5]), "a": None})
+        self.assertEqual(struct.unpack("=4I", packed[0]), (1, 0, ctypes.sizeof(TactileFrameHead), 8))
+        self.assertEqual(packed[2], struct.pack("=d", 1.5))
 
     def test_wrong_answers_are_refused(self):
+        outputs = [("a", Prediction), ("b", TactileFrame)]
         for wrong, reason in (
             (PredictionHead(), "expected a dict"),
             ({"c": PredictionHead()}, "expected one of a, b"),
             ({"a": TactileFrameHead()}, "expected PredictionHead"),
         ):
             with self.assertRaisesRegex(RuntimeError, reason):
-                self.made.by_output(wrong)
+                self.packed(outputs, wrong)
 
-
-class Boards(unittest.TestCase):
-    def test_a_board_keeps_whole_records_and_states(self):
-        with tempfile.NamedTemporaryFile() as file:
-            n_cells = 8
-            end = -(-(4096 + n_cells * 128) // 4096) * 4096
-            file.write(struct.pack("=4Q", module._Board.MAGIC, module._Board.LAYOUT, n_cells, 1))
-            file.truncate(end + module._Board.REGION_BYTES)
-            file.flush()
-            board = module._Board(file.name)
-            self.addCleanup(board.file.close)
-            self.assertEqual(board.answered(1), (None, [0] * 5))
-            board.commit_answered(1, (2, 0), (1, 0, 0, 0, 0))
-            self.assertEqual(board.answered(1), ((2, 0), [1, 0, 0, 0, 0]))
-            board.count_sent(2, (2, 0))
-            board.count_sent(2, (2, 0))
-            self.assertEqual(board.sent(2), (2, 0))
-            self.assertIsNone(board.state(0))
-            board.save_state(0, b"first")
-            board.save_state(0, b"second")
-            self.assertEqual(board.state(0), b"second")
+    def test_a_source_leaves_out_numbers_before_the_next_sample_of_each_output(self):
+        source = Source(print)
+        operator = module._Operator(None, Description("mine", "", outputs=[("a", Prediction), ("b", Prediction)]), source, {})
+        source.lost(2)
+        source.lost(1, "b")
+        lost = lambda said: [struct.unpack("=4I", part)[1] for part in operator.packed(said)[::3]]  # noqa: E731
+        self.assertEqual(lost({"a": PredictionHead()}), [2])
+        self.assertEqual(lost({"a": PredictionHead(), "b": PredictionHead()}), [0, 3])
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ class Numbers:
 
 
 def split(_params):
-    return Stage(lambda head, items: {"a": (head, items), "b": (head, items[: head.n_joints])}, max_items=160)
+    return Stage(lambda head, items: {"a": (head, items), "b": (head, head.joints)}, max_items=160)
 
 
 def join(_params):

@@ -1,8 +1,10 @@
 //! `blindgrasp operator`
 
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::host;
 use blindgrasp_operator::operator::{self, GroupMember, name_process};
 use blindgrasp_operators::{Form, SHIPPED};
 use clap::Args;
@@ -10,6 +12,8 @@ use clap::builder::PossibleValuesParser;
 
 /// The process of several operators, which their wiring names.
 const GROUP: &str = "group";
+/// The process of an operator whose program, the first argument, gets its samples over pipes.
+const HOST: &str = "host";
 
 /// Run an operator that comes with blindgrasp, as the processes of a graph do.
 ///
@@ -39,6 +43,14 @@ pub(crate) fn run(arguments: &Arguments) -> ExitCode {
         name_process(GROUP);
         return operator::run_group(member);
     }
+    if name == HOST {
+        let words: Vec<OsString> = arguments.arguments.iter().map(OsString::from).collect();
+        let Some((program, rest)) = words.split_first() else {
+            print_diagnostic("blindgrasp operator host: it has no program, expected one and its arguments");
+            return ExitCode::from(2);
+        };
+        return host::run(program, rest);
+    }
     let given: Vec<&str> =
         arguments.arguments.iter().map(String::as_str).filter(|text| *text != "--describe").collect();
     let Some(form) = form(name, &given) else {
@@ -67,5 +79,5 @@ fn form(name: &str, arguments: &[&str]) -> Option<Form> {
 }
 
 fn names() -> PossibleValuesParser {
-    PossibleValuesParser::new(SHIPPED.iter().map(|shipped| shipped.name).chain([GROUP]))
+    PossibleValuesParser::new(SHIPPED.iter().map(|shipped| shipped.name).chain([GROUP, HOST]))
 }

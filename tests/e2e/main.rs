@@ -14,6 +14,7 @@ mod export;
 mod graph;
 mod grid;
 mod hands;
+mod hosted;
 mod import;
 mod launcher;
 mod libsvm;

@@ -222,7 +222,7 @@ fn exported() -> &'static Path {
 }
 
 /// Replacements for [`dataflow`]: `tests/python_source.py` plays the recording.
-fn with_source(folder: &Path, kind: &str) -> Vec<(String, String)> {
+pub(crate) fn with_source(folder: &Path, kind: &str) -> Vec<(String, String)> {
     let recording = blindgrasp_recording::RecordingReader::open(&project().join(RECORDING)).expect("readable");
     let hand_id = recording.info().hand_id;
     let program = python_operator(folder, &project().join("tests/python_source.py"));
@@ -361,7 +361,7 @@ fn the_python_module_keeps_its_promises_without_a_graph() {
 #[test]
 fn shipped_python_operators_describe_themselves_without_their_libraries() {
     for program in ["sklearn_classifier.py"] {
-        // Without site packages: neither iceoryx2 nor numpy nor scikit-learn.
+        // Without site packages: neither numpy nor scikit-learn.
         let path = project().join("operators").join(program);
         let output = shell(project(), Path::new("python3"), &["-I", "-S", "-c", "pass"], 0);
         assert!(output.status.success());

@@ -307,6 +307,7 @@ mod tests {
                 link: LinkSettings::default(),
             }),
             local: None,
+            host: None,
         }
     }
 

@@ -11,6 +11,9 @@ use blindgrasp_operator::text::{did_you_mean, list};
 /// The operator that carries edges to other machines. The launcher adds it; a dataflow file cannot name it.
 pub const LINK_OPERATOR: &str = "link";
 
+/// The operator that has the ports of a program in another language. The launcher adds it to that program.
+pub const HOST_OPERATOR: &str = "host";
+
 /// The operators that a bare name in a dataflow file can mean. By default there are none, and each node names a program by its
 /// path.
 ///
@@ -24,6 +27,7 @@ pub const LINK_OPERATOR: &str = "link";
 pub struct Operators {
     programs: BTreeMap<String, Program>,
     link: Option<Program>,
+    host: Option<Program>,
     /// Those of which several can run in one process.
     sharing: BTreeSet<String>,
     /// Names that are no operators, and the advice to somebody who writes them.
@@ -37,6 +41,7 @@ impl Operators {
         Operators {
             programs: names.into_iter().map(|name| (name.to_owned(), started(name))).collect(),
             link: Some(started(LINK_OPERATOR)),
+            host: Some(started(HOST_OPERATOR)),
             ..Operators::default()
         }
     }
@@ -71,6 +76,11 @@ impl Operators {
         self.link.as_ref()
     }
 
+    /// How the host of an operator in another language is started, if there is one.
+    pub(crate) fn host(&self) -> Option<&Program> {
+        self.host.as_ref()
+    }
+
     /// All of them by their names.
     pub fn iter(&self) -> impl Iterator<Item = (&str, &Program)> {
         self.programs.iter().map(|(name, program)| (name.as_str(), program))
@@ -82,7 +92,7 @@ impl Operators {
     /// # Errors
     /// The path of a file that is not there.
     pub fn program_to_run(&self, run: &Path, args: &[String], folder: &Path) -> Result<Program, PathBuf> {
-        let program = match run.to_str().and_then(|name| self.get(present_name(name))) {
+        let program = match run.to_str().and_then(|name| self.get(name)) {
             Some(program) => program.clone(),
             None => program_of_path(run, folder),
         };
@@ -90,11 +100,6 @@ impl Operators {
             return Err(program.path);
         }
         Ok(Program { args: program.args_with(args), ..program })
-    }
-
-    /// Whether [`Operators::program_to_run`] takes this for one of these operators.
-    pub(crate) fn has(&self, run: &Path) -> bool {
-        run.to_str().is_some_and(|name| self.programs.contains_key(present_name(name)))
     }
 
     /// Whether a program with these arguments can run in one process with others.
@@ -130,11 +135,6 @@ fn program_of_path(run: &Path, folder: &Path) -> Program {
         return on_path.into();
     }
     file.into()
-}
-
-/// The encoder had another name before, as in dataflow files.
-fn present_name(name: &str) -> &str {
-    if name == "histogram" { "encoder" } else { name }
 }
 
 /// The path of the running program, also after a new build has taken its place.

@@ -290,6 +290,7 @@ impl Plan {
             state_region: *self.state_regions.get(&node.id)?,
             skip: Vec::new(),
             sandbox: node.sandbox,
+            hosted: node.description.hosted.then(|| node.description.clone()),
         })
     }
 

@@ -49,6 +49,10 @@ pub struct OperatorDescription {
     /// It opens sockets of the network while it runs: its sandbox leaves it those.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub uses_network: bool,
+    /// Its program knows nothing of shared memory: a process of blindgrasp has its ports, and gives it the samples over two
+    /// pipes ([`host`](crate::host)).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub hosted: bool,
 }
 
 /// An input or output of an operator.
@@ -114,6 +118,7 @@ impl OperatorDescription {
             params,
             answers_each: false,
             uses_network: false,
+            hosted: false,
         }
     }
 

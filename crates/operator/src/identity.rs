@@ -12,6 +12,7 @@ use std::path::Path;
 use serde_json::{Map, Value};
 
 use crate::description::OperatorDescription;
+use crate::host;
 use crate::param::ParamKind;
 
 /// The part of the identity that does not change while the process runs.
@@ -20,7 +21,8 @@ pub(crate) fn of_program(description: &OperatorDescription, params: &Map<String,
     (&description.operator, &description.version).hash(&mut hasher);
     std::env::args_os().collect::<Vec<_>>().hash(&mut hasher);
     // A program that was built again is another one.
-    if let Ok(metadata) = std::env::current_exe().and_then(std::fs::metadata) {
+    let program = if description.hosted { host::program() } else { std::env::current_exe().ok() };
+    if let Some(Ok(metadata)) = program.map(std::fs::metadata) {
         (metadata.len(), metadata.mtime(), metadata.mtime_nsec()).hash(&mut hasher);
     }
     // A source's samples are its own, whatever its recording is called.

@@ -35,6 +35,7 @@
 //! * [`port`] - publisher and subscriber of one message type. [`sequencer`] - puts samples of several publishers in
 //!   order, each once. [`waiter`] - waits for several ports at once.
 //! * [`cursors`] - how far each of a graph's processes has come. [`ages`] - how old samples are when a reader gets them.
+//! * [`host`] - gives the samples of an operator to a program in any language, over two pipes.
 //! * [`wiring`] - what the launcher tells an operator and what the operator tells the launcher.
 //! * [`namespace`] - a running graph's own corner of shared memory, and how it is left clean.
 //! * [`sandbox`] - what an operator process gives up once it is ready.
@@ -47,6 +48,7 @@ pub mod control_socket;
 pub mod cursors;
 pub mod description;
 pub mod diagnostics;
+pub mod host;
 mod identity;
 pub mod link_status;
 pub mod namespace;

@@ -27,10 +27,10 @@ use crate::port::{PortError, Publisher, ShadowPublisher, Subscriber};
 use crate::sandbox::Sandbox;
 use crate::waiter::{PollFd, Waiter, Waker};
 use crate::wiring::{
-    Addressed, Clock, Command, EdgePolicy, Enforcement, GroupMemberWiring, GroupWiring, REPORT_PREFIX, Report,
-    WIRING_VARIABLE, Wiring,
+    Addressed, Clock, Command, EdgePolicy, Enforcement, GroupMemberWiring, GroupWiring, LogEntry, REPORT_PREFIX,
+    Report, WIRING_VARIABLE, Wiring,
 };
-use crate::{identity, monotonic_nanos, namespace, sandbox, trace, wiring};
+use crate::{host, identity, monotonic_nanos, namespace, sandbox, trace, wiring};
 use blindgrasp_messages::Message;
 
 /// The longest time that an operator waits before it gives a sign of life.
@@ -152,10 +152,23 @@ pub fn run(description: &OperatorDescription, work: impl FnOnce(&Operator) -> an
         ));
         return ExitCode::from(2);
     }
+    run_described(description, work)
+}
+
+/// As [`run`], in a process that was started as part of a graph.
+pub(crate) fn run_described(
+    description: &OperatorDescription,
+    work: impl FnOnce(&Operator) -> anyhow::Result<()>,
+) -> ExitCode {
     match join_and_work(description, work) {
-        Ok(()) => return ExitCode::SUCCESS,
-        Err(error) => Voice(None).report(&Report::Failed { message: format!("{error:#}") }),
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => failed(&error),
     }
+}
+
+/// Reports to the launcher why this process cannot go on.
+pub(crate) fn failed(error: &anyhow::Error) -> ExitCode {
+    Voice(None).report(&Report::Failed { message: format!("{error:#}") });
     ExitCode::FAILURE
 }
 
@@ -192,6 +205,24 @@ impl Operator {
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn growing_publisher<M: Message>(&self, port: &str) -> Result<Publisher<M>, OperatorError> {
         Ok(Publisher::open_growing(&self.0.node, &self.0.cursors, wired(&self.0.wiring.outputs, port)?)?)
+    }
+
+    /// As [`Operator::shadow`], for messages whose largest number of items is unknown.
+    ///
+    /// # Errors
+    /// The wiring lacks the port, or iceoryx2 refuses it.
+    pub(crate) fn growing_shadow<M: Message>(&self, port: &str) -> Result<ShadowPublisher<M>, OperatorError> {
+        Ok(ShadowPublisher::open_growing(&self.0.node, &self.0.cursors, wired(&self.0.wiring.outputs, port)?)?)
+    }
+
+    /// Whether an input is connected.
+    pub(crate) fn has_input(&self, port: &str) -> bool {
+        self.0.wiring.inputs.contains_key(port)
+    }
+
+    /// The node's parameters as they are.
+    pub(crate) fn all_params(&self) -> &Map<String, Value> {
+        &self.0.wiring.params
     }
 
     /// A handle by which another thread ends a wait of this operator.
@@ -306,7 +337,12 @@ impl Operator {
     fn close_sandbox(&self) -> Enforcement {
         let (entered, sandbox) = &self.0.sandbox;
         let closed = sandbox.as_ref().map_or(Enforcement::None, |sandbox| sandbox::or_none(sandbox.close()));
-        closed.min(*entered)
+        let closed = closed.min(*entered);
+        if self.0.wiring.hosted.is_some() && closed != Enforcement::None {
+            closed.min(host::enforcement())
+        } else {
+            closed
+        }
     }
 
     /// Gives a sign of life.
@@ -451,6 +487,11 @@ impl Operator {
     /// Reports, as a link, its status.
     pub fn has_link_status(&self, status: LinkStatus) {
         self.report(&Report::Link(Box::new(status)));
+    }
+
+    /// Reports a line for the log.
+    pub(crate) fn log(&self, line: LogEntry) {
+        self.report(&Report::Log(line));
     }
 
     /// Reports that the graph must end.

@@ -33,6 +33,8 @@ const NEWEST: ABI = ABI::V6;
 const READ: BitFlags<AccessFs> = make_bitflags!(AccessFs::{ReadFile | ReadDir});
 /// Names of machines are looked up with these files and libraries.
 const NAME_SERVICE_FOLDERS: [&str; 5] = ["/etc", "/usr", "/lib", "/lib64", "/run"];
+/// Programs write to it what nobody needs.
+const NULL_DEVICE: &str = "/dev/null";
 /// A device that is plugged in again is another file in this folder.
 const DEVICE_FOLDER: &str = "/dev";
 /// Programs for the x32 ABI of x86-64 have the same system calls under numbers with this bit.
@@ -56,20 +58,52 @@ pub(crate) struct Sandbox {
     /// Folders that it may read and write.
     writable: Vec<PathBuf>,
     uses_network: bool,
+    /// It entered the scope of its signals and sockets before, with its program.
+    is_host: bool,
+}
+
+/// Lets this thread, and those and the programs that it will start, send signals to no other process, and connect to no abstract
+/// socket of one. A host does so first of all, so that it can still end its program.
+pub(crate) fn enter_scope() -> Result<Enforcement, SandboxError> {
+    enforce(Ruleset::default().scope(Scope::from_all(NEWEST))?.create()?)
 }
 
 impl Sandbox {
+    /// The rights of the program of a host, which knows nothing of shared memory.
+    pub(crate) fn of_program(description: &OperatorDescription, params: &Map<String, Value>) -> Self {
+        Sandbox::new_in(std::iter::once((description, params)), vec![NULL_DEVICE.into()])
+    }
+
+    /// Gives up writing files, the network, signals and sockets, for a program that is about to begin. It may read files and run
+    /// programs, which have its rights.
+    pub(crate) fn enter_program(&self) -> Result<Enforcement, SandboxError> {
+        deny_sockets(self.uses_network)?;
+        let rights = AccessFs::from_all(NEWEST) & !READ & !AccessFs::Execute;
+        let mut ruleset = Ruleset::default().handle_access(rights)?.scope(Scope::from_all(NEWEST))?;
+        if !self.uses_network {
+            ruleset = ruleset.handle_access(AccessNet::from_all(NEWEST))?;
+        }
+        enforce(ruleset.create()?.add_rules(path_beneath_rules(&self.writable, rights))?)
+    }
+
     /// The rights that the operators of a process need, each with its params: params of paths that must exist are read, others
     /// are written, with their folder.
     pub(crate) fn new<'a>(
         operators: impl Iterator<Item = (&'a OperatorDescription, &'a Map<String, Value>)>,
         domain: &NamespaceWiring,
     ) -> Self {
-        let mut uses_network = false;
+        Sandbox::new_in(operators, vec![PathBuf::from(SHARED_MEMORY_FOLDER), PathBuf::from(&domain.root_path)])
+    }
+
+    fn new_in<'a>(
+        operators: impl Iterator<Item = (&'a OperatorDescription, &'a Map<String, Value>)>,
+        mut writable: Vec<PathBuf>,
+    ) -> Self {
+        let (mut uses_network, mut is_host) = (false, false);
         let mut readable: Vec<PathBuf> = Vec::new();
-        let mut writable = vec![PathBuf::from(SHARED_MEMORY_FOLDER), PathBuf::from(&domain.root_path)];
         for (description, params) in operators {
             uses_network |= description.uses_network;
+            is_host |= description.hosted;
             for param in &description.params {
                 let path = params.get(&param.name).and_then(Value::as_str).map(Path::new);
                 match (&param.kind, path) {
@@ -87,14 +121,17 @@ impl Sandbox {
         if uses_network {
             readable.extend(NAME_SERVICE_FOLDERS.map(PathBuf::from));
         }
-        Sandbox { readable, writable, uses_network }
+        Sandbox { readable, writable, uses_network, is_host }
     }
 
     /// Gives up all but reading files, for this thread and those that it will start.
     pub(crate) fn enter(&self) -> Result<Enforcement, SandboxError> {
         deny_sockets(self.uses_network)?;
         let rights = AccessFs::from_all(NEWEST) & !READ;
-        let mut ruleset = Ruleset::default().handle_access(rights)?.scope(Scope::from_all(NEWEST))?;
+        let mut ruleset = Ruleset::default().handle_access(rights)?;
+        if !self.is_host {
+            ruleset = ruleset.scope(Scope::from_all(NEWEST))?;
+        }
         if !self.uses_network {
             ruleset = ruleset.handle_access(AccessNet::from_all(NEWEST))?;
         }

@@ -197,10 +197,10 @@ impl<T> Sequencer<T> {
     }
 
     /// Takes over the samples that an earlier order of the same reader held, and a sample that was put back.
-    pub fn hold_again(&mut self, before: Self, put_back: Option<(SampleId, T)>, now: Instant) {
+    pub fn hold_again(&mut self, before: Self, put_back: impl IntoIterator<Item = (SampleId, T)>, now: Instant) {
         let key = |(generation, seq): Place| Some(SampleId { epoch: *before.epochs.get(generation)?, seq });
         let held = before.held.into_iter().filter_map(|(place, held)| Some((key(place)?, held)));
-        let held: Vec<_> = held.chain(put_back.map(|(key, sample)| (key, (sample, now)))).collect();
+        let held: Vec<_> = held.chain(put_back.into_iter().map(|(key, sample)| (key, (sample, now)))).collect();
         let last = self.last.or(self.counted);
         for (key, sample) in held {
             let place = self.place(key);

@@ -22,9 +22,9 @@ use crate::wiring::{Clock, Command, InputCounts, OnLate};
 use blindgrasp_messages::{Header, Message};
 
 /// A stage that gave way to another one of its group tries again after this time.
-const ROOM_PAUSE: Duration = Duration::from_millis(1);
+pub(crate) const ROOM_PAUSE: Duration = Duration::from_millis(1);
 /// A standby reports that it is warm after so many samples.
-const N_WARM: u64 = 8;
+pub(crate) const N_WARM: u64 = 8;
 
 /// The format of states: numbers of fixed size, which cost bytes but hardly any time.
 pub const STATE_FORMAT: bincode::config::Configuration<bincode::config::LittleEndian, bincode::config::Fixint> =
@@ -204,7 +204,7 @@ struct Instance<S: Stage> {
 }
 
 /// The partner inputs of a stage.
-struct Partners {
+pub(crate) struct Partners {
     inputs: Vec<Rc<RefCell<dyn PairedInput>>>,
     /// The main sample that waits for its partners, since when, and until when.
     waiting: Option<(SampleId, Instant, Instant)>,
@@ -213,25 +213,30 @@ struct Partners {
 }
 
 impl Partners {
-    fn connect(&self) -> Result<(), PortError> {
+    /// The partner inputs that the operator has opened.
+    pub(crate) fn of(operator: &Operator) -> Partners {
+        Partners { inputs: operator.partners(), waiting: None, n_without: 0 }
+    }
+
+    pub(crate) fn connect(&self) -> Result<(), PortError> {
         self.inputs.iter().try_for_each(|input| input.borrow().connect())
     }
 
-    fn take_over(&mut self) {
+    pub(crate) fn take_over(&mut self) {
         self.waiting = None;
         self.inputs.iter().for_each(|input| input.borrow_mut().take_over());
     }
 
-    fn take_in(&self, is_active: bool, is_ending: bool) -> Result<(), PortError> {
+    pub(crate) fn take_in(&self, is_active: bool, is_ending: bool) -> Result<(), PortError> {
         self.inputs.iter().try_for_each(|input| input.borrow_mut().take_in(is_active, is_ending))
     }
 
-    fn is_caught_up(&self) -> bool {
+    pub(crate) fn is_caught_up(&self) -> bool {
         self.inputs.iter().all(|input| input.borrow().is_caught_up())
     }
 
     /// Chooses the partners of a main sample; false if it must wait for one. At the end of the stream, none comes any more.
-    fn choose(&mut self, main: &Header, is_active: bool, is_ending: bool) -> Result<bool, PortError> {
+    pub(crate) fn choose(&mut self, main: &Header, is_active: bool, is_ending: bool) -> Result<bool, PortError> {
         if self.inputs.is_empty() {
             return Ok(true);
         }
@@ -247,13 +252,13 @@ impl Partners {
         Ok(self.waiting.is_none())
     }
 
-    fn deadline(&self) -> Option<Instant> {
+    pub(crate) fn deadline(&self) -> Option<Instant> {
         let held = self.inputs.iter().filter_map(|input| input.borrow().hold_deadline()).min();
         self.waiting.map(|waiting| waiting.2).into_iter().chain(held).min()
     }
 
     /// Reports how many samples were answered without a partner.
-    fn report(&mut self, operator: &Operator) {
+    pub(crate) fn report(&mut self, operator: &Operator) {
         let count = |input: &Rc<RefCell<dyn PairedInput>>| {
             let input = input.borrow();
             let (port, n) = input.n_without();
@@ -293,7 +298,7 @@ pub fn run<S: Stage + 'static>(
         stage,
         has_state,
         subscriber: operator.subscriber(input)?,
-        partners: Partners { inputs: operator.partners(), waiting: None, n_without: 0 },
+        partners: Partners::of(operator),
         publisher: operator.publisher(output, max_items)?,
         last: None,
         answers: Answers::with_capacity(max_items),

@@ -19,6 +19,7 @@ use std::fmt;
 use serde::{Deserialize, Serialize};
 
 use crate::cursors::SampleId;
+use crate::description::OperatorDescription;
 use crate::link_status::LinkStatus;
 
 /// The environment variable that holds the [`Wiring`].
@@ -58,6 +59,9 @@ pub struct Wiring {
     /// Whether the process restricts what it may do.
     #[serde(default)]
     pub sandbox: Sandbox,
+    /// Of a process that is the [host](crate::host) of another program: the description of that program.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub hosted: Option<OperatorDescription>,
 }
 
 /// The wirings of a process with several operators, upstream ones first.

@@ -54,7 +54,7 @@ struct OperatorArguments {
 
 /// The versions that blindgrasp is tested with: the new operator is built with the same.
 const CARGO_LOCK: &str = include_str!("../../../Cargo.lock");
-const REQUIREMENTS: &str = "iceoryx2==0.10.0\nnumpy>=1.26\n";
+const REQUIREMENTS: &str = "numpy>=1.26\n";
 const MAX_NAME_CHARS: usize = 32;
 /// Names that Cargo refuses, or that a dependency of the new operator has.
 const TAKEN_IN_RUST: &str = "abstract alloc anyhow as async await become box break const continue core crate do dyn else \

@@ -12,8 +12,20 @@ pub struct ProcessUsage {
     pub resident_bytes: u64,
 }
 
-/// The use of a process since its start; `None` if it does not exist.
+/// The use of a process since its start, with that of its children, such as the program of a host; `None` if it does not exist.
 pub fn usage(pid: u32) -> Option<ProcessUsage> {
+    let mut sum = usage_of_one(pid)?;
+    let children = std::fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap_or_default();
+    for child in children.split_whitespace().filter_map(|child| child.parse().ok()) {
+        if let Some(own) = usage_of_one(child) {
+            sum.cpu_secs += own.cpu_secs;
+            sum.resident_bytes += own.resident_bytes;
+        }
+    }
+    Some(sum)
+}
+
+fn usage_of_one(pid: u32) -> Option<ProcessUsage> {
     let stat = std::fs::read_to_string(Path::new("/proc").join(pid.to_string()).join("stat")).ok()?;
     parse_stat(&stat, rustix::param::clock_ticks_per_second(), rustix::param::page_size() as u64)
 }

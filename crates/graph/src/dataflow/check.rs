@@ -117,7 +117,8 @@ pub fn check(
     }
     nodes.sort_by_key(|node| levels.get(node.id.as_str()).copied());
     let machines = file.machines.as_ref().map(|machines| machines.settle(&file.link, folder));
-    Ok(Graph { name: file.name.clone(), file: file.absolute_path.clone(), nodes, machines, local: None })
+    let host = operators.host().cloned();
+    Ok(Graph { name: file.name.clone(), file: file.absolute_path.clone(), nodes, machines, local: None, host })
 }
 
 /// The nodes of a group share a process: blindgrasp must know their operators, and what holds for the process must be said of

@@ -1,6 +1,7 @@
 //! A checked graph: what the launcher starts.
 
 use crate::dataflow::pins::Pins;
+use crate::dataflow::program::Program;
 use blindgrasp_operator::wiring::{EdgePolicy, OnLate, Sandbox};
 use std::fmt;
 use std::path::PathBuf;
@@ -27,6 +28,9 @@ pub struct Graph {
     /// Of one machine's part of a graph.
     #[serde(skip)]
     pub local: Option<LocalView>,
+    /// The program that has the ports of nodes in other languages, if there is one.
+    #[serde(skip)]
+    pub host: Option<Program>,
 }
 
 /// One instance of an operator.

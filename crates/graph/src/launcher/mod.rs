@@ -33,7 +33,7 @@ use serde_json::Value;
 
 use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
 use crate::dataflow::pins::PinError;
-use crate::dataflow::{Graph, Node};
+use crate::dataflow::{Graph, Node, Program};
 use crate::launcher::clients::Clients;
 use crate::launcher::link_book::LinkBook;
 use crate::launcher::log_writer::{Log, LogWriter};
@@ -147,6 +147,8 @@ enum Event {
 pub struct Launcher {
     options: LaunchOptions,
     name: String,
+    /// The program that has the ports of nodes in other languages.
+    host: Option<Program>,
     file: PathBuf,
     /// The folder of the dataflow file, for relative paths in it.
     folder: PathBuf,
@@ -251,6 +253,7 @@ impl Launcher {
             name: name.into(),
             folder: graph.file.parent().unwrap_or(std::path::Path::new("/")).into(),
             file: graph.file.clone(),
+            host: graph.host.clone(),
             plan,
             cursors,
             members: Vec::new(),
@@ -344,7 +347,7 @@ impl Launcher {
         let Some((_, first)) = nodes.first() else {
             return Ok(Vec::new());
         };
-        Process::spawn(starts, &self.sender).map_err(|source| failed(first, source))
+        Process::spawn(starts, self.host.as_ref(), &self.sender).map_err(|source| failed(first, source))
     }
 
     /// The number of a node's next instance: the first whose heartbeat cell is free. `None` if too many old instances are on

@@ -17,6 +17,7 @@ use rustix::process::{
 use rustix::thread::{CpuSet, sched_setaffinity, set_no_new_privs};
 
 use crate::dataflow::{Node, ProcessOptions, Scheduling, SchedulingPolicy};
+use crate::dataflow::Program;
 use crate::launcher::Event;
 use crate::launcher::log_writer::Log;
 use crate::launcher::service;
@@ -137,10 +138,22 @@ impl Process {
     ///
     /// # Errors
     /// The system cannot start the program.
-    pub(super) fn spawn(starts: Vec<Start<'_>>, events: &SyncSender<Event>) -> std::io::Result<Vec<Process>> {
+    pub(super) fn spawn(
+        starts: Vec<Start<'_>>,
+        host: Option<&Program>,
+        events: &SyncSender<Event>,
+    ) -> std::io::Result<Vec<Process>> {
         let launcher_pid = rustix::process::getpid();
         let node = starts.first().ok_or(std::io::ErrorKind::InvalidInput)?.node;
-        let mut command = Program::new(&node.program);
+        let mut command = if node.description.hosted {
+            let no_host = || std::io::Error::other("the program that runs the graph has no host for other languages");
+            let host = host.ok_or_else(no_host)?;
+            let mut command = std::process::Command::new(&host.path);
+            command.args(&host.args).arg(&node.program);
+            command
+        } else {
+            std::process::Command::new(&node.program)
+        };
         let wiring = match starts.as_slice() {
             [start] => {
                 command.args(&start.node.args);
@@ -506,7 +519,10 @@ fn lacking(sandbox: Enforcement) -> &'static str {
         Enforcement::None => {
             "it is not restricted: the kernel has no Landlock (blindgrasp doctor tells), or its program does not use it"
         }
-        Enforcement::Partial => "it is restricted in part only: the kernel is older than Linux 6.12",
+        Enforcement::Partial => {
+            "it is restricted in part only: the kernel is older than Linux 6.12, or its program is not blindgrasp's own and may \
+             read files and run programs"
+        }
         Enforcement::Full => "it is restricted in full",
     }
 }

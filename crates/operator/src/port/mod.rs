@@ -20,6 +20,7 @@ use iceoryx2::sample::Sample;
 use crate::cursors::SampleId;
 use blindgrasp_messages::{Header, Message};
 
+pub(crate) use publisher::{LONGEST_TRY, LOOK_PAUSE, RETRY_PAUSE};
 pub use publisher::{Publisher, Sent, ShadowPublisher};
 pub use subscriber::Subscriber;
 
@@ -67,6 +68,11 @@ impl<M: Message> PortSample<M> {
             Place::Lent(sample) => sample.payload(),
             Place::Copied(_, items) => items,
         }
+    }
+
+    /// A sample that was received before, from a copy.
+    pub(crate) fn of_copy(head: M::Head, items: Vec<M::Item>) -> Self {
+        PortSample(Place::Copied(head, items))
     }
 
     /// The sample in memory of this process, so that its publisher gets its own back. For each sample that a publisher must

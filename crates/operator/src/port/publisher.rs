@@ -16,11 +16,11 @@ use blindgrasp_messages::{Header, Message};
 /// A waiting publisher yields so often before it sleeps between tries.
 const N_YIELDS: u32 = 64;
 /// A waiting publisher then sleeps so long between tries.
-const RETRY_PAUSE: Duration = Duration::from_micros(50);
+pub(crate) const RETRY_PAUSE: Duration = Duration::from_micros(50);
 /// A waiting publisher looks so often for readers that have come back.
-const LOOK_PAUSE: Duration = Duration::from_millis(1);
+pub(crate) const LOOK_PAUSE: Duration = Duration::from_millis(1);
 /// A longer pause between two tries counts as this much: while the whole machine stands still, no guest is slow.
-const LONGEST_TRY: Duration = Duration::from_millis(5);
+pub(crate) const LONGEST_TRY: Duration = Duration::from_millis(5);
 /// A publisher that grows has room for so many items at first.
 const N_FIRST_ITEMS: usize = 64;
 
@@ -392,6 +392,38 @@ impl<M: Message> Publisher<M> {
         }
     }
 
+    /// How long the publisher waits for its readers before it fails.
+    pub(crate) fn wait_limit(&self) -> Duration {
+        self.wait_limit
+    }
+
+    /// Counts time for which the node waited for its readers.
+    pub(crate) fn has_waited(&self, time: Duration) {
+        self.cell().add_blocked(time.as_nanos() as u64);
+    }
+
+    /// Whether guests alone have not answered a sample that was sent. Those that have had longer than their time are given up.
+    pub(crate) fn give_up_guests_that_lack(&self, key: SampleId, waited: Duration) -> bool {
+        let last = self.cell().key();
+        let lacks = |reader: &Reader| match reader.least(&self.cursors, last) {
+            None => false,
+            Some(None) => true,
+            Some(Some(place)) if place.epoch == key.epoch => place.seq < key.seq,
+            // A reader in an earlier epoch is behind.
+            Some(Some(place)) => last.is_none_or(|last| place.epoch != last.epoch),
+        };
+        let behind: Vec<&Reader> = self.readers.iter().filter(|reader| lacks(reader)).collect();
+        if behind.is_empty() || behind.iter().any(|reader| reader.guest_cells.is_empty()) {
+            return false;
+        }
+        for reader in behind {
+            if waited > reader.guest_limit {
+                reader.guest_cells.iter().for_each(|cell| self.cursors.input(*cell).give_up(true));
+            }
+        }
+        true
+    }
+
     fn wait_for_room(&mut self, key: &SampleId, is_to_give_way: &mut dyn FnMut() -> bool) -> Result<Sent, PortError> {
         let start = Instant::now();
         let mut last_look = start;
@@ -448,6 +480,20 @@ impl<M: Message> ShadowPublisher<M> {
     ) -> Result<Self, PortError> {
         let sender =
             Sender::open(node, cursors, &[COMPARE_BELL], &wiring.shadow, max_items, AllocationStrategy::Static)?;
+        Ok(ShadowPublisher { sender })
+    }
+
+    /// As [`ShadowPublisher::open`], for messages whose largest number of items is unknown.
+    ///
+    /// # Errors
+    /// An error of iceoryx2.
+    pub(crate) fn open_growing(
+        node: &Node<ipc::Service>,
+        cursors: &Arc<SharedCursors>,
+        wiring: &OutputWiring,
+    ) -> Result<Self, PortError> {
+        let strategy = AllocationStrategy::PowerOfTwo;
+        let sender = Sender::open(node, cursors, &[COMPARE_BELL], &wiring.shadow, N_FIRST_ITEMS, strategy)?;
         Ok(ShadowPublisher { sender })
     }
 

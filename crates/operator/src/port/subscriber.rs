@@ -1,5 +1,6 @@
 //! The receiving end of an edge.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -28,8 +29,8 @@ pub struct Subscriber<M: Message> {
     late_nanos: Option<u64>,
     /// Whether samples wait for those before them. On an edge that may drop samples, they don't.
     may_hold: bool,
-    /// A sample that was taken and not answered.
-    put_back: Option<(SampleId, PortSample<M>)>,
+    /// Samples that were taken and not answered, the first one first.
+    put_back: VecDeque<(SampleId, PortSample<M>)>,
     sequencer: Sequencer<PortSample<M>>,
 }
 
@@ -64,7 +65,7 @@ impl<M: Message> Subscriber<M> {
             on_late: wiring.on_late,
             late_nanos: None,
             may_hold: wiring.policy == EdgePolicy::Lossless,
-            put_back: None,
+            put_back: VecDeque::new(),
             sequencer: Sequencer::onlooker(),
         };
         subscriber.begin_with(Sequencer::onlooker());
@@ -77,7 +78,7 @@ impl<M: Message> Subscriber<M> {
         let sequencer = if self.may_hold { sequencer } else { sequencer.without_waiting() };
         let before = std::mem::replace(&mut self.sequencer, sequencer);
         // Samples that this reader has received and not answered exist nowhere else any more.
-        let put_back = self.put_back.take().map(|(key, sample)| (key, sample.copied()));
+        let put_back = std::mem::take(&mut self.put_back).into_iter().map(|(key, sample)| (key, sample.copied()));
         self.sequencer.hold_again(before, put_back, now);
     }
 
@@ -135,6 +136,14 @@ impl<M: Message> Subscriber<M> {
     /// Whether its writer is on another machine whose link is cut off.
     pub fn is_cut_off(&self) -> bool {
         self.cursors.as_ref().is_some_and(|(cursors, _)| cursors.output(self.writer_cell).is_cut_off())
+    }
+
+    /// The last sample that any instance of the node has answered, and its counts of that time.
+    pub(crate) fn place(&self) -> (Option<SampleId>, InputCounts) {
+        let Some((cursors, cell)) = &self.cursors else {
+            return (None, InputCounts::default());
+        };
+        (cursors.input(*cell).key(), cursors.input(*cell).counts())
     }
 
     /// The last sample that any instance of the node has answered.
@@ -215,23 +224,28 @@ impl<M: Message> Subscriber<M> {
 
     /// Keeps a sample that was not answered, in case that this reader goes on.
     pub fn put_back(&mut self, sample: PortSample<M>) {
-        self.put_back = Some((sample_id(M::header(sample.user_header())), sample));
+        self.put_back.push_back((sample_id(M::header(sample.user_header())), sample));
     }
 
     /// A sample that was kept without an answer.
     pub(crate) fn take_back(&mut self) -> Option<PortSample<M>> {
-        self.put_back.take().map(|(_, sample)| sample)
+        self.put_back.pop_front().map(|(_, sample)| sample)
     }
 
     /// Marks all samples up to this one as answered: its writer may overwrite them, and an instance that takes over goes on
     /// after them.
     pub fn commit(&self, header: &Header) {
+        self.commit_with(header, &self.sequencer.counts());
+    }
+
+    /// As [`Subscriber::commit`], with the counts of the time at which it received this sample.
+    pub(crate) fn commit_with(&self, header: &Header, counts: &InputCounts) {
         if let Some((cursors, cell)) = &self.cursors {
             let key = sample_id(header);
             let cell = cursors.input(*cell);
             // A sample that goes back in order is answered, but does not move the cursor.
             let is_ahead = cell.key().is_none_or(|last| last.epoch != key.epoch || last.seq < key.seq);
-            cell.commit(is_ahead.then_some(key), &self.sequencer.counts());
+            cell.commit(is_ahead.then_some(key), counts);
         }
     }
 

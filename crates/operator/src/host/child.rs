@@ -1,0 +1,331 @@
+//! The program of a host: its process and the two pipes to it.
+
+use std::ffi::OsString;
+use std::io::{PipeReader, PipeWriter, Read, Write};
+use std::os::fd::{AsFd, AsRawFd, OwnedFd};
+use std::os::unix::process::CommandExt;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::FdFlags;
+use rustix::process::{Signal, getpid, getppid, set_parent_process_death_signal};
+
+use super::protocol::{Ask, FRAME_BYTES, MAX_BODY_BYTES, PIPES_VARIABLE, Say, Work, number, read_work, write_work};
+use crate::wiring::{LogEntry, WIRING_VARIABLE};
+
+/// A program whose pipes are closed gets so long to end.
+const END_LIMIT: Duration = Duration::from_secs(1);
+const END_POLL: Duration = Duration::from_millis(2);
+/// So much is read at a time.
+const READ_BYTES: usize = 64 << 10;
+/// Log lines and counts that a program may say before the answer for which the host waits.
+const MAX_ASIDES: usize = 10_000;
+
+/// A program that works for this process.
+pub(super) struct Program {
+    process: Child,
+    to: Option<PipeWriter>,
+    from: PipeReader,
+    out: Vec<u8>,
+    /// What was read; a message that was taken out ends at `used`.
+    read: Vec<u8>,
+    used: usize,
+    asides: Asides,
+}
+
+/// What a program says at any time.
+#[derive(Default)]
+pub(super) struct Asides {
+    pub(super) lines: Vec<LogEntry>,
+    pub(super) counts: std::collections::BTreeMap<String, u64>,
+}
+
+/// Why a program cannot be worked with.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum ProgramError {
+    #[error("{0}")]
+    Failed(String),
+    #[error("its program ended{0}, expected an answer to {1:?}")]
+    Ended(String, Ask),
+    #[error("its program ended{0} without being asked")]
+    Gone(String),
+    #[error("its program said {found}, expected {expected}")]
+    Unexpected { found: String, expected: &'static str },
+    #[error("its program wants to send {0} bytes at once, expected at most {MAX_BODY_BYTES}")]
+    TooLong(usize),
+    #[error("its program said {0} lines before its answer, expected at most {MAX_ASIDES}")]
+    TooManyLines(usize),
+    #[error(transparent)]
+    Work(#[from] super::protocol::WorkError),
+    #[error("its program's {0} cannot be read")]
+    Json(&'static str, #[source] serde_json::Error),
+    #[error("the pipe to its program does not work")]
+    Pipe(#[source] std::io::Error),
+}
+
+impl Program {
+    /// Starts a program before this process has a second thread. `restrict` is called in the new process, before it begins.
+    pub(super) fn spawn(
+        program: &OsString,
+        arguments: &[OsString],
+        restrict: impl Fn() -> std::io::Result<()> + Send + Sync + 'static,
+    ) -> anyhow::Result<Program> {
+        let (to_read, to) = std::io::pipe().context("cannot make a pipe")?;
+        let (from, from_write) = std::io::pipe().context("cannot make a pipe")?;
+        let its_own: [OwnedFd; 2] = [to_read.into(), from_write.into()];
+        let host = getpid();
+        let numbers: Vec<String> = its_own.iter().map(|fd| fd.as_raw_fd().to_string()).collect();
+        // What it prints is for the log, and no report to the launcher.
+        let log: OwnedFd = std::io::stderr().as_fd().try_clone_to_owned().context("cannot copy stderr")?;
+        let mut command = Command::new(program);
+        command
+            .args(arguments)
+            .env(PIPES_VARIABLE, numbers.join(","))
+            .env_remove(WIRING_VARIABLE)
+            .stdin(Stdio::null())
+            .stdout(log)
+            .stderr(Stdio::inherit());
+        let inherited: Vec<i32> = its_own.iter().map(AsRawFd::as_raw_fd).collect();
+        let before_exec = move || {
+            set_parent_process_death_signal(Some(Signal::KILL))?;
+            // The host may have died before the signal was set.
+            if getppid() != Some(host) {
+                return Err(rustix::io::Errno::SRCH.into());
+            }
+            for number in [libc::SIGTERM, libc::SIGINT] {
+                // SAFETY: to ignore a signal runs no code. The host says when it is to end.
+                unsafe { libc::signal(number, libc::SIG_IGN) };
+            }
+            for fd in &inherited {
+                // SAFETY: the descriptors are open until the program begins.
+                let fd = unsafe { std::os::fd::BorrowedFd::borrow_raw(*fd) };
+                rustix::io::fcntl_setfd(fd, FdFlags::empty())?;
+            }
+            restrict()
+        };
+        // SAFETY: this process has one thread, so that no lock is held by another one between fork and exec.
+        unsafe { command.pre_exec(before_exec) };
+        let process = command.spawn().with_context(|| format!("{} cannot be started", program.display()))?;
+        drop(its_own);
+        Ok(Program {
+            process,
+            to: Some(to),
+            from,
+            out: Vec::new(),
+            read: Vec::new(),
+            used: 0,
+            asides: Asides::default(),
+        })
+    }
+
+    /// Sends a message about samples.
+    pub(super) fn ask<'a>(
+        &mut self,
+        ask: Ask,
+        nanos: u64,
+        flags: u32,
+        state: &[u8],
+        parts: impl Iterator<Item = (usize, &'a [u8], &'a [u8])>,
+    ) -> Result<(), ProgramError> {
+        self.begin(ask);
+        write_work(nanos, flags, state, parts, &mut self.out);
+        self.send(ask)
+    }
+
+    /// Sends a message with a body of JSON.
+    pub(super) fn ask_json(&mut self, ask: Ask, body: &impl serde::Serialize) -> Result<(), ProgramError> {
+        self.begin(ask);
+        serde_json::to_writer(&mut self.out, body).map_err(|error| ProgramError::Json("message", error))?;
+        self.send(ask)
+    }
+
+    /// Its answer to a message about samples.
+    pub(super) fn answer(&mut self, to: Ask) -> Result<Answer, ProgramError> {
+        match self.next()? {
+            Some((Say::Done, body)) => Ok(Answer::Done(read_work(&body)?)),
+            Some((Say::OneByOne, _)) => Ok(Answer::OneByOne),
+            Some((Say::Refused, body)) => Ok(Answer::Refused(String::from_utf8_lossy(&body).into_owned())),
+            Some((found, _)) => Err(unexpected(found, "an answer")),
+            None => Err(ProgramError::Ended(self.end(), to)),
+        }
+    }
+
+    /// Its answer to [`Ask::Start`].
+    pub(super) fn ready<T: serde::de::DeserializeOwned>(&mut self) -> Result<T, ProgramError> {
+        match self.next()? {
+            Some((Say::Ready, body)) => {
+                serde_json::from_slice(&body).map_err(|error| ProgramError::Json("answer to Start", error))
+            }
+            Some((found, _)) => Err(unexpected(found, "that it is ready")),
+            None => Err(ProgramError::Ended(self.end(), Ask::Start)),
+        }
+    }
+
+    /// What it has said besides answers. Call it now and then: it also finds that the program has ended.
+    pub(super) fn listen(&mut self) -> Result<Asides, ProgramError> {
+        while self.has_more() {
+            match self.next_frame()? {
+                Some((kind @ (Say::Log | Say::Counts | Say::Failed), body)) => self.take_in(kind, &body)?,
+                Some((found, _)) => return Err(unexpected(found, "nothing, because it was not asked")),
+                None => return Err(ProgramError::Gone(self.end())),
+            }
+        }
+        Ok(std::mem::take(&mut self.asides))
+    }
+
+    /// What it has said besides answers so far.
+    pub(super) fn asides(&mut self) -> Asides {
+        std::mem::take(&mut self.asides)
+    }
+
+    fn has_more(&self) -> bool {
+        if self.used < self.read.len() {
+            return true;
+        }
+        let mut fds = [PollFd::new(&self.from, PollFlags::IN)];
+        poll(&mut fds, Some(&Timespec { tv_sec: 0, tv_nsec: 0 })).is_ok_and(|n_ready| n_ready > 0)
+    }
+
+    fn begin(&mut self, ask: Ask) {
+        self.out.clear();
+        self.out.extend_from_slice(&[0; 4]);
+        self.out.extend_from_slice(&(ask as u32).to_ne_bytes());
+    }
+
+    fn send(&mut self, ask: Ask) -> Result<(), ProgramError> {
+        let n_body = self.out.len() - FRAME_BYTES;
+        self.out[..4].copy_from_slice(&(n_body as u32).to_ne_bytes());
+        let Some(to) = &mut self.to else {
+            return Err(ProgramError::Ended(String::new(), ask));
+        };
+        match to.write_all(&self.out) {
+            Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Err(self.last_words(ask)),
+            outcome => outcome.map_err(ProgramError::Pipe),
+        }
+    }
+
+    /// Why a program does not listen any more: what it said before it ended, if it said something.
+    fn last_words(&mut self, ask: Ask) -> ProgramError {
+        match self.next() {
+            Err(error) => error,
+            Ok(_) => ProgramError::Ended(self.end(), ask),
+        }
+    }
+
+    /// Its next message that is an answer; `None` if it has ended.
+    fn next(&mut self) -> Result<Option<(Say, Vec<u8>)>, ProgramError> {
+        for _ in 0..MAX_ASIDES {
+            match self.next_frame()? {
+                Some((kind @ (Say::Log | Say::Counts | Say::Failed), body)) => self.take_in(kind, &body)?,
+                frame => return Ok(frame),
+            }
+        }
+        Err(ProgramError::TooManyLines(MAX_ASIDES + 1))
+    }
+
+    fn take_in(&mut self, kind: Say, body: &[u8]) -> Result<(), ProgramError> {
+        match kind {
+            Say::Log => {
+                let line = serde_json::from_slice(body).map_err(|error| ProgramError::Json("log line", error))?;
+                self.asides.lines.push(line);
+            }
+            Say::Counts => {
+                let counts: std::collections::BTreeMap<String, u64> =
+                    serde_json::from_slice(body).map_err(|error| ProgramError::Json("counts", error))?;
+                self.asides.counts.extend(counts);
+            }
+            _ => return Err(ProgramError::Failed(String::from_utf8_lossy(body).into_owned())),
+        }
+        Ok(())
+    }
+
+    fn next_frame(&mut self) -> Result<Option<(Say, Vec<u8>)>, ProgramError> {
+        loop {
+            let rest = &self.read[self.used..];
+            if rest.len() >= FRAME_BYTES {
+                let (n_body, kind) = (number(rest, 0) as usize, number(rest, 4) as u32);
+                if n_body > MAX_BODY_BYTES {
+                    return Err(ProgramError::TooLong(n_body));
+                }
+                if rest.len() >= FRAME_BYTES + n_body {
+                    let body = rest[FRAME_BYTES..FRAME_BYTES + n_body].to_vec();
+                    self.used += FRAME_BYTES + n_body;
+                    let found = || format!("a message of the unknown kind {kind}");
+                    let say = Say::of(kind);
+                    let say =
+                        say.ok_or_else(|| ProgramError::Unexpected { found: found(), expected: "one from 1 to 7" })?;
+                    return Ok(Some((say, body)));
+                }
+            }
+            if !self.read_more().map_err(ProgramError::Pipe)? {
+                if self.used < self.read.len() {
+                    let found = format!("a part of a message, and ended{}", self.end());
+                    return Err(ProgramError::Unexpected { found, expected: "a whole message" });
+                }
+                return Ok(None);
+            }
+        }
+    }
+
+    /// Reads what is there, or waits for it; false at the end.
+    fn read_more(&mut self) -> std::io::Result<bool> {
+        self.read.drain(..self.used);
+        self.used = 0;
+        let n_before = self.read.len();
+        self.read.resize(n_before + READ_BYTES, 0);
+        let n_read = loop {
+            match self.from.read(&mut self.read[n_before..]) {
+                Err(error) if error.kind() == std::io::ErrorKind::Interrupted => {}
+                outcome => break outcome,
+            }
+        };
+        self.read.truncate(n_before + *n_read.as_ref().unwrap_or(&0));
+        Ok(n_read? > 0)
+    }
+
+    /// How it has ended, for a person; empty if it has not.
+    fn end(&mut self) -> String {
+        self.to = None;
+        let start = Instant::now();
+        while start.elapsed() < END_LIMIT {
+            if let Ok(Some(status)) = self.process.try_wait() {
+                return format!(" ({status})");
+            }
+            std::thread::sleep(END_POLL);
+        }
+        String::new()
+    }
+}
+
+/// An answer of a program.
+pub(super) enum Answer {
+    Done(Work),
+    OneByOne,
+    Refused(String),
+}
+
+impl Answer {
+    /// The answer to a message that a program can neither refuse nor divide.
+    pub(super) fn done(self) -> Result<Work, ProgramError> {
+        match self {
+            Answer::Done(work) => Ok(work),
+            Answer::OneByOne => Err(unexpected(Say::OneByOne, "an answer")),
+            Answer::Refused(reason) => Err(ProgramError::Failed(reason)),
+        }
+    }
+}
+
+fn unexpected(found: Say, expected: &'static str) -> ProgramError {
+    ProgramError::Unexpected { found: format!("{found:?}"), expected }
+}
+
+impl Drop for Program {
+    /// A program whose pipes are closed ends, or is killed.
+    fn drop(&mut self) {
+        if self.end().is_empty() && self.process.kill().is_ok() {
+            let _ = self.process.wait();
+        }
+    }
+}

@@ -1,0 +1,122 @@
+#!/usr/bin/env python3
+"""Operators in Python for the tests, of each kind that an operator in Rust can be.
+
+senses: gives frames the senses of a partner input. watch: has no output, an optional input, and a state; it fails if a sample
+is not there once and in order. hand: a source with a feedback input that sends the frames of a grasp when the grasp before is
+decided. nag: answers silence and the end of the stream.
+"""
+
+import json
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "operators"))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import python_source
+from blindgrasp_messages import GraspFeature, LiftDecision, Prediction, PredictionHead, TactileFrame
+from blindgrasp_operator import Description, Param, Source, Stage, counted, run
+from python_ports import Numbers
+
+SENSES = Description(
+    "python_senses",
+    "Gives frames the senses of another source",
+    inputs=[("tactile", TactileFrame), ("senses", TactileFrame, "partner")],
+    output=("tactile", TactileFrame),
+    params=[Param("hand", "path")],
+)
+WATCH = Description(
+    "watch",
+    "Counts samples",
+    inputs=[("prediction", Prediction), ("feature", GraspFeature, "optional"), ("other", LiftDecision, "optional")],
+    params=[Param("told", "string", default="", live=True)],
+)
+HAND = Description(
+    "python_hand",
+    "Sends the frames of a grasp when the one before is decided",
+    inputs=[("decision", LiftDecision, "feedback")],
+    outputs=python_source.DESCRIPTION.outputs,
+    params=python_source.DESCRIPTION.params,
+)
+NAG = Description("nag", "Answers silence", ("tactile", TactileFrame), ("prediction", Prediction), answers_each=False)
+
+
+def senses(_params):
+    def answer(frame, _items, senses):
+        if senses is not None:
+            frame.senses = frame.senses | senses[0].senses
+        return frame
+
+    return Stage(answer)
+
+
+def watch(params):
+    numbers = Numbers()
+
+    def answer(port, head, _items):
+        numbers.check(port, head.header.seq)
+        counted(**{f"n_{port}": numbers.next[port], "is_told": params["told"] == "yes"})
+
+    return Stage(answer, state=numbers.state, restore=numbers.restore)
+
+
+def hand(params):
+    """The place among the lines, and the last grasp that was decided."""
+    with open(params["lines"]) as lines:
+        samples = [python_source.sample_of(json.loads(line)) for line in lines]
+    place, decided = 0, -1
+
+    def next_sample():
+        nonlocal place
+        if place >= len(samples):
+            raise StopIteration
+        port, head, items = samples[place]
+        # A grasp on which the votes do not agree is decided when the next one begins.
+        if head.grasp_id > decided + 2:
+            return None
+        head.header.hand_id = int(params["hand_id"], 16)
+        place += 1
+        return {port: (head, items)}
+
+    def receive(port, head, _items):
+        nonlocal decided
+        assert port == "decision", port
+        decided = head.grasp_id
+
+    def restore(state):
+        nonlocal place, decided
+        place, decided = json.loads(state) if state else (0, -1)
+
+    state = lambda: json.dumps([place, decided]).encode()  # noqa: E731
+    limits = {"tactile": params["max_items"], "truth": 128}
+    identity = {"hand": params["hand_id"]}
+    return Source(next_sample, receive=receive, state=state, restore=restore, max_items=limits, identity=identity, pause_secs=0.001)
+
+
+def nag(_params):
+    seen, said = 0, 0
+
+    def answer(head, _items):
+        nonlocal seen
+        seen = head.header.stamp_nanos
+
+    def say(now_nanos=0):
+        nonlocal said
+        made = PredictionHead(grasp_id=1)
+        made.header.epoch, made.header.seq, made.header.stamp_nanos = 1, said, seen
+        made.header.origin_nanos = now_nanos
+        said += 1
+        return made
+
+    def restore(state):
+        nonlocal seen, said
+        seen, said = json.loads(state) if state else (1, 0)
+
+    deadline = lambda: time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 20_000_000  # noqa: E731
+    state = lambda: json.dumps([seen, said]).encode()  # noqa: E731
+    return Stage(answer, state=state, restore=restore, deadline=deadline, on_silence=say, on_end=say)
+
+
+if __name__ == "__main__":
+    roles = {"senses": (SENSES, senses), "watch": (WATCH, watch), "hand": (HAND, hand), "nag": (NAG, nag)}
+    run(*roles[sys.argv[1]])
