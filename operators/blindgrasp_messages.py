@@ -187,7 +187,6 @@ class Contact(ctypes.Structure):
 class TactileFrameHead(Lists, ctypes.Structure):
     """The items are the joints, the senses that `has_senses` names, and then the cells' forces."""
 
-    LISTS = ("joints", "gravity", "wrench", "torques")
     _fields_ = [
         ("header", Header),
         ("grasp_id", ctypes.c_uint64),

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use blindgrasp_messages::{ContactSet, Fault, Phase, Recorded, TactileFrame, TactileFrameHead};
+use blindgrasp_messages::{Contact, ContactSet, Fault, FrameParts, Phase, Recorded, TactileFrame, TactileFrameHead};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;

@@ -1,6 +1,5 @@
 //! The edges of a graph that cross to other machines.
 
-use blindgrasp_graph::operators::running_program;
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 

@@ -552,7 +552,8 @@ fn the_live_graph_that_comes_with_the_project_is_sound() {
     let output = run(&["run", "--check", "dataflow-live.yaml"], 0);
     assert!(text(&output.stdout).contains("source/tactile"), "{}", text(&output.stdout));
     // The same graph with a simulated hand, to which the decisions come back.
-    let simulated = blindgrasp().args(["run", "--check", "dataflow-live.yaml"]).env("SOURCE", "simulated_hand").output();
+    let simulated =
+        blindgrasp().args(["run", "--check", "dataflow-live.yaml"]).env("SOURCE", "simulated_hand").output();
     let shown = text(&simulated.expect("started").stdout);
     assert!(shown.contains("lift_arbiter/decision → source/decision"), "{shown}");
     // The paper's label says nothing of lifts.

@@ -163,21 +163,4 @@ impl TactileFrameHead {
     pub fn cells_mut<'a>(&self, items: &'a mut [f64]) -> Result<&'a mut [f64], MessageError> {
         Ok(self.split_mut(items)?.cells_newtons)
     }
-
-    /// The cells' forces among the frame's items.
-    ///
-    /// # Errors
-    /// As [`TactileFrameHead::split`].
-    pub fn cells<'a>(&self, items: &'a [f64]) -> Result<&'a [f64], MessageError> {
-        Ok(self.split(items)?.cells_newtons)
-    }
-
-    /// As [`TactileFrameHead::cells`], to change them.
-    ///
-    /// # Errors
-    /// As [`TactileFrameHead::split`].
-    pub fn cells_mut<'a>(&self, items: &'a mut [f64]) -> Result<&'a mut [f64], MessageError> {
-        let n_before = items.len() - self.cells(items)?.len();
-        Ok(&mut items[n_before..])
-    }
 }

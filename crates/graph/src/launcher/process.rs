@@ -16,8 +16,7 @@ use rustix::process::{
 };
 use rustix::thread::{CpuSet, sched_setaffinity, set_no_new_privs};
 
-use crate::dataflow::{Node, ProcessOptions, Scheduling, SchedulingPolicy};
-use crate::dataflow::Program;
+use crate::dataflow::{self, Node, ProcessOptions, Scheduling, SchedulingPolicy};
 use crate::launcher::Event;
 use crate::launcher::log_writer::Log;
 use crate::launcher::service;
@@ -140,7 +139,7 @@ impl Process {
     /// The system cannot start the program.
     pub(super) fn spawn(
         starts: Vec<Start<'_>>,
-        host: Option<&Program>,
+        host: Option<&dataflow::Program>,
         events: &SyncSender<Event>,
     ) -> std::io::Result<Vec<Process>> {
         let launcher_pid = rustix::process::getpid();
@@ -148,11 +147,11 @@ impl Process {
         let mut command = if node.description.hosted {
             let no_host = || std::io::Error::other("the program that runs the graph has no host for other languages");
             let host = host.ok_or_else(no_host)?;
-            let mut command = std::process::Command::new(&host.path);
+            let mut command = Program::new(&host.path);
             command.args(&host.args).arg(&node.program);
             command
         } else {
-            std::process::Command::new(&node.program)
+            Program::new(&node.program)
         };
         let wiring = match starts.as_slice() {
             [start] => {

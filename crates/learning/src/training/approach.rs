@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 
 use super::{Example, TrainingError, calibrate};
 use crate::evaluation::measures::{area_under_roc, curve};
-use blindgrasp_messages::Sense;
 use crate::learners::booster::train_boosted;
+use blindgrasp_messages::Sense;
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::classifier::boosting::BoostingParams;
 use blindgrasp_stages::hand::Hand;
