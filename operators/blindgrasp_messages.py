@@ -314,6 +314,7 @@ class LiftOutcomeHead(ctypes.Structure):
         ("n_thing_bytes", ctypes.c_uint32),
         ("probed", ctypes.c_uint32),
         ("disturbed", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
     ]
 
     @staticmethod

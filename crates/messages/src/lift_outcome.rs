@@ -48,7 +48,7 @@ message! {
     pub struct LiftOutcomeHead = "blindgrasp/LiftOutcomeHead/4" {
         grasp_id: u64, trial: u64, slip_m: f64, turn_rad: f64, epsilon: f64, volume: f64, mass_kg: f64, friction: f64,
         attempt: u32, lifted: u32, held: u32, has_quality: u32, n_thing_bytes: u32 => thing, probed: u32,
-        disturbed: u32,
+        disturbed: u32, reserved: u32 = 0,
     }
     items: u8 => group;
 }
