@@ -23,7 +23,7 @@ pub(super) struct Arguments {
 }
 
 /// The project's files: those that this repository's own default graph consists of.
-pub(super) const FILES: [(&str, &[u8]); 11] = [
+pub(super) const FILES: [(&str, &[u8]); 10] = [
     ("dataflow.yaml", include_bytes!("../../dataflow.yaml")),
     ("dataflow-live.yaml", include_bytes!("../../dataflow-live.yaml")),
     ("tactile_bridge.py", include_bytes!("../../examples/tactile_bridge.py")),
