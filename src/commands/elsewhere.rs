@@ -59,8 +59,8 @@ pub(super) struct MachineArgument {
 /// Another machine, and where ssh finds it.
 #[derive(Debug)]
 pub(super) struct Destination {
-    machine: String,
-    host: String,
+    pub(super) machine: String,
+    pub(super) host: String,
 }
 
 /// A command that runs on another machine.
@@ -171,14 +171,6 @@ impl Destination {
             }
             _ => bail!("ssh to machine '{machine}' has ended: {status}"),
         }
-    }
-
-    pub(super) fn machine(&self) -> &str {
-        &self.machine
-    }
-
-    pub(super) fn host(&self) -> &str {
-        &self.host
     }
 }
 

@@ -118,7 +118,7 @@ fn receive(arguments: &Arguments, destination: &Destination, stdout: ChildStdout
         Ok(Some(recorded))
     });
     received.with_context(|| {
-        let (machine, host) = (destination.machine(), destination.host());
+        let Destination { machine, host } = destination;
         format!("the recording stays on machine '{machine}': scp '{host}:{}/*' .", folder.display())
     })
 }
