@@ -6,14 +6,14 @@
 //!
 //! The operators that the file names by a word (`contacts`, `classifier`, …) are those of the program `blindgrasp`.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::AtomicUsize;
 
 use anyhow::Context;
-use blindgrasp_graph::dataflow::{self, Program, Scope};
-use blindgrasp_graph::describe::{SHIPPED, describe};
+use blindgrasp_graph::dataflow::{self, Scope};
+use blindgrasp_graph::describe::describe;
 use blindgrasp_graph::run::{Run, RunOptions, RunSink, SeenDecision};
+use blindgrasp_operators::operators_of;
 
 /// Prints what it hears of the graph.
 struct Print;
@@ -31,13 +31,10 @@ fn main() -> anyhow::Result<()> {
     let program = args.next().context("expected the program blindgrasp, then a dataflow file")?;
     let file = args.next().context("expected a dataflow file after the program")?;
 
-    let program = std::path::absolute(program)?;
-    let started = |name: &str| Program { path: program.clone(), args: vec!["operator".into(), name.into()] };
-    let operators: BTreeMap<String, Program> =
-        SHIPPED.into_iter().map(|name| (name.to_owned(), started(name))).collect();
+    let operators = operators_of(&std::path::absolute(program)?);
     let file = dataflow::load(Path::new(&file))?;
     let graph = dataflow::check(&file, &operators, &[], Scope::Everything, describe)?;
-    // Whoever wants to stop the graph counts up.
+    // A caller that wants to stop the graph counts up.
     let n_stops = AtomicUsize::new(0);
     let ended = Run::prepare(&graph, &graph.name, RunOptions::default())?.run(Print, &n_stops)?;
     ended.outcome?;

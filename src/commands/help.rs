@@ -228,7 +228,7 @@ mod tests {
                 }
             }
         }
-        assert!(mistakes.is_empty() && n > 120, "{n} commands\n{}", mistakes.join("\n"));
+        assert!(mistakes.is_empty() && n > 100, "{n} commands\n{}", mistakes.join("\n"));
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! A dataflow file is checked against the real operators, without starting the graph.
 
-use crate::common::{ON_TWO_MACHINES, dataflow, operator, project, run, text};
+use crate::common::{ON_TWO_MACHINES, dataflow, operator, project, run, text, unique_name};
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};
 use serde_json::{Value, json};
 
