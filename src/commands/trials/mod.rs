@@ -25,8 +25,8 @@ use blindgrasp_learning::trials::page::{Made, Strip, strip, telling_records, tri
 use blindgrasp_learning::trials::tables::{Table, TrialsReport, tables};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Clock;
-use blindgrasp_simulator::trial::{LiftTarget, TrialOptions};
 use blindgrasp_simulator::trial::targets::{check_approaches, targets_and_warnings};
+use blindgrasp_simulator::trial::{LiftTarget, TrialOptions};
 
 /// Counter of simulated_hand for trials that no approach led to.
 const LEFT_OUT: &str = "left_out";
