@@ -214,7 +214,6 @@ fn ids<'a>(nodes: impl IntoIterator<Item = &'a Node>) -> String {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
     use std::path::Path;
 
     use super::*;
