@@ -288,6 +288,7 @@ impl Plan {
             wait: node.process.wait,
             lock_memory: node.process.lock_memory,
             state_region: *self.state_regions.get(&node.id)?,
+            answers_each: self.relies_on_each_answer(&node.id),
             skip: Vec::new(),
             sandbox: node.sandbox,
             hosted: node.description.hosted.then(|| node.description.clone()),

@@ -309,9 +309,12 @@ impl Operator {
         self.0.cursors.state(self.0.wiring.state_region)
     }
 
-    /// Drops the node's saved state, because its active instance has none.
+    /// Drops the node's saved state, because its active instance has none: an instance with a state that comes later must not
+    /// go on with an old one. Where answers have numbers of their own, the state is kept with them.
     pub(crate) fn forget_state(&self) {
-        self.0.cursors.forget_state(self.0.wiring.state_region);
+        if self.0.wiring.answers_each {
+            self.0.cursors.forget_state(self.0.wiring.state_region);
+        }
     }
 
     /// Reports that its ports are open and that it could answer at once. Its neighbours, and an instance that takes its

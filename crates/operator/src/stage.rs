@@ -613,7 +613,6 @@ impl<S: Stage> Instance<S> {
         self.partners.take_over();
         let known = self.publisher.known(is_handed_over);
         if !self.has_state {
-            // Whoever has a state after this instance must not go on with an older one.
             self.operator.forget_state();
         }
         if let Some(snapshot) = self.restore()? {

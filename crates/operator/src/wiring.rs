@@ -53,6 +53,10 @@ pub struct Wiring {
     pub lock_memory: bool,
     /// The cursors' region for the node's state, for an operator that has one.
     pub state_region: usize,
+    /// The nodes before it rely on its answering each sample under the same number: whether it has a state may change with a
+    /// swap.
+    #[serde(default)]
+    pub answers_each: bool,
     /// Samples that have killed earlier instances again and again: they are not answered.
     #[serde(default)]
     pub skip: Vec<SampleId>,
