@@ -132,7 +132,7 @@ fn says(session: &Session, key: &str, payload: &str, heard: &Heard) {
 }
 
 /// A Zenoh session with a configuration of its own.
-fn stranger(endpoint: &str, tls: Value, max_links: u32) -> Session {
+fn stranger(endpoint: &str, tls: Value) -> Session {
     stranger_as(None, &Endpoints { connect: vec![endpoint.into()], ..Endpoints::default() }, tls, 1)
 }
 
