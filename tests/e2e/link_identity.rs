@@ -233,7 +233,7 @@ fn tcp() -> String {
 }
 
 fn stranger(id: Option<&Session>, endpoints: &Endpoints) -> Stranger {
-    Stranger::new(stranger_as(id.map(|session| session.zid().to_string()), endpoints, json!({})))
+    Stranger::new(stranger_as(id.map(|session| session.zid().to_string()), endpoints, json!({}), 2))
 }
 
 #[test]

@@ -133,11 +133,11 @@ fn says(session: &Session, key: &str, payload: &str, heard: &Heard) {
 
 /// A Zenoh session with a configuration of its own.
 fn stranger(endpoint: &str, tls: Value) -> Session {
-    stranger_as(None, &Endpoints { connect: vec![endpoint.into()], ..Endpoints::default() }, tls)
+    stranger_as(None, &Endpoints { connect: vec![endpoint.into()], ..Endpoints::default() }, tls, 1)
 }
 
 /// As [`stranger`], with the Zenoh id of another session.
-pub(crate) fn stranger_as(id: Option<String>, endpoints: &Endpoints, tls: Value) -> Session {
+pub(crate) fn stranger_as(id: Option<String>, endpoints: &Endpoints, tls: Value, max_links: u32) -> Session {
     let mut config = json!({
         "mode": "peer",
         "listen": {"endpoints": endpoints.listen},
@@ -146,6 +146,7 @@ pub(crate) fn stranger_as(id: Option<String>, endpoints: &Endpoints, tls: Value)
         "scouting": {"multicast": {"enabled": false}, "gossip": {"enabled": false}},
         "transport": {
             "link": {"tls": tls},
+            "unicast": {"max_links": max_links},
             "shared_memory": {"enabled": false},
         },
     });
@@ -305,6 +306,45 @@ fn no_machine_speaks_or_hears_in_another_ones_name() {
         // Its own words come back to it, without leaving it.
         keys.retain(|key| !not_its_own.contains(key) && !key.contains("/laptop/brain/"));
         assert!(!heard.has("for robot") && !heard.has("connected too"), "laptop heard {keys:?}");
+    }
+}
+
+/// A Zenoh id is no secret. A stranger with a right key of another machine takes that of brain: as a client of a machine that
+/// listens and dials, and as a server of a machine that dials two others.
+#[test]
+fn no_machine_joins_the_connection_of_another_one() {
+    let folder = keys(&["robot", "brain", "laptop"]);
+    for max_links in [1, 2] {
+        let [robot_endpoint, brain_endpoint, laptop_endpoint] = [(); 3].map(|()| free_endpoint("tls"));
+        let brain = open(&config("brain", listen(&brain_endpoint), Some(folder.path()))).expect("open");
+        let brain_heard = Heard::listen(&brain, &key("*", "brain"));
+        let id = brain.zid().to_string();
+        let endpoints = Endpoints {
+            listen: vec![robot_endpoint.clone()],
+            connect: vec![brain_endpoint, laptop_endpoint.clone()],
+            ..Endpoints::default()
+        };
+        let robot = open(&config("robot", endpoints, Some(folder.path()))).expect("open");
+        let robot_heard = Heard::listen(&robot, &key("*", "robot"));
+        // Whoever comes first with a Zenoh id keeps the other out: that is all that a stranger can do.
+        says(&brain, &key("brain", "robot"), "connected", &robot_heard);
+        let server = Endpoints { listen: vec![laptop_endpoint], ..Endpoints::default() };
+        let server = stranger_as(Some(id.clone()), &server, tls_of(folder.path(), "laptop"), max_links);
+        let client = stranger_as(Some(id), &connect(&robot_endpoint), tls_of(folder.path(), "laptop"), max_links);
+        let strangers_heard = [Heard::listen(&client, "**"), Heard::listen(&server, "**")];
+        for round in 0..50 {
+            put(&client, &key("brain", "robot"), "forged by a client");
+            put(&server, &key("brain", "robot"), "forged by a server");
+            says(&brain, &key("brain", "robot"), &format!("right {round}"), &robot_heard);
+            says(&robot, &key("robot", "brain"), &format!("secret {round}"), &brain_heard);
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        for who in ["client", "server"] {
+            assert!(!robot_heard.has(&format!("forged by a {who}")), "max_links {max_links}: the {who} was heard");
+        }
+        for heard in &strangers_heard {
+            assert!((0..50).all(|round| !heard.has(&format!("secret {round}"))), "max_links {max_links}: it has heard");
+        }
     }
 }
 

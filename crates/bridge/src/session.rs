@@ -28,6 +28,8 @@ const ROUTER_MILLIS: u64 = 2000;
 /// Zenoh drops longer messages. This is more than the maximum size of a frame, so that the link itself can count frames
 /// that are too long.
 const MAX_MESSAGE_BYTES: usize = 2 * MAX_FRAME_BYTES;
+/// Two machines that both listen and dial may have two links.
+const MAX_LINKS: usize = 2;
 /// Maximum number of connections beyond one for each other machine of the file: a restarted machine comes back before
 /// Zenoh has noticed the end of its old connection, and one certificate must not take all places.
 const MORE_SESSIONS: usize = 8;
@@ -190,6 +192,10 @@ fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> std::io::Result
                 "open_timeout": ATTEMPT_MILLIS,
                 "accept_timeout": ATTEMPT_MILLIS,
                 "max_sessions": config.peers.len() + MORE_SESSIONS,
+                // Zenoh looks at a certificate once per connection, and a connection is known by a number that is no secret:
+                // without this, a link of a stranger with that number joins it unseen. With it, all links of a connection
+                // must show one key, which the stranger has not.
+                "max_links": MAX_LINKS,
             },
             "link": {
                 "protocols": if keys.is_some() { vec!["tls"] } else { vec!["tcp", "unixsock-stream"] },
