@@ -3,7 +3,7 @@
 
 senses: gives frames the senses of a partner input. watch: has no output, an optional input, and a state; it fails if a sample
 is not there once and in order. hand: a source with a feedback input that sends the frames of a grasp when the grasp before is
-decided. nag: answers silence and the end of the stream.
+decided. nag: answers silence and the end of the stream. fragile: fails on one sample, of several that it gets at once.
 """
 
 import json
@@ -39,6 +39,9 @@ HAND = Description(
     params=python_source.DESCRIPTION.params,
 )
 NAG = Description("nag", "Answers silence", ("tactile", TactileFrame), ("prediction", Prediction), answers_each=False)
+FRAGILE = Description("fragile", "Fails on a sample", ("feature", GraspFeature), ("prediction", Prediction))
+# The grasp to which the answers of nag belong.
+NAGS = 1_000_000
 
 
 def senses(_params):
@@ -55,6 +58,8 @@ def watch(params):
 
     def answer(port, head, _items):
         numbers.check(port, head.header.seq)
+        if port == "prediction" and head.grasp_id == NAGS and head.decision_value == 0:
+            raise RuntimeError("it was not looked at before it was sent")
         counted(**{f"n_{port}": numbers.next[port], "is_told": params["told"] == "yes"})
 
     return Stage(answer, state=numbers.state, restore=numbers.restore)
@@ -102,7 +107,7 @@ def nag(_params):
 
     def say(now_nanos=0):
         nonlocal said
-        made = PredictionHead(grasp_id=1)
+        made = PredictionHead(grasp_id=NAGS)
         made.header.epoch, made.header.seq, made.header.stamp_nanos = 1, said, seen
         made.header.origin_nanos = now_nanos
         said += 1
@@ -114,9 +119,21 @@ def nag(_params):
 
     deadline = lambda: time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 20_000_000  # noqa: E731
     state = lambda: json.dumps([seen, said]).encode()  # noqa: E731
-    return Stage(answer, state=state, restore=restore, deadline=deadline, on_silence=say, on_end=say)
+    look = lambda head, now_nanos: setattr(head, "decision_value", now_nanos)  # noqa: E731
+    return Stage(
+        answer, state=state, restore=restore, deadline=deadline, on_silence=say, on_end=say, before_sending=look
+    )
+
+
+def fragile(_params):
+    def answer_many(heads, _items):
+        if any(head.header.seq == 100 for head in heads):
+            raise ValueError("a sample too far")
+        return [PredictionHead(grasp_id=head.grasp_id, phase=head.phase, fault=head.fault) for head in heads]
+
+    return Stage(answer_many=answer_many)
 
 
 if __name__ == "__main__":
-    roles = {"senses": (SENSES, senses), "watch": (WATCH, watch), "hand": (HAND, hand), "nag": (NAG, nag)}
+    roles = {"senses": (SENSES, senses), "watch": (WATCH, watch), "hand": (HAND, hand), "nag": (NAG, nag), "fragile": (FRAGILE, fragile)}
     run(*roles[sys.argv[1]])

@@ -1,6 +1,6 @@
 //! The program of a host: its process and the two pipes to it.
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::io::{PipeReader, PipeWriter, Read, Write};
 use std::os::fd::{AsFd, AsRawFd, OwnedFd};
 use std::os::unix::process::CommandExt;
@@ -68,7 +68,7 @@ pub(super) enum ProgramError {
 impl Program {
     /// Starts a program before this process has a second thread. `restrict` is called in the new process, before it begins.
     pub(super) fn spawn(
-        program: &OsString,
+        program: &OsStr,
         arguments: &[OsString],
         restrict: impl Fn() -> std::io::Result<()> + Send + Sync + 'static,
     ) -> anyhow::Result<Program> {

@@ -12,7 +12,7 @@ mod source;
 mod stage;
 mod store;
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::OnceLock;
@@ -37,7 +37,7 @@ pub(crate) fn program() -> Option<PathBuf> {
 }
 
 /// The `main` of a host: starts the program with its arguments, and works for it until the launcher asks for the end.
-pub fn run(program: &OsString, arguments: &[OsString]) -> ExitCode {
+pub fn run(program: &OsStr, arguments: &[OsString]) -> ExitCode {
     if std::env::var_os(WIRING_VARIABLE).is_none() {
         crate::diagnostics::print_diagnostic(
             "this is the host of an operator: blindgrasp starts it as part of a graph (blindgrasp run dataflow.yaml)",
@@ -59,7 +59,7 @@ pub(crate) fn enforcement() -> Enforcement {
 }
 
 /// The program and what it says of itself. The process has no second thread yet.
-fn started(program: &OsString, arguments: &[OsString]) -> anyhow::Result<(OperatorDescription, Program)> {
+fn started(program: &OsStr, arguments: &[OsString]) -> anyhow::Result<(OperatorDescription, Program)> {
     let wiring = std::env::var(WIRING_VARIABLE).with_context(|| format!("{WIRING_VARIABLE} is not UTF-8"))?;
     let wiring: Wiring =
         serde_json::from_str(&wiring).with_context(|| format!("{WIRING_VARIABLE} is not a wiring of this version"))?;

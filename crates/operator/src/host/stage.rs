@@ -25,6 +25,9 @@ use crate::wiring::{Clock, Command, InputCounts, OnLate};
 /// The most samples that a program gets at once.
 const MAX_BATCH: usize = 256;
 
+/// A partner input, and its number in the description.
+type NumberedPartner = (usize, Box<dyn PartnerPort>);
+
 struct HostedStage {
     operator: Operator,
     child: Program,
@@ -32,8 +35,7 @@ struct HostedStage {
     inputs: Vec<Input>,
     outputs: Vec<Output>,
     partners: Partners,
-    /// By their numbers in the description.
-    partner_ports: Vec<(usize, Box<dyn PartnerPort>)>,
+    partner_ports: Vec<NumberedPartner>,
     /// Of a stage whose answers are saved.
     store: Option<Store>,
     /// The program numbers its answers: it has a state, one input and one output.
@@ -107,11 +109,10 @@ pub(super) fn run(
 ///
 /// # Errors
 /// The reason of a port.
-#[allow(clippy::type_complexity)]
 pub(super) fn open_inputs(
     operator: &Operator,
     description: &OperatorDescription,
-) -> anyhow::Result<(Vec<Input>, Vec<(usize, Box<dyn PartnerPort>)>)> {
+) -> anyhow::Result<(Vec<Input>, Vec<NumberedPartner>)> {
     let (mut inputs, mut partners) = (Vec::new(), Vec::new());
     for (idx, port) in description.inputs.iter().enumerate() {
         if !operator.has_input(&port.name) {
