@@ -25,7 +25,7 @@ const MAX_UNREAD_LINES: usize = 1 << 14;
 #[command(after_help = "Examples: blindgrasp echo lift_arbiter/decision\n          \
                         blindgrasp echo -n 1 classifier/prediction contacts/contacts\n\n\
                         The lines are those of blindgrasp export. The graph does not wait for a reader of stdout that is too slow:\n\
-                        lines that are left out for that reason are counted. blindgrasp hz measures rates.\n\
+                        lines that are left out for that reason are counted. blindgrasp top shows rates.\n\
                         Two commands can read a graph at once: echo, record and view --foxglove.")]
 pub(super) struct Arguments {
     /// Outputs to read [default: all]

@@ -78,6 +78,16 @@ fn a_group_is_swapped_together_and_takes_parameters_of_each_node() {
     // Together with the source, and a replacement beside a killed group.
     swap(&graph, &["recorded_source", "encoder", "--probation", "0.1"], 0);
     graph.wait_for_decisions(A_FEW_GRASPS);
+    run(&["set", "lift_arbiter.votes=4", "--graph", &graph.name], 0);
+    let shown = |what: &[&str]| text(&run(&[&["set", "--graph", &graph.name], what].concat(), 0).stdout);
+    assert_eq!(shown(&["lift_arbiter.votes"]), "4\n");
+    let of_node = shown(&["lift_arbiter"]);
+    let votes = of_node.lines().find(|line| line.starts_with("lift_arbiter.votes ")).expect("listed");
+    assert_eq!(votes.split_whitespace().collect::<Vec<_>>(), ["lift_arbiter.votes", "4", "live"]);
+    assert!(shown(&[]).contains("encoder.model") && !of_node.contains("encoder.model"), "{of_node}");
+    assert!(shown(&["--json"]).contains(r#"{"live":true,"node":"lift_arbiter","param":"votes","value":4}"#));
+    let unknown = text(&run(&["set", "--graph", &graph.name, "lift_arbiter.vote"], 1).stderr);
+    assert!(unknown.contains("no parameter 'vote'") && unknown.contains("votes"), "{unknown}");
     run(&["set", "lift_arbiter.votes=3", "--graph", &graph.name], 0);
     // One program cannot stand for all.
     let (_, said) = swap(&graph, &["classifier", "--run", "classifier"], 1);
