@@ -131,7 +131,7 @@ impl Stage for Arbiter {
             Ok(prediction) => {
                 // The clock of a frame from the future cannot be trusted: the frame counts as infinitely old.
                 let has_expired = head.header.valid_until_nanos().is_some_and(|until_nanos| now_nanos > until_nanos);
-                let age_nanos = now_nanos.checked_sub(head.header.origin_nanos).filter(|_| !has_expired);
+                let age_nanos = if has_expired { None } else { now_nanos.checked_sub(head.header.origin_nanos) };
                 let age_nanos = age_nanos.unwrap_or(u64::MAX);
                 self.arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut self.decided);
             }

@@ -86,7 +86,10 @@ impl LastDecision {
         let decision = self.decision.lock().unwrap_or_else(PoisonError::into_inner);
         let waited = self.comes.wait_timeout_while(decision, longest, is_too_old);
         let (decision, timeout) = waited.unwrap_or_else(PoisonError::into_inner);
-        let (decision, until_nanos) = decision.as_ref().filter(|_| !timeout.timed_out())?;
+        if timeout.timed_out() {
+            return None;
+        }
+        let (decision, until_nanos) = decision.as_ref()?;
         Some(Decision::new(decision, *until_nanos))
     }
 

@@ -72,9 +72,10 @@ fn send(config: &str, n: usize, rate_hz: f64, n_bytes: usize) -> anyhow::Result<
     for idx in 0..n {
         let due = start + Duration::from_secs_f64(idx as f64 / rate_hz);
         while let Some(left) = due.checked_duration_since(Instant::now()).filter(|left| !left.is_zero()) {
-            match left > Duration::from_micros(200) {
-                true => std::thread::sleep(left - Duration::from_micros(100)),
-                false => std::thread::yield_now(),
+            if left > Duration::from_micros(200) {
+                std::thread::sleep(left - Duration::from_micros(100))
+            } else {
+                std::thread::yield_now()
             }
         }
         payload[..8].copy_from_slice(&monotonic_nanos().to_le_bytes());

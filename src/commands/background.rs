@@ -53,12 +53,13 @@ pub(super) fn detach(name: &str, json: bool) -> anyhow::Result<Outcome> {
         std::thread::sleep(POLL);
     }
     let (pid, logs) = (child.id(), folder.path().display());
-    print_line(&match json {
-        true => json!({ "graph": name, "pid": pid, "log_folder": folder.path() }).to_string(),
-        false => format!(
+    print_line(&if json {
+        json!({ "graph": name, "pid": pid, "log_folder": folder.path() }).to_string()
+    } else {
+        format!(
             "graph '{name}' runs in the background (process {pid}); its logs are in {logs}\n\
              blindgrasp ps {name}    blindgrasp logs -f --graph {name}    blindgrasp stop {name}"
-        ),
+        )
     })?;
     Ok(Outcome::Done)
 }

@@ -77,7 +77,10 @@ impl MachineArgument {
     /// # Errors
     /// ssh would not take the destination, or it is not known which one is meant.
     pub(super) fn destination(&self) -> anyhow::Result<Option<Destination>> {
-        let Some(machine) = self.machine.clone().filter(|_| !is_over_ssh()) else { return Ok(None) };
+        if is_over_ssh() {
+            return Ok(None);
+        }
+        let Some(machine) = self.machine.clone() else { return Ok(None) };
         let host = match &self.ssh {
             Some(host) => host.clone(),
             None => host_of(&machine)?,

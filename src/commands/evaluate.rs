@@ -216,10 +216,8 @@ fn progress_bar() -> ProgressBar {
 /// The command as it could be given again.
 pub(super) fn command_line() -> String {
     let plain = |text: &str| !text.is_empty() && text.chars().all(|c| c.is_alphanumeric() || "-_=./,:+@%".contains(c));
-    let quoted = |argument: String| match plain(&argument) {
-        true => argument,
-        false => format!("'{}'", argument.replace('\'', r"'\''")),
-    };
+    let quoted =
+        |argument: String| if plain(&argument) { argument } else { format!("'{}'", argument.replace('\'', r"'\''")) };
     let arguments = std::env::args_os().skip(1).map(|argument| quoted(argument.to_string_lossy().into_owned()));
     std::iter::once("blindgrasp".to_string()).chain(arguments).collect::<Vec<_>>().join(" ")
 }

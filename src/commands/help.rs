@@ -208,7 +208,10 @@ mod tests {
                     is_shell = line == "```sh";
                     continue;
                 }
-                for (at, name) in line.match_indices("blindgrasp ").filter(|_| is_shell) {
+                if !is_shell {
+                    continue;
+                }
+                for (at, name) in line.match_indices("blindgrasp ") {
                     let before = &line[..at];
                     let words = words(&line[at + name.len()..]);
                     // Behind an option it is a name, as in `sudo -u blindgrasp`.

@@ -76,14 +76,15 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     // The dataflow files name it, for editors.
     write_new(&folder.join(SCHEMA), schema().as_bytes())?;
     let names: Vec<&str> = FILES.iter().map(|(name, _)| *name).chain([SCHEMA]).collect();
-    print_line(&match arguments.json {
-        true => json!({ "folder": folder, "files": names }).to_string(),
-        false => format!(
+    print_line(&if arguments.json {
+        json!({ "folder": folder, "files": names }).to_string()
+    } else {
+        format!(
             "{}: {}\n\nblindgrasp run {}",
             folder.display(),
             names.join(", "),
             folder.join("dataflow.yaml").display()
-        ),
+        )
     })?;
     Ok(Outcome::Done)
 }

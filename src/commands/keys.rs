@@ -90,9 +90,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             let dropped = drop_old_authorities(folder)?;
             let mut lines: Vec<String> =
                 dropped.iter().map(|old| format!("'{}' is no longer trusted", old.common_name)).collect();
-            lines.push(match dropped.is_empty() {
-                true => "there is only one authority".into(),
-                false => format!("copy {} to all machines", folder.join(AUTHORITY_FILE).display()),
+            lines.push(if dropped.is_empty() {
+                "there is only one authority".into()
+            } else {
+                format!("copy {} to all machines", folder.join(AUTHORITY_FILE).display())
             });
             say(arguments, &json!({ "dropped": dropped }), &lines)
         }
@@ -139,7 +140,9 @@ fn make(arguments: &Arguments, now: OffsetDateTime) -> anyhow::Result<Outcome> {
         let revoked = files.revoked();
         let mut copied = vec![authority, certificate, private_key];
         copied.extend(Some(&revoked).filter(|file| file.exists()));
-        copied.extend(router_config.as_ref().filter(|_| made.common_name == ROUTER_COMMON_NAME));
+        if made.common_name == ROUTER_COMMON_NAME {
+            copied.extend(router_config.as_ref());
+        }
         let copied: Vec<String> = copied.into_iter().map(|file| file.display().to_string()).collect();
         lines.push(format!("  copy to that machine's folder of keys: {}", copied.join(" ")));
     }
@@ -186,10 +189,7 @@ fn write_router_config(folder: &Path) -> anyhow::Result<PathBuf> {
 fn show(arguments: &Arguments, now: OffsetDateTime) -> anyhow::Result<Outcome> {
     let found = list(&arguments.folder)?;
     let line = |found: &CertificateSummary| {
-        let ends = match found.until_unix_secs < now.unix_timestamp() {
-            true => "ended",
-            false => "until",
-        };
+        let ends = if found.until_unix_secs < now.unix_timestamp() { "ended" } else { "until" };
         let kind = if found.is_authority { "authority" } else { "machine" };
         format!(
             "{:<28} {kind:<9} {:<28} {ends} {} by {}",
@@ -203,9 +203,10 @@ fn show(arguments: &Arguments, now: OffsetDateTime) -> anyhow::Result<Outcome> {
 }
 
 fn say(arguments: &Arguments, report: &Value, lines: &[String]) -> anyhow::Result<Outcome> {
-    match arguments.json {
-        true => print_line(&report.to_string())?,
-        false => lines.iter().try_for_each(|line| print_line(line))?,
+    if arguments.json {
+        print_line(&report.to_string())?
+    } else {
+        lines.iter().try_for_each(|line| print_line(line))?
     }
     Ok(Outcome::Done)
 }

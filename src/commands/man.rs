@@ -80,7 +80,7 @@ mod tests {
             assert!(reference.lines().any(|line| line == heading), "no '{heading}'");
         }
         for option in Cli::command().find_subcommand("run").expect("a command").get_opts() {
-            let name = option.get_long().filter(|_| !option.is_hide_set());
+            let name = if option.is_hide_set() { None } else { option.get_long() };
             assert!(name.is_none_or(|name| reference.contains(&format!("--{name}"))), "no '{option}'");
         }
         assert!(!reference.contains("## man"), "a hidden command");

@@ -142,9 +142,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
     let inputs = std::slice::from_ref(&arguments.model);
     // A pipe or a device is written to.
-    match arguments.out.is_file() {
-        true => check_new(&arguments.out, inputs, arguments.overwrite)?,
-        false => check_output(&arguments.out, inputs)?,
+    if arguments.out.is_file() {
+        check_new(&arguments.out, inputs, arguments.overwrite)?
+    } else {
+        check_output(&arguments.out, inputs)?
     }
     let Model { classifier, training, .. } = Model::load(&arguments.model)?;
     let Format::Libsvm = arguments.format;

@@ -47,10 +47,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let model = Model::load(&arguments.model)?;
     let mut files = Vec::new();
     for file in &arguments.files {
-        match file.is_dir() {
-            true => files.extend(recordings_in(std::slice::from_ref(file))?),
-            false => files.push(file.clone()),
-        }
+        if file.is_dir() { files.extend(recordings_in(std::slice::from_ref(file))?) } else { files.push(file.clone()) }
     }
     for file in &files {
         let is_recording = file.extension().is_some_and(|extension| extension == "mcap");

@@ -590,8 +590,8 @@ mod tests {
             capacity: 4,
             deadline_nanos: None,
             on_late: OnLate::Count,
-            cell: None,
-            writer_cell: 0,
+            slot: None,
+            writer_slot: 0,
         };
         let output = |port: &str| ShadowOutput {
             node: "n".into(),

@@ -133,9 +133,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         training.recipe.name,
         model.classifier.predictor.summary(),
     ))?;
-    match options.by_wrench_space {
-        true => print_line("stable: epsilon > 0.07 and volume > 0.1, whatever the recordings say")?,
-        false => print_label(&recordings)?,
+    if options.by_wrench_space {
+        print_line("stable: epsilon > 0.07 and volume > 0.1, whatever the recordings say")?
+    } else {
+        print_label(&recordings)?
     }
     for (reason, n) in &training.n_excluded {
         print_line(&format!("left out: {n} with {reason}"))?;

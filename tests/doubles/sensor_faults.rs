@@ -85,7 +85,9 @@ fn main() -> anyhow::Result<()> {
         let n_held = reported.iter().flatten().count();
         println!("{name}: {n_alarms} false alarms in {} healthy grasps, {n_held} grasps held", order.len());
         for (at, alarm) in reported.iter().enumerate() {
-            if let Some(fault) = alarm.filter(|_| at == 0 || reported[at - 1].is_none()) {
+            if let Some(fault) = alarm
+                && (at == 0 || reported[at - 1].is_none())
+            {
                 println!("  {fault:?} at grasp {at}, {}", order[at].object);
             }
         }

@@ -122,7 +122,10 @@ fn anchors(text: &str) -> BTreeSet<String> {
     let mut anchors = BTreeSet::new();
     for line in prose(text) {
         let level = line.chars().take_while(|&letter| letter == '#').count();
-        let Some(heading) = line[level..].strip_prefix(' ').filter(|_| (1..=6).contains(&level)) else { continue };
+        if !(1..=6).contains(&level) {
+            continue;
+        }
+        let Some(heading) = line[level..].strip_prefix(' ') else { continue };
         let name: String = without_targets(heading)
             .trim()
             .to_lowercase()

@@ -79,9 +79,10 @@ impl Link {
         let (is_hello, counter) = (matches!(body, Body::Hello(_)), self.peer.next_counter(KeyKind::Link));
         let mut bytes = Vec::new();
         Frame { instance: self.own.instance, counter, body }.encode_into(&mut bytes).expect("encoded");
-        let is_protected = match is_hello {
-            true => self.protection.sign(&mut bytes).is_ok(),
-            false => self.protection.encrypt(KeyKind::Link, &mut bytes),
+        let is_protected = if is_hello {
+            self.protection.sign(&mut bytes).is_ok()
+        } else {
+            self.protection.encrypt(KeyKind::Link, &mut bytes)
         };
         if is_protected {
             self.session.put(self.key(), bytes).wait().expect("put");

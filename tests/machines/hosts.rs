@@ -89,9 +89,10 @@ impl Host {
 
     fn ip(&self, arguments: &str) -> Result<(), String> {
         let output = self.enter("ip").args(arguments.split(' ')).output().map_err(|error| error.to_string())?;
-        match output.status.success() {
-            true => Ok(()),
-            false => Err(format!("ip {arguments}: {}", String::from_utf8_lossy(&output.stderr).trim())),
+        if output.status.success() {
+            Ok(())
+        } else {
+            Err(format!("ip {arguments}: {}", String::from_utf8_lossy(&output.stderr).trim()))
         }
     }
 

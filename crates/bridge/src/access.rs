@@ -16,9 +16,10 @@ pub(super) fn for_machine(config: &LinkConfig) -> Value {
     let mut acl = AccessControl::default();
     for peer in &config.peers {
         // A router passes the machines' messages on, and checks their names.
-        let names = match config.endpoints.router.is_empty() {
-            true => accepted_names(peer, config.namespace.as_deref()),
-            false => vec![ROUTER_COMMON_NAME.to_string()],
+        let names = if config.endpoints.router.is_empty() {
+            accepted_names(peer, config.namespace.as_deref())
+        } else {
+            vec![ROUTER_COMMON_NAME.to_string()]
         };
         acl.allow(peer, &names, Flow::Ingress, &DATA, &format!("{prefix}/{peer}/{me}/*"));
         acl.allow(peer, &names, Flow::Ingress, &SUBSCRIPTIONS, &format!("{prefix}/*/{peer}/*"));

@@ -104,9 +104,10 @@ impl Agreement {
     /// Whether a hello to this process answers it: the process in use with the keys in use, or another process with the
     /// keys for the next one.
     pub fn is_answered(&self, hello: &Hello, is_in_use: bool) -> bool {
-        match is_in_use {
-            true => self.settled.is_some_and(|(own, peers)| hello.key == Some(peers) && hello.heard_key == Some(own)),
-            false => hello.key.is_some() && hello.heard_key == Some(self.next.1),
+        if is_in_use {
+            self.settled.is_some_and(|(own, peers)| hello.key == Some(peers) && hello.heard_key == Some(own))
+        } else {
+            hello.key.is_some() && hello.heard_key == Some(self.next.1)
         }
     }
 
@@ -154,7 +155,7 @@ impl Agreement {
     /// Says whether the keys that were agreed on count.
     pub fn set_valid(&mut self, is_valid: bool) {
         self.is_valid = is_valid;
-        let keys = self.agreed.clone().filter(|_| is_valid);
+        let keys = if is_valid { self.agreed.clone() } else { None };
         *self.keys.write().unwrap_or_else(PoisonError::into_inner) = keys;
     }
 }

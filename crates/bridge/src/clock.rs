@@ -106,8 +106,8 @@ pub fn origin_on_arrival(passage: &Passage, estimate: Option<Estimate>, deadline
     let Passage { arrival_nanos, echo_nanos, sent_nanos, age_nanos } = *passage;
     // This machine has never sent a time in the future.
     let earliest_nanos = if echo_nanos <= arrival_nanos { echo_nanos } else { 0 };
-    let estimated_nanos = estimate
-        .filter(|_| arrival_nanos - earliest_nanos <= deadline_nanos)
+    let is_in_time = arrival_nanos - earliest_nanos <= deadline_nanos;
+    let estimated_nanos = if is_in_time { estimate } else { None }
         .and_then(|estimate| sent_nanos.checked_add_signed(estimate.offset_nanos.checked_neg()?))
         .map_or(earliest_nanos, |nanos| nanos.clamp(earliest_nanos, arrival_nanos));
     age_nanos.map_or(0, |age_nanos| estimated_nanos.saturating_sub(age_nanos))

@@ -109,7 +109,7 @@ impl Downlink {
             return Ok(Accepted::TooMany);
         }
         let decoded = self.writer.decode(frame.message);
-        let unreadable = sample::decode_unreadable(frame.message).filter(|_| decoded.is_none());
+        let unreadable = if decoded.is_none() { sample::decode_unreadable(frame.message) } else { None };
         // Bytes that are neither a message nor the place of one leave the place as it is.
         let key = decoded.or(unreadable).or(self.incoming.last()).unwrap_or(SampleId { epoch: 0, seq: 0 });
         match self.incoming.on_sample(frame.run, frame.index, key) {
@@ -152,7 +152,7 @@ impl Downlink {
         let answered = self.writer.answered();
         // No reader will answer a sample that cannot be decoded.
         let is_at_rest = self.writer.n_waiting() == 0 && answered == published;
-        self.unreadable.filter(|_| is_at_rest).or(answered)
+        if is_at_rest && self.unreadable.is_some() { self.unreadable } else { answered }
     }
 }
 
@@ -199,10 +199,7 @@ impl<M: Message> Writer for Queue<M> {
     }
 
     fn answered(&self) -> Option<SampleId> {
-        match self.publisher.has_readers() {
-            true => self.publisher.answered_by_readers(),
-            false => self.publisher.last(),
-        }
+        if self.publisher.has_readers() { self.publisher.answered_by_readers() } else { self.publisher.last() }
     }
 
     fn published(&self) -> Option<SampleId> {

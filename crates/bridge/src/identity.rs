@@ -231,11 +231,12 @@ fn load(
         return Err(malformed(&files.certificate, message));
     }
     let file = files.revoked();
-    let revoked = match file.exists() {
-        true => CertificateRevocationListDer::pem_file_iter(&file)
+    let revoked = if file.exists() {
+        CertificateRevocationListDer::pem_file_iter(&file)
             .and_then(Iterator::collect::<Result<Vec<_>, _>>)
-            .map_err(|error| malformed(&file, error.to_string()))?,
-        false => Vec::new(),
+            .map_err(|error| malformed(&file, error.to_string()))?
+    } else {
+        Vec::new()
     };
     let parse = |der: &CertificateRevocationListDer<'_>| OwnedCertRevocationList::from_der(der).map(Into::into);
     let revoked: Result<Vec<_>, _> = revoked.iter().map(parse).collect();

@@ -113,9 +113,12 @@ impl Incoming {
     }
 
     pub fn on_sample(&mut self, run: u32, index: u64, key: SampleId) -> Verdict {
-        let Some(asking) = self.asking.as_mut().filter(|_| run == self.run) else {
-            self.n_stale += 1;
-            return Verdict::Stale;
+        let asking = match &mut self.asking {
+            Some(asking) if run == self.run => asking,
+            _ => {
+                self.n_stale += 1;
+                return Verdict::Stale;
+            }
         };
         asking.is_heard = true;
         if index < self.expected {
@@ -138,7 +141,10 @@ impl Incoming {
     /// The writer has ended, and the readers here have answered all its samples. Returns whether the sender must be
     /// told that this is known; an answer to an earlier request is ignored.
     pub fn on_end(&mut self, run: u32) -> bool {
-        let Some(asking) = self.asking.as_mut().filter(|_| run == self.run) else { return false };
+        let asking = match &mut self.asking {
+            Some(asking) if run == self.run => asking,
+            _ => return false,
+        };
         asking.is_heard = true;
         self.has_ended = true;
         true

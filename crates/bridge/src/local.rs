@@ -156,9 +156,10 @@ fn endpoints(machines: &Machines, this: &Machine, placement: &Placement) -> Resu
     }
     let listen = given(&placement.listen, this.listen.clone());
     let others = machines.machines.iter();
-    let to_connect = match this.listen.is_empty() && placement.listen.is_empty() {
-        true => others.filter(|machine| machine.name != this.name).collect::<Vec<_>>(),
-        false => others.take_while(|machine| machine.name != this.name).collect(),
+    let to_connect = if this.listen.is_empty() && placement.listen.is_empty() {
+        others.filter(|machine| machine.name != this.name).collect::<Vec<_>>()
+    } else {
+        others.take_while(|machine| machine.name != this.name).collect()
     };
     let connect =
         given(&placement.connect, to_connect.into_iter().flat_map(|machine| machine.listen.iter().cloned()).collect());
@@ -184,7 +185,10 @@ fn depends_on_source(graph: &Graph, node: &str, is_such: impl Fn(Option<&String>
     let mut seen = BTreeSet::new();
     let mut open = vec![node];
     while let Some(id) = open.pop() {
-        let Some(node) = graph.node(id).filter(|_| seen.insert(id)) else {
+        if !seen.insert(id) {
+            continue;
+        }
+        let Some(node) = graph.node(id) else {
             continue;
         };
         if node.is_source() && is_such(node.machine.as_ref()) {

@@ -432,10 +432,8 @@ impl<'a> Link<'a> {
             age_nanos: frame.age_nanos,
         };
         let on_arrival = || origin_on_arrival(&passage, estimate, deadline_nanos);
-        let mut origin_of = |key: SampleId| match is_answer {
-            true => origin_of_answer(&key, &self.origins, on_arrival),
-            false => on_arrival(),
-        };
+        let mut origin_of =
+            |key: SampleId| if is_answer { origin_of_answer(&key, &self.origins, on_arrival) } else { on_arrival() };
         match downlink.accept(frame, &mut origin_of)? {
             Accepted::Yes | Accepted::Repeated | Accepted::Gap => {}
             // A repetition would be the same bytes. The readers see the gap.

@@ -258,10 +258,11 @@ impl Outgoing {
         let is_latest = self.options.policy == EdgePolicy::Latest;
         let n_on_their_way = if is_latest { run.n_sent - run.n_received } else { self.cursor - self.first };
         let is_probe_due = run.n_sent > run.n_received && now_nanos >= run.probe_due_nanos;
-        let has_room = match self.is_stalled {
+        let has_room = if self.is_stalled {
             // One sample, and later another one if that was given up. An answer ends the stall.
-            true => run.n_sent == 0 || (self.cursor == self.first && now_nanos >= run.probe_due_nanos),
-            false => n_on_their_way < self.options.window as u64,
+            run.n_sent == 0 || (self.cursor == self.first && now_nanos >= run.probe_due_nanos)
+        } else {
+            n_on_their_way < self.options.window as u64
         };
         let (position, index) = if self.cursor < end_position && (has_room || (is_latest && is_probe_due)) {
             self.cursor += 1;

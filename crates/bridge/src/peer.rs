@@ -233,10 +233,7 @@ impl Peer {
         now_nanos: u64,
     ) -> Result<Option<Change>, Rejection> {
         if self.instance != Some(instance) || matches!(self.state, PeerState::Waiting | PeerState::Refused) {
-            return Err(match self.past.contains(&instance) {
-                true => Rejection::Replayed,
-                false => Rejection::Stranger,
-            });
+            return Err(if self.past.contains(&instance) { Rejection::Replayed } else { Rejection::Stranger });
         }
         self.count(kind, counter)?;
         self.last_heard_nanos = Some(now_nanos);
@@ -281,23 +278,20 @@ impl Peer {
         let is_key_answered = self.agreement.as_ref().is_none_or(|agreement| agreement.is_answered(hello, is_in_use));
         if hello.heard != Some(own.instance) || !is_key_answered {
             // While the peer is up, a different hello changes nothing, because anyone could have sent it.
-            return match self.difference(own, hello).filter(|_| self.state != PeerState::Up) {
-                Some(reason) => Err(Rejection::Refused(reason)),
-                None => {
-                    self.candidate = Some(instance).filter(|_| !is_in_use);
-                    self.candidate_key = hello.key.filter(|_| !is_in_use);
-                    Ok((None, true))
-                }
-            };
+            if self.state != PeerState::Up
+                && let Some(reason) = self.difference(own, hello)
+            {
+                return Err(Rejection::Refused(reason));
+            }
+            self.candidate = if is_in_use { None } else { Some(instance) };
+            self.candidate_key = if is_in_use { None } else { hello.key };
+            return Ok((None, true));
         }
         if let Some(reason) = self.difference(own, hello) {
             let was_up = self.state == PeerState::Up;
             (self.state, self.reason) = (PeerState::Refused, Some(reason.clone()));
             self.version = Some(hello.version.clone());
-            return match was_up {
-                true => Ok((Some(Change::CutOff), false)),
-                false => Err(Rejection::Refused(reason)),
-            };
+            return if was_up { Ok((Some(Change::CutOff), false)) } else { Err(Rejection::Refused(reason)) };
         }
         if !is_in_use {
             if let Some(agreement) = &mut self.agreement {

@@ -131,15 +131,16 @@ impl PeerConnection {
 
     /// Sends a frame in its protected form, if there are keys for it.
     pub(super) fn send(&mut self, kind: KeyKind, is_hello: bool, frame: &mut Vec<u8>) {
-        let is_protected = match is_hello {
-            true => self.protection.sign(frame).map_or_else(
+        let is_protected = if is_hello {
+            self.protection.sign(frame).map_or_else(
                 |error| {
                     tracing::error!("no hello for machine '{}': {error}", self.peer.machine);
                     false
                 },
                 |()| true,
-            ),
-            false => self.protection.encrypt(kind, frame),
+            )
+        } else {
+            self.protection.encrypt(kind, frame)
         };
         if is_protected {
             self.put(kind, frame);
@@ -238,7 +239,7 @@ impl PeerConnection {
     pub(super) fn status(&self, now_nanos: u64) -> PeerStatus {
         let peer = &self.peer;
         let stall_reason = self.stall_reason();
-        let last_heard_nanos = peer.last_heard_nanos.filter(|_| stall_reason.is_none());
+        let last_heard_nanos = if stall_reason.is_none() { peer.last_heard_nanos } else { None };
         let estimate = peer.clock.estimate(now_nanos);
         let sent = self.uplinks.iter().map(|uplink| uplink.outgoing.status(&uplink.channel.port, now_nanos));
         let received = self.downlinks.iter().map(|downlink| ChannelStatus {

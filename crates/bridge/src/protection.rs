@@ -126,10 +126,7 @@ impl Opened<'_> {
         let frame = Frame::decode(&self.bytes)?;
         // A hello may be read by a machine that has no keys in common yet, everything else only by the one that has.
         let is_hello = matches!(frame.body, Body::Hello(_));
-        match self.has_keys && is_hello != (self.form == Form::Signed) {
-            true => Err(WireError::Forged),
-            false => Ok(frame),
-        }
+        if self.has_keys && is_hello != (self.form == Form::Signed) { Err(WireError::Forged) } else { Ok(frame) }
     }
 }
 

@@ -108,9 +108,10 @@ pub fn warning(config: &LinkConfig) -> Option<String> {
 
 fn endpoints(config: &LinkConfig) -> impl Iterator<Item = &str> {
     let endpoints = &config.endpoints;
-    let used = match endpoints.router.is_empty() {
-        true => [&endpoints.listen, &endpoints.connect].map(Vec::as_slice),
-        false => [endpoints.router.as_slice(), &[]],
+    let used = if endpoints.router.is_empty() {
+        [&endpoints.listen, &endpoints.connect].map(Vec::as_slice)
+    } else {
+        [endpoints.router.as_slice(), &[]]
     };
     used.into_iter().flatten().map(String::as_str)
 }
@@ -152,7 +153,8 @@ fn checked(config: &LinkConfig) -> Result<Option<&KeyFiles>, SessionError> {
         Some((text, _)) if has_tls => {
             Err(refused(text, "this machine's other endpoints use TLS: make this one tls/… as well".into()))
         }
-        _ => Ok(config.keys.as_ref().filter(|_| has_tls)),
+        _ if has_tls => Ok(config.keys.as_ref()),
+        _ => Ok(None),
     }
 }
 
@@ -169,9 +171,10 @@ fn of_zenoh(endpoint: &str) -> std::io::Result<String> {
 
 fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> std::io::Result<Value> {
     let by_router = !config.endpoints.router.is_empty();
-    let (mode, listen, connect) = match by_router {
-        true => ("client", &Vec::new(), &config.endpoints.router),
-        false => ("peer", &config.endpoints.listen, &config.endpoints.connect),
+    let (mode, listen, connect) = if by_router {
+        ("client", &Vec::new(), &config.endpoints.router)
+    } else {
+        ("peer", &config.endpoints.listen, &config.endpoints.connect)
     };
     let of_zenoh = |endpoints: &[String]| endpoints.iter().map(|it| of_zenoh(it)).collect::<std::io::Result<Vec<_>>>();
     let (listen, connect) = (of_zenoh(listen)?, of_zenoh(connect)?);

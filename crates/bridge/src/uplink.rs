@@ -80,7 +80,7 @@ impl Uplink {
 
     /// At the start: the last sample of a source here, or of a node behind it, that an earlier process has sent.
     pub(super) fn sent_before(&self) -> Option<SampleId> {
-        self.last.filter(|_| self.bears_source_number)
+        if self.bears_source_number { self.last } else { None }
     }
 
     /// Reads the writer's samples as long as there is room for them; returns whether there may be more.

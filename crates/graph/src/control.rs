@@ -154,7 +154,7 @@ pub struct AttachedEdge {
     pub topic: String,
     pub input: InputWiring,
     /// The slots of the inputs that its node answers here.
-    pub answered_cells: Vec<usize>,
+    pub answered_slots: Vec<usize>,
 }
 
 /// A node that was swapped.

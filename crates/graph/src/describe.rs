@@ -15,7 +15,7 @@ const LIMIT: Duration = Duration::from_secs(10);
 /// The pause between two looks at whether the program has ended.
 const POLL: Duration = Duration::from_millis(1);
 /// So much of the end of a failed program's stderr is shown.
-const MAX_LAST_WORDS: usize = 2048;
+const MAX_STDERR_TAIL: usize = 2048;
 /// The longest description.
 const MAX_BYTES: u64 = 1 << 20;
 
@@ -54,14 +54,14 @@ pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, 
             let _ = sender.send(read.map(|_| text));
         });
     }
-    let (sender, last_words) = channel();
+    let (sender, stderr_tail) = channel();
     if let Some(mut stderr) = child.stderr.take() {
         std::thread::spawn(move || {
             let mut said = Vec::new();
             let mut bytes = [0; 4096];
             while let Ok(n @ 1..) = stderr.read(&mut bytes) {
                 said.extend_from_slice(&bytes[..n]);
-                said.drain(..said.len().saturating_sub(MAX_LAST_WORDS));
+                said.drain(..said.len().saturating_sub(MAX_STDERR_TAIL));
             }
             let _ = sender.send(said);
         });
@@ -85,7 +85,7 @@ pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, 
         .map_err(|_| "it did not answer --describe".to_string())?
         .map_err(|error| format!("its answer to --describe cannot be read: {error}"))?;
     if !status.success() {
-        let said = last_words.recv_timeout(LIMIT).unwrap_or_default();
+        let said = stderr_tail.recv_timeout(LIMIT).unwrap_or_default();
         let said: Vec<String> = String::from_utf8_lossy(&said).lines().map(crate::log::printable).collect();
         let said = crate::log::log_tail(&said);
         return Err(format!("it failed at --describe ({status}){said}"));

@@ -22,7 +22,7 @@ const N_SPARE_SUBSCRIBERS: usize = 4;
 /// Readers of one instance of a consumer: its own, and the reader of a standby.
 const N_SUBSCRIBERS_PER_INSTANCE: usize = 2;
 /// The slots of an input: its own, and the histogram of its samples' ages.
-const N_INPUT_CELLS: usize = 1 + N_AGE_SLOTS;
+const N_INPUT_SLOTS: usize = 1 + N_AGE_SLOTS;
 /// This many samples may wait for the launching command, which prints and records, and for an attached reader.
 const OBSERVER_CAPACITY: usize = 256;
 /// This many readers, such as recorders, may be attached to a graph at a time without missing a sample.
@@ -30,7 +30,7 @@ pub const N_ATTACHED: usize = 2;
 
 /// A writer waits this long for an attached reader that is a whole capacity behind: well below the 100 ms after which a live
 /// hand's frames are late, so that recording a graph cannot disturb it.
-pub const GUEST_LIMIT_MILLIS: u64 = 20;
+pub const ATTACHED_LIMIT_MILLIS: u64 = 20;
 /// A writer waits this long for the launching command, whose disk may be slow, but not for one that was stopped.
 const OBSERVER_LIMIT_MILLIS: u64 = 1000;
 
@@ -42,16 +42,16 @@ pub struct Plan {
     services: BTreeMap<Port, ServiceWiring>,
     output_slots: BTreeMap<Port, usize>,
     /// By the consuming node and its port.
-    input_cells: BTreeMap<Port, usize>,
-    observer_cells: BTreeMap<Port, usize>,
-    attached_cells: BTreeMap<Port, [usize; N_ATTACHED]>,
-    instance_cells: BTreeMap<String, usize>,
+    input_slots: BTreeMap<Port, usize>,
+    observer_slots: BTreeMap<Port, usize>,
+    attached_slots: BTreeMap<Port, [usize; N_ATTACHED]>,
+    instance_slots: BTreeMap<String, usize>,
     /// The first node of each node's process.
     leaders: BTreeMap<String, String>,
     state_regions: BTreeMap<String, usize>,
     /// The nodes that answer each sample under the same number.
     answer_each: BTreeSet<String>,
-    n_cells: usize,
+    n_slots: usize,
     edges: Vec<PlannedEdge>,
 }
 
@@ -86,10 +86,10 @@ impl Plan {
             options,
             services: BTreeMap::new(),
             output_slots: BTreeMap::new(),
-            input_cells: BTreeMap::new(),
-            observer_cells: BTreeMap::new(),
-            attached_cells: BTreeMap::new(),
-            instance_cells: BTreeMap::new(),
+            input_slots: BTreeMap::new(),
+            observer_slots: BTreeMap::new(),
+            attached_slots: BTreeMap::new(),
+            instance_slots: BTreeMap::new(),
             leaders: graph.nodes.iter().map(|node| (node.id.clone(), graph.leader(node).id.clone())).collect(),
             state_regions: BTreeMap::new(),
             answer_each: graph
@@ -98,19 +98,19 @@ impl Plan {
                 .filter(|node| node.description.answers_each)
                 .map(|node| node.id.clone())
                 .collect(),
-            n_cells: N_COMMAND_BELLS,
+            n_slots: N_COMMAND_BELLS,
             edges: Vec::new(),
         };
-        let next = |n_cells: &mut usize, n: usize| std::mem::replace(n_cells, *n_cells + n);
+        let next = |n_slots: &mut usize, n: usize| std::mem::replace(n_slots, *n_slots + n);
         for (idx, node) in graph.nodes.iter().enumerate() {
-            plan.instance_cells.insert(node.id.clone(), next(&mut plan.n_cells, N_INSTANCES));
+            plan.instance_slots.insert(node.id.clone(), next(&mut plan.n_slots, N_INSTANCES));
             plan.state_regions.insert(node.id.clone(), idx);
             for input in &node.inputs {
-                let cell = next(&mut plan.n_cells, N_INPUT_CELLS);
-                plan.input_cells.insert((node.id.clone(), input.port.clone()), cell);
+                let slot = next(&mut plan.n_slots, N_INPUT_SLOTS);
+                plan.input_slots.insert((node.id.clone(), input.port.clone()), slot);
             }
             for (from, output) in node.output_ports() {
-                plan.output_slots.insert(from.clone(), next(&mut plan.n_cells, 1));
+                plan.output_slots.insert(from.clone(), next(&mut plan.n_slots, 1));
                 for consumer in &graph.nodes {
                     let inputs =
                         consumer.inputs.iter().filter(|input| input.from_node == from.0 && input.from_port == from.1);
@@ -123,7 +123,7 @@ impl Plan {
                     }));
                 }
                 if observed.contains(&from) {
-                    plan.observer_cells.insert(from.clone(), next(&mut plan.n_cells, N_INPUT_CELLS));
+                    plan.observer_slots.insert(from.clone(), next(&mut plan.n_slots, N_INPUT_SLOTS));
                     let options = EdgeOptions { capacity: OBSERVER_CAPACITY, ..EdgeOptions::default() };
                     plan.edges.push(PlannedEdge {
                         from: from.clone(),
@@ -133,8 +133,8 @@ impl Plan {
                         partner: false,
                     });
                 }
-                let cells = std::array::from_fn(|_| next(&mut plan.n_cells, N_INPUT_CELLS));
-                plan.attached_cells.insert(from.clone(), cells);
+                let slots = std::array::from_fn(|_| next(&mut plan.n_slots, N_INPUT_SLOTS));
+                plan.attached_slots.insert(from.clone(), slots);
                 let service = plan.service(&from, &output.type_name);
                 plan.services.insert(from, service);
             }
@@ -170,9 +170,9 @@ impl Plan {
     /// See [`SharedCursors::create`].
     pub fn create_cursors(&self) -> Result<SharedCursors, CursorsError> {
         let cursors =
-            SharedCursors::create(std::path::Path::new(&self.domain.cursors), self.n_cells, self.state_regions.len())?;
+            SharedCursors::create(std::path::Path::new(&self.domain.cursors), self.n_slots, self.state_regions.len())?;
         // No writer waits for a reader that is not there.
-        self.attached_cells.values().flatten().for_each(|cell| cursors.input(*cell).give_up(true));
+        self.attached_slots.values().flatten().for_each(|slot| cursors.input(*slot).give_up(true));
         Ok(cursors)
     }
 
@@ -185,25 +185,25 @@ impl Plan {
         Some(InputWiring {
             policy: EdgePolicy::Lossless,
             capacity: OBSERVER_CAPACITY,
-            cell: Some(*self.observer_cells.get(port)?),
+            slot: Some(*self.observer_slots.get(port)?),
             ..self.tool_input(port)?
         })
     }
 
     /// The input of an attached reader, which misses nothing once it has begun.
     pub fn attached_input(&self, port: &Port, reader: usize) -> Option<InputWiring> {
-        let cell = *self.attached_cells.get(port)?.get(reader)?;
+        let slot = *self.attached_slots.get(port)?.get(reader)?;
         Some(InputWiring {
             policy: EdgePolicy::Lossless,
             capacity: OBSERVER_CAPACITY,
-            cell: Some(cell),
+            slot: Some(slot),
             ..self.tool_input(port)?
         })
     }
 
     /// The slots of an attached reader, one an edge.
-    pub fn attached_cells(&self, reader: usize) -> Vec<usize> {
-        self.attached_cells.values().filter_map(|cells| cells.get(reader).copied()).collect()
+    pub fn attached_slots(&self, reader: usize) -> Vec<usize> {
+        self.attached_slots.values().filter_map(|slots| slots.get(reader).copied()).collect()
     }
 
     /// The topic of a port where a graph is recorded.
@@ -222,8 +222,8 @@ impl Plan {
             on_late: OnLate::Count,
             tolerance_nanos: 0,
             partner_wait_nanos: 0,
-            cell: None,
-            writer_cell: *self.output_slots.get(port)?,
+            slot: None,
+            writer_slot: *self.output_slots.get(port)?,
         })
     }
 
@@ -256,8 +256,8 @@ impl Plan {
                 on_late: input.edge.on_late,
                 tolerance_nanos: nanos(input.edge.tolerance_millis.unwrap_or(DEFAULT_TOLERANCE_MILLIS)),
                 partner_wait_nanos: nanos(input.edge.partner_wait_millis.unwrap_or(DEFAULT_PARTNER_WAIT_MILLIS)),
-                cell: Some(self.input_cell(&node.id, &input.port)?),
-                writer_cell: *self.output_slots.get(&from)?,
+                slot: Some(self.input_slot(&node.id, &input.port)?),
+                writer_slot: *self.output_slots.get(&from)?,
             };
             inputs.insert(input.port.clone(), wiring);
         }
@@ -267,7 +267,7 @@ impl Plan {
             let wiring = OutputWiring {
                 shadow: shadow_of(&service),
                 service,
-                cell: *self.output_slots.get(&from)?,
+                slot: *self.output_slots.get(&from)?,
                 consumers: self.consumers(&from),
                 bells: self.bells(&from),
                 wait_limit_millis: self.options.wait_limit_millis,
@@ -283,8 +283,8 @@ impl Plan {
             params: node.params.clone(),
             clock: self.options.clock,
             standby,
-            instance_cell: self.instance_cell(&node.id, n_before)?,
-            bell_cell: self.instance_cell(self.leaders.get(&node.id)?, n_before)?,
+            instance_slot: self.instance_slot(&node.id, n_before)?,
+            bell_slot: self.instance_slot(self.leaders.get(&node.id)?, n_before)?,
             wait: node.process.wait,
             lock_memory: node.process.lock_memory,
             state_region: *self.state_regions.get(&node.id)?,
@@ -295,8 +295,8 @@ impl Plan {
         })
     }
 
-    pub fn input_cell(&self, node: &str, port: &str) -> Option<usize> {
-        self.input_cells.get(&(node.to_string(), port.to_string())).copied()
+    pub fn input_slot(&self, node: &str, port: &str) -> Option<usize> {
+        self.input_slots.get(&(node.to_string(), port.to_string())).copied()
     }
 
     pub fn output_slot(&self, port: &Port) -> Option<usize> {
@@ -304,12 +304,12 @@ impl Plan {
     }
 
     /// The slot of the `n_before + 1`th instance of a node.
-    pub fn instance_cell(&self, node: &str, n_before: usize) -> Option<usize> {
-        self.instance_cells.get(node).map(|first| first + n_before % N_INSTANCES)
+    pub fn instance_slot(&self, node: &str, n_before: usize) -> Option<usize> {
+        self.instance_slots.get(node).map(|first| first + n_before % N_INSTANCES)
     }
 
-    pub fn input_cells<'a>(&'a self, node: &'a str) -> impl Iterator<Item = usize> + 'a {
-        self.input_cells.iter().filter(move |((id, _), _)| id == node).map(|(_, cell)| *cell)
+    pub fn input_slots<'a>(&'a self, node: &'a str) -> impl Iterator<Item = usize> + 'a {
+        self.input_slots.iter().filter(move |((id, _), _)| id == node).map(|(_, slot)| *slot)
     }
 
     /// The readers that a port's writer waits for.
@@ -317,51 +317,51 @@ impl Plan {
         let lossless = |edge: &&PlannedEdge| edge.from == *port && edge.options.policy == EdgePolicy::Lossless;
         let edges = self.edges.iter().filter(lossless);
         let own = edges.filter_map(|edge| {
-            let cell = self.reader_cell(edge)?;
-            let (guest_cells, guest_limit_millis) = match edge.to {
+            let slot = self.reader_slot(edge)?;
+            let (attached_slots, attached_limit_millis) = match edge.to {
                 Some(_) => (Vec::new(), 0),
-                None => (self.observer_cells.values().copied().collect(), OBSERVER_LIMIT_MILLIS),
+                None => (self.observer_slots.values().copied().collect(), OBSERVER_LIMIT_MILLIS),
             };
             let (capacity, behind) = (edge.options.capacity, self.behind(edge));
-            Some(ConsumerWiring { cell, capacity, guest_cells, guest_limit_millis, behind })
+            Some(ConsumerWiring { slot, capacity, attached_slots, attached_limit_millis, behind })
         });
         let attached =
-            self.attached_cells.get(port).into_iter().flatten().enumerate().map(|(reader, cell)| ConsumerWiring {
-                cell: *cell,
+            self.attached_slots.get(port).into_iter().flatten().enumerate().map(|(reader, slot)| ConsumerWiring {
+                slot: *slot,
                 capacity: OBSERVER_CAPACITY,
-                guest_cells: self.attached_cells(reader),
-                guest_limit_millis: GUEST_LIMIT_MILLIS,
+                attached_slots: self.attached_slots(reader),
+                attached_limit_millis: ATTACHED_LIMIT_MILLIS,
                 behind: Vec::new(),
             });
         own.chain(attached).collect()
     }
 
-    /// The cells whose bells a port's writer rings: those of all instances of its readers' processes, and of commands that read it. The bell
+    /// The slots whose bells a port's writer rings: those of all instances of its readers' processes, and of commands that read it. The bell
     /// of an instance that is not there stays rung, and costs nothing.
     fn bells(&self, port: &Port) -> Vec<usize> {
         let readers = self.edges.iter().filter(|edge| edge.from == *port).filter_map(|edge| edge.to.as_ref());
         let nodes: BTreeSet<&String> = readers.filter_map(|(node, _)| self.leaders.get(node)).collect();
-        let instances = nodes.into_iter().filter_map(|node| self.instance_cells.get(node));
-        let is_run_waiting = self.observer_cells.contains_key(port)
+        let instances = nodes.into_iter().filter_map(|node| self.instance_slots.get(node));
+        let is_run_waiting = self.observer_slots.contains_key(port)
             && self.services.get(port).is_some_and(|service| is_needed(&service.type_name));
         let commands = is_run_waiting.then_some(RUN_BELL).into_iter().chain([COMPARE_BELL]);
         instances.flat_map(|first| *first..first + N_INSTANCES).chain(commands).collect()
     }
 
-    /// The cells of a port's lossless readers and of those behind them.
-    pub fn reader_cells(&self, port: &Port) -> Vec<usize> {
-        fn collect(readers: &[ReaderWiring], cells: &mut Vec<usize>) {
+    /// The slots of a port's lossless readers and of those behind them.
+    pub fn reader_slots(&self, port: &Port) -> Vec<usize> {
+        fn collect(readers: &[ReaderWiring], slots: &mut Vec<usize>) {
             for reader in readers {
-                cells.push(reader.cell);
-                collect(&reader.behind, cells);
+                slots.push(reader.slot);
+                collect(&reader.behind, slots);
             }
         }
-        let mut cells = Vec::new();
+        let mut slots = Vec::new();
         for consumer in self.consumers(port) {
-            cells.push(consumer.cell);
-            collect(&consumer.behind, &mut cells);
+            slots.push(consumer.slot);
+            collect(&consumer.behind, &mut slots);
         }
-        cells
+        slots
     }
 
     /// Whether the nodes before this one count on its answering each sample under the same number.
@@ -372,24 +372,24 @@ impl Plan {
     /// The readers of the answers of an edge's reader, if it answers each sample under the same number.
     fn behind(&self, edge: &PlannedEdge) -> Vec<ReaderWiring> {
         // Answers have the numbers of the main input, and not those of a partner.
-        let to = edge.to.as_ref().filter(|_| !edge.partner);
+        let to = if edge.partner { None } else { edge.to.as_ref() };
         let Some((node, _)) = to.filter(|(node, _)| self.answer_each.contains(node)) else {
             return Vec::new();
         };
-        // The launching command is a guest: no source waits for it.
+        // The launching command is an attached reader: no source waits for it.
         let is_next = |next: &&PlannedEdge| {
             let is_waited_for = next.options.policy == EdgePolicy::Lossless && !next.feedback && next.to.is_some();
             next.from.0 == *node && is_waited_for
         };
         let next = self.edges.iter().filter(is_next);
-        next.filter_map(|next| Some(ReaderWiring { cell: self.reader_cell(next)?, behind: self.behind(next) }))
+        next.filter_map(|next| Some(ReaderWiring { slot: self.reader_slot(next)?, behind: self.behind(next) }))
             .collect()
     }
 
-    fn reader_cell(&self, edge: &PlannedEdge) -> Option<usize> {
+    fn reader_slot(&self, edge: &PlannedEdge) -> Option<usize> {
         match &edge.to {
-            Some(to) => self.input_cells.get(to).copied(),
-            None => self.observer_cells.get(&edge.from).copied(),
+            Some(to) => self.input_slots.get(to).copied(),
+            None => self.observer_slots.get(&edge.from).copied(),
         }
     }
 
@@ -397,14 +397,14 @@ impl Plan {
     pub fn edges(&self, cursors: &SharedCursors, has_ended: bool) -> Vec<EdgeStatus> {
         let edge_status = |edge: &PlannedEdge| {
             let output = cursors.output(*self.output_slots.get(&edge.from)?);
-            let reader_cell = self.reader_cell(edge)?;
-            let cell = cursors.input(reader_cell);
+            let reader_slot = self.reader_slot(edge)?;
+            let slot = cursors.input(reader_slot);
             // The reader first: what it has received was sent before.
-            let (received, key) = (cell.counts(), cell.key());
+            let (received, key) = (slot.counts(), slot.key());
             let (sent, sent_key) = (output.n_sent(), output.key());
             // While samples are on their way only missing numbers tell of a loss; at the end, the difference does.
             // Feedback may come after its reader has finished.
-            let is_at_rest = (has_ended && !edge.feedback) || key == sent_key || cell.is_given_up();
+            let is_at_rest = (has_ended && !edge.feedback) || key == sent_key || slot.is_given_up();
             let dropped = if is_at_rest { sent.saturating_sub(received.n_received) } else { 0 };
             Some(EdgeStatus {
                 from: format!("{}/{}", edge.from.0, edge.from.1),
@@ -419,7 +419,7 @@ impl Plan {
                 reordered: received.n_reordered,
                 late: received.n_late,
                 blocked_nanos: output.blocked_nanos(),
-                ages: cursors.ages(reader_cell).read(),
+                ages: cursors.ages(reader_slot).read(),
             })
         };
         self.edges.iter().filter_map(edge_status).collect()

@@ -223,7 +223,6 @@ fn python_text() -> String {
     text + "\n\nMESSAGES: dict[str, type[Message]] = {message.TYPE_NAME: message for message in Message.__subclasses__()}\n"
 }
 
-
 fn python_file() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../operators/blindgrasp_messages.py")
 }

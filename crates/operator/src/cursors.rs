@@ -37,11 +37,11 @@ const HEADER_BYTES: usize = 4096;
 pub const SLOT_BYTES: usize = 128;
 /// The number of slots that the histogram of an input's ages takes, right behind the input's own slot.
 pub const N_AGE_SLOTS: usize = N_BUCKETS * size_of::<u64>() / SLOT_BYTES;
-/// The cell of the bell of the launching command, which reads decisions.
+/// The slot of the bell of the launching command, which reads decisions.
 pub const RUN_BELL: usize = 0;
-/// The cell of the bell of the command that compares an operator with its replacement.
+/// The slot of the bell of the command that compares an operator with its replacement.
 pub const COMPARE_BELL: usize = 1;
-/// The number of cells with bells of commands. The cells of nodes and ports follow.
+/// The number of slots with bells of commands. The slots of nodes and ports follow.
 pub const N_COMMAND_BELLS: usize = 2;
 /// The largest state of a node.
 pub const STATE_BYTES: usize = 64 << 10;
@@ -61,7 +61,7 @@ pub enum CursorsError {
 pub struct SharedCursors {
     base: NonNull<u8>,
     n_bytes: usize,
-    n_cells: usize,
+    n_slots: usize,
     n_regions: usize,
     file: File,
 }
@@ -144,7 +144,7 @@ impl<const N: usize, W: Word> Commits<N, W> {
 pub struct InputSlot {
     /// Epoch and number of the last sample; received, missing, repeated, reordered, late.
     last: Commits<7>,
-    /// 1 when no process reads on: its node was given up, or it is the slot of a guest and no guest is there.
+    /// 1 when no process reads on: its node was given up, or it is the slot of an attached reader and no attached reader is there.
     is_given_up: AtomicU64,
 }
 
@@ -185,16 +185,16 @@ impl SharedCursors {
     ///
     /// # Errors
     /// The file cannot be made or mapped.
-    pub fn create(path: &Path, n_cells: usize, n_regions: usize) -> Result<SharedCursors, CursorsError> {
+    pub fn create(path: &Path, n_slots: usize, n_regions: usize) -> Result<SharedCursors, CursorsError> {
         let failed = |source: std::io::Error| CursorsError::Io { path: path.display().to_string(), source };
         let file = OpenOptions::new().read(true).write(true).create_new(true).mode(0o600).open(path).map_err(failed)?;
-        let n_bytes = HEADER_BYTES + n_cells * SLOT_BYTES;
+        let n_bytes = HEADER_BYTES + n_slots * SLOT_BYTES;
         // The memory of the slots is taken now: an operator must not die of a full memory because it counts.
         rustix::fs::fallocate(&file, rustix::fs::FallocateFlags::empty(), 0, n_bytes as u64)
             .map_err(|error| failed(error.into()))?;
         file.set_len((page_aligned(n_bytes) + n_regions * REGION_BYTES) as u64).map_err(failed)?;
-        let cursors = Self::map(file, n_cells, n_regions).map_err(failed)?;
-        for (word, value) in [LAYOUT, n_cells as u64, n_regions as u64].into_iter().enumerate() {
+        let cursors = Self::map(file, n_slots, n_regions).map_err(failed)?;
+        for (word, value) in [LAYOUT, n_slots as u64, n_regions as u64].into_iter().enumerate() {
             cursors.word((word + 1) * 8).store(value, Ordering::Relaxed);
         }
         cursors.word(0).store(MAGIC, Ordering::Release);
@@ -215,22 +215,22 @@ impl SharedCursors {
         }
         let header = Self::map(file.try_clone().map_err(failed)?, 0, 0).map_err(failed)?;
         let words: Vec<u64> = (0..4).map(|word| header.word(word * 8).load(Ordering::Acquire)).collect();
-        let (n_cells, n_regions) = (words[2] as usize, words[3] as usize);
-        if words[..2] != [MAGIC, LAYOUT] || size_of_cursors(n_cells, n_regions) != Some(n_bytes) {
+        let (n_slots, n_regions) = (words[2] as usize, words[3] as usize);
+        if words[..2] != [MAGIC, LAYOUT] || size_of_cursors(n_slots, n_regions) != Some(n_bytes) {
             return Err(alien());
         }
-        Self::map(file, n_cells, n_regions).map_err(failed)
+        Self::map(file, n_slots, n_regions).map_err(failed)
     }
 
-    fn map(file: File, n_cells: usize, n_regions: usize) -> std::io::Result<SharedCursors> {
+    fn map(file: File, n_slots: usize, n_regions: usize) -> std::io::Result<SharedCursors> {
         use rustix::mm::{MapFlags, ProtFlags, mmap};
-        let n_bytes = size_of_cursors(n_cells, n_regions).ok_or(std::io::ErrorKind::InvalidInput)?;
+        let n_bytes = size_of_cursors(n_slots, n_regions).ok_or(std::io::ErrorKind::InvalidInput)?;
         // SAFETY: a new mapping anywhere, of a file at least as large as the header says.
         let base = unsafe {
             mmap(std::ptr::null_mut(), n_bytes, ProtFlags::READ | ProtFlags::WRITE, MapFlags::SHARED, &file, 0)?
         };
         let base = NonNull::new(base.cast()).ok_or(std::io::ErrorKind::OutOfMemory)?;
-        Ok(SharedCursors { base, n_bytes, n_cells, n_regions, file })
+        Ok(SharedCursors { base, n_bytes, n_slots, n_regions, file })
     }
 
     fn word(&self, offset: usize) -> &AtomicU64 {
@@ -247,28 +247,28 @@ impl SharedCursors {
         unsafe { self.base.add(offset).cast().as_ref() }
     }
 
-    fn cell<T>(&self, idx: usize) -> &T {
+    fn slot<T>(&self, idx: usize) -> &T {
         const { assert!(size_of::<T>() == SLOT_BYTES) }
-        assert!(idx < self.n_cells, "slot {idx} of {}", self.n_cells);
+        assert!(idx < self.n_slots, "slot {idx} of {}", self.n_slots);
         self.at(HEADER_BYTES + idx * SLOT_BYTES)
     }
 
     pub fn input(&self, idx: usize) -> &InputSlot {
-        self.cell(idx)
+        self.slot(idx)
     }
 
     /// The ages of an input's samples on arrival, in the slots behind the input's own.
     pub fn ages(&self, input_idx: usize) -> &AgeCounter {
-        assert!(input_idx + N_AGE_SLOTS < self.n_cells, "slot {input_idx} of {}", self.n_cells);
+        assert!(input_idx + N_AGE_SLOTS < self.n_slots, "slot {input_idx} of {}", self.n_slots);
         self.at(HEADER_BYTES + (input_idx + 1) * SLOT_BYTES)
     }
 
     pub fn output(&self, idx: usize) -> &OutputSlot {
-        self.cell(idx)
+        self.slot(idx)
     }
 
     pub fn instance(&self, idx: usize) -> &InstanceSlot {
-        self.cell(idx)
+        self.slot(idx)
     }
 
     /// The bell of an instance, or of a reader that is no node.
@@ -278,7 +278,7 @@ impl SharedCursors {
 
     fn region_offset(&self, idx: usize) -> usize {
         assert!(idx < self.n_regions, "state region {idx} of {}", self.n_regions);
-        page_aligned(HEADER_BYTES + self.n_cells * SLOT_BYTES) + idx * REGION_BYTES
+        page_aligned(HEADER_BYTES + self.n_slots * SLOT_BYTES) + idx * REGION_BYTES
     }
 
     /// Takes the memory for a node's state now, so that saving it cannot fail later.
@@ -385,7 +385,7 @@ impl InputSlot {
         self.is_given_up.load(Ordering::Acquire) != 0
     }
 
-    /// Begins after `last` with nothing counted, as a guest does; its writers wait for it from now on.
+    /// Begins after `last` with nothing counted, as an attached reader does; its writers wait for it from now on.
     pub fn begin_after(&self, last: Option<SampleId>) {
         self.place_at(last, &InputCounts::default());
         self.is_given_up.store(0, Ordering::Release);
@@ -425,9 +425,10 @@ impl OutputSlot {
     pub fn commit(&self, key: SampleId) {
         let [epoch, seq, n_sent, n_resent, blocked_nanos] = self.record();
         let is_resent = from_words(epoch, seq).is_some_and(|last| last.epoch == key.epoch && key.seq <= last.seq);
-        self.last.store(match is_resent {
-            true => [epoch, seq, n_sent, n_resent + 1, blocked_nanos],
-            false => [key.epoch, key.seq, n_sent + 1, n_resent, blocked_nanos],
+        self.last.store(if is_resent {
+            [epoch, seq, n_sent, n_resent + 1, blocked_nanos]
+        } else {
+            [key.epoch, key.seq, n_sent + 1, n_resent, blocked_nanos]
         });
     }
 
@@ -476,9 +477,9 @@ fn page_aligned(n_bytes: usize) -> usize {
     n_bytes.next_multiple_of(4096)
 }
 
-fn size_of_cursors(n_cells: usize, n_regions: usize) -> Option<usize> {
-    let cells = n_cells.checked_mul(SLOT_BYTES)?.checked_add(HEADER_BYTES)?;
-    cells.checked_next_multiple_of(4096)?.checked_add(n_regions.checked_mul(REGION_BYTES)?)
+fn size_of_cursors(n_slots: usize, n_regions: usize) -> Option<usize> {
+    let slots = n_slots.checked_mul(SLOT_BYTES)?.checked_add(HEADER_BYTES)?;
+    slots.checked_next_multiple_of(4096)?.checked_add(n_regions.checked_mul(REGION_BYTES)?)
 }
 
 #[cfg(test)]

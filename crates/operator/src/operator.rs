@@ -350,12 +350,12 @@ impl Operator {
 
     /// Gives a sign of life.
     pub fn beat(&self) {
-        self.0.cursors.instance(self.0.wiring.instance_cell).beat(monotonic_nanos());
+        self.0.cursors.instance(self.0.wiring.instance_slot).beat(monotonic_nanos());
     }
 
     /// Names the sample that a stage works on, for the launcher if the process dies of it.
     pub(crate) fn works_on(&self, sample: Option<SampleId>) {
-        self.0.cursors.instance(self.0.wiring.instance_cell).works_on(sample);
+        self.0.cursors.instance(self.0.wiring.instance_slot).works_on(sample);
     }
 
     /// Whether a sample has killed earlier instances again and again.
@@ -385,7 +385,7 @@ impl Operator {
     /// Whether a publisher that waits for its readers should give up, because another instance is to take over or the
     /// graph ends. Gives a sign of life as well. In a group, the command of another operator is a reason too: that one may be
     /// the reader.
-    pub fn is_to_give_way(&self) -> bool {
+    pub fn should_yield(&self) -> bool {
         self.beat();
         let is_group_told = || {
             let inboxes = self.0.group.iter().flat_map(|group| &group.inboxes);
@@ -652,7 +652,7 @@ pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyho
         lock_memory()?;
     }
     let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&leader.domain.cursors))?);
-    let waiter = Rc::new(Waiter::of_cell(&cursors, leader.bell_cell, leader.wait).context("cannot make an event")?);
+    let waiter = Rc::new(Waiter::of_slot(&cursors, leader.bell_slot, leader.wait).context("cannot make an event")?);
     let inboxes: Vec<Arc<Inbox>> = wirings.iter().map(|_| Arc::default()).collect();
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGTERM, signal_hook::consts::SIGINT] {

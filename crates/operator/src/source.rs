@@ -169,7 +169,7 @@ pub fn send<M: Message>(
 ) -> Result<Sent, PortError> {
     let (head, items) = message.to_parts(Header { origin_nanos: monotonic_nanos(), ..header });
     operator.beat();
-    publisher.send(head, &items, &mut || operator.is_to_give_way())
+    publisher.send(head, &items, &mut || operator.should_yield())
 }
 
 /// Turns the times of samples into waiting.
@@ -223,5 +223,5 @@ pub fn send_parts<M: Message>(
 ) -> Result<Sent, PortError> {
     M::header_mut(&mut head).origin_nanos = monotonic_nanos();
     operator.beat();
-    publisher.send(head, items, &mut || operator.is_to_give_way())
+    publisher.send(head, items, &mut || operator.should_yield())
 }

@@ -245,7 +245,7 @@ impl Partners {
         let since = self.waiting.filter(|waiting| waiting.0 == id).map_or_else(Instant::now, |waiting| waiting.1);
         let is_over = is_ending && self.is_caught_up();
         let until = self.inputs.iter().filter_map(|input| input.borrow().waits_until(main, since)).max();
-        self.waiting = until.filter(|_| !is_over).map(|until| (id, since, until));
+        self.waiting = if is_over { None } else { until.map(|until| (id, since, until)) };
         if self.waiting.is_none() {
             self.inputs.iter().for_each(|input| input.borrow_mut().choose(main, is_active));
         }
@@ -423,8 +423,9 @@ impl<S: Stage> Instance<S> {
     fn deadline(&self) -> Option<Instant> {
         let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(crate::monotonic_nanos()));
         let is_timed = self.is_active && self.operator.clock() == Clock::Machine;
-        let deadline = self.stage.deadline_nanos().filter(|_| is_timed).map(|deadline| Instant::now() + left(deadline));
-        let hold_deadline = self.subscriber.hold_deadline().filter(|_| self.is_active);
+        let deadline = if is_timed { self.stage.deadline_nanos() } else { None };
+        let deadline = deadline.map(|deadline| Instant::now() + left(deadline));
+        let hold_deadline = if self.is_active { self.subscriber.hold_deadline() } else { None };
         deadline.into_iter().chain(hold_deadline).chain(self.partners.deadline()).min()
     }
 
@@ -541,7 +542,7 @@ impl<S: Stage> Instance<S> {
         let (operator, stage) = (&self.operator, &self.stage);
         for (head, items) in self.answers.iter() {
             let check = |head: &mut _| stage.before_sending(head, now_nanos(operator, head, S::Out::header));
-            if self.publisher.send_checked(head, items, &mut || operator.is_to_give_way(), check)? == Sent::GaveWay {
+            if self.publisher.send_checked(head, items, &mut || operator.should_yield(), check)? == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
             }
         }
@@ -552,7 +553,7 @@ impl<S: Stage> Instance<S> {
         let (operator, stage) = (&self.operator, &self.stage);
         while let Some((head, items)) = self.outbox.next()? {
             let check = |head: &mut _| stage.before_sending(head, now_nanos(operator, head, S::Out::header));
-            if self.publisher.send_checked(head, &items, &mut || operator.is_to_give_way(), check)? == Sent::GaveWay {
+            if self.publisher.send_checked(head, &items, &mut || operator.should_yield(), check)? == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
             }
             self.outbox.has_sent_next();

@@ -35,7 +35,7 @@ pub struct Waker {
 /// Where a waiter's bell is.
 #[derive(Clone)]
 enum BellPlace {
-    /// Among the cursors, at this cell: writers can ring it.
+    /// Among the cursors, at this slot: writers can ring it.
     Shared(Arc<SharedCursors>, usize),
     Own(Arc<Bell>),
 }
@@ -43,19 +43,19 @@ enum BellPlace {
 impl BellPlace {
     fn bell(&self) -> &Bell {
         match self {
-            BellPlace::Shared(cursors, cell) => cursors.bell(*cell),
+            BellPlace::Shared(cursors, slot) => cursors.bell(*slot),
             BellPlace::Own(bell) => bell,
         }
     }
 }
 
 impl Waiter {
-    /// A waiter that writers wake by the bell of a cell.
+    /// A waiter that writers wake by the bell of a slot.
     ///
     /// # Errors
     /// The system has no more descriptors.
-    pub fn of_cell(cursors: &Arc<SharedCursors>, cell: usize, mode: WaitMode) -> std::io::Result<Waiter> {
-        Self::new(BellPlace::Shared(Arc::clone(cursors), cell), mode)
+    pub fn of_slot(cursors: &Arc<SharedCursors>, slot: usize, mode: WaitMode) -> std::io::Result<Waiter> {
+        Self::new(BellPlace::Shared(Arc::clone(cursors), slot), mode)
     }
 
     /// A waiter that only this process wakes.

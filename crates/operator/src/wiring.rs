@@ -9,7 +9,7 @@
 //! * SIGTERM asks it to answer the samples that still lie in its inputs, report `drained`, and keep its ports open until
 //!   its stdin ends. An operator that exits at SIGTERM at once is accepted too.
 //!
-//! An instance is **active** or **standby**. The active one answers samples and owns the node's cells on the
+//! An instance is **active** or **standby**. The active one answers samples and owns the node's slots on the
 //! [cursors](crate::cursors); a standby waits beside it with open ports. An instance that starts, comes back after a crash or
 //! is swapped in does the same thing: it takes over from the instance before, at the sample that the cursors name.
 
@@ -42,10 +42,10 @@ pub struct Wiring {
     pub clock: Clock,
     /// Whether it begins as a standby, which waits for [`Command::TakeOver`].
     pub standby: bool,
-    /// The cell of this instance's heartbeat and bell among the cursors.
-    pub instance_cell: usize,
-    /// The cell of the bell that wakes this instance: its own, or that of the first operator of its process.
-    pub bell_cell: usize,
+    /// The slot of this instance's heartbeat and bell among the cursors.
+    pub instance_slot: usize,
+    /// The slot of the bell that wakes this instance: its own, or that of the first operator of its process.
+    pub bell_slot: usize,
     #[serde(default)]
     pub wait: WaitMode,
     /// Whether its memory stays in RAM.
@@ -194,10 +194,10 @@ pub struct InputWiring {
     /// Of a partner input: a main sample that is older is answered without its partner.
     #[serde(default)]
     pub partner_wait_nanos: u64,
-    /// Its cell on the cursors; `None` for a reader that no writer waits for.
-    pub cell: Option<usize>,
-    /// The writer's cell on the cursors, which names the last sample that was sent.
-    pub writer_cell: usize,
+    /// Its slot on the cursors; `None` for a reader that no writer waits for.
+    pub slot: Option<usize>,
+    /// The writer's slot on the cursors, which names the last sample that was sent.
+    pub writer_slot: usize,
 }
 
 /// An output port.
@@ -206,11 +206,11 @@ pub struct OutputWiring {
     pub service: ServiceWiring,
     /// A standby writes its answers here, for comparison.
     pub shadow: ServiceWiring,
-    /// Its cell on the cursors.
-    pub cell: usize,
+    /// Its slot on the cursors.
+    pub slot: usize,
     /// The readers that the writer waits for.
     pub consumers: Vec<ConsumerWiring>,
-    /// The cells whose bells the writer rings after each sample.
+    /// The slots whose bells the writer rings after each sample.
     #[serde(default)]
     pub bells: Vec<usize>,
     /// The writer fails after it has waited for so long.
@@ -220,16 +220,16 @@ pub struct OutputWiring {
 /// A reader that a writer waits for.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ConsumerWiring {
-    /// The reader's cell on the cursors, which names the last sample that it has answered.
-    pub cell: usize,
+    /// The reader's slot on the cursors, which names the last sample that it has answered.
+    pub slot: usize,
     /// How many samples may be unanswered.
     pub capacity: usize,
-    /// If the reader is a guest, the cells of all its readers, which are given up together: a writer waits for a guest for
-    /// `guest_limit_millis` at most. Empty for the graph's own readers.
+    /// If the reader is an attached reader, the slots of all its readers, which are given up together: a writer waits for an attached reader for
+    /// `attached_limit_millis` at most. Empty for the graph's own readers.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub guest_cells: Vec<usize>,
+    pub attached_slots: Vec<usize>,
     #[serde(default)]
-    pub guest_limit_millis: u64,
+    pub attached_limit_millis: u64,
     /// The readers of the answers of a reader that answers each sample under the same number.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub behind: Vec<ReaderWiring>,
@@ -239,8 +239,8 @@ pub struct ConsumerWiring {
 /// once, only the writer before them has the samples that this reader has not answered: it keeps them in its history.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ReaderWiring {
-    /// The reader's cell on the cursors.
-    pub cell: usize,
+    /// The reader's slot on the cursors.
+    pub slot: usize,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub behind: Vec<ReaderWiring>,
 }

@@ -282,9 +282,10 @@ impl World {
     fn next(&self, rules: Rules) -> (Vec<World>, bool) {
         let mut worlds = Vec::new();
         for node in 0..4 {
-            match self.processes[node].is_alive {
-                true => worlds.extend(self.step(node, rules)),
-                false => worlds.push(self.restart(node, rules)),
+            if self.processes[node].is_alive {
+                worlds.extend(self.step(node, rules))
+            } else {
+                worlds.push(self.restart(node, rules))
             }
         }
         let is_stuck = worlds.is_empty();

@@ -50,7 +50,9 @@ pub fn animation_svg(hand: &Hand, grasps: &[AnimatedGrasp]) -> Result<String, Pi
             let frame = &animated.grasp.frames[idx].message;
             // Contacts are those of the closed hand.
             let is_closed = frame.phase == whole.frame.phase;
-            if let Some(scene) = moment.scene.as_mut().filter(|_| !is_closed) {
+            if let Some(scene) = moment.scene.as_mut()
+                && !is_closed
+            {
                 scene.joints_rad.clone_from(&frame.joints_rad);
                 scene.contacts.clear();
             }
@@ -118,7 +120,7 @@ fn draw_texts(svg: &mut Svg, animated: &AnimatedGrasp, idx: usize) {
             svg.element("circle", &disc);
         }
     }
-    let decision = grasp.decision.as_ref().filter(|_| animated.decided_at.is_some_and(|at| at <= idx));
+    let decision = if animated.decided_at.is_some_and(|at| at <= idx) { grasp.decision.as_ref() } else { None };
     let (text, class) = match decision.map(|decision| decision.action) {
         None => ("…".into(), "wait"),
         Some(Action::Lift) => ("LIFT".to_owned(), "lift"),

@@ -78,9 +78,10 @@ pub(super) fn draw(placed: &Placed<'_>, surfaces: &Surfaces, cameras: &[Camera; 
         [COLUMN, TOP + 2.0],
         Anchor::Start,
         "head",
-        &match placed.grasp.is_hand_alone {
-            true => "CELLS".into(),
-            false => format!("CELLS, {} FRAME", placed.frame.phase.as_str().to_uppercase()),
+        &if placed.grasp.is_hand_alone {
+            "CELLS".into()
+        } else {
+            format!("CELLS, {} FRAME", placed.frame.phase.as_str().to_uppercase())
         },
     );
     let pads_height = draw_pads(&mut svg, placed, [COLUMN, TOP + 16.0], column_width, VIEW[1] - 16.0)?;
@@ -110,9 +111,10 @@ fn draw_header(svg: &mut Svg, placed: &Placed<'_>) {
         about.push(format!("class {}", truth.class));
         about.push(format!("grasp {}", grasp.grasp_id));
     }
-    match grasp.is_hand_alone {
-        true => about.push("the hand and its cells".into()),
-        false => about.push(format!("hand {}", placed.hand.name)),
+    if grasp.is_hand_alone {
+        about.push("the hand and its cells".into())
+    } else {
+        about.push(format!("hand {}", placed.hand.name))
     }
     if let Some(scene) = &grasp.scene {
         about.push(format!("{:.0} g", 1000.0 * scene.mass_kg));

@@ -145,9 +145,10 @@ pub(super) fn draw_pads(
         let room = (flat.width_m * panel.pixels_per_m).max(LEAST_WIDTH);
         svg.text([left, top + 11.0], Anchor::Start, "strong", &fit_text(&pad.name.replace('_', " "), 13.0, room));
         let n_cells = pad.cells.len();
-        let sum = match placed.grasp.is_hand_alone {
-            true => format!("{n_cells} cells").replace("1 cells", "1 cell"),
-            false => pad_summary(placed.frame, pad, hand.cell_unit),
+        let sum = if placed.grasp.is_hand_alone {
+            format!("{n_cells} cells").replace("1 cells", "1 cell")
+        } else {
+            pad_summary(placed.frame, pad, hand.cell_unit)
         };
         // Where the numbers of newtons and cells would run into the next caption, the newtons have the room.
         let sum = match sum.split_once(',') {
@@ -176,8 +177,10 @@ pub(super) fn draw_pads(
                 ],
             );
             if size[0] >= 15.0 && size[1] >= 10.5 {
-                let is_labelled = !placed.grasp.is_hand_alone;
-                let label = active.filter(|_| is_labelled).map_or(String::new(), cell_label);
+                let label = match active {
+                    Some(newtons) if !placed.grasp.is_hand_alone => cell_label(newtons),
+                    _ => String::new(),
+                };
                 let class = if lightness(fill) < DARK { "cell-force on-dark" } else { "cell-force" };
                 let at = [corner[0] + size[0] / 2.0, corner[1] + size[1] / 2.0 + 3.2];
                 svg.text_with(at, Anchor::Middle, class, &label, &[("data-force", &cell_idx)]);

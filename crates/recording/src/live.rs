@@ -334,7 +334,9 @@ impl LiveRecorder {
 
     fn complete(&mut self, mut part: Part, is_last: bool) -> Result<(), (PathBuf, RecordingError)> {
         let path = part.file.path().to_path_buf();
-        if let Some(ending) = self.ending.filter(|_| is_last) {
+        if let Some(ending) = self.ending
+            && is_last
+        {
             let metadata = BTreeMap::from([("ended".to_string(), ending.to_string())]);
             part.file.write_metadata(END_METADATA_NAME, &metadata).map_err(|error| (path.clone(), error))?;
         }

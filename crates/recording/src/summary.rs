@@ -50,9 +50,12 @@ pub(super) fn open(path: &Path) -> Result<(File, Summary), RecordingError> {
     let damaged = |message: String| RecordingError::Damaged { path: path.into(), message };
     let mut file = open_mcap(path)?;
     let n_file_bytes = file.metadata().map_err(io)?.len();
-    let raw = raw_summary(&mut file, n_file_bytes).map_err(|error| match is_being_written(&file) {
-        true => invalid("it is still being recorded: it can be read when its recorder has ended".into()),
-        false => damaged(format!("it was cut off or is damaged: expected MCAP's summary at its end ({error})")),
+    let raw = raw_summary(&mut file, n_file_bytes).map_err(|error| {
+        if is_being_written(&file) {
+            invalid("it is still being recorded: it can be read when its recorder has ended".into())
+        } else {
+            damaged(format!("it was cut off or is damaged: expected MCAP's summary at its end ({error})"))
+        }
     })?;
     let mut info = None;
     let mut metadata = BTreeMap::new();

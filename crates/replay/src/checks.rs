@@ -108,9 +108,10 @@ impl EdgesInQuestion<'_> {
                     is_played: edge.origin != Origin::Stage,
                 });
             } else if self.found.contains_key(&edge.found_topic) {
-                let text = match self.is_update {
-                    true => "was not recorded",
-                    false => "the graph has this edge, but the recording does not: record it again, or --update",
+                let text = if self.is_update {
+                    "was not recorded"
+                } else {
+                    "the graph has this edge, but the recording does not: record it again, or --update"
                 };
                 checks.push(Check::new(topic, self.is_update, text.into()));
             }
@@ -162,9 +163,8 @@ impl Decisions {
         if !expected.reasons.is_empty() {
             let n_of = |word: &str| self.decisions.values().filter(|decision| decision.reason.as_str() == word).count();
             let counts = expected.reasons.iter().map(|(word, wanted)| (word, n_of(word), *wanted));
-            let texts = counts.clone().map(|(word, n, wanted)| match n == wanted {
-                true => format!("{word} {n}"),
-                false => format!("{word} {n}, expected {wanted}"),
+            let texts = counts.clone().map(|(word, n, wanted)| {
+                if n == wanted { format!("{word} {n}") } else { format!("{word} {n}, expected {wanted}") }
             });
             let text = texts.collect::<Vec<_>>().join("; ");
             checks.push(Check::new("reasons", counts.clone().all(|(_, n, wanted)| n == wanted), text));

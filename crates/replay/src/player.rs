@@ -173,9 +173,10 @@ impl<M: Played> Player<M> {
             }
             None => {
                 self.so_far = Extent::default();
-                match self.is_kept {
-                    true => UnderWay::Kept(0),
-                    false => UnderWay::Read(Box::new(self.program.open(Reach::ByIndex)?)),
+                if self.is_kept {
+                    UnderWay::Kept(0)
+                } else {
+                    UnderWay::Read(Box::new(self.program.open(Reach::ByIndex)?))
                 }
             }
         };

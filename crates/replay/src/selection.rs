@@ -93,10 +93,10 @@ impl FromStr for GraspIds {
 
 impl fmt::Display for GraspIds {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let ranges = self.0.iter().map(|(first, last)| match first == last {
-            true => first.to_string(),
-            false => format!("{first}-{last}"),
-        });
+        let ranges = self
+            .0
+            .iter()
+            .map(|(first, last)| if first == last { first.to_string() } else { format!("{first}-{last}") });
         f.write_str(&ranges.collect::<Vec<_>>().join(","))
     }
 }

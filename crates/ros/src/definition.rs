@@ -80,8 +80,10 @@ impl Definition {
     /// # Errors
     /// See [`DefinitionError`].
     pub fn parse(name: &str, text: &str) -> Result<Definition, DefinitionError> {
-        let name =
-            full_name(name, "").filter(|_| name.contains('/')).ok_or_else(|| DefinitionError::Name(name.into()))?;
+        let name = match full_name(name, "") {
+            Some(full) if name.contains('/') => full,
+            _ => return Err(DefinitionError::Name(name.into())),
+        };
         let mut parts: BTreeMap<String, Vec<Field>> = BTreeMap::new();
         let (mut current, mut fields) = (name.clone(), Vec::new());
         for (idx, line) in text.lines().enumerate() {

@@ -138,10 +138,8 @@ impl Network {
 /// # Errors
 /// It is no name of a topic.
 pub fn topic_name(namespace: &str, topic: &str) -> Result<String, RosError> {
-    let full = match topic.starts_with('/') {
-        true => topic.to_owned(),
-        false => format!("{}/{topic}", namespace.trim_end_matches('/')),
-    };
+    let full =
+        if topic.starts_with('/') { topic.to_owned() } else { format!("{}/{topic}", namespace.trim_end_matches('/')) };
     let is_word = |word: &str| {
         word.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
             && word.chars().all(|char| char.is_ascii_alphanumeric() || char == '_')

@@ -157,7 +157,9 @@ impl RunReport {
         if wrong.points.len() < MAX_WRONG {
             wrong.points.push(point);
         }
-        if let Some(frame) = frame.filter(|_| wrong.pictures.len() < MAX_PICTURES) {
+        if let Some(frame) = frame
+            && wrong.pictures.len() < MAX_PICTURES
+        {
             wrong.pictures.push(RecordedGrasp {
                 grasp_id: decision.grasp_id,
                 frames: vec![frame],

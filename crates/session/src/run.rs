@@ -145,7 +145,9 @@ impl Session {
         };
         outcome?;
         reported?;
-        if let Some(path) = self.report.filter(|_| !self.is_quiet) {
+        if let Some(path) = self.report
+            && !self.is_quiet
+        {
             print_diagnostic(&format!("the report of the run is {}", path.display()));
         }
         if let Some(error) = printer.take_failure() {
@@ -165,7 +167,9 @@ fn hand_of(graph: &Graph) -> Option<Hand> {
 
 impl SessionSummary {
     fn print_recording(&self) {
-        if let Some(samples) = self.recorded_samples.as_ref().filter(|_| !self.recorded_files.is_empty()) {
+        if let Some(samples) = self.recorded_samples.as_ref()
+            && !self.recorded_files.is_empty()
+        {
             let topics: Vec<_> = samples.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
             let files: Vec<_> = self.recorded_files.iter().map(|file| file.display().to_string()).collect();
             print_diagnostic(&format!("recorded to {}: {}", files.join(", "), topics.join(", ")));

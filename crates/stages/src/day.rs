@@ -140,10 +140,11 @@ pub fn day_distance(mean: &[f64], other: &[f64], deviations: &[f64]) -> f64 {
 }
 
 fn ratio(difference: f64, deviation: f64) -> f64 {
-    match deviation > 1e-9 {
-        true => difference / deviation,
+    if deviation > 1e-9 {
+        difference / deviation
+    } else {
         // The posture of a whole day may be one number: another one is a difference of its own.
-        false => f64::from(u8::from(difference.abs() > 1e-6)),
+        f64::from(u8::from(difference.abs() > 1e-6))
     }
 }
 

@@ -32,7 +32,9 @@ impl Decided {
             None => self.runs.push_back(Run { epoch, first: grasp_id, n: 1 }),
         }
         let mut n_to_forget = self.runs.iter().map(|run| run.n).sum::<u64>().saturating_sub(n_remembered as u64);
-        while let Some(oldest) = self.runs.front_mut().filter(|_| n_to_forget > 0) {
+        while let Some(oldest) = self.runs.front_mut()
+            && n_to_forget > 0
+        {
             if oldest.n > n_to_forget {
                 (oldest.first, oldest.n) = (oldest.first + n_to_forget, oldest.n - n_to_forget);
                 return;

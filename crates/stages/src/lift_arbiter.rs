@@ -148,7 +148,7 @@ impl OpenGrasp {
 
     /// The probe that a promising grasp is asked for, if it has not been.
     fn asks_for(&self, options: &ArbiterOptions) -> Option<(Action, Phase)> {
-        options.probe.asked().filter(|_| self.awaited == Phase::Settled)
+        if self.awaited == Phase::Settled { options.probe.asked() } else { None }
     }
 
     /// Adds a vote, and returns the number of consecutive equal votes of the same operators and their lowest probability.
@@ -225,7 +225,9 @@ impl LiftArbiter {
         if self.state.options.promised_drops != options.promised_drops {
             self.state.promise = PromiseMonitor::default();
         }
-        if let Some(open) = self.state.open.as_mut().filter(|_| self.state.options != options) {
+        if let Some(open) = self.state.open.as_mut()
+            && self.state.options != options
+        {
             open.agreeing = None;
         }
         self.state.options = options;

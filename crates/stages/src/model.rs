@@ -284,7 +284,7 @@ impl Model {
         }
         if self.has_probes() {
             // A frame that is at fault leaves no feature behind.
-            let values = values.ok().filter(|_| verdict.is_ok()).unwrap_or_default();
+            let values = if verdict.is_ok() { values.unwrap_or_default() } else { &[] };
             memory.grasp.add((place.epoch, place.grasp_id), phase, values, &signals(&self.features));
         }
         verdict

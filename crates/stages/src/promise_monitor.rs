@@ -31,10 +31,8 @@ impl PromiseMonitor {
         }
         for (way, evidence) in WAYS.iter().zip(&mut self.evidence) {
             let suspected = promised_drops + way * (1.0 - promised_drops);
-            let ratio = match is_dropped {
-                true => suspected / promised_drops,
-                false => (1.0 - suspected) / (1.0 - promised_drops),
-            };
+            let ratio =
+                if is_dropped { suspected / promised_drops } else { (1.0 - suspected) / (1.0 - promised_drops) };
             *evidence = (1.0 + *evidence) * ratio;
         }
         self.is_withdrawn |= self.evidence.iter().sum::<f64>() >= WITHDRAWN_FROM * WAYS.len() as f64;

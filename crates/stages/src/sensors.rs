@@ -286,10 +286,8 @@ impl SensorCheck {
 
     /// Weighs that cells repeat their readings of the frame before, or do not.
     fn compare(&self, hand: &Hand, memory: &mut SensorMemory, cells_newtons: &[f64]) {
-        let ratio = |repeats: bool, by_chance: f64| match repeats {
-            true => (1.0 - LOOSE) / by_chance,
-            false => LOOSE / (1.0 - by_chance),
-        };
+        let ratio =
+            |repeats: bool, by_chance: f64| if repeats { (1.0 - LOOSE) / by_chance } else { LOOSE / (1.0 - by_chance) };
         for (pad_idx, (pad, flicker)) in hand.pads.iter().zip(&self.flicker).enumerate() {
             let range = pad.first_cell_idx..pad.first_cell_idx + pad.cells.len();
             let mut all_repeat = true;

@@ -494,7 +494,8 @@ impl FrameFilter {
 
     /// Makes a reading the last one, whether it is accepted or not.
     fn advance(&mut self, reading: &Reading, keys: Keys) {
-        let last = self.connection.seq.or(self.place.seq.filter(|_| self.connection.keys.is_none()));
+        let before = if self.connection.keys.is_none() { self.place.seq } else { None };
+        let last = self.connection.seq.or(before);
         let jump = match (reading.seq, last) {
             (Some(seq), Some(last)) if seq > last && seq - last <= MAX_JUMP => seq - last - 1,
             _ => 0,

@@ -47,9 +47,10 @@ fn without_checksum(text: &str) -> Result<Cow<'_, str>, String> {
     let given = given.ok_or("crc must be the last key, a whole number below 2^32")?;
     let line = format!("{before}}}");
     let found = crc32fast::hash(line.as_bytes());
-    match found == given {
-        true => Ok(line.into()),
-        false => Err(format!("crc is {given}, expected {found}: the line has changed on its way")),
+    if found == given {
+        Ok(line.into())
+    } else {
+        Err(format!("crc is {given}, expected {found}: the line has changed on its way"))
     }
 }
 

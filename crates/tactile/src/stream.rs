@@ -317,7 +317,9 @@ impl TactileDriver for Stream {
     }
 
     fn watch<'a>(&'a self, fds: &mut Vec<PollFd<'a>>) {
-        if let Some(listener) = self.listener.as_ref().filter(|_| self.retry.at_nanos <= self.no_client_nanos) {
+        if let Some(listener) = self.listener.as_ref()
+            && self.retry.at_nanos <= self.no_client_nanos
+        {
             fds.push(PollFd::from_borrowed_fd(listener.as_fd(), PollFlags::IN));
         }
         if let Some(connection) = &self.connection {

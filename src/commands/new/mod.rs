@@ -312,8 +312,12 @@ fn write_files(folder: &Path, files: &[File], words: &[(&str, String)]) -> anyho
     let written = files.iter().try_for_each(|(path, text, is_program)| {
         let path = folder.join(path);
         let is_template = ![PYTHON_OPERATOR, PYTHON_MESSAGES, CARGO_LOCK].contains(text);
-        let words = words.iter().filter(|_| is_template);
-        let filled = words.fold(text.to_string(), |text, (word, by)| text.replace(word, by));
+        let mut filled = text.to_string();
+        if is_template {
+            for (word, by) in *words {
+                filled = filled.replace(word, by);
+            }
+        }
         if let Some(parent) = path.parent() {
             std::fs::create_dir_all(parent)?;
         }

@@ -39,8 +39,8 @@ pub(super) struct EdgeSpan {
     is_numbered: bool,
     /// Whether it has one sample a grasp, with numbers of its own.
     is_said_once: bool,
-    answered_cells: Vec<usize>,
-    writer_cell: usize,
+    answered_slots: Vec<usize>,
+    writer_slot: usize,
     /// The last sample before the recorder attached.
     place: Option<SampleId>,
     has_begun: bool,
@@ -82,8 +82,8 @@ impl EdgeSpan {
             topic: edge.topic.clone(),
             is_numbered: bears_source_number(type_name),
             is_said_once: type_name == LiftDecision::TYPE_NAME,
-            answered_cells: edge.answered_cells.clone(),
-            writer_cell: edge.input.writer_cell,
+            answered_slots: edge.answered_slots.clone(),
+            writer_slot: edge.input.writer_slot,
             place: None,
             has_begun: false,
             first: None,
@@ -108,7 +108,8 @@ impl EdgeSpan {
 
     /// Counts a recorded sample, and the missing samples before it.
     fn count(&mut self, key: SampleId, before: Option<SampleId>) {
-        let last = self.last.or(before.filter(|_| self.is_numbered));
+        let before = if self.is_numbered { before } else { None };
+        let last = self.last.or(before);
         let n_missing = match last {
             Some(last) if last.epoch == key.epoch && key.seq > last.seq => key.seq - last.seq - 1,
             _ => 0,
@@ -140,11 +141,11 @@ impl EdgeSpan {
         }
         if self.until.is_none() {
             // Its answered samples are read before its sent samples, which then include the answers.
-            let has_answered = self.answered_cells.iter().all(|cell| is_at(&cursors.input(*cell).key(), end));
+            let has_answered = self.answered_slots.iter().all(|slot| is_at(&cursors.input(*slot).key(), end));
             if !has_answered {
                 return false;
             }
-            self.until = Some(cursors.output(self.writer_cell).key());
+            self.until = Some(cursors.output(self.writer_slot).key());
         }
         self.until.flatten().is_none_or(|until| is_at(&self.seen.or(self.place), &until))
     }
@@ -194,10 +195,13 @@ impl Span {
     fn belongs(&self, edge: &EdgeSpan, header: &Header) -> bool {
         let key = sample_id(header);
         if edge.is_numbered {
-            let is_behind_end = self.end.is_some_and(|(end, _)| match key.epoch == end.epoch {
-                true => key.seq > end.seq,
-                // A later epoch, if it has come to the end's already.
-                false => edge.last.is_some_and(|last| last.epoch == end.epoch),
+            let is_behind_end = self.end.is_some_and(|(end, _)| {
+                if key.epoch == end.epoch {
+                    key.seq > end.seq
+                } else {
+                    // A later epoch, if it has come to the end's already.
+                    edge.last.is_some_and(|last| last.epoch == end.epoch)
+                }
             });
             return !is_behind_end && (edge.has_begun || !edge.is_before(&key, self.before));
         }
@@ -274,8 +278,8 @@ mod tests {
             topic: "/tactile".into(),
             is_numbered,
             is_said_once: false,
-            answered_cells: Vec::new(),
-            writer_cell: 0,
+            answered_slots: Vec::new(),
+            writer_slot: 0,
             place,
             has_begun: false,
             first: None,

@@ -96,9 +96,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     };
     let fed = feed.into_graph(&graph, &arguments.overrides)?;
     let n_stops = stop_requests()?;
-    let tap = match arguments.step {
-        true => Some(step::start(&arguments.recording, &selection, &fed, name, arguments.json, &n_stops)?),
-        false => None,
+    let tap = if arguments.step {
+        Some(step::start(&arguments.recording, &selection, &fed, name, arguments.json, &n_stops)?)
+    } else {
+        None
     };
     let session = Session {
         launch: LaunchOptions { startup_limit: Duration::from_secs(60), ..LaunchOptions::default() },

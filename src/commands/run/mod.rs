@@ -223,7 +223,9 @@ fn graph_here(arguments: &Arguments, graph: &Graph) -> anyhow::Result<Graph> {
 
 /// A graph without machines, or with all of its machines here.
 fn whole(arguments: &Arguments, graph: Graph) -> anyhow::Result<Graph> {
-    if let Some(machines) = graph.machines.as_ref().filter(|_| !arguments.machines.all_machines) {
+    if let Some(machines) = graph.machines.as_ref()
+        && !arguments.machines.all_machines
+    {
         let names: Vec<_> = machines.machines.iter().map(|machine| machine.name.as_str()).collect();
         bail!(
             "this graph runs on several machines: say which one this is with --machine {}, or start all operators here \

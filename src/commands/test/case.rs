@@ -73,9 +73,10 @@ impl Runner<'_> {
         let (fed, summary) = self.replay(&recording, &graph, &found)?;
         let n_lost = summary.samples_lost + summary.samples_dropped;
         let has_lost = n_lost > 0 || summary.edges_unknown > 0;
-        let text = match has_lost {
-            true => format!("{n_lost} samples lost, unknown on {} edges", summary.edges_unknown),
-            false => format!("{} grasps decided, nothing lost", summary.grasps),
+        let text = if has_lost {
+            format!("{n_lost} samples lost, unknown on {} edges", summary.edges_unknown)
+        } else {
+            format!("{} grasps decided, nothing lost", summary.grasps)
         };
         case.checks.push(Check::new("replay", !has_lost, text));
 

@@ -102,9 +102,10 @@ fn write_suite<W: Write>(writer: &mut Writer<W>, case: &Case) -> std::io::Result
                     .with_attribute(("name", allowed(&check.name).as_str()));
                 let text = allowed(&check.text);
                 element.write_inner_content(|writer| {
-                    let said = match check.has_passed {
-                        true => writer.create_element("system-out"),
-                        false => writer.create_element("failure").with_attribute(("message", text.as_str())),
+                    let said = if check.has_passed {
+                        writer.create_element("system-out")
+                    } else {
+                        writer.create_element("failure").with_attribute(("message", text.as_str()))
                     };
                     said.write_text_content(BytesText::new(&text))?;
                     Ok(())

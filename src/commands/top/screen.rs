@@ -354,9 +354,10 @@ fn footer(view: &View, width: u16) -> Line<'static> {
     let secs = view.interval.as_secs_f64();
     let counted = if view.is_counted_anew() { "from r" } else { "from start" };
     let rates = if view.is_rate_since_base { counted.into() } else { format!("{secs} s") };
-    let keys = match view.has_ended() {
-        true => vec!["q quit".to_string(), "g another running graph".into()],
-        false => vec![
+    let keys = if view.has_ended() {
+        vec!["q quit".to_string(), "g another running graph".into()]
+    } else {
+        vec![
             "q quit".to_string(),
             "? help".into(),
             "p pause".into(),
@@ -365,7 +366,7 @@ fn footer(view: &View, width: u16) -> Line<'static> {
             format!("w rates {rates}"),
             "Tab ↑↓ scroll".into(),
             "g graph".into(),
-        ],
+        ]
     };
     let mut line = String::new();
     for key in keys {

@@ -66,10 +66,12 @@ pub(super) fn table(columns: &[Column], rows: &[Vec<Cell>], width: usize) -> (Li
                 spans.push(Span::raw(" ".repeat(GAP)));
             }
             let is_last = place + 1 == kept.len();
-            match columns[idx].is_left {
-                true if is_last => spans.push(Span::styled(text, style)),
-                true => spans.extend([Span::styled(text, style), Span::raw(blanks)]),
-                false => spans.extend([Span::raw(blanks), Span::styled(text, style)]),
+            if !columns[idx].is_left {
+                spans.extend([Span::raw(blanks), Span::styled(text, style)]);
+            } else if is_last {
+                spans.push(Span::styled(text, style));
+            } else {
+                spans.extend([Span::styled(text, style), Span::raw(blanks)]);
             }
         }
         Line::from(spans)

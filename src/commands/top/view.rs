@@ -185,9 +185,10 @@ impl View {
     /// To the next longer or shorter of the usual intervals.
     fn change_interval(&mut self, steps: i32) {
         let secs = self.interval.as_secs_f64();
-        let next = match steps > 0 {
-            true => INTERVALS_SECS.iter().find(|&&other| other > secs + 1e-9),
-            false => INTERVALS_SECS.iter().rfind(|&&other| other < secs - 1e-9),
+        let next = if steps > 0 {
+            INTERVALS_SECS.iter().find(|&&other| other > secs + 1e-9)
+        } else {
+            INTERVALS_SECS.iter().rfind(|&&other| other < secs - 1e-9)
         };
         if let Some(&secs) = next {
             self.interval = Duration::from_secs_f64(secs);

@@ -160,11 +160,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
                 "--port, --view-control, --foxglove and --shadow are for the page: leave out --out, --format and --json",
             );
         }
-        return match is_drawn {
-            true => graph::draw_running(name, arguments.out.as_deref(), graph),
-            false if graph.interval.is_some() => refuse("--interval is for a drawing: add --out, --format or --json"),
-            false => live::show(name, port, false, arguments.rights, shadow),
-        };
+        if is_drawn {
+            return graph::draw_running(name, arguments.out.as_deref(), graph);
+        }
+        if graph.interval.is_some() {
+            refuse("--interval is for a drawing: add --out, --format or --json");
+        }
+        return live::show(name, port, false, arguments.rights, shadow);
     }
     if graph.interval.is_some() {
         refuse("--interval is for a running graph: name one");

@@ -155,7 +155,10 @@ impl Reading {
         let step = listed.n_frames.div_ceil(most).max(1);
         let Samples { frames, contacts, probabilities, object } = self.samples(*id, listed, step)?;
         // Of a thinned out grasp, the gaps would decide.
-        let shadow = self.shadow.as_mut().filter(|_| step == 1).map(|judge| decide_alone(judge, &frames));
+        let shadow = match &mut self.shadow {
+            Some(judge) if step == 1 => Some(decide_alone(judge, &frames)),
+            _ => None,
+        };
         let start_nanos = frames.first().map_or(0, |frame| frame.header.stamp_nanos);
         let events = frames.iter().enumerate().map(|(idx, Stamped { header, message })| {
             let mut event = json!({

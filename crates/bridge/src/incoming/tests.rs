@@ -199,7 +199,8 @@ impl World {
                 place.heard_millis = now_millis;
             }
             let is_up = can_hear || now_millis - place.heard_millis < DEADLINE_MILLIS;
-            let peer = if can_hear { Some(other) } else { place.peer.filter(|_| is_up) };
+            let known = if is_up { place.peer } else { None };
+            let peer = if can_hear { Some(other) } else { known };
             let before = std::mem::replace(&mut place.peer, peer);
             if before == peer || !place.is_alive {
                 continue;

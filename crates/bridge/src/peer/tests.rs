@@ -77,10 +77,7 @@ fn greet(first: &mut Side, second: &mut Side, now_nanos: u64) -> [Option<Change>
 fn two_links_find_each_other_in_either_order() {
     for robot_begins in [true, false] {
         let [mut robot, mut brain] = pair();
-        let changes = match robot_begins {
-            true => greet(&mut robot, &mut brain, 0),
-            false => greet(&mut brain, &mut robot, 0),
-        };
+        let changes = if robot_begins { greet(&mut robot, &mut brain, 0) } else { greet(&mut brain, &mut robot, 0) };
         assert_eq!(changes, [Some(Change::Found); 2]);
         assert!(robot.peer.is_ready() && brain.peer.is_ready());
         assert_eq!((robot.peer.state, robot.peer.n_times_up), (PeerState::Up, 1));

@@ -109,7 +109,7 @@ pub fn bears_source_number(type_name: &str) -> bool {
 
 impl<S: Sink> Observer<S> {
     /// Starts observing `edges`, which are given in the graph's order, sources first; returns once all ports are open. Samples
-    /// of prompt edges wake it by the bell of this cell.
+    /// of prompt edges wake it by the bell of this slot.
     ///
     /// # Errors
     /// A type of an edge is unknown, or iceoryx2 fails.
@@ -143,7 +143,7 @@ impl<S: Sink> Observer<S> {
         let connected = Arc::new(AtomicBool::new(false));
         let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&domain.cursors))?);
         let waiter = match bell {
-            Some(cell) => Waiter::of_cell(&cursors, cell, WaitMode::Event),
+            Some(slot) => Waiter::of_slot(&cursors, slot, WaitMode::Event),
             None => Waiter::of_process(),
         };
         let waiter = waiter.context("cannot make an event")?;
@@ -153,9 +153,9 @@ impl<S: Sink> Observer<S> {
             let (request, failed, connected) = (Arc::clone(&request), Arc::clone(&failed), Arc::clone(&connected));
             let domain = domain.clone();
             move || {
-                let cells: Vec<usize> = edges.iter().filter_map(|edge| edge.input.cell).collect();
+                let slots: Vec<usize> = edges.iter().filter_map(|edge| edge.input.slot).collect();
                 // Also if the sink panics.
-                let mut seat = Seat { cursors: Arc::clone(&cursors), cells, failed, is_left: true };
+                let mut seat = Seat { cursors: Arc::clone(&cursors), slots, failed, is_left: true };
                 let watch = Watch { role, request: &request, connected: &connected, waiter: &waiter };
                 let outcome = observe(&domain, &cursors, &edges, sink, &watch, || {
                     let _ = ready.send(());
@@ -209,10 +209,10 @@ impl<S: Sink> Observer<S> {
     }
 }
 
-/// An observer's cells. No writer may wait for a reader that has ended, however it has ended.
+/// An observer's slots. No writer may wait for a reader that has ended, however it has ended.
 struct Seat {
     cursors: Arc<SharedCursors>,
-    cells: Vec<usize>,
+    slots: Vec<usize>,
     failed: Arc<AtomicBool>,
     is_left: bool,
 }
@@ -223,7 +223,7 @@ impl Drop for Seat {
             self.failed.store(true, Ordering::Relaxed);
         }
         if self.is_left {
-            self.cells.iter().for_each(|cell| self.cursors.input(*cell).give_up(true));
+            self.slots.iter().for_each(|slot| self.cursors.input(*slot).give_up(true));
         }
     }
 }

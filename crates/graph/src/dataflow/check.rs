@@ -264,7 +264,9 @@ fn find_program(
         }
         // The id alone starts no program: a node may have the name of any.
         let is_written = run.at != entry.id.at;
-        if let Some(program) = program_on_path(&run.text).filter(|_| is_written) {
+        if let Some(program) = program_on_path(&run.text)
+            && is_written
+        {
             return Some(program.into());
         }
         let on_path = if is_written { "; no program of this name is on PATH" } else { "" };

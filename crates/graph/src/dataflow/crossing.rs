@@ -72,7 +72,10 @@ fn crossings(file: &DataflowFile) -> Vec<Crossing<'_>> {
 
 /// One of two machines that an edge joins must listen, unless there is a router.
 fn check_listeners(file: &DataflowFile, crossings: &[Crossing], diagnostics: &mut Diagnostics) {
-    let Some(machines) = file.machines.as_ref().filter(|_| !file.link.has_router) else { return };
+    if file.link.has_router {
+        return;
+    }
+    let Some(machines) = &file.machines else { return };
     // A machine that the file does not have is another mistake.
     let listens = |name: &str| machines.find(name).is_none_or(|machine| machine.listens);
     let ways_out = |name: &str| {

@@ -57,10 +57,7 @@ impl fmt::Display for Endpoint {
             Self::Tls { host, port } => ("tls", host, port),
             Self::Tcp { host, port } => ("tcp", host, port),
         };
-        match host.contains(':') {
-            true => write!(f, "{protocol}/[{host}]:{port}"),
-            false => write!(f, "{protocol}/{host}:{port}"),
-        }
+        if host.contains(':') { write!(f, "{protocol}/[{host}]:{port}") } else { write!(f, "{protocol}/{host}:{port}") }
     }
 }
 

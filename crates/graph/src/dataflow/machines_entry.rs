@@ -274,7 +274,9 @@ fn address(endpoint: &Endpoint) -> (&str, u16) {
 pub(super) fn check_security(machines: &MachinesEntry, link: &LinkEntry, diagnostics: &mut Diagnostics) {
     let endpoints = || machines.machines.iter().flat_map(|machine| &machine.listen).chain(&link.router);
     let is_tls = |endpoint: &Endpoint| matches!(endpoint, Endpoint::Tls { .. });
-    if let Some((text, _)) = endpoints().find(|(_, endpoint)| is_tls(endpoint)).filter(|_| !link.has_keys) {
+    if let Some((text, _)) = endpoints().find(|(_, endpoint)| is_tls(endpoint))
+        && !link.has_keys
+    {
         let message = format!("{} needs certificates, but 'link' has no 'keys'", quote(&text.text));
         let help = "make them with 'blindgrasp keys' and write 'link: {keys: FOLDER}'".to_owned();
         diagnostics.push_with_help(text.at, message, Some(help));

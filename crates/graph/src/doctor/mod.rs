@@ -190,11 +190,13 @@ fn graphs() -> Finding {
     };
     let silent: Vec<String> =
         running.iter().filter_map(|graph| status(graph).err()).map(|error| error.to_string()).collect();
-    match silent.is_empty() {
-        false => Finding::warning(check, silent.join("; "), "continue or kill its launcher"),
-        true if running.is_empty() => Finding::ok(check, "none"),
-        true => Finding::ok(check, format!("{}, answering", running.join(", "))),
+    if !silent.is_empty() {
+        return Finding::warning(check, silent.join("; "), "continue or kill its launcher");
     }
+    if running.is_empty() {
+        return Finding::ok(check, "none");
+    }
+    Finding::ok(check, format!("{}, answering", running.join(", ")))
 }
 
 fn shipped(operators: &Operators) -> Finding {

@@ -37,10 +37,7 @@ pub(super) fn wake_ups(policy: &str, measured: Option<WakeUps>, advice: &str) ->
     };
     let found = format!("idle: {}; under load: {}", of(measured.idle), of(measured.under_load));
     let finding = Finding { wake_ups: Some(measured), ..Finding::ok(&check, found) };
-    match measured.under_load.p999_us > LATE_UNDER_LOAD_US {
-        true => finding.with_advice(advice),
-        false => finding,
-    }
+    if measured.under_load.p999_us > LATE_UNDER_LOAD_US { finding.with_advice(advice) } else { finding }
 }
 
 fn kernel(release: &str, is_preempt_rt: bool) -> Finding {
@@ -71,9 +68,10 @@ fn governors(found: &[String]) -> Finding {
         return Finding::ok(check, "not in the hands of this kernel");
     }
     let finding = Finding::ok(check, format!("governor {}", found.join(", ")));
-    match found.iter().all(|governor| governor == "performance") {
-        true => finding,
-        false => finding.with_advice("a core that slept begins slowly: cpupower frequency-set -g performance"),
+    if found.iter().all(|governor| governor == "performance") {
+        finding
+    } else {
+        finding.with_advice("a core that slept begins slowly: cpupower frequency-set -g performance")
     }
 }
 
@@ -97,12 +95,13 @@ fn locked_memory(limit_bytes: Option<u64>) -> Finding {
         return Finding::ok(check, "no limit");
     };
     let finding = Finding::ok(check, format!("at most {} KiB a process (RLIMIT_MEMLOCK)", limit_bytes >> 10));
-    match limit_bytes < ENOUGH_LOCKED_BYTES {
-        true => finding.with_advice(
+    if limit_bytes < ENOUGH_LOCKED_BYTES {
+        finding.with_advice(
             "for nodes with 'lock_memory': '@GROUP - memlock unlimited' in /etc/security/limits.d/realtime.conf; systemd: \
              LimitMEMLOCK=infinity; docker run --ulimit memlock=-1",
-        ),
-        false => finding,
+        )
+    } else {
+        finding
     }
 }
 

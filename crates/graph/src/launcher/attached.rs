@@ -2,7 +2,7 @@
 //!
 //! The plan has slots for them in every writer's list, given up until a reader takes them. The launcher only assigns
 //! the slots: the reader begins by itself once its ports are open, and a writer gives up a reader that keeps it waiting
-//! ([`GUEST_LIMIT_MILLIS`](crate::plan::GUEST_LIMIT_MILLIS)), so that no reader can stop the graph. The end of a
+//! ([`ATTACHED_LIMIT_MILLIS`](crate::plan::ATTACHED_LIMIT_MILLIS)), so that no reader can stop the graph. The end of a
 //! reader's connection frees its slots.
 
 use std::sync::mpsc::SyncSender;
@@ -15,7 +15,7 @@ use crate::plan::{N_ATTACHED, Port};
 use crate::recorded_graph::describe_graph;
 
 /// A graph that ends waits this long until its attached readers have read all samples.
-const SEE_OFF_LIMIT: Duration = Duration::from_secs(2);
+const RETIRE_LIMIT: Duration = Duration::from_secs(2);
 
 pub(super) struct AttachedReader {
     client: u64,
@@ -66,7 +66,7 @@ impl Launcher {
                 port: name(port),
                 topic: self.plan.topic(port),
                 input: self.plan.attached_input(port, place)?,
-                answered_cells: self.plan.input_cells(&port.0).collect(),
+                answered_slots: self.plan.input_slots(&port.0).collect(),
             })
         });
         Ok(Attachment {
@@ -85,20 +85,20 @@ impl Launcher {
     pub(super) fn release_attached(&mut self, client: u64) {
         for idx in 0..N_ATTACHED {
             if self.clients.attached[idx].take_if(|reader| reader.client == client).is_some() {
-                self.plan.attached_cells(idx).into_iter().for_each(|cell| self.cursors.input(cell).give_up(true));
+                self.plan.attached_slots(idx).into_iter().for_each(|slot| self.cursors.input(slot).give_up(true));
                 // It may have been killed.
-                self.bury_the_dead();
+                self.reap();
             }
         }
     }
 
     /// Tells the attached readers that all has been sent, and waits a little until they have read it and gone.
-    pub(super) fn see_off_attached(&mut self, should_hurry: &dyn Fn() -> bool) {
+    pub(super) fn retire_attached(&mut self, should_hurry: &dyn Fn() -> bool) {
         for reader in self.clients.attached.iter().flatten() {
             let _ = reader.reply.try_send(Reply::Drained);
         }
         let start = Instant::now();
-        while self.clients.attached.iter().any(Option::is_some) && start.elapsed() < SEE_OFF_LIMIT && !should_hurry() {
+        while self.clients.attached.iter().any(Option::is_some) && start.elapsed() < RETIRE_LIMIT && !should_hurry() {
             self.listen(Duration::from_millis(1));
             self.kill_hung();
         }

@@ -55,7 +55,7 @@ const RUNNING: &str = "running";
 /// The launcher checks the stop request and heartbeats this often. Output and ends of its children wake it at once.
 const POLL: Duration = Duration::from_millis(50);
 /// An ended process may take this long to be heard: the machine may be busy.
-const LAST_WORDS: Duration = Duration::from_millis(500);
+const LOG_DRAIN_LIMIT: Duration = Duration::from_millis(500);
 /// The launcher listens this long at a stretch before it does anything else.
 const LISTEN: Duration = Duration::from_millis(50);
 /// This many lines of all operators may wait for the launcher.
@@ -332,7 +332,7 @@ impl Launcher {
             if !standby {
                 wiring.skip.clone_from(&self.members[*idx].quarantine);
             }
-            let slot = self.cursors.instance(wiring.instance_cell);
+            let slot = self.cursors.instance(wiring.instance_slot);
             slot.beat(0);
             slot.works_on(None);
             self.n_processes += 1;
@@ -350,30 +350,30 @@ impl Launcher {
         Process::spawn(starts, self.host.as_ref(), &self.sender).map_err(|source| failed(first, source))
     }
 
-    /// The number of a node's next instance: the first whose heartbeat cell is free. `None` if too many old instances are on
+    /// The number of a node's next instance: the first whose heartbeat slot is free. `None` if too many old instances are on
     /// their way out.
     fn free_instance(&self, idx: usize) -> Option<usize> {
         let member = &self.members[idx];
         let leaving = self.leaving.iter().map(|leaving| &leaving.process);
         let living: Vec<usize> =
-            member.active.iter().chain(&member.standby).chain(leaving).map(|process| process.instance_cell).collect();
+            member.active.iter().chain(&member.standby).chain(leaving).map(|process| process.instance_slot).collect();
         let is_free = |n_before: &usize| {
-            self.plan.instance_cell(&member.node.id, *n_before).is_some_and(|cell| !living.contains(&cell))
+            self.plan.instance_slot(&member.node.id, *n_before).is_some_and(|slot| !living.contains(&slot))
         };
         let next = member.n_instances;
         (next..next + crate::plan::N_INSTANCES).find(is_free)
     }
 
-    /// Ends old instances of a node until a new one has a heartbeat cell of its own.
+    /// Ends old instances of a node until a new one has a heartbeat slot of its own.
     fn make_room_for_instance(&mut self, idx: usize) -> usize {
         loop {
             if let Some(n_before) = self.free_instance(idx) {
                 return n_before;
             }
-            let cells: Vec<usize> = (0..crate::plan::N_INSTANCES)
-                .filter_map(|n| self.plan.instance_cell(&self.members[idx].node.id, n))
+            let slots: Vec<usize> = (0..crate::plan::N_INSTANCES)
+                .filter_map(|n| self.plan.instance_slot(&self.members[idx].node.id, n))
                 .collect();
-            match self.leaving.iter().position(|leaving| cells.contains(&leaving.process.instance_cell)) {
+            match self.leaving.iter().position(|leaving| slots.contains(&leaving.process.instance_slot)) {
                 // Dropping it kills it.
                 Some(oldest) => drop(self.leaving.remove(oldest)),
                 None => return self.members[idx].n_instances,
@@ -415,7 +415,7 @@ impl Launcher {
                 {
                     member.is_over = true;
                     let id = member.node.id.clone();
-                    self.hear_last_words(|launcher| launcher.members[idx].active.as_ref());
+                    self.drain_logs(|launcher| launcher.members[idx].active.as_ref());
                     return Err(self.failed(&id, true));
                 }
             }
@@ -438,7 +438,9 @@ impl Launcher {
                 NodeState::Starting => NodeState::Running,
                 other => other,
             };
-            if let Some(process) = member.active.as_mut().filter(|_| !member.node.is_link()) {
+            if let Some(process) = member.active.as_mut()
+                && !member.node.is_link()
+            {
                 process.tell(&Command::Go);
             }
         }
@@ -536,9 +538,10 @@ impl Launcher {
             }
             let member = &self.members[idx];
             if !member.is_done() && !member.is_given_up() && !member.is_over {
-                let what = match should_hurry() {
-                    true => "had not drained when it was killed".into(),
-                    false => format!("did not drain within {} s", self.options.grace.as_secs_f64()),
+                let what = if should_hurry() {
+                    "had not drained when it was killed".into()
+                } else {
+                    format!("did not drain within {} s", self.options.grace.as_secs_f64())
                 };
                 let node = member.node.id.clone();
                 first_error.get_or_insert(LaunchError::Failed { node, what, log: Vec::new() });
@@ -547,7 +550,7 @@ impl Launcher {
             }
             self.on_node_ended(idx);
         }
-        self.see_off_attached(should_hurry);
+        self.retire_attached(should_hurry);
         if let Some(message) = &self.degraded {
             first_error.get_or_insert(LaunchError::Degraded(message.clone()));
         }
@@ -585,7 +588,7 @@ impl Launcher {
     /// A part of a graph that is stopped takes no more samples of sources on other machines.
     fn take_no_more(&mut self) {
         let ports: Vec<String> = self.link.driven_ports().cloned().collect();
-        let link = self.link_idx().filter(|_| self.link.was_stopped && !ports.is_empty());
+        let link = if self.link.was_stopped && !ports.is_empty() { self.link_idx() } else { None };
         if let Some(process) = link.and_then(|link| self.members[link].active.as_mut()) {
             process.tell(&Command::TakeNoMore { ports });
         }
@@ -672,7 +675,7 @@ impl Launcher {
         while let Some(ask) = self.clients.waiting.pop_front() {
             self.answer(*ask);
         }
-        self.see_off_leaving();
+        self.retire_leaving();
         if self.plan.clock() == Clock::Machine && self.slow_nodes.is_due() {
             let edges = self.edges();
             if let Some(line) = self.slow_nodes.look(&edges) {
@@ -683,7 +686,7 @@ impl Launcher {
     }
 
     /// Lets old instances go whose samples are answered, and kills those that do not end.
-    fn see_off_leaving(&mut self) {
+    fn retire_leaving(&mut self) {
         let mut leaving = std::mem::take(&mut self.leaving);
         leaving.retain_mut(|leaving| {
             leaving.process.look();
@@ -771,7 +774,9 @@ impl Launcher {
                 }
                 let is_ready = matches!(report, Report::Ready { .. });
                 process.on_report(report);
-                if let Some(what) = process.lacks_sandbox().filter(|_| is_ready) {
+                if let Some(what) = process.lacks_sandbox()
+                    && is_ready
+                {
                     let line = format!("blindgrasp: node '{node}' has 'sandbox: on', but {what}");
                     self.say(&line);
                 }
@@ -790,9 +795,9 @@ impl Launcher {
 
     /// Listens to an ended process until it has said why it failed, or half a second has passed: its last lines may still
     /// be on their way.
-    fn hear_last_words(&mut self, process: impl Fn(&Self) -> Option<&Process>) {
+    fn drain_logs(&mut self, process: impl Fn(&Self) -> Option<&Process>) {
         let start = Instant::now();
-        while process(self).is_some_and(|process| process.failure().is_none()) && start.elapsed() < LAST_WORDS {
+        while process(self).is_some_and(|process| process.failure().is_none()) && start.elapsed() < LOG_DRAIN_LIMIT {
             self.listen(POLL);
         }
     }
@@ -918,7 +923,7 @@ impl Launcher {
             file: self.file.clone(),
             pid: std::process::id(),
             state: self.state,
-            message: self.degraded.clone().filter(|_| self.members.iter().any(Member::is_given_up)),
+            message: if self.members.iter().any(Member::is_given_up) { self.degraded.clone() } else { None },
             uptime_secs: self.started.elapsed().as_secs_f64(),
             log_folder: self.log_folder.path().into(),
             nodes: self.members.iter().map(|member| self.node_status(member)).collect(),
@@ -930,7 +935,7 @@ impl Launcher {
     }
 
     fn node_status(&self, member: &Member) -> NodeStatus {
-        let beat = member.active.as_ref().map(|process| self.cursors.instance(process.instance_cell).last_beat_nanos());
+        let beat = member.active.as_ref().map(|process| self.cursors.instance(process.instance_slot).last_beat_nanos());
         NodeStatus {
             node: member.node.id.clone(),
             program: member.node.program.clone(),

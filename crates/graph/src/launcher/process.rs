@@ -55,8 +55,8 @@ pub(super) struct Process {
     /// Unique among all processes of this launch.
     pub(super) id: u64,
     pub(super) started: Instant,
-    /// Its heartbeat's cell on the cursors.
-    pub(super) instance_cell: usize,
+    /// Its heartbeat's slot on the cursors.
+    pub(super) instance_slot: usize,
     /// Its identity, once it is ready.
     pub(super) identity: Option<BTreeMap<String, String>>,
     /// Its answers depend on earlier samples.
@@ -224,7 +224,7 @@ impl Process {
         let process = |(start, hearer): (Start<'_>, Hearer)| Process {
             id: start.id,
             started: Instant::now(),
-            instance_cell: start.wiring.instance_cell,
+            instance_slot: start.wiring.instance_slot,
             identity: None,
             has_state: false,
             is_done: false,
@@ -402,9 +402,11 @@ impl Process {
                 Some(signal) if signal == Signal::BUS.as_raw() => {
                     format!("was killed (signal {signal}: shared memory is full, most likely)")
                 }
-                Some(signal) => match self.memory_max_mib.filter(|_| signal == Signal::ABORT.as_raw()) {
-                    Some(mib) => format!("was killed (signal {signal}; its memory_max_mib is {mib})"),
-                    None => format!("was killed (signal {signal})"),
+                Some(signal) => match self.memory_max_mib {
+                    Some(mib) if signal == Signal::ABORT.as_raw() => {
+                        format!("was killed (signal {signal}; its memory_max_mib is {mib})")
+                    }
+                    _ => format!("was killed (signal {signal})"),
                 },
                 None => format!("ended ({status})"),
             },
@@ -418,7 +420,10 @@ impl Process {
 
 impl Shared {
     fn write_commands(&mut self) {
-        let Some(stdin) = self.stdin.as_mut().filter(|_| !self.unwritten.is_empty()) else {
+        if self.unwritten.is_empty() {
+            return;
+        }
+        let Some(stdin) = &mut self.stdin else {
             return;
         };
         match stdin.write(&self.unwritten) {

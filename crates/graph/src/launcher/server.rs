@@ -45,7 +45,9 @@ impl Drop for Server {
     /// Waits for the thread, which holds the graph's name: the next graph of this process may need it.
     fn drop(&mut self) {
         let is_shut = rustix::net::shutdown(&self.listener, rustix::net::Shutdown::Both).is_ok();
-        if let Some(thread) = self.thread.take().filter(|_| is_shut) {
+        if let Some(thread) = self.thread.take()
+            && is_shut
+        {
             let _ = thread.join();
         }
     }
@@ -76,8 +78,10 @@ pub(super) fn serve(
                     continue;
                 }
             };
-            let Some(client_name) = own_user(&stream).filter(|_| n_clients.load(Ordering::Relaxed) < MAX_CLIENTS)
-            else {
+            if n_clients.load(Ordering::Relaxed) >= MAX_CLIENTS {
+                continue;
+            }
+            let Some(client_name) = own_user(&stream) else {
                 continue;
             };
             let trail = Trail::new(audit.clone(), client_name);

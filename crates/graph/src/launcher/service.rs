@@ -24,7 +24,7 @@ impl Service {
         let variable = |name: &str| std::env::var_os(name);
         let is_meant =
             variable(WATCHDOG_PID_VARIABLE).is_none_or(|pid| pid == OsString::from(std::process::id().to_string()));
-        let watchdog = variable(WATCHDOG_VARIABLE).filter(|_| is_meant);
+        let watchdog = if is_meant { variable(WATCHDOG_VARIABLE) } else { None };
         Service::new(variable(SOCKET_VARIABLE).as_deref(), watchdog.as_deref())
     }
 

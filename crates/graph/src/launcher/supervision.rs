@@ -53,7 +53,9 @@ impl Launcher {
 
     fn supervise_node(&mut self, idx: usize) -> Result<(), LaunchError> {
         let member = &mut self.members[idx];
-        if let Some(process) = member.active.as_mut().filter(|_| !member.is_over) {
+        if let Some(process) = member.active.as_mut()
+            && !member.is_over
+        {
             process.look();
             if process.is_stopped_by_somebody_else() {
                 process.kill();
@@ -113,12 +115,12 @@ impl Launcher {
             return;
         };
         for process in member.processes() {
-            let last = self.cursors.instance(process.instance_cell).last_beat_nanos();
+            let last = self.cursors.instance(process.instance_slot).last_beat_nanos();
             if last == 0 || !process.is_running() {
                 continue;
             }
             if was_away {
-                self.cursors.instance(process.instance_cell).beat(monotonic_nanos());
+                self.cursors.instance(process.instance_slot).beat(monotonic_nanos());
             } else if monotonic_nanos().saturating_sub(last) > limit_millis * 1_000_000 {
                 let what = format!("had no heartbeat for {limit_millis} ms and was killed");
                 process.kill();
@@ -162,7 +164,7 @@ impl Launcher {
             return Ok(());
         }
         // A failure that comes twice at the start for the same reason, such as a file that cannot be read, comes again.
-        let start_failure = process.failure().filter(|_| !process.is_ready());
+        let start_failure = if process.is_ready() { None } else { process.failure() };
         let is_permanent = start_failure.is_some() && start_failure == member.start_failure;
         member.start_failure = start_failure;
         if is_permanent {
@@ -170,7 +172,7 @@ impl Launcher {
             self.give_up(idx, format!("node '{id}' {ending}, twice in a row at its start: it is given up"));
             return Ok(());
         }
-        let sample = self.cursors.instance(process.instance_cell).sample();
+        let sample = self.cursors.instance(process.instance_slot).sample();
         member.active = None;
         self.quarantine(idx, sample);
         self.start_again(idx, &ending, &log);
@@ -182,7 +184,10 @@ impl Launcher {
     fn quarantine(&mut self, idx: usize, sample: Option<SampleId>) {
         let member = &mut self.members[idx];
         let before = std::mem::replace(&mut member.deadly, sample);
-        let Some(sample) = sample.filter(|_| sample == before) else {
+        if sample != before {
+            return;
+        }
+        let Some(sample) = sample else {
             return;
         };
         // Those that readers have passed do not come again.
@@ -254,19 +259,19 @@ impl Launcher {
                 self.link.ended_nodes.iter().for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
             }
         }
-        self.bury_the_dead();
+        self.reap();
     }
 
     /// Frees the iceoryx2 resources of dead processes, on a thread because it takes milliseconds.
-    pub(super) fn bury_the_dead(&self) {
+    pub(super) fn reap(&self) {
         let domain = self.plan.domain().clone();
         std::thread::spawn(move || namespace::clean_dead_nodes(&domain));
     }
 
     /// Tells the writers of a node's inputs that it reads no more.
     fn stop_waiting_for(&self, idx: usize) {
-        for cell in self.plan.input_cells(&self.members[idx].node.id) {
-            self.cursors.input(cell).give_up(true);
+        for slot in self.plan.input_slots(&self.members[idx].node.id) {
+            self.cursors.input(slot).give_up(true);
         }
     }
 
@@ -289,14 +294,14 @@ impl Launcher {
         ));
         self.service.has_status(&format!("degraded: {}", message.lines().next().unwrap_or_default()));
         self.degraded = Some(message);
-        self.bury_the_dead();
+        self.reap();
     }
 
     /// Takes back a node that was given up, after a swap has given it a new process.
     pub(super) fn heal(&mut self, idx: usize) {
-        let cells: Vec<usize> = self.plan.input_cells(&self.members[idx].node.id).collect();
-        for cell in cells {
-            self.cursors.input(cell).give_up(false);
+        let slots: Vec<usize> = self.plan.input_slots(&self.members[idx].node.id).collect();
+        for slot in slots {
+            self.cursors.input(slot).give_up(false);
         }
         self.members[idx].is_over = false;
         self.members[idx].restarts.clear();

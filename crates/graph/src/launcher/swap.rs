@@ -252,7 +252,7 @@ impl Launcher {
             is_warm &= process.is_warm || target.node.inputs.iter().all(|input| input.feedback);
         }
         if let Some((id, idx)) = failed {
-            self.hear_last_words(|launcher| launcher.members[idx].standby.as_ref());
+            self.drain_logs(|launcher| launcher.members[idx].standby.as_ref());
             let ending = self.members[idx].standby.as_ref().map_or_else(String::new, |process| {
                 let lines = if process.failure().is_none() { process.last_lines() } else { Vec::new() };
                 format!("{}{}", process.ending(), log_tail(&lines))
@@ -317,7 +317,9 @@ impl Launcher {
                 for (key, value) in identity {
                     let theirs = other.and_then(|other| other.get(key)).filter(|theirs| *theirs != value);
                     // Only the hand must agree with its predecessor's: a new dictionary may be the reason of the swap.
-                    if let Some(theirs) = theirs.filter(|_| !is_itself || key == "hand") {
+                    if let Some(theirs) = theirs
+                        && (!is_itself || key == "hand")
+                    {
                         let whose =
                             if is_itself { "the running one".into() } else { format!("node '{}'", member.node.id) };
                         return Some(format!(
@@ -445,8 +447,8 @@ impl Launcher {
     /// behind them, so that its memory may go.
     pub(super) fn is_read(&self, sent: &[(Port, SampleId)]) -> bool {
         sent.iter().all(|(port, last)| {
-            self.plan.reader_cells(port).iter().all(|cell| {
-                let slot = self.cursors.input(*cell);
+            self.plan.reader_slots(port).iter().all(|slot| {
+                let slot = self.cursors.input(*slot);
                 // A reader in another epoch has passed those samples, or is so far behind that the time limit decides.
                 let is_past = |key: SampleId| key.epoch != last.epoch || key.seq >= last.seq;
                 slot.is_given_up() || slot.key().is_some_and(is_past)
@@ -493,7 +495,7 @@ impl Launcher {
                 node.handover_pause_nanos as f64 / 1e6
             ));
         }
-        self.bury_the_dead();
+        self.reap();
         swap.tell(Reply::Swapped { nodes });
     }
 
@@ -513,10 +515,10 @@ impl Launcher {
             let Some(process) = &mut member.active else {
                 // There is no old operator, or it has ended meanwhile.
                 has_taken_over = false;
-                match target.was_given_up {
-                    true => self
-                        .give_up(idx, format!("the replacement of '{}', which was given up, failed", target.node.id)),
-                    false => self.start_again(idx, "and its replacement ended", &[]),
+                if target.was_given_up {
+                    self.give_up(idx, format!("the replacement of '{}', which was given up, failed", target.node.id))
+                } else {
+                    self.start_again(idx, "and its replacement ended", &[])
                 }
                 continue;
             };
@@ -529,11 +531,12 @@ impl Launcher {
             });
             has_taken_over &= self.members[idx].active.as_ref().is_some_and(|process| process.has_taken_over);
         }
-        self.bury_the_dead();
+        self.reap();
         self.say(&format!("blindgrasp: swap rolled back: {message}"));
-        let outcome = match has_taken_over {
-            true => "the old one has taken over again",
-            false => "there was no old one left to take over: see blindgrasp ps",
+        let outcome = if has_taken_over {
+            "the old one has taken over again"
+        } else {
+            "there was no old one left to take over: see blindgrasp ps"
         };
         swap.tell(Reply::Error { message: format!("{message}; {outcome}"), rolled_back: has_taken_over });
     }
@@ -561,7 +564,7 @@ impl Launcher {
             // Dropping it kills it.
             self.members[target.idx].standby = None;
         }
-        self.bury_the_dead();
+        self.reap();
     }
 
     /// The client's answer after the comparison.
@@ -624,8 +627,8 @@ impl Launcher {
             node.inputs.iter().filter(|input| targets.iter().any(|target| target.node.id == input.from_node));
         from_targets.into_iter().all(|input| {
             let from = (input.from_node.clone(), input.from_port.clone());
-            let sent = self.plan.output_slot(&from).and_then(|cell| self.cursors.output(cell).key());
-            let answered = self.plan.input_cell(&node.id, &input.port).and_then(|cell| self.cursors.input(cell).key());
+            let sent = self.plan.output_slot(&from).and_then(|slot| self.cursors.output(slot).key());
+            let answered = self.plan.input_slot(&node.id, &input.port).and_then(|slot| self.cursors.input(slot).key());
             sent.is_none() || sent == answered
         })
     }
@@ -633,7 +636,7 @@ impl Launcher {
     /// The last sample that a node has answered; of a source, the last that it has sent.
     fn last_answered(&self, idx: usize) -> Option<SampleId> {
         let node = &self.members[idx].node;
-        let mut inputs = self.plan.input_cells(&node.id).map(|cell| self.cursors.input(cell).key());
+        let mut inputs = self.plan.input_slots(&node.id).map(|slot| self.cursors.input(slot).key());
         match inputs.next() {
             Some(key) if !node.is_source() => key,
             _ => {

@@ -91,9 +91,10 @@ fn matches(header: &[String], patterns: &[String], flag: &str) -> Result<Vec<Vec
         let found: Vec<usize> = (0..header.len())
             .filter(|idx| !header[*idx].is_empty() && matches_pattern(pattern, &header[*idx]))
             .collect();
-        match found.is_empty() {
-            true => Err(format!("{flag}: no column is called '{pattern}'; {}", help(header, pattern))),
-            false => Ok(found),
+        if found.is_empty() {
+            Err(format!("{flag}: no column is called '{pattern}'; {}", help(header, pattern)))
+        } else {
+            Ok(found)
         }
     };
     patterns.iter().map(of).collect()

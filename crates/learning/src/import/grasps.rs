@@ -64,7 +64,7 @@ impl Grasps {
                     let expected = "expected the rows of a grasp one after another; sort the table";
                     return Err(format!("line {line}: grasp '{}' again: {expected}", shortened(&name)));
                 }
-                self.open = Some((name, row.filter(|_| !is_after_nameless)));
+                self.open = Some((name, if is_after_nameless { None } else { row }));
                 Ok(complete)
             }
         }

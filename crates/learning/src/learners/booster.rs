@@ -61,7 +61,12 @@ pub fn train_boosted(
     for _ in 0..params.n_rounds {
         let derivatives: Vec<Derivatives> =
             log_odds.iter().zip(targets).map(|(log_odds, y)| Derivatives::of(*log_odds, *y)).collect();
-        let seen = (0..n_labels as u32).filter(|_| random.random_bool(params.subsample)).collect();
+        let mut seen = Vec::with_capacity(n_labels);
+        for label_idx in 0..n_labels as u32 {
+            if random.random_bool(params.subsample) {
+                seen.push(label_idx);
+            }
+        }
         let tree = grow(&columns, &derivatives, seen, params, &mut random);
         let samples = features.par_chunks(n_features);
         log_odds.par_iter_mut().zip(samples).for_each(|(log_odds, sample)| *log_odds += f64::from(tree.value(sample)));
@@ -253,7 +258,9 @@ fn best_of_column(
     let is_filled = |(_, bin): &(usize, &Derivatives)| bin.second > 0.0;
     for (bin_idx, bin) in bins[..=column.cuts.len()].iter().enumerate().filter(is_filled) {
         let right = sum.minus(left);
-        if let Some(last_bin_idx) = last_bin_idx.filter(|_| left.second >= least_weight && right.second >= least_weight)
+        if let Some(last_bin_idx) = last_bin_idx
+            && left.second >= least_weight
+            && right.second >= least_weight
         {
             let gain = left.score(params.lambda) + right.score(params.lambda) - unsplit;
             if gain > best.map_or(LEAST_GAIN, |(gain, _)| gain) {

@@ -231,7 +231,9 @@ impl Examples {
         for grasp in grasps {
             let grasp_id = grasp.grasp_id;
             let mut truth = grasp.truth;
-            if let Some(truth) = truth.as_mut().filter(|_| by_wrench_space) {
+            if let Some(truth) = truth.as_mut()
+                && by_wrench_space
+            {
                 if truth.epsilon.is_nan() || truth.volume.is_nan() {
                     exclude("no epsilon and volume in its truth");
                     continue;

@@ -158,13 +158,14 @@ pub fn train_on(
     let examples: Vec<&Example> = read.examples.iter().collect();
     let folds = folds_by_object(&examples, options.n_folds)?;
     let mut cross_validating = |fold| progress(&format!("cross-validating, fold {} of {}", fold + 1, options.n_folds));
-    let judged = match recipe.day_baseline {
-        true => day::cross_validate(hand, recipe, &examples, &folds, options.seed, &mut cross_validating)?,
-        false => OutOfFold {
+    let judged = if recipe.day_baseline {
+        day::cross_validate(hand, recipe, &examples, &folds, options.seed, &mut cross_validating)?
+    } else {
+        OutOfFold {
             decision_values: cross_validate(hand, recipe, &examples, &folds, options.seed, &mut cross_validating)?,
             examples: examples.clone(),
             folds: folds.clone(),
-        },
+        }
     };
     let calibration = calibrate(&judged.examples, &judged.decision_values)?;
     progress("training on all grasps");
@@ -223,9 +224,10 @@ pub fn train_on(
         policies,
         recordings: recordings.iter().map(|path| file_name(path)).collect(),
         made_by: read.made_by.clone(),
-        labels: match options.by_wrench_space || read.labels.contains_key(&Label::Lift) {
-            true => read.labels.clone(),
-            false => BTreeMap::new(),
+        labels: if options.by_wrench_space || read.labels.contains_key(&Label::Lift) {
+            read.labels.clone()
+        } else {
+            BTreeMap::new()
         },
         recipe: recipe.clone(),
         frictions: options.frictions.clone(),
@@ -346,7 +348,7 @@ fn choose_policies(
         attempts_per_lift: policy.expected.attempts_per_lift,
         given_up: policy.expected.given_up,
         secs_per_kept: policy.expected.secs_per_kept,
-        promise: promise.filter(|_| promises),
+        promise: if promises { *promise } else { None },
     };
     let (mut summaries, mut refusals) = (Vec::new(), Vec::new());
     match aim.choose(&policies(None, NEVER), "settled") {

@@ -138,8 +138,8 @@ pub(crate) fn composed(features: &FeatureExtractor, phase: Phase, example: &Exam
     let moves = |moving: &[Signals], phase, add: &mut dyn FnMut(Phase, &[f64])| {
         let mut row = vec![0.0; features.len()];
         for signals in moving {
-            let pads = signals.pad_newtons.iter().copied().filter(|_| features.blocks.contains(&Block::Pads));
-            let numbers = pads.chain(signals.wrist_newtons);
+            let pads = if features.blocks.contains(&Block::Pads) { &signals.pad_newtons[..] } else { &[] };
+            let numbers = pads.iter().copied().chain(signals.wrist_newtons);
             followed.iter().zip(numbers).for_each(|(idx, number)| row[*idx] = number);
             add(phase, &row);
         }

@@ -124,7 +124,9 @@ pub fn strip(
     let mut attempt = Attempt::begin(hand, target, options, &start, sensor_seed(seed, record.trial, record.attempt))?;
     while attempt.next_frame(record.grasp_id).is_some() {}
     let mut snapshots = vec![attempt.snapshot()];
-    if let Some(probe) = probe.filter(|_| record.probed) {
+    if let Some(probe) = probe
+        && record.probed
+    {
         attempt.probe(probe);
         attempt.skip_frame();
         while attempt.next_frame(record.grasp_id).is_some() {}

@@ -201,13 +201,13 @@ impl Program {
             return Err(ProgramError::Ended(String::new(), ask));
         };
         match to.write_all(&self.out) {
-            Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Err(self.last_words(ask)),
+            Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Err(self.stderr_tail(ask)),
             outcome => outcome.map_err(ProgramError::Pipe),
         }
     }
 
     /// Why a program does not listen any more: what it said before it ended, if it said something.
-    fn last_words(&mut self, ask: Ask) -> ProgramError {
+    fn stderr_tail(&mut self, ask: Ask) -> ProgramError {
         match self.next() {
             Err(error) => error,
             Ok(_) => ProgramError::Ended(self.end(), ask),

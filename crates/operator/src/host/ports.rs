@@ -174,7 +174,7 @@ pub(super) trait OutputPort {
     fn send(
         &mut self,
         answer: &RawAnswer,
-        is_to_give_way: &mut dyn FnMut() -> bool,
+        should_yield: &mut dyn FnMut() -> bool,
         check: Option<Check<'_>>,
     ) -> Result<Sent, PortError>;
     /// Sends for comparison, as a standby.
@@ -214,14 +214,14 @@ impl<M: Message> OutputPort for Output<M> {
     fn send(
         &mut self,
         answer: &RawAnswer,
-        is_to_give_way: &mut dyn FnMut() -> bool,
+        should_yield: &mut dyn FnMut() -> bool,
         check: Option<Check<'_>>,
     ) -> Result<Sent, PortError> {
         // Lengths were checked when the answer came.
         let Some((head, items)) = Self::parts(answer) else {
             return Ok(Sent::Yes);
         };
-        self.publisher.send_checked(head, &items, is_to_give_way, |head| {
+        self.publisher.send_checked(head, &items, should_yield, |head| {
             if let Some(check) = check {
                 let header = *M::header(head);
                 let mut bytes = head_bytes::<M>(head).to_vec();

@@ -328,7 +328,7 @@ impl HostedSource {
             let head = output.port.with_header(&part.head, header);
             let answer = RawAnswer { header, head, items: part.items.clone() };
             let operator = &self.operator;
-            if output.port.send(&answer, &mut || operator.is_to_give_way(), None)? == Sent::GaveWay {
+            if output.port.send(&answer, &mut || operator.should_yield(), None)? == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
             }
         }

@@ -252,7 +252,7 @@ impl HostedStage {
             return partners;
         }
         let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(monotonic_nanos()));
-        let silence = self.deadline_nanos.filter(|_| self.operator.clock() == Clock::Machine);
+        let silence = if self.operator.clock() == Clock::Machine { self.deadline_nanos } else { None };
         let held = self.inputs.iter().filter_map(|input| input.port.hold_deadline());
         held.chain(partners).chain(silence.map(|deadline| Instant::now() + left(deadline))).min()
     }
@@ -416,13 +416,17 @@ impl HostedStage {
             return Ok(Vec::new());
         };
         self.operator.works_on(Some(self.name_of(idx, first)));
-        let partners: Vec<(usize, (Vec<u8>, Vec<u8>))> =
-            self.partner_ports.iter().filter_map(|(port, partner)| Some((*port, partner.sample()?))).collect();
+        let mut partners = Vec::new();
+        for (port, partner) in &self.partner_ports {
+            if let Some((head, items)) = partner.sample() {
+                partners.push((*port, head, items));
+            }
+        }
         let port = self.inputs[idx].idx;
         for (n, sample) in samples.iter().enumerate() {
             let flags = if n + 1 < samples.len() { MORE } else { 0 };
             let own = std::iter::once((port, &sample.head[..], &sample.items[..]));
-            let others = partners.iter().map(|(port, (head, items))| (*port, &head[..], &items[..]));
+            let others = partners.iter().map(|(port, head, items)| (*port, &head[..], &items[..]));
             self.child.ask(Ask::Sample, self.now_nanos(&sample.header), flags, &[], own.chain(others))?;
         }
         let mut works = Vec::with_capacity(samples.len());
@@ -562,7 +566,7 @@ impl HostedStage {
                 failure = checked(child, output.idx, head, items, now_nanos).err();
             };
             let check: Option<ports::Check<'_>> = if is_checked { Some(&mut check) } else { None };
-            let sent = output.port.send(&answer, &mut || operator.is_to_give_way(), check)?;
+            let sent = output.port.send(&answer, &mut || operator.should_yield(), check)?;
             if let Some(failure) = failure {
                 return Err(failure.into());
             }

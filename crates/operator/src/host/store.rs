@@ -218,17 +218,21 @@ impl Store {
         let mut waited = vec![Duration::ZERO; outputs.len()];
         let limit = outputs.iter().map(|output| output.port.wait_limit()).max().unwrap_or_default();
         let outcome = loop {
-            if outputs.iter_mut().fold(false, |any, output| output.forget() || any) {
+            let mut has_forgotten = false;
+            for output in outputs.iter_mut() {
+                has_forgotten |= output.forget();
+            }
+            if has_forgotten {
                 break Ok(Sent::Yes);
             }
-            let gives_way = self.operator.is_to_give_way() && (may_give_way || self.operator.should_quit());
+            let gives_way = self.operator.should_yield() && (may_give_way || self.operator.should_quit());
             if gives_way || (may_stop && self.operator.should_stop()) {
                 break Ok(Sent::GaveWay);
             }
             let now = Instant::now();
             let since = now.duration_since(std::mem::replace(&mut last_try, now)).min(LONGEST_TRY);
             for (output, waited) in outputs.iter().zip(&mut waited) {
-                let first = output.saved.front().filter(|_| output.n_sent > 0);
+                let first = if output.n_sent > 0 { output.saved.front() } else { None };
                 let are_guests = first.is_some_and(|first| output.port.give_up_guests_that_lack(first.key(), *waited));
                 *waited = if are_guests { *waited + since } else { Duration::ZERO };
             }
@@ -268,7 +272,7 @@ impl Store {
                 let idx = output.idx;
                 let mut checked = |head: &mut Vec<u8>, items: &[u8]| check(idx, head, items);
                 let check: Option<super::ports::Check<'_>> = if is_checked { Some(&mut checked) } else { None };
-                if output.port.send(answer, &mut || self.operator.is_to_give_way(), check)? == Sent::GaveWay {
+                if output.port.send(answer, &mut || self.operator.should_yield(), check)? == Sent::GaveWay {
                     return Ok(Sent::GaveWay);
                 }
                 output.n_sent += 1;

@@ -19,7 +19,7 @@ const N_YIELDS: u32 = 64;
 pub(crate) const RETRY_PAUSE: Duration = Duration::from_micros(50);
 /// A waiting publisher looks so often for readers that have come back.
 pub(crate) const LOOK_PAUSE: Duration = Duration::from_millis(1);
-/// A longer pause between two tries counts as this much: while the whole machine stands still, no guest is slow.
+/// A longer pause between two tries counts as this much: while the whole machine stands still, no attached reader is slow.
 pub(crate) const LONGEST_TRY: Duration = Duration::from_millis(5);
 /// A publisher that grows has room for so many items at first.
 const N_FIRST_ITEMS: usize = 64;
@@ -39,7 +39,7 @@ struct Sender<M: Message> {
     pub_sub: PubSub<M>,
     publisher: iceoryx2::port::publisher::Publisher<ipc::Service, [M::Item], M::Head>,
     cursors: Arc<SharedCursors>,
-    /// The cells of the bells that wake its readers.
+    /// The slots of the bells that wake its readers.
     bells: Vec<usize>,
     n_subscribers: usize,
 }
@@ -75,7 +75,7 @@ impl<M: Message> Sender<M> {
     }
 
     fn ring(&self) {
-        self.bells.iter().for_each(|cell| self.cursors.bell(*cell).ring());
+        self.bells.iter().for_each(|slot| self.cursors.bell(*slot).ring());
     }
 
     /// Gives the history to readers that have come since the last sample, and wakes them.
@@ -95,7 +95,7 @@ impl<M: Message> Sender<M> {
 pub struct Publisher<M: Message> {
     sender: Sender<M>,
     cursors: Arc<SharedCursors>,
-    cell: usize,
+    slot: usize,
     readers: Vec<Reader>,
     wait_limit: Duration,
     /// The first sample that this publisher, and not an earlier one, has sent.
@@ -106,13 +106,13 @@ pub struct Publisher<M: Message> {
 
 /// A reader whose unanswered samples the publisher must be able to send again.
 struct Reader {
-    cell: usize,
+    slot: usize,
     limit: Limit,
     /// The last sample that it had answered at the last look.
     key: Option<SampleId>,
-    /// If it is a guest, the cells of all its readers, and how long the publisher waits for it.
-    guest_cells: Vec<usize>,
-    guest_limit: Duration,
+    /// If it is an attached reader, the slots of all its readers, and how long the publisher waits for it.
+    attached_slots: Vec<usize>,
+    attached_limit: Duration,
     /// The readers of its answers, if it answers each sample under the same number.
     behind: Vec<Reader>,
 }
@@ -141,11 +141,11 @@ impl Reader {
         let behind = wiring.behind.iter().map(|behind| Reader::further_on(behind, history)).collect();
         let limit = Limit::Queue(wiring.capacity as u64);
         Reader {
-            cell: wiring.cell,
+            slot: wiring.slot,
             limit,
             key: None,
-            guest_cells: wiring.guest_cells.clone(),
-            guest_limit: Duration::from_millis(wiring.guest_limit_millis),
+            attached_slots: wiring.attached_slots.clone(),
+            attached_limit: Duration::from_millis(wiring.attached_limit_millis),
             behind,
         }
     }
@@ -153,12 +153,12 @@ impl Reader {
     fn further_on(wiring: &ReaderWiring, history: usize) -> Reader {
         let behind = wiring.behind.iter().map(|behind| Reader::further_on(behind, history)).collect();
         let limit = Limit::History(history as u64);
-        let (guest_cells, guest_limit) = (Vec::new(), Duration::ZERO);
-        Reader { cell: wiring.cell, limit, key: None, guest_cells, guest_limit, behind }
+        let (attached_slots, attached_limit) = (Vec::new(), Duration::ZERO);
+        Reader { slot: wiring.slot, limit, key: None, attached_slots, attached_limit, behind }
     }
 
     fn has_room(&mut self, cursors: &SharedCursors, next: &Next) -> bool {
-        let slot = cursors.input(self.cell);
+        let slot = cursors.input(self.slot);
         if !(self.key.is_some() && self.is_near(next)) {
             self.key = slot.key();
             if !self.is_near(next) {
@@ -186,7 +186,7 @@ impl Reader {
     /// Of the cursors of this reader and of those behind it, without readers that were given up, the one furthest behind; the
     /// outer `None` if there is no reader.
     fn least(&self, cursors: &SharedCursors, last: Option<SampleId>) -> Option<Option<SampleId>> {
-        let slot = cursors.input(self.cell);
+        let slot = cursors.input(self.slot);
         if slot.is_given_up() {
             return None;
         }
@@ -241,7 +241,7 @@ impl<M: Message> Publisher<M> {
         Ok(Publisher {
             sender: Sender::open(node, cursors, &wiring.bells, &wiring.service, max_items, strategy)?,
             cursors: Arc::clone(cursors),
-            cell: wiring.cell,
+            slot: wiring.slot,
             readers: wiring.consumers.iter().map(|reader| Reader::of_port(reader, wiring.service.history)).collect(),
             wait_limit: Duration::from_millis(wiring.wait_limit_millis),
             own_first: None,
@@ -249,14 +249,14 @@ impl<M: Message> Publisher<M> {
         })
     }
 
-    fn cell(&self) -> &OutputSlot {
-        self.cursors.output(self.cell)
+    fn slot(&self) -> &OutputSlot {
+        self.cursors.output(self.slot)
     }
 
     /// The last sample that every lossless reader has answered, and every reader of an answer to it: an instance that takes
     /// over goes on after it, so that no sample is lost that died with its publisher.
     pub fn answered(&self) -> Option<SampleId> {
-        let last = self.cell().key();
+        let last = self.slot().key();
         let least = self.least_answered(last).unwrap_or(last);
         // The samples of this very publisher lie in the readers' queues and in its history.
         match (least, self.own_last) {
@@ -277,7 +277,7 @@ impl<M: Message> Publisher<M> {
     /// The last sample that every lossless reader, and those behind it, have answered; `None` if there is none, or no such
     /// reader.
     pub fn answered_by_readers(&self) -> Option<SampleId> {
-        self.least_answered(self.cell().key()).flatten()
+        self.least_answered(self.slot().key()).flatten()
     }
 
     /// The last sample that the reader furthest behind has answered; the outer `None` if there is no reader.
@@ -288,26 +288,26 @@ impl<M: Message> Publisher<M> {
 
     /// Whether there is a reader that the publisher waits for.
     pub fn has_readers(&self) -> bool {
-        self.readers.iter().any(|reader| !self.cursors.input(reader.cell).is_given_up())
+        self.readers.iter().any(|reader| !self.cursors.input(reader.slot).is_given_up())
     }
 
     /// Tells readers whether its samples come from another machine whose link is cut off.
     pub fn set_cut_off(&self, is_cut_off: bool) {
-        self.cell().set_cut_off(is_cut_off);
+        self.slot().set_cut_off(is_cut_off);
     }
 
     /// The last sample that any instance of the node has sent.
     pub fn last(&self) -> Option<SampleId> {
-        self.cell().key()
+        self.slot().key()
     }
 
     /// The number of samples that the node has sent, each counted once.
     pub fn n_sent(&self) -> u64 {
-        self.cell().n_sent()
+        self.slot().n_sent()
     }
 
     /// Sends a message, written straight into shared memory, once every lossless reader has room for it. While it waits it
-    /// calls `is_to_give_way` now and then, and gives up when that returns true.
+    /// calls `should_yield` now and then, and gives up when that returns true.
     ///
     /// # Errors
     /// A reader had no room for longer than the limit, or an error of iceoryx2.
@@ -315,9 +315,9 @@ impl<M: Message> Publisher<M> {
         &mut self,
         head: M::Head,
         items: &[M::Item],
-        is_to_give_way: &mut dyn FnMut() -> bool,
+        should_yield: &mut dyn FnMut() -> bool,
     ) -> Result<Sent, PortError> {
-        self.send_checked(head, items, is_to_give_way, |_| {})
+        self.send_checked(head, items, should_yield, |_| {})
     }
 
     /// As [`Publisher::send`]; `check` may change the head at the last moment, when the readers have room.
@@ -328,17 +328,17 @@ impl<M: Message> Publisher<M> {
         &mut self,
         mut head: M::Head,
         items: &[M::Item],
-        is_to_give_way: &mut dyn FnMut() -> bool,
+        should_yield: &mut dyn FnMut() -> bool,
         check: impl FnOnce(&mut M::Head),
     ) -> Result<Sent, PortError> {
         let key = sample_id(M::header(&head));
-        if !self.has_room(&key) && self.wait_for_room(&key, is_to_give_way)? == Sent::GaveWay {
+        if !self.has_room(&key) && self.wait_for_room(&key, should_yield)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
         check(&mut head);
         // It is counted first: a publisher that is killed in between sends it again, and it is counted once. The other way
         // round, a reader could answer a sample that is not counted.
-        self.cell().commit(key);
+        self.slot().commit(key);
         self.sender.send(head, items)?;
         self.own_first = self.own_first.filter(|first| first.epoch == key.epoch).or(Some(key));
         self.own_last = Some(key);
@@ -353,7 +353,7 @@ impl<M: Message> Publisher<M> {
         self.sender.look_for_readers()
     }
 
-    /// Whether a sample could be sent without waiting. `waited` is the time since the caller first asked: guests are given up
+    /// Whether a sample could be sent without waiting. `waited` is the time since the caller first asked: attached readers are given up
     /// after their time.
     ///
     /// # Errors
@@ -363,7 +363,7 @@ impl<M: Message> Publisher<M> {
         if self.has_room(&key) {
             return Ok(true);
         }
-        self.give_up_guests(&key, waited);
+        self.give_up_attached(&key, waited);
         self.sender.look_for_readers()?;
         Ok(self.has_room(&key))
     }
@@ -375,20 +375,20 @@ impl<M: Message> Publisher<M> {
     /// The first reader that has no room for a sample, if there is one.
     fn first_without_room(&mut self, key: &SampleId) -> Option<&Reader> {
         let own_first = self.own_first.filter(|first| first.epoch == key.epoch).map_or(key.seq, |first| first.seq);
-        let next = Next { key: *key, last: self.cell().key(), own_first };
+        let next = Next { key: *key, last: self.slot().key(), own_first };
         let cursors = &self.cursors;
         self.readers.iter_mut().find_map(|reader| (!reader.has_room(cursors, &next)).then_some(&*reader))
     }
 
-    /// Gives up the guests that have had no room for a sample for longer than their time, with all their readers: the other
+    /// Gives up the attached readers that have had no room for a sample for longer than their time, with all their readers: the other
     /// ports need not wait for them as well.
-    fn give_up_guests(&mut self, key: &SampleId, waited: Duration) {
+    fn give_up_attached(&mut self, key: &SampleId, waited: Duration) {
         let cursors = Arc::clone(&self.cursors);
         while let Some(reader) = self.first_without_room(key) {
-            if reader.guest_cells.is_empty() || waited <= reader.guest_limit {
+            if reader.attached_slots.is_empty() || waited <= reader.attached_limit {
                 return;
             }
-            reader.guest_cells.iter().for_each(|cell| cursors.input(*cell).give_up(true));
+            reader.attached_slots.iter().for_each(|slot| cursors.input(*slot).give_up(true));
         }
     }
 
@@ -399,12 +399,12 @@ impl<M: Message> Publisher<M> {
 
     /// Counts time for which the node waited for its readers.
     pub(crate) fn has_waited(&self, time: Duration) {
-        self.cell().add_blocked(time.as_nanos() as u64);
+        self.slot().add_blocked(time.as_nanos() as u64);
     }
 
-    /// Whether guests alone have not answered a sample that was sent. Those that have had longer than their time are given up.
+    /// Whether attached readers alone have not answered a sample that was sent. Those that have had longer than their time are given up.
     pub(crate) fn give_up_guests_that_lack(&self, key: SampleId, waited: Duration) -> bool {
-        let last = self.cell().key();
+        let last = self.slot().key();
         let lacks = |reader: &Reader| match reader.least(&self.cursors, last) {
             None => false,
             Some(None) => true,
@@ -413,18 +413,18 @@ impl<M: Message> Publisher<M> {
             Some(Some(place)) => last.is_none_or(|last| place.epoch != last.epoch),
         };
         let behind: Vec<&Reader> = self.readers.iter().filter(|reader| lacks(reader)).collect();
-        if behind.is_empty() || behind.iter().any(|reader| reader.guest_cells.is_empty()) {
+        if behind.is_empty() || behind.iter().any(|reader| reader.attached_slots.is_empty()) {
             return false;
         }
         for reader in behind {
-            if waited > reader.guest_limit {
-                reader.guest_cells.iter().for_each(|cell| self.cursors.input(*cell).give_up(true));
+            if waited > reader.attached_limit {
+                reader.attached_slots.iter().for_each(|slot| self.cursors.input(*slot).give_up(true));
             }
         }
         true
     }
 
-    fn wait_for_room(&mut self, key: &SampleId, is_to_give_way: &mut dyn FnMut() -> bool) -> Result<Sent, PortError> {
+    fn wait_for_room(&mut self, key: &SampleId, should_yield: &mut dyn FnMut() -> bool) -> Result<Sent, PortError> {
         let start = Instant::now();
         let mut last_look = start;
         let (mut last_try, mut waited) = (start, Duration::ZERO);
@@ -438,12 +438,12 @@ impl<M: Message> Publisher<M> {
                 std::thread::yield_now();
                 continue;
             }
-            if is_to_give_way() {
+            if should_yield() {
                 break Ok(Sent::GaveWay);
             }
             let now = Instant::now();
             waited += now.duration_since(std::mem::replace(&mut last_try, now)).min(LONGEST_TRY);
-            self.give_up_guests(key, waited);
+            self.give_up_attached(key, waited);
             if start.elapsed() > self.wait_limit {
                 break Err(PortError::Stalled {
                     service: self.sender.service.clone(),
@@ -457,7 +457,7 @@ impl<M: Message> Publisher<M> {
             }
             std::thread::sleep(RETRY_PAUSE);
         };
-        self.cell().add_blocked(start.elapsed().as_nanos() as u64);
+        self.slot().add_blocked(start.elapsed().as_nanos() as u64);
         outcome
     }
 }

@@ -22,7 +22,7 @@ pub struct Subscriber<M: Message> {
     pub_sub: PubSub<M>,
     subscriber: iceoryx2::port::subscriber::Subscriber<ipc::Service, [M::Item], M::Head>,
     cursors: Option<(Arc<SharedCursors>, usize)>,
-    writer_cell: usize,
+    writer_slot: usize,
     deadline_nanos: Option<u64>,
     on_late: OnLate,
     /// The age of the last sample, if it came too late.
@@ -35,7 +35,7 @@ pub struct Subscriber<M: Message> {
 }
 
 impl<M: Message> Subscriber<M> {
-    /// Opens the port. With a file of cursors and a cell in the wiring, writers wait for it; otherwise it only reads along.
+    /// Opens the port. With a file of cursors and a slot in the wiring, writers wait for it; otherwise it only reads along.
     ///
     /// # Errors
     /// An error of iceoryx2.
@@ -59,8 +59,8 @@ impl<M: Message> Subscriber<M> {
             service: wiring.service.name.clone(),
             pub_sub,
             subscriber,
-            cursors: cursors.zip(wiring.cell).map(|(cursors, cell)| (Arc::clone(cursors), cell)),
-            writer_cell: wiring.writer_cell,
+            cursors: cursors.zip(wiring.slot).map(|(cursors, slot)| (Arc::clone(cursors), slot)),
+            writer_slot: wiring.writer_slot,
             deadline_nanos: wiring.deadline_nanos,
             on_late: wiring.on_late,
             late_nanos: None,
@@ -96,17 +96,17 @@ impl<M: Message> Subscriber<M> {
     /// Goes on after the last sample that the node has answered, which the cursors name. All answers up to `answered` have
     /// been received.
     pub fn take_over(&mut self, answered: Option<SampleId>) {
-        if let Some((cursors, cell)) = &self.cursors {
-            let cell = cursors.input(*cell);
-            let sequencer = Sequencer::resume(answered, cell.key(), cell.counts());
+        if let Some((cursors, slot)) = &self.cursors {
+            let slot = cursors.input(*slot);
+            let sequencer = Sequencer::resume(answered, slot.key(), slot.counts());
             self.begin_with(sequencer);
         }
     }
 
     /// Goes on after `last`, the last sample that a saved state includes, with the counts of that time.
     pub fn take_over_at(&mut self, last: Option<SampleId>, counts: InputCounts) {
-        if let Some((cursors, cell)) = &self.cursors {
-            cursors.input(*cell).place_at(last, &counts);
+        if let Some((cursors, slot)) = &self.cursors {
+            cursors.input(*slot).place_at(last, &counts);
             self.begin_with(Sequencer::resume(last, last, counts));
         }
     }
@@ -118,11 +118,11 @@ impl<M: Message> Subscriber<M> {
 
     /// Whether all samples that its writer has sent are answered.
     pub fn is_caught_up(&self) -> bool {
-        let Some((cursors, cell)) = &self.cursors else {
+        let Some((cursors, slot)) = &self.cursors else {
             return true;
         };
-        let sent = cursors.output(self.writer_cell).key();
-        let answered = cursors.input(*cell).key();
+        let sent = cursors.output(self.writer_slot).key();
+        let answered = cursors.input(*slot).key();
         sent.is_none_or(|sent| {
             answered.is_some_and(|answered| answered.epoch == sent.epoch && answered.seq >= sent.seq)
         })
@@ -130,25 +130,25 @@ impl<M: Message> Subscriber<M> {
 
     /// The last sample that its writer has sent.
     pub fn written(&self) -> Option<SampleId> {
-        self.cursors.as_ref().and_then(|(cursors, _)| cursors.output(self.writer_cell).key())
+        self.cursors.as_ref().and_then(|(cursors, _)| cursors.output(self.writer_slot).key())
     }
 
     /// Whether its writer is on another machine whose link is cut off.
     pub fn is_cut_off(&self) -> bool {
-        self.cursors.as_ref().is_some_and(|(cursors, _)| cursors.output(self.writer_cell).is_cut_off())
+        self.cursors.as_ref().is_some_and(|(cursors, _)| cursors.output(self.writer_slot).is_cut_off())
     }
 
     /// The last sample that any instance of the node has answered, and its counts of that time.
     pub(crate) fn place(&self) -> (Option<SampleId>, InputCounts) {
-        let Some((cursors, cell)) = &self.cursors else {
+        let Some((cursors, slot)) = &self.cursors else {
             return (None, InputCounts::default());
         };
-        (cursors.input(*cell).key(), cursors.input(*cell).counts())
+        (cursors.input(*slot).key(), cursors.input(*slot).counts())
     }
 
     /// The last sample that any instance of the node has answered.
     pub fn last(&self) -> Option<SampleId> {
-        self.cursors.as_ref().and_then(|(cursors, cell)| cursors.input(*cell).key())
+        self.cursors.as_ref().and_then(|(cursors, slot)| cursors.input(*slot).key())
     }
 
     /// The next sample in order, if one is there.
@@ -183,10 +183,12 @@ impl<M: Message> Subscriber<M> {
 
     fn delivered(&mut self, sample: PortSample<M>) -> PortSample<M> {
         let origin_nanos = M::header(sample.user_header()).origin_nanos;
-        // A reader without a cell counts nothing, and a sample without a time has no age.
-        if let Some((cursors, cell)) = self.cursors.as_ref().filter(|_| origin_nanos != 0) {
+        // A reader without a slot counts nothing, and a sample without a time has no age.
+        if let Some((cursors, slot)) = self.cursors.as_ref()
+            && origin_nanos != 0
+        {
             let age_nanos = monotonic_nanos().saturating_sub(origin_nanos);
-            cursors.ages(*cell).count(age_nanos);
+            cursors.ages(*slot).count(age_nanos);
             self.late_nanos = self.deadline_nanos.filter(|limit| age_nanos > *limit).map(|_| age_nanos);
             if self.late_nanos.is_some() {
                 self.sequencer.count_late();
@@ -202,22 +204,22 @@ impl<M: Message> Subscriber<M> {
 
     /// Sets whether its writer waits for this reader no longer.
     pub fn give_up(&self, is_given_up: bool) {
-        if let Some((cursors, cell)) = &self.cursors {
-            cursors.input(*cell).give_up(is_given_up);
+        if let Some((cursors, slot)) = &self.cursors {
+            cursors.input(*slot).give_up(is_given_up);
         }
     }
 
     /// Whether the writer waits for this reader no longer.
     pub fn is_given_up(&self) -> bool {
-        self.cursors.as_ref().is_some_and(|(cursors, cell)| cursors.input(*cell).is_given_up())
+        self.cursors.as_ref().is_some_and(|(cursors, slot)| cursors.input(*slot).is_given_up())
     }
 
     /// Begins after the samples that its writer has sent so far; the writer waits for it from now on. Returns the last sample
     /// before it.
     pub fn begin_here(&mut self) -> Option<SampleId> {
-        let (cursors, cell) = self.cursors.as_ref()?;
-        let last = cursors.output(self.writer_cell).key();
-        cursors.input(*cell).begin_after(last);
+        let (cursors, slot) = self.cursors.as_ref()?;
+        let last = cursors.output(self.writer_slot).key();
+        cursors.input(*slot).begin_after(last);
         self.begin_with(Sequencer::resume(last, last, InputCounts::default()));
         last
     }
@@ -240,20 +242,20 @@ impl<M: Message> Subscriber<M> {
 
     /// As [`Subscriber::commit`], with the counts of the time at which it received this sample.
     pub(crate) fn commit_with(&self, header: &Header, counts: &InputCounts) {
-        if let Some((cursors, cell)) = &self.cursors {
+        if let Some((cursors, slot)) = &self.cursors {
             let key = sample_id(header);
-            let cell = cursors.input(*cell);
+            let slot = cursors.input(*slot);
             // A sample that goes back in order is answered, but does not move the cursor.
-            let is_ahead = cell.key().is_none_or(|last| last.epoch != key.epoch || last.seq < key.seq);
-            cell.commit(is_ahead.then_some(key), counts);
+            let is_ahead = slot.key().is_none_or(|last| last.epoch != key.epoch || last.seq < key.seq);
+            slot.commit(is_ahead.then_some(key), counts);
         }
     }
 
     /// As [`Subscriber::commit`], for a reader that answers long after it has received; with the counts of the time at which
     /// it received this sample.
     pub fn commit_late(&self, key: SampleId, counts: &InputCounts) {
-        if let Some((cursors, cell)) = &self.cursors {
-            cursors.input(*cell).commit(Some(key), counts);
+        if let Some((cursors, slot)) = &self.cursors {
+            cursors.input(*slot).commit(Some(key), counts);
         }
     }
 

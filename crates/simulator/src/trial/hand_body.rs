@@ -301,7 +301,7 @@ impl HandBody {
             let is_at_limit = drive.target >= drive.range;
             if is_blocked || is_at_limit {
                 drive.stop(travel);
-                let leader = drive.follows.filter(|_| is_blocked);
+                let leader = if is_blocked { drive.follows } else { None };
                 if let Some(leader) = leader {
                     let travel = self.drives[leader].travel(world);
                     self.drives[leader].stop(travel);

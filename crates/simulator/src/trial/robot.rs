@@ -157,12 +157,12 @@ impl<'a> Robot<'a> {
         match std::mem::replace(&mut self.state, State::Between) {
             State::Deciding(mut grasp) if probe_of(action).is_some() && !self.options.lifts_always => {
                 // After a probe there is no other: in doubt it lets go.
-                match probe_of(action).filter(|_| grasp.probe.is_none()) {
-                    Some(probe) => {
+                match probe_of(action) {
+                    Some(probe) if grasp.probe.is_none() => {
                         grasp.begin_probe(probe);
                         self.state = State::Feeling(grasp);
                     }
-                    None => self.finish(*grasp, false),
+                    _ => self.finish(*grasp, false),
                 }
             }
             State::Deciding(grasp) => {
@@ -259,8 +259,10 @@ impl<'a> Robot<'a> {
             ..Header::default()
         };
         grasp.n_frames += 1;
-        let felt_again = grasp.outcome.as_ref().and_then(|finished| finished.probe).filter(|_| is_last);
-        if let Some(probe) = felt_again.filter(|_| grasp.probe.is_none()) {
+        let felt_again = if is_last { grasp.outcome.as_ref().and_then(|finished| finished.probe) } else { None };
+        if let Some(probe) = felt_again
+            && grasp.probe.is_none()
+        {
             grasp.begin_probe(probe);
             self.state = State::Feeling(grasp);
             return Ok(Doing::Feels(Stamped { header, message: frame }));
@@ -333,7 +335,7 @@ fn told_frame(finished: &Finished, last: Option<TactileFrame>, hand_id: u64) -> 
     let phase = if finished.outcome.held { Phase::Kept } else { Phase::Dropped };
     let header = told_header(finished, finished.last_seq(), hand_id);
     let tell = |last| Box::new(Stamped { header, message: TactileFrame { phase, ..last } });
-    last.filter(|_| finished.outcome.lifted).map(tell)
+    if finished.outcome.lifted { last.map(tell) } else { None }
 }
 
 /// The header of what is told of an attempt that is over, under its own number.

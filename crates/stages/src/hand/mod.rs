@@ -239,8 +239,9 @@ impl LinkShape {
     pub fn rounded(&self) -> SharedShape {
         /// Directions around and between the poles.
         const N_AROUND: u32 = 32;
-        let Some(core) = self.core.as_support_map().filter(|_| self.edge_radius_m > 0.0) else {
-            return self.core.clone();
+        let core = match self.core.as_support_map() {
+            Some(core) if self.edge_radius_m > 0.0 => core,
+            _ => return self.core.clone(),
         };
         let points: Vec<Vector> = (0..=N_AROUND / 2)
             .flat_map(|latitude| (0..N_AROUND).map(move |longitude| (latitude, longitude)))

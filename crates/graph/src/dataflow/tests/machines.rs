@@ -1,6 +1,5 @@
 //! Graphs on several machines: where nodes run, how the machines are linked, what must be there on one of them.
 
-
 use super::*;
 use blindgrasp_messages::{ContactSet, LiftDecision, MESSAGE_TYPES, Prediction, Recorded, TactileFrame};
 

@@ -232,7 +232,10 @@ fn solve_inner_body<const FUSED: bool>(inner: &mut Inner<'_>) {
     while inner.n_iterations < inner.max_iterations {
         let Some(growing_idx) = i else { return };
         let (violation, j) = select_shrinking::<FUSED>(inner, growing_idx);
-        let Some(shrinking_idx) = j.filter(|_| violation >= inner.tolerance) else { return };
+        if violation < inner.tolerance {
+            return;
+        }
+        let Some(shrinking_idx) = j else { return };
         let Some(step) = inner.move_pair(growing_idx, shrinking_idx) else { return };
         inner.n_iterations += 1;
         i = update_gradient::<FUSED>(inner, step, inner.row(growing_idx), inner.row(shrinking_idx));
