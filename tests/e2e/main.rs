@@ -31,6 +31,7 @@ mod package;
 mod partners;
 mod picture;
 mod pins;
+mod plain_statements;
 mod predict;
 mod processes;
 mod python;
