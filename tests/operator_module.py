@@ -74,24 +74,31 @@ class Frames(unittest.TestCase):
         if (numpy := module._numpy()) is not None:
             kinds.append(numpy.array(values))
         for items in kinds:
-            frame = TactileFrameHead(n_joints=2, n_gravity=3)
+            frame = TactileFrameHead(n_joints=2, has_senses=0b001)
             frame.items = items
             yield frame
 
     def test_gravity_is_not_touch(self):
         for frame in self.frames():
             self.assertEqual((list(frame.joints), list(frame.cells)), ([0.5, 0.7], [0.3]))
-            self.assertEqual({name: list(values) for name, values in frame.senses.items()}, {"gravity": [0.0, 0.0, 9.8]})
+            senses = {name: list(values) for name, values in frame.senses.items()}
+            self.assertEqual(senses, {"gravity_m_per_s2": [0.0, 0.0, 9.8]})
 
     def test_lists_are_set_whether_or_not_their_length_changes(self):
         for frame in self.frames():
             frame.cells = [1.0]
             frame.joints = [0.1, 0.2]
             self.assertEqual(list(frame.items), [0.1, 0.2, 0.0, 0.0, 9.8, 1.0])
-            frame.senses = {"torques": [3.0, 4.0]}
+            frame.senses = {"joint_torques": [3.0, 4.0]}
             frame.cells = [5.0, 6.0]
             self.assertEqual(list(frame.items), [0.1, 0.2, 3.0, 4.0, 5.0, 6.0])
-            self.assertEqual((frame.n_joints, frame.n_gravity, frame.n_torques), (2, 0, 2))
+            self.assertEqual((frame.n_joints, frame.has_senses), (2, 0b100))
+
+    def test_senses_that_cannot_be_are_refused(self):
+        for frame in self.frames():
+            for senses, said in (({"joint_torques": [1.0]}, "has 1 values: expected 2"), ({"torques": [1.0]}, "no such sense")):
+                with self.assertRaisesRegex(ValueError, said):
+                    frame.senses = senses
 
     def test_a_frame_that_says_too_much_is_refused(self):
         frame = TactileFrameHead(n_joints=5)

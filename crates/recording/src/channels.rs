@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use blindgrasp_messages::first_difference;
 use mcap::records::{Channel, Record as McapRecord, SchemaHeader, op};
 
-use super::types::{MESSAGE_ENCODING, OurType, SCHEMA_ENCODING, our_type};
+use super::types::{MESSAGE_ENCODING, OurType, SCHEMA_ENCODING, our_types};
 
 /// The schemas and channels of a file, as far as it was read.
 #[derive(Default)]
@@ -141,11 +141,14 @@ impl Channels {
             return Err(format!("{} has a schema that is not there", channel.topic));
         }
         let mut known = KnownChannel { channel, ours: None, other_version: None };
-        if let Some(schema) = schema
-            && let Some(ours) = our_type(&schema.name)
-        {
-            known.ours = Some(ours);
-            known.other_version = difference(&known.channel, schema, &ours.definition);
+        if let Some(schema) = schema {
+            let difference = |ours: &OurType| difference(&known.channel, schema, &ours.definition);
+            let mut versions = our_types(&schema.name);
+            let ours = versions.next();
+            let other_version = ours.and_then(difference);
+            let earlier = if other_version.is_some() { versions.find(|ours| difference(ours).is_none()) } else { None };
+            known.other_version = if earlier.is_some() { None } else { other_version };
+            known.ours = earlier.or(ours);
         }
         self.channels.insert(known.channel.id, known);
         Ok(())

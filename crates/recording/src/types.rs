@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 use cdr_encoding::{from_bytes, to_writer};
 use serde::Serialize;
 
-use blindgrasp_messages::{Header, Record, Recorded, Stamped, of_each_type};
+use blindgrasp_messages::{ContactSet, Header, Record, Recorded, Sense, Stamped, TactileFrame, of_each_type};
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
 const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
@@ -13,18 +13,26 @@ const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
 pub(super) const MESSAGE_ENCODING: &str = "cdr";
 pub(super) const SCHEMA_ENCODING: &str = "ros2msg";
 
-/// One of our message types: its definition, and what makes samples of recorded messages.
+/// One of our message types, as it is or as it was before its last senses: its definition, and what makes samples of
+/// recorded messages.
 #[derive(Debug)]
 pub(super) struct OurType {
     /// Its name as a schema.
     pub(super) schema: &'static str,
     pub(super) definition: String,
     decode: fn(&[u8]) -> Result<Record, String>,
+    /// The number of senses at the end of their table that its messages lack.
+    n_senses_lacking: usize,
 }
 
 impl OurType {
     pub(super) fn decode(&self, data: &[u8]) -> Result<Record, String> {
-        (self.decode)(data)
+        if self.n_senses_lacking == 0 {
+            return (self.decode)(data);
+        }
+        // An empty list is its length, 0. Behind the senses is the day.
+        let (before, day) = data.split_at(data.len().saturating_sub(size_of::<u32>()));
+        (self.decode)(&[before, &vec![0; size_of::<u32>() * self.n_senses_lacking], day].concat())
     }
 
     /// Reads the header and the grasp's number, with which every message of ours begins.
@@ -34,14 +42,28 @@ impl OurType {
     }
 }
 
-/// The type of this ROS name, if it is ours.
-pub(super) fn our_type(schema: &str) -> Option<&'static OurType> {
-    static TYPES: LazyLock<Vec<OurType>> = LazyLock::new(|| of_each_type!(our).into());
-    TYPES.iter().find(|ours| ours.schema == schema)
+/// Our type of this ROS name, if there is one, and then what it was before its last senses.
+pub(super) fn our_types(schema: &str) -> impl Iterator<Item = &'static OurType> {
+    static TYPES: LazyLock<Vec<OurType>> = LazyLock::new(|| of_each_type!(ours).into_iter().flatten().collect());
+    TYPES.iter().filter(move |ours| ours.schema == schema)
 }
 
-fn our<M: Recorded>() -> OurType {
-    OurType { schema: M::SCHEMA, definition: M::definition(), decode: |data| decode::<M>(data).map(M::record) }
+fn ours<M: Recorded>() -> Vec<OurType> {
+    let version = |definition: &str, n_senses_lacking| OurType {
+        schema: M::SCHEMA,
+        definition: definition.into(),
+        decode: |data| decode::<M>(data).map(M::record),
+        n_senses_lacking,
+    };
+    let mut definition = M::definition();
+    let mut versions = vec![version(&definition, 0)];
+    if [TactileFrame::SCHEMA, ContactSet::SCHEMA].contains(&M::SCHEMA) {
+        for (idx, sense) in Sense::ALL.iter().rev().enumerate() {
+            definition = definition.replace(&format!("float64[] {}\n", sense.name()), "");
+            versions.push(version(&definition, idx + 1));
+        }
+    }
+    versions
 }
 
 /// Puts a message, or anything else, into `data` as CDR, in place of what was there.
@@ -69,7 +91,7 @@ pub(super) fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use blindgrasp_messages::{Phase, TactileFrame};
+    use blindgrasp_messages::{OwnedSenses, Phase};
 
     #[test]
     fn a_message_is_read_whole_or_refused() {
@@ -83,12 +105,34 @@ mod tests {
         let sample = Stamped { header: Header { seq: 3, ..Header::default() }, message };
         let mut data = Vec::new();
         encode(&sample, &mut data).expect("encoded");
-        let ours = our_type(TactileFrame::SCHEMA).expect("a type");
+        let ours = our_types(TactileFrame::SCHEMA).next().expect("a type");
         assert_eq!(ours.decode(&data), Ok(sample.into()));
         for n_bytes in 0..data.len() {
             ours.decode(&data[..n_bytes]).expect_err("cut off");
         }
         data.push(0);
         ours.decode(&data).expect_err("a byte too many");
+    }
+
+    #[test]
+    fn frames_from_before_the_last_sense_lack_it() {
+        let [first, .., last] = Sense::ALL;
+        let message = TactileFrame {
+            grasp_id: 7,
+            joints_rad: vec![0.5],
+            cells_newtons: vec![1.0, 0.0],
+            senses: OwnedSenses::default().with(first, &vec![-9.75; first.len(1)]),
+            day: 20_261_124,
+            ..TactileFrame::default()
+        };
+        let sample = Stamped { header: Header { seq: 3, ..Header::default() }, message };
+        let mut data = Vec::new();
+        encode(&sample, &mut data).expect("encoded");
+        // The length of the last sense, before the day.
+        data.drain(data.len() - 8..data.len() - 4);
+        let before_it = our_types(TactileFrame::SCHEMA).nth(1).expect("an earlier version");
+        assert!(before_it.definition.contains(first.name()) && !before_it.definition.contains(last.name()));
+        assert_eq!(before_it.decode(&data), Ok(sample.into()));
+        before_it.decode(&data[..data.len() - 1]).expect_err("cut off");
     }
 }
