@@ -32,7 +32,7 @@ fn the_schema_accepts_good_files_and_names_mistakes() {
         ("votes: 3", "votes: 0.5", "0.5"),
         ("rate: 10", "rate: fast", "fast"),
         ("    sandbox: on", "    sandbox: sometimes", "'sometimes' is not valid"),
-        ("inputs: {contacts: contacts/contacts}", "inputs: {contcts: contacts/contacts}", "'contcts' was unexpected"),
+        ("inputs: {contacts: contacts/contacts}", "inputs: {contcts: contacts/contacts}", "'contcts' does not match"),
         ("inputs: {feature: encoder/feature}", "inputs: {feature: encoder}", "'encoder'"),
         ("  classifier:\n    inputs:", "  judge:\n    run: classifier\n    inpts:", "'inpts' was unexpected"),
         ("version: 1", "version: 2", "1 was expected"),
