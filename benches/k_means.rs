@@ -45,7 +45,7 @@ fn write_contacts(n_wanted: usize, out: &str, recordings: &[&str]) -> Result<(),
         let hand = hand_of(recording, None)?;
         read_grasps(recording, &hand, |_, frames| {
             let Some(frame) = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled) else { return };
-            let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
+            let (joints, cells) = (&frame.message.joints, &frame.message.cells_newtons);
             contacts_from_frame(&hand, frame.header.hand_id, joints, cells, &mut contacts);
             for contact in contacts.iter().take(n_wanted - n_written) {
                 bytes.extend(contact.position_m.iter().flat_map(|coordinate| coordinate.to_le_bytes()));

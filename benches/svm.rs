@@ -52,7 +52,7 @@ fn write_features(recording: &str, model: &str, n_samples: usize, out: &str) -> 
     let (mut text, mut n_written, mut contacts, mut values) = (String::new(), 0, Vec::new(), Vec::new());
     let grasps = read_grasps(Path::new(recording), &hand, |_, frames| {
         let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
-        let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
+        let (joints, cells) = (&frame.message.joints, &frame.message.cells_newtons);
         contacts_from_frame(&hand, frame.header.hand_id, joints, cells, &mut contacts);
         model.features.extract(&Reading::new(joints, &contacts), &mut values).ok()?;
         Some(values.clone())

@@ -45,7 +45,7 @@ static int list(char *to, int size, int length, const char *name, const double *
 /* The line protocol: one JSON object. The numbers begin at 0 and leave out no frame that was read. */
 static bool write_frame(char *to, int size, uint32_t seq, const struct frame *frame) {
     int length = snprintf(to, size, "{\"seq\":%lu,\"phase\":\"%s\"", (unsigned long)seq, frame->phase);
-    length = list(to, size, length, "joints_rad", frame->joints, N_JOINTS);
+    length = list(to, size, length, "joints", frame->joints, N_JOINTS);
     if (length < 0) return false;
     length = list(to, size, length, "cells_newtons", frame->cells, N_CELLS);
     if (length < 0 || length + 2 > size) return false;

@@ -215,7 +215,7 @@ class ContactSetHead(ctypes.Structure):
         ("n_joints", ctypes.c_uint32),
         ("has_senses", ctypes.c_uint32),
         ("day", ctypes.c_uint32),
-        ("joints_rad", ctypes.c_double * 32),
+        ("joints", ctypes.c_double * 32),
         ("senses", ctypes.c_double * 8 * 6),
     ]
 

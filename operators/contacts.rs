@@ -93,7 +93,7 @@ impl Watch {
         contacts: &[Contact],
     ) -> bool {
         let place = GraspPlace { epoch: head.header.epoch, grasp_id: head.grasp_id, day: head.day };
-        let readings = (parts.joints_rad, parts.cells_newtons);
+        let readings = (parts.joints, parts.cells_newtons);
         let fault = self.check.watch(hand, &mut self.memory, (place, phase), readings, contacts);
         self.report(hand, fault, place);
         fault.is_some()

@@ -66,7 +66,7 @@ struct Texture {
 /// The frame is another hand's.
 pub fn hand_markers(hand: &Hand, sample: &Stamped<TactileFrame>, data: &mut Vec<u8>) -> Result<(), String> {
     let frame = &sample.message;
-    let palm_from_links = hand.palm_from_links(&frame.joints_rad).map_err(|error| error.to_string())?;
+    let palm_from_links = hand.palm_from_links(&frame.joints).map_err(|error| error.to_string())?;
     if frame.cells_newtons.len() != hand.n_cells() {
         return Err(format!("{} cells, the hand has {}", frame.cells_newtons.len(), hand.n_cells()));
     }
@@ -106,7 +106,7 @@ pub fn hand_markers(hand: &Hand, sample: &Stamped<TactileFrame>, data: &mut Vec<
             marker("links", id, kind, &(palm_from_link * link_from_marker), scale)
         })
         .collect();
-    let cells = hand.cells_in_palm(&frame.joints_rad).map_err(|error| error.to_string())?;
+    let cells = hand.cells_in_palm(&frame.joints).map_err(|error| error.to_string())?;
     let smallest = hand.cells().map(|(_, cell)| cell.size_m[0].min(cell.size_m[1])).fold(f64::INFINITY, f64::min);
     let mut cell_marker = marker("cells", 0, SPHERE_LIST, &Isometry3::identity(), [smallest; 3]);
     cell_marker.points = cells.iter().map(|cell| cell.position_in_palm_m.coords.into()).collect();
@@ -121,7 +121,7 @@ pub fn hand_markers(hand: &Hand, sample: &Stamped<TactileFrame>, data: &mut Vec<
 /// The frame is another hand's.
 pub(crate) fn cell_points(hand: &Hand, sample: &Stamped<TactileFrame>, data: &mut Vec<u8>) -> Result<(), String> {
     let frame = &sample.message;
-    let cells = hand.cells_in_palm(&frame.joints_rad).map_err(|error| error.to_string())?;
+    let cells = hand.cells_in_palm(&frame.joints).map_err(|error| error.to_string())?;
     if frame.cells_newtons.len() != cells.len() {
         return Err(format!("{} cells, the hand has {}", frame.cells_newtons.len(), cells.len()));
     }

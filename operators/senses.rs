@@ -56,13 +56,13 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
 /// A frame with these senses in place of its own, where they are there. Senses of another number of joints are left out, and
 /// a frame that cannot be read stays as it is.
 fn with_senses(head: &TactileFrameHead, items: &[f64], other: Senses<'_>, merged: &mut Vec<f64>) -> TactileFrameHead {
-    let Ok(FrameParts { joints_rad, senses: own, cells_newtons }) = head.split(items) else {
+    let Ok(FrameParts { joints, senses: own, cells_newtons }) = head.split(items) else {
         merged.extend_from_slice(items);
         return *head;
     };
-    let n_joints = joints_rad.len();
+    let n_joints = joints.len();
     let mut has_senses = 0;
-    merged.extend_from_slice(joints_rad);
+    merged.extend_from_slice(joints);
     for sense in Sense::ALL {
         let is_there = !other.get(sense).is_empty() && other.get(sense).len() == sense.len(n_joints);
         let values = if is_there { other.get(sense) } else { own.get(sense) };
@@ -88,7 +88,7 @@ mod tests {
         TactileFrame {
             grasp_id: 3,
             phase: Phase::Settled,
-            joints_rad: vec![0.5; 2],
+            joints: vec![0.5; 2],
             cells_newtons: vec![1.0, 2.0, 3.0],
             senses,
             day: 20261125,

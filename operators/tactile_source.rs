@@ -524,7 +524,7 @@ impl TactileSource<'_> {
         let frame = TactileFrame {
             grasp_id: accepted.grasp_id,
             phase: reading.phase,
-            joints_rad: reading.joints_rad,
+            joints: reading.joints,
             cells_newtons: reading.cells_newtons,
             senses: reading.senses,
             day: reading.day.unwrap_or(self.day),

@@ -37,7 +37,7 @@ def sample_of(line):
         fields = {key: data[key] for key in ("grasp_id", "epsilon", "volume", "stable")}
         port, head, items = "truth", GraspTruthHead(n_object_bytes=len(names[0]), **fields), b"".join(names)
     else:
-        lists = [data[key] for key in ("joints_rad", *SENSES, "cells_newtons")]
+        lists = [data[key] for key in ("joints", *SENSES, "cells_newtons")]
         lengths = {"n_joints": len(lists[0]), "has_senses": sum(1 << bit for bit, key in enumerate(SENSES) if data[key])}
         phase = Phase[data["phase"].upper()]
         values = [float("nan") if value is None else value for values in lists for value in values]

@@ -109,7 +109,7 @@ class Expected:
 def check_joint_states(message, expected):
     """sensor_msgs/JointState against the frame of its stamp."""
     data = expected["/tactile"][stamp_nanos(message)]
-    assert [float(angle) for angle in message.position] == data["joints_rad"], f"{message} against {data}"
+    assert [float(angle) for angle in message.position] == data["joints"], f"{message} against {data}"
     assert len(message.name) == len(message.position)
 
 

@@ -75,7 +75,7 @@ def main() -> None:
         header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="palm")
         empty = numpy.zeros(0)
         # Other joints of the robot, in another order, are on the topic as well.
-        position = numpy.array([9.0, *reversed(frame["joints_rad"])])
+        position = numpy.array([9.0, *reversed(frame["joints"])])
         joints.publish(header=header, name=["elbow", *reversed(names)], position=position, velocity=empty, effort=empty)
         phases.publish(data=frame["phase"])
         cells.publish(layout=layout, data=numpy.array(frame["cells_newtons"]))

@@ -93,17 +93,11 @@ fn samples(recording: &Path, n_samples: usize) -> anyhow::Result<(RecordingInfo,
             let mut contacts = blindgrasp_messages::ContactSet {
                 grasp_id: frame.message.grasp_id,
                 phase: frame.message.phase,
-                joints_rad: frame.message.joints_rad.clone(),
+                joints: frame.message.joints.clone(),
                 ..Default::default()
             };
-            let (joints_rad, cells_newtons) = (&frame.message.joints_rad, &frame.message.cells_newtons);
-            blindgrasp_stages::contacts::contacts_from_frame(
-                &hand,
-                0,
-                joints_rad,
-                cells_newtons,
-                &mut contacts.contacts,
-            );
+            let (joints, cells_newtons) = (&frame.message.joints, &frame.message.cells_newtons);
+            blindgrasp_stages::contacts::contacts_from_frame(&hand, 0, joints, cells_newtons, &mut contacts.contacts);
             let contacts = Stamped { header: frame.header, message: contacts };
             recorded.push([("/tactile", Record::Tactile(frame)), ("/contacts", Record::Contacts(contacts))]);
         }
@@ -126,7 +120,7 @@ fn write_ours(path: &Path, info: &RecordingInfo, samples: &[(&str, Record)]) -> 
 fn write_live(path: &Path, info: &RecordingInfo, samples: &[(&str, Record)]) -> anyhow::Result<()> {
     let joint_names = match samples.first() {
         Some((_, Record::Tactile(frame))) => {
-            (0..frame.message.joints_rad.len()).map(|idx| format!("joint_{idx}")).collect()
+            (0..frame.message.joints.len()).map(|idx| format!("joint_{idx}")).collect()
         }
         _ => Vec::new(),
     };

@@ -44,12 +44,12 @@ fn main() -> anyhow::Result<()> {
         due += period;
         std::thread::sleep(due.saturating_duration_since(Instant::now()));
         let message = &frame.message;
-        let (joints_rad, cells_newtons) = (&message.joints_rad, &message.cells_newtons);
+        let (joints, cells_newtons) = (&message.joints, &message.cells_newtons);
         let start = Instant::now();
-        let summary = finder.find(&hand, frame.header.hand_id, joints_rad, cells_newtons, &mut contacts);
+        let summary = finder.find(&hand, frame.header.hand_id, joints, cells_newtons, &mut contacts);
         let felt = Instant::now();
         let feature = match summary.fault {
-            Fault::None => model.extract(Phase::Settled, &Reading::new(joints_rad, &contacts), &mut values),
+            Fault::None => model.extract(Phase::Settled, &Reading::new(joints, &contacts), &mut values),
             fault => Err(fault),
         };
         let described = Instant::now();

@@ -65,7 +65,7 @@ def send(connection, expected, options):
     """Sends at the rate; returns how many frames, and how far behind its time the worst was."""
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     forces = [round(0.01 * cell, 3) for cell in range(expected["n_cells"])]
-    body = {"joints_rad": [0.5] * expected["n_joints"], "cells_newtons": forces, "phase": "open"}
+    body = {"joints": [0.5] * expected["n_joints"], "cells_newtons": forces, "phase": "open"}
     rest = json.dumps(body)[1:]
     n_frames, behind_secs = int(options.rate * options.secs), 0.0
     begin = time.monotonic()

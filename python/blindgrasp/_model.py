@@ -136,7 +136,7 @@ def _frame_lines(grasps: list[Grasp]) -> Iterator[bytes]:
             raise ValueError(f"grasp {grasp.grasp_id} has no frames: there is nothing to decide on")
         seqs, stamps = ([int(number) for number in numbers] for numbers in (grasp.seq, grasp.stamp_nanos))
         for idx, phase in enumerate(grasp.phase):
-            lists = {"joints_rad": grasp.joints_rad, "cells_newtons": grasp.cells_newtons} | grasp.senses
+            lists = {"joints": grasp.joints, "cells_newtons": grasp.cells_newtons} | grasp.senses
             data: dict[str, Any] = {name: _numbers(rows[idx]) for name, rows in lists.items()}
             data |= {"grasp_id": int(grasp.grasp_id), "phase": str(phase), "day": int(grasp.day)}
             seq = next_seq + seqs[idx] - min(seqs)

@@ -71,7 +71,7 @@ class Grasp:
     """(n_frames,): when the source took the frames, nanoseconds of its clock."""
     phase: NDArray[np.str_]
     """(n_frames,): `open`, `closing`, `settled`, `ended` and others (docs/messages.md)."""
-    joints_rad: NDArray[np.float64]
+    joints: NDArray[np.float64]
     """(n_frames, n_joints): radians in the hand's order; metres for a joint that slides."""
     cells_newtons: NDArray[np.float64]
     """(n_frames, n_cells): newtons, pad after pad; raw counts for a hand with `cell_unit: counts`."""
@@ -88,7 +88,7 @@ class Grasp:
     """The recorded decisions. Several are recorded of a grasp that was probed."""
 
     def __repr__(self) -> str:
-        (n_frames, n_cells), n_joints = self.cells_newtons.shape, self.joints_rad.shape[1]
+        (n_frames, n_cells), n_joints = self.cells_newtons.shape, self.joints.shape[1]
         sizes = f"{n_frames} frames of {n_joints} joints and {n_cells} cells"
         return f"Grasp({self.grasp_id}: {sizes}, label={self.label}, decision={self.decision})"
 
@@ -204,14 +204,14 @@ class Recording:
         key = _key(frames[0])
         lists = [name for name, value in vars(frames[0]).items() if isinstance(value, np.ndarray)]
         tables = {name: _table([getattr(frame, name) for frame in frames]) for name in lists}
-        joints_rad, cells_newtons = tables.pop("joints_rad"), tables.pop("cells_newtons")
+        joints, cells_newtons = tables.pop("joints"), tables.pop("cells_newtons")
         return Grasp(
             grasp_id=key[1],
             epoch=key[0],
             seq=np.array([frame.header.seq for frame in frames], np.uint64),
             stamp_nanos=np.array([frame.header.stamp_nanos for frame in frames], np.int64),
             phase=np.array([_word(PHASES, frame.phase) for frame in frames]),
-            joints_rad=joints_rad,
+            joints=joints,
             cells_newtons=cells_newtons,
             senses={name: table for name, table in tables.items() if table.shape[1] > 0},
             hand_id=f"{frames[0].header.hand_id:016x}",

@@ -58,7 +58,7 @@ class Recordings(Folder):
             data = line["data"]
             self.assertEqual((grasp.grasp_id, grasp.phase[idx]), (data["grasp_id"], data["phase"]))
             self.assertEqual((grasp.seq[idx], grasp.stamp_nanos[idx]), (line["seq"], line["stamp_nanos"]))
-            lists = {"joints_rad": grasp.joints_rad, "cells_newtons": grasp.cells_newtons} | grasp.senses
+            lists = {"joints": grasp.joints, "cells_newtons": grasp.cells_newtons} | grasp.senses
             self.assertLessEqual({name for name, value in data.items() if value and isinstance(value, list)}, lists.keys())
             for name, rows in lists.items():
                 row = rows[idx]
@@ -85,7 +85,7 @@ class Recordings(Folder):
         grasps = self.compare(HELD_OUT)
         self.assertEqual(len(grasps), 240)
         self.assertEqual(grasps[0].cells_newtons.shape, (14, 96))
-        self.assertEqual(grasps[0].joints_rad.shape, (14, 7))
+        self.assertEqual(grasps[0].joints.shape, (14, 7))
         self.assertEqual(grasps[0].senses, {})
         self.assertEqual(sum(grasp.label.is_stable for grasp in grasps), 115)
         self.assertEqual((grasps[0].label.object_id, grasps[0].label.object_class), ("vase-20", "vase"))
@@ -235,7 +235,7 @@ class Graphs(Folder):
             self.assertEqual(outcome["lifted"], grasp.decision.action == "lift")
             self.assertEqual(grasp.label and grasp.label.is_stable, outcome["held"] if outcome["lifted"] else None)
             n_values = {name: rows.shape[1] for name, rows in grasp.senses.items()}
-            n_joints = grasp.joints_rad.shape[1]
+            n_joints = grasp.joints.shape[1]
             self.assertEqual(n_values, {"gravity_m_per_s2": 3, "wrist_wrench": 6, "joint_torques": n_joints})
             self.assertAlmostEqual(np.linalg.norm(grasp.senses["gravity_m_per_s2"][0]), 9.81, delta=0.5)
 

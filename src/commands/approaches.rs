@@ -14,11 +14,11 @@ use blindgrasp_stages::model::Model;
 /// Say how often lifts after given approaches keep their object.
 ///
 /// Reads questions from the standard input, one JSON object a line, and answers each with a line: a robot asks before it reaches
-/// for an object, and takes the best approach that it can do. "gravity" is its direction in the palm frame, "joints_rad" are the
+/// for an object, and takes the best approach that it can do. "gravity" is its direction in the palm frame, "joints" are the
 /// open hand's joints, in its order.
 #[derive(Debug, Args)]
 #[command(
-    after_help = "Example: echo '{\"approaches\": [{\"gravity\": [0, 0, 1], \"joints_rad\": [0.8, 0, 0, 0, 0, 0, 0]}]}' | \
+    after_help = "Example: echo '{\"approaches\": [{\"gravity\": [0, 0, 1], \"joints\": [0.8, 0, 0, 0, 0, 0, 0]}]}' | \
                   blindgrasp model approaches models/barrett-bh8-280-lifts.json"
 )]
 pub(super) struct Arguments {
@@ -36,7 +36,7 @@ struct Question {
 #[serde(deny_unknown_fields)]
 struct Approach {
     gravity: [f64; 3],
-    joints_rad: Vec<f64>,
+    joints: Vec<f64>,
 }
 
 #[derive(Serialize)]
@@ -63,15 +63,15 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 }
 
 fn answer(prior: &ApproachPrior, n_joints: usize, line: &str) -> anyhow::Result<Answer> {
-    let expected = r#"expected {"approaches": [{"gravity": [x, y, z], "joints_rad": […]}, …]}"#;
+    let expected = r#"expected {"approaches": [{"gravity": [x, y, z], "joints": […]}, …]}"#;
     let question: Question = serde_json::from_str(line).context(expected)?;
     for (idx, approach) in question.approaches.iter().enumerate() {
-        let found = approach.joints_rad.len();
-        anyhow::ensure!(found == n_joints, "approaches[{idx}].joints_rad has length {found}, expected {n_joints}");
+        let found = approach.joints.len();
+        anyhow::ensure!(found == n_joints, "approaches[{idx}].joints has length {found}, expected {n_joints}");
         let has_direction = approach.gravity.iter().any(|part| *part != 0.0);
         anyhow::ensure!(has_direction, "approaches[{idx}].gravity is zero, expected its direction in the palm frame");
     }
-    let probability = |approach: &Approach| prior.probability_kept(approach.gravity, &approach.joints_rad);
+    let probability = |approach: &Approach| prior.probability_kept(approach.gravity, &approach.joints);
     let probability_kept: Option<Vec<f64>> = question.approaches.iter().map(probability).collect();
     let probability_kept = probability_kept.context("gravity has no direction")?;
     let best = (0..probability_kept.len()).max_by(|a, b| probability_kept[*a].total_cmp(&probability_kept[*b]));

@@ -26,7 +26,7 @@ use blindgrasp_stages::model::Model;
                         blindgrasp export data/train --features models/barrett-bh8-280.json --out features.csv\n\n\
                         jsonl: a line is {\"topic\", \"seq\", \"stamp_nanos\", \"data\": {…}}; NaN and infinity are null.\n\
                         csv: a table a topic, with seq, stamp_nanos, epoch and hand_id first; numbers are exact. A list of \
-                        numbers that is equally long in all samples is a column per number, joints_rad[0], joints_rad[1], \
+                        numbers that is equally long in all samples is a column per number, joints[0], joints[1], \
                         …; any other list is JSON in one column.\n\
                         features: a row for each grasp with a label and a contact, of its first settled frame: recording, \
                         grasp_id, object, class, stable (1 or 0), hand_id, dictionary_id, then the values value_0, value_1, … \

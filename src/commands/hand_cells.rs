@@ -24,8 +24,8 @@ pub(super) fn is_hand(path: &Path) -> bool {
 /// Prints the positions and normals of the cells in the palm frame.
 pub(super) fn print(hand: &Path, joints: &[(String, f64)], json: bool) -> anyhow::Result<Outcome> {
     let hand = Hand::load(hand)?;
-    let joints_rad = hand.posture(joints.iter().map(|(name, value)| (name.as_str(), *value)))?;
-    let poses = hand.cells_in_palm(&joints_rad)?;
+    let joints = hand.posture(joints.iter().map(|(name, value)| (name.as_str(), *value)))?;
+    let poses = hand.cells_in_palm(&joints)?;
     let rows: Vec<CellRow<'_>> = hand
         .cells()
         .zip(poses)

@@ -221,8 +221,8 @@ fn print_report(
         lines.push(("pad", format!("{:<12} {}", pad.pad, range(&pad.columns))));
     }
     let joints: Vec<_> = match &options.joints {
-        Joints::Fixed(joints_rad) => {
-            hand.joints.iter().zip(joints_rad).map(|(joint, value)| format!("{} {value}", joint.name)).collect()
+        Joints::Fixed(joints) => {
+            hand.joints.iter().zip(joints).map(|(joint, value)| format!("{} {value}", joint.name)).collect()
         }
         Joints::Columns { .. } => hand
             .joints

@@ -384,7 +384,7 @@ impl Summary {
     fn count_contacts(&mut self, hand: &Hand, frame: Option<TactileFrame>) {
         let Some(frame) = frame.filter(|frame| frame.phase == Phase::Settled) else { return };
         let mut contacts = Vec::new();
-        let found = contacts_from_frame(hand, 0, &frame.joints_rad, &frame.cells_newtons, &mut contacts);
+        let found = contacts_from_frame(hand, 0, &frame.joints, &frame.cells_newtons, &mut contacts);
         self.n_settled += 1;
         self.n_self_collisions += usize::from(found.self_collision);
         self.n_without_contact += usize::from(contacts.is_empty());

@@ -137,11 +137,11 @@ fn read_frame(
     let header =
         Header { hand_id, seq: line.seq, stamp_nanos: line.stamp_nanos, epoch: line.epoch, ..Header::default() };
     let frame: FrameLine = serde_json::from_value(line.data)
-        .context("not a tactile frame: expected grasp_id, phase, joints_rad and cells_newtons")?;
+        .context("not a tactile frame: expected grasp_id, phase, joints and cells_newtons")?;
     let message = TactileFrame {
         grasp_id: frame.grasp_id,
         phase: frame.phase,
-        joints_rad: numbers(frame.joints_rad),
+        joints: numbers(frame.joints),
         cells_newtons: numbers(frame.cells_newtons),
         senses: frame.senses,
         day: frame.day,
@@ -159,7 +159,7 @@ fn of_bridge(line: &str, earlier: &[Stamped<TactileFrame>], hand: &Hand) -> anyh
     let message = TactileFrame {
         grasp_id,
         phase: reading.phase,
-        joints_rad: reading.joints_rad,
+        joints: reading.joints,
         cells_newtons: reading.cells_newtons,
         senses: reading.senses,
         day: reading.day.unwrap_or(0),
@@ -184,7 +184,7 @@ struct ExportedLine {
 struct FrameLine {
     grasp_id: u64,
     phase: Phase,
-    joints_rad: Vec<Option<f64>>,
+    joints: Vec<Option<f64>>,
     cells_newtons: Vec<Option<f64>>,
     #[serde(flatten)]
     senses: OwnedSenses,

@@ -191,7 +191,7 @@ fn of_another_hand(hand: &Hand, mut grasps: Vec<Grasp>) -> Vec<Grasp> {
         grasp.truth.header.hand_id = hand.id();
         for frame in &mut grasp.frames {
             frame.header.hand_id = hand.id();
-            frame.message.joints_rad.truncate(hand.joints.len());
+            frame.message.joints.truncate(hand.joints.len());
             // Raw counts, as its layout says.
             let counts = frame.message.cells_newtons.iter().map(|newtons| (3000.0 + 100.0 * newtons).round());
             frame.message.cells_newtons = counts.take(n_cells).collect();

@@ -147,9 +147,9 @@ fn judged(hand: &Hand, model: &Model, grasps: &[Grasp]) -> (f64, f64, f64) {
         let Some(frame) = grasp.frames.iter().find(|frame| frame.phase == Phase::Settled) else { continue };
         let Some(stable) = grasp.stable else { continue };
         n += 1.0;
-        contacts_from_frame(hand, 0, &frame.joints_rad, &frame.cells_newtons, &mut contacts);
+        contacts_from_frame(hand, 0, &frame.joints, &frame.cells_newtons, &mut contacts);
         let mut values = Vec::new();
-        let reading = Reading::new(&frame.joints_rad, &contacts);
+        let reading = Reading::new(&frame.joints, &contacts);
         let place = blindgrasp_stages::day::GraspPlace::default();
         let verdict = model.extract(Phase::Settled, &reading, &mut values).and_then(|_| {
             model.judge(&mut Memory::default(), model.dictionary_id(), place, Phase::Settled, Ok(&values))

@@ -33,7 +33,7 @@ fn main() -> ExitCode {
 fn work(operator: &Operator) -> anyhow::Result<()> {
     let Params { recording, rate_hz, n_samples } = operator.params()?;
     let frame = firmest_frame(&recording)?;
-    let n_items = frame.message.joints_rad.len() + frame.message.cells_newtons.len();
+    let n_items = frame.message.joints.len() + frame.message.cells_newtons.len();
     let source = SteadySource {
         operator,
         tactile: operator.publisher("tactile", n_items)?,

@@ -128,7 +128,7 @@ fn a_table_becomes_a_recording() {
     assert_eq!(report["skipped"], json!([]));
     let frames = folder.exported("/tactile");
     let data = |grasp_id: u64, cells: [f64; 3]| {
-        json!({"grasp_id": grasp_id, "phase": "settled", "joints_rad": [0.5, 0.0], "cells_newtons": cells,
+        json!({"grasp_id": grasp_id, "phase": "settled", "joints": [0.5, 0.0], "cells_newtons": cells,
         "gravity_m_per_s2": [], "wrist_wrench": [], "joint_torques": [], "day": 0})
     };
     let expected =
@@ -171,8 +171,8 @@ fn columns_may_hold_angles_classes_and_another_unit() {
     assert_eq!(report["joint_columns"], json!(["q_left", "q_right"]));
     let frames = folder.exported("/tactile");
     assert_eq!(frames[0]["data"]["cells_newtons"], json!([1.0, 0.0, 0.5]));
-    assert_eq!(frames[0]["data"]["joints_rad"], json!([std::f64::consts::FRAC_PI_4, 0.0]));
-    assert_eq!(frames[3]["data"]["joints_rad"][1], json!(57_f64.to_radians()));
+    assert_eq!(frames[0]["data"]["joints"], json!([std::f64::consts::FRAC_PI_4, 0.0]));
+    assert_eq!(frames[3]["data"]["joints"][1], json!(57_f64.to_radians()));
     assert_eq!(folder.exported("/truth")[1]["data"]["class"], "crate");
 }
 

@@ -138,13 +138,13 @@ fn a_browser_shows_a_graph_as_it_runs() {
     let frame = &shown["frame"];
     let recorded = RecordingReader::open(&project().join(RECORDING)).expect("a recording").find_map(|record| {
         let Record::Tactile(sample) = record.expect("a record").1 else { return None };
-        let is_it = sample.message.joints_rad == numbers(&frame["joints"])
+        let is_it = sample.message.joints == numbers(&frame["joints"])
             && sample.message.cells_newtons == numbers(&frame["cells"]);
         is_it.then_some(sample.message)
     });
     let recorded = recorded.expect("a frame of the recording");
     let hand = Hand::load(&project().join("hands/barrett-bh8-280.yaml")).expect("a hand");
-    let poses = hand.palm_from_links(&recorded.joints_rad).expect("a posture");
+    let poses = hand.palm_from_links(&recorded.joints).expect("a posture");
     for (idx, pose) in poses.iter().enumerate() {
         // Column by column, as nalgebra's.
         assert_near(&numbers(&shown["meshes"][idx]), pose.to_homogeneous().as_slice(), &hand.links[idx].name);
@@ -312,7 +312,7 @@ fn a_browser_shows_the_grasps_of_a_recording() {
     assert_eq!(browser.ask("blindgrasp.player.frames.length"), expected.len());
     for (idx, frame) in expected.iter().enumerate().step_by(5) {
         let at = format!("blindgrasp.player.frames[{idx}]");
-        assert_eq!(numbers(&browser.ask(&format!("{at}.joints"))), frame.joints_rad);
+        assert_eq!(numbers(&browser.ask(&format!("{at}.joints"))), frame.joints);
         assert_eq!(numbers(&browser.ask(&format!("{at}.cells"))), frame.cells_newtons);
     }
     assert!(browser.ask("blindgrasp.player.frames.at(-1).probability").is_f64());
@@ -415,7 +415,7 @@ fn foxglove_reads_the_samples_of_a_graph() {
         let tactile = &found["/tactile"]["fields"];
         let is_recorded = RecordingReader::open(&project().join(RECORDING)).expect("a recording").any(|record| {
             let Record::Tactile(sample) = record.expect("a record").1 else { return false };
-            sample.message.joints_rad == numbers(&tactile["joints_rad"])
+            sample.message.joints == numbers(&tactile["joints"])
                 && sample.message.cells_newtons == numbers(&tactile["cells_newtons"])
         });
         assert!(is_recorded, "{tactile}");

@@ -191,7 +191,7 @@ fn check_contacts(frame: &Value, set: &Value, positions: bool) {
     }
     let names = ["spread", "finger_1", "finger_2", "finger_3", "distal_1", "distal_2", "distal_3"];
     let joints: Vec<String> =
-        names.iter().zip(floats(&frame["joints_rad"])).map(|(name, value)| format!("{name}={value}")).collect();
+        names.iter().zip(floats(&frame["joints"])).map(|(name, value)| format!("{name}={value}")).collect();
     let cells = run(&["info", HAND, "--json", "--joints", &joints.join(",")], 0);
     let cells: Value = serde_json::from_slice(&cells.stdout).expect("JSON");
     for (idx, contact) in active.iter().zip(contacts) {

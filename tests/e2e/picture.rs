@@ -40,7 +40,7 @@ fn with_scene(path: &Path) {
                 grasp_id,
                 object_position_m: [0.0, 0.0, 0.06],
                 object_rotation_xyzw: [0.0, 0.0, 0.0, 1.0],
-                joints_rad: vec![0.5; 7],
+                joints: vec![0.5; 7],
                 contacts: vec![contact.clone(), SceneContact { other_link: 2, ..contact }],
                 ..GraspScene::default()
             };

@@ -92,8 +92,8 @@ fn input_that_is_no_frame_is_named() {
     };
     refused("", "expected lines with tactile frames, found none");
     refused("{", "-, line 1: not a line of JSON");
-    refused("{}\n", "-, line 1: not a frame: missing field `joints_rad`");
-    let frame = r#""data": {"grasp_id": 0, "phase": "settled", "joints_rad": [], "cells_newtons": []}"#;
+    refused("{}\n", "-, line 1: not a frame: missing field `joints`");
+    let frame = r#""data": {"grasp_id": 0, "phase": "settled", "joints": [], "cells_newtons": []}"#;
     let with = |seq: &str| format!("{{\"topic\": \"/tactile\", \"stamp_nanos\": 0, {seq}{frame}}}\n");
     for seq in ["", "\"seq\": 1.5, ", "\"seq\": \"1\", ", "\"seq\": -1, ", "\"seq\": 1, \"hand_id\": 170, "] {
         refused(&with(seq), "-, line 1: not a line of 'blindgrasp export': expected topic, seq, stamp_nanos and data");

@@ -33,7 +33,7 @@ fn frame(seq: u64, grasp_id: u64) -> Record {
     let message = TactileFrame {
         grasp_id,
         phase: Phase::Settled,
-        joints_rad: values(7),
+        joints: values(7),
         cells_newtons: values(N_CELLS),
         ..TactileFrame::default()
     };

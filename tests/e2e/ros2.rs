@@ -25,7 +25,7 @@ const N_GRASPS: u64 = 12;
 fn line_of(frame: &Stamped<TactileFrame>) -> Value {
     let message = &frame.message;
     json!({
-        "joints_rad": message.joints_rad, "cells_newtons": message.cells_newtons, "phase": message.phase,
+        "joints": message.joints, "cells_newtons": message.cells_newtons, "phase": message.phase,
         "seq": frame.header.seq,
     })
 }

@@ -67,7 +67,7 @@ pub(crate) fn grasps(n: u64) -> Vec<Stamped<TactileFrame>> {
 
 fn line(frame: &Stamped<TactileFrame>) -> Value {
     json!({
-        "joints_rad": frame.message.joints_rad,
+        "joints": frame.message.joints,
         "cells_newtons": frame.message.cells_newtons,
         "phase": frame.message.phase,
         "grasp_id": frame.message.grasp_id,
@@ -214,7 +214,7 @@ const WRONG: [Wrong; 14] = [
     ("malformed", |_| b"not JSON\n".to_vec()),
     ("malformed", |_| b"\xff\xfe\x00{\n".to_vec()),
     ("malformed", |frame| changed(frame, |line| drop(line["cells_newtons"].as_array_mut().expect("a list").pop()))),
-    ("malformed", |frame| changed(frame, |line| line["joints_rad"] = json!([]))),
+    ("malformed", |frame| changed(frame, |line| line["joints"] = json!([]))),
     ("malformed", |frame| changed(frame, |line| line["cells_newtons"][3] = json!(-0.5))),
     ("malformed", |frame| format!("{}\n", line(frame)).replacen(":[", ":[NaN,", 1).into_bytes()),
     ("malformed", |frame| changed(frame, |line| line["grasp"] = json!(1))),

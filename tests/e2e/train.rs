@@ -102,8 +102,7 @@ fn a_model_of_lifts_says_which_approaches_are_kept() {
         blindgrasp().args(["model", "approaches", model]).stdin(input).output().expect("started")
     };
     // From above and from the side, each with the fingers apart and side by side.
-    let approach =
-        |gravity: [f64; 3], spread: f64| json!({"gravity": gravity, "joints_rad": [spread, 0, 0, 0, 0, 0, 0]});
+    let approach = |gravity: [f64; 3], spread: f64| json!({"gravity": gravity, "joints": [spread, 0, 0, 0, 0, 0, 0]});
     let approaches = [
         approach([0.0, 0.0, 1.0], 0.1),
         approach([0.0, 0.0, 9.81], 0.1),
@@ -134,9 +133,9 @@ fn a_model_of_lifts_says_which_approaches_are_kept() {
     };
     assert!(refused(MODEL, "{}").contains("knows nothing of approaches: expected a model that was trained on lifts"));
     assert!(refused(LIFTS_MODEL, "\n").contains("line 1: expected {\"approaches\""));
-    let short = question(&[json!({"gravity": [0, 0, 1], "joints_rad": [0]})]).to_string();
-    assert!(refused(LIFTS_MODEL, &short).contains("line 1: approaches[0].joints_rad has length 1, expected 7"));
-    let weightless = question(&[json!({"gravity": [0, 0, 0], "joints_rad": [0, 0, 0, 0, 0, 0, 0]})]).to_string();
+    let short = question(&[json!({"gravity": [0, 0, 1], "joints": [0]})]).to_string();
+    assert!(refused(LIFTS_MODEL, &short).contains("line 1: approaches[0].joints has length 1, expected 7"));
+    let weightless = question(&[json!({"gravity": [0, 0, 0], "joints": [0, 0, 0, 0, 0, 0, 0]})]).to_string();
     assert!(refused(LIFTS_MODEL, &weightless).contains("line 1: approaches[0].gravity is zero"));
 }
 

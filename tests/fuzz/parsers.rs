@@ -153,7 +153,7 @@ fn texts_of_people_and_processes() {
         br#"[{"centre_of_mass_m": [0, 0, 0], "max_radius_m": 0.05, "contacts": [{"point_m": [0, 0, 0.02], "normal":
                   [0, 0, 1], "friction": 0.5, "torsion_m": 0.001}]}]"#;
     check(20_000, cases, |bytes| parse_cases(&text(bytes)).is_ok());
-    let frame = br#"{"joints_rad":[0.5],"cells_newtons":[0,1],"phase":"open","grasp_id":1,"seq":12,"stamp_nanos":7}"#;
+    let frame = br#"{"joints":[0.5],"cells_newtons":[0,1],"phase":"open","grasp_id":1,"seq":12,"stamp_nanos":7}"#;
     check(50_000, frame, |bytes| line_protocol::parse(bytes).is_ok());
     let request = br#"{"request":"set","node":"lift_arbiter","param":"votes","value":5}"#;
     check(50_000, request, |bytes| serde_json::from_slice::<Request>(bytes).is_ok());

@@ -37,7 +37,7 @@ fn records(epoch: u64, n_frames: u64) -> Vec<(String, Record)> {
         let header = Header { seq, stamp_nanos: 10 * seq, epoch, hand_id: 1, ..Header::default() };
         let grasp_id = seq / 5;
         let cells_newtons = (0..rng.random_range(1..40)).map(|_| rng.random_range(0.0..3.0)).collect();
-        let frame = TactileFrame { grasp_id, joints_rad: vec![0.5; 7], cells_newtons, ..TactileFrame::default() };
+        let frame = TactileFrame { grasp_id, joints: vec![0.5; 7], cells_newtons, ..TactileFrame::default() };
         records.push(("/tactile".into(), Record::Tactile(Stamped { header, message: frame })));
         let contacts = vec![Contact { force_newtons: 1.0, ..Contact::default() }; (seq % 4) as usize];
         let contacts = ContactSet { grasp_id, contacts, ..ContactSet::default() };

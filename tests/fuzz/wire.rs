@@ -84,13 +84,13 @@ fn samples(rng: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
     let numbers = |rng: &mut ChaCha8Rng, most: usize| -> Vec<f64> {
         (0..rng.random_range(0..most)).map(|_| f64::from_bits(rng.next_u64())).collect()
     };
-    let (joints_rad, cells_newtons, values) = (numbers(rng, 9), numbers(rng, 100), numbers(rng, 300));
+    let (joints, cells_newtons, values) = (numbers(rng, 9), numbers(rng, 100), numbers(rng, 300));
     let contacts = vec![Contact { force_newtons: 1.0, ..Contact::default() }; rng.random_range(0..20)];
     let truth = GraspTruth { object: "bücher".into(), class: "book".into(), ..GraspTruth::default() };
     let outcome = LiftOutcome { thing: "bücher".into(), group: "book".into(), ..LiftOutcome::default() };
     vec![
-        encoded(rng, &TactileFrame { joints_rad: joints_rad.clone(), cells_newtons, ..TactileFrame::default() }),
-        encoded(rng, &ContactSet { joints_rad, contacts, ..ContactSet::default() }),
+        encoded(rng, &TactileFrame { joints: joints.clone(), cells_newtons, ..TactileFrame::default() }),
+        encoded(rng, &ContactSet { joints, contacts, ..ContactSet::default() }),
         encoded(rng, &GraspFeature { values, ..GraspFeature::default() }),
         encoded(rng, &Prediction { stable: true, ..Prediction::default() }),
         encoded(rng, &LiftDecision::default()),

@@ -54,7 +54,7 @@ impl ZMessage for Decision {
 
 #[derive(Deserialize)]
 struct Frame {
-    joints_rad: Vec<f64>,
+    joints: Vec<f64>,
     cells_newtons: Vec<f64>,
     phase: String,
 }
@@ -71,7 +71,9 @@ fn main() -> Result<()> {
             }
         }
         ["echo", endpoint] => echo(&context("client", endpoint)?),
-        ["robot", endpoint, frames, rate, secs] => robot(&context("client", endpoint)?, frames, rate.parse()?, secs.parse()?),
+        ["robot", endpoint, frames, rate, secs] => {
+            robot(&context("client", endpoint)?, frames, rate.parse()?, secs.parse()?)
+        }
         _ => Err("usage: hiroz-peer router|echo|robot ENDPOINT [FRAMES RATE_HZ SECS]".into()),
     }
 }
@@ -187,7 +189,7 @@ fn robot(context: &ZContext, frames: &str, rate_hz: f64, secs: f64) -> Result<()
             None => n_late += 1,
         }
         let header = Header { stamp: now(), frame_id: "hand".into() };
-        let (position, none) = (frame.joints_rad.clone(), Vec::new());
+        let (position, none) = (frame.joints.clone(), Vec::new());
         joints.publish(&JointState { header, name: name.clone(), position, velocity: none.clone(), effort: none })?;
         phases.publish(&Text { data: frame.phase.clone() })?;
         let layout = MultiArrayLayout { dim: Vec::new(), data_offset: 0 };
@@ -211,6 +213,9 @@ fn robot(context: &ZContext, frames: &str, rate_hz: f64, secs: f64) -> Result<()
             Some(at.saturating_duration_since(*sent).as_secs_f64() * 1e6)
         })
         .collect();
-    println!("{}", serde_json::json!({"grasps": settled.len(), "decisions": received.len(), "late_sends": n_late, "micros": micros}));
+    println!(
+        "{}",
+        serde_json::json!({"grasps": settled.len(), "decisions": received.len(), "late_sends": n_late, "micros": micros})
+    );
     Ok(())
 }

@@ -43,7 +43,7 @@ pub enum SensorsError {
 #[derive(Debug, Clone)]
 pub struct Frame {
     pub phase: Phase,
-    pub joints_rad: Vec<f64>,
+    pub joints: Vec<f64>,
     pub cells_newtons: Vec<f64>,
 }
 
@@ -67,7 +67,7 @@ pub fn read(hand: &Hand, recordings: &[PathBuf]) -> Result<Vec<Grasp>, DatasetEr
         let grasps = read_grasps(path, hand, |_, frames| {
             let of = |message: TactileFrame| Frame {
                 phase: message.phase,
-                joints_rad: message.joints_rad,
+                joints: message.joints,
                 cells_newtons: message.cells_newtons,
             };
             let frames = frames.into_iter().map(|frame| of(frame.message));
@@ -84,7 +84,7 @@ pub fn read(hand: &Hand, recordings: &[PathBuf]) -> Result<Vec<Grasp>, DatasetEr
 }
 
 fn is_valid(hand: &Hand, frame: &Frame) -> bool {
-    let summary = contacts_from_frame(hand, 0, &frame.joints_rad, &frame.cells_newtons, &mut Vec::new());
+    let summary = contacts_from_frame(hand, 0, &frame.joints, &frame.cells_newtons, &mut Vec::new());
     matches!(summary.fault, Fault::None | Fault::NoContact)
 }
 
@@ -125,14 +125,14 @@ pub fn damaged(hand: &Hand, grasp: &Grasp, damage: Damage, other: &Grasp, random
             Damage::Noise { pad, newtons } => {
                 cells[cells_of(pad)].iter_mut().for_each(|force| *force = (*force + newtons * normal(random)).max(0.0));
             }
-            Damage::Encoder { joint, radians } => frame.joints_rad[joint] += radians,
+            Damage::Encoder { joint, radians } => frame.joints[joint] += radians,
             Damage::Exchanged { pads: [a, b] } => cells_of(a).zip(cells_of(b)).for_each(|(a, b)| cells.swap(a, b)),
             Damage::Posture => {
                 // The same moment of the other grasp, as far as it has one.
                 let of_phase = |of: &&Frame| of.phase == frame.phase;
                 let same = other.frames.get(idx).filter(of_phase).or_else(|| other.frames.iter().find(of_phase));
                 if let Some(found) = same {
-                    frame.joints_rad.clone_from(&found.joints_rad);
+                    frame.joints.clone_from(&found.joints);
                 }
             }
         }
@@ -151,11 +151,11 @@ fn values(hand: &Hand, grasp: &Grasp) -> Option<Vec<f64>> {
     let mut summary = GraspSummary::default();
     let mut contacts: Vec<Contact> = Vec::new();
     for frame in &grasp.frames {
-        contacts_from_frame(hand, 0, &frame.joints_rad, &frame.cells_newtons, &mut contacts);
-        summary.add(hand, frame.phase, &frame.joints_rad, &contacts, &frame.cells_newtons);
+        contacts_from_frame(hand, 0, &frame.joints, &frame.cells_newtons, &mut contacts);
+        summary.add(hand, frame.phase, &frame.joints, &contacts, &frame.cells_newtons);
         if frame.phase == Phase::Settled {
             let mut values = Vec::new();
-            summary.values(hand, &frame.joints_rad, &contacts, &mut values);
+            summary.values(hand, &frame.joints, &contacts, &mut values);
             return Some(values);
         }
     }
@@ -364,7 +364,7 @@ pub fn alarms(check: &SensorCheck, hand: &Hand, grasps: &[Grasp]) -> Vec<Option<
         let place = GraspPlace { epoch: 0, grasp_id: number as u64, day: 0 };
         let mut found = None;
         for frame in &grasp.frames {
-            let readings = (&frame.joints_rad[..], &frame.cells_newtons[..]);
+            let readings = (&frame.joints[..], &frame.cells_newtons[..]);
             let summary = contacts_from_frame(hand, 0, readings.0, readings.1, &mut contacts);
             // An encoder that was damaged may read beyond its joint's stops: the contacts stage refuses the frame.
             if matches!(summary.fault, Fault::None | Fault::NoContact) {

@@ -35,10 +35,10 @@ message! {
     pub struct ContactSet = "blindgrasp/ContactSet/7" on "/contacts" {
         pub grasp_id: u64,
         pub phase: Phase,
-        #[ros = "Radians, in the hand's order."]
+        #[ros = "Radians, or metres for a joint that slides, in the hand's order."]
         #[serde(deserialize_with = "crate::serialized::any_list")]
         #[max(MAX_JOINTS)]
-        pub joints_rad: Vec<f64>,
+        pub joints: Vec<f64>,
         /// The active cells, in the order of the hand's cells.
         #[serde(deserialize_with = "crate::serialized::any_list")]
         #[max(MAX_CELLS)]
@@ -64,11 +64,11 @@ message! {
     pub struct ContactSetHead = "blindgrasp/ContactSetHead/7" {
         grasp_id: u64, phase: u32, n_pads_in_contact: u32, self_collision: u32, n_self_contacts: u32, fault: u32,
         n_joints: u32, has_senses: u32, day: u32,
-        joints_rad: [f64; MAX_JOINTS], senses: [[f64; ROW]; MAX_SENSE_VALUES.div_ceil(ROW)],
+        joints: [f64; MAX_JOINTS], senses: [[f64; ROW]; MAX_SENSE_VALUES.div_ceil(ROW)],
     }
 }
 serialize_with_senses! {
-    ContactSet: grasp_id phase joints_rad contacts n_pads_in_contact self_collision n_self_contacts fault, senses, day
+    ContactSet: grasp_id phase joints contacts n_pads_in_contact self_collision n_self_contacts fault, senses, day
 }
 
 impl Message for ContactSet {
@@ -95,7 +95,7 @@ impl Message for ContactSet {
             day: self.day,
             ..ContactSetHead::default()
         }
-        .with_joints(&self.joints_rad)
+        .with_joints(&self.joints)
         .with_senses(&self.senses.view());
         (head, self.contacts.clone())
     }
@@ -104,7 +104,7 @@ impl Message for ContactSet {
         let message = ContactSet {
             grasp_id: head.grasp_id,
             phase: Phase::from_code(head.phase)?,
-            joints_rad: head.joints_rad()?.to_vec(),
+            joints: head.joints()?.to_vec(),
             contacts: items.to_vec(),
             n_pads_in_contact: head.n_pads_in_contact,
             self_collision: bool::from_raw("self_collision", head.self_collision)?,
@@ -119,14 +119,14 @@ impl Message for ContactSet {
 }
 
 fn check_senses(contacts: &ContactSet) -> Result<(), MessageError> {
-    contacts.senses.view().check(contacts.joints_rad.len())
+    contacts.senses.view().check(contacts.joints.len())
 }
 
 impl ContactSetHead {
     /// With these joints, at most [`MAX_JOINTS`].
-    pub fn with_joints(mut self, joints_rad: &[f64]) -> Self {
-        self.n_joints = joints_rad.len() as u32;
-        fill(&mut self.joints_rad, joints_rad);
+    pub fn with_joints(mut self, joints: &[f64]) -> Self {
+        self.n_joints = joints.len() as u32;
+        fill(&mut self.joints, joints);
         self
     }
 
@@ -141,9 +141,9 @@ impl ContactSetHead {
     ///
     /// # Errors
     /// More joints than a hand can have.
-    pub fn joints_rad(&self) -> Result<&[f64], MessageError> {
-        at_most("joints_rad", self.n_joints as usize, MAX_JOINTS)?;
-        Ok(&self.joints_rad[..self.n_joints as usize])
+    pub fn joints(&self) -> Result<&[f64], MessageError> {
+        at_most("joints", self.n_joints as usize, MAX_JOINTS)?;
+        Ok(&self.joints[..self.n_joints as usize])
     }
 
     /// The frame's senses.

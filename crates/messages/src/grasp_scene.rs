@@ -28,7 +28,7 @@ message! {
         /// The settled joints; the frames hold what the encoders say.
         #[ros = "Exactly, as no encoder says them."]
         #[max(MAX_JOINTS)]
-        pub joints_rad: Vec<f64>,
+        pub joints: Vec<f64>,
         /// Whether links of the hand press on each other.
         pub self_collision: bool,
         /// All contacts, sensed or not, of links with the object and with each other.

@@ -6,7 +6,7 @@
 //! let frame = TactileFrame {
 //!     grasp_id: 7,
 //!     phase: Phase::Settled,
-//!     joints_rad: vec![0.1, 0.9],
+//!     joints: vec![0.1, 0.9],
 //!     cells_newtons: vec![0.0, 1.5, 0.2],
 //!     ..TactileFrame::default()
 //! };

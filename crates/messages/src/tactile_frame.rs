@@ -11,11 +11,10 @@ message! {
     pub struct TactileFrame = "blindgrasp/TactileFrame/5" on "/tactile" {
         pub grasp_id: u64,
         pub phase: Phase,
-        /// Radians, and metres of joints that slide.
-        #[ros = "Radians, in the hand's order."]
+        #[ros = "Radians, or metres for a joint that slides, in the hand's order."]
         #[serde(deserialize_with = "crate::serialized::any_list")]
         #[max(MAX_JOINTS)]
-        pub joints_rad: Vec<f64>,
+        pub joints: Vec<f64>,
         /// Force on each cell, in the unit that the hand's layout declares if that is not newtons.
         #[ros = "Newtons, pad after pad."]
         #[serde(deserialize_with = "crate::serialized::any_list")]
@@ -35,7 +34,7 @@ message! {
         grasp_id: u64, phase: u32, n_joints: u32, has_senses: u32, day: u32,
     }
 }
-serialize_with_senses! { TactileFrame: grasp_id phase joints_rad cells_newtons, senses, day }
+serialize_with_senses! { TactileFrame: grasp_id phase joints cells_newtons, senses, day }
 
 impl Message for TactileFrame {
     type Head = TactileFrameHead;
@@ -55,19 +54,19 @@ impl Message for TactileFrame {
             header,
             grasp_id: self.grasp_id,
             phase: self.phase.code(),
-            n_joints: self.joints_rad.len() as u32,
-            has_senses: senses.mask(self.joints_rad.len()),
+            n_joints: self.joints.len() as u32,
+            has_senses: senses.mask(self.joints.len()),
             day: self.day,
         };
-        (head, [&self.joints_rad, senses.values(), &self.cells_newtons].concat())
+        (head, [&self.joints, senses.values(), &self.cells_newtons].concat())
     }
 
     fn from_parts(head: &TactileFrameHead, items: &[f64]) -> Result<Self, MessageError> {
-        let FrameParts { joints_rad, senses, cells_newtons } = head.split(items)?;
+        let FrameParts { joints, senses, cells_newtons } = head.split(items)?;
         let message = TactileFrame {
             grasp_id: head.grasp_id,
             phase: Phase::from_code(head.phase)?,
-            joints_rad: joints_rad.to_vec(),
+            joints: joints.to_vec(),
             cells_newtons: cells_newtons.to_vec(),
             senses: senses.into(),
             day: head.day,
@@ -85,13 +84,13 @@ impl TactileFrame {
 }
 
 fn check_senses(frame: &TactileFrame) -> Result<(), MessageError> {
-    frame.senses.view().check(frame.joints_rad.len())
+    frame.senses.view().check(frame.joints.len())
 }
 
 /// The lists of a frame among its items.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FrameParts<'a> {
-    pub joints_rad: &'a [f64],
+    pub joints: &'a [f64],
     pub senses: Senses<'a>,
     pub cells_newtons: &'a [f64],
 }
@@ -99,7 +98,7 @@ pub struct FrameParts<'a> {
 /// [`FrameParts`], of which joints and cells can be changed.
 #[derive(Debug, PartialEq)]
 pub struct FramePartsMut<'a> {
-    pub joints_rad: &'a mut [f64],
+    pub joints: &'a mut [f64],
     pub senses: Senses<'a>,
     pub cells_newtons: &'a mut [f64],
 }
@@ -111,12 +110,12 @@ impl TactileFrameHead {
     /// More of them than items, or more than a hand can have.
     pub fn split<'a>(&self, items: &'a [f64]) -> Result<FrameParts<'a>, MessageError> {
         let n_joints = self.n_joints as usize;
-        at_most("joints_rad", n_joints, MAX_JOINTS.min(items.len()))?;
-        let (joints_rad, rest) = items.split_at(n_joints);
+        at_most("joints", n_joints, MAX_JOINTS.min(items.len()))?;
+        let (joints, rest) = items.split_at(n_joints);
         let senses = Senses::first_of(self.has_senses, n_joints, rest)?;
         let cells_newtons = &rest[senses.values().len()..];
         at_most("cells_newtons", cells_newtons.len(), MAX_CELLS)?;
-        Ok(FrameParts { joints_rad, senses, cells_newtons })
+        Ok(FrameParts { joints, senses, cells_newtons })
     }
 
     /// As [`TactileFrameHead::split`], to change joints or cells.
@@ -124,12 +123,12 @@ impl TactileFrameHead {
     /// # Errors
     /// As [`TactileFrameHead::split`].
     pub fn split_mut<'a>(&self, items: &'a mut [f64]) -> Result<FramePartsMut<'a>, MessageError> {
-        let FrameParts { joints_rad, senses, .. } = self.split(items)?;
-        let (n_joints, n_values) = (joints_rad.len(), senses.values().len());
-        let (joints_rad, rest) = items.split_at_mut(n_joints);
+        let FrameParts { joints, senses, .. } = self.split(items)?;
+        let (n_joints, n_values) = (joints.len(), senses.values().len());
+        let (joints, rest) = items.split_at_mut(n_joints);
         let (values, cells_newtons) = rest.split_at_mut(n_values);
         let senses = Senses::first_of(self.has_senses, n_joints, values)?;
-        Ok(FramePartsMut { joints_rad, senses, cells_newtons })
+        Ok(FramePartsMut { joints, senses, cells_newtons })
     }
 
     /// The joints among the frame's items.
@@ -137,7 +136,7 @@ impl TactileFrameHead {
     /// # Errors
     /// As [`TactileFrameHead::split`].
     pub fn joints<'a>(&self, items: &'a [f64]) -> Result<&'a [f64], MessageError> {
-        Ok(self.split(items)?.joints_rad)
+        Ok(self.split(items)?.joints)
     }
 
     /// The senses among the frame's items.

@@ -73,7 +73,7 @@ fn shapes() -> Vec<Map<String, Value>> {
         sent(&TactileFrame {
             grasp_id: 11,
             phase: Phase::Settled,
-            joints_rad: vec![0.25, -0.5],
+            joints: vec![0.25, -0.5],
             cells_newtons: vec![1.5, 0.0, 2.25],
             senses: senses(),
             day: 20_261_124,
@@ -81,7 +81,7 @@ fn shapes() -> Vec<Map<String, Value>> {
         sent(&ContactSet {
             grasp_id: 11,
             phase: Phase::Closing,
-            joints_rad: vec![0.25, -0.5],
+            joints: vec![0.25, -0.5],
             contacts: vec![contact; 2],
             n_pads_in_contact: 1,
             self_collision: true,
@@ -149,7 +149,7 @@ fn shapes() -> Vec<Map<String, Value>> {
             max_radius_m: 0.07,
             mass_kg: 0.5,
             friction: 0.8,
-            joints_rad: vec![0.25, -0.5],
+            joints: vec![0.25, -0.5],
             self_collision: true,
             contacts: vec![scene_contact; 2],
         }),
@@ -193,7 +193,7 @@ fn type_name<M: Recorded>() -> &'static str {
 #[test]
 fn the_lists_of_a_frame_are_found_and_can_be_changed() {
     let frame = TactileFrame {
-        joints_rad: vec![0.25, -0.5],
+        joints: vec![0.25, -0.5],
         cells_newtons: vec![1.5, 2.5],
         senses: OwnedSenses::default().with(Sense::JointTorques, &[0.75, 1.0]).with(Sense::Gravity, &[0.0, 0.0, 9.75]),
         ..TactileFrame::default()
@@ -205,7 +205,7 @@ fn the_lists_of_a_frame_are_found_and_can_be_changed() {
     let lists: Vec<_> = frame.senses.view().iter().map(|(_, values)| values).collect();
     assert_eq!(lists, [&[0.0, 0.0, 9.75][..], &[], &[0.75, 1.0]]);
     let parts = head.split_mut(&mut items).expect("a frame");
-    parts.joints_rad[0] = 0.5;
+    parts.joints[0] = 0.5;
     assert_eq!(parts.senses.get(Sense::JointTorques), [0.75, 1.0]);
     head.cells_mut(&mut items).expect("a frame").fill(0.0);
     assert_eq!(items, [0.5, -0.5, 0.0, 0.0, 9.75, 0.75, 1.0, 0.0, 0.0]);
@@ -228,10 +228,10 @@ fn senses_that_cannot_be_are_refused() {
 #[test]
 fn unknown_codes_and_lengths_that_cannot_be_are_refused() {
     let (mut head, items) =
-        TactileFrame { joints_rad: vec![0.5; 3], ..TactileFrame::default() }.to_parts(Header::default());
+        TactileFrame { joints: vec![0.5; 3], ..TactileFrame::default() }.to_parts(Header::default());
     head.n_joints = 4;
     let error = TactileFrame::from_parts(&head, &items).expect_err("more joints than items").to_string();
-    assert_eq!(error, "joints_rad has length 4, expected 0 to 3");
+    assert_eq!(error, "joints has length 4, expected 0 to 3");
     let (mut head, items) = Prediction::default().to_parts(Header::default());
     head.stable = 2;
     let error = Prediction::from_parts(&head, &items).expect_err("neither yes nor no").to_string();

@@ -53,7 +53,7 @@ pub fn animation_svg(hand: &Hand, grasps: &[AnimatedGrasp]) -> Result<String, Pi
             if let Some(scene) = moment.scene.as_mut()
                 && !is_closed
             {
-                scene.joints_rad.clone_from(&frame.joints_rad);
+                scene.joints.clone_from(&frame.joints);
                 scene.contacts.clear();
             }
             let mut placed = Placed::new(hand, &moment)?;

@@ -42,7 +42,7 @@ fill:#1f2933}.words text.tiny{font-size:10px;paint-order:stroke;stroke:#ffffff;s
 ///
 /// # Errors
 /// Joint angles that are not the hand's.
-pub fn dictionary_svg(hand: &Hand, joints_rad: &[f64], words: &[DrawnWord]) -> Result<String, PictureError> {
+pub fn dictionary_svg(hand: &Hand, joints: &[f64], words: &[DrawnWord]) -> Result<String, PictureError> {
     let posture = RecordedGrasp {
         grasp_id: 0,
         frames: vec![Stamped {
@@ -50,7 +50,7 @@ pub fn dictionary_svg(hand: &Hand, joints_rad: &[f64], words: &[DrawnWord]) -> R
             message: TactileFrame {
                 grasp_id: 0,
                 phase: Phase::Settled,
-                joints_rad: joints_rad.to_vec(),
+                joints: joints.to_vec(),
                 cells_newtons: vec![0.0; hand.n_cells()],
                 ..TactileFrame::default()
             },
@@ -177,21 +177,21 @@ mod tests {
     #[test]
     fn every_word_is_in_every_view() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let joints_rad: Vec<f64> = hand.joints.iter().map(|joint| (joint.lower + joint.upper) / 4.0).collect();
+        let joints: Vec<f64> = hand.joints.iter().map(|joint| (joint.lower + joint.upper) / 4.0).collect();
         let word = |x: f64, share_stable| DrawnWord {
             position_m: [x, 0.0, 0.05],
             share_of_contacts: Some(0.5 - x),
             share_stable,
         };
         let words = [word(0.0, Some(0.4)), word(0.1, Some(0.6)), word(-0.1, None)];
-        let svg = dictionary_svg(&hand, &joints_rad, &words).expect("a picture");
+        let svg = dictionary_svg(&hand, &joints, &words).expect("a picture");
         assert_eq!(svg.matches("class=\"word\"").count(), 9);
         assert_eq!(svg.matches("<image").count(), 3);
         for expected in ["The 3 words", "40.0 %", "60.0 %", UNUSED, "50 mm"] {
             assert!(svg.contains(expected), "{expected}");
         }
-        assert!(dictionary_svg(&hand, &joints_rad[1..], &words).is_err());
+        assert!(dictionary_svg(&hand, &joints[1..], &words).is_err());
         let all_alike = words.map(|word| DrawnWord { share_of_contacts: None, share_stable: None, ..word });
-        assert!(!dictionary_svg(&hand, &joints_rad, &all_alike).expect("a picture").contains("share of the contacts"));
+        assert!(!dictionary_svg(&hand, &joints, &all_alike).expect("a picture").contains("share of the contacts"));
     }
 }

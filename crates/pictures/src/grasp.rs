@@ -40,9 +40,9 @@ pub struct RecordedGrasp {
 impl RecordedGrasp {
     /// A hand by itself in these postures (joint values), each of its cells pressed by 1 N, so that its normal shows.
     pub fn hand_alone(hand: &Hand, postures: &[Vec<f64>]) -> RecordedGrasp {
-        let frame = |joints_rad: &Vec<f64>| TactileFrame {
+        let frame = |joints: &Vec<f64>| TactileFrame {
             phase: Phase::Open,
-            joints_rad: joints_rad.clone(),
+            joints: joints.clone(),
             cells_newtons: vec![1.0; hand.n_cells()],
             ..TactileFrame::default()
         };
@@ -103,7 +103,7 @@ pub(super) struct Placed<'a> {
     pub(super) grasp: &'a RecordedGrasp,
     /// The frame shown.
     pub(super) frame: &'a TactileFrame,
-    pub(super) joints_rad: &'a [f64],
+    pub(super) joints: &'a [f64],
     pub(super) palm_from_links: Vec<Isometry3<f64>>,
     /// Where it is known and given.
     pub(super) object_in_palm: Option<Mesh>,
@@ -122,7 +122,7 @@ impl<'a> Placed<'a> {
                 return Err(PictureError::Cells { grasp_id: grasp.grasp_id, idx, found, expected: hand.n_cells() });
             }
             // Every frame is shown in the end: all of them must fit.
-            hand.palm_from_links(&frame.message.joints_rad)
+            hand.palm_from_links(&frame.message.joints)
                 .map_err(|source| PictureError::Joints { grasp_id: grasp.grasp_id, source })?;
         }
         let settled = grasp.frames.iter().rev().find(|frame| frame.message.phase == Phase::Settled);
@@ -130,10 +130,9 @@ impl<'a> Placed<'a> {
             .map(|frame| &frame.message)
             .ok_or(PictureError::NoFrames { grasp_id: grasp.grasp_id })?;
         // The scene's joints are what the contacts belong to; the frame's are rounded by the encoders.
-        let joints_rad = grasp.scene.as_ref().map_or(&frame.joints_rad, |scene| &scene.joints_rad);
-        let palm_from_links = hand
-            .palm_from_links(joints_rad)
-            .map_err(|source| PictureError::Joints { grasp_id: grasp.grasp_id, source })?;
+        let joints = grasp.scene.as_ref().map_or(&frame.joints, |scene| &scene.joints);
+        let palm_from_links =
+            hand.palm_from_links(joints).map_err(|source| PictureError::Joints { grasp_id: grasp.grasp_id, source })?;
         let (mut notes, mut contacts, mut object_in_palm) = (Vec::new(), Vec::new(), None);
         match (&grasp.scene, &grasp.object) {
             (None, _) if grasp.is_hand_alone => {}
@@ -160,7 +159,7 @@ impl<'a> Placed<'a> {
             hand,
             grasp,
             frame,
-            joints_rad,
+            joints,
             palm_from_links,
             object_in_palm,
             contacts,

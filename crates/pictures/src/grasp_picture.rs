@@ -259,7 +259,7 @@ fn draw_joints(svg: &mut Svg, placed: &Placed<'_>, top: f64, width: f64) -> f64 
     svg.text([COLUMN, top + 4.0], Anchor::Start, "head", "JOINTS");
     svg.text([COLUMN + width, top + 4.0], Anchor::End, "head", unit);
     let (bar_left, bar_right) = (COLUMN + 92.0, COLUMN + width - 48.0);
-    for (idx, (joint, value)) in placed.hand.joints.iter().zip(placed.joints_rad).enumerate() {
+    for (idx, (joint, value)) in placed.hand.joints.iter().zip(placed.joints).enumerate() {
         let y = top + 28.0 + idx as f64 * ROW;
         let name = fit_text(&joint.name.replace('_', " "), 13.0, 84.0);
         svg.text([COLUMN, y], Anchor::Start, "", &name);

@@ -101,7 +101,7 @@ fn data<'a>(placed: &'a Placed<'_>, azimuth_rad: f64) -> Result<Data<'a>, Pictur
         .iter()
         .map(|idx| {
             let frame = &all[*idx];
-            let links = link_poses(hand, &frame.message.joints_rad)
+            let links = link_poses(hand, &frame.message.joints)
                 .map_err(|source| PictureError::Joints { grasp_id: placed.grasp.grasp_id, source })?;
             Ok(FrameData {
                 since_start_ms: frame.header.stamp_nanos.saturating_sub(start_nanos) as f64 / 1e6,

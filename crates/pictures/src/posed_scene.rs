@@ -19,7 +19,7 @@ pub struct PosedScene {
     /// The palm.
     pub world_from_palm: Isometry3<f64>,
     /// The hand's joints.
-    pub joints_rad: Vec<f64>,
+    pub joints: Vec<f64>,
     /// The thing.
     pub world_from_thing: Isometry3<f64>,
 }
@@ -83,7 +83,7 @@ fn surfaces(
         mesh
     };
     let mut meshes = vec![post.clone(), moved(thing, &scene.world_from_thing)];
-    let palm_from_links = hand.palm_from_links(&scene.joints_rad)?;
+    let palm_from_links = hand.palm_from_links(&scene.joints)?;
     meshes.extend(
         links
             .iter()
@@ -124,7 +124,7 @@ mod tests {
         let down = nalgebra::UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
         PosedScene {
             world_from_palm: Isometry3::from_parts([0.0, 0.0, 0.2 + height_m].into(), down),
-            joints_rad: vec![0.0; hand.joints.len()],
+            joints: vec![0.0; hand.joints.len()],
             world_from_thing: Isometry3::translation(0.0, 0.0, height_m),
         }
     }
@@ -144,7 +144,7 @@ mod tests {
     #[test]
     fn joints_of_another_hand_are_refused() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
-        let wrong = PosedScene { joints_rad: vec![0.0; 2], ..scene(&hand, 0.0) };
+        let wrong = PosedScene { joints: vec![0.0; 2], ..scene(&hand, 0.0) };
         posed_scene_images(&hand, &Mesh::default(), 0.04, &[wrong], [10, 10]).expect_err("two joints");
     }
 }

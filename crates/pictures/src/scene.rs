@@ -94,8 +94,8 @@ impl ObjectScene {
 ///
 /// # Errors
 /// The joint values are another hand's.
-pub fn link_poses(hand: &Hand, joints_rad: &[f64]) -> Result<Vec<Vec<f64>>, JointError> {
-    Ok(hand.palm_from_links(joints_rad)?.iter().map(|pose: &Isometry3<f64>| rows(pose)).collect())
+pub fn link_poses(hand: &Hand, joints: &[f64]) -> Result<Vec<Vec<f64>>, JointError> {
+    Ok(hand.palm_from_links(joints)?.iter().map(|pose: &Isometry3<f64>| rows(pose)).collect())
 }
 
 fn cells(hand: &Hand) -> Vec<CellData> {

@@ -154,7 +154,7 @@ fn frames_and_contacts_of_another_hand_are_refused() {
         assert!(format!("{error:#}").contains(expected), "{error:#}");
     };
     refused(&|grasp| grasp.frames[3].message.cells_newtons.truncate(95), "frame 3: 95 cells, the hand has 96");
-    refused(&|grasp| grasp.frames[0].message.joints_rad.push(0.0), "8 joint angles, the hand has 7");
+    refused(&|grasp| grasp.frames[0].message.joints.push(0.0), "8 joint angles, the hand has 7");
     refused(&|grasp| grasp.frames.clear(), "no frames");
     let with_contact = |change: fn(&mut SceneContact)| {
         move |grasp: &mut RecordedGrasp| change(&mut grasp.scene.as_mut().expect("a scene").contacts[0])

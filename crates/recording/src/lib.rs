@@ -117,7 +117,7 @@ mod tests {
                     TactileFrame {
                         grasp_id: 7,
                         phase: Phase::Closing,
-                        joints_rad: vec![0.1, 0.2],
+                        joints: vec![0.1, 0.2],
                         cells_newtons: vec![0.3; 5],
                         ..Default::default()
                     },
@@ -130,7 +130,7 @@ mod tests {
                     ContactSet {
                         grasp_id: 7,
                         phase: Phase::Settled,
-                        joints_rad: vec![0.2, -0.4],
+                        joints: vec![0.2, -0.4],
                         contacts: vec![contact; 2],
                         n_pads_in_contact: 1,
                         self_collision: true,
@@ -162,7 +162,7 @@ mod tests {
                 Record::Scene(stamped(
                     5,
                     GraspScene {
-                        joints_rad: vec![0.5; 7],
+                        joints: vec![0.5; 7],
                         contacts: vec![SceneContact { other_link: -1, ..Default::default() }; 2],
                         ..Default::default()
                     },

@@ -219,7 +219,7 @@ impl LiveRecorder {
             written = match record {
                 Record::Tactile(sample)
                     if !names.is_empty()
-                        && names.len() == sample.message.joints_rad.len()
+                        && names.len() == sample.message.joints.len()
                         && is_first(&mut self.joint_topic, topic) =>
                 {
                     joint_state(&header, names, &sample.message, &mut self.data)

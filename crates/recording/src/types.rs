@@ -98,7 +98,7 @@ mod tests {
         let message = TactileFrame {
             grasp_id: 7,
             phase: Phase::Settled,
-            joints_rad: vec![0.5, 0.25],
+            joints: vec![0.5, 0.25],
             cells_newtons: vec![1.0, 0.0, 2.0],
             ..TactileFrame::default()
         };
@@ -119,7 +119,7 @@ mod tests {
         let [first, .., last] = Sense::ALL;
         let message = TactileFrame {
             grasp_id: 7,
-            joints_rad: vec![0.5],
+            joints: vec![0.5],
             cells_newtons: vec![1.0, 0.0],
             senses: OwnedSenses::default().with(first, &vec![-9.75; first.len(1)]),
             day: 20_261_124,

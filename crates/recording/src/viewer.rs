@@ -136,11 +136,11 @@ pub(super) fn joint_state(
     frame: &TactileFrame,
     data: &mut Vec<u8>,
 ) -> Result<(), String> {
-    if names.len() != frame.joints_rad.len() {
-        return Err(format!("{} joint values, the hand has {}", frame.joints_rad.len(), names.len()));
+    if names.len() != frame.joints.len() {
+        return Err(format!("{} joint values, the hand has {}", frame.joints.len(), names.len()));
     }
     let header = StandardHeader::new(header);
-    encode(&JointState { header, name: names, position: &frame.joints_rad, velocity: &[], effort: &[] }, data)
+    encode(&JointState { header, name: names, position: &frame.joints, velocity: &[], effort: &[] }, data)
 }
 
 /// A sample's contacts: palm frame, metres, and the force of each in newtons.
@@ -187,7 +187,7 @@ mod tests {
     #[test]
     fn joints_are_as_ros_writes_them() {
         let header = Header { stamp_nanos: 5_000_000_007, ..Header::default() };
-        let frame = TactileFrame { joints_rad: vec![0.25, -1.5], ..TactileFrame::default() };
+        let frame = TactileFrame { joints: vec![0.25, -1.5], ..TactileFrame::default() };
         let mut data = vec![9; 3];
         joint_state(&header, &["a".into(), "thumb".into()], &frame, &mut data).expect("CDR");
         let expected = "0001000005000000070000000500000070616c6d00000000020000000200000061000000060000007468756d62000000\

@@ -422,8 +422,8 @@ mod tests {
             for seq in (grasp_id * 3..).take(3).filter(|seq| *seq != 4) {
                 let header = Header { seq, stamp_nanos: seq * 1_000_000_000, epoch: 2, ..Header::default() };
                 let cells_newtons = (0..n_cells).map(|idx| (seq as f64 + idx as f64 * 0.7).sin()).collect();
-                let joints_rad = vec![seq as f64; 1 + grasp_id as usize % 4];
-                let message = TactileFrame { grasp_id, joints_rad, cells_newtons, ..TactileFrame::default() };
+                let joints = vec![seq as f64; 1 + grasp_id as usize % 4];
+                let message = TactileFrame { grasp_id, joints, cells_newtons, ..TactileFrame::default() };
                 writer.write("/tactile", &Stamped { header, message }).expect("written");
             }
         }

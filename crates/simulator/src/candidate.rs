@@ -165,7 +165,7 @@ impl Grasp {
             max_radius_m: object.max_radius_m,
             mass_kg: object.mass_kg,
             friction: options.friction,
-            joints_rad: self.exploration.joints_rad(self.exploration.end),
+            joints: self.exploration.posture(self.exploration.end),
             self_collision: self.contacts.iter().any(|contact| contact.point.other.is_some()),
             contacts: self.contacts.iter().map(SimulatedContact::to_scene).collect(),
         }
@@ -189,7 +189,7 @@ fn grasp(
     let Some(exploration) = mechanism.explore(object, start, &options.protocol)? else {
         return Ok(None);
     };
-    let palm_from_links = mechanism.hand.palm_from_links(&exploration.joints_rad(exploration.end))?;
+    let palm_from_links = mechanism.hand.palm_from_links(&exploration.posture(exploration.end))?;
     let palm_from_object = &exploration.palm_from_object;
     let tolerance_m = options.protocol.touch_tolerance_m;
     let mut points =
@@ -251,13 +251,13 @@ fn frames(hand: &Hand, grasp: &Grasp, options: &SimulatorOptions, grasp_id: u64)
                     cells_newtons[*cell_idx] += part * newtons;
                 }
             }
-            let joints_rad = grasp.exploration.joints_rad(progress);
+            let joints = grasp.exploration.posture(progress);
             TimedFrame {
                 offset_nanos: idx as u64 * period_nanos,
                 frame: TactileFrame {
                     grasp_id,
                     phase,
-                    joints_rad: sensor.read_joints(hand, &joints_rad, &options.sensor),
+                    joints: sensor.read_joints(hand, &joints, &options.sensor),
                     cells_newtons: sensor.read_cells(hand, &cells_newtons, &options.sensor, &mut rng),
                     ..TactileFrame::default()
                 },
@@ -310,7 +310,7 @@ mod tests {
         exploration: &Exploration,
         progress: f64,
     ) -> [f64; 2] {
-        let palm_from_links = mechanism.hand.palm_from_links(&exploration.joints_rad(progress)).expect("7 joints");
+        let palm_from_links = mechanism.hand.palm_from_links(&exploration.posture(progress)).expect("7 joints");
         let object_pose = pose_from_isometry(&exploration.palm_from_object);
         let to_object = mechanism.shapes.iter().map(|shape| {
             let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
@@ -344,7 +344,7 @@ mod tests {
         let hand = barrett();
         let options = SimulatorOptions::default();
         for (object, _, exploration, contacts) in grasps(&hand, &options, 100) {
-            let palm_from_links = hand.palm_from_links(&exploration.joints_rad(exploration.end)).expect("7 joints");
+            let palm_from_links = hand.palm_from_links(&exploration.posture(exploration.end)).expect("7 joints");
             for contact in &contacts {
                 let point = contact.point.point_in_palm_m;
                 let point = Vector::new(point.x, point.y, point.z);
@@ -379,10 +379,10 @@ mod tests {
         let hand = barrett();
         let mut n_alone = 0;
         for (_, _, exploration, _) in grasps(&hand, &SimulatorOptions::default(), 100) {
-            let joints_rad = exploration.joints_rad(exploration.end);
+            let joints = exploration.posture(exploration.end);
             for finger in 1..=3 {
-                let ahead_rad = joints_rad[finger + 3] - joints_rad[finger] * 45.0 / 140.0;
-                assert!(ahead_rad > -1e-12, "{joints_rad:?}");
+                let ahead_rad = joints[finger + 3] - joints[finger] * 45.0 / 140.0;
+                assert!(ahead_rad > -1e-12, "{joints:?}");
                 n_alone += usize::from(ahead_rad > 0.01);
             }
         }
@@ -440,7 +440,7 @@ mod tests {
                 let (exploration, contacts) =
                     grasp(&mechanism, &object, &start, &options).expect("a hand").expect("touches");
                 let case = grasp_case(&object, &exploration.palm_from_object, &contacts, options.friction);
-                (exploration.joints_rad(exploration.end), contacts, quality(&case).expect("a hull"))
+                (exploration.posture(exploration.end), contacts, quality(&case).expect("a hull"))
             });
             for (a, b) in here.0.iter().zip(&there.0) {
                 assert!((a - b).abs() < 1e-3, "{name}: {:?} {:?}", here.0, there.0);
@@ -494,7 +494,7 @@ mod tests {
             };
             let [here, there] = [(&object, start), (&mirrored, image)]
                 .map(|(object, start)| grasp(&mechanism, object, &start, &options).expect("a hand").expect("touches"));
-            let [joints_here, joints_there] = [&here.0, &there.0].map(|found| found.joints_rad(found.end));
+            let [joints_here, joints_there] = [&here.0, &there.0].map(|found| found.posture(found.end));
             for (a, b) in [0, 2, 1, 3, 5, 4, 6].into_iter().enumerate() {
                 assert!((joints_here[a] - joints_there[b]).abs() < 1e-3, "{name}: {joints_here:?} {joints_there:?}");
             }

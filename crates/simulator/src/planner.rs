@@ -131,7 +131,7 @@ pub(crate) fn energy(
     exploration: &Exploration,
     options: &PlannerOptions,
 ) -> Result<f64, JointError> {
-    let palm_from_links = hand.palm_from_links(&exploration.joints_rad(exploration.end))?;
+    let palm_from_links = hand.palm_from_links(&exploration.posture(exploration.end))?;
     let object_pose = pose_from_isometry(&exploration.palm_from_object);
     let of_pad = |pad: &blindgrasp_stages::hand::Pad| {
         let palm_from_link: &Isometry3<f64> = &palm_from_links[pad.link_idx];

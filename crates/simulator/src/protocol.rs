@@ -119,8 +119,8 @@ pub struct Exploration {
 
 impl Exploration {
     /// The joints at a progress between 0 (open) and [`Exploration::end`] (settled).
-    pub fn joints_rad(&self, progress: f64) -> Vec<f64> {
-        joints_rad(&self.open_joints_rad, &self.joints, progress)
+    pub fn posture(&self, progress: f64) -> Vec<f64> {
+        posture(&self.open_joints_rad, &self.joints, progress)
     }
 }
 
@@ -182,7 +182,7 @@ impl Mechanism<'_> {
         palm_from_object.translation.vector.z += start.back_off_m;
         let mut joints = self.close(object, &palm_from_object, &start.open_joints_rad, options)?;
         for _ in 0..MOST_PUSHES {
-            let posture = joints_rad(&start.open_joints_rad, &joints, f64::INFINITY);
+            let posture = posture(&start.open_joints_rad, &joints, f64::INFINITY);
             let Some(push) = self.push(object, &palm_from_object, &posture, &joints, options)? else { break };
             let pushed = Translation3::from(push) * palm_from_object;
             if !self.is_apart(object, &pushed, &start.open_joints_rad)? {
@@ -201,11 +201,11 @@ impl Mechanism<'_> {
         &self,
         object: &Object,
         palm_from_object: &Isometry3<f64>,
-        joints_rad: &[f64],
+        posture: &[f64],
         joints: &[ClosingJoint],
         options: &ProtocolOptions,
     ) -> Result<Option<Vector3<f64>>, JointError> {
-        let palm_from_links = self.hand.palm_from_links(joints_rad)?;
+        let palm_from_links = self.hand.palm_from_links(posture)?;
         let object_pose = pose_from_isometry(palm_from_object);
         for (closing_idx, fingers) in self.fingers.iter().enumerate() {
             if fingers.len() < 2 || joints[closing_idx].end >= self.joints[closing_idx].end {
@@ -240,9 +240,9 @@ impl Mechanism<'_> {
         &self,
         object: &Object,
         palm_from_object: &Isometry3<f64>,
-        joints_rad: &[f64],
+        posture: &[f64],
     ) -> Result<bool, JointError> {
-        let palm_from_links = self.hand.palm_from_links(joints_rad)?;
+        let palm_from_links = self.hand.palm_from_links(posture)?;
         let object_pose = pose_from_isometry(palm_from_object);
         Ok(self.shapes.iter().all(|shape| {
             let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
@@ -286,7 +286,7 @@ impl Mechanism<'_> {
         let mut pair_due = vec![0.0; self.pairs.len()];
         let mut progress = 0.0;
         loop {
-            let palm_from_links = self.hand.palm_from_links(&joints_rad(open_joints_rad, &joints, progress))?;
+            let palm_from_links = self.hand.palm_from_links(&posture(open_joints_rad, &joints, progress))?;
             for (shape, due) in self.shapes.iter().zip(&mut shape_due) {
                 if *due > progress {
                     continue;
@@ -367,12 +367,12 @@ fn stop_m(options: &ProtocolOptions) -> f64 {
     options.touch_tolerance_m / 2.0
 }
 
-fn joints_rad(open_joints_rad: &[f64], joints: &[ClosingJoint], progress: f64) -> Vec<f64> {
-    let mut joints_rad = open_joints_rad.to_vec();
+fn posture(open_joints_rad: &[f64], joints: &[ClosingJoint], progress: f64) -> Vec<f64> {
+    let mut posture = open_joints_rad.to_vec();
     for joint in joints {
-        joints_rad[joint.joint_idx] += joint.rate * progress.min(joint.end);
+        posture[joint.joint_idx] += joint.rate * progress.min(joint.end);
     }
-    joints_rad
+    posture
 }
 
 /// Uniform over all rotations (Shoemake 1992).

@@ -478,7 +478,7 @@ mod tests {
             assert_eq!(phases, expected);
             for (idx, timed) in grasp.frames.iter().enumerate() {
                 assert_eq!(timed.offset_nanos, idx as u64 * 10_000_000);
-                assert_eq!((timed.frame.joints_rad.len(), timed.frame.cells_newtons.len()), (7, 96));
+                assert_eq!((timed.frame.joints.len(), timed.frame.cells_newtons.len()), (7, 96));
             }
             // Noise alone in the open hand; what the contacts bring in the settled one.
             let strongest = |idx: usize| grasp.frames[idx].frame.cells_newtons.iter().copied().fold(0.0, f64::max);

@@ -194,13 +194,13 @@ impl Sensor {
             .collect()
     }
 
-    /// The encoders' readings of `joints_rad`, within the joints' limits.
-    pub fn read_joints(&self, hand: &Hand, joints_rad: &[f64], options: &SensorOptions) -> Vec<f64> {
+    /// The encoders' readings of `joints`, within the joints' limits.
+    pub fn read_joints(&self, hand: &Hand, joints: &[f64], options: &SensorOptions) -> Vec<f64> {
         let quantum_rad = options.encoder_quantum_rad;
         let offsets_rad = self.encoder_offsets_rad.iter().copied().chain(std::iter::repeat(0.0));
         hand.joints
             .iter()
-            .zip(joints_rad)
+            .zip(joints)
             .zip(offsets_rad)
             .map(|((joint, value), offset_rad)| {
                 let per_radian = joint.kind.per_radian();
@@ -338,10 +338,10 @@ mod tests {
             drawn.read_cells(&hand, &forces, &drifted, &mut rng).iter().map(|read| (read - 5.0).powi(2)).sum::<f64>();
         let sigma = (squares / hand.n_cells() as f64).sqrt();
         assert!((0.07..0.13).contains(&sigma), "{sigma}");
-        let joints_rad: Vec<f64> = hand.joints.iter().map(|joint| 0.5 * (joint.lower + joint.upper)).collect();
+        let joints: Vec<f64> = hand.joints.iter().map(|joint| 0.5 * (joint.lower + joint.upper)).collect();
         let moved = |sensor: &Sensor| {
-            let read = sensor.read_joints(&hand, &joints_rad, &drifted);
-            read.iter().zip(&joints_rad).map(|(read, exact)| (read - exact).abs()).fold(0.0, f64::max)
+            let read = sensor.read_joints(&hand, &joints, &drifted);
+            read.iter().zip(&joints).map(|(read, exact)| (read - exact).abs()).fold(0.0, f64::max)
         };
         assert!(moved(&exact) < 1e-3 && moved(&drawn) > 0.01, "{} {}", moved(&exact), moved(&drawn));
     }

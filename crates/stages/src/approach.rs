@@ -26,10 +26,10 @@ pub struct ApproachPrior {
 impl ApproachPrior {
     /// The numbers that describe an approach: the direction of gravity in the palm frame, a unit vector, and the preshape
     /// joints, radians. `None` if a joint is missing or gravity has no direction.
-    pub fn values(preshape_idxs: &[usize], gravity: [f64; 3], joints_rad: &[f64]) -> Option<Vec<f64>> {
+    pub fn values(preshape_idxs: &[usize], gravity: [f64; 3], joints: &[f64]) -> Option<Vec<f64>> {
         let norm = gravity.iter().map(|part| part * part).sum::<f64>().sqrt();
         let down = gravity.iter().map(|part| part / norm).filter(|part| part.is_finite());
-        let preshape = preshape_idxs.iter().filter_map(|idx| joints_rad.get(*idx)).copied();
+        let preshape = preshape_idxs.iter().filter_map(|idx| joints.get(*idx)).copied();
         let values: Vec<f64> = down.chain(preshape).collect();
         (values.len() == 3 + preshape_idxs.len()).then_some(values)
     }
@@ -37,9 +37,9 @@ impl ApproachPrior {
     /// The probability that a lift after this approach keeps the object.
     ///
     /// * `gravity` - in the palm frame; only its direction counts.
-    /// * `joints_rad` - the open hand's, in its order.
-    pub fn probability_kept(&self, gravity: [f64; 3], joints_rad: &[f64]) -> Option<f64> {
-        let values = ApproachPrior::values(&self.preshape_idxs, gravity, joints_rad)?;
+    /// * `joints` - the open hand's, in its order.
+    pub fn probability_kept(&self, gravity: [f64; 3], joints: &[f64]) -> Option<f64> {
+        let values = ApproachPrior::values(&self.preshape_idxs, gravity, joints)?;
         Some(self.calibration.probability(self.trees.decision_value(&values)))
     }
 

@@ -34,7 +34,7 @@ pub struct ContactSummary {
 /// Writes the active cells of a frame to `contacts`, in the order of the hand's cells.
 ///
 /// * `hand_id` - the frame's, [`Hand::id`] or 0 for unknown.
-/// * `joints_rad`, `cells_newtons` - one per joint and cell of the hand, in its order.
+/// * `joints`, `cells_newtons` - one per joint and cell of the hand, in its order.
 ///
 /// A cell is active when its force exceeds its noise threshold. A joint outside its range (degrees instead of radians,
 /// say), or a force that is negative, not finite or beyond any hand, makes the whole frame invalid, because the
@@ -42,11 +42,11 @@ pub struct ContactSummary {
 pub fn contacts_from_frame(
     hand: &Hand,
     hand_id: u64,
-    joints_rad: &[f64],
+    joints: &[f64],
     cells_newtons: &[f64],
     contacts: &mut Vec<Contact>,
 ) -> ContactSummary {
-    ContactFinder::default().find(hand, hand_id, joints_rad, cells_newtons, contacts)
+    ContactFinder::default().find(hand, hand_id, joints, cells_newtons, contacts)
 }
 
 /// Finds the contacts of frame after frame as [`contacts_from_frame`] does, in memory that it keeps.
@@ -64,7 +64,7 @@ impl ContactFinder {
         &mut self,
         hand: &Hand,
         hand_id: u64,
-        joints_rad: &[f64],
+        joints: &[f64],
         cells_newtons: &[f64],
         contacts: &mut Vec<Contact>,
     ) -> ContactSummary {
@@ -74,13 +74,13 @@ impl ContactFinder {
             return faulty(Fault::WrongHand);
         }
         let thresholds_newtons = hand.noise_thresholds_newtons();
-        if joints_rad.len() != hand.joints.len() || cells_newtons.len() != thresholds_newtons.len() {
+        if joints.len() != hand.joints.len() || cells_newtons.len() != thresholds_newtons.len() {
             return faulty(Fault::WrongLength);
         }
         let in_range = |(value, joint): (&f64, &Joint)| joint.allows(*value, LIMIT_TOLERANCE_RAD);
         if !are_forces(cells_newtons)
-            || !joints_rad.iter().zip(&hand.joints).all(in_range)
-            || hand.write_palm_from_links(joints_rad, &mut self.palm_from_links).is_err()
+            || !joints.iter().zip(&hand.joints).all(in_range)
+            || hand.write_palm_from_links(joints, &mut self.palm_from_links).is_err()
         {
             return faulty(Fault::InvalidValue);
         }
@@ -143,10 +143,10 @@ mod tests {
     use super::*;
     use std::path::Path;
 
-    fn run(hand_id: u64, joints_rad: &[f64], cells_newtons: &[f64]) -> (ContactSummary, Vec<Contact>) {
+    fn run(hand_id: u64, joints: &[f64], cells_newtons: &[f64]) -> (ContactSummary, Vec<Contact>) {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
         let mut contacts = vec![Contact::default()];
-        (contacts_from_frame(&hand, hand_id, joints_rad, cells_newtons, &mut contacts), contacts)
+        (contacts_from_frame(&hand, hand_id, joints, cells_newtons, &mut contacts), contacts)
     }
 
     #[test]
@@ -213,16 +213,16 @@ mod tests {
         let mut finder = ContactFinder::default();
         let mut found = Vec::new();
         let touching = [0.5, 1.7, 1.7, 1.7, 0.55, 0.55, 0.55];
-        for joints_rad in [touching, [f64::NAN; 7], [0.0; 7], touching] {
-            let summary = finder.find(&hand, 0, &joints_rad, &[1.0; 96], &mut found);
-            assert_eq!((summary, found.clone()), run(0, &joints_rad, &[1.0; 96]));
+        for joints in [touching, [f64::NAN; 7], [0.0; 7], touching] {
+            let summary = finder.find(&hand, 0, &joints, &[1.0; 96], &mut found);
+            assert_eq!((summary, found.clone()), run(0, &joints, &[1.0; 96]));
         }
     }
 
     #[test]
     fn cells_between_fingers_that_touch_are_left_out_and_counted() {
-        let joints_rad = [0.5, 1.7, 1.7, 1.7, 0.55, 0.55, 0.55];
-        let (summary, contacts) = run(0, &joints_rad, &[1.0; 96]);
+        let joints = [0.5, 1.7, 1.7, 1.7, 0.55, 0.55, 0.55];
+        let (summary, contacts) = run(0, &joints, &[1.0; 96]);
         assert!(summary.self_collision);
         assert!(summary.n_self_contacts > 0, "{summary:?}");
         assert_eq!(contacts.len() + summary.n_self_contacts as usize, 96);
@@ -234,7 +234,7 @@ mod tests {
         let left: Vec<usize> = contacts.iter().map(|c| c.pad as usize * 24 + c.cell as usize).collect();
         (0..96).filter(|idx| !left.contains(idx)).for_each(|idx| between[idx] = 1.0);
         let mut contacts = Vec::new();
-        let summary = contacts_from_frame(&hand, 0, &joints_rad, &between, &mut contacts);
+        let summary = contacts_from_frame(&hand, 0, &joints, &between, &mut contacts);
         assert_eq!((summary.fault, contacts.len()), (Fault::NoContact, 0));
     }
 }

@@ -52,8 +52,8 @@ pub enum Block {
 /// A frame as the encoder sees it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reading<'a> {
-    /// Radians, in the hand's order.
-    pub joints_rad: &'a [f64],
+    /// Radians, or metres for a joint that slides, in the hand's order.
+    pub joints: &'a [f64],
     /// As [`crate::contacts::contacts_from_frame`] finds them.
     pub contacts: &'a [Contact],
     pub senses: Senses<'a>,
@@ -61,8 +61,8 @@ pub struct Reading<'a> {
 
 impl<'a> Reading<'a> {
     /// A frame without senses beside joint angles and cells.
-    pub fn new(joints_rad: &'a [f64], contacts: &'a [Contact]) -> Self {
-        Reading { joints_rad, contacts, senses: Senses::default() }
+    pub fn new(joints: &'a [f64], contacts: &'a [Contact]) -> Self {
+        Reading { joints, contacts, senses: Senses::default() }
     }
 }
 
@@ -153,15 +153,15 @@ impl FeatureExtractor {
     }
 
     fn check(&self, reading: &Reading<'_>) -> Result<(), Fault> {
-        let Reading { joints_rad, contacts, .. } = *reading;
-        if joints_rad.len() != self.couplings.len() {
+        let Reading { joints, contacts, .. } = *reading;
+        if joints.len() != self.couplings.len() {
             return Err(Fault::WrongLength);
         }
         let is_cell = |contact: &Contact| {
             self.cells_in_link_m.get(contact.pad as usize).map(Vec::len) > Some(contact.cell as usize)
         };
         let is_finite = |contact: &Contact| contact.normal.iter().all(|number| number.is_finite());
-        if !joints_rad.iter().all(|angle| angle.is_finite())
+        if !joints.iter().all(|angle| angle.is_finite())
             || !contacts.iter().all(|contact| is_cell(contact) && is_finite(contact))
         {
             return Err(Fault::InvalidValue);
@@ -170,7 +170,7 @@ impl FeatureExtractor {
     }
 
     fn write_blocks(&self, reading: &Reading<'_>, values: &mut Vec<f64>) -> Result<u32, Fault> {
-        let Reading { joints_rad, contacts, senses } = *reading;
+        let Reading { joints, contacts, senses } = *reading;
         // The histogram is computed for all blocks, because it checks positions and forces.
         let n_pads_in_contact = histogram(&self.dictionary, self.sigma_m, contacts, values)?;
         let n_words = values.len();
@@ -183,19 +183,19 @@ impl FeatureExtractor {
                     self.write_cells(contacts, values);
                     self.make_relative(&mut values[start..]);
                 }
-                Block::Joints => values.extend_from_slice(joints_rad),
+                Block::Joints => values.extend_from_slice(joints),
                 Block::Breakaways => {
                     let breakaway = |(angle, coupling): (&f64, &Option<Coupling>)| {
-                        coupling.map(|coupling| angle - coupling.ratio * joints_rad[coupling.follows_idx])
+                        coupling.map(|coupling| angle - coupling.ratio * joints[coupling.follows_idx])
                     };
-                    values.extend(joints_rad.iter().zip(&self.couplings).filter_map(breakaway));
+                    values.extend(joints.iter().zip(&self.couplings).filter_map(breakaway));
                 }
                 Block::Pads => self.write_pads(contacts, values),
                 Block::Gravity => values.extend(down(&senses)?),
                 Block::Wrist => values.extend(wrist_values(&senses)?),
                 Block::JointTorques => {
                     let torques = senses.get(Sense::JointTorques);
-                    if torques.len() != joints_rad.len() {
+                    if torques.len() != joints.len() {
                         return Err(Fault::MissingReading);
                     }
                     values.extend_from_slice(torques);

@@ -144,8 +144,8 @@ mod tests {
     /// A frame of a hand that feels nothing.
     fn frame(phase: Phase) -> TactileFrame {
         let hand = hand("barrett-bh8-280");
-        let (joints_rad, cells_newtons) = (vec![0.5; hand.joints.len()], vec![0.0; hand.n_cells()]);
-        TactileFrame { grasp_id: 1, phase, joints_rad, cells_newtons, ..TactileFrame::default() }
+        let (joints, cells_newtons) = (vec![0.5; hand.joints.len()], vec![0.0; hand.n_cells()]);
+        TactileFrame { grasp_id: 1, phase, joints, cells_newtons, ..TactileFrame::default() }
     }
 
     #[test]

@@ -11,7 +11,7 @@
 //! let closed_on_nothing = TactileFrame {
 //!     grasp_id: 1,
 //!     phase: Phase::Settled,
-//!     joints_rad: vec![0.5; hand.joints.len()],
+//!     joints: vec![0.5; hand.joints.len()],
 //!     cells_newtons: vec![0.0; hand.n_cells()],
 //!     ..TactileFrame::default()
 //! };

@@ -245,7 +245,7 @@ impl Model {
             Phase::TestLifted => self.test_lifted.as_ref().map(|probe| &probe.training_range),
             _ => Some(&self.training_range),
         };
-        let checked = range.map_or(Ok(()), |range| range.check(&self.features, reading.joints_rad, reading.contacts));
+        let checked = range.map_or(Ok(()), |range| range.check(&self.features, reading.joints, reading.contacts));
         checked.inspect_err(|_| values.clear())?;
         Ok(n_pads_in_contact)
     }

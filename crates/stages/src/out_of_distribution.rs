@@ -41,25 +41,20 @@ impl TrainingRange {
     ///
     /// # Errors
     /// [`Fault::OutOfDistribution`].
-    pub fn check(&self, features: &FeatureExtractor, joints_rad: &[f64], contacts: &[Contact]) -> Result<(), Fault> {
+    pub fn check(&self, features: &FeatureExtractor, joints: &[f64], contacts: &[Contact]) -> Result<(), Fault> {
         let mut limits = self.limits.iter();
         let mut is_within = true;
-        for_each_quantity(features, joints_rad, contacts, |value| {
+        for_each_quantity(features, joints, contacts, |value| {
             is_within &= limits.next().is_some_and(|limits| (limits.lower..=limits.upper).contains(&value));
         });
         if is_within { Ok(()) } else { Err(Fault::OutOfDistribution) }
     }
 
     /// The limits that a frame with a feature violates, each with the value found.
-    pub fn violations(
-        &self,
-        features: &FeatureExtractor,
-        joints_rad: &[f64],
-        contacts: &[Contact],
-    ) -> Vec<(&Limits, f64)> {
+    pub fn violations(&self, features: &FeatureExtractor, joints: &[f64], contacts: &[Contact]) -> Vec<(&Limits, f64)> {
         let mut limits = self.limits.iter();
         let mut found = Vec::new();
-        for_each_quantity(features, joints_rad, contacts, |value| {
+        for_each_quantity(features, joints, contacts, |value| {
             found.extend(
                 limits.next().filter(|limits| !(limits.lower..=limits.upper).contains(&value)).map(|of| (of, value)),
             );
@@ -111,14 +106,14 @@ pub fn quantity_names(features: &FeatureExtractor) -> Vec<(String, f64)> {
 /// Passes the quantities of a frame with a feature to `visit`.
 pub fn for_each_quantity(
     features: &FeatureExtractor,
-    joints_rad: &[f64],
+    joints: &[f64],
     contacts: &[Contact],
     mut visit: impl FnMut(f64),
 ) {
-    joints_rad.iter().for_each(|angle| visit(*angle));
-    for (angle, coupling) in joints_rad.iter().zip(&features.couplings) {
+    joints.iter().for_each(|angle| visit(*angle));
+    for (angle, coupling) in joints.iter().zip(&features.couplings) {
         if let Some(coupling) = coupling {
-            visit(angle - coupling.ratio * joints_rad[coupling.follows_idx]);
+            visit(angle - coupling.ratio * joints[coupling.follows_idx]);
         }
     }
     let mut pad_newtons = [0.0; MAX_PADS];

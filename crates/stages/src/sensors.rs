@@ -233,13 +233,13 @@ impl SensorCheck {
     /// Looks at the next frame, which is valid and has these contacts ([`crate::contacts::contacts_from_frame`]), and returns
     /// the most probable fault while there is enough evidence for one.
     ///
-    /// * `joints_rad`, `cells_newtons` - one per joint and cell of the hand.
+    /// * `joints`, `cells_newtons` - one per joint and cell of the hand.
     pub fn watch(
         &self,
         hand: &Hand,
         memory: &mut SensorMemory,
         (place, phase): (GraspPlace, Phase),
-        (joints_rad, cells_newtons): (&[f64], &[f64]),
+        (joints, cells_newtons): (&[f64], &[f64]),
         contacts: &[Contact],
     ) -> Option<SensorFault> {
         if memory.priors.len() != hand.n_cells() + hand.pads.len() + self.detectors.len() {
@@ -259,11 +259,11 @@ impl SensorCheck {
         }
         memory.before.clear();
         memory.before.extend_from_slice(cells_newtons);
-        memory.grasp.add(hand, phase, joints_rad, contacts, cells_newtons);
+        memory.grasp.add(hand, phase, joints, contacts, cells_newtons);
         if phase == Phase::Settled && !memory.grasp.is_judged {
             memory.grasp.is_judged = true;
             let mut values = Vec::with_capacity(n_values(hand));
-            memory.grasp.values(hand, joints_rad, contacts, &mut values);
+            memory.grasp.values(hand, joints, contacts, &mut values);
             let first = hand.n_cells() + hand.pads.len();
             for (evidence, detector) in memory.evidence[first..].iter_mut().zip(&self.detectors) {
                 *evidence *= (detector.power * detector.trees.decision_value(&values)).exp();
@@ -362,10 +362,10 @@ const MAX_CLOSING: usize = 64;
 
 impl GraspSummary {
     /// Adds a frame.
-    pub fn add(&mut self, hand: &Hand, phase: Phase, joints_rad: &[f64], contacts: &[Contact], cells_newtons: &[f64]) {
+    pub fn add(&mut self, hand: &Hand, phase: Phase, joints: &[f64], contacts: &[Contact], cells_newtons: &[f64]) {
         match phase {
             Phase::Open => {
-                self.open_joints_rad = joints_rad.to_vec();
+                self.open_joints_rad = joints.to_vec();
                 self.open_newtons.resize(hand.pads.len(), [0.0; 3]);
                 self.n_open += 1;
                 for (of, pad) in self.open_newtons.iter_mut().zip(&hand.pads) {
@@ -378,7 +378,7 @@ impl GraspSummary {
                 }
             }
             Phase::Closing if self.closing_rad.len() < MAX_CLOSING => {
-                self.closing_rad.push(joints_rad.to_vec());
+                self.closing_rad.push(joints.to_vec());
                 self.closing_newtons.push(pad_loads(hand, contacts));
             }
             _ => {}
@@ -408,13 +408,11 @@ impl GraspSummary {
     /// frame, its share of the load, when it first felt the object, when its force began to rise, by itself and after each of
     /// the two joints before it had stalled (by its speed, and by its last moving frame), and the level of the open hand; of each two pads the distance of their centres.
     /// Moments are in closing frames.
-    pub fn values(&self, hand: &Hand, joints_rad: &[f64], contacts: &[Contact], values: &mut Vec<f64>) {
+    pub fn values(&self, hand: &Hand, joints: &[f64], contacts: &[Contact], values: &mut Vec<f64>) {
         values.clear();
-        for (idx, (angle, joint)) in joints_rad.iter().zip(&hand.joints).enumerate() {
-            let breakaway = joint
-                .coupling
-                .as_ref()
-                .map_or(0.0, |coupling| angle - coupling.ratio * joints_rad[coupling.follows_idx]);
+        for (idx, (angle, joint)) in joints.iter().zip(&hand.joints).enumerate() {
+            let breakaway =
+                joint.coupling.as_ref().map_or(0.0, |coupling| angle - coupling.ratio * joints[coupling.follows_idx]);
             let open = self.open_joints_rad.get(idx).copied();
             values.extend([*angle, open.unwrap_or(NEVER), breakaway, self.stalled(hand, idx, *angle)]);
         }
@@ -438,7 +436,7 @@ impl GraspSummary {
             let after_joint = |nth: usize| {
                 let joint = joints_before(hand, hand.pads[pad].link_idx).nth(nth);
                 joint.zip(began).map_or([NEVER; 2], |(joint, began)| {
-                    [self.stalled(hand, joint, joints_rad[joint]), self.last_moving(hand, joint, joints_rad[joint])]
+                    [self.stalled(hand, joint, joints[joint]), self.last_moving(hand, joint, joints[joint])]
                         .map(|moment| began - moment)
                 })
             };

@@ -24,8 +24,8 @@ pub fn find_contacts<'a>(
 ) -> (ContactSummary, Option<FrameParts<'a>>) {
     match head.split(items) {
         Ok(parts) => {
-            let FrameParts { joints_rad, cells_newtons, .. } = parts;
-            (finder.find(hand, head.header.hand_id, joints_rad, cells_newtons, contacts), Some(parts))
+            let FrameParts { joints, cells_newtons, .. } = parts;
+            (finder.find(hand, head.header.hand_id, joints, cells_newtons, contacts), Some(parts))
         }
         Err(_) => {
             contacts.clear();
@@ -52,7 +52,7 @@ pub fn contact_set(
         day: head.day,
         ..ContactSetHead::default()
     }
-    .with_joints(parts.map_or(&[], |parts| parts.joints_rad))
+    .with_joints(parts.map_or(&[], |parts| parts.joints))
     .with_senses(&parts.map_or(Senses::default(), |parts| parts.senses))
 }
 
@@ -85,11 +85,10 @@ pub fn encode(
 }
 
 fn extract(model: &Model, head: &ContactSetHead, contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {
-    let (Ok(joints_rad), Ok(senses), Ok(phase)) = (head.joints_rad(), head.senses(), Phase::from_code(head.phase))
-    else {
+    let (Ok(joints), Ok(senses), Ok(phase)) = (head.joints(), head.senses(), Phase::from_code(head.phase)) else {
         return Err(Fault::Malformed);
     };
-    model.extract(phase, &Reading { joints_rad, contacts, senses }, values)
+    model.extract(phase, &Reading { joints, contacts, senses }, values)
 }
 
 /// Judges the feature of a frame, and keeps in `memory` what the model needs for later frames. `dictionary_id` is

@@ -86,8 +86,8 @@ pub struct TrainedOn {
 pub struct ReadingId(u64);
 
 impl ReadingId {
-    pub fn of(joints_rad: &[f64], cells_newtons: &[f64]) -> ReadingId {
-        let numbers = joints_rad.iter().chain(cells_newtons);
+    pub fn of(joints: &[f64], cells_newtons: &[f64]) -> ReadingId {
+        let numbers = joints.iter().chain(cells_newtons);
         let digest = numbers.fold(Sha256::new(), |hasher, number| hasher.chain_update(number.to_le_bytes())).finalize();
         let mut first = [0; 8];
         first.copy_from_slice(&digest[..8]);

@@ -553,9 +553,9 @@ impl FrameFilter {
 }
 
 fn check_values(reading: &Reading, shape: Shape) -> Result<(), String> {
-    let Reading { joints_rad, cells_newtons, .. } = reading;
+    let Reading { joints, cells_newtons, .. } = reading;
     for (name, found, expected) in
-        [("joints_rad", joints_rad.len(), shape.n_joints), ("cells_newtons", cells_newtons.len(), shape.n_cells)]
+        [("joints", joints.len(), shape.n_joints), ("cells_newtons", cells_newtons.len(), shape.n_cells)]
     {
         if found != expected {
             return Err(format!("{name} has {found} numbers, the hand {expected}"));
@@ -564,8 +564,8 @@ fn check_values(reading: &Reading, shape: Shape) -> Result<(), String> {
     if let Some(grasp_id) = reading.grasp_id.filter(|grasp_id| *grasp_id > i64::MAX as u64) {
         return Err(format!("grasp_id is {grasp_id}: expected at most {}", i64::MAX));
     }
-    if let Some((idx, angle)) = joints_rad.iter().enumerate().find(|(_, angle)| !angle.is_finite()) {
-        return Err(format!("joints_rad[{idx}] is {angle}: expected an angle in radians"));
+    if let Some((idx, angle)) = joints.iter().enumerate().find(|(_, angle)| !angle.is_finite()) {
+        return Err(format!("joints[{idx}] is {angle}: expected an angle in radians"));
     }
     if let Some((idx, force)) =
         cells_newtons.iter().enumerate().find(|(_, force)| !(force.is_finite() && **force >= 0.0))

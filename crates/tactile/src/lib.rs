@@ -3,11 +3,11 @@
 //! ```
 //! use blindgrasp_tactile::line_protocol;
 //!
-//! let line = br#"{"phase": "settled", "grasp_id": 4, "joints_rad": [0.1, 0.9], "cells_newtons": [0, 1.5]}"#;
+//! let line = br#"{"phase": "settled", "grasp_id": 4, "joints": [0.1, 0.9], "cells_newtons": [0, 1.5]}"#;
 //! let reading = line_protocol::parse(line).expect("a frame");
 //! assert_eq!(reading.grasp_id, Some(4));
 //! let refusal = line_protocol::parse(br#"{"phase": "settled"}"#).expect_err("a frame without readings");
-//! assert!(refusal.why.contains("joints_rad"));
+//! assert!(refusal.why.contains("joints"));
 //! ```
 //!
 //! A [`TactileDriver`] reads frames from the hand; the [`gate`] accepts and numbers them, and the operator
@@ -91,8 +91,8 @@ pub enum Event {
 /// One reading of all joints and cells.
 #[derive(Debug, Clone, PartialEq, Default, Deserialize)]
 pub struct Reading {
-    /// Joint angles in the hand's order, radians.
-    pub joints_rad: Vec<f64>,
+    /// Radians, or metres for a joint that slides, in the hand's order.
+    pub joints: Vec<f64>,
     /// Force on each cell, pad after pad in the hand's order, newtons (or the unit of the hand's layout).
     pub cells_newtons: Vec<f64>,
     pub phase: Phase,

@@ -33,7 +33,7 @@ pub fn parse(line: &[u8]) -> Result<Reading, Refusal> {
     let text = &*without_checksum(text).map_err(malformed)?;
     // serde would accept a list of the values as well.
     if !text.trim_start().starts_with('{') {
-        return Err(malformed("not a frame: expected an object with joints_rad, cells_newtons and phase".into()));
+        return Err(malformed("not a frame: expected an object with joints, cells_newtons and phase".into()));
     }
     serde_json::from_str(text).map_err(|error| malformed(format!("not a frame: {error}")))
 }

@@ -55,7 +55,7 @@ impl Replay {
             {
                 let message = frame.message;
                 self.next = Some(Reading {
-                    joints_rad: message.joints_rad,
+                    joints: message.joints,
                     cells_newtons: message.cells_newtons,
                     senses: message.senses,
                     phase: message.phase,

@@ -252,7 +252,7 @@ impl Ros2 {
         let cells_newtons = cells(value, &self.topics.cells_field)?;
         self.take_gravity(stamp_nanos, at_nanos)?;
         let is_near = |other: u64| other.abs_diff(stamp_nanos) <= self.topics.tolerance_nanos;
-        let mut joints_rad = Vec::with_capacity(self.joints.len());
+        let mut joints = Vec::with_capacity(self.joints.len());
         for ((name, _), joint) in self.topics.joint_names.iter().zip(&self.joints) {
             let (angle, at) =
                 joint.ok_or_else(|| format!("no angle of joint '{name}' has come on {}", self.topics.joints))?;
@@ -260,7 +260,7 @@ impl Ros2 {
                 let millis = at.abs_diff(stamp_nanos) as f64 / 1e6;
                 return Err(format!("the angle of joint '{name}' is {millis:.1} ms from the cells in time"));
             }
-            joints_rad.push(angle);
+            joints.push(angle);
         }
         let (phase, _) = self
             .phase
@@ -282,8 +282,7 @@ impl Ros2 {
             }
         }
         let seq = received.seq.and_then(|seq| u64::try_from(i128::from(seq) + self.offset).ok());
-        let reading =
-            Reading { joints_rad, cells_newtons, phase, senses, seq, stamp_nanos: stamp, ..Reading::default() };
+        let reading = Reading { joints, cells_newtons, phase, senses, seq, stamp_nanos: stamp, ..Reading::default() };
         Ok(Event::Frame(reading, Arrival { at_nanos, waited_nanos: 0 }))
     }
 }
@@ -459,7 +458,7 @@ mod tests {
         let Some(Event::Frame(reading, _)) = take(&mut driver, Topic::Cells, frame, t, None) else {
             panic!("no frame");
         };
-        assert_eq!((reading.joints_rad, reading.cells_newtons), (vec![0.1, 0.2], vec![1.0, 2.0]));
+        assert_eq!((reading.joints, reading.cells_newtons), (vec![0.1, 0.2], vec![1.0, 2.0]));
         assert_eq!(reading.senses.get(Sense::WristWrench), [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
         assert_eq!(reading.senses.get(Sense::Gravity), [0.0, 0.0, -9.8]);
         assert_eq!((reading.phase, reading.seq, reading.stamp_nanos), (Phase::Settled, Some(8), Some(t)));

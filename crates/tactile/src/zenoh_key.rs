@@ -68,7 +68,7 @@ impl ZenohKey {
             return Err(malformed(format!("the hand is {:016x}, expected {:016x}", header.hand_id, self.hand_id)));
         }
         Ok(Reading {
-            joints_rad: frame.joints_rad,
+            joints: frame.joints,
             cells_newtons: frame.cells_newtons,
             phase: frame.phase,
             senses: frame.senses,

@@ -11,7 +11,7 @@ const MS: u64 = 1_000_000;
 const SHAPE: Shape = Shape { n_joints: 1, n_cells: 2 };
 
 fn reading(phase: Phase) -> Reading {
-    Reading { joints_rad: vec![0.5], cells_newtons: vec![0.0, 1.0], phase, ..Reading::default() }
+    Reading { joints: vec![0.5], cells_newtons: vec![0.0, 1.0], phase, ..Reading::default() }
 }
 
 fn gate() -> FrameFilter {
@@ -41,22 +41,22 @@ fn take(gate: &mut FrameFilter, reading: &Reading, arrival: Arrival) -> Result<(
 
 #[test]
 fn a_line_is_a_frame_or_is_refused_in_words() {
-    let frame = parse(br#"{"joints_rad":[0.5],"cells_newtons":[0,1.0],"phase":"open"}"#).expect("a frame");
+    let frame = parse(br#"{"joints":[0.5],"cells_newtons":[0,1.0],"phase":"open"}"#).expect("a frame");
     assert_eq!(frame, reading(Phase::Open));
-    let all = br#"{"phase":"settled","stamp_nanos":3,"seq":2,"grasp_id":1,"joints_rad":[],"cells_newtons":[]}"#;
+    let all = br#"{"phase":"settled","stamp_nanos":3,"seq":2,"grasp_id":1,"joints":[],"cells_newtons":[]}"#;
     let frame = parse(all).expect("a frame");
     assert_eq!((frame.grasp_id, frame.seq, frame.stamp_nanos), (Some(1), Some(2), Some(3)));
     for (line, word) in [
-        (&br#"{"joints_rad":[0.5],"cells_newtons":[0,1],"phase":"open","grasp":1}"#[..], "unknown field `grasp`"),
-        (br#"{"joints_rad":[0.5],"phase":"open"}"#, "missing field `cells_newtons`"),
-        (br#"{"joints_rad":[0.5],"cells_newtons":[NaN,1],"phase":"open"}"#, "expected value"),
-        (br#"{"joints_rad":[0.5],"cells_newtons":[1e999,1],"phase":"open"}"#, "number out of range"),
-        (br#"{"joints_rad":[0.5],"cells_newtons":[0,1],"phase":"close"}"#, "unknown variant `close`"),
-        (br#"{"joints_rad":[0.5],"cells_newtons":[0,1],"phase":"open","seq":-1}"#, "seq"),
-        (br#"{"joints_rad":[0.5],"cells_newtons":[0,1],"phase":"open"} x"#, "trailing characters"),
+        (&br#"{"joints":[0.5],"cells_newtons":[0,1],"phase":"open","grasp":1}"#[..], "unknown field `grasp`"),
+        (br#"{"joints":[0.5],"phase":"open"}"#, "missing field `cells_newtons`"),
+        (br#"{"joints":[0.5],"cells_newtons":[NaN,1],"phase":"open"}"#, "expected value"),
+        (br#"{"joints":[0.5],"cells_newtons":[1e999,1],"phase":"open"}"#, "number out of range"),
+        (br#"{"joints":[0.5],"cells_newtons":[0,1],"phase":"close"}"#, "unknown variant `close`"),
+        (br#"{"joints":[0.5],"cells_newtons":[0,1],"phase":"open","seq":-1}"#, "seq"),
+        (br#"{"joints":[0.5],"cells_newtons":[0,1],"phase":"open"} x"#, "trailing characters"),
         (b"\xff\xfe", "not UTF-8"),
         (b"hello", "not a frame"),
-        (b"[1]", "expected an object with joints_rad, cells_newtons and phase"),
+        (b"[1]", "expected an object with joints, cells_newtons and phase"),
     ] {
         let refusal = parse(line).expect_err("refused");
         assert_eq!(refusal.kind, RefusalKind::Malformed);
@@ -67,7 +67,7 @@ fn a_line_is_a_frame_or_is_refused_in_words() {
 
 #[test]
 fn a_line_with_a_checksum_is_refused_if_a_byte_changes() {
-    let bare = r#"{"joints_rad":[0.5],"cells_newtons":[0,1],"phase":"open","seq":12}"#;
+    let bare = r#"{"joints":[0.5],"cells_newtons":[0,1],"phase":"open","seq":12}"#;
     // By zlib's crc32.
     let line = format!("{},\"crc\":{}}}", bare.strip_suffix('}').expect("an object"), 94_939_163);
     assert_eq!(parse(line.as_bytes()).expect("a frame").seq, Some(12));
@@ -81,16 +81,15 @@ fn a_line_with_a_checksum_is_refused_if_a_byte_changes() {
 
 #[test]
 fn values_that_no_hand_has_are_refused() {
-    for (joints_rad, cells_newtons, word) in [
-        (vec![], vec![0.0, 0.0], "joints_rad has 0 numbers, the hand 1"),
+    for (joints, cells_newtons, word) in [
+        (vec![], vec![0.0, 0.0], "joints has 0 numbers, the hand 1"),
         (vec![0.0], vec![0.0; 3], "cells_newtons has 3 numbers, the hand 2"),
-        (vec![f64::NAN], vec![0.0; 2], "joints_rad[0] is NaN"),
+        (vec![f64::NAN], vec![0.0; 2], "joints[0] is NaN"),
         (vec![0.0], vec![0.0, -0.1], "cells_newtons[1] is -0.1"),
         (vec![0.0], vec![f64::INFINITY, 0.0], "cells_newtons[0] is inf"),
     ] {
         let mut gate = gate();
-        let refusal =
-            gate.take(&Reading { joints_rad, cells_newtons, ..Reading::default() }, &at(1)).expect_err("refused");
+        let refusal = gate.take(&Reading { joints, cells_newtons, ..Reading::default() }, &at(1)).expect_err("refused");
         assert!(refusal.why.contains(word), "expected '{word}' in '{}'", refusal.why);
         assert_eq!(gate.counts().malformed, 1);
         // The next one knows that something is missing before it.
@@ -125,7 +124,7 @@ fn a_probe_belongs_to_its_grasp() {
 
 #[test]
 fn other_senses_are_whole_and_in_all_frames_or_in_none() {
-    let line = br#"{"joints_rad":[0.5],"cells_newtons":[0,1.0],"phase":"open","gravity_m_per_s2":[0,0,-9.8],
+    let line = br#"{"joints":[0.5],"cells_newtons":[0,1.0],"phase":"open","gravity_m_per_s2":[0,0,-9.8],
         "wrist_wrench":[0,0,1,0,0,0.5],"joint_torques":[0.25]}"#;
     let felt = parse(line).expect("a frame");
     assert_eq!(Sense::ALL.map(|sense| felt.senses.get(sense).len()), [3, 6, 1]);
@@ -420,7 +419,7 @@ fn random_bytes_are_cut_into_lines_and_each_is_accounted_for() {
     let mut rng = ChaCha8Rng::seed_from_u64(3);
     let (mut n_lines, mut n_long, mut n_frames) = (0, 0, 0);
     for _ in 0..2000 {
-        let good = br#"{"joints_rad":[0],"cells_newtons":[1,2],"phase":"open"}"#;
+        let good = br#"{"joints":[0],"cells_newtons":[1,2],"phase":"open"}"#;
         let mut bytes = Vec::new();
         for _ in 0..rng.random_range(0..20) {
             match rng.random_range(0..6) {

@@ -8,7 +8,7 @@ use blindgrasp_tactile::stream::{Link, Stream};
 use blindgrasp_tactile::{Event, ExpectedHand, Place, TactileDriver};
 
 const SEC: u64 = 1_000_000_000;
-const FRAME: &[u8] = b"{\"joints_rad\":[0.5],\"cells_newtons\":[0,1],\"phase\":\"open\"}\n";
+const FRAME: &[u8] = b"{\"joints\":[0.5],\"cells_newtons\":[0,1],\"phase\":\"open\"}\n";
 
 fn source(path: &std::path::Path) -> Stream {
     let hand = ExpectedHand {

@@ -314,7 +314,7 @@ fn write_files(folder: &Path, files: &[File], words: &[(&str, String)]) -> anyho
         let is_template = ![PYTHON_OPERATOR, PYTHON_MESSAGES, CARGO_LOCK].contains(text);
         let mut filled = text.to_string();
         if is_template {
-            for (word, by) in *words {
+            for (word, by) in words {
                 filled = filled.replace(word, by);
             }
         }

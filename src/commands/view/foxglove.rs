@@ -74,7 +74,7 @@ impl Streams {
             Record::Contacts(sample) if is_shown => {
                 self.pass_on(POINTS, |_, data| cdr::contact_points(&sample.header, &sample.message, data));
             }
-            Record::Tactile(sample) if is_shown && sample.message.joints_rad.len() == self.joint_names.len() => {
+            Record::Tactile(sample) if is_shown && sample.message.joints.len() == self.joint_names.len() => {
                 self.pass_on(JOINTS, |streams, data| {
                     cdr::joint_state(&sample.header, &streams.joint_names, &sample.message, data)
                 });

@@ -412,14 +412,14 @@ fn frame_event(hand: Option<&Hand>, model: &ShownModel, latest: Latest) -> Optio
 
 /// Adds a frame with the contacts of its grasp, unless its joints are not those of the hand.
 pub(super) fn add_frame(event: &mut Value, hand: &Hand, frame: &TactileFrame, contacts: Option<&ContactSet>) {
-    let Ok(links) = link_poses(hand, &frame.joints_rad) else { return };
+    let Ok(links) = link_poses(hand, &frame.joints) else { return };
     let contacts = contacts.filter(|contacts| contacts.grasp_id == frame.grasp_id);
     // Each as its point, the outward normal of its pad, and its force.
     let contacts = contacts.into_iter().flat_map(|contacts| &contacts.contacts);
     let contacts = contacts.map(|it| [&it.position_m[..], &it.normal, &[it.force_newtons]].concat());
     event["grasp_id"] = frame.grasp_id.to_string().into();
     event["phase"] = json!(frame.phase);
-    event["joints"] = json!(frame.joints_rad);
+    event["joints"] = json!(frame.joints);
     event["links"] = json!(links);
     // JSON has no NaN: null stands for it.
     event["cells"] = json!(frame.cells_newtons);

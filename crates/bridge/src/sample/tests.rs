@@ -73,23 +73,17 @@ fn every_message_arrives_bit_by_bit() {
     for _ in 0..300 {
         let rng = &mut rng;
         let (grasp_id, phase, fault) = (rng.next_u64(), any_of(rng, Phase::ALL), any_of(rng, Fault::ALL));
-        let joints_rad = any_list(rng, MAX_JOINTS);
+        let joints = any_list(rng, MAX_JOINTS);
         let cells_newtons = any_list(rng, MAX_CELLS);
         let sense = |rng: &mut ChaCha8Rng, n: usize| {
             let n = if rng.random() { n } else { 0 };
             (0..n).map(|_| any_f64(rng)).collect::<Vec<f64>>()
         };
         let mut senses = OwnedSenses::default();
-        Sense::ALL.into_iter().for_each(|one| senses.set(one, &sense(rng, one.len(joints_rad.len()))));
+        Sense::ALL.into_iter().for_each(|one| senses.set(one, &sense(rng, one.len(joints.len()))));
         let day = rng.next_u32();
-        let frame = TactileFrame {
-            grasp_id,
-            phase,
-            joints_rad: joints_rad.clone(),
-            cells_newtons,
-            senses: senses.clone(),
-            day,
-        };
+        let frame =
+            TactileFrame { grasp_id, phase, joints: joints.clone(), cells_newtons, senses: senses.clone(), day };
         check(rng, &frame);
         let n_contacts = if rng.random_bool(0.1) { MAX_CELLS } else { rng.random_range(0..10) };
         let contact = |rng: &mut ChaCha8Rng| Contact {
@@ -102,7 +96,7 @@ fn every_message_arrives_bit_by_bit() {
         let contacts = ContactSet {
             grasp_id,
             phase,
-            joints_rad,
+            joints,
             contacts: (0..n_contacts).map(|_| contact(rng)).collect(),
             n_pads_in_contact: rng.random_range(0..=32),
             self_collision: rng.random(),

@@ -170,7 +170,7 @@ fn a_barrett_frame_takes_a_tenth_more_than_its_message_at_most() {
     let frame = TactileFrame {
         grasp_id: u64::MAX,
         phase: Phase::Settled,
-        joints_rad: vec![0.5; 7],
+        joints: vec![0.5; 7],
         cells_newtons: vec![0.25; 96],
         ..TactileFrame::default()
     };
@@ -199,7 +199,7 @@ fn the_largest_messages_fit_into_a_frame() {
     use blindgrasp_messages::{Contact, ContactSet, MAX_CELLS, MAX_JOINTS};
     let contact = Contact { pad: u32::MAX, cell: u32::MAX, ..Contact::default() };
     let contacts =
-        ContactSet { joints_rad: vec![0.0; MAX_JOINTS], contacts: vec![contact; MAX_CELLS], ..ContactSet::default() };
+        ContactSet { joints: vec![0.0; MAX_JOINTS], contacts: vec![contact; MAX_CELLS], ..ContactSet::default() };
     let (head, items) = contacts.to_parts(Header::default());
     let mut message = Vec::new();
     sample::encode::<ContactSet>(&head, &items, &mut message).expect("encoded");

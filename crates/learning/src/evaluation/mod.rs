@@ -165,7 +165,7 @@ fn decide_recording(judge: &mut Judge, path: &Path) -> Result<Vec<Decided>, Data
             decisions.extend(judge.sample(frame).decisions);
         }
         let settled = frames.iter().map(|frame| &frame.message).find(|frame| frame.phase == Phase::Settled);
-        settled.map(|frame| ReadingId::of(&frame.joints_rad, &frame.cells_newtons))
+        settled.map(|frame| ReadingId::of(&frame.joints, &frame.cells_newtons))
     })?;
     decisions.extend(judge.end());
     if grasps.is_empty() {

@@ -104,7 +104,7 @@ pub fn figures(hand: &Hand, report: &Report) -> Result<Vec<(String, String)>, Pi
 
 /// The contact dictionary; `None` if there is no grasp.
 fn figure_1(hand: &Hand, report: &Report) -> Result<Option<String>, PictureError> {
-    if report.dictionary.joints_rad.is_empty() {
+    if report.dictionary.joints.is_empty() {
         return Ok(None);
     }
     let words: Vec<DrawnWord> = report
@@ -117,7 +117,7 @@ fn figure_1(hand: &Hand, report: &Report) -> Result<Option<String>, PictureError
             share_stable: word.share_stable,
         })
         .collect();
-    dictionary_svg(hand, &report.dictionary.joints_rad, &words).map(Some)
+    dictionary_svg(hand, &report.dictionary.joints, &words).map(Some)
 }
 
 fn title(report: &Report) -> String {

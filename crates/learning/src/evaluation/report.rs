@@ -149,7 +149,7 @@ pub struct DictionaryUse {
     /// The model or fold that it is of.
     pub from: String,
     /// The posture of the drawn hand: the median of each joint over the grasps, radians.
-    pub joints_rad: Vec<f64>,
+    pub joints: Vec<f64>,
     pub words: Vec<Word>,
 }
 
@@ -234,7 +234,7 @@ pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptio
         judges,
         dictionary: DictionaryUse {
             from: format!("what recipe {} learned from all folds but the first", names[0]),
-            joints_rad: median_joints(&read.examples),
+            joints: median_joints(&read.examples),
             words: held_out.words.clone(),
         },
     }
@@ -268,7 +268,7 @@ pub fn report_on_model(origin: Origin, name: &str, model: &Model, evaluated: Eva
         learning_curve: Vec::new(),
         dictionary: DictionaryUse {
             from: format!("the model's, and the contacts of these recordings ({name})"),
-            joints_rad: median_joints(&read.examples),
+            joints: median_joints(&read.examples),
             words: used_words(&model.features.dictionary, read.examples.iter()),
         },
         graph: Some(graph),
@@ -442,11 +442,11 @@ fn learning_curve(
 
 /// The median of each joint; empty without examples.
 fn median_joints(examples: &[Example]) -> Vec<f64> {
-    let n_joints = examples.first().map_or(0, |example| example.joints_rad.len());
+    let n_joints = examples.first().map_or(0, |example| example.joints.len());
     (0..n_joints)
         .map(|joint| {
             let mut angles: Vec<f64> =
-                examples.iter().filter_map(|example| example.joints_rad.get(joint).copied()).collect();
+                examples.iter().filter_map(|example| example.joints.get(joint).copied()).collect();
             angles.sort_by(f64::total_cmp);
             angles[angles.len() / 2]
         })

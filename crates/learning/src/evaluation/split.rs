@@ -200,7 +200,7 @@ pub(super) mod tests {
                 examples.push(Example {
                     recording_idx: 0,
                     grasp_id: examples.len() as u64,
-                    joints_rad: vec![],
+                    joints: vec![],
                     contacts: vec![],
                     stable: idx % 3 == 0,
                     stable_by_friction: vec![],

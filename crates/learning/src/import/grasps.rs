@@ -104,7 +104,7 @@ pub(super) struct Grasp {
 pub(super) struct Reading {
     pub(super) phase: Phase,
     pub(super) cells: Vec<f64>,
-    pub(super) joints_rad: Vec<f64>,
+    pub(super) joints: Vec<f64>,
 }
 
 impl Grasp {

@@ -246,8 +246,8 @@ impl RowReader<'_> {
         let object = self.name(record, self.columns.group)?;
         let class = self.columns.class.map_or(Ok(object.clone()), |class| self.name(record, class))?;
         let cells = self.columns.cells.iter().map(|idx| self.reading(record, *idx)).collect::<Result<_, _>>()?;
-        let joints_rad = match &options.joints {
-            Joints::Fixed(joints_rad) => joints_rad.clone(),
+        let joints = match &options.joints {
+            Joints::Fixed(joints) => joints.clone(),
             Joints::Columns { unit, .. } => (0..self.columns.joints.len())
                 .map(|joint_idx| self.joint_value(record, joint_idx, *unit))
                 .collect::<Result<_, _>>()?,
@@ -268,7 +268,7 @@ impl RowReader<'_> {
         if let Some(idx) = self.columns.grasp.filter(|idx| record[*idx].is_empty()) {
             return Err(format!("column '{}': expected the name of a grasp, found nothing", self.header[idx]));
         }
-        let (readings, label) = (vec![Reading { phase, cells, joints_rad }], label.to_string());
+        let (readings, label) = (vec![Reading { phase, cells, joints }], label.to_string());
         let stable = label == options.stable_value;
         Ok(Grasp { line, readings, label, stable, object, class, day })
     }
@@ -390,15 +390,9 @@ impl GraspWriter {
         let header = Header { seq: self.n_grasps, ..self.header };
         self.recording.write(GraspTruth::TOPIC, &Stamped { header, message: truth })?;
         let day = grasp.day.map_or(0, |(_, day)| day);
-        for Reading { phase, cells: cells_newtons, joints_rad } in grasp.readings {
-            let message = TactileFrame {
-                grasp_id: self.grasp_id,
-                phase,
-                joints_rad,
-                cells_newtons,
-                day,
-                ..TactileFrame::default()
-            };
+        for Reading { phase, cells: cells_newtons, joints } in grasp.readings {
+            let message =
+                TactileFrame { grasp_id: self.grasp_id, phase, joints, cells_newtons, day, ..TactileFrame::default() };
             let mut sample = Stamped { header: self.header, message };
             for _ in 0..self.n_frames {
                 sample.header = self.header;

@@ -18,10 +18,10 @@ pub fn learn_training_range(features: &FeatureExtractor, grasps: &[Reading<'_>],
     let mut values = Vec::new();
     let mut rows: Vec<(usize, Vec<f64>)> = Vec::new();
     for (reading, fold) in grasps.iter().zip(folds) {
-        let Reading { joints_rad, contacts, .. } = *reading;
+        let Reading { joints, contacts, .. } = *reading;
         if features.extract(reading, &mut values).is_ok() {
             let mut row = Vec::with_capacity(names.len());
-            for_each_quantity(features, joints_rad, contacts, |quantity| row.push(quantity));
+            for_each_quantity(features, joints, contacts, |quantity| row.push(quantity));
             rows.push((*fold, row));
         }
     }

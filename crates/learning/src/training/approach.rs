@@ -31,7 +31,7 @@ pub(super) fn learn(
     let preshape_idxs: Vec<usize> = (0..hand.joints.len()).filter(|idx| hand.joints[*idx].is_preshape).collect();
     let row = |example: &&Example| {
         let gravity = example.senses.get(Sense::Gravity).try_into().ok()?;
-        ApproachPrior::values(&preshape_idxs, gravity, &example.joints_rad)
+        ApproachPrior::values(&preshape_idxs, gravity, &example.joints)
     };
     let Some(rows) = examples.iter().map(row).collect::<Option<Vec<Vec<f64>>>>() else { return Ok(None) };
     let trees = |is_used: &dyn Fn(usize) -> bool| {

@@ -29,8 +29,8 @@ pub struct Example {
     pub reading_id: ReadingId,
     /// The number of its recording day; 0 if it is not known.
     pub day: u32,
-    /// Joint angles, radians.
-    pub joints_rad: Vec<f64>,
+    /// Radians, or metres for a joint that slides.
+    pub joints: Vec<f64>,
     /// At least one.
     pub contacts: Vec<Contact>,
     pub senses: OwnedSenses,
@@ -68,7 +68,7 @@ impl Signals {
 /// What a frame felt. A frame that cannot be used has no contacts.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Felt {
-    pub joints_rad: Vec<f64>,
+    pub joints: Vec<f64>,
     pub contacts: Vec<Contact>,
     pub senses: OwnedSenses,
 }
@@ -77,12 +77,12 @@ impl Felt {
     fn of(hand: &Hand, frame: &Stamped<TactileFrame>) -> Felt {
         let message = &frame.message;
         let mut contacts = Vec::new();
-        contacts_from_frame(hand, frame.header.hand_id, &message.joints_rad, &message.cells_newtons, &mut contacts);
-        Felt { joints_rad: message.joints_rad.clone(), contacts, senses: message.senses.clone() }
+        contacts_from_frame(hand, frame.header.hand_id, &message.joints, &message.cells_newtons, &mut contacts);
+        Felt { joints: message.joints.clone(), contacts, senses: message.senses.clone() }
     }
 
     pub fn reading(&self) -> Reading<'_> {
-        Reading { joints_rad: &self.joints_rad, contacts: &self.contacts, senses: self.senses.view() }
+        Reading { joints: &self.joints, contacts: &self.contacts, senses: self.senses.view() }
     }
 }
 
@@ -107,11 +107,11 @@ impl FeltGrasp {
         let moving = [Phase::Squeezing, Phase::TestLifting]
             .map(|phase| frames.iter().filter(is_of(phase)).map(|frame| Signals::of(hand, frame)).collect::<Vec<_>>());
         let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
-        let (joints, cells) = (&frame.message.joints_rad, &frame.message.cells_newtons);
+        let (joints, cells) = (&frame.message.joints, &frame.message.cells_newtons);
         let reading_id = ReadingId::of(joints, cells);
         let mut contacts = Vec::new();
         let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells, &mut contacts);
-        let settled = Felt { joints_rad: frame.message.joints_rad, contacts, senses: frame.message.senses };
+        let settled = Felt { joints: frame.message.joints, contacts, senses: frame.message.senses };
         let (fault, day) = (summary.fault, frame.message.day);
         Some(FeltGrasp { settled, fault, reading_id, day, squeezed, test_lifted, moving })
     }
@@ -254,7 +254,7 @@ impl Examples {
                             grasp_id,
                             reading_id: felt.reading_id,
                             day: felt.day,
-                            joints_rad: felt.settled.joints_rad,
+                            joints: felt.settled.joints,
                             contacts: felt.settled.contacts,
                             senses: felt.settled.senses,
                             squeezed: felt.squeezed,
@@ -306,7 +306,7 @@ impl Examples {
 impl Example {
     /// The settled frame.
     pub fn reading(&self) -> Reading<'_> {
-        Reading { joints_rad: &self.joints_rad, contacts: &self.contacts, senses: self.senses.view() }
+        Reading { joints: &self.joints, contacts: &self.contacts, senses: self.senses.view() }
     }
 
     /// Whether the grasp is stable, for each friction coefficient if there are several.

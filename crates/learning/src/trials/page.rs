@@ -187,7 +187,7 @@ fn scene(snapshot: &Snapshot) -> PosedScene {
     };
     PosedScene {
         world_from_palm: pose(snapshot.palm_position_m, snapshot.palm_rotation_xyzw),
-        joints_rad: snapshot.joints_rad.clone(),
+        joints: snapshot.joints.clone(),
         world_from_thing: pose(snapshot.target_position_m, snapshot.target_rotation_xyzw),
     }
 }

@@ -25,7 +25,7 @@ struct Column {
 /// A CSV file being written.
 ///
 /// Numbers read back exactly; NaN is `NaN`, infinity `inf`. A list of numbers that is equally long in all samples is a
-/// column per number, `joints_rad[0]`, `joints_rad[1]`, …; any other list is JSON in one column.
+/// column per number, `joints[0]`, `joints[1]`, …; any other list is JSON in one column.
 pub struct CsvTable<W: Write> {
     writer: csv::Writer<W>,
     columns: Vec<Column>,

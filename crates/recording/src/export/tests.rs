@@ -59,8 +59,8 @@ fn contact_sets() -> Vec<Record> {
     let contact =
         |force_newtons, pad| Contact { position_m: [0.5, -1.0, 1e-9], force_newtons, pad, ..Contact::default() };
     let set = |seq, contacts, fault| {
-        let joints_rad = vec![0.1 + 0.2, f64::NAN];
-        Record::Contacts(stamped(seq, ContactSet { joints_rad, contacts, fault, ..ContactSet::default() }))
+        let joints = vec![0.1 + 0.2, f64::NAN];
+        Record::Contacts(stamped(seq, ContactSet { joints, contacts, fault, ..ContactSet::default() }))
     };
     vec![
         set(0, vec![], Fault::NoContact),
@@ -89,7 +89,7 @@ fn every_value_of_a_message_has_its_path() {
     let message = ContactSet {
         grasp_id: 7,
         phase: Phase::Settled,
-        joints_rad: vec![],
+        joints: vec![],
         contacts: vec![Contact::default(), contact],
         self_collision: true,
         fault: Fault::NoContact,
@@ -150,7 +150,7 @@ fn csv_has_a_column_per_number_where_lists_are_equally_long_and_json_elsewhere()
         )
     };
     let expected = [
-        "seq,stamp_nanos,epoch,hand_id,grasp_id,phase,joints_rad[0],joints_rad[1],contacts,n_pads_in_contact,\
+        "seq,stamp_nanos,epoch,hand_id,grasp_id,phase,joints[0],joints[1],contacts,n_pads_in_contact,\
          self_collision,n_self_contacts,fault,gravity_m_per_s2,wrist_wrench,joint_torques,day"
             .to_string(),
         "0,0,3,00000000000000ab,0,open,0.30000000000000004,NaN,[],0,false,0,no_contact,[],[],[],0".into(),
@@ -166,10 +166,10 @@ fn csv_has_a_column_per_number_where_lists_are_equally_long_and_json_elsewhere()
 #[test]
 fn csv_keeps_lists_that_vary_or_are_empty_and_what_numbers_and_names_may_be() {
     let frame = |cells_newtons| {
-        let joints_rad = vec![-f64::INFINITY, 1e300];
+        let joints = vec![-f64::INFINITY, 1e300];
         Record::Tactile(stamped(
             u64::MAX,
-            TactileFrame { grasp_id: u64::MAX, joints_rad, cells_newtons, ..Default::default() },
+            TactileFrame { grasp_id: u64::MAX, joints, cells_newtons, ..Default::default() },
         ))
     };
     let found = csv_of(&[frame(vec![-0.0]), frame(vec![1.0, f64::NAN])]);

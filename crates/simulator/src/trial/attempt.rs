@@ -90,7 +90,7 @@ impl Stage {
 pub(super) struct Moment {
     offset_nanos: u64,
     pub(super) phase: Phase,
-    joints_rad: Vec<f64>,
+    joints: Vec<f64>,
     /// Where the encoders are.
     motors_rad: Vec<f64>,
     torques: Vec<f64>,
@@ -185,7 +185,7 @@ impl<'a> Attempt<'a> {
         Some(Moment {
             offset_nanos,
             phase: self.stage.phase(),
-            joints_rad: self.body.joints_rad(&self.world),
+            joints: self.body.joints(&self.world),
             motors_rad: self.body.motors_rad(),
             torques: self.body.torques(&self.world),
             touches: self.world.touches(&self.body.shapes),
@@ -198,7 +198,7 @@ impl<'a> Attempt<'a> {
     pub(super) fn feel(&mut self, moment: Moment, grasp_id: u64) -> TimedFrame {
         let hand = self.mechanism.hand;
         let mut cells_newtons = vec![0.0; hand.n_cells()];
-        for contact in self.patches(&moment.joints_rad, moment.touches, &moment.palm_from_target) {
+        for contact in self.patches(&moment.joints, moment.touches, &moment.palm_from_target) {
             for (cell_idx, newtons) in &contact.cells_newtons {
                 cells_newtons[*cell_idx] += newtons;
             }
@@ -209,7 +209,7 @@ impl<'a> Attempt<'a> {
         let frame = TactileFrame {
             grasp_id,
             phase: moment.phase,
-            joints_rad: self.sensor.read_joints(hand, &moment.motors_rad, sensor),
+            joints: self.sensor.read_joints(hand, &moment.motors_rad, sensor),
             cells_newtons: self.sensor.read_cells(hand, &cells_newtons, sensor, &mut self.rng),
             senses: OwnedSenses::default()
                 .with(Sense::Gravity, gravity.as_slice())
@@ -328,12 +328,12 @@ impl<'a> Attempt<'a> {
 
     /// The contacts of target, stand and hand with the hand now, felt or not, in the palm frame.
     pub fn contacts(&self) -> Vec<SimulatedContact> {
-        self.patches(&self.joints_rad(), self.world.touches(&self.body.shapes), &self.world.palm_from_target())
+        self.patches(&self.joints(), self.world.touches(&self.body.shapes), &self.world.palm_from_target())
     }
 
     /// The hand's joints now, exactly, radians.
-    pub fn joints_rad(&self) -> Vec<f64> {
-        self.body.joints_rad(&self.world)
+    pub fn joints(&self) -> Vec<f64> {
+        self.body.joints(&self.world)
     }
 
     /// Whether the simulation has come to a state that cannot be: the hand's links swing without bounds, which happens to a
@@ -342,7 +342,7 @@ impl<'a> Attempt<'a> {
         let hand = self.mechanism.hand;
         let is_joint = |(joint, value): (&blindgrasp_stages::hand::Joint, &f64)| joint.allows(*value, MOST_BEYOND_RAD);
         let is_target = self.palm_from_target().translation.vector.iter().all(|number| number.is_finite());
-        !(is_target && hand.joints.iter().zip(&self.joints_rad()).all(is_joint))
+        !(is_target && hand.joints.iter().zip(&self.joints()).all(is_joint))
     }
 
     pub fn palm_from_target(&self) -> Isometry3<f64> {
@@ -353,14 +353,9 @@ impl<'a> Attempt<'a> {
         self.snapshot_over(&Vector3::new(0.0, 0.0, self.lifted_m))
     }
 
-    fn patches(
-        &self,
-        joints_rad: &[f64],
-        touches: Vec<Touch>,
-        palm_from_target: &Isometry3<f64>,
-    ) -> Vec<SimulatedContact> {
+    fn patches(&self, joints: &[f64], touches: Vec<Touch>, palm_from_target: &Isometry3<f64>) -> Vec<SimulatedContact> {
         // The joints are the hand's own: as many as it has, and finite.
-        let Ok(palm_from_links) = self.mechanism.hand.palm_from_links(joints_rad) else { return Vec::new() };
+        let Ok(palm_from_links) = self.mechanism.hand.palm_from_links(joints) else { return Vec::new() };
         patches(touches, palm_from_target, &self.mechanism, &palm_from_links, &self.target, &self.options.physics)
     }
 
@@ -377,7 +372,7 @@ impl<'a> Attempt<'a> {
             elapsed_nanos: self.elapsed_nanos(),
             palm_position_m: palm.translation.vector.into(),
             palm_rotation_xyzw: palm.rotation.coords.into(),
-            joints_rad: self.body.joints_rad(&self.world),
+            joints: self.body.joints(&self.world),
             target_position_m: target.translation.vector.into(),
             target_rotation_xyzw: target.rotation.coords.into(),
         }

@@ -258,7 +258,7 @@ impl HandBody {
     }
 
     /// The joints' values: radians, or metres of a slide.
-    pub(super) fn joints_rad(&self, world: &World) -> Vec<f64> {
+    pub(super) fn joints(&self, world: &World) -> Vec<f64> {
         self.values(|drive| drive.travel(world))
     }
 
@@ -614,7 +614,7 @@ mod tests {
             grip(world, body, options);
             let ball = world.palm_from_target().translation.vector;
             assert!(ball.y.abs() < 0.001, "{ball}");
-            assert!((body.joints_rad(world)[0] - 0.02).abs() < 0.001, "{:?}", body.joints_rad(world));
+            assert!((body.joints(world)[0] - 0.02).abs() < 0.001, "{:?}", body.joints(world));
             let touches = world.touches(&body.shapes);
             let newtons: Vec<f64> = touches.iter().map(|touch| touch.newtons).collect();
             assert_eq!(touches.len(), 2, "{newtons:?}");
@@ -660,7 +660,7 @@ mod tests {
             let newtons: Vec<f64> = touches.iter().map(|touch| touch.newtons).collect();
             // The motor's torque is that of the full force for a tip that moves straight at the object. The knuckles are
             // still turned outwards by so much, so that the tips move slower towards it and press harder.
-            let outwards_rad = 0.8 - body.joints_rad(world)[0];
+            let outwards_rad = 0.8 - body.joints(world)[0];
             let wanted = options.lift_grip_newtons / outwards_rad.cos();
             assert!(touches.len() == 2, "{newtons:?}");
             assert!(newtons.iter().all(|found| (found - wanted).abs() < 0.02 * wanted), "{newtons:?} {wanted}");

@@ -142,7 +142,7 @@ fn scene(attempt: &Attempt<'_>, target: &LiftTarget, candidate: u64, contacts: &
         max_radius_m: target.object.max_radius_m,
         mass_kg: target.mass_kg,
         friction: target.friction,
-        joints_rad: attempt.joints_rad(),
+        joints: attempt.joints(),
         self_collision: contacts.iter().any(|contact| is_of_hand(&contact)),
         contacts: contacts
             .iter()

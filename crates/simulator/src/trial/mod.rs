@@ -118,7 +118,7 @@ pub struct Snapshot {
     pub palm_position_m: [f64; 3],
     /// The palm's rotation: x, y, z, w.
     pub palm_rotation_xyzw: [f64; 4],
-    pub joints_rad: Vec<f64>,
+    pub joints: Vec<f64>,
     /// The target's own frame in the world.
     pub target_position_m: [f64; 3],
     /// The target's rotation: x, y, z, w.

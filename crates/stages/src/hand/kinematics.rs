@@ -29,29 +29,29 @@ pub struct CellPose {
 }
 
 impl Hand {
-    /// `palm_from_link` of every link for `joints_rad` (in the order of [`Hand::joints`]).
+    /// `palm_from_link` of every link for `joints` (in the order of [`Hand::joints`]).
     ///
     /// # Errors
     /// Not one finite angle per joint.
-    pub fn palm_from_links(&self, joints_rad: &[f64]) -> Result<Vec<Isometry3<f64>>, JointError> {
+    pub fn palm_from_links(&self, joints: &[f64]) -> Result<Vec<Isometry3<f64>>, JointError> {
         let mut palm_from_links = Vec::with_capacity(self.links.len());
-        self.write_palm_from_links(joints_rad, &mut palm_from_links)?;
+        self.write_palm_from_links(joints, &mut palm_from_links)?;
         Ok(palm_from_links)
     }
 
     /// As [`Hand::palm_from_links`], in memory that is there already. After an error it holds nothing.
     pub(crate) fn write_palm_from_links(
         &self,
-        joints_rad: &[f64],
+        joints: &[f64],
         palm_from_links: &mut Vec<Isometry3<f64>>,
     ) -> Result<(), JointError> {
         palm_from_links.clear();
-        self.check_joints(joints_rad)?;
+        self.check_joints(joints)?;
         let root_from_links = palm_from_links;
         for link in &self.links {
             let parent_from_link = match link.motion {
                 Motion::Fixed => link.parent_from_joint,
-                _ => link.parent_from_joint * link.motion.joint_from_link(joints_rad),
+                _ => link.parent_from_joint * link.motion.joint_from_link(joints),
             };
             let root_from_parent = link.parent_idx.map_or_else(Isometry3::identity, |idx| root_from_links[idx]);
             root_from_links.push(root_from_parent * parent_from_link);
@@ -66,8 +66,8 @@ impl Hand {
     ///
     /// # Errors
     /// As [`Hand::palm_from_links`].
-    pub fn cells_in_palm(&self, joints_rad: &[f64]) -> Result<Vec<CellPose>, JointError> {
-        let palm_from_links = self.palm_from_links(joints_rad)?;
+    pub fn cells_in_palm(&self, joints: &[f64]) -> Result<Vec<CellPose>, JointError> {
+        let palm_from_links = self.palm_from_links(joints)?;
         Ok(self
             .cells()
             .map(|(pad_idx, cell)| {
@@ -120,11 +120,11 @@ impl Hand {
             .collect())
     }
 
-    fn check_joints(&self, joints_rad: &[f64]) -> Result<(), JointError> {
-        if joints_rad.len() != self.joints.len() {
-            return Err(JointError::Count { expected: self.joints.len(), found: joints_rad.len() });
+    fn check_joints(&self, joints: &[f64]) -> Result<(), JointError> {
+        if joints.len() != self.joints.len() {
+            return Err(JointError::Count { expected: self.joints.len(), found: joints.len() });
         }
-        match joints_rad.iter().zip(&self.joints).find(|(value, _)| !value.is_finite()) {
+        match joints.iter().zip(&self.joints).find(|(value, _)| !value.is_finite()) {
             Some((value, joint)) => Err(JointError::NotFinite { joint: joint.name.clone(), value: *value }),
             None => Ok(()),
         }

@@ -35,7 +35,7 @@ pub use urdf_part::part_below;
 pub struct Hand {
     /// The layout's name for the hand, e.g. `barrett-bh8-280`.
     pub name: String,
-    /// The joints in the order of `TactileFrame::joints_rad`.
+    /// The joints in the order of `TactileFrame::joints`.
     pub joints: Vec<Joint>,
     /// The links, parents before children.
     pub links: Vec<Link>,
@@ -191,9 +191,9 @@ pub enum Motion {
 
 impl Motion {
     /// `joint_from_link` for the joints' values.
-    pub fn joint_from_link(&self, joints_rad: &[f64]) -> Isometry3<f64> {
+    pub fn joint_from_link(&self, joints: &[f64]) -> Isometry3<f64> {
         let Motion::Joint { joint_idx, kind, multiplier, offset, axis } = *self else { return Isometry3::identity() };
-        let value = multiplier * joints_rad[joint_idx] + offset;
+        let value = multiplier * joints[joint_idx] + offset;
         match kind {
             JointKind::Revolute => {
                 Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_axis_angle(&axis, value))

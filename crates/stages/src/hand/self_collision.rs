@@ -49,9 +49,9 @@ impl Hand {
     ///
     /// # Errors
     /// Not one finite angle per joint.
-    pub fn self_collides(&self, joints_rad: &[f64]) -> Result<bool, JointError> {
+    pub fn self_collides(&self, joints: &[f64]) -> Result<bool, JointError> {
         let mut shapes = PosedShapes::default();
-        shapes.place(self, &self.palm_from_links(joints_rad)?);
+        shapes.place(self, &self.palm_from_links(joints)?);
         Ok(self.touching_pairs(&shapes).next().is_some())
     }
 
