@@ -119,7 +119,8 @@ class Recordings(Folder):
         spec.loader.exec_module(messages)
         for name in ("Phase", "Action", "Reason"):
             words = getattr(_recording, f"{name.upper()}S")
-            self.assertEqual(list(words), [code.name.lower() for code in getattr(messages, name)])
+            found = words if isinstance(words, dict) else dict(enumerate(words))
+            self.assertEqual(found, {code.value: code.name.lower() for code in getattr(messages, name)})
 
     def test_what_cannot_be_read_is_said(self):
         with self.assertRaises(FileNotFoundError):
