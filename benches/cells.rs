@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use blindgrasp_stages::contacts::ContactFinder;
 use blindgrasp_stages::dictionary::Dictionary;
-use blindgrasp_stages::encoder::{Block, FeatureExtractor, Reading};
+use blindgrasp_stages::encoder::{Block, FeatureExtractor, FeltReading};
 use blindgrasp_stages::hand::{Hand, HandError};
 use serde_json::{Value, json};
 
@@ -109,7 +109,7 @@ impl Bench {
         self.contacts_us.push(micros(start));
         let start = Instant::now();
         for _ in 0..n_frames {
-            let reading = Reading::new(&JOINTS_RAD, std::hint::black_box(&contacts));
+            let reading = FeltReading::new(&JOINTS_RAD, std::hint::black_box(&contacts));
             let n_pads = self.extractor.extract(&reading, &mut values);
             assert_eq!(std::hint::black_box(n_pads), Ok(N_PADS as u32));
         }

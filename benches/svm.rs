@@ -14,7 +14,7 @@ use blindgrasp_learning::learners::svm::train_svm;
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::svm::{PreparedSvm, SvmParams};
 use blindgrasp_stages::contacts::contacts_from_frame;
-use blindgrasp_stages::encoder::Reading;
+use blindgrasp_stages::encoder::FeltReading;
 use blindgrasp_stages::model::Model;
 use serde_json::json;
 
@@ -54,7 +54,7 @@ fn write_features(recording: &str, model: &str, n_samples: usize, out: &str) -> 
         let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
         let (joints, cells) = (&frame.message.joints, &frame.message.cells_newtons);
         contacts_from_frame(&hand, frame.header.hand_id, joints, cells, &mut contacts);
-        model.features.extract(&Reading::new(joints, &contacts), &mut values).ok()?;
+        model.features.extract(&FeltReading::new(joints, &contacts), &mut values).ok()?;
         Some(values.clone())
     })?;
     for (values, truth) in grasps.into_iter().filter_map(|grasp| Some((grasp.value?, grasp.truth?))).take(n_samples) {

@@ -28,6 +28,9 @@ def main() -> None:
             options.add_argument(f"--{word}")
         driver = webdriver.Chrome(options, webdriver.ChromeService("/usr/bin/chromedriver"))
         try:
+            # Drawing in software beside other work takes its time.
+            driver.set_script_timeout(300)
+            driver.set_page_load_timeout(300)
             driver.set_window_size(1280, 1000)
             driver.get(sys.argv[1])
             print("null", flush=True)

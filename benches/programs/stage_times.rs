@@ -12,7 +12,7 @@ use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_messages::{Fault, Phase, Prediction};
 use blindgrasp_recording::{Record, RecordingReader};
 use blindgrasp_stages::contacts::ContactFinder;
-use blindgrasp_stages::encoder::Reading;
+use blindgrasp_stages::encoder::FeltReading;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter};
 use blindgrasp_stages::model::Model;
 use serde_json::json;
@@ -49,7 +49,7 @@ fn main() -> anyhow::Result<()> {
         let summary = finder.find(&hand, frame.header.hand_id, joints, cells_newtons, &mut contacts);
         let felt = Instant::now();
         let feature = match summary.fault {
-            Fault::None => model.extract(Phase::Settled, &Reading::new(joints, &contacts), &mut values),
+            Fault::None => model.extract(Phase::Settled, &FeltReading::new(joints, &contacts), &mut values),
             fault => Err(fault),
         };
         let described = Instant::now();

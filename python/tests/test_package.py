@@ -222,9 +222,8 @@ class Graphs(Folder):
     def test_lift_trials_have_outcomes_senses_and_several_decisions_of_a_grasp(self):
         recorded, given = self.folder / "trials.mcap", {"source.trials": 2, "lift_arbiter.max_age_ms": 600000}
         flow = REPOSITORY / "dataflow-live.yaml"
-        with mock.patch.dict(os.environ, SOURCE="simulated_hand"):
-            running = blindgrasp.run(flow, set=given, name=unique_name(), recording=recorded)
-        with running as graph:
+        running = blindgrasp.run(flow, set=given, name=unique_name(), recording=recorded)
+        with mock.patch.dict(os.environ, SOURCE="simulated_hand"), running as graph:
             decisions = list(graph)
         grasps = blindgrasp.read(recorded)
         of_grasps = [decision for grasp in grasps for decision in grasp.decisions]

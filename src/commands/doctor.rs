@@ -5,7 +5,7 @@ use serde_json::json;
 
 use super::graph_file::shipped;
 use super::{Outcome, print_line};
-use blindgrasp_graph::doctor::{Measurement, Verdict, examine};
+use blindgrasp_graph::doctor::{Fitness, Measurement, examine};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::namespace::{left_over, sweep};
 
@@ -43,7 +43,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     let measurement = if arguments.quick { Measurement::Skipped } else { Measurement::TwoSeconds };
     let findings = examine(measurement, &shipped()?);
-    let verdict = findings.iter().map(|finding| finding.verdict).max().unwrap_or(Verdict::Ok);
+    let verdict = findings.iter().map(|finding| finding.verdict).max().unwrap_or(Fitness::Ok);
     if arguments.json {
         print_line(&json!({ "verdict": verdict, "removed": removed, "findings": findings }).to_string())?;
     } else {
@@ -57,7 +57,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         }
     }
     match verdict {
-        Verdict::Failure => anyhow::bail!("a graph cannot run here"),
-        Verdict::Ok | Verdict::Warning => Ok(Outcome::Done),
+        Fitness::Failure => anyhow::bail!("a graph cannot run here"),
+        Fitness::Ok | Fitness::Warning => Ok(Outcome::Done),
     }
 }

@@ -83,7 +83,7 @@ struct Overview {
 
 /// The summary of recordings.
 #[derive(Debug, Default, Serialize)]
-struct Summary {
+struct FileReport {
     #[serde(flatten)]
     overview: Overview,
     n_grasps: usize,
@@ -305,9 +305,9 @@ impl Overview {
     }
 }
 
-fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow::Result<Summary> {
+fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow::Result<FileReport> {
     let overview = Overview { hand: hand.name.clone(), is_full: true, n_samples: BTreeMap::new(), ..overview };
-    let mut summary = Summary { overview, ..Summary::default() };
+    let mut summary = FileReport { overview, ..FileReport::default() };
     for pad in &hand.pads {
         summary.pads.insert(pad.name.clone(), PadSummary::default());
     }
@@ -364,7 +364,7 @@ fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow:
     Ok(summary)
 }
 
-impl Summary {
+impl FileReport {
     fn count_truth(&mut self, truth: &GraspTruth, qualities: &mut Vec<(f64, f64)>) {
         self.n_with_truth += 1;
         self.n_stable += usize::from(truth.stable);
@@ -423,7 +423,7 @@ fn quantiles(mut values: Vec<f64>) -> Option<[f64; 5]> {
     Some([0.05, 0.25, 0.5, 0.75, 0.95].map(|part| values[(part * last as f64).round() as usize]))
 }
 
-fn print_summary(hand: &Hand, summary: &Summary) -> anyhow::Result<()> {
+fn print_summary(hand: &Hand, summary: &FileReport) -> anyhow::Result<()> {
     let share = |part: usize, whole: usize| percent((whole > 0).then(|| part as f64 / whole as f64));
     let quantiles = |quantiles: Option<[f64; 5]>| {
         quantiles.map_or("n/a".into(), |values| values.map(|value| format!("{value:.3}")).join("  "))

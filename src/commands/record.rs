@@ -61,7 +61,7 @@ pub(super) struct Arguments {
 }
 
 #[derive(Debug, Serialize)]
-struct Summary {
+struct RecordSummary {
     graph: String,
     /// `graph` if it ended, else `detached`.
     ended: &'static str,
@@ -89,7 +89,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 }
 
 /// Records a graph of this machine to `out`.
-fn record(arguments: &Arguments, out: &Path) -> anyhow::Result<Summary> {
+fn record(arguments: &Arguments, out: &Path) -> anyhow::Result<RecordSummary> {
     let stop = stop_signal()?;
     let connection = Connection::open(&pick_graph(arguments.graph.name())?)?;
     record_from(arguments, out, connection, &|| stop.load(Ordering::Relaxed))
@@ -100,7 +100,7 @@ fn record_from(
     out: &Path,
     mut connection: Connection,
     is_interrupted: &dyn Fn() -> bool,
-) -> anyhow::Result<Summary> {
+) -> anyhow::Result<RecordSummary> {
     let attachment = match connection.ask(&Request::Attach { ports: arguments.edges.clone() }, ANSWER_LIMIT)? {
         Reply::Attached(attachment) => attachment,
         other => return Err(connection.unexpected(&other).into()),
@@ -164,10 +164,10 @@ fn record_from(
     let secs = start.elapsed().as_secs_f64();
     let (edges, recorded) = finished.context("cannot read the graph's edges any more")?.0.finish(ending);
     let missing = edges.iter().map(|edge| edge.missing).sum();
-    Ok(Summary { graph, ended: ending.word(), secs, edges, missing, recorded })
+    Ok(RecordSummary { graph, ended: ending.word(), secs, edges, missing, recorded })
 }
 
-impl Summary {
+impl RecordSummary {
     fn lines(&self, json: bool) -> Vec<String> {
         if json { vec![json!(self).to_string()] } else { table(self) }
     }
@@ -180,7 +180,7 @@ impl Summary {
 }
 
 /// The summary for a person.
-fn table(summary: &Summary) -> Vec<String> {
+fn table(summary: &RecordSummary) -> Vec<String> {
     let number = |number: Option<u64>| number.map_or("-".to_string(), |number| number.to_string());
     let mut edges = TextTable::new(["topic", "samples", "first", "last", "missing"], 1);
     for edge in &summary.edges {

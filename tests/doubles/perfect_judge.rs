@@ -8,7 +8,7 @@ use std::path::Path;
 
 use anyhow::Context;
 use blindgrasp_simulator::trial::targets::{target_of_trial, targets_named};
-use blindgrasp_simulator::trial::{Attempt, LiftTarget, Probe, TrialOptions, choose_start, sensor_seed};
+use blindgrasp_simulator::trial::{Attempt, LiftTarget, ProbeMove, TrialOptions, choose_start, sensor_seed};
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
@@ -62,7 +62,7 @@ fn kept_at(
         let start = choose_start(hand, thing, options, Some(prior), seed, trial, number)?;
         let mut attempt = Attempt::begin(hand, thing, options, &start, sensor_seed(seed, trial, number))?;
         while attempt.next_frame(0).is_some() {}
-        attempt.probe(Probe::TestLift);
+        attempt.probe(ProbeMove::TestLift);
         while attempt.next_frame(0).is_some() {}
         if attempt.lift(|_| {}).held {
             return Ok(Some(number));

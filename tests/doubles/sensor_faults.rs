@@ -8,10 +8,10 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
-use blindgrasp_learning::sensors::{Damage, Grasp, alarms, damaged, read};
+use blindgrasp_learning::sensors::{Damage, SensorGrasp, alarms, damaged, read};
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::contacts::contacts_from_frame;
-use blindgrasp_stages::encoder::Reading;
+use blindgrasp_stages::encoder::FeltReading;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::{Memory, Model};
 use blindgrasp_stages::sensors::{SensorCheck, SensorFault};
@@ -43,8 +43,8 @@ fn main() -> anyhow::Result<()> {
         for run in 0..n_runs {
             let (damage, fault) = parts[run % parts.len()];
             let mut pick = || &grasps[random.random_range(0..grasps.len())];
-            let mut sequence: Vec<Grasp> = (0..N_BEFORE).map(|_| pick().clone()).collect();
-            let chosen: Vec<(&Grasp, &Grasp)> = (0..N_AFTER).map(|_| (pick(), pick())).collect();
+            let mut sequence: Vec<SensorGrasp> = (0..N_BEFORE).map(|_| pick().clone()).collect();
+            let chosen: Vec<(&SensorGrasp, &SensorGrasp)> = (0..N_AFTER).map(|_| (pick(), pick())).collect();
             for (grasp, other) in chosen {
                 sequence.push(damaged(&hand, grasp, damage, other, &mut random));
             }
@@ -140,7 +140,7 @@ fn damages(hand: &Hand) -> Vec<Damages> {
 }
 
 /// Per cent: grasps held for another reason than touch, accuracy of those judged or felt nowhere, false positives.
-fn judged(hand: &Hand, model: &Model, grasps: &[Grasp]) -> (f64, f64, f64) {
+fn judged(hand: &Hand, model: &Model, grasps: &[SensorGrasp]) -> (f64, f64, f64) {
     let (mut n_held, mut n_right, mut n, mut n_unstable, mut n_wrong) = (0.0, 0.0, 0.0, 0.0, 0.0);
     let mut contacts = Vec::new();
     for grasp in grasps {
@@ -149,7 +149,7 @@ fn judged(hand: &Hand, model: &Model, grasps: &[Grasp]) -> (f64, f64, f64) {
         n += 1.0;
         contacts_from_frame(hand, 0, &frame.joints, &frame.cells_newtons, &mut contacts);
         let mut values = Vec::new();
-        let reading = Reading::new(&frame.joints, &contacts);
+        let reading = FeltReading::new(&frame.joints, &contacts);
         let place = blindgrasp_stages::day::GraspPlace::default();
         let verdict = model.extract(Phase::Settled, &reading, &mut values).and_then(|_| {
             model.judge(&mut Memory::default(), model.dictionary_id(), place, Phase::Settled, Ok(&values))

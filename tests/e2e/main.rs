@@ -10,6 +10,7 @@ mod days;
 mod docs;
 mod echo;
 mod evaluate;
+mod examples;
 mod export;
 mod graph;
 mod grid;

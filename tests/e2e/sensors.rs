@@ -89,13 +89,11 @@ fn a_graph_holds_while_a_pad_is_dead_and_says_which() {
     swap(&graph, &["contacts", "--probation", "0"], 0);
     graph.wait_for_decisions(30);
     // Without the sensor check, and so without a state, while its neighbours go on; and with it again.
-    let n_watched = graph.n_decisions();
     swap(&graph, &["contacts", "--set", "sensors=", "--probation", "0"], 0);
     assert_eq!(graph.node("contacts")["params"].get("sensors"), None);
     graph.wait_for_decisions(30);
     graph.kill("contacts");
     graph.wait_for_decisions(30);
-    let n_unwatched = graph.n_decisions();
     swap(&graph, &["contacts", "--set", &format!("sensors={CHECK}"), "--probation", "0"], 0);
     graph.wait_for_decisions(30);
     graph.kill("contacts");
@@ -104,9 +102,9 @@ fn a_graph_holds_while_a_pad_is_dead_and_says_which() {
     assert_eq!((ended.code, &ended.summary["samples_lost"]), (Some(0), &0.into()), "{}", ended.stderr);
     let is_held = |line: &Value| line["reason"] == "sensor_fault";
     let lines = &ended.decisions;
-    assert!(lines[..n_watched].iter().all(is_held), "{lines:?}");
-    assert!(lines[n_watched + 10..n_unwatched].iter().all(|line| !is_held(line)), "{lines:?}");
-    assert!(lines[lines.len() - 10..].iter().all(is_held), "{lines:?}");
+    // Held, not held, and held again: a busy machine may take long for a swap.
+    let n_changes = lines.windows(2).filter(|pair| is_held(&pair[0]) != is_held(&pair[1])).count();
+    assert!(n_changes == 2 && is_held(&lines[0]) && is_held(&lines[lines.len() - 1]), "{lines:?}");
 
     let healthy = folder.path().join("healthy");
     std::fs::create_dir(&healthy).expect("a folder");

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use super::config::Channel;
-use super::incoming::{Incoming, Verdict};
+use super::incoming::{Admission, Incoming};
 use super::sample;
 use super::wire::SampleFrame;
 use blindgrasp_messages::{Message, Stamped};
@@ -113,8 +113,8 @@ impl Downlink {
         // Bytes that are neither a message nor the place of one leave the place as it is.
         let key = decoded.or(unreadable).or(self.incoming.last()).unwrap_or(SampleId { epoch: 0, seq: 0 });
         match self.incoming.on_sample(frame.run, frame.index, key) {
-            Verdict::Deliver => {}
-            Verdict::Gap => return Ok(Accepted::Gap),
+            Admission::Deliver => {}
+            Admission::Gap => return Ok(Accepted::Gap),
             _ => return Ok(Accepted::Repeated),
         }
         if self.before.is_some_and(|before| before.epoch == key.epoch && before.seq >= key.seq) {

@@ -32,7 +32,7 @@ pub struct Incoming {
 
 /// What is done with a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Verdict {
+pub enum Admission {
     /// It is the next one: publish it. It counts as received from now on.
     Deliver,
     /// It was received before.
@@ -112,30 +112,30 @@ impl Incoming {
         Some((self.run, self.last))
     }
 
-    pub fn on_sample(&mut self, run: u32, index: u64, key: SampleId) -> Verdict {
+    pub fn on_sample(&mut self, run: u32, index: u64, key: SampleId) -> Admission {
         let asking = match &mut self.asking {
             Some(asking) if run == self.run => asking,
             _ => {
                 self.n_stale += 1;
-                return Verdict::Stale;
+                return Admission::Stale;
             }
         };
         asking.is_heard = true;
         if index < self.expected {
             self.n_repeated += 1;
-            return Verdict::Repeated;
+            return Admission::Repeated;
         }
         if index > self.expected {
             if self.policy == EdgePolicy::Lossless {
                 self.reconnected();
-                return Verdict::Gap;
+                return Admission::Gap;
             }
             self.n_lost = self.n_lost.saturating_add(index - self.expected);
         }
         self.expected = index.saturating_add(1);
         self.last = Some(key);
         self.n_samples += 1;
-        Verdict::Deliver
+        Admission::Deliver
     }
 
     /// The writer has ended, and the readers here have answered all its samples. Returns whether the sender must be

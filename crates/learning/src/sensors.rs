@@ -49,7 +49,7 @@ pub struct Frame {
 
 /// The frames of a grasp, up to the decision.
 #[derive(Debug, Clone)]
-pub struct Grasp {
+pub struct SensorGrasp {
     pub grasp_id: u64,
     /// Grasps of one object are in one fold. Empty if nobody says.
     pub object: String,
@@ -61,7 +61,7 @@ pub struct Grasp {
 ///
 /// # Errors
 /// A recording that cannot be read.
-pub fn read(hand: &Hand, recordings: &[PathBuf]) -> Result<Vec<Grasp>, DatasetError> {
+pub fn read(hand: &Hand, recordings: &[PathBuf]) -> Result<Vec<SensorGrasp>, DatasetError> {
     let mut all = Vec::new();
     for path in recordings {
         let grasps = read_grasps(path, hand, |_, frames| {
@@ -73,7 +73,7 @@ pub fn read(hand: &Hand, recordings: &[PathBuf]) -> Result<Vec<Grasp>, DatasetEr
             let frames = frames.into_iter().map(|frame| of(frame.message));
             frames.filter(|frame| !frame.phase.is_over() && is_valid(hand, frame)).collect::<Vec<_>>()
         })?;
-        all.extend(grasps.into_iter().map(|grasp| Grasp {
+        all.extend(grasps.into_iter().map(|grasp| SensorGrasp {
             grasp_id: grasp.grasp_id,
             object: grasp.truth.as_ref().map(|truth| truth.object.clone()).unwrap_or_default(),
             stable: grasp.truth.map(|truth| truth.stable),
@@ -110,7 +110,13 @@ pub enum Damage {
 }
 
 /// The same grasp as a damaged hand would have felt it. `other` is the grasp that [`Damage::Posture`] takes the joints of.
-pub fn damaged(hand: &Hand, grasp: &Grasp, damage: Damage, other: &Grasp, random: &mut impl Rng) -> Grasp {
+pub fn damaged(
+    hand: &Hand,
+    grasp: &SensorGrasp,
+    damage: Damage,
+    other: &SensorGrasp,
+    random: &mut impl Rng,
+) -> SensorGrasp {
     let mut grasp = grasp.clone();
     let cells_of =
         |pad: usize| hand.pads[pad].first_cell_idx..hand.pads[pad].first_cell_idx + hand.pads[pad].cells.len();
@@ -147,7 +153,7 @@ fn normal(random: &mut impl Rng) -> f64 {
 }
 
 /// The grasp's values for detectors, if it settles.
-fn values(hand: &Hand, grasp: &Grasp) -> Option<Vec<f64>> {
+fn values(hand: &Hand, grasp: &SensorGrasp) -> Option<Vec<f64>> {
     let mut summary = GraspSummary::default();
     let mut contacts: Vec<Contact> = Vec::new();
     for frame in &grasp.frames {
@@ -211,12 +217,12 @@ fn boosting(fault: SensorFault) -> BoostingParams {
 /// Too few grasps.
 pub fn learn(
     hand: &Hand,
-    grasps: &[Grasp],
+    grasps: &[SensorGrasp],
     recordings: &[PathBuf],
     seed: u64,
     mut progress: impl FnMut(usize, usize),
 ) -> Result<SensorCheck, SensorsError> {
-    let settled: Vec<(&Grasp, Vec<f64>)> =
+    let settled: Vec<(&SensorGrasp, Vec<f64>)> =
         grasps.iter().filter_map(|grasp| values(hand, grasp).map(|values| (grasp, values))).collect();
     if settled.len() < MIN_GRASPS {
         return Err(SensorsError::TooFew(settled.len()));
@@ -306,7 +312,7 @@ fn power(log_odds: &[f64], objects: &[usize]) -> f64 {
 }
 
 /// Standard deviation of the noise: of readings of the open hand that are cut off at 0.
-fn noise(grasps: &[Grasp]) -> f64 {
+fn noise(grasps: &[SensorGrasp]) -> f64 {
     let open = grasps.iter().flat_map(|grasp| &grasp.frames).filter(|frame| frame.phase == Phase::Open);
     let (mut sum, mut n) = (0.0, 0.0);
     for force in open.flat_map(|frame| &frame.cells_newtons) {
@@ -315,7 +321,7 @@ fn noise(grasps: &[Grasp]) -> f64 {
     if n > 0.0 { f64::sqrt(sum / n) } else { 0.01 }
 }
 
-fn flicker(hand: &Hand, grasps: &[Grasp]) -> Vec<Flicker> {
+fn flicker(hand: &Hand, grasps: &[SensorGrasp]) -> Vec<Flicker> {
     let pairs = || grasps.iter().flat_map(|grasp| grasp.frames.windows(2));
     let most = |cell: usize| {
         let readings = grasps.iter().flat_map(|grasp| &grasp.frames).map(|frame| frame.cells_newtons[cell]);
@@ -357,10 +363,10 @@ fn flicker(hand: &Hand, grasps: &[Grasp]) -> Vec<Flicker> {
 }
 
 /// For each grasp, in their order, the fault that a check reports in it.
-pub fn alarms(check: &SensorCheck, hand: &Hand, grasps: &[Grasp]) -> Vec<Option<SensorFault>> {
+pub fn alarms(check: &SensorCheck, hand: &Hand, grasps: &[SensorGrasp]) -> Vec<Option<SensorFault>> {
     let mut memory = SensorMemory::default();
     let mut contacts = Vec::new();
-    let mut of_grasp = |(number, grasp): (usize, &Grasp)| {
+    let mut of_grasp = |(number, grasp): (usize, &SensorGrasp)| {
         let place = GraspPlace { epoch: 0, grasp_id: number as u64, day: 0 };
         let mut found = None;
         for frame in &grasp.frames {

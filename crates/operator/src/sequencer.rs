@@ -47,7 +47,7 @@ pub struct Sequencer<T> {
 
 /// The sequencer's answer to a sample.
 #[derive(Debug, PartialEq, Eq)]
-pub enum Verdict<T> {
+pub enum Placing<T> {
     Deliver(T),
     /// The sample is early.
     Hold,
@@ -128,7 +128,7 @@ impl<T> Sequencer<T> {
         publisher: u128,
         has_other_publishers: impl FnOnce() -> bool,
         now: impl FnOnce() -> Instant,
-    ) -> Verdict<T> {
+    ) -> Placing<T> {
         let place = self.place(key);
         let known = self.publishers.iter_mut().find(|(id, _)| *id == publisher);
         let is_first_of_publisher = known.is_none();
@@ -136,7 +136,7 @@ impl<T> Sequencer<T> {
             Some((_, last)) if place <= *last => {
                 // No restart or swap explains this: the stage sees the sample as it is.
                 self.counts.n_repeated += 1;
-                return Verdict::Deliver(sample);
+                return Placing::Deliver(sample);
             }
             Some((_, last)) => *last = place,
             None => {
@@ -148,7 +148,7 @@ impl<T> Sequencer<T> {
             // An earlier instance has counted the sample.
             let is_known = self.answered.is_some_and(|answered| place <= answered);
             self.counts.n_repeated += u64::from(!is_known);
-            return Verdict::Drop;
+            return Placing::Drop;
         }
         let n_before = self.n_before(place);
         // A publisher sends in order and skips no number that it or another publisher has. So a gap within its own samples is
@@ -159,10 +159,10 @@ impl<T> Sequencer<T> {
         };
         if self.may_hold && self.is_early(place) && may_come() {
             self.held.insert(place, (sample, now()));
-            return Verdict::Hold;
+            return Placing::Hold;
         }
         self.deliver(place, n_before);
-        Verdict::Deliver(sample)
+        Placing::Deliver(sample)
     }
 
     /// Whether samples before this place have not been delivered: missing ones, or held ones of an earlier epoch.
@@ -345,7 +345,7 @@ mod tests {
                     let (_, seq, publisher) = waiting.remove(next);
                     let verdict =
                         sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, || true, || start + now);
-                    if let Verdict::Deliver(seq) = verdict {
+                    if let Placing::Deliver(seq) = verdict {
                         received.push(seq);
                     }
                 } else if !waiting.iter().any(is_there) {
@@ -398,7 +398,7 @@ mod tests {
                 continue;
             }
             let push = |sequencer: &mut Sequencer<u64>, seq: u64| {
-                sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 0, || false, Instant::now) == Verdict::Deliver(seq)
+                sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 0, || false, Instant::now) == Placing::Deliver(seq)
             };
             let n_counted = rng.random_range(0..=sent.len());
             let n_answered = rng.random_range(0..=n_counted);
@@ -427,7 +427,7 @@ mod tests {
             for seq in numbers {
                 let verdict = sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, || true, || now);
                 delivered.extend(match verdict {
-                    Verdict::Deliver(seq) => Some(seq),
+                    Placing::Deliver(seq) => Some(seq),
                     _ => None,
                 });
             }
@@ -443,22 +443,22 @@ mod tests {
         let start = Instant::now();
         let id = |seq| SampleId { epoch: EPOCH, seq };
         let mut sequencer = Sequencer::resume(None, None, InputCounts::default()).beginning_at(start, Some(id(5)));
-        assert_eq!(sequencer.push(5, id(5), 2, || true, || start), Verdict::Hold);
+        assert_eq!(sequencer.push(5, id(5), 2, || true, || start), Placing::Hold);
         assert_eq!(sequencer.next_overdue(start + 2 * HOLD_LIMIT), None);
         for seq in 0..5 {
-            assert_eq!(sequencer.push(seq, id(seq), 1, || true, || start), Verdict::Deliver(seq));
+            assert_eq!(sequencer.push(seq, id(seq), 1, || true, || start), Placing::Deliver(seq));
         }
         assert_eq!(sequencer.next_in_order(), Some(5));
         // A gap of later samples is not waited for longer.
-        assert_eq!(sequencer.push(8, id(8), 3, || true, || start), Verdict::Hold);
+        assert_eq!(sequencer.push(8, id(8), 3, || true, || start), Placing::Hold);
         assert_eq!(sequencer.next_overdue(start + HOLD_LIMIT), Some(8));
         // Those that do not come are given up in the end.
         let mut sequencer = Sequencer::resume(None, None, InputCounts::default()).beginning_at(start, Some(id(5)));
-        assert_eq!(sequencer.push(5, id(5), 2, || true, || start), Verdict::Hold);
+        assert_eq!(sequencer.push(5, id(5), 2, || true, || start), Placing::Hold);
         assert_eq!(sequencer.next_overdue(start + START_HOLD_LIMIT), Some(5));
         // A reader that begins before its writer awaits nothing.
         let mut first = Sequencer::resume(None, None, InputCounts::default()).beginning_at(start, None);
-        assert_eq!(first.push(5, id(5), 2, || true, || start), Verdict::Hold);
+        assert_eq!(first.push(5, id(5), 2, || true, || start), Placing::Hold);
         assert_eq!(first.next_overdue(start + HOLD_LIMIT), Some(5));
     }
 
@@ -468,7 +468,7 @@ mod tests {
         let mut sequencer = Sequencer::resume(None, None, InputCounts::default());
         for seq in [0, 1, 5, 6, 9] {
             let verdict = sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 1, || true, Instant::now);
-            assert_eq!(verdict, Verdict::Deliver(seq));
+            assert_eq!(verdict, Placing::Deliver(seq));
         }
         assert_eq!(sequencer.counts().n_missing, 5);
     }
@@ -481,14 +481,14 @@ mod tests {
         let counts = InputCounts { n_received: 6, ..InputCounts::default() };
         let mut sequencer = Sequencer::resume(Some(key(old, 5)), Some(key(old, 5)), counts);
         let push = |sequencer: &mut Sequencer<_>, key, publisher| sequencer.push(key, key, publisher, || true, || now);
-        assert_eq!(push(&mut sequencer, key(old, 9), 1), Verdict::Hold);
-        assert_eq!(push(&mut sequencer, key(new, 0), 2), Verdict::Hold, "8 is on its way");
-        assert_eq!(push(&mut sequencer, key(old, 6), 3), Verdict::Deliver(key(old, 6)));
+        assert_eq!(push(&mut sequencer, key(old, 9), 1), Placing::Hold);
+        assert_eq!(push(&mut sequencer, key(new, 0), 2), Placing::Hold, "8 is on its way");
+        assert_eq!(push(&mut sequencer, key(old, 6), 3), Placing::Deliver(key(old, 6)));
         let later = now + HOLD_LIMIT;
         assert_eq!(sequencer.next_overdue(later), Some(key(old, 9)));
         assert_eq!(sequencer.next_in_order(), Some(key(new, 0)));
-        assert_eq!(push(&mut sequencer, key(old, 8), 4), Verdict::Drop, "its epoch is over");
-        assert_eq!(push(&mut sequencer, key(new, 1), 2), Verdict::Deliver(key(new, 1)));
+        assert_eq!(push(&mut sequencer, key(old, 8), 4), Placing::Drop, "its epoch is over");
+        assert_eq!(push(&mut sequencer, key(new, 1), 2), Placing::Deliver(key(new, 1)));
         assert_eq!((sequencer.counts().n_received, sequencer.counts().n_missing), (10, 2));
         assert_eq!(sequencer.counts().n_repeated, 1);
     }
@@ -497,10 +497,10 @@ mod tests {
     fn where_gaps_are_usual_nothing_waits() {
         let mut sequencer = Sequencer::resume(None, None, InputCounts::default()).without_waiting();
         for (seq, publisher, verdict) in [
-            (0, 1, Verdict::Deliver(0)),
-            (7, 2, Verdict::Deliver(7)),
-            (3, 1, Verdict::Drop),
-            (9, 2, Verdict::Deliver(9)),
+            (0, 1, Placing::Deliver(0)),
+            (7, 2, Placing::Deliver(7)),
+            (3, 1, Placing::Drop),
+            (9, 2, Placing::Deliver(9)),
         ] {
             assert_eq!(sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, || true, Instant::now), verdict);
         }
@@ -512,7 +512,7 @@ mod tests {
         let mut sequencer = Sequencer::onlooker();
         for seq in [3, 4, 4, 2] {
             let verdict = sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 1, || true, Instant::now);
-            assert_eq!(verdict, Verdict::Deliver(seq));
+            assert_eq!(verdict, Placing::Deliver(seq));
         }
         assert_eq!(sequencer.counts().n_repeated, 2);
     }

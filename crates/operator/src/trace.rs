@@ -175,7 +175,7 @@ mod tests {
         let filter = Targets::new().with_default(LevelFilter::INFO);
         let subscriber = tracing_subscriber::registry().with(Sayer { say, repeats: None }.with_filter(filter));
         tracing::subscriber::with_default(subscriber, || {
-            tracing::warn!(slot = 7, force_newtons = -0.5, unit = "N", "negative force on {}", "finger_1");
+            tracing::warn!(cell = 7, force_newtons = -0.5, unit = "N", "negative force on {}", "finger_1");
             tracing::debug!("not heard");
             tracing::info!(ratio = f64::NAN, "plain");
         });
@@ -183,11 +183,11 @@ mod tests {
         let texts: Vec<String> = said.iter().map(ToString::to_string).collect();
         assert_eq!(
             texts,
-            [r#"WARN negative force on finger_1 slot=7 force_newtons=-0.5 unit="N""#, r#"INFO plain ratio="NaN""#]
+            [r#"WARN negative force on finger_1 cell=7 force_newtons=-0.5 unit="N""#, r#"INFO plain ratio="NaN""#]
         );
         let json = serde_json::to_value(&said[0]).expect("JSON");
         assert_eq!(json["level"], "warn");
-        assert_eq!(json["fields"]["slot"], 7);
+        assert_eq!(json["fields"]["cell"], 7);
     }
 
     #[test]

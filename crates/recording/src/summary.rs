@@ -18,7 +18,7 @@ const FOOTER_BYTES: u64 = 9 + 20 + 8;
 const DATA_END_BYTES: u64 = 9 + 4;
 
 /// The summary of a file, with a correct checksum.
-pub(super) struct Summary {
+pub(super) struct FileSummary {
     pub(super) info: RecordingInfo,
     /// By name, without the recording's info.
     pub(super) metadata: BTreeMap<String, BTreeMap<String, String>>,
@@ -29,7 +29,7 @@ pub(super) struct Summary {
     pub(super) n_file_bytes: u64,
 }
 
-impl Summary {
+impl FileSummary {
     /// The topics that have samples, each with the name of its schema.
     pub(super) fn topics(&self) -> BTreeMap<String, String> {
         let counts = self.statistics.as_ref().map(|statistics| &statistics.channel_message_counts);
@@ -44,7 +44,7 @@ impl Summary {
 }
 
 /// Opens a file and reads its summary.
-pub(super) fn open(path: &Path) -> Result<(File, Summary), RecordingError> {
+pub(super) fn open(path: &Path) -> Result<(File, FileSummary), RecordingError> {
     let io = |source| RecordingError::Io { path: path.into(), source };
     let invalid = |message: String| RecordingError::Invalid { path: path.into(), message };
     let damaged = |message: String| RecordingError::Damaged { path: path.into(), message };
@@ -76,7 +76,7 @@ pub(super) fn open(path: &Path) -> Result<(File, Summary), RecordingError> {
         return Err(invalid(other_version(difference, &info)));
     }
     let RawSummary { channels, statistics, chunks, .. } = raw;
-    Ok((file, Summary { info, metadata, channels, statistics, chunks, n_file_bytes }))
+    Ok((file, FileSummary { info, metadata, channels, statistics, chunks, n_file_bytes }))
 }
 
 /// What to say of a recording whose messages are not ours.

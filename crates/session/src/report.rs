@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use blindgrasp_graph::log::AUDIT;
 use blindgrasp_graph::log::{LogFolder, LogTail};
-use blindgrasp_graph::run::{SeenDecision, Summary};
+use blindgrasp_graph::run::{RunSummary, SeenDecision};
 use blindgrasp_messages::{Action, GraspTruth, LiftDecision, Phase, Record, Stamped, TactileFrame};
 use blindgrasp_operator::ages::Ages;
 use blindgrasp_operator::wiring::LogLevel;
@@ -38,7 +38,7 @@ pub(super) struct RunReport {
     start: Instant,
     hand: Option<Hand>,
     /// The last grasps, in the order in which they came: neither epochs nor numbers need to rise.
-    grasps: VecDeque<(GraspKey, Grasp)>,
+    grasps: VecDeque<(GraspKey, ReportedGrasp)>,
     /// Decisions that count as right, or of which the truth is not known: every `step`th.
     others: Vec<Point>,
     step: usize,
@@ -49,7 +49,7 @@ pub(super) struct RunReport {
 
 /// The things that are known of a grasp.
 #[derive(Default)]
-struct Grasp {
+struct ReportedGrasp {
     /// The last settled frame, or the last one.
     frame: Option<Stamped<TactileFrame>>,
     decision: Option<(f64, LiftDecision)>,
@@ -78,7 +78,7 @@ impl RunReport {
         }
     }
 
-    fn grasp(&mut self, key: GraspKey) -> &mut Grasp {
+    fn grasp(&mut self, key: GraspKey) -> &mut ReportedGrasp {
         // Most often it is one of the last.
         let known = self.grasps.iter().rposition(|(known, _)| *known == key);
         let idx = known.unwrap_or_else(|| {
@@ -87,14 +87,14 @@ impl RunReport {
             {
                 self.add_without_truth(&oldest);
             }
-            self.grasps.push_back((key, Grasp::default()));
+            self.grasps.push_back((key, ReportedGrasp::default()));
             self.grasps.len() - 1
         });
         &mut self.grasps[idx].1
     }
 
     /// Counts a decision whose truth has not come.
-    fn add_without_truth(&mut self, grasp: &Grasp) {
+    fn add_without_truth(&mut self, grasp: &ReportedGrasp) {
         if let (false, Some((secs, decision))) = (grasp.is_counted, &grasp.decision) {
             self.add([*secs, decision.probability_stable]);
         }
@@ -141,7 +141,8 @@ impl RunReport {
     /// Counts a grasp whose decision and truth are known.
     fn settle(&mut self, key: GraspKey) {
         let grasp = self.grasp(key);
-        let Grasp { decision: Some((secs, decision)), truth: Some(truth), is_counted: false, .. } = grasp else {
+        let ReportedGrasp { decision: Some((secs, decision)), truth: Some(truth), is_counted: false, .. } = grasp
+        else {
             return;
         };
         let (secs, decision, truth) = (*secs, decision.clone(), truth.clone());
@@ -192,7 +193,7 @@ impl RunReport {
     ///
     /// # Errors
     /// The file cannot be written.
-    pub(super) fn write(mut self, path: &Path, summary: &Summary) -> anyhow::Result<()> {
+    pub(super) fn write(mut self, path: &Path, summary: &RunSummary) -> anyhow::Result<()> {
         for (_, grasp) in std::mem::take(&mut self.grasps) {
             self.add_without_truth(&grasp);
         }
@@ -200,7 +201,7 @@ impl RunReport {
             .map_err(|error| anyhow::anyhow!("cannot write {} (--report): {error}", path.display()))
     }
 
-    fn page(&self, summary: &Summary) -> String {
+    fn page(&self, summary: &RunSummary) -> String {
         let mut page = ReportPage::begin(&format!("Run of {}", summary.graph), &lead(summary));
         page.section("Decisions", &reasons(summary));
         page.figure(&chart_svg(&self.timeline()), &self.timeline_caption());
@@ -270,7 +271,7 @@ impl RunReport {
     }
 }
 
-fn lead(summary: &Summary) -> String {
+fn lead(summary: &RunSummary) -> String {
     let losses = [
         (summary.samples_lost, "samples were lost"),
         (summary.samples_dropped, "samples were dropped for newer ones"),
@@ -306,12 +307,12 @@ fn time(nanos: u64) -> String {
     }
 }
 
-fn reasons(summary: &Summary) -> String {
+fn reasons(summary: &RunSummary) -> String {
     let rows = summary.reasons.iter().map(|(reason, n)| (false, vec![escape(reason), n.to_string()]));
     report_table(&[("reason", false), ("grasps", true)], &rows.collect::<Vec<_>>())
 }
 
-fn edges(summary: &Summary) -> String {
+fn edges(summary: &RunSummary) -> String {
     let rows = summary.edges.iter().map(|edge| {
         let age = |share| edge.ages.quantile_nanos(share).map_or("–".into(), time);
         let cells = vec![
@@ -357,7 +358,7 @@ fn histogram(title: &str, ages: &Ages) -> BarChart {
 }
 
 /// The lines of this run in the logs of the launcher and of its clients, and the warnings and errors of its operators.
-fn changes(summary: &Summary) -> String {
+fn changes(summary: &RunSummary) -> String {
     let mut lines = match LogTail::open(LogFolder::of_graph(&summary.graph), None, usize::MAX, 1 << 20) {
         Ok((_, lines)) => lines,
         Err(error) => return format!("<p>The logs cannot be read: {}</p>\n", escape(&error.to_string())),

@@ -50,7 +50,7 @@ pub struct Session {
 #[derive(Serialize)]
 pub struct SessionSummary {
     #[serde(flatten)]
-    pub run: run::Summary,
+    pub run: run::RunSummary,
     #[serde(rename = "recorded")]
     recorded_samples: Option<BTreeMap<String, u64>>,
     recorded_files: Vec<PathBuf>,

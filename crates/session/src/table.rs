@@ -1,11 +1,11 @@
 //! The summary of a run, for a person.
 
 use crate::text_table::{TextTable, percent};
-use blindgrasp_graph::run::{Latency, Summary};
+use blindgrasp_graph::run::{Latency, RunSummary};
 use blindgrasp_operator::link_status::{ChannelStatus, PeerStatus};
 
 /// The lines of the summary: figures, then a table of the edges.
-pub(super) fn table(summary: &Summary) -> Vec<String> {
+pub(super) fn table(summary: &RunSummary) -> Vec<String> {
     let rows = figures(summary).into_iter().map(|(name, value)| format!("{name:<16} {value}"));
     let mut edges = TextTable::new(["edge from", "to", "sent", "received", "dropped", "missing", "late"], 2);
     for edge in &summary.edges {
@@ -15,7 +15,7 @@ pub(super) fn table(summary: &Summary) -> Vec<String> {
     std::iter::once(String::new()).chain(rows).chain([String::new()]).chain(edges.lines()).collect()
 }
 
-fn figures(summary: &Summary) -> Vec<(&'static str, String)> {
+fn figures(summary: &RunSummary) -> Vec<(&'static str, String)> {
     let probes = if summary.probes > 0 { format!(", after {} probes", summary.probes) } else { String::new() };
     let end = if summary.end == "finished" { String::new() } else { format!("; the graph was {}", summary.end) };
     let (grasps, lift, hold, undecided) = (summary.grasps, summary.lift, summary.hold, summary.undecided);

@@ -47,7 +47,7 @@ pub enum CandidateError {
 
 /// A closed hand on an object, with its contacts.
 #[derive(Debug, Clone)]
-pub(crate) struct Grasp {
+pub(crate) struct CandidateGrasp {
     object_idx: usize,
     contacts: Vec<SimulatedContact>,
     candidate: u64,
@@ -74,7 +74,7 @@ pub(crate) struct Judged {
 /// The state of a candidate before it is kept.
 pub(crate) enum Made {
     /// A grasp whose frames are made when it is kept.
-    Closed(Grasp),
+    Closed(CandidateGrasp),
     /// A grasp that has its frames, because a lift follows them.
     Lifted(SimulatedGrasp),
 }
@@ -122,14 +122,14 @@ pub(super) fn try_candidate(
             object_idx,
             is_stable: options.thresholds.hold(&quality),
             quality,
-            made: Made::Closed(Grasp { object_idx, candidate, exploration, contacts }),
+            made: Made::Closed(CandidateGrasp { object_idx, candidate, exploration, contacts }),
         }))),
         Err(QualityError::Hull { .. }) => Ok(Outcome::HullFailure),
         Err(source) => Err(CandidateError::Quality { candidate, source }),
     }
 }
 
-impl Grasp {
+impl CandidateGrasp {
     /// With frames, as grasp number `grasp_id`.
     fn into_simulated(
         self,
@@ -225,7 +225,7 @@ fn grasp(
     Ok(Some((exploration, contacts)))
 }
 
-fn frames(hand: &Hand, grasp: &Grasp, options: &SimulatorOptions, grasp_id: u64) -> Vec<TimedFrame> {
+fn frames(hand: &Hand, grasp: &CandidateGrasp, options: &SimulatorOptions, grasp_id: u64) -> Vec<TimedFrame> {
     let mut rng = candidate_rng(options.seed, grasp.candidate, 1);
     let sensor = Sensor::draw(hand, &options.sensor, options.seed, &mut rng);
     let FrameOptions { n_open, n_closing, n_settled, period_nanos } = options.frames;

@@ -51,7 +51,7 @@ pub enum Block {
 
 /// A frame as the encoder sees it.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Reading<'a> {
+pub struct FeltReading<'a> {
     /// Radians, or metres for a joint that slides, in the hand's order.
     pub joints: &'a [f64],
     /// As [`crate::contacts::contacts_from_frame`] finds them.
@@ -59,10 +59,10 @@ pub struct Reading<'a> {
     pub senses: Senses<'a>,
 }
 
-impl<'a> Reading<'a> {
+impl<'a> FeltReading<'a> {
     /// A frame without senses beside joint angles and cells.
     pub fn new(joints: &'a [f64], contacts: &'a [Contact]) -> Self {
-        Reading { joints, contacts, senses: Senses::default() }
+        FeltReading { joints, contacts, senses: Senses::default() }
     }
 }
 
@@ -143,7 +143,7 @@ impl FeatureExtractor {
     /// The fault, with `values` empty: no contact ([`Fault::NoContact`]: there is no feature), not as many joints as
     /// the hand has ([`Fault::WrongLength`]), an impossible number, pad or cell ([`Fault::InvalidValue`]), or a sense that
     /// a block needs and the frame does not have ([`Fault::MissingReading`]).
-    pub fn extract(&self, reading: &Reading<'_>, values: &mut Vec<f64>) -> Result<u32, Fault> {
+    pub fn extract(&self, reading: &FeltReading<'_>, values: &mut Vec<f64>) -> Result<u32, Fault> {
         values.clear();
         let outcome = self.check(reading).and_then(|()| self.write_blocks(reading, values));
         if outcome.is_err() {
@@ -152,8 +152,8 @@ impl FeatureExtractor {
         outcome
     }
 
-    fn check(&self, reading: &Reading<'_>) -> Result<(), Fault> {
-        let Reading { joints, contacts, .. } = *reading;
+    fn check(&self, reading: &FeltReading<'_>) -> Result<(), Fault> {
+        let FeltReading { joints, contacts, .. } = *reading;
         if joints.len() != self.couplings.len() {
             return Err(Fault::WrongLength);
         }
@@ -169,8 +169,8 @@ impl FeatureExtractor {
         Ok(())
     }
 
-    fn write_blocks(&self, reading: &Reading<'_>, values: &mut Vec<f64>) -> Result<u32, Fault> {
-        let Reading { joints, contacts, senses } = *reading;
+    fn write_blocks(&self, reading: &FeltReading<'_>, values: &mut Vec<f64>) -> Result<u32, Fault> {
+        let FeltReading { joints, contacts, senses } = *reading;
         // The histogram is computed for all blocks, because it checks positions and forces.
         let n_pads_in_contact = histogram(&self.dictionary, self.sigma_m, contacts, values)?;
         let n_words = values.len();
@@ -364,7 +364,7 @@ mod tests {
 
     fn of(extractor: &FeatureExtractor, contacts: &[Contact]) -> Result<Vec<f64>, Fault> {
         let mut values = vec![7.0];
-        let outcome = extractor.extract(&Reading::new(&JOINTS, contacts), &mut values);
+        let outcome = extractor.extract(&FeltReading::new(&JOINTS, contacts), &mut values);
         assert_eq!(outcome.is_err(), values.is_empty());
         outcome.map(|_| values)
     }
@@ -448,7 +448,7 @@ mod tests {
             assert_eq!(of(&all, &[good, bad]), Err(Fault::InvalidValue), "{bad:?}");
         }
         let mut values = vec![];
-        assert_eq!(all.extract(&Reading::new(&JOINTS[..6], &[good]), &mut values), Err(Fault::WrongLength));
-        assert_eq!(all.extract(&Reading::new(&[f64::NAN; 7], &[good]), &mut values), Err(Fault::InvalidValue));
+        assert_eq!(all.extract(&FeltReading::new(&JOINTS[..6], &[good]), &mut values), Err(Fault::WrongLength));
+        assert_eq!(all.extract(&FeltReading::new(&[f64::NAN; 7], &[good]), &mut values), Err(Fault::InvalidValue));
     }
 }

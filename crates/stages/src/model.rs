@@ -13,7 +13,7 @@ use sha2::{Digest, Sha256};
 use crate::approach::ApproachPrior;
 use crate::classifier::{Classifier, Verdict};
 use crate::day::{DayMemory, DayModel, GraspPlace};
-use crate::encoder::{FeatureExtractor, Reading};
+use crate::encoder::{FeatureExtractor, FeltReading};
 use crate::hand::Hand;
 use crate::out_of_distribution::TrainingRange;
 use crate::probe::{GraspHistory, ProbeModel, signals};
@@ -235,7 +235,7 @@ impl Model {
     ///
     /// # Errors
     /// The fault, with `values` empty: as of [`FeatureExtractor::extract`], or [`Fault::OutOfDistribution`].
-    pub fn extract(&self, phase: Phase, reading: &Reading<'_>, values: &mut Vec<f64>) -> Result<u32, Fault> {
+    pub fn extract(&self, phase: Phase, reading: &FeltReading<'_>, values: &mut Vec<f64>) -> Result<u32, Fault> {
         // First, because a malformed frame has a fault of its own.
         let n_pads_in_contact = self.features.extract(reading, values)?;
         let range = match phase {

@@ -171,7 +171,7 @@ fn spread_m<'a>(
 mod tests {
     use super::*;
     use crate::dictionary::Dictionary;
-    use crate::encoder::{Block, Reading};
+    use crate::encoder::{Block, FeltReading};
     use crate::hand::Hand;
     use std::path::Path;
 
@@ -225,7 +225,7 @@ mod tests {
         let features = extractor();
         let contacts = [contact(0, 0.013, 3.0), contact(3, 0.03, 1.0), Contact { pad: 0, ..contact(2, -0.01, 0.5) }];
         let mut values = Vec::new();
-        features.extract(&Reading::new(&[0.0; 7], &contacts), &mut values).expect("a feature");
+        features.extract(&FeltReading::new(&[0.0; 7], &contacts), &mut values).expect("a feature");
         let mut last = 0.0;
         for_each_quantity(&features, &[0.0; 7], &contacts, |value| last = value);
         assert!((values.iter().sum::<f64>() - last).abs() < 1e-12);

@@ -10,7 +10,7 @@ use blindgrasp_messages::{
 
 use crate::contacts::{ContactFinder, ContactSummary};
 use crate::day::GraspPlace;
-use crate::encoder::Reading;
+use crate::encoder::FeltReading;
 use crate::hand::Hand;
 use crate::model::{Memory, Model};
 
@@ -88,7 +88,7 @@ fn extract(model: &Model, head: &ContactSetHead, contacts: &[Contact], values: &
     let (Ok(joints), Ok(senses), Ok(phase)) = (head.joints(), head.senses(), Phase::from_code(head.phase)) else {
         return Err(Fault::Malformed);
     };
-    model.extract(phase, &Reading { joints, contacts, senses }, values)
+    model.extract(phase, &FeltReading { joints, contacts, senses }, values)
 }
 
 /// Judges the feature of a frame, and keeps in `memory` what the model needs for later frames. `dictionary_id` is

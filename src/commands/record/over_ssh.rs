@@ -86,7 +86,7 @@ pub(super) fn record_for_caller(arguments: &Arguments) -> anyhow::Result<Outcome
     sent
 }
 
-fn send(arguments: &Arguments, mut summary: super::Summary) -> anyhow::Result<Outcome> {
+fn send(arguments: &Arguments, mut summary: super::RecordSummary) -> anyhow::Result<Outcome> {
     let mut files = Vec::new();
     let mut opened = Vec::new();
     for path in &mut summary.recorded.files {

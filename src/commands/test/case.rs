@@ -14,7 +14,7 @@ use super::settings;
 use crate::commands::replay::{Fed, Feed};
 use blindgrasp_graph::dataflow::{self, Graph};
 use blindgrasp_graph::launcher::LaunchOptions;
-use blindgrasp_graph::run::{Summary, observed_topics};
+use blindgrasp_graph::run::{RunSummary, observed_topics};
 use blindgrasp_messages::{LiftDecision, Recorded};
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_recording::RecordingReader;
@@ -113,7 +113,7 @@ impl Runner<'_> {
     }
 
     /// Plays a recording as fast as the graph takes it, and records every edge to `found`.
-    fn replay(&self, recording: &Path, graph: &Graph, found: &Path) -> anyhow::Result<(Fed, Summary)> {
+    fn replay(&self, recording: &Path, graph: &Graph, found: &Path) -> anyhow::Result<(Fed, RunSummary)> {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let feed = Feed {
             recording,

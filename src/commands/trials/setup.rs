@@ -8,7 +8,7 @@ use super::super::graph_file::{OnMisfit, checked, fitting};
 use super::{Arguments, Way};
 use blindgrasp_graph::dataflow::{self, DataflowFile, Graph, Node, Override, Scope};
 use blindgrasp_messages::{LiftOutcome, Recorded};
-use blindgrasp_simulator::trial::{Probe, TrialOptions};
+use blindgrasp_simulator::trial::{ProbeMove, TrialOptions};
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
@@ -37,7 +37,7 @@ pub(super) struct Setup {
     /// The prior with which the hand chooses its approaches.
     pub(super) prior: Option<ApproachPrior>,
     /// The probe that the arbiter asks for.
-    pub(super) probe: Option<Probe>,
+    pub(super) probe: Option<ProbeMove>,
 }
 
 impl Setup {
@@ -105,8 +105,8 @@ impl Setup {
             }
         };
         let probe = match text_param(&graph, "probe").as_deref() {
-            Some("squeeze") => Some(Probe::Squeeze),
-            Some("test_lift") => Some(Probe::TestLift),
+            Some("squeeze") => Some(ProbeMove::Squeeze),
+            Some("test_lift") => Some(ProbeMove::TestLift),
             _ => None,
         };
         let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());

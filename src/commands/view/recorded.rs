@@ -74,7 +74,7 @@ pub(super) fn show(
         json!({"file": recording.display().to_string(), "first": first, "grasps": list.values().collect::<Vec<_>>()});
     let shadow = shadow.map(|model| judge_of(model, &hand)).transpose()?;
     let objects = arguments.objects.clone();
-    let mut reading = Reading { recording: recording.into(), objects, hand, list, shadow };
+    let mut reading = ShownReading { recording: recording.into(), objects, hand, list, shadow };
     let grasps: Grasps = Box::new(move |idx| reading.grasp(idx).map_err(|error| format!("{error:#}")));
     let viewer = Viewer::serve(port, Abilities { grasps: Some(grasps), ..Abilities::default() })?;
     viewer.keep("scene", &scene);
@@ -129,7 +129,7 @@ fn list(recording: &Path) -> anyhow::Result<BTreeMap<u64, Listed>> {
 }
 
 /// A recording whose grasps are read one by one.
-struct Reading {
+struct ShownReading {
     recording: PathBuf,
     objects: Option<PathBuf>,
     hand: Hand,
@@ -147,7 +147,7 @@ struct Samples {
     object: Option<ObjectScene>,
 }
 
-impl Reading {
+impl ShownReading {
     /// The frames of a grasp, with contacts and probability where the recording has them, and the object.
     fn grasp(&mut self, idx: usize) -> anyhow::Result<String> {
         let Some((id, listed)) = self.list.iter().nth(idx) else { bail!("there are {} grasps", self.list.len()) };

@@ -326,7 +326,7 @@ impl World {
                         }
                     }
                     Frame::Sample { run, index, key } => {
-                        if self.receiver.on_sample(run, index, key) == Verdict::Deliver {
+                        if self.receiver.on_sample(run, index, key) == Admission::Deliver {
                             self.lives.last_mut().expect("one").push(key);
                             self.n_unanswered += 1;
                         }
@@ -517,18 +517,18 @@ fn a_request_is_repeated_until_it_is_answered() {
     assert_eq!(after, Some(key(1, 4)));
     assert_eq!(incoming.resume_to_send(FIRST_RESUME_PAUSE_NANOS - 1), None);
     assert_eq!(incoming.resume_to_send(FIRST_RESUME_PAUSE_NANOS), Some((run, after)));
-    assert_eq!(incoming.on_sample(run, 0, key(1, 5)), Verdict::Deliver);
+    assert_eq!(incoming.on_sample(run, 0, key(1, 5)), Admission::Deliver);
     assert_eq!(incoming.resume_to_send(u64::MAX), None);
     // A repetition, a sample of an earlier request, and one after a gap.
-    assert_eq!(incoming.on_sample(run, 0, key(1, 5)), Verdict::Repeated);
-    assert_eq!(incoming.on_sample(run - 1, 1, key(1, 6)), Verdict::Stale);
-    assert_eq!(incoming.on_sample(run, 2, key(1, 7)), Verdict::Gap);
+    assert_eq!(incoming.on_sample(run, 0, key(1, 5)), Admission::Repeated);
+    assert_eq!(incoming.on_sample(run - 1, 1, key(1, 6)), Admission::Stale);
+    assert_eq!(incoming.on_sample(run, 2, key(1, 7)), Admission::Gap);
     assert_eq!(incoming.resume_to_send(0), Some((run + 1, Some(key(1, 5)))));
-    assert_eq!(incoming.on_sample(run, 1, key(1, 6)), Verdict::Stale);
+    assert_eq!(incoming.on_sample(run, 1, key(1, 6)), Admission::Stale);
     assert!(!incoming.on_end(run) && !incoming.has_ended());
     assert!(incoming.on_end(run + 1) && incoming.has_ended());
     incoming.cut_off();
-    assert_eq!(incoming.on_sample(run + 1, 0, key(1, 6)), Verdict::Stale);
+    assert_eq!(incoming.on_sample(run + 1, 0, key(1, 6)), Admission::Stale);
     let status = incoming.status("a/b");
     assert_eq!((status.n_samples, status.n_repeated, status.n_lost, incoming.n_stale()), (1, 1, 0, 3));
 }
@@ -540,7 +540,7 @@ fn a_restarted_receiver_rejects_samples_for_an_earlier_process() {
     let (run, _) = first.resume_to_send(0).expect("asked");
     let mut second = Incoming::new(EdgePolicy::Lossless, 0xdead_beef_1234_5678, None);
     second.reconnected();
-    assert_eq!(second.on_sample(run, 0, key(1, 0)), Verdict::Stale);
+    assert_eq!(second.on_sample(run, 0, key(1, 0)), Admission::Stale);
 }
 
 #[test]

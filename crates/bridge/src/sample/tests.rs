@@ -183,7 +183,7 @@ fn what_cannot_be_is_refused_on_both_ends() {
 fn schema_numbers_tell_types_apart_and_stay_as_they_are() {
     // A change here means: machines with the version before refuse each other. A type's name changes then, too.
     let found = MESSAGE_TYPES.map(|type_name| schema_id(type_name).expect("it can cross"));
-    assert_eq!(found, [4086326095, 3272837417, 3090473340, 381244699, 2984450275, 1162676088, 412222848]);
+    assert_eq!(found, [490395355, 2308423216, 3090473340, 381244699, 2984450275, 1162676088, 412222848]);
     let others = [GraspScene::TYPE_NAME, "blindgrasp/TactileFrame/2", ""];
     assert!(others.iter().all(|type_name| schema_id(type_name).is_none()));
 }

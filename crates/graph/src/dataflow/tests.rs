@@ -743,7 +743,7 @@ fn damaged_files_give_errors_not_panics() {
 #[test]
 fn an_input_with_a_question_mark_is_left_out_if_the_operator_has_none() {
     let folder = Folder::new();
-    let nodes = "  source:\n    inputs: {veto?: filter/out}\n  filter:\n    inputs: {in?: source/tactile}\n";
+    let nodes = "  source:\n    params: {recording: recordings/a.mcap}\n    inputs: {veto?: filter/out}\n  filter:\n    inputs: {in?: source/tactile}\n";
     let yaml = |nodes: &str| format!("version: 1\nname: g\noperators:\n{nodes}");
     let graph = folder.check(yaml(nodes)).expect("a graph");
     let edges: Vec<String> = graph.edges().map(|edge| format!("{} -> {}", edge.from_node, edge.to_node)).collect();

@@ -34,7 +34,7 @@ const ENOUGH_FILES: u64 = 1024;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Finding {
     pub check: String,
-    pub verdict: Verdict,
+    pub verdict: Fitness,
     pub found: String,
     pub advice: Option<String>,
     /// Of the checks that measure how late threads wake up.
@@ -52,26 +52,26 @@ pub enum Measurement {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Verdict {
+pub enum Fitness {
     Ok,
     /// A graph runs, but maybe with delays.
     Warning,
     Failure,
 }
 
-impl fmt::Display for Verdict {
+impl fmt::Display for Fitness {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.pad(match self {
-            Verdict::Ok => "ok",
-            Verdict::Warning => "warning",
-            Verdict::Failure => "FAILURE",
+            Fitness::Ok => "ok",
+            Fitness::Warning => "warning",
+            Fitness::Failure => "FAILURE",
         })
     }
 }
 
 impl Finding {
     fn ok(check: &str, found: impl Into<String>) -> Self {
-        Finding { check: check.into(), verdict: Verdict::Ok, found: found.into(), advice: None, wake_ups: None }
+        Finding { check: check.into(), verdict: Fitness::Ok, found: found.into(), advice: None, wake_ups: None }
     }
 
     fn with_advice(self, advice: impl Into<String>) -> Self {
@@ -79,11 +79,11 @@ impl Finding {
     }
 
     fn warning(check: &str, found: impl Into<String>, advice: impl Into<String>) -> Self {
-        Finding { verdict: Verdict::Warning, ..Finding::ok(check, found).with_advice(advice) }
+        Finding { verdict: Fitness::Warning, ..Finding::ok(check, found).with_advice(advice) }
     }
 
     fn failure(check: &str, found: impl Into<String>, advice: impl Into<String>) -> Self {
-        Finding { verdict: Verdict::Failure, ..Finding::warning(check, found, advice) }
+        Finding { verdict: Fitness::Failure, ..Finding::warning(check, found, advice) }
     }
 }
 
@@ -257,7 +257,7 @@ fn wake_ups((normal, fifo): (Option<WakeUps>, Option<WakeUps>)) -> [Finding; 2] 
         Some(measured) if measured.idle.p99_us > LATE_WAKE_US => {
             let advice = "something else keeps the cores busy: a replay may need a larger max_age_ms of the lift_arbiter, a \
                           robot a quieter machine";
-            Finding { verdict: Verdict::Warning, ..real_time::wake_ups(NORMAL, normal, "").with_advice(advice) }
+            Finding { verdict: Fitness::Warning, ..real_time::wake_ups(NORMAL, normal, "").with_advice(advice) }
         }
         _ => real_time::wake_ups(
             NORMAL,
@@ -327,18 +327,18 @@ mod tests {
     #[test]
     fn what_is_poor_is_said_with_what_to_do() {
         let verdict = |finding: Finding| {
-            assert_eq!(finding.verdict == Verdict::Ok, finding.advice.is_none(), "{finding:?}");
+            assert_eq!(finding.verdict == Fitness::Ok, finding.advice.is_none(), "{finding:?}");
             finding.verdict
         };
-        assert_eq!((verdict(cores(1)), verdict(cores(2))), (Verdict::Warning, Verdict::Ok));
+        assert_eq!((verdict(cores(1)), verdict(cores(2))), (Fitness::Warning, Fitness::Ok));
         let slow = Duration::from_micros(3);
-        assert_eq!(verdict(clock("hpet", slow)), Verdict::Warning);
+        assert_eq!(verdict(clock("hpet", slow)), Fitness::Warning);
         // On a busy machine a read takes long whatever the source is.
-        assert_eq!(verdict(clock("tsc", slow)), Verdict::Ok);
-        assert_eq!(verdict(clock("", Duration::from_nanos(40))), Verdict::Ok);
-        assert_eq!((verdict(files(Some(256))), verdict(files(None))), (Verdict::Warning, Verdict::Ok));
-        assert_eq!(verdict(sandbox(Enforcement::Full)), Verdict::Ok);
-        assert_eq!(verdict(sandbox(Enforcement::None)), Verdict::Warning);
+        assert_eq!(verdict(clock("tsc", slow)), Fitness::Ok);
+        assert_eq!(verdict(clock("", Duration::from_nanos(40))), Fitness::Ok);
+        assert_eq!((verdict(files(Some(256))), verdict(files(None))), (Fitness::Warning, Fitness::Ok));
+        assert_eq!(verdict(sandbox(Enforcement::Full)), Fitness::Ok);
+        assert_eq!(verdict(sandbox(Enforcement::None)), Fitness::Warning);
     }
 
     #[test]
@@ -349,10 +349,10 @@ mod tests {
             wake_ups((Some(measured), None)).map(|finding| (finding.verdict, finding.advice.unwrap_or_default()))
         };
         let [(verdict, advice), (fifo_verdict, _)] = found(LATE_WAKE_US);
-        assert_eq!((verdict, fifo_verdict), (Verdict::Ok, Verdict::Ok));
+        assert_eq!((verdict, fifo_verdict), (Fitness::Ok, Fitness::Ok));
         assert!(advice.contains("policy: fifo"), "{advice}");
         let [(verdict, advice), _] = found(LATE_WAKE_US + 1);
-        assert_eq!(verdict, Verdict::Warning);
+        assert_eq!(verdict, Fitness::Warning);
         assert!(advice.contains("a quieter machine"), "{advice}");
     }
 

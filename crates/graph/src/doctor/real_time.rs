@@ -127,12 +127,12 @@ fn isolation(isolated: &str, nohz_full: &str, n_cores: usize) -> Finding {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Lateness, Verdict};
+    use super::super::{Fitness, Lateness};
     use super::*;
 
     /// The advice; empty if there is none.
     fn advice(finding: Finding) -> String {
-        assert_eq!(finding.verdict, Verdict::Ok, "a graph runs without it: {finding:?}");
+        assert_eq!(finding.verdict, Fitness::Ok, "a graph runs without it: {finding:?}");
         let advice = finding.advice.unwrap_or_default();
         assert!(!advice.contains('\n'), "{advice}");
         advice

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use hdrhistogram::Histogram;
 
 use super::summary::{
-    OperatorPid, Ran, Summary, edges, latency, lost_to_machines, missing_from_machines, skipped_by_stages,
+    OperatorPid, Ran, RunSummary, edges, latency, lost_to_machines, missing_from_machines, skipped_by_stages,
 };
 use super::{RunSink, SeenDecision};
 use crate::client::observer::Sink;
@@ -175,7 +175,7 @@ impl<S: RunSink> RunLog<S> {
         mut self,
         ran: &Ran<'_>,
         observed: &BTreeMap<String, InputCounts>,
-    ) -> anyhow::Result<(Summary, S)> {
+    ) -> anyhow::Result<(RunSummary, S)> {
         for decision in self.decisions.values() {
             self.evaluation.add(decision, None);
         }
@@ -188,7 +188,7 @@ impl<S: RunSink> RunLog<S> {
         };
         let counts = ran.status.nodes.iter().filter(|node| !node.counts.is_empty());
         let score = &self.evaluation.score;
-        let summary = Summary {
+        let summary = RunSummary {
             graph: ran.status.graph.clone(),
             end: match ran.outcome {
                 Ok(End::Finished) => "finished",

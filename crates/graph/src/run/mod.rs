@@ -13,7 +13,7 @@ use std::sync::{Arc, Mutex};
 
 use serde_json::Value;
 
-pub use self::summary::{Latency, OperatorPid, Summary};
+pub use self::summary::{Latency, OperatorPid, RunSummary};
 
 use self::log::RunLog;
 use self::summary::Ran;
@@ -92,7 +92,7 @@ pub struct Run<'a> {
 
 /// A graph that has run.
 pub struct Ended<S> {
-    pub summary: Summary,
+    pub summary: RunSummary,
     pub sink: S,
     pub outcome: Result<End, LaunchError>,
 }

@@ -15,7 +15,7 @@ use blindgrasp_operator::wiring::{Clock, InputCounts};
 
 /// What became of a graph.
 #[derive(Debug, Clone, Serialize)]
-pub struct Summary {
+pub struct RunSummary {
     pub graph: String,
     /// `finished`, `stopped`, `degraded` or `failed`.
     pub end: &'static str,
@@ -53,7 +53,7 @@ pub struct Summary {
     pub operators: Vec<OperatorPid>,
 }
 
-impl Summary {
+impl RunSummary {
     /// Whether samples were lost or may have been, or a grasp was not decided.
     pub fn is_lossy(&self, clock: Clock) -> bool {
         // A stopped graph may know the truth of a grasp that it has not reached. A replay may be cut out of a longer

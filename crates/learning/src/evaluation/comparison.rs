@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::decisions::{DecidedGrasp, Unit, by_object, with_probability};
+use super::decisions::{JudgedGrasp, Unit, by_object, with_probability};
 use super::measures::{CurvePoint, at_recall, curve};
 use super::statistics::{Estimate, bootstrap, mcnemar_exact};
 
@@ -39,10 +39,10 @@ pub struct EqualRecall {
 }
 
 /// Compares two judges that decided the same grasps in the same order.
-pub fn compare([first, second]: [(&str, &[DecidedGrasp]); 2], unit: Unit, seed: u64) -> Comparison {
-    let pairs: Vec<(&DecidedGrasp, &DecidedGrasp)> =
+pub fn compare([first, second]: [(&str, &[JudgedGrasp]); 2], unit: Unit, seed: u64) -> Comparison {
+    let pairs: Vec<(&JudgedGrasp, &JudgedGrasp)> =
         first.1.iter().zip(second.1).filter(|(first, second)| first.judged && second.judged).collect();
-    let is_right = |grasp: &DecidedGrasp| grasp.lifted == grasp.stable;
+    let is_right = |grasp: &JudgedGrasp| grasp.lifted == grasp.stable;
     let count = |wanted: &dyn Fn(bool, bool) -> bool| {
         pairs.iter().filter(|(first, second)| wanted(is_right(first), is_right(second))).count()
     };
@@ -50,7 +50,7 @@ pub fn compare([first, second]: [(&str, &[DecidedGrasp]); 2], unit: Unit, seed: 
     let (n_first_wrong, n_second_wrong) = (count(&|a, _| !a), count(&|_, b| !b));
     let n = pairs.len();
 
-    let wrong = |grasp: &DecidedGrasp| f64::from(u8::from(!is_right(grasp)));
+    let wrong = |grasp: &JudgedGrasp| f64::from(u8::from(!is_right(grasp)));
     let clusters = clusters(&pairs, unit, |(first, second)| [1.0, wrong(first), wrong(second)]);
     let [difference, reduction] =
         bootstrap(&clusters, seed, |[n, first, second]| [(second - first) / n, 1.0 - first / second]);
@@ -70,12 +70,12 @@ pub fn compare([first, second]: [(&str, &[DecidedGrasp]); 2], unit: Unit, seed: 
     }
 }
 
-fn equal_recall(pairs: &[(&DecidedGrasp, &DecidedGrasp)], unit: Unit, seed: u64) -> Option<EqualRecall> {
-    let curve_of = |grasps: Vec<&DecidedGrasp>| {
+fn equal_recall(pairs: &[(&JudgedGrasp, &JudgedGrasp)], unit: Unit, seed: u64) -> Option<EqualRecall> {
+    let curve_of = |grasps: Vec<&JudgedGrasp>| {
         let (probabilities, stable) = with_probability(&grasps);
         curve(&probabilities, &stable)
     };
-    let second_grasps: Vec<&DecidedGrasp> = pairs.iter().map(|(_, second)| *second).collect();
+    let second_grasps: Vec<&JudgedGrasp> = pairs.iter().map(|(_, second)| *second).collect();
     let n_stable = second_grasps.iter().filter(|grasp| grasp.stable).count();
     let n_lifted = second_grasps.iter().filter(|grasp| grasp.stable && grasp.lifted).count();
     if n_lifted == 0 {
@@ -83,10 +83,10 @@ fn equal_recall(pairs: &[(&DecidedGrasp, &DecidedGrasp)], unit: Unit, seed: u64)
     }
     let second = at_recall(&curve_of(second_grasps), n_lifted as f64 / n_stable as f64)?;
     let first = at_recall(&curve_of(pairs.iter().map(|(first, _)| *first).collect()), second.recall)?;
-    let dropped = |grasp: &DecidedGrasp, threshold: f64| {
+    let dropped = |grasp: &JudgedGrasp, threshold: f64| {
         f64::from(u8::from(!grasp.stable && grasp.probability.is_some_and(|probability| probability >= threshold)))
     };
-    let of_pair = |(a, b): (&DecidedGrasp, &DecidedGrasp)| [dropped(a, first.threshold), dropped(b, second.threshold)];
+    let of_pair = |(a, b): (&JudgedGrasp, &JudgedGrasp)| [dropped(a, first.threshold), dropped(b, second.threshold)];
     let [interval] = bootstrap(&clusters(pairs, unit, of_pair), seed, |[first, second]| [1.0 - first / second]);
     let relative_reduction = (second.n_false_positive > 0)
         .then(|| Estimate { value: 1.0 - first.n_false_positive as f64 / second.n_false_positive as f64, interval });
@@ -95,14 +95,14 @@ fn equal_recall(pairs: &[(&DecidedGrasp, &DecidedGrasp)], unit: Unit, seed: u64)
 
 /// Values of pairs, summed by the unit that a bootstrap draws.
 fn clusters<'a, const K: usize>(
-    pairs: &[(&'a DecidedGrasp, &'a DecidedGrasp)],
+    pairs: &[(&'a JudgedGrasp, &'a JudgedGrasp)],
     unit: Unit,
-    of_pair: impl Fn((&'a DecidedGrasp, &'a DecidedGrasp)) -> [f64; K],
+    of_pair: impl Fn((&'a JudgedGrasp, &'a JudgedGrasp)) -> [f64; K],
 ) -> Vec<[f64; K]> {
     match unit {
         Unit::Grasp => pairs.iter().copied().map(of_pair).collect(),
         Unit::Object => {
-            let firsts: Vec<&DecidedGrasp> = pairs.iter().map(|(first, _)| *first).collect();
+            let firsts: Vec<&JudgedGrasp> = pairs.iter().map(|(first, _)| *first).collect();
             let place_of: std::collections::BTreeMap<&str, usize> =
                 by_object(&firsts).into_keys().enumerate().map(|(place, object)| (object, place)).collect();
             let mut sums = vec![[0.0; K]; place_of.len()];

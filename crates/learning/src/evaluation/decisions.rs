@@ -10,7 +10,7 @@ use super::statistics::{Estimate, Interval, bootstrap, wilson_interval};
 
 /// A labelled grasp and the decision on it.
 #[derive(Debug, Clone, PartialEq)]
-pub struct DecidedGrasp {
+pub struct JudgedGrasp {
     pub object: String,
     pub class: String,
     pub stable: bool,
@@ -70,7 +70,7 @@ pub struct ClassErrors {
 
 /// A recipe or a model, and its figures.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Judge {
+pub struct JudgedRecipe {
     /// The recipe's name, or the model's file.
     pub name: String,
     /// Its features and its learner.
@@ -92,20 +92,20 @@ pub struct Judge {
     pub reliability: Option<Reliability>,
 }
 
-impl Judge {
+impl JudgedRecipe {
     /// Computes the figures. Curves and reliability are over the grasps with a probability.
     pub fn new(
         name: &str,
         about: String,
         threshold_probability: f64,
-        decided: &[DecidedGrasp],
+        decided: &[JudgedGrasp],
         unit: Unit,
         seed: u64,
-    ) -> Judge {
-        let judged: Vec<&DecidedGrasp> = decided.iter().filter(|grasp| grasp.judged).collect();
+    ) -> JudgedRecipe {
+        let judged: Vec<&JudgedGrasp> = decided.iter().filter(|grasp| grasp.judged).collect();
         let (probabilities, stable) = with_probability(&judged);
         let curve = curve(&probabilities, &stable);
-        Judge {
+        JudgedRecipe {
             name: name.into(),
             about,
             threshold_probability,
@@ -124,11 +124,11 @@ impl Judge {
 const CURVE_STEP: f64 = 0.005;
 
 /// The probabilities and labels of the grasps that have a probability.
-pub(super) fn with_probability(grasps: &[&DecidedGrasp]) -> (Vec<f64>, Vec<bool>) {
+pub(super) fn with_probability(grasps: &[&JudgedGrasp]) -> (Vec<f64>, Vec<bool>) {
     grasps.iter().filter_map(|grasp| Some((grasp.probability?, grasp.stable))).unzip()
 }
 
-pub fn measure(grasps: &[&DecidedGrasp], unit: Unit, seed: u64) -> Measures {
+pub fn measure(grasps: &[&JudgedGrasp], unit: Unit, seed: u64) -> Measures {
     const SHARES: [Share; 5] =
         [Share::Accuracy, Share::Precision, Share::Recall, Share::FalsePositiveShare, Share::FalsePositiveRate];
     let counts = Counts::of(grasps.iter().map(|grasp| (grasp.lifted, grasp.stable)));
@@ -168,15 +168,15 @@ pub fn measure(grasps: &[&DecidedGrasp], unit: Unit, seed: u64) -> Measures {
 }
 
 /// Grasps by their objects.
-pub(super) fn by_object<'a>(grasps: &[&'a DecidedGrasp]) -> BTreeMap<&'a str, Vec<&'a DecidedGrasp>> {
-    let mut objects: BTreeMap<&str, Vec<&DecidedGrasp>> = BTreeMap::new();
+pub(super) fn by_object<'a>(grasps: &[&'a JudgedGrasp]) -> BTreeMap<&'a str, Vec<&'a JudgedGrasp>> {
+    let mut objects: BTreeMap<&str, Vec<&JudgedGrasp>> = BTreeMap::new();
     for grasp in grasps {
         objects.entry(&grasp.object).or_default().push(grasp);
     }
     objects
 }
 
-fn by_class(grasps: &[&DecidedGrasp]) -> Vec<ClassErrors> {
+fn by_class(grasps: &[&JudgedGrasp]) -> Vec<ClassErrors> {
     let mut classes: BTreeMap<&str, Counts> = BTreeMap::new();
     for grasp in grasps {
         classes.entry(&grasp.class).or_default().add(grasp.lifted, grasp.stable);
@@ -201,8 +201,8 @@ pub(super) mod tests {
         object: &str,
         class: &str,
         grasps: &[(bool, Option<f64>)],
-    ) -> Vec<DecidedGrasp> {
-        let decided = |(stable, probability): &(bool, Option<f64>)| DecidedGrasp {
+    ) -> Vec<JudgedGrasp> {
+        let decided = |(stable, probability): &(bool, Option<f64>)| JudgedGrasp {
             object: object.into(),
             class: class.into(),
             stable: *stable,
@@ -217,7 +217,7 @@ pub(super) mod tests {
     fn what_was_held_unjudged_counts_among_all_only() {
         let mut grasps = decided("a", "x", &[(true, Some(0.9)), (false, Some(0.7)), (true, None), (false, None)]);
         grasps.extend(decided("b", "y", &[(true, Some(0.2)), (false, Some(0.1))]));
-        let judge = Judge::new("j", String::new(), 0.5, &grasps, Unit::Grasp, 1);
+        let judge = JudgedRecipe::new("j", String::new(), 0.5, &grasps, Unit::Grasp, 1);
         let counts = |measures: &Measures| (measures.n_grasps, measures.counts.n_wrong(), measures.n_objects);
         assert_eq!((counts(&judge.judged), counts(&judge.all)), ((4, 2, 2), (6, 3, 2)));
         assert_eq!(judge.judged.accuracy.expect("some").value, 0.5);

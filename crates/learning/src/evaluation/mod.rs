@@ -31,7 +31,7 @@ pub use blindgrasp_messages::score::{Evaluation, Score};
 use blindgrasp_messages::{Action, GraspTruth, Header, LiftDecision, Phase, Prediction, Reason, Stamped, TactileFrame};
 use blindgrasp_stages::training_summary::ReadingId;
 use blindgrasp_stages::{ArbiterOptions, Hand, Judge, Model};
-use decisions::DecidedGrasp;
+use decisions::JudgedGrasp;
 use split::SplitError;
 
 #[derive(Debug, thiserror::Error)]
@@ -52,7 +52,7 @@ pub enum EvaluationError {
 pub struct Evaluated {
     pub evaluation: Evaluation,
     /// The labelled grasps in order.
-    pub decided: Vec<DecidedGrasp>,
+    pub decided: Vec<JudgedGrasp>,
     /// `None` if the model does not name its training grasps.
     pub trained: Option<Trained>,
 }
@@ -142,10 +142,10 @@ pub fn decide_frames(judge: &mut Judge, frames: &[Stamped<TactileFrame>]) -> Vec
     decisions
 }
 
-fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> DecidedGrasp {
+fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> JudgedGrasp {
     // Without agreement of the votes, no single probability decided.
     let has_probability = is_judged(decision.reason) && decision.reason != Reason::NoAgreement;
-    DecidedGrasp {
+    JudgedGrasp {
         object: truth.object,
         class: truth.class,
         stable: truth.stable,

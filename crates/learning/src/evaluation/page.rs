@@ -3,7 +3,7 @@
 use std::fmt::Write;
 
 use super::comparison::Comparison;
-use super::decisions::{Judge, Measures};
+use super::decisions::{JudgedRecipe, Measures};
 use super::measures::at_recall;
 use super::report::{LearningPoint, Report, TableRow};
 use super::split::Split;
@@ -210,7 +210,7 @@ fn table_1(report: &Report) -> String {
 }
 
 fn measures_table(report: &Report) -> String {
-    let row = |judge: &Judge, name: &str, m: &Measures, of_curve: bool| {
+    let row = |judge: &JudgedRecipe, name: &str, m: &Measures, of_curve: bool| {
         let curve = |value: Option<f64>| if of_curve { decimals(value) } else { "–".into() };
         let reliability = judge.reliability.as_ref();
         vec![
@@ -456,7 +456,7 @@ fn guide(points: Vec<[f64; 2]>) -> Series {
 }
 
 /// Each judge with its colour.
-fn coloured(report: &Report) -> impl Iterator<Item = (&Judge, &'static str)> {
+fn coloured(report: &Report) -> impl Iterator<Item = (&JudgedRecipe, &'static str)> {
     report.judges.iter().zip(COLOURS.into_iter().cycle())
 }
 
@@ -593,7 +593,7 @@ fn learning_curve(report: &Report, what: &str, of: &dyn Fn(&LearningPoint) -> Op
 fn figure_2(report: &Report) -> Vec<BarChart> {
     let highest =
         range_from_zero(report.judges.iter().flat_map(|judge| &judge.by_class).map(|class| class.error_share));
-    let chart = |judge: &Judge| BarChart {
+    let chart = |judge: &JudgedRecipe| BarChart {
         title: format!("Figure 2: errors and false positives by class, {}", judge.name),
         size: [FULL_WIDTH, 330.0],
         y: percent_axis("share of the class's grasps (%)", highest),

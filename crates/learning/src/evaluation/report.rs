@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::comparison::{Comparison, compare};
 use super::cross_validation::{HeldOut, HeldOutOptions, N_INNER_FOLDS, Word, used_words};
-use super::decisions::{DecidedGrasp, Judge, Unit, measure};
+use super::decisions::{JudgedGrasp, JudgedRecipe, Unit, measure};
 use super::looks::{Look, looks};
 use super::split::Split;
 use super::statistics::{Estimate, N_RESAMPLES};
@@ -33,7 +33,7 @@ pub struct Report {
     /// The paper's Table I, and the same rows for these data.
     pub table_1: Vec<TableRow>,
     /// The recipes, or the model.
-    pub judges: Vec<Judge>,
+    pub judges: Vec<JudgedRecipe>,
     /// Each pair of recipes.
     pub comparisons: Vec<Comparison>,
     /// The same with other folds, if repeats were asked for. All other figures are of the first repeat.
@@ -168,7 +168,7 @@ pub const THRESHOLD_PROBABILITY: f64 = 0.5;
 pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptions, held_out: &HeldOut) -> Report {
     let unit = if options.split == Split::Grasp { Unit::Grasp } else { Unit::Object };
     let threshold = THRESHOLD_PROBABILITY;
-    let decide = |example: &Example, probability: f64| DecidedGrasp {
+    let decide = |example: &Example, probability: f64| JudgedGrasp {
         object: example.object.clone(),
         class: example.class.clone(),
         stable: example.stable,
@@ -176,10 +176,10 @@ pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptio
         judged: true,
         probability: Some(probability),
     };
-    let unfelt: Vec<DecidedGrasp> = read
+    let unfelt: Vec<JudgedGrasp> = read
         .unfelt
         .iter()
-        .map(|(object, class, stable)| DecidedGrasp {
+        .map(|(object, class, stable)| JudgedGrasp {
             object: object.clone(),
             class: class.clone(),
             stable: *stable,
@@ -190,7 +190,7 @@ pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptio
         .collect();
     let names: Vec<&str> = options.recipes.iter().map(|recipe| recipe.name.as_str()).collect();
     // The decisions of each repeat and recipe; the judged grasps come first.
-    let decided: Vec<Vec<Vec<DecidedGrasp>>> = held_out
+    let decided: Vec<Vec<Vec<JudgedGrasp>>> = held_out
         .repeats
         .iter()
         .map(|repeat| {
@@ -202,12 +202,12 @@ pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptio
         })
         .collect();
     let main = decided.first().map_or(&[][..], Vec::as_slice);
-    let judge = |(recipe, decided): (&Recipe, &Vec<DecidedGrasp>)| {
-        Judge::new(&recipe.name, about(recipe), threshold, decided, unit, options.seed)
+    let judge = |(recipe, decided): (&Recipe, &Vec<JudgedGrasp>)| {
+        JudgedRecipe::new(&recipe.name, about(recipe), threshold, decided, unit, options.seed)
     };
-    let judges: Vec<Judge> = options.recipes.iter().zip(main).map(judge).collect();
+    let judges: Vec<JudgedRecipe> = options.recipes.iter().zip(main).map(judge).collect();
     let pairs = || (0..names.len()).flat_map(|first| (first + 1..names.len()).map(move |second| (first, second)));
-    let paired = |of: &[Vec<DecidedGrasp>], (first, second): (usize, usize)| {
+    let paired = |of: &[Vec<JudgedGrasp>], (first, second): (usize, usize)| {
         compare([(names[first], &of[first]), (names[second], &of[second])], unit, options.seed)
     };
     let n_examples = read.examples.len() as f64;
@@ -251,7 +251,7 @@ pub fn report_on_model(origin: Origin, name: &str, model: &Model, evaluated: Eva
     let unit = Unit::Object;
     let recipe = &training.recipe;
     let about = format!("{}: {}", about(recipe), model.classifier.predictor.summary());
-    let judge = Judge::new(name, about, model.classifier.threshold_probability, &decided, unit, training.seed);
+    let judge = JudgedRecipe::new(name, about, model.classifier.threshold_probability, &decided, unit, training.seed);
     let without_truth = (graph.n_without_truth > 0).then(|| ("no truth".to_string(), graph.n_without_truth));
     let judges = vec![judge];
     Report {
@@ -319,9 +319,9 @@ fn made(origin: Origin, read: &Examples, unit: Unit, options: Option<&HeldOutOpt
     }
 }
 
-fn data(decided: &[DecidedGrasp], n_excluded: BTreeMap<String, usize>) -> Data {
-    let distinct = |of: fn(&DecidedGrasp) -> &String| decided.iter().map(of).collect::<BTreeSet<_>>().len();
-    let count = |wanted: fn(&DecidedGrasp) -> bool| decided.iter().filter(|grasp| wanted(grasp)).count();
+fn data(decided: &[JudgedGrasp], n_excluded: BTreeMap<String, usize>) -> Data {
+    let distinct = |of: fn(&JudgedGrasp) -> &String| decided.iter().map(of).collect::<BTreeSet<_>>().len();
+    let count = |wanted: fn(&JudgedGrasp) -> bool| decided.iter().filter(|grasp| wanted(grasp)).count();
     Data {
         n_grasps: decided.len(),
         n_stable: count(|grasp| grasp.stable),
@@ -349,7 +349,7 @@ fn row(data_set: String, [n_grasps, n_stable]: [f64; 2]) -> TableRow {
 }
 
 /// The paper's rows, then the rows of these data.
-fn table_1(training: TableRow, judges: &[Judge]) -> Vec<TableRow> {
+fn table_1(training: TableRow, judges: &[JudgedRecipe]) -> Vec<TableRow> {
     let exactly = |value| Some(Estimate { value, interval: None });
     let paper = |data_set: &str, numbers| TableRow { of_paper: true, ..row(data_set.into(), numbers) };
     let mut rows = vec![
@@ -375,13 +375,13 @@ fn table_1(training: TableRow, judges: &[Judge]) -> Vec<TableRow> {
     rows
 }
 
-fn repeats(held_out: &HeldOut, names: &[&str], decided: &[Vec<Vec<DecidedGrasp>>]) -> Vec<RepeatSummary> {
+fn repeats(held_out: &HeldOut, names: &[&str], decided: &[Vec<Vec<JudgedGrasp>>]) -> Vec<RepeatSummary> {
     use super::measures::{Counts, Share};
     if decided.len() < 2 {
         return Vec::new();
     }
-    let of_recipes = |of: &[Vec<DecidedGrasp>], share: Share| -> BTreeMap<String, f64> {
-        let of_recipe = |(name, decided): (&&str, &Vec<DecidedGrasp>)| {
+    let of_recipes = |of: &[Vec<JudgedGrasp>], share: Share| -> BTreeMap<String, f64> {
+        let of_recipe = |(name, decided): (&&str, &Vec<JudgedGrasp>)| {
             let judged = decided.iter().filter(|grasp| grasp.judged);
             let counts = Counts::of(judged.map(|grasp| (grasp.lifted, grasp.stable)));
             Some(((*name).to_string(), counts.share(share)?))
@@ -419,11 +419,11 @@ fn learning_curve(
     held_out: &HeldOut,
     read: &Examples,
     options: &HeldOutOptions,
-    decide: &dyn Fn(&Example, f64) -> DecidedGrasp,
+    decide: &dyn Fn(&Example, f64) -> JudgedGrasp,
     unit: Unit,
 ) -> Vec<LearningPoint> {
     let point = |step: &super::cross_validation::LearningStep| {
-        let decided: Vec<DecidedGrasp> =
+        let decided: Vec<JudgedGrasp> =
             step.judged.iter().flatten().map(|(idx, probability)| decide(&read.examples[*idx], *probability)).collect();
         let measures = measure(&decided.iter().collect::<Vec<_>>(), unit, options.seed);
         LearningPoint {

@@ -11,7 +11,7 @@ use blindgrasp_messages::Phase;
 pub(super) struct Grasps {
     by_name: bool,
     /// The grasp whose rows are being read, with its name; `None` in the place of one with a bad row.
-    open: Option<(String, Option<Grasp>)>,
+    open: Option<(String, Option<TableGrasp>)>,
     /// The names of earlier grasps.
     closed: BTreeSet<String>,
     /// Whether the row before has no name that can be read: it may be the first one of the next grasp.
@@ -34,9 +34,9 @@ impl Grasps {
     /// A grasp whose rows do not follow each other.
     pub(super) fn add(
         &mut self,
-        (name, row): (Option<String>, Result<Grasp, BadRow>),
+        (name, row): (Option<String>, Result<TableGrasp, BadRow>),
         line: u64,
-    ) -> Result<Option<Grasp>, String> {
+    ) -> Result<Option<TableGrasp>, String> {
         if let Ok(grasp) = &row {
             self.first_lines.entry(grasp.label.clone()).or_insert(line);
         }
@@ -71,7 +71,7 @@ impl Grasps {
     }
 
     /// The open grasp, if it is complete.
-    pub(super) fn close(&mut self) -> Option<Grasp> {
+    pub(super) fn close(&mut self) -> Option<TableGrasp> {
         let (name, grasp) = self.open.take()?;
         let grasp = grasp.filter(|grasp| {
             let has_settled = grasp.readings.iter().any(|reading| reading.phase == Phase::Settled);
@@ -87,11 +87,11 @@ impl Grasps {
 }
 
 /// A grasp of the table.
-pub(super) struct Grasp {
+pub(super) struct TableGrasp {
     /// The line of its first row.
     pub(super) line: u64,
     /// Of each row.
-    pub(super) readings: Vec<Reading>,
+    pub(super) readings: Vec<TableReading>,
     pub(super) label: String,
     pub(super) stable: bool,
     pub(super) object: String,
@@ -101,17 +101,17 @@ pub(super) struct Grasp {
 }
 
 /// A row's reading.
-pub(super) struct Reading {
+pub(super) struct TableReading {
     pub(super) phase: Phase,
     pub(super) cells: Vec<f64>,
     pub(super) joints: Vec<f64>,
 }
 
-impl Grasp {
+impl TableGrasp {
     /// The grasp with the frames of its next row; an error if they do not fit together.
-    fn followed_by(mut self, next: Grasp) -> Result<Grasp, String> {
+    fn followed_by(mut self, next: TableGrasp) -> Result<TableGrasp, String> {
         let first = self.line;
-        let day = |grasp: &Grasp| grasp.day.as_ref().map(|(name, _)| name.clone()).unwrap_or_default();
+        let day = |grasp: &TableGrasp| grasp.day.as_ref().map(|(name, _)| name.clone()).unwrap_or_default();
         for (what, ours, theirs) in [
             ("label", &self.label, &next.label),
             ("object", &self.object, &next.object),
@@ -123,7 +123,7 @@ impl Grasp {
                 return Err(format!("{what} '{theirs}', but '{ours}' in line {first} of the same grasp"));
             }
         }
-        let phase = |grasp: &Grasp| grasp.readings.last().map(|reading| reading.phase);
+        let phase = |grasp: &TableGrasp| grasp.readings.last().map(|reading| reading.phase);
         if let (Some(before), Some(after)) = (phase(&self), phase(&next))
             && after.is_before(before)
         {

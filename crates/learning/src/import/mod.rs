@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use self::columns::{Columns, shortened};
-use self::grasps::{Grasp, Grasps, Reading};
+use self::grasps::{Grasps, TableGrasp, TableReading};
 use self::lines::Lines;
 use blindgrasp_messages::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::{RecordingError, RecordingInfo, RecordingWriter};
@@ -237,7 +237,7 @@ struct RowReader<'a> {
 }
 
 impl RowReader<'_> {
-    fn read(&self, record: &csv::StringRecord, line: u64) -> Result<Grasp, String> {
+    fn read(&self, record: &csv::StringRecord, line: u64) -> Result<TableGrasp, String> {
         let options = self.options;
         let label = &record[self.columns.label];
         if label.is_empty() {
@@ -268,9 +268,9 @@ impl RowReader<'_> {
         if let Some(idx) = self.columns.grasp.filter(|idx| record[*idx].is_empty()) {
             return Err(format!("column '{}': expected the name of a grasp, found nothing", self.header[idx]));
         }
-        let (readings, label) = (vec![Reading { phase, cells, joints }], label.to_string());
+        let (readings, label) = (vec![TableReading { phase, cells, joints }], label.to_string());
         let stable = label == options.stable_value;
-        Ok(Grasp { line, readings, label, stable, object, class, day })
+        Ok(TableGrasp { line, readings, label, stable, object, class, day })
     }
 
     fn name(&self, record: &csv::StringRecord, idx: usize) -> Result<String, String> {
@@ -333,7 +333,7 @@ impl RowReader<'_> {
 }
 
 impl ImportReport {
-    fn count(&mut self, grasp: &Grasp) {
+    fn count(&mut self, grasp: &TableGrasp) {
         if let Some((name, day)) = &grasp.day {
             self.days.entry(name.clone()).or_insert(DayReport { day: *day, n_grasps: 0 }).n_grasps += 1;
         }
@@ -378,7 +378,7 @@ impl GraspWriter {
         })
     }
 
-    fn write(&mut self, grasp: Grasp) -> Result<(), RecordingError> {
+    fn write(&mut self, grasp: TableGrasp) -> Result<(), RecordingError> {
         let truth = GraspTruth {
             grasp_id: self.grasp_id,
             epsilon: f64::NAN,
@@ -390,7 +390,7 @@ impl GraspWriter {
         let header = Header { seq: self.n_grasps, ..self.header };
         self.recording.write(GraspTruth::TOPIC, &Stamped { header, message: truth })?;
         let day = grasp.day.map_or(0, |(_, day)| day);
-        for Reading { phase, cells: cells_newtons, joints } in grasp.readings {
+        for TableReading { phase, cells: cells_newtons, joints } in grasp.readings {
             let message =
                 TactileFrame { grasp_id: self.grasp_id, phase, joints, cells_newtons, day, ..TactileFrame::default() };
             let mut sample = Stamped { header: self.header, message };

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use blindgrasp_stages::encoder::{FeatureExtractor, Reading};
+use blindgrasp_stages::encoder::{FeatureExtractor, FeltReading};
 use blindgrasp_stages::out_of_distribution::{Limits, TrainingRange, for_each_quantity, quantity_names};
 
 /// Share of the grasps of new objects that the margin flags. A flagged grasp is held. That costs one lift in 200, which
@@ -13,12 +13,12 @@ pub const FALSE_ALARM_SHARE: f64 = 0.005;
 /// Learns limits from grasps, so that at most the share [`FALSE_ALARM_SHARE`] of a fold's
 /// grasps is outside the range of all other folds. All grasps of an object should be in one fold. Grasps without a
 /// feature are ignored.
-pub fn learn_training_range(features: &FeatureExtractor, grasps: &[Reading<'_>], folds: &[usize]) -> TrainingRange {
+pub fn learn_training_range(features: &FeatureExtractor, grasps: &[FeltReading<'_>], folds: &[usize]) -> TrainingRange {
     let names = quantity_names(features);
     let mut values = Vec::new();
     let mut rows: Vec<(usize, Vec<f64>)> = Vec::new();
     for (reading, fold) in grasps.iter().zip(folds) {
-        let Reading { joints, contacts, .. } = *reading;
+        let FeltReading { joints, contacts, .. } = *reading;
         if features.extract(reading, &mut values).is_ok() {
             let mut row = Vec::with_capacity(names.len());
             for_each_quantity(features, joints, contacts, |quantity| row.push(quantity));
@@ -122,7 +122,8 @@ mod tests {
 
     fn range(features: &FeatureExtractor) -> TrainingRange {
         let grasps = grasps();
-        let views: Vec<Reading<'_>> = grasps.iter().map(|(joints, contacts)| Reading::new(joints, contacts)).collect();
+        let views: Vec<FeltReading<'_>> =
+            grasps.iter().map(|(joints, contacts)| FeltReading::new(joints, contacts)).collect();
         let folds: Vec<usize> = (0..200).map(|idx| idx / 2 % 5).collect();
         learn_training_range(features, &views, &folds)
     }

@@ -11,7 +11,7 @@ use blindgrasp_messages::{Contact, Fault, GraspTruth, OwnedSenses, Phase, Stampe
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use blindgrasp_stages::contacts::contacts_from_frame;
-use blindgrasp_stages::encoder::{Reading, wrist_values};
+use blindgrasp_stages::encoder::{FeltReading, wrist_values};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::training_summary::{ReadingId, TrainedOn};
@@ -81,8 +81,8 @@ impl Felt {
         Felt { joints: message.joints.clone(), contacts, senses: message.senses.clone() }
     }
 
-    pub fn reading(&self) -> Reading<'_> {
-        Reading { joints: &self.joints, contacts: &self.contacts, senses: self.senses.view() }
+    pub fn reading(&self) -> FeltReading<'_> {
+        FeltReading { joints: &self.joints, contacts: &self.contacts, senses: self.senses.view() }
     }
 }
 
@@ -305,8 +305,8 @@ impl Examples {
 
 impl Example {
     /// The settled frame.
-    pub fn reading(&self) -> Reading<'_> {
-        Reading { joints: &self.joints, contacts: &self.contacts, senses: self.senses.view() }
+    pub fn reading(&self) -> FeltReading<'_> {
+        FeltReading { joints: &self.joints, contacts: &self.contacts, senses: self.senses.view() }
     }
 
     /// Whether the grasp is stable, for each friction coefficient if there are several.

@@ -37,7 +37,7 @@ use blindgrasp_stages::classifier::boosting::BoostingError;
 use blindgrasp_stages::classifier::calibration::PlattCalibration;
 use blindgrasp_stages::classifier::svm::SvmError;
 use blindgrasp_stages::classifier::{Blend, Classifier, Predictor};
-use blindgrasp_stages::encoder::{FeatureExtractor, Reading, Scaling};
+use blindgrasp_stages::encoder::{FeatureExtractor, FeltReading, Scaling};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::{FORMAT, Model, ModelHand};
@@ -485,7 +485,7 @@ fn out_of_fold_probabilities(judged: &OutOfFold<'_>) -> Result<Vec<f64>, PlattEr
 }
 
 /// The settled frames of the examples.
-fn readings<'a>(examples: &[&'a Example]) -> Vec<Reading<'a>> {
+fn readings<'a>(examples: &[&'a Example]) -> Vec<FeltReading<'a>> {
     examples.iter().map(|example| example.reading()).collect()
 }
 

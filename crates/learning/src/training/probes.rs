@@ -17,7 +17,7 @@ use crate::promise::{ObjectTrials, promise};
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::boosting::BoostingParams;
 use blindgrasp_stages::classifier::{Classifier, Predictor};
-use blindgrasp_stages::encoder::{Block, FeatureExtractor, Reading};
+use blindgrasp_stages::encoder::{Block, FeatureExtractor, FeltReading};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::probe::{GraspHistory, ProbeModel, n_values, signals};
 use blindgrasp_stages::recipe::{Learner, Recipe};
@@ -110,7 +110,7 @@ pub(super) fn learn(
     for (idx, probability) in kept_idxs.iter().zip(&judged) {
         probabilities[*idx] = Some(*probability);
     }
-    let readings: Vec<Reading<'_>> =
+    let readings: Vec<FeltReading<'_>> =
         kept.examples.iter().filter_map(|example| felt(phase, example)).map(Felt::reading).collect();
     let probe = ProbeModel {
         classifier: Classifier {
@@ -145,7 +145,7 @@ pub(crate) fn composed(features: &FeatureExtractor, phase: Phase, example: &Exam
         }
     };
     let [squeezing, test_lifting] = &example.moving;
-    let mut extract = |reading: &Reading<'_>| {
+    let mut extract = |reading: &FeltReading<'_>| {
         let _ = features.extract(reading, &mut values);
         values.clone()
     };

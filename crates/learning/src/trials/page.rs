@@ -10,7 +10,7 @@ use super::tables::{Table, TrialsReport, tables};
 use super::tally::TrialRecord;
 use blindgrasp_pictures::{PictureError, PosedScene, ReportPage, escape, posed_scene_images};
 use blindgrasp_simulator::trial::{
-    Attempt, LiftTarget, Probe, Snapshot, TrialError, TrialOptions, choose_start, sensor_seed,
+    Attempt, LiftTarget, ProbeMove, Snapshot, TrialError, TrialOptions, choose_start, sensor_seed,
 };
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
@@ -105,7 +105,7 @@ pub struct Made<'a> {
     /// It chose among approaches.
     pub prior: Option<&'a ApproachPrior>,
     /// The probe of attempts that had one.
-    pub probe: Option<Probe>,
+    pub probe: Option<ProbeMove>,
 }
 
 /// Simulates an attempt again and draws its lift, or the settled grasp if it was not lifted.

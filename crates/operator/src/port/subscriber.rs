@@ -12,7 +12,7 @@ use super::service::{self, PubSub};
 use super::{Place, PortError, PortSample, sample_id};
 use crate::cursors::{SampleId, SharedCursors};
 use crate::monotonic_nanos;
-use crate::sequencer::{Sequencer, Verdict};
+use crate::sequencer::{Placing, Sequencer};
 use crate::wiring::{EdgePolicy, InputCounts, InputWiring, OnLate};
 use blindgrasp_messages::{Header, Message};
 
@@ -174,9 +174,9 @@ impl<M: Message> Subscriber<M> {
             let may_reorder = || self.pub_sub.dynamic_config().number_of_publishers() > 1;
             let sample = PortSample(Place::Lent(sample));
             match self.sequencer.push(sample, key, publisher, may_reorder, Instant::now) {
-                Verdict::Deliver(sample) => return Ok(Some(self.delivered(sample))),
-                Verdict::Hold => self.sequencer.keep_as(key, PortSample::copied),
-                Verdict::Drop => {}
+                Placing::Deliver(sample) => return Ok(Some(self.delivered(sample))),
+                Placing::Hold => self.sequencer.keep_as(key, PortSample::copied),
+                Placing::Drop => {}
             }
         }
     }

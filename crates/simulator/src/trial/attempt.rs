@@ -101,7 +101,7 @@ pub(super) struct Moment {
 
 /// What a hand does to feel more of a grasp before it decides.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub enum Probe {
+pub enum ProbeMove {
     /// It tightens to the force of a lift.
     Squeeze,
     /// It tightens, lifts by a few millimetres and rests.
@@ -221,14 +221,14 @@ impl<'a> Attempt<'a> {
     }
 
     /// Begins a probe, whose frames follow.
-    pub fn probe(&mut self, probe: Probe) {
+    pub fn probe(&mut self, probe: ProbeMove) {
         self.last_stage = match probe {
-            Probe::Squeeze => Stage::Squeezed,
-            Probe::TestLift => Stage::TestLifted,
+            ProbeMove::Squeeze => Stage::Squeezed,
+            ProbeMove::TestLift => Stage::TestLifted,
         };
         match (self.stage, probe) {
-            (Stage::TestLifted, _) | (Stage::Squeezed, Probe::Squeeze) => {}
-            (Stage::Squeezed, Probe::TestLift) => self.enter(Stage::TestLift),
+            (Stage::TestLifted, _) | (Stage::Squeezed, ProbeMove::Squeeze) => {}
+            (Stage::Squeezed, ProbeMove::TestLift) => self.enter(Stage::TestLift),
             _ => {
                 self.settled = Some(self.world.palm_from_target());
                 self.enter(Stage::Squeeze);
@@ -477,7 +477,7 @@ mod tests {
             attempt
         };
         let mut attempt = closed();
-        attempt.probe(Probe::TestLift);
+        attempt.probe(ProbeMove::TestLift);
         let frames: Vec<TimedFrame> = std::iter::from_fn(|| attempt.next_frame(0)).collect();
         assert!(frames.windows(2).all(|pair| pair[1].offset_nanos - pair[0].offset_nanos == 10_000_000));
         let mut phases: Vec<Phase> = frames.iter().map(|timed| timed.frame.phase).collect();
@@ -497,12 +497,12 @@ mod tests {
         assert!(lift.held && highest > 0.15, "{lift:?}, {highest} m");
 
         let mut attempt = closed();
-        attempt.probe(Probe::TestLift);
+        attempt.probe(ProbeMove::TestLift);
         while attempt.next_frame(0).is_some() {}
         let (moved_m, turned_rad) = attempt.set_down();
         assert!(moved_m < 0.01 && turned_rad < 0.2, "{moved_m} m, {turned_rad} rad");
         let mut attempt = closed();
-        attempt.probe(Probe::Squeeze);
+        attempt.probe(ProbeMove::Squeeze);
         let frames: Vec<TimedFrame> = std::iter::from_fn(|| attempt.next_frame(0)).collect();
         assert_eq!(frames.last().map(|timed| timed.frame.phase), Some(Phase::Squeezed));
         assert_eq!(attempt.snapshot().palm_position_m, closed().snapshot().palm_position_m);

@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use super::Probe;
+use super::ProbeMove;
 use blindgrasp_messages::{GraspTruth, LiftOutcome};
 
 /// The numbers of an attempt in a run.
@@ -34,7 +34,7 @@ pub struct Finished {
     /// When it was over, simulated time since the run began.
     pub end_nanos: u64,
     /// The probe that was made, which is felt again with its frames.
-    pub probe: Option<Probe>,
+    pub probe: Option<ProbeMove>,
     pub outcome: LiftOutcome,
 }
 

@@ -10,7 +10,7 @@ use nalgebra::Vector3;
 use rand::RngExt;
 
 use super::attempt::Moment;
-use super::{Attempt, LiftTarget, PhysicsOptions, Probe, TrialError, TrialOptions, TrialProtocol, draw_start};
+use super::{Attempt, LiftTarget, PhysicsOptions, ProbeMove, TrialError, TrialOptions, TrialProtocol, draw_start};
 use crate::candidate::{CandidateError, Judged, Made, Outcome, SimulatedGrasp, TimedFrame, candidate_rng};
 use crate::loaded_contacts::SimulatedContact;
 use crate::mechanism::Mechanism;
@@ -65,7 +65,7 @@ pub(crate) fn try_candidate(
     let moments = moments.into_iter().enumerate().filter(|(idx, _)| kept.contains(idx));
     let mut frames: Vec<TimedFrame> = moments.map(|(_, moment)| attempt.feel(moment, 0)).collect();
     let scene = scene(&attempt, &target, candidate, &contacts);
-    attempt.probe(Probe::TestLift);
+    attempt.probe(ProbeMove::TestLift);
     frames.extend(std::iter::from_fn(|| attempt.next_frame(0)));
     // The times leave no room for the frames that are left out.
     for (timed, offset_nanos) in frames.iter_mut().zip((0..).step_by(options.frames.period_nanos as usize)) {

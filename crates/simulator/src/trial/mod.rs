@@ -29,7 +29,7 @@ use serde::{Deserialize, Serialize};
 use crate::OptionError;
 use blindgrasp_objects::Object;
 
-pub use attempt::{Attempt, Probe};
+pub use attempt::{Attempt, ProbeMove};
 pub(crate) use options::check_planner;
 pub use options::{PhysicsOptions, TrialOptions, TrialProtocol};
 pub use start::{choose_start, draw_start, sensor_seed};

@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 
 use super::course::{Course, Finished, Place};
 use super::targets::target_of_trial;
-use super::{Attempt, LiftTarget, Probe, TrialError, TrialOptions, choose_start, sensor_seed};
+use super::{Attempt, LiftTarget, ProbeMove, TrialError, TrialOptions, choose_start, sensor_seed};
 use blindgrasp_messages::{Action, Header, LiftOutcome, Phase, Stamped, TactileFrame};
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
@@ -65,8 +65,8 @@ pub struct Robot<'a> {
 enum State<'a> {
     /// Between two attempts.
     Between,
-    Feeling(Box<Grasp<'a>>),
-    Deciding(Box<Grasp<'a>>),
+    Feeling(Box<TriedGrasp<'a>>),
+    Deciding(Box<TriedGrasp<'a>>),
     Over {
         finished: Finished,
         /// The frame that says how a lift ended, if it is to be sent.
@@ -76,7 +76,7 @@ enum State<'a> {
 }
 
 /// An attempt under way.
-struct Grasp<'a> {
+struct TriedGrasp<'a> {
     place: Place,
     thing: LiftTarget,
     attempt: Attempt<'a>,
@@ -84,7 +84,7 @@ struct Grasp<'a> {
     /// Simulated time from its beginning to the last frame.
     elapsed_nanos: u64,
     last: Option<TactileFrame>,
-    probe: Option<Probe>,
+    probe: Option<ProbeMove>,
     /// How it ended, if only its frames are felt again.
     outcome: Option<Finished>,
 }
@@ -228,12 +228,13 @@ impl<'a> Robot<'a> {
         attempt: Attempt<'a>,
         outcome: Option<Finished>,
     ) -> Result<Doing, TrialError> {
-        let grasp = Grasp { place, thing, attempt, n_frames: 0, elapsed_nanos: 0, last: None, probe: None, outcome };
+        let grasp =
+            TriedGrasp { place, thing, attempt, n_frames: 0, elapsed_nanos: 0, last: None, probe: None, outcome };
         self.feel(Box::new(grasp))
     }
 
     /// The next frame of an attempt.
-    fn feel(&mut self, mut grasp: Box<Grasp<'a>>) -> Result<Doing, TrialError> {
+    fn feel(&mut self, mut grasp: Box<TriedGrasp<'a>>) -> Result<Doing, TrialError> {
         let (frame, is_last) = match grasp.attempt.next_frame(grasp.place.grasp_id) {
             Some(timed) => {
                 grasp.elapsed_nanos = timed.offset_nanos;
@@ -279,14 +280,14 @@ impl<'a> Robot<'a> {
     }
 
     /// Lifts, or lets go.
-    fn finish(&mut self, mut grasp: Grasp<'a>, lifts: bool) {
+    fn finish(&mut self, mut grasp: TriedGrasp<'a>, lifts: bool) {
         let quality = grasp.attempt.quality().filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
         let lift = lifts.then(|| grasp.attempt.lift(|_| {}));
-        let is_set_down = !lifts && grasp.probe == Some(Probe::TestLift);
+        let is_set_down = !lifts && grasp.probe == Some(ProbeMove::TestLift);
         let (moved_m, turned_rad) = if is_set_down { grasp.attempt.set_down() } else { (0.0, 0.0) };
         let disturbed = moved_m > DISTURBED_M || turned_rad > DISTURBED_RAD;
         let (epsilon, volume) = quality.unwrap_or((-1.0, 0.0));
-        let Grasp { place, thing, attempt, n_frames, elapsed_nanos, probe, last, .. } = grasp;
+        let TriedGrasp { place, thing, attempt, n_frames, elapsed_nanos, probe, last, .. } = grasp;
         let n_frames = n_frames + u64::from(lifts);
         let outcome = LiftOutcome {
             grasp_id: place.grasp_id,
@@ -313,8 +314,8 @@ impl<'a> Robot<'a> {
     }
 }
 
-impl Grasp<'_> {
-    fn begin_probe(&mut self, probe: Probe) {
+impl TriedGrasp<'_> {
+    fn begin_probe(&mut self, probe: ProbeMove) {
         self.attempt.probe(probe);
         // A frame with the number of the last one has been sent in between.
         self.attempt.skip_frame();
@@ -322,10 +323,10 @@ impl Grasp<'_> {
     }
 }
 
-fn probe_of(action: Action) -> Option<Probe> {
+fn probe_of(action: Action) -> Option<ProbeMove> {
     match action {
-        Action::Squeeze => Some(Probe::Squeeze),
-        Action::TestLift => Some(Probe::TestLift),
+        Action::Squeeze => Some(ProbeMove::Squeeze),
+        Action::TestLift => Some(ProbeMove::TestLift),
         Action::Hold | Action::Lift => None,
     }
 }

@@ -69,7 +69,7 @@ pub(super) struct Joint {
 /// Reads the text of a URDF.
 pub(super) fn read(text: &str) -> Result<Robot, String> {
     let mut reader = Reader::from_str(text);
-    let mut reading = Reading::default();
+    let mut reading = UrdfReading::default();
     loop {
         let event = reader.read_event();
         let line = || {
@@ -100,14 +100,14 @@ pub(super) fn read(text: &str) -> Result<Robot, String> {
 
 /// What has been read so far.
 #[derive(Default)]
-struct Reading {
+struct UrdfReading {
     /// The names of the open elements, from the outermost.
     path: Vec<String>,
     robot: Option<Robot>,
     n_shapes: usize,
 }
 
-impl Reading {
+impl UrdfReading {
     fn enter(&mut self, element: &BytesStart<'_>) -> Result<(), String> {
         let name = String::from_utf8_lossy(element.name().as_ref()).into_owned();
         if self.path.is_empty() && (name != "robot" || self.robot.is_some()) {

@@ -72,7 +72,10 @@ fn mistakes_in_overrides() {
             "--set source.on_end=stpo: param 'on_end' of node 'source' must be one of 'stop', 'no', 'off', \
              found 'stpo'; did you mean 'stop'?",
         ),
-        (&["source.log="], "--set source.log=: param 'log' of node 'source' must be a path, found ''"),
+        (
+            &["source.recording="],
+            "--set source.recording=: param 'recording' of node 'source' must be a path, found ''",
+        ),
         (
             &["source.recording=/absent.mcap"],
             "--set source.recording=/absent.mcap: param 'recording' of node 'source': '/absent.mcap' does not exist",
