@@ -1,6 +1,6 @@
 //! The protocol between the launcher and an operator, so that an operator can be written in any language.
 //!
-//! * `PROGRAM --describe` answers with an [`OperatorDescription`](crate::description::OperatorDescription) as JSON.
+//! * `PROGRAM --describe` answers with an [`OperatorDescription`] as JSON.
 //! * The launcher starts `PROGRAM` with a [`Wiring`] as JSON in the environment variable [`WIRING_VARIABLE`].
 //! * The operator reports on stdout, one line each, beginning with [`REPORT_PREFIX`]: see [`Report`]. Any other line on
 //!   stdout or stderr is a log line. A report of at most 4096 bytes that is written in one go is heard even if a child of

@@ -122,7 +122,7 @@ impl<S: Sink> Observer<S> {
         Self::start_as(Role::Member, domain, Some(bell), edges, sink)
     }
 
-    /// Attaches to a running graph, see [`attached`](crate::launcher::attached); returns once it has begun. It misses nothing
+    /// Attaches to a running graph, returns once it has begun. It misses nothing
     /// from then on.
     ///
     /// # Errors

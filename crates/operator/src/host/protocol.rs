@@ -1,7 +1,7 @@
 //! The messages between a host and its program: docs/operators-other-languages.md describes them for programs.
 //!
 //! A message is the length of its body and its kind, 32 bits each, and the body. Bodies of messages that come once for a
-//! sample have a fixed form, [`Work`]; all others are JSON. Numbers have the order of bytes of the machine.
+//! sample have a fixed form, `Work`; all others are JSON. Numbers have the order of bytes of the machine.
 
 use std::collections::BTreeMap;
 
