@@ -53,7 +53,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         let is_recording = file.extension().is_some_and(|extension| extension == "mcap");
         if is_recording {
             let hand = hand_of(file, arguments.hand.as_deref())?;
-            let mut judge = Judge::new(hand, model.clone())?;
+            let judge = Judge::new(hand, model.clone());
+            let mut judge = judge.with_context(|| format!("recording {}", file.display()))?;
             for decided in decide(&mut judge, file)? {
                 print(arguments.json, file, &decided.decision, decided.truth.as_ref())?;
             }
