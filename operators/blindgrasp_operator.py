@@ -36,6 +36,7 @@ PROTOCOL = 3
 PIPES_VARIABLE = "BLINDGRASP_HOST"
 
 # Kinds of messages from the host, and to it: crates/operator/src/host/protocol.rs.
+VERSION = 1
 START, RESTORE, SAMPLE, SILENCE, END, CUT_OFF, SET, NEXT, RESUME, OPEN, CLOSE, CHECK = range(1, 13)
 READY, DONE, REFUSED, FAILED, LOG, COUNTS, ONE_BY_ONE = range(1, 8)
 MORE, HAS_STATE = 1, 2
@@ -477,7 +478,10 @@ def _work(host: _Host, description: Description, start: Callable[[dict[str, Any]
     kind, body = host.receive()
     if kind != START:
         return
-    params = json.loads(body)["params"]
+    message = json.loads(body)
+    if message["version"] != VERSION:
+        raise RuntimeError(f"its host speaks version {message['version']}, expected {VERSION}: copy blindgrasp_operator.py anew")
+    params = message["params"]
     work = start(params)
     if isinstance(work, Stage) and work.answer_many is not None and len(description.inputs) > 1:
         raise RuntimeError(f"answer_many is for one input, and the operator has {len(description.inputs)}: expected `answer`")

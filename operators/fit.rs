@@ -72,7 +72,7 @@ pub struct Misfit {
     pub help: String,
 }
 
-/// What does not fit the model.
+/// The part that does not fit the model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MisfitKind {
     /// The arbiter's probe.
@@ -167,9 +167,7 @@ impl<'a> Check<'a> {
                 MisfitKind::Probe,
                 arbiter,
                 format!("probe is {name}, and {of} never calls {phase} grasps stable: nothing would be lifted"),
-                format!(
-                    "expected {instead}, or a model with a threshold below 1 (blindgrasp train --threshold-probability)"
-                ),
+                format!("expected {instead}, or a model with a threshold below 1 (blindgrasp train --threshold)"),
             ),
             Some(_) => {}
         }

@@ -67,20 +67,11 @@ pub const SHIPPED: [Shipped; 11] = [
     Shipped::new(LINK_OPERATOR, link::describe, link::work),
 ];
 
-/// Names for which people look, and what does it.
-const ADVICE: [(&str, &str); 3] = [
-    ("checked_contacts", "contacts does it, with its param 'sensors'"),
-    ("probe_classifier", "classifier does it: the model says what it can judge"),
-    ("day_classifier", "classifier does it: the model says what it can judge"),
-];
-
 /// These operators as a dataflow file can name them. `program` must run each as `PROGRAM operator NAME`, as blindgrasp does.
 pub fn operators_of(program: &Path) -> Operators {
     let in_files = || SHIPPED.iter().filter(|shipped| shipped.name != LINK_OPERATOR);
     let sharing = in_files().filter(|shipped| shipped.can_share_process);
-    Operators::of_program(program, in_files().map(|shipped| shipped.name))
-        .sharing(sharing.map(|shipped| shipped.name))
-        .advising(ADVICE)
+    Operators::of_program(program, in_files().map(|shipped| shipped.name)).sharing(sharing.map(|shipped| shipped.name))
 }
 
 impl Shipped {

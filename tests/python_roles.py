@@ -3,7 +3,8 @@
 
 senses: gives frames the senses of a partner input. watch: has no output, an optional input, and a state; it fails if a sample
 is not there once and in order. hand: a source with a feedback input that sends the frames of a grasp when the grasp before is
-decided. nag: answers silence and the end of the stream. fragile: fails on one sample, of several that it gets at once.
+decided. nag: answers silence and the end of the stream. plain: a classifier without a state. fragile: fails on one
+sample, of several that it gets at once.
 """
 
 import json
@@ -39,6 +40,7 @@ HAND = Description(
     params=python_source.DESCRIPTION.params,
 )
 NAG = Description("nag", "Answers silence", ("tactile", TactileFrame), ("prediction", Prediction), answers_each=False)
+PLAIN = Description("plain", "Judges without a state", ("feature", GraspFeature), ("prediction", Prediction))
 FRAGILE = Description("fragile", "Fails on a sample", ("feature", GraspFeature), ("prediction", Prediction))
 # The grasp to which the answers of nag belong.
 NAGS = 1_000_000
@@ -125,6 +127,10 @@ def nag(_params):
     )
 
 
+def plain(_params):
+    return Stage(lambda head, _items: PredictionHead(grasp_id=head.grasp_id, phase=head.phase, fault=head.fault))
+
+
 def fragile(_params):
     def answer_many(heads, _items):
         if any(head.header.seq == 100 for head in heads):
@@ -135,5 +141,6 @@ def fragile(_params):
 
 
 if __name__ == "__main__":
-    roles = {"senses": (SENSES, senses), "watch": (WATCH, watch), "hand": (HAND, hand), "nag": (NAG, nag), "fragile": (FRAGILE, fragile)}
+    roles = {"senses": (SENSES, senses), "watch": (WATCH, watch), "hand": (HAND, hand), "nag": (NAG, nag),
+             "plain": (PLAIN, plain), "fragile": (FRAGILE, fragile)}
     run(*roles[sys.argv[1]])

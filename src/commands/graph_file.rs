@@ -37,7 +37,17 @@ pub(super) fn fitting(
     on_misfit: OnMisfit,
 ) -> anyhow::Result<Graph> {
     let graph = checked(file, overrides, scope)?;
-    let Fit { mut errors, mut warnings } = check_fit(&parts_of(&graph));
+    let mut parts = parts_of(&graph);
+    if let Scope::Machine(here) = scope {
+        // The files of another machine are not those of the same names here.
+        for (part, node) in parts.iter_mut().zip(&graph.nodes) {
+            if node.machine.as_deref().is_some_and(|machine| machine != here) {
+                part.params.remove("hand");
+                part.params.remove("model");
+            }
+        }
+    }
+    let Fit { mut errors, mut warnings } = check_fit(&parts);
     if on_misfit == OnMisfit::Warn {
         warnings.append(&mut errors);
     }

@@ -3,6 +3,7 @@
 use std::ffi::OsString;
 use std::process::ExitCode;
 
+use blindgrasp_graph::operators::HOST_OPERATOR;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::host;
 use blindgrasp_operator::operator::{self, GroupMember, name_process};
@@ -12,8 +13,6 @@ use clap::builder::PossibleValuesParser;
 
 /// The process of several operators, which their wiring names.
 const GROUP: &str = "group";
-/// The process of an operator whose program, the first argument, gets its samples over pipes.
-const HOST: &str = "host";
 
 /// Run an operator that comes with blindgrasp, as the processes of a graph do.
 ///
@@ -43,7 +42,7 @@ pub(crate) fn run(arguments: &Arguments) -> ExitCode {
         name_process(GROUP);
         return operator::run_group(member);
     }
-    if name == HOST {
+    if name == HOST_OPERATOR {
         let words: Vec<OsString> = arguments.arguments.iter().map(OsString::from).collect();
         let Some((program, rest)) = words.split_first() else {
             print_diagnostic("blindgrasp operator host: it has no program, expected one and its arguments");
@@ -79,5 +78,5 @@ fn form(name: &str, arguments: &[&str]) -> Option<Form> {
 }
 
 fn names() -> PossibleValuesParser {
-    PossibleValuesParser::new(SHIPPED.iter().map(|shipped| shipped.name).chain([GROUP, HOST]))
+    PossibleValuesParser::new(SHIPPED.iter().map(|shipped| shipped.name).chain([GROUP, HOST_OPERATOR]))
 }

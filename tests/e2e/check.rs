@@ -234,18 +234,3 @@ fn a_graph_that_could_never_lift_is_refused() {
     let warned = run(&[&["replay", "recordings/ordinary.mcap", "--name", &name], &probe[..]].concat(), 0);
     assert!(text(&warned.stderr).contains(expected), "{}", text(&warned.stderr));
 }
-
-#[test]
-fn names_of_operators_that_are_part_of_others_get_advice() {
-    let folder = tempfile::tempdir().expect("a folder");
-    for (name, operator, advice) in [
-        ("checked_contacts", "  contacts:\n", "contacts does it, with its param 'sensors'"),
-        ("probe_classifier", "  classifier:\n", "classifier does it: the model says what it can judge"),
-        ("day_classifier", "  classifier:\n", "classifier does it: the model says what it can judge"),
-    ] {
-        let path = dataflow(folder.path(), &[(operator, &format!("{operator}    run: {name}\n"))]);
-        let refused = run(&["run", "--check", path.to_str().expect("UTF-8")], 1);
-        let said = text(&refused.stderr);
-        assert!(said.contains(&format!("unknown operator '{name}'; {advice}")), "{said}");
-    }
-}

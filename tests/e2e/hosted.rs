@@ -205,6 +205,27 @@ fn a_sample_that_kills_a_program_among_others_is_found_and_left_out() {
     assert_eq!(missing("classifier/feature"), Some(0.into()), "{}", ended.summary);
 }
 
+/// The state of an instance that is long gone must not come back: it names samples that no writer keeps any more.
+#[test]
+fn a_program_without_a_state_leaves_none_to_the_stage_that_takes_its_place() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    let lifts = format!("model={}", project().join("models/barrett-bh8-280-lifts.json").display());
+    swap(&graph, &["encoder", "classifier", "--set", &lifts, "--probation", "0"], 0);
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    let program = role(folder.path());
+    let to_plain = ["classifier", "--run", utf8(&program), "--probation", "0", "--allow-mismatch", "--args", "plain"];
+    swap(&graph, &to_plain, 0);
+    // Fourteen frames a grasp: more than the 256 samples that the encoder keeps.
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    swap(&graph, &["classifier", "--run", "classifier", "--set", &lifts, "--probation", "0"], 0);
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    let ended = graph.stop();
+    assert_eq!((ended.code, &ended.summary["samples_lost"]), (Some(0), &0.into()), "{}", ended.stderr);
+    assert_each_once(&ended);
+}
+
 /// A classifier that says something else than it should.
 const BROKEN: &str = r#"
 import os, struct, sys

@@ -326,7 +326,7 @@ fn no_machine_joins_the_connection_of_another_one() {
         };
         let robot = open(&config("robot", endpoints, Some(folder.path()))).expect("open");
         let robot_heard = Heard::listen(&robot, &key("*", "robot"));
-        // Whoever comes first with a Zenoh id keeps the other out: that is all that a stranger can do.
+        // The first machine with a Zenoh id keeps the other out: that is all that a stranger can do.
         says(&brain, &key("brain", "robot"), "connected", &robot_heard);
         let server = Endpoints { listen: vec![laptop_endpoint], ..Endpoints::default() };
         let server = stranger_as(Some(id.clone()), &server, tls_of(folder.path(), "laptop"), max_links);

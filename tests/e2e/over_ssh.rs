@@ -82,7 +82,7 @@ impl Sshd {
             line.clear();
             assert!(log.read_line(&mut line).expect("read") > 0, "sshd does not start");
         }
-        // Whoever reads nothing would stop it.
+        // A pipe that nobody reads would stop it.
         std::thread::spawn(move || std::io::copy(&mut log, &mut std::io::sink()));
         Some(Sshd { folder, child })
     }
@@ -193,6 +193,9 @@ fn commands_do_there_what_they_do_here() {
     let changed = sshd.on_brain(&["set", "lift_arbiter.votes=4", "--graph", name, "--json"], 0);
     assert_eq!(json_lines(&changed.stdout)[0]["new"], 4);
     assert_eq!(graph.node("lift_arbiter")["params"]["votes"], 4);
+    // It asks the programs which parameters are live.
+    let listed = sshd.on_brain(&["set", "--graph", name, "--json"], 0);
+    assert_eq!(text(&listed.stdout), text(&run(&["set", "--graph", name, "--json"], 0).stdout));
     let refused = sshd.on_brain(&["set", "lift_arbiter.votes=0", "--graph", name], 1);
     let here = run(&["set", "lift_arbiter.votes=0", "--graph", name], 1);
     assert_eq!(text(&refused.stderr), text(&here.stderr));
@@ -269,7 +272,7 @@ fn a_recording_there_is_written_here() {
         "{files:?}"
     );
 
-    // Whoever goes without a word leaves a whole recording there.
+    // A caller that is killed leaves a whole recording there.
     let lost = format!("lost-{unique}.mcap");
     let mut recorder = Running::start(record(&folder.path().join(&lost), &there));
     recorder.wait_for("recording ");

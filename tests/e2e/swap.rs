@@ -427,7 +427,7 @@ fn a_model_with_a_memory_takes_the_place_of_one_without_and_back() {
     for model in [LIFTS, MODEL, LIFTS, LIFTS, MODEL] {
         swap(&graph, &["encoder", "classifier", "--set", &set_model(model), "--probation", "0"], 0);
         graph.wait_for_decisions(A_FEW_GRASPS);
-        // Whoever comes back begins where its readers are, with a saved state or without one.
+        // A process that comes back begins where its readers are, with a saved state or without one.
         for node in ["classifier", "encoder", "lift_arbiter"] {
             graph.kill(node);
         }

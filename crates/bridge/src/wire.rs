@@ -109,7 +109,6 @@ impl Rejected {
         self.add(reason, 1);
     }
 
-    /// Adds the counts of another part of the link.
     /// For [`LinkStatus::rejected`](blindgrasp_operator::link_status::LinkStatus::rejected).
     pub fn by_reason(&self) -> BTreeMap<String, u64> {
         self.0.iter().map(|(reason, count)| (reason.to_string(), *count)).collect()

@@ -30,8 +30,6 @@ pub struct Operators {
     host: Option<Program>,
     /// Those of which several can run in one process.
     sharing: BTreeSet<String>,
-    /// Names that are no operators, and the advice to somebody who writes them.
-    advice: BTreeMap<String, String>,
 }
 
 impl Operators {
@@ -56,13 +54,6 @@ impl Operators {
     #[must_use]
     pub fn sharing<'a>(mut self, names: impl IntoIterator<Item = &'a str>) -> Operators {
         self.sharing = names.into_iter().map(str::to_owned).collect();
-        self
-    }
-
-    /// With the advice to somebody who writes a name that is no operator.
-    #[must_use]
-    pub fn advising<'a>(mut self, names: impl IntoIterator<Item = (&'a str, &'a str)>) -> Operators {
-        self.advice = names.into_iter().map(|(name, advice)| (name.to_owned(), advice.to_owned())).collect();
         self
     }
 
@@ -115,9 +106,6 @@ impl Operators {
 
     /// What to do instead, for a name that is no operator.
     pub(crate) fn help_for(&self, name: &str) -> String {
-        if let Some(advice) = self.advice.get(name) {
-            return advice.clone();
-        }
         if self.programs.is_empty() {
             return "there are no operators by name here".into();
         }

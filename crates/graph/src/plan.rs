@@ -212,7 +212,7 @@ impl Plan {
     }
 
     /// The input of a tool for which no writer waits.
-    pub fn tool_input(&self, port: &Port) -> Option<InputWiring> {
+    fn tool_input(&self, port: &Port) -> Option<InputWiring> {
         let service = self.services.get(port)?.clone();
         Some(InputWiring {
             policy: EdgePolicy::Latest,
@@ -376,7 +376,7 @@ impl Plan {
         let Some((node, _)) = to.filter(|(node, _)| self.answer_each.contains(node)) else {
             return Vec::new();
         };
-        // The launching command is an attached reader: no source waits for it.
+        // The launching command is given up like an attached reader: no source waits for it.
         let is_next = |next: &&PlannedEdge| {
             let is_waited_for = next.options.policy == EdgePolicy::Lossless && !next.feedback && next.to.is_some();
             next.from.0 == *node && is_waited_for

@@ -27,8 +27,8 @@ use crate::ages::{AgeCounter, N_BUCKETS};
 use crate::bell::Bell;
 use crate::wiring::InputCounts;
 
-/// "bg-board" in ASCII.
-const MAGIC: u64 = u64::from_be_bytes(*b"bg-board");
+/// "bgcursor" in ASCII.
+const MAGIC: u64 = u64::from_be_bytes(*b"bgcursor");
 /// Changes with the layout.
 const LAYOUT: u64 = 4;
 /// The offset of the first slot.
@@ -144,7 +144,7 @@ impl<const N: usize, W: Word> Commits<N, W> {
 pub struct InputSlot {
     /// Epoch and number of the last sample; received, missing, repeated, reordered, late.
     last: Commits<7>,
-    /// 1 when no process reads on: its node was given up, or it is the slot of an attached reader and no attached reader is there.
+    /// 1 when no process reads on: its node was given up, or it is a slot for attached readers that none uses.
     is_given_up: AtomicU64,
 }
 
@@ -408,10 +408,6 @@ impl OutputSlot {
         self.record()[2]
     }
 
-    pub fn n_resent(&self) -> u64 {
-        self.record()[3]
-    }
-
     /// The time for which the writer has waited for readers.
     pub fn blocked_nanos(&self) -> u64 {
         self.record()[4]
@@ -506,7 +502,7 @@ mod tests {
             mine.output(1).commit(SampleId { epoch: 7, seq });
         }
         let output = theirs.output(1);
-        assert_eq!((output.key(), output.n_sent(), output.n_resent()), (Some(SampleId { epoch: 7, seq: 2 }), 3, 1));
+        assert_eq!((output.key(), output.n_sent()), (Some(SampleId { epoch: 7, seq: 2 }), 3));
         for state in [&b"one"[..], b"", b"three"] {
             assert!(mine.save_state(1, state));
             assert_eq!(theirs.state(1).as_deref(), Some(state));

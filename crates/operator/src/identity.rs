@@ -1,6 +1,6 @@
 //! The identity of an operator: its program, its parameters and the files that they name.
 //!
-//! Each sample carries the identities of all operators that it has passed, mixed into one number. Whoever counts several
+//! Each sample carries the identities of all operators that it has passed, mixed into one number. A reader that counts several
 //! samples together, as the arbiter counts votes, sees from it whether the same operators have made them. A restart does not
 //! change it; another program, parameter or model does.
 

@@ -565,10 +565,7 @@ pub type GroupMember = (OperatorDescription, fn(&Operator) -> anyhow::Result<()>
 pub fn run_group(member: impl Fn(&[String]) -> Option<GroupMember>) -> ExitCode {
     match join_and_work_together(member) {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            Voice(None).report(&Report::Failed { message: format!("{error:#}") });
-            ExitCode::FAILURE
-        }
+        Err(error) => failed(&error),
     }
 }
 

@@ -3,8 +3,7 @@
 //! The stage answers its main input by number. Of a partner input it gets the sample whose stamp is nearest, if the two are
 //! no further apart than the edge's tolerance. It waits until a later sample of the partner input has come, because only then
 //! the nearest one is known, so that the pairs do not depend on speed. A sample whose partner does not come in time is
-//! answered without one, and counted. Where the stamps of
-//! an input go back, as those of a recording that is played again do, a new round begins, and has no pairs with the one before.
+//! answered without one, and counted. Where the stamps of an input go back, as those of a recording that is played again do, a new round begins, and has no pairs with the one before.
 //!
 //! A sample of a partner input counts as answered when it has been received. After a restart the instance reads all that
 //! its writer still keeps, and finds the partners of the samples that it answers again.
@@ -16,7 +15,8 @@ use std::time::{Duration, Instant};
 
 use crate::cursors::SampleId;
 use crate::monotonic_nanos;
-use crate::port::{PortError, Subscriber};
+use crate::operator::Operator;
+use crate::port::{PortError, Subscriber, sample_id};
 use crate::wiring::{Clock, InputWiring};
 use blindgrasp_messages::{Header, Message};
 
@@ -169,6 +169,74 @@ pub(crate) trait PairedInput {
 
     /// The port, and how many main samples were answered without a partner.
     fn n_without(&self) -> (&str, u64);
+}
+
+/// The partner inputs of a stage.
+pub(crate) struct Partners {
+    inputs: Vec<Rc<RefCell<dyn PairedInput>>>,
+    /// The main sample that waits for its partners, since when, and until when.
+    waiting: Option<(SampleId, Instant, Instant)>,
+    /// The counts that were reported last.
+    n_without: u64,
+}
+
+impl Partners {
+    /// The partner inputs that the operator has opened.
+    pub(crate) fn of(operator: &Operator) -> Partners {
+        Partners { inputs: operator.partners(), waiting: None, n_without: 0 }
+    }
+
+    pub(crate) fn connect(&self) -> Result<(), PortError> {
+        self.inputs.iter().try_for_each(|input| input.borrow().connect())
+    }
+
+    pub(crate) fn take_over(&mut self) {
+        self.waiting = None;
+        self.inputs.iter().for_each(|input| input.borrow_mut().take_over());
+    }
+
+    pub(crate) fn take_in(&self, is_active: bool, is_ending: bool) -> Result<(), PortError> {
+        self.inputs.iter().try_for_each(|input| input.borrow_mut().take_in(is_active, is_ending))
+    }
+
+    pub(crate) fn is_caught_up(&self) -> bool {
+        self.inputs.iter().all(|input| input.borrow().is_caught_up())
+    }
+
+    /// Chooses the partners of a main sample; false if it must wait for one. At the end of the stream, none comes any more.
+    pub(crate) fn choose(&mut self, main: &Header, is_active: bool, is_ending: bool) -> Result<bool, PortError> {
+        if self.inputs.is_empty() {
+            return Ok(true);
+        }
+        self.take_in(is_active, is_ending)?;
+        let id = sample_id(main);
+        let since = self.waiting.filter(|waiting| waiting.0 == id).map_or_else(Instant::now, |waiting| waiting.1);
+        let is_over = is_ending && self.is_caught_up();
+        let until = self.inputs.iter().filter_map(|input| input.borrow().waits_until(main, since)).max();
+        self.waiting = if is_over { None } else { until.map(|until| (id, since, until)) };
+        if self.waiting.is_none() {
+            self.inputs.iter().for_each(|input| input.borrow_mut().choose(main, is_active));
+        }
+        Ok(self.waiting.is_none())
+    }
+
+    pub(crate) fn deadline(&self) -> Option<Instant> {
+        let held = self.inputs.iter().filter_map(|input| input.borrow().hold_deadline()).min();
+        self.waiting.map(|waiting| waiting.2).into_iter().chain(held).min()
+    }
+
+    /// Reports how many samples were answered without a partner.
+    pub(crate) fn report(&mut self, operator: &Operator) {
+        let count = |input: &Rc<RefCell<dyn PairedInput>>| {
+            let input = input.borrow();
+            let (port, n) = input.n_without();
+            (format!("{port}_without_partner"), n)
+        };
+        let n_without = self.inputs.iter().map(|input| input.borrow().n_without().1).sum();
+        if std::mem::replace(&mut self.n_without, n_without) != n_without {
+            operator.has_counted(self.inputs.iter().map(count).collect());
+        }
+    }
 }
 
 impl<M: Message> PartnerInput<M> {

@@ -275,9 +275,7 @@ mod tests {
 
     const EPOCH: u64 = 7;
 
-    /// What up to three publishers send, each of which takes over from the one before and sends its last few samples again;
-    /// whose last few do not come if it has crashed. Samples come up to 40 ms late, those of one publisher in order.
-    /// `skipped` are never sent.
+    /// One sample of twenty, by chance.
     fn some_of(rng: &mut ChaCha8Rng, n_samples: u64) -> Vec<u64> {
         let mut chosen = Vec::new();
         for seq in 0..n_samples {
@@ -288,6 +286,9 @@ mod tests {
         chosen
     }
 
+    /// The samples of up to three publishers, each of which takes over from the one before and sends its last few samples
+    /// again; the last few of one that has crashed do not come. Samples come up to 40 ms late, those of one publisher in order.
+    /// `skipped` are never sent.
     fn arrivals(rng: &mut ChaCha8Rng, n_samples: u64, skipped: &[u64]) -> Vec<Arrival> {
         let mut arrivals = Vec::new();
         let (mut now, mut first) = (Duration::ZERO, 0);

@@ -4,9 +4,7 @@
 //! while it is the active instance, reads along while it stands by, and begins after the last sample whose answer was
 //! received, which the cursors name.
 
-use std::cell::RefCell;
 use std::collections::{BTreeMap, VecDeque};
-use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
@@ -16,7 +14,7 @@ use serde_json::{Map, Value};
 use crate::cursors::SampleId;
 use crate::operator::{Operator, TICK, Task, Turn, run_in_turn};
 use crate::outbox::{Entry, Outbox};
-use crate::partner::PairedInput;
+use crate::partner::Partners;
 use crate::port::{PortError, PortSample, Publisher, Sent, ShadowPublisher, Subscriber, sample_id};
 use crate::wiring::{Clock, Command, InputCounts, OnLate};
 use blindgrasp_messages::{Header, Message};
@@ -201,74 +199,6 @@ struct Instance<S: Stage> {
     shadow: Option<Shadow<S>>,
     last_look: Instant,
     is_drained: bool,
-}
-
-/// The partner inputs of a stage.
-pub(crate) struct Partners {
-    inputs: Vec<Rc<RefCell<dyn PairedInput>>>,
-    /// The main sample that waits for its partners, since when, and until when.
-    waiting: Option<(SampleId, Instant, Instant)>,
-    /// The counts that were reported last.
-    n_without: u64,
-}
-
-impl Partners {
-    /// The partner inputs that the operator has opened.
-    pub(crate) fn of(operator: &Operator) -> Partners {
-        Partners { inputs: operator.partners(), waiting: None, n_without: 0 }
-    }
-
-    pub(crate) fn connect(&self) -> Result<(), PortError> {
-        self.inputs.iter().try_for_each(|input| input.borrow().connect())
-    }
-
-    pub(crate) fn take_over(&mut self) {
-        self.waiting = None;
-        self.inputs.iter().for_each(|input| input.borrow_mut().take_over());
-    }
-
-    pub(crate) fn take_in(&self, is_active: bool, is_ending: bool) -> Result<(), PortError> {
-        self.inputs.iter().try_for_each(|input| input.borrow_mut().take_in(is_active, is_ending))
-    }
-
-    pub(crate) fn is_caught_up(&self) -> bool {
-        self.inputs.iter().all(|input| input.borrow().is_caught_up())
-    }
-
-    /// Chooses the partners of a main sample; false if it must wait for one. At the end of the stream, none comes any more.
-    pub(crate) fn choose(&mut self, main: &Header, is_active: bool, is_ending: bool) -> Result<bool, PortError> {
-        if self.inputs.is_empty() {
-            return Ok(true);
-        }
-        self.take_in(is_active, is_ending)?;
-        let id = sample_id(main);
-        let since = self.waiting.filter(|waiting| waiting.0 == id).map_or_else(Instant::now, |waiting| waiting.1);
-        let is_over = is_ending && self.is_caught_up();
-        let until = self.inputs.iter().filter_map(|input| input.borrow().waits_until(main, since)).max();
-        self.waiting = if is_over { None } else { until.map(|until| (id, since, until)) };
-        if self.waiting.is_none() {
-            self.inputs.iter().for_each(|input| input.borrow_mut().choose(main, is_active));
-        }
-        Ok(self.waiting.is_none())
-    }
-
-    pub(crate) fn deadline(&self) -> Option<Instant> {
-        let held = self.inputs.iter().filter_map(|input| input.borrow().hold_deadline()).min();
-        self.waiting.map(|waiting| waiting.2).into_iter().chain(held).min()
-    }
-
-    /// Reports how many samples were answered without a partner.
-    pub(crate) fn report(&mut self, operator: &Operator) {
-        let count = |input: &Rc<RefCell<dyn PairedInput>>| {
-            let input = input.borrow();
-            let (port, n) = input.n_without();
-            (format!("{port}_without_partner"), n)
-        };
-        let n_without = self.inputs.iter().map(|input| input.borrow().n_without().1).sum();
-        if std::mem::replace(&mut self.n_without, n_without) != n_without {
-            operator.has_counted(self.inputs.iter().map(count).collect());
-        }
-    }
 }
 
 struct Shadow<S: Stage> {
@@ -500,10 +430,7 @@ impl<S: Stage> Instance<S> {
                 // The least that says so: see `Header::valid_until_nanos`.
                 header.valid_nanos = 1;
                 if on_late == OnLate::Stop && !std::mem::replace(&mut self.is_unfit, true) {
-                    let (seq, age_millis) = (header.seq, age_nanos as f64 / 1e6);
-                    let message =
-                        format!("got sample {seq} after {age_millis:.1} ms, too late, and 'on_late' is 'stop'");
-                    self.operator.is_unfit(message);
+                    self.operator.is_unfit(too_late(header.seq, age_nanos));
                 }
             }
         }
@@ -541,7 +468,10 @@ impl<S: Stage> Instance<S> {
         }
         let (operator, stage) = (&self.operator, &self.stage);
         for (head, items) in self.answers.iter() {
-            let check = |head: &mut _| stage.before_sending(head, now_nanos(operator, head, S::Out::header));
+            let check = |head: &mut _| {
+                stage.before_sending(head, arrival_nanos(operator, S::Out::header(head)));
+                true
+            };
             if self.publisher.send_checked(head, items, &mut || operator.should_yield(), check)? == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
             }
@@ -552,7 +482,10 @@ impl<S: Stage> Instance<S> {
     fn send_outbox(&mut self) -> anyhow::Result<Sent> {
         let (operator, stage) = (&self.operator, &self.stage);
         while let Some((head, items)) = self.outbox.next()? {
-            let check = |head: &mut _| stage.before_sending(head, now_nanos(operator, head, S::Out::header));
+            let check = |head: &mut _| {
+                stage.before_sending(head, arrival_nanos(operator, S::Out::header(head)));
+                true
+            };
             if self.publisher.send_checked(head, &items, &mut || operator.should_yield(), check)? == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
             }
@@ -651,14 +584,14 @@ fn next<M: Message>(subscriber: &mut Subscriber<M>) -> Result<Option<PortSample<
     }
 }
 
-/// The time at which an answer is sent. By a recording's clock, its source has sent it just now.
-fn now_nanos<H>(operator: &Operator, head: &H, header: fn(&H) -> &Header) -> u64 {
-    arrival_nanos(operator, header(head))
+/// Why an operator whose input has `on_late: stop` ends the graph.
+pub(crate) fn too_late(seq: u64, age_nanos: u64) -> String {
+    format!("got sample {seq} after {:.1} ms, too late, and 'on_late' is 'stop'", age_nanos as f64 / 1e6)
 }
 
-/// The time at which a sample counts as arrived. By a recording's clock, its source sent it then: the load of the machine
-/// must not influence the answers.
-fn arrival_nanos(operator: &Operator, header: &Header) -> u64 {
+/// The time at which a sample counts as arrived, and an answer as sent. By a recording's clock, its source sent it then: the
+/// load of the machine must not influence the answers.
+pub(crate) fn arrival_nanos(operator: &Operator, header: &Header) -> u64 {
     match operator.clock() {
         Clock::Machine => crate::monotonic_nanos(),
         Clock::Recording => header.origin_nanos,

@@ -167,7 +167,6 @@ pub struct NamespaceWiring {
     pub root_path: String,
     pub prefix: String,
     /// The [cursors](crate::cursors)'s file.
-    #[serde(rename = "board")]
     pub cursors: String,
     /// The abstract unix socket that is the launcher's while it lives. An operator that can take it and the lock on
     /// `lock_file` is the last, or among the last: it removes the root path, and what bears the prefix in shared memory.
@@ -224,8 +223,8 @@ pub struct ConsumerWiring {
     pub slot: usize,
     /// How many samples may be unanswered.
     pub capacity: usize,
-    /// If the reader is an attached reader, the slots of all its readers, which are given up together: a writer waits for an attached reader for
-    /// `attached_limit_millis` at most. Empty for the graph's own readers.
+    /// Of a reader that may be given up: the slots of all its readers, which are given up together, after
+    /// `attached_limit_millis`. Empty for the graph's own readers.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub attached_slots: Vec<usize>,
     #[serde(default)]

@@ -126,13 +126,13 @@ fn receive(arguments: &Arguments, destination: &Destination, stdout: ChildStdout
 fn receive_file(arguments: &Arguments, sent: &SentFile, stdout: &mut impl Read) -> anyhow::Result<()> {
     let stem = arguments.out.file_stem().unwrap_or_default().to_string_lossy();
     if name_of(Path::new(&sent.name))? != sent.name || !sent.name.starts_with(&*stem) {
-        bail!("the other machine sends a file '{}', which is none of this recording", sent.name.escape_debug());
+        bail!("the other machine sends a file '{}', which does not belong to this recording", sent.name.escape_debug());
     }
     let path = arguments.out.with_file_name(&sent.name);
     if !arguments.recording.options().overwrite && path.exists() {
         bail!("{}: the file exists", path.display());
     }
-    let part = arguments.out.with_file_name(format!("{}.part", sent.name));
+    let part = arguments.out.with_file_name(format!("{}.{}.part", sent.name, std::process::id()));
     let copied = copy_to(&part, stdout, sent.n_bytes).and_then(|()| Ok(std::fs::rename(&part, &path)?));
     if copied.is_err() {
         let _ = std::fs::remove_file(&part);
@@ -141,7 +141,7 @@ fn receive_file(arguments: &Arguments, sent: &SentFile, stdout: &mut impl Read) 
 }
 
 fn copy_to(path: &Path, from: &mut impl Read, n_bytes: u64) -> anyhow::Result<()> {
-    let mut file = File::create(path)?;
+    let mut file = File::create_new(path)?;
     let n_copied = std::io::copy(&mut from.take(n_bytes), &mut file)?;
     if n_copied < n_bytes {
         bail!("the connection ended after {n_copied} of {n_bytes} bytes");

@@ -27,10 +27,7 @@ const MAX_LINE_BYTES: usize = 16 << 20;
 /// Why a graph could not be asked, or did not do what it was asked.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
-    #[error(
-        "graph name '{name}': expected letters, digits, _ and -, at most 32{}",
-        if name.contains('@') { "; for a graph on another machine, give --machine" } else { "" }
-    )]
+    #[error("graph name '{name}': expected letters, digits, _ and -, at most 32")]
     Name { name: String },
     #[error("no graph is running; start one with: blindgrasp run")]
     NoneRunning,

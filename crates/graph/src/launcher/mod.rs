@@ -5,7 +5,7 @@
 //! flight is decided. Ports close only after the last one is drained. An operator that doesn't end in time is killed.
 //!
 //! An operator that dies, or gives no sign of life for longer than it may, is started again and goes on where the cursors
-//! says (`supervision`). One that keeps dying is given up: its writers wait for it no longer, and the graph goes on
+//! say (`supervision`). One that keeps dying is given up: its writers wait for it no longer, and the graph goes on
 //! degraded until somebody stops it or swaps the operator (`swap`).
 //!
 //! If the launcher dies, its operators end: their stdin closes, and the kernel sends them SIGTERM.
@@ -513,7 +513,7 @@ impl Launcher {
 
     /// How the run has ended. A client may have stopped a graph that begins again after its last sample, while it drained.
     #[must_use]
-    pub fn last_word(&self, end: End) -> End {
+    pub fn final_end(&self, end: End) -> End {
         if self.is_to_begin_again && self.clients.is_asked_to_stop { End::Stopped } else { end }
     }
 

@@ -156,7 +156,7 @@ impl<'a> Run<'a> {
         }
         let observed = observer.finish();
         let quit = launcher.quit(&should_hurry);
-        outcome = outcome.and_then(|end| quit.map(|()| launcher.last_word(end)));
+        outcome = outcome.and_then(|end| quit.map(|()| launcher.final_end(end)));
         let (log, received) = observed?;
         let ran = Ran { graph, status: launcher.status(), outcome: &outcome, pids: &pids, topics: &topics };
         drop(launcher);

@@ -22,6 +22,8 @@ const END_POLL: Duration = Duration::from_millis(2);
 const READ_BYTES: usize = 64 << 10;
 /// Log lines and counts that a program may say before the answer for which the host waits.
 const MAX_ASIDES: usize = 10_000;
+/// The longest text of a log line or a failure: the launcher reads lines of up to 64 KiB.
+const MAX_TEXT_BYTES: usize = 4096;
 
 /// A program that works for this process.
 pub(super) struct Program {
@@ -29,13 +31,13 @@ pub(super) struct Program {
     to: Option<PipeWriter>,
     from: PipeReader,
     out: Vec<u8>,
-    /// What was read; a message that was taken out ends at `used`.
+    /// The bytes that were read; a message that was taken out ends at `used`.
     read: Vec<u8>,
     used: usize,
     asides: Asides,
 }
 
-/// What a program says at any time.
+/// The log lines and counts of a program, which may come at any time.
 #[derive(Default)]
 pub(super) struct Asides {
     pub(super) lines: Vec<LogEntry>,
@@ -55,6 +57,8 @@ pub(super) enum ProgramError {
     Unexpected { found: String, expected: &'static str },
     #[error("its program wants to send {0} bytes at once, expected at most {MAX_BODY_BYTES}")]
     TooLong(usize),
+    #[error("its program changed a head into one of {found} bytes right before it was sent, expected {expected}")]
+    CheckedHead { found: usize, expected: usize },
     #[error("its program said {0} lines before its answer, expected at most {MAX_ASIDES}")]
     TooManyLines(usize),
     #[error(transparent)]
@@ -163,9 +167,13 @@ impl Program {
         }
     }
 
-    /// What it has said besides answers. Call it now and then: it also finds that the program has ended.
+    /// The log lines and counts that have come. Call it now and then: it also finds that the program has ended.
     pub(super) fn listen(&mut self) -> Result<Asides, ProgramError> {
-        while self.has_more() {
+        // A program that talks without pause is heard again the next time.
+        for _ in 0..MAX_ASIDES {
+            if !self.has_more() {
+                break;
+            }
             match self.next_frame()? {
                 Some((kind @ (Say::Log | Say::Counts | Say::Failed), body)) => self.take_in(kind, &body)?,
                 Some((found, _)) => return Err(unexpected(found, "nothing, because it was not asked")),
@@ -175,9 +183,10 @@ impl Program {
         Ok(std::mem::take(&mut self.asides))
     }
 
-    /// What it has said besides answers so far.
-    pub(super) fn asides(&mut self) -> Asides {
-        std::mem::take(&mut self.asides)
+    /// The log lines that it has said besides answers so far. Counts wait for [`Program::listen`]: the launcher wants them
+    /// some times a second.
+    pub(super) fn lines(&mut self) -> Vec<LogEntry> {
+        std::mem::take(&mut self.asides.lines)
     }
 
     fn has_more(&self) -> bool {
@@ -201,13 +210,13 @@ impl Program {
             return Err(ProgramError::Ended(String::new(), ask));
         };
         match to.write_all(&self.out) {
-            Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Err(self.stderr_tail(ask)),
+            Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Err(self.reason_of_end(ask)),
             outcome => outcome.map_err(ProgramError::Pipe),
         }
     }
 
     /// Why a program does not listen any more: what it said before it ended, if it said something.
-    fn stderr_tail(&mut self, ask: Ask) -> ProgramError {
+    fn reason_of_end(&mut self, ask: Ask) -> ProgramError {
         match self.next() {
             Err(error) => error,
             Ok(_) => ProgramError::Ended(self.end(), ask),
@@ -228,7 +237,13 @@ impl Program {
     fn take_in(&mut self, kind: Say, body: &[u8]) -> Result<(), ProgramError> {
         match kind {
             Say::Log => {
-                let line = serde_json::from_slice(body).map_err(|error| ProgramError::Json("log line", error))?;
+                let mut line: LogEntry =
+                    serde_json::from_slice(body).map_err(|error| ProgramError::Json("log line", error))?;
+                line.text = shortened(&line.text);
+                if serde_json::to_string(&line.fields).is_ok_and(|fields| fields.len() > MAX_TEXT_BYTES) {
+                    line.fields = LogEntry::plain("").fields;
+                    line.text += " (its fields are too long for the log)";
+                }
                 self.asides.lines.push(line);
             }
             Say::Counts => {
@@ -236,7 +251,7 @@ impl Program {
                     serde_json::from_slice(body).map_err(|error| ProgramError::Json("counts", error))?;
                 self.asides.counts.extend(counts);
             }
-            _ => return Err(ProgramError::Failed(String::from_utf8_lossy(body).into_owned())),
+            _ => return Err(ProgramError::Failed(shortened(&String::from_utf8_lossy(body)))),
         }
         Ok(())
     }
@@ -315,6 +330,14 @@ impl Answer {
             Answer::Refused(reason) => Err(ProgramError::Failed(reason)),
         }
     }
+}
+
+/// A text that fits into a line to the launcher.
+fn shortened(text: &str) -> String {
+    if text.len() <= MAX_TEXT_BYTES {
+        return text.to_owned();
+    }
+    format!("{} …", &text[..text.floor_char_boundary(MAX_TEXT_BYTES)])
 }
 
 fn unexpected(found: Say, expected: &'static str) -> ProgramError {

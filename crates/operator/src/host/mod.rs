@@ -23,7 +23,7 @@ use serde_json::{Map, Value};
 use crate::description::OperatorDescription;
 use crate::operator::{self, Operator, name_process};
 use crate::sandbox::Sandbox;
-use crate::wiring::{self, Enforcement, WIRING_VARIABLE, Wiring};
+use crate::wiring::{self, Enforcement, LogEntry, WIRING_VARIABLE, Wiring};
 use crate::{monotonic_nanos, sandbox};
 use child::{Answer, Asides, Program, ProgramError};
 use protocol::{Ask, HAS_STATE, Ready, Start, VERSION, Work};
@@ -77,7 +77,7 @@ fn started(program: &OsStr, arguments: &[OsString]) -> anyhow::Result<(OperatorD
 
 fn work(operator: &Operator, description: &OperatorDescription, mut child: Program) -> anyhow::Result<()> {
     let ready = start(operator, description, &mut child);
-    say(operator, child.asides());
+    log(operator, child.lines());
     let ready = ready?;
     if ready.is_source {
         source::run(operator, description, ready, child)
@@ -166,19 +166,20 @@ fn check(description: &OperatorDescription, ready: &Ready) -> Result<(), String>
     Ok(())
 }
 
-/// Passes on what a program says besides answers.
-fn say(operator: &Operator, asides: Asides) {
-    for line in asides.lines {
+/// Passes on the log lines of a program.
+fn log(operator: &Operator, lines: Vec<LogEntry>) {
+    for line in lines {
         operator.log(line);
-    }
-    if !asides.counts.is_empty() {
-        operator.has_counted(asides.counts);
     }
 }
 
-/// Listens to a program that has nothing to do: it may have said something, or ended.
+/// Listens to a program that has nothing to do, some times a second: it may have said something, or ended.
 fn listen(operator: &Operator, child: &mut Program) -> Result<(), ProgramError> {
-    say(operator, child.listen()?);
+    let Asides { lines, counts } = child.listen()?;
+    log(operator, lines);
+    if !counts.is_empty() {
+        operator.has_counted(counts);
+    }
     Ok(())
 }
 

@@ -166,8 +166,8 @@ impl RawAnswer {
     }
 }
 
-/// A change of the bytes of a head right before it is sent.
-pub(super) type Check<'a> = &'a mut dyn FnMut(&mut Vec<u8>, &[u8]);
+/// A change of the bytes of a head right before it is sent; false if it cannot be sent.
+pub(super) type Check<'a> = &'a mut dyn FnMut(&Header, &mut Vec<u8>, &[u8]) -> bool;
 
 /// The sending end of an edge.
 pub(super) trait OutputPort {
@@ -188,7 +188,7 @@ pub(super) trait OutputPort {
     fn answered_by_readers(&self) -> Option<SampleId>;
     fn wait_limit(&self) -> Duration;
     fn has_waited(&self, time: Duration);
-    fn give_up_guests_that_lack(&self, key: SampleId, waited: Duration) -> bool;
+    fn give_up_attached_that_lack(&self, key: SampleId, waited: Duration) -> bool;
     /// The header in the bytes of a head.
     fn header_of(&self, head: &[u8]) -> Option<Header>;
     /// The bytes of a head with another header.
@@ -222,15 +222,16 @@ impl<M: Message> OutputPort for Output<M> {
             return Ok(Sent::Yes);
         };
         self.publisher.send_checked(head, &items, should_yield, |head| {
-            if let Some(check) = check {
-                let header = *M::header(head);
-                let mut bytes = head_bytes::<M>(head).to_vec();
-                check(&mut bytes, &answer.items);
-                if let Some(changed) = head_of::<M>(&bytes) {
-                    *head = changed;
-                    *M::header_mut(head) = header;
-                }
+            let Some(check) = check else { return true };
+            let header = *M::header(head);
+            let mut bytes = head_bytes::<M>(head).to_vec();
+            if !check(&header, &mut bytes, &answer.items) {
+                return false;
             }
+            let Some(changed) = head_of::<M>(&bytes) else { return false };
+            *head = changed;
+            *M::header_mut(head) = header;
+            true
         })
     }
 
@@ -273,8 +274,8 @@ impl<M: Message> OutputPort for Output<M> {
         self.publisher.has_waited(time);
     }
 
-    fn give_up_guests_that_lack(&self, key: SampleId, waited: Duration) -> bool {
-        self.publisher.give_up_guests_that_lack(key, waited)
+    fn give_up_attached_that_lack(&self, key: SampleId, waited: Duration) -> bool {
+        self.publisher.give_up_attached_that_lack(key, waited)
     }
 
     fn header_of(&self, head: &[u8]) -> Option<Header> {

@@ -93,7 +93,7 @@ pub(super) struct Start<'a> {
 /// The body of [`Ask::Resume`]: epoch and number of the last sample that readers have, by output.
 pub(super) type Resume = BTreeMap<String, Option<(u64, u64)>>;
 
-/// What the program says of itself once it has its parameters.
+/// The program's answer once it has its parameters.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Ready {
@@ -118,7 +118,7 @@ pub(super) struct Ready {
     /// The most samples that it takes at once.
     #[serde(default)]
     pub(super) batch: usize,
-    /// What it wants to hear besides samples.
+    /// The messages that it wants to hear besides samples.
     #[serde(default)]
     pub(super) hears: Vec<Hears>,
     /// How long a source that has nothing waits before it is asked again.
@@ -155,6 +155,13 @@ pub(super) struct Work {
     pub(super) flags: u32,
     pub(super) state: Vec<u8>,
     pub(super) parts: Vec<Part>,
+}
+
+impl Work {
+    /// When a program wants to hear of silence.
+    pub(super) fn deadline_nanos(&self) -> Option<u64> {
+        if self.nanos == 0 { None } else { Some(self.nanos) }
+    }
 }
 
 /// Why a message of a program cannot be read.

@@ -132,7 +132,7 @@ impl Source for HostedSource {
 
     fn step(&mut self) -> anyhow::Result<Step> {
         let step = self.take_step();
-        super::say(&self.operator, self.child.asides());
+        super::log(&self.operator, self.child.lines());
         step
     }
 
@@ -176,7 +176,7 @@ impl HostedSource {
     /// Takes in feedback, and sends the next sample.
     fn take_step(&mut self) -> anyhow::Result<Step> {
         if let Some(store) = &self.store
-            && store.send(&mut self.outputs, |_, _, _| {}, false)? == Sent::GaveWay
+            && store.send(&mut self.outputs, |_, _, _, _| true, false)? == Sent::GaveWay
         {
             return Ok(Step::GaveWay);
         }
@@ -200,6 +200,12 @@ impl HostedSource {
         }
         self.child.ask(Ask::Next, monotonic_nanos(), 0, &[], std::iter::empty())?;
         let work = self.child.answer(Ask::Next)?.done()?;
+        if work.flags & (FINISHED | NOTHING_YET) != 0 && !work.parts.is_empty() {
+            anyhow::bail!(
+                "its program gave samples and said that it has none: expected the samples first, and that it says so when it \
+                 is asked again"
+            );
+        }
         if work.flags & FINISHED != 0 {
             return self.end(work);
         }
@@ -299,7 +305,7 @@ impl HostedSource {
         if store.save(&self.inputs, &mut self.outputs, &self.state, false)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
-        Ok(store.send(&mut self.outputs, |_, _, _| {}, false)?)
+        Ok(store.send(&mut self.outputs, |_, _, _, _| true, false)?)
     }
 
     /// Sends samples unless readers have them.

@@ -13,13 +13,14 @@ use super::child::{Answer, Program, ProgramError};
 use super::ports::{self, PartnerPort, RawAnswer, RawSample};
 use super::protocol::{Ask, Hears, MORE, Part, Ready, Work};
 use super::store::{Input, Output, Store, is_at_most, look_for_readers};
-use super::{listen, say};
+use super::{listen, log};
 use crate::cursors::SampleId;
 use crate::description::OperatorDescription;
 use crate::monotonic_nanos;
 use crate::operator::{Operator, TICK, Task, Turn, run_in_turn};
+use crate::partner::Partners;
 use crate::port::Sent;
-use crate::stage::{N_WARM, Partners, ROOM_PAUSE};
+use crate::stage::{N_WARM, ROOM_PAUSE, arrival_nanos, too_late};
 use crate::wiring::{Clock, Command, InputCounts, OnLate};
 
 /// The most samples that a program gets at once.
@@ -70,14 +71,14 @@ pub(super) fn run(
 ) -> anyhow::Result<()> {
     let (inputs, partner_ports) = open_inputs(operator, description)?;
     let outputs = open_outputs(operator, description, &ready, true)?;
-    let is_alike = !ready.has_state
-        && inputs.len() == 1
-        && !outputs.is_empty()
-        && (description.answers_each || outputs.len() == 1);
+    // An optional input that is not connected changes nothing of how answers are numbered.
+    let has_one_input = description.inputs.iter().filter(|port| !port.partner).count() == 1 && inputs.len() == 1;
+    let is_alike =
+        !ready.has_state && has_one_input && !outputs.is_empty() && (description.answers_each || outputs.len() == 1);
     let mut stage = HostedStage {
         operator: operator.clone(),
         child,
-        numbers_itself: !is_alike && inputs.len() == 1 && outputs.len() == 1,
+        numbers_itself: !is_alike && has_one_input && outputs.len() == 1,
         inputs,
         outputs,
         partners: Partners::of(operator),
@@ -174,7 +175,7 @@ impl Task for HostedStage {
 
     fn step(&mut self) -> anyhow::Result<Turn> {
         let turn = self.take_turn();
-        say(&self.operator, self.child.asides());
+        log(&self.operator, self.child.lines());
         turn
     }
 }
@@ -348,7 +349,7 @@ impl HostedStage {
     fn hear(&mut self, ask: Ask) -> anyhow::Result<Sent> {
         self.child.ask(ask, monotonic_nanos(), 0, &[], std::iter::empty())?;
         let work = self.child.answer(ask)?.done()?;
-        self.deadline_nanos = (work.nanos != 0).then_some(work.nanos);
+        self.deadline_nanos = work.deadline_nanos();
         if self.store.is_none() {
             if work.parts.is_empty() {
                 return Ok(Sent::Yes);
@@ -427,7 +428,13 @@ impl HostedStage {
             let flags = if n + 1 < samples.len() { MORE } else { 0 };
             let own = std::iter::once((port, &sample.head[..], &sample.items[..]));
             let others = partners.iter().map(|(port, head, items)| (*port, &head[..], &items[..]));
-            self.child.ask(Ask::Sample, self.now_nanos(&sample.header), flags, &[], own.chain(others))?;
+            self.child.ask(
+                Ask::Sample,
+                arrival_nanos(&self.operator, &sample.header),
+                flags,
+                &[],
+                own.chain(others),
+            )?;
         }
         let mut works = Vec::with_capacity(samples.len());
         for _ in samples {
@@ -444,17 +451,9 @@ impl HostedStage {
         }
         self.operator.works_on(None);
         if let Some(last) = works.last() {
-            self.deadline_nanos = (last.nanos != 0).then_some(last.nanos);
+            self.deadline_nanos = last.deadline_nanos();
         }
         Ok(works)
-    }
-
-    /// The time by the clock of the stages.
-    fn now_nanos(&self, header: &Header) -> u64 {
-        match self.operator.clock() {
-            Clock::Machine => monotonic_nanos(),
-            Clock::Recording => header.origin_nanos,
-        }
     }
 
     /// The name of a sample for the launcher, which knows nothing of inputs: two inputs may have samples of one number.
@@ -471,9 +470,7 @@ impl HostedStage {
     fn judge_lateness(&mut self, sample: &RawSample) {
         let Some((OnLate::Stop, age_nanos)) = sample.late else { return };
         if self.operator.clock() == Clock::Machine && !std::mem::replace(&mut self.is_unfit, true) {
-            let (seq, age_millis) = (sample.header.seq, age_nanos as f64 / 1e6);
-            let message = format!("got sample {seq} after {age_millis:.1} ms, too late, and 'on_late' is 'stop'");
-            self.operator.is_unfit(message);
+            self.operator.is_unfit(too_late(sample.header.seq, age_nanos));
         }
     }
 
@@ -554,7 +551,6 @@ impl HostedStage {
         let is_checked = self.ready.hears.contains(&Hears::Check);
         let has_others = self.outputs.len() > 1;
         for (output_idx, answer) in answers {
-            let now_nanos = self.now_nanos(&answer.header);
             let output = &mut self.outputs[output_idx];
             // One output may be ahead of another: its readers have this answer.
             if has_others && is_at_most(sample.key(), output.known) {
@@ -562,8 +558,9 @@ impl HostedStage {
             }
             let (operator, child) = (&self.operator, &mut self.child);
             let mut failure = None;
-            let mut check = |head: &mut Vec<u8>, items: &[u8]| {
-                failure = checked(child, output.idx, head, items, now_nanos).err();
+            let mut check = |header: &Header, head: &mut Vec<u8>, items: &[u8]| {
+                failure = checked(child, output.idx, head, items, arrival_nanos(operator, header)).err();
+                failure.is_none()
             };
             let check: Option<ports::Check<'_>> = if is_checked { Some(&mut check) } else { None };
             let sent = output.port.send(&answer, &mut || operator.should_yield(), check)?;
@@ -638,12 +635,11 @@ impl HostedStage {
             return Ok(Sent::Yes);
         };
         let is_checked = self.ready.hears.contains(&Hears::Check);
-        let child = &mut self.child;
+        let (operator, child) = (&self.operator, &mut self.child);
         let mut failure = None;
-        let check = |output: usize, head: &mut Vec<u8>, items: &[u8]| {
-            if failure.is_none() {
-                failure = checked(child, output, head, items, monotonic_nanos()).err();
-            }
+        let check = |output: usize, header: &Header, head: &mut Vec<u8>, items: &[u8]| {
+            failure = checked(child, output, head, items, arrival_nanos(operator, header)).err();
+            failure.is_none()
         };
         let sent = store.send(&mut self.outputs, check, is_checked)?;
         match failure {
@@ -672,7 +668,7 @@ impl HostedStage {
         let restored = store.restore(&mut self.inputs, &mut self.outputs, is_handed_over, false)?;
         if self.ready.has_state {
             let work = super::restore(&mut self.child, restored.state.as_deref())?;
-            self.deadline_nanos = (work.nanos != 0).then_some(work.nanos);
+            self.deadline_nanos = work.deadline_nanos();
             self.state = work.state;
         }
         Ok(())
@@ -689,6 +685,8 @@ impl HostedStage {
             self.last = self.inputs.first().and_then(|input| input.last);
             return Ok(());
         }
+        // A later instance with a state must not go on with an old one.
+        self.operator.forget_state();
         for output in &mut self.outputs {
             output.known = output.port.known(is_handed_over);
         }
@@ -787,6 +785,9 @@ fn checked(
     child.ask(Ask::Check, now_nanos, 0, &[], std::iter::once((output, &head[..], items)))?;
     let work = child.answer(Ask::Check)?.done()?;
     if let Some(part) = work.parts.into_iter().next() {
+        if part.head.len() != head.len() {
+            return Err(ProgramError::CheckedHead { found: part.head.len(), expected: head.len() });
+        }
         *head = part.head;
     }
     Ok(())

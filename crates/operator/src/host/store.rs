@@ -1,4 +1,4 @@
-//! What a host saves for the one that takes over: how far it has come, answers that readers may still need, and the state of
+//! The state that a host saves for the one that takes over: how far it has come, answers that readers may still need, and the state of
 //! its program.
 //!
 //! It is saved as a whole, before the answers are sent: a kill at any moment neither loses an answer nor makes another one
@@ -16,12 +16,13 @@ use crate::operator::Operator;
 use crate::port::{LONGEST_TRY, LOOK_PAUSE, PortError, RETRY_PAUSE, Sent};
 use crate::stage::{STATE_FORMAT, encode_state};
 use crate::wiring::InputCounts;
+use blindgrasp_messages::Header;
 
 /// The beginning of what hosts save. No stage in Rust saves anything that begins like this.
 const MAGIC: &[u8] = b"bg-host1";
 /// An upper bound of the bytes that are saved for each port besides its answers, and for the rest.
 const PORT_BYTES: usize = 256;
-/// What is saved with an answer: the lengths of its head and items.
+/// The numbers that are saved with an answer: the lengths of its head and items.
 const ENTRY_BYTES: usize = 16;
 
 /// An input, and how far the operator has come.
@@ -107,7 +108,7 @@ impl Output {
     }
 }
 
-/// What is saved of the ports, by name.
+/// The saved places of the ports, by name.
 #[derive(Default, Serialize, Deserialize)]
 struct Places {
     inputs: BTreeMap<String, (Option<SampleId>, InputCounts)>,
@@ -123,7 +124,7 @@ pub(super) struct Store {
     is_done: bool,
 }
 
-/// What another instance has saved.
+/// The saved state of another instance.
 pub(super) struct Restored {
     /// The state of its program; `None` if there is none.
     pub(super) state: Option<Vec<u8>>,
@@ -233,8 +234,9 @@ impl Store {
             let since = now.duration_since(std::mem::replace(&mut last_try, now)).min(LONGEST_TRY);
             for (output, waited) in outputs.iter().zip(&mut waited) {
                 let first = if output.n_sent > 0 { output.saved.front() } else { None };
-                let are_guests = first.is_some_and(|first| output.port.give_up_guests_that_lack(first.key(), *waited));
-                *waited = if are_guests { *waited + since } else { Duration::ZERO };
+                let are_attached =
+                    first.is_some_and(|first| output.port.give_up_attached_that_lack(first.key(), *waited));
+                *waited = if are_attached { *waited + since } else { Duration::ZERO };
             }
             if start.elapsed() > limit {
                 let slow = outputs.iter().filter(|output| output.n_sent > 0).map(|output| output.name.as_str());
@@ -264,13 +266,13 @@ impl Store {
     pub(super) fn send(
         &self,
         outputs: &mut [Output],
-        mut check: impl FnMut(usize, &mut Vec<u8>, &[u8]),
+        mut check: impl FnMut(usize, &Header, &mut Vec<u8>, &[u8]) -> bool,
         is_checked: bool,
     ) -> Result<Sent, PortError> {
         for output in outputs {
             while let Some(answer) = output.saved.get(output.n_sent) {
                 let idx = output.idx;
-                let mut checked = |head: &mut Vec<u8>, items: &[u8]| check(idx, head, items);
+                let mut checked = |header: &Header, head: &mut Vec<u8>, items: &[u8]| check(idx, header, head, items);
                 let check: Option<super::ports::Check<'_>> = if is_checked { Some(&mut checked) } else { None };
                 if output.port.send(answer, &mut || self.operator.should_yield(), check)? == Sent::GaveWay {
                     return Ok(Sent::GaveWay);
@@ -283,7 +285,7 @@ impl Store {
 
     /// Takes over what the node's active instance has saved last.
     ///
-    /// What another operator has saved says nothing: a source then goes on after the last sample that was sent, a stage after
+    /// The state of another operator says nothing: a source then goes on after the last sample that was sent, a stage after
     /// the last one that was answered.
     ///
     /// # Errors
@@ -485,7 +487,7 @@ mod tests {
             Duration::ZERO
         }
         fn has_waited(&self, _: Duration) {}
-        fn give_up_guests_that_lack(&self, _: SampleId, _: Duration) -> bool {
+        fn give_up_attached_that_lack(&self, _: SampleId, _: Duration) -> bool {
             false
         }
         fn header_of(&self, head: &[u8]) -> Option<Header> {

@@ -317,10 +317,11 @@ impl<M: Message> Publisher<M> {
         items: &[M::Item],
         should_yield: &mut dyn FnMut() -> bool,
     ) -> Result<Sent, PortError> {
-        self.send_checked(head, items, should_yield, |_| {})
+        self.send_checked(head, items, should_yield, |_| true)
     }
 
-    /// As [`Publisher::send`]; `check` may change the head at the last moment, when the readers have room.
+    /// As [`Publisher::send`]; `check` may change the head at the last moment, when the readers have room. If it returns
+    /// false, nothing is sent ([`Sent::GaveWay`]).
     ///
     /// # Errors
     /// As [`Publisher::send`].
@@ -329,13 +330,15 @@ impl<M: Message> Publisher<M> {
         mut head: M::Head,
         items: &[M::Item],
         should_yield: &mut dyn FnMut() -> bool,
-        check: impl FnOnce(&mut M::Head),
+        check: impl FnOnce(&mut M::Head) -> bool,
     ) -> Result<Sent, PortError> {
         let key = sample_id(M::header(&head));
         if !self.has_room(&key) && self.wait_for_room(&key, should_yield)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
-        check(&mut head);
+        if !check(&mut head) {
+            return Ok(Sent::GaveWay);
+        }
         // It is counted first: a publisher that is killed in between sends it again, and it is counted once. The other way
         // round, a reader could answer a sample that is not counted.
         self.slot().commit(key);
@@ -403,7 +406,7 @@ impl<M: Message> Publisher<M> {
     }
 
     /// Whether attached readers alone have not answered a sample that was sent. Those that have had longer than their time are given up.
-    pub(crate) fn give_up_guests_that_lack(&self, key: SampleId, waited: Duration) -> bool {
+    pub(crate) fn give_up_attached_that_lack(&self, key: SampleId, waited: Duration) -> bool {
         let last = self.slot().key();
         let lacks = |reader: &Reader| match reader.least(&self.cursors, last) {
             None => false,
