@@ -57,7 +57,7 @@ pub(super) fn unix_nanos() -> u64 {
 pub(super) trait Forward {
     fn open(&mut self, node: &mut Node, namespace: &str) -> Result<(), RosError>;
     fn close(&mut self);
-    fn connect(&self) -> anyhow::Result<()>;
+    fn connect(&mut self) -> anyhow::Result<()>;
     /// Publishes the next sample, if there is a session.
     fn forward(&mut self, data: &mut Vec<u8>) -> anyhow::Result<Forwarded>;
 }
@@ -139,7 +139,7 @@ impl<M: Message> Forward for Edge<M> {
         self.publishers.clear();
     }
 
-    fn connect(&self) -> anyhow::Result<()> {
+    fn connect(&mut self) -> anyhow::Result<()> {
         self.subscriber.connect()?;
         Ok(())
     }
@@ -270,7 +270,7 @@ impl Source for Publishing<'_> {
 
     fn look(&mut self) -> anyhow::Result<()> {
         self.report_counts();
-        self.edges.iter().try_for_each(|edge| edge.connect())
+        self.edges.iter_mut().try_for_each(|edge| edge.connect())
     }
 
     /// Publishes the samples that are there, and ends the session.

@@ -159,7 +159,7 @@ impl<M: Played> Source for RecordedSource<'_, M> {
             operator.beat();
             !operator.has_command() && !operator.should_stop()
         };
-        let (frame, truth) = (self.frames.known(is_handed_over), self.truths.known(is_handed_over));
+        let (frame, truth) = (self.frames.begin(is_handed_over), self.truths.begin(is_handed_over));
         Ok(self.player.resume(frame, truth, &mut go_on)?)
     }
 

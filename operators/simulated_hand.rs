@@ -181,9 +181,9 @@ impl Source for SimulatedHand<'_> {
         };
         self.decisions.resume(saved.last_decision, saved.counts);
         self.known = Known {
-            frame: self.frames.known(is_handed_over),
-            outcome: self.outcomes.known(is_handed_over),
-            truth: self.truths.known(is_handed_over),
+            frame: self.frames.begin(is_handed_over),
+            outcome: self.outcomes.begin(is_handed_over),
+            truth: self.truths.begin(is_handed_over),
         };
         self.robot.resume(saved.course, self.known.frame.map(|last| last.seq));
         self.deadline = None;

@@ -79,9 +79,9 @@ impl Downlink {
     /// # Errors
     /// The wiring does not have this port, or iceoryx2 fails.
     pub(super) fn open<M: Message>(operator: &Operator, channel: &Channel, instance: u64) -> anyhow::Result<Downlink> {
-        let publisher = operator.growing_publisher::<M>(&channel.port)?;
+        let mut publisher = operator.growing_publisher::<M>(&channel.port)?;
         // Samples that an earlier process published and that have no answer may have been lost with that process.
-        let incoming = Incoming::new(channel.policy, instance, publisher.answered());
+        let incoming = Incoming::new(channel.policy, instance, publisher.begin(false));
         Ok(Downlink {
             channel: channel.clone(),
             schema_id: sample::schema_id(M::TYPE_NAME).unwrap_or_default(),

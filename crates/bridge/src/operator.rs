@@ -156,8 +156,8 @@ impl<'a> Link<'a> {
             }
             if self.last_look.elapsed() >= LOOK_PAUSE {
                 self.last_look = Instant::now();
-                for connection in &self.connections {
-                    connection.uplinks.iter().try_for_each(Uplink::connect)?;
+                for connection in &mut self.connections {
+                    connection.uplinks.iter_mut().try_for_each(Uplink::connect)?;
                 }
                 self.look_for_readers()?;
             }

@@ -43,7 +43,7 @@ trait Reader {
     fn counts(&self) -> InputCounts;
     fn commit_late(&mut self, key: SampleId, counts: &InputCounts);
     fn written(&self) -> Option<SampleId>;
-    fn connect(&self) -> anyhow::Result<()>;
+    fn connect(&mut self) -> anyhow::Result<()>;
 }
 
 impl Uplink {
@@ -132,7 +132,7 @@ impl Uplink {
     ///
     /// # Errors
     /// The port fails.
-    pub(super) fn connect(&self) -> anyhow::Result<()> {
+    pub(super) fn connect(&mut self) -> anyhow::Result<()> {
         self.reader.connect()
     }
 }
@@ -164,7 +164,7 @@ impl<M: Message> Reader for Subscriber<M> {
         Subscriber::written(self)
     }
 
-    fn connect(&self) -> anyhow::Result<()> {
+    fn connect(&mut self) -> anyhow::Result<()> {
         Subscriber::connect(self)?;
         Ok(())
     }

@@ -290,6 +290,7 @@ impl Plan {
             state_region: *self.state_regions.get(&node.id)?,
             answers_each: self.relies_on_each_answer(&node.id),
             skip: Vec::new(),
+            suspect: None,
             sandbox: node.sandbox,
             hosted: node.description.hosted.then(|| node.description.clone()),
         })

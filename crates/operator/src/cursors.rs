@@ -26,11 +26,12 @@ use serde::{Deserialize, Serialize};
 use crate::ages::{AgeCounter, N_BUCKETS};
 use crate::bell::Bell;
 use crate::wiring::InputCounts;
+use crate::written::Written;
 
 /// "bgcursor" in ASCII.
 const MAGIC: u64 = u64::from_be_bytes(*b"bgcursor");
 /// Changes with the layout.
-const LAYOUT: u64 = 4;
+const LAYOUT: u64 = 5;
 /// The offset of the first slot.
 const HEADER_BYTES: usize = 4096;
 /// The size of a slot: two cache lines, so that neighbours don't disturb each other.
@@ -72,7 +73,7 @@ unsafe impl Send for SharedCursors {}
 unsafe impl Sync for SharedCursors {}
 
 /// The number of a sample in a stream.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 pub struct SampleId {
     /// The generation of the source.
     pub epoch: u64,
@@ -151,8 +152,9 @@ pub struct InputSlot {
 /// The cursor of a writer, and counts of its samples.
 #[repr(C, align(128))]
 pub struct OutputSlot {
-    /// Epoch and number of the last sample; sent, resent, nanoseconds of waiting for readers.
-    last: Commits<5>,
+    /// Epoch and number of the last sample, the first number of its epoch; sent, nanoseconds of waiting for readers; epoch and
+    /// number of the last sample of the epoch before.
+    last: Commits<7>,
     /// 1 when the writer is on another machine whose link is cut off.
     is_cut_off: AtomicU64,
 }
@@ -400,12 +402,16 @@ impl InputSlot {
 impl OutputSlot {
     /// The last sample that was sent.
     pub fn key(&self) -> Option<SampleId> {
-        let [epoch, seq, ..] = self.record();
-        from_words(epoch, seq)
+        self.written().map(|written| written.last)
+    }
+
+    /// How far the instances of the node have come.
+    pub fn written(&self) -> Option<Written> {
+        written_of(&self.record())
     }
 
     pub fn n_sent(&self) -> u64 {
-        self.record()[2]
+        self.record()[3]
     }
 
     /// The time for which the writer has waited for readers.
@@ -413,19 +419,19 @@ impl OutputSlot {
         self.record()[4]
     }
 
-    fn record(&self) -> [u64; 5] {
-        self.last.load().unwrap_or([0, NO_SEQ, 0, 0, 0])
+    fn record(&self) -> [u64; 7] {
+        self.last.load().unwrap_or([0, NO_SEQ, 0, 0, 0, 0, NO_SEQ])
     }
 
-    /// Counts a sample that was sent.
+    /// Counts a sample that is sent. One that is sent again moves nothing.
     pub fn commit(&self, key: SampleId) {
-        let [epoch, seq, n_sent, n_resent, blocked_nanos] = self.record();
-        let is_resent = from_words(epoch, seq).is_some_and(|last| last.epoch == key.epoch && key.seq <= last.seq);
-        self.last.store(if is_resent {
-            [epoch, seq, n_sent, n_resent + 1, blocked_nanos]
-        } else {
-            [key.epoch, key.seq, n_sent + 1, n_resent, blocked_nanos]
-        });
+        let record = self.record();
+        if let Some(written) = Written::with(written_of(&record), key) {
+            let [before_epoch, before_seq] = to_words(written.before);
+            let [.., n_sent, blocked_nanos, _, _] = record;
+            let Written { last, first_seq, .. } = written;
+            self.last.store([last.epoch, last.seq, first_seq, n_sent + 1, blocked_nanos, before_epoch, before_seq]);
+        }
     }
 
     /// Whether the link to the writer's machine is cut off.
@@ -438,9 +444,15 @@ impl OutputSlot {
     }
 
     pub fn add_blocked(&self, nanos: u64) {
-        let [epoch, seq, n_sent, n_resent, blocked_nanos] = self.record();
-        self.last.store([epoch, seq, n_sent, n_resent, blocked_nanos + nanos]);
+        let mut record = self.record();
+        record[4] += nanos;
+        self.last.store(record);
     }
+}
+
+fn written_of(record: &[u64; 7]) -> Option<Written> {
+    let [epoch, seq, first_seq, _, _, before_epoch, before_seq] = *record;
+    Some(Written { last: from_words(epoch, seq)?, first_seq, before: from_words(before_epoch, before_seq) })
 }
 
 impl InstanceSlot {

@@ -34,6 +34,7 @@
 //! * [`description`] and [`param`] - what an operator says about itself (`--describe`).
 //! * [`port`] - publisher and subscriber of one message type. [`sequencer`] - puts samples of several publishers in
 //!   order, each once. [`waiter`] - waits for several ports at once.
+//! * [`written`] - the order of a writer's samples across epochs.
 //! * [`cursors`] - how far each of a graph's processes has come. [`ages`] - how old samples are when a reader gets them.
 //! * [`host`] - gives the samples of an operator to a program in any language, over two pipes.
 //! * [`wiring`] - what the launcher tells an operator and what the operator tells the launcher.
@@ -45,6 +46,7 @@
 pub mod ages;
 pub mod bell;
 pub mod control_socket;
+mod credit;
 pub mod cursors;
 pub mod description;
 pub mod diagnostics;
@@ -57,6 +59,8 @@ mod outbox;
 pub mod param;
 pub mod partner;
 pub mod port;
+#[cfg(test)]
+mod recovery_model;
 pub mod sandbox;
 pub mod sequencer;
 pub mod source;
@@ -65,6 +69,7 @@ pub mod text;
 mod trace;
 pub mod waiter;
 pub mod wiring;
+pub mod written;
 
 pub use description::OperatorDescription;
 pub use operator::{Operator, parse_params, run};

@@ -58,6 +58,8 @@ struct Member {
     /// The partner inputs, and the counts of its own that it has reported.
     partners: RefCell<Vec<Rc<RefCell<dyn PairedInput>>>>,
     counts: RefCell<BTreeMap<String, u64>>,
+    /// Of each output, whether all samples that are not answered can be received.
+    has_sent_all: RefCell<Vec<Arc<AtomicBool>>>,
     /// The other operators of the process, and the stages that wait for all of them to be open; `None` if it is alone.
     group: Option<Rc<Group>>,
 }
@@ -65,6 +67,8 @@ struct Member {
 /// The operators of a process that run in turn.
 pub(crate) struct Group {
     inboxes: Vec<Arc<Inbox>>,
+    /// The slots of their inputs.
+    input_slots: Vec<usize>,
     pub(crate) tasks: RefCell<Vec<Box<dyn Task>>>,
 }
 
@@ -196,7 +200,20 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn publisher<M: Message>(&self, port: &str, max_items: usize) -> Result<Publisher<M>, OperatorError> {
-        Ok(Publisher::open(&self.0.node, &self.0.cursors, wired(&self.0.wiring.outputs, port)?, max_items)?)
+        Ok(self.enlist(Publisher::open(
+            &self.0.node,
+            &self.0.cursors,
+            wired(&self.0.wiring.outputs, port)?,
+            max_items,
+        )?))
+    }
+
+    fn enlist<M: Message>(&self, mut publisher: Publisher<M>) -> Publisher<M> {
+        if let Some(group) = &self.0.group {
+            publisher.shares_process_with(group.input_slots.clone());
+        }
+        self.0.has_sent_all.borrow_mut().push(publisher.has_sent_all());
+        publisher
     }
 
     /// As [`Operator::publisher`], for messages whose largest number of items is unknown.
@@ -204,7 +221,7 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn growing_publisher<M: Message>(&self, port: &str) -> Result<Publisher<M>, OperatorError> {
-        Ok(Publisher::open_growing(&self.0.node, &self.0.cursors, wired(&self.0.wiring.outputs, port)?)?)
+        Ok(self.enlist(Publisher::open_growing(&self.0.node, &self.0.cursors, wired(&self.0.wiring.outputs, port)?)?))
     }
 
     /// As [`Operator::shadow`], for messages whose largest number of items is unknown.
@@ -358,6 +375,11 @@ impl Operator {
         self.0.cursors.instance(self.0.wiring.instance_slot).works_on(sample);
     }
 
+    /// Whether the last instance died while it worked on a sample.
+    pub(crate) fn has_suspect(&self) -> bool {
+        self.0.wiring.suspect.is_some()
+    }
+
     /// Whether a sample has killed earlier instances again and again.
     pub(crate) fn skips(&self, sample: SampleId) -> bool {
         self.0.wiring.skip.contains(&sample)
@@ -440,7 +462,8 @@ impl Operator {
 
     /// Reports that it answers no more.
     pub fn handed_over(&self) {
-        self.report(&Report::HandedOver);
+        let has_sent_all = self.0.has_sent_all.borrow().iter().all(|has_sent_all| has_sent_all.load(Ordering::Relaxed));
+        self.report(&Report::HandedOver { has_sent_all });
     }
 
     /// Reports that it is the active instance.
@@ -666,7 +689,8 @@ pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyho
         Arc::new(Sandbox::new(operators, &leader.domain))
     });
     let entered = sandbox.as_ref().map_or(Enforcement::None, |sandbox| sandbox::or_none(sandbox.enter()));
-    let group = is_group.then(|| Rc::new(Group { inboxes: inboxes.clone(), tasks: RefCell::default() }));
+    let input_slots = wirings.iter().flat_map(|wiring| wiring.inputs.values()).filter_map(|input| input.slot).collect();
+    let group = is_group.then(|| Rc::new(Group { inboxes: inboxes.clone(), input_slots, tasks: RefCell::default() }));
     let mut operators = Vec::with_capacity(wirings.len());
     for ((wiring, description), inbox) in wirings.into_iter().zip(descriptions).zip(inboxes) {
         let program = identity::of_program(description, &wiring.params);
@@ -681,6 +705,7 @@ pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyho
             voice: voice(&wiring.node),
             partners: RefCell::default(),
             counts: RefCell::default(),
+            has_sent_all: RefCell::default(),
             group: group.clone(),
             wiring,
         })));

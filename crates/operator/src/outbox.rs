@@ -56,10 +56,83 @@ mod as_bytes {
     }
 }
 
-pub(crate) struct Outbox<M> {
-    entries: VecDeque<Entry>,
+/// A sample with its number.
+pub(crate) trait Keyed {
+    fn key(&self) -> SampleId;
+}
+
+impl Keyed for Entry {
+    fn key(&self) -> SampleId {
+        self.key
+    }
+}
+
+/// Answers in the order in which they are sent, from the first that a reader may still need on.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(crate) struct Kept<E> {
+    entries: VecDeque<E>,
     /// So many of the first entries were sent.
     n_sent: usize,
+}
+
+impl<E> Default for Kept<E> {
+    fn default() -> Self {
+        Kept { entries: VecDeque::new(), n_sent: 0 }
+    }
+}
+
+impl<E: Keyed> Kept<E> {
+    pub(crate) fn push(&mut self, entry: E) {
+        self.entries.push_back(entry);
+    }
+
+    /// The first answer that was not sent.
+    pub(crate) fn next(&self) -> Option<&E> {
+        self.entries.get(self.n_sent)
+    }
+
+    pub(crate) fn has_sent_next(&mut self) {
+        self.n_sent += 1;
+    }
+
+    /// The first answer that was sent and may still be needed.
+    pub(crate) fn first_sent(&self) -> Option<SampleId> {
+        self.entries.front().filter(|_| self.n_sent > 0).map(Keyed::key)
+    }
+
+    /// Takes out the answers that were sent and that no reader needs again: those up to `answered`, or all if there is no
+    /// reader.
+    pub(crate) fn forget(
+        &mut self,
+        has_readers: bool,
+        answered: Option<SampleId>,
+    ) -> std::collections::vec_deque::Drain<'_, E> {
+        let n_answered = if has_readers { self.n_up_to(answered) } else { self.n_sent };
+        let n_forgotten = n_answered.min(self.n_sent);
+        self.n_sent -= n_forgotten;
+        self.entries.drain(..n_forgotten)
+    }
+
+    pub(crate) fn entries(&self) -> &VecDeque<E> {
+        &self.entries
+    }
+
+    /// The answers of an earlier instance; those up to `known` need not be sent again.
+    pub(crate) fn restored(entries: VecDeque<E>, known: Option<SampleId>) -> Self {
+        let kept = Kept { entries, n_sent: 0 };
+        Kept { n_sent: kept.n_up_to(known), ..kept }
+    }
+
+    /// The number of entries up to that answer. Answers are in order, and an answer that is not there is older than all.
+    fn n_up_to(&self, key: Option<SampleId>) -> usize {
+        let found = key.and_then(|key| self.entries.iter().rposition(|entry| entry.key() == key));
+        found.map_or(0, |idx| idx + 1)
+    }
+}
+
+/// The answers of a stage in Rust.
+pub(crate) struct Outbox<M> {
+    kept: Kept<Entry>,
     /// Memory of entries that were dropped.
     spare: Vec<Vec<u8>>,
     _message: PhantomData<M>,
@@ -67,7 +140,7 @@ pub(crate) struct Outbox<M> {
 
 impl<M: Message> Outbox<M> {
     pub(crate) fn new() -> Self {
-        Outbox { entries: VecDeque::new(), n_sent: 0, spare: Vec::new(), _message: PhantomData }
+        Outbox { kept: Kept::default(), spare: Vec::new(), _message: PhantomData }
     }
 
     /// Adds an answer that is to be sent.
@@ -81,7 +154,7 @@ impl<M: Message> Outbox<M> {
         sample.clear();
         encode_state(Stamped { header, message }, &mut sample)?;
         let Header { origin_nanos, valid_nanos, made_by, .. } = header;
-        self.entries.push_back(Entry { key: sample_id(&header), origin_nanos, valid_nanos, made_by, sample });
+        self.kept.push(Entry { key: sample_id(&header), origin_nanos, valid_nanos, made_by, sample });
         Ok(())
     }
 
@@ -90,7 +163,7 @@ impl<M: Message> Outbox<M> {
     /// # Errors
     /// It was saved by another version.
     pub(crate) fn next(&self) -> anyhow::Result<Option<Answer<M>>> {
-        let Some(entry) = self.entries.get(self.n_sent) else {
+        let Some(entry) = self.kept.next() else {
             return Ok(None);
         };
         let (sample, _): (Stamped<M>, _) = bincode::serde::decode_from_slice(&entry.sample, STATE_FORMAT)
@@ -99,33 +172,29 @@ impl<M: Message> Outbox<M> {
         Ok(Some(sample.message.to_parts(Header { origin_nanos, valid_nanos, made_by, ..sample.header })))
     }
 
+    /// See [`Kept::has_sent_next`].
     pub(crate) fn has_sent_next(&mut self) {
-        self.n_sent += 1;
+        self.kept.has_sent_next();
     }
 
-    /// Drops the answers that were sent and that no reader needs again: those up to `answered`, or all if there is no reader.
+    /// See [`Kept::first_sent`].
+    pub(crate) fn first_sent(&self) -> Option<SampleId> {
+        self.kept.first_sent()
+    }
+
+    /// See [`Kept::forget`].
     pub(crate) fn forget(&mut self, has_readers: bool, answered: Option<SampleId>) {
-        let n_answered = if has_readers { self.n_up_to(answered) } else { self.n_sent };
-        let n_forgotten = n_answered.min(self.n_sent);
-        self.spare.extend(self.entries.drain(..n_forgotten).map(|entry| entry.sample));
-        self.n_sent -= n_forgotten;
+        self.spare.extend(self.kept.forget(has_readers, answered).map(|entry| entry.sample));
     }
 
     /// What is saved with the state.
     pub(crate) fn entries(&self) -> &VecDeque<Entry> {
-        &self.entries
+        self.kept.entries()
     }
 
     /// Takes over the saved answers; those up to `known` need not be sent again.
     pub(crate) fn restore(&mut self, entries: VecDeque<Entry>, known: Option<SampleId>) {
-        self.entries = entries;
-        self.n_sent = self.n_up_to(known);
-    }
-
-    /// The number of entries up to that answer. Answers are in order, and an answer that is not there is older than all.
-    fn n_up_to(&self, key: Option<SampleId>) -> usize {
-        let found = key.and_then(|key| self.entries.iter().rposition(|entry| entry.key == key));
-        found.map_or(0, |idx| idx + 1)
+        self.kept = Kept::restored(entries, known);
     }
 }
 

@@ -3,10 +3,11 @@
 //! The stage answers its main input by number. Of a partner input it gets the sample whose stamp is nearest, if the two are
 //! no further apart than the edge's tolerance. It waits until a later sample of the partner input has come, because only then
 //! the nearest one is known, so that the pairs do not depend on speed. A sample whose partner does not come in time is
-//! answered without one, and counted. Where the stamps of an input go back, as those of a recording that is played again do, a new round begins, and has no pairs with the one before.
+//! answered without one, and counted. Where the stamps of an input go back, as those of a recording that is played again do, a
+//! new round begins, and has no pairs with the one before.
 //!
-//! A sample of a partner input counts as answered when it has been received. After a restart the instance reads all that
-//! its writer still keeps, and finds the partners of the samples that it answers again.
+//! A sample of a partner input counts as answered once no sample of the main input that may be answered again needs it, so
+//! that its writer keeps it until then. After a restart the instance finds the partners of the samples that it answers again.
 
 use std::cell::{Ref, RefCell};
 use std::collections::VecDeque;
@@ -17,13 +18,16 @@ use crate::cursors::SampleId;
 use crate::monotonic_nanos;
 use crate::operator::Operator;
 use crate::port::{PortError, Subscriber, sample_id};
-use crate::wiring::{Clock, InputWiring};
+use crate::wiring::{Clock, InputCounts, InputWiring};
 use blindgrasp_messages::{Header, Message};
 
 /// So many samples are kept for a main input that is behind.
 const MAX_KEPT: usize = 1024;
 /// By a recording's clock, a partner is waited for so long, and room for samples that are still needed.
 const RECORDING_LIMIT: Duration = Duration::from_secs(1);
+
+/// A sample is retained for at most so long for main samples that may be answered again.
+const RETAIN_LIMIT: Duration = Duration::from_secs(1);
 
 /// The samples of an input in the order in which they came. Where stamps go back, a new segment begins.
 struct Timeline<T> {
@@ -106,6 +110,65 @@ impl<T> Segment<T> {
     }
 }
 
+/// The samples of a partner input that may be needed again after a restart. They leave the timeline in the order in which they
+/// came.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(crate) struct Retained {
+    /// The samples that were received and not committed, with the counts and the time (CLOCK_BOOTTIME, nanoseconds) at which
+    /// they came.
+    samples: VecDeque<(SampleId, InputCounts, u64)>,
+    /// So many of the first ones have left the timeline.
+    n_left: usize,
+    /// The samples of the main input that were answered, each with the number of samples that had left the timeline by then.
+    answered: VecDeque<(SampleId, usize)>,
+    /// At most so many are retained, so that the writer is not held up.
+    n_most: usize,
+    last: Option<SampleId>,
+}
+
+impl Retained {
+    pub(crate) fn new(n_most: usize) -> Self {
+        Retained { samples: VecDeque::new(), n_left: 0, answered: VecDeque::new(), n_most, last: None }
+    }
+
+    pub(crate) fn receive(&mut self, key: SampleId, counts: InputCounts, now_nanos: u64) {
+        self.samples.push_back((key, counts, now_nanos));
+        self.last = Some(key);
+    }
+
+    /// Samples have left the timeline.
+    pub(crate) fn leave(&mut self, n_samples: usize) {
+        self.n_left += n_samples;
+    }
+
+    /// A sample of the main input is answered with those that are left.
+    pub(crate) fn answer(&mut self, main: SampleId) {
+        self.answered.push_back((main, self.n_left));
+    }
+
+    /// The sample up to which all may be committed, if there is one. Samples of the main input up to `main` will not be
+    /// answered again. Samples that came before `until_nanos` are retained no longer: a main input that stands still must
+    /// not hold up the writer, which begins an epoch only when all samples of the one before are committed.
+    pub(crate) fn commit_point(&mut self, main: Option<SampleId>, until_nanos: u64) -> Option<(SampleId, InputCounts)> {
+        let found = main.and_then(|main| self.answered.iter().rposition(|(key, _)| *key == main));
+        let n_free = found.map_or(0, |idx| self.answered.drain(..=idx).next_back().map_or(0, |(_, n_left)| n_left));
+        let n_old = self.samples.partition_point(|(_, _, came_nanos)| *came_nanos < until_nanos);
+        self.commit(n_free.max(n_old).max(self.samples.len().saturating_sub(self.n_most)))
+    }
+
+    /// As [`Retained::commit_point`], when no sample will be answered any more.
+    pub(crate) fn commit_all(&mut self) -> Option<(SampleId, InputCounts)> {
+        self.commit(self.samples.len())
+    }
+
+    fn commit(&mut self, n_samples: usize) -> Option<(SampleId, InputCounts)> {
+        let n_samples = n_samples.min(self.samples.len());
+        self.n_left = self.n_left.saturating_sub(n_samples);
+        self.answered.iter_mut().for_each(|(_, n_left)| *n_left = n_left.saturating_sub(n_samples));
+        self.samples.drain(..n_samples).next_back().map(|(key, counts, _)| (key, counts))
+    }
+}
+
 /// A sample of a partner input.
 #[derive(Debug)]
 pub struct PartnerSample<M: Message> {
@@ -130,6 +193,7 @@ impl<M: Message> Partner<M> {
 /// A partner input, for the operator that runs the stage.
 pub(crate) struct PartnerInput<M: Message> {
     port: String,
+    retained: Retained,
     subscriber: Subscriber<M>,
     /// The reader of a standby.
     onlooker: Option<Subscriber<M>>,
@@ -147,7 +211,13 @@ pub(crate) struct PartnerInput<M: Message> {
 /// A partner input of any type.
 pub(crate) trait PairedInput {
     /// Looks for its writers.
-    fn connect(&self) -> Result<(), PortError>;
+    fn connect(&mut self) -> Result<(), PortError>;
+
+    /// Commits the samples that are needed no more: samples of the main input up to `main` will not be answered again.
+    fn commit(&mut self, main: Option<SampleId>);
+
+    /// Commits all samples.
+    fn commit_all(&mut self);
 
     /// Goes on as the reader of the active instance.
     fn take_over(&mut self);
@@ -187,7 +257,7 @@ impl Partners {
     }
 
     pub(crate) fn connect(&self) -> Result<(), PortError> {
-        self.inputs.iter().try_for_each(|input| input.borrow().connect())
+        self.inputs.iter().try_for_each(|input| input.borrow_mut().connect())
     }
 
     pub(crate) fn take_over(&mut self) {
@@ -197,6 +267,16 @@ impl Partners {
 
     pub(crate) fn take_in(&self, is_active: bool, is_ending: bool) -> Result<(), PortError> {
         self.inputs.iter().try_for_each(|input| input.borrow_mut().take_in(is_active, is_ending))
+    }
+
+    /// Samples of the main input up to `main` will not be answered again.
+    pub(crate) fn have_answered(&self, main: Option<SampleId>) {
+        self.inputs.iter().for_each(|input| input.borrow_mut().commit(main));
+    }
+
+    /// No sample will be answered any more.
+    pub(crate) fn have_ended(&self) {
+        self.inputs.iter().for_each(|input| input.borrow_mut().commit_all());
     }
 
     pub(crate) fn is_caught_up(&self) -> bool {
@@ -249,6 +329,7 @@ impl<M: Message> PartnerInput<M> {
     ) -> Self {
         PartnerInput {
             port: port.into(),
+            retained: Retained::new(wiring.capacity - wiring.capacity / 4),
             subscriber,
             onlooker,
             timeline: Timeline::new(wiring.tolerance_nanos),
@@ -266,13 +347,14 @@ impl<M: Message> PartnerInput<M> {
 }
 
 impl<M: Message> PairedInput for PartnerInput<M> {
-    fn connect(&self) -> Result<(), PortError> {
-        self.onlooker.as_ref().map_or(Ok(false), Subscriber::connect)?;
+    fn connect(&mut self) -> Result<(), PortError> {
+        self.onlooker.as_mut().map_or(Ok(false), Subscriber::connect)?;
         self.subscriber.connect().map(|_| ())
     }
 
     fn take_over(&mut self) {
         self.onlooker = None;
+        self.retained = Retained::new(self.retained.n_most);
         self.timeline.segments.clear();
         self.chosen = None;
         self.subscriber.take_over(None::<SampleId>);
@@ -288,21 +370,29 @@ impl<M: Message> PairedInput for PartnerInput<M> {
                 }
                 self.chosen = None;
                 self.spare.extend(self.timeline.pop().map(|sample| sample.items));
+                self.retained.leave(1);
+                self.commit(None);
             }
             let reader = match (&mut self.onlooker, is_active) {
                 (_, true) => &mut self.subscriber,
                 (Some(onlooker), false) => onlooker,
                 (None, false) => return Ok(()),
             };
-            let Some(sample) = reader.receive()? else { return Ok(()) };
+            let Some(sample) = reader.receive()? else {
+                if is_active {
+                    self.commit(None);
+                }
+                return Ok(());
+            };
             let head = *sample.user_header();
             let mut items = self.spare.pop().unwrap_or_default();
             items.clear();
             items.extend_from_slice(sample.payload());
-            if is_active {
-                self.subscriber.commit(M::header(&head));
-            }
             drop(sample);
+            if is_active {
+                self.retained.receive(sample_id(M::header(&head)), self.subscriber.counts(), monotonic_nanos());
+                self.commit(None);
+            }
             self.timeline.push(M::header(&head).stamp_nanos, PartnerSample { head, items });
         }
     }
@@ -323,13 +413,30 @@ impl<M: Message> PairedInput for PartnerInput<M> {
 
     fn choose(&mut self, main: &Header, is_active: bool) {
         self.last_answer = Instant::now();
-        let spare = &mut self.spare;
+        let (spare, n_before) = (&mut self.spare, self.timeline.len());
         self.chosen = self.timeline.choose(main.stamp_nanos, |sample| spare.push(sample.items));
+        if is_active {
+            self.retained.leave(n_before - self.timeline.len());
+            self.retained.answer(sample_id(main));
+        }
         self.n_without += u64::from(is_active && self.chosen.is_none());
     }
 
     fn is_caught_up(&self) -> bool {
-        self.subscriber.is_caught_up()
+        self.subscriber.is_caught_up() || self.subscriber.written() == self.retained.last
+    }
+
+    fn commit(&mut self, main: Option<SampleId>) {
+        let until_nanos = monotonic_nanos().saturating_sub(RETAIN_LIMIT.as_nanos() as u64);
+        if let Some((key, counts)) = self.retained.commit_point(main, until_nanos) {
+            self.subscriber.commit_late(key, &counts);
+        }
+    }
+
+    fn commit_all(&mut self) {
+        if let Some((key, counts)) = self.retained.commit_all() {
+            self.subscriber.commit_late(key, &counts);
+        }
     }
 
     fn hold_deadline(&self) -> Option<Instant> {

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use crate::cursors::SampleId;
 use crate::wiring::InputCounts;
+use crate::written::Written;
 
 /// An early sample waits at most this long for those before it.
 pub const HOLD_LIMIT: Duration = Duration::from_millis(50);
@@ -19,13 +20,17 @@ pub const START_HOLD_LIMIT: Duration = Duration::from_secs(2);
 /// The number of publishers whose last sample is remembered: more than there can be at a time.
 const N_PUBLISHERS: usize = 16;
 
+/// The number of epochs that are remembered.
+const N_EPOCHS: usize = 16;
+
 /// A place in the stream: the generation of the sample's epoch, and its number. Places are ordered as the stream is.
 type Place = (usize, u64);
 
 /// The order of one input. It has no clock: the caller gives the time.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Sequencer<T> {
-    /// The epochs of the stream in the order in which they began. An epoch's index is its generation.
-    epochs: Vec<u64>,
+    /// The last epochs of the stream in the order in which they began, each with its generation.
+    epochs: VecDeque<(usize, u64)>,
     /// The last sample delivered.
     last: Option<Place>,
     /// Samples up to here were answered by an earlier instance, and its answers were received: dropped.
@@ -59,7 +64,7 @@ impl<T> Sequencer<T> {
     /// The order of a reader that begins with whatever sample comes first.
     pub fn onlooker() -> Self {
         Sequencer {
-            epochs: Vec::new(),
+            epochs: VecDeque::new(),
             last: None,
             answered: None,
             counted: None,
@@ -77,11 +82,11 @@ impl<T> Sequencer<T> {
     /// `counted` is the last sample that the earlier instance has answered, with its counts; `answered` is the last sample
     /// whose answer all readers have received. The samples between them are answered again.
     pub fn resume(answered: Option<SampleId>, counted: Option<SampleId>, counts: InputCounts) -> Self {
-        // If they are of different epochs, `answered` has no meaning.
+        // If they are of different epochs, all samples of the later one are answered again.
         let answered = answered.zip(counted).filter(|(answered, counted)| answered.epoch == counted.epoch);
         let answered = answered.map(|(answered, counted)| (0, answered.seq.min(counted.seq)));
         Sequencer {
-            epochs: counted.iter().map(|counted| counted.epoch).collect(),
+            epochs: counted.iter().map(|counted| (0, counted.epoch)).collect(),
             // Nothing is missing between the two: the earlier instance received it.
             last: answered,
             answered,
@@ -110,26 +115,52 @@ impl<T> Sequencer<T> {
         self.counts.n_late += 1;
     }
 
-    /// The place of a sample. An epoch that was not seen yet begins after all others.
-    fn place(&mut self, key: SampleId) -> Place {
-        let generation = self.epochs.iter().rposition(|epoch| *epoch == key.epoch).unwrap_or_else(|| {
-            self.epochs.push(key.epoch);
-            self.epochs.len() - 1
-        });
-        (generation, key.seq)
+    /// The place of a sample, whose writer has come to `written`; `None` if its epoch is over and this reader has left it.
+    fn place(&mut self, key: SampleId, written: Option<&Written>) -> Option<Place> {
+        let is_current = written.is_some_and(|written| written.is_current(key));
+        // An epoch that comes back with higher numbers is another one.
+        let is_begun_again = |at: usize| is_current && at + 1 < self.epochs.len();
+        let known = self.epochs.iter().rposition(|(_, epoch)| *epoch == key.epoch).filter(|at| !is_begun_again(*at));
+        if let Some(at) = known {
+            return Some((self.epochs[at].0, key.seq));
+        }
+        // A writer keeps samples of epochs that its readers have left. Where readers are not waited for, it may have begun
+        // several since.
+        let is_over = !is_current && written.is_some() && self.may_hold && !self.epochs.is_empty();
+        if is_over {
+            return None;
+        }
+        let generation = self.epochs.back().map_or(0, |(generation, _)| generation + 1);
+        self.epochs.push_back((generation, key.epoch));
+        if self.epochs.len() > N_EPOCHS {
+            self.epochs.pop_front();
+        }
+        Some((generation, key.seq))
     }
 
-    /// Takes a sample. If the sample is early, `has_other_publishers` is asked whether another publisher may still have the
-    /// samples before it.
+    fn epoch(&self, generation: usize) -> Option<u64> {
+        self.epochs.iter().find(|(known, _)| *known == generation).map(|(_, epoch)| *epoch)
+    }
+
+    /// Forgets which publisher has sent which samples: the reader has connected to them anew and gets their history again.
+    pub fn has_reconnected(&mut self) {
+        self.publishers.clear();
+    }
+
+    /// Takes a sample of a writer that has come to `written`. If the sample is early, `has_other_publishers` is asked whether
+    /// another publisher may still have the samples before it.
     pub fn push(
         &mut self,
         sample: T,
         key: SampleId,
         publisher: u128,
+        written: Option<&Written>,
         has_other_publishers: impl FnOnce() -> bool,
         now: impl FnOnce() -> Instant,
     ) -> Placing<T> {
-        let place = self.place(key);
+        let Some(place) = self.place(key, written) else {
+            return Placing::Drop;
+        };
         let known = self.publishers.iter_mut().find(|(id, _)| *id == publisher);
         let is_first_of_publisher = known.is_none();
         match known {
@@ -197,13 +228,22 @@ impl<T> Sequencer<T> {
     }
 
     /// Takes over the samples that an earlier order of the same reader held, and a sample that was put back.
-    pub fn hold_again(&mut self, before: Self, put_back: impl IntoIterator<Item = (SampleId, T)>, now: Instant) {
-        let key = |(generation, seq): Place| Some(SampleId { epoch: *before.epochs.get(generation)?, seq });
-        let held = before.held.into_iter().filter_map(|(place, held)| Some((key(place)?, held)));
-        let held: Vec<_> = held.chain(put_back.into_iter().map(|(key, sample)| (key, (sample, now)))).collect();
+    pub fn hold_again(
+        &mut self,
+        before: Self,
+        put_back: impl IntoIterator<Item = (SampleId, T)>,
+        written: Option<&Written>,
+        now: Instant,
+    ) {
+        let mut held: Vec<(SampleId, (T, Instant))> = Vec::new();
+        let mut before = before;
+        for ((generation, seq), sample) in std::mem::take(&mut before.held) {
+            held.extend(before.epoch(generation).map(|epoch| (SampleId { epoch, seq }, sample)));
+        }
+        held.extend(put_back.into_iter().map(|(key, sample)| (key, (sample, now))));
         let last = self.last.or(self.counted);
         for (key, sample) in held {
-            let place = self.place(key);
+            let Some(place) = self.place(key, written) else { continue };
             if last.is_none_or(|last| place > last) {
                 self.held.insert(place, sample);
             }
@@ -212,7 +252,8 @@ impl<T> Sequencer<T> {
 
     /// Changes the form in which a held sample is kept.
     pub fn keep_as(&mut self, key: SampleId, form: impl FnOnce(T) -> T) {
-        let place = self.place(key);
+        let epochs = self.epochs.iter().rfind(|(_, epoch)| *epoch == key.epoch);
+        let Some(place) = epochs.map(|(generation, _)| (*generation, key.seq)) else { return };
         if let Some((sample, since)) = self.held.remove(&place) {
             self.held.insert(place, (form(sample), since));
         }
@@ -225,8 +266,8 @@ impl<T> Sequencer<T> {
         let Some((sent, until)) = self.awaited else { return Some(deadline) };
         let has_all = self.last.is_some_and(|(generation, seq)| {
             // An epoch that has not come yet begins after all others.
-            let of_sent = self.epochs.iter().position(|epoch| *epoch == sent.epoch);
-            of_sent.is_some_and(|of_sent| (of_sent, sent.seq) <= (generation, seq))
+            let of_sent = self.epochs.iter().rfind(|(_, epoch)| *epoch == sent.epoch);
+            of_sent.is_some_and(|(of_sent, _)| (*of_sent, sent.seq) <= (generation, seq))
         });
         Some(if has_all { deadline } else { deadline.max(until) })
     }
@@ -345,7 +386,7 @@ mod tests {
                 if let Some(next) = waiting.iter().position(of_publisher) {
                     let (_, seq, publisher) = waiting.remove(next);
                     let verdict =
-                        sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, || true, || start + now);
+                        sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, None, || true, || start + now);
                     if let Placing::Deliver(seq) = verdict {
                         received.push(seq);
                     }
@@ -399,7 +440,8 @@ mod tests {
                 continue;
             }
             let push = |sequencer: &mut Sequencer<u64>, seq: u64| {
-                sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 0, || false, Instant::now) == Placing::Deliver(seq)
+                sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 0, None, || false, Instant::now)
+                    == Placing::Deliver(seq)
             };
             let n_counted = rng.random_range(0..=sent.len());
             let n_answered = rng.random_range(0..=n_counted);
@@ -426,7 +468,7 @@ mod tests {
         let mut delivered = Vec::new();
         for (publisher, numbers) in [(3, 40..60), (2, 20..40), (1, 0..20)] {
             for seq in numbers {
-                let verdict = sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, || true, || now);
+                let verdict = sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, None, || true, || now);
                 delivered.extend(match verdict {
                     Placing::Deliver(seq) => Some(seq),
                     _ => None,
@@ -444,22 +486,22 @@ mod tests {
         let start = Instant::now();
         let id = |seq| SampleId { epoch: EPOCH, seq };
         let mut sequencer = Sequencer::resume(None, None, InputCounts::default()).beginning_at(start, Some(id(5)));
-        assert_eq!(sequencer.push(5, id(5), 2, || true, || start), Placing::Hold);
+        assert_eq!(sequencer.push(5, id(5), 2, None, || true, || start), Placing::Hold);
         assert_eq!(sequencer.next_overdue(start + 2 * HOLD_LIMIT), None);
         for seq in 0..5 {
-            assert_eq!(sequencer.push(seq, id(seq), 1, || true, || start), Placing::Deliver(seq));
+            assert_eq!(sequencer.push(seq, id(seq), 1, None, || true, || start), Placing::Deliver(seq));
         }
         assert_eq!(sequencer.next_in_order(), Some(5));
         // A gap of later samples is not waited for longer.
-        assert_eq!(sequencer.push(8, id(8), 3, || true, || start), Placing::Hold);
+        assert_eq!(sequencer.push(8, id(8), 3, None, || true, || start), Placing::Hold);
         assert_eq!(sequencer.next_overdue(start + HOLD_LIMIT), Some(8));
         // Those that do not come are given up in the end.
         let mut sequencer = Sequencer::resume(None, None, InputCounts::default()).beginning_at(start, Some(id(5)));
-        assert_eq!(sequencer.push(5, id(5), 2, || true, || start), Placing::Hold);
+        assert_eq!(sequencer.push(5, id(5), 2, None, || true, || start), Placing::Hold);
         assert_eq!(sequencer.next_overdue(start + START_HOLD_LIMIT), Some(5));
         // A reader that begins before its writer awaits nothing.
         let mut first = Sequencer::resume(None, None, InputCounts::default()).beginning_at(start, None);
-        assert_eq!(first.push(5, id(5), 2, || true, || start), Placing::Hold);
+        assert_eq!(first.push(5, id(5), 2, None, || true, || start), Placing::Hold);
         assert_eq!(first.next_overdue(start + HOLD_LIMIT), Some(5));
     }
 
@@ -468,7 +510,7 @@ mod tests {
     fn a_gap_within_the_samples_of_one_publisher_is_not_waited_for() {
         let mut sequencer = Sequencer::resume(None, None, InputCounts::default());
         for seq in [0, 1, 5, 6, 9] {
-            let verdict = sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 1, || true, Instant::now);
+            let verdict = sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 1, None, || true, Instant::now);
             assert_eq!(verdict, Placing::Deliver(seq));
         }
         assert_eq!(sequencer.counts().n_missing, 5);
@@ -481,7 +523,8 @@ mod tests {
         let key = |epoch, seq| SampleId { epoch, seq };
         let counts = InputCounts { n_received: 6, ..InputCounts::default() };
         let mut sequencer = Sequencer::resume(Some(key(old, 5)), Some(key(old, 5)), counts);
-        let push = |sequencer: &mut Sequencer<_>, key, publisher| sequencer.push(key, key, publisher, || true, || now);
+        let push =
+            |sequencer: &mut Sequencer<_>, key, publisher| sequencer.push(key, key, publisher, None, || true, || now);
         assert_eq!(push(&mut sequencer, key(old, 9), 1), Placing::Hold);
         assert_eq!(push(&mut sequencer, key(new, 0), 2), Placing::Hold, "8 is on its way");
         assert_eq!(push(&mut sequencer, key(old, 6), 3), Placing::Deliver(key(old, 6)));
@@ -494,6 +537,30 @@ mod tests {
         assert_eq!(sequencer.counts().n_repeated, 1);
     }
 
+    /// The writer keeps the last samples of the epoch before, and of earlier ones.
+    #[test]
+    fn a_reader_that_comes_back_after_a_change_of_epoch_takes_no_sample_of_the_epoch_before() {
+        let key = |epoch, seq| SampleId { epoch, seq };
+        let mut written = Written { last: key(2, 1), first_seq: 0, before: Some(key(9, 3)) };
+        let mut sequencer = Sequencer::resume(Some(key(2, 0)), Some(key(2, 0)), InputCounts::default());
+        let mut delivered = Vec::new();
+        let mut push = |sequencer: &mut Sequencer<SampleId>, key, written: Written| {
+            if let Placing::Deliver(key) = sequencer.push(key, key, 1, Some(&written), || false, Instant::now) {
+                delivered.push(key);
+            }
+        };
+        for key in [key(7, 0), key(9, 2), key(9, 3), key(2, 0), key(2, 1)] {
+            push(&mut sequencer, key, written);
+        }
+        // The recording begins again: the first of these epochs comes back with higher numbers.
+        for key in [key(9, 4), key(9, 5)] {
+            written = Written::with(Some(written), key).expect("a new sample");
+            push(&mut sequencer, key, written);
+        }
+        assert_eq!(delivered, [key(2, 1), key(9, 4), key(9, 5)]);
+        assert_eq!(sequencer.counts(), InputCounts { n_received: 3, ..InputCounts::default() });
+    }
+
     #[test]
     fn where_gaps_are_usual_nothing_waits() {
         let mut sequencer = Sequencer::resume(None, None, InputCounts::default()).without_waiting();
@@ -503,7 +570,10 @@ mod tests {
             (3, 1, Placing::Drop),
             (9, 2, Placing::Deliver(9)),
         ] {
-            assert_eq!(sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, || true, Instant::now), verdict);
+            assert_eq!(
+                sequencer.push(seq, SampleId { epoch: EPOCH, seq }, publisher, None, || true, Instant::now),
+                verdict
+            );
         }
         assert_eq!((sequencer.counts().n_missing, sequencer.n_held()), (7, 0));
     }
@@ -512,7 +582,7 @@ mod tests {
     fn what_one_publisher_sends_out_of_order_is_passed_on_as_it_is() {
         let mut sequencer = Sequencer::onlooker();
         for seq in [3, 4, 4, 2] {
-            let verdict = sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 1, || true, Instant::now);
+            let verdict = sequencer.push(seq, SampleId { epoch: EPOCH, seq }, 1, None, || true, Instant::now);
             assert_eq!(verdict, Placing::Deliver(seq));
         }
         assert_eq!(sequencer.counts().n_repeated, 2);

@@ -11,7 +11,7 @@ use anyhow::Context as _;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::cursors::SampleId;
+use crate::cursors::{STATE_BYTES, SampleId};
 use crate::operator::{Operator, TICK, Task, Turn, run_in_turn};
 use crate::outbox::{Entry, Outbox};
 use crate::partner::Partners;
@@ -190,8 +190,8 @@ struct Instance<S: Stage> {
     outbox: Outbox<S::Out>,
     /// Memory for the bytes of its state.
     saved: Vec<u8>,
-    /// A sample that the saved state includes, and whose answers were not sent.
-    uncommitted: Option<Header>,
+    /// Of a stage with state: the work that was begun and gave way.
+    pending: Option<Pending<S::In>>,
     /// It has said that the graph must end.
     is_unfit: bool,
     is_active: bool,
@@ -201,10 +201,19 @@ struct Instance<S: Stage> {
     is_drained: bool,
 }
 
+/// Answers in the outbox that are to be saved, sent and committed.
+struct Pending<M: Message> {
+    /// The sample that they answer; `None` if they answer none.
+    sample: Option<PortSample<M>>,
+    is_saved: bool,
+}
+
 struct Shadow<S: Stage> {
     subscriber: Subscriber<S::In>,
     publisher: ShadowPublisher<S::Out>,
     n_samples: u64,
+    /// It reads along after a sample that a saved state includes.
+    has_begun_from_state: bool,
 }
 
 /// Runs a stage between `input` and `output` until the operator is asked to stop. An answer has at most `max_items`
@@ -234,7 +243,7 @@ pub fn run<S: Stage + 'static>(
         answers: Answers::with_capacity(max_items),
         outbox: Outbox::new(),
         saved: Vec::new(),
-        uncommitted: None,
+        pending: None,
         is_unfit: false,
         is_active: !operator.begins_as_standby(),
         shadow: None,
@@ -284,6 +293,7 @@ impl<S: Stage> Task for Instance<S> {
         if self.operator.should_quit() || (stop && is_caught_up()) {
             self.stage.look();
             self.partners.report(&self.operator);
+            self.partners.have_ended();
             self.operator.report_drained();
             self.is_drained = true;
             return self.wait_for_the_end();
@@ -329,6 +339,7 @@ impl<S: Stage> Instance<S> {
                 }
                 Command::HandOver => {
                     self.is_active = false;
+                    self.put_pending_back();
                     self.operator.handed_over();
                 }
                 Command::Set { id, params } => {
@@ -361,11 +372,8 @@ impl<S: Stage> Instance<S> {
 
     /// Answers the samples that are there, and tells the stage of silence or the end of the stream.
     fn work(&mut self, stop: bool) -> anyhow::Result<Sent> {
-        if self.send_outbox()? == Sent::GaveWay {
+        if self.settle()? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
-        }
-        if let Some(header) = self.uncommitted.take() {
-            self.subscriber.commit(&header);
         }
         // Also while no main sample comes: their writers wait for this reader.
         self.partners.take_in(true, stop)?;
@@ -392,18 +400,11 @@ impl<S: Stage> Instance<S> {
             self.operator.works_on(Some(sample_id(&header)));
             self.stage.answer(&head, sample.payload(), arrival_nanos, &mut self.answers);
             self.operator.works_on(None);
-            if self.publish(Some(header))? == Sent::GaveWay {
-                // Another instance finds the sample in its own queue; this one finds it here if it is active again, or
-                // still is. A saved state includes the sample.
-                if self.has_state {
-                    self.uncommitted = Some(header);
-                } else {
-                    self.subscriber.put_back(sample);
-                }
+            let sent = if self.has_state { self.keep(Some(sample))? } else { self.send(sample)? };
+            if sent == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
             }
-            self.last = Some(sample_id(&header));
-            self.subscriber.commit(&header);
+            self.partners.have_answered(self.needed_from());
         }
         if self.is_interrupted() {
             return Ok(Sent::Yes);
@@ -416,10 +417,18 @@ impl<S: Stage> Instance<S> {
         } else if self.operator.clock() == Clock::Machine {
             self.stage.on_silence(crate::monotonic_nanos(), &mut self.answers);
         }
-        if !self.answers.heads.is_empty() {
-            return self.publish(None);
+        if self.answers.heads.is_empty() {
+            return Ok(Sent::Yes);
         }
-        Ok(Sent::Yes)
+        if self.has_state {
+            return self.keep(None);
+        }
+        self.send_answers(None)
+    }
+
+    /// The last sample that an instance after this one will not answer again.
+    fn needed_from(&self) -> Option<SampleId> {
+        if self.has_state || !self.publisher.has_readers() { self.last } else { self.publisher.answered_by_readers() }
     }
 
     /// Marks a late sample as expired, and tells the launcher, where the file asks for that.
@@ -441,7 +450,8 @@ impl<S: Stage> Instance<S> {
         tracing::error!("sample {} is not answered: it has killed this operator again and again", header.seq);
         self.last = Some(sample_id(header));
         if self.has_state {
-            self.save()?;
+            // If it gives way, the next instance skips the sample again.
+            let _ = self.save()?;
         }
         self.subscriber.commit(header);
         Ok(())
@@ -451,21 +461,21 @@ impl<S: Stage> Instance<S> {
         self.operator.has_command() || self.operator.should_quit()
     }
 
-    /// Sends the answers to a sample, or to none. A stage with state is saved first, with its answers: a kill at any moment
-    /// neither loses an answer nor makes another one under the same number.
-    fn publish(&mut self, answered: Option<Header>) -> anyhow::Result<Sent> {
-        for (head, _) in &mut self.answers.heads {
-            let header = S::Out::header_mut(head);
-            header.made_by = self.operator.made_by(answered.map_or(header.made_by, |answered| answered.made_by));
+    /// Answers a sample without saving anything.
+    fn send(&mut self, sample: PortSample<S::In>) -> anyhow::Result<Sent> {
+        let header = *S::In::header(sample.user_header());
+        if self.send_answers(Some(&header))? == Sent::GaveWay {
+            // Another instance finds the sample in its own queue; this one finds it here if it is active again, or still is.
+            self.subscriber.put_back(sample);
+            return Ok(Sent::GaveWay);
         }
-        if self.has_state {
-            self.last = answered.as_ref().map(sample_id).or(self.last);
-            for (head, items) in self.answers.iter() {
-                self.outbox.push(&head, items)?;
-            }
-            self.save()?;
-            return self.send_outbox();
-        }
+        self.last = Some(sample_id(&header));
+        self.subscriber.commit(&header);
+        Ok(Sent::Yes)
+    }
+
+    fn send_answers(&mut self, answered: Option<&Header>) -> anyhow::Result<Sent> {
+        self.name_makers(answered);
         let (operator, stage) = (&self.operator, &self.stage);
         for (head, items) in self.answers.iter() {
             let check = |head: &mut _| {
@@ -477,6 +487,52 @@ impl<S: Stage> Instance<S> {
             }
         }
         Ok(Sent::Yes)
+    }
+
+    /// Names what the answers were made by.
+    fn name_makers(&mut self, answered: Option<&Header>) {
+        for (head, _) in &mut self.answers.heads {
+            let header = S::Out::header_mut(head);
+            header.made_by = self.operator.made_by(answered.map_or(header.made_by, |answered| answered.made_by));
+        }
+    }
+
+    /// Takes the answers of a stage with state to a sample, or to none. They are saved with its state before they are sent: a
+    /// kill at any moment neither loses an answer nor makes another one under the same number.
+    fn keep(&mut self, sample: Option<PortSample<S::In>>) -> anyhow::Result<Sent> {
+        let answered = sample.as_ref().map(|sample| *S::In::header(sample.user_header()));
+        self.name_makers(answered.as_ref());
+        self.last = answered.as_ref().map(sample_id).or(self.last);
+        for (head, items) in self.answers.iter() {
+            self.outbox.push(&head, items)?;
+        }
+        self.pending = Some(Pending { sample, is_saved: false });
+        self.settle()
+    }
+
+    /// Saves, sends and commits the answers that were kept.
+    fn settle(&mut self) -> anyhow::Result<Sent> {
+        if self.pending.as_ref().is_some_and(|pending| !pending.is_saved) {
+            if self.save()? == Sent::GaveWay {
+                return Ok(Sent::GaveWay);
+            }
+            self.pending.iter_mut().for_each(|pending| pending.is_saved = true);
+        }
+        if self.send_outbox()? == Sent::GaveWay {
+            return Ok(Sent::GaveWay);
+        }
+        if let Some(sample) = self.pending.take().and_then(|pending| pending.sample) {
+            self.subscriber.commit(S::In::header(sample.user_header()));
+        }
+        Ok(Sent::Yes)
+    }
+
+    /// Before another instance takes over: a sample that the saved state does not include is answered again by the instance
+    /// that is active next.
+    fn put_pending_back(&mut self) {
+        if let Some(Pending { sample: Some(sample), is_saved: false }) = self.pending.take() {
+            self.subscriber.put_back(sample);
+        }
     }
 
     fn send_outbox(&mut self) -> anyhow::Result<Sent> {
@@ -494,22 +550,34 @@ impl<S: Stage> Instance<S> {
         Ok(Sent::Yes)
     }
 
-    fn save(&mut self) -> anyhow::Result<()> {
-        self.outbox.forget(self.publisher.has_readers(), self.publisher.answered_by_readers());
-        self.saved.clear();
-        encode_state((self.last, self.subscriber.counts(), self.outbox.entries()), &mut self.saved)?;
-        self.stage.state(&mut self.saved)?;
-        Ok(self.operator.save_state(&self.saved)?)
+    /// Saves the state with the answers that readers may still need. Where they do not fit, it waits until readers have answered
+    /// some of them.
+    fn save(&mut self) -> anyhow::Result<Sent> {
+        loop {
+            self.outbox.forget(self.publisher.has_readers(), self.publisher.answered_by_readers());
+            self.saved.clear();
+            encode_state((self.last, self.subscriber.counts(), self.outbox.entries()), &mut self.saved)?;
+            self.stage.state(&mut self.saved)?;
+            let Some(first) = self.outbox.first_sent().filter(|_| self.saved.len() > STATE_BYTES) else {
+                self.operator.save_state(&self.saved)?;
+                return Ok(Sent::Yes);
+            };
+            let operator = &self.operator;
+            if self.publisher.wait_for_answers(first, &mut || operator.should_yield())? == Sent::GaveWay {
+                return Ok(Sent::GaveWay);
+            }
+        }
     }
 
     /// Opens the ports of a standby, which reads along after the last sample that the saved state includes.
     fn stand_by(&mut self, input: &str, output: &str, max_items: usize) -> anyhow::Result<()> {
         let snapshot = self.restore()?;
         let (mut subscriber, publisher) = (self.operator.onlooker(input)?, self.operator.shadow(output, max_items)?);
-        if let Some(last) = snapshot.and_then(|snapshot| snapshot.last) {
+        let last = snapshot.and_then(|snapshot| snapshot.last);
+        if let Some(last) = last {
             subscriber.look_on_from(last);
         }
-        self.shadow = Some(Shadow { subscriber, publisher, n_samples: 0 });
+        self.shadow = Some(Shadow { subscriber, publisher, n_samples: 0, has_begun_from_state: last.is_some() });
         Ok(())
     }
 
@@ -523,6 +591,11 @@ impl<S: Stage> Instance<S> {
             && let Some(sample) = next(&mut shadow.subscriber)?
         {
             self.operator.beat();
+            if shadow.has_begun_from_state && shadow.subscriber.counts().n_missing > 0 {
+                // Its queue has overflowed: the state does not include the samples before this one, the saved one does.
+                shadow.subscriber.put_back(sample);
+                return self.look_on_again();
+            }
             self.answers.clear();
             let head = sample.user_header();
             if !self.partners.choose(S::In::header(head), false, false)? {
@@ -542,10 +615,18 @@ impl<S: Stage> Instance<S> {
         Ok(())
     }
 
+    fn look_on_again(&mut self) -> anyhow::Result<()> {
+        let snapshot = self.restore()?;
+        if let (Some(shadow), Some(last)) = (&mut self.shadow, snapshot.and_then(|snapshot| snapshot.last)) {
+            shadow.subscriber.look_on_from(last);
+        }
+        Ok(())
+    }
+
     fn take_over(&mut self, is_handed_over: bool) -> anyhow::Result<()> {
-        self.uncommitted = None;
+        self.put_pending_back();
         self.partners.take_over();
-        let known = self.publisher.known(is_handed_over);
+        let known = self.publisher.begin(is_handed_over);
         if !self.has_state {
             self.operator.forget_state();
         }

@@ -60,6 +60,9 @@ pub struct Wiring {
     /// Samples that have killed earlier instances again and again: they are not answered.
     #[serde(default)]
     pub skip: Vec<SampleId>,
+    /// The sample on which the last instance died, or the first of several on which it worked at once.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub suspect: Option<SampleId>,
     /// Whether the process restricts what it may do.
     #[serde(default)]
     pub sandbox: Sandbox,
@@ -319,7 +322,10 @@ pub enum Report {
         sandbox: Enforcement,
     },
     /// After [`Command::HandOver`].
-    HandedOver,
+    HandedOver {
+        /// Whether the samples that it and those before it have sent, and that are not answered, can all be received.
+        has_sent_all: bool,
+    },
     /// After [`Command::TakeOver`].
     TookOver,
     /// A standby has computed live samples; reported now and then.
@@ -426,7 +432,7 @@ impl LogLevel {
 }
 
 /// The samples that came in through one input port.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct InputCounts {
     /// Samples received, each once.
     pub n_received: u64,

@@ -257,7 +257,7 @@ fn observe<S: Sink>(
     }
     on_ready();
     let (mut pace, mut comeback) = (Pace::of(edges), Comeback::default());
-    let mut ending = None;
+    let (mut ending, mut last_look) = (None, Instant::now());
     loop {
         // Looked at before the last look at the ports, as in an operator.
         let request = watch.request.load(Ordering::Relaxed);
@@ -267,12 +267,14 @@ fn observe<S: Sink>(
                 sink.leave();
             }
         }
-        if !watch.connected.load(Ordering::Relaxed) {
-            let mut is_connected = true;
-            for (_, port) in &ports {
-                is_connected &= port.connect()?;
+        let is_connected = watch.connected.load(Ordering::Relaxed);
+        if !is_connected || last_look.elapsed() >= WAIT {
+            last_look = Instant::now();
+            let mut are_all = true;
+            for (_, port) in &mut ports {
+                are_all &= port.connect()?;
             }
-            watch.connected.store(is_connected, Ordering::Relaxed);
+            watch.connected.store(is_connected || are_all, Ordering::Relaxed);
         }
         let round = match receive_round(&mut ports) {
             Ok(round) => round,
@@ -342,7 +344,7 @@ impl Comeback {
 
 /// Begins to read on all ports of an attached observer.
 fn begin(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Vec<Option<SampleId>>> {
-    for (_, port) in ports.iter() {
+    for (_, port) in ports.iter_mut() {
         // Before this, the newest sample is dropped from a full queue, not the oldest.
         port.connect()?;
     }
@@ -417,7 +419,7 @@ fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Resu
 /// A subscriber whose message type is not known at compile time.
 trait AnySubscriber {
     fn receive(&mut self) -> Result<Option<Result<Record, blindgrasp_messages::MessageError>>, PortError>;
-    fn connect(&self) -> Result<bool, PortError>;
+    fn connect(&mut self) -> Result<bool, PortError>;
     fn begin_here(&mut self) -> Option<SampleId>;
     fn commit(&self, header: &Header);
     fn give_up(&self, is_given_up: bool);
@@ -444,7 +446,7 @@ impl<M: Message> AnySubscriber for Typed<M> {
         Ok(Some(message.map(|message| M::record(Stamped { header: *M::header(head), message }))))
     }
 
-    fn connect(&self) -> Result<bool, PortError> {
+    fn connect(&mut self) -> Result<bool, PortError> {
         self.subscriber.connect()
     }
 

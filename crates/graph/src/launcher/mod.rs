@@ -190,6 +190,8 @@ pub struct Launcher {
 
 /// An old instance of a swapped node. It stays until its samples are answered, because its memory goes with it.
 struct Leaving {
+    /// The index of its node among the members.
+    idx: usize,
     process: Process,
     since: Instant,
     /// The last sample that it has sent at each output.
@@ -331,6 +333,7 @@ impl Launcher {
                 .ok_or_else(|| failed(node, std::io::Error::other("its ports are not those of the running graph")))?;
             if !standby {
                 wiring.skip.clone_from(&self.members[*idx].quarantine);
+                wiring.suspect = self.members[*idx].deadly;
             }
             let slot = self.cursors.instance(wiring.instance_slot);
             slot.beat(0);

@@ -71,6 +71,8 @@ pub(super) struct Process {
     pub(super) is_connected: bool,
     /// Its answer to the last [`Command::HandOver`].
     pub(super) has_handed_over: bool,
+    /// Whether the samples that it, and those before it, had sent when it handed over can all be received.
+    pub(super) has_sent_all: bool,
     /// Its answer to the last [`Command::TakeOver`].
     pub(super) has_taken_over: bool,
     /// It has computed samples as a standby.
@@ -232,6 +234,7 @@ impl Process {
             is_stopped: false,
             is_connected: false,
             has_handed_over: false,
+            has_sent_all: false,
             has_taken_over: false,
             is_warm: false,
             set_answer: None,
@@ -286,7 +289,7 @@ impl Process {
                 self.has_state = has_state;
                 self.sandbox = sandbox;
             }
-            Report::HandedOver => self.has_handed_over = true,
+            Report::HandedOver { has_sent_all } => (self.has_handed_over, self.has_sent_all) = (true, has_sent_all),
             Report::TookOver => self.has_taken_over = true,
             Report::Warm { .. } => self.is_warm = true,
             Report::Set { id, from_seq, error } => self.set_answer = Some((id, from_seq, error)),

@@ -114,7 +114,8 @@ impl Launcher {
         let Some(limit_millis) = member.node.heartbeat_millis else {
             return;
         };
-        for process in member.processes() {
+        let leaving = self.leaving.iter_mut().filter(|leaving| leaving.idx == idx);
+        for process in member.processes().chain(leaving.map(|leaving| &mut leaving.process)) {
             let last = self.cursors.instance(process.instance_slot).last_beat_nanos();
             if last == 0 || !process.is_running() {
                 continue;

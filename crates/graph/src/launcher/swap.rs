@@ -358,7 +358,7 @@ impl Launcher {
                 return self.take_back(swap, at, &message);
             }
             if let Some(process) = self.members[idx].active.as_mut().filter(|process| process.is_running()) {
-                process.has_handed_over = false;
+                (process.has_handed_over, process.has_sent_all) = (false, false);
                 process.tell(&Command::HandOver);
             }
             let has_handed_over = self.wait_until(&swap, |launcher| {
@@ -378,7 +378,7 @@ impl Launcher {
             std::mem::swap(&mut member.active, &mut member.standby);
             // A restart that was due is no longer needed.
             (member.restart_at, member.died) = (None, None);
-            let is_handed_over = member.standby.as_ref().is_some_and(|old| old.is_running() && old.has_handed_over);
+            let is_handed_over = member.standby.as_ref().is_some_and(has_handed_over_all);
             if let Some(process) = &mut member.active {
                 process.has_taken_over = false;
                 process.tell(&Command::Go);
@@ -418,7 +418,7 @@ impl Launcher {
     fn take_back(&mut self, swap: Swap, n: usize, message: &str) {
         for target in &swap.targets[..n] {
             if let Some(process) = &mut self.members[target.idx].active {
-                process.tell(&Command::TakeOver { is_handed_over: true });
+                process.tell(&Command::TakeOver { is_handed_over: has_handed_over_all(process) });
             }
         }
         self.swap = Some(swap);
@@ -435,6 +435,10 @@ impl Launcher {
                 process.look();
                 !process.is_running() || process.failure().is_some()
             });
+            if has_failed && self.members[target.idx].standby.as_mut().is_some_and(|old| !old.is_running()) {
+                // No operator is left to go back to: the new program is started again.
+                return self.conclude_swap();
+            }
             if has_failed {
                 let id = target.node.id.clone();
                 let ending = self.members[target.idx].active.as_ref().map_or("ended".into(), Process::ending);
@@ -453,10 +457,10 @@ impl Launcher {
     /// behind them, so that its memory may go.
     pub(super) fn is_read(&self, sent: &[(Port, SampleId)]) -> bool {
         sent.iter().all(|(port, last)| {
+            let written = self.plan.output_slot(port).and_then(|slot| self.cursors.output(slot).written());
             self.plan.reader_slots(port).iter().all(|slot| {
                 let slot = self.cursors.input(*slot);
-                // A reader in another epoch has passed those samples, or is so far behind that the time limit decides.
-                let is_past = |key: SampleId| key.epoch != last.epoch || key.seq >= last.seq;
+                let is_past = |key| written.is_none_or(|written| written.is_past(key, *last));
                 slot.is_given_up() || slot.key().is_some_and(is_past)
             })
         })
@@ -481,7 +485,7 @@ impl Launcher {
             member.n_swaps += 1;
             if let Some(process) = member.standby.take() {
                 let sent = if process.is_running() { target.sent.clone() } else { Vec::new() };
-                self.leaving.push(Leaving { process, since: Instant::now(), sent, is_let_go: false });
+                self.leaving.push(Leaving { idx: target.idx, process, since: Instant::now(), sent, is_let_go: false });
             }
             nodes.push(SwappedNode {
                 node: target.node.id.clone(),
@@ -651,6 +655,11 @@ impl Launcher {
             }
         }
     }
+}
+
+/// Whether the readers will receive all that an operator, and those before it, have sent.
+fn has_handed_over_all(process: &Process) -> bool {
+    process.is_running() && process.has_handed_over && process.has_sent_all
 }
 
 /// Whether a program can stand where a node stands.

@@ -8,6 +8,7 @@ use blindgrasp_messages::{Header, MESSAGE_TYPES, Message, WithMessage, with_mess
 
 use crate::cursors::SampleId;
 use crate::operator::{Operator, OperatorError};
+use crate::outbox::Keyed;
 use crate::partner::Partner;
 use crate::port::{PortError, PortSample, Publisher, Sent, ShadowPublisher, Subscriber, sample_id};
 use crate::wiring::{Clock, InputCounts, OnLate};
@@ -32,7 +33,7 @@ impl RawSample {
 
 /// The receiving end of an edge.
 pub(super) trait InputPort {
-    fn connect(&self) -> Result<bool, PortError>;
+    fn connect(&mut self) -> Result<bool, PortError>;
     fn receive(&mut self) -> Result<Option<RawSample>, PortError>;
     /// Keeps samples that were not answered, the first one first.
     fn put_back(&mut self, samples: Vec<RawSample>);
@@ -45,8 +46,8 @@ pub(super) trait InputPort {
     fn hold_deadline(&self) -> Option<Instant>;
     /// The last sample that any instance has answered, with its counts.
     fn place(&self) -> (Option<SampleId>, InputCounts);
-    /// The last sample that its writer has sent.
-    fn written(&self) -> Option<SampleId>;
+    /// Whether its writer has sent a sample after another one.
+    fn is_after(&self, key: SampleId, other: Option<SampleId>) -> bool;
 }
 
 struct Input<M: Message> {
@@ -68,7 +69,7 @@ impl<M: Message> Input<M> {
 }
 
 impl<M: Message> InputPort for Input<M> {
-    fn connect(&self) -> Result<bool, PortError> {
+    fn connect(&mut self) -> Result<bool, PortError> {
         self.subscriber.connect()
     }
 
@@ -111,6 +112,7 @@ impl<M: Message> InputPort for Input<M> {
     }
 
     fn look_on_from(&mut self, last: SampleId) {
+        self.begin_anew();
         self.subscriber.look_on_from(last);
     }
 
@@ -134,8 +136,8 @@ impl<M: Message> InputPort for Input<M> {
         self.subscriber.place()
     }
 
-    fn written(&self) -> Option<SampleId> {
-        self.subscriber.written()
+    fn is_after(&self, key: SampleId, other: Option<SampleId>) -> bool {
+        self.subscriber.is_after(key, other)
     }
 }
 
@@ -160,8 +162,8 @@ pub(super) struct RawAnswer {
     pub(super) items: Vec<u8>,
 }
 
-impl RawAnswer {
-    pub(super) fn key(&self) -> SampleId {
+impl Keyed for RawAnswer {
+    fn key(&self) -> SampleId {
         sample_id(&self.header)
     }
 }
@@ -182,6 +184,9 @@ pub(super) trait OutputPort {
     /// Gives up the port for comparison.
     fn end_comparison(&mut self);
     fn look_for_readers(&mut self) -> Result<(), PortError>;
+    /// Takes over; returns the last sample that need not be sent again.
+    fn begin(&mut self, is_handed_over: bool) -> Option<SampleId>;
+    /// As [`OutputPort::begin`], without taking over.
     fn known(&self, is_handed_over: bool) -> Option<SampleId>;
     fn last(&self) -> Option<SampleId>;
     fn has_readers(&self) -> bool;
@@ -248,6 +253,10 @@ impl<M: Message> OutputPort for Output<M> {
 
     fn look_for_readers(&mut self) -> Result<(), PortError> {
         self.publisher.look_for_readers()
+    }
+
+    fn begin(&mut self, is_handed_over: bool) -> Option<SampleId> {
+        self.publisher.begin(is_handed_over)
     }
 
     fn known(&self, is_handed_over: bool) -> Option<SampleId> {

@@ -101,6 +101,9 @@ impl Source for HostedSource {
     fn resume(&mut self, is_handed_over: bool) -> anyhow::Result<bool> {
         self.came.clear();
         self.ask_at = None;
+        for output in &mut self.outputs {
+            output.known = output.port.begin(is_handed_over);
+        }
         match &mut self.store {
             None => {
                 self.is_done = false;
@@ -109,8 +112,7 @@ impl Source for HostedSource {
                     input.port.take_over(last);
                 }
                 let mut places = Resume::new();
-                for output in &mut self.outputs {
-                    output.known = output.port.known(is_handed_over);
+                for output in &self.outputs {
                     places.insert(output.name.clone(), output.known.map(|known| (known.epoch, known.seq)));
                 }
                 self.child.ask_json(Ask::Resume, &places)?;
@@ -138,7 +140,7 @@ impl Source for HostedSource {
 
     fn look(&mut self) -> anyhow::Result<()> {
         look_for_readers(&mut self.outputs)?;
-        for input in &self.inputs {
+        for input in &mut self.inputs {
             input.port.connect()?;
         }
         listen(&self.operator, &mut self.child)?;

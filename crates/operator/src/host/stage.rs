@@ -12,7 +12,7 @@ use blindgrasp_messages::Header;
 use super::child::{Answer, Program, ProgramError};
 use super::ports::{self, PartnerPort, RawAnswer, RawSample};
 use super::protocol::{Ask, Hears, MORE, Part, Ready, Work};
-use super::store::{Input, Output, Store, is_at_most, look_for_readers};
+use super::store::{Input, Output, Store, look_for_readers};
 use super::{listen, log};
 use crate::cursors::SampleId;
 use crate::description::OperatorDescription;
@@ -57,6 +57,8 @@ struct HostedStage {
     n_looked_on: u64,
     last_look: Instant,
     is_drained: bool,
+    /// So many samples are given to the program one by one, so that the launcher learns on which one it dies.
+    n_one_by_one: usize,
 }
 
 /// Runs the stage of a program until the operator is asked to stop.
@@ -96,6 +98,7 @@ pub(super) fn run(
         n_looked_on: 0,
         last_look: Instant::now(),
         is_drained: false,
+        n_one_by_one: if operator.has_suspect() { MAX_BATCH } else { 0 },
     };
     if stage.is_active {
         stage.take_over(false)?;
@@ -196,6 +199,7 @@ impl HostedStage {
         }
         if self.operator.should_quit() || (stop && (!self.is_active || self.is_caught_up())) {
             self.look()?;
+            self.partners.have_ended();
             self.operator.report_drained();
             self.is_drained = true;
             return self.wait_for_the_end();
@@ -230,8 +234,8 @@ impl HostedStage {
         Ok(())
     }
 
-    fn connect(&self) -> anyhow::Result<()> {
-        for input in &self.inputs {
+    fn connect(&mut self) -> anyhow::Result<()> {
+        for input in &mut self.inputs {
             input.port.connect()?;
         }
         Ok(self.partners.connect()?)
@@ -371,7 +375,7 @@ impl HostedStage {
 
     /// The samples of an input that are there, as many as are answered at once.
     fn take(&mut self, idx: usize) -> anyhow::Result<Vec<RawSample>> {
-        let is_single = self.store.is_some() || !self.partner_ports.is_empty();
+        let is_single = self.store.is_some() || !self.partner_ports.is_empty() || self.n_one_by_one > 0;
         let n_most = if is_single { 1 } else { self.ready.batch.clamp(1, MAX_BATCH) };
         let mut samples = Vec::with_capacity(1);
         while samples.len() < n_most
@@ -397,8 +401,22 @@ impl HostedStage {
             }
             self.last = Some(sample.key());
             self.inputs[idx].port.commit(&sample);
+            self.n_one_by_one = self.n_one_by_one.saturating_sub(1);
+            self.partners.have_answered(self.needed_from(idx));
         }
         Ok(Sent::Yes)
+    }
+
+    /// The last sample of an input that an instance after this one will not answer again.
+    fn needed_from(&self, idx: usize) -> Option<SampleId> {
+        if self.store.is_some() {
+            return self.inputs[idx].last;
+        }
+        let readers = self.outputs.iter().filter(|output| output.port.has_readers());
+        let answered = readers.map(|output| output.port.answered_by_readers());
+        let is_after = |key, other| self.inputs[idx].port.is_after(key, other);
+        let least = answered.reduce(|a, b| if a.is_some_and(|a| is_after(a, b)) { b } else { a });
+        least.unwrap_or(self.last)
     }
 
     /// The answers of the program to each sample; `None` to one that has killed earlier instances again and again. The launcher
@@ -497,7 +515,7 @@ impl HostedStage {
         }
         let input = &mut self.inputs[idx];
         // A sample that goes back in order is answered, but does not move the cursor.
-        if !is_at_most(sample.key(), input.last) {
+        if input.port.is_after(sample.key(), input.last) {
             input.last = Some(sample.key());
         }
         input.counts = sample.counts;
@@ -553,7 +571,7 @@ impl HostedStage {
         for (output_idx, answer) in answers {
             let output = &mut self.outputs[output_idx];
             // One output may be ahead of another: its readers have this answer.
-            if has_others && is_at_most(sample.key(), output.known) {
+            if has_others && !self.inputs[idx].port.is_after(sample.key(), output.known) {
                 continue;
             }
             let (operator, child) = (&self.operator, &mut self.child);
@@ -677,6 +695,9 @@ impl HostedStage {
     fn take_over(&mut self, is_handed_over: bool) -> anyhow::Result<()> {
         self.partners.take_over();
         self.is_cut_off = false;
+        for output in &mut self.outputs {
+            output.known = output.port.begin(is_handed_over);
+        }
         if self.store.is_some() {
             self.restore(is_handed_over)?;
             for input in &mut self.inputs {
@@ -687,9 +708,6 @@ impl HostedStage {
         }
         // A later instance with a state must not go on with an old one.
         self.operator.forget_state();
-        for output in &mut self.outputs {
-            output.known = output.port.known(is_handed_over);
-        }
         self.last = self.least_known();
         self.inputs[0].port.take_over(self.last);
         Ok(())
@@ -698,20 +716,23 @@ impl HostedStage {
     /// The last sample whose answers all readers of all outputs have.
     fn least_known(&self) -> Option<SampleId> {
         let known: Option<Vec<SampleId>> = self.outputs.iter().map(|output| output.known).collect();
-        let known = known?;
-        // An output in an earlier epoch is behind.
-        let written = self.inputs[0].port.written();
-        let is_behind = |key: &&SampleId| written.is_none_or(|written| key.epoch != written.epoch);
-        known.iter().filter(is_behind).min().or(known.iter().min()).copied()
+        let input = &self.inputs[0].port;
+        known?.into_iter().reduce(|least, key| if input.is_after(least, Some(key)) { key } else { least })
     }
 
     /// Computes live samples beside the active instance.
     fn look_on(&mut self) -> anyhow::Result<()> {
         for idx in 0..self.inputs.len() {
             while !self.operator.has_command() && !self.operator.should_stop() {
+                let has_begun_from_state = self.store.is_some() && self.inputs[idx].last.is_some();
                 let Some(onlooker) = &mut self.inputs[idx].onlooker else { break };
                 let Some(sample) = onlooker.receive()? else { break };
                 self.operator.beat();
+                if has_begun_from_state && sample.counts.n_missing > 0 {
+                    // Its queue has overflowed: the state does not include the samples before this one, the saved one does.
+                    onlooker.put_back(vec![sample]);
+                    return self.stand_by();
+                }
                 if !self.partners.choose(&sample.header, false, false)? {
                     onlooker.put_back(vec![sample]);
                     return Ok(());

@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use super::ports::{InputPort, OutputPort, RawAnswer};
 use crate::cursors::{STATE_BYTES, SampleId};
 use crate::operator::Operator;
+use crate::outbox::{Kept, Keyed as _};
 use crate::port::{LONGEST_TRY, LOOK_PAUSE, PortError, RETRY_PAUSE, Sent};
 use crate::stage::{STATE_FORMAT, encode_state};
 use crate::wiring::InputCounts;
@@ -51,8 +52,7 @@ pub(super) struct Output {
     pub(super) known: Option<SampleId>,
     /// The last sample that was saved.
     pub(super) last: Option<SampleId>,
-    saved: VecDeque<RawAnswer>,
-    n_sent: usize,
+    saved: Kept<RawAnswer>,
 }
 
 impl Output {
@@ -64,42 +64,28 @@ impl Output {
         port: Box<dyn OutputPort>,
     ) -> Output {
         let name = name.into();
-        Output { idx, name, max_items, answers, port, known: None, last: None, saved: VecDeque::new(), n_sent: 0 }
+        Output { idx, name, max_items, answers, port, known: None, last: None, saved: Kept::default() }
     }
 
     /// Takes an answer that is to be saved and then sent.
     pub(super) fn keep(&mut self, answer: RawAnswer) {
         self.last = Some(answer.key());
-        self.saved.push_back(answer);
+        self.saved.push(answer);
     }
 
     /// Drops the answers that were sent and that all readers have answered; true if there was one.
     fn forget(&mut self) -> bool {
-        if self.n_sent == 0 {
-            return false;
-        }
-        let n_answered =
-            if self.port.has_readers() { self.n_up_to(self.port.answered_by_readers()) } else { self.n_sent };
-        let n_forgotten = n_answered.min(self.n_sent);
-        self.saved.drain(..n_forgotten);
-        self.n_sent -= n_forgotten;
-        n_forgotten > 0
-    }
-
-    /// The number of saved answers up to that one. They are in order, and one that is not there is older than all.
-    fn n_up_to(&self, key: Option<SampleId>) -> usize {
-        let found = key.and_then(|key| self.saved.iter().rposition(|answer| answer.key() == key));
-        found.map_or(0, |idx| idx + 1)
+        let (has_readers, answered) = (self.port.has_readers(), self.port.answered_by_readers());
+        self.saved.forget(has_readers, answered).count() > 0
     }
 
     fn restore(&mut self, saved: VecDeque<RawAnswer>, last: Option<SampleId>, known: Option<SampleId>) {
-        self.saved = saved;
+        self.saved = Kept::restored(saved, known);
         self.last = last;
-        self.n_sent = self.n_up_to(known);
     }
 
     fn n_saved_bytes(&self) -> usize {
-        self.saved.iter().map(|answer| ENTRY_BYTES + answer.head.len() + answer.items.len()).sum()
+        self.saved.entries().iter().map(|answer| ENTRY_BYTES + answer.head.len() + answer.items.len()).sum()
     }
 
     /// The most bytes that an answer takes where it is saved; `None` if that is not limited.
@@ -172,7 +158,7 @@ impl Store {
                 self.write(inputs, outputs, state)?;
                 return Ok(Sent::Yes);
             }
-            if outputs.iter().all(|output| output.n_sent == 0) {
+            if outputs.iter().all(|output| output.saved.first_sent().is_none()) {
                 anyhow::bail!(
                     "its state takes {} bytes and the answers to one sample {n_saved}, expected at most {} together",
                     state.len(),
@@ -203,7 +189,9 @@ impl Store {
     ) -> anyhow::Result<Sent> {
         loop {
             let n_saved: usize = outputs.iter().map(Output::n_saved_bytes).sum();
-            if n_saved + n_bytes <= Store::room(inputs, outputs) || outputs.iter().all(|output| output.n_sent == 0) {
+            if n_saved + n_bytes <= Store::room(inputs, outputs)
+                || outputs.iter().all(|output| output.saved.first_sent().is_none())
+            {
                 return Ok(Sent::Yes);
             }
             if self.wait_for_readers(outputs, true, true)? == Sent::GaveWay {
@@ -233,13 +221,15 @@ impl Store {
             let now = Instant::now();
             let since = now.duration_since(std::mem::replace(&mut last_try, now)).min(LONGEST_TRY);
             for (output, waited) in outputs.iter().zip(&mut waited) {
-                let first = if output.n_sent > 0 { output.saved.front() } else { None };
-                let are_attached =
-                    first.is_some_and(|first| output.port.give_up_attached_that_lack(first.key(), *waited));
+                let first = output.saved.first_sent();
+                let are_attached = first.is_some_and(|first| output.port.give_up_attached_that_lack(first, *waited));
                 *waited = if are_attached { *waited + since } else { Duration::ZERO };
             }
             if start.elapsed() > limit {
-                let slow = outputs.iter().filter(|output| output.n_sent > 0).map(|output| output.name.as_str());
+                let slow = outputs
+                    .iter()
+                    .filter(|output| output.saved.first_sent().is_some())
+                    .map(|output| output.name.as_str());
                 let slow: Vec<&str> = slow.collect();
                 break Err(anyhow::anyhow!(
                     "no saved sample of the output {} was answered within {} ms: a reader is stopped or too slow",
@@ -253,7 +243,7 @@ impl Store {
             }
             std::thread::sleep(RETRY_PAUSE);
         };
-        for output in outputs.iter().filter(|output| output.n_sent > 0) {
+        for output in outputs.iter().filter(|output| output.saved.first_sent().is_some()) {
             output.port.has_waited(start.elapsed());
         }
         outcome
@@ -270,14 +260,14 @@ impl Store {
         is_checked: bool,
     ) -> Result<Sent, PortError> {
         for output in outputs {
-            while let Some(answer) = output.saved.get(output.n_sent) {
+            while let Some(answer) = output.saved.next() {
                 let idx = output.idx;
                 let mut checked = |header: &Header, head: &mut Vec<u8>, items: &[u8]| check(idx, header, head, items);
                 let check: Option<super::ports::Check<'_>> = if is_checked { Some(&mut checked) } else { None };
                 if output.port.send(answer, &mut || self.operator.should_yield(), check)? == Sent::GaveWay {
                     return Ok(Sent::GaveWay);
                 }
-                output.n_sent += 1;
+                output.saved.has_sent_next();
             }
         }
         Ok(Sent::Yes)
@@ -339,14 +329,17 @@ fn encode(
 ) -> anyhow::Result<()> {
     let places = Places {
         inputs: inputs.iter().map(|input| (input.name.clone(), (input.last, input.counts))).collect(),
-        outputs: outputs.iter().map(|output| (output.name.clone(), (output.last, output.saved.len() as u64))).collect(),
+        outputs: outputs
+            .iter()
+            .map(|output| (output.name.clone(), (output.last, output.saved.entries().len() as u64)))
+            .collect(),
         is_done,
     };
     bytes.extend_from_slice(MAGIC);
     encode_state(&places, &mut *bytes)?;
     // In the order of their names, in which they are read.
     for name in places.outputs.keys() {
-        for answer in outputs.iter().filter(|output| output.name == *name).flat_map(|output| &output.saved) {
+        for answer in outputs.iter().filter(|output| output.name == *name).flat_map(|output| output.saved.entries()) {
             bytes.extend_from_slice(&(answer.head.len() as u64).to_ne_bytes());
             bytes.extend_from_slice(&(answer.items.len() as u64).to_ne_bytes());
             bytes.extend_from_slice(&answer.head);
@@ -398,10 +391,7 @@ fn is_old(
 ) -> bool {
     for (input, (place, _)) in inputs.iter().zip(answered) {
         let last = places.inputs.get(&input.name).and_then(|(last, _)| *last);
-        let Some(place) = place.filter(|place| !is_at_most(*place, last)) else { continue };
-        // A sample of the next epoch may have been saved and not marked as answered yet.
-        let Some(last) = last else { return true };
-        if place.epoch == last.epoch || input.port.written().is_some_and(|written| written.epoch != last.epoch) {
+        if place.is_some_and(|place| input.port.is_after(place, last)) {
             return true;
         }
     }
@@ -471,6 +461,9 @@ mod tests {
         fn look_for_readers(&mut self) -> Result<(), PortError> {
             Ok(())
         }
+        fn begin(&mut self, _: bool) -> Option<SampleId> {
+            self.0
+        }
         fn known(&self, _: bool) -> Option<SampleId> {
             self.0
         }
@@ -505,11 +498,11 @@ mod tests {
         }
     }
 
-    /// An input whose writer has sent up to a sample.
-    struct Written(Option<SampleId>);
+    /// An input whose writer is in one epoch.
+    struct OfOneEpoch;
 
-    impl InputPort for Written {
-        fn connect(&self) -> Result<bool, PortError> {
+    impl InputPort for OfOneEpoch {
+        fn connect(&mut self) -> Result<bool, PortError> {
             Ok(true)
         }
         fn receive(&mut self) -> Result<Option<RawSample>, PortError> {
@@ -532,13 +525,13 @@ mod tests {
         fn place(&self) -> (Option<SampleId>, InputCounts) {
             (None, InputCounts::default())
         }
-        fn written(&self) -> Option<SampleId> {
-            self.0
+        fn is_after(&self, key: SampleId, other: Option<SampleId>) -> bool {
+            other.is_none_or(|other| other.seq < key.seq)
         }
     }
 
     fn input(name: &str, last: Option<SampleId>) -> Input {
-        let port = Box::new(Written(None));
+        let port = Box::new(OfOneEpoch);
         let (name, counts) = (name.into(), InputCounts { n_received: 8, ..InputCounts::default() });
         Input { idx: 0, name, is_feedback: false, port, onlooker: None, last, counts }
     }
@@ -565,9 +558,8 @@ mod tests {
         assert_eq!((&state[..], places.is_done), (&b"mine"[..], true));
         assert_eq!((inputs[0].last, inputs[0].counts.n_received, inputs[1].last), (Some(id(7)), 8, None));
         let [a, b] = outputs;
-        assert_eq!((a.n_sent, a.last, a.saved.len()), (0, Some(id(9)), 1));
-        assert_eq!((b.n_sent, b.last), (1, Some(id(2))));
-        assert_eq!(b.saved[1], answer(1, b"items"));
+        assert_eq!((a.saved.first_sent(), a.last, a.saved.entries().len()), (None, Some(id(9)), 1));
+        assert_eq!((b.saved.next(), b.last), (Some(&answer(1, b"items")), Some(id(2))));
         for n_bytes_kept in n_bytes..content.len() - 4 {
             let cut = &content[n_bytes..n_bytes_kept];
             assert!(take_in(&places, cut, &mut [], &mut [output("a", None)], false).is_err(), "{n_bytes_kept}");
@@ -579,9 +571,9 @@ mod tests {
         let mut output = output("a", Some(id(1)));
         (0..4).for_each(|seq| output.keep(answer(seq, b"")));
         assert!(!output.forget(), "nothing was sent");
-        output.n_sent = 3;
+        (0..3).for_each(|_| output.saved.has_sent_next());
         assert!(output.forget());
-        assert_eq!((output.saved.len(), output.n_sent), (2, 1));
+        assert_eq!((output.saved.entries().len(), output.saved.first_sent()), (2, Some(id(2))));
         assert_eq!(output.n_saved_bytes(), 2 * (ENTRY_BYTES + 8));
     }
 
@@ -589,16 +581,15 @@ mod tests {
     fn what_another_operator_did_meanwhile_makes_a_state_old() {
         let places =
             |last| Places { inputs: [("a".into(), (last, InputCounts::default()))].into(), ..Places::default() };
-        let is_old = |saved: Option<u64>, answered: u64, written: Option<SampleId>| {
-            let mut input = input("a", None);
-            input.port = Box::new(Written(written));
+        let is_old = |saved: Option<u64>, answered: u64| {
+            let input = input("a", None);
             let answered = [(Some(id(answered)), InputCounts::default())];
             is_old(&places(saved.map(id)), &[input], &[], &answered, &[], false)
         };
-        assert!(!is_old(Some(7), 7, None));
-        assert!(!is_old(Some(8), 7, None), "saved, and not marked as answered yet");
-        assert!(is_old(Some(6), 7, None));
-        assert!(is_old(None, 7, None));
+        assert!(!is_old(Some(7), 7));
+        assert!(!is_old(Some(8), 7), "saved, and not marked as answered yet");
+        assert!(is_old(Some(6), 7));
+        assert!(is_old(None, 7));
         let outputs = [output("a", None)];
         let saved = Places { outputs: [("a".into(), (Some(id(4)), 0))].into(), ..Places::default() };
         for (sent, expected) in [(4, false), (5, true)] {

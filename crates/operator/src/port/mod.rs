@@ -39,6 +39,11 @@ pub enum PortError {
         "sample {seq} of port {service} could not be delivered within {limit_millis} ms: a reader is stopped or too slow"
     )]
     Stalled { service: String, seq: u64, limit_millis: u128 },
+    #[error(
+        "the readers of port {service} lack samples up to {seq}, which ended with the instance that has handed over: this one \
+         begins again after their last sample"
+    )]
+    PredecessorGone { service: String, seq: u64 },
     #[error("port {service} cannot receive")]
     Receive { service: String, source: BoxedError },
 }

@@ -1,16 +1,19 @@
 //! The sending end of an edge.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, ipc};
 use iceoryx2::service::port_factory::PortFactory;
 
-use super::service::{self, PubSub};
+use super::service::{self, Connections, PubSub};
 use super::{PortError, sample_id};
+use crate::credit::{Credit, Reader};
 use crate::cursors::{COMPARE_BELL, OutputSlot, SampleId, SharedCursors};
-use crate::wiring::{ConsumerWiring, OutputWiring, ReaderWiring, ServiceWiring};
+use crate::wiring::{OutputWiring, ServiceWiring};
+use crate::written::Written;
 use blindgrasp_messages::{Header, Message};
 
 /// A waiting publisher yields so often before it sleeps between tries.
@@ -42,6 +45,7 @@ struct Sender<M: Message> {
     /// The slots of the bells that wake its readers.
     bells: Vec<usize>,
     n_subscribers: usize,
+    connections: Connections,
 }
 
 impl<M: Message> Sender<M> {
@@ -54,15 +58,17 @@ impl<M: Message> Sender<M> {
         strategy: AllocationStrategy,
     ) -> Result<Self, PortError> {
         let pub_sub = service::pub_sub::<M>(node, wiring)?;
+        let connections = Connections::default();
         let publisher = pub_sub
             .publisher_builder()
+            .set_degradation_handler(connections.handler())
             .initial_max_slice_len(max_items.max(1))
             .allocation_strategy(strategy)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
             .map_err(|error| service::open_failed(wiring, error))?;
         let (service, cursors, bells) = (wiring.name.clone(), Arc::clone(cursors), bells.to_vec());
-        Ok(Sender { service, pub_sub, publisher, cursors, bells, n_subscribers: 0 })
+        Ok(Sender { service, pub_sub, publisher, cursors, bells, n_subscribers: 0, connections })
     }
 
     fn send(&self, head: M::Head, items: &[M::Item]) -> Result<(), PortError> {
@@ -81,9 +87,13 @@ impl<M: Message> Sender<M> {
     /// Gives the history to readers that have come since the last sample, and wakes them.
     fn look_for_readers(&mut self) -> Result<(), PortError> {
         let n_subscribers = self.pub_sub.dynamic_config().number_of_subscribers();
-        self.publisher
-            .update_connections()
-            .map_err(|error| PortError::Connect { service: self.service.clone(), source: error.into() })?;
+        let failed = |source| PortError::Connect { service: self.service.clone(), source };
+        self.publisher.update_connections().map_err(|error| failed(error.into()))?;
+        if self.connections.is_to_be_tried_again().map_err(|error| failed(error.into()))? {
+            // A port that comes lets iceoryx2 look at all of them again.
+            drop(self.pub_sub.subscriber_builder().buffer_size(1).create());
+            self.publisher.update_connections().map_err(|error| failed(error.into()))?;
+        }
         if std::mem::replace(&mut self.n_subscribers, n_subscribers) != n_subscribers {
             self.ring();
         }
@@ -96,113 +106,12 @@ pub struct Publisher<M: Message> {
     sender: Sender<M>,
     cursors: Arc<SharedCursors>,
     slot: usize,
-    readers: Vec<Reader>,
+    credit: Credit,
     wait_limit: Duration,
-    /// The first sample that this publisher, and not an earlier one, has sent.
-    own_first: Option<SampleId>,
-    /// The last sample that this publisher has sent.
-    own_last: Option<SampleId>,
-}
-
-/// A reader whose unanswered samples the publisher must be able to send again.
-struct Reader {
-    slot: usize,
-    limit: Limit,
-    /// The last sample that it had answered at the last look.
-    key: Option<SampleId>,
-    /// If it is an attached reader, the slots of all its readers, and how long the publisher waits for it.
-    attached_slots: Vec<usize>,
-    attached_limit: Duration,
-    /// The readers of its answers, if it answers each sample under the same number.
-    behind: Vec<Reader>,
-}
-
-/// How many samples a reader may leave unanswered.
-#[derive(Clone, Copy)]
-enum Limit {
-    /// Of the samples of this very publisher, as many as the reader's queue takes. The samples of an earlier publisher lie in
-    /// a queue of their own, or have died with it: waiting for a reader to answer them could last for ever.
-    Queue(u64),
-    /// Of all samples, as many as the publisher keeps.
-    History(u64),
-}
-
-/// The sample that is to be sent, for [`Reader::has_room`].
-struct Next {
-    key: SampleId,
-    /// The last sample that was sent.
-    last: Option<SampleId>,
-    /// The number of the first sample of this publisher.
-    own_first: u64,
-}
-
-impl Reader {
-    fn of_port(wiring: &ConsumerWiring, history: usize) -> Reader {
-        let behind = wiring.behind.iter().map(|behind| Reader::further_on(behind, history)).collect();
-        let limit = Limit::Queue(wiring.capacity as u64);
-        Reader {
-            slot: wiring.slot,
-            limit,
-            key: None,
-            attached_slots: wiring.attached_slots.clone(),
-            attached_limit: Duration::from_millis(wiring.attached_limit_millis),
-            behind,
-        }
-    }
-
-    fn further_on(wiring: &ReaderWiring, history: usize) -> Reader {
-        let behind = wiring.behind.iter().map(|behind| Reader::further_on(behind, history)).collect();
-        let limit = Limit::History(history as u64);
-        let (attached_slots, attached_limit) = (Vec::new(), Duration::ZERO);
-        Reader { slot: wiring.slot, limit, key: None, attached_slots, attached_limit, behind }
-    }
-
-    fn has_room(&mut self, cursors: &SharedCursors, next: &Next) -> bool {
-        let slot = cursors.input(self.slot);
-        if !(self.key.is_some() && self.is_near(next)) {
-            self.key = slot.key();
-            if !self.is_near(next) {
-                return slot.is_given_up();
-            }
-        }
-        self.behind.iter_mut().all(|reader| reader.has_room(cursors, next)) || slot.is_given_up()
-    }
-
-    fn is_near(&self, next: &Next) -> bool {
-        let is_within = |first_unanswered: u64| match self.limit {
-            Limit::Queue(limit) => next.key.seq.saturating_sub(first_unanswered.max(next.own_first)) < limit,
-            Limit::History(limit) => next.key.seq.saturating_sub(first_unanswered) < limit,
-        };
-        match (self.key, next.last) {
-            // A reader that has answered all samples has room for one more, however far the numbers jump.
-            (Some(key), last) if key.epoch == next.key.epoch => is_within(key.seq + 1) || last == Some(key),
-            // A new epoch begins when every reader has answered the one before.
-            (Some(key), Some(last)) => key == last,
-            (None, Some(last)) => last.epoch == next.key.epoch && is_within(0),
-            (Some(_) | None, None) => true,
-        }
-    }
-
-    /// Of the cursors of this reader and of those behind it, without readers that were given up, the one furthest behind; the
-    /// outer `None` if there is no reader.
-    fn least(&self, cursors: &SharedCursors, last: Option<SampleId>) -> Option<Option<SampleId>> {
-        let slot = cursors.input(self.slot);
-        if slot.is_given_up() {
-            return None;
-        }
-        let behind = self.behind.iter().filter_map(|reader| reader.least(cursors, last));
-        Some(behind.fold(slot.key(), |least, key| further_behind(least, key, last)))
-    }
-}
-
-/// The cursor that is further behind, where `last` is the last sample that was sent.
-fn further_behind(a: Option<SampleId>, b: Option<SampleId>, last: Option<SampleId>) -> Option<SampleId> {
-    match (a, b, last) {
-        (Some(a), Some(b), _) if a.epoch == b.epoch => Some(a.min(b)),
-        // The reader in the earlier epoch is behind.
-        (Some(a), Some(b), Some(last)) => Some(if a.epoch == last.epoch { b } else { a }),
-        _ => None,
-    }
+    /// The slots of the readers in this process, which cannot go on while this publisher waits.
+    own_readers: Vec<usize>,
+    /// See [`Credit::has_sent_all`].
+    has_sent_all: Arc<AtomicBool>,
 }
 
 impl<M: Message> Publisher<M> {
@@ -242,10 +151,10 @@ impl<M: Message> Publisher<M> {
             sender: Sender::open(node, cursors, &wiring.bells, &wiring.service, max_items, strategy)?,
             cursors: Arc::clone(cursors),
             slot: wiring.slot,
-            readers: wiring.consumers.iter().map(|reader| Reader::of_port(reader, wiring.service.history)).collect(),
+            credit: Credit::new(&wiring.consumers, wiring.service.history),
             wait_limit: Duration::from_millis(wiring.wait_limit_millis),
-            own_first: None,
-            own_last: None,
+            own_readers: Vec::new(),
+            has_sent_all: Arc::new(AtomicBool::new(true)),
         })
     }
 
@@ -253,42 +162,45 @@ impl<M: Message> Publisher<M> {
         self.cursors.output(self.slot)
     }
 
-    /// The last sample that every lossless reader has answered, and every reader of an answer to it: an instance that takes
-    /// over goes on after it, so that no sample is lost that died with its publisher.
-    pub fn answered(&self) -> Option<SampleId> {
-        let last = self.slot().key();
-        let least = self.least_answered(last).unwrap_or(last);
-        // The samples of this very publisher lie in the readers' queues and in its history.
-        match (least, self.own_last) {
-            (Some(least), Some(own)) if least.epoch == own.epoch => Some(least.max(own)),
-            // An epoch begins when all readers have answered the one before.
-            (Some(_), Some(own)) if last.is_some_and(|last| last.epoch == own.epoch) => Some(own),
-            (None, own) => own,
-            (least, _) => least,
-        }
+    /// Names the readers in this process, by their slots: the publisher gives way at once if one of them has no room.
+    pub(crate) fn shares_process_with(&mut self, slots: Vec<usize>) {
+        self.own_readers = slots;
     }
 
-    /// The last sample that need not be sent again: if another instance has handed over, the last that it has sent;
-    /// otherwise, the last that the readers have answered.
-    pub fn known(&self, is_handed_over: bool) -> Option<SampleId> {
-        if is_handed_over { self.last() } else { self.answered() }
+    /// Whether an instance that takes over from this one finds all samples that are not answered in its memory, or in that of
+    /// one before it.
+    pub(crate) fn has_sent_all(&self) -> Arc<AtomicBool> {
+        Arc::clone(&self.has_sent_all)
+    }
+
+    /// Takes over: returns the last sample that need not be sent again. If another instance has handed over, that is the last
+    /// one that it has sent; otherwise, the last one that the readers, and those behind them, have answered.
+    pub fn begin(&mut self, is_handed_over: bool) -> Option<SampleId> {
+        let written = self.written();
+        let known = self.credit.begin(is_handed_over, &*self.cursors, written);
+        self.has_sent_all.store(self.credit.has_sent_all(written), Ordering::Relaxed);
+        known
+    }
+
+    /// As [`Publisher::begin`], without taking over.
+    pub(crate) fn known(&self, is_handed_over: bool) -> Option<SampleId> {
+        self.credit.known(is_handed_over, &*self.cursors, self.written())
     }
 
     /// The last sample that every lossless reader, and those behind it, have answered; `None` if there is none, or no such
     /// reader.
     pub fn answered_by_readers(&self) -> Option<SampleId> {
-        self.least_answered(self.slot().key()).flatten()
-    }
-
-    /// The last sample that the reader furthest behind has answered; the outer `None` if there is no reader.
-    fn least_answered(&self, last: Option<SampleId>) -> Option<Option<SampleId>> {
-        let least = self.readers.iter().filter_map(|reader| reader.least(&self.cursors, last));
-        least.reduce(|a, b| further_behind(a, b, last))
+        self.credit.answered_by_readers(&*self.cursors, self.written())
     }
 
     /// Whether there is a reader that the publisher waits for.
     pub fn has_readers(&self) -> bool {
-        self.readers.iter().any(|reader| !self.cursors.input(reader.slot).is_given_up())
+        self.credit.has_readers(&*self.cursors)
+    }
+
+    /// How far the instances of the node have come.
+    pub(crate) fn written(&self) -> Option<Written> {
+        self.slot().written()
     }
 
     /// Tells readers whether its samples come from another machine whose link is cut off.
@@ -333,7 +245,7 @@ impl<M: Message> Publisher<M> {
         check: impl FnOnce(&mut M::Head) -> bool,
     ) -> Result<Sent, PortError> {
         let key = sample_id(M::header(&head));
-        if !self.has_room(&key) && self.wait_for_room(&key, should_yield)? == Sent::GaveWay {
+        if !self.has_room(key) && self.wait_for_room(key, should_yield)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
         if !check(&mut head) {
@@ -343,17 +255,25 @@ impl<M: Message> Publisher<M> {
         // round, a reader could answer a sample that is not counted.
         self.slot().commit(key);
         self.sender.send(head, items)?;
-        self.own_first = self.own_first.filter(|first| first.epoch == key.epoch).or(Some(key));
-        self.own_last = Some(key);
+        self.credit.has_sent(key);
+        if !self.has_sent_all.load(Ordering::Relaxed) {
+            self.has_sent_all.store(self.credit.has_sent_all(self.written()), Ordering::Relaxed);
+        }
         Ok(Sent::Yes)
     }
 
     /// Gives readers that have come back the samples that they missed. Call it when there is nothing to send.
     ///
     /// # Errors
-    /// An error of iceoryx2.
+    /// An error of iceoryx2, or readers lack samples that died with the instance that has handed over: this one must begin
+    /// again, so that it sends them.
     pub fn look_for_readers(&mut self) -> Result<(), PortError> {
-        self.sender.look_for_readers()
+        self.sender.look_for_readers()?;
+        let n_publishers = self.sender.pub_sub.dynamic_config().number_of_publishers();
+        match self.credit.lost_predecessor(&*self.cursors, self.written(), n_publishers) {
+            Some(SampleId { seq, .. }) => Err(PortError::PredecessorGone { service: self.sender.service.clone(), seq }),
+            None => Ok(()),
+        }
     }
 
     /// Whether a sample could be sent without waiting. `waited` is the time since the caller first asked: attached readers are given up
@@ -363,35 +283,27 @@ impl<M: Message> Publisher<M> {
     /// An error of iceoryx2.
     pub fn has_room_for(&mut self, header: &Header, waited: Duration) -> Result<bool, PortError> {
         let key = sample_id(header);
-        if self.has_room(&key) {
+        if self.has_room(key) {
             return Ok(true);
         }
-        self.give_up_attached(&key, waited);
-        self.sender.look_for_readers()?;
-        Ok(self.has_room(&key))
+        self.give_up_attached(key, waited);
+        self.look_for_readers()?;
+        Ok(self.has_room(key))
     }
 
-    fn has_room(&mut self, key: &SampleId) -> bool {
-        self.first_without_room(key).is_none()
+    fn has_room(&mut self, key: SampleId) -> bool {
+        let written = self.written();
+        self.credit.first_without_room(&*self.cursors, written, key).is_none()
     }
 
-    /// The first reader that has no room for a sample, if there is one.
-    fn first_without_room(&mut self, key: &SampleId) -> Option<&Reader> {
-        let own_first = self.own_first.filter(|first| first.epoch == key.epoch).map_or(key.seq, |first| first.seq);
-        let next = Next { key: *key, last: self.slot().key(), own_first };
-        let cursors = &self.cursors;
-        self.readers.iter_mut().find_map(|reader| (!reader.has_room(cursors, &next)).then_some(&*reader))
-    }
-
-    /// Gives up the attached readers that have had no room for a sample for longer than their time, with all their readers: the other
-    /// ports need not wait for them as well.
-    fn give_up_attached(&mut self, key: &SampleId, waited: Duration) {
-        let cursors = Arc::clone(&self.cursors);
-        while let Some(reader) = self.first_without_room(key) {
-            if reader.attached_slots.is_empty() || waited <= reader.attached_limit {
+    /// Gives up the attached readers that have had no room for a sample for longer than their time, with all their readers:
+    /// the other ports need not wait for them as well.
+    fn give_up_attached(&mut self, key: SampleId, waited: Duration) {
+        let (cursors, written) = (Arc::clone(&self.cursors), self.written());
+        while let Some(reader) = self.credit.first_without_room(&*cursors, written, key) {
+            if !gives_up(reader, waited, &cursors) {
                 return;
             }
-            reader.attached_slots.iter().for_each(|slot| cursors.input(*slot).give_up(true));
         }
     }
 
@@ -405,36 +317,72 @@ impl<M: Message> Publisher<M> {
         self.slot().add_blocked(time.as_nanos() as u64);
     }
 
-    /// Whether attached readers alone have not answered a sample that was sent. Those that have had longer than their time are given up.
+    /// Whether attached readers alone have not answered a sample that was sent. Those that have had longer than their time are
+    /// given up.
     pub(crate) fn give_up_attached_that_lack(&self, key: SampleId, waited: Duration) -> bool {
-        let last = self.slot().key();
-        let lacks = |reader: &Reader| match reader.least(&self.cursors, last) {
-            None => false,
-            Some(None) => true,
-            Some(Some(place)) if place.epoch == key.epoch => place.seq < key.seq,
-            // A reader in an earlier epoch is behind.
-            Some(Some(place)) => last.is_none_or(|last| place.epoch != last.epoch),
-        };
-        let behind: Vec<&Reader> = self.readers.iter().filter(|reader| lacks(reader)).collect();
+        let behind = self.credit.readers_that_lack(key, &*self.cursors, self.written());
         if behind.is_empty() || behind.iter().any(|reader| reader.attached_slots.is_empty()) {
             return false;
         }
         for reader in behind {
-            if waited > reader.attached_limit {
-                reader.attached_slots.iter().for_each(|slot| self.cursors.input(*slot).give_up(true));
-            }
+            gives_up(reader, waited, &self.cursors);
         }
         true
     }
 
-    fn wait_for_room(&mut self, key: &SampleId, should_yield: &mut dyn FnMut() -> bool) -> Result<Sent, PortError> {
+    fn wait_for_room(&mut self, key: SampleId, should_yield: &mut dyn FnMut() -> bool) -> Result<Sent, PortError> {
+        self.wait(key, should_yield, |publisher, waited| {
+            if publisher.has_room(key) {
+                return Wait::Over;
+            }
+            publisher.give_up_attached(key, waited);
+            let written = publisher.written();
+            let own_readers = &publisher.own_readers;
+            if publisher.credit.waits_for_one_of(own_readers, &*publisher.cursors, written, key) {
+                return Wait::InVain;
+            }
+            Wait::On
+        })
+    }
+
+    /// Waits until the readers, and those behind them, have answered a sample that was sent. While it waits it calls
+    /// `should_yield` now and then, and gives up when that returns true.
+    ///
+    /// # Errors
+    /// A reader did not answer within the limit, or an error of iceoryx2.
+    pub(crate) fn wait_for_answers(
+        &mut self,
+        key: SampleId,
+        should_yield: &mut dyn FnMut() -> bool,
+    ) -> Result<Sent, PortError> {
+        self.wait(key, should_yield, |publisher, waited| {
+            let behind = publisher.credit.readers_that_lack(key, &*publisher.cursors, publisher.written());
+            if behind.is_empty() {
+                return Wait::Over;
+            }
+            if behind.iter().any(|reader| reader.is_among(&publisher.own_readers)) {
+                return Wait::InVain;
+            }
+            publisher.give_up_attached_that_lack(key, waited);
+            Wait::On
+        })
+    }
+
+    fn wait(
+        &mut self,
+        key: SampleId,
+        should_yield: &mut dyn FnMut() -> bool,
+        mut look: impl FnMut(&mut Self, Duration) -> Wait,
+    ) -> Result<Sent, PortError> {
         let start = Instant::now();
         let mut last_look = start;
         let (mut last_try, mut waited) = (start, Duration::ZERO);
         let mut n_tries = 0;
         let outcome = loop {
-            if self.has_room(key) {
-                break Ok(Sent::Yes);
+            match look(self, waited) {
+                Wait::Over => break Ok(Sent::Yes),
+                Wait::InVain => break Ok(Sent::GaveWay),
+                Wait::On => {}
             }
             n_tries += 1;
             if n_tries < N_YIELDS {
@@ -446,7 +394,6 @@ impl<M: Message> Publisher<M> {
             }
             let now = Instant::now();
             waited += now.duration_since(std::mem::replace(&mut last_try, now)).min(LONGEST_TRY);
-            self.give_up_attached(key, waited);
             if start.elapsed() > self.wait_limit {
                 break Err(PortError::Stalled {
                     service: self.sender.service.clone(),
@@ -456,13 +403,31 @@ impl<M: Message> Publisher<M> {
             }
             if last_look.elapsed() > LOOK_PAUSE {
                 last_look = Instant::now();
-                self.sender.look_for_readers()?;
+                self.look_for_readers()?;
             }
             std::thread::sleep(RETRY_PAUSE);
         };
         self.slot().add_blocked(start.elapsed().as_nanos() as u64);
         outcome
     }
+}
+
+/// The outcome of a look at the readers.
+enum Wait {
+    Over,
+    /// The reader cannot go on while the publisher waits.
+    InVain,
+    On,
+}
+
+/// Gives up an attached reader, with all its readers, if it has had longer than its time.
+fn gives_up(reader: &Reader, waited: Duration, cursors: &SharedCursors) -> bool {
+    let limit = Duration::from_millis(reader.attached_limit_millis);
+    if reader.attached_slots.is_empty() || waited <= limit {
+        return false;
+    }
+    reader.attached_slots.iter().for_each(|slot| cursors.input(*slot).give_up(true));
+    true
 }
 
 /// The output of a standby, for comparison. It waits for no reader.

@@ -1,7 +1,10 @@
 //! The iceoryx2 service of a port.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::Duration;
 
+use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
 use iceoryx2::prelude::{Node, ServiceName, ipc};
 use iceoryx2::service::port_factory::publish_subscribe;
 
@@ -48,6 +51,54 @@ fn open_with_retries<T, E>(mut open: impl FnMut() -> Result<T, E>) -> Result<T, 
         std::thread::sleep(OPENING_PAUSE);
     }
     open()
+}
+
+/// A connection that could not be made is tried so often, each time that the port looks for its partners.
+const N_CONNECTIONS: u32 = 20;
+
+/// Notices connections that iceoryx2 could not make, for want of a descriptor or of memory or because the other process stood
+/// still. iceoryx2 0.10 passes over them, and tries them again only when another port comes or goes.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Connections {
+    has_failed: Arc<AtomicBool>,
+    n_failures: Arc<AtomicU32>,
+}
+
+/// A connection could not be made.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "a connection could not be made {N_CONNECTIONS} times: the process may have too few descriptors ('ulimit -n'), or shared \
+     memory may be full"
+)]
+pub(super) struct NotConnected;
+
+impl Connections {
+    /// The handler of a port.
+    pub(super) fn handler(&self) -> impl Fn(DegradationCause, &DegradationInfo) -> DegradationAction + Send + 'static {
+        let has_failed = Arc::clone(&self.has_failed);
+        move |cause, _| {
+            if matches!(cause, DegradationCause::FailedToEstablishConnection) {
+                has_failed.store(true, Ordering::Relaxed);
+                return DegradationAction::Ignore;
+            }
+            DegradationAction::Warn
+        }
+    }
+
+    /// Whether a connection has failed since the last look and must be tried again.
+    ///
+    /// # Errors
+    /// It has failed too often.
+    pub(super) fn is_to_be_tried_again(&self) -> Result<bool, NotConnected> {
+        if !self.has_failed.swap(false, Ordering::Relaxed) {
+            self.n_failures.store(0, Ordering::Relaxed);
+            return Ok(false);
+        }
+        if self.n_failures.fetch_add(1, Ordering::Relaxed) >= N_CONNECTIONS {
+            return Err(NotConnected);
+        }
+        Ok(true)
+    }
 }
 
 fn service_name(wiring: &ServiceWiring) -> Result<ServiceName, PortError> {

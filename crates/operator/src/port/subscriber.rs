@@ -4,23 +4,38 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Instant;
 
+use iceoryx2::port::subscriber::SubscriberCreateError;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{Node, ipc};
 use iceoryx2::service::port_factory::PortFactory;
 
-use super::service::{self, PubSub};
+use super::service::{self, Connections, PubSub};
 use super::{Place, PortError, PortSample, sample_id};
 use crate::cursors::{SampleId, SharedCursors};
 use crate::monotonic_nanos;
 use crate::sequencer::{Placing, Sequencer};
 use crate::wiring::{EdgePolicy, InputCounts, InputWiring, OnLate};
+use crate::written::Written;
 use blindgrasp_messages::{Header, Message};
+
+type Port<M> = iceoryx2::port::subscriber::Subscriber<ipc::Service, [<M as Message>::Item], <M as Message>::Head>;
+
+fn open_port<M: Message>(
+    pub_sub: &PubSub<M>,
+    buffer_size: usize,
+    connections: &Connections,
+) -> Result<Port<M>, SubscriberCreateError> {
+    pub_sub.subscriber_builder().buffer_size(buffer_size).set_degradation_handler(connections.handler()).create()
+}
 
 /// The receiving end of an edge.
 pub struct Subscriber<M: Message> {
     service: String,
     pub_sub: PubSub<M>,
-    subscriber: iceoryx2::port::subscriber::Subscriber<ipc::Service, [M::Item], M::Head>,
+    subscriber: Port<M>,
+    connections: Connections,
+    /// The number of samples that the queue takes.
+    buffer_size: usize,
     cursors: Option<(Arc<SharedCursors>, usize)>,
     writer_slot: usize,
     deadline_nanos: Option<u64>,
@@ -50,15 +65,15 @@ impl<M: Message> Subscriber<M> {
             EdgePolicy::Lossless => wiring.service.max_capacity,
             EdgePolicy::Latest => wiring.capacity.min(wiring.service.max_capacity),
         };
-        let subscriber = pub_sub
-            .subscriber_builder()
-            .buffer_size(buffer_size)
-            .create()
+        let connections = Connections::default();
+        let subscriber = open_port::<M>(&pub_sub, buffer_size, &connections)
             .map_err(|error| service::open_failed(&wiring.service, error))?;
         let mut subscriber = Subscriber {
             service: wiring.service.name.clone(),
             pub_sub,
             subscriber,
+            connections,
+            buffer_size,
             cursors: cursors.zip(wiring.slot).map(|(cursors, slot)| (Arc::clone(cursors), slot)),
             writer_slot: wiring.writer_slot,
             deadline_nanos: wiring.deadline_nanos,
@@ -74,23 +89,35 @@ impl<M: Message> Subscriber<M> {
 
     fn begin_with(&mut self, sequencer: Sequencer<PortSample<M>>) {
         let now = Instant::now();
-        let sequencer = sequencer.beginning_at(now, self.written());
+        let written = self.writer();
+        let sequencer = sequencer.beginning_at(now, written.map(|written| written.last));
         let sequencer = if self.may_hold { sequencer } else { sequencer.without_waiting() };
         let before = std::mem::replace(&mut self.sequencer, sequencer);
         // Samples that this reader has received and not answered exist nowhere else any more.
         let put_back = std::mem::take(&mut self.put_back).into_iter().map(|(key, sample)| (key, sample.copied()));
-        self.sequencer.hold_again(before, put_back, now);
+        self.sequencer.hold_again(before, put_back, written.as_ref(), now);
     }
 
     /// Connects to its publishers; false if there is none yet.
     ///
     /// # Errors
-    /// An error of iceoryx2.
-    pub fn connect(&self) -> Result<bool, PortError> {
-        self.subscriber
-            .update_connections()
-            .map_err(|error| PortError::Connect { service: self.service.clone(), source: error.into() })?;
+    /// An error of iceoryx2, or a connection could not be made again and again.
+    pub fn connect(&mut self) -> Result<bool, PortError> {
+        let failed = |service: &str, source| PortError::Connect { service: service.into(), source };
+        self.subscriber.update_connections().map_err(|error| failed(&self.service, error.into()))?;
+        if self.connections.is_to_be_tried_again().map_err(|error| failed(&self.service, error.into()))? {
+            // A new port connects to all publishers, and gets what they keep.
+            if let Ok(port) = open_port::<M>(&self.pub_sub, self.buffer_size, &self.connections) {
+                self.subscriber = port;
+                self.sequencer.has_reconnected();
+            }
+        }
         Ok(self.pub_sub.dynamic_config().number_of_publishers() > 0)
+    }
+
+    /// How far its writer has come; `None` for a reader that only reads along.
+    fn writer(&self) -> Option<Written> {
+        self.cursors.as_ref().and_then(|(cursors, _)| cursors.output(self.writer_slot).written())
     }
 
     /// Goes on after the last sample that the node has answered, which the cursors name. All answers up to `answered` have
@@ -130,7 +157,16 @@ impl<M: Message> Subscriber<M> {
 
     /// The last sample that its writer has sent.
     pub fn written(&self) -> Option<SampleId> {
-        self.cursors.as_ref().and_then(|(cursors, _)| cursors.output(self.writer_slot).key())
+        self.writer().map(|written| written.last)
+    }
+
+    /// Whether a sample is one that its writer has sent after another one, if it has sent both.
+    pub(crate) fn is_after(&self, key: SampleId, other: Option<SampleId>) -> bool {
+        let Some(other) = other else { return true };
+        match self.writer() {
+            Some(written) => !written.is_past(other, key),
+            None => other.epoch != key.epoch || other.seq < key.seq,
+        }
     }
 
     /// Whether its writer is on another machine whose link is cut off.
@@ -173,7 +209,8 @@ impl<M: Message> Subscriber<M> {
             let publisher = sample.header().publisher_id().value();
             let may_reorder = || self.pub_sub.dynamic_config().number_of_publishers() > 1;
             let sample = PortSample(Place::Lent(sample));
-            match self.sequencer.push(sample, key, publisher, may_reorder, Instant::now) {
+            let written = self.cursors.as_ref().and_then(|(cursors, _)| cursors.output(self.writer_slot).written());
+            match self.sequencer.push(sample, key, publisher, written.as_ref(), may_reorder, Instant::now) {
                 Placing::Deliver(sample) => return Ok(Some(self.delivered(sample))),
                 Placing::Hold => self.sequencer.keep_as(key, PortSample::copied),
                 Placing::Drop => {}
@@ -246,7 +283,7 @@ impl<M: Message> Subscriber<M> {
             let key = sample_id(header);
             let slot = cursors.input(*slot);
             // A sample that goes back in order is answered, but does not move the cursor.
-            let is_ahead = slot.key().is_none_or(|last| last.epoch != key.epoch || last.seq < key.seq);
+            let is_ahead = self.is_after(key, slot.key());
             slot.commit(is_ahead.then_some(key), counts);
         }
     }

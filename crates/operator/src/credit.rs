@@ -1,0 +1,276 @@
+//! How far a publisher may be ahead of its readers, and which samples an instance that takes over must send again.
+//!
+//! It decides on the places of readers that the [cursors](crate::cursors) show, and does no I/O: the publishers of all
+//! operators and the search through all histories (`recovery_model.rs`) call the same code.
+
+use crate::cursors::{SampleId, SharedCursors};
+use crate::wiring::{ConsumerWiring, ReaderWiring};
+use crate::written::Written;
+
+/// The places of readers, by slot.
+pub(crate) trait Places {
+    /// The last sample that a reader has answered.
+    fn answered(&self, slot: usize) -> Option<SampleId>;
+    /// Whether no process will read on.
+    fn is_given_up(&self, slot: usize) -> bool;
+}
+
+impl Places for SharedCursors {
+    fn answered(&self, slot: usize) -> Option<SampleId> {
+        self.input(slot).key()
+    }
+
+    fn is_given_up(&self, slot: usize) -> bool {
+        self.input(slot).is_given_up()
+    }
+}
+
+/// The readers of an output, and the part of its samples that this very publisher has sent.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(crate) struct Credit {
+    readers: Vec<Reader>,
+    /// The last sample that others have sent before this publisher; `None` if it cannot send such samples again.
+    begun_after: Option<Option<SampleId>>,
+    /// The first sample of this publisher in the current epoch.
+    own_first: Option<SampleId>,
+    own_last: Option<SampleId>,
+}
+
+/// A reader whose unanswered samples the publisher must be able to send again.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub(crate) struct Reader {
+    pub(crate) slot: usize,
+    limit: Limit,
+    /// The last sample that it had answered at the last look.
+    key: Option<SampleId>,
+    /// If it is an attached reader, the slots of all its readers, and how long the publisher waits for it.
+    pub(crate) attached_slots: Vec<usize>,
+    pub(crate) attached_limit_millis: u64,
+    /// The readers of its answers, if it answers each sample under the same number.
+    behind: Vec<Reader>,
+}
+
+/// How many samples a reader may leave unanswered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+enum Limit {
+    /// Of the samples of this very publisher, as many as the reader's queue takes. The samples of an earlier publisher lie in
+    /// a queue of their own, or have died with it: waiting for a reader to answer them could last for ever.
+    Queue(u64),
+    /// Of all samples, as many as the publisher keeps.
+    History(u64),
+}
+
+/// The sample that is to be sent, for [`Reader::has_room`].
+struct Next {
+    key: SampleId,
+    written: Option<Written>,
+    /// The number of the first sample of this publisher in the epoch.
+    own_first: u64,
+    /// Whether samples of earlier publishers can be sent again.
+    is_repeatable: bool,
+}
+
+impl Reader {
+    fn of_port(wiring: &ConsumerWiring, history: usize) -> Reader {
+        Reader {
+            slot: wiring.slot,
+            limit: Limit::Queue(wiring.capacity as u64),
+            key: None,
+            attached_slots: wiring.attached_slots.clone(),
+            attached_limit_millis: wiring.attached_limit_millis,
+            behind: wiring.behind.iter().map(|behind| Reader::further_on(behind, history)).collect(),
+        }
+    }
+
+    fn further_on(wiring: &ReaderWiring, history: usize) -> Reader {
+        Reader {
+            slot: wiring.slot,
+            limit: Limit::History(history as u64),
+            key: None,
+            attached_slots: Vec::new(),
+            attached_limit_millis: 0,
+            behind: wiring.behind.iter().map(|behind| Reader::further_on(behind, history)).collect(),
+        }
+    }
+
+    fn has_room(&mut self, places: &impl Places, next: &Next) -> bool {
+        if !(self.key.is_some() && self.is_near(next)) {
+            self.key = places.answered(self.slot);
+            if !self.is_near(next) {
+                return places.is_given_up(self.slot);
+            }
+        }
+        self.behind.iter_mut().all(|reader| reader.has_room(places, next)) || places.is_given_up(self.slot)
+    }
+
+    fn is_near(&self, next: &Next) -> bool {
+        let Some(written) = &next.written else {
+            return true;
+        };
+        // A reader that has answered all samples has room for one more, however far the numbers jump.
+        if self.key == Some(written.last) {
+            return true;
+        }
+        // A new epoch begins when every reader has answered the one before.
+        if next.key.epoch != written.last.epoch {
+            return false;
+        }
+        // It had answered the epoch before, or it has just come.
+        let is_within_epoch = self.key.filter(|key| written.is_current(*key));
+        let first_unanswered = is_within_epoch.map_or(written.first_seq, |key| key.seq + 1);
+        let (first_unanswered, limit) = match self.limit {
+            Limit::History(limit) if next.is_repeatable => (first_unanswered, limit),
+            Limit::Queue(limit) | Limit::History(limit) => (first_unanswered.max(next.own_first), limit),
+        };
+        next.key.seq.saturating_sub(first_unanswered) < limit
+    }
+
+    /// Of the places of this reader and of those behind it, without readers that were given up, the one furthest behind; the
+    /// outer `None` if there is no reader.
+    fn least(&self, places: &impl Places, written: Option<&Written>) -> Option<Option<SampleId>> {
+        if places.is_given_up(self.slot) {
+            return None;
+        }
+        let mut least = places.answered(self.slot);
+        for reader in &self.behind {
+            if let Some(key) = reader.least(places, written) {
+                least = written.and_then(|written| written.behind(least, key));
+            }
+        }
+        Some(least)
+    }
+
+    pub(crate) fn is_among(&self, slots: &[usize]) -> bool {
+        slots.contains(&self.slot) || self.behind.iter().any(|reader| reader.is_among(slots))
+    }
+}
+
+impl Credit {
+    /// The credit of a publisher whose wiring names these readers and so many samples that it keeps.
+    pub(crate) fn new(consumers: &[ConsumerWiring], history: usize) -> Credit {
+        let readers = consumers.iter().map(|reader| Reader::of_port(reader, history)).collect();
+        Credit { readers, begun_after: None, own_first: None, own_last: None }
+    }
+
+    /// The first reader that has no room for a sample, if there is one.
+    pub(crate) fn first_without_room(
+        &mut self,
+        places: &impl Places,
+        written: Option<Written>,
+        key: SampleId,
+    ) -> Option<&Reader> {
+        let own_first = self.own_first.filter(|first| first.epoch == key.epoch).map_or(key.seq, |first| first.seq);
+        let next = Next { key, written, own_first, is_repeatable: self.begun_after.is_some() };
+        self.readers.iter_mut().find_map(|reader| (!reader.has_room(places, &next)).then_some(&*reader))
+    }
+
+    /// Whether a reader without room, or one behind it, is among these: it cannot go on while this publisher waits for it in
+    /// the same process.
+    pub(crate) fn waits_for_one_of(
+        &mut self,
+        slots: &[usize],
+        places: &impl Places,
+        written: Option<Written>,
+        key: SampleId,
+    ) -> bool {
+        self.first_without_room(places, written, key).is_some_and(|reader| reader.is_among(slots))
+    }
+
+    /// Notes a sample that this publisher sends.
+    pub(crate) fn has_sent(&mut self, key: SampleId) {
+        self.own_first = self.own_first.filter(|first| first.epoch == key.epoch).or(Some(key));
+        self.own_last = Some(key);
+    }
+
+    /// The last sample that need not be sent again by an instance that takes over with this publisher: if another one has
+    /// handed over, the last that was sent, otherwise the last that the readers have answered.
+    pub(crate) fn known(
+        &self,
+        is_handed_over: bool,
+        places: &impl Places,
+        written: Option<Written>,
+    ) -> Option<SampleId> {
+        if is_handed_over { written.map(|written| written.last) } else { self.answered(places, written) }
+    }
+
+    /// Takes over; see [`Credit::known`].
+    pub(crate) fn begin(
+        &mut self,
+        is_handed_over: bool,
+        places: &impl Places,
+        written: Option<Written>,
+    ) -> Option<SampleId> {
+        let known = self.known(is_handed_over, places, written);
+        // If it goes on after its own last sample, it still needs the others for those before its first one.
+        if self.begun_after.is_none() || self.own_last.is_none() || known != self.own_last {
+            self.begun_after = Some(known);
+        }
+        known
+    }
+
+    /// The last sample that every lossless reader has answered, and every reader of an answer to it: an instance that takes
+    /// over goes on after it, so that no sample is lost that died with its publisher.
+    fn answered(&self, places: &impl Places, written: Option<Written>) -> Option<SampleId> {
+        let written = written?;
+        let least = self.least_answered(places, Some(written)).unwrap_or(Some(written.last));
+        // The samples of this very publisher lie in the readers' queues and in its history.
+        written.ahead(least, self.own_last)
+    }
+
+    /// Whether all samples that were sent and not answered lie in the memory of this publisher, or in that of one which has
+    /// handed over to it. If not, an instance that takes over from it must send them again.
+    pub(crate) fn has_sent_all(&self, written: Option<Written>) -> bool {
+        let (Some(written), Some(begun_after)) = (written, self.begun_after) else {
+            return true;
+        };
+        let reached = written.ahead(begun_after, self.own_last);
+        reached.is_some_and(|reached| written.is_past(reached, written.last))
+    }
+
+    /// The sample up to which another instance was to keep the samples for the readers, if a reader has not come so far and
+    /// no other publisher is left that has them.
+    pub(crate) fn lost_predecessor(
+        &self,
+        places: &impl Places,
+        written: Option<Written>,
+        n_publishers: usize,
+    ) -> Option<SampleId> {
+        let (written, begun_after) = (written?, self.begun_after??);
+        let least = self.least_answered(places, Some(written))?;
+        let is_behind = least.is_none_or(|least| !written.is_past(least, begun_after));
+        (n_publishers == 1 && is_behind).then_some(begun_after)
+    }
+
+    /// The last sample that every lossless reader, and those behind it, have answered; `None` if there is none, or no such
+    /// reader.
+    pub(crate) fn answered_by_readers(&self, places: &impl Places, written: Option<Written>) -> Option<SampleId> {
+        self.least_answered(places, written).flatten()
+    }
+
+    /// The last sample that the reader furthest behind has answered; the outer `None` if there is no reader.
+    fn least_answered(&self, places: &impl Places, written: Option<Written>) -> Option<Option<SampleId>> {
+        let written = written.as_ref();
+        let least = self.readers.iter().filter_map(|reader| reader.least(places, written));
+        least.reduce(|a, b| written.and_then(|written| written.behind(a, b)))
+    }
+
+    /// Whether there is a reader that the publisher waits for.
+    pub(crate) fn has_readers(&self, places: &impl Places) -> bool {
+        self.readers.iter().any(|reader| !places.is_given_up(reader.slot))
+    }
+
+    /// The readers that have not answered a sample that was sent.
+    pub(crate) fn readers_that_lack(
+        &self,
+        key: SampleId,
+        places: &impl Places,
+        written: Option<Written>,
+    ) -> Vec<&Reader> {
+        let lacks = |reader: &&Reader| match (reader.least(places, written.as_ref()), written) {
+            (None, _) | (_, None) => false,
+            (Some(None), _) => true,
+            (Some(Some(place)), Some(written)) => !written.is_past(place, key),
+        };
+        self.readers.iter().filter(lacks).collect()
+    }
+}
