@@ -442,7 +442,7 @@ fn a_run_with_few_descriptors_loses_nothing_or_is_refused_in_words() {
     let folder = tempfile::tempdir().expect("a folder");
     let flow = dataflow_with(folder.path(), &[]);
     let mut n_whole = 0;
-    for n_files in (32..=72).step_by(4) {
+    for n_files in (40..=56).step_by(2) {
         let mut limited = Command::new("sh");
         let exec = format!("ulimit -n {n_files} && exec \"$0\" \"$@\"");
         limited.args(["-c", &exec, env!("CARGO_BIN_EXE_blindgrasp")]).current_dir(project());
