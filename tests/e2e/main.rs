@@ -22,6 +22,7 @@ mod libsvm;
 mod link_identity;
 mod link_security;
 mod live_page;
+mod losses;
 mod main_job;
 mod many_cells;
 mod meshes;
