@@ -27,7 +27,7 @@ const MAX_KEPT: usize = 1024;
 const RECORDING_LIMIT: Duration = Duration::from_secs(1);
 
 /// A sample is retained for at most so long for main samples that may be answered again.
-const RETAIN_LIMIT: Duration = Duration::from_secs(1);
+const RETAIN_LIMIT: Duration = Duration::from_secs(2);
 
 /// The samples of an input in the order in which they came. Where stamps go back, a new segment begins.
 struct Timeline<T> {
@@ -329,7 +329,7 @@ impl<M: Message> PartnerInput<M> {
     ) -> Self {
         PartnerInput {
             port: port.into(),
-            retained: Retained::new(wiring.capacity - wiring.capacity / 4),
+            retained: Retained::new(wiring.capacity),
             subscriber,
             onlooker,
             timeline: Timeline::new(wiring.tolerance_nanos),

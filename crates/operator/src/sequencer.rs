@@ -29,8 +29,8 @@ type Place = (usize, u64);
 /// The order of one input. It has no clock: the caller gives the time.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Sequencer<T> {
-    /// The last epochs of the stream in the order in which they began, each with its generation.
-    epochs: VecDeque<(usize, u64)>,
+    /// The last epochs of the stream in the order in which they began.
+    epochs: VecDeque<Epoch>,
     /// The last sample delivered.
     last: Option<Place>,
     /// Samples up to here were answered by an earlier instance, and its answers were received: dropped.
@@ -48,6 +48,14 @@ pub struct Sequencer<T> {
     /// The last sample that was sent before this reader began, and until when those up to it are awaited.
     awaited: Option<(SampleId, Instant)>,
     counts: InputCounts,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Epoch {
+    generation: usize,
+    value: u64,
+    /// The number of its first sample, if the writer has said it.
+    first_seq: Option<u64>,
 }
 
 /// The sequencer's answer to a sample.
@@ -86,7 +94,10 @@ impl<T> Sequencer<T> {
         let answered = answered.zip(counted).filter(|(answered, counted)| answered.epoch == counted.epoch);
         let answered = answered.map(|(answered, counted)| (0, answered.seq.min(counted.seq)));
         Sequencer {
-            epochs: counted.iter().map(|counted| (0, counted.epoch)).collect(),
+            epochs: counted
+                .iter()
+                .map(|counted| Epoch { generation: 0, value: counted.epoch, first_seq: None })
+                .collect(),
             // Nothing is missing between the two: the earlier instance received it.
             last: answered,
             answered,
@@ -117,29 +128,32 @@ impl<T> Sequencer<T> {
 
     /// The place of a sample, whose writer has come to `written`; `None` if its epoch is over and this reader has left it.
     fn place(&mut self, key: SampleId, written: Option<&Written>) -> Option<Place> {
-        let is_current = written.is_some_and(|written| written.is_current(key));
+        let current = written.filter(|written| written.is_current(key));
         // An epoch that comes back with higher numbers is another one.
-        let is_begun_again = |at: usize| is_current && at + 1 < self.epochs.len();
-        let known = self.epochs.iter().rposition(|(_, epoch)| *epoch == key.epoch).filter(|at| !is_begun_again(*at));
+        let is_begun_again = |at: usize| current.is_some() && at + 1 < self.epochs.len();
+        let known = self.epochs.iter().rposition(|epoch| epoch.value == key.epoch).filter(|at| !is_begun_again(*at));
+        let first_seq = current.map(|written| written.first_seq);
         if let Some(at) = known {
-            return Some((self.epochs[at].0, key.seq));
+            let epoch = &mut self.epochs[at];
+            epoch.first_seq = epoch.first_seq.or(first_seq);
+            return Some((epoch.generation, key.seq));
         }
         // A writer keeps samples of epochs that its readers have left. Where readers are not waited for, it may have begun
         // several since.
-        let is_over = !is_current && written.is_some() && self.may_hold && !self.epochs.is_empty();
+        let is_over = current.is_none() && written.is_some() && self.may_hold && !self.epochs.is_empty();
         if is_over {
             return None;
         }
-        let generation = self.epochs.back().map_or(0, |(generation, _)| generation + 1);
-        self.epochs.push_back((generation, key.epoch));
+        let generation = self.epochs.back().map_or(0, |epoch| epoch.generation + 1);
+        self.epochs.push_back(Epoch { generation, value: key.epoch, first_seq });
         if self.epochs.len() > N_EPOCHS {
             self.epochs.pop_front();
         }
         Some((generation, key.seq))
     }
 
-    fn epoch(&self, generation: usize) -> Option<u64> {
-        self.epochs.iter().find(|(known, _)| *known == generation).map(|(_, epoch)| *epoch)
+    fn epoch(&self, generation: usize) -> Option<&Epoch> {
+        self.epochs.iter().rfind(|epoch| epoch.generation == generation)
     }
 
     /// Forgets which publisher has sent which samples: the reader has connected to them anew and gets their history again.
@@ -238,7 +252,7 @@ impl<T> Sequencer<T> {
         let mut held: Vec<(SampleId, (T, Instant))> = Vec::new();
         let mut before = before;
         for ((generation, seq), sample) in std::mem::take(&mut before.held) {
-            held.extend(before.epoch(generation).map(|epoch| (SampleId { epoch, seq }, sample)));
+            held.extend(before.epoch(generation).map(|epoch| (SampleId { epoch: epoch.value, seq }, sample)));
         }
         held.extend(put_back.into_iter().map(|(key, sample)| (key, (sample, now))));
         let last = self.last.or(self.counted);
@@ -252,8 +266,8 @@ impl<T> Sequencer<T> {
 
     /// Changes the form in which a held sample is kept.
     pub fn keep_as(&mut self, key: SampleId, form: impl FnOnce(T) -> T) {
-        let epochs = self.epochs.iter().rfind(|(_, epoch)| *epoch == key.epoch);
-        let Some(place) = epochs.map(|(generation, _)| (*generation, key.seq)) else { return };
+        let epoch = self.epochs.iter().rfind(|epoch| epoch.value == key.epoch);
+        let Some(place) = epoch.map(|epoch| (epoch.generation, key.seq)) else { return };
         if let Some((sample, since)) = self.held.remove(&place) {
             self.held.insert(place, (form(sample), since));
         }
@@ -266,8 +280,8 @@ impl<T> Sequencer<T> {
         let Some((sent, until)) = self.awaited else { return Some(deadline) };
         let has_all = self.last.is_some_and(|(generation, seq)| {
             // An epoch that has not come yet begins after all others.
-            let of_sent = self.epochs.iter().rfind(|(_, epoch)| *epoch == sent.epoch);
-            of_sent.is_some_and(|(of_sent, _)| (*of_sent, sent.seq) <= (generation, seq))
+            let of_sent = self.epochs.iter().rfind(|epoch| epoch.value == sent.epoch);
+            of_sent.is_some_and(|of_sent| (of_sent.generation, sent.seq) <= (generation, seq))
         });
         Some(if has_all { deadline } else { deadline.max(until) })
     }
@@ -278,11 +292,16 @@ impl<T> Sequencer<T> {
 
     /// The number of samples before `place`, which is after the last one, that have not come.
     fn n_before(&self, place: Place) -> u64 {
+        let since_first = || {
+            let first_seq = self.epoch(place.0).and_then(|epoch| epoch.first_seq);
+            first_seq.map_or(0, |first_seq| place.1.saturating_sub(first_seq))
+        };
         match self.last {
             Some((generation, seq)) if generation == place.0 => place.1.saturating_sub(seq).saturating_sub(1),
-            // A new epoch may begin at any number.
-            Some(_) => 0,
-            None if self.begins_at_zero => self.counted.map_or(place.1, |_| 0),
+            // A new epoch may begin at any number; its writer says at which.
+            Some(_) => since_first(),
+            None if self.begins_at_zero && self.counted.is_none() => place.1,
+            None if self.begins_at_zero => since_first(),
             None => 0,
         }
     }

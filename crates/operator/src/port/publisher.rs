@@ -89,11 +89,12 @@ impl<M: Message> Sender<M> {
         let n_subscribers = self.pub_sub.dynamic_config().number_of_subscribers();
         let failed = |source| PortError::Connect { service: self.service.clone(), source };
         self.publisher.update_connections().map_err(|error| failed(error.into()))?;
-        if self.connections.is_to_be_tried_again().map_err(|error| failed(error.into()))? {
-            // A port that comes lets iceoryx2 look at all of them again.
-            drop(self.pub_sub.subscriber_builder().buffer_size(1).create());
-            self.publisher.update_connections().map_err(|error| failed(error.into()))?;
-        }
+        let (pub_sub, publisher) = (&self.pub_sub, &self.publisher);
+        let mended = self.connections.mend(|| {
+            // A port that comes and goes lets iceoryx2 look at all of them again.
+            pub_sub.subscriber_builder().buffer_size(1).create().is_ok() && publisher.update_connections().is_ok()
+        });
+        mended.map_err(|error| failed(error.into()))?;
         if std::mem::replace(&mut self.n_subscribers, n_subscribers) != n_subscribers {
             self.ring();
         }

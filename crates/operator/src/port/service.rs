@@ -1,8 +1,8 @@
 //! The iceoryx2 service of a port.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
 use iceoryx2::prelude::{Node, ServiceName, ipc};
@@ -53,22 +53,25 @@ fn open_with_retries<T, E>(mut open: impl FnMut() -> Result<T, E>) -> Result<T, 
     open()
 }
 
-/// A connection that could not be made is tried so often, each time that the port looks for its partners.
-const N_CONNECTIONS: u32 = 20;
+/// A connection that could not be made is tried again after this pause, for so long.
+const CONNECT_PAUSE: Duration = Duration::from_millis(50);
+const CONNECT_LIMIT: Duration = Duration::from_secs(3);
 
 /// Notices connections that iceoryx2 could not make, for want of a descriptor or of memory or because the other process stood
 /// still. iceoryx2 0.10 passes over them, and tries them again only when another port comes or goes.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Default)]
 pub(super) struct Connections {
     has_failed: Arc<AtomicBool>,
-    n_failures: Arc<AtomicU32>,
+    /// Since when connections have failed at each try, and when they were tried last.
+    failing: Option<(Instant, Instant)>,
 }
 
 /// A connection could not be made.
 #[derive(Debug, thiserror::Error)]
 #[error(
-    "a connection could not be made {N_CONNECTIONS} times: the process may have too few descriptors ('ulimit -n'), or shared \
-     memory may be full"
+    "a connection could not be made within {} s: the process may have too few descriptors ('ulimit -n'), or shared memory may \
+     be full",
+    CONNECT_LIMIT.as_secs()
 )]
 pub(super) struct NotConnected;
 
@@ -85,19 +88,33 @@ impl Connections {
         }
     }
 
-    /// Whether a connection has failed since the last look and must be tried again.
+    /// Whether all connections are made.
+    pub(super) fn are_made(&self) -> bool {
+        !self.has_failed.load(Ordering::Relaxed)
+    }
+
+    /// Lets `try_again` look for all partners anew if a connection has failed; it returns false if it could not.
     ///
     /// # Errors
-    /// It has failed too often.
-    pub(super) fn is_to_be_tried_again(&self) -> Result<bool, NotConnected> {
-        if !self.has_failed.swap(false, Ordering::Relaxed) {
-            self.n_failures.store(0, Ordering::Relaxed);
-            return Ok(false);
+    /// Connections have failed for too long.
+    pub(super) fn mend(&mut self, try_again: impl FnOnce() -> bool) -> Result<(), NotConnected> {
+        if self.are_made() {
+            self.failing = None;
+            return Ok(());
         }
-        if self.n_failures.fetch_add(1, Ordering::Relaxed) >= N_CONNECTIONS {
+        let now = Instant::now();
+        let (since, last_try) = *self.failing.get_or_insert((now, now));
+        if now.duration_since(since) > CONNECT_LIMIT {
             return Err(NotConnected);
         }
-        Ok(true)
+        if last_try == since || now.duration_since(last_try) >= CONNECT_PAUSE {
+            self.failing = Some((since, now));
+            self.has_failed.store(false, Ordering::Relaxed);
+            if !try_again() {
+                self.has_failed.store(true, Ordering::Relaxed);
+            }
+        }
+        Ok(())
     }
 }
 

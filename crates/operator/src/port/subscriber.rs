@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use iceoryx2::port::subscriber::SubscriberCreateError;
+use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{Node, ipc};
 use iceoryx2::service::port_factory::PortFactory;
@@ -23,9 +24,9 @@ type Port<M> = iceoryx2::port::subscriber::Subscriber<ipc::Service, [<M as Messa
 fn open_port<M: Message>(
     pub_sub: &PubSub<M>,
     buffer_size: usize,
-    connections: &Connections,
+    handler: impl Fn(DegradationCause, &DegradationInfo) -> DegradationAction + Send + 'static,
 ) -> Result<Port<M>, SubscriberCreateError> {
-    pub_sub.subscriber_builder().buffer_size(buffer_size).set_degradation_handler(connections.handler()).create()
+    pub_sub.subscriber_builder().buffer_size(buffer_size).set_degradation_handler(handler).create()
 }
 
 /// The receiving end of an edge.
@@ -66,7 +67,7 @@ impl<M: Message> Subscriber<M> {
             EdgePolicy::Latest => wiring.capacity.min(wiring.service.max_capacity),
         };
         let connections = Connections::default();
-        let subscriber = open_port::<M>(&pub_sub, buffer_size, &connections)
+        let subscriber = open_port::<M>(&pub_sub, buffer_size, connections.handler())
             .map_err(|error| service::open_failed(&wiring.service, error))?;
         let mut subscriber = Subscriber {
             service: wiring.service.name.clone(),
@@ -105,14 +106,17 @@ impl<M: Message> Subscriber<M> {
     pub fn connect(&mut self) -> Result<bool, PortError> {
         let failed = |service: &str, source| PortError::Connect { service: service.into(), source };
         self.subscriber.update_connections().map_err(|error| failed(&self.service, error.into()))?;
-        if self.connections.is_to_be_tried_again().map_err(|error| failed(&self.service, error.into()))? {
+        let (pub_sub, buffer_size, handler) = (&self.pub_sub, self.buffer_size, self.connections.handler());
+        let (subscriber, sequencer) = (&mut self.subscriber, &mut self.sequencer);
+        let mended = self.connections.mend(|| {
             // A new port connects to all publishers, and gets what they keep.
-            if let Ok(port) = open_port::<M>(&self.pub_sub, self.buffer_size, &self.connections) {
-                self.subscriber = port;
-                self.sequencer.has_reconnected();
-            }
-        }
-        Ok(self.pub_sub.dynamic_config().number_of_publishers() > 0)
+            let Ok(port) = open_port::<M>(pub_sub, buffer_size, handler) else { return false };
+            *subscriber = port;
+            sequencer.has_reconnected();
+            subscriber.update_connections().is_ok()
+        });
+        mended.map_err(|error| failed(&self.service, error.into()))?;
+        Ok(self.pub_sub.dynamic_config().number_of_publishers() > 0 && self.connections.are_made())
     }
 
     /// How far its writer has come; `None` for a reader that only reads along.
