@@ -46,6 +46,7 @@ mod regression;
 mod replay;
 mod reproduce;
 mod ros2;
+mod ros2_access;
 mod ros2_commands;
 mod run_report;
 mod sandbox;
