@@ -6,7 +6,7 @@ use blindgrasp_bridge::certificates::key_files;
 use blindgrasp_bridge::config::KeyFiles;
 use blindgrasp_bridge::keys::revoke;
 use blindgrasp_ros::node::{Keys, Network, Rights};
-use serde_json::json;
+use serde_json::{Value, json};
 use time::OffsetDateTime;
 use zenoh::{Session, Wait};
 
@@ -35,6 +35,26 @@ fn source() -> Rights {
 /// As the operator `zenoh` opens one.
 fn output() -> Rights {
     Rights { sends: vec!["robot/hand/**".into()], ..Rights::default() }
+}
+
+/// A client: a session to which it connects passes its messages on to other clients, if that may be.
+fn client(endpoint: &str, tls: &Value) -> Session {
+    let config = json!({
+        "mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": false}},
+        "transport": {"link": {"tls": tls}},
+    });
+    let config = zenoh::Config::from_json5(&config.to_string()).expect("a configuration");
+    zenoh::open(config).wait().expect("open")
+}
+
+/// A session that others can connect to, without access control.
+fn listening(endpoint: &str, tls: &Value) -> Session {
+    let config = json!({
+        "mode": "peer", "listen": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": false}},
+        "transport": {"link": {"tls": tls}},
+    });
+    let config = zenoh::Config::from_json5(&config.to_string()).expect("a configuration");
+    zenoh::open(config).wait().expect("open")
 }
 
 fn is_connected(session: &Session) -> bool {
@@ -84,13 +104,19 @@ fn an_output_passes_no_decisions_of_others_on() {
     let folder = folder_of_keys();
     for scheme in ["tls", "tcp"] {
         let has_keys = scheme == "tls";
+        let of = |name: &str| if has_keys { tls_of(folder.path(), name) } else { json!({}) };
+        // A session without access control does.
+        let endpoint = free_endpoint(scheme);
+        let _open_to_all = listening(&endpoint, &of("ros2"));
+        let [arm, laptop] = ["arm", "laptop"].map(|name| client(&endpoint, &of(name)));
+        says(&laptop, DECISIONS, "forged", &Heard::listen(&arm, DECISIONS));
+
         let endpoint = free_endpoint(scheme);
         let output = network(&endpoint, "", has_keys.then(|| folder.path())).open(&output()).expect("a session");
         let own = Heard::listen(&output, "**");
-        let of = |name: &str| if has_keys { tls_of(folder.path(), name) } else { json!({}) };
-        let arm = stranger(&endpoint, of("arm"));
+        let arm = client(&endpoint, &of("arm"));
         let arm_hears = Heard::listen(&arm, "**");
-        let forgers = ["laptop", "lost", "ros2"].map(|name| (name, stranger(&endpoint, of(name))));
+        let forgers = ["laptop", "lost", "ros2"].map(|name| (name, client(&endpoint, &of(name))));
         let forgers_hear: Vec<Heard> = forgers.iter().map(|(_, session)| Heard::listen(session, DECISIONS)).collect();
         for (name, session) in &forgers {
             wait_until(&format!("{name} is connected"), || is_connected(session));
@@ -116,13 +142,7 @@ fn what_a_node_connects_to_must_bear_a_name_that_takes_part() {
     let folder = folder_of_keys();
     for (name, takes_part) in [("laptop", false), ("arm", true)] {
         let endpoint = free_endpoint("tls");
-        let tls = tls_of(folder.path(), name);
-        let listens = json!({
-            "mode": "peer", "listen": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": false}},
-            "transport": {"link": {"tls": tls}},
-        });
-        let config = zenoh::Config::from_json5(&listens.to_string()).expect("a configuration");
-        let router = zenoh::open(config).wait().expect("open");
+        let router = listening(&endpoint, &tls_of(folder.path(), name));
         let router_hears = Heard::listen(&router, "**");
         let connects = network("", &endpoint, Some(folder.path()));
         let (source, output) =
