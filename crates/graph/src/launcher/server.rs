@@ -138,7 +138,7 @@ fn attend_late(
     let is_stop = is_limited
         && reader.fill_buf().is_ok_and(|bytes| {
             let line = bytes.split(|byte| *byte == b'\n').next().unwrap_or_default();
-            matches!(serde_json::from_slice(line), Ok(Request::Stop { .. }))
+            matches!(serde_json::from_slice(line), Ok(Request::Stop))
         });
     if is_stop && reader.get_ref().set_read_timeout(None).is_ok() {
         attend(reader, client, pins, events, trail);
