@@ -3,7 +3,7 @@
 use std::net::IpAddr;
 use std::path::PathBuf;
 
-use blindgrasp_bridge::certificates::key_files;
+use blindgrasp_bridge::certificates::{ROUTER_COMMON_NAME, key_files};
 use blindgrasp_bridge::config::KeyFiles;
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -25,6 +25,8 @@ pub struct ConnectionParams {
     pub listen: Option<String>,
     /// A folder with `ca.pem`, `ros2.pem` and `ros2.key.pem`.
     pub keys: Option<PathBuf>,
+    /// With keys: common names of certificates, with commas between them.
+    pub from: Option<String>,
 }
 
 /// Adds the parameters of a connection.
@@ -37,14 +39,37 @@ pub(crate) fn with_connection_params(description: OperatorDescription) -> Operat
             ParamKind::Path { must_exist: true },
             "A folder with ca.pem, ros2.pem and ros2.key.pem, for endpoints tls/HOST:PORT",
         )
+        .optional_param(
+            "from",
+            ParamKind::String {},
+            "With keys: the common names of the certificates at the other end that take part, like ros2,arm; ros2 by default, and \
+             with connect also @router",
+        )
 }
 
 impl ConnectionParams {
     /// The network, with a warning if others can reach it.
     ///
     /// # Errors
-    /// An endpoint is not valid.
+    /// An endpoint is not valid, or the keys are of no use to it.
     pub fn network(&self) -> Result<Network, RosError> {
+        let network = self.checked()?;
+        if network.keys.is_none() {
+            let mut endpoints = network.connect.iter().chain(&network.listen);
+            if let Some(endpoint) = endpoints.find(|endpoint| !is_on_loopback(endpoint)) {
+                print_diagnostic(&format!(
+                    "WARNING: {endpoint} without TLS: everybody who reaches it can read and send what passes there"
+                ));
+            }
+        }
+        Ok(network)
+    }
+
+    /// The network.
+    ///
+    /// # Errors
+    /// An endpoint is not valid, or the keys are of no use to it.
+    pub(crate) fn checked(&self) -> Result<Network, RosError> {
         let keys = self.keys.as_deref().map(|folder| {
             let KeyFiles { authority, certificate, private_key } = key_files(folder, KEY_NAME);
             Keys { authority, certificate, private_key }
@@ -54,16 +79,30 @@ impl ConnectionParams {
             (None, Some(_)) => vec![],
             (None, None) => vec![ROUTER.to_owned()],
         };
-        let network = Network { connect, listen: self.listen.iter().cloned().collect(), keys };
-        network.check()?;
-        if network.keys.is_none() {
-            let mut endpoints = network.connect.iter().chain(&network.listen);
-            if let Some(endpoint) = endpoints.find(|endpoint| !is_on_loopback(endpoint)) {
-                print_diagnostic(&format!(
-                    "WARNING: {endpoint} without TLS: everybody who reaches it can read and send what passes there"
-                ));
-            }
+        if keys.is_none() && self.from.is_some() {
+            return Err(RosError::Keys(
+                "'from' without keys: names come from certificates, so give 'keys' as well".into(),
+            ));
         }
+        let has_tls = connect.iter().chain(&self.listen).any(|endpoint| endpoint.starts_with("tls/"));
+        if keys.is_some() && !has_tls {
+            return Err(RosError::Keys(
+                "keys without an endpoint that uses them: expected 'connect' or 'listen' like tls/HOST:PORT, or no keys".into(),
+            ));
+        }
+        let names = match (&self.from, &keys) {
+            (Some(from), _) => from.split(',').map(|name| name.trim().to_owned()).collect(),
+            (None, Some(_)) if connect.is_empty() => vec![KEY_NAME.into()],
+            (None, Some(_)) => vec![KEY_NAME.into(), ROUTER_COMMON_NAME.into()],
+            (None, None) => vec![],
+        };
+        if names.iter().any(String::is_empty) {
+            return Err(RosError::Keys(
+                "'from' has an empty name: expected names of certificates, like ros2,arm".into(),
+            ));
+        }
+        let network = Network { connect, listen: self.listen.iter().cloned().collect(), keys, names };
+        network.check()?;
         Ok(network)
     }
 }
@@ -77,7 +116,38 @@ fn is_on_loopback(endpoint: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
+
+    fn params(yaml: &serde_json::Value) -> Result<Network, RosError> {
+        serde_json::from_value::<ConnectionParams>(yaml.clone()).expect("params").checked()
+    }
+
+    #[test]
+    fn by_default_the_names_of_ros_2_take_part_and_where_it_connects_the_routers() {
+        let names = |yaml| params(&yaml).map(|network| network.names);
+        let of = |names: &[&str]| Ok(names.iter().map(|name| (*name).to_owned()).collect());
+        assert_eq!(names(json!({"keys": "/k", "listen": "tls/0.0.0.0:1"})), of(&["ros2"]));
+        assert_eq!(names(json!({"keys": "/k", "connect": "tls/robot:1"})), of(&["ros2", "@router"]));
+        assert_eq!(names(json!({"keys": "/k", "listen": "tls/0.0.0.0:1", "from": "arm, hand"})), of(&["arm", "hand"]));
+        assert_eq!(names(json!({})), of(&[]));
+    }
+
+    #[test]
+    fn keys_and_names_that_mean_nothing_are_refused() {
+        for (yaml, expected) in [
+            (json!({"keys": "/k"}), "keys without an endpoint that uses them"),
+            (json!({"keys": "/k", "listen": "tcp/127.0.0.1:1"}), "keys without an endpoint that uses them"),
+            (json!({"keys": "/k", "listen": "tls/a:1", "connect": "tls/b:1"}), "expected one of them"),
+            (json!({"keys": "/k", "listen": "tls/a:1", "from": "ros2,"}), "'from' has an empty name"),
+            (json!({"listen": "tls/a:1"}), "is no endpoint"),
+            (json!({"from": "ros2"}), "'from' without keys"),
+        ] {
+            let error = params(&yaml).expect_err("refused").to_string();
+            assert!(error.contains(expected), "{error}");
+        }
+    }
 
     #[test]
     fn endpoints_that_other_machines_reach_are_told_from_those_on_loopback() {

@@ -1,10 +1,11 @@
-//! Whether arbiter, model and hand of a graph fit together, as far as params and files tell before it starts. A graph that does
-//! not fit runs and holds every grasp, and nobody would know why.
+//! Whether arbiter, model and hand of a graph fit together, and whether the keys of its nodes protect something, as far as params
+//! and files tell before it starts. A graph that does not fit runs and holds every grasp, and nobody would know why.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
+use blindgrasp_bridge::certificates::REVOKED_FILE;
 use blindgrasp_graph::control::GraphStatus;
 use blindgrasp_graph::dataflow::Graph;
 use blindgrasp_stages::hand::Hand;
@@ -12,6 +13,8 @@ use blindgrasp_stages::label::Label;
 use blindgrasp_stages::lift_arbiter::Probe;
 use blindgrasp_stages::model::Model;
 use serde_json::{Map, Value};
+
+use super::connection::ConnectionParams;
 
 /// A node, its operator, and where its samples come from.
 #[derive(Debug, Clone, PartialEq)]
@@ -82,6 +85,8 @@ pub enum MisfitKind {
     Hand,
     /// The source: the model's label says nothing of its lifts.
     Label,
+    /// The endpoints and keys of a node that speaks Zenoh.
+    Network,
 }
 
 /// The outcome of the check.
@@ -99,6 +104,7 @@ pub fn check_fit(parts: &[Part]) -> Fit {
     for arbiter in parts.iter().filter(|part| part.operator == "lift_arbiter") {
         check.arbiter(arbiter);
     }
+    parts.iter().for_each(|part| check.network(part));
     check.fit
 }
 
@@ -210,6 +216,47 @@ impl<'a> Check<'a> {
                     path_of(classifier, "model").display()
                 ),
                 help: "expected a model that was trained on lifts (simulate --label lift)".into(),
+            });
+        }
+    }
+
+    /// The endpoints and keys of a node that speaks Zenoh.
+    fn network(&mut self, part: &Part) {
+        let driver = part.params.get("driver").and_then(Value::as_str).unwrap_or_default();
+        let speaks_zenoh = match part.operator.as_str() {
+            "ros2" | "zenoh" => true,
+            "tactile_source" => matches!(driver, "ros2" | "zenoh"),
+            _ => return,
+        };
+        if !speaks_zenoh {
+            if part.params.contains_key("keys") {
+                let message = format!("its keys protect nothing: the driver {driver} has no TLS");
+                self.refuse(
+                    MisfitKind::Network,
+                    part,
+                    message,
+                    "leave out keys, or use the driver zenoh or ros2".into(),
+                );
+            }
+            return;
+        }
+        let Ok(params) = serde_json::from_value::<ConnectionParams>(Value::Object(part.params.clone())) else {
+            return;
+        };
+        if let Err(error) = params.checked() {
+            let help = "docs/ros2.md says what endpoints and keys a node can have".into();
+            self.refuse(MisfitKind::Network, part, error.to_string(), help);
+        } else if let Some(keys) = &params.keys
+            && keys.join(REVOKED_FILE).exists()
+        {
+            self.fit.warnings.push(Misfit {
+                kind: MisfitKind::Network,
+                node: part.node.clone(),
+                message: format!(
+                    "{} is not read here: a revoked certificate whose name may take part still does",
+                    keys.join(REVOKED_FILE).display()
+                ),
+                help: "take its name out of the param from, and start the node again".into(),
             });
         }
     }
@@ -355,5 +402,25 @@ mod tests {
         assert!(fit.warnings[0].message.contains("learned the paper's label"), "{fit:?}");
         parts[0].operator = "recorded_source".into();
         assert!(check_fit(&parts).warnings.is_empty());
+    }
+
+    #[test]
+    fn keys_that_protect_nothing_are_refused_and_a_list_of_revoked_certificates_is_warned_of() {
+        let fit = |operator: &str, params: &[(&str, &str)]| check_fit(&[part(operator, params, &[])]);
+        for (operator, params) in [
+            ("ros2", &[("keys", "/k")][..]),
+            ("zenoh", &[("keys", "/k"), ("listen", "tcp/127.0.0.1:1")]),
+            ("tactile_source", &[("driver", "zenoh"), ("keys", "/k"), ("connect", "tcp/127.0.0.1:1")]),
+            ("tactile_source", &[("driver", "listen"), ("keys", "/k")]),
+        ] {
+            let errors = fit(operator, params).errors;
+            assert!(errors.len() == 1 && errors[0].kind == MisfitKind::Network, "{operator}: {errors:?}");
+        }
+        let folder = tempfile::tempdir().expect("a folder");
+        let keys = folder.path().to_str().expect("UTF-8");
+        let params = [("keys", keys), ("listen", "tls/127.0.0.1:1")];
+        assert!(fit("zenoh", &params).errors.is_empty() && fit("zenoh", &params).warnings.is_empty());
+        std::fs::write(folder.path().join("crl.pem"), "").expect("written");
+        assert_eq!(fit("zenoh", &params).warnings.len(), 1);
     }
 }

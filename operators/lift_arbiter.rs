@@ -2,9 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use blindgrasp_messages::{
-    Action, Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Reason, Recorded,
-};
+use blindgrasp_messages::{Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
@@ -145,11 +143,11 @@ impl Stage for Arbiter {
 
     /// Nothing else has looked at the clock since the decision was made.
     fn before_sending(&self, head: &mut LiftDecisionHead, now_nanos: u64) {
-        let is_late = head.header.valid_until_nanos().is_some_and(|valid_until_nanos| now_nanos > valid_until_nanos);
-        if is_late && head.action == Action::Lift.code() {
+        if let Ok(mut decision) = LiftDecision::from_parts(head, &[])
+            && decision.expire(head.header.valid_until_nanos(), now_nanos)
+        {
             tracing::warn!(grasp_id = head.grasp_id, "a lift was not sent in time: it is a hold");
-            let (action, reason) = (Action::Hold.code(), Reason::Stale.code());
-            *head = LiftDecisionHead { action, reason, probability_stable: 0.0, ..*head };
+            (*head, _) = decision.to_parts(head.header);
         }
     }
 

@@ -12,7 +12,7 @@ use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_recording::cdr;
 use blindgrasp_ros::definition::Definition;
-use blindgrasp_ros::node::{MAX_DOMAIN, MessageType, Network, Quality, RosNode, topic_name};
+use blindgrasp_ros::node::{MAX_DOMAIN, MessageType, Network, Quality, Rights, RosNode, topic_key, topic_name};
 use blindgrasp_ros::standard;
 use blindgrasp_stages::hand::Hand;
 use serde::Deserialize;
@@ -136,8 +136,11 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let opened = format!("publishes in {namespace}, domain {domain}");
     let service = if decides { Some(decide_type()?) } else { None };
     let prefix = namespace.clone();
+    let answers = if decides { vec![topic_key(domain, &topic_name(&namespace, "decide")?)] } else { vec![] };
+    let sends = vec![format!("{domain}{}/**", namespace.trim_end_matches('/'))];
+    let rights = Rights { takes: vec![], sends, answers };
     let open = Box::new(move || {
-        let mut node = RosNode::new(network.open()?, domain, &namespace, "blindgrasp")?;
+        let mut node = RosNode::new(network.open(&rights)?, domain, &namespace, "blindgrasp")?;
         if let Some((message, request_type)) = service.clone() {
             let (name, last) = (topic_name(&namespace, "decide")?, Arc::clone(&last));
             node.service(&name, &message, move |request| last.answer(&request_type, request))?;
@@ -175,7 +178,7 @@ fn decision_topic(last: &Arc<LastDecision>) -> anyhow::Result<Topic<LiftDecision
         message: Some(decision_type()?),
         quality: Quality::KeepLast(1),
         encode: Box::new(move |sample, data| {
-            let until_nanos = sample.header.valid_until_nanos().unwrap_or(0);
+            let until_nanos = sample.header.valid_until_nanos();
             last.set(&sample.message, until_nanos);
             cdr::encode(&Decision::new(&sample.message, until_nanos), data)
         }),

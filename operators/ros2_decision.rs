@@ -1,7 +1,7 @@
 //! Decisions as ROS 2 has them: the message for programs that move an arm, and the service that waits for a decision.
 
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::collections::VecDeque;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use anyhow::Context as _;
@@ -24,8 +24,8 @@ const DECISION_SCHEMA: &str = "blindgrasp_msgs/msg/Decision";
 const DECIDE: &str = include_str!("Decide.srv");
 const DECIDE_SCHEMA: &str = "blindgrasp_msgs/srv/Decide";
 const MAX_TIMEOUT_SECS: f64 = 60.0;
-/// Calls that wait at the same time; others are answered at once, without a decision.
-const MAX_WAITING: usize = 16;
+/// Calls that wait at the same time.
+const MAX_WAITING: usize = 64;
 
 /// `blindgrasp_msgs/msg/Decision`.
 #[derive(Serialize, Default)]
@@ -45,16 +45,18 @@ struct Time {
 }
 
 impl Decision {
-    /// As it is said now, of a decision that is valid until a time of this machine.
-    pub(super) fn new(decision: &LiftDecision, until_nanos: u64) -> Decision {
+    /// As it is said now, of a decision that is valid until a time of this machine; without such a time it is not valid.
+    pub(super) fn new(decision: &LiftDecision, until_nanos: Option<u64>) -> Decision {
         let time = |nanos: u64| Time {
             sec: i32::try_from(nanos / 1_000_000_000).unwrap_or(i32::MAX),
             nanosec: (nanos % 1_000_000_000) as u32,
         };
-        let now = unix_nanos();
+        let (now, now_nanos) = (unix_nanos(), monotonic_nanos());
+        let mut decision = decision.clone();
+        decision.expire(until_nanos, now_nanos);
         Decision {
             stamp: time(now),
-            valid_until: time(now + until_nanos.saturating_sub(monotonic_nanos())),
+            valid_until: time(now + until_nanos.unwrap_or(0).saturating_sub(now_nanos)),
             grasp_id: decision.grasp_id,
             action: decision.action.code() as u8,
             reason: decision.reason.as_str().into(),
@@ -66,30 +68,56 @@ impl Decision {
 /// The last decision, for calls that wait for one.
 #[derive(Default)]
 pub(super) struct LastDecision {
+    calls: Mutex<Calls>,
+    changes: Condvar,
+}
+
+#[derive(Default)]
+struct Calls {
     /// The decision, and until when it is valid by the clock of this machine.
-    decision: Mutex<Option<(LiftDecision, u64)>>,
-    comes: Condvar,
-    n_waiting: AtomicUsize,
+    decision: Option<(LiftDecision, Option<u64>)>,
+    /// The calls that wait, the eldest first.
+    waiting: VecDeque<u64>,
+    n_calls: u64,
+}
+
+impl Calls {
+    fn is_valid(&self) -> bool {
+        let until_nanos = self.decision.as_ref().and_then(|(_, until_nanos)| *until_nanos);
+        until_nanos.is_some_and(|until_nanos| until_nanos > monotonic_nanos())
+    }
 }
 
 impl LastDecision {
-    pub(super) fn set(&self, decision: &LiftDecision, until_nanos: u64) {
-        *self.decision.lock().unwrap_or_else(PoisonError::into_inner) = Some((decision.clone(), until_nanos));
-        self.comes.notify_all();
+    pub(super) fn set(&self, decision: &LiftDecision, until_nanos: Option<u64>) {
+        self.calls().decision = Some((decision.clone(), until_nanos));
+        self.changes.notify_all();
     }
 
-    /// The last decision if it is valid, or else the next one that is, within the time.
-    fn wait(&self, longest: Duration) -> Option<Decision> {
-        let is_too_old = |decision: &mut Option<(LiftDecision, u64)>| {
-            decision.as_ref().is_none_or(|(_, until_nanos)| *until_nanos <= monotonic_nanos())
-        };
-        let decision = self.decision.lock().unwrap_or_else(PoisonError::into_inner);
-        let waited = self.comes.wait_timeout_while(decision, longest, is_too_old);
-        let (decision, timeout) = waited.unwrap_or_else(PoisonError::into_inner);
-        if timeout.timed_out() {
-            return None;
+    fn calls(&self) -> MutexGuard<'_, Calls> {
+        self.calls.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A place among the calls that wait. If there is none, the eldest call makes room: it is answered without a decision.
+    fn enter(&self) -> u64 {
+        let mut calls = self.calls();
+        calls.n_calls += 1;
+        let call = calls.n_calls;
+        calls.waiting.push_back(call);
+        if calls.waiting.len() > MAX_WAITING {
+            calls.waiting.pop_front();
+            self.changes.notify_all();
         }
-        let (decision, until_nanos) = decision.as_ref()?;
+        call
+    }
+
+    /// The last decision if it is valid, or else the next one that is, within the time and as long as the call has its place.
+    fn wait(&self, call: u64, longest: Duration) -> Option<Decision> {
+        let has_to_wait = |calls: &mut Calls| !calls.is_valid() && calls.waiting.contains(&call);
+        let waited = self.changes.wait_timeout_while(self.calls(), longest, has_to_wait);
+        let (mut calls, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        calls.waiting.retain(|waiting| *waiting != call);
+        let (decision, until_nanos) = calls.decision.as_ref().filter(|_| calls.is_valid())?;
         Some(Decision::new(decision, *until_nanos))
     }
 
@@ -99,11 +127,10 @@ impl LastDecision {
         let last = Arc::clone(self);
         let read = cdr::read(definition, &request.bytes).ok().and_then(|value| value.at("timeout_secs")?.numbers());
         let timeout_secs = read.and_then(|numbers| numbers.first().copied()).filter(|secs| *secs > 0.0).unwrap_or(0.0);
-        let timeout_secs = timeout_secs.min(MAX_TIMEOUT_SECS);
-        let has_room = self.n_waiting.fetch_add(1, Ordering::Relaxed) < MAX_WAITING;
-        let longest = Duration::from_secs_f64(if has_room { timeout_secs } else { 0.0 });
+        let longest = Duration::from_secs_f64(timeout_secs.min(MAX_TIMEOUT_SECS));
+        let call = self.enter();
         let answering = move || {
-            let decision = last.wait(longest);
+            let decision = last.wait(call, longest);
             let mut data = Vec::new();
             let answer = (decision.is_some(), decision.unwrap_or_default());
             if encode(&answer, &mut data).is_ok()
@@ -111,10 +138,9 @@ impl LastDecision {
             {
                 print_diagnostic(&format!("a call of decide is not answered: {error}"));
             }
-            last.n_waiting.fetch_sub(1, Ordering::Relaxed);
         };
         if std::thread::Builder::new().name("decide".into()).spawn(answering).is_err() {
-            self.n_waiting.fetch_sub(1, Ordering::Relaxed);
+            self.calls().waiting.retain(|waiting| *waiting != call);
         }
     }
 }
@@ -139,24 +165,54 @@ pub(super) fn decision_type() -> anyhow::Result<MessageType> {
 mod tests {
     use std::path::Path;
 
+    use blindgrasp_messages::{Action, Reason};
+
     use super::*;
 
     #[test]
     fn a_call_gets_the_valid_decision_or_waits_for_the_next_or_gets_none() {
         let last = Arc::new(LastDecision::default());
         let decision = |grasp_id| LiftDecision { grasp_id, ..LiftDecision::default() };
-        assert!(last.wait(Duration::ZERO).is_none());
+        let wait = |longest| last.wait(last.enter(), longest);
+        assert!(wait(Duration::ZERO).is_none());
         // One that is no longer valid is not told.
-        last.set(&decision(1), monotonic_nanos() - 1);
-        assert!(last.wait(Duration::from_millis(20)).is_none());
-        last.set(&decision(2), monotonic_nanos() + 60_000_000_000);
-        assert_eq!(last.wait(Duration::ZERO).map(|decision| decision.grasp_id), Some(2));
-        last.set(&decision(3), 0);
+        last.set(&decision(1), Some(monotonic_nanos() - 1));
+        assert!(wait(Duration::from_millis(20)).is_none());
+        last.set(&decision(2), Some(monotonic_nanos() + 60_000_000_000));
+        assert_eq!(wait(Duration::ZERO).map(|decision| decision.grasp_id), Some(2));
+        last.set(&decision(3), None);
         let other = Arc::clone(&last);
-        let waiting = std::thread::spawn(move || other.wait(Duration::from_secs(60)).map(|found| found.grasp_id));
+        let waiting =
+            std::thread::spawn(move || other.wait(other.enter(), Duration::from_secs(60)).map(|found| found.grasp_id));
         std::thread::sleep(Duration::from_millis(20));
-        last.set(&decision(4), monotonic_nanos() + 60_000_000_000);
+        last.set(&decision(4), Some(monotonic_nanos() + 60_000_000_000));
         assert_eq!(waiting.join().expect("ended"), Some(4));
+    }
+
+    /// Calls of others that wait for long do not keep a new one out: the eldest is answered without a decision.
+    #[test]
+    fn a_new_call_always_waits() {
+        let last = Arc::new(LastDecision::default());
+        let call = |longest| {
+            let (other, call) = (Arc::clone(&last), last.enter());
+            std::thread::spawn(move || other.wait(call, longest).map(|found| found.grasp_id))
+        };
+        let eldest = call(Duration::from_secs(60));
+        let others: Vec<_> = (0..MAX_WAITING).map(|_| call(Duration::from_secs(60))).collect();
+        assert_eq!(eldest.join().expect("ended"), None);
+        last.set(&LiftDecision { grasp_id: 9, ..LiftDecision::default() }, Some(monotonic_nanos() + 60_000_000_000));
+        for other in others {
+            assert_eq!(other.join().expect("ended"), Some(9));
+        }
+    }
+
+    #[test]
+    fn a_lift_whose_time_is_over_is_said_as_a_hold() {
+        let lift = LiftDecision { action: Action::Lift, reason: Reason::Stable, ..LiftDecision::default() };
+        let said = |until_nanos| Decision::new(&lift, Some(until_nanos));
+        let late = said(monotonic_nanos() - 1);
+        assert_eq!((late.action, late.reason.as_str()), (Action::Hold.code() as u8, Reason::Stale.as_str()));
+        assert_eq!(said(monotonic_nanos() + 60_000_000_000).action, Action::Lift.code() as u8);
     }
 
     /// The file of the service.

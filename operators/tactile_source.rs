@@ -42,12 +42,13 @@ const DEFAULT_BAUD: u32 = 115_200;
 /// Half of the age that the arbiter allows by default, which counts from the source on.
 const DEFAULT_MAX_DELAY_MS: f64 = 100.0;
 /// The parameters of the driver ros2.
-const ROS2_PARAMS: [&str; 20] = [
+const ROS2_PARAMS: [&str; 21] = [
     "domain",
     "namespace",
     "connect",
     "listen",
     "keys",
+    "from",
     "joints_topic",
     "joint_prefix",
     "cells_topic",
@@ -255,7 +256,7 @@ fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box
         DriverWord::Serial => ("serial", &["device", "baud", "idle_limit_ms"]),
         DriverWord::Recording => ("recording", &["recording"]),
         DriverWord::Ros2 => ("ros2", &ROS2_PARAMS),
-        DriverWord::Zenoh => ("zenoh", &["connect", "listen", "keys", "key"]),
+        DriverWord::Zenoh => ("zenoh", &["connect", "listen", "keys", "from", "key"]),
     };
     let topics = &params.topics;
     let given = [
@@ -268,6 +269,7 @@ fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box
         ("connect", params.network.connection.connect.is_some()),
         ("listen", params.network.connection.listen.is_some()),
         ("keys", params.network.connection.keys.is_some()),
+        ("from", params.network.connection.from.is_some()),
         ("domain", params.network.domain.is_some()),
         ("namespace", params.network.namespace.is_some()),
         ("joints_topic", topics.joints_topic.is_some()),

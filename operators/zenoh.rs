@@ -2,13 +2,13 @@
 
 use anyhow::Context as _;
 use blindgrasp_messages::{
-    ContactSet, GraspFeature, LiftDecision, Message, Prediction, Recorded, Stamped, TactileFrame,
+    ContactSet, GraspFeature, Header, LiftDecision, Message, Prediction, Recorded, Stamped, TactileFrame,
 };
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_ros::node::{Quality, topic_name};
+use blindgrasp_ros::node::{Quality, Rights, topic_name};
 use serde::{Deserialize, Serialize};
 
 use super::connection::{ConnectionParams, with_connection_params};
@@ -47,38 +47,56 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     topic_name("/", &format!("/{prefix}"))
         .with_context(|| format!("prefix '{prefix}': expected words of letters, digits and _, with / between them"))?;
     let mut edges: Vec<Box<dyn Forward>> = Vec::new();
-    edges.extend(json_edge::<LiftDecision>(operator, "decision", Quality::KeepLast(1))?);
-    edges.extend(json_edge::<TactileFrame>(operator, "tactile", Quality::Sensor)?);
-    edges.extend(json_edge::<ContactSet>(operator, "contacts", Quality::Sensor)?);
-    edges.extend(json_edge::<GraspFeature>(operator, "feature", Quality::Sensor)?);
-    edges.extend(json_edge::<Prediction>(operator, "prediction", Quality::Sensor)?);
+    edges.extend(decision_edge(operator)?);
+    edges.extend(json_edge::<TactileFrame>(operator, "tactile")?);
+    edges.extend(json_edge::<ContactSet>(operator, "contacts")?);
+    edges.extend(json_edge::<GraspFeature>(operator, "feature")?);
+    edges.extend(json_edge::<Prediction>(operator, "prediction")?);
     let opened = format!("publishes on {prefix}/*");
-    let open = Box::new(move || Ok(Node::Json(network.open()?)));
+    let rights = Rights { sends: vec![format!("{prefix}/**")], ..Rights::default() };
+    let open = Box::new(move || Ok(Node::Json(network.open(&rights)?)));
     publish(operator, Outside { open, prefix, opened }, edges)
+}
+
+/// A sample as it is published.
+#[derive(Serialize)]
+struct Sample<'a, M> {
+    seq: u64,
+    stamp_nanos: u64,
+    /// For how long a decision is still valid when it is sent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    valid_for_nanos: Option<u64>,
+    data: &'a M,
 }
 
 /// An input whose samples are published as JSON.
 fn json_edge<M: Message + Serialize>(
     operator: &Operator,
     name: &'static str,
-    quality: Quality,
 ) -> anyhow::Result<Option<Box<dyn Forward>>> {
-    #[derive(Serialize)]
-    struct Sample<'a, M> {
-        seq: u64,
-        stamp_nanos: u64,
-        /// For how long a decision is still valid when it is sent.
-        #[serde(skip_serializing_if = "Option::is_none")]
-        valid_for_nanos: Option<u64>,
-        data: &'a M,
-    }
-    let encode: Encode<M> = Box::new(move |sample: &Stamped<M>, data: &mut Vec<u8>| {
-        let Stamped { header, message } = sample;
-        let until = header.valid_until_nanos().unwrap_or(0);
-        let valid_for_nanos = (name == "decision").then(|| until.saturating_sub(monotonic_nanos()));
-        let sample = Sample { seq: header.seq, stamp_nanos: header.stamp_nanos, valid_for_nanos, data: message };
-        data.clear();
-        serde_json::to_writer(data, &sample).map_err(|error| error.to_string())
+    let encode: Encode<M> = Box::new(|Stamped { header, message }, data| write_json(header, None, message, data));
+    edge(operator, name, vec![Topic { name, message: None, quality: Quality::Sensor, encode, interval_nanos: 0 }])
+}
+
+/// The input of decisions: none is published as a lift once its time is over.
+fn decision_edge(operator: &Operator) -> anyhow::Result<Option<Box<dyn Forward>>> {
+    let encode: Encode<LiftDecision> = Box::new(|Stamped { header, message }, data| {
+        let (until_nanos, now_nanos) = (header.valid_until_nanos(), monotonic_nanos());
+        let mut decision = message.clone();
+        decision.expire(until_nanos, now_nanos);
+        write_json(header, Some(until_nanos.unwrap_or(0).saturating_sub(now_nanos)), &decision, data)
     });
-    edge(operator, name, vec![Topic { name, message: None, quality, encode, interval_nanos: 0 }])
+    let name = "decision";
+    edge(operator, name, vec![Topic { name, message: None, quality: Quality::KeepLast(1), encode, interval_nanos: 0 }])
+}
+
+fn write_json(
+    header: &Header,
+    valid_for_nanos: Option<u64>,
+    message: &impl Serialize,
+    data: &mut Vec<u8>,
+) -> Result<(), String> {
+    let sample = Sample { seq: header.seq, stamp_nanos: header.stamp_nanos, valid_for_nanos, data: message };
+    data.clear();
+    serde_json::to_writer(data, &sample).map_err(|error| error.to_string())
 }

@@ -5,9 +5,15 @@ mod commands;
 use std::process::ExitCode;
 
 use blindgrasp_graph::dataflow::DataflowError;
+use blindgrasp_graph::launcher::ZENOH_THREADS;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
 fn main() -> ExitCode {
+    let (name, value) = ZENOH_THREADS;
+    if std::env::var_os(name).is_none() {
+        // SAFETY: no other thread has begun yet, which could read the environment meanwhile.
+        unsafe { std::env::set_var(name, value) };
+    }
     let cli = commands::Cli::read();
     if let Some(code) = cli.run_operator() {
         return code;

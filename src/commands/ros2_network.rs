@@ -14,6 +14,9 @@ pub(super) struct Ros2Network {
     /// Folder with ca.pem, ros2.pem and ros2.key.pem, for an endpoint tls/HOST:PORT
     #[arg(long, value_name = "DIR")]
     keys: Option<PathBuf>,
+    /// With --keys: common names of the certificates at the other end that take part [default: ros2,@router]
+    #[arg(long, value_name = "NAMES", requires = "keys")]
+    from: Option<String>,
     /// ROS domain [default: 0]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=i64::from(MAX_DOMAIN)))]
     domain: Option<u32>,
@@ -22,7 +25,7 @@ pub(super) struct Ros2Network {
 impl Ros2Network {
     /// Whether there is any of the options.
     pub(super) fn is_given(&self) -> bool {
-        self.connect.is_some() || self.keys.is_some() || self.domain.is_some()
+        self.connect.is_some() || self.keys.is_some() || self.from.is_some() || self.domain.is_some()
     }
 
     /// The network and the domain.
@@ -30,8 +33,8 @@ impl Ros2Network {
     /// # Errors
     /// The endpoint is not valid.
     pub(super) fn network(&self) -> anyhow::Result<(Network, u32)> {
-        let connection =
-            ConnectionParams { connect: self.connect.clone(), keys: self.keys.clone(), ..ConnectionParams::default() };
+        let (connect, keys, from) = (self.connect.clone(), self.keys.clone(), self.from.clone());
+        let connection = ConnectionParams { connect, listen: None, keys, from };
         Ok((connection.network()?, self.domain.unwrap_or(0)))
     }
 }

@@ -163,3 +163,20 @@ fn a_permanent_error_ends_at_once_and_says_why() {
     let ended = graph.stop();
     assert_eq!(ended.code, Some(1), "{}", ended.stderr);
 }
+
+#[test]
+fn a_launcher_and_its_operators_may_have_as_many_descriptors_as_the_hard_limit() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut limited = Command::new("prlimit");
+    limited.args(["--nofile=512:3456", env!("CARGO_BIN_EXE_blindgrasp")]).current_dir(env!("CARGO_MANIFEST_DIR"));
+    limited.stdin(Stdio::null()).env("XDG_STATE_HOME", folder.path());
+    let graph = Graph::launch_on(limited, &unique_name(), &dataflow(folder.path(), &[]), &FAST_FOREVER);
+    graph.wait_for_decisions(1);
+    for pid in [i64::from(graph.pid()), graph.node("classifier")["pid"].as_i64().expect("a process")] {
+        let limits = std::fs::read_to_string(format!("/proc/{pid}/limits")).expect("readable");
+        let line = limits.lines().find(|line| line.starts_with("Max open files")).expect("a limit");
+        let found: Vec<&str> = line.split_whitespace().skip(3).take(2).collect();
+        assert_eq!(found, ["3456", "3456"], "{pid}: {line}");
+    }
+    graph.stop();
+}

@@ -89,10 +89,10 @@ pub(crate) fn by_router(endpoint: &str) -> Endpoints {
 
 /// What a session hears under a key: keys and payloads.
 #[derive(Clone, Default)]
-struct Heard(Arc<Mutex<Vec<(String, String)>>>);
+pub(crate) struct Heard(Arc<Mutex<Vec<(String, String)>>>);
 
 impl Heard {
-    fn listen(session: &Session, key: &str) -> Heard {
+    pub(crate) fn listen(session: &Session, key: &str) -> Heard {
         let heard = Heard::default();
         let into = heard.clone();
         session
@@ -107,7 +107,7 @@ impl Heard {
         heard
     }
 
-    fn has(&self, payload: &str) -> bool {
+    pub(crate) fn has(&self, payload: &str) -> bool {
         self.0.lock().expect("not poisoned").iter().any(|(_, heard)| heard == payload)
     }
 
@@ -119,12 +119,12 @@ impl Heard {
     }
 }
 
-fn put(session: &Session, key: &str, payload: &str) {
+pub(crate) fn put(session: &Session, key: &str, payload: &str) {
     session.put(key, payload).congestion_control(CongestionControl::Block).wait().expect("put");
 }
 
 /// Puts until it is heard.
-fn says(session: &Session, key: &str, payload: &str, heard: &Heard) {
+pub(crate) fn says(session: &Session, key: &str, payload: &str, heard: &Heard) {
     wait_until(&format!("'{payload}' is heard under {key}"), || {
         put(session, key, payload);
         heard.has(payload)
@@ -132,7 +132,7 @@ fn says(session: &Session, key: &str, payload: &str, heard: &Heard) {
 }
 
 /// A Zenoh session with a configuration of its own.
-fn stranger(endpoint: &str, tls: Value) -> Session {
+pub(crate) fn stranger(endpoint: &str, tls: Value) -> Session {
     stranger_as(None, &Endpoints { connect: vec![endpoint.into()], ..Endpoints::default() }, tls, 1)
 }
 
@@ -156,7 +156,7 @@ pub(crate) fn stranger_as(id: Option<String>, endpoints: &Endpoints, tls: Value,
     zenoh::open(zenoh::Config::from_json5(&config.to_string()).expect("a configuration")).wait().expect("open")
 }
 
-fn tls_of(folder: &Path, machine: &str) -> Value {
+pub(crate) fn tls_of(folder: &Path, machine: &str) -> Value {
     let files = key_files(folder, machine);
     json!({
         "root_ca_certificate": files.authority,

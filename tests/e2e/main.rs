@@ -47,6 +47,7 @@ mod regression;
 mod replay;
 mod reproduce;
 mod ros2;
+mod ros2_access;
 mod ros2_commands;
 mod run_report;
 mod sandbox;

@@ -109,7 +109,17 @@ impl Host {
 
     /// The `blindgrasp` of this build on this host, in the project's folder.
     pub(crate) fn blindgrasp(&self) -> Command {
-        let mut command = self.enter(env!("CARGO_BIN_EXE_blindgrasp"));
+        Self::at_home(self.enter(env!("CARGO_BIN_EXE_blindgrasp")))
+    }
+
+    /// As [`Host::blindgrasp`], where no process can have more descriptors than these.
+    pub(crate) fn blindgrasp_with_descriptors(&self, n: u32) -> Command {
+        let mut command = self.enter("prlimit");
+        command.args([&format!("--nofile={n}:{n}"), env!("CARGO_BIN_EXE_blindgrasp")]);
+        Self::at_home(command)
+    }
+
+    fn at_home(mut command: Command) -> Command {
         command.current_dir(project()).env("XDG_STATE_HOME", "/dev/shm/state");
         command
     }

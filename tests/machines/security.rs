@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
-use crate::common::{signal, wait_until};
+use crate::common::{Graph, signal, unique_name, wait_until};
 use crate::hosts::{Host, Network};
 use crate::split::{
-    Attacker, FOREVER, assert_lost_nothing, decided, keys, on_one_machine, part, patient, peer, pid_of, rejected,
-    split, stop, wait_for_state,
+    Attacker, FOREVER, assert_lost_nothing, assert_nothing_unsafe, decided, keys, on_one_machine, part, patient, peer,
+    pid_of, rejected, split, stop, wait_for_state,
 };
 use blindgrasp_bridge::certificates::key_files;
 use blindgrasp_bridge::wire::PROTOCOL;
@@ -284,7 +284,12 @@ fn keys_are_renewed_and_revoked_while_the_graph_runs() {
 
     of_keys(&["--revoke", "robot"]);
     wait_for_state(brain, &brain_part, "robot", "down");
-    wait_for_state(robot, &robot_part, "brain", "refused");
+    // A refusal is not signed: it is the reason that is shown, and changes no state.
+    wait_for_state(robot, &robot_part, "brain", "down");
+    wait_until(
+        || peer(robot, &robot_part, "brain")["reason"].to_string().contains("was revoked"),
+        || robot_part.said(),
+    );
     assert!(rejected(brain, &brain_part, "forged") > 0);
     for part in [&robot_part, &brain_part] {
         wait_until(|| part.said().contains("was revoked"), || part.said());
@@ -295,4 +300,33 @@ fn keys_are_renewed_and_revoked_while_the_graph_runs() {
     robot_part.wait_for_decisions(3);
     stop(robot, robot_part);
     brain_part.finish();
+}
+
+/// Connections without a certificate that take all descriptors of a link keep no machine out for longer than they last and the
+/// link needs to notice it.
+#[test]
+fn a_flood_of_connections_does_not_keep_machines_out_for_good() {
+    const N_DESCRIPTORS: u32 = 400;
+    let Some(network) = Network::new(&[0, 0, 0]) else { return };
+    let [robot, brain, attacker] = &network.hosts[..] else { panic!("three hosts") };
+    let folder = tempfile::tempdir().expect("a folder");
+    let keys = keys(folder.path(), &["--machine", "robot", "--machine", "brain"]);
+    let flow = split(folder.path(), &with_tls(brain, &keys), &[patient()]);
+    let limited = brain.blindgrasp_with_descriptors(N_DESCRIPTORS);
+    let brain_part = Graph::launch_on(limited, &unique_name(), &flow, &["--machine", "brain"]);
+    wait_until(|| brain_part.said().contains("waiting for machine robot"), || brain_part.said());
+    let n_open = || {
+        let folder = format!("/proc/{}/fd", pid_of(brain, &brain_part, "link"));
+        std::fs::read_dir(folder).map_or(0, |entries| entries.count())
+    };
+    let address = format!("{}:7447", brain.address);
+    let flood = Attacker::start(attacker, folder.path(), &["half-open", &address, "1000", "3"]);
+    wait_until(|| n_open() + 5 >= N_DESCRIPTORS as usize, || format!("{} descriptors", n_open()));
+    flood.told();
+    let robot_part = part(robot, &flow, "robot", &FOREVER);
+    wait_for_state(brain, &brain_part, "robot", "up");
+    robot_part.wait_for_decisions(5);
+    let robot_end = stop(robot, robot_part);
+    brain_part.finish();
+    assert_nothing_unsafe(&robot_end);
 }

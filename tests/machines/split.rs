@@ -147,7 +147,8 @@ impl Attacker {
         let program = example("link_attacker");
         // Entering a host changes the current folder.
         let mut command: Command = host.enter("env");
-        command.arg("-C").arg(folder);
+        // A router with the setting stops reading at full speed.
+        command.arg("-C").arg(folder).env_remove("ZENOH_RUNTIME");
         if arguments[0] != "router" {
             // Zenoh's TLS breaks otherwise, as in `runtime::process`.
             command.arg("ZENOH_RUNTIME=(tx: (worker_threads: 1), rx: (handover: tx))");

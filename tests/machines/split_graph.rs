@@ -3,8 +3,8 @@
 use crate::common::{signal, wait_until};
 use crate::hosts::{Host, Network};
 use crate::split::{
-    FOREVER, assert_lost_nothing, assert_nothing_unsafe, decided, on_one_machine, part, patient, peer, pid_of, split,
-    stop, wait_for_state,
+    FOREVER, assert_lost_nothing, assert_nothing_unsafe, decided, node, on_one_machine, part, patient, peer, pid_of,
+    split, stop, wait_for_state,
 };
 use serde_json::Value;
 
@@ -158,6 +158,44 @@ fn killed_links_come_back_and_the_decisions_are_undisturbed() {
     assert_eq!(brain_end.summary["samples_lost"], 0, "{}\n{}", brain_end.summary, brain_end.stderr);
 }
 
+/// The samples that a link keeps while the other machine is away outlive it.
+#[test]
+fn a_link_that_is_killed_while_the_other_machine_is_away_loses_nothing() {
+    let Some(network) = Network::new(&[0, 0]) else { return };
+    let [robot, brain] = &network.hosts[..] else { panic!("two hosts") };
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = split(folder.path(), &plain(brain, DEADLINE_MILLIS), &[patient()]);
+    let brain_part = part(brain, &flow, "brain", &[]);
+    let robot_part = part(robot, &flow, "robot", &FOREVER);
+    robot_part.wait_for_decisions(5);
+    let waiting = || {
+        let peer = peer(robot, &robot_part, "brain");
+        let channels = peer["channels"].as_array().cloned().unwrap_or_default();
+        channels.iter().filter(|channel| channel["is_sent"] == true).map(|it| it["n_waiting"].as_u64()).max().flatten()
+    };
+    for n_kills in 1..4 {
+        network.cable(1, false);
+        wait_for_state(robot, &robot_part, "brain", "down");
+        // More than the writer's history holds.
+        wait_until(|| waiting() > Some(600), || format!("{:?} wait", waiting()));
+        for _ in 0..n_kills {
+            let pid = pid_of(robot, &robot_part, "link");
+            signal(pid, rustix::process::Signal::KILL);
+            let is_back =
+                || node(robot, &robot_part.name, "link")["pid"].as_i64().is_some_and(|it| it != i64::from(pid));
+            wait_until(|| is_back() && waiting() > Some(600), || format!("{:?} wait", waiting()));
+        }
+        network.cable(1, true);
+        wait_for_state(robot, &robot_part, "brain", "up");
+        robot_part.wait_for_decisions(5);
+    }
+    let robot_end = stop(robot, robot_part);
+    let brain_end = brain_part.finish();
+    assert_nothing_unsafe(&robot_end);
+    assert_lost_nothing("robot", &robot_end);
+    assert_lost_nothing("brain", &brain_end);
+}
+
 #[test]
 fn a_brain_that_answers_no_samples_is_cut_off_and_the_hands_side_goes_on() {
     let Some(network) = Network::new(&[0, 0]) else { return };
@@ -190,6 +228,8 @@ fn a_brain_that_answers_no_samples_is_cut_off_and_the_hands_side_goes_on() {
     brain_part.finish();
     assert_eq!(robot_end.summary["restarts"], 0, "{}\n{}", robot_end.summary, robot_end.stderr);
     assert_eq!(robot_end.code, Some(3), "{}\n{}", robot_end.summary, robot_end.stderr);
+    // Each lost sample counts once, although brain's answers to it are missing as well.
+    assert_eq!(robot_end.summary["samples_lost"], robot_end.summary["link"]["peers"][0]["channels"][0]["n_lost"]);
     let expected = on_one_machine();
     for line in &robot_end.decisions {
         let grasp_id = line["grasp_id"].as_u64().expect("an id") as usize;

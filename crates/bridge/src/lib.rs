@@ -14,7 +14,8 @@
 //! * [`session`] - Zenoh's configuration: endpoints, TLS. [`access`] - its access control. [`keys`] - makes
 //!   certificates. [`certificates`] - reads and checks certificates.
 //! * [`identity`] - signs and verifies hellos. [`agreement`] - agrees on keys. [`protection`] - applies both to frames.
-//! * [`peer`] - the state of another machine's link. `uplink`, `downlink` - the local ports of a channel.
+//! * [`peer`] - the state of another machine's link. `uplink`, `downlink` - the local ports of a channel; `spool` - the file of
+//!   the samples that a channel keeps.
 //!   `peer_connection` - the Zenoh side.
 //! * [`operator`] - the process.
 
@@ -23,6 +24,7 @@ pub mod agreement;
 pub mod certificates;
 pub mod clock;
 pub mod config;
+mod descriptors;
 mod downlink;
 mod envelope;
 
@@ -37,5 +39,6 @@ mod peer_connection;
 pub mod protection;
 pub mod sample;
 pub mod session;
+mod spool;
 mod uplink;
 pub mod wire;

@@ -235,7 +235,7 @@ fn link_node(config: &LinkConfig, machine: &str, program: &Program) -> Node {
         description,
         params,
         // A link that ends is always restarted. Meanwhile the arbiter holds, and samples are kept.
-        restart: Restart { policy: RestartPolicy::Always, limit: 20, ..Restart::default() },
+        restart: Restart { policy: RestartPolicy::Always, limit: 60, ..Restart::default() },
         heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
         // It opens sockets, and reads its keys again when they change.
         sandbox: Sandbox::Off,

@@ -8,11 +8,12 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, anyhow};
+use anyhow::{Context, anyhow, bail};
 use time::OffsetDateTime;
 
 use super::clock::{Origins, Passage, origin_of_answer, origin_on_arrival};
 use super::config::{KeyKind, LinkConfig};
+use super::descriptors::{self, DescriptorWatch};
 use super::downlink::{Accepted, Downlink};
 use super::identity::Identity;
 use super::peer::{Change, Own, Rejection};
@@ -69,6 +70,8 @@ struct Link<'a> {
     frame: Vec<u8>,
     last_status: Instant,
     last_look: Instant,
+    descriptors: DescriptorWatch,
+    last_count: Instant,
     started: Instant,
     started_nanos: u64,
     has_said_waiting: bool,
@@ -124,6 +127,8 @@ impl<'a> Link<'a> {
             frame: Vec::new(),
             last_status: now,
             last_look: now,
+            descriptors: DescriptorWatch::default(),
+            last_count: now,
             started: now,
             started_nanos: monotonic_nanos(),
             has_said_waiting: false,
@@ -161,10 +166,28 @@ impl<'a> Link<'a> {
                 }
                 self.look_for_readers()?;
             }
+            self.look_at_descriptors()?;
             if !is_busy {
                 self.wait(stop);
             }
         }
+    }
+
+    /// # Errors
+    /// This process has had no descriptors left for some time: the next one begins without the connections that hold them.
+    fn look_at_descriptors(&mut self) -> anyhow::Result<()> {
+        if self.last_count.elapsed() < descriptors::LOOK_PAUSE {
+            return Ok(());
+        }
+        self.last_count = Instant::now();
+        let limit = descriptors::limit();
+        if self.descriptors.is_out(descriptors::n_open(), limit, self.started.elapsed()) {
+            bail!(
+                "nearly all {limit} descriptors have been in use for some seconds, perhaps by connections of strangers: machines \
+                 could not come in any more; limit the connections per address in the firewall (docs/security.md)"
+            );
+        }
+        Ok(())
     }
 
     fn look_for_readers(&mut self) -> anyhow::Result<()> {
@@ -254,9 +277,13 @@ impl<'a> Link<'a> {
             match opened.as_ref().map_err(WireError::clone).and_then(Opened::frame) {
                 Ok(frame) => self.on_frame(idx, kind, frame)?,
                 Err(WireError::Refused(reason)) => {
-                    let peer = &mut self.connections[idx].peer;
-                    if peer.on_refusal(&reason) {
-                        tracing::error!("machine '{}' refuses this one: {reason}", peer.machine);
+                    let connection = &mut self.connections[idx];
+                    // A refusal is not signed: everybody who can send here can send one, with any text.
+                    if connection.peer.on_refusal(&reason)
+                        && connection.refused_logged.is_none_or(|logged| logged.elapsed() > REFUSAL_PAUSE)
+                    {
+                        connection.refused_logged = Some(Instant::now());
+                        tracing::error!("machine '{}' refuses this one: {reason}", connection.peer.machine);
                     }
                 }
                 Err(error) => self.reject(idx, &error),
@@ -296,7 +323,8 @@ impl<'a> Link<'a> {
                 super::wire::PROTOCOL,
                 peer.machine
             );
-            self.refuse(idx, &reason);
+            peer.on_unverified(&reason);
+            self.say_refusal(idx, &reason);
         }
     }
 

@@ -12,6 +12,10 @@
 //!   machine that takes no samples cannot hold the writer up for ever.
 //! * **Latest**: only the newest sample is kept.
 //!
+//! A sample may be **committed**, so that its writer forgets it, when it is answered, or when it was saved outside of this
+//! process. The channel says which samples to save, because the writer must not wait for them ([`Outgoing::next_to_save`]); the
+//! process that takes over gets them back ([`Outgoing::restore`]).
+//!
 //! A position in the stream counts the samples in the order in which they were pushed. Keys order samples only within
 //! an epoch: a recording that is played has its recorded epochs, and a machine's clock may have been set back.
 
@@ -26,7 +30,7 @@ const FIRST_PROBE_NANOS: u64 = 250_000_000;
 const LONGEST_PROBE_NANOS: u64 = 2_000_000_000;
 /// Pause before the end of a channel is repeated.
 const END_PAUSE_NANOS: u64 = 100_000_000;
-/// While the receiver is cut off, a sample is committed after this time. A writer starts a new epoch when all readers
+/// While the receiver is cut off, a sample is saved and committed after this time. A writer starts a new epoch when all readers
 /// have answered the old one, and it must not wait for a machine that is away.
 const COMMIT_AFTER_NANOS: u64 = 50_000_000;
 
@@ -43,8 +47,23 @@ pub struct OutgoingOptions {
     pub stall_limit_nanos: u64,
 }
 
+/// A sample as it is saved for a process that takes over.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct KeptSample {
+    pub key: SampleId,
+    pub origin_nanos: u64,
+    /// The encoded message.
+    pub message: Vec<u8>,
+}
+
+impl KeptSample {
+    pub fn as_parts(&self) -> (SampleId, u64, &[u8]) {
+        (self.key, self.origin_nanos, &self.message)
+    }
+}
+
 /// The sending end of a channel.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Outgoing {
     options: OutgoingOptions,
     /// The last sample that an earlier process had committed.
@@ -57,7 +76,7 @@ pub struct Outgoing {
     cursor: u64,
     /// Samples before this position were sent, or the receiver had them.
     reached: u64,
-    /// Samples before this position may be committed.
+    /// Samples before this position may be committed: they are answered, given up or saved.
     committed: u64,
     committed_key: Option<SampleId>,
     /// The last sample that is no longer kept.
@@ -67,7 +86,6 @@ pub struct Outgoing {
     /// Samples that were sent, are no longer kept, and are not acknowledged.
     unsettled: VecDeque<(Sent, SampleId)>,
     run: Option<Run>,
-    had_resume: bool,
     is_catching_up: bool,
     /// The last sample that the receiver's readers have answered, by its last acknowledgement.
     last_answered: Option<SampleId>,
@@ -100,7 +118,7 @@ pub struct Next<'a> {
     pub is_repeat: bool,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Kept {
     key: SampleId,
     message: Vec<u8>,
@@ -117,7 +135,7 @@ struct Sent {
 }
 
 /// A request of the receiver.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Run {
     number: u32,
     n_sent: u64,
@@ -126,7 +144,7 @@ struct Run {
     probe_pause_nanos: u64,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct End {
     last: Option<SampleId>,
     due_nanos: u64,
@@ -151,7 +169,6 @@ impl Outgoing {
             skip: None,
             unsettled: VecDeque::new(),
             run: None,
-            had_resume: false,
             is_catching_up: true,
             last_answered: None,
             full_since_nanos: None,
@@ -164,6 +181,29 @@ impl Outgoing {
             n_lost: 0,
             blocked_nanos: 0,
         }
+    }
+
+    /// Goes on with what an earlier process has saved, in its order, and with the number of samples that it has lost. Those behind
+    /// the last committed sample were not committed any more: the writer sends them again.
+    pub fn restore(&mut self, mut saved: Vec<KeptSample>, n_lost: u64) {
+        let n_committed =
+            saved.iter().rposition(|sample| Some(sample.key) == self.begun_after).map_or(0, |idx| idx + 1);
+        saved.truncate(n_committed);
+        self.n_lost = n_lost;
+        if saved.is_empty() {
+            return;
+        }
+        let kept = saved.into_iter().map(|KeptSample { key, origin_nanos, message }| Kept {
+            key,
+            message,
+            origin_nanos,
+            pushed_nanos: 0,
+            sent: None,
+        });
+        self.kept = kept.collect();
+        self.committed = self.end_position();
+        // The sample before them is not known.
+        self.last_removed = None;
     }
 
     /// Whether another sample may be taken from the local writer. It may not while the receiver is up and behind; the
@@ -231,9 +271,6 @@ impl Outgoing {
             return;
         }
         self.settle(after);
-        if !std::mem::replace(&mut self.had_resume, true) {
-            self.count_lost_before_start(after);
-        }
         self.cursor = after.map_or(self.first, |key| self.position_after(&key));
         self.reached = self.reached.max(self.cursor);
         let is_known =
@@ -323,27 +360,47 @@ impl Outgoing {
         }
     }
 
-    /// The last sample that may be committed on this machine's cursors, so that the local writer goes on. Samples may be
-    /// committed that are answered, and samples that only this process keeps because the writer must not wait.
-    pub fn commit_point(&mut self, now_nanos: u64) -> Option<SampleId> {
-        let Some(newest) = self.kept.back().map(|kept| kept.key) else { return self.committed_key };
-        if self.options.policy == EdgePolicy::Lossless {
-            let capacity = self.options.capacity as u64;
-            let most = capacity - (capacity / 4).max(1).min(capacity);
-            while let Some(kept) = self.kept.get((self.committed - self.first) as usize) {
-                // The writer's limit is a difference of sequence numbers, not a number of samples.
-                let is_far = newest.epoch == kept.key.epoch && newest.seq.saturating_sub(kept.key.seq) >= most;
-                let is_many = self.end_position() - self.committed > most;
-                let is_cut_off_long = (self.run.is_none() || self.is_on_trial)
-                    && now_nanos.saturating_sub(kept.pushed_nanos) >= COMMIT_AFTER_NANOS;
-                if !is_far && !is_many && !is_cut_off_long {
-                    break;
-                }
-                self.committed_key = Some(kept.key);
-                self.committed += 1;
-            }
+    /// The next sample that must be saved outside of this process, because the writer must not wait for its answer: call
+    /// [`Outgoing::saved`] once that is done, and this until it returns `None`.
+    pub fn next_to_save(&self, now_nanos: u64) -> Option<(SampleId, u64, &[u8])> {
+        if self.options.policy != EdgePolicy::Lossless {
+            return None;
         }
+        let newest = self.kept.back()?.key;
+        let kept = self.kept.get((self.committed - self.first) as usize)?;
+        let capacity = self.options.capacity as u64;
+        let most = capacity - (capacity / 4).max(1).min(capacity);
+        // The writer's limit is a difference of sequence numbers, not a number of samples.
+        let is_far = newest.epoch == kept.key.epoch && newest.seq.saturating_sub(kept.key.seq) >= most;
+        let is_many = self.end_position() - self.committed > most;
+        let is_cut_off_long = (self.run.is_none() || self.is_on_trial)
+            && now_nanos.saturating_sub(kept.pushed_nanos) >= COMMIT_AFTER_NANOS;
+        (is_far || is_many || is_cut_off_long).then_some((kept.key, kept.origin_nanos, &kept.message))
+    }
+
+    /// The sample of [`Outgoing::next_to_save`] is saved: it may be committed.
+    pub fn saved(&mut self) {
+        if let Some(kept) = self.kept.get((self.committed - self.first) as usize) {
+            self.committed_key = Some(kept.key);
+            self.committed += 1;
+        }
+    }
+
+    /// The samples that are committed and not answered. A process that takes over needs them.
+    pub fn committed(&self) -> impl ExactSizeIterator<Item = (SampleId, u64, &[u8])> {
+        let n_committed = (self.committed - self.first) as usize;
+        self.kept.iter().take(n_committed).map(|kept| (kept.key, kept.origin_nanos, kept.message.as_slice()))
+    }
+
+    /// The last sample that may be committed on this machine's cursors, so that the local writer goes on.
+    pub fn commit_point(&self) -> Option<SampleId> {
         self.committed_key
+    }
+
+    /// The number of lost samples for a process that takes over. Of the samples that were sent and given up, only this process
+    /// would learn whether the receiver has them.
+    pub fn n_lost_to_save(&self) -> u64 {
+        self.n_lost + self.unsettled.len() as u64
     }
 
     /// The writer has ended; `last` was its last sample and has been pushed.
@@ -480,21 +537,9 @@ impl Outgoing {
         self.n_lost += n_lost as u64;
         self.unsettled.clear();
     }
-
-    /// Counts the samples as lost that only the memory of an earlier process held.
-    fn count_lost_before_start(&mut self, after: Option<SampleId>) {
-        if self.options.policy == EdgePolicy::Latest {
-            return;
-        }
-        if let (Some(committed), Some(had)) = (self.begun_after, after) {
-            self.n_lost += match committed.epoch.cmp(&had.epoch) {
-                std::cmp::Ordering::Equal => committed.seq.saturating_sub(had.seq),
-                std::cmp::Ordering::Greater => committed.seq.saturating_add(1),
-                std::cmp::Ordering::Less => 0,
-            };
-        }
-    }
 }
 
+#[cfg(test)]
+mod model;
 #[cfg(test)]
 mod tests;

@@ -322,13 +322,17 @@ impl Peer {
         }
     }
 
-    /// Takes a refusal by the peer, unless the peer is up; returns whether its reason is new.
+    /// Takes a refusal in the peer's name, which nobody has signed, unless the peer is up; returns whether its reason is new.
+    /// Only the state of a peer that was never found depends on it.
     pub fn on_refusal(&mut self, reason: &str) -> bool {
         let reason = format!("it refuses: {reason}");
         if self.state == PeerState::Up || self.reason.as_ref() == Some(&reason) {
             return false;
         }
-        (self.state, self.reason) = (PeerState::Refused, Some(reason));
+        if self.state == PeerState::Waiting {
+            self.state = PeerState::Refused;
+        }
+        self.reason = Some(reason);
         true
     }
 

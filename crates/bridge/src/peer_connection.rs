@@ -41,6 +41,8 @@ pub(super) struct PeerConnection {
     pub(super) stall_logged: bool,
     /// When the refusal of this peer was logged last.
     pub(super) refusal_logged: Option<Instant>,
+    /// When it was logged last that this peer refuses this machine.
+    pub(super) refused_logged: Option<Instant>,
     inbox: Arc<Inbox>,
     /// `None` until there is a session.
     zenoh: Option<ZenohPorts>,
@@ -97,6 +99,7 @@ impl PeerConnection {
             peer: Peer::new(machine.into(), exports, imports, config.deadline_millis * 1_000_000, agreement),
             stall_logged: false,
             refusal_logged: None,
+            refused_logged: None,
             inbox: Arc::default(),
             zenoh: None,
         })

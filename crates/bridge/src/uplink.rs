@@ -3,10 +3,13 @@
 
 use std::collections::VecDeque;
 
+use anyhow::Context as _;
+
 use super::clock::Origins;
 use super::config::{Channel, LinkConfig};
 use super::outgoing::{Outgoing, OutgoingOptions};
 use super::sample;
+use super::spool::Spool;
 use blindgrasp_graph::client::observer::bears_source_number;
 use blindgrasp_messages::{Header, Message};
 use blindgrasp_operator::cursors::SampleId;
@@ -31,6 +34,10 @@ pub(super) struct Uplink {
     /// The last sample that was read, by this process or an earlier one.
     pub(super) last: Option<SampleId>,
     reader: Box<dyn Reader>,
+    /// What a process that takes over needs.
+    spool: Spool,
+    /// The log says that the spool cannot be written.
+    cannot_save: bool,
     /// The samples that are not committed yet, each with the counts of the input at the time when it was read.
     uncommitted: VecDeque<(SampleId, InputCounts)>,
     bears_source_number: bool,
@@ -60,6 +67,8 @@ impl Uplink {
         let last = subscriber.last();
         subscriber.take_over(last);
         let deadlines_nanos = config.deadline_millis.saturating_mul(1_000_000 * N_DEADLINES_STALLED);
+        let path = operator.folder().join(format!("spool_{}", channel.input_port().replace('/', "_")));
+        let (mut spool, saved) = Spool::open(&path).with_context(|| path.display().to_string())?;
         let options = OutgoingOptions {
             policy: channel.policy,
             window: WINDOW,
@@ -67,10 +76,16 @@ impl Uplink {
             buffer: config.buffer,
             stall_limit_nanos: deadlines_nanos.min(LONGEST_STALL_NANOS),
         };
+        let mut outgoing = Outgoing::new(options, last);
+        outgoing.restore(saved.samples, saved.n_lost);
+        // Samples that were saved and not committed come again, and must not be there twice.
+        spool.replace(outgoing.committed(), saved.n_lost).with_context(|| path.display().to_string())?;
         Ok(Uplink {
             channel: channel.clone(),
             schema_id: sample::schema_id(M::TYPE_NAME).unwrap_or_default(),
-            outgoing: Outgoing::new(options, last),
+            outgoing,
+            spool,
+            cannot_save: false,
             last,
             reader: Box::new(subscriber),
             uncommitted: VecDeque::new(),
@@ -107,9 +122,35 @@ impl Uplink {
         Ok(true)
     }
 
-    /// Lets the writer go on as far as the other machine has answered.
+    /// Saves the samples for which the writer must not wait. Without room for them, the graph goes on as if they were saved.
+    fn save(&mut self) {
+        let now_nanos = monotonic_nanos();
+        let mut outcome = self.spool.save_lost(self.outgoing.n_lost_to_save());
+        while let Some(sample) = self.outgoing.next_to_save(now_nanos) {
+            let saved = self.spool.save(sample);
+            outcome = outcome.and(saved);
+            self.outgoing.saved();
+        }
+        if self.spool.is_long(self.outgoing.committed().len()) {
+            let replaced = self.spool.replace(self.outgoing.committed(), self.outgoing.n_lost_to_save());
+            outcome = outcome.and(replaced);
+        }
+        if let Err(error) = outcome
+            && !std::mem::replace(&mut self.cannot_save, true)
+        {
+            let port = &self.channel.port;
+            tracing::warn!(
+                "samples of {port} cannot be saved for machine '{}' ({error}): if the link is killed while that machine is away, \
+                 they are lost",
+                self.channel.to
+            );
+        }
+    }
+
+    /// Lets the writer go on as far as the other machine has answered, or samples are saved for it.
     pub(super) fn commit(&mut self) {
-        let Some(point) = self.outgoing.commit_point(monotonic_nanos()) else {
+        self.save();
+        let Some(point) = self.outgoing.commit_point() else {
             return;
         };
         let Some(idx) = self.uncommitted.iter().position(|(key, _)| *key == point) else {

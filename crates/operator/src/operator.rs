@@ -185,6 +185,11 @@ impl Operator {
         parse_params(&self.0.wiring.params)
     }
 
+    /// The graph's folder, private to its user. It is removed with all its files when the graph has ended.
+    pub fn folder(&self) -> &std::path::Path {
+        std::path::Path::new(&self.0.wiring.domain.root_path)
+    }
+
     /// The clock of its stages.
     pub fn clock(&self) -> Clock {
         self.0.wiring.clock

@@ -13,6 +13,7 @@
 //! * [`standard`] - the definitions of the standard messages that blindgrasp reads.
 //! * [`node`] - a node that other nodes see: publishers and subscribers with tokens, attachments and qualities of service.
 
+mod access;
 pub mod cdr;
 pub mod definition;
 pub mod node;

@@ -19,6 +19,9 @@ use zenoh_ext::{
 
 pub use zenoh::Session;
 
+pub use super::access::Rights;
+use super::access::access_control;
+
 /// A longer message is dropped by Zenoh.
 const MAX_MESSAGE_BYTES: usize = 16 << 20;
 /// Of a longer message, only the length is passed on.
@@ -40,6 +43,8 @@ pub struct Network {
     /// Endpoints at which other nodes connect.
     pub listen: Vec<String>,
     pub keys: Option<Keys>,
+    /// With keys: the common names of the certificates that take part.
+    pub names: Vec<String>,
 }
 
 /// The files for TLS, in PEM.
@@ -52,8 +57,10 @@ pub struct Keys {
 
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RosError {
-    #[error("'{0}' is no endpoint: expected tcp/HOST:PORT, or tls/HOST:PORT with keys")]
+    #[error("'{0}' is no endpoint: expected tcp/HOST:PORT without keys, or tls/HOST:PORT with keys")]
     Endpoint(String),
+    #[error("{0}")]
+    Keys(String),
     #[error("{endpoints}: {message}")]
     Open { endpoints: String, message: String },
     #[error("'{0}' is no name of a topic: expected words of letters, digits and '_', joined by '/'")]
@@ -75,14 +82,30 @@ impl Network {
             })
         };
         let mut endpoints = self.connect.iter().chain(&self.listen);
-        endpoints.find(|endpoint| !is_valid(endpoint)).map_or(Ok(()), |bad| Err(RosError::Endpoint(bad.clone())))
+        if let Some(bad) = endpoints.find(|endpoint| !is_valid(endpoint)) {
+            return Err(RosError::Endpoint(bad.clone()));
+        }
+        if self.keys.is_none() {
+            return Ok(());
+        }
+        // Zenoh looks at a certificate once per connection. A connection that this side has made takes a link from outside that
+        // bears the other end's number, which is no secret, whatever its certificate.
+        if !self.connect.is_empty() && !self.listen.is_empty() {
+            return Err(RosError::Keys("both 'connect' and 'listen' with keys: expected one of them".into()));
+        }
+        if self.names.is_empty() {
+            return Err(RosError::Keys(
+                "no name may take part: expected the common names of certificates, like ros2".into(),
+            ));
+        }
+        Ok(())
     }
 
-    /// Opens a session. A router must answer within a second.
+    /// Opens a session for these rights. A router must answer within a second.
     ///
     /// # Errors
     /// An endpoint cannot be used.
-    pub fn open(&self) -> Result<Session, RosError> {
+    pub fn open(&self, rights: &Rights) -> Result<Session, RosError> {
         self.check()?;
         let is_client = self.listen.is_empty();
         let mut config = json!({
@@ -108,6 +131,8 @@ impl Network {
                 "shared_memory": {"enabled": false},
             },
         });
+        let names = self.keys.is_some().then_some(self.names.as_slice());
+        config["access_control"] = access_control(rights, names);
         if let Some(Keys { authority, certificate, private_key }) = &self.keys {
             config["transport"]["link"]["tls"] = json!({
                 "root_ca_certificate": authority,
@@ -116,7 +141,8 @@ impl Network {
                 "listen_private_key": private_key,
                 "connect_certificate": certificate,
                 "connect_private_key": private_key,
-                // The authority is the robot's own: a node with its certificate may take part, at any address.
+                // Access control goes by the common name, at any address. The certificates of `blindgrasp keys` bear no address,
+                // and public authorities, which Zenoh's connecting side accepts as well, sign no name without a dot.
                 "verify_name_on_connect": false,
                 "close_link_on_expiration": true,
             });
@@ -146,6 +172,11 @@ pub fn topic_name(namespace: &str, topic: &str) -> Result<String, RosError> {
     };
     let rest = full.strip_prefix('/').ok_or_else(|| RosError::Topic(topic.into()))?;
     if rest.split('/').all(is_word) { Ok(full) } else { Err(RosError::Topic(topic.into())) }
+}
+
+/// The key expression of a topic's messages, of all types.
+pub fn topic_key(domain: u32, topic: &str) -> String {
+    format!("{domain}{topic}/*/*")
 }
 
 /// The type of a topic's messages.
@@ -285,8 +316,10 @@ impl RosNode {
         take: impl Fn(Received) + Send + Sync + 'static,
     ) -> Result<RosSubscriber, RosError> {
         self.endpoint("MS", topic, message, quality)?;
-        let key = format!("{}{topic}/*/*", self.domain);
-        let builder = self.session.declare_subscriber(key).callback(move |sample| take(Received::of(&sample)));
+        let builder = self
+            .session
+            .declare_subscriber(topic_key(self.domain, topic))
+            .callback(move |sample| take(Received::of(&sample)));
         let subscriber: Box<dyn Send> = match quality {
             Quality::Sensor => Box::new(builder.wait().map_err(of_zenoh)?),
             Quality::KeepLast(n) => {
@@ -518,7 +551,7 @@ mod tests {
     #[test]
     fn tokens_are_those_of_rmw_zenoh() {
         let listens = Network { listen: vec!["tcp/127.0.0.1:0".into()], ..Network::default() };
-        let session = listens.open().expect("a session");
+        let session = listens.open(&Rights::default()).expect("a session");
         let message = MessageType { name: "std_msgs/msg/String".into(), hash: STRING_HASH.into() };
         let tokens: Vec<String> = [(0, "/", "p_tl", "/q_transient"), (7, "/cell4", "gw", "/cell4/chatter")]
             .into_iter()
@@ -548,14 +581,19 @@ mod tests {
         let port = std::net::TcpListener::bind("127.0.0.1:0").and_then(|it| it.local_addr()).expect("a port").port();
         let endpoint = format!("tcp/127.0.0.1:{port}");
         let listens = Network { listen: vec![endpoint.clone()], ..Network::default() };
-        let mut heard_at = RosNode::new(listens.open().expect("a session"), 3, "/robot", "hearer").expect("a node");
+        let takes = Rights { takes: vec![topic_key(3, "/robot/words")], ..Rights::default() };
+        let session = listens.open(&takes).expect("a session");
+        let mut heard_at = RosNode::new(session, 3, "/robot", "hearer").expect("a node");
         let (sender, heard) = std::sync::mpsc::channel();
         let topic = topic_name("/robot", "words").expect("a topic");
         let _subscriber = heard_at
-            .subscriber(&topic, &message, Quality::Sensor, move |received| sender.send(received).expect("a receiver"))
+            .subscriber(&topic, &message, Quality::Sensor, move |received| drop(sender.send(received)))
             .expect("a subscriber");
         let connects = Network { connect: vec![endpoint], ..Network::default() };
-        let mut said_at = RosNode::new(connects.open().expect("a session"), 3, "/robot", "sayer").expect("a node");
+        let sends =
+            Rights { sends: [3, 4].map(|domain| topic_key(domain, "/robot/words")).to_vec(), ..Rights::default() };
+        let session = connects.open(&sends).expect("a session");
+        let mut said_at = RosNode::new(session, 3, "/robot", "sayer").expect("a node");
         let mut publisher = said_at.publisher(&topic, &message, Quality::KeepLast(1)).expect("a publisher");
         // Until the subscription is known, samples go nowhere.
         let received = (0..200).find_map(|_| {
@@ -569,9 +607,7 @@ mod tests {
         // A subscriber that comes later gets the last message if it asks for it.
         let (sender, late) = std::sync::mpsc::channel();
         let _late = heard_at
-            .subscriber(&topic, &message, Quality::KeepLast(1), move |received| {
-                sender.send(received).expect("a receiver")
-            })
+            .subscriber(&topic, &message, Quality::KeepLast(1), move |received| drop(sender.send(received)))
             .expect("a subscriber");
         let kept = late.recv_timeout(std::time::Duration::from_secs(10)).expect("a message");
         assert_eq!((kept.message, kept.sender), (message.clone(), Some(publisher.gid)));

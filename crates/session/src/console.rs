@@ -10,6 +10,7 @@ use crate::run::Tap;
 use blindgrasp_graph::run::{RunSink, SeenDecision};
 use blindgrasp_messages::{Action, GraspTruth, LiftOutcome};
 use blindgrasp_operator::diagnostics::LinePrinter;
+use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_recording::Record;
 
 /// This many lines wait for the reader of stdout.
@@ -93,6 +94,9 @@ impl RunSink for Console {
             return Ok(());
         }
         let SeenDecision { header, decision, latency_nanos, truth } = *seen;
+        let mut decision = decision.clone();
+        // A program that reads the lines may move an arm.
+        decision.expire(header.valid_until_nanos(), monotonic_nanos());
         let (action, reason) = (decision.action, decision.reason.as_str());
         let line = if self.json {
             serde_json::to_string(&DecisionLine {

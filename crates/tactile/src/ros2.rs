@@ -17,7 +17,7 @@ use super::{Arrival, DriverError, Event, Place, Reading, Refusal, RefusalKind, T
 use blindgrasp_messages::{OwnedSenses, Phase, Sense};
 use blindgrasp_ros::cdr::{self, Value};
 use blindgrasp_ros::definition::Definition;
-use blindgrasp_ros::node::{MAX_RECEIVED_BYTES, MessageType, Network, Quality, Received, RosNode};
+use blindgrasp_ros::node::{MAX_RECEIVED_BYTES, MessageType, Network, Quality, Received, Rights, RosNode, topic_key};
 use blindgrasp_ros::standard;
 
 /// A sender that has sent nothing for so long gives way to another one.
@@ -300,7 +300,9 @@ impl TactileDriver for Ros2 {
             .collect();
         let name = wanted.iter().map(|(_, name, _)| name.as_str()).collect::<Vec<_>>().join(", ");
         inbox.keep(name, move |inbox| {
-            let session = topics.network.open().map_err(|error| error.to_string())?;
+            let takes = wanted.iter().map(|(_, name, _)| topic_key(topics.domain, name)).collect();
+            let rights = Rights { takes, ..Rights::default() };
+            let session = topics.network.open(&rights).map_err(|error| error.to_string())?;
             let node = RosNode::new(session, topics.domain, &topics.namespace, "blindgrasp_tactile_source");
             let mut node = node.map_err(|error| error.to_string())?;
             let mut subscribers = Vec::new();

@@ -10,7 +10,7 @@ use super::line_protocol::parse;
 use super::{Arrival, DriverError, Event, Place, Reading, Refusal, RefusalKind, TactileDriver};
 use blindgrasp_messages::TactileFrame;
 use blindgrasp_recording::cdr;
-use blindgrasp_ros::node::Network;
+use blindgrasp_ros::node::{Network, Rights};
 use zenoh::Wait;
 
 /// The bytes of a frame, none if there are too many, and their number.
@@ -85,7 +85,8 @@ impl TactileDriver for ZenohKey {
         let inbox = Inbox::new().map_err(DriverError::Inbox)?;
         let (network, key, max_bytes) = (self.network.clone(), self.key.clone(), self.max_bytes);
         inbox.keep(format!("key {key}"), move |inbox| {
-            let session = network.open().map_err(|error| error.to_string())?;
+            let rights = Rights { takes: vec![key.clone()], ..Rights::default() };
+            let session = network.open(&rights).map_err(|error| error.to_string())?;
             let inbox = Arc::clone(inbox);
             let subscriber = session
                 .declare_subscriber(key.clone())

@@ -472,7 +472,7 @@ setInterval(() => {
 readLog();
 
 // --- the stream
-const source = new EventSource("/events");
+const source = new EventSource(token ? `/events?token=${encodeURIComponent(token)}` : "/events");
 const on = (name, take) => source.addEventListener(name, (event) => take(JSON.parse(event.data)));
 on("server", (server) => {
   // Another server at the same address: the page begins anew.

@@ -2,13 +2,14 @@
 
 use std::sync::{Arc, Mutex, TryLockError};
 
+use axum::Extension;
 use axum::body::Bytes;
-use axum::extract::State;
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::extract::{Request, State};
+use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 
-use crate::Shared;
+use crate::{FOXGLOVE, IsOwner, Shared};
 
 /// A change of the graph that the page asks for.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -55,40 +56,49 @@ impl Control {
         &self.token
     }
 
-    /// Whether a request bears the token. The time that this takes does not tell how much of a wrong one is right.
-    fn is_allowed(&self, headers: &HeaderMap) -> bool {
-        let given = headers.get(header::AUTHORIZATION).map(|value| value.as_bytes()).unwrap_or_default();
-        let expected = format!("Bearer {}", self.token);
-        let differs = given.iter().zip(expected.as_bytes()).fold(0, |differs, (a, b)| differs | (a ^ b));
-        given.len() == expected.len() && differs == 0
+    /// Whether a request bears the token: in a header, or, as a stream of events and a WebSocket have none, behind the address of
+    /// these. The time that this takes does not tell how much of a wrong one is right.
+    pub(crate) fn is_borne_by(&self, request: &Request) -> bool {
+        let header = request.headers().get(header::AUTHORIZATION).map(|value| value.as_bytes()).unwrap_or_default();
+        let is_stream = ["/events", FOXGLOVE].contains(&request.uri().path());
+        let query = request.uri().query().filter(|_| is_stream).unwrap_or_default();
+        is_same(header, &format!("Bearer {}", self.token))
+            || is_same(query.as_bytes(), &format!("token={}", self.token))
     }
 }
 
-/// The right of a request; otherwise the answer to it.
-fn control_for<'a>(shared: &'a Shared, headers: &HeaderMap) -> Result<&'a Control, Box<Response>> {
-    let refused = |status: StatusCode, why: &'static str| Err(Box::new((status, why).into_response()));
+fn is_same(given: &[u8], expected: &str) -> bool {
+    let differs = given.iter().zip(expected.as_bytes()).fold(0, |differs, (a, b)| differs | (a ^ b));
+    given.len() == expected.len() && differs == 0
+}
+
+/// The answer to a request that needs the token and does not bear it.
+pub(crate) fn refusal(shared: &Shared) -> Response {
     match &shared.control {
-        None => refused(StatusCode::NOT_FOUND, "the page only shows the graph: start it with --view-control\n"),
-        Some(control) if !control.is_allowed(headers) => refused(
-            StatusCode::UNAUTHORIZED,
-            "the token is not that of this page: open the address that the command has printed\n",
-        ),
-        Some(control) => Ok(control),
+        None => {
+            (StatusCode::NOT_FOUND, "the page only shows the graph: start it with --view-control\n").into_response()
+        }
+        Some(_) => {
+            let why = "the token is not that of this page: open the address that the command has printed\n";
+            (StatusCode::UNAUTHORIZED, why).into_response()
+        }
     }
 }
 
 /// The log, which other users of the machine may not read.
-pub(crate) async fn log(State(shared): State<Arc<Shared>>, headers: HeaderMap) -> Response {
-    match control_for(&shared, &headers) {
-        Ok(_) => ([(header::CONTENT_TYPE, "application/json")], shared.log()).into_response(),
-        Err(refused) => *refused,
+pub(crate) async fn log(
+    State(shared): State<Arc<Shared>>,
+    Extension(IsOwner(is_owner)): Extension<IsOwner>,
+) -> Response {
+    if is_owner {
+        ([(header::CONTENT_TYPE, "application/json")], shared.log()).into_response()
+    } else {
+        refusal(&shared)
     }
 }
 
-pub(crate) async fn order(State(shared): State<Arc<Shared>>, headers: HeaderMap, body: Bytes) -> Response {
-    if let Err(refused) = control_for(&shared, &headers) {
-        return *refused;
-    }
+/// Carries out an order of a request that bears the token.
+pub(crate) async fn order(State(shared): State<Arc<Shared>>, body: Bytes) -> Response {
     let order: Order = match serde_json::from_slice(&body) {
         Ok(order) => order,
         Err(error) => return (StatusCode::BAD_REQUEST, format!("expected an order: {error}\n")).into_response(),

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use axum::Extension;
 use axum::body::Bytes;
 use axum::extract::State;
 use axum::extract::ws::{Message, WebSocket, WebSocketUpgrade};
@@ -16,12 +17,12 @@ use serde_json::{Value, json};
 use tokio::sync::broadcast::error::RecvError;
 use tokio::sync::{broadcast, watch};
 
-use crate::Shared;
+use crate::{IsOwner, Shared};
 
 const SUBPROTOCOLS: [&str; 2] = ["foxglove.sdk.v1", "foxglove.websocket.v1"];
 /// Samples that wait for a client; the eldest are dropped for newer ones.
 const MAX_WAITING: usize = 2048;
-/// Clients that are served at a time; others are turned away.
+/// Clients that are served at a time; others without the token are turned away.
 const MAX_CLIENTS: usize = 16;
 /// A client sends lists of channels, nothing larger.
 const MAX_MESSAGE_BYTES: usize = 64 * 1024;
@@ -120,7 +121,11 @@ struct Subscription {
     channel_id: u32,
 }
 
-pub(crate) async fn connect(State(shared): State<Arc<Shared>>, upgrade: WebSocketUpgrade) -> Response {
+pub(crate) async fn connect(
+    State(shared): State<Arc<Shared>>,
+    Extension(IsOwner(is_owner)): Extension<IsOwner>,
+    upgrade: WebSocketUpgrade,
+) -> Response {
     if shared.streams.is_none() {
         return (StatusCode::NOT_FOUND, "start the page with --foxglove\n").into_response();
     }
@@ -129,9 +134,9 @@ pub(crate) async fn connect(State(shared): State<Arc<Shared>>, upgrade: WebSocke
         let expected = format!("expected the subprotocol {}\n", SUBPROTOCOLS.join(" or "));
         return (StatusCode::BAD_REQUEST, expected).into_response();
     }
-    upgrade.on_upgrade(|socket| async move {
+    upgrade.on_upgrade(move |socket| async move {
         let Some(streams) = &shared.streams else { return };
-        if streams.n_clients.fetch_add(1, Ordering::Relaxed) < MAX_CLIENTS {
+        if streams.n_clients.fetch_add(1, Ordering::Relaxed) < MAX_CLIENTS || is_owner {
             let mut client = Client { streams, advertised: Arc::default(), subscriptions: BTreeMap::new(), socket };
             // An error is the end of the connection.
             let _ = client.serve().await;

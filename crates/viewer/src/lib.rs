@@ -5,11 +5,13 @@
 //! misses events and is told how many; it holds up neither the caller nor other browsers. Of a recording, the page asks for one
 //! grasp after the other ([`Grasps`]).
 //!
-//! Without a [`Control`] the page can only be read. With one, a browser that knows the token may give orders. The page is served
-//! on the loopback interface, and requests that a page from elsewhere makes are refused by their host and origin.
+//! Without a [`Control`] the page can only be read. With one, a browser that knows the token may give orders, and others do not
+//! keep it out. The page is served on the loopback interface, and requests that a page from elsewhere makes are refused by their
+//! host and origin.
 
 mod control;
 mod foxglove;
+mod serving;
 
 use std::convert::Infallible;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -17,13 +19,13 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use axum::Router;
 use axum::body::{Body, Bytes};
-use axum::extract::{Path, Request, State};
+use axum::extract::{DefaultBodyLimit, Path, Request, State};
 use axum::http::{HeaderMap, HeaderValue, Method, StatusCode, header};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
+use axum::{Extension, Router};
 use blindgrasp_pictures::{STAGE_JS, THREE_JS};
 use futures_util::stream;
 use tokio::sync::broadcast;
@@ -32,11 +34,14 @@ use tokio::sync::broadcast::error::RecvError;
 pub use control::{Act, Control, Order};
 pub use foxglove::Channel;
 use foxglove::Streams;
+use serving::Owned;
 
 /// Events that wait for a browser; the eldest are dropped for newer ones.
 const MAX_WAITING: usize = 64;
-/// Browsers that are served at a time; others are turned away.
+/// Browsers that read events at a time; others without the token are turned away.
 const MAX_BROWSERS: usize = 64;
+/// Bytes of an order.
+const MAX_ORDER_BYTES: usize = 16 << 10;
 /// The address of orders.
 const ORDERS: &str = "/orders";
 /// The address of Foxglove's WebSocket.
@@ -124,9 +129,10 @@ impl Viewer {
             .route(ORDERS, post(control::order))
             .route("/log", get(control::log))
             .route(FOXGLOVE, get(foxglove::connect))
+            .layer(DefaultBodyLimit::max(MAX_ORDER_BYTES))
             .with_state(Arc::clone(&shared))
-            .layer(middleware::from_fn(guard));
-        std::thread::spawn(move || runtime.block_on(async { axum::serve(listener, pages).await }));
+            .layer(middleware::from_fn_with_state(Arc::clone(&shared), guard));
+        std::thread::spawn(move || runtime.block_on(serving::serve(listener, pages)));
         let viewer = Viewer { shared, address };
         // A page reloads if another server answers at its address.
         let started = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
@@ -140,9 +146,10 @@ impl Viewer {
         format!("http://{}{}", self.address, token.unwrap_or_default())
     }
 
-    /// The address for Foxglove, if it may read.
+    /// The address for Foxglove, if it may read. With a control it holds the token, for a place of its own.
     pub fn foxglove_address(&self) -> Option<String> {
-        self.shared.streams.as_ref().map(|_| format!("ws://{}{FOXGLOVE}", self.address))
+        let token = self.shared.control.as_ref().map(|control| format!("?token={}", control.token()));
+        self.shared.streams.as_ref().map(|_| format!("ws://{}{FOXGLOVE}{}", self.address, token.unwrap_or_default()))
     }
 
     /// Replaces the streams that Foxglove may read.
@@ -212,14 +219,31 @@ fn event(name: &str, json: &str) -> Bytes {
     format!("event: {name}\ndata: {}\n\n", json.replace('\n', " ")).into()
 }
 
-/// Refuses what a page from elsewhere asks for, and adds what tells browsers to be strict.
-async fn guard(request: Request, next: Next) -> Response {
+/// Whether a request bears the token of the page's owner.
+#[derive(Clone, Copy)]
+struct IsOwner(bool);
+
+/// Refuses what a page from elsewhere asks for, and orders without the token before their body is read. It adds what tells
+/// browsers to be strict.
+async fn guard(
+    State(shared): State<Arc<Shared>>,
+    Extension(connection): Extension<Owned>,
+    mut request: Request,
+    next: Next,
+) -> Response {
+    let is_owner = shared.control.as_ref().is_some_and(|control| control.is_borne_by(&request));
+    if is_owner {
+        connection.mark();
+    }
+    request.extensions_mut().insert(IsOwner(is_owner));
     let refused = |status: StatusCode, why: &'static str| (status, why).into_response();
     let is_allowed = if request.uri().path() == FOXGLOVE { may_be_foxglove } else { is_from_here };
     let mut response = if !is_allowed(request.headers()) {
         refused(StatusCode::FORBIDDEN, "expected Host: localhost or 127.0.0.1, and no page from elsewhere\n")
     } else if !matches!(*request.method(), Method::GET | Method::HEAD) && request.uri().path() != ORDERS {
         refused(StatusCode::METHOD_NOT_ALLOWED, "expected GET: this can only be read\n")
+    } else if request.uri().path() == ORDERS && !is_owner {
+        control::refusal(&shared)
     } else {
         next.run(request).await
     };
@@ -275,8 +299,8 @@ impl Drop for Reader {
     }
 }
 
-async fn events(State(shared): State<Arc<Shared>>) -> Response {
-    if shared.n_browsers.fetch_add(1, Ordering::Relaxed) >= MAX_BROWSERS {
+async fn events(State(shared): State<Arc<Shared>>, Extension(IsOwner(is_owner)): Extension<IsOwner>) -> Response {
+    if shared.n_browsers.fetch_add(1, Ordering::Relaxed) >= MAX_BROWSERS && !is_owner {
         shared.n_browsers.fetch_sub(1, Ordering::Relaxed);
         return (StatusCode::SERVICE_UNAVAILABLE, format!("{MAX_BROWSERS} browsers are served already\n"))
             .into_response();
@@ -384,6 +408,12 @@ mod tests {
         };
         let set = r#"{"order":"set","node":"a","param":"b","value":"1"}"#;
         let with_token = format!("Authorization: Bearer {token}");
+        // The answer comes before the body, which would never be complete.
+        let endless = |head: &str| {
+            answer(&viewer, &format!("POST /orders HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2000000\r\n{head}"))
+        };
+        assert!(endless("X: y").starts_with("HTTP/1.1 401"), "{}", endless("X: y"));
+        assert!(sent(&viewer, &with_token, &"7".repeat(MAX_ORDER_BYTES + 1)).starts_with("HTTP/1.1 413"));
         for (head, status) in [
             ("X: y".to_owned(), 401),
             (format!("Authorization: Bearer {}", &token[1..]), 401),
@@ -439,6 +469,36 @@ mod tests {
         let n_dropped: usize =
             told.map(|pair| pair[1].trim_start_matches("data: ").parse::<usize>().expect("a number")).sum();
         assert!(n_dropped > 0 && n_frames + n_dropped == 400, "{n_frames} frames, {n_dropped} dropped");
+    }
+
+    /// Strangers who read events, and others who never end the head of a request, keep the owner out of nothing.
+    #[test]
+    fn the_owner_of_the_token_always_comes_in() {
+        let control = Control::new(Box::new(|_| Ok("done".into()))).expect("a token");
+        let viewer = Viewer::serve(0, Abilities { control: Some(control), ..Abilities::default() }).expect("served");
+        viewer.keep("scene", "1");
+        let token = viewer.address().split_once('#').map(|(_, token)| token.to_owned()).expect("a token");
+        let mut readers = Vec::new();
+        for _ in 0..MAX_BROWSERS {
+            let mut reader = BufReader::new(asked(&viewer, "GET /events HTTP/1.1\r\nHost: localhost"));
+            read_until(&mut reader, "data: 1");
+            readers.push(reader);
+        }
+        let of_owner = format!("GET /events?token={token} HTTP/1.1\r\nHost: localhost");
+        let mut owner = BufReader::new(asked(&viewer, &of_owner));
+        read_until(&mut owner, "data: 1");
+        let half_requests: Vec<_> = (0..300)
+            .map(|_| {
+                let mut client = TcpStream::connect(viewer.address).expect("connected");
+                client.write_all(b"GET / HTTP/1.1\r\n").expect("sent");
+                client
+            })
+            .collect();
+        let log = format!("GET /log HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {token}");
+        assert!(answer(&viewer, &log).starts_with("HTTP/1.1 200"));
+        viewer.send("frame", "2");
+        read_until(&mut owner, "data: 2");
+        drop(half_requests);
     }
 
     #[test]

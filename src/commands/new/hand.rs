@@ -10,7 +10,7 @@ use anyhow::{Context, bail};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{RecordedGrasp, grasp_svg};
 use blindgrasp_ros::cdr::{self, Value};
-use blindgrasp_ros::node::{MAX_RECEIVED_BYTES, MessageType, Quality, RosNode, topic_name};
+use blindgrasp_ros::node::{MAX_RECEIVED_BYTES, MessageType, Quality, Rights, RosNode, topic_key, topic_name};
 use blindgrasp_ros::standard;
 use blindgrasp_simulator::mechanism::Mechanism;
 use blindgrasp_simulator::pad_grid::pad_grid;
@@ -217,7 +217,8 @@ fn described(topic: &str, network: &Ros2Network) -> anyhow::Result<String> {
     let topic = topic_name("/", topic)?;
     let definition = standard::definition("std_msgs/msg/String").context("no definition of std_msgs/msg/String")?;
     let message = MessageType { name: definition.name.clone(), hash: definition.hash() };
-    let mut node = RosNode::new(network.open()?, domain, "/", "blindgrasp_new_hand")?;
+    let rights = Rights { takes: vec![topic_key(domain, &topic)], ..Rights::default() };
+    let mut node = RosNode::new(network.open(&rights)?, domain, "/", "blindgrasp_new_hand")?;
     let (sender, received) = std::sync::mpsc::channel();
     let _subscriber = node.subscriber(&topic, &message, Quality::KeepLast(1), move |it| drop(sender.send(it)))?;
     let received = received.recv_timeout(DESCRIPTION_LIMIT).map_err(|_| {

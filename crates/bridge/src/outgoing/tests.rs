@@ -27,6 +27,14 @@ fn sent(outgoing: &mut Outgoing, now_nanos: u64) -> Vec<u64> {
     seqs
 }
 
+/// Saves the samples that must be, and returns the last one that may be committed.
+fn saved(outgoing: &mut Outgoing, now_nanos: u64) -> Option<SampleId> {
+    while outgoing.next_to_save(now_nanos).is_some() {
+        outgoing.saved();
+    }
+    outgoing.commit_point()
+}
+
 #[test]
 fn nothing_goes_before_it_is_asked_for_and_then_from_there() {
     let mut outgoing = outgoing(EdgePolicy::Lossless, 8, 8, 100);
@@ -223,9 +231,9 @@ fn of_latest_only_the_newest_waits() {
     outgoing.on_resume(2, Some(key(4)));
     assert_eq!(outgoing.status("a/b", 0).n_lost, 6);
     assert_eq!(sent(&mut outgoing, 0), [7]);
-    assert_eq!(outgoing.commit_point(u64::MAX), Some(key(6)));
+    assert_eq!(saved(&mut outgoing, u64::MAX), Some(key(6)));
     outgoing.on_ack(2, 1, Some(key(7)), 0);
-    assert_eq!(outgoing.commit_point(u64::MAX), Some(key(7)));
+    assert_eq!(saved(&mut outgoing, u64::MAX), Some(key(7)));
 }
 
 #[test]
@@ -241,32 +249,32 @@ fn the_writer_can_always_go_on_while_the_receiver_is_cut_off() {
             let is_all_answered = n > 0 && place == Some(key((n - 1) * step));
             assert!(next.seq - first_unanswered.min(next.seq) < capacity as u64 || is_all_answered, "{n}");
             outgoing.push(next, Vec::new(), 0, 1000);
-            place = outgoing.commit_point(1000);
+            place = saved(&mut outgoing, 1000);
             if capacity == 64 && step == 1 {
                 let n_in_memory_only = place.map_or(0, |place| place.seq + 1);
                 assert_eq!(n_in_memory_only, (n + 1).saturating_sub(48), "the last ones lie in the history as well");
             }
         }
         // A new epoch begins when the old one is answered.
-        assert_eq!(outgoing.commit_point(1000 + COMMIT_AFTER_NANOS), Some(key(499 * step)));
+        assert_eq!(saved(&mut outgoing, 1000 + COMMIT_AFTER_NANOS), Some(key(499 * step)));
     }
 }
 
 #[test]
 fn a_place_goes_on_as_answers_come() {
     let mut outgoing = outgoing(EdgePolicy::Lossless, 100, 8, 100);
-    assert_eq!(outgoing.commit_point(0), None);
+    assert_eq!(saved(&mut outgoing, 0), None);
     outgoing.on_resume(1, None);
     push(&mut outgoing, 0..5);
     sent(&mut outgoing, 0);
-    assert_eq!(outgoing.commit_point(u64::MAX), None);
+    assert_eq!(saved(&mut outgoing, u64::MAX), None);
     outgoing.on_ack(1, 3, Some(key(1)), 0);
-    assert_eq!(outgoing.commit_point(u64::MAX), Some(key(1)));
+    assert_eq!(saved(&mut outgoing, u64::MAX), Some(key(1)));
     push(&mut outgoing, 5..10);
-    assert_eq!(outgoing.commit_point(0), Some(key(3)));
+    assert_eq!(saved(&mut outgoing, 0), Some(key(3)));
     // A sample that was not sent cannot be answered.
     outgoing.on_ack(1, 900, Some(key(9)), 0);
-    assert_eq!((outgoing.commit_point(0), outgoing.n_waiting()), (Some(key(4)), 5));
+    assert_eq!((saved(&mut outgoing, 0), outgoing.n_waiting()), (Some(key(4)), 5));
 }
 
 #[test]
@@ -293,7 +301,8 @@ fn the_end_is_sent_when_all_is_answered_and_after_each_request() {
 }
 
 #[test]
-fn the_loss_of_an_earlier_process_is_counted_at_the_first_request() {
+fn a_process_that_takes_over_goes_on_with_what_was_saved() {
+    let kept = |seq| KeptSample { key: key(seq), origin_nanos: 100 + seq, message: vec![seq as u8] };
     let options = OutgoingOptions {
         policy: EdgePolicy::Lossless,
         window: 8,
@@ -301,15 +310,27 @@ fn the_loss_of_an_earlier_process_is_counted_at_the_first_request() {
         buffer: 100,
         stall_limit_nanos: STALL_LIMIT,
     };
-    for (after, n_lost) in [(Some(key(10)), 0), (Some(key(4)), 6), (Some(SampleId { epoch: 1, seq: 3 }), 11), (None, 0)]
-    {
-        let mut outgoing = Outgoing::new(options, Some(key(10)));
-        push(&mut outgoing, 11..13);
-        outgoing.on_resume(1, after);
-        assert_eq!(outgoing.status("a/b", 0).n_lost, n_lost, "{after:?}");
-        outgoing.on_resume(2, after);
-        assert_eq!(outgoing.status("a/b", 0).n_lost, n_lost, "counted once: {after:?}");
-        assert_eq!(sent(&mut outgoing, 0), [11, 12]);
+    // Saved samples, the last committed one, the last one that the receiver has, and the samples that it gets. The writer sends
+    // those behind the committed one again.
+    for (saved, committed, after, expected) in [
+        (4..8, 7, Some(3), vec![4, 5, 6, 7, 8, 9]),
+        (4..8, 7, Some(5), vec![6, 7, 8, 9]),
+        (4..8, 7, None, vec![4, 5, 6, 7, 8, 9]),
+        (4..8, 7, Some(8), vec![9]),
+        // It was killed before it committed them, or after later ones were answered.
+        (4..8, 5, Some(3), vec![4, 5, 6, 7, 8, 9]),
+        (4..8, 3, Some(3), vec![4, 5, 6, 7, 8, 9]),
+        (4..6, 7, Some(7), vec![8, 9]),
+    ] {
+        let mut outgoing = Outgoing::new(options, Some(key(committed)));
+        outgoing.restore(saved.clone().map(kept).collect(), 0);
+        assert_eq!(outgoing.commit_point(), Some(key(committed)));
+        push(&mut outgoing, committed + 1..10);
+        outgoing.on_resume(1, after.map(key));
+        assert_eq!(sent(&mut outgoing, 0), expected, "{saved:?} {committed} {after:?}");
+        outgoing.on_ack(1, 100, Some(key(9)), 0);
+        assert_eq!((outgoing.n_waiting(), outgoing.status("a/b", 0).n_lost), (0, 0));
+        assert_eq!((outgoing.commit_point(), outgoing.committed().len()), (Some(key(9)), 0));
     }
 }
 
@@ -334,7 +355,7 @@ fn a_receiver_that_answers_nothing_is_cut_off_until_it_answers() {
     for seq in 5..1000 {
         assert!(outgoing.wants_more(true, now_nanos));
         push(&mut outgoing, seq..seq + 1);
-        assert!(outgoing.commit_point(now_nanos + COMMIT_AFTER_NANOS).is_some_and(|point| point.seq == seq));
+        assert!(saved(&mut outgoing, now_nanos + COMMIT_AFTER_NANOS).is_some_and(|point| point.seq == seq));
     }
     // Samples 1 to 4 were sent, so that only the receiver knows whether they are lost.
     assert_eq!(outgoing.status("a/b", 0).n_lost, 994 - 5);

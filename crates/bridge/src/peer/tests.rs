@@ -192,3 +192,15 @@ fn the_next_due_time_is_always_in_the_future() {
     }
     assert_eq!(robot.peer.state, PeerState::Down);
 }
+
+/// A refusal is not signed. It is the state of a peer that was never found, and only shown of one that was.
+#[test]
+fn a_refusal_changes_no_state_of_a_peer_that_was_found() {
+    let [mut robot, mut brain] = pair();
+    assert!(robot.peer.on_refusal("another version") && robot.peer.state == PeerState::Refused);
+    greet(&mut robot, &mut brain, 0);
+    assert!(robot.peer.state == PeerState::Up && !robot.peer.on_refusal("forged"));
+    robot.peer.on_leaving(PeerState::Down);
+    assert!(robot.peer.on_refusal("forged") && robot.peer.state == PeerState::Down);
+    assert_eq!(robot.peer.reason.as_deref(), Some("it refuses: forged"));
+}

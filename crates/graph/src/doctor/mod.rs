@@ -101,7 +101,8 @@ pub fn examine(measurement: Measurement, operators: &Operators) -> Vec<Finding> 
         findings.extend(wake_ups(lateness::measure(n_cores)));
     }
     findings.push(sandbox(supported()));
-    findings.push(files(getrlimit(Resource::Nofile).current));
+    // The launcher raises its own limit to this one.
+    findings.push(files(getrlimit(Resource::Nofile).maximum));
     let memory_lock = getrlimit(Resource::Memlock).current;
     findings.extend(real_time::findings(lateness::granted_priority(), memory_lock, n_cores));
     findings.extend(serial_devices());
@@ -286,7 +287,7 @@ fn files(limit: Option<u64>) -> Finding {
     let check = "open files";
     match limit {
         Some(limit) if limit < ENOUGH_FILES => {
-            Finding::warning(check, format!("at most {limit} a process"), format!("ulimit -n {ENOUGH_FILES} or more"))
+            Finding::warning(check, format!("at most {limit} a process"), format!("ulimit -Hn {ENOUGH_FILES} or more"))
         }
         Some(limit) => Finding::ok(check, format!("at most {limit} a process")),
         None => Finding::ok(check, "no limit"),

@@ -29,6 +29,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use serde_json::Value;
 
 use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
@@ -37,6 +38,7 @@ use crate::dataflow::{Graph, Node, Program};
 use crate::launcher::clients::Clients;
 use crate::launcher::link_book::LinkBook;
 use crate::launcher::log_writer::{Log, LogWriter};
+pub use crate::launcher::process::ZENOH_THREADS;
 use crate::launcher::process::{LineSink, Process, ProcessOutput, Start};
 use crate::launcher::server::Ask;
 use crate::launcher::service::Service;
@@ -64,6 +66,8 @@ const MAX_PENDING_EVENTS: usize = 1024;
 const MAX_UNREAD_LINES: usize = 4096;
 /// An old instance stays for at most this long until its last samples are answered.
 const READ_LIMIT: Duration = Duration::from_secs(30);
+/// The limit of descriptors is not raised further: a connection of a stranger takes about 15 kB of the link's memory.
+const MOST_DESCRIPTORS: u64 = 1 << 16;
 /// An operator must apply a parameter within this time.
 const SET_LIMIT: Duration = Duration::from_secs(5);
 
@@ -228,6 +232,17 @@ struct Member {
     counts: BTreeMap<String, u64>,
 }
 
+/// Raises the limit of descriptors of this process and of those that it starts as far as it may: connections of strangers to
+/// the link take some, and the usual limit (1024) is for programs that call select().
+fn raise_descriptor_limit() {
+    let limit = getrlimit(Resource::Nofile);
+    let most = limit.maximum.unwrap_or(MOST_DESCRIPTORS).min(MOST_DESCRIPTORS);
+    if limit.current.is_some_and(|current| current < most) {
+        // A process may raise its soft limit to the hard one. If the system refuses nevertheless, the graph runs as before.
+        let _ = setrlimit(Resource::Nofile, Rlimit { current: Some(most), ..limit });
+    }
+}
+
 impl Launcher {
     /// Starts all processes of a graph, in its order, and answers commands on `control`.
     ///
@@ -242,6 +257,7 @@ impl Launcher {
         decisions: Arc<Mutex<DecisionStatus>>,
         options: LaunchOptions,
     ) -> Result<Launcher, LaunchError> {
+        raise_descriptor_limit();
         let (sender, events) = sync_channel(MAX_PENDING_EVENTS);
         let now = Instant::now();
         let log_folder = LogFolder::of_graph(name);

@@ -26,15 +26,15 @@ use blindgrasp_operator::wiring::{
     WIRING_VARIABLE, Wiring,
 };
 
+/// The environment of a process that opens TLS connections: its Zenoh receives and sends on one thread. It reads and writes a
+/// TLS connection without a lock, which on several threads breaks the connections or the process (eclipse-zenoh/zenoh issue
+/// 2557). Its other work keeps its threads: with everything on one thread, a client of a router takes ten seconds to close.
+pub const ZENOH_THREADS: (&str, &str) = ("ZENOH_RUNTIME", "(tx: (worker_threads: 1), rx: (handover: tx))");
 /// The arguments of the program that runs the operators of a group.
 const GROUP_ARGS: [&str; 2] = ["operator", "group"];
 
 /// A longer line is split.
 const MAX_LINE_BYTES: u64 = 64 << 10;
-/// In the link, Zenoh receives and sends on one thread: it reads and writes TLS connections without a lock, which on
-/// several threads breaks the connections or the process (eclipse-zenoh/zenoh issue 2557). Its other work keeps its
-/// threads: with everything on one thread, a client of a router takes ten seconds to close.
-const ZENOH_THREADS: (&str, &str) = ("ZENOH_RUNTIME", "(tx: (worker_threads: 1), rx: (handover: tx))");
 /// The last log lines of an operator explain its failure.
 const N_KEPT_LINES: usize = 20;
 /// A killed process ends within this time, unless it waits for a device.
@@ -176,7 +176,7 @@ impl Process {
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .process_group(0);
-        if node.is_link() {
+        if starts.iter().any(|start| start.node.is_link() || start.node.description.uses_network) {
             command.env(ZENOH_THREADS.0, ZENOH_THREADS.1);
         }
         let options = node.process.clone();

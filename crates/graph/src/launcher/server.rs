@@ -24,6 +24,9 @@ const MAX_PENDING_REPLIES: usize = 256;
 const RETRY_PAUSE: std::time::Duration = std::time::Duration::from_millis(100);
 /// The most clients at a time.
 const MAX_CLIENTS: usize = 32;
+/// Clients beyond them may only ask to stop the graph, within this time, as many at a time.
+const MAX_LATE_CLIENTS: usize = 8;
+const LATE_LIMIT: std::time::Duration = std::time::Duration::from_secs(1);
 
 /// A request and where to answer.
 pub(super) struct Ask {
@@ -78,19 +81,28 @@ pub(super) fn serve(
                     continue;
                 }
             };
-            if n_clients.load(Ordering::Relaxed) >= MAX_CLIENTS {
-                continue;
-            }
             let Some(client_name) = own_user(&stream) else {
                 continue;
             };
             let trail = Trail::new(audit.clone(), client_name);
-            n_clients.fetch_add(1, Ordering::Relaxed);
+            let n_before = n_clients.fetch_add(1, Ordering::Relaxed);
+            if n_before >= MAX_CLIENTS + MAX_LATE_CLIENTS {
+                n_clients.fetch_sub(1, Ordering::Relaxed);
+                // It is told within the room of the socket: nothing waits for it.
+                let _ = stream.set_nonblocking(true);
+                let _ = refuse(&stream);
+                continue;
+            }
+            let is_late = n_before >= MAX_CLIENTS;
             let (client, events, n_clients) =
                 (next_client.fetch_add(1, Ordering::Relaxed), events.clone(), Arc::clone(&n_clients));
             let pins = Arc::clone(&pins);
             std::thread::spawn(move || {
-                attend(stream, client, &pins, &events, trail);
+                if is_late {
+                    attend_late(stream, client, &pins, &events, trail);
+                } else {
+                    attend(BufReader::new(stream), client, &pins, &events, trail);
+                }
                 n_clients.fetch_sub(1, Ordering::Relaxed);
             });
         }
@@ -105,8 +117,45 @@ fn own_user(stream: &UnixStream) -> Option<String> {
         .then(|| format!("uid {} pid {}", peer.uid.as_raw(), peer.pid.as_raw_nonzero()))
 }
 
-fn attend(stream: UnixStream, client: u64, pins: &BTreeMap<String, Pins>, events: &SyncSender<Event>, trail: Trail) {
-    let Ok(writer) = stream.try_clone() else {
+/// Tells a client that there is no place for it.
+fn refuse(mut stream: &UnixStream) -> std::io::Result<()> {
+    let message = format!("too many commands at work ({MAX_CLIENTS}): end some of them; stop still works");
+    let reply = Reply::Error { message, rolled_back: false };
+    stream.write_all(format!("{}\n", serde_json::to_string(&reply)?).as_bytes())
+}
+
+/// Attends to a client beyond the others if its first request is to stop the graph.
+fn attend_late(
+    stream: UnixStream,
+    client: u64,
+    pins: &BTreeMap<String, Pins>,
+    events: &SyncSender<Event>,
+    trail: Trail,
+) {
+    let is_limited = stream.set_read_timeout(Some(LATE_LIMIT)).is_ok();
+    let mut reader = BufReader::new(stream);
+    // A request to stop fits into the reader's memory, from which it is not taken yet.
+    let is_stop = is_limited
+        && reader.fill_buf().is_ok_and(|bytes| {
+            let line = bytes.split(|byte| *byte == b'\n').next().unwrap_or_default();
+            matches!(serde_json::from_slice(line), Ok(Request::Stop))
+        });
+    if is_stop && reader.get_ref().set_read_timeout(None).is_ok() {
+        attend(reader, client, pins, events, trail);
+    } else {
+        // A client that does not read has gone, or goes on alone.
+        let _ = refuse(reader.get_ref());
+    }
+}
+
+fn attend(
+    mut reader: BufReader<UnixStream>,
+    client: u64,
+    pins: &BTreeMap<String, Pins>,
+    events: &SyncSender<Event>,
+    trail: Trail,
+) {
+    let Ok(writer) = reader.get_ref().try_clone() else {
         return;
     };
     let (reply, replies) = sync_channel(MAX_PENDING_REPLIES);
@@ -115,7 +164,6 @@ fn attend(stream: UnixStream, client: u64, pins: &BTreeMap<String, Pins>, events
         let trail = Arc::clone(&trail);
         move || write_replies(writer, &replies, &trail)
     });
-    let mut reader = BufReader::new(stream);
     let mut line = Vec::new();
     loop {
         line.clear();
@@ -166,5 +214,51 @@ fn write_replies(mut writer: UnixStream, replies: &Receiver<Reply>, trail: &Mute
         {
             return;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::launcher::log_writer::LogWriter;
+    use crate::log::{AUDIT, LogFolder, LogFormat};
+
+    /// Clients of the same user, or of the link, may leave no place for others.
+    #[test]
+    fn beyond_the_most_clients_stop_is_served_and_others_are_told() {
+        let temporary = tempfile::tempdir().expect("a folder");
+        let writer = LogWriter::new(LogFolder::at(temporary.path().join("graph")), LogFormat::Text);
+        let socket = temporary.path().join("socket");
+        let listener = UnixListener::bind(&socket).expect("bound");
+        let (events, asked) = sync_channel(64);
+        let _server = serve(&listener, BTreeMap::new(), &events, writer.log_if_written(AUDIT)).expect("served");
+        let connect = || UnixStream::connect(&socket).expect("connected");
+        let ask = |mut client: &UnixStream, request: &Request| {
+            writeln!(client, "{}", serde_json::to_string(request).expect("JSON")).expect("sent");
+        };
+        let said = |client: &UnixStream| {
+            let mut line = String::new();
+            BufReader::new(client).read_line(&mut line).expect("read");
+            line
+        };
+        let answered = |client: &UnixStream, reply: Reply| {
+            let Ok(Event::Ask(asked)) = asked.recv() else { panic!("a request") };
+            asked.reply.send(reply).expect("sent");
+            said(client)
+        };
+        let clients: Vec<UnixStream> = (0..MAX_CLIENTS).map(|_| connect()).collect();
+        for client in &clients {
+            ask(client, &Request::Status);
+            answered(client, Reply::Stopping);
+        }
+        let late = connect();
+        ask(&late, &Request::Status);
+        assert!(said(&late).contains("too many commands at work"));
+        let stopping = connect();
+        ask(&stopping, &Request::Stop);
+        assert!(answered(&stopping, Reply::Stopping).contains("stopping"));
+        // The others still have their places.
+        ask(&clients[0], &Request::Status);
+        answered(&clients[0], Reply::Drained);
     }
 }

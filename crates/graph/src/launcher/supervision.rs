@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use crate::control::{GraphState, NodeState};
-use crate::dataflow::RestartPolicy;
+use crate::dataflow::{Restart, RestartPolicy};
 use crate::launcher::{LaunchError, Launcher, Member, RUNNING};
 use crate::log::log_tail;
 use blindgrasp_operator::cursors::SampleId;
@@ -19,6 +19,16 @@ const MAX_QUARANTINE: usize = 64;
 
 /// A launcher that has not looked for longer than this was stopped.
 const AWAY_NANOS: u64 = 1_000_000_000;
+
+/// The pause before a restart, after so many others. A writer fails that waits for a reader for as long as `wait_limit`: the next
+/// instance must be there sooner.
+fn pause_before(restart: &Restart, n_before: u32, wait_limit: Duration) -> Duration {
+    if n_before == 0 {
+        return Duration::ZERO;
+    }
+    let first = Duration::from_millis(restart.backoff_millis);
+    (first * (1 << (n_before - 1).min(10))).min(MAX_BACKOFF.min(wait_limit / 2).max(first))
+}
 
 impl Launcher {
     /// Finds dead and hung processes, and starts them again if they may be.
@@ -221,13 +231,7 @@ impl Launcher {
             return self.give_up(idx, message);
         }
         let n_before = member.restarts.len() as u32;
-        let backoff = match n_before {
-            0 => Duration::ZERO,
-            n => {
-                let backoff = Duration::from_millis(restart.backoff_millis);
-                (backoff * (1 << (n - 1).min(10))).min(MAX_BACKOFF.max(backoff))
-            }
-        };
+        let backoff = pause_before(&restart, n_before, self.options.wait_limit);
         member.state = NodeState::Restarting;
         member.died.get_or_insert(now);
         member.restart_at = Some(now + backoff);
@@ -311,5 +315,21 @@ impl Launcher {
             self.service.has_status(RUNNING);
             self.degraded = None;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_node_is_back_before_its_writers_give_up() {
+        let millis = Duration::from_millis;
+        let pause = |n_before, wait_millis| pause_before(&Restart::default(), n_before, millis(wait_millis));
+        let pauses: Vec<Duration> = [0, 1, 2, 9, 10, 60].map(|n_before| pause(n_before, 5000)).into();
+        assert_eq!(pauses, [0, 10, 20, 2500, 2500, 2500].map(millis));
+        assert_eq!((pause(10, 60_000), pause(11, 60_000)), (millis(5120), MAX_BACKOFF));
+        let slow = Restart { backoff_millis: 60_000, ..Restart::default() };
+        assert_eq!(pause_before(&slow, 5, millis(5000)), millis(60_000), "the file asks for it");
     }
 }

@@ -186,6 +186,7 @@ impl<S: RunSink> RunLog<S> {
         let dropped = |policy: EdgePolicy| {
             edges.iter().filter(|edge| edge.policy == policy).map(|edge| edge.dropped).sum::<u64>()
         };
+        let n_lost_to_machines = lost_to_machines(ran, EdgePolicy::Lossless);
         let counts = ran.status.nodes.iter().filter(|node| !node.counts.is_empty());
         let score = &self.evaluation.score;
         let summary = RunSummary {
@@ -209,8 +210,9 @@ impl<S: RunSink> RunLog<S> {
             latency_nanos: latency(&self.latencies_nanos),
             samples_lost: dropped(EdgePolicy::Lossless)
                 + skipped_by_stages(ran.graph, &edges)
-                + lost_to_machines(ran, EdgePolicy::Lossless)
-                + missing_from_machines(ran.graph, &edges),
+                + n_lost_to_machines
+                // What never reached another machine is missing in its answers as well.
+                + missing_from_machines(ran.graph, &edges).saturating_sub(n_lost_to_machines),
             samples_dropped: dropped(EdgePolicy::Latest) + lost_to_machines(ran, EdgePolicy::Latest),
             edges_unknown: edges.iter().filter(|edge| edge.received > edge.sent).count(),
             restarts: ran.status.nodes.iter().map(|node| node.n_restarts).sum(),

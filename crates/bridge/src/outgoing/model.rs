@@ -1,0 +1,238 @@
+//! A model of a lossless channel: a writer with a history, the sending end, the file of saved samples, and a receiver. All orders
+//! of a few steps are tried, kills of the sending process between any two among them. No order may lose a sample or send one
+//! that the receiver has.
+
+use std::collections::BTreeSet;
+
+use super::*;
+
+const N_SAMPLES: u64 = 3;
+/// The writer's limit; its history holds what is not committed.
+const CAPACITY: usize = 2;
+/// Late enough for a sample to be committed while the receiver is away.
+const NOW_NANOS: u64 = COMMIT_AFTER_NANOS;
+const OPTIONS: OutgoingOptions = OutgoingOptions {
+    policy: EdgePolicy::Lossless,
+    window: 2,
+    capacity: CAPACITY,
+    buffer: 100,
+    stall_limit_nanos: u64::MAX,
+};
+
+fn key(seq: u64) -> SampleId {
+    SampleId { epoch: 1, seq }
+}
+
+/// The content of the file where it holds nothing else than what is needed.
+fn saved(sender: &Outgoing) -> Vec<KeptSample> {
+    let kept = |(key, origin_nanos, message): (SampleId, u64, &[u8])| KeptSample {
+        key,
+        origin_nanos,
+        message: message.into(),
+    };
+    sender.committed().map(kept).collect()
+}
+
+#[derive(Debug, Clone)]
+struct State {
+    n_written: u64,
+    /// On the cursors: the sample up to which the writer forgets.
+    committed: Option<SampleId>,
+    /// The number of samples that the link has read.
+    n_read: u64,
+    sender: Outgoing,
+    spool: Vec<KeptSample>,
+    n_received: u64,
+    is_wrong: bool,
+    run: u32,
+    n_kills: u32,
+    n_cuts: u32,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Step {
+    Write,
+    Read,
+    Save,
+    Commit,
+    ForgetAnswered,
+    Kill,
+    Resume,
+    Deliver,
+    Answer,
+    CutOff,
+}
+
+const STEPS: [Step; 10] = [
+    Step::Write,
+    Step::Read,
+    Step::Save,
+    Step::Commit,
+    Step::ForgetAnswered,
+    Step::Kill,
+    Step::Resume,
+    Step::Deliver,
+    Step::Answer,
+    Step::CutOff,
+];
+
+impl State {
+    fn new() -> State {
+        State {
+            n_written: 0,
+            committed: None,
+            n_read: 0,
+            sender: Outgoing::new(OPTIONS, None),
+            spool: Vec::new(),
+            n_received: 0,
+            is_wrong: false,
+            run: 0,
+            n_kills: 0,
+            n_cuts: 0,
+        }
+    }
+
+    /// The state after a step; `None` if the step is not possible.
+    fn after(&self, step: Step, saves: bool) -> Option<State> {
+        let mut next = self.clone();
+        let n_committed = self.committed.map_or(0, |committed| committed.seq + 1);
+        match step {
+            Step::Write => {
+                if self.n_written == N_SAMPLES || self.n_written - n_committed >= CAPACITY as u64 {
+                    return None;
+                }
+                next.n_written += 1;
+            }
+            Step::Read => {
+                if self.n_read == self.n_written || !next.sender.wants_more(self.sender.run.is_some(), NOW_NANOS) {
+                    return None;
+                }
+                next.sender.push(key(self.n_read), vec![self.n_read as u8], 0, 0);
+                next.n_read += 1;
+            }
+            Step::Save => {
+                let (key, origin_nanos, message) = self.sender.next_to_save(NOW_NANOS)?;
+                if saves {
+                    next.spool.push(KeptSample { key, origin_nanos, message: message.into() });
+                }
+                next.sender.saved();
+            }
+            Step::Commit => {
+                next.committed = self.sender.commit_point();
+                if next.committed == self.committed {
+                    return None;
+                }
+            }
+            Step::ForgetAnswered => {
+                let kept = self.sender.committed();
+                if kept.len() >= self.spool.len() {
+                    return None;
+                }
+                next.spool = saved(&self.sender);
+            }
+            Step::Kill => {
+                if self.n_kills == 2 {
+                    return None;
+                }
+                next.n_kills += 1;
+                next.sender = Outgoing::new(OPTIONS, self.committed);
+                next.sender.restore(self.spool.clone(), 0);
+                next.spool = saved(&next.sender);
+                next.n_read = n_committed;
+            }
+            Step::Resume => {
+                if self.sender.run.is_some() || self.run == 3 {
+                    return None;
+                }
+                next.resume();
+            }
+            Step::Deliver => {
+                if !next.deliver() {
+                    return None;
+                }
+            }
+            Step::Answer => {
+                if self.n_received == 0 {
+                    return None;
+                }
+                next.answer();
+            }
+            Step::CutOff => {
+                if self.sender.run.is_none() || self.n_cuts == 1 {
+                    return None;
+                }
+                next.n_cuts += 1;
+                next.sender.cut_off();
+            }
+        }
+        Some(next)
+    }
+
+    fn resume(&mut self) {
+        self.run += 1;
+        self.sender.on_resume(self.run, self.n_received.checked_sub(1).map(key));
+    }
+
+    /// Hands the next sample to the receiver; false if none is due.
+    fn deliver(&mut self) -> bool {
+        let Some(next) = self.sender.next(NOW_NANOS) else { return false };
+        // The receiver takes what comes, as from a writer whose numbers have gaps.
+        self.is_wrong |= next.key.seq != self.n_received;
+        self.n_received = self.n_received.max(next.key.seq + 1);
+        true
+    }
+
+    fn answer(&mut self) {
+        let n = self.n_received;
+        self.sender.on_ack(self.run, n, n.checked_sub(1).map(key), NOW_NANOS);
+    }
+
+    /// Whether the receiver gets all samples from here on without any fault.
+    fn loses_nothing(&self) -> bool {
+        let mut state = self.clone();
+        state.sender.cut_off();
+        state.resume();
+        for _ in 0..4 * N_SAMPLES {
+            for step in [Step::Write, Step::Read] {
+                if let Some(next) = state.after(step, true) {
+                    state = next;
+                }
+            }
+            while state.deliver() {}
+            state.answer();
+            state.committed = state.sender.commit_point();
+        }
+        state.n_received == N_SAMPLES && !state.is_wrong && state.sender.n_lost == 0
+    }
+}
+
+/// The number of states that were found, and whether some of them has lost a sample. `saves` is the rule: a sample that is
+/// committed without an answer is saved before.
+fn explore(saves: bool) -> (usize, bool) {
+    let mut seen = BTreeSet::new();
+    let mut open = vec![State::new()];
+    while let Some(state) = open.pop() {
+        if !seen.insert(format!("{state:?}")) {
+            continue;
+        }
+        if !state.loses_nothing() {
+            return (seen.len(), true);
+        }
+        for step in STEPS {
+            open.extend(state.after(step, saves));
+        }
+    }
+    (seen.len(), false)
+}
+
+#[test]
+fn no_order_of_steps_and_kills_loses_a_sample() {
+    let (n_states, has_lost) = explore(true);
+    assert!(!has_lost);
+    assert!(n_states > 1000, "{n_states}");
+}
+
+#[test]
+fn samples_that_are_committed_and_not_saved_are_lost() {
+    assert!(explore(false).1);
+}

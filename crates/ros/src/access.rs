@@ -1,0 +1,68 @@
+//! Zenoh's access control for a session: what passes its connections. Everything else is denied.
+//!
+//! Without it, a session passes messages on between the programs that connect to it, and takes samples on all keys to which
+//! something here subscribes. With TLS it goes by the common name in the certificate at the other end.
+
+use serde_json::{Value, json};
+
+/// What a session takes from other programs, and what it sends. Keys are key expressions of Zenoh.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Rights {
+    /// Keys of which samples are taken.
+    pub takes: Vec<String>,
+    /// Keys under which samples are sent.
+    pub sends: Vec<String>,
+    /// Keys of services that are answered.
+    pub answers: Vec<String>,
+}
+
+/// The tokens by which nodes of ROS 2 show themselves.
+const ROS_TOKENS: &str = "@ros2_lv/**";
+/// All keys that others may ask about: `**` does not match a part that begins with `@`.
+const ALL_KEYS: [&str; 3] = ["**", "**/@adv/**", ROS_TOKENS];
+
+/// The part `access_control` of Zenoh's configuration. With TLS, `names` are the common names of the certificates that take
+/// part.
+pub(super) fn access_control(rights: &Rights, names: Option<&[String]>) -> Value {
+    let Rights { takes, sends, answers } = rights;
+    // What publishers keep for subscribers that come later, and the tokens of such publishers.
+    let beside = |keys: &[String]| keys.iter().map(|key| format!("{key}/@adv/**")).collect::<Vec<_>>();
+    let (taken, sent) = (beside(takes), beside(sends));
+    let all_keys = ALL_KEYS.map(String::from).to_vec();
+    let wanted: [(&str, &[&str], Vec<String>); 13] = [
+        ("egress", &["declare_subscriber"], takes.clone()),
+        ("egress", &["query"], [takes.as_slice(), &taken].concat()),
+        ("egress", &["declare_liveliness_subscriber", "liveliness_query"], taken.clone()),
+        ("ingress", &["put"], takes.clone()),
+        ("ingress", &["reply"], [takes.as_slice(), &taken].concat()),
+        ("ingress", &["declare_queryable", "liveliness_token"], taken),
+        ("egress", &["put"], sends.clone()),
+        ("egress", &["reply"], [sends.as_slice(), &sent, answers].concat()),
+        ("egress", &["declare_queryable"], [sent.as_slice(), answers].concat()),
+        ("egress", &["liveliness_token"], [sent.as_slice(), &[ROS_TOKENS.into()]].concat()),
+        ("ingress", &["declare_liveliness_subscriber", "liveliness_query"], all_keys.clone()),
+        ("ingress", &["declare_subscriber"], if sends.is_empty() { vec![] } else { all_keys.clone() }),
+        ("ingress", &["query"], if sends.is_empty() && answers.is_empty() { vec![] } else { all_keys }),
+    ];
+    let rules: Vec<Value> = wanted
+        .iter()
+        .filter(|(_, _, keys)| !keys.is_empty())
+        .enumerate()
+        .map(|(idx, (flow, messages, keys))| {
+            json!({"id": idx.to_string(), "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys})
+        })
+        .collect();
+    let ids: Vec<&Value> = rules.iter().map(|rule| &rule["id"]).collect();
+    let policies = json!([{"rules": ids, "subjects": ["others"]}]);
+    let mut subject = json!({"id": "others"});
+    if let Some(names) = names {
+        subject["cert_common_names"] = json!(names);
+    }
+    json!({
+        "enabled": true,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": [subject],
+        "policies": policies,
+    })
+}
