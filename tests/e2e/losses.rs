@@ -334,10 +334,12 @@ fn kill_the_old_one_and_its_reader(writer: &str, reader: &str, changes: &[(Strin
     let probation = Probation::begin(&graph, writer);
     kill(&[old, slow]);
     graph.wait_for_restart(reader, 1);
+    graph.wait_for_restart(writer, 1);
     graph.wait_for_decisions(2 * A_FEW_GRASPS);
     let ended = graph.stop();
     drop(probation);
-    assert_whole(&ended, &decisions_of(&flow), 1, &format!("the old {writer} and {reader} killed"));
+    // The new process begins again as well, after the last sample that is answered.
+    assert_whole(&ended, &decisions_of(&flow), 2, &format!("the old {writer} and {reader} killed"));
 }
 
 #[test]

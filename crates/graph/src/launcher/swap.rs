@@ -435,7 +435,12 @@ impl Launcher {
                 process.look();
                 !process.is_running() || process.failure().is_some()
             });
-            if has_failed && self.members[target.idx].standby.as_mut().is_some_and(|old| !old.is_running()) {
+            let old = self.members[target.idx].standby.as_mut();
+            let has_ended = old.is_some_and(|old| {
+                old.look();
+                !old.is_running()
+            });
+            if has_failed && has_ended {
                 // No operator is left to go back to: the new program is started again.
                 return self.conclude_swap();
             }

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use iceoryx2::port::subscriber::SubscriberCreateError;
-use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
 use iceoryx2::port::update_connections::UpdateConnections;
+use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
 use iceoryx2::prelude::{Node, ipc};
 use iceoryx2::service::port_factory::PortFactory;
 
