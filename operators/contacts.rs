@@ -71,7 +71,7 @@ struct Watch {
     reported: Reported,
 }
 
-/// The faults that this instance has reported.
+/// The faults that were reported. The last grasp with one and the counts are a part of the state.
 #[derive(Default)]
 struct Reported {
     fault: Option<SensorFault>,
@@ -145,23 +145,24 @@ impl Stage for FindContacts {
         if let Some(watch) = &mut self.watch
             && std::mem::take(&mut watch.reported.has_counted)
         {
-            watch.operator.has_counted(watch.reported.counts.clone());
+            watch.operator.has_counted_in_all(watch.reported.counts.clone());
         }
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
         match &self.watch {
-            Some(watch) => encode_state(&watch.memory, bytes),
+            Some(Watch { memory, reported, .. }) => encode_state((memory, reported.grasp, &reported.counts), bytes),
             None => Ok(()),
         }
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
         if let Some(watch) = &mut self.watch {
-            watch.memory = match state {
+            let restored = match state {
                 Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
-                None => SensorMemory::default(),
+                None => (SensorMemory::default(), None, BTreeMap::new()),
             };
+            (watch.memory, watch.reported.grasp, watch.reported.counts) = restored;
         }
         Ok(())
     }

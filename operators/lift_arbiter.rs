@@ -10,7 +10,7 @@ use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_stat
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter, Probe};
 use blindgrasp_stages::promise_monitor::PromiseMonitor;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 #[derive(Deserialize)]
@@ -81,6 +81,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         n_decisions: 0,
         last_arrival_nanos: 0,
         decided: Vec::new(),
+        ended: EndedPromises::default(),
         reported: Default::default(),
     };
     stage::run(operator, "prediction", "decision", 0, BTreeMap::new(), stage)
@@ -110,8 +111,17 @@ struct Arbiter {
     n_decisions: u64,
     last_arrival_nanos: u64,
     decided: Vec<LiftDecision>,
+    ended: EndedPromises,
     /// The outcomes that are counted in the node's status, and the number of lifts without one.
     reported: (PromiseMonitor, u64),
+}
+
+/// The outcomes of lifts under promises that another one has replaced.
+#[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
+struct EndedPromises {
+    n_kept: u64,
+    n_dropped: u64,
+    n_withdrawn: u64,
 }
 
 impl Stage for Arbiter {
@@ -178,31 +188,46 @@ impl Stage for Arbiter {
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
-        encode_state((self.arbiter.state(), self.last, self.n_decisions), bytes)
+        encode_state((self.arbiter.state(), self.last, self.n_decisions, self.ended), bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
         self.decided.clear();
         // Silence counts from now: before, this instance did not listen.
         self.last_arrival_nanos = blindgrasp_operator::monotonic_nanos();
-        let (state, last, n_decisions) = match state {
+        let (state, last, n_decisions, ended): (ArbiterState, _, _, _) = match state {
             Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
-            None => (ArbiterState::default(), Header::default(), 0),
+            None => Default::default(),
         };
+        self.ended = ended;
+        let promise = state.promise().clone();
         self.arbiter.restore(state);
+        self.has_replaced(&promise);
         self.report();
         (self.last, self.n_decisions) = (last, n_decisions);
         Ok(())
     }
 
     fn set(&mut self, params: &Map<String, Value>) -> anyhow::Result<()> {
-        self.arbiter.set_options(parse_params::<Params>(params)?.options());
+        let options = parse_params::<Params>(params)?.options();
+        let promise = self.arbiter.state().promise().clone();
+        self.arbiter.set_options(options);
+        self.has_replaced(&promise);
         self.report();
         Ok(())
     }
 }
 
 impl Arbiter {
+    /// Keeps the outcomes under a promise, if the arbiter has another one now.
+    fn has_replaced(&mut self, before: &PromiseMonitor) {
+        if self.arbiter.state().promise() != before {
+            self.ended.n_kept += before.n_kept;
+            self.ended.n_dropped += before.n_dropped;
+            self.ended.n_withdrawn += u64::from(before.is_withdrawn());
+        }
+    }
+
     /// Counts outcomes of lifts in the node's status, and says once that the promise is withdrawn.
     fn report(&mut self) {
         let state = self.arbiter.state();
@@ -219,11 +244,11 @@ impl Arbiter {
                 n_kept + n_dropped
             );
         }
-        self.operator.has_counted(BTreeMap::from([
-            ("lifts/kept".into(), n_kept),
-            ("lifts/dropped".into(), n_dropped),
+        self.operator.has_counted_in_all(BTreeMap::from([
+            ("lifts/kept".into(), self.ended.n_kept + n_kept),
+            ("lifts/dropped".into(), self.ended.n_dropped + n_dropped),
             ("lifts/unreported".into(), state.n_unreported()),
-            ("promise_withdrawn".into(), promise.is_withdrawn().into()),
+            ("promise_withdrawn".into(), self.ended.n_withdrawn + u64::from(promise.is_withdrawn())),
         ]));
         self.reported = (promise.clone(), state.n_unreported());
     }

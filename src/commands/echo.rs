@@ -57,7 +57,7 @@ impl Sink for Echo {
             self.n_left.store(0, Ordering::Relaxed);
         }
         if self.n_left.load(Ordering::Relaxed) > 0 {
-            self.printer.print(json_line(topic, &record)?);
+            self.printer.print(&json_line(topic, &record)?);
             self.n_left.fetch_sub(1, Ordering::Relaxed);
         }
         Ok(())

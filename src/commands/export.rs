@@ -9,7 +9,7 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 use serde_json::json;
 
-use super::{Outcome, check_new, print_line};
+use super::{Outcome, check_new, data_on_stdout, print_line};
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::training::write_feature_table;
 use blindgrasp_messages::files::partial_path;
@@ -105,7 +105,7 @@ fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::R
 
 fn export_lines(arguments: &Arguments, recording: &Path) -> anyhow::Result<Outcome> {
     match &arguments.out {
-        None => write_lines(recording, &arguments.topic, std::io::stdout().lock())?,
+        None => write_lines(recording, &arguments.topic, data_on_stdout())?,
         Some(path) => {
             let file = NewFile::create(path, recording, arguments.overwrite)?;
             write_lines(recording, &arguments.topic, &file.file).with_context(|| path.display().to_string())?;
@@ -146,7 +146,7 @@ fn export_tables(arguments: &Arguments, recording: &Path) -> anyhow::Result<Outc
             );
         }
         for (topic, shape) in &shapes {
-            let stdout: Box<dyn Write> = Box::new(BufWriter::new(std::io::stdout()));
+            let stdout: Box<dyn Write> = Box::new(BufWriter::new(data_on_stdout()));
             tables.insert(topic.clone(), (CsvTable::new(stdout, shape)?, 0));
         }
         write_tables(recording, tables)?;

@@ -9,6 +9,7 @@ use serde::Serialize;
 
 use super::simulate::report_in;
 use super::{Outcome, cases, hand_cells, percent, print_line};
+use blindgrasp_graph::log::printable;
 use blindgrasp_learning::dataset::{REPORT_METADATA, hand_of, label_of};
 use blindgrasp_learning::evaluation::paper_label::PaperLabel;
 use blindgrasp_learning::evaluation::statistics::Interval;
@@ -515,7 +516,8 @@ fn print_paper_label(found: &PaperLabel) -> anyhow::Result<()> {
     ))?;
     for (class, agreement) in found.by_disagreement().into_iter().take(N_CLASSES) {
         print_line(&format!(
-            "  {class:<16} differs in {} of {}: {} stable by the label only, {} by the truth only",
+            "  {:<16} differs in {} of {}: {} stable by the label only, {} by the truth only",
+            printable(class),
             agreement.n_different(),
             agreement.n(),
             agreement.n_stable_by_paper_only,
@@ -530,7 +532,7 @@ fn print_paper_label(found: &PaperLabel) -> anyhow::Result<()> {
 
 fn print_lines(lines: Vec<(&str, String)>) -> anyhow::Result<()> {
     for (what, value) in lines {
-        print_line(&format!("{what:<17} {value}"))?;
+        print_line(&format!("{what:<17} {}", printable(&value)))?;
     }
     Ok(())
 }

@@ -45,7 +45,7 @@ mod train;
 mod trials;
 mod view;
 
-use std::io::Write;
+use std::io::{IsTerminal, Write};
 use std::ops::RangeInclusive;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -54,6 +54,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use anyhow::Context;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
+use blindgrasp_operator::text::{HarmlessWriter, harmless};
 use blindgrasp_session::output::{check_new, check_output, check_page};
 use blindgrasp_session::text_table::{self, percent};
 
@@ -222,12 +223,18 @@ pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
     })
 }
 
-/// Writes a line of results to stdout at once (unlike `println!`, without a panic when nobody reads it).
+/// Writes a line of results to stdout at once, harmless to a terminal (unlike `println!`, without a panic when nobody reads it).
 fn print_line(line: &str) -> std::io::Result<()> {
     let mut stdout = std::io::stdout().lock();
-    stdout.write_all(line.as_bytes())?;
+    stdout.write_all(harmless(line).as_bytes())?;
     stdout.write_all(b"\n")?;
     stdout.flush()
+}
+
+/// Stdout for data: as they are for a program, harmless for a terminal.
+fn data_on_stdout() -> Box<dyn Write> {
+    let stdout = std::io::stdout();
+    if stdout.is_terminal() { Box::new(HarmlessWriter::new(stdout)) } else { Box::new(stdout) }
 }
 
 /// Raised by the signals that stop a command.

@@ -11,7 +11,7 @@ use super::{Outcome, check_new, check_output, percent, print_line};
 use blindgrasp_learning::dataset::{hand_of, label_line};
 use blindgrasp_learning::learners::libsvm_format::{parse_libsvm, write_libsvm};
 use blindgrasp_learning::training::recalibrate;
-use blindgrasp_messages::files::write_whole;
+use blindgrasp_messages::files::{read_regular, write_whole};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::boosting::BoostedTrees;
@@ -177,7 +177,7 @@ fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
     check_new(out, &[file.clone(), like.clone()], arguments.overwrite)?;
     let mut model = Model::load(like)?;
     let Format::Libsvm = arguments.format;
-    let text = std::fs::read_to_string(file).with_context(|| format!("{}", file.display()))?;
+    let text = read_regular(file).with_context(|| format!("{}", file.display()))?;
     let n_features = model.features.len();
     let (svm, calibration) = parse_libsvm(&text, n_features).with_context(|| format!("{}", file.display()))?;
     match calibration {

@@ -13,6 +13,7 @@ use serde::Serialize;
 use super::object_list::list;
 use super::{Outcome, check_new, number_in, percent, print_line};
 use blindgrasp_learning::dataset::REPORT_METADATA;
+use blindgrasp_messages::files::read_regular;
 use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
 use blindgrasp_objects::{objects_id, objects_named};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -283,7 +284,7 @@ pub(super) fn report_in(reader: &RecordingReader, path: &Path) -> anyhow::Result
 fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {
     let mut options = match &arguments.options {
         Some(path) => {
-            let text = std::fs::read_to_string(path).with_context(|| format!("options {}", path.display()))?;
+            let text = read_regular(path).with_context(|| format!("options {}", path.display()))?;
             serde_saphyr::from_str(&text).with_context(|| format!("options {}", path.display()))?
         }
         None => SimulatorOptions::default(),

@@ -6,7 +6,7 @@ use serde_json::json;
 
 use super::elsewhere::MachineArgument;
 use super::{GraphArgument, Outcome, print_line};
-use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph, running_graphs};
+use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_starting_graph, running_graphs};
 use blindgrasp_graph::control::{Reply, Request};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
@@ -32,7 +32,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(destination) = arguments.machine.destination()? {
         return destination.run();
     }
-    let graphs = if arguments.all { running_graphs()? } else { vec![pick_graph(arguments.graph.name())?] };
+    let graphs = if arguments.all { running_graphs()? } else { vec![pick_starting_graph(arguments.graph.name())?] };
     if graphs.is_empty() {
         print_diagnostic("no graph is running");
     }

@@ -57,6 +57,7 @@ mod sensors;
 mod service;
 mod simulate;
 mod start;
+mod strangers;
 mod supervision;
 mod swap;
 mod tactile_source;

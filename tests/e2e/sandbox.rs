@@ -1,11 +1,14 @@
 //! Operators that give up what their work does not need, and those that are given little memory.
 
+use std::path::Path;
+use std::process::Command;
+
 use blindgrasp_operator::sandbox::supported;
 use blindgrasp_operator::wiring::Enforcement;
 
 use crate::common::{
-    FAST_FOREVER, Graph, MODEL, NODES, classifier_runs, dataflow, dataflow_with, of_node, operator, run, script,
-    skipped, stubborn_classifier, swap, text, unique_name, wait_until,
+    FAST_FOREVER, Graph, HAND, MODEL, NODES, blindgrasp, classifier_runs, dataflow, dataflow_with, of_node, operator,
+    project, run, script, skipped, stubborn_classifier, swap, text, unique_name, wait_until,
 };
 
 /// What the intruder tries.
@@ -42,6 +45,102 @@ fn an_operator_in_a_sandbox_can_do_nothing_but_its_work() {
     graph.wait_for_decisions(150);
     let ended = graph.stop();
     assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+}
+
+/// A library that is loaded into each operator. When the operator has reported that it is ready, it tries on the operator's
+/// main thread what the filter of system calls denies.
+const ESCAPE: &str = r#"
+#define _GNU_SOURCE
+#include <errno.h>
+#include <fcntl.h>
+#include <stdio.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <sys/xattr.h>
+#include <unistd.h>
+
+static void try(const char *what, long outcome) {
+    char line[128];
+    int n = snprintf(line, sizeof line, "%s: %s\n", what, outcome >= 0 ? "done" : errno == EACCES ? "denied" : strerror(errno));
+    syscall(SYS_write, 2, line, n);
+}
+
+ssize_t write(int fd, const void *bytes, size_t n) {
+    static int has_tried;
+    ssize_t outcome = syscall(SYS_write, fd, bytes, n);
+    if (fd != 1 || has_tried || !memmem(bytes, n, "\"report\":\"ready\"", 16)) return outcome;
+    has_tried = 1;
+    int error = errno, own = open("/dev/shm", O_TMPFILE | O_RDWR, 0600), program = memfd_create("program", 0);
+    char *const nothing[] = {0};
+    try("own file", own);
+    try("set-user-ID file", open("/dev/shm", O_TMPFILE | O_RDWR, 04700));
+    try("fchmod 4700", fchmod(own, 04700));
+    try("fchmod 0644", fchmod(own, 0644));
+    try("fchmod 0600", fchmod(own, 0600));
+    try("chmod", chmod("/dev/shm", 01777));
+    try("fchmodat", fchmodat(AT_FDCWD, "/dev/shm", 01777, 0));
+    try("chown", chown("/dev/shm", -1, -1));
+    try("fchown", fchown(own, -1, -1));
+    try("setxattr", fsetxattr(own, "user.some", "", 0, 0));
+    try("utimensat", futimens(own, NULL));
+    try("execve", execve("/bin/true", nothing, nothing));
+    try("execveat", syscall(SYS_execveat, program, "", nothing, nothing, AT_EMPTY_PATH));
+    try("io_uring", syscall(SYS_io_uring_setup, 1, NULL));
+    try("socket UNIX", socket(AF_UNIX, SOCK_STREAM, 0));
+    try("socket INET", socket(AF_INET, SOCK_STREAM, 0));
+    try("socket NETLINK", socket(AF_NETLINK, SOCK_RAW, 0));
+    try("socket CAN", socket(AF_CAN, SOCK_RAW, 0));
+    try("socket VSOCK", socket(AF_VSOCK, SOCK_STREAM, 0));
+    try("last", 0);
+    errno = error;
+    return outcome;
+}
+"#;
+
+/// The lines that [`ESCAPE`] writes.
+const N_ESCAPES: usize = 20;
+
+#[test]
+fn no_shipped_operator_can_change_rights_run_programs_or_make_sockets() {
+    if supported() != Enforcement::Full {
+        return skipped("the kernel has no Landlock, or one older than Linux 6.12");
+    }
+    if Command::new("cc").arg("--version").output().is_err() {
+        return skipped("there is no C compiler");
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let source = folder.path().join("escape.c");
+    let library = folder.path().join("escape.so");
+    std::fs::write(&source, ESCAPE).expect("written");
+    let compiled = Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&library).arg(&source).output();
+    let compiled = compiled.expect("started");
+    assert!(compiled.status.success(), "{}", text(&compiled.stderr));
+
+    let try_in = |flow: &Path, nodes: &[&str], expected: &[&str]| {
+        let mut command = blindgrasp();
+        command.env("LD_PRELOAD", &library);
+        let graph = Graph::launch_on(command, &unique_name(), flow, &["--stay"]);
+        for node in nodes {
+            wait_until(|| graph.said().contains(&format!("[{node}] last: done")), || graph.said());
+            let said = graph.said();
+            let of_node = said.lines().filter_map(|line| Some(line.split_once(&format!("[{node}] "))?.1));
+            let outcomes: Vec<&str> =
+                of_node.filter(|line| line.ends_with(": done") || line.ends_with(": denied")).collect();
+            let done: Vec<&str> = outcomes.iter().filter_map(|line| line.strip_suffix(": done")).collect();
+            assert_eq!(done, expected, "{node}");
+            assert_eq!(outcomes.len(), N_ESCAPES, "{node}: {said}");
+        }
+    };
+    try_in(&dataflow(folder.path(), &[]), &NODES, &["own file", "fchmod 0600", "last"]);
+    let flow = folder.path().join("network.yaml");
+    let node =
+        format!("{{sandbox: required, params: {{hand: {}/{HAND}, address: '127.0.0.1:0'}}}}", project().display());
+    std::fs::write(&flow, format!("version: 1\nname: network\noperators:\n  tactile_source: {node}\n"))
+        .expect("written");
+    try_in(&flow, &["tactile_source"], &["own file", "fchmod 0600", "socket INET", "socket NETLINK", "last"]);
 }
 
 #[test]

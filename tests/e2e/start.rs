@@ -49,22 +49,22 @@ fn the_doctor_finds_what_a_dead_graph_left_and_removes_only_that() {
     // Shared memory and a folder as a graph leaves them that was killed with all its operators; and a running graph's.
     let (dead, alive) = (format!("{}-dead", unique_name()), format!("{}-alive", unique_name()));
     let paths_of = |name: &str| {
-        let segment = std::path::PathBuf::from(format!("/dev/shm/blindgrasp_{name}.4242.cursors"));
-        let root = std::env::temp_dir().join(format!("blindgrasp-{name}.4242"));
+        let segment = std::path::PathBuf::from(format!("/dev/shm/blindgrasp_{name}.42424242.cursors"));
+        let root = std::env::temp_dir().join(format!("blindgrasp-{name}.42424242"));
         std::fs::write(&segment, [0; 64]).expect("written");
         std::fs::create_dir(&root).expect("made");
         std::fs::write(root.join("node.details"), b"").expect("written");
         [segment, root]
     };
     let address = <std::os::unix::net::SocketAddr as std::os::linux::net::SocketAddrExt>::from_abstract_name(format!(
-        "blindgrasp-domain/{alive}.4242"
+        "blindgrasp-domain/{alive}.42424242"
     ));
     let lock = std::os::unix::net::UnixListener::bind_addr(&address.expect("short")).expect("free");
     let (left, held) = (paths_of(&dead), paths_of(&alive));
     // The same, of a launcher in another network namespace: only the lock on its file tells.
     let far = format!("{}-far", unique_name());
     let far_paths = paths_of(&far);
-    let lock_file = format!("/dev/shm/blindgrasp_{far}.4242.lock");
+    let lock_file = format!("/dev/shm/blindgrasp_{far}.42424242.lock");
     let far_lock = std::fs::File::create(&lock_file).expect("made");
     far_lock.lock().expect("locked");
 
@@ -74,7 +74,7 @@ fn the_doctor_finds_what_a_dead_graph_left_and_removes_only_that() {
     let check = |name: &str| findings.iter().find(|finding| finding["check"] == name).expect("a finding").clone();
     let leftovers = check("leftovers of dead graphs");
     if left.iter().all(|path| path.exists()) {
-        assert!(leftovers["found"].as_str().expect("text").contains(&format!("{dead}.4242 (2 files and folders)")));
+        assert!(leftovers["found"].as_str().expect("text").contains(&format!("{dead}.42424242 (2 files and folders)")));
         assert!(leftovers["advice"].as_str().expect("text").contains("doctor --fix"), "{leftovers}");
     }
     assert!(!leftovers["found"].as_str().expect("text").contains(&alive), "{leftovers}");

@@ -49,7 +49,8 @@ pub fn hand_of(recording: &Path, hand: Option<&Path>) -> Result<Hand, DatasetErr
     let info = reader.info();
     let hand = match hand {
         Some(path) => Hand::load(path)?,
-        None => Hand::load(Path::new(&info.hand)).map_err(|_| {
+        // A stranger's recording names a hand, and no file.
+        None => Hand::built_in(&info.hand).ok_or_else(|| {
             unusable(format!("it was made with the hand '{}': name its pad layout with --hand", info.hand))
         })?,
     };

@@ -1,7 +1,8 @@
-//! Files that are complete or not there.
+//! Files that are complete or not there, and files that can be read to their end.
 
 use std::fs::File;
-use std::io::Write;
+use std::io::{ErrorKind, Read, Write};
+use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 
 /// Where a file is written until it is complete: beside its place, so that a rename puts it there at once.
@@ -9,6 +10,37 @@ pub fn partial_path(path: &Path) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(".partial");
     name.into()
+}
+
+/// Opens a file to read it. A pipe, a device, a socket or a folder is refused: its reading might wait for ever, or never end.
+///
+/// # Errors
+/// The file cannot be opened, or is no regular file.
+pub fn open_regular(path: &Path) -> std::io::Result<File> {
+    let kind = std::fs::metadata(path)?.file_type();
+    if kind.is_file() {
+        return File::open(path);
+    }
+    let found = if kind.is_dir() {
+        "a folder"
+    } else if kind.is_fifo() {
+        "a pipe"
+    } else if kind.is_socket() {
+        "a socket"
+    } else {
+        "a device"
+    };
+    Err(std::io::Error::new(ErrorKind::InvalidInput, format!("it is {found}, expected a regular file")))
+}
+
+/// Reads a text by [`open_regular`].
+///
+/// # Errors
+/// The file cannot be opened or read, is no regular file, or is not UTF-8.
+pub fn read_regular(path: &Path) -> std::io::Result<String> {
+    let mut text = String::new();
+    open_regular(path)?.read_to_string(&mut text)?;
+    Ok(text)
 }
 
 /// Writes a file whole or not at all: under [`partial_path`], onto the disk, and then into its place.
@@ -24,4 +56,25 @@ pub fn write_whole(path: &Path, content: impl AsRef<[u8]>) -> std::io::Result<()
         let _ = std::fs::remove_file(&partial);
     }
     written
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_regular_files_are_read() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (file, socket) = (folder.path().join("file"), folder.path().join("socket"));
+        std::fs::write(&file, "text").expect("written");
+        assert_eq!(read_regular(&file).expect("read"), "text");
+        let _listener = std::os::unix::net::UnixListener::bind(&socket).expect("bound");
+        for (path, found) in [(folder.path(), "a folder"), (&socket, "a socket"), (Path::new("/dev/zero"), "a device")]
+        {
+            let error = open_regular(path).expect_err(found).to_string();
+            assert_eq!(error, format!("it is {found}, expected a regular file"));
+        }
+        let missing = open_regular(&folder.path().join("missing")).expect_err("missing");
+        assert_eq!(missing.kind(), ErrorKind::NotFound);
+    }
 }

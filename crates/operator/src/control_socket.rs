@@ -1,7 +1,11 @@
 //! The sockets at which running graphs take commands: one file for each graph, in a folder of this user alone.
 //!
-//! The folder is `/tmp/blindgrasp-UID`, whatever `TMPDIR` says, so that a command finds each graph of its user. Files, unlike
-//! abstract sockets, are not shared with a container that has its own files and the network of its host.
+//! The folder is `/run/bgrasp` if that belongs to this user, as it does in a service of systemd, otherwise
+//! `/tmp/blindgrasp-UID`. If another user has taken that name, it is `/run/user/UID/blindgrasp`, which no other user can take.
+//! That one is the last choice, because it goes when the user logs out, and a graph may go on. A command looks for graphs in
+//! all of them. Environment variables such as `TMPDIR` are not asked: a command and a graph may have different ones.
+//!
+//! Files, unlike abstract sockets, are not shared with a container that has its own files and the network of its host.
 
 use std::fs::{DirBuilder, File};
 use std::io::{Error, ErrorKind, Result};
@@ -16,6 +20,8 @@ use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
 
 /// The end of a socket's name.
 const SUFFIX: &str = ".sock";
+/// The folder of the graphs of a service (`RuntimeDirectory=` in its unit).
+const SERVICE_FOLDER: &str = "/run/bgrasp";
 
 /// A socket that listens under a graph's name. Dropping it frees the name.
 #[derive(Debug)]
@@ -31,12 +37,13 @@ impl ControlSocket {
     /// # Errors
     /// [`ErrorKind::AddrInUse`] if a process listens under this name; the folder cannot be made, or is another user's.
     pub fn bind(graph: &str) -> Result<ControlSocket> {
-        let _lock = lock_folder()?;
-        let path = path_of(graph);
+        let folder = folder()?;
+        let _lock = lock(&folder)?;
+        let path = path_in(&folder, graph);
         match connect(graph) {
             // The queue of one that does not accept is full.
             Ok(_) | Err(Errno::AGAIN) => return Err(ErrorKind::AddrInUse.into()),
-            Err(Errno::CONNREFUSED) => std::fs::remove_file(&path)?,
+            Err(Errno::CONNREFUSED) => remove_if_there(&path)?,
             Err(_) => {}
         }
         let listener = UnixListener::bind(&path)?;
@@ -53,7 +60,8 @@ impl Drop for ControlSocket {
     fn drop(&mut self) {
         // A socket that was shut down may have been taken for a dead one, and replaced.
         let is_own = |path: &PathBuf| std::fs::metadata(path).is_ok_and(|found| found.ino() == self.inode);
-        if let Ok(_lock) = lock_folder()
+        if let Some(folder) = self.path.parent()
+            && let Ok(_lock) = lock(folder)
             && is_own(&self.path)
         {
             let _ = std::fs::remove_file(&self.path);
@@ -67,9 +75,22 @@ impl Drop for ControlSocket {
 /// # Errors
 /// [`Errno::NOENT`] or [`Errno::CONNREFUSED`] if no process listens, [`Errno::AGAIN`] if too many wait for it.
 pub fn connect(graph: &str) -> rustix::io::Result<OwnedFd> {
+    let mut outcome = Err(Errno::NOENT);
+    for folder in own_folders() {
+        match connect_to(&path_in(&folder, graph)) {
+            Err(Errno::NOENT) => {}
+            // A folder may still have the socket of a dead process, and another one that of a living.
+            Err(Errno::CONNREFUSED) => outcome = Err(Errno::CONNREFUSED),
+            connected => return connected,
+        }
+    }
+    outcome
+}
+
+fn connect_to(path: &Path) -> rustix::io::Result<OwnedFd> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
     let socket = rustix::net::socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
-    rustix::net::connect(&socket, &SocketAddrUnix::new(path_of(graph))?)?;
+    rustix::net::connect(&socket, &SocketAddrUnix::new(path)?)?;
     Ok(socket)
 }
 
@@ -80,25 +101,46 @@ pub fn connect(graph: &str) -> rustix::io::Result<OwnedFd> {
 pub fn names() -> Result<Vec<String>> {
     // A file outlives a process that is killed; the kernel's list doesn't. Connecting would disturb those that listen.
     let sockets = String::from_utf8_lossy(&std::fs::read("/proc/net/unix")?).into_owned();
-    let mut names = listening(&sockets, &folder());
-    names.retain(|name| path_of(name).exists());
+    let mut names = Vec::new();
+    for folder in own_folders() {
+        let listening = listening(&sockets, &folder);
+        names.extend(listening.into_iter().filter(|name| path_in(&folder, name).exists()));
+    }
+    names.sort();
+    names.dedup();
     Ok(names)
+}
+
+/// The names of processes that were killed, with the files that they have left.
+pub fn dead() -> Vec<(String, PathBuf)> {
+    own_folders().iter().filter_map(|folder| dead_in(folder).ok()).flatten().collect()
 }
 
 /// Removes the files of processes that were killed.
 pub fn remove_dead() {
-    let (Ok(_lock), Ok(living), Ok(entries)) = (lock_folder(), names(), std::fs::read_dir(folder())) else {
-        return;
-    };
-    for path in entries.filter_map(|entry| Some(entry.ok()?.path())) {
+    for folder in own_folders() {
+        if let Ok(_lock) = lock(&folder) {
+            for (_, path) in dead_in(&folder).unwrap_or_default() {
+                let _ = std::fs::remove_file(path);
+            }
+        }
+    }
+}
+
+fn dead_in(folder: &Path) -> Result<Vec<(String, PathBuf)>> {
+    let living = names()?;
+    let mut dead = Vec::new();
+    for path in std::fs::read_dir(folder)?.filter_map(|entry| Some(entry.ok()?.path())) {
         let name = path.file_name().and_then(|name| name.to_str()).and_then(|name| name.strip_suffix(SUFFIX));
         // A container that shares the folder may have a list of sockets of its own.
         if let Some(name) = name.filter(|name| !living.iter().any(|living| living == name))
-            && matches!(connect(name), Err(Errno::CONNREFUSED))
+            && matches!(connect_to(&path), Err(Errno::CONNREFUSED))
         {
-            let _ = std::fs::remove_file(path);
+            dead.push((name.to_string(), path));
         }
     }
+    dead.sort();
+    Ok(dead)
 }
 
 /// The names of sockets in a folder. The columns are number, references, protocol, flags, type, state, inode, path.
@@ -117,17 +159,12 @@ fn listening(sockets: &str, folder: &Path) -> Vec<String> {
     names
 }
 
-/// The file of a graph's socket.
-pub fn path_of(graph: &str) -> PathBuf {
-    folder().join(format!("{graph}{SUFFIX}"))
-}
-
 /// The socket at which a live tactile source listens by default: other users cannot send frames.
 ///
 /// # Errors
 /// The folder cannot be made, or is open to other users.
 pub fn tactile_path() -> Result<PathBuf> {
-    Ok(checked_folder()?.join("tactile.hand"))
+    Ok(folder()?.join("tactile.hand"))
 }
 
 /// The file of a socket by which machines of a graph are linked that are one computer.
@@ -135,34 +172,95 @@ pub fn tactile_path() -> Result<PathBuf> {
 /// # Errors
 /// The folder cannot be made, or is open to other users.
 pub fn link_path(name: &str) -> Result<PathBuf> {
-    Ok(checked_folder()?.join(format!("{name}.link")))
+    Ok(folder()?.join(format!("{name}.link")))
 }
 
-fn folder() -> PathBuf {
-    PathBuf::from(format!("/tmp/blindgrasp-{}", rustix::process::getuid().as_raw()))
+fn path_in(folder: &Path, graph: &str) -> PathBuf {
+    folder.join(format!("{graph}{SUFFIX}"))
 }
 
-/// No other process binds or frees a name until the file is dropped.
-fn lock_folder() -> Result<File> {
-    let file = File::open(checked_folder()?)?;
+fn remove_if_there(path: &Path) -> Result<()> {
+    match std::fs::remove_file(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
+        outcome => outcome,
+    }
+}
+
+/// No other process binds or frees a name in a folder until the file is dropped.
+fn lock(folder: &Path) -> Result<File> {
+    let file = File::open(folder)?;
     flock(&file, FlockOperation::LockExclusive)?;
     Ok(file)
 }
 
-/// Makes the folder if it is missing.
-fn checked_folder() -> Result<PathBuf> {
-    let path = folder();
-    match DirBuilder::new().mode(0o700).create(&path) {
-        Err(error) if error.kind() != ErrorKind::AlreadyExists => return Err(error),
-        _ => {}
+/// The folder of this user's sockets. It is made if it is missing.
+///
+/// # Errors
+/// The folder cannot be made, or is another user's.
+pub fn folder() -> Result<PathBuf> {
+    choose(&candidates(), own_uid())
+}
+
+/// The folders that may have sockets of this user.
+fn own_folders() -> Vec<PathBuf> {
+    let uid = own_uid();
+    candidates().into_iter().map(|candidate| candidate.path).filter(|path| check(path, uid).is_ok()).collect()
+}
+
+fn own_uid() -> u32 {
+    rustix::process::getuid().as_raw()
+}
+
+/// A folder that may have sockets of this user.
+struct Candidate {
+    path: PathBuf,
+    /// It may be made if it is missing.
+    is_made: bool,
+}
+
+/// The folders that may have sockets of this user, the first choice first.
+fn candidates() -> [Candidate; 3] {
+    let uid = own_uid();
+    [
+        Candidate { path: SERVICE_FOLDER.into(), is_made: false },
+        Candidate { path: format!("/tmp/blindgrasp-{uid}").into(), is_made: true },
+        Candidate { path: format!("/run/user/{uid}/blindgrasp").into(), is_made: true },
+    ]
+}
+
+/// The first candidate that is a user's, made if it is missing. The error is that of the first one that could not be made.
+fn choose(candidates: &[Candidate], uid: u32) -> Result<PathBuf> {
+    let mut first_error = None;
+    for Candidate { path, is_made } in candidates {
+        let made = if *is_made { make(path) } else { Ok(()) };
+        match made.and_then(|()| check(path, uid)) {
+            Ok(()) => return Ok(path.clone()),
+            Err(error) if *is_made => drop(first_error.get_or_insert(error)),
+            Err(_) => {}
+        }
     }
-    let found = std::fs::symlink_metadata(&path)?;
-    if !found.is_dir() || found.uid() != rustix::process::getuid().as_raw() || found.mode() & 0o077 != 0 {
-        let message =
-            format!("{} must be a folder of this user with mode 0700: remove it, or change it", path.display());
-        return Err(Error::new(ErrorKind::PermissionDenied, message));
+    Err(first_error.unwrap_or_else(|| ErrorKind::NotFound.into()))
+}
+
+fn make(path: &Path) -> Result<()> {
+    match DirBuilder::new().mode(0o700).create(path) {
+        Err(error) if error.kind() == ErrorKind::AlreadyExists => Ok(()),
+        outcome => outcome,
     }
-    Ok(path)
+}
+
+/// Refuses a folder that other users may write to, or that is one of them.
+fn check(path: &Path, uid: u32) -> Result<()> {
+    let found = std::fs::symlink_metadata(path)?;
+    let cure = if !found.is_dir() || found.uid() != uid {
+        "the system's administrator must remove it (sudo rm -r)"
+    } else if found.mode() & 0o077 != 0 {
+        "chmod 0700, if all that is in it is yours"
+    } else {
+        return Ok(());
+    };
+    let message = format!("{} must be a folder of this user with mode 0700: {cure}", path.display());
+    Err(Error::new(ErrorKind::PermissionDenied, message))
 }
 
 #[cfg(test)]
@@ -172,9 +270,11 @@ mod tests {
     #[test]
     fn a_name_is_one_processs_until_it_ends_however_it_ends() {
         let name = format!("socket-{}@brain", std::process::id());
+        let folder = folder().expect("a folder");
+        let path_of = |name: &str| path_in(&folder, name);
         assert_eq!(connect(&name).expect_err("nobody listens"), Errno::NOENT);
         let socket = ControlSocket::bind(&name).expect("free");
-        assert_eq!(std::fs::metadata(folder()).expect("made").mode() & 0o777, 0o700);
+        assert_eq!(std::fs::metadata(&folder).expect("made").mode() & 0o777, 0o700);
         assert!(names().expect("read").contains(&name));
         assert_eq!(ControlSocket::bind(&name).expect_err("taken").kind(), ErrorKind::AddrInUse);
         drop(socket);
@@ -182,6 +282,7 @@ mod tests {
         // A process that is killed leaves the file.
         drop(UnixListener::bind(path_of(&name)).expect("free"));
         assert!(!names().expect("read").contains(&name) && path_of(&name).exists());
+        assert!(dead().contains(&(name.clone(), path_of(&name))));
         remove_dead();
         assert!(!path_of(&name).exists());
         drop(UnixListener::bind(path_of(&name)).expect("free"));
@@ -193,6 +294,28 @@ mod tests {
         assert!(connect(&name).is_ok());
         drop(next);
         assert!(!path_of(&name).exists());
+    }
+
+    #[test]
+    fn a_folder_that_another_user_has_taken_first_is_passed_over() {
+        let parent = tempfile::tempdir().expect("a folder");
+        let at = |name: &str| parent.path().join(name);
+        let candidates = [("service", false), ("tmp", true), ("run", true)]
+            .map(|(name, is_made)| Candidate { path: at(name), is_made });
+        let uid = own_uid();
+        assert_eq!(choose(&candidates, uid).expect("made"), at("tmp"));
+        // A link stands for a folder of another user: neither belongs to this one.
+        std::fs::remove_dir(at("tmp")).expect("removed");
+        std::os::unix::fs::symlink("/tmp", at("tmp")).expect("a link");
+        assert_eq!(choose(&candidates, uid).expect("made"), at("run"));
+        assert_eq!(choose(&candidates[..2], uid + 1).expect_err("taken").kind(), ErrorKind::PermissionDenied);
+        let error = choose(&candidates[..2], uid).expect_err("taken").to_string();
+        assert!(error.contains("tmp must be a folder of this user") && error.contains("administrator"), "{error}");
+        std::fs::remove_file(at("tmp")).expect("removed");
+        DirBuilder::new().mode(0o755).create(at("tmp")).expect("made");
+        assert!(choose(&candidates[..2], uid).expect_err("open").to_string().contains("chmod 0700"));
+        DirBuilder::new().mode(0o700).create(at("service")).expect("made");
+        assert_eq!(choose(&candidates, uid).expect("a service's"), at("service"));
     }
 
     #[test]

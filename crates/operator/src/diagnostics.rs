@@ -6,10 +6,40 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Writes a line to stderr at once. Unlike `eprintln!` it doesn't panic when the reader is gone: the graph goes on.
+use rustix::io::Errno;
+use rustix::process::{Resource, getrlimit};
+
+use crate::text::harmless;
+
+/// Writes a line to stderr at once, harmless to a terminal. Unlike `eprintln!` it doesn't panic when the reader is gone: the graph goes on.
 pub fn print_diagnostic(line: &str) {
     let mut stderr = std::io::stderr().lock();
-    let _ = stderr.write_all(format!("{line}\n").as_bytes());
+    let _ = stderr.write_all(format!("{}\n", harmless(line)).as_bytes());
+}
+
+/// So many descriptors may have been closed again since one was missing.
+const N_CLOSED_AGAIN: u64 = 8;
+/// The descriptors that a process of a graph of sixteen nodes needs, with room.
+pub const ENOUGH_FILES: u64 = 1024;
+
+/// An error with its likely cause, if this process has nearly as many files open as it may: iceoryx2 says only that something
+/// has failed. To be called right where the error came.
+pub fn with_lack_of_files(error: anyhow::Error) -> anyhow::Error {
+    let Some(limit) = getrlimit(Resource::Nofile).current else {
+        return error;
+    };
+    let n_open = match std::fs::read_dir("/proc/self/fd") {
+        Ok(entries) => entries.count() as u64,
+        Err(error) if error.raw_os_error() == Some(Errno::MFILE.raw_os_error()) => limit,
+        Err(_) => 0,
+    };
+    if n_open + N_CLOSED_AGAIN < limit {
+        return error;
+    }
+    error.context(format!(
+        "this process may have {limit} files open, and needs more: raise the limit, with ulimit -n {ENOUGH_FILES} or \
+         LimitNOFILE= of a service"
+    ))
 }
 
 /// A printer that is dropped waits so long for its reader.
@@ -46,8 +76,14 @@ impl LinePrinter {
         LinePrinter { sender: Some(sender), thread: Some(thread), n_dropped: 0, failure }
     }
 
-    /// Writes a line, soon.
-    pub fn print(&mut self, line: String) {
+    /// Writes a line, soon, harmless to a terminal.
+    pub fn print(&mut self, line: &str) {
+        self.print_styled(harmless(line).into_owned());
+    }
+
+    /// As [`LinePrinter::print`], for a line that has colours. The caller sees to it that all other text is
+    /// [`harmless`].
+    pub fn print_styled(&mut self, line: String) {
         if let Some(sender) = &self.sender
             && let Err(TrySendError::Full(_)) = sender.try_send(line)
         {

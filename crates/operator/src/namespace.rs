@@ -7,7 +7,9 @@
 use std::collections::BTreeSet;
 use std::fs::{DirBuilder, File};
 use std::hash::{BuildHasher, RandomState};
+use std::io::Write;
 use std::os::linux::net::SocketAddrExt;
+use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::os::unix::net::{SocketAddr, UnixListener};
 use std::path::PathBuf;
@@ -17,7 +19,8 @@ use iceoryx2::prelude::{
     Config, FileName, LogLevel, Node, NodeBuilder, NodeName, SemanticString, SignalHandlingMode, ipc,
 };
 
-use rustix::fs::FlockOperation;
+use rustix::fs::{FallocateFlags, FlockOperation};
+use rustix::io::Errno;
 
 use crate::control_socket::{self, ControlSocket};
 use crate::diagnostics::print_diagnostic;
@@ -27,25 +30,35 @@ use crate::wiring::NamespaceWiring;
 
 /// The folder of POSIX shared memory on Linux.
 pub const SHARED_MEMORY_FOLDER: &str = "/dev/shm";
-/// The shared memory that must be free before a graph starts: the default graph writes to 10 MiB of it. A process that writes
-/// to shared memory that is not there dies (SIGBUS), so this is checked before.
+/// The shared memory that must be free before a graph starts. A graph with few cells takes so much when it has started, the
+/// default graph 34 MiB ([`take_room`]); a process that writes to shared memory that is not there dies (SIGBUS).
 pub const LEAST_FREE_BYTES: u64 = 16 << 20;
+
+/// A process that dies of full shared memory (SIGBUS) is started again when so much of it is free.
+const LEAST_FREE_FOR_RESTART_BYTES: u64 = 4 << 20;
 
 /// The names of folders of graphs, in the folder for temporary files, begin with this; their id follows.
 const FOLDER_PREFIX: &str = "blindgrasp-";
+/// The unit in which the kernel counts the blocks of a file.
+const BLOCK_BYTES: u64 = 512;
 /// The names of all files that iceoryx2 makes begin with this; the id follows.
 const FILE_PREFIX: &str = "blindgrasp_";
 /// The names of files have so much of the graph's name.
 const MAX_ID_NAME_BYTES: usize = 11;
-/// The random letters in an id: few, because they stand twice in the path of a socket.
+/// The random letters in an id: so many that no other user can take all names first (36^8 is about 3 · 10^12).
 const ID_LETTERS: &[u8; 36] = b"abcdefghijklmnopqrstuvwxyz0123456789";
-const N_ID_LETTERS: usize = 4;
+const N_ID_LETTERS: usize = 8;
 /// So many ids are tried, in case that one is taken.
 const N_ID_TRIES: u32 = 8;
-/// The longest path of a socket (`sun_path`, less the final 0).
-const MAX_SOCKET_PATH_BYTES: usize = 107;
-/// iceoryx2 0.10 adds to the prefix of a socket a number of up to 33 digits, and `.event`.
-const MAX_SOCKET_NAME_BYTES: usize = 33 + 6;
+/// The longest path of a file in iceoryx2 0.10.
+const MAX_PATH_BYTES: usize = 255;
+/// iceoryx2 0.10 adds to the prefix of a connection the digits of a hash, two numbers of up to 33 digits, and an ending.
+const MAX_NAME_BYTES: usize = 40 + 1 + 33 + 1 + 33 + ".connection".len();
+/// The file in which iceoryx2 0.10 counts the processes of a graph. iceoryx2 lets all users of the machine write to it, so the
+/// launcher makes it before the first process joins. The name has the hash of a type.
+const COUNTER_NAME: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.global_mgmt";
+/// The version of iceoryx2 (0.10.0, 16 bits a part), and the count, which is 0, with its padding.
+const COUNTER: [u64; 2] = [10 << 16, 0];
 
 /// Why a graph has no namespace, or a process cannot join it.
 #[derive(Debug, thiserror::Error)]
@@ -64,7 +77,12 @@ pub enum NamespaceError {
     )]
     Full { free_mib: f64, needed_mib: u64 },
     #[error(
-        "the path of the folder for temporary files, {}, is {excess} bytes too long for the sockets below it: set TMPDIR to a \
+        "the graph needs {missing_mib:.1} MiB of shared memory more than are free in {SHARED_MEMORY_FOLDER}: remove old files \
+         there, stop other graphs, or make it larger (mount -o remount,size=…; docker run --shm-size=…)"
+    )]
+    NoRoom { missing_mib: f64 },
+    #[error(
+        "the path of the folder for temporary files, {}, is {excess} bytes too long for the files below it: set TMPDIR to a \
          shorter one",
         folder.display()
     )]
@@ -109,6 +127,7 @@ impl Namespace {
         let (wiring, lock) = Self::reserve_files(name)?;
         let domain = Namespace { name: name.into(), wiring, socket, _lock: lock };
         check_room()?;
+        make_counter(&domain.wiring).map_err(|source| NamespaceError::Lock { name: name.into(), source })?;
         Ok(domain)
     }
 
@@ -118,9 +137,9 @@ impl Namespace {
         for attempt in 1.. {
             let id = Id::new(name);
             let wiring = id.wiring();
-            let n_bytes = wiring.root_path.len() + 1 + wiring.prefix.len() + MAX_SOCKET_NAME_BYTES;
-            if n_bytes > MAX_SOCKET_PATH_BYTES {
-                let excess = n_bytes - MAX_SOCKET_PATH_BYTES;
+            let n_bytes = wiring.root_path.len() + 1 + wiring.prefix.len() + MAX_NAME_BYTES;
+            if n_bytes > MAX_PATH_BYTES {
+                let excess = n_bytes - MAX_PATH_BYTES;
                 return Err(NamespaceError::TooDeep { folder: std::env::temp_dir(), excess });
             }
             let folder = std::env::temp_dir();
@@ -162,8 +181,7 @@ struct Lock {
 }
 
 /// The id in the names of a graph's files: the beginning of the graph's name, for people, and random letters, which
-/// distinguish it from all others and cannot be foreseen. It is short, because iceoryx2 makes sockets below the root path,
-/// and the path of a socket has little room.
+/// distinguish it from all others and cannot be foreseen.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 struct Id(String);
 
@@ -262,15 +280,19 @@ pub fn clear_orphaned(domain: &NamespaceWiring) {
     if let Some(lock) = id_of(domain).and_then(|id| id.lock().ok()) {
         clear_or_say(domain);
         drop(lock);
+        // An operator in a sandbox cannot: then the next graph that starts does.
+        control_socket::remove_dead();
     }
 }
 
-/// The files and folders that ended graphs have left, by id. There are seldom any: the next graph that starts removes them, and
+/// The files and folders that ended graphs have left, by id or name. There are seldom any: the next graph that starts removes them, and
 /// so does [`sweep`].
 pub fn left_over() -> Vec<(String, Vec<PathBuf>)> {
     // Taking the lock shows that no process holds it.
     let dead = ids().into_iter().filter(|id| id.lock().is_ok());
-    dead.map(|id| (id.0.clone(), id.remains())).collect()
+    let mut left: Vec<(String, Vec<PathBuf>)> = dead.map(|id| (id.0.clone(), id.remains())).collect();
+    left.extend(control_socket::dead().into_iter().map(|(name, socket)| (name, vec![socket])));
+    left
 }
 
 /// Removes the files of graphs that were killed before their operators could do so. Returns the files that could not be
@@ -363,17 +385,65 @@ fn config(domain: &NamespaceWiring) -> Result<Config, NamespaceError> {
     Ok(config)
 }
 
+/// Makes the file of [`COUNTER_NAME`] for this user alone.
+fn make_counter(wiring: &NamespaceWiring) -> std::io::Result<()> {
+    let path = format!("{SHARED_MEMORY_FOLDER}/{}{COUNTER_NAME}", wiring.prefix);
+    let mut file = std::fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?;
+    COUNTER.iter().try_for_each(|word| file.write_all(&word.to_ne_bytes()))
+}
+
+/// Takes the memory of a graph's files. The kernel gives memory to a file in shared memory when it is written to for the first
+/// time, and kills a process that writes when there is none left; memory that is taken no other program can take.
+///
+/// # Errors
+/// There is not so much left. What was taken stays taken.
+pub fn take_room(wiring: &NamespaceWiring) -> Result<(), NamespaceError> {
+    let mut n_missing_bytes = 0;
+    for entry in std::fs::read_dir(SHARED_MEMORY_FOLDER).into_iter().flatten().flatten() {
+        if !entry.file_name().as_bytes().starts_with(wiring.prefix.as_bytes()) {
+            continue;
+        }
+        // A file may go meanwhile, with its process, and some are read-only: these are written already.
+        let Ok(file) = std::fs::OpenOptions::new().write(true).open(entry.path()) else {
+            continue;
+        };
+        let Ok(metadata) = file.metadata() else {
+            continue;
+        };
+        let n_bytes_to_take = metadata.len().saturating_sub(metadata.blocks() * BLOCK_BYTES);
+        if n_bytes_to_take > 0
+            && rustix::fs::fallocate(&file, FallocateFlags::empty(), 0, metadata.len()) == Err(Errno::NOSPC)
+        {
+            n_missing_bytes += n_bytes_to_take;
+        }
+    }
+    match n_missing_bytes.saturating_sub(free_bytes().unwrap_or(0)) {
+        _ if n_missing_bytes == 0 => Ok(()),
+        n_bytes => Err(NamespaceError::NoRoom { missing_mib: n_bytes as f64 / f64::from(1 << 20) }),
+    }
+}
+
+/// Whether shared memory is so full that a process may die of it.
+pub fn is_full() -> bool {
+    free_bytes().is_some_and(|free_bytes| free_bytes < LEAST_FREE_FOR_RESTART_BYTES)
+}
+
+/// The shared memory that is free; `None` if it has no limit, or the file system does not say.
+fn free_bytes() -> Option<u64> {
+    let memory = rustix::fs::statvfs(SHARED_MEMORY_FOLDER).ok()?;
+    (memory.f_blocks != 0).then_some(memory.f_bavail * memory.f_frsize)
+}
+
 /// Whether there is room for a graph's shared memory.
 fn check_room() -> Result<(), NamespaceError> {
-    // A file system that has no limit, or does not say, is no reason to refuse.
-    let Ok(memory) = rustix::fs::statvfs(SHARED_MEMORY_FOLDER) else {
-        return Ok(());
-    };
-    let free_bytes = memory.f_bavail * memory.f_frsize;
-    if memory.f_blocks == 0 || free_bytes >= LEAST_FREE_BYTES {
-        return Ok(());
+    match free_bytes() {
+        Some(free_bytes) if free_bytes < LEAST_FREE_BYTES => Err(NamespaceError::Full {
+            free_mib: free_bytes as f64 / f64::from(1 << 20),
+            needed_mib: LEAST_FREE_BYTES >> 20,
+        }),
+        // A file system that has no limit, or does not say, is no reason to refuse.
+        _ => Ok(()),
     }
-    Err(NamespaceError::Full { free_mib: free_bytes as f64 / f64::from(1 << 20), needed_mib: LEAST_FREE_BYTES >> 20 })
 }
 
 #[cfg(test)]
@@ -396,18 +466,61 @@ mod tests {
         }
     }
 
+    /// The names, modes and contents of a graph's files in shared memory.
+    fn files_of(wiring: &NamespaceWiring) -> Vec<(String, u32, Vec<u8>)> {
+        let entries = std::fs::read_dir(SHARED_MEMORY_FOLDER).expect("readable").flatten();
+        let of_graph = entries.filter_map(|entry| {
+            let name = entry.file_name().to_str()?.strip_prefix(&wiring.prefix)?.to_string();
+            Some((name, entry.metadata().ok()?.mode() & 0o7777, std::fs::read(entry.path()).ok()?))
+        });
+        of_graph.collect()
+    }
+
     #[test]
-    fn a_graph_of_the_longest_name_has_room_for_its_sockets() {
+    fn the_counter_of_processes_is_the_one_that_iceoryx2_would_make_but_for_its_mode() {
+        let name = format!("counter-{}", std::process::id());
+        let domain = Namespace::reserve(&name).expect("reserved");
+        let counter = |files: Vec<(String, u32, Vec<u8>)>| files.into_iter().find(|(name, ..)| name == COUNTER_NAME);
+        let (_, own_mode, own) = counter(files_of(domain.wiring())).expect("made");
+        // Without it, iceoryx2 makes its own.
+        let path = format!("{SHARED_MEMORY_FOLDER}/{}{COUNTER_NAME}", domain.wiring().prefix);
+        std::fs::remove_file(path).expect("removed");
+        drop(join(domain.wiring(), "first").expect("joined"));
+        let (_, mode, mut made) = counter(files_of(domain.wiring())).expect("iceoryx2 has made it under this name");
+        assert_eq!((own_mode, mode), (0o600, 0o666));
+        // The first process is counted, and iceoryx2 leaves the padding as it is.
+        made[8..12].fill(0);
+        assert_eq!(own, made);
+    }
+
+    #[test]
+    fn no_file_of_a_graph_is_open_to_other_users() {
+        let domain = Namespace::reserve(&format!("modes-{}", std::process::id())).expect("reserved");
+        let nodes = ["one", "two"].map(|name| join(domain.wiring(), name).expect("joined"));
+        for (name, mode, _) in files_of(domain.wiring()) {
+            assert_eq!(mode & 0o077, 0, "{name}: {mode:o}");
+        }
+        drop(nodes);
+    }
+
+    #[test]
+    fn a_folder_for_temporary_files_with_a_long_path_has_room_for_a_graph() {
+        let id = Id::new("a_graph-with_the_longest_name_32");
+        let NamespaceWiring { prefix, .. } = id.wiring();
+        let n_left = MAX_PATH_BYTES - MAX_NAME_BYTES - prefix.len() - FOLDER_PREFIX.len() - id.0.len() - 2;
+        assert!(n_left >= 64, "{n_left}");
+    }
+
+    #[test]
+    fn a_graphs_name_is_reserved_and_nothing_is_left_of_it() {
         let name = format!("{:0<32}", format!("r{}-", std::process::id()));
         let domain = Namespace::reserve(&name).expect("reserved");
         let again = Namespace::reserve(&name).err().expect("taken");
         assert!(matches!(again, NamespaceError::NameTaken { .. }), "{again}");
         let node = join(domain.wiring(), "reader").expect("joined");
-        let service = node.service_builder(&"a".try_into().expect("a name")).event().open_or_create().expect("made");
-        let listener = service.listener_builder().create().expect("a socket");
         let root_path = PathBuf::from(&domain.wiring().root_path);
         assert!(root_path.exists() && left_over().iter().all(|(_, paths)| !paths.contains(&root_path)));
-        drop((listener, service, node));
+        drop(node);
         drop(domain);
         assert!(!root_path.exists());
     }

@@ -20,7 +20,7 @@ use serde_json::{Map, Value};
 
 use crate::cursors::{STATE_BYTES, SampleId, SharedCursors};
 use crate::description::OperatorDescription;
-use crate::diagnostics::print_diagnostic;
+use crate::diagnostics::{print_diagnostic, with_lack_of_files};
 use crate::link_status::LinkStatus;
 use crate::partner::{PairedInput, Partner, PartnerInput};
 use crate::port::{PortError, Publisher, ShadowPublisher, Subscriber};
@@ -502,7 +502,13 @@ impl Operator {
     pub fn has_counted(&self, counts: BTreeMap<String, u64>) {
         let mut all = self.0.counts.borrow_mut();
         all.extend(counts);
-        self.report(&Report::Counts { counts: all.clone() });
+        self.report(&Report::Counts { counts: all.clone(), in_all: false });
+    }
+
+    /// As [`Operator::has_counted`], for counts that are a part of the stage's state: an instance that takes over goes on with
+    /// them, and reports those of its predecessors as well.
+    pub fn has_counted_in_all(&self, counts: BTreeMap<String, u64>) {
+        self.report(&Report::Counts { counts, in_all: true });
     }
 
     /// Reports, as a link, that all other machines are there and ready.
@@ -577,9 +583,9 @@ fn join_and_work(
     let wiring: Wiring =
         serde_json::from_str(&wiring).with_context(|| format!("{WIRING_VARIABLE} is not a wiring of this version"))?;
     let domain = wiring.domain.clone();
-    let operators = join(std::slice::from_ref(description), vec![wiring])?;
+    let operators = join(std::slice::from_ref(description), vec![wiring]).map_err(with_lack_of_files)?;
     listen(&operators);
-    let outcome = work(&operators[0]);
+    let outcome = work(&operators[0]).map_err(with_lack_of_files);
     drop(operators);
     namespace::clear_orphaned(&domain);
     outcome
@@ -608,10 +614,10 @@ fn join_and_work_together(member: impl Fn(&[String]) -> Option<GroupMember>) -> 
         works.push(work);
         inner.push(wiring);
     }
-    let operators = join(&descriptions, inner)?;
+    let operators = join(&descriptions, inner).map_err(with_lack_of_files)?;
     listen(&operators);
     let domain = operators[0].0.wiring.domain.clone();
-    let outcome = open(&operators, &works).and_then(run_in_turn);
+    let outcome = open(&operators, &works).and_then(run_in_turn).map_err(with_lack_of_files);
     drop(operators);
     namespace::clear_orphaned(&domain);
     outcome

@@ -1,12 +1,13 @@
-//! The sandbox of an operator process, which restricts itself with Landlock.
+//! The sandbox of an operator process, which restricts itself with Landlock and a filter of system calls (seccomp).
 //!
 //! A process with a sandbox restricts itself twice. Before it begins, it gives up running programs, the network, writing files,
-//! signals to other processes and sockets such as the launcher's, through which it could have programs run. When it is ready
-//! and has read its files, it gives up reading any others. It keeps the graph's shared memory and folder, the files that its
-//! params name, and the network if its description says that it uses it.
+//! changing the rights, owner and times of files, signals to other processes, and all sockets, because one leads to the launcher,
+//! through which it could have programs run. When it is ready and has read its files, it gives up reading any others. It keeps
+//! the graph's shared memory and folder, the files that its params name, and the network if its description says that it uses
+//! it.
 //!
-//! Landlock knows sockets in the file system from Linux 7.1 on, and the launcher's is one. So a filter of system calls
-//! (seccomp) denies making sockets of that family. The filter decides nothing else, so that
+//! Landlock decides by the place of a file. It has no rights for sockets other than TCP, for programs in memory or for the mode
+//! and owner of files, so the filter denies these ([`DENIED_CALLS`]). The filter names what is denied, not what is allowed:
 //! another version of a library, with other system calls, does not end an operator.
 //!
 //! Both restrict threads and those that they start. Threads that an operator starts before it is ready can read files for as
@@ -20,7 +21,10 @@ use landlock::{
     RulesetCreatedAttr, RulesetError, RulesetStatus, Scope, make_bitflags, path_beneath_rules,
 };
 use seccompiler::SeccompCmpArgLen::Dword;
-use seccompiler::{SeccompAction, SeccompCmpOp, SeccompCondition, SeccompFilter, SeccompRule, apply_filter};
+use seccompiler::{
+    BpfProgram, SeccompAction, SeccompCmpOp, SeccompCondition, SeccompFilter, SeccompRule, apply_filter,
+    apply_filter_all_threads, sock_filter,
+};
 use serde_json::{Map, Value};
 
 use crate::description::OperatorDescription;
@@ -37,16 +41,71 @@ const NAME_SERVICE_FOLDERS: [&str; 5] = ["/etc", "/usr", "/lib", "/lib64", "/run
 const NULL_DEVICE: &str = "/dev/null";
 /// A device that is plugged in again is another file in this folder.
 const DEVICE_FOLDER: &str = "/dev";
-/// Programs for the x32 ABI of x86-64 have the same system calls under numbers with this bit.
-const X32_BIT: i64 = 0x4000_0000;
+/// System calls from this number on belong to the x32 ABI of x86-64, which has each call under another number.
+const FIRST_X32_CALL: u32 = 0x4000_0000;
+/// System calls that no operator needs. Those with which it would give others rights on a file of its user, or take them from
+/// its user; those that hide from this filter what they do; and those that make files which are neither regular nor folders.
+const DENIED_CALLS: [i64; 17] = [
+    libc::SYS_fchmodat,
+    libc::SYS_fchmodat2,
+    libc::SYS_fchown,
+    libc::SYS_fchownat,
+    libc::SYS_setxattr,
+    libc::SYS_lsetxattr,
+    libc::SYS_fsetxattr,
+    SYS_SETXATTRAT,
+    libc::SYS_removexattr,
+    libc::SYS_lremovexattr,
+    libc::SYS_fremovexattr,
+    SYS_REMOVEXATTRAT,
+    SYS_FILE_SETATTR,
+    libc::SYS_utimensat,
+    libc::SYS_mknodat,
+    // Its mode lies behind a pointer, which a filter cannot follow.
+    libc::SYS_openat2,
+    libc::SYS_io_uring_setup,
+];
+/// The older forms of these calls, which newer machines do not have.
+#[cfg(target_arch = "x86_64")]
+const DENIED_OLD_CALLS: [i64; 7] = [
+    libc::SYS_chmod,
+    libc::SYS_chown,
+    libc::SYS_lchown,
+    libc::SYS_utime,
+    libc::SYS_utimes,
+    libc::SYS_futimesat,
+    libc::SYS_mknod,
+];
+#[cfg(not(target_arch = "x86_64"))]
+const DENIED_OLD_CALLS: [i64; 0] = [];
+/// Calls of Linux 6.13 and 6.17, which have the same numbers on all machines.
+const SYS_SETXATTRAT: i64 = 463;
+const SYS_REMOVEXATTRAT: i64 = 466;
+const SYS_FILE_SETATTR: i64 = 469;
+const PROGRAM_CALLS: [i64; 2] = [libc::SYS_execve, libc::SYS_execveat];
+/// The families of sockets that an operator of the network needs: TCP, UDP, and the kernel's list of interfaces.
+const NETWORK_FAMILIES: [i32; 3] = [libc::AF_INET, libc::AF_INET6, libc::AF_NETLINK];
+/// Types of pairs of sockets of which one end can be connected to another process's socket.
+const DATAGRAM_TYPES: [i32; 2] = [libc::SOCK_DGRAM, libc::SOCK_RAW];
+/// The type of a socket in an argument that has flags as well.
+const SOCKET_TYPE_MASK: u64 = 0xf;
+/// A file with such a mode could be run with its user's rights by others (set-user-ID, set-group-ID).
+const SET_ID_BITS: [libc::mode_t; 2] = [libc::S_ISUID, libc::S_ISGID];
+/// Bits of a mode that an open file must not get: those above, and rights of other users. iceoryx2 lets the group read its
+/// folders, which lie in a folder of the user alone.
+const FOREIGN_BITS: [libc::mode_t; 6] =
+    [libc::S_ISUID, libc::S_ISGID, libc::S_IWGRP, libc::S_IROTH, libc::S_IWOTH, libc::S_IXOTH];
 
 /// Why a sandbox cannot be entered.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum SandboxError {
+pub enum SandboxError {
+    /// The rights of files, TCP, signals and abstract sockets.
     #[error(transparent)]
     Landlock(#[from] RulesetError),
+    /// The filter of system calls cannot be built for this machine.
     #[error("the filter of system calls is not taken")]
     Filter(#[from] seccompiler::BackendError),
+    /// The kernel does not take the filter.
     #[error("the filter of system calls cannot be installed")]
     Install(#[from] seccompiler::Error),
 }
@@ -77,7 +136,7 @@ impl Sandbox {
     /// Gives up writing files, the network, signals and sockets, for a program that is about to begin. It may read files and run
     /// programs, which have its rights.
     pub(crate) fn enter_program(&self) -> Result<Enforcement, SandboxError> {
-        deny_sockets(self.uses_network)?;
+        apply_filter(&calls_without(&[], self.families())?)?;
         let rights = AccessFs::from_all(NEWEST) & !READ & !AccessFs::Execute;
         let mut ruleset = Ruleset::default().handle_access(rights)?.scope(Scope::from_all(NEWEST))?;
         if !self.uses_network {
@@ -126,7 +185,7 @@ impl Sandbox {
 
     /// Gives up all but reading files, for this thread and those that it will start.
     pub(crate) fn enter(&self) -> Result<Enforcement, SandboxError> {
-        deny_sockets(self.uses_network)?;
+        apply_filter(&calls_without(&PROGRAM_CALLS, self.families())?)?;
         let rights = AccessFs::from_all(NEWEST) & !READ;
         let mut ruleset = Ruleset::default().handle_access(rights)?;
         if !self.is_host {
@@ -138,6 +197,11 @@ impl Sandbox {
         let ruleset = ruleset.create()?.add_rules(path_beneath_rules(&self.writable, rights & !AccessFs::Execute))?;
         // The last process of a graph removes its folder, which is in this one.
         enforce(ruleset.add_rules(path_beneath_rules([std::env::temp_dir()], AccessFs::RemoveDir))?)
+    }
+
+    /// The families of the sockets that it may make.
+    fn families(&self) -> &'static [i32] {
+        if self.uses_network { &NETWORK_FAMILIES } else { &[] }
     }
 
     /// Gives up reading other files than those that it keeps.
@@ -166,23 +230,78 @@ pub(crate) fn or_none(step: Result<Enforcement, SandboxError>) -> Enforcement {
     })
 }
 
-/// Denies this thread, and those that it will start, sockets that connect to a socket in the file system, and all of the
-/// internet where they are not needed.
-fn deny_sockets(uses_network: bool) -> Result<(), SandboxError> {
-    let is = |argument, value: i32| SeccompCondition::new(argument, Dword, SeccompCmpOp::Eq, value as u64);
-    let mut denied = vec![SeccompRule::new(vec![is(0, libc::AF_UNIX)?])?];
-    if !uses_network {
-        denied.push(SeccompRule::new(vec![is(0, libc::AF_INET)?])?);
-        denied.push(SeccompRule::new(vec![is(0, libc::AF_INET6)?])?);
+/// Gives up running programs and changing the rights of files, for all threads of a process that needs sockets of all families
+/// and so has no sandbox.
+///
+/// # Errors
+/// The kernel does not take the filter.
+pub fn deny_programs() -> Result<(), SandboxError> {
+    let families = [&NETWORK_FAMILIES[..], &[libc::AF_UNIX]].concat();
+    Ok(apply_filter_all_threads(&calls_without(&PROGRAM_CALLS, &families)?)?)
+}
+
+/// A filter that denies [`DENIED_CALLS`], `denied` and all sockets but those of some families.
+fn calls_without(denied: &[i64], families: &[i32]) -> Result<BpfProgram, SandboxError> {
+    let masked =
+        |argument, mask: u64, value: u64| SeccompCondition::new(argument, Dword, SeccompCmpOp::MaskedEq(mask), value);
+    let whole = [&DENIED_CALLS[..], &DENIED_OLD_CALLS, denied].concat();
+    // A call without rules is denied whatever its arguments are.
+    let mut rules: BTreeMap<i64, Vec<SeccompRule>> = whole.into_iter().map(|call| (call, Vec::new())).collect();
+
+    let is_another = |family: &i32| SeccompCondition::new(0, Dword, SeccompCmpOp::Ne, *family as u64);
+    let other_families: Vec<SeccompCondition> = families.iter().map(is_another).collect::<Result<_, _>>()?;
+    rules.insert(
+        libc::SYS_socket,
+        if families.is_empty() { Vec::new() } else { vec![SeccompRule::new(other_families)?] },
+    );
+
+    let mut pairs = Vec::new();
+    for kind in DATAGRAM_TYPES {
+        pairs.push(SeccompRule::new(vec![masked(1, SOCKET_TYPE_MASK, kind as u64)?])?);
     }
-    // io_uring makes sockets as well, and connects them.
-    let whole = [libc::SYS_io_uring_setup, libc::SYS_io_uring_setup | X32_BIT, libc::SYS_socket | X32_BIT];
-    let mut rules: BTreeMap<i64, Vec<SeccompRule>> = whole.map(|call| (call, Vec::new())).into();
-    rules.insert(libc::SYS_socket, denied);
+    rules.insert(libc::SYS_socketpair, pairs);
+
+    let mut modes = Vec::new();
+    for bit in FOREIGN_BITS.map(u64::from) {
+        modes.push(SeccompRule::new(vec![masked(1, bit, bit)?])?);
+    }
+    rules.insert(libc::SYS_fchmod, modes);
+
+    // Each call that makes a file, with the positions of its flags and of its mode.
+    #[cfg(target_arch = "x86_64")]
+    let making = [(libc::SYS_openat, Some(2), 3), (libc::SYS_open, Some(1), 2), (libc::SYS_creat, None, 1)];
+    #[cfg(not(target_arch = "x86_64"))]
+    let making = [(libc::SYS_openat, Some(2), 3)];
+    for (call, flags, mode) in making {
+        let mut rules_of_call = Vec::new();
+        for bit in SET_ID_BITS.map(u64::from) {
+            let has_bit = masked(mode, bit, bit)?;
+            let Some(flags) = flags else {
+                rules_of_call.push(SeccompRule::new(vec![has_bit])?);
+                continue;
+            };
+            // Without these flags, the argument of the mode is what happened to be in the register.
+            for makes in [libc::O_CREAT, libc::O_TMPFILE & !libc::O_DIRECTORY].map(|flag| flag as u64) {
+                rules_of_call.push(SeccompRule::new(vec![masked(flags, makes, makes)?, has_bit.clone()])?);
+            }
+        }
+        rules.insert(call, rules_of_call);
+    }
+
     let denial = SeccompAction::Errno(libc::EACCES as u32);
-    let filter = SeccompFilter::new(rules, SeccompAction::Allow, denial, std::env::consts::ARCH.try_into()?)?;
-    let program: seccompiler::BpfProgram = filter.try_into()?;
-    Ok(apply_filter(&program)?)
+    let filter = SeccompFilter::new(rules, SeccompAction::Allow, denial.clone(), std::env::consts::ARCH.try_into()?)?;
+    let filter: BpfProgram = filter.try_into()?;
+    Ok(without_x32(denial.into(), filter))
+}
+
+/// A filter that denies all calls of the x32 ABI, and passes the others on.
+fn without_x32(denial: u32, filter: BpfProgram) -> BpfProgram {
+    let statement = |code: u32, k: u32, jf: u8| sock_filter { code: code as u16, jt: 0, jf, k };
+    // The number of the call is the first field of `seccomp_data`.
+    let number = statement(libc::BPF_LD | libc::BPF_W | libc::BPF_ABS, 0, 0);
+    let is_x32 = statement(libc::BPF_JMP | libc::BPF_JGE | libc::BPF_K, FIRST_X32_CALL, 1);
+    let deny = statement(libc::BPF_RET | libc::BPF_K, denial, 0);
+    [vec![number, is_x32, deny], filter].concat()
 }
 
 fn enforce(ruleset: RulesetCreated) -> Result<Enforcement, SandboxError> {
@@ -196,10 +315,14 @@ fn enforce(ruleset: RulesetCreated) -> Result<Enforcement, SandboxError> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::{File, Permissions};
     use std::io::{ErrorKind, Write};
     use std::net::{TcpListener, TcpStream, UdpSocket};
+    use std::os::fd::AsRawFd;
+    use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
     use std::os::unix::net::{UnixDatagram, UnixListener, UnixStream};
 
+    use rustix::fs::{CWD, FileType, Mode};
     use serde_json::json;
 
     use super::*;
@@ -225,6 +348,59 @@ mod tests {
             check();
         });
         restricted.join().expect("no panic");
+    }
+
+    /// The outcome of a system call that libraries do not make.
+    fn outcome_of(returned: i64) -> std::io::Result<()> {
+        if returned < 0 { Err(std::io::Error::last_os_error()) } else { Ok(()) }
+    }
+
+    /// Calls that neither a stage nor an operator of the network may make, on a file of its user.
+    fn assert_nothing_is_given_away(path: &Path) {
+        let open =
+            File::options().read(true).write(true).create(true).truncate(false).open(path).expect("its own file");
+        let mut made_set_id = std::fs::OpenOptions::new();
+        assert_denied(made_set_id.write(true).create(true).mode(0o4600).open(path.with_extension("set-id")));
+        for mode in [0o4700, 0o2700, 0o644, 0o620, 0o604] {
+            assert_denied(open.set_permissions(Permissions::from_mode(mode)));
+        }
+        open.set_permissions(Permissions::from_mode(0o600)).expect("as iceoryx2 does");
+        assert_denied(std::fs::set_permissions(path, Permissions::from_mode(0o600)));
+        assert_denied(open.set_modified(std::time::SystemTime::now()));
+        let (uid, gid) = (rustix::process::getuid().as_raw(), rustix::process::getgid().as_raw());
+        assert_denied(std::os::unix::fs::chown(path, Some(uid), Some(gid)));
+        assert_denied(std::os::unix::fs::fchown(&open, Some(uid), Some(gid)));
+        let name = c"user.blindgrasp";
+        assert_denied(rustix::fs::fsetxattr(&open, name, b"", rustix::fs::XattrFlags::empty()).map_err(Into::into));
+        assert_denied(
+            rustix::fs::mknodat(CWD, path.with_extension("fifo"), FileType::Fifo, Mode::RWXU, 0).map_err(Into::into),
+        );
+        let program = rustix::fs::memfd_create("program", rustix::fs::MemfdFlags::empty()).expect("memory");
+        // SAFETY: the call reads its arguments, which live on; if it were allowed, the test would end.
+        let executed = unsafe {
+            libc::syscall(
+                libc::SYS_execveat,
+                program.as_raw_fd(),
+                c"".as_ptr(),
+                [std::ptr::null::<u8>()].as_ptr(),
+                [std::ptr::null::<u8>()].as_ptr(),
+                libc::AT_EMPTY_PATH,
+            )
+        };
+        assert_denied(outcome_of(executed));
+        for family in
+            [libc::AF_UNIX, libc::AF_PACKET, libc::AF_CAN, libc::AF_ALG, libc::AF_VSOCK, libc::AF_LLC, libc::AF_XDP]
+        {
+            // SAFETY: the call has no pointers.
+            assert_denied(outcome_of(unsafe { libc::syscall(libc::SYS_socket, family, libc::SOCK_STREAM, 0) }));
+        }
+        UnixStream::pair().expect("it reaches nobody");
+        assert_denied(UnixDatagram::pair());
+        #[cfg(target_arch = "x86_64")]
+        {
+            // SAFETY: the call has no pointers.
+            assert_denied(outcome_of(unsafe { libc::syscall(i64::from(FIRST_X32_CALL) + libc::SYS_getpid) }));
+        }
     }
 
     fn assert_denied<T>(outcome: std::io::Result<T>) {
@@ -260,6 +436,10 @@ mod tests {
             assert_denied(UdpSocket::bind("127.0.0.1:0"));
             assert_denied(UnixStream::connect(&launcher));
             assert_denied(UnixDatagram::unbound());
+            // SAFETY: the call has no pointers.
+            let netlink = unsafe { libc::syscall(libc::SYS_socket, libc::AF_NETLINK, libc::SOCK_RAW, 0) };
+            assert_denied(outcome_of(netlink));
+            assert_nothing_is_given_away(&path.join("out/own"));
             let parent = rustix::process::getppid().expect("a parent");
             assert!(rustix::process::test_kill_process(parent).is_err());
         });
@@ -267,13 +447,26 @@ mod tests {
 
     #[test]
     fn an_operator_of_the_network_keeps_tcp_and_nothing_more() {
-        let description = OperatorDescription::new("mine", "").uses_network();
-        in_sandbox(description, json!({}), || {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("own");
+        let description = OperatorDescription::new("mine", "").uses_network().param(
+            "out",
+            ParamKind::Path { must_exist: false },
+            None,
+            "",
+        );
+        in_sandbox(description, json!({"out": path}), move || {
             let port = TcpListener::bind("127.0.0.1:0").expect("a port");
             TcpStream::connect(port.local_addr().expect("an address")).expect("connected");
             assert_denied(UnixStream::connect("/run/launcher.sock"));
             assert_denied(std::process::Command::new("/bin/true").status());
             assert_denied(std::fs::read("/proc/self/environ"));
+            UdpSocket::bind("127.0.0.1:0").expect("UDP");
+            // SAFETY: the call has no pointers.
+            let netlink = unsafe { libc::syscall(libc::SYS_socket, libc::AF_NETLINK, libc::SOCK_RAW, 0) };
+            outcome_of(netlink).expect("the list of interfaces");
+            assert_nothing_is_given_away(&path);
         });
+        drop(folder);
     }
 }

@@ -1,5 +1,7 @@
 //! Names and quotes in messages for people.
 
+use std::borrow::Cow;
+use std::io::Write;
 use std::path::Path;
 
 /// Longest piece of the file's text that a message repeats, in characters.
@@ -17,6 +19,69 @@ pub const MAX_NAME_CHARS: usize = 32;
 pub fn is_name(text: &str) -> bool {
     (1..=MAX_NAME_CHARS).contains(&text.len())
         && text.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-')
+}
+
+/// Lines for a terminal: characters that move its cursor, change its colours or reverse its text are escaped as in JSON, like
+/// `\u001b`, so that a line of JSON keeps its meaning. Ends of lines and tabulators stay.
+pub fn harmless(lines: &str) -> Cow<'_, str> {
+    if !lines.chars().any(commands_a_terminal) {
+        return Cow::Borrowed(lines);
+    }
+    let mut harmless = String::with_capacity(lines.len() + 16);
+    for char in lines.chars() {
+        if commands_a_terminal(char) {
+            harmless += &format!("\\u{:04x}", u32::from(char));
+        } else {
+            harmless.push(char);
+        }
+    }
+    Cow::Owned(harmless)
+}
+
+fn commands_a_terminal(char: char) -> bool {
+    let turns_around = matches!(char, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+    (char.is_control() && char != '\n' && char != '\t') || turns_around
+}
+
+/// Writes whole lines as [`harmless`] text. Bytes that are not UTF-8 are replaced.
+pub struct HarmlessWriter<W: Write> {
+    to: W,
+    /// The begin of a line.
+    line: Vec<u8>,
+}
+
+impl<W: Write> HarmlessWriter<W> {
+    pub fn new(to: W) -> Self {
+        HarmlessWriter { to, line: Vec::new() }
+    }
+
+    fn write_line(&mut self) -> std::io::Result<()> {
+        let line = std::mem::take(&mut self.line);
+        self.to.write_all(harmless(&String::from_utf8_lossy(&line)).as_bytes())
+    }
+}
+
+impl<W: Write> Write for HarmlessWriter<W> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        for part in bytes.split_inclusive(|byte| *byte == b'\n') {
+            self.line.extend_from_slice(part);
+            if part.ends_with(b"\n") {
+                self.write_line()?;
+            }
+        }
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.write_line()?;
+        self.to.flush()
+    }
+}
+
+impl<W: Write> Drop for HarmlessWriter<W> {
+    fn drop(&mut self) {
+        let _ = self.flush();
+    }
 }
 
 /// Text from the file, in quotes, without control characters, cut when it is long.
@@ -96,4 +161,29 @@ fn lacks_unit(wrong: &str, name: &str) -> bool {
 fn distance(a: &str, b: &str) -> usize {
     let plain = |text: &str| text.to_lowercase().replace('-', "_");
     strsim::osa_distance(&plain(a), &plain(b))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_byte_of_a_stranger_commands_a_terminal() {
+        let evil = "\u{1b}]0;own\u{7}a\u{9b}2Jb\rc\u{202e}\td\n";
+        let expected = "\\u001b]0;own\\u0007a\\u009b2Jb\\u000dc\\u202e\td\n";
+        assert_eq!(harmless(evil), expected);
+        assert!(matches!(harmless("plain, µ, ✓\n"), Cow::Borrowed(_)));
+        // JSON keeps its meaning.
+        let json = serde_json::json!({ "name": evil }).to_string();
+        let read: serde_json::Value = serde_json::from_str(&harmless(&json)).expect("JSON");
+        assert_eq!(read["name"], evil);
+        let mut written = Vec::new();
+        let mut writer = HarmlessWriter::new(&mut written);
+        // Two writes divide a character.
+        writer.write_all(&evil.as_bytes()[..10]).expect("written");
+        writer.write_all(&evil.as_bytes()[10..]).expect("written");
+        writer.write_all(b"last").expect("written");
+        drop(writer);
+        assert_eq!(String::from_utf8(written).expect("UTF-8"), format!("{expected}last"));
+    }
 }

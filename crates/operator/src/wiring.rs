@@ -346,6 +346,9 @@ pub enum Report {
     Counts {
         /// Names in snake_case.
         counts: BTreeMap<String, u64>,
+        /// They are a part of the node's state, so they are those of all its instances together.
+        #[serde(default)]
+        in_all: bool,
     },
     /// A line for the log, with a level and fields. A line without [`REPORT_PREFIX`] is a log line without them.
     Log(LogEntry),

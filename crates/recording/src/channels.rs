@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use blindgrasp_messages::first_difference;
 use mcap::records::{Channel, Record as McapRecord, SchemaHeader, op};
 
+use super::source::parse_record;
 use super::types::{MESSAGE_ENCODING, OurType, SCHEMA_ENCODING, our_types};
 
 /// The schemas and channels of a file, as far as it was read.
@@ -42,7 +43,7 @@ impl Channels {
         if opcode != op::SCHEMA && opcode != op::CHANNEL {
             return Ok(());
         }
-        match mcap::parse_record(opcode, data).map_err(|error| error.to_string())? {
+        match parse_record(opcode, data)? {
             McapRecord::Schema { header: SchemaHeader { id, name, encoding }, data } => {
                 let schema = Schema { name, encoding, data: data.into_owned() };
                 if self.schemas.get(&id).is_some_and(|known| *known != schema) {
@@ -59,7 +60,7 @@ impl Channels {
     /// As [`Channels::add`] for a damaged file: a schema or channel that contradicts a known one takes its place,
     /// unless a checksum covers only the known one.
     pub(super) fn replace(&mut self, opcode: u8, data: &[u8], is_checked: bool) {
-        let id = match mcap::parse_record(opcode, data) {
+        let id = match parse_record(opcode, data) {
             Ok(McapRecord::Schema { header, .. }) => header.id,
             Ok(McapRecord::Channel(channel)) => channel.id,
             _ => return,

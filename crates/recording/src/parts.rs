@@ -5,6 +5,7 @@
 
 use std::path::{Path, PathBuf};
 
+use blindgrasp_messages::files::read_regular;
 use serde::{Deserialize, Serialize};
 
 use super::RecordingError;
@@ -55,7 +56,7 @@ impl Manifest {
     /// It cannot be read or is invalid.
     pub fn read(folder: &Path) -> Result<Option<Manifest>, RecordingError> {
         let path = folder.join(MANIFEST_NAME);
-        let text = match std::fs::read_to_string(&path) {
+        let text = match read_regular(&path) {
             Ok(text) => text,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
             Err(source) => return Err(RecordingError::Io { path, source }),

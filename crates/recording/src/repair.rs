@@ -17,7 +17,7 @@ use serde::Serialize;
 
 use super::channels::Channels;
 use super::reader::{RecordingReader, message_parts};
-use super::source::{Growth, MAX_RECORD_BYTES, PREFIX_BYTES, read_records};
+use super::source::{Growth, MAX_RECORD_BYTES, PREFIX_BYTES, parse_record, read_records};
 use super::summary::{info_from_metadata, is_being_written, open_mcap, raw_summary};
 use super::writer::{complete, info_metadata, lock_partial, write_error, write_options};
 use super::{METADATA_NAME, RecordingError, RecordingInfo};
@@ -250,13 +250,13 @@ impl Repair {
             op::SCHEMA | op::CHANNEL => self.channels.replace(opcode, data, false),
             op::MESSAGE => self.salvage.message(data, false, &self.channels, &mut self.report),
             op::METADATA => {
-                if let Ok(McapRecord::Metadata(found)) = mcap::parse_record(opcode, data) {
+                if let Ok(McapRecord::Metadata(found)) = parse_record(opcode, data) {
                     self.metadata.insert(found.name, found.metadata);
                 }
             }
             // The index has the number of messages in the chunk before, which is damaged.
             _ if last_chunk_is_damaged => {
-                let Ok(McapRecord::MessageIndex(index)) = mcap::parse_record(opcode, data) else { return };
+                let Ok(McapRecord::MessageIndex(index)) = parse_record(opcode, data) else { return };
                 let n_taken = self.salvage.n_of_chunk.get(&index.channel_id).copied().unwrap_or(0);
                 let n_lost = (index.records.len() as u64).saturating_sub(n_taken);
                 match self.channels.get(index.channel_id) {

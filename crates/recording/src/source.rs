@@ -6,10 +6,91 @@ use std::io::{BufReader, Read};
 use std::ops::Range;
 
 use mcap::McapError;
+use mcap::records::{Record as McapRecord, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader};
 
 /// The longest record, far longer than ours: a damaged length would otherwise take all memory.
 pub(super) const MAX_RECORD_BYTES: usize = 256 << 20;
+/// The longest record of a file: none is longer than its file, but those that are compressed.
+pub(super) fn longest_record(n_file_bytes: u64) -> usize {
+    MAX_RECORD_BYTES.min(usize::try_from(n_file_bytes).unwrap_or(usize::MAX))
+}
+
+/// A part of a record.
+enum Field {
+    /// Bytes of a known number.
+    Bytes(usize),
+    /// A length of 32 bits, and so many bytes of text.
+    Text,
+    /// A length of 32 bits, and so many bytes of pairs of texts.
+    Texts,
+    /// A length of 32 bits, and so many bytes of numbers.
+    Numbers,
+}
+
+/// The fields of the records that have texts, up to the last of them (MCAP specification, "Records").
+fn fields(opcode: u8) -> &'static [Field] {
+    use Field::{Bytes, Numbers, Text, Texts};
+    match opcode {
+        op::HEADER => &[Text, Text],
+        op::SCHEMA => &[Bytes(2), Text, Text],
+        op::CHANNEL => &[Bytes(2 + 2), Text, Text, Texts],
+        op::CHUNK => &[Bytes(8 + 8 + 8 + 4), Text],
+        op::CHUNK_INDEX => &[Bytes(8 + 8 + 8 + 8), Numbers, Bytes(8), Text],
+        op::ATTACHMENT => &[Bytes(8 + 8), Text, Text],
+        op::ATTACHMENT_INDEX => &[Bytes(8 + 8 + 8 + 8 + 8), Text, Text],
+        op::METADATA => &[Text, Texts],
+        op::METADATA_INDEX => &[Bytes(8 + 8), Text],
+        _ => &[],
+    }
+}
+
+/// Reads a record. MCAP's library takes memory for a text before it looks whether the record has so many bytes, up to 4 GiB: so
+/// the lengths are checked before.
+///
+/// # Errors
+/// A length is greater than the record, or the record is not as its type says.
+pub(super) fn parse_record(opcode: u8, data: &[u8]) -> Result<McapRecord<'_>, String> {
+    let mut rest = data;
+    for field in fields(opcode) {
+        match field {
+            Field::Bytes(n) => drop(take(&mut rest, *n)?),
+            Field::Text | Field::Numbers => drop(take_counted(&mut rest)?),
+            Field::Texts => {
+                // The last pair may be longer than the length says: MCAP's library reads it as well.
+                let n_after = rest.len().saturating_sub(4 + number(rest)?);
+                take(&mut rest, 4)?;
+                while rest.len() > n_after {
+                    take_counted(&mut rest)?;
+                    take_counted(&mut rest)?;
+                }
+            }
+        }
+    }
+    mcap::parse_record(opcode, data).map_err(|error| with_cause(&error))
+}
+
+fn take<'a>(rest: &mut &'a [u8], n: usize) -> Result<&'a [u8], String> {
+    let (taken, after) = rest
+        .split_at_checked(n)
+        .ok_or_else(|| format!("a record has a length of {n} bytes where it has {} more", rest.len()))?;
+    *rest = after;
+    Ok(taken)
+}
+
+fn take_counted<'a>(rest: &mut &'a [u8]) -> Result<&'a [u8], String> {
+    let n = number(rest)?;
+    take(rest, 4)?;
+    take(rest, n)
+}
+
+/// The number of 32 bits at the beginning.
+fn number(bytes: &[u8]) -> Result<usize, String> {
+    let mut bytes = bytes;
+    let number = take(&mut bytes, 4)?;
+    Ok(number.iter().rev().fold(0, |number, byte| number << 8 | usize::from(*byte)))
+}
+
 /// Bytes of a record before its content: opcode and length.
 pub(super) const PREFIX_BYTES: u64 = 1 + 8;
 
@@ -122,6 +203,7 @@ mod tests {
     use std::collections::BTreeMap;
     use std::path::Path;
 
+    use super::*;
     use crate::writer::{info_metadata, write_options};
     use crate::{METADATA_NAME, RecordingReader, repair};
     use mcap::records::{MessageHeader, Metadata};
@@ -154,5 +236,28 @@ mod tests {
         assert!(error.contains("bomb.mcap") && error.contains("expected at most 500 for each"), "{error}");
         let report = repair(&path).expect("a beginning");
         assert!(report.n_recovered["/camera"] < 6 && report.n_damaged_chunks > 0, "{report:?}");
+    }
+
+    #[test]
+    fn a_length_that_is_greater_than_its_record_is_refused_before_memory_is_taken() {
+        let text = |length: u32, text: &str| [&length.to_le_bytes()[..], text.as_bytes()].concat();
+        let index = |length| [&[0; 16][..], &text(length, "some")].concat();
+        let found = parse_record(op::METADATA_INDEX, &index(4)).map(|record| match record {
+            McapRecord::MetadataIndex(index) => index.name,
+            _ => String::new(),
+        });
+        assert_eq!(found.as_deref(), Ok("some"));
+        let error = parse_record(op::METADATA_INDEX, &index(0xff00_0007)).err();
+        assert_eq!(error.as_deref(), Some("a record has a length of 4278190087 bytes where it has 4 more"));
+        let metadata = |length, value| {
+            let pair = [text(3, "key"), text(length, value)].concat();
+            [text(4, "name"), (pair.len() as u32).to_le_bytes().to_vec(), pair].concat()
+        };
+        let Ok(McapRecord::Metadata(found)) = parse_record(op::METADATA, &metadata(5, "value")) else {
+            panic!("expected metadata");
+        };
+        assert_eq!(found.metadata["key"], "value");
+        assert!(parse_record(op::METADATA, &metadata(u32::MAX, "value")).is_err());
+        assert!(parse_record(op::CHUNK_INDEX, &[0; 40]).is_err());
     }
 }

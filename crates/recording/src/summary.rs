@@ -5,11 +5,12 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 
+use blindgrasp_messages::files::open_regular;
 use mcap::records::{ChunkIndex, MetadataIndex, Record as McapRecord, Statistics, op};
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
 
 use super::channels::Channels;
-use super::source::{Growth, MAX_RECORD_BYTES, read_records};
+use super::source::{Growth, MAX_RECORD_BYTES, longest_record, parse_record, read_records};
 use super::{METADATA_NAME, RecordingError, RecordingInfo};
 
 /// Bytes of the footer: opcode and length, its 20 bytes, and MCAP's mark behind it.
@@ -89,9 +90,9 @@ pub(super) fn other_version(difference: &str, info: &RecordingInfo) -> String {
 
 /// Opens a file that begins as MCAP does.
 pub(super) fn open_mcap(path: &Path) -> Result<File, RecordingError> {
-    let mut file = File::open(path).map_err(|source| RecordingError::Io { path: path.into(), source })?;
+    let mut file = open_regular(path).map_err(|source| RecordingError::Io { path: path.into(), source })?;
     let mut magic = [0; 8];
-    if !path.is_file() || file.read_exact(&mut magic).is_err() || magic != *mcap::MAGIC {
+    if file.read_exact(&mut magic).is_err() || magic != *mcap::MAGIC {
         let message = "not a recording: expected an MCAP file".into();
         return Err(RecordingError::Invalid { path: path.into(), message });
     }
@@ -120,9 +121,7 @@ pub(super) fn raw_summary(file: &mut File, n_file_bytes: u64) -> Result<RawSumma
     if footer[29..] != *mcap::MAGIC || footer[0] != op::FOOTER {
         return Err("it does not end as MCAP does".into());
     }
-    let McapRecord::Footer(found) =
-        mcap::parse_record(op::FOOTER, &footer[9..29]).map_err(|error| error.to_string())?
-    else {
+    let McapRecord::Footer(found) = parse_record(op::FOOTER, &footer[9..29])? else {
         return Err("it does not end as MCAP does".into());
     };
     let data_end = match found.summary_start.checked_sub(DATA_END_BYTES) {
@@ -135,7 +134,7 @@ pub(super) fn raw_summary(file: &mut File, n_file_bytes: u64) -> Result<RawSumma
             .with_skip_start_magic(true)
             .with_validate_summary_section_crc(true)
             .with_check_finishes_after_end_magic(true)
-            .with_record_length_limit(MAX_RECORD_BYTES.min(usize::try_from(n_file_bytes).unwrap_or(usize::MAX))),
+            .with_record_length_limit(longest_record(n_file_bytes)),
     );
     let mut input = std::io::BufReader::new(file);
     let mut summary =
@@ -175,7 +174,7 @@ impl RawSummary {
         if !matches!(opcode, op::STATISTICS | op::CHUNK_INDEX | op::METADATA_INDEX) {
             return Ok(());
         }
-        match mcap::parse_record(opcode, data).map_err(|error| error.to_string())? {
+        match parse_record(opcode, data)? {
             McapRecord::Statistics(statistics) => self.statistics = Some(statistics),
             McapRecord::ChunkIndex(index) => self.chunks.push(index),
             McapRecord::MetadataIndex(index) => self.metadata.push(index),
@@ -212,7 +211,7 @@ fn read_metadata(
         .and_then(|_| file.read_exact(&mut bytes))
         .map_err(|error| error.to_string())?;
     let record = match bytes.split_at_checked(9) {
-        Some((&[op::METADATA, ..], body)) => mcap::parse_record(op::METADATA, body).ok(),
+        Some((&[op::METADATA, ..], body)) => parse_record(op::METADATA, body).ok(),
         _ => None,
     };
     match record {

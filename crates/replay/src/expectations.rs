@@ -17,6 +17,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use super::comparison::Tolerance;
+use blindgrasp_messages::files::read_regular;
 use blindgrasp_messages::{Action, Reason};
 
 /// The keys of an expectations file.
@@ -78,7 +79,7 @@ impl Expectations {
     pub fn of(recording: &Path) -> Result<Option<Expectations>, ExpectationsError> {
         let path = path_of(recording);
         let invalid = |message: String| ExpectationsError { path: path.clone(), message };
-        let text = match std::fs::read_to_string(&path) {
+        let text = match read_regular(&path) {
             Ok(text) => text,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
             Err(error) => return Err(invalid(error.to_string())),

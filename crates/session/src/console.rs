@@ -7,10 +7,12 @@ use serde::Serialize;
 use crate::recorder::Recorder;
 use crate::report::RunReport;
 use crate::run::Tap;
+use blindgrasp_graph::log::printable;
 use blindgrasp_graph::run::{RunSink, SeenDecision};
 use blindgrasp_messages::{Action, GraspTruth, LiftOutcome};
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::text::harmless;
 use blindgrasp_recording::Record;
 
 /// This many lines wait for the reader of stdout.
@@ -99,7 +101,7 @@ impl RunSink for Console {
         decision.expire(header.valid_until_nanos(), monotonic_nanos());
         let (action, reason) = (decision.action, decision.reason.as_str());
         let line = if self.json {
-            serde_json::to_string(&DecisionLine {
+            let json = serde_json::to_string(&DecisionLine {
                 grasp_id: decision.grasp_id,
                 action,
                 reason,
@@ -109,12 +111,17 @@ impl RunSink for Console {
                 seq: header.seq,
                 stamp_nanos: header.stamp_nanos,
                 truth,
-            })?
+            })?;
+            harmless(&json).into_owned()
         } else {
             let latency = latency_nanos.map_or("-".into(), |nanos| format!("{:.0} µs", nanos as f64 / 1e3));
             let painted = |text: &str, colour| if self.is_coloured { paint(text, colour) } else { text.to_owned() };
             let truth = truth.map_or(String::new(), |truth| {
-                let text = format!("truth: {} ({})", if truth.stable { "stable" } else { "unstable" }, truth.object);
+                let text = format!(
+                    "truth: {} ({})",
+                    if truth.stable { "stable" } else { "unstable" },
+                    printable(&truth.object)
+                );
                 let is_false_positive = action == Action::Lift && !truth.stable;
                 format!("  {}", if is_false_positive { painted(&text, RED) } else { text })
             });
@@ -122,7 +129,7 @@ impl RunSink for Console {
             let action = painted(action.shown(), if action == Action::Lift { GREEN } else { YELLOW });
             format!("grasp {grasp_id:>5}  {action}  p {p:.3}  {reason:<14} {latency:>9}{truth}")
         };
-        self.printer.print(line);
+        self.printer.print_styled(line);
         Ok(())
     }
 
@@ -140,10 +147,10 @@ impl RunSink for Console {
                 if outcome.held { "kept   " } else { "DROPPED" },
                 outcome.slip_m * 1e3,
                 outcome.turn_rad.to_degrees(),
-                outcome.thing
+                printable(&outcome.thing)
             )
         };
-        self.printer.print(line);
+        self.printer.print(&line);
         Ok(())
     }
 }

@@ -130,7 +130,7 @@ impl Session {
         } else {
             Vec::new()
         };
-        lines.into_iter().for_each(|line| printer.print(line));
+        lines.into_iter().for_each(|line| printer.print(&line));
         printer.flush(&|| n_stops.load(Ordering::Relaxed) > n_seen);
         if printer.n_dropped() > 0 {
             let n = printer.n_dropped();

@@ -18,7 +18,7 @@ use crate::hand::Hand;
 use crate::out_of_distribution::TrainingRange;
 use crate::probe::{GraspHistory, ProbeModel, signals};
 use crate::training_summary::TrainingSummary;
-use blindgrasp_messages::files::write_whole;
+use blindgrasp_messages::files::{open_regular, write_whole};
 use blindgrasp_messages::{Fault, Phase};
 
 /// The format that this program writes and reads.
@@ -144,7 +144,7 @@ impl Model {
     /// A file that cannot be read, is no model, has another format version, a wrong checksum or inconsistent contents.
     pub fn load(path: &Path) -> Result<Model, ModelError> {
         let mut bytes = Vec::new();
-        std::fs::File::open(path)
+        open_regular(path)
             .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
             .map_err(|source| ModelError::Io { path: path.into(), source })?;
         let invalid = |reason| ModelError::Invalid { path: path.into(), reason };

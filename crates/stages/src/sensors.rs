@@ -19,7 +19,7 @@ use crate::classifier::boosting::BoostedTrees;
 use crate::day::GraspPlace;
 use crate::hand::{Hand, Motion};
 use crate::model::ModelHand;
-use blindgrasp_messages::files::write_whole;
+use blindgrasp_messages::files::{read_regular, write_whole};
 use blindgrasp_messages::{Contact, Phase};
 
 /// The format that this program writes and reads.
@@ -166,7 +166,7 @@ impl SensorCheck {
     /// A file that cannot be read, is no sensor check, is for another hand, or contradicts itself.
     pub fn load(path: &Path, hand: &Hand) -> Result<SensorCheck, SensorCheckError> {
         let invalid = |message: String| SensorCheckError { path: path.into(), message };
-        let text = std::fs::read_to_string(path).map_err(|error| invalid(error.to_string()))?;
+        let text = read_regular(path).map_err(|error| invalid(error.to_string()))?;
         let check: SensorCheck = serde_json::from_str(&text)
             .map_err(|error| invalid(format!("expected a file of blindgrasp sensors learn ({error})")))?;
         check.validate(hand).map_err(invalid)?;

@@ -7,6 +7,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
+use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{RecordedGrasp, grasp_svg};
 use blindgrasp_ros::cdr::{self, Value};
@@ -246,7 +247,7 @@ fn described(topic: &str, network: &Ros2Network) -> anyhow::Result<String> {
 /// The text of the URDF. A xacro file is expanded.
 fn urdf_text(path: &Path) -> anyhow::Result<String> {
     if path.extension().is_none_or(|extension| extension != "xacro") {
-        return std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()));
+        return read_regular(path).with_context(|| format!("cannot read {}", path.display()));
     }
     let output = Command::new("xacro").arg(path).output().map_err(|error| match error.kind() {
         std::io::ErrorKind::NotFound => {

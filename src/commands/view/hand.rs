@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::super::{Outcome, check_output, print_line};
 use super::grasp::{Format, format_of};
+use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{RecordedGrasp, grasp_html, grasp_svg};
 use blindgrasp_simulator::mechanism::Mechanism;
@@ -17,7 +18,7 @@ pub(super) fn is_hand(path: &Path) -> bool {
     if !path.exists() {
         return path.extension().is_none() && Hand::load(path).is_ok();
     }
-    let text = std::fs::read_to_string(path).unwrap_or_default();
+    let text = read_regular(path).unwrap_or_default();
     text.lines().any(|line| line.starts_with("format: blindgrasp-hand"))
 }
 

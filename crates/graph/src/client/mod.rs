@@ -62,6 +62,10 @@ pub enum ClientError {
     Io { graph: String, source: std::io::Error },
 }
 
+/// A graph that was started right before has its name after this time, unless its check fails or takes long.
+const NAME_LIMIT: Duration = Duration::from_millis(300);
+const NAME_POLL: Duration = Duration::from_millis(10);
+
 /// A connection to a running graph. A swap begun over it is abandoned when it is dropped.
 #[derive(Debug)]
 pub struct Connection {
@@ -94,6 +98,22 @@ pub fn pick_graph(asked_for: Option<&str>) -> Result<String, ClientError> {
         (None, []) => Err(ClientError::NoneRunning),
         (None, [graph]) => Ok(graph.clone()),
         (None, running) => Err(ClientError::SeveralRunning { running: running.to_vec() }),
+    }
+}
+
+/// As [`pick_graph`], for a command right after the start of a graph: waits for a moment until the graph has its name.
+///
+/// # Errors
+/// As [`pick_graph`].
+pub fn pick_starting_graph(asked_for: Option<&str>) -> Result<String, ClientError> {
+    let start = Instant::now();
+    loop {
+        let picked = pick_graph(asked_for);
+        let is_missing = matches!(picked, Err(ClientError::NotRunning { .. } | ClientError::NoneRunning));
+        if !is_missing || start.elapsed() > NAME_LIMIT {
+            return picked;
+        }
+        std::thread::sleep(NAME_POLL);
     }
 }
 

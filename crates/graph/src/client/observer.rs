@@ -20,7 +20,7 @@ use blindgrasp_messages::{
     with_message,
 };
 use blindgrasp_operator::cursors::{SampleId, SharedCursors};
-use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::diagnostics::{print_diagnostic, with_lack_of_files};
 use blindgrasp_operator::port::{PortError, Subscriber};
 use blindgrasp_operator::waiter::{Waiter, Waker};
 use blindgrasp_operator::wiring::{InputCounts, InputWiring, NamespaceWiring, WaitMode};
@@ -244,13 +244,13 @@ fn observe<S: Sink>(
     watch: &Watch<'_>,
     on_ready: impl FnOnce(),
 ) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
-    let node = namespace::join(domain, "observer")?;
+    let node = namespace::join(domain, "observer").map_err(|error| with_lack_of_files(error.into()))?;
     let mut ports = Vec::new();
     for edge in edges {
         let type_name = &edge.input.service.type_name;
         let opened = with_message(type_name, Opener(&node, cursors, edge))
             .with_context(|| format!("{}: cannot observe a {type_name}", edge.topic))?;
-        ports.push((edge.topic.clone(), opened?));
+        ports.push((edge.topic.clone(), opened.map_err(|error| with_lack_of_files(error.into()))?));
     }
     if watch.role == Role::Attached {
         sink.begin(&begin(&mut ports)?);

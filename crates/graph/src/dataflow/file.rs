@@ -1,6 +1,5 @@
 //! Reads the dataflow file and checks its form. `check` resolves its names.
 
-use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -12,6 +11,7 @@ use crate::dataflow::machines_entry::{
 };
 use crate::dataflow::node::{NodeEntry, read_node};
 use crate::dataflow::yaml::{self, Content, Entry, Text, Value};
+use blindgrasp_messages::files::open_regular;
 use blindgrasp_operator::text::did_you_mean;
 
 /// Far above any graph that a machine can run; a file beyond it is not a dataflow file.
@@ -123,7 +123,7 @@ fn parse_with(path: &Path, content: &[u8], variables: &[(&str, &str)]) -> Result
 /// Reads at most one byte more than is allowed, also of an endless device.
 fn read(path: &Path) -> std::io::Result<Vec<u8>> {
     let mut content = Vec::new();
-    File::open(path)?.take(MAX_FILE_BYTES as u64 + 1).read_to_end(&mut content)?;
+    open_regular(path)?.take(MAX_FILE_BYTES as u64 + 1).read_to_end(&mut content)?;
     Ok(content)
 }
 

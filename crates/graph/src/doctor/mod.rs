@@ -15,6 +15,7 @@ use crate::client::{running_graphs, status};
 use crate::describe::describe;
 use crate::log::LogFolder;
 use crate::operators::Operators;
+use blindgrasp_operator::diagnostics::ENOUGH_FILES;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::namespace::{LEAST_FREE_BYTES, SHARED_MEMORY_FOLDER, left_over};
 use blindgrasp_operator::sandbox::supported;
@@ -27,8 +28,6 @@ const LATE_WAKE_US: u64 = 5000;
 const NORMAL: &str = "normal";
 /// Clock sources of the kernel that a program reads without a system call.
 const FAST_CLOCK_SOURCES: [&str; 4] = ["tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter"];
-/// File descriptors that a graph of sixteen nodes needs, with room.
-const ENOUGH_FILES: u64 = 1024;
 
 /// The result of a check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]

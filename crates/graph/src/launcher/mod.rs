@@ -50,6 +50,7 @@ use crate::plan::{Plan, Port};
 use blindgrasp_operator::cursors::{CursorsError, SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::namespace::{self, NamespaceError};
 use blindgrasp_operator::wiring::{Clock, Command, LogEntry, LogLevel, Report};
 
 /// The status of a graph without trouble.
@@ -123,6 +124,9 @@ pub enum LaunchError {
     Degraded(String),
     #[error(transparent)]
     SharedCursors(#[from] CursorsError),
+    /// Shared memory is full.
+    #[error(transparent)]
+    Room(NamespaceError),
     /// Without its socket no command could stop the graph.
     #[error("commands cannot reach the graph: its socket cannot be used")]
     Control(#[source] std::io::Error),
@@ -217,6 +221,8 @@ struct Member {
     /// When it was restarted, within its window.
     restarts: VecDeque<Instant>,
     restart_at: Option<Instant>,
+    /// It has died because shared memory is full, and is started again when there is room.
+    waits_for_room: bool,
     /// When it was found dead, until it is ready again.
     died: Option<Instant>,
     /// The sample on which its last process has died.
@@ -442,6 +448,7 @@ impl Launcher {
                 return Err(self.not_ready());
             }
         }
+        namespace::take_room(self.plan.domain()).map_err(LaunchError::Room)?;
         self.warn_of_mismatches();
         // The start of the service must not depend on other machines.
         self.service.is_ready(if self.link_idx().is_some() { "waiting for the other machines" } else { RUNNING });
@@ -783,7 +790,14 @@ impl Launcher {
                         let entry = LogEntry { level: Some(LogLevel::Error), ..LogEntry::plain(message) };
                         log.write(entry);
                     }
-                    Report::Counts { counts } => {
+                    Report::Counts { counts, in_all: true } => {
+                        for (name, count) in counts {
+                            let total = totals.entry(name.clone()).or_default();
+                            // An instance that takes over may have a state from before the last report.
+                            *total = (*total).max(*count);
+                        }
+                    }
+                    Report::Counts { counts, in_all: false } => {
                         for (name, count) in counts {
                             let before = process.counts.get(name).copied().unwrap_or(0);
                             *totals.entry(name.clone()).or_default() += count.saturating_sub(before);
@@ -793,11 +807,18 @@ impl Launcher {
                 }
                 let is_ready = matches!(report, Report::Ready { .. });
                 process.on_report(report);
-                if let Some(what) = process.lacks_sandbox()
-                    && is_ready
+                if !is_ready {
+                    return;
+                }
+                let lacks_sandbox = process.lacks_sandbox();
+                let lacks_sandbox =
+                    lacks_sandbox.map(|what| format!("blindgrasp: node '{node}' has 'sandbox: on', but {what}"));
+                lacks_sandbox.into_iter().for_each(|line| self.say(&line));
+                // A process of a restart or a swap has files of its own.
+                if self.has_gone
+                    && let Err(error) = namespace::take_room(self.plan.domain())
                 {
-                    let line = format!("blindgrasp: node '{node}' has 'sandbox: on', but {what}");
-                    self.say(&line);
+                    self.say(&format!("blindgrasp: shared memory is nearly full: {error}"));
                 }
             }
             ProcessOutput::Closed => {}
@@ -806,7 +827,7 @@ impl Launcher {
 
     /// Prints and logs a line of the launcher's own.
     fn say(&mut self, line: &str) {
-        self.printer.lock().unwrap_or_else(PoisonError::into_inner).print(line.into());
+        self.printer.lock().unwrap_or_else(PoisonError::into_inner).print(line);
         if let Some(log) = &self.own_log {
             log.write(LogEntry::plain(line));
         }
@@ -997,6 +1018,7 @@ impl Member {
             n_restarts: 0,
             restarts: VecDeque::new(),
             restart_at: None,
+            waits_for_room: false,
             died: None,
             start_failure: None,
             is_over: false,

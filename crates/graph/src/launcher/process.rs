@@ -20,7 +20,9 @@ use crate::dataflow::{self, Node, ProcessOptions, Scheduling, SchedulingPolicy};
 use crate::launcher::Event;
 use crate::launcher::log_writer::Log;
 use crate::launcher::service;
+use crate::log::printable;
 use blindgrasp_operator::diagnostics::LinePrinter;
+use blindgrasp_operator::namespace;
 use blindgrasp_operator::wiring::{
     Addressed, Command, Enforcement, GroupMemberWiring, GroupWiring, LogEntry, REPORT_PREFIX, Report, Sandbox,
     WIRING_VARIABLE, Wiring,
@@ -79,7 +81,7 @@ pub(super) struct Process {
     pub(super) is_warm: bool,
     /// Its answer to the last [`Command::Set`].
     pub(super) set_answer: Option<(u64, Option<u64>, Option<String>)>,
-    /// Its counts of other things than samples.
+    /// Its counts of other things than samples, since it started.
     pub(super) counts: BTreeMap<String, u64>,
     /// The launcher's reason to end it.
     pub(super) finding: Option<String>,
@@ -293,13 +295,17 @@ impl Process {
             Report::TookOver => self.has_taken_over = true,
             Report::Warm { .. } => self.is_warm = true,
             Report::Set { id, from_seq, error } => self.set_answer = Some((id, from_seq, error)),
-            Report::Counts { counts } => self.counts = counts,
+            Report::Counts { counts, in_all: false } => self.counts = counts,
             Report::Connected => self.is_connected = true,
             Report::Finished => self.is_done = true,
             Report::Drained if self.is_asked => self.is_done = true,
             Report::Drained => self.is_stopped = true,
             Report::Failed { message } => self.shared.borrow_mut().failure = Some(message),
-            Report::Log(_) | Report::Ended { .. } | Report::Link(_) | Report::Unfit { .. } => {}
+            Report::Counts { in_all: true, .. }
+            | Report::Log(_)
+            | Report::Ended { .. }
+            | Report::Link(_)
+            | Report::Unfit { .. } => {}
         }
     }
 
@@ -391,6 +397,11 @@ impl Process {
             && self.exit.is_some_and(|status| {
                 status.success() || (self.is_asked && status.signal() == Some(Signal::TERM.as_raw()))
             })
+    }
+
+    /// Whether it has died of shared memory that was not there when it was written to.
+    pub(super) fn has_died_of_full_memory(&self) -> bool {
+        self.exit.is_some_and(|status| status.signal() == Some(Signal::BUS.as_raw())) && namespace::is_full()
     }
 
     /// How it ended, for a person: "failed: …", "was killed (signal 9)", "ended with exit status 1".
@@ -591,9 +602,9 @@ impl Hearer {
 
 impl LineSink {
     fn take(&self, entry: LogEntry, lines: &Lines) {
-        let line = entry.to_string();
+        let line = printable(&entry.to_string());
         if let Some(printer) = &self.printer {
-            printer.lock().unwrap_or_else(PoisonError::into_inner).print(format!("[{}] {line}", self.node));
+            printer.lock().unwrap_or_else(PoisonError::into_inner).print(&format!("[{}] {line}", self.node));
         }
         {
             let mut lines = lines.lock().unwrap_or_else(PoisonError::into_inner);

@@ -7,11 +7,15 @@ use crate::dataflow::{Restart, RestartPolicy};
 use crate::launcher::{LaunchError, Launcher, Member, RUNNING};
 use crate::log::log_tail;
 use blindgrasp_operator::cursors::SampleId;
+use blindgrasp_operator::namespace::SHARED_MEMORY_FOLDER;
 use blindgrasp_operator::wiring::Command;
 use blindgrasp_operator::{monotonic_nanos, namespace};
 
 /// The longest pause before a restart, unless the file asks for a longer one.
 const MAX_BACKOFF: Duration = Duration::from_secs(10);
+
+/// The pause between two looks at whether shared memory has room again.
+const ROOM_PAUSE: Duration = Duration::from_millis(500);
 
 /// The name of the count of samples that are left without an answer.
 const QUARANTINED: &str = "quarantined";
@@ -94,6 +98,7 @@ impl Launcher {
             && let Some(died) = member.died.take()
         {
             member.state = NodeState::Running;
+            member.waits_for_room = false;
             let line = format!(
                 "blindgrasp: node '{}' is back after {:.1} ms",
                 member.node.id,
@@ -167,11 +172,17 @@ impl Launcher {
             self.stop_waiting_for(idx);
             return Err(self.failed(&id, true));
         }
-        let log = process.last_lines();
+        let (log, is_for_want_of_room) = (process.last_lines(), process.has_died_of_full_memory());
         if is_stopping && !self.has_gone {
             // The launch has failed: the graph will not run.
             member.is_over = true;
             self.stop_waiting_for(idx);
+            return Ok(());
+        }
+        if is_for_want_of_room {
+            // Neither the node nor the sample is to blame.
+            member.active = None;
+            self.wait_for_room(idx, &ending);
             return Ok(());
         }
         // A failure that comes twice at the start for the same reason, such as a file that cannot be read, comes again.
@@ -233,17 +244,43 @@ impl Launcher {
         let n_before = member.restarts.len() as u32;
         let backoff = pause_before(&restart, n_before, self.options.wait_limit);
         member.state = NodeState::Restarting;
+        member.waits_for_room = false;
         member.died.get_or_insert(now);
         member.restart_at = Some(now + backoff);
         self.say(&format!("blindgrasp: node '{id}' {ending}; it is started again"));
     }
 
+    /// Plans the restart of a node without a process for when shared memory has room. It does not count among its restarts.
+    fn wait_for_room(&mut self, idx: usize, ending: &str) {
+        let now = Instant::now();
+        let member = &mut self.members[idx];
+        member.state = NodeState::Restarting;
+        member.died.get_or_insert(now);
+        member.restart_at = Some(now + ROOM_PAUSE);
+        if !std::mem::replace(&mut member.waits_for_room, true) {
+            let line = format!(
+                "blindgrasp: node '{}' {ending}; it is started again when there is room in {SHARED_MEMORY_FOLDER}",
+                member.node.id
+            );
+            self.say(&line);
+        }
+        // The memory of the dead process is free then.
+        self.reap();
+    }
+
     fn restart(&mut self, idx: usize) {
         let idxs = self.together(idx);
+        let waits_for_room = idxs.iter().any(|idx| self.members[*idx].waits_for_room);
+        if waits_for_room && namespace::is_full() {
+            let again = Instant::now() + ROOM_PAUSE;
+            return idxs.into_iter().for_each(|idx| self.members[idx].restart_at = Some(again));
+        }
         for idx in &idxs {
             let member = &mut self.members[*idx];
             member.restart_at = None;
-            member.restarts.push_back(Instant::now());
+            if !waits_for_room {
+                member.restarts.push_back(Instant::now());
+            }
             member.n_restarts += 1;
         }
         if let Err(error) = self.spawn_active(idx) {

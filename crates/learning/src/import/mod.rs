@@ -9,7 +9,6 @@ mod grasps;
 mod lines;
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
@@ -18,6 +17,7 @@ use serde::Serialize;
 use self::columns::{Columns, shortened};
 use self::grasps::{Grasps, TableGrasp, TableReading};
 use self::lines::Lines;
+use blindgrasp_messages::files::open_regular;
 use blindgrasp_messages::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::{RecordingError, RecordingInfo, RecordingWriter};
 use blindgrasp_stages::contacts::{LIMIT_TOLERANCE_RAD, MAX_CELL_NEWTONS};
@@ -441,7 +441,7 @@ fn found(field: &str) -> String {
 
 fn read(table: &Path) -> Result<Vec<u8>, ImportError> {
     let mut bytes = Vec::new();
-    File::open(table)
+    open_regular(table)
         .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
         .map_err(|source| ImportError::Read { path: table.into(), source })?;
     if bytes.len() as u64 > MAX_BYTES {

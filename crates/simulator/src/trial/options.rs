@@ -12,6 +12,7 @@ use crate::planner::PlannerOptions;
 use crate::protocol::{Approach, check_preshape_range};
 use crate::soft_finger::SoftFingerOptions;
 use crate::tactile_sensor::SensorOptions;
+use blindgrasp_messages::files::read_regular;
 
 /// All options of trials.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
@@ -195,7 +196,7 @@ impl TrialOptions {
     /// A file that cannot be read, an unknown option, or a value that cannot be used; with the file's name.
     pub fn load(path: &Path) -> Result<TrialOptions, TrialError> {
         let refuse = |reason: String| TrialError::OptionsFile { path: path.into(), reason };
-        let text = std::fs::read_to_string(path).map_err(|error| refuse(error.to_string()))?;
+        let text = read_regular(path).map_err(|error| refuse(error.to_string()))?;
         let options: TrialOptions = serde_saphyr::from_str(&text).map_err(|error| refuse(error.to_string()))?;
         options.check().map_err(|error| refuse(error.to_string()))?;
         Ok(options)

@@ -16,6 +16,7 @@ use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use blindgrasp_messages::files::open_regular;
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, UnitVector3, Vector3};
 use parry3d_f64::math::Vector;
 use parry3d_f64::shape::SharedShape;
@@ -362,6 +363,12 @@ impl Hand {
         })
     }
 
+    /// The hand of that name that comes with the program.
+    pub fn built_in(name: &str) -> Option<Hand> {
+        let (_, layout, urdf) = BUILTIN.iter().find(|(known, _, _)| *known == name)?;
+        Hand::parse(&PathBuf::from(format!("built-in {name}.yaml")), layout, |_| Ok((*urdf).into())).ok()
+    }
+
     /// Reads a hand from a pad layout file, or takes the built-in hand of that name.
     ///
     /// # Errors
@@ -370,8 +377,8 @@ impl Hand {
         if !path_or_name.exists()
             && let Some(name) = path_or_name.to_str()
         {
-            if let Some((_, layout, urdf)) = BUILTIN.iter().find(|(known, _, _)| *known == name) {
-                return Hand::parse(&PathBuf::from(format!("built-in {name}.yaml")), layout, |_| Ok((*urdf).into()));
+            if let Some(hand) = Hand::built_in(name) {
+                return Ok(hand);
             }
             if path_or_name.extension().is_none() && !name.contains('/') {
                 return Err(HandError::Unknown { name: name.into() });
@@ -548,7 +555,7 @@ const MAX_BYTES: u64 = 16 << 20;
 
 fn read(path: &Path) -> Result<String, HandError> {
     let mut bytes = Vec::new();
-    std::fs::File::open(path)
+    open_regular(path)
         .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
         .map_err(|source| HandError::Read { path: path.into(), source })?;
     let invalid = |message: &str| HandError::Invalid { path: path.into(), message: message.into() };

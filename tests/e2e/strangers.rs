@@ -1,0 +1,259 @@
+//! Other users of the machine, and files and programs of strangers: they reach no graph, no terminal and no other file.
+
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use blindgrasp_recording::{Record, RecordingInfo, RecordingReader, RecordingWriter};
+use rustix::process::{Signal, getuid};
+
+use crate::common::{
+    FAST_FOREVER, Graph, HAND, MODEL, RECORDING, blindgrasp, classifier_runs, dataflow, dataflow_with, operator,
+    project, run, script, skipped, text, unique_name, wait_until,
+};
+
+const A_FEW_GRASPS: usize = 20;
+/// It names the terminal's window, rings, clears the screen, and turns text around.
+const EVIL: &str = "\u{1b}]0;own\u{7}\u{1b}[2J\u{9b}1m\u{202e}";
+
+fn utf8(path: &Path) -> &str {
+    path.to_str().expect("UTF-8")
+}
+
+/// The files of a graph: its shared memory, and its folder with all that is in it.
+fn files_of(name: &str) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    let mut folders = vec![PathBuf::from("/dev/shm"), std::env::temp_dir()];
+    while let Some(folder) = folders.pop() {
+        for path in std::fs::read_dir(folder).expect("readable").flatten().map(|entry| entry.path()) {
+            let is_of_graph = utf8(&path).contains("blindgrasp") && utf8(&path).contains(name);
+            if is_of_graph && path.is_dir() {
+                folders.push(path.clone());
+            }
+            if is_of_graph {
+                found.push(path);
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn another_user_cannot_touch_a_running_graph() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    let files = files_of(&graph.name[..graph.name.len().min(11)]);
+    assert!(files.len() > 20, "{files:?}");
+    for path in &files {
+        // Some go while the graph runs.
+        if let Ok(metadata) = std::fs::symlink_metadata(path) {
+            // iceoryx2 lets the group read folders, which lie in the graph's folder, which no other user can enter.
+            let of_others = if metadata.is_dir() { 0o027 } else { 0o077 };
+            assert_eq!(metadata.mode() & of_others, 0, "{}: {:o}", path.display(), metadata.mode());
+        }
+    }
+    if getuid().is_root() {
+        let empty_all = "for file; do (: > \"$file\") 2>/dev/null && echo \"$file\"; done; true";
+        let output = Command::new("setpriv")
+            .args(["--reuid=65534", "--regid=65534", "--clear-groups", "sh", "-c", empty_all, "sh"])
+            .args(files.iter().filter(|path| path.is_file()))
+            .output()
+            .expect("started");
+        assert_eq!(text(&output.stdout), "", "{}", text(&output.stderr));
+    } else {
+        skipped("acting as another user (needs root)");
+    }
+    // Processes still join it.
+    graph.kill("classifier");
+    let recording = folder.path().join("some.mcap");
+    run(&["record", &graph.name, "--for", "0.2", "--out", utf8(&recording)], 0);
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    graph.stop().assert_undisturbed("beside another user");
+}
+
+/// The project's recording by a stranger: its objects, its maker and the name of its hand are what they like.
+fn recording_of_stranger(path: &Path, hand: &str) {
+    let reader = RecordingReader::open(&project().join(RECORDING)).expect("a recording");
+    let info = RecordingInfo { hand: hand.into(), made_by: format!("me{EVIL}"), ..reader.info().clone() };
+    let mut writer = RecordingWriter::create(path, &info).expect("made");
+    for record in reader {
+        let (topic, record) = record.expect("read");
+        match record {
+            Record::Truth(mut truth) => {
+                truth.message.object = format!("mug{EVIL}\ngrasp 1 LIFT");
+                truth.message.class = format!("cup{EVIL}");
+                writer.write_record(&topic, &Record::Truth(truth)).expect("written");
+            }
+            record @ Record::Tactile(_) => writer.write_record(&topic, &record).expect("written"),
+            _ => {}
+        }
+    }
+    writer.finish().expect("finished");
+}
+
+fn assert_harmless(said: &[u8], what: &str) {
+    let said = text(said);
+    let evil = said.chars().find(|char| (char.is_control() && *char != '\n' && *char != '\t') || *char == '\u{202e}');
+    assert_eq!(evil, None, "{what}: {said:?}");
+}
+
+#[test]
+fn nothing_of_a_stranger_commands_the_terminal() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let recording = folder.path().join("evil.mcap");
+    recording_of_stranger(&recording, "barrett-bh8-280");
+    for arguments in [&["info", utf8(&recording)][..], &["info", "--json", utf8(&recording)]] {
+        let output = run(arguments, 0);
+        assert_harmless(&[output.stdout, output.stderr].concat(), "info");
+    }
+    // An operator that prints what it was sent, as lines and as log entries.
+    let body = format!(
+        "case \"$*\" in *--describe*) ;; *) printf 'chat\\033]0;own\\007 \\302\\2331m\\n' >&2; printf \
+         '@blindgrasp {{\"report\":\"log\",\"level\":\"warn\",\"text\":\"a\\\\u001b[2J\\\\n[lift_arbiter] b\"}}\\n';; esac\nexec {} \"$@\"",
+        operator("classifier")
+    );
+    let chatty = script(folder.path(), "chatty", &body);
+    let runs = classifier_runs(&chatty, &format!("{{model: {MODEL}}}"));
+    let flow = dataflow_with(folder.path(), &[runs]);
+    let of_stranger = format!("recorded_source.recording={}", utf8(&recording));
+    for json in [&[][..], &["--json"]] {
+        let mut command = blindgrasp();
+        command.args(["run", "--name", &unique_name(), "--set", &of_stranger, "--set", "recorded_source.rate=max"]);
+        let output = command.args(json).arg(&flow).output().expect("started");
+        let (stdout, stderr) = (text(&output.stdout), text(&output.stderr));
+        assert_eq!(output.status.code(), Some(0), "{stderr}");
+        assert_harmless(stdout.as_bytes(), "the lines of decisions");
+        assert_harmless(stderr.as_bytes(), "the lines of operators");
+        assert!(stdout.contains("mug\\u"), "{stdout}");
+        assert!(!stdout.lines().any(|line| line.starts_with("grasp 1 LIFT")), "{stdout}");
+        assert!(stderr.contains("[classifier] chat\\u"), "{stderr}");
+        assert!(!stderr.lines().any(|line| line.starts_with("[lift_arbiter] b")), "{stderr}");
+    }
+}
+
+#[test]
+fn a_recording_names_a_hand_that_is_built_in_and_no_file() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let recording = folder.path().join("path.mcap");
+    let hand = project().join(HAND);
+    recording_of_stranger(&recording, utf8(&hand));
+    let refused = run(&["info", utf8(&recording)], 1);
+    let said = text(&refused.stderr);
+    assert!(said.contains("name its pad layout with --hand"), "{said}");
+    run(&["info", utf8(&recording), "--hand", HAND], 0);
+}
+
+#[test]
+fn what_is_no_regular_file_is_refused_at_once() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let pipe = folder.path().join("pipe");
+    rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, rustix::fs::Mode::from_raw_mode(0o600), 0)
+        .expect("made");
+    let pipe = utf8(&pipe);
+    for path in [pipe, "/dev/zero", "/dev/null"] {
+        for arguments in [
+            &["info", path][..],
+            &["export", path],
+            &["run", path],
+            &["run", "--check", path],
+            &["model", "show", path],
+            &["info", RECORDING, "--hand", path],
+            &["evaluate", RECORDING, "--model", path],
+        ] {
+            let output = blindgrasp().args(arguments).output().expect("started");
+            let said = text(&output.stderr);
+            assert!(matches!(output.status.code(), Some(1 | 2)), "{arguments:?}: {said}");
+            assert!(said.contains("regular file") || said.contains("not a"), "{arguments:?}: {said}");
+        }
+    }
+}
+
+#[test]
+fn a_process_that_may_open_few_files_says_so() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max")]);
+    for limit in ["16", "20", "24", "28"] {
+        let mut command = Command::new("prlimit");
+        command.args([&format!("--nofile={limit}"), env!("CARGO_BIN_EXE_blindgrasp"), "run", "--name", &unique_name()]);
+        let state = Path::new(env!("CARGO_TARGET_TMPDIR")).join("state");
+        let output = command.arg(&flow).env("XDG_STATE_HOME", state).current_dir(project()).output().expect("started");
+        let said = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{limit}: {said}");
+        assert!(said.contains("ulimit -n") || said.contains("Too many open files"), "{limit}: {said}");
+    }
+}
+
+#[test]
+fn a_graph_is_stopped_right_after_its_start() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = dataflow(folder.path(), &[]);
+    let name = unique_name();
+    let mut stop = blindgrasp();
+    let stop = stop.args(["stop", &name]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("started");
+    let graph = Graph::launch(&name, &flow, &FAST_FOREVER);
+    let output = stop.wait_with_output().expect("ended");
+    if output.status.success() {
+        assert_eq!(graph.finish().code, Some(0));
+        return;
+    }
+    // On a busy machine the graph may come later than the command waits.
+    assert!(text(&output.stderr).contains("no graph"), "{}", text(&output.stderr));
+    wait_until(|| graph.said().contains("Error") || graph.n_decisions() > 0, || graph.said());
+    graph.stop();
+}
+
+/// Shared memory of 64 MB that only the processes of this test see. Only root can make it.
+#[test]
+fn a_graph_goes_on_when_shared_memory_was_full() {
+    let mount = "mount -t tmpfs -o size=64m none /dev/shm && exec \"$@\"";
+    let within = |arguments: &[&str]| {
+        let mut command = Command::new("unshare");
+        command.args(["-m", "sh", "-c", mount, "sh"]).args(arguments).current_dir(project());
+        command.env("XDG_STATE_HOME", Path::new(env!("CARGO_TARGET_TMPDIR")).join("state"));
+        command
+    };
+    if !within(&["true"]).stderr(Stdio::null()).status().is_ok_and(|status| status.success()) {
+        return skipped("no file system can be mounted here (needs root)");
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = dataflow(folder.path(), &[]);
+    let graph = Graph::launch_on(within(&[env!("CARGO_BIN_EXE_blindgrasp")]), &unique_name(), &flow, &FAST_FOREVER);
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    let in_shm = |arguments: &[&str]| {
+        let target = format!("--target={}", graph.pid());
+        Command::new("nsenter").args([&target, "--mount"]).args(arguments).output().expect("started")
+    };
+    let fill = || in_shm(&["dd", "if=/dev/zero", "of=/dev/shm/filler", "bs=64k"]);
+    // What the graph needs is its own: it goes on while the rest is full.
+    assert!(text(&fill().stderr).contains("No space left"), "the file system is full");
+    graph.wait_for_decisions(5 * A_FEW_GRASPS);
+    assert_eq!(graph.node("contacts")["n_restarts"], 0, "{}", graph.said());
+    // A process that is started again finds room only later. It dies more often than a node may, and is not given up.
+    crate::common::signal(graph.pid_of("contacts"), Signal::KILL);
+    fill();
+    wait_until(
+        || graph.node("contacts")["state"] == "running" || graph.said().contains("when there is room"),
+        || graph.said(),
+    );
+    fill();
+    assert_eq!(graph.status()["state"], "running", "{}", graph.said());
+    in_shm(&["rm", "/dev/shm/filler"]);
+    wait_until(|| graph.node("contacts")["state"] == "running", || graph.said());
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    graph.stop().assert_undisturbed("full shared memory");
+}
+
+#[test]
+fn the_socket_of_a_dead_launcher_is_named_and_removed() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let name = unique_name();
+    let graph = Graph::launch(&name, &dataflow(folder.path(), &[]), &FAST_FOREVER);
+    graph.wait_for_decisions(1);
+    let socket = blindgrasp_operator::control_socket::folder().expect("a folder").join(format!("{name}.sock"));
+    assert!(socket.exists());
+    crate::common::signal(graph.pid(), Signal::KILL);
+    drop(graph);
+    // Other tests' graphs start meanwhile, and remove it as well.
+    let doctor = || text(&run(&["doctor", "--quick", "--fix"], 0).stdout);
+    wait_until(|| doctor().lines().count() > 0 && !socket.exists(), || format!("{} is left", socket.display()));
+}
