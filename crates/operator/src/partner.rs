@@ -357,7 +357,7 @@ impl<M: Message> PairedInput for PartnerInput<M> {
         self.retained = Retained::new(self.retained.n_most);
         self.timeline.segments.clear();
         self.chosen = None;
-        self.subscriber.take_over(None::<SampleId>);
+        self.subscriber.take_over_all();
     }
 
     fn take_in(&mut self, is_active: bool, is_ending: bool) -> Result<(), PortError> {

@@ -45,6 +45,8 @@ pub struct Sequencer<T> {
     held: BTreeMap<Place, (T, Instant)>,
     /// Whether samples wait for those before them at all.
     may_hold: bool,
+    /// Nothing is missing before the first sample.
+    takes_what_comes: bool,
     /// The last sample that was sent before this reader began, and until when those up to it are awaited.
     awaited: Option<(SampleId, Instant)>,
     counts: InputCounts,
@@ -80,6 +82,7 @@ impl<T> Sequencer<T> {
             publishers: VecDeque::new(),
             held: BTreeMap::new(),
             may_hold: true,
+            takes_what_comes: false,
             awaited: None,
             counts: InputCounts::default(),
         }
@@ -111,6 +114,11 @@ impl<T> Sequencer<T> {
     /// The order of an edge on which samples may be dropped: no sample waits for those before it.
     pub fn without_waiting(self) -> Self {
         Sequencer { may_hold: false, ..self }
+    }
+
+    /// The order of a reader that goes on with the first sample that its writer still has.
+    pub fn taking_what_comes(self) -> Self {
+        Sequencer { takes_what_comes: true, ..self }
     }
 
     /// The order of a reader that begins at `start`, when `sent` was the last sample that its writer had sent.
@@ -300,6 +308,7 @@ impl<T> Sequencer<T> {
             Some((generation, seq)) if generation == place.0 => place.1.saturating_sub(seq).saturating_sub(1),
             // A new epoch may begin at any number; its writer says at which.
             Some(_) => since_first(),
+            None if self.takes_what_comes => 0,
             None if self.begins_at_zero && self.counted.is_none() => place.1,
             None if self.begins_at_zero => since_first(),
             None => 0,
@@ -314,7 +323,7 @@ impl<T> Sequencer<T> {
         // Samples that an earlier instance counted are not missing, though they may not have come again.
         let n_counted = match (self.counted, n_missing) {
             (Some((generation, seq)), 1..) if generation == place.0 => {
-                n_missing.min(seq.saturating_sub(place.1 - n_missing - 1))
+                n_missing.min((seq + 1).saturating_sub(place.1 - n_missing))
             }
             _ => 0,
         };

@@ -134,6 +134,14 @@ impl<M: Message> Subscriber<M> {
         }
     }
 
+    /// Goes on with all samples that its writer still has, those that were committed too.
+    pub(crate) fn take_over_all(&mut self) {
+        if let Some((cursors, slot)) = &self.cursors {
+            let slot = cursors.input(*slot);
+            self.begin_with(Sequencer::resume(None, slot.key(), slot.counts()).taking_what_comes());
+        }
+    }
+
     /// Goes on after `last`, the last sample that a saved state includes, with the counts of that time.
     pub fn take_over_at(&mut self, last: Option<SampleId>, counts: InputCounts) {
         if let Some((cursors, slot)) = &self.cursors {
