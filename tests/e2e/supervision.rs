@@ -409,7 +409,9 @@ fn full_shared_memory_ends_the_run_in_words() {
         skipped("this system allows no mount in a namespace of one's own");
         return;
     }
-    for (kilobytes, is_enough) in [(4, false), (16, false), (64, false), (1024, false), (8192, false), (20480, false), (65536, true)] {
+    for (kilobytes, is_enough) in
+        [(4, false), (16, false), (64, false), (1024, false), (8192, false), (20480, false), (65536, true)]
+    {
         let name = unique_name();
         let program = env!("CARGO_BIN_EXE_blindgrasp");
         let command = format!(

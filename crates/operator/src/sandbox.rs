@@ -93,14 +93,8 @@ const SOCKET_TYPE_MASK: u64 = 0xf;
 const SET_ID_BITS: [libc::mode_t; 2] = [libc::S_ISUID, libc::S_ISGID];
 /// Bits of a mode that an open file must not get: those above, and rights of other users. iceoryx2 lets the group read its
 /// folders, which lie in a folder of the user alone.
-const FOREIGN_BITS: [libc::mode_t; 6] = [
-    libc::S_ISUID,
-    libc::S_ISGID,
-    libc::S_IWGRP,
-    libc::S_IROTH,
-    libc::S_IWOTH,
-    libc::S_IXOTH,
-];
+const FOREIGN_BITS: [libc::mode_t; 6] =
+    [libc::S_ISUID, libc::S_ISGID, libc::S_IWGRP, libc::S_IROTH, libc::S_IWOTH, libc::S_IXOTH];
 
 /// Why a sandbox cannot be entered.
 #[derive(Debug, thiserror::Error)]
