@@ -68,7 +68,7 @@ pub(super) fn print(path: &Path, as_json: bool) -> anyhow::Result<Outcome> {
 
 fn read(path: &Path) -> std::io::Result<String> {
     if path != Path::new("-") {
-        return std::fs::read_to_string(path);
+        return blindgrasp_messages::files::read_regular(path);
     }
     let mut text = String::new();
     std::io::stdin().lock().read_to_string(&mut text)?;

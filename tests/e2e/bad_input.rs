@@ -93,7 +93,7 @@ fn hands() {
         &urdf,
         &["distal_1", "two joints"],
     );
-    check(&["info", "/dev/zero"], 1, &["/dev/zero", "not a recording"]);
+    check(&["info", "/dev/zero"], 1, &["/dev/zero", "a device, expected a regular file"]);
 }
 
 #[test]

@@ -119,10 +119,10 @@ fn no_shipped_operator_can_change_rights_run_programs_or_make_sockets() {
     let compiled = compiled.expect("started");
     assert!(compiled.status.success(), "{}", text(&compiled.stderr));
 
-    let try_in = |flow: &Path, nodes: &[&str], expected: &[&str]| {
+    let try_in = |flow: &Path, arguments: &[&str], nodes: &[&str], expected: &[&str]| {
         let mut command = blindgrasp();
         command.env("LD_PRELOAD", &library);
-        let graph = Graph::launch_on(command, &unique_name(), flow, &["--stay"]);
+        let graph = Graph::launch_on(command, &unique_name(), flow, arguments);
         for node in nodes {
             wait_until(|| graph.said().contains(&format!("[{node}] last: done")), || graph.said());
             let said = graph.said();
@@ -134,13 +134,13 @@ fn no_shipped_operator_can_change_rights_run_programs_or_make_sockets() {
             assert_eq!(outcomes.len(), N_ESCAPES, "{node}: {said}");
         }
     };
-    try_in(&dataflow(folder.path(), &[]), &NODES, &["own file", "fchmod 0600", "last"]);
+    try_in(&dataflow(folder.path(), &[]), &FAST_FOREVER, &NODES, &["own file", "fchmod 0600", "last"]);
     let flow = folder.path().join("network.yaml");
     let node =
         format!("{{sandbox: required, params: {{hand: {}/{HAND}, address: '127.0.0.1:0'}}}}", project().display());
     std::fs::write(&flow, format!("version: 1\nname: network\noperators:\n  tactile_source: {node}\n"))
         .expect("written");
-    try_in(&flow, &["tactile_source"], &["own file", "fchmod 0600", "socket INET", "socket NETLINK", "last"]);
+    try_in(&flow, &[], &["tactile_source"], &["own file", "fchmod 0600", "socket INET", "socket NETLINK", "last"]);
 }
 
 #[test]

@@ -275,10 +275,12 @@ impl Launcher {
             let again = Instant::now() + ROOM_PAUSE;
             return idxs.into_iter().for_each(|idx| self.members[idx].restart_at = Some(again));
         }
+        // A source fails because a node behind it waits for room.
+        let is_counted = !self.members.iter().any(|member| member.waits_for_room);
         for idx in &idxs {
             let member = &mut self.members[*idx];
             member.restart_at = None;
-            if !waits_for_room {
+            if is_counted {
                 member.restarts.push_back(Instant::now());
             }
             member.n_restarts += 1;
