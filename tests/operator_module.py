@@ -140,7 +140,7 @@ class Pipes(unittest.TestCase):
         os.close(its_input)
         os.close(its_output)
         self.input = open(self.input, "rb")
-        self.send(module.START, json.dumps({"params": {"more": 1.0}}).encode())
+        self.send(module.START, json.dumps({"version": 1, "params": {"more": 1.0}}).encode())
         self.assertEqual(self.receive(), (module.COUNTS, b'{"n_started": 1}'))
         kind, body = self.receive()
         self.assertEqual((kind, json.loads(body)["batch"], json.loads(body)["max_items"]), (module.READY, 32, {"out": 0}))

@@ -263,7 +263,8 @@ impl<T> Sequencer<T> {
             held.extend(before.epoch(generation).map(|epoch| (SampleId { epoch: epoch.value, seq }, sample)));
         }
         held.extend(put_back.into_iter().map(|(key, sample)| (key, (sample, now))));
-        let last = self.last.or(self.counted);
+        // Those that an earlier instance has counted are answered again, if its answers were not received.
+        let last = self.last;
         for (key, sample) in held {
             let Some(place) = self.place(key, written) else { continue };
             if last.is_none_or(|last| place > last) {
