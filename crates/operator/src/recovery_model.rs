@@ -581,7 +581,10 @@ impl Search {
 
     /// The active process ends if its readers lack samples that only its predecessor had.
     fn look(&self, world: &World, node: usize) -> Option<World> {
-        let process = world.nodes[node].active.as_ref().filter(|_| node < SINK)?;
+        if node == SINK {
+            return None;
+        }
+        let process = world.nodes[node].active.as_ref()?;
         // It also finds, later and with a restart, what was not sent when an instance handed over.
         if matches!(self.without, Without::LostPredecessor | Without::HasSentAll) {
             return None;

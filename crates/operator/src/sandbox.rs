@@ -7,7 +7,7 @@
 //! it.
 //!
 //! Landlock decides by the place of a file. It has no rights for sockets other than TCP, for programs in memory or for the mode
-//! and owner of files, so the filter denies these ([`DENIED_CALLS`]). The filter names what is denied, not what is allowed:
+//! and owner of files, so the filter denies these (`DENIED_CALLS`). The filter names what is denied, not what is allowed:
 //! another version of a library, with other system calls, does not end an operator.
 //!
 //! Both restrict threads and those that they start. Threads that an operator starts before it is ready can read files for as
@@ -240,7 +240,7 @@ pub fn deny_programs() -> Result<(), SandboxError> {
     Ok(apply_filter_all_threads(&calls_without(&PROGRAM_CALLS, &families)?)?)
 }
 
-/// A filter that denies [`DENIED_CALLS`], `denied` and all sockets but those of some families.
+/// A filter that denies `DENIED_CALLS`, `denied` and all sockets but those of some families.
 fn calls_without(denied: &[i64], families: &[i32]) -> Result<BpfProgram, SandboxError> {
     let masked =
         |argument, mask: u64, value: u64| SeccompCondition::new(argument, Dword, SeccompCmpOp::MaskedEq(mask), value);

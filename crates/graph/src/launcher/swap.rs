@@ -635,11 +635,14 @@ impl Launcher {
         swap.is_some_and(|swap| swap.targets.iter().any(|target| target.idx == idx))
     }
 
-    /// Whether a node has answered all samples of these targets.
+    /// Whether a node has answered all samples of these targets. Those of a partner input stay unanswered for a while: their
+    /// writer keeps them.
     fn has_caught_up(&self, targets: &[Target], idx: usize) -> bool {
         let node = &self.members[idx].node;
-        let from_targets =
-            node.inputs.iter().filter(|input| targets.iter().any(|target| target.node.id == input.from_node));
+        let from_targets = node
+            .inputs
+            .iter()
+            .filter(|input| !input.partner && targets.iter().any(|target| target.node.id == input.from_node));
         from_targets.into_iter().all(|input| {
             let from = (input.from_node.clone(), input.from_port.clone());
             let sent = self.plan.output_slot(&from).and_then(|slot| self.cursors.output(slot).key());
