@@ -117,7 +117,10 @@ impl LastDecision {
         let waited = self.changes.wait_timeout_while(self.calls(), longest, has_to_wait);
         let (mut calls, _) = waited.unwrap_or_else(PoisonError::into_inner);
         calls.waiting.retain(|waiting| *waiting != call);
-        let (decision, until_nanos) = calls.decision.as_ref().filter(|_| calls.is_valid())?;
+        if !calls.is_valid() {
+            return None;
+        }
+        let (decision, until_nanos) = calls.decision.as_ref()?;
         Some(Decision::new(decision, *until_nanos))
     }
 

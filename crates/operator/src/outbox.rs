@@ -97,7 +97,10 @@ impl<E: Keyed> Kept<E> {
 
     /// The first answer that was sent and may still be needed.
     pub(crate) fn first_sent(&self) -> Option<SampleId> {
-        self.entries.front().filter(|_| self.n_sent > 0).map(Keyed::key)
+        if self.n_sent == 0 {
+            return None;
+        }
+        self.entries.front().map(Keyed::key)
     }
 
     /// Takes out the answers that were sent and that no reader needs again: those up to `answered`, or all if there is no

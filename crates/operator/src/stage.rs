@@ -558,7 +558,8 @@ impl<S: Stage> Instance<S> {
             self.saved.clear();
             encode_state((self.last, self.subscriber.counts(), self.outbox.entries()), &mut self.saved)?;
             self.stage.state(&mut self.saved)?;
-            let Some(first) = self.outbox.first_sent().filter(|_| self.saved.len() > STATE_BYTES) else {
+            let first_sent = if self.saved.len() > STATE_BYTES { self.outbox.first_sent() } else { None };
+            let Some(first) = first_sent else {
                 self.operator.save_state(&self.saved)?;
                 return Ok(Sent::Yes);
             };

@@ -61,7 +61,7 @@ impl Control {
     pub(crate) fn is_borne_by(&self, request: &Request) -> bool {
         let header = request.headers().get(header::AUTHORIZATION).map(|value| value.as_bytes()).unwrap_or_default();
         let is_stream = ["/events", FOXGLOVE].contains(&request.uri().path());
-        let query = request.uri().query().filter(|_| is_stream).unwrap_or_default();
+        let query = if is_stream { request.uri().query().unwrap_or_default() } else { "" };
         is_same(header, &format!("Bearer {}", self.token))
             || is_same(query.as_bytes(), &format!("token={}", self.token))
     }

@@ -275,9 +275,9 @@ fn unreadable_files() {
     assert!(error.contains("absent.yaml: cannot read the file: No such file or directory (os error 2)"), "{error}");
     assert!(error.ends_with("; blindgrasp init DIR makes a project with one"), "{error}");
     let error = load(&folder.0).expect_err("a folder").to_string();
-    assert!(error.contains(": cannot read the file: Is a directory"), "{error}");
+    assert!(error.contains(": cannot read the file: it is a folder, expected a regular file"), "{error}");
     let error = load(Path::new("/dev/zero")).expect_err("endless").to_string();
-    assert_eq!(error, "/dev/zero: larger than 1 MiB, so it is not a dataflow file");
+    assert_eq!(error, "/dev/zero: cannot read the file: it is a device, expected a regular file");
 
     check_err(b"version: 1\nname: \xc3\xa9\xff\n", "2:8: not UTF-8 text");
     check_err("", "1:1: the file is empty");
