@@ -31,7 +31,7 @@ impl DescriptorWatch {
     }
 }
 
-/// The number of open descriptors of this process; `None` if there is none left to look.
+/// The number of open descriptors of this process; `None` if no descriptor is left for counting them.
 pub(super) fn n_open() -> Option<u64> {
     std::fs::read_dir("/proc/self/fd").ok().map(|entries| entries.count() as u64)
 }

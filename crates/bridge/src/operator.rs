@@ -278,7 +278,7 @@ impl<'a> Link<'a> {
                 Ok(frame) => self.on_frame(idx, kind, frame)?,
                 Err(WireError::Refused(reason)) => {
                     let connection = &mut self.connections[idx];
-                    // A refusal is not signed: everybody who can send here can send one, with any text.
+                    // Refusals are not signed: any program that reaches this key can send one, with any text.
                     if connection.peer.on_refusal(&reason)
                         && connection.refused_logged.is_none_or(|logged| logged.elapsed() > REFUSAL_PAUSE)
                     {

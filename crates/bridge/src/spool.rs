@@ -10,7 +10,7 @@ use blindgrasp_operator::cursors::SampleId;
 
 use super::outgoing::KeptSample;
 
-/// A file of answered samples is written anew beyond this length and twice that of the others.
+/// The file is written anew when it is longer than this, and longer than twice the samples in it that are still kept.
 const SLACK_BYTES: u64 = 1 << 20;
 /// The kinds of records: a sample, and the number of samples that were lost so far.
 const SAMPLE: u8 = 0;
@@ -75,7 +75,7 @@ impl Spool {
         Ok(())
     }
 
-    /// Whether the file is to be written anew, where so many samples of it are still kept.
+    /// Whether the file is due to be written anew, if that many of its samples are still kept.
     pub(super) fn is_long(&self, n_kept: usize) -> bool {
         self.n_bytes > self.most_bytes || (n_kept == 0 && self.n_bytes > SLACK_BYTES)
     }

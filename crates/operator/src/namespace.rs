@@ -393,10 +393,10 @@ fn make_counter(wiring: &NamespaceWiring) -> std::io::Result<()> {
 }
 
 /// Takes the memory of a graph's files. The kernel gives memory to a file in shared memory when it is written to for the first
-/// time, and kills a process that writes when there is none left; memory that is taken no other program can take.
+/// time, and kills a process that writes when there is none left; no other program can take memory that the graph has taken.
 ///
 /// # Errors
-/// There is not so much left. What was taken stays taken.
+/// Shared memory has too little room. The part that was taken stays taken.
 pub fn take_room(wiring: &NamespaceWiring) -> Result<(), NamespaceError> {
     let mut n_missing_bytes = 0;
     for entry in std::fs::read_dir(SHARED_MEMORY_FOLDER).into_iter().flatten().flatten() {

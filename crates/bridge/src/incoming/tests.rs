@@ -466,7 +466,7 @@ fn a_receiver_that_is_killed_again_and_again_misses_nothing() {
     assert!(n_lives > 100, "{n_lives}");
 }
 
-/// Also while it is cut off: its successor has what it has saved.
+/// The sender is killed while it is cut off as well. Its successor sends the samples that the file holds.
 #[test]
 fn a_sender_that_is_killed_again_and_again_loses_nothing() {
     // A new process knows the order of epochs by their numbers alone.

@@ -23,7 +23,7 @@ fn key(seq: u64) -> SampleId {
     SampleId { epoch: 1, seq }
 }
 
-/// The content of the file where it holds nothing else than what is needed.
+/// The content of the file without samples that are needed no more.
 fn saved(sender: &Outgoing) -> Vec<KeptSample> {
     let kept = |(key, origin_nanos, message): (SampleId, u64, &[u8])| KeptSample {
         key,
