@@ -147,8 +147,12 @@ impl Launcher {
 
     /// Restarts a node whose active process has ended, if it may be.
     fn on_death(&mut self, idx: usize) -> Result<(), LaunchError> {
-        // Its last lines may still be on their way.
+        // Its last lines may still be on their way. A process that ends by itself with an error says why.
         self.listen(Duration::from_millis(1));
+        let exit = self.members[idx].active.as_ref().and_then(|process| process.exit);
+        if exit.is_some_and(|exit| exit.code().is_some_and(|code| code != 0)) {
+            self.drain_logs(|launcher| launcher.members[idx].active.as_ref());
+        }
         let is_stopping = self.state == GraphState::Stopping;
         let member = &mut self.members[idx];
         let Some(process) = &member.active else {
