@@ -24,7 +24,7 @@ use blindgrasp_operator::port::{Publisher, Sent, Subscriber, sample_id};
 use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
 use blindgrasp_operator::wiring::InputCounts;
-use blindgrasp_simulator::trial::TrialOptions;
+use blindgrasp_simulator::trial::{PhysicsEngine, TrialOptions};
 use blindgrasp_simulator::trial::course::{Course, Finished};
 use blindgrasp_simulator::trial::robot::{Doing, Robot, RobotOptions, told_header};
 use blindgrasp_simulator::trial::targets::{check_approaches, targets_named};
@@ -47,6 +47,7 @@ struct Params {
     decision_timeout_s: f64,
     friction: Option<f64>,
     options: Option<PathBuf>,
+    physics: Option<PhysicsEngine>,
     model: Option<PathBuf>,
 }
 
@@ -87,6 +88,11 @@ pub(crate) fn describe() -> OperatorDescription {
             "How attempts are made (YAML or JSON): options of the protocol, the physics and the cells other than the default",
         )
         .optional_param(
+            "physics",
+            ParamKind::Choice { values: vec!["rapier".into(), "mujoco".into()] },
+            "The physics engine instead of that of the options: rapier is built in, mujoco comes from PyPI",
+        )
+        .optional_param(
             "model",
             ParamKind::Path { must_exist: true },
             "A model of lifts: of several random approaches, the hand takes the one that it says is kept most often",
@@ -105,7 +111,8 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         let names = LiftOutcome { thing: thing.name.clone(), group: thing.group.clone(), ..LiftOutcome::default() };
         names.check().with_context(|| format!("things: '{}'", thing.name))?;
     }
-    let trial_options = params.options.as_deref().map_or_else(|| Ok(TrialOptions::default()), TrialOptions::load)?;
+    let mut trial_options = params.options.as_deref().map_or_else(|| Ok(TrialOptions::default()), TrialOptions::load)?;
+    trial_options.physics.engine = params.physics.unwrap_or(trial_options.physics.engine);
     operator.reserve_state()?;
     // An instance that goes on has checked before.
     if operator.saved_state().is_none() {

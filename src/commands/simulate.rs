@@ -11,6 +11,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 
 use super::object_list::list;
+use super::trials::physics;
 use super::{Outcome, check_new, number_in, percent, print_line};
 use blindgrasp_learning::dataset::REPORT_METADATA;
 use blindgrasp_messages::files::read_regular;
@@ -21,6 +22,7 @@ use blindgrasp_recording::{Manifest, RecordingError, RecordingInfo, RecordingRea
 use blindgrasp_simulator::candidate::SimulatedGrasp;
 use blindgrasp_simulator::options::{SimulatorOptions, Thresholds, check_hand};
 use blindgrasp_simulator::protocol::Approach;
+use blindgrasp_simulator::trial::PhysicsEngine;
 use blindgrasp_simulator::simulator::{Part, SimulateError, Simulation, SimulationReport};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
@@ -57,6 +59,9 @@ pub(super) struct Arguments {
     /// which takes a second of CPU time a candidate [default: wrench-space].
     #[arg(long, value_parser = label)]
     label: Option<Label>,
+    /// Physics engine of lifts: rapier, the built-in one; mujoco (pip install 'blindgrasp[mujoco]') [default: rapier].
+    #[arg(long, value_parser = physics)]
+    physics: Option<PhysicsEngine>,
     /// Least epsilon and volume of a stable grasp with label wrench-space [default: 0.07,0.1, the paper's].
     #[arg(long, value_name = "EPSILON,VOLUME", value_parser = thresholds)]
     thresholds: Option<Thresholds>,
@@ -292,6 +297,7 @@ fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {
     options.n_grasps = arguments.grasps.unwrap_or(options.n_grasps);
     options.seed = arguments.seed.unwrap_or(options.seed);
     options.label = arguments.label.unwrap_or(options.label);
+    options.lift.engine = arguments.physics.unwrap_or(options.lift.engine);
     options.protocol.approach = arguments.protocol.unwrap_or(options.protocol.approach);
     options.thresholds = arguments.thresholds.unwrap_or(options.thresholds);
     options.friction = arguments.friction.unwrap_or(options.friction);

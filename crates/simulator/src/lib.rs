@@ -20,7 +20,7 @@
 //! The path of a candidate: an object of [`blindgrasp_objects`] and a random start (or the [`planner`]'s)
 //! -> [`protocol`] (the palm comes, the fingers close; by the distances of [`distance`] and the joints of [`mechanism`]) ->
 //! [`contact_points`] -> [`loaded_contacts`] ([`soft_finger`] patches, cell forces) -> [`wrench_space`] (over [`hull`]) ->
-//! [`tactile_sensor`] (cell readings). [`candidate`] connects these steps. [`simulator`] goes through the candidates of a
+//! [`tactile_sensor`] (cell readings; of skins that spread force, [`skin`]). [`candidate`] connects these steps. [`simulator`] goes through the candidates of a
 //! part and keeps those that fill the asked-for numbers of stable and unstable grasps; [`options`] has its options. With
 //! the label `lift`, the physics of [`crate::trial`] replace the steps between the object and the label.
 //!
@@ -43,6 +43,7 @@ pub mod pad_grid;
 pub mod planner;
 pub mod protocol;
 pub mod simulator;
+pub mod skin;
 pub mod soft_finger;
 pub mod tactile_sensor;
 pub mod trial;

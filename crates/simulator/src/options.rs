@@ -9,7 +9,7 @@ use super::protocol::ProtocolOptions;
 use super::soft_finger::SoftFingerOptions;
 use super::tactile_sensor::SensorOptions;
 use super::wrench_space::{MAX_FRICTION, Quality, STABLE_EPSILON, STABLE_VOLUME};
-use crate::trial::{PhysicsOptions, TrialProtocol, check_planner};
+use crate::trial::{PhysicsEngine, PhysicsOptions, TrialProtocol, check_planner};
 use blindgrasp_stages::hand::{CellUnit, Hand};
 use blindgrasp_stages::label::Label;
 
@@ -99,7 +99,11 @@ impl SimulatorOptions {
         match self.label {
             Label::WrenchSpace => {
                 self.thresholds.check()?;
-                require("lift", "set", self.lift.is_default(), "its default without label lift: nothing is lifted")
+                require("lift", "set", self.lift.is_default(), "its default without label lift: nothing is lifted")?;
+                let SensorOptions { skin, lag_secs, joint_encoders, .. } = &self.sensor;
+                let is_plain = skin.is_default() && *lag_secs == 0.0 && *joint_encoders == 0.0;
+                let expected = "their defaults without label lift: only lifts have them";
+                require("sensor.skin, lag_secs or joint_encoders", "set", is_plain, expected)
             }
             Label::Lift => self.check_for_lift(),
         }
@@ -164,12 +168,30 @@ impl Thresholds {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LiftOptions {
+    /// The physics engine.
+    pub engine: PhysicsEngine,
     /// Range of a factor on the friction, uniform. `[1, 1]`: none.
     pub friction_factor: [f64; 2],
     /// Range of a factor on the object's mass, its logarithm uniform. `[1, 1]`: none.
     pub mass_factor: [f64; 2],
     /// Largest distance by which the centre of mass is off the object's own, uniform over the ball: contents. 0: none.
     pub centre_shift_m: f64,
+    /// Range of the radius of the table or post on which the object stands, its logarithm uniform. As in trials.
+    pub stand_radius_m: [f64; 2],
+    /// Range of a factor on the forces with which the fingers close and grip, its logarithm uniform. `[1, 1]`: none.
+    pub force_factor: [f64; 2],
+    /// Range of a factor on the fingers' closing speed, its logarithm uniform. `[1, 1]`: none.
+    pub speed_factor: [f64; 2],
+    /// Range of a factor on the stiffness of the rubber that spreads a force over cells, its logarithm uniform. `[1, 1]`: none.
+    pub rubber_factor: [f64; 2],
+    /// Range of a factor on how fast contacts give way, its logarithm uniform: 0.5 is four times as soft. `[1, 1]`: none.
+    pub contact_factor: [f64; 2],
+    /// Range of a factor on the stiffness of the gears between motors and joints, its logarithm uniform. `[1, 1]`: none.
+    pub gear_factor: [f64; 2],
+    /// Share of the lifts in which contacts creep, with MuJoCo. 0.
+    pub creep_share: f64,
+    /// Whether hands that touch nothing once they have closed count as drops; they are left out otherwise.
+    pub keeps_empty: bool,
     /// Height of the test lift. As in trials.
     pub test_lift_m: f64,
     /// Amplitude of the shake after it; 0: none. As in trials.
@@ -185,9 +207,18 @@ pub struct LiftOptions {
 impl Default for LiftOptions {
     fn default() -> Self {
         LiftOptions {
+            engine: PhysicsEngine::default(),
             friction_factor: [1.0; 2],
             mass_factor: [1.0; 2],
             centre_shift_m: 0.0,
+            stand_radius_m: [PhysicsOptions::default().stand_radius_m; 2],
+            force_factor: [1.0; 2],
+            speed_factor: [1.0; 2],
+            rubber_factor: [1.0; 2],
+            contact_factor: [1.0; 2],
+            gear_factor: [1.0; 2],
+            creep_share: 0.0,
+            keeps_empty: true,
             test_lift_m: TrialProtocol::default().test_lift_m,
             test_shake_m: TrialProtocol::default().test_shake_m,
             step_secs: PhysicsOptions::default().step_secs,
@@ -202,12 +233,22 @@ impl LiftOptions {
     }
 
     fn check(&self) -> Result<(), OptionError> {
-        for (option, [low, high]) in
-            [("lift.friction_factor", self.friction_factor), ("lift.mass_factor", self.mass_factor)]
-        {
+        for (option, [low, high]) in [
+            ("lift.friction_factor", self.friction_factor),
+            ("lift.mass_factor", self.mass_factor),
+            ("lift.stand_radius_m", self.stand_radius_m),
+            ("lift.force_factor", self.force_factor),
+            ("lift.speed_factor", self.speed_factor),
+            ("lift.rubber_factor", self.rubber_factor),
+            ("lift.contact_factor", self.contact_factor),
+            ("lift.gear_factor", self.gear_factor),
+        ] {
             let is_range = low > 0.0 && low <= high && high <= 100.0;
-            require(option, format!("[{low}, {high}]"), is_range, "two ascending factors above 0, at most 100")?;
+            require(option, format!("[{low}, {high}]"), is_range, "two ascending numbers above 0, at most 100")?;
         }
+        share("lift.creep_share", self.creep_share)?;
+        let creeps = self.creep_share == 0.0 || self.engine == PhysicsEngine::Mujoco;
+        require("lift.creep_share", self.creep_share, creeps, "0 without engine mujoco")?;
         not_negative("lift.centre_shift_m", self.centre_shift_m)?;
         let most_m = TrialProtocol::default().lift_m;
         let is_height = self.test_lift_m > 0.0 && self.test_lift_m < most_m;

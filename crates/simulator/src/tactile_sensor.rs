@@ -1,7 +1,8 @@
 //! The sensor: readings of cells and joint encoders from true forces and angles.
 //!
 //! Noise, offset-corrected counts that are never negative, saturation; by option gains and offsets that differ from cell to
-//! cell, crosstalk between cells, dead cells and stuck ones, encoders with a wrong zero. Not modelled: hysteresis and creep.
+//! cell or that all cells share, crosstalk between cells, skins that spread force and lag behind it, dead cells and stuck ones,
+//! encoders at motor or joint with a wrong zero. Not modelled: hysteresis.
 
 use nalgebra::Vector3;
 use rand::{RngExt, SeedableRng};
@@ -9,6 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::option_check::{OptionError, not_negative, positive, require, share};
+use super::skin::{Bell, SkinOptions};
 use blindgrasp_stages::hand::{Cell, Hand};
 
 /// The quality of the sensor.
@@ -19,10 +21,16 @@ pub struct SensorOptions {
     pub noise_newtons: f64,
     /// Standard deviation of the logarithm of the cells' gains: 0.1 is about 10 %. 0: all cells are calibrated.
     pub gain_sigma: f64,
+    /// Standard deviation of the logarithm of the gain that all cells share. 0.
+    pub common_gain_sigma: f64,
     /// Standard deviation of each cell's offset: its drift since the sensor was tared. 0.
     pub offset_newtons: f64,
     /// Share of the force on a cell that the cells around it feel in its place, in equal parts. 0.
     pub crosstalk: f64,
+    /// How the skin spreads force over the cells, in lifts.
+    pub skin: SkinOptions,
+    /// Longest time constant with which cells follow a force, in lifts, uniform from 0 on: seconds. 0.
+    pub lag_secs: f64,
     /// The part of the cells that always reads 0. 0.
     pub dead_fraction: f64,
     /// The part of the cells that always reads the largest count. 0.
@@ -39,6 +47,8 @@ pub struct SensorOptions {
     pub encoder_quantum_rad: f64,
     /// Standard deviation of the zero of each encoder. 0.
     pub encoder_offset_rad: f64,
+    /// Share of the hands whose encoders are at the joints, in lifts; others have them at the motors, whose gears give. 0.
+    pub joint_encoders: f64,
     /// Standard deviation of the noise of each force at the wrist. 0.1 N: assumed, of a sensor for 100 N and more.
     pub wrist_noise_newtons: f64,
     /// Standard deviation of the noise of each torque at the wrist, newton metres. 0.005: assumed, of the same sensor.
@@ -64,8 +74,11 @@ impl Default for SensorOptions {
         SensorOptions {
             noise_newtons: 0.01,
             gain_sigma: 0.0,
+            common_gain_sigma: 0.0,
             offset_newtons: 0.0,
             crosstalk: 0.0,
+            skin: SkinOptions::default(),
+            lag_secs: 0.0,
             dead_fraction: 0.0,
             stuck_fraction: 0.0,
             faults_of: FaultsOf::Hand,
@@ -73,6 +86,7 @@ impl Default for SensorOptions {
             largest_count: 4095,
             encoder_quantum_rad: std::f64::consts::TAU / 4096.0,
             encoder_offset_rad: 0.0,
+            joint_encoders: 0.0,
             wrist_noise_newtons: 0.1,
             wrist_noise_torque: 0.005,
             joint_torque_noise: 0.02,
@@ -84,7 +98,11 @@ impl SensorOptions {
     pub(crate) fn check(&self) -> Result<(), OptionError> {
         not_negative("noise_newtons", self.noise_newtons)?;
         not_negative("gain_sigma", self.gain_sigma)?;
+        not_negative("common_gain_sigma", self.common_gain_sigma)?;
         not_negative("offset_newtons", self.offset_newtons)?;
+        self.skin.check()?;
+        require("lag_secs", self.lag_secs, (0.0..=1.0).contains(&self.lag_secs), "0 to 1")?;
+        share("joint_encoders", self.joint_encoders)?;
         share("crosstalk", self.crosstalk)?;
         share("dead_fraction", self.dead_fraction)?;
         share("stuck_fraction", self.stuck_fraction)?;
@@ -109,6 +127,12 @@ pub struct Sensor {
     neighbours: Vec<Vec<usize>>,
     /// Empty if all encoders have the right zero.
     encoder_offsets_rad: Vec<f64>,
+    common_gain: f64,
+    /// `None` for the rubber's patches.
+    pub(crate) bell: Option<Bell>,
+    pub(crate) lag_secs: f64,
+    /// Whether the encoders are at the joints, behind the gears.
+    pub(crate) reads_joints: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -143,7 +167,20 @@ impl Sensor {
             let offsets_newtons = offsets(options.offset_newtons, hand.n_cells());
             let encoder_offsets_rad = offsets(options.encoder_offset_rad, hand.joints.len());
             let neighbours = if options.crosstalk > 0.0 { neighbours(hand) } else { Vec::new() };
-            Sensor { cells, offsets_newtons, neighbours, encoder_offsets_rad }
+            let common_gain = if options.common_gain_sigma > 0.0 { options.common_gain_sigma * gaussian(rng) } else { 0.0 };
+            let mut part = |of: f64| if of > 0.0 { of * rng.random::<f64>() } else { 0.0 };
+            let lag_secs = part(options.lag_secs);
+            let reads_joints = options.joint_encoders > 0.0 && part(1.0) < options.joint_encoders;
+            Sensor {
+                cells,
+                offsets_newtons,
+                neighbours,
+                encoder_offsets_rad,
+                common_gain: common_gain.exp(),
+                bell: options.skin.draw(rng),
+                lag_secs,
+                reads_joints,
+            }
         };
         match options.faults_of {
             FaultsOf::Grasp => draw_all(grasp_rng),
@@ -184,7 +221,7 @@ impl Sensor {
                     CellState::Dead => 0.0,
                     CellState::Stuck => largest,
                     CellState::Gain(gain) => {
-                        let read_newtons = gain * newtons + noise_newtons;
+                        let read_newtons = gain * self.common_gain * newtons + noise_newtons;
                         (read_newtons / area_cm2 * options.counts_per_newton_per_cm2).round().clamp(0.0, largest)
                     }
                 };
@@ -194,7 +231,7 @@ impl Sensor {
             .collect()
     }
 
-    /// The encoders' readings of `joints`, within the joints' limits.
+    /// The encoders' readings of `joints`, within the joints' limits but for wrong zeros.
     pub fn read_joints(&self, hand: &Hand, joints: &[f64], options: &SensorOptions) -> Vec<f64> {
         let quantum_rad = options.encoder_quantum_rad;
         let offsets_rad = self.encoder_offsets_rad.iter().copied().chain(std::iter::repeat(0.0));
@@ -207,7 +244,8 @@ impl Sensor {
                 let quantum = quantum_rad * per_radian;
                 let read = value + offset_rad * per_radian;
                 let rounded = if quantum > 0.0 { (read / quantum).round() * quantum } else { read };
-                rounded.clamp(joint.lower, joint.upper)
+                let off = offset_rad * per_radian;
+                rounded.clamp(joint.lower + off.min(0.0), joint.upper + off.max(0.0))
             })
             .collect()
     }

@@ -25,7 +25,7 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_session::recorder::RecordOptions;
 use blindgrasp_session::run::Session;
 use blindgrasp_simulator::trial::targets::{check_approaches, targets_and_warnings};
-use blindgrasp_simulator::trial::{LiftTarget, TrialOptions};
+use blindgrasp_simulator::trial::{LiftTarget, PhysicsEngine, TrialOptions};
 
 /// Counter of simulated_hand for trials that no approach led to.
 const LEFT_OUT: &str = "left_out";
@@ -44,6 +44,7 @@ const MAX_STRIPS: usize = 18;
 #[command(after_help = "Examples:\n  \
                         blindgrasp trials                                           the paper's 110 trials, with and without the decision\n  \
                         blindgrasp trials --trials 11 --lift-policy decision        each of its objects once\n  \
+                        blindgrasp trials --trials 11 --physics mujoco              the same in a physics of others\n  \
                         blindgrasp trials --objects held-out --trials 240 --report trials.html\n  \
                         blindgrasp trials --objects box-02@0.3kg@mu0.5,paper/mug --trials 40 --json\n\n\
                         Ctrl-C ends the run; the trials made so far are shown. The same seed gives the same trials.")]
@@ -70,6 +71,9 @@ pub(super) struct Arguments {
     /// File of options (YAML or JSON) that replace the defaults; --print-options prints them all.
     #[arg(long, value_name = "FILE")]
     options: Option<PathBuf>,
+    /// Physics engine instead of that of the options: rapier, the built-in one; mujoco (pip install 'blindgrasp[mujoco]').
+    #[arg(long, value_parser = physics)]
+    physics: Option<PhysicsEngine>,
     /// Print all options with their defaults and what they mean, as YAML, and stop.
     #[arg(long)]
     print_options: bool,
@@ -101,6 +105,14 @@ enum LiftPolicy {
     Decision,
     Always,
     Both,
+}
+
+pub(super) fn physics(text: &str) -> Result<PhysicsEngine, String> {
+    match text {
+        "rapier" => Ok(PhysicsEngine::Rapier),
+        "mujoco" => Ok(PhysicsEngine::Mujoco),
+        _ => Err("expected rapier or mujoco".into()),
+    }
 }
 
 /// One way to make the trials.

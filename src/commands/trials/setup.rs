@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 
 use super::super::graph_file::{OnMisfit, checked, fitting};
-use super::{Arguments, Way};
+use super::{Arguments, Way, physics};
 use blindgrasp_graph::dataflow::{self, DataflowFile, Graph, Node, Override, Scope};
 use blindgrasp_messages::{LiftOutcome, Recorded};
-use blindgrasp_simulator::trial::{ProbeMove, TrialOptions};
+use blindgrasp_simulator::trial::{PhysicsEngine, ProbeMove, TrialOptions};
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
@@ -83,7 +83,7 @@ impl Setup {
             overrides.extend(judges.map(|node| set(&node.id, "model", path.into())));
             model = path.into();
         }
-        let options = match (&arguments.options, node.params.get("options").and_then(|path| path.as_str())) {
+        let mut options = match (&arguments.options, node.params.get("options").and_then(|path| path.as_str())) {
             (Some(path), _) => {
                 let text = path.to_str().context("--options: the path is not UTF-8")?;
                 overrides.push(set(&node.id, "options", text.into()));
@@ -92,6 +92,12 @@ impl Setup {
             (None, Some(path)) => TrialOptions::load(Path::new(path))?,
             (None, None) => TrialOptions::default(),
         };
+        if let Some(engine) = arguments.physics {
+            let engine_word = if engine == PhysicsEngine::Mujoco { "mujoco" } else { "rapier" };
+            overrides.push(set(&node.id, "physics", engine_word.into()));
+        }
+        let own = node.params.get("physics").and_then(|engine| engine.as_str()).and_then(|word| physics(word).ok());
+        options.physics.engine = arguments.physics.or(own).unwrap_or(options.physics.engine);
         let hand = node.params.get("hand").and_then(|hand| hand.as_str()).unwrap_or(DEFAULT_HAND);
         let hand = Hand::load(Path::new(hand))?;
         let friction = node.params.get("friction").and_then(|friction| friction.as_f64());

@@ -5,16 +5,19 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
+use super::engine::{Engine, GRAVITY, Side, Touch, load_on_wrist, stand_newtons};
 use super::hand_body::HandBody;
+use super::mujoco::Mujoco;
 use super::motion::{LiftPath, Path, TestLiftPath};
 use super::sensing::patches;
 use super::start::first_touch;
-use super::world::{GRAVITY, Side, Touch, World};
-use super::{LiftResult, LiftTarget, Snapshot, Start, TrialError, TrialOptions};
+use super::world::World;
+use super::{LiftResult, LiftTarget, PhysicsEngine, Snapshot, Start, TrialError, TrialOptions};
 use crate::candidate::TimedFrame;
 use crate::loaded_contacts::{SimulatedContact, grasp_case};
 use crate::mechanism::Mechanism;
 use crate::options::check_hand;
+use crate::skin::Pressure;
 use crate::tactile_sensor::{Sensor, read_torques, read_wrench};
 use crate::wrench_space::{GraspCase, quality};
 use blindgrasp_messages::{OwnedSenses, Phase, Sense, TactileFrame};
@@ -36,7 +39,7 @@ pub struct Attempt<'a> {
     mechanism: Mechanism<'a>,
     target: LiftTarget,
     options: TrialOptions,
-    world: World,
+    engine: Box<dyn Engine>,
     body: HandBody,
     sensor: Sensor,
     rng: ChaCha8Rng,
@@ -57,6 +60,8 @@ pub struct Attempt<'a> {
     lifted_m: f64,
     /// The target's velocity at the last frame, in the palm frame.
     last_velocity: Vector3<f64>,
+    /// What cells felt that lag behind their forces, and when.
+    felt: Option<(Vec<f64>, u64)>,
 }
 
 /// What the hand does until it is asked to do something else.
@@ -128,9 +133,14 @@ impl<'a> Attempt<'a> {
         };
         let stand_off = Isometry3::translation(0.0, 0.0, options.protocol.stand_off_m);
         let palm_from_world = stand_off * touch.palm_from_world;
-        let mut world = World::new(target, &touch.world_from_target, &palm_from_world, &options.physics);
-        let body = HandBody::new(&mut world, &mechanism, &start.open_joints_rad, &options.physics)?;
-        world.push_off(&Vector3::new(0.0, 0.0, options.protocol.approach_speed));
+        let (plan, body) = HandBody::new(&mechanism, &start.open_joints_rad, &options.physics)?;
+        let (standing, physics) = (&touch.world_from_target, &options.physics);
+        let mut engine: Box<dyn Engine> = match physics.engine {
+            PhysicsEngine::Rapier => Box::new(World::new(target, standing, &palm_from_world, &plan, physics)?),
+            PhysicsEngine::Mujoco => Box::new(Mujoco::new(target, standing, &palm_from_world, &plan, physics)?),
+        };
+        body.hold(&mut *engine, &options.physics);
+        engine.push_off(&Vector3::new(0.0, 0.0, options.protocol.approach_speed));
         let mut rng = ChaCha8Rng::seed_from_u64(sensor_seed);
         // All attempts are one hand's.
         let sensor = Sensor::draw(hand, &options.sensor, HAND_SEED, &mut rng);
@@ -138,7 +148,7 @@ impl<'a> Attempt<'a> {
             mechanism,
             target: target.clone(),
             options: options.clone(),
-            world,
+            engine,
             body,
             sensor,
             rng,
@@ -153,6 +163,7 @@ impl<'a> Attempt<'a> {
             settled: None,
             lifted_m: 0.0,
             last_velocity: Vector3::zeros(),
+            felt: None,
         })
     }
 
@@ -179,37 +190,36 @@ impl<'a> Attempt<'a> {
         }
         self.n_frames += 1;
         self.n_frames_of_stage += 1;
-        let velocity = self.world.target_velocity();
+        let velocity = self.engine.target_velocity();
         let acceleration = (velocity - self.last_velocity) / (frame_nanos as f64 * 1e-9);
         self.last_velocity = velocity;
+        let centre = self.engine.palm_from_target() * self.target.object.centre_of_mass_m;
         Some(Moment {
             offset_nanos,
             phase: self.stage.phase(),
-            joints: self.body.joints(&self.world),
+            joints: self.body.joints(&*self.engine),
             motors_rad: self.body.motors_rad(),
-            torques: self.body.torques(&self.world),
-            touches: self.world.touches(&self.body.shapes),
-            palm_from_target: self.world.palm_from_target(),
-            load_on_wrist: self.world.load_on_wrist(self.target.mass_kg, &acceleration),
+            torques: self.body.torques(&*self.engine),
+            touches: self.engine.touches(),
+            palm_from_target: self.engine.palm_from_target(),
+            load_on_wrist: load_on_wrist(&*self.engine, self.target.mass_kg, &centre, &acceleration),
         })
     }
 
     /// What the hand feels at a moment.
     pub(super) fn feel(&mut self, moment: Moment, grasp_id: u64) -> TimedFrame {
         let hand = self.mechanism.hand;
-        let mut cells_newtons = vec![0.0; hand.n_cells()];
-        for contact in self.patches(&moment.joints, moment.touches, &moment.palm_from_target) {
-            for (cell_idx, newtons) in &contact.cells_newtons {
-                cells_newtons[*cell_idx] += newtons;
-            }
-        }
+        let motors_or_joints = if self.sensor.reads_joints { &moment.joints } else { &moment.motors_rad };
+        let joints = self.sensor.read_joints(hand, motors_or_joints, &self.options.sensor);
+        let cells_newtons = self.press(&moment.joints, moment.touches, &moment.palm_from_target);
+        let cells_newtons = self.lag(cells_newtons, moment.offset_nanos);
         let sensor = &self.options.sensor;
         let (force, torque) = &moment.load_on_wrist;
         let gravity = self.world_from_palm.rotation.inverse() * Vector3::new(0.0, 0.0, -GRAVITY);
         let frame = TactileFrame {
             grasp_id,
             phase: moment.phase,
-            joints: self.sensor.read_joints(hand, &moment.motors_rad, sensor),
+            joints,
             cells_newtons: self.sensor.read_cells(hand, &cells_newtons, sensor, &mut self.rng),
             senses: OwnedSenses::default()
                 .with(Sense::Gravity, gravity.as_slice())
@@ -218,6 +228,42 @@ impl<'a> Attempt<'a> {
             day: 0,
         };
         TimedFrame { offset_nanos: moment.offset_nanos, frame }
+    }
+
+    /// The forces on the cells.
+    fn press(&self, joints: &[f64], touches: Vec<Touch>, palm_from_target: &Isometry3<f64>) -> Vec<f64> {
+        let hand = self.mechanism.hand;
+        if let Some(bell) = &self.sensor.bell
+            && let Ok(palm_from_links) = hand.palm_from_links(joints)
+        {
+            let pressures = touches.into_iter().map(|touch| Pressure {
+                link_idx: touch.link_idx,
+                point_m: touch.point_m,
+                direction: touch.outward,
+                newtons: touch.newtons,
+            });
+            return bell.cells_newtons(hand, &palm_from_links, pressures);
+        }
+        let mut cells_newtons = vec![0.0; hand.n_cells()];
+        for contact in self.patches(joints, touches, palm_from_target) {
+            for (cell_idx, newtons) in &contact.cells_newtons {
+                cells_newtons[*cell_idx] += newtons;
+            }
+        }
+        cells_newtons
+    }
+
+    /// What cells that lag behind their forces feel.
+    fn lag(&mut self, cells_newtons: Vec<f64>, offset_nanos: u64) -> Vec<f64> {
+        if self.sensor.lag_secs == 0.0 {
+            return cells_newtons;
+        }
+        let (felt, at_nanos) = self.felt.get_or_insert_with(|| (vec![0.0; cells_newtons.len()], offset_nanos));
+        let passed_secs = offset_nanos.saturating_sub(*at_nanos) as f64 * 1e-9;
+        let part = 1.0 - (-passed_secs / self.sensor.lag_secs).exp();
+        felt.iter_mut().zip(&cells_newtons).for_each(|(felt, newtons)| *felt += part * (newtons - *felt));
+        *at_nanos = offset_nanos;
+        felt.clone()
     }
 
     /// Begins a probe, whose frames follow.
@@ -230,7 +276,7 @@ impl<'a> Attempt<'a> {
             (Stage::TestLifted, _) | (Stage::Squeezed, ProbeMove::Squeeze) => {}
             (Stage::Squeezed, ProbeMove::TestLift) => self.enter(Stage::TestLift),
             _ => {
-                self.settled = Some(self.world.palm_from_target());
+                self.settled = Some(self.engine.palm_from_target());
                 self.enter(Stage::Squeeze);
             }
         }
@@ -241,7 +287,7 @@ impl<'a> Attempt<'a> {
         let physics = &mut self.options.physics;
         self.n_steps = (self.n_steps as f64 * physics.step_secs / step_secs).round() as u64;
         physics.step_secs = step_secs;
-        self.world.engine.integration_parameters.dt = step_secs;
+        self.engine.set_step(step_secs);
     }
 
     /// Lets the time of a frame pass that is not felt.
@@ -258,13 +304,13 @@ impl<'a> Attempt<'a> {
         for step in 0..n_steps {
             let motion = path.motion(step as f64 * self.options.physics.step_secs, self.options.physics.step_secs);
             self.move_palm(motion);
-            self.world.step();
+            self.engine.step();
             self.n_steps += 1;
         }
         self.move_palm((Vector3::zeros(), Vector3::zeros()));
         self.lifted_m = 0.0;
         let Some(before) = self.settled else { return (0.0, 0.0) };
-        let (now, centre) = (self.world.palm_from_target(), self.target.object.centre_of_mass_m);
+        let (now, centre) = (self.engine.palm_from_target(), self.target.object.centre_of_mass_m);
         ((now * centre - before * centre).norm(), before.rotation.angle_to(&now.rotation))
     }
 
@@ -274,7 +320,7 @@ impl<'a> Attempt<'a> {
         let protocol = self.options.protocol.clone();
         let step_secs = self.options.physics.step_secs;
         let steps_per_frame = (protocol.frame_nanos as f64 * 1e-9 / step_secs).round().max(1.0) as u64;
-        let begin = self.settled.unwrap_or_else(|| self.world.palm_from_target());
+        let begin = self.settled.unwrap_or_else(|| self.engine.palm_from_target());
         if self.settled.is_none() {
             self.settled = Some(begin);
             self.enter(Stage::Squeeze);
@@ -293,26 +339,26 @@ impl<'a> Attempt<'a> {
         for step in 0..n_steps {
             let secs = step as f64 * step_secs;
             self.move_palm(path.motion(secs, step_secs));
-            self.world.step();
+            self.engine.step();
             self.n_steps += 1;
             if (step + 1) % steps_per_frame == 0 {
                 watch(&self.snapshot_over(&path.place_m(secs + step_secs)));
-                if slip_m(&self.world.palm_from_target()) > protocol.lost_m {
+                if slip_m(&self.engine.palm_from_target()) > protocol.lost_m {
                     break;
                 }
             }
         }
-        let end = self.world.palm_from_target();
+        let end = self.engine.palm_from_target();
         let slip_m = slip_m(&end);
-        let is_touched = self.world.touches(&self.body.shapes).iter().any(|touch| touch.side == Side::Target);
-        let held = is_touched && !self.has_diverged() && self.world.stand_newtons() == 0.0 && slip_m <= protocol.lost_m;
+        let is_touched = self.engine.touches().iter().any(|touch| touch.side == Side::Target);
+        let held = is_touched && !self.has_diverged() && stand_newtons(&*self.engine) == 0.0 && slip_m <= protocol.lost_m;
         LiftResult { held, slip_m, turn_rad: begin.rotation.angle_to(&end.rotation) }
     }
 
     /// Gives the palm a velocity and an acceleration, both in the world, for the next step.
     fn move_palm(&mut self, (velocity, acceleration): (Vector3<f64>, Vector3<f64>)) {
         let turn = self.world_from_palm.rotation.inverse();
-        self.world.set_palm_motion(&(turn * velocity), &(turn * acceleration));
+        self.engine.set_palm_motion(&(turn * velocity), &(turn * acceleration));
     }
 
     /// The grasp now, as its wrench space sees it with a friction coefficient: every contact with the target, felt or
@@ -328,12 +374,12 @@ impl<'a> Attempt<'a> {
 
     /// The contacts of target, stand and hand with the hand now, felt or not, in the palm frame.
     pub fn contacts(&self) -> Vec<SimulatedContact> {
-        self.patches(&self.joints(), self.world.touches(&self.body.shapes), &self.world.palm_from_target())
+        self.patches(&self.joints(), self.engine.touches(), &self.engine.palm_from_target())
     }
 
     /// The hand's joints now, exactly, radians.
     pub fn joints(&self) -> Vec<f64> {
-        self.body.joints(&self.world)
+        self.body.joints(&*self.engine)
     }
 
     /// Whether the simulation has come to a state that cannot be: the hand's links swing without bounds, which happens to a
@@ -345,8 +391,16 @@ impl<'a> Attempt<'a> {
         !(is_target && hand.joints.iter().zip(&self.joints()).all(is_joint))
     }
 
+    /// Why the physics has stopped, if it has: what the attempt says then is not to be used.
+    ///
+    /// # Errors
+    /// The engine's process has ended or refused a step.
+    pub fn check(&self) -> Result<(), TrialError> {
+        self.engine.failure().map_or(Ok(()), |reason| Err(TrialError::Engine { reason }))
+    }
+
     pub fn palm_from_target(&self) -> Isometry3<f64> {
-        self.world.palm_from_target()
+        self.engine.palm_from_target()
     }
 
     pub fn snapshot(&self) -> Snapshot {
@@ -367,12 +421,12 @@ impl<'a> Attempt<'a> {
         let palm = nalgebra::Translation3::from(*lifted)
             * self.world_from_palm
             * nalgebra::Translation3::from(self.palm_from_start);
-        let target = palm * self.world.palm_from_target();
+        let target = palm * self.engine.palm_from_target();
         Snapshot {
             elapsed_nanos: self.elapsed_nanos(),
             palm_position_m: palm.translation.vector.into(),
             palm_rotation_xyzw: palm.rotation.coords.into(),
-            joints: self.body.joints(&self.world),
+            joints: self.body.joints(&*self.engine),
             target_position_m: target.translation.vector.into(),
             target_rotation_xyzw: target.rotation.coords.into(),
         }
@@ -389,9 +443,9 @@ impl<'a> Attempt<'a> {
         }
         if self.stage == Stage::Squeeze {
             let part = ((self.stage_secs + physics.step_secs) / protocol.grip_secs).min(1.0);
-            self.body.grip(&mut self.world, part, &physics);
+            self.body.grip(&mut *self.engine, part, &physics);
         }
-        self.world.step();
+        self.engine.step();
         self.n_steps += 1;
         self.stage_secs += physics.step_secs;
         // Sums of time steps are not exact.
@@ -400,21 +454,21 @@ impl<'a> Attempt<'a> {
             Stage::Approach => {
                 self.palm_from_start.z += protocol.approach_speed * physics.step_secs;
                 let newtons: f64 = self
-                    .world
-                    .touches(&self.body.shapes)
+                    .engine
+                    .touches()
                     .iter()
                     .filter(|touch| !matches!(touch.side, Side::Hand { .. }))
                     .map(|touch| touch.newtons)
                     .sum();
                 if newtons >= protocol.touch_newtons || self.palm_from_start.z >= protocol.stand_off_m + OVERSHOOT_M {
-                    self.world.stop_palm(&Vector3::new(0.0, 0.0, protocol.approach_speed));
+                    self.engine.stop_palm(&Vector3::new(0.0, 0.0, protocol.approach_speed));
                     self.enter(Stage::Close);
                 }
             }
             Stage::Close => {
-                let has_stopped = self.body.close(&mut self.world, &physics);
+                let has_stopped = self.body.close(&mut *self.engine, &physics);
                 if has_stopped || self.stage_secs >= MOST_CLOSING_SECS {
-                    self.body.stop(&mut self.world, &physics);
+                    self.body.stop(&mut *self.engine, &physics);
                     self.enter(Stage::Settle);
                 }
             }

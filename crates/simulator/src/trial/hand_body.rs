@@ -11,31 +11,20 @@
 //! linkage. Each axle has a gear of its own, and the motor feels all of them.
 
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
-use rapier3d_f64::dynamics::{
-    GenericJoint, JointAxis, MotorModel, MultibodyJointHandle, PrismaticJointBuilder, RevoluteJointBuilder,
-    RigidBodyBuilder, RigidBodyHandle,
-};
-use rapier3d_f64::geometry::{ColliderHandle, Group};
+use rapier3d_f64::geometry::Group;
 use rapier3d_f64::parry::mass_properties::MassProperties;
-use rapier3d_f64::parry::shape::{Shape, SharedShape};
+use rapier3d_f64::parry::shape::SharedShape;
 
+use super::engine::{AxleCommand, BodyPlan, Engine, HandPlan, ShapePlan};
 use crate::mechanism::{Mechanism, first_moved};
-use crate::trial::world::{MAX_LINKS_WITH_SHAPES, World, to_engine};
+use crate::trial::world::MAX_LINKS_WITH_SHAPES;
 use crate::trial::{PhysicsOptions, TrialError};
 use blindgrasp_stages::hand::{Hand, JointKind, Motion, pose_from_isometry};
 
-/// A collider and its shape of the hand.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct ShapeCollider {
-    pub(super) collider: ColliderHandle,
-    /// Index into the mechanism's shapes.
-    pub(super) shape_idx: usize,
-    pub(super) link_idx: usize,
-}
-
 /// A link that a motor moves, by a gear of its own.
 struct Axle {
-    joint: MultibodyJointHandle,
+    /// The engine's axle.
+    idx: usize,
     kind: JointKind,
     /// Its travel per travel of the motor.
     ratio: f64,
@@ -87,44 +76,46 @@ impl Drive {
     }
 
     /// Where the motor would be if its gears did not give: the mean of the axles, weighted by their stiffness as the motor feels it.
-    fn travel(&self, world: &World) -> f64 {
+    fn travel(&self, engine: &dyn Engine) -> f64 {
         match &self.axles[..] {
-            [axle] => travel(world, axle) / axle.ratio,
+            [axle] => engine.travel(axle.idx) / axle.ratio,
             axles => {
-                let felt = axles.iter().map(|axle| axle.ratio * axle.stiffness * travel(world, axle)).sum::<f64>();
+                let felt = axles.iter().map(|axle| axle.ratio * axle.stiffness * engine.travel(axle.idx)).sum::<f64>();
                 felt / self.stiffness
             }
         }
     }
 }
 
-/// The hand in a world.
+/// The motors of a hand.
 pub(super) struct HandBody {
     drives: Vec<Drive>,
-    /// All colliders of the hand.
-    pub(super) shapes: Vec<ShapeCollider>,
+    n_axles: usize,
     open_joints_rad: Vec<f64>,
 }
 
 impl HandBody {
+    /// The hand's bodies for an engine, and the motors that move them.
+    ///
+    /// # Errors
+    /// A hand of more links than an engine tells apart.
     pub(super) fn new(
-        world: &mut World,
         mechanism: &Mechanism<'_>,
         open_joints_rad: &[f64],
         options: &PhysicsOptions,
-    ) -> Result<HandBody, TrialError> {
+    ) -> Result<(HandPlan, HandBody), TrialError> {
         let hand = mechanism.hand;
         let refuse = |reason: String| TrialError::Hand { hand: hand.name.clone(), reason };
         let palm_from_links = hand.palm_from_links(open_joints_rad).map_err(|error| refuse(error.to_string()))?;
         let is_closing = |joint_idx: usize| mechanism.joints.iter().any(|joint| joint.joint_idx == joint_idx);
-        let palm = world.engine.insert_body(RigidBodyBuilder::fixed());
-        let mut link_bodies: Vec<RigidBodyHandle> = Vec::with_capacity(hand.links.len());
-        let mut drives: Vec<Drive> = Vec::new();
-        // Where a link is on its body.
+        let mut plan = HandPlan::default();
+        // The body of each link, `None` for the palm, and where the link is on it.
+        let mut link_bodies: Vec<Option<usize>> = Vec::with_capacity(hand.links.len());
         let mut body_from_links: Vec<Isometry3<f64>> = Vec::with_capacity(hand.links.len());
+        let mut drives: Vec<Drive> = Vec::new();
         for (link_idx, link) in hand.links.iter().enumerate() {
             let palm_from_link = palm_from_links[link_idx];
-            let parent = link.parent_idx.map_or(palm, |parent_idx| link_bodies[parent_idx]);
+            let parent = link.parent_idx.and_then(|parent_idx| link_bodies[parent_idx]);
             let (joint_idx, kind, multiplier, axis) = match link.motion {
                 Motion::Joint { joint_idx, kind, multiplier, axis, .. } if is_closing(joint_idx) => {
                     (joint_idx, kind, multiplier, axis)
@@ -133,7 +124,7 @@ impl HandBody {
                     let parent_from_link = link.parent_from_joint * motion.joint_from_link(open_joints_rad);
                     link_bodies.push(parent);
                     body_from_links.push(match link.parent_idx {
-                        Some(parent_idx) if parent != palm => body_from_links[parent_idx] * parent_from_link,
+                        Some(parent_idx) if parent.is_some() => body_from_links[parent_idx] * parent_from_link,
                         _ => palm_from_link,
                     });
                     continue;
@@ -143,13 +134,6 @@ impl HandBody {
             let rate = hand.closing_rate(joint_idx);
             let sign = if rate < 0.0 { -1.0 } else { 1.0 };
             let reach_m = reach_m(hand, link_idx);
-            let body = world.engine.insert_body(
-                RigidBodyBuilder::dynamic()
-                    .pose(pose_from_isometry(&palm_from_link))
-                    .can_sleep(false)
-                    .gravity_scale(0.0)
-                    .additional_mass_properties(body_mass(hand, link_idx, open_joints_rad, &is_closing, options)),
-            );
             // Where the parent's body has the joint, and its axis as x, in the direction of closing.
             let parent_from_joint = match link.parent_idx {
                 None => link.parent_from_joint,
@@ -158,28 +142,27 @@ impl HandBody {
             let closing_axis = if sign * multiplier < 0.0 { -axis } else { axis };
             let x_to_axis = UnitQuaternion::rotation_between(&Vector3::x(), &closing_axis)
                 .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI));
-            let turned = |rotation: UnitQuaternion<f64>| Isometry3::from_parts(Default::default(), rotation);
-            let joint_from_axis = link.motion.joint_from_link(open_joints_rad) * turned(x_to_axis);
-            let mut data: GenericJoint = match kind {
-                JointKind::Revolute => RevoluteJointBuilder::new(to_engine(&Vector3::x())).into(),
-                JointKind::Prismatic => PrismaticJointBuilder::new(to_engine(&Vector3::x())).into(),
-            };
-            data.set_local_frame1(pose_from_isometry(&(parent_from_joint * joint_from_axis)));
-            data.set_local_frame2(pose_from_isometry(&turned(x_to_axis)));
-            data.set_contacts_enabled(false);
-            let Some(handle) = world.engine.insert_multibody_joint(parent, body, data) else {
-                return Err(refuse(format!("joint {} cannot be hung on its link", spec.name)));
-            };
+            let body_from_axis = Isometry3::from_parts(Default::default(), x_to_axis);
+            let joint_from_axis = link.motion.joint_from_link(open_joints_rad) * body_from_axis;
             let per_radian = kind.per_radian();
             let axle = Axle {
-                joint: handle,
+                idx: plan.bodies.len(),
                 kind,
                 ratio: multiplier.abs(),
                 reach: if kind == JointKind::Prismatic { 1.0 } else { reach_m },
                 stiffness: options.gear_stiffness / (per_radian * per_radian),
             };
-            link_bodies.push(body);
+            link_bodies.push(Some(plan.bodies.len()));
             body_from_links.push(Isometry3::identity());
+            plan.bodies.push(BodyPlan {
+                parent,
+                palm_from_body: palm_from_link,
+                kind,
+                parent_from_axis: parent_from_joint * joint_from_axis,
+                body_from_axis,
+                mass: body_mass(hand, link_idx, open_joints_rad, &is_closing, options),
+                armature: 0.0,
+            });
             if let Some(drive) = drives.iter_mut().find(|drive| drive.joint_idx == joint_idx) {
                 drive.axles.push(axle);
                 continue;
@@ -217,10 +200,9 @@ impl HandBody {
             let follows = hand.joints[drives[idx].joint_idx].coupling.map(|coupling| coupling.follows_idx);
             drives[idx].follows = follows.and_then(|leader| drives.iter().position(|drive| drive.joint_idx == leader));
         }
-        let mut shapes = Vec::new();
         let body_above = |idx: usize| {
             let links = std::iter::successors(Some(idx), |idx| hand.links[*idx].parent_idx);
-            links.map(|idx| link_bodies[idx]).find(|body| *body != link_bodies[idx]).unwrap_or(palm)
+            links.map(|idx| link_bodies[idx]).find(|body| *body != link_bodies[idx]).flatten()
         };
         let are_joined = |a: usize, b: usize| {
             let (body_a, body_b) = (link_bodies[a], link_bodies[b]);
@@ -231,35 +213,38 @@ impl HandBody {
         })?;
         for (shape_idx, placed) in mechanism.shapes.iter().enumerate() {
             let link_idx = placed.link_idx;
-            let body = link_bodies[link_idx];
-            let shape = grown(placed.core, placed.edge_radius_m);
-            let builder =
-                World::hand_collider(shape, &(body_from_links[link_idx] * placed.link_from_shape), groups[link_idx]);
-            let collider = world.engine.insert_collider(builder, Some(body));
-            shapes.push(ShapeCollider { collider, shape_idx, link_idx });
+            let (own, touched) = groups[link_idx];
+            plan.shapes.push(ShapePlan {
+                shape_idx,
+                link_idx,
+                body: link_bodies[link_idx],
+                body_from_shape: body_from_links[link_idx] * placed.link_from_shape,
+                core: SharedShape(placed.core.clone_dyn().into()),
+                edge_radius_m: placed.edge_radius_m,
+                own,
+                touched,
+            });
         }
-        let mut hand_body = HandBody { drives, shapes, open_joints_rad: open_joints_rad.to_vec() };
-        let axles = hand_body.drives.iter().flat_map(|drive| {
+        for drive in &drives {
             // A motor has one rotor, whose inertia its axles share.
             let whole: f64 = drive.axles.iter().map(|axle| axle.ratio * axle.ratio).sum();
-            drive.axles.iter().map(move |axle| (axle, options.rotor_inertia / whole))
-        });
-        for (axle, inertia) in axles {
-            if let Some((multibody, link_id)) = world.engine.multibody_joints.get_mut(axle.joint) {
-                multibody.set_self_contacts_enabled(true);
+            for axle in &drive.axles {
                 let per_radian = axle.kind.per_radian();
-                if let Some(dof) = multibody.link(link_id).map(|link| link.assembly_id()) {
-                    multibody.armature_mut()[dof] = inertia / (per_radian * per_radian);
-                }
+                plan.bodies[axle.idx].armature = options.rotor_inertia / whole / (per_radian * per_radian);
             }
         }
-        hand_body.command(world, 0.0, options);
-        Ok(hand_body)
+        let n_axles = plan.bodies.len();
+        Ok((plan, HandBody { drives, n_axles, open_joints_rad: open_joints_rad.to_vec() }))
+    }
+
+    /// Holds the open hand.
+    pub(super) fn hold(&self, engine: &mut dyn Engine, options: &PhysicsOptions) {
+        self.command(engine, 0.0, options);
     }
 
     /// The joints' values: radians, or metres of a slide.
-    pub(super) fn joints(&self, world: &World) -> Vec<f64> {
-        self.values(|drive| drive.travel(world))
+    pub(super) fn joints(&self, engine: &dyn Engine) -> Vec<f64> {
+        self.values(|drive| drive.travel(engine))
     }
 
     /// The encoders' values before rounding: they sit at the motors, whose gears give.
@@ -277,19 +262,19 @@ impl HandBody {
 
     /// The torque of each joint's motor or gear, from the gear's twist, newton metres; of a slide the force, newtons. It is
     /// 0 of a joint without a motor.
-    pub(super) fn torques(&self, world: &World) -> Vec<f64> {
+    pub(super) fn torques(&self, engine: &dyn Engine) -> Vec<f64> {
         let mut torques = vec![0.0; self.open_joints_rad.len()];
         for drive in &self.drives {
-            torques[drive.joint_idx] = drive.sign * ((drive.target - drive.travel(world)) * drive.stiffness);
+            torques[drive.joint_idx] = drive.sign * ((drive.target - drive.travel(engine)) * drive.stiffness);
         }
         torques
     }
 
     /// Closes on for a time step; whether every joint has stopped.
-    pub(super) fn close(&mut self, world: &mut World, options: &PhysicsOptions) -> bool {
+    pub(super) fn close(&mut self, engine: &mut dyn Engine, options: &PhysicsOptions) -> bool {
         let dt = options.step_secs;
         for idx in 0..self.drives.len() {
-            let travel = self.drives[idx].travel(world);
+            let travel = self.drives[idx].travel(engine);
             let drive = &mut self.drives[idx];
             if drive.is_stopped {
                 continue;
@@ -303,7 +288,7 @@ impl HandBody {
                 drive.stop(travel);
                 let leader = if is_blocked { drive.follows } else { None };
                 if let Some(leader) = leader {
-                    let travel = self.drives[leader].travel(world);
+                    let travel = self.drives[leader].travel(engine);
                     self.drives[leader].stop(travel);
                 }
                 let mut followers = self.drives.iter().filter(|other| other.follows == Some(idx));
@@ -319,24 +304,24 @@ impl HandBody {
             drive.target_speed = (drive.target - before) / dt;
         }
         let all_stopped = self.drives.iter().all(|drive| drive.is_stopped);
-        self.command(world, if all_stopped { 0.0 } else { options.closing_rad_per_sec }, options);
+        self.command(engine, if all_stopped { 0.0 } else { options.closing_rad_per_sec }, options);
         all_stopped
     }
 
     /// Stops every joint that has not stopped yet.
-    pub(super) fn stop(&mut self, world: &mut World, options: &PhysicsOptions) {
+    pub(super) fn stop(&mut self, engine: &mut dyn Engine, options: &PhysicsOptions) {
         for drive in &mut self.drives {
-            drive.stop(drive.travel(world));
+            drive.stop(drive.travel(engine));
         }
-        self.command(world, 0.0, options);
+        self.command(engine, 0.0, options);
     }
 
     /// Grips on for a time step, with a part of the way to the force of lifting: from 0, as it closed, to 1. Where the target
     /// gives, the joint closes on. A joint that has broken away, or is at its limit, stays.
-    pub(super) fn grip(&mut self, world: &mut World, part: f64, options: &PhysicsOptions) {
+    pub(super) fn grip(&mut self, engine: &mut dyn Engine, part: f64, options: &PhysicsOptions) {
         let more_newtons = (options.lift_grip_newtons - options.grip_newtons).max(0.0) * part;
         for drive in &mut self.drives {
-            let travel = drive.travel(world);
+            let travel = drive.travel(engine);
             drive.stop(travel);
             if drive.has_broken_away || drive.target >= drive.range {
                 continue;
@@ -348,10 +333,12 @@ impl HandBody {
             let closed = (drive.target + step).min(twisted).min(drive.range);
             drive.target = drive.target.max(closed);
         }
-        self.command(world, 0.0, options);
+        self.command(engine, 0.0, options);
     }
 
-    fn command(&mut self, world: &mut World, rad_per_sec: f64, options: &PhysicsOptions) {
+    fn command(&self, engine: &mut dyn Engine, rad_per_sec: f64, options: &PhysicsOptions) {
+        let still = AxleCommand { target: 0.0, speed: 0.0, stiffness: 0.0, damping: 0.0, most: 0.0 };
+        let mut commands = vec![still; self.n_axles];
         for drive in &self.drives {
             // A linkage is rigid: its gears hold with more than the motor has. What limits them is the target, which waits, and
             // must not go on by its speed.
@@ -361,20 +348,17 @@ impl HandBody {
                 (false, _) => (drive.target_speed, options.hold_newtons),
             };
             for axle in &drive.axles {
-                let Some((multibody, link_id)) = world.engine.multibody_joints.get_mut(axle.joint) else { continue };
-                let Some(link) = multibody.link_mut(link_id) else { continue };
-                let axis = match axle.kind {
-                    JointKind::Revolute => JointAxis::AngX,
-                    JointKind::Prismatic => JointAxis::LinX,
-                };
                 let per_radian = axle.kind.per_radian();
-                let damping = options.gear_damping / (per_radian * per_radian);
-                let data = &mut link.joint.data;
-                data.set_motor_model(axis, MotorModel::ForceBased);
-                data.set_motor(axis, axle.ratio * drive.target, axle.ratio * speed, axle.stiffness, damping);
-                data.set_motor_max_force(axis, newtons * axle.reach);
+                commands[axle.idx] = AxleCommand {
+                    target: axle.ratio * drive.target,
+                    speed: axle.ratio * speed,
+                    stiffness: axle.stiffness,
+                    damping: options.gear_damping / (per_radian * per_radian),
+                    most: newtons * axle.reach,
+                };
             }
         }
+        engine.drive(&commands);
     }
 }
 
@@ -405,18 +389,6 @@ fn link_groups(
         (0..own.len()).filter(may_touch).fold(Group::NONE, |all, other| all | own[other])
     };
     (n_used <= MAX_LINKS_WITH_SHAPES).then(|| (0..own.len()).map(|idx| (own[idx], touched_by(idx))).collect())
-}
-
-/// How far an axle has come from the open hand.
-fn travel(world: &World, axle: &Axle) -> f64 {
-    let joints = &world.engine.multibody_joints;
-    joints.get(axle.joint).and_then(|(multibody, id)| multibody.link(id)).map_or(0.0, |link| {
-        // Three shifts, then the turn about x.
-        match axle.kind {
-            JointKind::Prismatic => link.joint.coords()[0],
-            JointKind::Revolute => link.joint.coords()[3],
-        }
-    })
 }
 
 /// The motor's torque or force for each newton at the fingertips that a joint with several links moves: the sum of the
@@ -454,20 +426,6 @@ fn reach_m(hand: &Hand, link_idx: usize) -> f64 {
         .fold(own_m, f64::max)
 }
 
-/// A core with its rounded edges.
-fn grown(core: &dyn Shape, edge_radius_m: f64) -> SharedShape {
-    if edge_radius_m > 0.0 {
-        if let Some(cuboid) = core.as_cuboid() {
-            let half = cuboid.half_extents;
-            return SharedShape::round_cuboid(half.x, half.y, half.z, edge_radius_m);
-        }
-        if let Some(cylinder) = core.as_cylinder() {
-            return SharedShape::round_cylinder(cylinder.half_height, cylinder.radius, edge_radius_m);
-        }
-    }
-    SharedShape(core.clone_dyn().into())
-}
-
 /// The mass of a link's shapes and of those of the links that are fixed on it, overlaps counted twice. Rotors are heavier
 /// than links: see [`PhysicsOptions::rotor_inertia`].
 fn body_mass(
@@ -498,6 +456,7 @@ mod tests {
 
     use super::*;
     use crate::trial::LiftTarget;
+    use crate::trial::world::{World, to_engine};
     use blindgrasp_objects::Object;
 
     /// The hand, open, before a ball that nothing moves, its middle so far from the palm's frame along z; no gravity.
@@ -520,10 +479,10 @@ mod tests {
         // The stand is far away.
         let palm_from_world = Isometry3::translation(0.0, 0.0, -5.0);
         let world_from_target = Isometry3::translation(x, y, 5.0 + z);
-        let mut world = World::new(&target, &world_from_target, &palm_from_world, &options);
+        let (plan, mut body) = HandBody::new(&mechanism, &hand.open_joints_rad(), &options).expect("a hand");
+        let mut world = World::new(&target, &world_from_target, &palm_from_world, &plan, &options).expect("a world");
         world.engine.gravity = to_engine(&Vector3::zeros());
-        let open = hand.open_joints_rad();
-        let mut body = HandBody::new(&mut world, &mechanism, &open, &options).expect("a hand");
+        body.hold(&mut world, &options);
         test(&mut world, &mut body, &options);
     }
 
@@ -615,7 +574,7 @@ mod tests {
             let ball = world.palm_from_target().translation.vector;
             assert!(ball.y.abs() < 0.001, "{ball}");
             assert!((body.joints(world)[0] - 0.02).abs() < 0.001, "{:?}", body.joints(world));
-            let touches = world.touches(&body.shapes);
+            let touches = world.touches();
             let newtons: Vec<f64> = touches.iter().map(|touch| touch.newtons).collect();
             assert_eq!(touches.len(), 2, "{newtons:?}");
             let wanted = options.lift_grip_newtons;
@@ -656,7 +615,7 @@ mod tests {
         with_a_ball(&hand, 0.02, [0.0, 0.0, 0.085], 0.2, |world, body, options| {
             close_until_stopped(world, body, options);
             grip(world, body, options);
-            let touches = world.touches(&body.shapes);
+            let touches = world.touches();
             let newtons: Vec<f64> = touches.iter().map(|touch| touch.newtons).collect();
             // The motor's torque is that of the full force for a tip that moves straight at the object. The knuckles are
             // still turned outwards by so much, so that the tips move slower towards it and press harder.
@@ -665,7 +624,7 @@ mod tests {
             assert!(touches.len() == 2, "{newtons:?}");
             assert!(newtons.iter().all(|found| (found - wanted).abs() < 0.02 * wanted), "{newtons:?} {wanted}");
             for axle in body.drives.iter().flat_map(|drive| &drive.axles) {
-                let off_rad = travel(world, axle) - axle.ratio * body.drives[0].travel(world);
+                let off_rad = world.travel(axle.idx) - axle.ratio * body.drives[0].travel(world);
                 assert!(off_rad.abs() < 0.02, "{off_rad}");
             }
         });

@@ -10,7 +10,7 @@ use nalgebra::Vector3;
 use rand::RngExt;
 
 use super::attempt::Moment;
-use super::{Attempt, LiftTarget, PhysicsOptions, ProbeMove, TrialError, TrialOptions, TrialProtocol, draw_start};
+use super::{Attempt, LiftTarget, MujocoOptions, PhysicsOptions, ProbeMove, TrialError, TrialOptions, TrialProtocol, draw_start};
 use crate::candidate::{CandidateError, Judged, Made, Outcome, SimulatedGrasp, TimedFrame, candidate_rng};
 use crate::loaded_contacts::SimulatedContact;
 use crate::mechanism::Mechanism;
@@ -19,6 +19,9 @@ use crate::tactile_sensor::Sensor;
 use crate::wrench_space::{QualityError, quality};
 use blindgrasp_messages::{GraspScene, GraspTruth, Phase};
 use blindgrasp_objects::Object;
+
+/// How much harder contacts that creep resist slipping than pressing: a usual setting of MuJoCo for grasps.
+const CREEPING_IMPRATIO: f64 = 100.0;
 
 /// Friction of the paper's label, whatever the friction in the physics.
 const LABEL_FRICTION: f64 = 1.0;
@@ -39,8 +42,9 @@ pub(crate) fn try_candidate(
     let (object, friction) = varied(object, options, &mut rng);
     let mass_kg = object.mass_kg;
     let target = LiftTarget::new(name, class, object, mass_kg, friction);
-    let trial_options = trial_options(options);
-    let begun = draw_start(hand, &target, &trial_options, rng.random(), 0, 0)
+    let start_seed = rng.random();
+    let trial_options = trial_options(options, &mut rng);
+    let begun = draw_start(hand, &target, &trial_options, start_seed, 0, 0)
         .and_then(|start| Attempt::begin(hand, &target, &trial_options, &start, 0));
     let attempt = match begun {
         Ok(attempt) => attempt,
@@ -52,7 +56,8 @@ pub(crate) fn try_candidate(
     let mut attempt = attempt.sensed_by(sensor, rng);
     let moments: Vec<Moment> = std::iter::from_fn(|| attempt.next_moment()).collect();
     let contacts = attempt.contacts();
-    if !contacts.iter().any(|contact| contact.of_object) {
+    let is_empty = !contacts.iter().any(|contact| contact.of_object);
+    if is_empty && !options.lift.keeps_empty {
         return Ok(Outcome::NoTouch);
     }
     let quality = match quality(&attempt.grasp_case(LABEL_FRICTION)) {
@@ -74,7 +79,9 @@ pub(crate) fn try_candidate(
     if let Some(step_secs) = options.lift.lift_step_secs {
         attempt.set_step(step_secs);
     }
-    let is_stable = attempt.lift(|_| {}).held;
+    // A hand that has touched nothing lifts nothing.
+    let is_stable = !is_empty && attempt.lift(|_| {}).held;
+    attempt.check().map_err(|source| CandidateError::Lift { candidate, source: source.into() })?;
     if attempt.has_diverged() {
         return Ok(Outcome::Diverged);
     }
@@ -104,8 +111,17 @@ fn varied(object: &Object, options: &SimulatorOptions, rng: &mut impl rand::Rng)
     (object, friction)
 }
 
-/// The options of the physics: the simulator's where it has them, defaults elsewhere.
-fn trial_options(options: &SimulatorOptions) -> TrialOptions {
+/// The options of the physics in one lift: the simulator's where it has them, drawn from its ranges; defaults elsewhere.
+fn trial_options(options: &SimulatorOptions, rng: &mut impl rand::Rng) -> TrialOptions {
+    let LiftOptions { stand_radius_m, force_factor, speed_factor, rubber_factor, contact_factor, gear_factor, .. } =
+        options.lift;
+    let default = PhysicsOptions::default();
+    let mut factor = |[low, high]: [f64; 2]| (low.ln() + (high / low).ln() * rng.random::<f64>()).exp();
+    let (stand_radius_m, force, speed) = (factor(stand_radius_m), factor(force_factor), factor(speed_factor));
+    let (rubber, contact, gear) = (factor(rubber_factor), factor(contact_factor), factor(gear_factor));
+    let creeps = rng.random::<f64>() < options.lift.creep_share;
+    let mut soft_finger = options.soft_finger.clone();
+    soft_finger.youngs_modulus_pa *= rubber;
     TrialOptions {
         planner: options.planner.clone(),
         protocol: TrialProtocol {
@@ -119,11 +135,24 @@ fn trial_options(options: &SimulatorOptions) -> TrialOptions {
             ..TrialProtocol::default()
         },
         physics: PhysicsOptions {
-            grip_newtons: options.soft_finger.normal_force_newtons,
+            engine: options.lift.engine,
+            stand_radius_m,
+            grip_newtons: force * options.soft_finger.normal_force_newtons,
+            lift_grip_newtons: force * default.lift_grip_newtons,
+            closing_rad_per_sec: speed * default.closing_rad_per_sec,
+            contact_hertz: contact * default.contact_hertz,
+            gear_stiffness: gear * default.gear_stiffness,
             contacts: options.contacts.clone(),
-            soft_finger: options.soft_finger.clone(),
+            soft_finger,
             step_secs: options.lift.step_secs,
-            ..PhysicsOptions::default()
+            mujoco: MujocoOptions {
+                // Without the iterations, the ratio alone keeps contacts from creeping.
+                noslip_iterations: if creeps { 0 } else { default.mujoco.noslip_iterations },
+                impratio: if creeps { CREEPING_IMPRATIO } else { default.mujoco.impratio },
+                contact_secs: default.mujoco.contact_secs / contact,
+                ..default.mujoco
+            },
+            ..default
         },
         sensor: options.sensor.clone(),
     }

@@ -9,9 +9,11 @@
 
 mod attempt;
 pub mod course;
+mod engine;
 mod hand_body;
 pub mod lift_label;
 mod motion;
+mod mujoco;
 mod options;
 mod rest;
 pub mod robot;
@@ -31,7 +33,7 @@ use blindgrasp_objects::Object;
 
 pub use attempt::{Attempt, ProbeMove};
 pub(crate) use options::check_planner;
-pub use options::{PhysicsOptions, TrialOptions, TrialProtocol};
+pub use options::{MujocoOptions, PhysicsEngine, PhysicsOptions, TrialOptions, TrialProtocol};
 pub use start::{choose_start, draw_start, sensor_seed};
 
 /// An object to lift.
@@ -92,6 +94,9 @@ pub enum TrialError {
     /// The hand cannot be simulated.
     #[error("hand {hand}: {reason}")]
     Hand { hand: String, reason: String },
+    /// The physics engine cannot be used, or has stopped.
+    #[error("physics: {reason}")]
+    Engine { reason: String },
     #[error("object {name}: {reason}")]
     Target { name: String, reason: String },
     #[error("{}: {reason}", path.display())]

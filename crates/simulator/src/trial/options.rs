@@ -123,7 +123,9 @@ impl Default for TrialProtocol {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PhysicsOptions {
-    /// The engine's time step. 5 ms.
+    /// The engine that moves the bodies.
+    pub engine: PhysicsEngine,
+    /// The engine's time step. 5 ms. Of MuJoCo it is the time between two commands of the motors.
     pub step_secs: f64,
     /// Small steps of the solver in a time step. 10: of 0.5 ms.
     pub n_solver_iterations: usize,
@@ -131,11 +133,12 @@ pub struct PhysicsOptions {
     pub contact_hertz: f64,
     /// Damping of contacts, as a share of critical damping. 1.
     pub contact_damping_ratio: f64,
-    /// Radius of the round post on which the target stands, so that fingers find room under and beside it. 40 mm.
+    /// Radius of the round table on which the target stands. 0.4 m. With 0.04 it is a post, under whose edge fingers find
+    /// room.
     pub stand_radius_m: f64,
-    /// The post's height. 0.3 m: fingers do not come to its foot.
+    /// The table's height over the ground. 0.3 m: the fingers do not come to the ground beside a post.
     pub stand_height_m: f64,
-    /// Coulomb friction between the target and the post, at most 1. 0.5, assumed: wood.
+    /// Coulomb friction between the target and the table, at most 1. 0.5, assumed: wood.
     pub stand_friction: f64,
     /// Force of a finger at its tip while it closes, and after its stop. 5 N: the static load of the training data.
     pub grip_newtons: f64,
@@ -159,16 +162,58 @@ pub struct PhysicsOptions {
     pub contacts: ContactOptions,
     /// Options of the rubber, for the cells, as in the training data. Its load is not used: forces are the engine's.
     pub soft_finger: SoftFingerOptions,
+    /// Options of MuJoCo.
+    pub mujoco: MujocoOptions,
+}
+
+/// A physics engine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PhysicsEngine {
+    /// The built-in one.
+    #[default]
+    Rapier,
+    /// MuJoCo, from PyPI: another model of contact.
+    Mujoco,
+}
+
+/// MuJoCo's contacts.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct MujocoOptions {
+    /// Its time step. 2 ms.
+    pub step_secs: f64,
+    /// How much harder contacts resist slipping than pressing. 10.
+    pub impratio: f64,
+    /// Iterations that keep what friction holds from creeping. 10; 0: contacts creep, as the engine's usually do.
+    pub noslip_iterations: usize,
+    /// Time constant of contacts, which give way like rubber: solref. 6 ms.
+    pub contact_secs: f64,
+    /// The torque about the normal that a contact resists, per friction force. 5 mm: of a patch of about 10 mm.
+    pub torsion_m: f64,
+}
+
+impl Default for MujocoOptions {
+    fn default() -> Self {
+        MujocoOptions {
+            step_secs: 0.002,
+            impratio: 10.0,
+            noslip_iterations: 10,
+            contact_secs: 0.006,
+            torsion_m: 0.005,
+        }
+    }
 }
 
 impl Default for PhysicsOptions {
     fn default() -> Self {
         PhysicsOptions {
+            engine: PhysicsEngine::Rapier,
             step_secs: 0.005,
             n_solver_iterations: 10,
             contact_hertz: 100.0,
             contact_damping_ratio: 1.0,
-            stand_radius_m: 0.04,
+            stand_radius_m: 0.4,
             stand_height_m: 0.3,
             stand_friction: 0.5,
             grip_newtons: 5.0,
@@ -182,6 +227,7 @@ impl Default for PhysicsOptions {
             link_density_kg_per_m3: 2700.0,
             contacts: ContactOptions::default(),
             soft_finger: SoftFingerOptions::default(),
+            mujoco: MujocoOptions::default(),
         }
     }
 }
@@ -289,9 +335,18 @@ impl PhysicsOptions {
             ("physics.gear_stiffness", self.gear_stiffness),
             ("physics.rotor_inertia", self.rotor_inertia),
             ("physics.link_density_kg_per_m3", self.link_density_kg_per_m3),
+            ("physics.mujoco.impratio", self.mujoco.impratio),
+            ("physics.mujoco.contact_secs", self.mujoco.contact_secs),
+            ("physics.mujoco.torsion_m", self.mujoco.torsion_m),
         ] {
             positive(option, value)?;
         }
+        require(
+            "physics.mujoco.step_secs",
+            self.mujoco.step_secs,
+            self.mujoco.step_secs > 0.0 && self.mujoco.step_secs <= 0.005,
+            "0 to 0.005, not 0",
+        )?;
         not_negative("physics.contact_damping_ratio", self.contact_damping_ratio)?;
         not_negative("physics.blocked_secs", self.blocked_secs)?;
         not_negative("physics.gear_damping", self.gear_damping)?;

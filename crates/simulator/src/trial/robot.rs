@@ -73,6 +73,8 @@ enum State<'a> {
         told: Option<Box<Stamped<TactileFrame>>>,
         is_again: bool,
     },
+    /// The physics has stopped.
+    Failed(TrialError),
 }
 
 /// An attempt under way.
@@ -136,6 +138,7 @@ impl<'a> Robot<'a> {
         match std::mem::replace(&mut self.state, State::Between) {
             State::Between => self.begin(),
             State::Feeling(grasp) => self.feel(grasp),
+            State::Failed(error) => Err(error),
             State::Deciding(grasp) => {
                 let (grasp_id, n_before) = (grasp.place.grasp_id, usize::from(grasp.probe.is_some()));
                 self.state = State::Deciding(grasp);
@@ -235,7 +238,9 @@ impl<'a> Robot<'a> {
 
     /// The next frame of an attempt.
     fn feel(&mut self, mut grasp: Box<TriedGrasp<'a>>) -> Result<Doing, TrialError> {
-        let (frame, is_last) = match grasp.attempt.next_frame(grasp.place.grasp_id) {
+        let next = grasp.attempt.next_frame(grasp.place.grasp_id);
+        grasp.attempt.check()?;
+        let (frame, is_last) = match next {
             Some(timed) => {
                 grasp.elapsed_nanos = timed.offset_nanos;
                 grasp.last = Some(timed.frame.clone());
@@ -285,6 +290,10 @@ impl<'a> Robot<'a> {
         let lift = lifts.then(|| grasp.attempt.lift(|_| {}));
         let is_set_down = !lifts && grasp.probe == Some(ProbeMove::TestLift);
         let (moved_m, turned_rad) = if is_set_down { grasp.attempt.set_down() } else { (0.0, 0.0) };
+        if let Err(error) = grasp.attempt.check() {
+            self.state = State::Failed(error);
+            return;
+        }
         let disturbed = moved_m > DISTURBED_M || turned_rad > DISTURBED_RAD;
         let (epsilon, volume) = quality.unwrap_or((-1.0, 0.0));
         let TriedGrasp { place, thing, attempt, n_frames, elapsed_nanos, probe, last, .. } = grasp;

@@ -3,7 +3,7 @@
 
 use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
 
-use super::world::{Side, Touch};
+use super::engine::{Side, Touch};
 use super::{LiftTarget, PhysicsOptions};
 use crate::contact_points::{ContactPoint, OtherLink};
 use crate::loaded_contacts::{LoadedPoint, SimulatedContact, press};

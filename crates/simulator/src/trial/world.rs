@@ -4,19 +4,22 @@
 //! acceleration only, which is taken off gravity. So the arm needs no motors, and lifting is the stand going away.
 
 use nalgebra::{Isometry3, Point3, UnitVector3, Vector3};
-use rapier3d_f64::dynamics::{RigidBodyBuilder, RigidBodyHandle};
+use rapier3d_f64::dynamics::{
+    GenericJoint, JointAxis, MotorModel, MultibodyJointHandle, PrismaticJointBuilder, RevoluteJointBuilder,
+    RigidBodyBuilder, RigidBodyHandle,
+};
 use rapier3d_f64::geometry::{
     ColliderBuilder, ColliderHandle, ContactPair, Group, InteractionGroups, InteractionTestMode, NEW_CONTACT_BIT,
 };
 use rapier3d_f64::math::{Pose, Vector};
 use rapier3d_f64::parry::mass_properties::MassProperties;
-use rapier3d_f64::parry::shape::SharedShape;
+use rapier3d_f64::parry::shape::{Shape, SharedShape};
 use rapier3d_f64::pipeline::PhysicsWorld;
 use rapier3d_f64::prelude::CoefficientCombineRule;
 
-use super::hand_body::ShapeCollider;
-use super::{LiftTarget, PhysicsOptions};
-use blindgrasp_stages::hand::pose_from_isometry;
+use super::engine::{AxleCommand, Engine, GRAVITY, HandPlan, Side, StandForce, Touch};
+use super::{LiftTarget, PhysicsOptions, TrialError};
+use blindgrasp_stages::hand::{JointKind, pose_from_isometry};
 
 /// Groups of colliders, as bits.
 /// Each link of the hand has a group of its own among the first; the last four are for other things.
@@ -27,32 +30,6 @@ const STAND: Group = Group::GROUP_30;
 /// The target as the stand sees it: its convex hull, which rests without rattling.
 const FOOT: Group = Group::GROUP_31;
 
-/// m/s².
-pub(super) const GRAVITY: f64 = 9.81;
-
-/// The body that the hand touches.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Side {
-    Target,
-    Stand,
-    Hand { link_idx: usize, shape_idx: usize },
-}
-
-/// A force that presses on a link of the hand, in the palm frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Touch {
-    pub(super) link_idx: usize,
-    /// Index into the mechanism's shapes.
-    pub(super) shape_idx: usize,
-    pub(super) side: Side,
-    /// The point on the surface of the touched body.
-    pub(super) point_m: Point3<f64>,
-    /// The normal out of the touched body.
-    pub(super) outward: UnitVector3<f64>,
-    /// The force at right angles to the surface.
-    pub(super) newtons: f64,
-}
-
 /// The engine with a stand and a target.
 pub(super) struct World {
     pub(super) engine: PhysicsWorld,
@@ -60,17 +37,32 @@ pub(super) struct World {
     stand: RigidBodyHandle,
     /// The vertical, in the palm frame.
     up: Vector3<f64>,
+    shapes: Vec<ShapeCollider>,
+    axles: Vec<(MultibodyJointHandle, JointKind)>,
+}
+
+/// A collider and its shape of the hand.
+#[derive(Debug, Clone, Copy)]
+struct ShapeCollider {
+    collider: ColliderHandle,
+    /// Index into the mechanism's shapes.
+    shape_idx: usize,
+    link_idx: usize,
 }
 
 impl World {
-    /// Puts a target on the stand. `palm_from_world` is how the palm is placed at the beginning, `world_from_target`
-    /// how the target stands.
+    /// Puts a target on the stand, and a hand before it. `palm_from_world` is how the palm is placed at the beginning,
+    /// `world_from_target` how the target stands.
+    ///
+    /// # Errors
+    /// The name of a link whose joint cannot be made.
     pub(super) fn new(
         target: &LiftTarget,
         world_from_target: &Isometry3<f64>,
         palm_from_world: &Isometry3<f64>,
+        hand: &HandPlan,
         options: &PhysicsOptions,
-    ) -> World {
+    ) -> Result<World, TrialError> {
         let mut engine = PhysicsWorld::new();
         let parameters = &mut engine.integration_parameters;
         parameters.dt = options.step_secs;
@@ -93,6 +85,15 @@ impl World {
                 .collision_groups(groups(STAND, HAND | FOOT)),
         );
 
+        let ground = Isometry3::translation(0.0, -options.stand_height_m / 2.0 - GROUND_HALF_M, 0.0);
+        engine.insert_collider(
+            ColliderBuilder::cuboid(5.0, GROUND_HALF_M, 5.0)
+                .position(pose_from_isometry(&ground))
+                .friction(options.stand_friction)
+                .friction_combine_rule(CoefficientCombineRule::Min)
+                .collision_groups(groups(STAND, HAND | FOOT)),
+            Some(stand),
+        );
         let object = &target.object;
         let palm_from_target = palm_from_world * world_from_target;
         // Colliders have no mass: the target's is its own, its inertia that of its hull about its centre of mass.
@@ -114,7 +115,54 @@ impl World {
                 .collision_groups(groups(FOOT, STAND)),
             Some(target_handle),
         );
-        World { engine, target: target_handle, stand, up }
+        let mut world = World { engine, target: target_handle, stand, up, shapes: Vec::new(), axles: Vec::new() };
+        world.build(hand)?;
+        Ok(world)
+    }
+
+    /// Puts the hand there.
+    fn build(&mut self, hand: &HandPlan) -> Result<(), TrialError> {
+        let palm = self.engine.insert_body(RigidBodyBuilder::fixed());
+        let mut handles: Vec<RigidBodyHandle> = Vec::with_capacity(hand.bodies.len());
+        for plan in &hand.bodies {
+            let body = self.engine.insert_body(
+                RigidBodyBuilder::dynamic()
+                    .pose(pose_from_isometry(&plan.palm_from_body))
+                    .can_sleep(false)
+                    .gravity_scale(0.0)
+                    .additional_mass_properties(plan.mass),
+            );
+            let mut data: GenericJoint = match plan.kind {
+                JointKind::Revolute => RevoluteJointBuilder::new(to_engine(&Vector3::x())).into(),
+                JointKind::Prismatic => PrismaticJointBuilder::new(to_engine(&Vector3::x())).into(),
+            };
+            data.set_local_frame1(pose_from_isometry(&plan.parent_from_axis));
+            data.set_local_frame2(pose_from_isometry(&plan.body_from_axis));
+            data.set_contacts_enabled(false);
+            let parent = plan.parent.map_or(palm, |parent| handles[parent]);
+            let Some(handle) = self.engine.insert_multibody_joint(parent, body, data) else {
+                let reason = format!("joint {} cannot be hung on its link", handles.len());
+                return Err(TrialError::Engine { reason });
+            };
+            handles.push(body);
+            self.axles.push((handle, plan.kind));
+        }
+        for plan in &hand.shapes {
+            let body = plan.body.map_or(palm, |body| handles[body]);
+            let shape = grown(&*plan.core, plan.edge_radius_m);
+            let builder = World::hand_collider(shape, &plan.body_from_shape, (plan.own, plan.touched));
+            let collider = self.engine.insert_collider(builder, Some(body));
+            self.shapes.push(ShapeCollider { collider, shape_idx: plan.shape_idx, link_idx: plan.link_idx });
+        }
+        for ((handle, _), plan) in self.axles.iter().zip(&hand.bodies) {
+            if let Some((multibody, link_id)) = self.engine.multibody_joints.get_mut(*handle) {
+                multibody.set_self_contacts_enabled(true);
+                if let Some(dof) = multibody.link(link_id).map(|link| link.assembly_id()) {
+                    multibody.armature_mut()[dof] = plan.armature;
+                }
+            }
+        }
+        Ok(())
     }
 
     /// A collider of the hand, with its link's own group and those of the links that it may touch. Its friction is the
@@ -131,43 +179,77 @@ impl World {
             .friction_combine_rule(CoefficientCombineRule::Multiply)
             .collision_groups(groups(own, touched | TARGET | STAND))
     }
+}
 
-    /// Lets the palm move with `velocity` and `acceleration` in the world, both in the palm frame, for the next step.
-    pub(super) fn set_palm_motion(&mut self, velocity: &Vector3<f64>, acceleration: &Vector3<f64>) {
+impl Engine for World {
+    fn travel(&self, axle: usize) -> f64 {
+        let (handle, kind) = self.axles[axle];
+        let joints = &self.engine.multibody_joints;
+        joints.get(handle).and_then(|(multibody, id)| multibody.link(id)).map_or(0.0, |link| {
+            // Three shifts, then the turn about x.
+            match kind {
+                JointKind::Prismatic => link.joint.coords()[0],
+                JointKind::Revolute => link.joint.coords()[3],
+            }
+        })
+    }
+
+    fn drive(&mut self, commands: &[AxleCommand]) {
+        for ((handle, kind), command) in self.axles.iter().zip(commands) {
+            let Some((multibody, link_id)) = self.engine.multibody_joints.get_mut(*handle) else { continue };
+            let Some(link) = multibody.link_mut(link_id) else { continue };
+            let axis = match kind {
+                JointKind::Revolute => JointAxis::AngX,
+                JointKind::Prismatic => JointAxis::LinX,
+            };
+            let data = &mut link.joint.data;
+            data.set_motor_model(axis, MotorModel::ForceBased);
+            data.set_motor(axis, command.target, command.speed, command.stiffness, command.damping);
+            data.set_motor_max_force(axis, command.most);
+        }
+    }
+
+    /// The palm stands still in the engine, and the stand goes the other way.
+    fn set_palm_motion(&mut self, velocity: &Vector3<f64>, acceleration: &Vector3<f64>) {
         self.engine.gravity = to_engine(&(self.up * -GRAVITY - acceleration));
         if let Some(stand) = self.engine.bodies.get_mut(self.stand) {
             stand.set_linvel(to_engine(&-velocity), true);
         }
     }
 
-    /// The stand and the target come towards the palm with `palm_velocity` from now on.
-    pub(super) fn push_off(&mut self, palm_velocity: &Vector3<f64>) {
-        self.set_palm_motion(palm_velocity, &Vector3::zeros());
+    fn push_off(&mut self, velocity: &Vector3<f64>) {
+        self.set_palm_motion(velocity, &Vector3::zeros());
         if let Some(target) = self.engine.bodies.get_mut(self.target) {
-            target.set_linvel(to_engine(&-palm_velocity), true);
+            target.set_linvel(to_engine(&-velocity), true);
         }
     }
 
-    /// The palm stops at once, and the target stays where it is.
-    pub(super) fn stop_palm(&mut self, palm_velocity: &Vector3<f64>) {
+    fn stop_palm(&mut self, velocity: &Vector3<f64>) {
         self.set_palm_motion(&Vector3::zeros(), &Vector3::zeros());
         if let Some(target) = self.engine.bodies.get_mut(self.target) {
-            let linvel = target.linvel() + to_engine(palm_velocity);
+            let linvel = target.linvel() + to_engine(velocity);
             target.set_linvel(linvel, true);
         }
     }
 
-    pub(super) fn step(&mut self) {
+    fn step(&mut self) {
         self.engine.step();
     }
 
-    pub(super) fn palm_from_target(&self) -> Isometry3<f64> {
+    fn set_step(&mut self, secs: f64) {
+        self.engine.integration_parameters.dt = secs;
+    }
+
+    fn palm_from_target(&self) -> Isometry3<f64> {
         from_engine(self.engine.bodies[self.target].position())
     }
 
-    /// The forces on the hand.
-    pub(super) fn touches(&self, shapes: &[ShapeCollider]) -> Vec<Touch> {
-        let of_hand = |collider: ColliderHandle| shapes.iter().find(|shape| shape.collider == collider);
+    fn target_velocity(&self) -> Vector3<f64> {
+        from_engine_vector(self.engine.bodies[self.target].linvel())
+    }
+
+    fn touches(&self) -> Vec<Touch> {
+        let of_hand = |collider: ColliderHandle| self.shapes.iter().find(|shape| shape.collider == collider);
         let mut touches = Vec::new();
         for pair in self.engine.narrow_phase.contact_pairs() {
             let sides = [pair.collider1, pair.collider2];
@@ -195,35 +277,8 @@ impl World {
         touches
     }
 
-    /// The force with which the stand carries the target, at right angles to it.
-    pub(super) fn stand_newtons(&self) -> f64 {
-        let mut sum = 0.0;
-        self.for_each_stand_force(|_, _, newtons| sum += newtons);
-        sum
-    }
-
-    pub(super) fn target_velocity(&self) -> Vector3<f64> {
-        from_engine_vector(self.engine.bodies[self.target].linvel())
-    }
-
-    /// Force and torque about the palm's origin with which the target loads the wrist, in the palm frame, given the
-    /// target's `acceleration` against the palm: its weight and inertia, less what the stand carries. The stand's
-    /// friction and the target's turning are left out.
-    pub(super) fn load_on_wrist(&self, mass_kg: f64, acceleration: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
-        let body = &self.engine.bodies[self.target];
-        let centre = from_engine_vector(body.center_of_mass());
-        let mut force = (from_engine_vector(self.engine.gravity) - acceleration) * mass_kg;
-        let mut torque = centre.cross(&force);
-        self.for_each_stand_force(|point, onto_target, newtons| {
-            let carried = onto_target * newtons;
-            force += carried;
-            torque += point.coords.cross(&carried);
-        });
-        (force, torque)
-    }
-
-    /// The forces of the stand on the target: a point, the direction, newtons.
-    fn for_each_stand_force(&self, mut visit: impl FnMut(Point3<f64>, Vector3<f64>, f64)) {
+    fn stand_forces(&self) -> Vec<StandForce> {
+        let mut forces = Vec::new();
         for &collider in self.engine.bodies[self.stand].colliders() {
             for pair in self.engine.narrow_phase.contact_pairs_with(collider) {
                 let is_first = pair.collider1 == collider;
@@ -231,11 +286,17 @@ impl World {
                 if self.engine.colliders[other].parent() == Some(self.target) {
                     let sign = if is_first { 1.0 } else { -1.0 };
                     for_each_force(&self.engine, pair, |points, normal, newtons| {
-                        visit(points[usize::from(is_first)], normal * sign, newtons);
+                        let point_m = points[usize::from(is_first)];
+                        forces.push(StandForce { point_m, onto_target: normal * sign, newtons });
                     });
                 }
             }
         }
+        forces
+    }
+
+    fn gravity_in_palm(&self) -> Vector3<f64> {
+        from_engine_vector(self.engine.gravity)
     }
 }
 
@@ -246,7 +307,10 @@ const LENGTH_UNIT_M: f64 = 0.1;
 /// and moves them along.
 const RECYCLE_M: f64 = 1e-4;
 
-/// A post, its axis along y as the engine has cylinders.
+/// Half the thickness of the ground under the stand.
+const GROUND_HALF_M: f64 = 0.05;
+
+/// A table or post, its axis along y as the engine has cylinders.
 pub(super) fn stand_shape(options: &PhysicsOptions) -> SharedShape {
     SharedShape::cylinder(options.stand_height_m / 2.0, options.stand_radius_m)
 }
@@ -254,6 +318,20 @@ pub(super) fn stand_shape(options: &PhysicsOptions) -> SharedShape {
 /// Upright, its upper face at z = 0.
 pub(super) fn world_from_stand(options: &PhysicsOptions) -> Isometry3<f64> {
     Isometry3::new(Vector3::new(0.0, 0.0, -options.stand_height_m / 2.0), Vector3::x() * std::f64::consts::FRAC_PI_2)
+}
+
+/// A core with its rounded edges.
+fn grown(core: &dyn Shape, edge_radius_m: f64) -> SharedShape {
+    if edge_radius_m > 0.0 {
+        if let Some(cuboid) = core.as_cuboid() {
+            let half = cuboid.half_extents;
+            return SharedShape::round_cuboid(half.x, half.y, half.z, edge_radius_m);
+        }
+        if let Some(cylinder) = core.as_cylinder() {
+            return SharedShape::round_cylinder(cylinder.half_height, cylinder.radius, edge_radius_m);
+        }
+    }
+    SharedShape(core.clone_dyn().into())
 }
 
 fn groups(member: Group, filter: Group) -> InteractionGroups {
@@ -296,7 +374,7 @@ pub(super) fn from_engine(pose: &Pose) -> Isometry3<f64> {
 
 impl LiftTarget {
     /// Mass, centre and inertia: the inertia that of the convex hull, scaled to the mass.
-    fn mass_properties(&self, centre: Vector) -> MassProperties {
+    pub(super) fn mass_properties(&self, centre: Vector) -> MassProperties {
         let hull = self.hull.mass_properties(1.0);
         let inertia = hull.reconstruct_inertia_matrix() * (self.mass_kg / hull.mass());
         MassProperties::with_inertia_matrix(centre, self.mass_kg, inertia)
@@ -310,9 +388,15 @@ mod tests {
     use rapier3d_f64::dynamics::LockedAxes;
 
     use super::*;
+    use crate::trial::engine::{load_on_wrist, stand_newtons};
     use blindgrasp_objects::Object;
 
     const MASS_KG: f64 = 0.4;
+
+    fn load(world: &World) -> (Vector3<f64>, Vector3<f64>) {
+        let centre = Point3::from(world.palm_from_target().translation.vector);
+        load_on_wrist(world, MASS_KG, &centre, &Vector3::zeros())
+    }
 
     /// A cube of 60 mm: a box, or a mesh.
     #[derive(Debug, Clone, Copy)]
@@ -332,7 +416,8 @@ mod tests {
     }
 
     fn standing(target: &LiftTarget, options: &PhysicsOptions) -> World {
-        World::new(target, &Isometry3::translation(0.0, 0.0, 0.03), &Isometry3::identity(), options)
+        let standing = Isometry3::translation(0.0, 0.0, 0.03);
+        World::new(target, &standing, &Isometry3::identity(), &HandPlan::default(), options).expect("a world")
     }
 
     fn run(world: &mut World, secs: f64) {
@@ -348,7 +433,7 @@ mod tests {
             let mut world = standing(&cube(1.0, Made::Box), &options);
             run(&mut world, 1.0);
             let weight_newtons = MASS_KG * GRAVITY;
-            let found = world.stand_newtons();
+            let found = stand_newtons(&world);
             assert!((found / weight_newtons - 1.0).abs() < 0.01, "{found} N, expected {weight_newtons} N");
             assert!(world.palm_from_target().translation.vector.xy().norm() < 1e-4);
         }
@@ -383,7 +468,10 @@ mod tests {
     fn fallen_m(friction: f64, newtons: f64, made: Made) -> f64 {
         let options = PhysicsOptions::default();
         let target = cube(friction, made);
-        let mut world = World::new(&target, &Isometry3::translation(0.0, 0.0, 0.5), &Isometry3::identity(), &options);
+        let at_height = Isometry3::translation(0.0, 0.0, 0.5);
+        let no_hand = HandPlan::default();
+        let mut world =
+            World::new(&target, &at_height, &Isometry3::identity(), &no_hand, &options).expect("a world");
         let plate = || {
             let groups = (Group::GROUP_1, Group::NONE);
             World::hand_collider(SharedShape::cuboid(0.005, 0.02, 0.02), &Isometry3::identity(), groups)
@@ -422,19 +510,19 @@ mod tests {
         run(&mut world, 0.5);
         world.set_palm_motion(&Vector3::zeros(), &Vector3::new(0.0, 0.0, -GRAVITY));
         run(&mut world, 0.2);
-        assert!(world.stand_newtons() < 0.01 * MASS_KG * GRAVITY, "{}", world.stand_newtons());
+        assert!(stand_newtons(&world) < 0.01 * MASS_KG * GRAVITY, "{}", stand_newtons(&world));
     }
 
     #[test]
     fn the_wrist_bears_what_the_stand_does_not() {
         let mut world = standing(&cube(1.0, Made::Box), &PhysicsOptions::default());
         run(&mut world, 0.5);
-        let (force, _) = world.load_on_wrist(MASS_KG, &Vector3::zeros());
+        let (force, _) = load(&world);
         assert!(force.norm() < 0.01 * MASS_KG * GRAVITY, "it stands: {force}");
         // The stand is taken away: all of the weight would hang on the hand, off its axis by where the cube is.
         world.set_palm_motion(&Vector3::new(0.0, 0.0, 1.0), &Vector3::zeros());
         run(&mut world, 0.05);
-        let (force, torque) = world.load_on_wrist(MASS_KG, &Vector3::zeros());
+        let (force, torque) = load(&world);
         assert!((force + Vector3::new(0.0, 0.0, MASS_KG * GRAVITY)).norm() < 1e-9, "{force}");
         assert!(torque.norm() < 1e-3, "{torque}");
     }

@@ -1,0 +1,499 @@
+//! MuJoCo as the physics engine: a second robot, which shares nothing with the first one's contacts.
+//!
+//! A Python process (`mujoco.py`) runs the engine, because MuJoCo comes from PyPI. It is told a model as MJCF, which is made
+//! from the hand's own description, and then goes on step by step. A process serves one attempt after another.
+//!
+//! The palm is a heavy body that really moves. Links have weight. Rounded edges are contact margins. An object of a mesh is
+//! cut into convex parts by CoACD.
+
+use std::fmt::Write as _;
+use std::io::{BufRead, BufReader, Write as _};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::sync::{Mutex, PoisonError};
+
+use nalgebra::{Isometry3, Point3, Quaternion, UnitQuaternion, UnitVector3, Vector3};
+use parry3d_f64::shape::{Shape, TypedShape};
+use rapier3d_f64::parry::mass_properties::MassProperties;
+use serde::Deserialize;
+use serde_json::{Value, json};
+
+use super::engine::{AxleCommand, Engine, GRAVITY, HandPlan, Side, StandForce, Touch};
+use super::{LiftTarget, MujocoOptions, PhysicsOptions, TrialError};
+use blindgrasp_objects::shape::mesh_of_shape;
+use blindgrasp_stages::hand::JointKind;
+
+const SCRIPT: &str = include_str!("mujoco.py");
+
+/// The variable with the Python interpreter that has MuJoCo; `python3` where it is not set.
+const PYTHON: &str = "BLINDGRASP_PYTHON";
+
+/// Processes that wait for an attempt.
+static IDLE: Mutex<Vec<Process>> = Mutex::new(Vec::new());
+
+/// Kinds of bodies, as bits of MuJoCo's contype and conaffinity. The target stands on its convex hull, its foot.
+const HAND: u32 = 1;
+const TARGET: u32 = 2;
+const STAND: u32 = 4;
+const FOOT: u32 = 8;
+
+/// A Python process with the engine.
+struct Process {
+    child: Child,
+    commands: ChildStdin,
+    answers: BufReader<ChildStdout>,
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+impl Process {
+    fn start() -> Result<Process, String> {
+        let python = std::env::var(PYTHON).unwrap_or_else(|_| "python3".into());
+        let started = Command::new(&python)
+            .args(["-c", SCRIPT])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            // One thread for each process: there are as many processes as threads.
+            .env("OMP_NUM_THREADS", "1")
+            .env("OPENBLAS_NUM_THREADS", "1")
+            .spawn();
+        let mut child = started.map_err(|error| format!("{python} does not start ({error}): set {PYTHON}"))?;
+        let (commands, answers) = (child.stdin.take(), child.stdout.take());
+        let (Some(commands), Some(answers)) = (commands, answers) else {
+            return Err(format!("{python} has no standard input or output"));
+        };
+        Ok(Process { child, commands, answers: BufReader::new(answers) })
+    }
+
+    fn ask(&mut self, command: &Value) -> Result<Value, String> {
+        let mut line = String::new();
+        // A process that has ended may still have said why.
+        let written = writeln!(self.commands, "{command}").and_then(|()| self.commands.flush());
+        let n_read = self.answers.read_line(&mut line).map_err(|error| format!("MuJoCo does not answer: {error}"))?;
+        if n_read == 0 {
+            return Err(format!("the process of MuJoCo has ended{}", written.err().map_or(String::new(), |error| format!(": {error}"))));
+        }
+        let answer: Value = serde_json::from_str(&line).map_err(|error| format!("MuJoCo's answer: {error}"))?;
+        match answer.get("error").and_then(Value::as_str) {
+            Some(error) => Err(error.into()),
+            None => Ok(answer),
+        }
+    }
+}
+
+/// The bodies after a step.
+#[derive(Debug, Clone, Default, Deserialize)]
+struct State {
+    travels: Vec<f64>,
+    /// Position, and rotation as w, x, y, z.
+    place: [f64; 7],
+    velocity: [f64; 3],
+}
+
+/// MuJoCo with a hand, a stand and a target.
+pub(super) struct Mujoco {
+    /// `None` once it has failed.
+    process: Mutex<Option<Process>>,
+    failure: Mutex<Option<String>>,
+    state: State,
+    /// The link of each shape.
+    links: Vec<usize>,
+    up: Vector3<f64>,
+    acceleration: Vector3<f64>,
+    velocity: Vector3<f64>,
+    jumps: bool,
+    commands: Option<Vec<AxleCommand>>,
+    step_secs: f64,
+}
+
+impl Mujoco {
+    /// Builds the model; the arguments are as of the other engine.
+    ///
+    /// # Errors
+    /// Python, MuJoCo or CoACD is missing, or the model is refused.
+    pub(super) fn new(
+        target: &LiftTarget,
+        world_from_target: &Isometry3<f64>,
+        palm_from_world: &Isometry3<f64>,
+        hand: &HandPlan,
+        options: &PhysicsOptions,
+    ) -> Result<Mujoco, TrialError> {
+        let refuse = |reason: String| TrialError::Engine { reason };
+        let idle = IDLE.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        let mut process = idle.map_or_else(Process::start, Ok).map_err(refuse)?;
+        let begin = json!({"begin": {
+            "xml": model(target, world_from_target, palm_from_world, hand, options),
+            "mesh": concave(target, options),
+            "n_axles": hand.bodies.len(),
+            "step_secs": options.mujoco.step_secs,
+        }});
+        let answer = process.ask(&begin).map_err(refuse)?;
+        let state = serde_json::from_value(answer).map_err(|error| refuse(format!("MuJoCo's answer: {error}")))?;
+        Ok(Mujoco {
+            process: Mutex::new(Some(process)),
+            failure: Mutex::new(None),
+            state,
+            links: hand.shapes.iter().map(|shape| shape.link_idx).collect(),
+            up: palm_from_world.rotation * Vector3::z(),
+            acceleration: Vector3::zeros(),
+            velocity: Vector3::zeros(),
+            jumps: false,
+            commands: None,
+            step_secs: options.step_secs,
+        })
+    }
+
+    /// Asks the process. `None` once it has failed.
+    fn ask(&self, command: &Value) -> Option<Value> {
+        let mut process = self.process.lock().unwrap_or_else(PoisonError::into_inner);
+        match process.as_mut()?.ask(command) {
+            Ok(answer) => Some(answer),
+            Err(error) => {
+                *process = None;
+                *self.failure.lock().unwrap_or_else(PoisonError::into_inner) = Some(error);
+                None
+            }
+        }
+    }
+
+    /// Each force between two bodies: the pressed shape of the hand, or -1 for the target, the other side, and where.
+    fn forces(&self) -> Vec<(i64, i64, Point3<f64>, Vector3<f64>, f64)> {
+        type Row = (i64, i64, [f64; 3], [f64; 3], f64);
+        let answer = self.ask(&json!({"touches": {}}));
+        let rows: Vec<Row> = answer.and_then(|answer| serde_json::from_value(answer).ok()).unwrap_or_default();
+        let force = |(own, other, point, normal, newtons): Row| (own, other, point.into(), normal.into(), newtons);
+        rows.into_iter().map(force).collect()
+    }
+}
+
+impl Drop for Mujoco {
+    fn drop(&mut self) {
+        let process = self.process.lock().unwrap_or_else(PoisonError::into_inner).take();
+        IDLE.lock().unwrap_or_else(PoisonError::into_inner).extend(process);
+    }
+}
+
+impl Engine for Mujoco {
+    fn travel(&self, axle: usize) -> f64 {
+        self.state.travels.get(axle).copied().unwrap_or(0.0)
+    }
+
+    fn drive(&mut self, commands: &[AxleCommand]) {
+        self.commands = Some(commands.to_vec());
+    }
+
+    fn set_palm_motion(&mut self, velocity: &Vector3<f64>, acceleration: &Vector3<f64>) {
+        (self.velocity, self.acceleration) = (*velocity, *acceleration);
+    }
+
+    fn push_off(&mut self, velocity: &Vector3<f64>) {
+        (self.velocity, self.jumps) = (*velocity, true);
+    }
+
+    fn stop_palm(&mut self, _velocity: &Vector3<f64>) {
+        (self.velocity, self.jumps) = (Vector3::zeros(), true);
+    }
+
+    fn step(&mut self) {
+        // What the motor does at its speed is a place ahead of it.
+        let control = |command: &AxleCommand| command.target + command.speed * command.damping / command.stiffness;
+        let commands = self.commands.take();
+        let controls = commands.as_ref().map(|all| all.iter().map(control).collect::<Vec<_>>());
+        let most = commands.as_ref().map(|all| all.iter().map(|command| command.most).collect::<Vec<_>>());
+        let step = json!({"step": {
+            "controls": controls,
+            "most": most,
+            "velocity": [self.velocity.x, self.velocity.y, self.velocity.z],
+            "jumps": std::mem::take(&mut self.jumps),
+            "secs": self.step_secs,
+        }});
+        let Some(answer) = self.ask(&step) else { return };
+        match serde_json::from_value::<State>(answer) {
+            Ok(state) => self.state = state,
+            // The engine has lost the bodies. A target nowhere is one that is not held.
+            Err(_) => self.state.place = [f64::NAN; 7],
+        }
+    }
+
+    fn set_step(&mut self, secs: f64) {
+        self.step_secs = secs;
+    }
+
+    fn palm_from_target(&self) -> Isometry3<f64> {
+        let [x, y, z, w, i, j, k] = self.state.place;
+        Isometry3::from_parts(
+            Vector3::new(x, y, z).into(),
+            UnitQuaternion::from_quaternion(Quaternion::new(w, i, j, k)),
+        )
+    }
+
+    fn target_velocity(&self) -> Vector3<f64> {
+        self.state.velocity.into()
+    }
+
+    fn touches(&self) -> Vec<Touch> {
+        let touch = |(own, other, point_m, outward, newtons): (i64, i64, Point3<f64>, Vector3<f64>, f64)| {
+            let shape = |idx: i64| {
+                let idx = usize::try_from(idx).ok()?;
+                Some((*self.links.get(idx)?, idx))
+            };
+            let (link_idx, shape_idx) = shape(own)?;
+            let side = match other {
+                -1 => Side::Target,
+                -2 => Side::Stand,
+                other => shape(other).map(|(link_idx, shape_idx)| Side::Hand { link_idx, shape_idx })?,
+            };
+            let outward = UnitVector3::new_normalize(outward);
+            Some(Touch { link_idx, shape_idx, side, point_m, outward, newtons })
+        };
+        self.forces().into_iter().filter_map(touch).collect()
+    }
+
+    fn stand_forces(&self) -> Vec<StandForce> {
+        let of_stand = self.forces().into_iter().filter(|(own, other, ..)| (*own, *other) == (-1, -2));
+        of_stand.map(|(.., point_m, onto_target, newtons)| StandForce { point_m, onto_target, newtons }).collect()
+    }
+
+    fn gravity_in_palm(&self) -> Vector3<f64> {
+        self.up * -GRAVITY - self.acceleration
+    }
+
+    fn failure(&self) -> Option<String> {
+        self.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+/// The mesh of a target that is not convex, and how its parts touch; `null` of a convex one.
+fn concave(target: &LiftTarget, options: &PhysicsOptions) -> Value {
+    let TypedShape::TriMesh(_) = target.object.shape.as_typed_shape() else { return Value::Null };
+    let mesh = mesh_of_shape(&target.object.shape);
+    let MujocoOptions { contact_secs, .. } = options.mujoco;
+    json!({
+        "points_m": mesh.vertices_m.iter().map(|point| [point.x, point.y, point.z]).collect::<Vec<_>>(),
+        "triangles": mesh.triangles,
+        "geom": {
+            "contype": TARGET, "conaffinity": HAND, "condim": 4, "priority": 1,
+            "friction": friction(target.friction, options),
+            "solref": [contact_secs, 1.0],
+        },
+    })
+}
+
+/// Friction along the surface, about its normal (metres), and of rolling (metres).
+fn friction(sliding: f64, options: &PhysicsOptions) -> [f64; 3] {
+    [sliding, sliding * options.mujoco.torsion_m, 1e-4]
+}
+
+/// The model as MJCF. Its world is the palm's frame at the beginning.
+fn model(
+    target: &LiftTarget,
+    world_from_target: &Isometry3<f64>,
+    palm_from_world: &Isometry3<f64>,
+    hand: &HandPlan,
+    options: &PhysicsOptions,
+) -> String {
+    let MujocoOptions { step_secs, impratio, noslip_iterations, contact_secs, .. } = options.mujoco;
+    let gravity = palm_from_world.rotation * Vector3::new(0.0, 0.0, -GRAVITY);
+    let mut meshes = Meshes::default();
+    let mut bodies = String::new();
+    let roots = (0..hand.bodies.len()).filter(|idx| hand.bodies[*idx].parent.is_none());
+    for root in roots {
+        write_body(hand, root, &mut meshes, &mut bodies);
+    }
+    let on_palm = write_shapes(hand, None, &mut meshes);
+
+    let radius_m = options.stand_radius_m;
+    let half_height_m = options.stand_height_m / 2.0;
+    let palm_from_stand = palm_from_world * Isometry3::translation(0.0, 0.0, -half_height_m);
+    let around = (0..32).map(|idx| (std::f64::consts::TAU * f64::from(idx) / 32.0).sin_cos());
+    let prism: Vec<Point3<f64>> = around
+        .flat_map(|(sin, cos)| [-1.0, 1.0].map(|z| Point3::new(radius_m * cos, radius_m * sin, z * half_height_m)))
+        .collect();
+    let stand = meshes.geom(&prism);
+    let ground = palm_from_world * Isometry3::translation(0.0, 0.0, -options.stand_height_m - 0.05);
+    let [slide, twist, roll] = friction(target.friction, options);
+    let surface = format!(
+        r#"condim="4" priority="1" friction="{slide} {twist} {roll}" solref="{contact_secs} 1""#
+    );
+    let solid = match target.object.shape.as_typed_shape() {
+        TypedShape::TriMesh(_) => String::new(),
+        _ => {
+            let geom = geom(&*target.object.shape, &Isometry3::identity(), &mut meshes);
+            format!(r#"<geom name="target" contype="{TARGET}" conaffinity="{HAND}" {surface} {geom}/>"#)
+        }
+    };
+    let foot = meshes.geom(&mesh_of_shape(&target.hull).vertices_m);
+    let palm_from_target = palm_from_world * world_from_target;
+    let centre = target.object.centre_of_mass_m;
+    let mass = target.mass_properties(parry3d_f64::math::Vector::new(centre.x, centre.y, centre.z));
+    let on_stand = format!(
+        r#"contype="{STAND}" conaffinity="{}" priority="2" friction="{} 0 0" solref="{contact_secs} 1""#,
+        HAND | FOOT,
+        options.stand_friction
+    );
+    let mut excluded = String::new();
+    for (a, b) in apart(hand) {
+        let _ = writeln!(excluded, r#"<exclude body1="{}" body2="{}"/>"#, body_name(a), body_name(b));
+    }
+    let mut actuators = String::new();
+    for (idx, body) in hand.bodies.iter().enumerate() {
+        let per_radian = body.kind.per_radian();
+        let (stiffness, damping) =
+            (options.gear_stiffness / (per_radian * per_radian), options.gear_damping / (per_radian * per_radian));
+        let _ = writeln!(
+            actuators,
+            r#"<general joint="axle{idx}" gainprm="{stiffness}" biastype="affine" biasprm="0 -{stiffness} -{damping}" forcelimited="true" forcerange="-1 1"/>"#
+        );
+    }
+    format!(
+        r#"<mujoco>
+<compiler angle="radian" autolimits="false" balanceinertia="true" boundmass="1e-6" boundinertia="1e-9"/>
+<option timestep="{step_secs}" gravity="{}" cone="elliptic" impratio="{impratio}" noslip_iterations="{noslip_iterations}" integrator="implicitfast">
+<flag multiccd="enable"/></option>
+<size memory="64M"/>
+<default><geom contype="{HAND}" conaffinity="{HAND}" condim="4" friction="1 0.005 0.0001" solref="{contact_secs} 1"/></default>
+<asset>{}</asset>
+<worldbody>
+<geom name="stand" {on_stand} {stand} {}/>
+<geom name="stand_ground" {on_stand} type="box" size="5 5 0.05" {}/>
+<body name="palm" gravcomp="1">
+<joint name="palm_x" type="slide" axis="1 0 0"/><joint name="palm_y" type="slide" axis="0 1 0"/><joint name="palm_z" type="slide" axis="0 0 1"/>
+<inertial pos="0 0 0" mass="3000" diaginertia="300 300 300"/>
+{on_palm}{bodies}</body>
+<body name="target" {}><freejoint/>{}{solid}
+<geom name="foot" contype="{FOOT}" conaffinity="{STAND}" friction="1 0 0" {foot}/></body>
+</worldbody>
+<contact>{excluded}</contact>
+<actuator>{actuators}</actuator>
+</mujoco>"#,
+        vector(&gravity),
+        meshes.assets,
+        pose(&palm_from_stand),
+        pose(&ground),
+        pose(&palm_from_target),
+        inertial(&mass),
+    )
+}
+
+fn body_name(body: Option<usize>) -> String {
+    body.map_or_else(|| "palm".into(), |idx| format!("body{idx}"))
+}
+
+/// The pairs of bodies that have links which are built into each other.
+fn apart(hand: &HandPlan) -> Vec<(Option<usize>, Option<usize>)> {
+    let mut pairs = Vec::new();
+    for (idx, a) in hand.shapes.iter().enumerate() {
+        for b in &hand.shapes[..idx] {
+            let may_touch = (a.touched & b.own) == b.own;
+            if !may_touch && a.body != b.body && !pairs.contains(&(b.body, a.body)) {
+                pairs.push((b.body, a.body));
+            }
+        }
+    }
+    pairs
+}
+
+fn write_body(hand: &HandPlan, idx: usize, meshes: &mut Meshes, out: &mut String) {
+    let body = &hand.bodies[idx];
+    let parent_from_body = body.parent_from_axis * body.body_from_axis.inverse();
+    let axis = body.body_from_axis.rotation * Vector3::x();
+    let kind = match body.kind {
+        JointKind::Revolute => "hinge",
+        JointKind::Prismatic => "slide",
+    };
+    let _ = writeln!(
+        out,
+        r#"<body name="body{idx}" {}><joint name="axle{idx}" type="{kind}" axis="{}" armature="{}"/>{}"#,
+        pose(&parent_from_body),
+        vector(&axis),
+        body.armature,
+        inertial(&body.mass)
+    );
+    out.push_str(&write_shapes(hand, Some(idx), meshes));
+    for child in (0..hand.bodies.len()).filter(|child| hand.bodies[*child].parent == Some(idx)) {
+        write_body(hand, child, meshes, out);
+    }
+    out.push_str("</body>\n");
+}
+
+fn write_shapes(hand: &HandPlan, body: Option<usize>, meshes: &mut Meshes) -> String {
+    let of_body = hand.shapes.iter().filter(|shape| shape.body == body);
+    let geoms = of_body.map(|shape| {
+        let geom = geom(&*shape.core, &shape.body_from_shape, meshes);
+        format!("<geom name=\"shape{}\" margin=\"{}\" {geom}/>\n", shape.shape_idx, shape.edge_radius_m)
+    });
+    geoms.collect()
+}
+
+/// Meshes of the model, by their corners: MuJoCo takes their convex hulls.
+#[derive(Default)]
+struct Meshes {
+    n: usize,
+    assets: String,
+}
+
+impl Meshes {
+    /// The attributes of a geom of these corners.
+    fn geom(&mut self, corners: &[Point3<f64>]) -> String {
+        let idx = self.n;
+        self.n += 1;
+        let corners: Vec<String> = corners.iter().map(|corner| vector(&corner.coords)).collect();
+        let _ = writeln!(self.assets, r#"<mesh name="mesh{idx}" vertex="{}"/>"#, corners.join(" "));
+        format!(r#"type="mesh" mesh="mesh{idx}""#)
+    }
+}
+
+/// The attributes of a geom with a shape and its place.
+fn geom(shape: &dyn Shape, body_from_shape: &Isometry3<f64>, meshes: &mut Meshes) -> String {
+    // Cylinders of MuJoCo stand along z, parry's along y.
+    let y_to_z = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), -std::f64::consts::FRAC_PI_2);
+    let upright = body_from_shape * Isometry3::from_parts(Default::default(), y_to_z);
+    match shape.as_typed_shape() {
+        TypedShape::Ball(ball) => format!(r#"type="sphere" size="{}" {}"#, ball.radius, pose(body_from_shape)),
+        TypedShape::Cuboid(cuboid) => {
+            let half = cuboid.half_extents;
+            format!(r#"type="box" size="{} {} {}" {}"#, half.x, half.y, half.z, pose(body_from_shape))
+        }
+        TypedShape::Cylinder(cylinder) => {
+            format!(r#"type="cylinder" size="{} {}" {}"#, cylinder.radius, cylinder.half_height, pose(&upright))
+        }
+        _ => {
+            let corners = mesh_of_shape(&parry3d_f64::shape::SharedShape(shape.clone_dyn().into())).vertices_m;
+            format!("{} {}", meshes.geom(&corners), pose(body_from_shape))
+        }
+    }
+}
+
+fn inertial(mass: &MassProperties) -> String {
+    let inertia = mass.reconstruct_inertia_matrix();
+    let at = |row: usize, column: usize| inertia.col(column)[row];
+    let centre = mass.local_com;
+    format!(
+        r#"<inertial pos="{} {} {}" mass="{}" fullinertia="{} {} {} {} {} {}"/>"#,
+        centre.x,
+        centre.y,
+        centre.z,
+        mass.mass(),
+        at(0, 0),
+        at(1, 1),
+        at(2, 2),
+        at(0, 1),
+        at(0, 2),
+        at(1, 2)
+    )
+}
+
+fn pose(isometry: &Isometry3<f64>) -> String {
+    let rotation = isometry.rotation.coords;
+    let position = vector(&isometry.translation.vector);
+    format!(r#"pos="{position}" quat="{} {} {} {}""#, rotation.w, rotation.x, rotation.y, rotation.z)
+}
+
+fn vector(vector: &Vector3<f64>) -> String {
+    format!("{} {} {}", vector.x, vector.y, vector.z)
+}
