@@ -27,6 +27,7 @@ mod main_job;
 mod many_cells;
 mod meshes;
 mod metrics;
+mod mujoco;
 mod over_ssh;
 mod own_program;
 mod package;

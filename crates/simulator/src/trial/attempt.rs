@@ -56,6 +56,8 @@ pub struct Attempt<'a> {
     n_frames_of_stage: usize,
     /// Where the target was in the hand when the hand had settled.
     settled: Option<Isometry3<f64>>,
+    /// Whether the hand touched the target when the last probe began.
+    was_touched: bool,
     /// How far the arm has lifted.
     lifted_m: f64,
     /// The target's velocity at the last frame, in the palm frame.
@@ -161,6 +163,7 @@ impl<'a> Attempt<'a> {
             stage_secs: 0.0,
             n_frames_of_stage: 0,
             settled: None,
+            was_touched: false,
             lifted_m: 0.0,
             last_velocity: Vector3::zeros(),
             felt: None,
@@ -268,6 +271,7 @@ impl<'a> Attempt<'a> {
 
     /// Begins a probe, whose frames follow.
     pub fn probe(&mut self, probe: ProbeMove) {
+        self.was_touched = self.is_touched();
         self.last_stage = match probe {
             ProbeMove::Squeeze => Stage::Squeezed,
             ProbeMove::TestLift => Stage::TestLifted,
@@ -296,7 +300,8 @@ impl<'a> Attempt<'a> {
     }
 
     /// Lowers the arm again after a test lift that is not followed by a lift. Returns by how much the target's centre of
-    /// mass has moved, and the target turned, in the hand since it settled: metres, radians.
+    /// mass has moved, and the target turned, in the hand since it settled: metres, radians; 0 if the hand did not touch it
+    /// before the test lift, which then has moved nothing.
     pub fn set_down(&mut self) -> (f64, f64) {
         let protocol = &self.options.protocol;
         let n_steps = (protocol.test_lift_secs / self.options.physics.step_secs).round() as u64;
@@ -310,6 +315,9 @@ impl<'a> Attempt<'a> {
         self.move_palm((Vector3::zeros(), Vector3::zeros()));
         self.lifted_m = 0.0;
         let Some(before) = self.settled else { return (0.0, 0.0) };
+        if !self.was_touched {
+            return (0.0, 0.0);
+        }
         let (now, centre) = (self.engine.palm_from_target(), self.target.object.centre_of_mass_m);
         ((now * centre - before * centre).norm(), before.rotation.angle_to(&now.rotation))
     }
@@ -350,9 +358,13 @@ impl<'a> Attempt<'a> {
         }
         let end = self.engine.palm_from_target();
         let slip_m = slip_m(&end);
-        let is_touched = self.engine.touches().iter().any(|touch| touch.side == Side::Target);
-        let held = is_touched && !self.has_diverged() && stand_newtons(&*self.engine) == 0.0 && slip_m <= protocol.lost_m;
+        let held = self.is_touched() && !self.has_diverged() && stand_newtons(&*self.engine) == 0.0 && slip_m <= protocol.lost_m;
         LiftResult { held, slip_m, turn_rad: begin.rotation.angle_to(&end.rotation) }
+    }
+
+    /// Whether the hand touches the target now.
+    pub(super) fn is_touched(&self) -> bool {
+        self.engine.touches().iter().any(|touch| touch.side == Side::Target)
     }
 
     /// Gives the palm a velocity and an acceleration, both in the world, for the next step.

@@ -24,8 +24,11 @@ use blindgrasp_stages::hand::JointKind;
 
 const SCRIPT: &str = include_str!("mujoco.py");
 
-/// The variable with the Python interpreter that has MuJoCo; `python3` where it is not set.
+/// The variable with the Python interpreter that has MuJoCo.
 const PYTHON: &str = "BLINDGRASP_PYTHON";
+/// The interpreter where the variable is not set. Tests have an environment of their own.
+const DEFAULT_PYTHON: &str =
+    if cfg!(test) { concat!(env!("CARGO_MANIFEST_DIR"), "/../../target/python-env/bin/python") } else { "python3" };
 
 /// Processes that wait for an attempt.
 static IDLE: Mutex<Vec<Process>> = Mutex::new(Vec::new());
@@ -52,7 +55,7 @@ impl Drop for Process {
 
 impl Process {
     fn start() -> Result<Process, String> {
-        let python = std::env::var(PYTHON).unwrap_or_else(|_| "python3".into());
+        let python = std::env::var(PYTHON).unwrap_or_else(|_| DEFAULT_PYTHON.into());
         let started = Command::new(&python)
             .args(["-c", SCRIPT])
             .stdin(Stdio::piped())
@@ -496,4 +499,87 @@ fn pose(isometry: &Isometry3<f64>) -> String {
 
 fn vector(vector: &Vector3<f64>) -> String {
     format!("{} {} {}", vector.x, vector.y, vector.z)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::trial::engine::stand_newtons;
+    use blindgrasp_objects::{Object, select};
+
+    /// Whether the environment of the tests is there, which `scripts/python-env` makes.
+    fn can_run(test: &str) -> bool {
+        let can_run = std::env::var_os(PYTHON).is_some() || Path::new(DEFAULT_PYTHON).exists();
+        if !can_run {
+            eprintln!("SKIPPED {test}: target/python-env is missing, scripts/python-env makes it");
+        }
+        can_run
+    }
+
+    fn standing(object: Object, mass_kg: f64) -> (Mujoco, LiftTarget) {
+        let target = LiftTarget::new("thing".into(), "thing".into(), object, mass_kg, 1.0);
+        let stands = crate::trial::start::world_from_standing(&target, 0.3);
+        // The palm is far away, and tilted.
+        let palm_from_world = Isometry3::new(Vector3::new(0.1, 0.2, 1.0), Vector3::new(0.5, -0.4, 0.2));
+        let options = PhysicsOptions::default();
+        let engine = Mujoco::new(&target, &stands, &palm_from_world, &HandPlan::default(), &options);
+        (engine.expect("MuJoCo"), target)
+    }
+
+    fn run(engine: &mut Mujoco, secs: f64) {
+        for _ in 0..(secs / engine.step_secs).round() as usize {
+            engine.step();
+        }
+        assert_eq!(engine.failure(), None);
+    }
+
+    #[test]
+    fn a_thing_on_the_table_weighs_what_it_weighs_and_stays() {
+        if !can_run("mujoco::a_thing_on_the_table") {
+            return;
+        }
+        // Convex, and a vessel that CoACD cuts.
+        for name in ["box-00", "can-00"] {
+            let object = select(name).expect("an object").remove(0);
+            let (mut engine, _) = standing(object, 0.4);
+            run(&mut engine, 0.5);
+            let begin = engine.palm_from_target();
+            run(&mut engine, 0.5);
+            let (end, newtons) = (engine.palm_from_target(), stand_newtons(&engine));
+            assert!((newtons / (0.4 * GRAVITY) - 1.0).abs() < 0.02, "{name}: {newtons} N");
+            assert!((end.translation.vector - begin.translation.vector).norm() < 1e-3, "{name}: {begin} {end}");
+            assert!(engine.touches().is_empty(), "there is no hand");
+        }
+    }
+
+    #[test]
+    fn the_palm_moves_and_the_thing_does_not() {
+        if !can_run("mujoco::the_palm_moves") {
+            return;
+        }
+        let (mut engine, _) = standing(select("box-00").expect("an object").remove(0), 0.4);
+        run(&mut engine, 0.3);
+        let begin = engine.palm_from_target().translation.vector;
+        let velocity = Vector3::new(0.02, 0.0, 0.01);
+        engine.push_off(&velocity);
+        run(&mut engine, 1.0);
+        let moved = engine.palm_from_target().translation.vector - begin;
+        assert!((moved + velocity).norm() < 1e-3, "{moved}");
+        engine.stop_palm(&velocity);
+        run(&mut engine, 0.2);
+        assert!((engine.palm_from_target().translation.vector - begin + velocity).norm() < 1e-3);
+    }
+
+    #[test]
+    fn a_process_that_ends_is_told() {
+        if !can_run("mujoco::a_process_that_ends") {
+            return;
+        }
+        let (mut engine, _) = standing(select("box-00").expect("an object").remove(0), 0.4);
+        engine.process.lock().expect("a lock").as_mut().expect("a process").child.kill().expect("killed");
+        engine.step();
+        assert!(engine.failure().is_some_and(|reason| reason.contains("the process of MuJoCo has ended")));
+    }
 }

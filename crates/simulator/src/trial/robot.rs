@@ -14,7 +14,8 @@ use blindgrasp_stages::hand::Hand;
 
 /// The samples of an instance go on where those of the one before ended: there is one generation of them.
 const EPOCH: u64 = 0;
-/// A target that a test lift has moved or turned by more in the hand, once set down again, is disturbed.
+/// A target that a test lift has moved or turned by more in the hand, once set down again, is disturbed. One that was gone
+/// before is not.
 const DISTURBED_M: f64 = 0.01;
 const DISTURBED_RAD: f64 = 0.2;
 
