@@ -8,7 +8,7 @@ use nalgebra::Isometry3;
 use crate::hand::{Hand, Joint, PosedShapes};
 use blindgrasp_messages::{Contact, Fault};
 
-/// How far beyond its limits a joint may read: an encoder's offset.
+/// How far beyond its limits a joint may read: an encoder's offset. It counts as at the limit then.
 pub const LIMIT_TOLERANCE_RAD: f64 = 0.1;
 /// Greatest force on a cell. No tactile cell bears more, and sums of such forces are far from overflow.
 pub const MAX_CELL_NEWTONS: f64 = 1e6;
@@ -49,9 +49,21 @@ pub fn contacts_from_frame(
     ContactFinder::default().find(hand, hand_id, joints, cells_newtons, contacts)
 }
 
+/// Moves the joints that read beyond their limits, by at most [`LIMIT_TOLERANCE_RAD`], to the limits: a joint does not go
+/// beyond its stop, and no later stage should see an encoder's zero as an unusual posture. Others stay as they are.
+pub fn clip_to_limits(hand: &Hand, joints: &mut [f64]) {
+    for (value, joint) in joints.iter_mut().zip(&hand.joints) {
+        if joint.allows(*value, LIMIT_TOLERANCE_RAD) {
+            *value = value.clamp(joint.lower, joint.upper);
+        }
+    }
+}
+
 /// Finds the contacts of frame after frame as [`contacts_from_frame`] does, in memory that it keeps.
 #[derive(Debug, Default)]
 pub struct ContactFinder {
+    /// Within their limits.
+    joints: Vec<f64>,
     palm_from_links: Vec<Isometry3<f64>>,
     shapes: PosedShapes,
     /// The links that touch each other.
@@ -77,10 +89,13 @@ impl ContactFinder {
         if joints.len() != hand.joints.len() || cells_newtons.len() != thresholds_newtons.len() {
             return faulty(Fault::WrongLength);
         }
-        let in_range = |(value, joint): (&f64, &Joint)| joint.allows(*value, LIMIT_TOLERANCE_RAD);
+        self.joints.clear();
+        self.joints.extend_from_slice(joints);
+        clip_to_limits(hand, &mut self.joints);
+        let in_range = |(value, joint): (&f64, &Joint)| joint.allows(*value, 0.0);
         if !are_forces(cells_newtons)
-            || !joints.iter().zip(&hand.joints).all(in_range)
-            || hand.write_palm_from_links(joints, &mut self.palm_from_links).is_err()
+            || !self.joints.iter().zip(&hand.joints).all(in_range)
+            || hand.write_palm_from_links(&self.joints, &mut self.palm_from_links).is_err()
         {
             return faulty(Fault::InvalidValue);
         }
@@ -182,6 +197,21 @@ mod tests {
             assert_eq!((summary.fault, contacts.len()), (fault, 0));
         }
         assert_eq!(run(1, &[0.0; 7], &[1.0; 96]).0.fault, Fault::WrongHand);
+    }
+
+    #[test]
+    fn a_joint_that_reads_beyond_its_stop_is_at_it() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let stops: Vec<f64> = hand.joints.iter().map(|joint| joint.upper).collect();
+        let beyond = |rad: f64| stops.iter().map(|stop| stop + rad).collect::<Vec<f64>>();
+        assert_eq!(run(0, &beyond(0.09), &[1.0; 96]), run(0, &stops, &[1.0; 96]));
+        let mut joints = beyond(0.09);
+        clip_to_limits(&hand, &mut joints);
+        assert_eq!(joints, stops);
+        // Farther is no zero of an encoder, and is shown as it is.
+        let mut joints = beyond(0.11);
+        clip_to_limits(&hand, &mut joints);
+        assert_eq!((joints, run(0, &beyond(0.11), &[1.0; 96]).0.fault), (beyond(0.11), Fault::InvalidValue));
     }
 
     #[test]

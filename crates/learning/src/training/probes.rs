@@ -119,7 +119,7 @@ pub(super) fn learn(
             threshold_probability: 1.0,
             unsure_from_probability: 1.0,
         },
-        training_range: learn_training_range(features, &readings, &kept.folds),
+        training_range: learn_training_range(hand, features, &readings, &kept.folds),
         cross_validated_roc_area: area_under_roc(&curve(&judged, &stable)).unwrap_or(0.5),
         cross_validated_ece: reliability(&judged, &stable, N_RELIABILITY_BINS).ece,
     };
