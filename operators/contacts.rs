@@ -138,7 +138,7 @@ impl Stage for FindContacts {
             summary = ContactSummary { fault: Fault::SensorFault, ..ContactSummary::default() };
             answers.items().clear();
         }
-        answers.push(contact_set(head, self.hand.id(), summary, parts.as_ref()));
+        answers.push(contact_set(&self.hand, head, summary, parts.as_ref()));
     }
 
     fn look(&mut self) {

@@ -1,14 +1,16 @@
 //! The contacts stage: from cells and joint angles to contacts in the palm frame (Dang & Allen, section II, Eq. 1).
 //!
 //! Pure: no clock, no I/O, no state. Where links of the hand touch each other, the cells between them feel the hand and
-//! not the object. They are left out and counted (Dang & Allen, section IV-F.3). Pads' normals are not corrected.
+//! not the object. They are left out and counted (Dang & Allen, section IV-F.3). A skin may spread this force beyond these
+//! cells. So a pad on a link that touches another one counts only if other pads show that an object is there: see
+//! [`contacts_from_frame`]. Pads' normals are not corrected.
 
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Vector3};
 
 use crate::hand::{Hand, Joint, PosedShapes};
-use blindgrasp_messages::{Contact, Fault};
+use blindgrasp_messages::{Contact, Fault, MAX_PADS};
 
-/// How far beyond its limits a joint may read: an encoder's offset.
+/// How far beyond its limits a joint may read: an encoder's offset. It counts as at the limit then.
 pub const LIMIT_TOLERANCE_RAD: f64 = 0.1;
 /// Greatest force on a cell. No tactile cell bears more, and sums of such forces are far from overflow.
 pub const MAX_CELL_NEWTONS: f64 = 1e6;
@@ -25,7 +27,7 @@ pub struct ContactSummary {
     pub n_pads_in_contact: u32,
     /// Whether links of the hand touch each other.
     pub self_collision: bool,
-    /// Active cells that feel another link of the hand. They are not among the contacts.
+    /// Active cells that feel another link of the hand, or may do so. They are not among the contacts.
     pub n_self_contacts: u32,
     /// The reason why the frame cannot be used. The contacts are empty then.
     pub fault: Fault,
@@ -39,6 +41,10 @@ pub struct ContactSummary {
 /// A cell is active when its force exceeds its noise threshold. A joint outside its range (degrees instead of radians,
 /// say), or a force that is negative, not finite or beyond any hand, makes the whole frame invalid, because the
 /// sensor's other readings are then doubtful too.
+///
+/// The active cells of a pad whose link touches no other link are contacts. If its link touches others, its cells within 5 mm
+/// of these are none, and the rest are contacts only if one of another pad opposes them, which itself is a contact and
+/// is not on a link that touches this one. So fingers that press each other on nothing feel no object.
 pub fn contacts_from_frame(
     hand: &Hand,
     hand_id: u64,
@@ -49,9 +55,21 @@ pub fn contacts_from_frame(
     ContactFinder::default().find(hand, hand_id, joints, cells_newtons, contacts)
 }
 
+/// Moves the joints that read beyond their limits, by at most [`LIMIT_TOLERANCE_RAD`], to the limits: a joint does not go
+/// beyond its stop, and no later stage should see an encoder's zero as an unusual posture. Others stay as they are.
+pub fn clip_to_limits(hand: &Hand, joints: &mut [f64]) {
+    for (value, joint) in joints.iter_mut().zip(&hand.joints) {
+        if joint.allows(*value, LIMIT_TOLERANCE_RAD) {
+            *value = value.clamp(joint.lower, joint.upper);
+        }
+    }
+}
+
 /// Finds the contacts of frame after frame as [`contacts_from_frame`] does, in memory that it keeps.
 #[derive(Debug, Default)]
 pub struct ContactFinder {
+    /// Within their limits.
+    joints: Vec<f64>,
     palm_from_links: Vec<Isometry3<f64>>,
     shapes: PosedShapes,
     /// The links that touch each other.
@@ -77,10 +95,13 @@ impl ContactFinder {
         if joints.len() != hand.joints.len() || cells_newtons.len() != thresholds_newtons.len() {
             return faulty(Fault::WrongLength);
         }
-        let in_range = |(value, joint): (&f64, &Joint)| joint.allows(*value, LIMIT_TOLERANCE_RAD);
+        self.joints.clear();
+        self.joints.extend_from_slice(joints);
+        clip_to_limits(hand, &mut self.joints);
+        let in_range = |(value, joint): (&f64, &Joint)| joint.allows(*value, 0.0);
         if !are_forces(cells_newtons)
-            || !joints.iter().zip(&hand.joints).all(in_range)
-            || hand.write_palm_from_links(joints, &mut self.palm_from_links).is_err()
+            || !self.joints.iter().zip(&hand.joints).all(in_range)
+            || hand.write_palm_from_links(&self.joints, &mut self.palm_from_links).is_err()
         {
             return faulty(Fault::InvalidValue);
         }
@@ -88,12 +109,10 @@ impl ContactFinder {
         self.shapes.place(hand, palm_from_links);
         self.touching.clear();
         self.touching.extend(hand.touching_pairs(&self.shapes));
-        let mut n_pads_in_contact = 0;
         let mut n_self_contacts = 0;
         for (pad_idx, pad) in hand.pads.iter().enumerate() {
             let palm_from_link = &palm_from_links[pad.link_idx];
             let cells = pad.first_cell_idx..pad.first_cell_idx + pad.cells.len();
-            let n_before = contacts.len();
             for cell_idx in active_idxs(&cells_newtons[cells.clone()], &thresholds_newtons[cells.clone()]) {
                 let cell = &pad.cells[cell_idx];
                 let position = palm_from_link * cell.position_in_link_m;
@@ -112,10 +131,41 @@ impl ContactFinder {
                     cell: cell_idx as u32,
                 });
             }
-            n_pads_in_contact += u32::from(contacts.len() > n_before);
         }
+        let n_active = contacts.len();
+        let is_object = pads_on_the_object(hand, &self.touching, contacts);
+        contacts.retain(|contact| is_object[contact.pad as usize]);
+        n_self_contacts += (n_active - contacts.len()) as u32;
+        let n_pads_in_contact = contacts.chunk_by(|a, b| a.pad == b.pad).count() as u32;
         let fault = if contacts.is_empty() { Fault::NoContact } else { Fault::None };
         ContactSummary { n_pads_in_contact, self_collision: !self.touching.is_empty(), n_self_contacts, fault }
+    }
+}
+
+/// For each pad, whether its contacts are with the object: those of links that touch no other link, and those that are
+/// opposed by such contacts, or by contacts that are opposed in turn. Opposed are a contact and the mean normal of a pad that
+/// are more than a right angle apart: with friction up to 1, nothing is held between others.
+fn pads_on_the_object(hand: &Hand, touching: &[(usize, usize)], contacts: &[Contact]) -> [bool; MAX_PADS] {
+    let touch = |a, b| touching.contains(&(a, b)) || touching.contains(&(b, a));
+    let mut is_object = [false; MAX_PADS];
+    for (is_object, pad) in is_object.iter_mut().zip(&hand.pads) {
+        *is_object = !touching.iter().any(|&(a, b)| a == pad.link_idx || b == pad.link_idx);
+    }
+    // Each round finds a pad, or is the last one.
+    loop {
+        let opposed = |of_pad: &&[Contact]| {
+            let pad_idx = of_pad[0].pad as usize;
+            let link_idx = hand.pads[pad_idx].link_idx;
+            let sum: Vector3<f64> = of_pad.iter().map(|contact| Vector3::from(contact.normal)).sum();
+            let opposes = |other: &Contact| {
+                is_object[other.pad as usize]
+                    && !touch(link_idx, hand.pads[other.pad as usize].link_idx)
+                    && sum.dot(&Vector3::from(other.normal)) < 0.0
+            };
+            !is_object[pad_idx] && contacts.iter().any(opposes)
+        };
+        let Some(found) = contacts.chunk_by(|a, b| a.pad == b.pad).find(opposed) else { return is_object };
+        is_object[found[0].pad as usize] = true;
     }
 }
 
@@ -185,6 +235,21 @@ mod tests {
     }
 
     #[test]
+    fn a_joint_that_reads_beyond_its_stop_is_at_it() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let stops: Vec<f64> = hand.joints.iter().map(|joint| joint.upper).collect();
+        let beyond = |rad: f64| stops.iter().map(|stop| stop + rad).collect::<Vec<f64>>();
+        assert_eq!(run(0, &beyond(0.09), &[1.0; 96]), run(0, &stops, &[1.0; 96]));
+        let mut joints = beyond(0.09);
+        clip_to_limits(&hand, &mut joints);
+        assert_eq!(joints, stops);
+        // Farther is no zero of an encoder, and is shown as it is.
+        let mut joints = beyond(0.11);
+        clip_to_limits(&hand, &mut joints);
+        assert_eq!((joints, run(0, &beyond(0.11), &[1.0; 96]).0.fault), (beyond(0.11), Fault::InvalidValue));
+    }
+
+    #[test]
     fn active_cells_are_found_wherever_they_are() {
         for n_cells in [1, 15, 16, 17, 100] {
             // Half of them have the threshold 0, and a force at its threshold is not above it.
@@ -236,5 +301,49 @@ mod tests {
         let mut contacts = Vec::new();
         let summary = contacts_from_frame(&hand, 0, &joints, &between, &mut contacts);
         assert_eq!((summary.fault, contacts.len()), (Fault::NoContact, 0));
+    }
+
+    /// Forces of 1 N on the cells so near to a link that touches theirs.
+    fn pressed_by_links(hand: &Hand, joints: &[f64], within_m: f64) -> [f64; 96] {
+        let palm_from_links = hand.palm_from_links(joints).expect("7 joints");
+        let mut shapes = PosedShapes::default();
+        shapes.place(hand, &palm_from_links);
+        let touching: Vec<(usize, usize)> = hand.touching_pairs(&shapes).collect();
+        let mut cells_newtons = [0.0; 96];
+        for (newtons, (pad_idx, cell)) in cells_newtons.iter_mut().zip(hand.cells()) {
+            let link_idx = hand.pads[pad_idx].link_idx;
+            let position = palm_from_links[link_idx] * cell.position_in_link_m;
+            let is_near = |other| hand.distance_to_link_m(&position, other, &palm_from_links) <= within_m;
+            let presses = |&(a, b): &(usize, usize)| (a == link_idx && is_near(b)) || (b == link_idx && is_near(a));
+            *newtons = f64::from(u8::from(touching.iter().any(presses)));
+        }
+        cells_newtons
+    }
+
+    #[test]
+    fn fingers_that_press_each_other_on_nothing_feel_no_object() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let joints = [0.5, 1.7, 1.7, 1.7, 0.55, 0.55, 0.55];
+        let n_pressed = |within_m: f64| pressed_by_links(&hand, &joints, within_m).iter().sum::<f64>() as u32;
+        assert!(n_pressed(SELF_CONTACT_M) > 0 && n_pressed(0.012) > n_pressed(SELF_CONTACT_M), "the skin spreads it");
+        let (summary, contacts) = run(0, &joints, &pressed_by_links(&hand, &joints, 0.012));
+        assert_eq!((summary.fault, summary.n_self_contacts, contacts.len()), (Fault::NoContact, n_pressed(0.012), 0));
+    }
+
+    #[test]
+    fn an_object_between_finger_and_palm_is_felt_by_fingers_that_touch_each_other_as_well() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        // Fingers 2 and 3 touch; finger 1 and the palm touch nothing.
+        let joints = [0.5, 1.2, 1.7, 1.7, 0.4, 0.55, 0.55];
+        let pressed = pressed_by_links(&hand, &joints, 0.1);
+        assert!(
+            pressed[..48].iter().all(|newtons| *newtons == 0.0) && pressed[48..].iter().all(|newtons| *newtons > 0.0)
+        );
+        let between: f64 = pressed_by_links(&hand, &joints, SELF_CONTACT_M).iter().sum();
+        let (summary, contacts) = run(0, &joints, &[1.0; 96]);
+        assert_eq!((summary.n_pads_in_contact, summary.n_self_contacts), (4, between as u32));
+        assert_eq!(contacts.len() + between as usize, 96);
+        // Without anything that opposes them, they feel each other.
+        assert_eq!(run(0, &joints, &pressed).0.fault, Fault::NoContact);
     }
 }

@@ -90,7 +90,7 @@ impl Judge {
         self.next_seq = header.seq.wrapping_add(1);
         let (head, items) = frame.to_parts(header);
         let (summary, parts) = steps::find_contacts(&self.hand, &mut self.finder, &head, &items, &mut self.contacts);
-        let contacts = steps::contact_set(&head, self.hand_id, summary, parts.as_ref());
+        let contacts = steps::contact_set(&self.hand, &head, summary, parts.as_ref());
         let feature = steps::encode(&self.model, self.dictionary_id, &contacts, &self.contacts, &mut self.values);
         let head = steps::classify(&self.model, self.dictionary_id, &mut self.memory, &feature, &self.values);
         let mut decisions = Vec::new();

@@ -264,8 +264,8 @@ impl Model {
     /// [`Model::dictionary_id`].
     ///
     /// # Errors
-    /// The fault: the frame's own, [`Fault::WrongModel`] if the model does not judge this phase, [`Fault::MissingReading`] if
-    /// it needs a phase before that had no feature, [`Fault::NoBaseline`] and [`Fault::UnlikeDay`] if the day forbids a
+    /// The fault: the frame's own, [`Fault::WrongModel`] if the model does not judge this phase, that of the phase before,
+    /// [`Fault::MissingReading`] if that did not come, [`Fault::NoBaseline`] and [`Fault::UnlikeDay`] if the day forbids a
     /// judgement, and as of [`Classifier::classify`].
     pub fn judge(
         &self,
@@ -283,8 +283,8 @@ impl Model {
             memory.day.settle(place, values);
         }
         if self.has_probes() {
-            // A frame that is at fault leaves no feature behind.
-            let values = if verdict.is_ok() { values.unwrap_or_default() } else { &[] };
+            // A frame that is at fault leaves no feature behind, but its fault.
+            let values = verdict.and(values);
             memory.grasp.add((place.epoch, place.grasp_id), phase, values, &signals(&self.features));
         }
         verdict
@@ -381,6 +381,30 @@ mod tests {
             let edited = text.replacen("0.5", "0.6", 1);
             assert_eq!(Model::parse(&edited), Err(InvalidModel::Checksum));
         }
+    }
+
+    #[test]
+    fn a_look_after_a_faulty_one_has_its_fault() {
+        let model = Model::parse(include_str!("../../../models/barrett-bh8-280-lifts.json")).expect("a model");
+        let values = vec![0.0; model.features.len()];
+        let felt = Ok(&values[..]);
+        let judge_all = |looks: &[(Phase, Result<&[f64], Fault>)]| {
+            let mut memory = Memory::default();
+            let judge = |(phase, values)| model.judge(&mut memory, 0, GraspPlace::default(), phase, values);
+            looks.iter().copied().map(judge).last().expect("a look").map(|_| ())
+        };
+        let faulty = |phase, fault| (phase, Err(fault));
+        let [settled, squeezing, squeezed, lifting, lifted] =
+            [Phase::Settled, Phase::Squeezing, Phase::Squeezed, Phase::TestLifting, Phase::TestLifted];
+        assert_eq!(judge_all(&[(settled, felt), (squeezing, felt), (squeezed, felt)]), Ok(()));
+        for fault in [Fault::NoContact, Fault::OutOfDistribution] {
+            let settled = faulty(settled, fault);
+            assert_eq!(judge_all(&[settled, (squeezing, felt), (squeezed, felt)]), Err(fault));
+            let looks = [settled, (squeezing, felt), (squeezed, felt), (lifting, felt), (lifted, felt)];
+            assert_eq!(judge_all(&looks), Err(fault));
+        }
+        assert_eq!(judge_all(&[(squeezing, felt), (squeezed, felt)]), Err(Fault::MissingReading));
+        assert_eq!(judge_all(&[(settled, felt), (squeezed, felt)]), Err(Fault::MissingReading));
     }
 
     #[test]

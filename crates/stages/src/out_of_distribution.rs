@@ -3,15 +3,19 @@
 //!
 //! It compares a few quantities, which a person can check on the robot, with their limits: joint angles, breakaways of
 //! coupled joints, the load of each pad and its spread, the distance of contacts from the dictionary's words, and the
-//! mass of the histogram. The limits are the range of the training grasps and a margin, which is the same for all
-//! quantities in units of their standard deviations. docs/trust.md says what this finds, and that distances in the
-//! space of all quantities (Mahalanobis, nearest neighbours, K-means) found less.
+//! mass of the histogram. The limits are the range of the training grasps, widened by the resolution of each quantity and
+//! by a margin that is the same for all in units of their standard deviations, and cut to the values that are possible.
+//! docs/trust.md says what this finds, and that distances in the space of all quantities (Mahalanobis, nearest
+//! neighbours, K-means) found less.
 //!
 //! Pure: no clock, no I/O, no state, and no allocation in [`TrainingRange::check`].
+
+use std::ops::RangeInclusive;
 
 use serde::{Deserialize, Serialize};
 
 use crate::encoder::FeatureExtractor;
+use crate::hand::Hand;
 use blindgrasp_messages::{Contact, Fault, MAX_PADS};
 
 /// The limits of a model's training grasps.
@@ -67,7 +71,7 @@ impl TrainingRange {
     /// # Errors
     /// What is wrong with it.
     pub fn validate(&self, features: &FeatureExtractor) -> Result<(), String> {
-        let expected = quantity_names(features).len();
+        let expected = n_of_posture(features) + N_PAD_QUANTITIES * features.cells_in_link_m.len() + 2;
         if self.limits.len() != expected {
             return Err(format!("{} limits, expected {expected}", self.limits.len()));
         }
@@ -78,29 +82,73 @@ impl TrainingRange {
     }
 }
 
+/// A quantity, and what is known of it without training.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Quantity {
+    /// Its name and unit.
+    pub name: String,
+    /// The values that a hand can read. For a joint, these are its limits.
+    pub possible: RangeInclusive<f64>,
+    /// How far apart two healthy hands of one make may read the same grasp.
+    pub resolution: f64,
+    /// The same as a share of the training grasps' range, if that is more: the gain of a force sensor.
+    pub gain_resolution: f64,
+}
+
+/// An encoder's zero and the play of a gear. A joint that slides has a tenth of it, metres.
+const ANGLE_RESOLUTION_RAD: f64 = 0.05;
+/// A skin's hysteresis.
+const FORCE_RESOLUTION_NEWTONS: f64 = 0.5;
+/// The gains of a skin's cells.
+const FORCE_GAIN_RESOLUTION: f64 = 0.1;
+/// A load on the edge of a cell may count for its neighbours.
+const CONTACTS_RESOLUTION: f64 = 2.0;
+/// One cell more or less among a few.
+const OVER_MEAN_RESOLUTION: f64 = 0.5;
+/// A part of the distance of two cells, in which a load may move.
+const SPREAD_RESOLUTION_M: f64 = 0.002;
+/// How far [`ANGLE_RESOLUTION_RAD`] moves a contact on a finger of 6 cm.
+const DISTANCE_RESOLUTION_M: f64 = 0.003;
+/// [`DISTANCE_RESOLUTION_M`] changes the part of a word by up to 0.07 if σ is 36 mm, and a word or two are near.
+const MASS_RESOLUTION: f64 = 0.1;
+
 /// Quantities of each pad.
 const N_PAD_QUANTITIES: usize = 5;
 
-/// The names of the quantities in the order of [`for_each_quantity`], and the least unit of each, so that a quantity
-/// that hardly varied in training is not measured in units of its noise.
-pub fn quantity_names(features: &FeatureExtractor) -> Vec<(String, f64)> {
-    let mut names = Vec::new();
-    names.extend((0..features.couplings.len()).map(|joint| (format!("angle of joint {joint}, rad"), 0.01)));
-    let coupled = features.couplings.iter().enumerate().filter(|(_, coupling)| coupling.is_some());
-    names.extend(coupled.map(|(joint, _)| (format!("breakaway of joint {joint}, rad"), 0.01)));
-    for pad in 0..features.cells_in_link_m.len() {
-        let of_pad: [(String, f64); N_PAD_QUANTITIES] = [
-            (format!("load of pad {pad}, newtons"), 0.1),
-            (format!("contacts of pad {pad}"), 1.0),
-            (format!("greatest force on a cell of pad {pad}, newtons"), 0.1),
-            (format!("greatest over mean force on the cells of pad {pad}"), 0.1),
-            (format!("spread of the load of pad {pad}, m"), 1e-3),
-        ];
-        names.extend(of_pad);
+/// The number of quantities that depend on the joints alone. They come first.
+pub fn n_of_posture(features: &FeatureExtractor) -> usize {
+    features.couplings.len() + features.couplings.iter().flatten().count()
+}
+
+/// The quantities of a hand's grasps, in the order of [`for_each_quantity`].
+pub fn quantities(hand: &Hand) -> Vec<Quantity> {
+    let quantity =
+        |name: String, resolution| Quantity { name, possible: 0.0..=f64::INFINITY, resolution, gain_resolution: 0.0 };
+    let force = |name| Quantity { gain_resolution: FORCE_GAIN_RESOLUTION, ..quantity(name, FORCE_RESOLUTION_NEWTONS) };
+    let mut quantities = Vec::new();
+    for (idx, joint) in hand.joints.iter().enumerate() {
+        let name = format!("position of joint {idx}, {}", joint.kind.unit());
+        let resolution = ANGLE_RESOLUTION_RAD * joint.kind.per_radian();
+        quantities.push(Quantity { possible: joint.lower..=joint.upper, ..quantity(name, resolution) });
     }
-    names.push(("greatest distance of a contact to its nearest word, m".into(), 1e-3));
-    names.push(("mass of the histogram".into(), 0.01));
-    names
+    for (idx, joint) in hand.joints.iter().enumerate().filter(|(_, joint)| joint.coupling.is_some()) {
+        let name = format!("breakaway of joint {idx}, {}", joint.kind.unit());
+        let resolution = ANGLE_RESOLUTION_RAD * joint.kind.per_radian();
+        quantities.push(Quantity { possible: f64::NEG_INFINITY..=f64::INFINITY, ..quantity(name, resolution) });
+    }
+    for pad in 0..hand.pads.len() {
+        let of_pad: [Quantity; N_PAD_QUANTITIES] = [
+            force(format!("load of pad {pad}, newtons")),
+            quantity(format!("contacts of pad {pad}"), CONTACTS_RESOLUTION),
+            force(format!("greatest force on a cell of pad {pad}, newtons")),
+            quantity(format!("greatest over mean force on the cells of pad {pad}"), OVER_MEAN_RESOLUTION),
+            quantity(format!("spread of the load of pad {pad}, m"), SPREAD_RESOLUTION_M),
+        ];
+        quantities.extend(of_pad);
+    }
+    quantities.push(quantity("greatest distance of a contact to its nearest word, m".into(), DISTANCE_RESOLUTION_M));
+    quantities.push(quantity("mass of the histogram".into(), MASS_RESOLUTION));
+    quantities
 }
 
 /// Passes the quantities of a frame with a feature to `visit`.
@@ -172,7 +220,6 @@ mod tests {
     use super::*;
     use crate::dictionary::Dictionary;
     use crate::encoder::{Block, FeltReading};
-    use crate::hand::Hand;
     use std::path::Path;
 
     /// A contact of the Barrett hand's pad 1, in the palm frame at x.
@@ -180,8 +227,12 @@ mod tests {
         Contact { position_m: [x_m, 0.0, 0.0], normal: [0.0, 0.0, 1.0], force_newtons, pad: 1, cell }
     }
 
+    fn barrett() -> Hand {
+        Hand::load(Path::new("barrett-bh8-280")).expect("built in")
+    }
+
     fn extractor() -> FeatureExtractor {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let hand = barrett();
         let dictionary = Dictionary { words_m: vec![[0.0; 3], [0.04, 0.0, 0.0]] };
         FeatureExtractor::new(&hand, &[Block::Histogram], dictionary, 0.02)
     }
@@ -197,15 +248,15 @@ mod tests {
         let mut found = Vec::new();
         let contacts = [contact(0, 0.0, 3.0), contact(3, 0.03, 1.0)];
         for_each_quantity(&features, &posture(1.4, 0.2), &contacts, |value| found.push(value));
-        let names = quantity_names(&features);
-        assert_eq!(found.len(), names.len());
-        let value = |name: &str| found[names.iter().position(|(found, _)| found.contains(name)).expect(name)];
+        let quantities = quantities(&barrett());
+        assert_eq!(found.len(), quantities.len());
+        let value = |name: &str| found[quantities.iter().position(|of| of.name.contains(name)).expect(name)];
         // One row of cells lies 6 mm from the next; a quarter of the load is on the second.
         let spread = (0.75_f64 * 0.25).sqrt() * 0.006;
         let e = |squared_mm: f64| (-squared_mm / 400.0).exp();
         let mass = 0.75 * (1.0 + e(1600.0)) + 0.25 * (e(900.0) + e(100.0));
         for (name, expected) in [
-            ("angle of joint 1", 1.4),
+            ("position of joint 1", 1.4),
             ("breakaway of joint 4", 0.2),
             ("load of pad 0", 0.0),
             ("load of pad 1", 4.0),

@@ -102,29 +102,39 @@ impl Track {
     }
 }
 
+/// What is left of the last frame of a phase: its feature, or the fault for which it has none. `None` before the first one.
+type Look = Option<Result<Vec<f64>, Fault>>;
+
 /// The features of the open grasp from which a probe is judged.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct GraspHistory {
     /// Epoch and number of the grasp.
     grasp: Option<(u64, u64)>,
-    /// The last feature of the settled hand.
-    settled: Vec<f64>,
-    /// The last feature of the tight hand, before the arm moved.
-    squeezed: Vec<f64>,
+    /// The settled hand.
+    settled: Look,
+    /// The tight hand, before the arm moved.
+    squeezed: Look,
     track: Track,
 }
 
 impl GraspHistory {
-    /// Takes the feature of the next frame; a frame without one has no values. `signals` are [`signals`].
-    pub fn add(&mut self, (epoch, grasp_id): (u64, u64), phase: Phase, values: &[f64], signals: &[usize]) {
+    /// Takes the feature of the next frame, or its fault. `signals` are [`signals`].
+    pub fn add(
+        &mut self,
+        (epoch, grasp_id): (u64, u64),
+        phase: Phase,
+        values: Result<&[f64], Fault>,
+        signals: &[usize],
+    ) {
         if self.grasp != Some((epoch, grasp_id)) {
             *self = GraspHistory { grasp: Some((epoch, grasp_id)), ..GraspHistory::default() };
         }
         match phase {
-            Phase::Settled => self.settled = values.to_vec(),
-            Phase::Squeezed => self.squeezed = values.to_vec(),
+            Phase::Settled => self.settled = Some(values.map(<[f64]>::to_vec)),
+            Phase::Squeezed => self.squeezed = Some(values.map(<[f64]>::to_vec)),
             // Pads without contact have no load.
             Phase::Squeezing | Phase::TestLifting => {
+                let values = values.unwrap_or_default();
                 let signal = |idx: &usize| values.get(*idx).copied().unwrap_or(0.0);
                 self.track.add(phase, signals.iter().map(signal));
             }
@@ -139,7 +149,7 @@ impl GraspHistory {
     /// the greatest one.
     ///
     /// # Errors
-    /// [`Fault::MissingReading`] if the phase before had no feature, or the hand has not been seen to move.
+    /// The fault of the phase before; [`Fault::MissingReading`] if no frame of it came, or the hand has not been seen to move.
     pub fn compose(
         &self,
         phase: Phase,
@@ -152,6 +162,7 @@ impl GraspHistory {
             Phase::Squeezed => (&self.settled, Phase::Squeezing),
             _ => (&self.squeezed, Phase::TestLifting),
         };
+        let before = before.as_ref().ok_or(Fault::MissingReading)?.as_ref().map_err(|fault| *fault)?;
         let track = &self.track;
         if before.len() != values.len() || track.phase != moving || track.last.len() != signals.len() {
             return Err(Fault::MissingReading);
@@ -175,13 +186,12 @@ mod tests {
         const SIGNALS: [usize; 1] = [1];
         let mut history = GraspHistory::default();
         let mut composed = Vec::new();
-        let mut add = |phase, values: &[f64]| history.add((0, 7), phase, values, &SIGNALS);
+        let mut add = |phase, values: &[f64]| history.add((0, 7), phase, Ok(values), &SIGNALS);
         add(Phase::Settled, &[1.0, 2.0]);
         add(Phase::Settled, &[1.0, 3.0]);
         add(Phase::Squeezing, &[9.0, 4.0]);
         add(Phase::Squeezing, &[9.0, 7.0]);
-        // No contact.
-        add(Phase::Squeezing, &[]);
+        history.add((0, 7), Phase::Squeezing, Err(Fault::NoContact), &SIGNALS);
         let of = |history: &GraspHistory, phase, values: &[f64], composed: &mut Vec<f64>| {
             history.compose(phase, values, &SIGNALS, composed)
         };
@@ -189,19 +199,25 @@ mod tests {
         assert_eq!(composed, [1.0, 3.0, 2.0, 5.0, 1.0, 2.0, 7.0, 0.0, 10.0, 7.0]);
         let missing = Err(Fault::MissingReading);
         assert_eq!(of(&history, Phase::TestLifted, &[2.0, 5.0], &mut composed), missing);
-        history.add((0, 7), Phase::Squeezed, &[2.0, 5.0], &SIGNALS);
+        history.add((0, 7), Phase::Squeezed, Ok(&[2.0, 5.0]), &SIGNALS);
         assert_eq!(of(&history, Phase::TestLifted, &[2.0, 5.0], &mut composed), missing, "it has not been lifted");
-        history.add((0, 7), Phase::TestLifting, &[2.0, 4.0], &SIGNALS);
+        history.add((0, 7), Phase::TestLifting, Ok(&[2.0, 4.0]), &SIGNALS);
         assert_eq!(of(&history, Phase::TestLifted, &[2.0, 4.0], &mut composed), Ok(()));
         assert_eq!(composed[4..], [0.0, -1.0, 4.0, 4.0, 0.0, 0.0]);
         // There is no history after the hand has closed again, of another grasp, and of a source that began anew.
         for (grasp, phase) in [((0, 7), Phase::Closing), ((0, 8), Phase::Settled), ((1, 7), Phase::Settled)] {
             let mut other = history.clone();
-            other.add(grasp, phase, &[0.0, 0.0], &SIGNALS);
+            other.add(grasp, phase, Ok(&[0.0, 0.0]), &SIGNALS);
             assert_eq!(of(&other, Phase::TestLifted, &[2.0, 4.0], &mut composed), missing);
         }
-        // A frame without a feature leaves none behind.
-        history.add((0, 7), Phase::Squeezed, &[], &SIGNALS);
-        assert_eq!(of(&history, Phase::TestLifted, &[2.0, 4.0], &mut composed), missing);
+        // A frame without a feature leaves its fault behind, until the next one.
+        for fault in [Fault::NoContact, Fault::OutOfDistribution] {
+            history.add((0, 7), Phase::Squeezed, Err(fault), &SIGNALS);
+            let state = serde_json::to_string(&history).expect("written");
+            let restored = serde_json::from_str(&state).expect("read");
+            assert_eq!(of(&restored, Phase::TestLifted, &[2.0, 4.0], &mut composed), Err(fault));
+        }
+        history.add((0, 7), Phase::Squeezed, Ok(&[2.0, 5.0]), &SIGNALS);
+        assert_eq!(of(&history, Phase::TestLifted, &[2.0, 4.0], &mut composed), Ok(()));
     }
 }

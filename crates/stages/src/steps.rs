@@ -8,7 +8,7 @@ use blindgrasp_messages::{
     TactileFrameHead,
 };
 
-use crate::contacts::{ContactFinder, ContactSummary};
+use crate::contacts::{ContactFinder, ContactSummary, clip_to_limits};
 use crate::day::GraspPlace;
 use crate::encoder::FeltReading;
 use crate::hand::Hand;
@@ -34,15 +34,15 @@ pub fn find_contacts<'a>(
     }
 }
 
-/// The head of the contacts that [`find_contacts`] found, for a hand with the identity `hand_id`.
+/// The head of the contacts that [`find_contacts`] found, with the joints within their limits.
 pub fn contact_set(
+    hand: &Hand,
     head: &TactileFrameHead,
-    hand_id: u64,
     summary: ContactSummary,
     parts: Option<&FrameParts<'_>>,
 ) -> ContactSetHead {
-    ContactSetHead {
-        header: Header { hand_id, ..head.header },
+    let mut set = ContactSetHead {
+        header: Header { hand_id: hand.id(), ..head.header },
         grasp_id: head.grasp_id,
         phase: head.phase,
         n_pads_in_contact: summary.n_pads_in_contact,
@@ -53,7 +53,9 @@ pub fn contact_set(
         ..ContactSetHead::default()
     }
     .with_joints(parts.map_or(&[], |parts| parts.joints))
-    .with_senses(&parts.map_or(Senses::default(), |parts| parts.senses))
+    .with_senses(&parts.map_or(Senses::default(), |parts| parts.senses));
+    clip_to_limits(hand, &mut set.joints);
+    set
 }
 
 /// Writes the feature of a frame's contacts to `values`. `dictionary_id` is [`Model::dictionary_id`].
@@ -132,5 +134,28 @@ fn usable_values<'a>(
         _ if head.dictionary_id != dictionary_id => Err(Fault::WrongModel),
         Ok(Fault::None) => Ok(values),
         Ok(fault) => Err(fault),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use blindgrasp_messages::{Message, TactileFrame};
+
+    #[test]
+    fn the_encoder_gets_joints_within_their_limits() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let mut stops: Vec<f64> = hand.joints.iter().map(|joint| joint.upper).collect();
+        stops[0] = 0.5;
+        let joints = stops.iter().map(|stop| stop + 0.01).collect();
+        let frame = TactileFrame { joints, cells_newtons: vec![1.0; hand.n_cells()], ..TactileFrame::default() };
+        let (head, items) = frame.to_parts(Header::default());
+        let (mut finder, mut contacts) = (ContactFinder::default(), Vec::new());
+        let (summary, parts) = find_contacts(&hand, &mut finder, &head, &items, &mut contacts);
+        let set = contact_set(&hand, &head, summary, parts.as_ref());
+        stops[0] = 0.51;
+        assert_eq!(set.joints(), Ok(&stops[..]));
     }
 }

@@ -4,35 +4,51 @@
 use std::collections::BTreeSet;
 
 use blindgrasp_stages::encoder::{FeatureExtractor, FeltReading};
-use blindgrasp_stages::out_of_distribution::{Limits, TrainingRange, for_each_quantity, quantity_names};
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::out_of_distribution::{
+    Limits, Quantity, TrainingRange, for_each_quantity, n_of_posture, quantities,
+};
 
 /// Share of the grasps of new objects that the margin flags. A flagged grasp is held. That costs one lift in 200, which
 /// is little beside the errors of a classifier.
 pub const FALSE_ALARM_SHARE: f64 = 0.005;
 
-/// Learns limits from grasps, so that at most the share [`FALSE_ALARM_SHARE`] of a fold's
-/// grasps is outside the range of all other folds. All grasps of an object should be in one fold. Grasps without a
-/// feature are ignored.
-pub fn learn_training_range(features: &FeatureExtractor, grasps: &[FeltReading<'_>], folds: &[usize]) -> TrainingRange {
-    let names = quantity_names(features);
+/// Learns limits from grasps: the range of each quantity, its resolution, and the least margin with which at most the share
+/// [`FALSE_ALARM_SHARE`] of a fold's grasps is outside the limits of all other folds. The last value seen is no limit: it is
+/// that of one sensor, and another one may read beyond. All grasps of an object should be in one fold. Grasps
+/// without a feature are ignored.
+pub fn learn_training_range(
+    hand: &Hand,
+    features: &FeatureExtractor,
+    grasps: &[FeltReading<'_>],
+    folds: &[usize],
+) -> TrainingRange {
+    let quantities = quantities(hand);
     let mut values = Vec::new();
     let mut rows: Vec<(usize, Vec<f64>)> = Vec::new();
     for (reading, fold) in grasps.iter().zip(folds) {
         let FeltReading { joints, contacts, .. } = *reading;
         if features.extract(reading, &mut values).is_ok() {
-            let mut row = Vec::with_capacity(names.len());
+            let mut row = Vec::with_capacity(quantities.len());
             for_each_quantity(features, joints, contacts, |quantity| row.push(quantity));
             rows.push((*fold, row));
         }
     }
-    let units: Vec<f64> = names.iter().enumerate().map(|(idx, (_, least))| deviation(&rows, idx).max(*least)).collect();
+    let all = ranges(rows.iter().map(|row| &row.1), quantities.len());
+    let rooms: Vec<f64> = quantities
+        .iter()
+        .zip(&all)
+        .map(|(quantity, (lower, upper))| quantity.resolution.max(quantity.gain_resolution * (upper - lower)))
+        .collect();
+    // A quantity that hardly varied is not measured in units of its noise.
+    let units: Vec<f64> = rooms.iter().enumerate().map(|(idx, room)| deviation(&rows, idx).max(*room)).collect();
     let fold_names: BTreeSet<usize> = rows.iter().map(|(fold, _)| *fold).collect();
     let mut excesses: Vec<f64> = Vec::new();
     for fold in fold_names {
-        let ranges = ranges(rows.iter().filter(|row| row.0 != fold).map(|row| &row.1), names.len());
+        let ranges = ranges(rows.iter().filter(|row| row.0 != fold).map(|row| &row.1), quantities.len());
         let excess = |row: &Vec<f64>| {
-            let beyond = row.iter().zip(&ranges).zip(&units);
-            beyond.map(|((value, (lower, upper)), unit)| (lower - value).max(value - upper) / unit).fold(0.0, f64::max)
+            let beyond = |idx: usize| (ranges[idx].0 - row[idx]).max(row[idx] - ranges[idx].1);
+            (0..row.len()).map(|idx| (beyond(idx) - rooms[idx]) / units[idx]).fold(0.0, f64::max)
         };
         excesses.extend(rows.iter().filter(|row| row.0 == fold).map(|row| excess(&row.1)));
     }
@@ -41,16 +57,15 @@ pub fn learn_training_range(features: &FeatureExtractor, grasps: &[FeltReading<'
     let margin = excesses.len().checked_sub(n_flagged + 1).map_or(0.0, |idx| excesses[idx]);
     let share_flagged =
         excesses.iter().filter(|excess| **excess > margin).count() as f64 / excesses.len().max(1) as f64;
-    let limits = names
-        .into_iter()
-        .zip(ranges(rows.iter().map(|row| &row.1), units.len()))
-        .zip(&units)
-        .map(|(((quantity, _), (lower, upper)), unit)| Limits {
-            quantity,
-            lower: lower - margin * unit,
-            upper: upper + margin * unit,
-        })
-        .collect();
+    let limits = |(idx, quantity): (usize, Quantity)| {
+        let (room, possible) = (rooms[idx] + margin * units[idx], quantity.possible);
+        Limits {
+            quantity: quantity.name,
+            lower: (all[idx].0 - room).max(*possible.start()),
+            upper: (all[idx].1 + room).min(*possible.end()),
+        }
+    };
+    let limits = quantities.into_iter().enumerate().map(limits).collect();
     TrainingRange { limits, share_flagged }
 }
 
@@ -58,8 +73,7 @@ pub fn learn_training_range(features: &FeatureExtractor, grasps: &[FeltReading<'
 /// more or less, and are judged relative to that day (see [`blindgrasp_stages::day`]).
 #[must_use]
 pub fn widened_for_other_days(mut range: TrainingRange, features: &FeatureExtractor) -> TrainingRange {
-    let n_of_posture = features.couplings.len() + features.couplings.iter().flatten().count();
-    for limits in range.limits.iter_mut().skip(n_of_posture) {
+    for limits in range.limits.iter_mut().skip(n_of_posture(features)) {
         let width = limits.upper - limits.lower;
         (limits.lower, limits.upper) = (limits.lower - width, limits.upper + width);
     }
@@ -90,17 +104,21 @@ mod tests {
 
     use super::*;
     use blindgrasp_messages::{Contact, Fault};
+    use blindgrasp_stages::contacts::clip_to_limits;
     use blindgrasp_stages::dictionary::Dictionary;
     use blindgrasp_stages::encoder::Block;
-    use blindgrasp_stages::hand::Hand;
 
     /// A contact of the Barrett hand's pad 1, in the palm frame at x.
     fn contact(cell: u32, x_m: f64, force_newtons: f64) -> Contact {
         Contact { position_m: [x_m, 0.0, 0.0], normal: [0.0, 0.0, 1.0], force_newtons, pad: 1, cell }
     }
 
+    fn barrett() -> Hand {
+        Hand::load(Path::new("barrett-bh8-280")).expect("built in")
+    }
+
     fn extractor() -> FeatureExtractor {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let hand = barrett();
         let dictionary = Dictionary { words_m: vec![[0.0; 3], [0.04, 0.0, 0.0]] };
         FeatureExtractor::new(&hand, &[Block::Histogram], dictionary, 0.02)
     }
@@ -120,18 +138,38 @@ mod tests {
             .collect()
     }
 
-    fn range(features: &FeatureExtractor) -> TrainingRange {
-        let grasps = grasps();
+    fn range(features: &FeatureExtractor, grasps: &[([f64; 7], Vec<Contact>)]) -> TrainingRange {
         let views: Vec<FeltReading<'_>> =
             grasps.iter().map(|(joints, contacts)| FeltReading::new(joints, contacts)).collect();
-        let folds: Vec<usize> = (0..200).map(|idx| idx / 2 % 5).collect();
-        learn_training_range(features, &views, &folds)
+        let folds: Vec<usize> = (0..grasps.len()).map(|idx| idx / 2 % 5).collect();
+        learn_training_range(&barrett(), features, &views, &folds)
+    }
+
+    #[test]
+    fn a_joint_at_its_stop_passes_whatever_the_zero_of_its_encoder() {
+        let (features, hand) = (extractor(), barrett());
+        let (stop_rad, contacts) = (hand.joints[4].upper, vec![contact(0, 0.005, 1.5), contact(3, 0.0, 1.0)]);
+        // The last count of an encoder with 4096 counts a turn is 0.2 mrad before the stop.
+        let last_count_rad = 546.0 * std::f64::consts::TAU / 4096.0;
+        assert!(last_count_rad < stop_rad);
+        let distal = |angle_rad: f64| [0.0, 1.4, 1.0, 1.0, angle_rad, 0.4, 0.4];
+        let grasps = |idx: usize| (distal(last_count_rad - 0.3 * (idx as f64 / 199.0)), contacts.clone());
+        let range = range(&features, &(0..200).map(grasps).collect::<Vec<_>>());
+        assert_eq!(range.limits[4].upper, stop_rad);
+        for zero_rad in [-0.01, 0.0, 0.01] {
+            let mut joints = distal(stop_rad).map(|angle| angle + zero_rad);
+            clip_to_limits(&hand, &mut joints);
+            assert_eq!(range.check(&features, &joints, &contacts), Ok(()), "{zero_rad} rad");
+        }
+        for far in [[0.2, 1.4, 1.0, 1.0, 0.8, 0.4, 0.4], distal(0.3), [0.0, 1.4, 1.0, 1.6, 0.8, 0.4, 0.4]] {
+            assert_eq!(range.check(&features, &far, &contacts), Err(Fault::OutOfDistribution), "{far:?}");
+        }
     }
 
     #[test]
     fn what_was_trained_on_passes_and_strangers_are_named() {
         let features = extractor();
-        let range = range(&features);
+        let range = range(&features, &grasps());
         assert_eq!(range.validate(&features), Ok(()));
         assert!(range.share_flagged <= FALSE_ALARM_SHARE);
         for (joints, contacts) in grasps() {
@@ -141,7 +179,7 @@ mod tests {
         let stuck = vec![contact(0, 0.005, 1.5), contact(3, 0.0, 15.0)];
         let far = vec![contact(0, 0.1, 1.5), contact(3, 0.0, 1.0)];
         for (joints, contacts, named) in [
-            (posture(2.4, 0.1), usual(), "angle of joint 1"),
+            (posture(2.4, 0.1), usual(), "position of joint 1"),
             (posture(1.0, -0.2), usual(), "breakaway of joint 4"),
             (posture(1.0, 0.1), stuck, "greatest force on a cell of pad 1"),
             (posture(1.0, 0.1), far, "greatest distance"),
@@ -156,7 +194,7 @@ mod tests {
     #[test]
     fn order_of_contacts_does_not_matter_and_a_range_fits_its_features() {
         let features = extractor();
-        let range = range(&features);
+        let range = range(&features, &grasps());
         let contacts = [contact(0, 0.005, 1.5), contact(3, 0.0, 1.0)];
         let reversed = [contacts[1], contacts[0]];
         for joints in [posture(1.0, 0.1), posture(2.4, 0.1)] {
@@ -173,7 +211,7 @@ mod tests {
     #[test]
     fn nothing_to_learn_from_lets_nothing_pass() {
         let features = extractor();
-        let range = learn_training_range(&features, &[], &[]);
+        let range = learn_training_range(&barrett(), &features, &[], &[]);
         assert_eq!(range.validate(&features), Ok(()));
         let outcome = range.check(&features, &posture(1.0, 0.1), &[contact(0, 0.0, 1.0)]);
         assert_eq!(outcome, Err(Fault::OutOfDistribution));

@@ -10,7 +10,7 @@ use crate::dataset::{DatasetError, Grasp, label_of, read_grasps};
 use blindgrasp_messages::{Contact, Fault, GraspTruth, OwnedSenses, Phase, Stamped, TactileFrame};
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
-use blindgrasp_stages::contacts::contacts_from_frame;
+use blindgrasp_stages::contacts::{clip_to_limits, contacts_from_frame};
 use blindgrasp_stages::encoder::{FeltReading, wrist_values};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
@@ -75,10 +75,16 @@ pub struct Felt {
 
 impl Felt {
     fn of(hand: &Hand, frame: &Stamped<TactileFrame>) -> Felt {
-        let message = &frame.message;
-        let mut contacts = Vec::new();
-        contacts_from_frame(hand, frame.header.hand_id, &message.joints, &message.cells_newtons, &mut contacts);
-        Felt { joints: message.joints.clone(), contacts, senses: message.senses.clone() }
+        Felt::with_fault(hand, frame).0
+    }
+
+    /// What the encoder gets of a frame, and why it cannot be used.
+    fn with_fault(hand: &Hand, frame: &Stamped<TactileFrame>) -> (Felt, Fault) {
+        let TactileFrame { joints, cells_newtons, senses, .. } = &frame.message;
+        let mut felt = Felt { joints: joints.clone(), contacts: Vec::new(), senses: senses.clone() };
+        let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells_newtons, &mut felt.contacts);
+        clip_to_limits(hand, &mut felt.joints);
+        (felt, summary.fault)
     }
 
     pub fn reading(&self) -> FeltReading<'_> {
@@ -107,12 +113,9 @@ impl FeltGrasp {
         let moving = [Phase::Squeezing, Phase::TestLifting]
             .map(|phase| frames.iter().filter(is_of(phase)).map(|frame| Signals::of(hand, frame)).collect::<Vec<_>>());
         let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
-        let (joints, cells) = (&frame.message.joints, &frame.message.cells_newtons);
-        let reading_id = ReadingId::of(joints, cells);
-        let mut contacts = Vec::new();
-        let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells, &mut contacts);
-        let settled = Felt { joints: frame.message.joints, contacts, senses: frame.message.senses };
-        let (fault, day) = (summary.fault, frame.message.day);
+        let reading_id = ReadingId::of(&frame.message.joints, &frame.message.cells_newtons);
+        let (settled, fault) = Felt::with_fault(hand, &frame);
+        let day = frame.message.day;
         Some(FeltGrasp { settled, fault, reading_id, day, squeezed, test_lifted, moving })
     }
 }

@@ -170,7 +170,7 @@ pub fn train_on(
     let calibration = calibrate(&judged.examples, &judged.decision_values)?;
     progress("training on all grasps");
     let fitted = fit(hand, recipe, &examples, options.seed)?;
-    let mut training_range = learn_training_range(&fitted.features, &readings(&examples), &folds);
+    let mut training_range = learn_training_range(hand, &fitted.features, &readings(&examples), &folds);
     if recipe.day_baseline {
         training_range = widened_for_other_days(training_range, &fitted.features);
     }

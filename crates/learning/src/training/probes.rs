@@ -14,7 +14,7 @@ use crate::evaluation::reliability::{N_RELIABILITY_BINS, reliability};
 use crate::learners::booster::train_boosted;
 use crate::learners::training_range::learn_training_range;
 use crate::promise::{ObjectTrials, promise};
-use blindgrasp_messages::Phase;
+use blindgrasp_messages::{Fault, Phase};
 use blindgrasp_stages::classifier::boosting::BoostingParams;
 use blindgrasp_stages::classifier::{Classifier, Predictor};
 use blindgrasp_stages::encoder::{Block, FeatureExtractor, FeltReading};
@@ -119,7 +119,7 @@ pub(super) fn learn(
             threshold_probability: 1.0,
             unsure_from_probability: 1.0,
         },
-        training_range: learn_training_range(features, &readings, &kept.folds),
+        training_range: learn_training_range(hand, features, &readings, &kept.folds),
         cross_validated_roc_area: area_under_roc(&curve(&judged, &stable)).unwrap_or(0.5),
         cross_validated_ece: reliability(&judged, &stable, N_RELIABILITY_BINS).ece,
     };
@@ -134,31 +134,27 @@ fn felt(phase: Phase, example: &Example) -> Option<&Felt> {
 pub(crate) fn composed(features: &FeatureExtractor, phase: Phase, example: &Example) -> Option<Vec<f64>> {
     let (mut history, mut values, mut composed) = (GraspHistory::default(), Vec::new(), Vec::new());
     let followed = signals(features);
-    let mut add = |phase, values: &[f64]| history.add((0, 0), phase, values, &followed);
-    let moves = |moving: &[Signals], phase, add: &mut dyn FnMut(Phase, &[f64])| {
+    let mut add = |phase, values: Result<Vec<f64>, Fault>| {
+        history.add((0, 0), phase, values.as_deref().map_err(|fault| *fault), &followed);
+    };
+    let moves = |moving: &[Signals], phase, add: &mut dyn FnMut(Phase, Result<Vec<f64>, Fault>)| {
         let mut row = vec![0.0; features.len()];
         for signals in moving {
             let pads = if features.blocks.contains(&Block::Pads) { &signals.pad_newtons[..] } else { &[] };
             let numbers = pads.iter().copied().chain(signals.wrist_newtons);
             followed.iter().zip(numbers).for_each(|(idx, number)| row[*idx] = number);
-            add(phase, &row);
+            add(phase, Ok(row.clone()));
         }
     };
     let [squeezing, test_lifting] = &example.moving;
-    let mut extract = |reading: &FeltReading<'_>| {
-        let _ = features.extract(reading, &mut values);
-        values.clone()
-    };
-    add(Phase::Settled, &extract(&example.reading()));
+    let mut extract = |reading: &FeltReading<'_>| features.extract(reading, &mut values).map(|_| values.clone());
+    add(Phase::Settled, extract(&example.reading()));
     moves(squeezing, Phase::Squeezing, &mut add);
     if phase == Phase::TestLifted {
-        add(Phase::Squeezed, &extract(&example.squeezed.as_ref()?.reading()));
+        add(Phase::Squeezed, extract(&example.squeezed.as_ref()?.reading()));
         moves(test_lifting, Phase::TestLifting, &mut add);
     }
-    let now = extract(&felt(phase, example)?.reading());
-    if now.is_empty() {
-        return None;
-    }
+    let now = extract(&felt(phase, example)?.reading()).ok()?;
     history.compose(phase, &now, &followed, &mut composed).ok()?;
     Some(composed)
 }
