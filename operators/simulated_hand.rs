@@ -24,10 +24,10 @@ use blindgrasp_operator::port::{Publisher, Sent, Subscriber, sample_id};
 use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
 use blindgrasp_operator::wiring::InputCounts;
-use blindgrasp_simulator::trial::{PhysicsEngine, TrialOptions};
 use blindgrasp_simulator::trial::course::{Course, Finished};
 use blindgrasp_simulator::trial::robot::{Doing, Robot, RobotOptions, told_header};
 use blindgrasp_simulator::trial::targets::{check_approaches, targets_named};
+use blindgrasp_simulator::trial::{PhysicsEngine, TrialOptions};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 use serde::{Deserialize, Serialize};
@@ -111,7 +111,8 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         let names = LiftOutcome { thing: thing.name.clone(), group: thing.group.clone(), ..LiftOutcome::default() };
         names.check().with_context(|| format!("things: '{}'", thing.name))?;
     }
-    let mut trial_options = params.options.as_deref().map_or_else(|| Ok(TrialOptions::default()), TrialOptions::load)?;
+    let mut trial_options =
+        params.options.as_deref().map_or_else(|| Ok(TrialOptions::default()), TrialOptions::load)?;
     trial_options.physics.engine = params.physics.unwrap_or(trial_options.physics.engine);
     operator.reserve_state()?;
     // An instance that goes on has checked before.

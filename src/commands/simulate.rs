@@ -22,8 +22,8 @@ use blindgrasp_recording::{Manifest, RecordingError, RecordingInfo, RecordingRea
 use blindgrasp_simulator::candidate::SimulatedGrasp;
 use blindgrasp_simulator::options::{SimulatorOptions, Thresholds, check_hand};
 use blindgrasp_simulator::protocol::Approach;
-use blindgrasp_simulator::trial::PhysicsEngine;
 use blindgrasp_simulator::simulator::{Part, SimulateError, Simulation, SimulationReport};
+use blindgrasp_simulator::trial::PhysicsEngine;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 

@@ -68,6 +68,9 @@ fn without_mujoco_one_line_says_what_to_install() {
     std::fs::write(&bare, "#!/bin/sh\nexec python3 -S -E \"$@\"\n").expect("written");
     std::fs::set_permissions(&bare, std::os::unix::fs::PermissionsExt::from_mode(0o755)).expect("executable");
     let (_, missing) = run_with(bare.to_str().expect("UTF-8"), &arguments, 1);
-    assert!(missing.contains("cannot import mujoco") && missing.contains("pip install 'blindgrasp[mujoco]'"), "{missing}");
+    assert!(
+        missing.contains("cannot import mujoco") && missing.contains("pip install 'blindgrasp[mujoco]'"),
+        "{missing}"
+    );
     assert!(!out.exists());
 }

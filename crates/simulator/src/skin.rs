@@ -105,7 +105,8 @@ impl Bell {
             for pad in hand.pads.iter().filter(|pad| pad.link_idx == link_idx) {
                 for (cell_idx, cell) in pad.cells.iter().enumerate() {
                     let across = cell.normal_in_link.cross(&cell.along_in_link);
-                    let (from_cell, along_normal) = (point - cell.position_in_link_m, -cell.normal_in_link.dot(&direction));
+                    let (from_cell, along_normal) =
+                        (point - cell.position_in_link_m, -cell.normal_in_link.dot(&direction));
                     if along_normal <= 0.0 || from_cell.dot(&cell.normal_in_link).abs() > CELL_DEPTH_M {
                         continue;
                     }

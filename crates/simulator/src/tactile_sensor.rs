@@ -167,7 +167,8 @@ impl Sensor {
             let offsets_newtons = offsets(options.offset_newtons, hand.n_cells());
             let encoder_offsets_rad = offsets(options.encoder_offset_rad, hand.joints.len());
             let neighbours = if options.crosstalk > 0.0 { neighbours(hand) } else { Vec::new() };
-            let common_gain = if options.common_gain_sigma > 0.0 { options.common_gain_sigma * gaussian(rng) } else { 0.0 };
+            let common_gain =
+                if options.common_gain_sigma > 0.0 { options.common_gain_sigma * gaussian(rng) } else { 0.0 };
             let mut part = |of: f64| if of > 0.0 { of * rng.random::<f64>() } else { 0.0 };
             let lag_secs = part(options.lag_secs);
             let reads_joints = options.joint_encoders > 0.0 && part(1.0) < options.joint_encoders;

@@ -11,7 +11,8 @@
 //!
 //! A wrong "stable" drops the object. So there is one path to LIFT, an `Ok(Vote::Stable)` of `OpenGrasp::assess`, and every
 //! other path ends in HOLD with its reason. With the option `probe`, settled predictions that are not unstable ask for a
-//! probe, which decides nothing: the grasp stays open, and only the frames after the probe can lead to a LIFT. If the
+//! squeeze, and those of the tight hand for a test lift. A probe decides nothing: the grasp stays open, and only the frames
+//! after the last probe can lead to a LIFT. If the
 //! outcomes of lifts refute [`ArbiterOptions::promised_drops`], every later grasp is held.
 
 use serde::{Deserialize, Serialize};
@@ -47,17 +48,17 @@ pub enum Probe {
     None,
     /// It can tighten to the force of a lift.
     Squeeze,
-    /// It can tighten, and lift by a few millimetres.
+    /// It can tighten, and then lift by a few millimetres.
     TestLift,
 }
 
 impl Probe {
-    /// The action that asks for it, and the phase of the frames that decide then.
-    fn asked(self) -> Option<(Action, Phase)> {
-        match self {
-            Probe::None => None,
-            Probe::Squeeze => Some((Action::Squeeze, Phase::Squeezed)),
-            Probe::TestLift => Some((Action::TestLift, Phase::TestLifted)),
+    /// What a promising grasp is asked for after frames of this phase, and the phase of the frames that vote then.
+    fn asked(self, awaited: Phase) -> Option<(Action, Phase)> {
+        match (self, awaited) {
+            (Probe::Squeeze | Probe::TestLift, Phase::Settled) => Some((Action::Squeeze, Phase::Squeezed)),
+            (Probe::TestLift, Phase::Squeezed) => Some((Action::TestLift, Phase::TestLifted)),
+            _ => None,
         }
     }
 }
@@ -141,14 +142,11 @@ impl OpenGrasp {
     fn assess(&self, prediction: &Prediction, options: &ArbiterOptions) -> Result<Vote, Reason> {
         match self.doubt {
             Some(reason) => Err(reason),
-            None if self.asks_for(options).is_some() && (prediction.stable || prediction.unsure) => Ok(Vote::Promising),
+            None if options.probe.asked(self.awaited).is_some() && (prediction.stable || prediction.unsure) => {
+                Ok(Vote::Promising)
+            }
             None => Ok(Vote::of(prediction, options)),
         }
-    }
-
-    /// The probe that a promising grasp is asked for, if it has not been.
-    fn asks_for(&self, options: &ArbiterOptions) -> Option<(Action, Phase)> {
-        if self.awaited == Phase::Settled { options.probe.asked() } else { None }
     }
 
     /// Adds a vote, and returns the number of consecutive equal votes of the same operators and their lowest probability.
@@ -297,7 +295,7 @@ impl LiftArbiter {
                         if n_agreeing >= options.votes.max(1) {
                             let reason = vote.reason();
                             if vote == Vote::Promising {
-                                if let Some((action, awaited)) = open.asks_for(&options) {
+                                if let Some((action, awaited)) = options.probe.asked(open.awaited) {
                                     (open.awaited, open.agreeing, open.is_probe_pending) = (awaited, None, true);
                                     let (grasp_id, probability_stable) = (open.grasp_id, lowest);
                                     decisions.push(LiftDecision { grasp_id, action, reason, probability_stable });
@@ -1006,30 +1004,49 @@ mod tests {
         };
         let of = |phase, probability| Prediction { phase, ..settled(probability) };
         let mut s = probing();
+        let last_asked = |s: &mut Stream| {
+            let asked = s.decisions.drain(..).map(|decision| (decision.action, decision.reason));
+            asked.collect::<Vec<_>>()
+        };
         // Stable and unsure both are worth a probe. The source says that it has ended before it hears of it.
         s.push(settled(0.9)).push(Prediction { unsure: true, ..settled(0.4) }).push(settled(0.9));
         s.push(of(Phase::Ended, 0.9));
-        let asked: Vec<_> = s.decisions.drain(..).map(|decision| (decision.action, decision.reason)).collect();
-        assert_eq!(asked, [(Action::TestLift, Reason::Promising)]);
-        s.push(of(Phase::Squeezing, 0.9)).push(of(Phase::Squeezed, 0.9)).push(of(Phase::TestLifting, 0.1));
+        assert_eq!(last_asked(&mut s), [(Action::Squeeze, Reason::Promising)]);
+        let squeeze = |s: &mut Stream, probability| {
+            s.push(of(Phase::Squeezing, 0.9));
+            (0..3).for_each(|_| _ = s.push(of(Phase::Squeezed, probability)));
+        };
+        squeeze(&mut s, 0.9);
+        s.push(of(Phase::Ended, 0.9));
+        assert_eq!(last_asked(&mut s), [(Action::TestLift, Reason::Promising)]);
+        s.push(of(Phase::TestLifting, 0.1));
         s.push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9));
         assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
-        // No probe is asked for if the grasp is unstable. After the probe, `ended` ends the grasp. A hand that closes again
-        // needs another probe.
+        // No probe is asked for if the grasp is unstable, settled or squeezed. After the probe, `ended` ends the grasp. A hand
+        // that closes again needs another probe. One that makes the test lift before it is asked for has not been judged.
         let mut s = probing();
         s.push(settled(0.1)).push(settled(0.1)).push(settled(0.1));
         assert_eq!(s.end(), [(0, Action::Hold, Reason::Unstable)]);
-        let mut s = probing();
-        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9)).push(of(Phase::TestLifted, 0.9));
-        s.push(of(Phase::Ended, 0.9));
-        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::NoAgreement)]);
-        let mut s = probing();
-        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9)).push(of(Phase::Closing, 0.9));
+        let squeezed = |probability| {
+            let mut s = probing();
+            s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
+            squeeze(&mut s, probability);
+            s
+        };
+        assert_eq!(squeezed(0.1).end()[1..], [(0, Action::Hold, Reason::Unstable)]);
+        let mut s = squeezed(0.9);
+        s.push(of(Phase::TestLifted, 0.9)).push(of(Phase::Ended, 0.9));
+        assert_eq!(s.end()[2..], [(0, Action::Hold, Reason::NoAgreement)]);
+        let mut s = squeezed(0.9);
+        s.push(of(Phase::Closing, 0.9));
         s.push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9));
-        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::NoAgreement)]);
+        assert_eq!(s.end()[2..], [(0, Action::Hold, Reason::NoAgreement)]);
+        let mut s = squeezed(0.9);
+        s.push(Prediction { fault: Fault::MissingReading, ..of(Phase::TestLifted, 0.0) });
+        assert_eq!(s.end()[2..], [(0, Action::Hold, Reason::MissingReading)]);
         let mut s = probing();
         s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
-        s.push(Prediction { fault: Fault::MissingReading, ..of(Phase::TestLifted, 0.0) });
-        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::MissingReading)]);
+        (0..3).for_each(|_| _ = s.push(of(Phase::TestLifted, 0.9)));
+        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::NoAgreement)]);
     }
 }

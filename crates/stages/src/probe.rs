@@ -4,7 +4,7 @@
 //! by a few millimetres and rest. The load that arrives on the fingers, moves over their cells or goes away again says
 //! more about the lift than the settled grasp does (Chebotar et al., "Self-supervised regrasping using spatio-temporal tactile
 //! features and reinforcement learning", 2016, predict from the early lift). [`ProbeModel`] takes the feature of the frame,
-//! that of the last frame of the phase before, and their difference.
+//! that of the last frame of the phase before, their difference, and loads relative to the hand's own grip.
 //!
 //! Pure: no clock, no I/O. [`GraspHistory`] is the state.
 
@@ -42,11 +42,14 @@ impl ProbeModel {
 
 /// Values that a probe's classifier takes.
 pub fn n_values(features: &FeatureExtractor) -> usize {
-    3 * features.len() + N_TRACK_VALUES * signals(features).len()
+    3 * features.len() + (N_TRACK_VALUES + N_SHARES) * signals(features).len()
 }
 
 /// Values of a [`Track`] for each signal.
 const N_TRACK_VALUES: usize = 4;
+
+/// Values of each signal that do not change if all cells read the same factor more: see [`shares`].
+const N_SHARES: usize = 4;
 
 /// Where the signals that are followed while the hand moves stand among a feature's values: the load of each pad, and the
 /// load on the wrist along gravity, as far as the feature has them.
@@ -146,7 +149,7 @@ impl GraspHistory {
 
     /// Writes the values from which a frame of the grasp is judged: the feature of the phase before, the frame's own, how it
     /// differs, and of each signal while the hand moved in between its greatest and least value, the sum of its steps and
-    /// the greatest one.
+    /// the greatest one, and its [`shares`].
     ///
     /// # Errors
     /// The fault of the phase before; [`Fault::MissingReading`] if no frame of it came, or the hand has not been seen to move.
@@ -173,13 +176,37 @@ impl GraspHistory {
         for part in [&track.greatest, &track.least, &track.travelled, &track.greatest_step] {
             composed.extend_from_slice(part);
         }
+        composed.extend(signals.iter().zip(&track.travelled).flat_map(|(idx, travelled)| {
+            let sum = |of: &[f64]| signals.iter().map(|idx| of[*idx].abs()).sum::<f64>();
+            shares((before[*idx], sum(before)), (values[*idx], sum(values)), *travelled)
+        }));
         Ok(())
     }
 }
 
+/// A signal relative to the hand's own grip, from the signal before and now, each with the sum of all signals: its shares of the
+/// sums, its part now of before and now, and how far it travelled for each newton of these. 0 of nothing. Skins differ in
+/// their gain, and in how much force they lose between cells; these values do not.
+fn shares((before, all_before): (f64, f64), (now, all_now): (f64, f64), travelled: f64) -> [f64; N_SHARES] {
+    let part = |of: f64, whole: f64| if whole.abs() > LEAST_NEWTONS { of / whole } else { 0.0 };
+    let both = before.abs() + now.abs();
+    [part(before, all_before), part(now, all_now), part(now, both), part(travelled, both)]
+}
+
+/// A hundredth of what a cell's noise comes to: no share is known of less.
+const LEAST_NEWTONS: f64 = 1e-3;
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn shares_are_the_same_for_a_skin_that_reads_twice_as_much() {
+        let of = |gain: f64| shares((1.0 * gain, 4.0 * gain), (3.0 * gain, 5.0 * gain), 2.0 * gain);
+        assert_eq!(of(1.0), [0.25, 0.6, 0.75, 0.5]);
+        assert_eq!(of(2.0), of(1.0));
+        assert_eq!(shares((0.0, 0.0), (0.0, 0.0), 0.0), [0.0; N_SHARES]);
+    }
 
     #[test]
     fn a_reading_is_compared_with_the_phase_before_of_the_same_grasp() {
@@ -196,14 +223,16 @@ mod tests {
             history.compose(phase, values, &SIGNALS, composed)
         };
         assert_eq!(of(&history, Phase::Squeezed, &[2.0, 5.0], &mut composed), Ok(()));
-        assert_eq!(composed, [1.0, 3.0, 2.0, 5.0, 1.0, 2.0, 7.0, 0.0, 10.0, 7.0]);
+        assert_eq!(composed[..10], [1.0, 3.0, 2.0, 5.0, 1.0, 2.0, 7.0, 0.0, 10.0, 7.0]);
+        assert_eq!(composed[10..], [1.0, 1.0, 5.0 / 8.0, 10.0 / 8.0]);
         let missing = Err(Fault::MissingReading);
         assert_eq!(of(&history, Phase::TestLifted, &[2.0, 5.0], &mut composed), missing);
         history.add((0, 7), Phase::Squeezed, Ok(&[2.0, 5.0]), &SIGNALS);
         assert_eq!(of(&history, Phase::TestLifted, &[2.0, 5.0], &mut composed), missing, "it has not been lifted");
         history.add((0, 7), Phase::TestLifting, Ok(&[2.0, 4.0]), &SIGNALS);
         assert_eq!(of(&history, Phase::TestLifted, &[2.0, 4.0], &mut composed), Ok(()));
-        assert_eq!(composed[4..], [0.0, -1.0, 4.0, 4.0, 0.0, 0.0]);
+        assert_eq!(composed[4..10], [0.0, -1.0, 4.0, 4.0, 0.0, 0.0]);
+        assert_eq!(composed[10..], [1.0, 1.0, 4.0 / 9.0, 0.0]);
         // There is no history after the hand has closed again, of another grasp, and of a source that began anew.
         for (grasp, phase) in [((0, 7), Phase::Closing), ((0, 8), Phase::Settled), ((1, 7), Phase::Settled)] {
             let mut other = history.clone();

@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use super::engine::{Engine, GRAVITY, Side, Touch, load_on_wrist, stand_newtons};
 use super::hand_body::HandBody;
-use super::mujoco::Mujoco;
 use super::motion::{LiftPath, Path, TestLiftPath};
+use super::mujoco::Mujoco;
 use super::sensing::patches;
 use super::start::first_touch;
 use super::world::World;
@@ -358,7 +358,10 @@ impl<'a> Attempt<'a> {
         }
         let end = self.engine.palm_from_target();
         let slip_m = slip_m(&end);
-        let held = self.is_touched() && !self.has_diverged() && stand_newtons(&*self.engine) == 0.0 && slip_m <= protocol.lost_m;
+        let held = self.is_touched()
+            && !self.has_diverged()
+            && stand_newtons(&*self.engine) == 0.0
+            && slip_m <= protocol.lost_m;
         LiftResult { held, slip_m, turn_rad: begin.rotation.angle_to(&end.rotation) }
     }
 

@@ -33,8 +33,8 @@ pub struct Finished {
     pub n_frames: u64,
     /// When it was over, simulated time since the run began.
     pub end_nanos: u64,
-    /// The probe that was made, which is felt again with its frames.
-    pub probe: Option<ProbeMove>,
+    /// The probes that were made, which are felt again with their frames.
+    pub probes: Vec<ProbeMove>,
     pub outcome: LiftOutcome,
 }
 
@@ -110,7 +110,7 @@ mod tests {
             lifted,
             ..LiftOutcome::default()
         };
-        Finished { n_frames: 9, end_nanos: place.begin_nanos + 100, probe: None, outcome, place }
+        Finished { n_frames: 9, end_nanos: place.begin_nanos + 100, probes: Vec::new(), outcome, place }
     }
 
     #[test]

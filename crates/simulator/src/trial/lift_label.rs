@@ -10,7 +10,9 @@ use nalgebra::Vector3;
 use rand::RngExt;
 
 use super::attempt::Moment;
-use super::{Attempt, LiftTarget, MujocoOptions, PhysicsOptions, ProbeMove, TrialError, TrialOptions, TrialProtocol, draw_start};
+use super::{
+    Attempt, LiftTarget, MujocoOptions, PhysicsOptions, ProbeMove, TrialError, TrialOptions, TrialProtocol, draw_start,
+};
 use crate::candidate::{CandidateError, Judged, Made, Outcome, SimulatedGrasp, TimedFrame, candidate_rng};
 use crate::loaded_contacts::SimulatedContact;
 use crate::mechanism::Mechanism;

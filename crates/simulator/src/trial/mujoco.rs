@@ -79,7 +79,10 @@ impl Process {
         let written = writeln!(self.commands, "{command}").and_then(|()| self.commands.flush());
         let n_read = self.answers.read_line(&mut line).map_err(|error| format!("MuJoCo does not answer: {error}"))?;
         if n_read == 0 {
-            return Err(format!("the process of MuJoCo has ended{}", written.err().map_or(String::new(), |error| format!(": {error}"))));
+            return Err(format!(
+                "the process of MuJoCo has ended{}",
+                written.err().map_or(String::new(), |error| format!(": {error}"))
+            ));
         }
         let answer: Value = serde_json::from_str(&line).map_err(|error| format!("MuJoCo's answer: {error}"))?;
         match answer.get("error").and_then(Value::as_str) {
@@ -320,9 +323,7 @@ fn model(
     let stand = meshes.geom(&prism);
     let ground = palm_from_world * Isometry3::translation(0.0, 0.0, -options.stand_height_m - 0.05);
     let [slide, twist, roll] = friction(target.friction, options);
-    let surface = format!(
-        r#"condim="4" priority="1" friction="{slide} {twist} {roll}" solref="{contact_secs} 1""#
-    );
+    let surface = format!(r#"condim="4" priority="1" friction="{slide} {twist} {roll}" solref="{contact_secs} 1""#);
     let solid = match target.object.shape.as_typed_shape() {
         TypedShape::TriMesh(_) => String::new(),
         _ => {

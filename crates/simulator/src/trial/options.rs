@@ -195,13 +195,7 @@ pub struct MujocoOptions {
 
 impl Default for MujocoOptions {
     fn default() -> Self {
-        MujocoOptions {
-            step_secs: 0.002,
-            impratio: 10.0,
-            noslip_iterations: 10,
-            contact_secs: 0.006,
-            torsion_m: 0.005,
-        }
+        MujocoOptions { step_secs: 0.002, impratio: 10.0, noslip_iterations: 10, contact_secs: 0.006, torsion_m: 0.005 }
     }
 }
 

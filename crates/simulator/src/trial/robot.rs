@@ -87,7 +87,7 @@ struct TriedGrasp<'a> {
     /// Simulated time from its beginning to the last frame.
     elapsed_nanos: u64,
     last: Option<TactileFrame>,
-    probe: Option<ProbeMove>,
+    probes: Vec<ProbeMove>,
     /// How it ended, if only its frames are felt again.
     outcome: Option<Finished>,
 }
@@ -141,7 +141,7 @@ impl<'a> Robot<'a> {
             State::Feeling(grasp) => self.feel(grasp),
             State::Failed(error) => Err(error),
             State::Deciding(grasp) => {
-                let (grasp_id, n_before) = (grasp.place.grasp_id, usize::from(grasp.probe.is_some()));
+                let (grasp_id, n_before) = (grasp.place.grasp_id, grasp.probes.len());
                 self.state = State::Deciding(grasp);
                 Ok(Doing::AsksForDecision { grasp_id, n_before })
             }
@@ -160,9 +160,12 @@ impl<'a> Robot<'a> {
     pub fn decide(&mut self, action: Action) {
         match std::mem::replace(&mut self.state, State::Between) {
             State::Deciding(mut grasp) if probe_of(action).is_some() && !self.options.lifts_always => {
-                // After a probe there is no other: in doubt it lets go.
+                // No probe is made twice, and none after a test lift: in doubt it lets go.
                 match probe_of(action) {
-                    Some(probe) if grasp.probe.is_none() => {
+                    Some(probe)
+                        if grasp.probes.is_empty()
+                            || grasp.probes == [ProbeMove::Squeeze] && probe == ProbeMove::TestLift =>
+                    {
                         grasp.begin_probe(probe);
                         self.state = State::Feeling(grasp);
                     }
@@ -232,8 +235,16 @@ impl<'a> Robot<'a> {
         attempt: Attempt<'a>,
         outcome: Option<Finished>,
     ) -> Result<Doing, TrialError> {
-        let grasp =
-            TriedGrasp { place, thing, attempt, n_frames: 0, elapsed_nanos: 0, last: None, probe: None, outcome };
+        let grasp = TriedGrasp {
+            place,
+            thing,
+            attempt,
+            n_frames: 0,
+            elapsed_nanos: 0,
+            last: None,
+            probes: Vec::new(),
+            outcome,
+        };
         self.feel(Box::new(grasp))
     }
 
@@ -266,9 +277,9 @@ impl<'a> Robot<'a> {
             ..Header::default()
         };
         grasp.n_frames += 1;
-        let felt_again = if is_last { grasp.outcome.as_ref().and_then(|finished| finished.probe) } else { None };
-        if let Some(probe) = felt_again
-            && grasp.probe.is_none()
+        let felt_again = grasp.outcome.as_ref().filter(|finished| finished.probes.len() > grasp.probes.len());
+        if let Some(probe) = felt_again.map(|finished| finished.probes[grasp.probes.len()])
+            && is_last
         {
             grasp.begin_probe(probe);
             self.state = State::Feeling(grasp);
@@ -289,7 +300,7 @@ impl<'a> Robot<'a> {
     fn finish(&mut self, mut grasp: TriedGrasp<'a>, lifts: bool) {
         let quality = grasp.attempt.quality().filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
         let lift = lifts.then(|| grasp.attempt.lift(|_| {}));
-        let is_set_down = !lifts && grasp.probe == Some(ProbeMove::TestLift);
+        let is_set_down = !lifts && grasp.probes.last() == Some(&ProbeMove::TestLift);
         let (moved_m, turned_rad) = if is_set_down { grasp.attempt.set_down() } else { (0.0, 0.0) };
         if let Err(error) = grasp.attempt.check() {
             self.state = State::Failed(error);
@@ -297,7 +308,7 @@ impl<'a> Robot<'a> {
         }
         let disturbed = moved_m > DISTURBED_M || turned_rad > DISTURBED_RAD;
         let (epsilon, volume) = quality.unwrap_or((-1.0, 0.0));
-        let TriedGrasp { place, thing, attempt, n_frames, elapsed_nanos, probe, last, .. } = grasp;
+        let TriedGrasp { place, thing, attempt, n_frames, elapsed_nanos, probes, last, .. } = grasp;
         let n_frames = n_frames + u64::from(lifts);
         let outcome = LiftOutcome {
             grasp_id: place.grasp_id,
@@ -314,11 +325,11 @@ impl<'a> Robot<'a> {
             friction: thing.friction,
             thing: thing.name,
             group: thing.group,
-            probed: probe.is_some(),
+            probed: !probes.is_empty(),
             disturbed,
         };
         let end_nanos = place.begin_nanos + attempt.snapshot().elapsed_nanos.max(elapsed_nanos);
-        let finished = Finished { place, n_frames, end_nanos, probe, outcome };
+        let finished = Finished { place, n_frames, end_nanos, probes, outcome };
         let told = told_frame(&finished, last, self.hand.id());
         self.state = State::Over { finished, told, is_again: false };
     }
@@ -329,7 +340,7 @@ impl TriedGrasp<'_> {
         self.attempt.probe(probe);
         // A frame with the number of the last one has been sent in between.
         self.attempt.skip_frame();
-        self.probe = Some(probe);
+        self.probes.push(probe);
     }
 }
 
@@ -424,7 +435,7 @@ mod tests {
     }
 
     #[test]
-    fn a_probe_is_made_once_and_felt_again() {
+    fn probes_are_made_once_and_felt_again() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
         let robot = || {
             let targets = targets_named("paper/pencil-cup").expect("targets");
@@ -432,12 +443,16 @@ mod tests {
         };
         let mut first = robot();
         let mut asked = Vec::new();
-        // The first attempt is held after its probe. A second probe of the second attempt is a hold.
+        // The first attempt is held after its probe. The second one makes both, and a third probe is a hold.
         let (frames, finished) = run(&mut first, |grasp_id, n_before| {
             asked.push((grasp_id, n_before));
-            if (grasp_id, n_before) == (0, 1) { Action::Hold } else { Action::TestLift }
+            match (grasp_id, n_before) {
+                (0, 1) => Action::Hold,
+                (1, 0) => Action::Squeeze,
+                _ => Action::TestLift,
+            }
         });
-        assert_eq!(asked, [(0, 0), (0, 1), (1, 0), (1, 1)]);
+        assert_eq!(asked, [(0, 0), (0, 1), (1, 0), (1, 1), (1, 2)]);
         assert!(finished.iter().all(|finished| finished.outcome.probed && !finished.outcome.lifted));
         assert!(frames.iter().enumerate().all(|(seq, frame)| frame.header.seq == seq as u64));
         assert!(frames.windows(2).all(|pair| pair[0].header.stamp_nanos < pair[1].header.stamp_nanos));

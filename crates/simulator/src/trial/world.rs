@@ -470,8 +470,7 @@ mod tests {
         let target = cube(friction, made);
         let at_height = Isometry3::translation(0.0, 0.0, 0.5);
         let no_hand = HandPlan::default();
-        let mut world =
-            World::new(&target, &at_height, &Isometry3::identity(), &no_hand, &options).expect("a world");
+        let mut world = World::new(&target, &at_height, &Isometry3::identity(), &no_hand, &options).expect("a world");
         let plate = || {
             let groups = (Group::GROUP_1, Group::NONE);
             World::hand_collider(SharedShape::cuboid(0.005, 0.02, 0.02), &Isometry3::identity(), groups)
