@@ -8,6 +8,7 @@ use std::rc::Rc;
 use blindgrasp_bridge::certificates::REVOKED_FILE;
 use blindgrasp_graph::control::GraphStatus;
 use blindgrasp_graph::dataflow::Graph;
+use blindgrasp_stages::classifier::Classifier;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::lift_arbiter::Probe;
@@ -158,7 +159,7 @@ impl<'a> Check<'a> {
         let (phase, judge) = match probe {
             Probe::None => ("settled", Some(&model.classifier)),
             Probe::Squeeze => ("squeezed", model.squeezed.as_ref().map(|probe| &probe.classifier)),
-            Probe::TestLift => ("test_lifted", model.test_lifted.as_ref().map(|probe| &probe.classifier)),
+            Probe::TestLift => ("test_lifted", test_lifted(model)),
         };
         let of = format!("the model of node '{}' ({})", classifier.node, path_of(classifier, "model").display());
         let instead = probes_of(model);
@@ -286,14 +287,20 @@ fn path_of(part: &Part, param: &str) -> PathBuf {
     part.params.get(param).and_then(Value::as_str).unwrap_or_default().into()
 }
 
+/// The judge of a test lift, which follows a squeeze that is judged as well.
+fn test_lifted(model: &Model) -> Option<&Classifier> {
+    model.squeezed.as_ref().and(model.test_lifted.as_ref()).map(|probe| &probe.classifier)
+}
+
 /// The values of `probe` with which grasps can be lifted by this model.
 fn probes_of(model: &Model) -> String {
     let mut probes = Vec::new();
     if model.classifier.threshold_probability < 1.0 {
         probes.push("none");
     }
-    for (name, judge) in [("squeeze", &model.squeezed), ("test_lift", &model.test_lifted)] {
-        if judge.as_ref().is_some_and(|judge| judge.classifier.threshold_probability < 1.0) {
+    let squeezed = model.squeezed.as_ref().map(|probe| &probe.classifier);
+    for (name, judge) in [("squeeze", squeezed), ("test_lift", test_lifted(model))] {
+        if judge.is_some_and(|judge| judge.threshold_probability < 1.0) {
             probes.push(name);
         }
     }

@@ -8,6 +8,7 @@ use crate::training::{Example, composed};
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::Classifier;
 use blindgrasp_stages::model::Model;
+use blindgrasp_stages::probe::ProbeModel;
 
 /// The judgement of the grasps that have this look.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -20,7 +21,7 @@ pub struct Look {
     pub roc_area: Option<f64>,
     /// Expected calibration error.
     pub ece: f64,
-    /// Grasps that the model's thresholds lift: promising when settled, and stable at this look.
+    /// Grasps that the model's thresholds lift: promising at the looks before, and stable at this one.
     pub n_lifted: usize,
     /// Stable ones of these.
     pub n_kept: usize,
@@ -47,12 +48,22 @@ pub fn looks(model: &Model, examples: &[Example]) -> Vec<Look> {
     let of_settled = Look::of(Phase::Settled, model.classifier.threshold_probability, examples, |idx| {
         settled[idx].map(|probability| (probability, true))
     });
+    let of_probe = |phase: Phase, probe: &ProbeModel| -> Vec<Option<f64>> {
+        let composed = |example| composed(&model.features, phase, example);
+        examples.iter().map(|example| judged(&probe.classifier, &composed(example)?)).collect()
+    };
+    // Whether a grasp was promising at all looks before.
+    let mut is_promising: Vec<bool> =
+        settled.iter().map(|settled| *settled >= Some(model.classifier.unsure_from_probability)).collect();
     let of_probes = probes.into_iter().map(|(phase, probe)| {
-        let threshold = probe.classifier.threshold_probability;
-        Look::of(phase, threshold, examples, |idx| {
-            let probability = judged(&probe.classifier, &composed(&model.features, phase, &examples[idx])?)?;
-            Some((probability, settled[idx] >= Some(model.classifier.unsure_from_probability)))
-        })
+        let judged = of_probe(phase, probe);
+        let look = Look::of(phase, probe.classifier.threshold_probability, examples, |idx| {
+            Some((judged[idx]?, is_promising[idx]))
+        });
+        for (is_promising, probability) in is_promising.iter_mut().zip(&judged) {
+            *is_promising &= *probability >= Some(probe.classifier.unsure_from_probability);
+        }
+        look
     });
     std::iter::once(of_settled).chain(of_probes).filter(|look| look.n_grasps > 0).collect()
 }

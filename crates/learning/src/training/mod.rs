@@ -42,6 +42,7 @@ use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::{FORMAT, Model, ModelHand};
 use blindgrasp_stages::training_summary::{Bounded, Promise};
+use probes::Last;
 
 /// How a model is trained.
 #[derive(Debug, Clone, PartialEq)]
@@ -205,6 +206,9 @@ pub fn train_on(
         if probe.is_none() && n_without == 0 && matches!(recipe.learner, Learner::Boosting(_)) {
             progress(&format!("not learned: frames of {} hands say nothing of objects not seen", phase.as_str()));
         }
+        if phase == Phase::TestLifted && matches!(learned[..], [None]) && probe.take().is_some() {
+            progress("not learned: a test lift follows a squeeze, whose frames say nothing");
+        }
         if let Some(learned) = &mut probe {
             learned.probe.classifier.threshold_probability = threshold_probability;
             learned.probe.classifier.unsure_from_probability = threshold_probability;
@@ -273,7 +277,7 @@ type Chosen = (probes::Policy, f64, Option<Promise>);
 
 impl Aim {
     /// Chooses the policy of a look. The error is the reason why the look has none.
-    fn choose(self, policies: &probes::Policies<'_>, look: &str) -> Result<Chosen, String> {
+    fn choose(self, policies: &probes::Policies, look: &str) -> Result<Chosen, String> {
         match self {
             Aim::DropSecs(drop_secs) => {
                 let policy = policies.cheapest(drop_secs).ok_or_else(|| {
@@ -329,16 +333,28 @@ fn choose_policies(
     }
     let examples = &judged.examples;
     let settled = out_of_fold_probabilities(judged)?;
-    let policies = |decided: Option<&[Option<f64>]>, settled_threshold: f64| {
+    let names: BTreeSet<&String> = examples.iter().map(|example| &example.object).collect();
+    let objects: BTreeMap<&String, usize> = names.into_iter().zip(0..).collect();
+    let [squeezed, test_lifted] = learned else {
+        return Err(TrainingError::Data(format!("{} looks after a probe, expected two", learned.len())));
+    };
+    let policies = |last: Last, learned: [&Option<probes::Learned>; 2], settled_threshold: f64| {
+        let probability = |learned: &Option<probes::Learned>, idx: usize| learned.as_ref()?.probabilities[idx];
         let attempts = examples.iter().zip(&settled).enumerate();
         let attempted = attempts.map(|(idx, (example, settled))| probes::Attempted {
-            object: &example.object,
+            object: objects[&example.object],
             fold: judged.folds[idx],
             settled: *settled,
-            decided: decided.map_or(Some(*settled), |decided| decided[idx]),
+            // A tight hand that feels nothing is given up.
+            squeezed: if last == Last::TestLift { probability(learned[0], idx).unwrap_or(-1.0) } else { 1.0 },
+            decided: match last {
+                Last::Settled => Some(*settled),
+                Last::Squeeze => probability(learned[0], idx),
+                Last::TestLift => probability(learned[1], idx),
+            },
             stable: example.stable,
         });
-        probes::Policies::new(&attempted.collect::<Vec<_>>(), decided.is_some(), settled_threshold)
+        probes::Policies::new(&attempted.collect::<Vec<_>>(), last, settled_threshold)
     };
     let summary = |look: &str, roc_area: f64, (policy, drop_secs, promise): &Chosen| PolicySummary {
         roc_area,
@@ -351,7 +367,7 @@ fn choose_policies(
         promise: if promises { *promise } else { None },
     };
     let (mut summaries, mut refusals) = (Vec::new(), Vec::new());
-    match aim.choose(&policies(None, NEVER), "settled") {
+    match aim.choose(&policies(Last::Settled, [squeezed, test_lifted], NEVER), "settled") {
         Ok(without) => {
             classifier.threshold_probability = without.0.lift;
             let stable: Vec<bool> = examples.iter().map(|example| example.stable).collect();
@@ -365,33 +381,44 @@ fn choose_policies(
     }
     classifier.unsure_from_probability = classifier.threshold_probability;
     let settled_threshold = classifier.threshold_probability;
-    let [squeezed, test_lifted] = learned else {
-        return Err(TrainingError::Data(format!("{} looks after a probe, expected two", learned.len())));
-    };
-    let mut before = None;
-    for (look, learned) in [("squeezed", squeezed), ("test_lifted", test_lifted)] {
-        let Some(learned) = learned else { continue };
+    let chosen =
+        [(Last::Squeeze, "squeezed", squeezed.is_some()), (Last::TestLift, "test_lifted", test_lifted.is_some())].map(
+            |(last, look, is_learned)| {
+                is_learned.then(|| aim.choose(&policies(last, [squeezed, test_lifted], settled_threshold), look))
+            },
+        );
+    for learned in [&mut *squeezed, &mut *test_lifted].into_iter().flatten() {
         let probe = &mut learned.probe.classifier;
         (probe.threshold_probability, probe.unsure_from_probability) = (NEVER, NEVER);
-        match aim.choose(&policies(Some(&learned.probabilities), settled_threshold), look) {
+    }
+    let [of_squeeze, of_test_lift] = chosen;
+    let has_test_lift = matches!(of_test_lift, Some(Ok(_)));
+    if let (Some(learned), Some(chosen)) = (&mut *squeezed, of_squeeze) {
+        match chosen {
+            // Without a promise a look does not lift, if one was asked for, and that of this look was for another choice of
+            // the grasps to probe.
+            Ok(_) if has_test_lift && matches!(aim, Aim::MaxDrops(_)) => {
+                progress("squeezed hands are never lifted: the thresholds are for the test lift");
+            }
             Ok(chosen) => {
-                let policy = &chosen.0;
+                let (probe, policy) = (&mut learned.probe.classifier, &chosen.0);
                 (probe.threshold_probability, probe.unsure_from_probability) = (policy.lift, policy.lift);
-                // A grasp that is worth the last probe is worth the one before it, whose promise was for another choice of the
-                // grasps to probe: without a promise it does not lift, if one was asked for.
                 classifier.unsure_from_probability = policy.promising;
-                summaries
-                    .iter_mut()
-                    .filter(|summary| summary.look == "squeezed")
-                    .for_each(|summary| summary.promise = None);
-                if let (Aim::MaxDrops(_), Some(before)) = (aim, before.take()) {
-                    let before: &mut Classifier = before;
-                    (before.threshold_probability, before.unsure_from_probability) = (NEVER, NEVER);
-                    summaries.retain(|summary| summary.look != "squeezed");
-                    progress("squeezed hands are never lifted: the thresholds are for the test lift");
-                }
-                summaries.push(summary(look, learned.probe.cross_validated_roc_area, &chosen));
-                before = Some(probe);
+                let promised = if has_test_lift { (chosen.0, chosen.1, None) } else { chosen };
+                summaries.push(summary("squeezed", learned.probe.cross_validated_roc_area, &promised));
+            }
+            Err(refusal) => refusals.push(refusal),
+        }
+    }
+    if let (Some(learned), Some(before), Some(chosen)) = (test_lifted, squeezed, of_test_lift) {
+        match chosen {
+            Ok(chosen) => {
+                let (probe, policy) = (&mut learned.probe.classifier, &chosen.0);
+                (probe.threshold_probability, probe.unsure_from_probability) = (policy.lift, policy.lift);
+                classifier.unsure_from_probability = policy.promising;
+                let before = &mut before.probe.classifier;
+                before.unsure_from_probability = policy.promising_squeezed.clamp(0.0, before.threshold_probability);
+                summaries.push(summary("test_lifted", learned.probe.cross_validated_roc_area, &chosen));
             }
             Err(refusal) => refusals.push(refusal),
         }

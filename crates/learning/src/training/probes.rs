@@ -4,8 +4,6 @@
 //! settled is given up; otherwise a probe follows, and its judgement decides. The thresholds are chosen for trials:
 //! hard objects take more attempts, so a share of kept objects over single grasps would promise too much.
 
-use std::collections::BTreeMap;
-
 use rayon::prelude::*;
 
 use super::{Example, Felt, OutOfFold, Signals, TrainingError, calibrate, out_of_fold_probabilities, prepare};
@@ -25,9 +23,11 @@ use blindgrasp_stages::training_summary::Promise;
 
 /// The attempts of a trial that is never lifted.
 const MOST_ATTEMPTS: u32 = 20;
-/// Time of an attempt until the hand has settled, of a probe after it, and of a lift, seconds: as the simulated hand takes.
+/// Time of an attempt until the hand has settled, of tightening it, of a test lift, and of a lift, seconds: as the simulated
+/// hand takes.
 const ATTEMPT_SECS: f64 = 3.0;
-const PROBE_SECS: f64 = 1.2;
+const SQUEEZE_SECS: f64 = 0.4;
+const TEST_LIFT_SECS: f64 = 0.8;
 const LIFT_SECS: f64 = 4.0;
 /// Costs that differ by a smaller part than this count as equal. The cost is flat near its least value: two simulations of the same
 /// 10,000 lifts, with other noise of the cells, had their least costs where 3.1 and 5.1 % of the lifts drop.
@@ -164,6 +164,8 @@ pub(crate) fn composed(features: &FeatureExtractor, phase: Phase, example: &Exam
 pub(super) struct Policy {
     /// A settled grasp below this is given up.
     pub(super) promising: f64,
+    /// A tight grasp below this is given up before the test lift. 0 without a test lift.
+    pub(super) promising_squeezed: f64,
     /// From here on the grasp is lifted.
     pub(super) lift: f64,
     pub(super) expected: Expected,
@@ -187,32 +189,45 @@ impl Expected {
     }
 }
 
-/// One grasp of a policy: its object, its probability when it had settled, and when it is decided.
+/// One grasp of a policy: its object, its probability at each look, and its outcome.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Attempted<'a> {
-    pub(super) object: &'a str,
+pub(super) struct Attempted {
+    /// A number below that of all objects.
+    pub(super) object: usize,
     /// The fold of its object.
     pub(super) fold: usize,
     pub(super) settled: f64,
+    /// When it is tight, before a test lift that decides. 1 without one.
+    pub(super) squeezed: f64,
+    /// When it is decided; `None` if that look has no feature.
     pub(super) decided: Option<f64>,
     pub(super) stable: bool,
 }
 
+/// What decides.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Last {
+    Settled,
+    Squeeze,
+    TestLift,
+}
+
 /// The policies that grasps offer, from all of them and from those of all folds but one.
-pub(super) struct Policies<'a> {
+pub(super) struct Policies {
     all: Vec<Policy>,
     /// The grasps of each fold, and the policies that the other folds offer.
-    folds: Vec<(Vec<Attempted<'a>>, Vec<Policy>)>,
+    folds: Vec<(Vec<Attempted>, Vec<Policy>)>,
     /// The most attempts of a trial: so many grasps of nine objects in ten were recorded.
     n_attempts: u32,
 }
 
-impl<'a> Policies<'a> {
+impl Policies {
     /// Without a probe, `decided` is `settled`, and no grasp is given up before. With one, no grasp is given up from
     /// `settled_threshold` on: it counts as stable before the probe.
-    pub(super) fn new(grasps: &[Attempted<'a>], has_probe: bool, settled_threshold: f64) -> Policies<'a> {
-        let policies = |grasps: &[Attempted<'_>]| policies(grasps, has_probe.then_some(settled_threshold));
-        let mut n_grasps: Vec<u32> = counts(grasps, 0.0, 0.0).values().map(|count| count.n as u32).collect();
+    pub(super) fn new(grasps: &[Attempted], last: Last, settled_threshold: f64) -> Policies {
+        let policies = |grasps: &[Attempted]| policies(grasps, last, settled_threshold);
+        let all = Thresholds { promising: 0.0, promising_squeezed: 0.0, lift: 0.0 };
+        let mut n_grasps: Vec<u32> = counts(grasps, all).iter().map(|count| count.n as u32).collect();
         n_grasps.sort_unstable();
         let n_attempts = n_grasps.get(n_grasps.len() / 10).copied().unwrap_or(0).min(MOST_ATTEMPTS);
         let n_folds = grasps.iter().map(|grasp| grasp.fold + 1).max().unwrap_or(0);
@@ -234,8 +249,8 @@ impl<'a> Policies<'a> {
     pub(super) fn promise(&self, drop_secs: f64) -> Option<Promise> {
         let tried = self.folds.iter().map(|(grasps, policies)| {
             let policy = cheapest(policies, drop_secs)?;
-            let counts = counts(grasps, policy.promising, policy.lift);
-            Some(counts.values().map(|count| count.trials(self.n_attempts)).collect::<Vec<_>>())
+            let counts = counts(grasps, policy.thresholds());
+            Some(counts.iter().map(|count| count.trials(self.n_attempts)).collect::<Vec<_>>())
         });
         let promise = promise(&tried.collect::<Option<Vec<_>>>()?.concat())?;
         Some(Promise { n_attempts: Some(self.n_attempts), ..promise })
@@ -250,39 +265,63 @@ fn cheapest(policies: &[Policy], drop_secs: f64) -> Option<Policy> {
     equal.max_by(|a, b| a.expected.kept.total_cmp(&b.expected.kept).then(cost(b).total_cmp(&cost(a))))
 }
 
+/// The thresholds of the looks at a grasp.
+#[derive(Debug, Clone, Copy)]
+struct Thresholds {
+    promising: f64,
+    promising_squeezed: f64,
+    lift: f64,
+}
+
+impl Policy {
+    fn thresholds(&self) -> Thresholds {
+        let Policy { promising, promising_squeezed, lift, .. } = *self;
+        Thresholds { promising, promising_squeezed, lift }
+    }
+}
+
 /// The policies among which one is chosen: quantiles of the probabilities as thresholds. With a probe, all grasps from
 /// `settled_threshold` on are probed.
-fn policies(grasps: &[Attempted<'_>], settled_threshold: Option<f64>) -> Vec<Policy> {
-    let has_probe = settled_threshold.is_some();
+fn policies(grasps: &[Attempted], last: Last, settled_threshold: f64) -> Vec<Policy> {
     let quantiles = |mut values: Vec<f64>, n: usize| -> Vec<f64> {
         values.sort_by(f64::total_cmp);
         values.dedup();
         (0..n).filter_map(|idx| values.get(idx * values.len() / n).copied()).collect()
     };
-    let promising = match settled_threshold {
-        Some(most) => {
-            let stable = grasps.iter().filter(|grasp| grasp.stable);
-            quantiles(stable.map(|grasp| grasp.settled.min(most)).collect(), 20)
-        }
-        None => vec![0.0],
+    let of_stable = |probability: &dyn Fn(&Attempted) -> f64, n: usize| {
+        quantiles(grasps.iter().filter(|grasp| grasp.stable).map(probability).collect(), n)
     };
-    let lifts = quantiles(grasps.iter().filter_map(|grasp| grasp.decided).collect(), 400);
-    promising
+    let (promising, promising_squeezed, n_lifts) = match last {
+        Last::Settled => (vec![0.0], vec![0.0], 400),
+        Last::Squeeze => (of_stable(&|grasp| grasp.settled.min(settled_threshold), 20), vec![0.0], 400),
+        Last::TestLift => {
+            let settled = of_stable(&|grasp| grasp.settled.min(settled_threshold), 16);
+            (settled, of_stable(&|grasp| grasp.squeezed, 12), 200)
+        }
+    };
+    let lifts = quantiles(grasps.iter().filter_map(|grasp| grasp.decided).collect(), n_lifts);
+    let pairs: Vec<(f64, f64)> = promising
+        .iter()
+        .flat_map(|promising| promising_squeezed.iter().map(move |squeezed| (*promising, *squeezed)))
+        .collect();
+    pairs
         .par_iter()
-        .flat_map_iter(|promising| {
-            lifts.iter().filter_map(|lift| {
-                let expected = expect(grasps, *promising, *lift, has_probe)?;
-                Some(Policy { promising: *promising, lift: *lift, expected })
+        .flat_map_iter(|&(promising, promising_squeezed)| {
+            lifts.iter().filter_map(move |&lift| {
+                let expected = expect(grasps, Thresholds { promising, promising_squeezed, lift }, last)?;
+                Some(Policy { promising, promising_squeezed, lift, expected })
             })
         })
         .collect()
 }
 
 /// The grasps of an object, and those of them that thresholds let pass.
-#[derive(Default)]
+#[derive(Clone, Default)]
 struct Count {
     n: f64,
     promising: f64,
+    /// Those that are still promising when they are tight.
+    promising_squeezed: f64,
     lifted: f64,
     kept: f64,
 }
@@ -301,20 +340,28 @@ impl Count {
     }
 }
 
-fn counts<'a>(grasps: &[Attempted<'a>], promising: f64, lift: f64) -> BTreeMap<&'a str, Count> {
-    let mut objects: BTreeMap<&str, Count> = BTreeMap::new();
+fn counts(grasps: &[Attempted], thresholds: Thresholds) -> Vec<Count> {
+    let Thresholds { promising, promising_squeezed, lift } = thresholds;
+    let n_objects = grasps.iter().map(|grasp| grasp.object + 1).max().unwrap_or(0);
+    let mut objects = vec![Count::default(); n_objects];
     for grasp in grasps {
-        let count = objects.entry(grasp.object).or_default();
+        let count = &mut objects[grasp.object];
         count.n += 1.0;
         if grasp.settled < promising {
             continue;
         }
         count.promising += 1.0;
+        if grasp.squeezed < promising_squeezed {
+            continue;
+        }
+        count.promising_squeezed += 1.0;
         if grasp.decided.is_some_and(|probability| probability >= lift) {
             count.lifted += 1.0;
             count.kept += f64::from(u8::from(grasp.stable));
         }
     }
+    // Of a part of the grasps, some objects are in the other part.
+    objects.retain(|count| count.n > 0.0);
     objects
 }
 
@@ -330,9 +377,9 @@ struct Chances {
 impl Chances {
     /// Both moments are unbiased for any number of grasps: the mean of the share of lifts, and that of the share of an object's
     /// pairs of grasps that are both lifts. Without a pair, an object's next grasp is taken to end like the one before.
-    fn of(objects: &BTreeMap<&str, Count>) -> Chances {
+    fn of(objects: &[Count]) -> Chances {
         let (mut lifted, mut both_lifted, mut n_with_pairs) = (0.0, 0.0, 0.0);
-        for count in objects.values() {
+        for count in objects {
             lifted += count.lifted / count.n;
             if count.n > 1.0 {
                 both_lifted += count.lifted * (count.lifted - 1.0) / (count.n * (count.n - 1.0));
@@ -370,12 +417,12 @@ fn trial(count: &Count, chances: &Chances) -> (f64, f64) {
 }
 
 /// What thresholds lead to in trials of objects like these; each object weighs the same. `None` if nothing is lifted.
-fn expect(grasps: &[Attempted<'_>], promising: f64, lift: f64, has_probe: bool) -> Option<Expected> {
-    let objects = counts(grasps, promising, lift);
+fn expect(grasps: &[Attempted], thresholds: Thresholds, last: Last) -> Option<Expected> {
+    let objects = counts(grasps, thresholds);
     let chances = Chances::of(&objects);
     let (mut lifted, mut attempts, mut secs) = (0.0, 0.0, 0.0);
     let (mut first_lifted, mut first_dropped) = (0.0, 0.0);
-    for count in objects.values() {
+    for count in &objects {
         let (n_attempts, none_lifted) = trial(count, &chances);
         let ends = 1.0 - none_lifted;
         let of_first = count.trials(MOST_ATTEMPTS);
@@ -384,9 +431,13 @@ fn expect(grasps: &[Attempted<'_>], promising: f64, lift: f64, has_probe: bool) 
         lifted += ends;
         attempts += n_attempts;
         // The attempts before a lift are a random part of the grasps that are not lifted.
-        let share_probed = (count.promising - count.lifted) / (count.n - count.lifted).max(1.0);
-        let n_probes = if has_probe { ends + (n_attempts - ends) * share_probed } else { 0.0 };
-        secs += n_attempts * ATTEMPT_SECS + n_probes * PROBE_SECS + ends * LIFT_SECS;
+        let n_of = |part: f64| ends + (n_attempts - ends) * (part - count.lifted) / (count.n - count.lifted).max(1.0);
+        let probe_secs = match last {
+            Last::Settled => 0.0,
+            Last::Squeeze => n_of(count.promising) * SQUEEZE_SECS,
+            Last::TestLift => n_of(count.promising) * SQUEEZE_SECS + n_of(count.promising_squeezed) * TEST_LIFT_SECS,
+        };
+        secs += n_attempts * ATTEMPT_SECS + probe_secs + ends * LIFT_SECS;
     }
     // An object that is lifted after its recorded grasps is kept as often as others.
     let kept = if first_lifted > 0.0 { 1.0 - first_dropped / first_lifted } else { 0.0 };
@@ -405,12 +456,13 @@ mod tests {
 
     use super::*;
 
-    fn grasps(of: &[(&'static str, f64, f64, bool)]) -> Vec<Attempted<'static>> {
+    fn grasps(of: &[(&str, f64, f64, bool)]) -> Vec<Attempted> {
         of.iter()
             .map(|(object, settled, decided, stable)| Attempted {
-                object,
+                object: usize::from(*object == "b"),
                 fold: usize::from(*object == "b"),
                 settled: *settled,
+                squeezed: 1.0,
                 decided: Some(*decided),
                 stable: *stable,
             })
@@ -428,24 +480,25 @@ mod tests {
             ("b", 0.9, 0.2, false),
             ("b", 0.9, 0.2, false),
         ]);
-        let expected = expect(&grasps, 0.5, 0.5, true).expect("lifts");
+        let with = |lift: f64| Thresholds { promising: 0.5, promising_squeezed: 0.0, lift };
+        let expected = expect(&grasps, with(0.5), Last::TestLift).expect("lifts");
         // In random order, the lift is number 1.5 and 2.5 in the mean. A probe comes before each lift, and in all grasps of b.
-        let secs = (1.5 + 2.5) * ATTEMPT_SECS + (1.0 + 2.5) * PROBE_SECS + 2.0 * LIFT_SECS;
+        let secs = (1.5 + 2.5) * ATTEMPT_SECS + (1.0 + 2.5) * (SQUEEZE_SECS + TEST_LIFT_SECS) + 2.0 * LIFT_SECS;
         assert_eq!((expected.kept, expected.attempts_per_lift, expected.given_up), (0.5, 2.0, 0.0));
         assert!((expected.secs_per_kept - secs).abs() < 1e-12, "{expected:?}");
         // A higher threshold lifts none of b's grasps, and keeps each object that it lifts. As both shares of lifts, 1/2 and 0,
         // vary less than chance makes them, b has the mean of the two from its fifth attempt on.
-        let strict = expect(&grasps, 0.5, 0.85, true).expect("lifts");
+        let strict = expect(&grasps, with(0.85), Last::TestLift).expect("lifts");
         assert_eq!(strict.kept, 1.0);
         assert!((strict.given_up - 0.75_f64.powi(16) / 2.0).abs() < 1e-12, "{strict:?}");
-        assert_eq!(expect(&grasps, 0.5, 1.0, true), None);
+        assert_eq!(expect(&grasps, with(1.0), Last::TestLift), None);
     }
 
     #[test]
     fn drops_that_cost_more_are_worth_more_attempts() {
         let grasps =
             grasps(&[("a", 0.9, 0.9, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, false)]);
-        let policies = Policies::new(&grasps, true, 1.0);
+        let policies = Policies::new(&grasps, Last::Squeeze, 1.0);
         let chosen = |drop_secs| policies.cheapest(drop_secs).map(|policy| (policy.lift, policy.expected.kept));
         assert_eq!((chosen(0.0), chosen(1000.0)), (Some((0.3, 0.75)), Some((0.9, 1.0))));
     }
@@ -454,7 +507,6 @@ mod tests {
     fn what_is_expected_is_what_happens_however_few_grasps_an_object_has() {
         let mut random = ChaCha8Rng::seed_from_u64(5);
         let n_runs = 200;
-        let objects: Vec<String> = (0..480).map(|idx| idx.to_string()).collect();
         // Chances that are beta distributed; with a or b = 1 they are a root of a uniform number.
         for (a, b) in [(1.0, 3.0), (0.4, 1.0)] {
             let chance = |uniform: f64| if a == 1.0 { 1.0 - uniform.powf(1.0 / b) } else { uniform.powf(1.0 / a) };
@@ -463,12 +515,12 @@ mod tests {
             let lifted = 1.0 - given_up;
             // Half of the grasps that are no lifts are probed.
             let secs =
-                n_attempts * ATTEMPT_SECS + (lifted + 0.5 * (n_attempts - lifted)) * PROBE_SECS + lifted * LIFT_SECS;
+                n_attempts * ATTEMPT_SECS + (lifted + 0.5 * (n_attempts - lifted)) * SQUEEZE_SECS + lifted * LIFT_SECS;
             for n_grasps in [2, 5, 20] {
                 let (mut of_given_up, mut of_attempts, mut of_secs) = (0.0, 0.0, 0.0);
                 for _ in 0..n_runs {
                     let mut grasps = Vec::new();
-                    for object in &objects {
+                    for object in 0..480 {
                         let chance = chance(random.random());
                         grasps.extend((0..n_grasps).map(|_| {
                             let is_lifted = random.random::<f64>() < chance;
@@ -477,12 +529,14 @@ mod tests {
                                 object,
                                 fold: 0,
                                 settled,
+                                squeezed: 1.0,
                                 decided: Some(f64::from(u8::from(is_lifted))),
                                 stable: true,
                             }
                         }));
                     }
-                    let expected = expect(&grasps, 0.5, 0.5, true).expect("lifts");
+                    let with = Thresholds { promising: 0.5, promising_squeezed: 0.0, lift: 0.5 };
+                    let expected = expect(&grasps, with, Last::Squeeze).expect("lifts");
                     of_given_up += expected.given_up / f64::from(n_runs);
                     of_attempts += expected.attempts_per_lift / f64::from(n_runs);
                     of_secs += expected.secs_per_kept / f64::from(n_runs);
@@ -495,21 +549,36 @@ mod tests {
     }
 
     #[test]
+    fn a_tight_grasp_that_is_not_promising_is_worth_no_test_lift() {
+        let looks = [(0.9, 0.9, true), (0.3, 0.2, false), (0.3, 0.8, false), (0.9, 0.95, true)];
+        let grasps = looks.map(|(squeezed, decided, stable)| Attempted {
+            object: 0,
+            fold: 0,
+            settled: 0.9,
+            squeezed,
+            decided: Some(decided),
+            stable,
+        });
+        let policy = Policies::new(&grasps, Last::TestLift, 1.0).cheapest(10.0).expect("a policy");
+        assert_eq!((policy.promising_squeezed, policy.expected.kept), (0.9, 1.0), "{policy:?}");
+    }
+
+    #[test]
     fn grasps_that_count_as_stable_are_probed() {
         let grasps =
             grasps(&[("a", 0.9, 0.9, true), ("a", 0.7, 0.1, false), ("b", 0.9, 0.9, true), ("b", 0.6, 0.1, false)]);
-        let free = Policies::new(&grasps, true, 1.0).cheapest(0.0).expect("a policy");
+        let free = Policies::new(&grasps, Last::Squeeze, 1.0).cheapest(0.0).expect("a policy");
         assert_eq!(free.promising, 0.9, "the others are not worth a probe");
-        assert_eq!(Policies::new(&grasps, true, 0.65).cheapest(0.0).expect("a policy").promising, 0.65);
+        assert_eq!(Policies::new(&grasps, Last::Squeeze, 0.65).cheapest(0.0).expect("a policy").promising, 0.65);
     }
 
     #[test]
     fn trials_of_a_promise_use_each_grasp_once() {
         // One of 40 grasps is lifted, and dropped: it is among the first 20 in every second order.
-        let one = Count { n: 40.0, promising: 1.0, lifted: 1.0, kept: 0.0 };
+        let one = Count { n: 40.0, promising: 1.0, lifted: 1.0, ..Count::default() };
         assert!((one.trials(20).lifted - 0.5).abs() < 1e-12 && (one.trials(20).dropped - 0.5).abs() < 1e-12);
         // With fewer grasps than attempts a lift is certain; of two lifted ones each is the first as often.
-        let few = Count { n: 4.0, promising: 4.0, lifted: 2.0, kept: 1.0 };
+        let few = Count { n: 4.0, promising: 4.0, lifted: 2.0, kept: 1.0, ..Count::default() };
         assert_eq!(few.trials(20), ObjectTrials { lifted: 1.0, dropped: 0.5 });
         let none = Count { n: 30.0, ..Count::default() };
         assert_eq!(none.trials(20), ObjectTrials { lifted: 0.0, dropped: 0.0 });
@@ -526,7 +595,7 @@ mod tests {
             ("b", 0.9, 0.9, true),
             ("b", 0.9, 0.3, false),
         ]);
-        let policies = Policies::new(&grasps, false, 1.0);
+        let policies = Policies::new(&grasps, Last::Settled, 1.0);
         let found = policies.promise(1000.0).expect("lifts");
         // b with the threshold 0.3: a lift of three is dropped. a with 0.9 or more drops none.
         let dropped = (1.0 / 3.0) / 2.0;
