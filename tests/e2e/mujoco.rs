@@ -21,13 +21,10 @@ fn run(arguments: &[&str], exit_code: i32) -> (String, String) {
 fn the_graph_lifts_in_mujoco_and_slippery_things_are_dropped() {
     let name = unique_name();
     let flow = project().join("dataflow-live.yaml");
-    let arguments = [
-        ["trials", "--dataflow", flow.to_str().expect("UTF-8"), "--name", &name].as_slice(),
-        &["--physics", "mujoco", "--lift-policy", "always", "--trials", "4", "--json"],
-        &["--objects", "paper/candle-box@mu1,paper/candle-box@mu0.02"],
-        &["--set", "lift_arbiter.max_age_ms=600000", "--set", "source.decision_timeout_s=600"],
-    ];
-    let (out, _) = run(&arguments.concat(), 0);
+    let fixed = "trials --physics mujoco --lift-policy always --trials 4 --json --set lift_arbiter.max_age_ms=600000 \
+                 --set source.decision_timeout_s=600 --objects paper/candle-box@mu1,paper/candle-box@mu0.02";
+    let flow = ["--dataflow", flow.to_str().expect("UTF-8"), "--name", &name];
+    let (out, _) = run(&fixed.split_whitespace().chain(flow).collect::<Vec<_>>(), 0);
     assert_nothing_left(&name);
     let report: Value = serde_json::from_str(&out).expect("JSON");
     assert_eq!(report["options"]["physics"]["engine"], "mujoco", "{report}");
