@@ -288,15 +288,6 @@ struct Count {
 }
 
 impl Count {
-    fn share(&self, part: f64) -> f64 {
-        part / self.n
-    }
-
-    /// The share of trials that end with a lift, if each attempt is one of these grasps, any of them each time.
-    fn ends(&self) -> f64 {
-        1.0 - (1.0 - self.share(self.lifted)).powf(f64::from(MOST_ATTEMPTS))
-    }
-
     /// The trials of at most so many attempts if these are the grasps in random order, each once. So each share is an unbiased
     /// estimate for trials of this object, which the same grasp drawn several times would not give.
     fn trials(&self, n_attempts: u32) -> ObjectTrials {
@@ -327,30 +318,91 @@ fn counts<'a>(grasps: &[Attempted<'a>], promising: f64, lift: f64) -> BTreeMap<&
     objects
 }
 
-/// What thresholds lead to if each object's attempts are drawn from its own grasps; each object weighs the same. `None` if
-/// nothing is lifted.
+/// The chances of objects that an attempt ends with a lift, by their first two moments over all objects, each of which weighs
+/// the same. Taken as beta distributed, they say what an object does after its recorded grasps.
+struct Chances {
+    mean: f64,
+    /// Their variance as a share of the largest one with this mean: 0 if all objects are alike, 1 if an object is lifted
+    /// always or never.
+    correlation: f64,
+}
+
+impl Chances {
+    /// Both moments are unbiased for any number of grasps: the mean of the share of lifts, and that of the share of an object's
+    /// pairs of grasps that are both lifts. Without a pair, an object's next grasp is taken to end like the one before.
+    fn of(objects: &BTreeMap<&str, Count>) -> Chances {
+        let (mut lifted, mut both_lifted, mut n_with_pairs) = (0.0, 0.0, 0.0);
+        for count in objects.values() {
+            lifted += count.lifted / count.n;
+            if count.n > 1.0 {
+                both_lifted += count.lifted * (count.lifted - 1.0) / (count.n * (count.n - 1.0));
+                n_with_pairs += 1.0;
+            }
+        }
+        let mean = lifted / objects.len() as f64;
+        let square = if n_with_pairs > 0.0 { both_lifted / n_with_pairs } else { mean };
+        let most = mean - mean * mean;
+        let correlation = if most > 0.0 { ((square - mean * mean) / most).clamp(0.0, 1.0) } else { 0.0 };
+        Chances { mean, correlation }
+    }
+
+    /// The probability that an object whose `n_failed` grasps were no lifts is not lifted by the next attempt either.
+    fn fails_again(&self, n_failed: f64) -> f64 {
+        let prior = 1.0 - self.correlation;
+        (prior * (1.0 - self.mean) + self.correlation * n_failed) / (prior + self.correlation * n_failed)
+    }
+}
+
+/// A trial of an object with these grasps: the expected number of its attempts, and the probability that none of them ends
+/// with a lift. The first attempts are the grasps in random order, each once, which is unbiased as in [`Count::trials`]. Later
+/// ones are needed if none of the grasps is a lift, and follow from the chances of all objects.
+fn trial(count: &Count, chances: &Chances) -> (f64, f64) {
+    let (mut n_attempts, mut none_lifted) = (0.0, 1.0);
+    for n_failed in (0..MOST_ATTEMPTS).map(f64::from) {
+        n_attempts += none_lifted;
+        none_lifted *= if n_failed < count.n {
+            (count.n - count.lifted - n_failed).max(0.0) / (count.n - n_failed)
+        } else {
+            chances.fails_again(n_failed)
+        };
+    }
+    (n_attempts, none_lifted)
+}
+
+/// What thresholds lead to in trials of objects like these; each object weighs the same. `None` if nothing is lifted.
 fn expect(grasps: &[Attempted<'_>], promising: f64, lift: f64, has_probe: bool) -> Option<Expected> {
     let objects = counts(grasps, promising, lift);
-    let (mut lifted, mut kept, mut attempts, mut secs) = (0.0, 0.0, 0.0, 0.0);
+    let chances = Chances::of(&objects);
+    let (mut lifted, mut attempts, mut secs) = (0.0, 0.0, 0.0);
+    let (mut first_lifted, mut first_dropped) = (0.0, 0.0);
     for count in objects.values() {
-        let ends = count.ends();
-        let n_attempts = if count.lifted > 0.0 { ends / count.share(count.lifted) } else { f64::from(MOST_ATTEMPTS) };
+        let (n_attempts, none_lifted) = trial(count, &chances);
+        let ends = 1.0 - none_lifted;
+        let of_first = count.trials(MOST_ATTEMPTS);
+        first_lifted += of_first.lifted;
+        first_dropped += of_first.dropped;
         lifted += ends;
-        kept += if count.lifted > 0.0 { ends * count.kept / count.lifted } else { 0.0 };
         attempts += n_attempts;
-        let probe_secs = if has_probe { PROBE_SECS * count.share(count.promising) } else { 0.0 };
-        secs += n_attempts * (ATTEMPT_SECS + probe_secs) + LIFT_SECS * ends;
+        // The attempts before a lift are a random part of the grasps that are not lifted.
+        let share_probed = (count.promising - count.lifted) / (count.n - count.lifted).max(1.0);
+        let n_probes = if has_probe { ends + (n_attempts - ends) * share_probed } else { 0.0 };
+        secs += n_attempts * ATTEMPT_SECS + n_probes * PROBE_SECS + ends * LIFT_SECS;
     }
+    // An object that is lifted after its recorded grasps is kept as often as others.
+    let kept = if first_lifted > 0.0 { 1.0 - first_dropped / first_lifted } else { 0.0 };
     (kept > 0.0).then(|| Expected {
-        kept: kept / lifted,
+        kept,
         attempts_per_lift: attempts / lifted,
         given_up: 1.0 - lifted / objects.len() as f64,
-        secs_per_kept: secs / kept,
+        secs_per_kept: secs / (kept * lifted),
     })
 }
 
 #[cfg(test)]
 mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
     use super::*;
 
     fn grasps(of: &[(&'static str, f64, f64, bool)]) -> Vec<Attempted<'static>> {
@@ -367,7 +419,7 @@ mod tests {
 
     #[test]
     fn trials_by_hand() {
-        // Of object a every second attempt is lifted, and kept; of b every fourth, and dropped.
+        // Of object a the first or second grasp is lifted, and kept; of b any of four, and dropped.
         let grasps = grasps(&[
             ("a", 0.9, 0.9, true),
             ("a", 0.1, 0.9, false),
@@ -377,17 +429,69 @@ mod tests {
             ("b", 0.9, 0.2, false),
         ]);
         let expected = expect(&grasps, 0.5, 0.5, true).expect("lifts");
-        let ends = [1.0 - 0.5_f64.powi(20), 1.0 - 0.75_f64.powi(20)];
-        assert!((expected.kept - ends[0] / (ends[0] + ends[1])).abs() < 1e-12);
-        assert!((expected.attempts_per_lift - (ends[0] * 2.0 + ends[1] * 4.0) / (ends[0] + ends[1])).abs() < 1e-12);
-        assert!((expected.given_up - (1.0 - (ends[0] + ends[1]) / 2.0)).abs() < 1e-12);
-        // A higher threshold never lifts b, and keeps each object that it lifts. It is worth the time if drops cost some.
-        let policies = Policies::new(&grasps, true, 1.0);
-        let policy = policies.cheapest(1000.0).expect("a policy");
-        assert!(policy.lift > 0.8 && policy.expected.kept == 1.0, "{policy:?}");
-        let free = policies.cheapest(0.0).expect("a policy");
-        assert!(free.expected.kept < 1.0 && free.expected.secs_per_kept < policy.expected.secs_per_kept, "{free:?}");
+        // In random order, the lift is number 1.5 and 2.5 in the mean. A probe comes before each lift, and in all grasps of b.
+        let secs = (1.5 + 2.5) * ATTEMPT_SECS + (1.0 + 2.5) * PROBE_SECS + 2.0 * LIFT_SECS;
+        assert_eq!((expected.kept, expected.attempts_per_lift, expected.given_up), (0.5, 2.0, 0.0));
+        assert!((expected.secs_per_kept - secs).abs() < 1e-12, "{expected:?}");
+        // A higher threshold lifts none of b's grasps, and keeps each object that it lifts. As both shares of lifts, 1/2 and 0,
+        // vary less than chance makes them, b has the mean of the two from its fifth attempt on.
+        let strict = expect(&grasps, 0.5, 0.85, true).expect("lifts");
+        assert_eq!(strict.kept, 1.0);
+        assert!((strict.given_up - 0.75_f64.powi(16) / 2.0).abs() < 1e-12, "{strict:?}");
         assert_eq!(expect(&grasps, 0.5, 1.0, true), None);
+    }
+
+    #[test]
+    fn drops_that_cost_more_are_worth_more_attempts() {
+        let grasps =
+            grasps(&[("a", 0.9, 0.9, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, false)]);
+        let policies = Policies::new(&grasps, true, 1.0);
+        let chosen = |drop_secs| policies.cheapest(drop_secs).map(|policy| (policy.lift, policy.expected.kept));
+        assert_eq!((chosen(0.0), chosen(1000.0)), (Some((0.3, 0.75)), Some((0.9, 1.0))));
+    }
+
+    #[test]
+    fn what_is_expected_is_what_happens_however_few_grasps_an_object_has() {
+        let mut random = ChaCha8Rng::seed_from_u64(5);
+        let n_runs = 200;
+        let objects: Vec<String> = (0..480).map(|idx| idx.to_string()).collect();
+        // Chances that are beta distributed; with a or b = 1 they are a root of a uniform number.
+        for (a, b) in [(1.0, 3.0), (0.4, 1.0)] {
+            let chance = |uniform: f64| if a == 1.0 { 1.0 - uniform.powf(1.0 / b) } else { uniform.powf(1.0 / a) };
+            let none_lifted = |n: u32| (0..n).map(f64::from).map(|k| (b + k) / (a + b + k)).product::<f64>();
+            let (given_up, n_attempts) = (none_lifted(MOST_ATTEMPTS), (0..MOST_ATTEMPTS).map(none_lifted).sum::<f64>());
+            let lifted = 1.0 - given_up;
+            // Half of the grasps that are no lifts are probed.
+            let secs =
+                n_attempts * ATTEMPT_SECS + (lifted + 0.5 * (n_attempts - lifted)) * PROBE_SECS + lifted * LIFT_SECS;
+            for n_grasps in [2, 5, 20] {
+                let (mut of_given_up, mut of_attempts, mut of_secs) = (0.0, 0.0, 0.0);
+                for _ in 0..n_runs {
+                    let mut grasps = Vec::new();
+                    for object in &objects {
+                        let chance = chance(random.random());
+                        grasps.extend((0..n_grasps).map(|_| {
+                            let is_lifted = random.random::<f64>() < chance;
+                            let settled = if is_lifted { 1.0 } else { random.random() };
+                            Attempted {
+                                object,
+                                fold: 0,
+                                settled,
+                                decided: Some(f64::from(u8::from(is_lifted))),
+                                stable: true,
+                            }
+                        }));
+                    }
+                    let expected = expect(&grasps, 0.5, 0.5, true).expect("lifts");
+                    of_given_up += expected.given_up / f64::from(n_runs);
+                    of_attempts += expected.attempts_per_lift / f64::from(n_runs);
+                    of_secs += expected.secs_per_kept / f64::from(n_runs);
+                }
+                assert!((of_given_up - given_up).abs() < 0.01, "{n_grasps} grasps: {of_given_up} for {given_up}");
+                assert!((of_attempts * lifted / n_attempts - 1.0).abs() < 0.03, "{n_grasps} grasps: {of_attempts}");
+                assert!((of_secs * lifted / secs - 1.0).abs() < 0.03, "{n_grasps} grasps: {of_secs} s");
+            }
+        }
     }
 
     #[test]
