@@ -11,8 +11,8 @@
 //!
 //! A wrong "stable" drops the object. So there is one path to LIFT, an `Ok(Vote::Stable)` of `OpenGrasp::assess`, and every
 //! other path ends in HOLD with its reason. With the option `probe`, settled predictions that are not unstable ask for a
-//! squeeze, and those of the tight hand for a test lift. A probe decides nothing: the grasp stays open, and only the frames
-//! after the last probe can lead to a LIFT. If the
+//! probe, which decides nothing: the grasp stays open, and only the frames after the probe can lead to a LIFT. Before a
+//! test lift, the frames of the tight hand may end the grasp with HOLD. If the
 //! outcomes of lifts refute [`ArbiterOptions::promised_drops`], every later grasp is held.
 
 use serde::{Deserialize, Serialize};
@@ -53,12 +53,12 @@ pub enum Probe {
 }
 
 impl Probe {
-    /// What a promising grasp is asked for after frames of this phase, and the phase of the frames that vote then.
-    fn asked(self, awaited: Phase) -> Option<(Action, Phase)> {
-        match (self, awaited) {
-            (Probe::Squeeze | Probe::TestLift, Phase::Settled) => Some((Action::Squeeze, Phase::Squeezed)),
-            (Probe::TestLift, Phase::Squeezed) => Some((Action::TestLift, Phase::TestLifted)),
-            _ => None,
+    /// The action that asks for it, and the phase of the frames that decide then.
+    fn asked(self) -> Option<(Action, Phase)> {
+        match self {
+            Probe::None => None,
+            Probe::Squeeze => Some((Action::Squeeze, Phase::Squeezed)),
+            Probe::TestLift => Some((Action::TestLift, Phase::TestLifted)),
         }
     }
 }
@@ -131,6 +131,8 @@ struct OpenGrasp {
     awaited: Phase,
     /// Whether a probe has been asked for of which no frame has come.
     is_probe_pending: bool,
+    /// Whether its last frame was of a tight hand that has a test lift before it.
+    is_before_test_lift: bool,
     /// Who has made the agreeing predictions: [`Header::made_by`].
     made_by: u64,
     /// The latest consecutive settled predictions that agree: their vote, their number, their lowest probability.
@@ -139,14 +141,25 @@ struct OpenGrasp {
 
 impl OpenGrasp {
     /// The vote of a settled prediction, or the reason why the grasp cannot be lifted any more.
-    fn assess(&self, prediction: &Prediction, options: &ArbiterOptions) -> Result<Vote, Reason> {
+    fn assess(
+        &self,
+        prediction: &Prediction,
+        is_before_test_lift: bool,
+        options: &ArbiterOptions,
+    ) -> Result<Vote, Reason> {
         match self.doubt {
             Some(reason) => Err(reason),
-            None if options.probe.asked(self.awaited).is_some() && (prediction.stable || prediction.unsure) => {
-                Ok(Vote::Promising)
+            None => {
+                let decides = !is_before_test_lift && self.asks_for(options).is_none();
+                let is_promising = prediction.stable || prediction.unsure;
+                Ok(if is_promising && !decides { Vote::Promising } else { Vote::of(prediction, options) })
             }
-            None => Ok(Vote::of(prediction, options)),
         }
+    }
+
+    /// The probe that a promising grasp is asked for, if it has not been.
+    fn asks_for(&self, options: &ArbiterOptions) -> Option<(Action, Phase)> {
+        if self.awaited == Phase::Settled { options.probe.asked() } else { None }
     }
 
     /// Adds a vote, and returns the number of consecutive equal votes of the same operators and their lowest probability.
@@ -276,6 +289,10 @@ impl LiftArbiter {
         let votes = prediction.phase == open.awaited;
         let has_begun = Phase::Settled.is_before(prediction.phase) && !prediction.phase.is_over();
         open.is_probe_pending &= !has_begun;
+        let is_before_test_lift = open.awaited == Phase::TestLifted
+            && (prediction.phase == Phase::Squeezed || prediction.phase == Phase::Ended && open.is_before_test_lift);
+        open.is_before_test_lift = is_before_test_lift;
+        let votes = votes || is_before_test_lift && prediction.phase == Phase::Squeezed;
         let invalid = (!is_valid).then_some(Reason::Invalid);
         let stale = (age_nanos > options.max_age_nanos).then_some(Reason::Stale);
         let faulty = reason_of(prediction.fault, votes);
@@ -283,7 +300,7 @@ impl LiftArbiter {
         match prediction.phase {
             _ if votes => {
                 open.n_settled += 1;
-                match open.assess(prediction, &options) {
+                match open.assess(prediction, is_before_test_lift, &options) {
                     Err(reason) => decisions.extend(self.decide(Action::Hold, reason, 0.0)),
                     // It has no vote, but if it contradicts the votes, they don't count either.
                     Ok(vote) if !is_new_reading => {
@@ -295,7 +312,7 @@ impl LiftArbiter {
                         if n_agreeing >= options.votes.max(1) {
                             let reason = vote.reason();
                             if vote == Vote::Promising {
-                                if let Some((action, awaited)) = options.probe.asked(open.awaited) {
+                                if let Some((action, awaited)) = open.asks_for(&options) {
                                     (open.awaited, open.agreeing, open.is_probe_pending) = (awaited, None, true);
                                     let (grasp_id, probability_stable) = (open.grasp_id, lowest);
                                     decisions.push(LiftDecision { grasp_id, action, reason, probability_stable });
@@ -310,6 +327,13 @@ impl LiftArbiter {
             }
             // The source did not know yet that a probe was asked for.
             Phase::Ended if open.is_probe_pending => {}
+            // A source that waits for an answer before the test lift is told to go on; others do.
+            Phase::Ended if is_before_test_lift && open.doubt.is_none() => {
+                let (grasp_id, action, reason) = (open.grasp_id, Action::TestLift, Reason::Promising);
+                (open.is_before_test_lift, open.is_probe_pending) = (false, true);
+                let probability_stable = open.agreeing.map_or(0.0, |(.., lowest)| lowest);
+                decisions.push(LiftDecision { grasp_id, action, reason, probability_stable });
+            }
             // If its outcome comes, the robot has lifted although the grasp was not decided.
             Phase::Ended | Phase::Kept | Phase::Dropped => {
                 let reason = open.reason_at_end();
@@ -380,6 +404,7 @@ impl LiftArbiter {
                 n_settled: 0,
                 awaited: Phase::Settled,
                 is_probe_pending: false,
+                is_before_test_lift: false,
                 made_by: 0,
                 agreeing: None,
             }
@@ -1011,42 +1036,54 @@ mod tests {
         // Stable and unsure both are worth a probe. The source says that it has ended before it hears of it.
         s.push(settled(0.9)).push(Prediction { unsure: true, ..settled(0.4) }).push(settled(0.9));
         s.push(of(Phase::Ended, 0.9));
-        assert_eq!(last_asked(&mut s), [(Action::Squeeze, Reason::Promising)]);
+        assert_eq!(last_asked(&mut s), [(Action::TestLift, Reason::Promising)]);
         let squeeze = |s: &mut Stream, probability| {
             s.push(of(Phase::Squeezing, 0.9));
             (0..3).for_each(|_| _ = s.push(of(Phase::Squeezed, probability)));
         };
+        let lifted = |s: &mut Stream| {
+            s.push(of(Phase::TestLifting, 0.1));
+            (0..3).for_each(|_| _ = s.push(of(Phase::TestLifted, 0.9)));
+        };
         squeeze(&mut s, 0.9);
-        s.push(of(Phase::Ended, 0.9));
-        assert_eq!(last_asked(&mut s), [(Action::TestLift, Reason::Promising)]);
-        s.push(of(Phase::TestLifting, 0.1));
-        s.push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9));
+        lifted(&mut s);
         assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
-        // No probe is asked for if the grasp is unstable, settled or squeezed. After the probe, `ended` ends the grasp. A hand
-        // that closes again needs another probe. One that makes the test lift before it is asked for has not been judged.
-        let mut s = probing();
-        s.push(settled(0.1)).push(settled(0.1)).push(settled(0.1));
-        assert_eq!(s.end(), [(0, Action::Hold, Reason::Unstable)]);
         let squeezed = |probability| {
             let mut s = probing();
             s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
             squeeze(&mut s, probability);
             s
         };
-        assert_eq!(squeezed(0.1).end()[1..], [(0, Action::Hold, Reason::Unstable)]);
+        // A source that waits before the test lift is told to go on, once for each time that it asks.
+        let mut s = squeezed(0.9);
+        s.push(of(Phase::Ended, 0.9));
+        assert_eq!(last_asked(&mut s), [(Action::TestLift, Reason::Promising); 2]);
+        lifted(&mut s);
+        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
+        // A tight hand that is not promising ends the grasp, whether the source waits or not; a faulty one at once.
+        let mut s = squeezed(0.1);
+        s.push(of(Phase::Ended, 0.1));
+        lifted(&mut s);
+        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::Unstable)]);
+        let mut s = probing();
+        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9)).push(of(Phase::Squeezing, 0.9));
+        s.push(Prediction { fault: Fault::NoContact, ..of(Phase::Squeezed, 0.0) });
+        lifted(&mut s);
+        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::NoContact)]);
+        // No probe is asked for if the grasp is unstable. After the probe, `ended` ends the grasp. A hand that closes again
+        // needs another probe.
+        let mut s = probing();
+        s.push(settled(0.1)).push(settled(0.1)).push(settled(0.1));
+        assert_eq!(s.end(), [(0, Action::Hold, Reason::Unstable)]);
         let mut s = squeezed(0.9);
         s.push(of(Phase::TestLifted, 0.9)).push(of(Phase::Ended, 0.9));
-        assert_eq!(s.end()[2..], [(0, Action::Hold, Reason::NoAgreement)]);
+        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::NoAgreement)]);
         let mut s = squeezed(0.9);
         s.push(of(Phase::Closing, 0.9));
         s.push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9));
-        assert_eq!(s.end()[2..], [(0, Action::Hold, Reason::NoAgreement)]);
+        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::NoAgreement)]);
         let mut s = squeezed(0.9);
         s.push(Prediction { fault: Fault::MissingReading, ..of(Phase::TestLifted, 0.0) });
-        assert_eq!(s.end()[2..], [(0, Action::Hold, Reason::MissingReading)]);
-        let mut s = probing();
-        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
-        (0..3).for_each(|_| _ = s.push(of(Phase::TestLifted, 0.9)));
-        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::NoAgreement)]);
+        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::MissingReading)]);
     }
 }

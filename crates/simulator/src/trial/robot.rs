@@ -160,16 +160,19 @@ impl<'a> Robot<'a> {
     pub fn decide(&mut self, action: Action) {
         match std::mem::replace(&mut self.state, State::Between) {
             State::Deciding(mut grasp) if probe_of(action).is_some() && !self.options.lifts_always => {
-                // No probe is made twice, and none after a test lift: in doubt it lets go.
-                match probe_of(action) {
-                    Some(probe)
-                        if grasp.probes.is_empty()
-                            || grasp.probes == [ProbeMove::Squeeze] && probe == ProbeMove::TestLift =>
-                    {
+                // A test lift follows a squeeze, after which the robot waits for the answer whether to go on. No probe is made
+                // twice: in doubt it lets go.
+                let next = match (&grasp.probes[..], probe_of(action)) {
+                    ([], Some(_)) => Some(ProbeMove::Squeeze),
+                    ([ProbeMove::Squeeze], Some(ProbeMove::TestLift)) => Some(ProbeMove::TestLift),
+                    _ => None,
+                };
+                match next {
+                    Some(probe) => {
                         grasp.begin_probe(probe);
                         self.state = State::Feeling(grasp);
                     }
-                    _ => self.finish(*grasp, false),
+                    None => self.finish(*grasp, false),
                 }
             }
             State::Deciding(grasp) => {
@@ -443,14 +446,10 @@ mod tests {
         };
         let mut first = robot();
         let mut asked = Vec::new();
-        // The first attempt is held after its probe. The second one makes both, and a third probe is a hold.
+        // The first attempt is held when it is tight. The second one makes its test lift, and a third probe is a hold.
         let (frames, finished) = run(&mut first, |grasp_id, n_before| {
             asked.push((grasp_id, n_before));
-            match (grasp_id, n_before) {
-                (0, 1) => Action::Hold,
-                (1, 0) => Action::Squeeze,
-                _ => Action::TestLift,
-            }
+            if (grasp_id, n_before) == (0, 1) { Action::Hold } else { Action::TestLift }
         });
         assert_eq!(asked, [(0, 0), (0, 1), (1, 0), (1, 1), (1, 2)]);
         assert!(finished.iter().all(|finished| finished.outcome.probed && !finished.outcome.lifted));
