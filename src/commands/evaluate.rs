@@ -20,7 +20,7 @@ use blindgrasp_learning::training::{Example, Examples, Relabelling};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::hand::Hand;
-use blindgrasp_stages::lift_arbiter::ArbiterOptions;
+use blindgrasp_stages::lift_arbiter::{ArbiterOptions, Probe};
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::Recipe;
 
@@ -31,6 +31,7 @@ use blindgrasp_stages::recipe::Recipe;
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                         blindgrasp evaluate models/barrett-bh8-280.json recordings/held-out.mcap\n  \
+                        blindgrasp evaluate gate.json lifts --probe test_lift         the decisions after a test lift\n  \
                         blindgrasp evaluate data/paper --split object --folds 5 --report report.html\n  \
                         blindgrasp evaluate data/paper --split class --recipe boosted,paper,raw --json\n\n\
                         Positive means lifted: a false positive is an object dropped.")]
@@ -38,6 +39,9 @@ pub(super) struct Arguments {
     /// A model (its name ends in .json) and recordings (MCAP), or folders of them; with --split, recordings only.
     #[arg(required = true, value_name = "[MODEL] RECORDING")]
     inputs: Vec<PathBuf>,
+    /// The probe after which the model's arbiter decides: none, squeeze or test_lift; the recordings need its frames.
+    #[arg(long, default_value = "none", value_parser = probe, conflicts_with = "split")]
+    probe: Probe,
     /// Train recipes on a part of the grasps and judge the rest, by folds that share no grasp, object or class.
     #[arg(long, value_parser = ["grasp", "object", "class"])]
     split: Option<String>,
@@ -114,6 +118,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
 }
 
+fn probe(text: &str) -> Result<Probe, String> {
+    serde_json::from_value(text.into()).map_err(|_| "expected none, squeeze or test_lift".into())
+}
+
 /// The inputs that models and recipes have in common.
 struct Job<'a> {
     arguments: &'a Arguments,
@@ -124,7 +132,8 @@ struct Job<'a> {
 
 impl Job<'_> {
     fn model(self, path: &Path, model: &Model) -> anyhow::Result<Outcome> {
-        let evaluated = evaluate(self.hand, model, self.recordings, &ArbiterOptions::default())?;
+        let options = ArbiterOptions { probe: self.arguments.probe, ..ArbiterOptions::default() };
+        let evaluated = evaluate(self.hand, model, self.recordings, &options)?;
         let is_table = !self.arguments.json;
         if is_table {
             print_scores(&evaluated)?;

@@ -512,11 +512,18 @@ mod tests {
     use crate::trial::draw_start;
     use crate::trial::targets::targets_named;
 
+    /// On a post, where the hand finds room around it.
+    fn on_a_post() -> TrialOptions {
+        let mut options = TrialOptions::default();
+        options.physics.stand_radius_m = 0.04;
+        options
+    }
+
     /// The result of lifting a cup with this friction, and the last snapshot.
     fn lifted(friction: f64) -> (LiftResult, Snapshot) {
         let hand = Hand::load(std::path::Path::new("barrett-bh8-280")).expect("built in");
         let targets = targets_named(&format!("paper/pencil-cup@mu{friction}")).expect("a cup");
-        let options = TrialOptions::default();
+        let options = on_a_post();
         let start = draw_start(&hand, &targets[0], &options, 3, 0, 0).expect("a start");
         let mut attempt = Attempt::begin(&hand, &targets[0], &options, &start, 0).expect("an attempt");
         while attempt.next_frame(0).is_some() {}
@@ -538,7 +545,7 @@ mod tests {
     fn a_test_lift_lets_the_weight_arrive_and_the_lift_goes_on_from_there() {
         let hand = Hand::load(std::path::Path::new("barrett-bh8-280")).expect("built in");
         let targets = targets_named("paper/pencil-cup@mu1").expect("a cup");
-        let options = TrialOptions::default();
+        let options = on_a_post();
         let start = draw_start(&hand, &targets[0], &options, 3, 0, 0).expect("a start");
         let closed = || {
             let mut attempt = Attempt::begin(&hand, &targets[0], &options, &start, 0).expect("an attempt");

@@ -12,6 +12,7 @@ number, the target is -1, the stand and the ground are -2.
 
 import hashlib
 import json
+import math
 import os
 import pathlib
 import sys
@@ -85,9 +86,9 @@ class Attempt:
                     name=f"target{idx}", type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"part{idx}", **mesh["geom"]
                 )
         self.model = spec.compile()
+        self.most_secs = step_secs
         self.data = mujoco.MjData(self.model)
         self.n_axles = n_axles
-        self.step_secs = step_secs
         self.velocity = np.zeros(3)
         self.target = self.model.body("target").id
         names = [self.model.geom(idx).name for idx in range(self.model.ngeom)]
@@ -118,11 +119,13 @@ class Attempt:
         wanted = np.asarray(velocity)
         if jumps:
             self.velocity = wanted
-        n_steps = max(1, round(secs / self.step_secs))
+        # Whole steps that fill the time, none of them longer than asked for.
+        n_steps = math.ceil(secs / self.most_secs - 1e-9)
+        model.opt.timestep = secs / n_steps
         change = (wanted - self.velocity) / n_steps
         for _ in range(n_steps):
             data.qvel[:3] = self.velocity
-            data.qfrc_applied[:3] = change * (PALM_KG / self.step_secs)
+            data.qfrc_applied[:3] = change * (PALM_KG / model.opt.timestep)
             self.velocity = self.velocity + change
             mujoco.mj_step(model, data)
         if not np.isfinite(data.qpos).all() or data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:

@@ -181,7 +181,7 @@ pub enum PhysicsEngine {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MujocoOptions {
-    /// Its time step. 2 ms.
+    /// Its longest time step. 2.5 ms.
     pub step_secs: f64,
     /// How much harder contacts resist slipping than pressing. 10.
     pub impratio: f64,

@@ -445,7 +445,8 @@ mod tests {
         for friction in [0.3_f64, 0.5] {
             let critical_rad = friction.atan();
             let slid_m = |slope_rad: f64| {
-                let options = PhysicsOptions { stand_friction: friction, ..PhysicsOptions::default() };
+                let options =
+                    PhysicsOptions { stand_friction: friction, stand_radius_m: 0.04, ..PhysicsOptions::default() };
                 let mut world = standing(&cube(1.0, Made::Box), &options);
                 run(&mut world, 0.2);
                 // Tilted slowly, so that nothing swings.
