@@ -181,7 +181,7 @@ pub enum PhysicsEngine {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MujocoOptions {
-    /// Its longest time step. 2.5 ms.
+    /// Its longest time step. 2 ms: three steps fill the 5 ms between two commands.
     pub step_secs: f64,
     /// How much harder contacts resist slipping than pressing. 10.
     pub impratio: f64,
