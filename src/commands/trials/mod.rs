@@ -136,7 +136,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(friction) = setup.friction {
         targets.iter_mut().for_each(|target| target.friction = friction);
     }
-    check_approaches(&setup.hand, &targets, &setup.options, arguments.seed, arguments.trials)?;
+    let left_out = check_approaches(&setup.hand, &targets, &setup.options, arguments.seed, arguments.trials)?;
+    if !left_out.is_empty() {
+        print_diagnostic(&format!(
+            "warning: left out, because no approach leads the open hand to them without touching the table before: {}",
+            left_out.join(", ")
+        ));
+    }
     // It also ends the work after the graph.
     let n_stops = stop_requests()?;
     let mut report = empty_report(arguments, &setup);

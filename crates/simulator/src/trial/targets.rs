@@ -93,24 +93,33 @@ pub fn target_of_trial(targets: &[LiftTarget], trial: u64) -> Option<&LiftTarget
     if n == 0 { None } else { targets.get((trial % n) as usize) }
 }
 
-/// Looks for an approach to each target, as the first attempt at it begins: targets without an approach are known before
-/// the first of `n_trials` trials.
+/// Looks for an approach to each target, as the first attempt at it begins: the names of targets without one are known before
+/// the first of `n_trials` trials, which are left out. Flat things on a table are such.
 ///
 /// # Errors
-/// The first target without an approach, or a hand that cannot be simulated.
+/// No target has an approach, or a hand that cannot be simulated.
 pub fn check_approaches(
     hand: &Hand,
     targets: &[LiftTarget],
     options: &TrialOptions,
     seed: u64,
     n_trials: u64,
-) -> Result<(), TrialError> {
+) -> Result<Vec<String>, TrialError> {
     let n_tried = usize::try_from(n_trials).unwrap_or(usize::MAX).min(targets.len());
-    let refused = targets[..n_tried]
+    let refused: Vec<TrialError> = targets[..n_tried]
         .par_iter()
         .enumerate()
-        .find_map_first(|(trial, target)| draw_start(hand, target, options, seed, trial as u64, 0).err());
-    refused.map_or(Ok(()), Err)
+        .filter_map(|(trial, target)| draw_start(hand, target, options, seed, trial as u64, 0).err())
+        .collect();
+    let is_all = refused.len() == n_tried;
+    let mut left_out = Vec::new();
+    for error in refused {
+        match error {
+            TrialError::NoApproach { target, .. } if !is_all => left_out.push(target),
+            error => return Err(error),
+        }
+    }
+    Ok(left_out)
 }
 
 /// The number of the paper's ten lifts of this target that were kept; `None` for a target that the paper did not try.
