@@ -101,6 +101,11 @@ struct State {
     velocity: [f64; 3],
 }
 
+/// A force between two bodies: the pressed shape of the hand, or -1 for the target; the other side, -2 for the stand; the
+/// point, the normal out of the other side, newtons.
+#[derive(Debug, Clone, Copy, Deserialize)]
+struct Force(i64, i64, [f64; 3], [f64; 3], f64);
+
 /// MuJoCo with a hand, a stand and a target.
 pub(super) struct Mujoco {
     /// `None` once it has failed.
@@ -167,13 +172,10 @@ impl Mujoco {
         }
     }
 
-    /// Each force between two bodies: the pressed shape of the hand, or -1 for the target, the other side, and where.
-    fn forces(&self) -> Vec<(i64, i64, Point3<f64>, Vector3<f64>, f64)> {
-        type Row = (i64, i64, [f64; 3], [f64; 3], f64);
+    /// The forces between two bodies.
+    fn forces(&self) -> Vec<Force> {
         let answer = self.ask(&json!({"touches": {}}));
-        let rows: Vec<Row> = answer.and_then(|answer| serde_json::from_value(answer).ok()).unwrap_or_default();
-        let force = |(own, other, point, normal, newtons): Row| (own, other, point.into(), normal.into(), newtons);
-        rows.into_iter().map(force).collect()
+        answer.and_then(|answer| serde_json::from_value(answer).ok()).unwrap_or_default()
     }
 }
 
@@ -243,7 +245,7 @@ impl Engine for Mujoco {
     }
 
     fn touches(&self) -> Vec<Touch> {
-        let touch = |(own, other, point_m, outward, newtons): (i64, i64, Point3<f64>, Vector3<f64>, f64)| {
+        let touch = |Force(own, other, point_m, outward, newtons)| {
             let shape = |idx: i64| {
                 let idx = usize::try_from(idx).ok()?;
                 Some((*self.links.get(idx)?, idx))
@@ -254,15 +256,20 @@ impl Engine for Mujoco {
                 -2 => Side::Stand,
                 other => shape(other).map(|(link_idx, shape_idx)| Side::Hand { link_idx, shape_idx })?,
             };
-            let outward = UnitVector3::new_normalize(outward);
+            let (point_m, outward) = (point_m.into(), UnitVector3::new_normalize(outward.into()));
             Some(Touch { link_idx, shape_idx, side, point_m, outward, newtons })
         };
         self.forces().into_iter().filter_map(touch).collect()
     }
 
     fn stand_forces(&self) -> Vec<StandForce> {
-        let of_stand = self.forces().into_iter().filter(|(own, other, ..)| (*own, *other) == (-1, -2));
-        of_stand.map(|(.., point_m, onto_target, newtons)| StandForce { point_m, onto_target, newtons }).collect()
+        let of_stand = self.forces().into_iter().filter(|Force(own, other, ..)| (*own, *other) == (-1, -2));
+        let force = |Force(_, _, point_m, onto_target, newtons)| StandForce {
+            point_m: point_m.into(),
+            onto_target: onto_target.into(),
+            newtons,
+        };
+        of_stand.map(force).collect()
     }
 
     fn gravity_in_palm(&self) -> Vector3<f64> {

@@ -62,7 +62,6 @@ pub struct Robot<'a> {
     state: State<'a>,
 }
 
-#[expect(clippy::large_enum_variant, reason = "a process has one state")]
 enum State<'a> {
     /// Between two attempts.
     Between,
