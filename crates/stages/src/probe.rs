@@ -48,7 +48,7 @@ pub fn n_values(features: &FeatureExtractor) -> usize {
 /// Values of a [`Track`] for each signal.
 const N_TRACK_VALUES: usize = 4;
 
-/// Values of each signal that do not change if all cells read the same factor more: see [`shares`].
+/// Values of each signal that do not change if all cells read the same factor more: see `shares`.
 const N_SHARES: usize = 4;
 
 /// Where the signals that are followed while the hand moves stand among a feature's values: the load of each pad, and the
@@ -149,7 +149,7 @@ impl GraspHistory {
 
     /// Writes the values from which a frame of the grasp is judged: the feature of the phase before, the frame's own, how it
     /// differs, and of each signal while the hand moved in between its greatest and least value, the sum of its steps and
-    /// the greatest one, and its [`shares`].
+    /// the greatest one, and its values relative to the grip.
     ///
     /// # Errors
     /// The fault of the phase before; [`Fault::MissingReading`] if no frame of it came, or the hand has not been seen to move.
