@@ -190,8 +190,6 @@ pub struct LiftOptions {
     pub gear_factor: [f64; 2],
     /// Share of the lifts in which contacts creep, with MuJoCo. 0.
     pub creep_share: f64,
-    /// Whether hands that touch nothing once they have closed count as drops; they are left out otherwise.
-    pub keeps_empty: bool,
     /// Height of the test lift. As in trials.
     pub test_lift_m: f64,
     /// Amplitude of the shake after it; 0: none. As in trials.
@@ -218,7 +216,6 @@ impl Default for LiftOptions {
             contact_factor: [1.0; 2],
             gear_factor: [1.0; 2],
             creep_share: 0.0,
-            keeps_empty: true,
             test_lift_m: TrialProtocol::default().test_lift_m,
             test_shake_m: TrialProtocol::default().test_shake_m,
             step_secs: PhysicsOptions::default().step_secs,

@@ -338,7 +338,7 @@ fn choose_policies(
     let [squeezed, test_lifted] = learned else {
         return Err(TrainingError::Data(format!("{} looks after a probe, expected two", learned.len())));
     };
-    let policies = |last: Last, learned: [&Option<probes::Learned>; 2], settled_threshold: f64| {
+    let policies = |last: Last, learned: [&Option<probes::Learned>; 2], stable_from: [f64; 2]| {
         let probability = |learned: &Option<probes::Learned>, idx: usize| learned.as_ref()?.probabilities[idx];
         let attempts = examples.iter().zip(&settled).enumerate();
         let attempted = attempts.map(|(idx, (example, settled))| probes::Attempted {
@@ -354,7 +354,7 @@ fn choose_policies(
             },
             stable: example.stable,
         });
-        probes::Policies::new(&attempted.collect::<Vec<_>>(), last, settled_threshold)
+        probes::Policies::new(&attempted.collect::<Vec<_>>(), last, stable_from)
     };
     let summary = |look: &str, roc_area: f64, (policy, drop_secs, promise): &Chosen| PolicySummary {
         roc_area,
@@ -367,7 +367,7 @@ fn choose_policies(
         promise: if promises { *promise } else { None },
     };
     let (mut summaries, mut refusals) = (Vec::new(), Vec::new());
-    match aim.choose(&policies(Last::Settled, [squeezed, test_lifted], NEVER), "settled") {
+    match aim.choose(&policies(Last::Settled, [squeezed, test_lifted], [NEVER; 2]), "settled") {
         Ok(without) => {
             classifier.threshold_probability = without.0.lift;
             let stable: Vec<bool> = examples.iter().map(|example| example.stable).collect();
@@ -381,17 +381,21 @@ fn choose_policies(
     }
     classifier.unsure_from_probability = classifier.threshold_probability;
     let settled_threshold = classifier.threshold_probability;
-    let chosen =
-        [(Last::Squeeze, "squeezed", squeezed.is_some()), (Last::TestLift, "test_lifted", test_lifted.is_some())].map(
-            |(last, look, is_learned)| {
-                is_learned.then(|| aim.choose(&policies(last, [squeezed, test_lifted], settled_threshold), look))
-            },
-        );
+    let choose = |last: Last, look: &str, squeezed_threshold: f64| {
+        let stable_from = [settled_threshold, squeezed_threshold];
+        aim.choose(&policies(last, [squeezed, test_lifted], stable_from), look)
+    };
+    let of_squeeze = squeezed.is_some().then(|| choose(Last::Squeeze, "squeezed", NEVER));
+    // With a promise, a tight hand is not lifted before its test lift, so that no threshold of its own lets it go on.
+    let squeezed_threshold = match (&of_squeeze, aim) {
+        (Some(Ok(chosen)), Aim::DropSecs(_)) => chosen.0.lift,
+        _ => NEVER,
+    };
+    let of_test_lift = test_lifted.is_some().then(|| choose(Last::TestLift, "test_lifted", squeezed_threshold));
     for learned in [&mut *squeezed, &mut *test_lifted].into_iter().flatten() {
         let probe = &mut learned.probe.classifier;
         (probe.threshold_probability, probe.unsure_from_probability) = (NEVER, NEVER);
     }
-    let [of_squeeze, of_test_lift] = chosen;
     let has_test_lift = matches!(of_test_lift, Some(Ok(_)));
     if let (Some(learned), Some(chosen)) = (&mut *squeezed, of_squeeze) {
         match chosen {
@@ -417,7 +421,8 @@ fn choose_policies(
                 (probe.threshold_probability, probe.unsure_from_probability) = (policy.lift, policy.lift);
                 classifier.unsure_from_probability = policy.promising;
                 let before = &mut before.probe.classifier;
-                before.unsure_from_probability = policy.promising_squeezed.clamp(0.0, before.threshold_probability);
+                // A tight hand without a feature counts as -1 above.
+                before.unsure_from_probability = policy.promising_squeezed.max(0.0);
                 summaries.push(summary("test_lifted", learned.probe.cross_validated_roc_area, &chosen));
             }
             Err(refusal) => refusals.push(refusal),

@@ -223,9 +223,9 @@ pub(super) struct Policies {
 
 impl Policies {
     /// Without a probe, `decided` is `settled`, and no grasp is given up before. With one, no grasp is given up from
-    /// `settled_threshold` on: it counts as stable before the probe.
-    pub(super) fn new(grasps: &[Attempted], last: Last, settled_threshold: f64) -> Policies {
-        let policies = |grasps: &[Attempted]| policies(grasps, last, settled_threshold);
+    /// the first of `stable_from` on when it has settled, and from the second on when it is tight: it counts as stable there.
+    pub(super) fn new(grasps: &[Attempted], last: Last, stable_from: [f64; 2]) -> Policies {
+        let policies = |grasps: &[Attempted]| policies(grasps, last, stable_from);
         let all = Thresholds { promising: 0.0, promising_squeezed: 0.0, lift: 0.0 };
         let mut n_grasps: Vec<u32> = counts(grasps, all).iter().map(|count| count.n as u32).collect();
         n_grasps.sort_unstable();
@@ -280,9 +280,9 @@ impl Policy {
     }
 }
 
-/// The policies among which one is chosen: quantiles of the probabilities as thresholds. With a probe, all grasps from
-/// `settled_threshold` on are probed.
-fn policies(grasps: &[Attempted], last: Last, settled_threshold: f64) -> Vec<Policy> {
+/// The policies among which one is chosen: quantiles of the probabilities as thresholds. All grasps from
+/// `stable_from` on go on, settled and tight.
+fn policies(grasps: &[Attempted], last: Last, [settled_from, squeezed_from]: [f64; 2]) -> Vec<Policy> {
     let quantiles = |mut values: Vec<f64>, n: usize| -> Vec<f64> {
         values.sort_by(f64::total_cmp);
         values.dedup();
@@ -293,10 +293,10 @@ fn policies(grasps: &[Attempted], last: Last, settled_threshold: f64) -> Vec<Pol
     };
     let (promising, promising_squeezed, n_lifts) = match last {
         Last::Settled => (vec![0.0], vec![0.0], 400),
-        Last::Squeeze => (of_stable(&|grasp| grasp.settled.min(settled_threshold), 20), vec![0.0], 400),
+        Last::Squeeze => (of_stable(&|grasp| grasp.settled.min(settled_from), 20), vec![0.0], 400),
         Last::TestLift => {
-            let settled = of_stable(&|grasp| grasp.settled.min(settled_threshold), 16);
-            (settled, of_stable(&|grasp| grasp.squeezed, 12), 200)
+            let settled = of_stable(&|grasp| grasp.settled.min(settled_from), 16);
+            (settled, of_stable(&|grasp| grasp.squeezed.min(squeezed_from), 12), 200)
         }
     };
     let lifts = quantiles(grasps.iter().filter_map(|grasp| grasp.decided).collect(), n_lifts);
@@ -498,7 +498,7 @@ mod tests {
     fn drops_that_cost_more_are_worth_more_attempts() {
         let grasps =
             grasps(&[("a", 0.9, 0.9, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, false)]);
-        let policies = Policies::new(&grasps, Last::Squeeze, 1.0);
+        let policies = Policies::new(&grasps, Last::Squeeze, [1.0, 1.0]);
         let chosen = |drop_secs| policies.cheapest(drop_secs).map(|policy| (policy.lift, policy.expected.kept));
         assert_eq!((chosen(0.0), chosen(1000.0)), (Some((0.3, 0.75)), Some((0.9, 1.0))));
     }
@@ -559,7 +559,7 @@ mod tests {
             decided: Some(decided),
             stable,
         });
-        let policy = Policies::new(&grasps, Last::TestLift, 1.0).cheapest(10.0).expect("a policy");
+        let policy = Policies::new(&grasps, Last::TestLift, [1.0, 1.0]).cheapest(10.0).expect("a policy");
         assert_eq!((policy.promising_squeezed, policy.expected.kept), (0.9, 1.0), "{policy:?}");
     }
 
@@ -567,9 +567,9 @@ mod tests {
     fn grasps_that_count_as_stable_are_probed() {
         let grasps =
             grasps(&[("a", 0.9, 0.9, true), ("a", 0.7, 0.1, false), ("b", 0.9, 0.9, true), ("b", 0.6, 0.1, false)]);
-        let free = Policies::new(&grasps, Last::Squeeze, 1.0).cheapest(0.0).expect("a policy");
+        let free = Policies::new(&grasps, Last::Squeeze, [1.0, 1.0]).cheapest(0.0).expect("a policy");
         assert_eq!(free.promising, 0.9, "the others are not worth a probe");
-        assert_eq!(Policies::new(&grasps, Last::Squeeze, 0.65).cheapest(0.0).expect("a policy").promising, 0.65);
+        assert_eq!(Policies::new(&grasps, Last::Squeeze, [0.65, 1.0]).cheapest(0.0).expect("a policy").promising, 0.65);
     }
 
     #[test]
@@ -595,7 +595,7 @@ mod tests {
             ("b", 0.9, 0.9, true),
             ("b", 0.9, 0.3, false),
         ]);
-        let policies = Policies::new(&grasps, Last::Settled, 1.0);
+        let policies = Policies::new(&grasps, Last::Settled, [1.0, 1.0]);
         let found = policies.promise(1000.0).expect("lifts");
         // b with the threshold 0.3: a lift of three is dropped. a with 0.9 or more drops none.
         let dropped = (1.0 / 3.0) / 2.0;

@@ -98,6 +98,9 @@ pub fn telling_records(report: &TrialsReport) -> Vec<&TrialRecord> {
     telling
 }
 
+/// Of a wide table, the part that is drawn: the hand should fill the picture.
+const DRAWN_STAND_M: f64 = 0.08;
+
 /// How attempts were made.
 #[derive(Debug, Clone, Copy)]
 pub struct Made<'a> {
@@ -124,10 +127,14 @@ pub fn strip(
     let mut attempt = Attempt::begin(hand, target, options, &start, sensor_seed(seed, record.trial, record.attempt))?;
     while attempt.next_frame(record.grasp_id).is_some() {}
     let mut snapshots = vec![attempt.snapshot()];
-    if let Some(probe) = probe
-        && record.probed
-    {
-        attempt.probe(probe);
+    // A lift after a test lift had both probes. Of an attempt that was not lifted, only the squeeze is known.
+    let probes: &[ProbeMove] = match probe {
+        Some(ProbeMove::TestLift) if record.probed && record.lifted => &[ProbeMove::Squeeze, ProbeMove::TestLift],
+        Some(_) if record.probed => &[ProbeMove::Squeeze],
+        _ => &[],
+    };
+    for probe in probes {
+        attempt.probe(*probe);
         attempt.skip_frame();
         while attempt.next_frame(record.grasp_id).is_some() {}
         snapshots.push(attempt.snapshot());
@@ -138,7 +145,8 @@ pub fn strip(
     let moments =
         if record.lifted && !record.held { moments_of_a_drop(&snapshots) } else { moments_of_a_lift(&snapshots) };
     let scenes: Vec<PosedScene> = moments.iter().map(|snapshot| scene(snapshot)).collect();
-    let images = posed_scene_images(hand, &target.object.to_mesh(), options.physics.stand_radius_m, &scenes, IMAGE)?;
+    let stand_radius_m = options.physics.stand_radius_m.min(DRAWN_STAND_M);
+    let images = posed_scene_images(hand, &target.object.to_mesh(), stand_radius_m, &scenes, IMAGE)?;
     let secs = moments.iter().map(|snapshot| snapshot.elapsed_nanos as f64 / 1e9);
     Ok(Strip { caption: caption(record), images: secs.zip(images).collect() })
 }

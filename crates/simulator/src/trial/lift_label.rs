@@ -59,9 +59,6 @@ pub(crate) fn try_candidate(
     let moments: Vec<Moment> = std::iter::from_fn(|| attempt.next_moment()).collect();
     let contacts = attempt.contacts();
     let is_empty = !contacts.iter().any(|contact| contact.of_object);
-    if is_empty && !options.lift.keeps_empty {
-        return Ok(Outcome::NoTouch);
-    }
     let quality = match quality(&attempt.grasp_case(LABEL_FRICTION)) {
         Ok(quality) => quality,
         Err(QualityError::Hull { .. }) => return Ok(Outcome::HullFailure),

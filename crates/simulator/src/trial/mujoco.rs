@@ -15,6 +15,7 @@ use nalgebra::{Isometry3, Point3, Quaternion, UnitQuaternion, UnitVector3, Vecto
 use parry3d_f64::shape::{Shape, TypedShape};
 use rapier3d_f64::parry::mass_properties::MassProperties;
 use serde::Deserialize;
+use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
 use super::engine::{AxleCommand, Engine, GRAVITY, HandPlan, Side, StandForce, Touch};
@@ -101,6 +102,18 @@ struct State {
     velocity: [f64; 3],
 }
 
+/// The answer to a step.
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Stepped {
+    To(State),
+    /// The engine has lost the bodies.
+    Diverged {
+        #[serde(rename = "diverged")]
+        _is: bool,
+    },
+}
+
 /// A force between two bodies: the pressed shape of the hand, or -1 for the target; the other side, -2 for the stand; the
 /// point, the normal out of the other side, newtons.
 #[derive(Debug, Clone, Copy, Deserialize)]
@@ -159,10 +172,12 @@ impl Mujoco {
         })
     }
 
-    /// Asks the process. `None` once it has failed.
-    fn ask(&self, command: &Value) -> Option<Value> {
+    /// Asks the process. `None` once it has failed, or its answer cannot be read.
+    fn ask<T: DeserializeOwned>(&self, command: &Value) -> Option<T> {
         let mut process = self.process.lock().unwrap_or_else(PoisonError::into_inner);
-        match process.as_mut()?.ask(command) {
+        let answer = process.as_mut()?.ask(command);
+        let read = |answer| serde_json::from_value(answer).map_err(|error| format!("MuJoCo's answer: {error}"));
+        match answer.and_then(read) {
             Ok(answer) => Some(answer),
             Err(error) => {
                 *process = None;
@@ -174,8 +189,7 @@ impl Mujoco {
 
     /// The forces between two bodies.
     fn forces(&self) -> Vec<Force> {
-        let answer = self.ask(&json!({"touches": {}}));
-        answer.and_then(|answer| serde_json::from_value(answer).ok()).unwrap_or_default()
+        self.ask(&json!({"touches": {}})).unwrap_or_default()
     }
 }
 
@@ -220,11 +234,11 @@ impl Engine for Mujoco {
             "jumps": std::mem::take(&mut self.jumps),
             "secs": self.step_secs,
         }});
-        let Some(answer) = self.ask(&step) else { return };
-        match serde_json::from_value::<State>(answer) {
-            Ok(state) => self.state = state,
-            // The engine has lost the bodies. A target nowhere is one that is not held.
-            Err(_) => self.state.place = [f64::NAN; 7],
+        match self.ask(&step) {
+            Some(Stepped::To(state)) => self.state = state,
+            // A target nowhere is one that is not held.
+            Some(Stepped::Diverged { .. }) => self.state.place = [f64::NAN; 7],
+            None => {}
         }
     }
 
