@@ -29,6 +29,7 @@ class Phase(enum.IntEnum):
     TEST_LIFTED = 7
     KEPT = 8
     DROPPED = 9
+    LIFTING = 10
 
 
 class Fault(enum.IntEnum):
@@ -52,6 +53,9 @@ class Action(enum.IntEnum):
     LIFT = 1
     SQUEEZE = 3
     TEST_LIFT = 4
+    TIGHTEN = 5
+    SET_DOWN = 6
+    GO_ON = 7
 
 
 class Reason(enum.IntEnum):
@@ -75,6 +79,7 @@ class Reason(enum.IntEnum):
     UNLIKE_DAY = 17
     SENSOR_FAULT = 18
     PROMISE_WITHDRAWN = 19
+    SLIPPING = 20
 
 
 class Lists:

@@ -44,6 +44,7 @@ struct Params {
     seed: u64,
     gate: String,
     attempts: u32,
+    watch: String,
     decision_timeout_s: f64,
     friction: Option<f64>,
     options: Option<PathBuf>,
@@ -74,6 +75,13 @@ pub(crate) fn describe() -> OperatorDescription {
             whole(1, 65_535),
             Some(20.into()),
             "The most attempts of a trial in which nothing is lifted",
+        )
+        .param(
+            "watch",
+            ParamKind::Choice { values: vec!["on".into(), "off".into()] },
+            Some("off".into()),
+            "on: the hand sends frames while it lifts, asks whether to go on, and tightens or sets down; the arbiter's model \
+             judges such frames",
         )
         .param(
             "decision_timeout_s",
@@ -128,6 +136,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         seed: params.seed,
         max_attempts: params.attempts,
         lifts_always: params.gate == "off",
+        is_watched: params.watch == "on",
     };
     let mut source = SimulatedHand {
         operator,

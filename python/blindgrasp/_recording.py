@@ -36,12 +36,15 @@ DECISIONS = "blindgrasp_msgs/msg/LiftDecision"
 # The codes of crates/messages, as operators/blindgrasp_messages.py has them.
 PHASES = (
     "open", "closing", "settled", "ended", "squeezing", "squeezed", "test_lifting", "test_lifted", "kept", "dropped",
+    "lifting",
 )  # fmt: skip
-ACTIONS = {0: "hold", 1: "lift", 3: "squeeze", 4: "test_lift"}
+ACTIONS = {0: "hold", 1: "lift", 3: "squeeze", 4: "test_lift", 5: "tighten", 6: "set_down", 7: "go_on"}
+# Actions that are told while the arm lifts.
+WHILE_LIFTING = {"tighten", "set_down", "go_on"}
 REASONS = (
     "stable", "unstable", "no_agreement", "missing", "out_of_order", "stale", "no_contact", "invalid", "self_collision",
     "wrong_hand", "wrong_model", "out_of_distribution", "unsure", "link_down", "promising", "missing_reading",
-    "no_baseline", "unlike_day", "sensor_fault", "promise_withdrawn",
+    "no_baseline", "unlike_day", "sensor_fault", "promise_withdrawn", "slipping",
 )  # fmt: skip
 
 # The errors of the readers of MCAP and of CDR about content that is not as it should be.
@@ -85,7 +88,7 @@ class Grasp:
     label: Label | None = None
     """What is known to be true of the grasp; None if nothing was recorded."""
     decisions: tuple[Decision, ...] = ()
-    """The recorded decisions. Several are recorded of a grasp that was probed."""
+    """The recorded decisions. Several are recorded of a grasp that was probed, or watched while the arm lifted."""
 
     def __repr__(self) -> str:
         (n_frames, n_cells), n_joints = self.cells_newtons.shape, self.joints.shape[1]
@@ -94,8 +97,9 @@ class Grasp:
 
     @property
     def decision(self) -> Decision | None:
-        """The last decision about the grasp; None if none was recorded."""
-        return self.decisions[-1] if self.decisions else None
+        """The last decision about the grasp before the arm lifts; None if none was recorded."""
+        before = [decision for decision in self.decisions if decision.action not in WHILE_LIFTING]
+        return before[-1] if before else None
 
 
 class Recording:

@@ -43,7 +43,8 @@ class Decision:
 
     grasp_id: int
     action: str
-    """`lift`, `hold`, `squeeze` or `test_lift`. Only `lift` allows a lift."""
+    """`lift`, `hold`, `squeeze` or `test_lift`; while the arm lifts, `tighten`, `set_down` or `go_on`. Only `lift` allows
+    a lift."""
     reason: str
     """Why, like `stable` or `out_of_order`: the table of `docs/messages.md`."""
     probability_stable: float

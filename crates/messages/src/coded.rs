@@ -119,6 +119,8 @@ coded_enums! {
         Kept = 8, "kept";
         /// The arm has lifted, and the object was dropped. The readings do not matter.
         Dropped = 9, "dropped";
+        /// The arm lifts, holds or moves what it has been allowed to lift.
+        Lifting = 10, "lifting";
     }
 
     /// Why a stage has no result for a frame. The fault travels on to the arbiter, which holds.
@@ -164,6 +166,12 @@ coded_enums! {
         /// Tighten to the force of a lift, lift by a few millimetres, rest, and send frames: the decision follows. A
         /// reader that cannot do this treats it as [`Action::Hold`].
         TestLift = 4, "test_lift";
+        /// Tighten to the force of a lift, hold it from now on, and go on lifting.
+        Tighten = 5, "tighten";
+        /// Stop lifting and set the object down: it will leave the hand.
+        SetDown = 6, "set_down";
+        /// Go on lifting: the answer to a source that asks while it lifts, by a frame of [`Phase::Ended`].
+        GoOn = 7, "go_on";
     }
 
     /// Why the arbiter decided so.
@@ -209,6 +217,8 @@ coded_enums! {
         SensorFault = 18, "sensor_fault";
         /// More lifts dropped their objects than was promised.
         PromiseWithdrawn = 19, "promise_withdrawn";
+        /// While the arm lifts, consecutive predictions agreed that the object leaves the hand.
+        Slipping = 20, "slipping";
     }
 }
 
@@ -223,7 +233,8 @@ impl Phase {
             Phase::Squeezed => 4,
             Phase::TestLifting => 5,
             Phase::TestLifted => 6,
-            Phase::Ended => 7,
+            // A source may ask while it lifts, by a frame of `ended`.
+            Phase::Ended | Phase::Lifting => 7,
             Phase::Kept | Phase::Dropped => 8,
         };
         place(self) < place(other)
@@ -248,11 +259,15 @@ impl Action {
             Action::Lift => "LIFT",
             Action::Squeeze => "SQUEEZE",
             Action::TestLift => "TEST LIFT",
+            Action::Tighten => "TIGHTEN",
+            Action::SetDown => "SET DOWN",
+            Action::GoOn => "GO ON",
         }
     }
 
-    /// Whether it asks for a probe, after which another decision about the same grasp follows.
-    pub fn is_probe(self) -> bool {
-        matches!(self, Action::Squeeze | Action::TestLift)
+    /// Whether it decides the grasp, as one action for each grasp does. Probes come before it, and what the arm should do
+    /// while it lifts comes after it.
+    pub fn decides(self) -> bool {
+        matches!(self, Action::Hold | Action::Lift)
     }
 }

@@ -134,7 +134,7 @@ impl Decisions {
         for record in RecordingReader::open(found)? {
             let is_again = match record?.1 {
                 // A probe comes before the decision about its grasp.
-                Record::Decision(sample) if sample.message.action.is_probe() => continue,
+                Record::Decision(sample) if !sample.message.action.decides() => continue,
                 Record::Decision(sample) => read.decisions.insert(sample.message.grasp_id, sample.message).is_some(),
                 Record::Truth(sample) => read.truths.insert(sample.message.grasp_id, sample.message).is_some(),
                 _ => false,

@@ -127,7 +127,7 @@ impl RunReport {
 
     pub(super) fn decision(&mut self, seen: &SeenDecision<'_>) {
         // Another decision follows a probe.
-        if seen.decision.action.is_probe() {
+        if !seen.decision.action.decides() {
             return;
         }
         let key = (seen.header.epoch, seen.decision.grasp_id);

@@ -48,6 +48,7 @@ pub mod histogram;
 mod judge;
 pub mod label;
 pub mod lift_arbiter;
+mod lift_watch;
 pub mod model;
 pub mod out_of_distribution;
 pub mod probe;

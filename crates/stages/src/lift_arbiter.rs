@@ -14,10 +14,13 @@
 //! probe, which decides nothing: the grasp stays open, and only the frames after the probe can lead to a LIFT. Before a
 //! test lift, the frames of the tight hand may end the grasp with HOLD. If the
 //! outcomes of lifts refute [`ArbiterOptions::promised_drops`], every later grasp is held.
+//!
+//! While the arm lifts, frames of the phase `lifting` are watched, and `tighten` or `set_down` may follow (`LiftWatch`).
 
 use serde::{Deserialize, Serialize};
 
 use crate::decided::Decided;
+use crate::lift_watch::LiftWatch;
 use crate::promise_monitor::PromiseMonitor;
 use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction, Reason};
 
@@ -103,6 +106,8 @@ pub struct ArbiterState {
     pending_doubt: Option<Reason>,
     /// The last lifted grasp, if its outcome has not come.
     lifted: Option<u64>,
+    /// The watch of the last lift.
+    watch: Option<LiftWatch>,
     /// Number of lifts whose outcome did not come before the next lift.
     n_unreported: u64,
     promise: PromiseMonitor,
@@ -279,13 +284,19 @@ impl LiftArbiter {
         // Frames of one time are one reading: only the first of them votes.
         let is_new_reading =
             last.is_none_or(|last| last.epoch != header.epoch || last.stamp_nanos != header.stamp_nanos);
-        let Some(open) = self.open((header.epoch, prediction.grasp_id), decisions) else {
-            return;
-        };
         let numbers = [prediction.probability_stable, prediction.decision_value];
         let is_valid = numbers.iter().all(|number| number.is_finite())
             && (0.0..=1.0).contains(&prediction.probability_stable)
             && !(prediction.stable && prediction.unsure);
+        if let Some(watch) = &mut self.state.watch {
+            let is_trusted = break_in_order.is_none() && is_valid && age_nanos <= options.max_age_nanos;
+            if is_new_reading || prediction.phase == Phase::Ended {
+                decisions.extend(watch.on_prediction(header, prediction, is_trusted, options.votes.max(1)));
+            }
+        }
+        let Some(open) = self.open((header.epoch, prediction.grasp_id), decisions) else {
+            return;
+        };
         let votes = prediction.phase == open.awaited;
         let has_begun = Phase::Settled.is_before(prediction.phase) && !prediction.phase.is_over();
         open.is_probe_pending &= !has_begun;
@@ -334,8 +345,8 @@ impl LiftArbiter {
                 let probability_stable = open.agreeing.map_or(0.0, |(.., lowest)| lowest);
                 decisions.push(LiftDecision { grasp_id, action, reason, probability_stable });
             }
-            // If its outcome comes, the robot has lifted although the grasp was not decided.
-            Phase::Ended | Phase::Kept | Phase::Dropped => {
+            // The robot lifts, or has lifted, although the grasp was not decided.
+            Phase::Ended | Phase::Lifting | Phase::Kept | Phase::Dropped => {
                 let reason = open.reason_at_end();
                 decisions.extend(self.decide(Action::Hold, reason, 0.0));
             }
@@ -419,7 +430,10 @@ impl LiftArbiter {
         self.state.decided.push((epoch, grasp_id), self.options.n_remembered);
         if action == Action::Lift {
             let before = self.state.lifted.replace(grasp_id);
-            self.state.n_unreported += u64::from(before.is_some());
+            let watch = self.state.watch.replace(LiftWatch::new(epoch, grasp_id, probability_stable));
+            // A lift that was broken off has no outcome, unless the object was dropped.
+            let is_unreported = before.is_some() && !watch.is_some_and(|watch| watch.is_set_down());
+            self.state.n_unreported += u64::from(is_unreported);
         }
         Some(LiftDecision { grasp_id, action, reason, probability_stable })
     }
@@ -1085,5 +1099,49 @@ mod tests {
         let mut s = squeezed(0.9);
         s.push(Prediction { fault: Fault::MissingReading, ..of(Phase::TestLifted, 0.0) });
         assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::MissingReading)]);
+    }
+
+    #[test]
+    fn a_lift_is_watched_and_neither_lifted_again_nor_lifted_after_a_hold() {
+        let lifting = |probability: f64, unsure: bool| Prediction {
+            phase: Phase::Lifting,
+            unsure,
+            stable: !unsure && probability >= 0.5,
+            ..settled(probability)
+        };
+        let ended = Prediction { phase: Phase::Ended, ..settled(0.9) };
+        let said = |s: &mut Stream| -> Vec<Action> { s.decisions.drain(..).map(|decision| decision.action).collect() };
+        let mut s = stream();
+        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9)).push(ended.clone());
+        assert_eq!(said(&mut s), [Action::Lift], "it has not begun to lift");
+        s.push(lifting(0.9, false)).push(ended.clone());
+        assert_eq!(said(&mut s), [Action::GoOn]);
+        // Two are too few, and a fault or a late frame has no vote.
+        s.push(lifting(0.4, true)).push(lifting(0.4, true)).push(lifting(0.9, false));
+        s.push(lifting(0.4, true)).push(Prediction { fault: Fault::SensorFault, ..lifting(0.0, false) });
+        s.push(lifting(0.4, true)).push_aged(lifting(0.4, true), u64::MAX).push(lifting(0.4, true));
+        assert_eq!(said(&mut s), []);
+        s.push(lifting(0.4, true)).push(lifting(0.1, false)).push(lifting(0.4, true)).push(ended.clone());
+        assert_eq!(said(&mut s), [Action::Tighten, Action::GoOn], "once");
+        // A hand that feels nothing has lost the object.
+        s.push(lifting(0.1, false)).push(lifting(0.1, false));
+        s.push(Prediction { fault: Fault::NoContact, ..lifting(0.0, false) });
+        assert_eq!(s.decisions[0].reason, Reason::Slipping);
+        assert_eq!(said(&mut s), [Action::SetDown]);
+        s.push(lifting(0.9, false)).push(ended).push(lifting(0.1, false));
+        assert_eq!(said(&mut s), [], "that was all");
+        // A robot that lifts without having been allowed to is not watched; its grasp is held.
+        s.push(Prediction { grasp_id: 1, ..settled(0.9) }).push(Prediction { grasp_id: 1, ..lifting(0.9, false) });
+        s.push(Prediction { grasp_id: 1, ..lifting(0.1, false) })
+            .push(Prediction { grasp_id: 1, ..lifting(0.1, false) });
+        s.push(Prediction { grasp_id: 1, ..lifting(0.1, false) });
+        assert_eq!(s.decisions.iter().map(|it| (it.grasp_id, it.action)).collect::<Vec<_>>(), [(1, Action::Hold)]);
+        // A lift that was broken off has no outcome that could be missing.
+        for grasp_id in [2, 3] {
+            for _ in 0..3 {
+                s.push(Prediction { grasp_id, ..settled(0.9) });
+            }
+        }
+        assert_eq!(s.arbiter.state().n_unreported(), 1);
     }
 }

@@ -16,7 +16,7 @@ use crate::day::{DayMemory, DayModel, GraspPlace};
 use crate::encoder::{FeatureExtractor, FeltReading};
 use crate::hand::Hand;
 use crate::out_of_distribution::TrainingRange;
-use crate::probe::{GraspHistory, ProbeModel, signals};
+use crate::probe::{GraspHistory, ProbeModel, pad_newtons, signals};
 use crate::training_summary::TrainingSummary;
 use blindgrasp_messages::files::{open_regular, write_whole};
 use blindgrasp_messages::{Fault, Phase};
@@ -240,7 +240,7 @@ impl Model {
         let n_pads_in_contact = self.features.extract(reading, values)?;
         let range = match phase {
             // What the hand feels while it moves is part of no training range.
-            Phase::Squeezing | Phase::TestLifting => return Ok(n_pads_in_contact),
+            Phase::Squeezing | Phase::TestLifting | Phase::Lifting => return Ok(n_pads_in_contact),
             Phase::Squeezed => self.squeezed.as_ref().map(|probe| &probe.training_range),
             Phase::TestLifted => self.test_lifted.as_ref().map(|probe| &probe.training_range),
             _ => Some(&self.training_range),
@@ -253,6 +253,11 @@ impl Model {
     /// Whether it judges anything but settled grasps.
     pub fn has_probes(&self) -> bool {
         self.squeezed.is_some() || self.test_lifted.is_some()
+    }
+
+    /// Whether it judges frames while the arm lifts.
+    pub fn can_watch(&self) -> bool {
+        self.test_lifted.is_some() && pad_newtons(&self.features, &vec![0.0; self.features.len()]).is_some()
     }
 
     /// Whether its answers depend on earlier frames.
@@ -286,6 +291,11 @@ impl Model {
             // A frame that is at fault leaves no feature behind, but its fault.
             let values = verdict.and(values);
             memory.grasp.add((place.epoch, place.grasp_id), phase, values, &signals(&self.features));
+            if let (Phase::TestLifted, Ok(values)) = (phase, values)
+                && let Some(newtons) = pad_newtons(&self.features, values)
+            {
+                memory.grasp.bears(newtons);
+            }
         }
         verdict
     }
@@ -298,6 +308,10 @@ impl Model {
         let probe = match (phase, &self.day) {
             (Phase::Squeezed, _) => &self.squeezed,
             (Phase::TestLifted, _) => &self.test_lifted,
+            (Phase::Lifting, _) => {
+                let newtons = pad_newtons(&self.features, values).filter(|_| self.test_lifted.is_some());
+                return memory.grasp.judge_lifting(newtons.ok_or(Fault::WrongModel)?);
+            }
             (_, None) => return self.classifier.classify(values),
             (_, Some(model)) => return model.classify(&self.classifier, values, day, &memory.day),
         };

@@ -41,6 +41,9 @@ enum Step {
     TestLifted,
     TestLiftedUnstable,
     Dropped,
+    Lifting,
+    LiftingUnsure,
+    LiftingUnstable,
 }
 
 use Step::*;
@@ -96,6 +99,26 @@ const STEPS_WITH_PROBE: [Step; 19] = [
     Dropped,
 ];
 
+/// The inputs of histories with a lift that is watched.
+const STEPS_WHILE_LIFTING: [Step; 16] = [
+    Stable,
+    Ended,
+    NextGrasp,
+    OtherModel,
+    SameTimeUnstable,
+    Gap,
+    NewEpoch,
+    Old,
+    Faulty,
+    Unreadable,
+    Silence,
+    CutOff,
+    Dropped,
+    Step::Lifting,
+    LiftingUnsure,
+    LiftingUnstable,
+];
+
 /// An input as the arbiter gets it. A silence and a cut link have the header and the grasp of the input before them.
 #[derive(Debug, Clone)]
 struct Input {
@@ -132,6 +155,9 @@ impl Input {
             SqueezedUnstable => Prediction { phase: Phase::Squeezed, ..unstable },
             TestLifting => Prediction { phase: Phase::TestLifting, ..stable },
             Dropped => Prediction { phase: Phase::Dropped, ..stable },
+            Step::Lifting => Prediction { phase: Phase::Lifting, ..stable },
+            LiftingUnsure => Prediction { phase: Phase::Lifting, unsure: true, ..unstable },
+            LiftingUnstable => Prediction { phase: Phase::Lifting, ..unstable },
             Step::TestLifted => Prediction { phase: Phase::TestLifted, ..stable },
             TestLiftedUnstable => Prediction { phase: Phase::TestLifted, ..unstable },
             NextGrasp => Prediction { grasp_id: grasp_id + 1, ..stable },
@@ -140,6 +166,14 @@ impl Input {
             Faulty => Prediction { fault: Fault::InvalidValue, ..stable },
             Improbable => Prediction { probability_stable: options.min_probability_stable / 2.0, ..stable },
             _ => stable,
+        };
+        // While the arm lifts, they say that the object leaves the hand.
+        let is_lifting = last.is_some_and(|last| last.prediction.phase == Phase::Lifting);
+        let prediction = match step {
+            OtherModel | SameTimeUnstable | Gap | Old | Faulty if is_lifting => {
+                Prediction { phase: Phase::Lifting, stable: false, probability_stable: 0.1, ..prediction }
+            }
+            _ => prediction,
         };
         match step {
             OtherModel => header.made_by += 1,
@@ -274,6 +308,37 @@ fn may_lift(history: &[Input], decided: &[(usize, u64)], options: &ArbiterOption
         && all_agree
 }
 
+/// Whether the last input may be answered with what the arm should do while it lifts: `lifted` are the inputs that were
+/// answered with LIFT, and their grasps.
+fn may_react(history: &[Input], lifted: &[(usize, u64)], decision: &LiftDecision, options: &ArbiterOptions) -> bool {
+    let (Some(last), Some((lift_idx, id))) = (history.last(), lifted.last()) else { return false };
+    let grasp = history[*lift_idx].grasp();
+    if grasp.1 != *id || decision.grasp_id != *id || last.grasp() != grasp || !last.is_sample() {
+        return false;
+    }
+    if decision.action == Action::GoOn {
+        return last.prediction.phase == Phase::Ended;
+    }
+    let samples: Vec<&Input> = history.iter().filter(|input| input.is_sample()).collect();
+    let readings = samples.windows(2).rev().filter(|pair| {
+        let (before, now) = (pair[0].header, pair[1].header);
+        let is_new = (now.epoch, now.stamp_nanos) != (before.epoch, before.stamp_nanos);
+        pair[1].grasp() == grasp && pair[1].prediction.phase == Phase::Lifting && is_new
+    });
+    let row: Vec<_> = readings.take(options.votes as usize).collect();
+    let is_slipping =
+        |prediction: &Prediction| !prediction.stable && (!prediction.unsure || decision.action == Action::Tighten);
+    row.len() == options.votes as usize
+        && last.prediction.phase == Phase::Lifting
+        && row.iter().all(|pair| {
+            let is_same = pair[1].header.made_by == last.header.made_by;
+            pair[1].follows(pair[0])
+                && is_plain_prediction(pair[1], options)
+                && is_same
+                && is_slipping(&pair[1].prediction)
+        })
+}
+
 /// Each grasp that was heard of is decided once. A grasp that goes on while its source starts anew, even several times,
 /// may have one decision for these epochs.
 fn check_decisions(history: &[Input], decided: &[(usize, u64)], is_over: bool) {
@@ -302,9 +367,12 @@ struct Explorer {
     decided: Vec<(usize, u64)>,
     /// The inputs that were answered with a probe, and their grasps.
     asked: Vec<(usize, u64)>,
+    /// Those that were answered with LIFT.
+    lifted: Vec<(usize, u64)>,
     steps: &'static [Step],
     n_histories: u64,
     n_lifts: u64,
+    n_reactions: u64,
 }
 
 impl Explorer {
@@ -323,7 +391,17 @@ impl Explorer {
         let grasp_id = input.prediction.grasp_id;
         self.history.push(input);
         let idx = self.history.len() - 1;
-        for decision in decisions.extract_if(.., |decision| decision.action.is_probe()) {
+        for decision in decisions
+            .extract_if(.., |decision| matches!(decision.action, Action::Tighten | Action::SetDown | Action::GoOn))
+        {
+            assert!(
+                may_react(&self.history, &self.lifted, &decision, &self.options),
+                "{decision:?} after {:#?}",
+                self.history
+            );
+            self.n_reactions += 1;
+        }
+        for decision in decisions.extract_if(.., |decision| !decision.action.decides()) {
             let asks = may_ask(&self.history, &self.options) && !was_probed(&self.history, &self.asked);
             assert!(asks || may_go_on(&self.history, &self.asked), "{decision:?} after {:#?}", self.history);
             self.asked.push((idx, decision.grasp_id));
@@ -331,6 +409,7 @@ impl Explorer {
         for decision in &decisions {
             if decision.action == Action::Lift {
                 self.n_lifts += 1;
+                self.lifted.push((idx, grasp_id));
                 assert!(
                     decision.grasp_id == grasp_id
                         && !arbiter.state().promise().is_withdrawn()
@@ -357,35 +436,39 @@ impl Explorer {
             return;
         }
         for step in self.steps {
-            let (n_decided, n_asked) = (self.decided.len(), self.asked.len());
+            let (n_decided, n_asked, n_lifted) = (self.decided.len(), self.asked.len(), self.lifted.len());
             let next = self.step(arbiter, *step);
             self.explore(&next, n_left - 1);
             self.history.pop();
             self.decided.truncate(n_decided);
             self.asked.truncate(n_asked);
+            self.lifted.truncate(n_lifted);
         }
     }
 }
 
 /// All histories of up to `n_steps` more inputs after each of some beginnings.
-fn explore(options: ArbiterOptions, steps: &'static [Step], beginnings: &[Vec<Step>], n_steps: usize) {
+fn explore(options: ArbiterOptions, steps: &'static [Step], beginnings: &[Vec<Step>], n_steps: usize) -> u64 {
     let jobs: Vec<(&Vec<Step>, &Step)> =
         beginnings.iter().flat_map(|beginning| steps.iter().map(move |step| (beginning, step))).collect();
-    let (n_histories, n_lifts) = jobs
+    let (n_histories, n_lifts, n_reactions) = jobs
         .into_par_iter()
         .map(|(beginning, first)| {
-            let (history, decided, asked) = (vec![], vec![], vec![]);
-            let mut explorer = Explorer { options, history, decided, asked, steps, n_histories: 0, n_lifts: 0 };
+            let (history, decided, asked, lifted) = (vec![], vec![], vec![], vec![]);
+            let (n_histories, n_lifts, n_reactions) = (0, 0, 0);
+            let mut explorer =
+                Explorer { options, history, decided, asked, lifted, steps, n_histories, n_lifts, n_reactions };
             let mut arbiter = LiftArbiter::new(options);
             for step in beginning.iter().chain([first]) {
                 arbiter = explorer.step(&arbiter, *step);
             }
             explorer.explore(&arbiter, n_steps - 1);
-            (explorer.n_histories, explorer.n_lifts)
+            (explorer.n_histories, explorer.n_lifts, explorer.n_reactions)
         })
-        .reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
-    println!("{options:?}: {n_histories} histories, {n_lifts} lifts");
+        .reduce(|| (0, 0, 0), |a, b| (a.0 + b.0, a.1 + b.1, a.2 + b.2));
+    println!("{options:?}: {n_histories} histories, {n_lifts} lifts, {n_reactions} reactions");
     assert!(n_lifts > 1000, "{n_lifts} lifts show nothing");
+    n_reactions
 }
 
 #[test]
@@ -412,5 +495,16 @@ fn no_history_with_a_probe_lifts_before_the_probe_was_asked_for_and_felt() {
         let asked = vec![Unsure; n];
         let felt = [asked.clone(), vec![TestLifting], vec![Step::TestLifted; n - 1]].concat();
         explore(options, &STEPS_WITH_PROBE, &[vec![], asked, felt], 5);
+    }
+}
+
+#[test]
+fn no_history_lifts_while_a_lift_is_watched_and_reactions_follow_votes_of_the_lift_alone() {
+    for votes in [1, 2] {
+        let options = ArbiterOptions { votes, promised_drops: 0.0, ..ArbiterOptions::default() };
+        let lifted = vec![Stable; votes as usize];
+        let beginnings = [lifted.clone(), [lifted, vec![LiftingUnstable; votes as usize - 1]].concat()];
+        let n_reactions = explore(options, &STEPS_WHILE_LIFTING, &beginnings, 5);
+        assert!(n_reactions > 1000, "{n_reactions} reactions show nothing");
     }
 }

@@ -68,6 +68,8 @@ const cut = (body, n) => { while (body.rows.length > n) body.deleteRow(n); };
 const colours = { lift: "--lift", hold: "--hold" };
 let spokenAt = -Infinity;
 const showDecision = (decision) => {
+  // It changes nothing of what is shown.
+  if (decision.action === "go_on") return;
   shown.decision = decision;
   const action = byId("action");
   action.textContent = decision.action.replaceAll("_", " ");
@@ -179,7 +181,7 @@ const showVotes = ({ side, n }, frame) => {
   const votes = Object.values(shown.graph?.params ?? {}).find((params) => "votes" in params)?.votes;
   if (!votes) return;
   const isOpen = shown.decision?.grasp_id !== frame.grasp_id || ["squeeze", "test_lift"].includes(shown.decision.action);
-  const isProbed = !["open", "closing", "settled", "ended"].includes(frame.phase);
+  const isProbed = !["open", "closing", "settled", "ended", "lifting"].includes(frame.phase);
   const wanted = `${votes} settled predictions that agree`;
   const text = !isOpen ? "" : isProbed ? `Grasp ${frame.grasp_id} is probed; the hand is ${frame.phase.replaceAll("_", " ")}.` : n === 0 ? `Grasp ${frame.grasp_id} waits for ${wanted}; the hand is ${frame.phase}.`
     : `Grasp ${frame.grasp_id} waits for ${wanted}; the last ${n} say ${side}.`;
@@ -499,7 +501,7 @@ on("frame", (frame) => {
   for (const p of frame.probabilities) if (p !== null) points.push({ at: now, p });
   for (const p of frame.shadow) if (p !== null) shadows.push({ at: now, p });
   showKey(frame.shadow.length > 0);
-  for (const action of frame.actions) marks.push({ at: now, action });
+  for (const action of frame.actions) if (action !== "go_on") marks.push({ at: now, action });
   if (frame.links) {
     frameAt = now;
     showFrame(frame);

@@ -307,7 +307,7 @@ fn decision_row(decided: &DecidedGrasp, now_nanos: u64) -> Vec<Cell> {
     let style = match decided.action {
         Action::Lift if is_wrong => LOUD,
         Action::Lift => STRONG,
-        Action::Hold | Action::Squeeze | Action::TestLift => Style::new(),
+        _ => Style::new(),
     };
     let truth = match decided.truth {
         Some(true) => "stable",

@@ -243,7 +243,7 @@ fn run_way(
         ..Session::default()
     };
     let ended = session.run(&graph, name, n_stops);
-    let Watched { records, decisions } = watch.finish();
+    let Watched { records, decisions, .. } = watch.finish();
     if way.obeys {
         report.late = Some(LateDecisions::new(&records, &decisions));
         report.records_with_gate = records;

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use blindgrasp_learning::trials::tally::TrialRecord;
-use blindgrasp_messages::LiftDecision;
+use blindgrasp_messages::{Action, LiftDecision};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::Record;
 use blindgrasp_session::run::Tap;
@@ -21,6 +21,8 @@ pub(super) struct Watched {
     pub(super) records: Vec<TrialRecord>,
     /// Decisions, by grasp.
     pub(super) decisions: BTreeMap<u64, LiftDecision>,
+    /// What the arm was told to do while it lifted, by grasp.
+    reactions: BTreeMap<u64, Vec<Action>>,
 }
 
 #[derive(Default)]
@@ -57,10 +59,13 @@ impl Watch {
             let mut seen = seen.lock().unwrap_or_else(PoisonError::into_inner);
             let record = match record {
                 Record::Outcome(outcome) => TrialRecord::from(outcome.clone()),
-                // The decision about the grasp follows.
-                Record::Decision(decision) if decision.message.action.is_probe() => return Ok(()),
                 Record::Decision(decision) => {
-                    seen.watched.decisions.insert(decision.message.grasp_id, decision.message.clone());
+                    let LiftDecision { grasp_id, action, .. } = decision.message;
+                    if action.decides() {
+                        seen.watched.decisions.insert(grasp_id, decision.message.clone());
+                    } else {
+                        seen.watched.reactions.entry(grasp_id).or_default().push(action);
+                    }
                     return Ok(());
                 }
                 _ => return Ok(()),
@@ -82,6 +87,12 @@ impl Watch {
 
     pub(super) fn finish(self) -> Watched {
         self.bar.finish_and_clear();
-        std::mem::take(&mut self.seen.lock().unwrap_or_else(PoisonError::into_inner).watched)
+        let mut watched = std::mem::take(&mut self.seen.lock().unwrap_or_else(PoisonError::into_inner).watched);
+        for record in &mut watched.records {
+            let was_told =
+                |action: Action| watched.reactions.get(&record.grasp_id).is_some_and(|told| told.contains(&action));
+            (record.tightened, record.set_down) = (was_told(Action::Tighten), was_told(Action::SetDown));
+        }
+        watched
     }
 }

@@ -85,7 +85,7 @@ impl<S: RunSink> RunLog<S> {
         match decided.action {
             Action::Lift => status.n_lift += 1,
             Action::Hold => status.n_hold += 1,
-            Action::Squeeze | Action::TestLift => {}
+            _ => {}
         }
         status.n_false_positives += u64::from(decided.is_false_positive());
         status.latest.push_back(decided);
@@ -134,9 +134,12 @@ impl<S: RunSink> RunLog<S> {
         if let Some(nanos) = latency_nanos {
             self.latencies_nanos.saturating_record(nanos);
         }
-        if message.action.is_probe() {
-            // The grasp's decision follows.
-            self.n_probes += 1;
+        if !message.action.decides() {
+            // It comes before the grasp's decision, or after it.
+            if message.action == Action::GoOn {
+                return Ok(());
+            }
+            self.n_probes += usize::from(matches!(message.action, Action::Squeeze | Action::TestLift));
             return self.sink.decision(&SeenDecision { header, decision: message, latency_nanos, truth: None });
         }
         let truth = self.truths.remove(&message.grasp_id);

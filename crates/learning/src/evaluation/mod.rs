@@ -138,7 +138,7 @@ pub fn decide_frames(judge: &mut Judge, frames: &[Stamped<TactileFrame>]) -> Vec
     judge.reset();
     let mut decisions: Vec<LiftDecision> = frames.iter().flat_map(|frame| judge.sample(frame).decisions).collect();
     decisions.extend(judge.end());
-    decisions.retain(|decision| !decision.action.is_probe());
+    decisions.retain(|decision| decision.action.decides());
     decisions
 }
 
@@ -172,11 +172,8 @@ fn decide_recording(judge: &mut Judge, path: &Path) -> Result<Vec<Decided>, Data
         let message = "it holds no tactile frames to decide on".into();
         return Err(DatasetError::Unusable { path: path.into(), message });
     }
-    let mut by_grasp: BTreeMap<u64, LiftDecision> = decisions
-        .into_iter()
-        .filter(|it| !it.action.is_probe())
-        .map(|decision| (decision.grasp_id, decision))
-        .collect();
+    let mut by_grasp: BTreeMap<u64, LiftDecision> =
+        decisions.into_iter().filter(|it| it.action.decides()).map(|decision| (decision.grasp_id, decision)).collect();
     let mut decide =
         |grasp_id| by_grasp.remove(&grasp_id).unwrap_or(LiftDecision { grasp_id, ..LiftDecision::default() });
     let decided = |grasp: Grasp<Option<ReadingId>>| Decided {

@@ -216,11 +216,22 @@ fn cost(report: &TrialsReport) -> Table {
             part_of_whole([total.n_given_up, total.n_trials]),
             part_of_whole([tallies.n_probes, total.n_attempts]),
             part_of_whole([tallies.n_disturbed, tallies.n_probes]),
+            tallies.n_tightened.to_string(),
+            tallies.n_set_down.to_string(),
             number(tallies.kept_per_hour, 0),
         ]
     };
-    let head =
-        ["", "attempts per lift", "attempts per kept object", "given up", "with a probe", "disturbed", "kept per hour"];
+    let head = [
+        "",
+        "attempts per lift",
+        "attempts per kept object",
+        "given up",
+        "with a probe",
+        "disturbed",
+        "tightened",
+        "set down",
+        "kept per hour",
+    ];
     Table {
         title: "Cost, in the robot's time".into(),
         head: head.map(String::from).into(),

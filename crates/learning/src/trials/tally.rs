@@ -47,6 +47,9 @@ pub struct TrialRecord {
     pub probed: bool,
     /// Whether a test lift that was not followed by a lift left the object elsewhere in the hand.
     pub disturbed: bool,
+    /// Whether the hand tightened, and whether it set the object down, while it lifted.
+    pub tightened: bool,
+    pub set_down: bool,
     /// When it was over, robot time since the run began, seconds.
     pub end_secs: f64,
 }
@@ -75,6 +78,8 @@ impl From<Stamped<LiftOutcome>> for TrialRecord {
             volume,
             probed,
             disturbed,
+            tightened: false,
+            set_down: false,
             end_secs,
         }
     }
@@ -123,6 +128,9 @@ pub struct Tallies {
     pub n_probes: usize,
     /// Of these, attempts that were not lifted and left the object elsewhere in the hand.
     pub n_disturbed: usize,
+    /// Attempts in which the hand tightened, and those in which it set the object down, while it lifted.
+    pub n_tightened: usize,
+    pub n_set_down: usize,
     /// Objects kept in an hour of the robot's time; putting an object back takes none.
     pub kept_per_hour: Option<f64>,
     /// Trials that had no end: the run was stopped.
@@ -190,6 +198,8 @@ impl Tallies {
             promise: if total.paper.is_some() { None } else { promise_of(&things) },
             n_probes: unique.values().filter(|record| record.probed).count(),
             n_disturbed: unique.values().filter(|record| record.disturbed).count(),
+            n_tightened: unique.values().filter(|record| record.tightened).count(),
+            n_set_down: unique.values().filter(|record| record.set_down).count(),
             kept_per_hour: (robot_secs > 0.0).then(|| 3600.0 * total.n_held as f64 / robot_secs),
             total,
             groups: by_name(&trials, |record| &record.group),
@@ -323,6 +333,8 @@ pub(super) mod tests {
                     volume: Some(0.2),
                     probed: false,
                     disturbed: false,
+                    tightened: false,
+                    set_down: false,
                     end_secs: 0.0,
                 });
             }

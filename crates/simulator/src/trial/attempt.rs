@@ -12,7 +12,7 @@ use super::mujoco::Mujoco;
 use super::sensing::patches;
 use super::start::first_touch;
 use super::world::World;
-use super::{LiftResult, LiftTarget, PhysicsEngine, Snapshot, Start, TrialError, TrialOptions};
+use super::{LiftResult, LiftTarget, PhysicsEngine, Snapshot, Start, TrialError, TrialOptions, TrialProtocol};
 use crate::candidate::TimedFrame;
 use crate::loaded_contacts::{SimulatedContact, grasp_case};
 use crate::mechanism::Mechanism;
@@ -50,7 +50,8 @@ pub struct Attempt<'a> {
     /// The stage whose frames are the last until it is asked to go on.
     last_stage: Stage,
     n_steps: u64,
-    n_frames: u64,
+    /// When the next frame is, since the beginning.
+    next_nanos: u64,
     stage_secs: f64,
     /// Frames of this stage so far.
     n_frames_of_stage: usize,
@@ -58,12 +59,18 @@ pub struct Attempt<'a> {
     settled: Option<Isometry3<f64>>,
     /// Whether the hand touched the target when the last probe began.
     was_touched: bool,
-    /// How far the arm has lifted.
-    lifted_m: f64,
+    /// How far the arm has moved from where the hand closed, in the world.
+    lifted: Vector3<f64>,
+    /// How far it had lifted when the lift began.
+    lift_from_m: f64,
     /// The target's velocity at the last frame, in the palm frame.
     last_velocity: Vector3<f64>,
     /// What cells felt that lag behind their forces, and when.
     felt: Option<(Vec<f64>, u64)>,
+    /// Whether the target has left the hand while the arm lifted.
+    is_lost: bool,
+    /// Whether the fingers hold the force of a lift while the arm lifts.
+    holds_force: bool,
 }
 
 /// What the hand does until it is asked to do something else.
@@ -77,6 +84,7 @@ enum Stage {
     Squeezed,
     TestLift,
     TestLifted,
+    Lift,
 }
 
 impl Stage {
@@ -89,6 +97,7 @@ impl Stage {
             Stage::Squeezed => Phase::Squeezed,
             Stage::TestLift => Phase::TestLifting,
             Stage::TestLifted => Phase::TestLifted,
+            Stage::Lift => Phase::Lifting,
         }
     }
 }
@@ -113,6 +122,16 @@ pub enum ProbeMove {
     Squeeze,
     /// It tightens, lifts by a few millimetres and rests.
     TestLift,
+}
+
+/// What a hand does while it lifts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Reaction {
+    GoOn,
+    /// It tightens to the force of a lift once more.
+    Tighten,
+    /// It sets the target down.
+    SetDown,
 }
 
 impl<'a> Attempt<'a> {
@@ -159,14 +178,17 @@ impl<'a> Attempt<'a> {
             stage: Stage::Approach,
             last_stage: Stage::Settled,
             n_steps: 0,
-            n_frames: 0,
+            next_nanos: 0,
             stage_secs: 0.0,
             n_frames_of_stage: 0,
             settled: None,
             was_touched: false,
-            lifted_m: 0.0,
+            lifted: Vector3::zeros(),
+            lift_from_m: 0.0,
             last_velocity: Vector3::zeros(),
             felt: None,
+            is_lost: false,
+            holds_force: false,
         })
     }
 
@@ -175,7 +197,8 @@ impl<'a> Attempt<'a> {
         Attempt { sensor, rng, ..self }
     }
 
-    /// Goes on to the next frame; `None` after the last settled frame, and after the last frame of a probe.
+    /// Goes on to the next frame; `None` after the last settled frame, after the last frame of a probe, and when a lift
+    /// is over.
     pub fn next_frame(&mut self, grasp_id: u64) -> Option<TimedFrame> {
         let moment = self.next_moment()?;
         Some(self.feel(moment, grasp_id))
@@ -183,18 +206,23 @@ impl<'a> Attempt<'a> {
 
     /// Goes on to the time of the next frame, without what cells and other sensors read.
     pub(super) fn next_moment(&mut self) -> Option<Moment> {
-        if self.stage == self.last_stage && self.n_frames_of_stage == self.options.protocol.n_settled {
+        let is_lift = self.stage == Stage::Lift;
+        if !is_lift && self.stage == self.last_stage && self.n_frames_of_stage == self.options.protocol.n_settled {
             return None;
         }
-        let frame_nanos = self.options.protocol.frame_nanos;
-        let offset_nanos = self.n_frames * frame_nanos;
+        let offset_nanos = self.next_nanos;
         while self.elapsed_nanos() < offset_nanos {
+            if self.is_lift_over() {
+                return None;
+            }
             self.step();
         }
-        self.n_frames += 1;
+        let TrialProtocol { frame_nanos, lifting_frame_nanos, .. } = self.options.protocol;
+        let period_nanos = if is_lift { lifting_frame_nanos } else { frame_nanos };
+        self.next_nanos += period_nanos;
         self.n_frames_of_stage += 1;
         let velocity = self.engine.target_velocity();
-        let acceleration = (velocity - self.last_velocity) / (frame_nanos as f64 * 1e-9);
+        let acceleration = (velocity - self.last_velocity) / (period_nanos as f64 * 1e-9);
         self.last_velocity = velocity;
         let centre = self.engine.palm_from_target() * self.target.object.centre_of_mass_m;
         Some(Moment {
@@ -296,24 +324,25 @@ impl<'a> Attempt<'a> {
 
     /// Lets the time of a frame pass that is not felt.
     pub fn skip_frame(&mut self) {
-        self.n_frames += 1;
+        self.next_nanos += self.options.protocol.frame_nanos;
     }
 
-    /// Lowers the arm again after a test lift that is not followed by a lift. Returns by how much the target's centre of
+    /// Lowers the arm again after a test lift, or in the middle of a lift. Returns by how much the target's centre of
     /// mass has moved, and the target turned, in the hand since it settled: metres, radians; 0 if the hand did not touch it
     /// before the test lift, which then has moved nothing.
     pub fn set_down(&mut self) -> (f64, f64) {
-        let protocol = &self.options.protocol;
-        let n_steps = (protocol.test_lift_secs / self.options.physics.step_secs).round() as u64;
-        let path = Path { from_m: self.lifted_m, by_m: -self.lifted_m, secs: protocol.test_lift_secs };
-        for step in 0..n_steps {
-            let motion = path.motion(step as f64 * self.options.physics.step_secs, self.options.physics.step_secs);
+        let (protocol, step_secs) = (&self.options.protocol, self.options.physics.step_secs);
+        let begin = self.lifted;
+        let secs = protocol.test_lift_secs.max(protocol.lift_secs * begin.z / protocol.lift_m);
+        let path = Path { from_m: begin.z, by_m: -begin.z, secs };
+        for step in 0..(secs / step_secs).round() as u64 {
+            let motion = path.motion(step as f64 * step_secs, step_secs);
             self.move_palm(motion);
             self.engine.step();
             self.n_steps += 1;
         }
         self.move_palm((Vector3::zeros(), Vector3::zeros()));
-        self.lifted_m = 0.0;
+        self.lifted = Vector3::zeros();
         let Some(before) = self.settled else { return (0.0, 0.0) };
         if !self.was_touched {
             return (0.0, 0.0);
@@ -322,47 +351,68 @@ impl<'a> Attempt<'a> {
         ((now * centre - before * centre).norm(), before.rotation.angle_to(&now.rotation))
     }
 
-    /// Tightens the grip to its full force if no probe has, lifts, holds, shakes and judges. `watch` sees a snapshot at
-    /// each frame's time.
+    /// Lifts, holds, shakes and judges. `watch` sees a snapshot at each frame's time.
     pub fn lift(&mut self, mut watch: impl FnMut(&Snapshot)) -> LiftResult {
-        let protocol = self.options.protocol.clone();
-        let step_secs = self.options.physics.step_secs;
-        let steps_per_frame = (protocol.frame_nanos as f64 * 1e-9 / step_secs).round().max(1.0) as u64;
-        let begin = self.settled.unwrap_or_else(|| self.engine.palm_from_target());
+        let steps_per_frame = self.steps_per_frame();
+        self.begin_lift();
+        while !self.is_lift_over() {
+            self.step();
+            if self.n_steps.is_multiple_of(steps_per_frame) {
+                watch(&self.snapshot());
+            }
+        }
+        self.lift_result()
+    }
+
+    /// Begins a lift, whose frames follow. A hand that no probe has tightened is tightened to its full force before.
+    pub fn begin_lift(&mut self) {
         if self.settled.is_none() {
-            self.settled = Some(begin);
-            self.enter(Stage::Squeeze);
-            self.last_stage = Stage::Squeezed;
+            self.probe(ProbeMove::Squeeze);
             while self.stage == Stage::Squeeze {
                 self.step();
-                if self.n_steps.is_multiple_of(steps_per_frame) {
-                    watch(&self.snapshot());
-                }
             }
+            self.next_nanos = self.next_nanos.max(self.elapsed_nanos());
         }
-        let centre = self.target.object.centre_of_mass_m;
-        let slip_m = |now: &Isometry3<f64>| (now * centre - begin * centre).norm();
-        let path = LiftPath { from_m: self.lifted_m, protocol: &protocol };
-        let n_steps = (path.secs() / step_secs).round() as u64;
-        for step in 0..n_steps {
-            let secs = step as f64 * step_secs;
-            self.move_palm(path.motion(secs, step_secs));
-            self.engine.step();
-            self.n_steps += 1;
-            if (step + 1) % steps_per_frame == 0 {
-                watch(&self.snapshot_over(&path.place_m(secs + step_secs)));
-                if slip_m(&self.engine.palm_from_target()) > protocol.lost_m {
-                    break;
-                }
-            }
-        }
+        self.lift_from_m = self.lifted.z;
+        self.last_stage = Stage::Lift;
+        self.enter(Stage::Lift);
+    }
+
+    /// Tightens to the force of a lift again, and holds this force from now on: where the target gives way, fingers with a
+    /// gear lose it.
+    pub fn tighten(&mut self) {
+        self.holds_force = true;
+    }
+
+    /// What has become of the target when a lift is over.
+    pub fn lift_result(&self) -> LiftResult {
         let end = self.engine.palm_from_target();
-        let slip_m = slip_m(&end);
+        let slip_m = self.slip_m();
         let held = self.is_touched()
             && !self.has_diverged()
             && stand_newtons(&*self.engine) == 0.0
-            && slip_m <= protocol.lost_m;
-        LiftResult { held, slip_m, turn_rad: begin.rotation.angle_to(&end.rotation) }
+            && slip_m <= self.options.protocol.lost_m;
+        LiftResult { held, slip_m, turn_rad: self.settled.unwrap_or(end).rotation.angle_to(&end.rotation) }
+    }
+
+    fn is_lift_over(&self) -> bool {
+        let over_secs = self.lift_path(&self.options.protocol).secs() - 0.5 * self.options.physics.step_secs;
+        self.stage == Stage::Lift && (self.is_lost || self.stage_secs >= over_secs)
+    }
+
+    fn lift_path<'p>(&self, protocol: &'p TrialProtocol) -> LiftPath<'p> {
+        LiftPath { from_m: self.lift_from_m, protocol }
+    }
+
+    /// How far the target's centre of mass has moved in the hand since it settled.
+    fn slip_m(&self) -> f64 {
+        let (now, centre) = (self.engine.palm_from_target(), self.target.object.centre_of_mass_m);
+        self.settled.map_or(0.0, |begin| (now * centre - begin * centre).norm())
+    }
+
+    fn steps_per_frame(&self) -> u64 {
+        let frame_secs = self.options.protocol.frame_nanos as f64 * 1e-9;
+        (frame_secs / self.options.physics.step_secs).round().max(1.0) as u64
     }
 
     /// Whether the hand touches the target now.
@@ -419,21 +469,7 @@ impl<'a> Attempt<'a> {
     }
 
     pub fn snapshot(&self) -> Snapshot {
-        self.snapshot_over(&Vector3::new(0.0, 0.0, self.lifted_m))
-    }
-
-    fn patches(&self, joints: &[f64], touches: Vec<Touch>, palm_from_target: &Isometry3<f64>) -> Vec<SimulatedContact> {
-        // The joints are the hand's own: as many as it has, and finite.
-        let Ok(palm_from_links) = self.mechanism.hand.palm_from_links(joints) else { return Vec::new() };
-        patches(touches, palm_from_target, &self.mechanism, &palm_from_links, &self.target, &self.options.physics)
-    }
-
-    fn elapsed_nanos(&self) -> u64 {
-        (self.n_steps as f64 * self.options.physics.step_secs * 1e9).round() as u64
-    }
-
-    fn snapshot_over(&self, lifted: &Vector3<f64>) -> Snapshot {
-        let palm = nalgebra::Translation3::from(*lifted)
+        let palm = nalgebra::Translation3::from(self.lifted)
             * self.world_from_palm
             * nalgebra::Translation3::from(self.palm_from_start);
         let target = palm * self.engine.palm_from_target();
@@ -447,14 +483,34 @@ impl<'a> Attempt<'a> {
         }
     }
 
-    /// A time step before the lift.
+    fn patches(&self, joints: &[f64], touches: Vec<Touch>, palm_from_target: &Isometry3<f64>) -> Vec<SimulatedContact> {
+        // The joints are the hand's own: as many as it has, and finite.
+        let Ok(palm_from_links) = self.mechanism.hand.palm_from_links(joints) else { return Vec::new() };
+        patches(touches, palm_from_target, &self.mechanism, &palm_from_links, &self.target, &self.options.physics)
+    }
+
+    fn elapsed_nanos(&self) -> u64 {
+        (self.n_steps as f64 * self.options.physics.step_secs * 1e9).round() as u64
+    }
+
+    /// A time step.
     fn step(&mut self) {
         let physics = self.options.physics.clone();
         let protocol = self.options.protocol.clone();
         if self.stage == Stage::TestLift {
             let path = TestLiftPath(&protocol);
             self.move_palm(path.motion(self.stage_secs, physics.step_secs));
-            self.lifted_m = path.place_m(self.stage_secs + physics.step_secs).z;
+            self.lifted = path.place_m(self.stage_secs + physics.step_secs);
+        }
+        if self.stage == Stage::Lift {
+            let path = self.lift_path(&protocol);
+            let secs = self.stage_secs;
+            let (motion, lifted) = (path.motion(secs, physics.step_secs), path.place_m(secs + physics.step_secs));
+            self.move_palm(motion);
+            self.lifted = lifted;
+            if self.holds_force {
+                self.body.grip(&mut *self.engine, 1.0, &physics);
+            }
         }
         if self.stage == Stage::Squeeze {
             let part = ((self.stage_secs + physics.step_secs) / protocol.grip_secs).min(1.0);
@@ -491,6 +547,9 @@ impl<'a> Attempt<'a> {
             Stage::Squeeze if is_over(protocol.grip_secs) => self.enter(Stage::Squeezed),
             Stage::Squeezed if self.last_stage != Stage::Squeezed && self.n_frames_of_stage == protocol.n_settled => {
                 self.enter(Stage::TestLift);
+            }
+            Stage::Lift if self.n_steps.is_multiple_of(self.steps_per_frame()) => {
+                self.is_lost = self.slip_m() > protocol.lost_m;
             }
             Stage::TestLift if is_over(TestLiftPath(&protocol).secs() + protocol.test_rest_secs) => {
                 self.enter(Stage::TestLifted);

@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use super::ProbeMove;
+use super::{ProbeMove, Reaction};
 use blindgrasp_messages::{GraspTruth, LiftOutcome};
 
 /// The numbers of an attempt in a run.
@@ -35,6 +35,8 @@ pub struct Finished {
     pub end_nanos: u64,
     /// The probes that were made, which are felt again with their frames.
     pub probes: Vec<ProbeMove>,
+    /// The answers to a hand that asked while it lifted; `None` if it did not ask.
+    pub reactions: Option<Vec<Reaction>>,
     pub outcome: LiftOutcome,
 }
 
@@ -110,7 +112,14 @@ mod tests {
             lifted,
             ..LiftOutcome::default()
         };
-        Finished { n_frames: 9, end_nanos: place.begin_nanos + 100, probes: Vec::new(), outcome, place }
+        Finished {
+            n_frames: 9,
+            end_nanos: place.begin_nanos + 100,
+            probes: Vec::new(),
+            reactions: None,
+            outcome,
+            place,
+        }
     }
 
     #[test]

@@ -1,5 +1,5 @@
 //! Labels a simulated grasp by a lift: the object stands, the hand comes, closes, lifts and shakes in the physics of
-//! trials. The frames are those before the lift.
+//! trials. The frames are those before the lift and, fewer a second, while the arm lifts.
 //!
 //! Epsilon and volume are those of the settled grasp with friction 1, so that the paper's label can be compared with the
 //! lift.
@@ -71,15 +71,23 @@ pub(crate) fn try_candidate(
     let scene = scene(&attempt, &target, candidate, &contacts);
     attempt.probe(ProbeMove::TestLift);
     frames.extend(std::iter::from_fn(|| attempt.next_frame(0)));
-    // The times leave no room for the frames that are left out.
-    for (timed, offset_nanos) in frames.iter_mut().zip((0..).step_by(options.frames.period_nanos as usize)) {
-        timed.offset_nanos = offset_nanos;
-    }
     if let Some(step_secs) = options.lift.lift_step_secs {
         attempt.set_step(step_secs);
     }
     // A hand that has touched nothing lifts nothing.
-    let is_stable = !is_empty && attempt.lift(|_| {}).held;
+    if !is_empty {
+        attempt.begin_lift();
+        frames.extend(std::iter::from_fn(|| attempt.next_frame(0)));
+    }
+    let is_stable = !is_empty && attempt.lift_result().held;
+    // The times leave no room for the frames that are left out.
+    let mut next_nanos = 0;
+    for timed in &mut frames {
+        timed.offset_nanos = next_nanos;
+        let is_lifting = timed.frame.phase == Phase::Lifting;
+        let period_nanos = options.frames.period_nanos;
+        next_nanos += if is_lifting { trial_options.protocol.lifting_frame_nanos } else { period_nanos };
+    }
     attempt.check().map_err(|source| CandidateError::Lift { candidate, source: source.into() })?;
     if attempt.has_diverged() {
         return Ok(Outcome::Diverged);
@@ -235,8 +243,11 @@ mod tests {
             assert_eq!(phases[..expected.len()], expected);
             let n_of = |wanted: Phase| phases.iter().filter(|phase| **phase == wanted).count();
             assert_eq!((n_of(Phase::Squeezed), n_of(Phase::TestLifted)), (6, 6), "the test lift follows");
+            let n_before = phases.len() - n_of(Phase::Lifting);
+            assert!(phases[n_before..].iter().all(|phase| *phase == Phase::Lifting), "then the lift");
             for (idx, timed) in grasp.frames.iter().enumerate() {
-                assert_eq!((timed.offset_nanos, timed.frame.grasp_id), (idx as u64 * 10_000_000, grasp_id as u64));
+                let offset_nanos = 10_000_000 * idx.min(n_before) + 50_000_000 * idx.saturating_sub(n_before);
+                assert_eq!((timed.offset_nanos, timed.frame.grasp_id), (offset_nanos as u64, grasp_id as u64));
             }
             assert_eq!((grasp.truth.grasp_id, grasp.scene.grasp_id), (grasp_id as u64, grasp_id as u64));
             // The scene is the settled grasp: its quality is the truth's, and what cells feel is in the last frame.
@@ -257,7 +268,10 @@ mod tests {
                 ..Default::default()
             };
             (options.lift.step_secs, options.lift.lift_step_secs) = (step_secs, lift_step_secs);
-            simulated(&options, 1).0.remove(0)
+            let mut grasp = simulated(&options, 1).0.remove(0);
+            let n_before = grasp.frames.iter().position(|timed| timed.frame.phase == Phase::Lifting).expect("it lifts");
+            grasp.frames.truncate(n_before);
+            grasp
         };
         let (usual, other_lift, other) = (with(0.005, None), with(0.005, Some(0.0025)), with(0.0025, None));
         assert_eq!((&usual.frames, &usual.scene), (&other_lift.frames, &other_lift.scene));

@@ -31,7 +31,7 @@ use serde::{Deserialize, Serialize};
 use crate::OptionError;
 use blindgrasp_objects::Object;
 
-pub use attempt::{Attempt, ProbeMove};
+pub use attempt::{Attempt, ProbeMove, Reaction};
 pub(crate) use options::check_planner;
 pub use options::{MujocoOptions, PhysicsEngine, PhysicsOptions, TrialOptions, TrialProtocol};
 pub use start::{choose_start, draw_start, sensor_seed};

@@ -49,6 +49,8 @@ pub struct TrialProtocol {
     pub stand_clearance_m: f64,
     /// Time between frames. 10 ms: 100 Hz.
     pub frame_nanos: u64,
+    /// Time between frames while the arm lifts. 50 ms: 20 Hz.
+    pub lifting_frame_nanos: u64,
     /// Distance of the hand's first place from the first touch. 3 mm.
     pub stand_off_m: f64,
     /// Speed of the approach, metres per second. 0.03: a guarded move.
@@ -97,6 +99,7 @@ impl Default for TrialProtocol {
             n_approaches: 8,
             stand_clearance_m: 0.005,
             frame_nanos: 10_000_000,
+            lifting_frame_nanos: 50_000_000,
             stand_off_m: 0.003,
             approach_speed: 0.03,
             touch_newtons: 0.1,
@@ -275,6 +278,8 @@ impl TrialProtocol {
         not_negative("protocol.stand_clearance_m", self.stand_clearance_m)?;
         let is_frame_time = (1_000_000..=100_000_000).contains(&self.frame_nanos);
         require("protocol.frame_nanos", self.frame_nanos, is_frame_time, "1e6 to 1e8")?;
+        let is_frame_time = (1_000_000..=100_000_000).contains(&self.lifting_frame_nanos);
+        require("protocol.lifting_frame_nanos", self.lifting_frame_nanos, is_frame_time, "1e6 to 1e8")?;
         not_negative("protocol.stand_off_m", self.stand_off_m)?;
         positive("protocol.approach_speed", self.approach_speed)?;
         positive("protocol.touch_newtons", self.touch_newtons)?;

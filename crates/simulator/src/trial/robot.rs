@@ -7,7 +7,9 @@ use std::collections::VecDeque;
 
 use super::course::{Course, Finished, Place};
 use super::targets::target_of_trial;
-use super::{Attempt, LiftTarget, ProbeMove, TrialError, TrialOptions, choose_start, sensor_seed};
+use super::{
+    Attempt, LiftResult, LiftTarget, ProbeMove, Reaction, TrialError, TrialOptions, choose_start, sensor_seed,
+};
 use blindgrasp_messages::{Action, Header, LiftOutcome, Phase, Stamped, TactileFrame};
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
@@ -18,6 +20,9 @@ const EPOCH: u64 = 0;
 /// before is not.
 const DISTURBED_M: f64 = 0.01;
 const DISTURBED_RAD: f64 = 0.2;
+/// A hand that is watched asks after so many frames of a lift whether it may go on: with 20 frames a second, five times a
+/// second.
+const FRAMES_PER_ASK: usize = 4;
 
 /// How the robot goes about its trials.
 #[derive(Debug, Clone, Copy)]
@@ -28,6 +33,8 @@ pub struct RobotOptions {
     pub max_attempts: u32,
     /// Every settled grasp is lifted, whatever is decided.
     pub lifts_always: bool,
+    /// It sends frames while it lifts, asks whether to go on, and reacts.
+    pub is_watched: bool,
 }
 
 /// What the robot does next.
@@ -87,8 +94,18 @@ struct TriedGrasp<'a> {
     elapsed_nanos: u64,
     last: Option<TactileFrame>,
     probes: Vec<ProbeMove>,
+    lift: Option<WatchedLift>,
     /// How it ended, if only its frames are felt again.
     outcome: Option<Finished>,
+}
+
+/// A lift under way in which the hand asks whether to go on.
+#[derive(Default)]
+struct WatchedLift {
+    /// Epsilon and volume of the grasp before.
+    quality: Option<(f64, f64)>,
+    reactions: Vec<Reaction>,
+    n_frames_since_asked: usize,
 }
 
 impl<'a> Robot<'a> {
@@ -140,7 +157,8 @@ impl<'a> Robot<'a> {
             State::Feeling(grasp) => self.feel(grasp),
             State::Failed(error) => Err(error),
             State::Deciding(grasp) => {
-                let (grasp_id, n_before) = (grasp.place.grasp_id, grasp.probes.len());
+                let n_of_lift = grasp.lift.as_ref().map_or(0, |lift| 1 + lift.reactions.len());
+                let (grasp_id, n_before) = (grasp.place.grasp_id, grasp.probes.len() + n_of_lift);
                 self.state = State::Deciding(grasp);
                 Ok(Doing::AsksForDecision { grasp_id, n_before })
             }
@@ -158,6 +176,21 @@ impl<'a> Robot<'a> {
     /// Takes the decision that the robot has asked for, and acts on it.
     pub fn decide(&mut self, action: Action) {
         match std::mem::replace(&mut self.state, State::Between) {
+            State::Deciding(grasp) if grasp.lift.is_some() => {
+                let reaction = match action {
+                    Action::GoOn => Reaction::GoOn,
+                    Action::Tighten => Reaction::Tighten,
+                    // In doubt it sets the thing down.
+                    _ => Reaction::SetDown,
+                };
+                self.react(grasp, reaction);
+            }
+            State::Deciding(mut grasp)
+                if action == Action::Lift && self.options.is_watched && !self.options.lifts_always =>
+            {
+                grasp.begin_lift();
+                self.state = State::Feeling(grasp);
+            }
             State::Deciding(mut grasp) if probe_of(action).is_some() && !self.options.lifts_always => {
                 // A test lift follows a squeeze, after which the robot waits for the answer whether to go on. No probe is made
                 // twice: in doubt it lets go.
@@ -171,12 +204,17 @@ impl<'a> Robot<'a> {
                         grasp.begin_probe(probe);
                         self.state = State::Feeling(grasp);
                     }
-                    None => self.finish(*grasp, false),
+                    None => {
+                        let quality = grasp.quality();
+                        self.finish(*grasp, quality, None);
+                    }
                 }
             }
-            State::Deciding(grasp) => {
+            State::Deciding(mut grasp) => {
                 let lifts = action == Action::Lift || self.options.lifts_always;
-                self.finish(*grasp, lifts);
+                let quality = grasp.quality();
+                let lift = lifts.then(|| grasp.attempt.lift(|_| {}));
+                self.finish(*grasp, quality, lift);
             }
             other => self.state = other,
         }
@@ -245,6 +283,7 @@ impl<'a> Robot<'a> {
             elapsed_nanos: 0,
             last: None,
             probes: Vec::new(),
+            lift: None,
             outcome,
         };
         self.feel(Box::new(grasp))
@@ -252,18 +291,28 @@ impl<'a> Robot<'a> {
 
     /// The next frame of an attempt.
     fn feel(&mut self, mut grasp: Box<TriedGrasp<'a>>) -> Result<Doing, TrialError> {
-        let next = grasp.attempt.next_frame(grasp.place.grasp_id);
+        let asks = grasp.lift.as_ref().is_some_and(|lift| lift.n_frames_since_asked == FRAMES_PER_ASK);
+        let next = if asks { None } else { grasp.attempt.next_frame(grasp.place.grasp_id) };
         grasp.attempt.check()?;
+        if next.is_none() && !asks && grasp.lift.is_some() {
+            self.end_lift(grasp);
+            return self.advance();
+        }
         let (frame, is_last) = match next {
             Some(timed) => {
                 grasp.elapsed_nanos = timed.offset_nanos;
                 grasp.last = Some(timed.frame.clone());
+                if let Some(lift) = &mut grasp.lift {
+                    lift.n_frames_since_asked += 1;
+                }
                 (timed.frame, false)
             }
             None => {
-                // The last frame once more says that no more come unless a probe is asked for: an arbiter need not wait for
-                // silence.
-                grasp.elapsed_nanos += self.trial_options.protocol.frame_nanos;
+                // The last frame once more says that no more come unless a probe is asked for, or that the hand asks: an
+                // arbiter need not wait for silence.
+                if grasp.lift.is_none() {
+                    grasp.elapsed_nanos += self.trial_options.protocol.frame_nanos;
+                }
                 let Some(last) = grasp.last.clone() else {
                     let reason = format!("grasp {} has no frames", grasp.place.grasp_id);
                     return Err(TrialError::Target { name: grasp.thing.name.clone(), reason });
@@ -279,39 +328,95 @@ impl<'a> Robot<'a> {
             ..Header::default()
         };
         grasp.n_frames += 1;
-        let felt_again = grasp.outcome.as_ref().filter(|finished| finished.probes.len() > grasp.probes.len());
-        if let Some(probe) = felt_again.map(|finished| finished.probes[grasp.probes.len()])
-            && is_last
-        {
-            grasp.begin_probe(probe);
-            self.state = State::Feeling(grasp);
-            return Ok(Doing::Feels(Stamped { header, message: frame }));
+        match (is_last, grasp.outcome.is_some()) {
+            (false, _) => self.state = State::Feeling(grasp),
+            (true, false) => self.state = State::Deciding(grasp),
+            (true, true) => self.do_again(grasp),
         }
-        self.state = match grasp.outcome.take_if(|_| is_last) {
-            Some(finished) => {
-                let told = told_frame(&finished, grasp.last.take(), self.hand.id());
-                State::Over { finished, told, is_again: true }
-            }
-            None if is_last => State::Deciding(grasp),
-            None => State::Feeling(grasp),
-        };
         Ok(Doing::Feels(Stamped { header, message: frame }))
     }
 
-    /// Lifts, or lets go.
-    fn finish(&mut self, mut grasp: TriedGrasp<'a>, lifts: bool) {
-        let quality = grasp.attempt.quality().filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite());
-        let lift = lifts.then(|| grasp.attempt.lift(|_| {}));
-        let is_set_down = !lifts && grasp.probes.last() == Some(&ProbeMove::TestLift);
+    /// Does what an attempt that is felt again did when it had asked.
+    fn do_again(&mut self, mut grasp: Box<TriedGrasp<'a>>) {
+        let Some(finished) = &grasp.outcome else { return };
+        if let Some(lift) = &grasp.lift {
+            let reactions = finished.reactions.iter().flatten().skip(lift.reactions.len()).copied();
+            // The hand asked once, and was answered until it went on or set the thing down.
+            let answers: Vec<Reaction> = reactions.collect();
+            let until = answers.iter().position(|answer| *answer != Reaction::Tighten).map_or(0, |idx| idx + 1);
+            self.state = State::Deciding(grasp);
+            for answer in &answers[..until] {
+                if let State::Deciding(grasp) = std::mem::replace(&mut self.state, State::Between) {
+                    self.react(grasp, *answer);
+                }
+            }
+            return;
+        }
+        if let Some(probe) = finished.probes.get(grasp.probes.len()).copied() {
+            grasp.begin_probe(probe);
+        } else if finished.reactions.is_some() {
+            grasp.begin_lift();
+        } else {
+            self.is_over_again(grasp);
+            return;
+        }
+        self.state = State::Feeling(grasp);
+    }
+
+    fn is_over_again(&mut self, mut grasp: Box<TriedGrasp<'a>>) {
+        if let Some(finished) = grasp.outcome.take() {
+            let told = told_frame(&finished, grasp.last.take(), self.hand.id());
+            self.state = State::Over { finished, told, is_again: true };
+        }
+    }
+
+    /// Reacts while it lifts.
+    fn react(&mut self, mut grasp: Box<TriedGrasp<'a>>, reaction: Reaction) {
+        let Some(lift) = &mut grasp.lift else { return };
+        lift.reactions.push(reaction);
+        match reaction {
+            Reaction::GoOn => {
+                lift.n_frames_since_asked = 0;
+                self.state = State::Feeling(grasp);
+            }
+            Reaction::Tighten => {
+                grasp.attempt.tighten();
+                self.state = State::Deciding(grasp);
+            }
+            Reaction::SetDown if grasp.outcome.is_some() => self.is_over_again(grasp),
+            Reaction::SetDown => {
+                let quality = lift.quality;
+                self.finish(*grasp, quality, None);
+            }
+        }
+    }
+
+    fn end_lift(&mut self, grasp: Box<TriedGrasp<'a>>) {
+        if grasp.outcome.is_some() {
+            self.is_over_again(grasp);
+            return;
+        }
+        let quality = grasp.lift.as_ref().and_then(|lift| lift.quality);
+        let result = grasp.attempt.lift_result();
+        self.finish(*grasp, quality, Some(result));
+    }
+
+    /// Ends an attempt with a lift, or lets go: after a test lift, or in the middle of a lift, it sets the thing down.
+    fn finish(&mut self, mut grasp: TriedGrasp<'a>, quality: Option<(f64, f64)>, lift: Option<LiftResult>) {
+        let is_broken_off = lift.is_none() && grasp.lift.is_some();
+        let is_set_down = is_broken_off || lift.is_none() && grasp.probes.last() == Some(&ProbeMove::TestLift);
         let (moved_m, turned_rad) = if is_set_down { grasp.attempt.set_down() } else { (0.0, 0.0) };
         if let Err(error) = grasp.attempt.check() {
             self.state = State::Failed(error);
             return;
         }
-        let disturbed = moved_m > DISTURBED_M || turned_rad > DISTURBED_RAD;
+        // What leaves the hand on its way down is dropped.
+        let is_lost = is_broken_off && (!grasp.attempt.is_touched() || moved_m > self.trial_options.protocol.lost_m);
+        let lift = lift.or(is_lost.then_some(LiftResult { held: false, slip_m: moved_m, turn_rad: turned_rad }));
+        let disturbed = lift.is_none() && (moved_m > DISTURBED_M || turned_rad > DISTURBED_RAD);
         let (epsilon, volume) = quality.unwrap_or((-1.0, 0.0));
-        let TriedGrasp { place, thing, attempt, n_frames, elapsed_nanos, probes, last, .. } = grasp;
-        let n_frames = n_frames + u64::from(lifts);
+        let TriedGrasp { place, thing, attempt, n_frames, elapsed_nanos, probes, last, lift: watched, .. } = grasp;
+        let n_frames = n_frames + u64::from(lift.is_some());
         let outcome = LiftOutcome {
             grasp_id: place.grasp_id,
             trial: place.trial,
@@ -331,7 +436,8 @@ impl<'a> Robot<'a> {
             disturbed,
         };
         let end_nanos = place.begin_nanos + attempt.snapshot().elapsed_nanos.max(elapsed_nanos);
-        let finished = Finished { place, n_frames, end_nanos, probes, outcome };
+        let reactions = watched.map(|lift| lift.reactions);
+        let finished = Finished { place, n_frames, end_nanos, probes, reactions, outcome };
         let told = told_frame(&finished, last, self.hand.id());
         self.state = State::Over { finished, told, is_again: false };
     }
@@ -344,13 +450,23 @@ impl TriedGrasp<'_> {
         self.attempt.skip_frame();
         self.probes.push(probe);
     }
+
+    fn begin_lift(&mut self) {
+        self.lift = Some(WatchedLift { quality: self.quality(), ..WatchedLift::default() });
+        self.attempt.begin_lift();
+        self.attempt.skip_frame();
+    }
+
+    fn quality(&self) -> Option<(f64, f64)> {
+        self.attempt.quality().filter(|(epsilon, volume)| epsilon.is_finite() && volume.is_finite())
+    }
 }
 
 fn probe_of(action: Action) -> Option<ProbeMove> {
     match action {
         Action::Squeeze => Some(ProbeMove::Squeeze),
         Action::TestLift => Some(ProbeMove::TestLift),
-        Action::Hold | Action::Lift => None,
+        _ => None,
     }
 }
 
@@ -374,7 +490,8 @@ mod tests {
     use super::*;
     use crate::trial::targets::targets_named;
 
-    const OPTIONS: RobotOptions = RobotOptions { n_trials: 1, seed: 0, max_attempts: 2, lifts_always: false };
+    const OPTIONS: RobotOptions =
+        RobotOptions { n_trials: 1, seed: 0, max_attempts: 2, lifts_always: false, is_watched: false };
 
     /// Runs the robot to its end, with an action for each grasp and number of answers before. Returns its frames and its
     /// attempts.
@@ -434,6 +551,44 @@ mod tests {
         again.resume(first.course().clone(), Some(finished[0].last_seq()));
         let (frames, told) = run(&mut again, hold_the_first);
         assert_eq!((frames[0].header.seq, told), (finished[1].place.first_seq, finished));
+    }
+
+    #[test]
+    fn a_watched_hand_asks_while_it_lifts_reacts_and_is_felt_again() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
+        let robot = || {
+            let targets = targets_named("paper/pencil-cup").expect("targets");
+            Robot::new(&hand, targets, TrialOptions::default(), RobotOptions { is_watched: true, ..OPTIONS })
+        };
+        let mut first = robot();
+        let mut asked = Vec::new();
+        // The first lift is tightened and broken off, the second one goes on.
+        let (frames, finished) = run(&mut first, |grasp_id, n_before| {
+            asked.push((grasp_id, n_before));
+            match (grasp_id, n_before) {
+                (_, 0) => Action::Lift,
+                (0, 1) => Action::GoOn,
+                (0, 2) => Action::Tighten,
+                (0, _) => Action::SetDown,
+                _ => Action::GoOn,
+            }
+        });
+        assert_eq!(asked[..6], [(0, 0), (0, 1), (0, 2), (0, 3), (1, 0), (1, 1)]);
+        assert_eq!(finished[0].reactions.as_deref(), Some(&[Reaction::GoOn, Reaction::Tighten, Reaction::SetDown][..]));
+        assert_eq!(finished.iter().map(|over| over.outcome.lifted).collect::<Vec<_>>(), [false, true]);
+        assert!(finished[0].outcome.slip_m < DISTURBED_M, "it stands where it stood: {:?}", finished[0].outcome);
+        assert!(frames.iter().enumerate().all(|(seq, frame)| frame.header.seq == seq as u64));
+        assert!(frames.windows(2).all(|pair| pair[0].header.stamp_nanos <= pair[1].header.stamp_nanos));
+        let mut phases: Vec<Phase> = frames.iter().map(|frame| frame.message.phase).collect();
+        let n_lifting = phases.iter().filter(|phase| **phase == Phase::Lifting).count();
+        phases.dedup();
+        let n_asks = phases.windows(2).filter(|pair| *pair == [Phase::Lifting, Phase::Ended]).count();
+        assert_eq!(n_lifting / FRAMES_PER_ASK, n_asks);
+        // The first lift asked twice, and had two answers at the second time.
+        assert_eq!(n_asks, asked.len() - 1 - 2);
+        let mut again = robot();
+        again.resume(first.course().clone(), None);
+        assert_eq!(run(&mut again, |_, _| panic!("all is decided")), (frames, finished));
     }
 
     #[test]

@@ -1,0 +1,98 @@
+//! Watches a lift that the arbiter has allowed: contacts that creep show nothing before the arm lifts.
+//!
+//! The classifier judges each frame of the phase `lifting` by the load that is left
+//! ([`GraspHistory::judge_lifting`](crate::probe::GraspHistory::judge_lifting)). As many consecutive readings as an arbiter
+//! takes votes for a decision ask for a reaction: `tighten`, once, when it is unsure, and `set_down` when it is unstable.
+//! A reading that is faulty, late or out of order has no vote. The watch never lifts: a grasp that was held stays so.
+
+use serde::{Deserialize, Serialize};
+
+use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction, Reason};
+
+/// The watch of one lift.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct LiftWatch {
+    epoch: u64,
+    grasp_id: u64,
+    /// Who has made the votes: [`Header::made_by`].
+    made_by: u64,
+    /// The latest consecutive readings that are not stable, and those of them that are unstable.
+    n_slipping: u32,
+    n_unstable: u32,
+    probability_stable: f64,
+    has_begun: bool,
+    has_tightened: bool,
+    is_set_down: bool,
+}
+
+impl LiftWatch {
+    /// The watch of a grasp that may be lifted, by its source's epoch.
+    pub(crate) fn new(epoch: u64, grasp_id: u64, probability_stable: f64) -> LiftWatch {
+        LiftWatch {
+            epoch,
+            grasp_id,
+            made_by: 0,
+            n_slipping: 0,
+            n_unstable: 0,
+            probability_stable,
+            has_begun: false,
+            has_tightened: false,
+            is_set_down: false,
+        }
+    }
+
+    /// Whether the arm was told to set the object down.
+    pub(crate) fn is_set_down(&self) -> bool {
+        self.is_set_down
+    }
+
+    /// Takes a prediction that `is_trusted`, or not, and returns what the arm should do beside going on. `votes` is
+    /// [`ArbiterOptions::votes`](crate::lift_arbiter::ArbiterOptions::votes).
+    pub(crate) fn on_prediction(
+        &mut self,
+        header: &Header,
+        prediction: &Prediction,
+        is_trusted: bool,
+        votes: u32,
+    ) -> Option<LiftDecision> {
+        let is_of_lift = (header.epoch, prediction.grasp_id) == (self.epoch, self.grasp_id);
+        if !is_of_lift || self.is_set_down {
+            return None;
+        }
+        match prediction.phase {
+            Phase::Lifting => {
+                self.has_begun = true;
+                self.count(header, prediction, is_trusted);
+                if self.n_unstable >= votes {
+                    self.is_set_down = true;
+                    return Some(self.says(Action::SetDown, Reason::Slipping));
+                }
+                let tightens = self.n_slipping >= votes && !self.has_tightened;
+                self.has_tightened |= tightens;
+                tightens.then(|| self.says(Action::Tighten, Reason::Slipping))
+            }
+            Phase::Ended if self.has_begun => Some(self.says(Action::GoOn, Reason::Stable)),
+            _ => None,
+        }
+    }
+
+    fn count(&mut self, header: &Header, prediction: &Prediction, is_trusted: bool) {
+        // A model agrees with itself only.
+        let is_same = std::mem::replace(&mut self.made_by, header.made_by) == header.made_by;
+        let is_empty = prediction.fault == Fault::NoContact;
+        let votes = is_trusted && (is_empty || prediction.fault == Fault::None);
+        let is_slipping = votes && !prediction.stable;
+        let is_unstable = is_slipping && !prediction.unsure;
+        let counted = |n: u32, is_one: bool| if is_one { u32::from(is_same) * n + 1 } else { 0 };
+        self.n_slipping = counted(self.n_slipping, is_slipping);
+        self.n_unstable = counted(self.n_unstable, is_unstable);
+        if votes {
+            self.probability_stable = prediction.probability_stable;
+        }
+    }
+
+    fn says(&self, action: Action, reason: Reason) -> LiftDecision {
+        let LiftWatch { grasp_id, probability_stable, .. } = *self;
+        LiftDecision { grasp_id, action, reason, probability_stable }
+    }
+}
