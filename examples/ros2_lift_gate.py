@@ -24,6 +24,9 @@ class LiftGate(Node):
         self.create_subscription(Decision, "/blindgrasp/decision", self.on_decision, qos)
 
     def on_decision(self, decision):
+        if decision.action in (Decision.TIGHTEN, Decision.SET_DOWN, Decision.GO_ON):
+            # This node sends no frames while the arm lifts, so it is not told what to do then.
+            return
         if decision.action != Decision.LIFT:
             self.get_logger().info(f"grasp {decision.grasp_id}: hold, {decision.reason}")
             return

@@ -78,10 +78,10 @@ pub(crate) fn describe() -> OperatorDescription {
         )
         .param(
             "watch",
-            ParamKind::Choice { values: vec!["on".into(), "off".into()] },
-            Some("off".into()),
-            "on: the hand sends frames while it lifts, asks whether to go on, and tightens or sets down; the arbiter's model \
-             judges such frames",
+            ParamKind::Choice { values: vec!["auto".into(), "on".into(), "off".into()] },
+            Some("auto".into()),
+            "auto: off, but on in trials with a model that judges such frames. on: the hand sends frames while it lifts, asks whether to go on, and \
+             tightens or sets down",
         )
         .param(
             "decision_timeout_s",

@@ -233,7 +233,7 @@ impl Record {
         with_sample!(self, sample => sample.message.grasp_id)
     }
 
-    /// Whether a stage sends one sample per grasp and numbers these samples itself. Such a sample does not bear the
+    /// Whether a stage sends few samples per grasp and numbers these samples itself. Such a sample does not bear the
     /// number of a frame.
     pub fn is_said_once(&self) -> bool {
         matches!(self, Record::Decision(_))

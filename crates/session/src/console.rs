@@ -113,6 +113,9 @@ impl RunSink for Console {
                 truth,
             })?;
             harmless(&json).into_owned()
+        } else if action == Action::GoOn {
+            // Several a second, for programs alone.
+            return Ok(());
         } else {
             let latency = latency_nanos.map_or("-".into(), |nanos| format!("{:.0} µs", nanos as f64 / 1e3));
             let painted = |text: &str, colour| if self.is_coloured { paint(text, colour) } else { text.to_owned() };

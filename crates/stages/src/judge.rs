@@ -72,7 +72,8 @@ impl Judge {
         &self.model
     }
 
-    /// Takes the next frame, and returns the decision if it comes with this frame. `stamp_nanos` is the time of the
+    /// Takes the next frame, and returns the decision if it comes with this frame: also a probe before it, or what the arm
+    /// should do while it lifts. `stamp_nanos` is the time of the
     /// reading by the source's clock: frames of one time are one reading and have one vote, and a grasp whose frames
     /// come more than 100 ms apart (see [`ArbiterOptions`]) is held.
     pub fn frame(&mut self, stamp_nanos: u64, frame: &TactileFrame) -> Option<LiftDecision> {

@@ -241,10 +241,13 @@ impl LiftArbiter {
         if self.state.options.promised_drops != options.promised_drops {
             self.state.promise = PromiseMonitor::default();
         }
-        if let Some(open) = self.state.open.as_mut()
-            && self.state.options != options
-        {
-            open.agreeing = None;
+        if self.state.options != options {
+            if let Some(open) = self.state.open.as_mut() {
+                open.agreeing = None;
+            }
+            if let Some(watch) = self.state.watch.as_mut() {
+                watch.forget_votes();
+            }
         }
         self.state.options = options;
     }
@@ -363,6 +366,9 @@ impl LiftArbiter {
     pub fn on_unreadable(&mut self, header: &Header, grasp_id: u64, decisions: &mut Vec<LiftDecision>) {
         let break_in_order = self.break_in_order(header, grasp_id);
         self.state.last = Some(*header);
+        if let Some(watch) = self.state.watch.as_mut() {
+            watch.forget_votes();
+        }
         if self.open((header.epoch, grasp_id), decisions).is_some() {
             decisions.extend(self.decide(Action::Hold, Reason::Invalid, 0.0));
         }
@@ -1123,9 +1129,7 @@ mod tests {
         assert_eq!(said(&mut s), []);
         s.push(lifting(0.4, true)).push(lifting(0.1, false)).push(lifting(0.4, true)).push(ended.clone());
         assert_eq!(said(&mut s), [Action::Tighten, Action::GoOn], "once");
-        // A hand that feels nothing has lost the object.
-        s.push(lifting(0.1, false)).push(lifting(0.1, false));
-        s.push(Prediction { fault: Fault::NoContact, ..lifting(0.0, false) });
+        s.push(lifting(0.1, false)).push(lifting(0.1, false)).push(lifting(0.0, false));
         assert_eq!(s.decisions[0].reason, Reason::Slipping);
         assert_eq!(said(&mut s), [Action::SetDown]);
         s.push(lifting(0.9, false)).push(ended).push(lifting(0.1, false));

@@ -46,6 +46,11 @@ impl LiftWatch {
         self.is_set_down
     }
 
+    /// Begins to count anew.
+    pub(crate) fn forget_votes(&mut self) {
+        (self.n_slipping, self.n_unstable) = (0, 0);
+    }
+
     /// Takes a prediction that `is_trusted`, or not, and returns what the arm should do beside going on. `votes` is
     /// [`ArbiterOptions::votes`](crate::lift_arbiter::ArbiterOptions::votes).
     pub(crate) fn on_prediction(
@@ -79,8 +84,7 @@ impl LiftWatch {
     fn count(&mut self, header: &Header, prediction: &Prediction, is_trusted: bool) {
         // A model agrees with itself only.
         let is_same = std::mem::replace(&mut self.made_by, header.made_by) == header.made_by;
-        let is_empty = prediction.fault == Fault::NoContact;
-        let votes = is_trusted && (is_empty || prediction.fault == Fault::None);
+        let votes = is_trusted && prediction.fault == Fault::None;
         let is_slipping = votes && !prediction.stable;
         let is_unstable = is_slipping && !prediction.unsure;
         let counted = |n: u32, is_one: bool| if is_one { u32::from(is_same) * n + 1 } else { 0 };

@@ -283,7 +283,11 @@ impl Model {
         if let Some(day) = &self.day {
             memory.day.begin(dictionary_id, place, day);
         }
-        let verdict = values.and_then(|values| self.classify(phase, values, place.day, memory));
+        let verdict = match values {
+            // A hand that feels nothing any more while it lifts bears nothing.
+            Err(Fault::NoContact) if phase == Phase::Lifting && self.can_watch() => memory.grasp.judge_lifting(0.0),
+            values => values.and_then(|values| self.classify(phase, values, place.day, memory)),
+        };
         if let (true, Phase::Settled, Ok(values)) = (self.day.is_some(), phase, values) {
             memory.day.settle(place, values);
         }

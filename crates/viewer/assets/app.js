@@ -68,8 +68,6 @@ const cut = (body, n) => { while (body.rows.length > n) body.deleteRow(n); };
 const colours = { lift: "--lift", hold: "--hold" };
 let spokenAt = -Infinity;
 const showDecision = (decision) => {
-  // It changes nothing of what is shown.
-  if (decision.action === "go_on") return;
   shown.decision = decision;
   const action = byId("action");
   action.textContent = decision.action.replaceAll("_", " ");
@@ -501,7 +499,7 @@ on("frame", (frame) => {
   for (const p of frame.probabilities) if (p !== null) points.push({ at: now, p });
   for (const p of frame.shadow) if (p !== null) shadows.push({ at: now, p });
   showKey(frame.shadow.length > 0);
-  for (const action of frame.actions) if (action !== "go_on") marks.push({ at: now, action });
+  for (const action of frame.actions) marks.push({ at: now, action });
   if (frame.links) {
     frameAt = now;
     showFrame(frame);

@@ -115,10 +115,12 @@ impl Setup {
             Some("test_lift") => Some(ProbeMove::TestLift),
             _ => None,
         };
-        // A hand is watched while it lifts if the model can, and the file says nothing else.
-        let can_watch = probe == Some(ProbeMove::TestLift) && node.params.contains_key("watch");
-        let is_set = overrides.iter().any(|set| set.is_of(&node.id) && set.param == "watch");
-        if can_watch && !is_set && Model::load(Path::new(&model)).is_ok_and(|model| model.can_watch()) {
+        // A hand is watched while it lifts if the model can, and nothing else was asked for.
+        let is_auto = node.params.get("watch").and_then(|watch| watch.as_str()) == Some("auto");
+        if probe == Some(ProbeMove::TestLift)
+            && is_auto
+            && Model::load(Path::new(&model)).is_ok_and(|model| model.can_watch())
+        {
             overrides.push(set(&node.id, "watch", "on".into()));
         }
         let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());

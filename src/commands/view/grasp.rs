@@ -129,7 +129,10 @@ fn read_grasp(path: &Path, wanted: Option<u64>) -> anyhow::Result<RecordedGrasp>
                     found.prediction = Some(prediction.message);
                 }
             }
-            Record::Decision(decision) if Some(decision.message.grasp_id) == wanted_id => {
+            Record::Decision(decision)
+                if Some(decision.message.grasp_id) == wanted_id
+                    && (decision.message.action.decides() || found.decision.is_none()) =>
+            {
                 found.decision = Some(decision.message);
             }
             _ => {}

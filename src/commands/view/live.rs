@@ -12,7 +12,7 @@ use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection};
 use blindgrasp_graph::control::{Attachment, Reply, Request};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_messages::{
-    ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Record, Sense, TactileFrame,
+    Action, ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Record, Sense, TactileFrame,
 };
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, link_poses};
@@ -344,7 +344,8 @@ impl Sink for Reader {
             if latest.shadow_probabilities.len() < MAX_PROBABILITIES {
                 latest.shadow_probabilities.push(prediction.probability_stable);
             }
-            latest.shadow_decision = decisions.into_iter().last().or(latest.shadow_decision.take());
+            let decided = decisions.into_iter().rfind(|decision| decision.action.decides());
+            latest.shadow_decision = decided.or(latest.shadow_decision.take());
         }
         match record {
             Record::Tactile(sample) if is_shown(sample.header.hand_id) => latest.frame = Some(sample.message),
@@ -357,6 +358,8 @@ impl Sink for Reader {
                 let min_probability_stable = latest.min_probability_stable;
                 latest.votes.count(&sample.header, &sample.message, min_probability_stable);
             }
+            // Several a second, and nothing to look at.
+            Record::Decision(sample) if sample.message.action == Action::GoOn => {}
             Record::Decision(sample) if is_shown(sample.header.hand_id) => {
                 latest.is_decided = true;
                 latest.decisions.push(((sample.header.epoch, sample.message.grasp_id), sample.message));

@@ -116,7 +116,7 @@ fn list(recording: &Path) -> anyhow::Result<BTreeMap<u64, Listed>> {
                 grasp.truth = Some(truth.message.stable);
                 grasp.object = truth.message.object;
             }
-            Record::Decision(decision) => {
+            Record::Decision(decision) if decision.message.action.decides() || grasp.action.is_none() => {
                 grasp.action = Some(decision.message.action);
                 grasp.reason = Some(decision.message.reason.as_str());
                 grasp.probability_stable = Some(decision.message.probability_stable);

@@ -131,14 +131,13 @@ impl<S: RunSink> RunLog<S> {
     fn on_decision(&mut self, decision: &Stamped<LiftDecision>, received_nanos: u64) -> anyhow::Result<()> {
         let Stamped { header, message } = decision;
         let latency_nanos = (header.origin_nanos != 0).then(|| received_nanos.saturating_sub(header.origin_nanos));
-        if let Some(nanos) = latency_nanos {
+        if let Some(nanos) = latency_nanos
+            && message.action != Action::GoOn
+        {
             self.latencies_nanos.saturating_record(nanos);
         }
         if !message.action.decides() {
             // It comes before the grasp's decision, or after it.
-            if message.action == Action::GoOn {
-                return Ok(());
-            }
             self.n_probes += usize::from(matches!(message.action, Action::Squeeze | Action::TestLift));
             return self.sink.decision(&SeenDecision { header, decision: message, latency_nanos, truth: None });
         }

@@ -54,7 +54,7 @@ pub trait RunSink: Send + 'static {
         Ok(())
     }
 
-    /// A decision, once for each grasp.
+    /// A decision, once for each grasp; also the probes before it, and what the arm should do while it lifts.
     ///
     /// # Errors
     /// An error ends the run.

@@ -23,8 +23,11 @@ impl LateDecisions {
     pub fn new(records: &[TrialRecord], decisions: &BTreeMap<u64, LiftDecision>) -> Self {
         let mut late = LateDecisions::default();
         // A record may come twice.
-        let held: BTreeMap<u64, &TrialRecord> =
-            records.iter().filter(|record| !record.lifted).map(|record| (record.grasp_id, record)).collect();
+        let held: BTreeMap<u64, &TrialRecord> = records
+            .iter()
+            .filter(|record| !record.lifted && !record.set_down)
+            .map(|record| (record.grasp_id, record))
+            .collect();
         for grasp_id in held.keys() {
             match decisions.get(grasp_id) {
                 Some(decision) if decision.reason == Reason::Stale => late.n_stale += 1,

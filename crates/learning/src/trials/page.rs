@@ -87,7 +87,8 @@ pub fn telling_records(report: &TrialsReport) -> Vec<&TrialRecord> {
         if report.records_with_gate.is_empty() { &report.records_without_gate } else { &report.records_with_gate };
     let mut seen: Vec<(&str, bool, bool)> = Vec::new();
     let mut telling: Vec<&TrialRecord> = Vec::new();
-    for record in records {
+    // What a watched hand did while it lifted is not made again.
+    for record in records.iter().filter(|record| !record.tightened && !record.set_down) {
         let kind = (record.group.as_str(), record.lifted, record.held);
         if !seen.contains(&kind) {
             seen.push(kind);

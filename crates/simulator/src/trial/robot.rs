@@ -21,8 +21,9 @@ const EPOCH: u64 = 0;
 const DISTURBED_M: f64 = 0.01;
 const DISTURBED_RAD: f64 = 0.2;
 /// A hand that is watched asks after so many frames of a lift whether it may go on: with 20 frames a second, five times a
-/// second.
+/// second. In a long lift it asks less often, because its state holds the answers.
 const FRAMES_PER_ASK: usize = 4;
+const MOST_ASKS: u64 = 50;
 
 /// How the robot goes about its trials.
 #[derive(Debug, Clone, Copy)]
@@ -291,7 +292,8 @@ impl<'a> Robot<'a> {
 
     /// The next frame of an attempt.
     fn feel(&mut self, mut grasp: Box<TriedGrasp<'a>>) -> Result<Doing, TrialError> {
-        let asks = grasp.lift.as_ref().is_some_and(|lift| lift.n_frames_since_asked == FRAMES_PER_ASK);
+        let frames_per_ask = self.frames_per_ask();
+        let asks = grasp.lift.as_ref().is_some_and(|lift| lift.n_frames_since_asked == frames_per_ask);
         let next = if asks { None } else { grasp.attempt.next_frame(grasp.place.grasp_id) };
         grasp.attempt.check()?;
         if next.is_none() && !asks && grasp.lift.is_some() {
@@ -334,6 +336,12 @@ impl<'a> Robot<'a> {
             (true, true) => self.do_again(grasp),
         }
         Ok(Doing::Feels(Stamped { header, message: frame }))
+    }
+
+    fn frames_per_ask(&self) -> usize {
+        let protocol = &self.trial_options.protocol;
+        let lift_nanos = (protocol.lift_secs + protocol.hold_secs + 2.0 * protocol.shake_secs) * 1e9;
+        FRAMES_PER_ASK.max((lift_nanos as u64 / protocol.lifting_frame_nanos / MOST_ASKS) as usize)
     }
 
     /// Does what an attempt that is felt again did when it had asked.
