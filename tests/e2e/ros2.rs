@@ -406,7 +406,7 @@ class Time:
     @staticmethod
     def from_msg(nanos): return Time(nanos)
 class Decision:
-    HOLD, LIFT, SQUEEZE, TEST_LIFT = 0, 1, 3, 4
+    HOLD, LIFT, SQUEEZE, TEST_LIFT, TIGHTEN, SET_DOWN, GO_ON = 0, 1, 3, 4, 5, 6, 7
     def __init__(self, grasp_id, action, left_secs):
         self.grasp_id, self.action, self.reason, self.probability_stable = grasp_id, action, 'stable', 0.9
         self.valid_until = time.time_ns() + int(left_secs * 1e9)
@@ -422,7 +422,7 @@ node, lifted = gate.LiftGate(), []
 node.lift = lambda decision: lifted.append(decision.grasp_id)
 for decision in [Decision(1, Decision.HOLD, 60), Decision(2, Decision.LIFT, -1), Decision(3, Decision.LIFT, 0),
                  Decision(4, Decision.LIFT, 60), Decision(4, Decision.LIFT, 60), Decision(5, Decision.SQUEEZE, 60),
-                 Decision(6, Decision.TEST_LIFT, 60), Decision(7, Decision.LIFT, 60)]:
+                 Decision(6, Decision.TEST_LIFT, 60), Decision(4, Decision.TIGHTEN, 60), Decision(7, Decision.LIFT, 60)]:
     node.on_decision(decision)
 print(node.topic, lifted)
 ";
