@@ -313,8 +313,10 @@ impl Model {
             (Phase::Squeezed, _) => &self.squeezed,
             (Phase::TestLifted, _) => &self.test_lifted,
             (Phase::Lifting, _) => {
-                let newtons = pad_newtons(&self.features, values).filter(|_| self.test_lifted.is_some());
-                return memory.grasp.judge_lifting(newtons.ok_or(Fault::WrongModel)?);
+                if self.test_lifted.is_none() {
+                    return Err(Fault::WrongModel);
+                }
+                return memory.grasp.judge_lifting(pad_newtons(&self.features, values).ok_or(Fault::WrongModel)?);
             }
             (_, None) => return self.classifier.classify(values),
             (_, Some(model)) => return model.classify(&self.classifier, values, day, &memory.day),

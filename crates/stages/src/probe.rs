@@ -67,10 +67,12 @@ pub fn signals(features: &FeatureExtractor) -> Vec<usize> {
     signals
 }
 
-/// What all pads together feel, by the values of a feature: newtons; `None` if the feature does not have it.
+/// What all pads together feel, by the values of a feature that is not scaled: newtons; `None` if it does not have it.
 pub fn pad_newtons(features: &FeatureExtractor, values: &[f64]) -> Option<f64> {
-    let place =
-        features.blocks.iter().position(|block| *block == Block::Pads).filter(|_| features.scaling.is_none())?;
+    if features.scaling.is_some() {
+        return None;
+    }
+    let place = features.blocks.iter().position(|block| *block == Block::Pads)?;
     let start: usize = features.blocks[..place].iter().map(|block| features.block_len(*block)).sum();
     let of_pads = values.get(start..start + features.block_len(Block::Pads))?;
     Some(of_pads.iter().step_by(N_PAD_VALUES).sum())
