@@ -5,7 +5,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use anyhow::Context as _;
-use blindgrasp_messages::LiftDecision;
+use blindgrasp_messages::{Action, LiftDecision};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_recording::cdr::encode;
@@ -89,8 +89,19 @@ impl Calls {
 }
 
 impl LastDecision {
+    /// Keeps a decision. `go_on` does not take the place of `tighten`, which is said once.
     pub(super) fn set(&self, decision: &LiftDecision, until_nanos: Option<u64>) {
-        self.calls().decision = Some((decision.clone(), until_nanos));
+        let mut calls = self.calls();
+        let is_told_to_tighten = calls.is_valid()
+            && calls
+                .decision
+                .as_ref()
+                .is_some_and(|(last, _)| (last.grasp_id, last.action) == (decision.grasp_id, Action::Tighten));
+        if decision.action == Action::GoOn && is_told_to_tighten {
+            return;
+        }
+        calls.decision = Some((decision.clone(), until_nanos));
+        drop(calls);
         self.changes.notify_all();
     }
 
@@ -168,7 +179,7 @@ pub(super) fn decision_type() -> anyhow::Result<MessageType> {
 mod tests {
     use std::path::Path;
 
-    use blindgrasp_messages::{Action, Reason};
+    use blindgrasp_messages::Reason;
 
     use super::*;
 
@@ -183,6 +194,12 @@ mod tests {
         assert!(wait(Duration::from_millis(20)).is_none());
         last.set(&decision(2), Some(monotonic_nanos() + 60_000_000_000));
         assert_eq!(wait(Duration::ZERO).map(|decision| decision.grasp_id), Some(2));
+        // The answer to a robot that asks while it lifts does not hide the advice before it.
+        let while_lifting = |action| LiftDecision { action, ..decision(2) };
+        let until_nanos = Some(monotonic_nanos() + 60_000_000_000);
+        last.set(&while_lifting(Action::Tighten), until_nanos);
+        last.set(&while_lifting(Action::GoOn), until_nanos);
+        assert_eq!(wait(Duration::ZERO).map(|decision| decision.action), Some(Action::Tighten.code() as u8));
         last.set(&decision(3), None);
         let other = Arc::clone(&last);
         let waiting =

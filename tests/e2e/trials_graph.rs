@@ -200,6 +200,21 @@ fn a_hand_that_is_killed_with_its_classifier_and_arbiter_amid_probes_goes_on_whe
 }
 
 #[test]
+fn a_hand_that_is_killed_with_its_arbiter_while_it_lifts_and_asks_goes_on_where_it_was() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = trial_flow(folder.path(), "trials: 4, watch: 'on'", &[]);
+    let Run { outcomes, summary, decisions } = run_to_end(&flow, &[]);
+    let lifts: Vec<&Value> = decisions.iter().filter(|line| line["action"] == "lift").collect();
+    let n_answers = decisions.iter().filter(|line| line["action"] == "go_on").count();
+    // A lift takes 4 s, in which the hand asks five times a second; a thing that is lost at once ends it.
+    assert!(!lifts.is_empty() && n_answers >= 10, "{n_answers} answers, {} lifts: {summary}", lifts.len());
+    let n_decided = decisions.iter().filter(|line| line["action"] == "lift" || line["action"] == "hold").count();
+    assert_eq!(n_decided, outcomes.len(), "{decisions:?}");
+    assert_eq!(summary["lift"], lifts.len(), "{summary}");
+    assert_killed_hand_goes_on(&flow, &outcomes, (3, 1), &["lift_arbiter", "classifier"]);
+}
+
+#[test]
 fn a_graph_that_is_stopped_amid_a_trial_ends_cleanly() {
     let folder = tempfile::tempdir().expect("a folder");
     let graph = Graph::launch(&unique_name(), &flow(folder.path()), &["--set", "source.trials=100000"]);

@@ -119,7 +119,7 @@ coded_enums! {
         Kept = 8, "kept";
         /// The arm has lifted, and the object was dropped. The readings do not matter.
         Dropped = 9, "dropped";
-        /// The arm lifts, holds or moves what it has been allowed to lift.
+        /// The arm lifts the object, holds it or moves it, after [`Action::Lift`].
         Lifting = 10, "lifting";
     }
 
@@ -168,7 +168,7 @@ coded_enums! {
         TestLift = 4, "test_lift";
         /// Tighten to the force of a lift, hold it from now on, and go on lifting.
         Tighten = 5, "tighten";
-        /// Stop lifting and set the object down: it will leave the hand.
+        /// Stop lifting, and set the object down: most of the load on the fingers is gone.
         SetDown = 6, "set_down";
         /// Go on lifting: the answer to a source that asks while it lifts, by a frame of [`Phase::Ended`].
         GoOn = 7, "go_on";
@@ -217,7 +217,7 @@ coded_enums! {
         SensorFault = 18, "sensor_fault";
         /// More lifts dropped their objects than was promised.
         PromiseWithdrawn = 19, "promise_withdrawn";
-        /// While the arm lifts, consecutive predictions agreed that the object leaves the hand.
+        /// While the arm lifts, enough consecutive predictions agreed that the fingers lose the object's load.
         Slipping = 20, "slipping";
     }
 }

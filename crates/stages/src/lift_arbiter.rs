@@ -1120,8 +1120,19 @@ mod tests {
         let mut s = stream();
         s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9)).push(ended.clone());
         assert_eq!(said(&mut s), [Action::Lift], "it has not begun to lift");
-        s.push(lifting(0.9, false)).push(ended.clone());
-        assert_eq!(said(&mut s), [Action::GoOn]);
+        s.push(lifting(0.9, false))
+            .push(ended.clone())
+            .push(lifting(0.4, true))
+            .push(ended.clone())
+            .push(ended.clone());
+        let reasons: Vec<Reason> = s.decisions.iter().map(|decision| decision.reason).collect();
+        assert_eq!(
+            reasons,
+            [Reason::Stable, Reason::NoAgreement, Reason::NoAgreement],
+            "nothing was judged for the last"
+        );
+        assert_eq!(said(&mut s), [Action::GoOn; 3]);
+        s.push(lifting(0.9, false));
         // Two are too few, and a fault or a late frame has no vote.
         s.push(lifting(0.4, true)).push(lifting(0.4, true)).push(lifting(0.9, false));
         s.push(lifting(0.4, true)).push(Prediction { fault: Fault::SensorFault, ..lifting(0.0, false) });

@@ -14,13 +14,15 @@ use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction
 pub(crate) struct LiftWatch {
     epoch: u64,
     grasp_id: u64,
-    /// Who has made the votes: [`Header::made_by`].
+    /// The operators that made the votes: [`Header::made_by`].
     made_by: u64,
     /// The latest consecutive readings that are not stable, and those of them that are unstable.
     n_slipping: u32,
     n_unstable: u32,
     probability_stable: f64,
     has_begun: bool,
+    /// Whether a reading has had a vote since the source asked.
+    is_judged: bool,
     has_tightened: bool,
     is_set_down: bool,
 }
@@ -36,6 +38,7 @@ impl LiftWatch {
             n_unstable: 0,
             probability_stable,
             has_begun: false,
+            is_judged: false,
             has_tightened: false,
             is_set_down: false,
         }
@@ -46,12 +49,13 @@ impl LiftWatch {
         self.is_set_down
     }
 
-    /// Begins to count anew.
+    /// Starts the counts at zero again.
     pub(crate) fn forget_votes(&mut self) {
         (self.n_slipping, self.n_unstable) = (0, 0);
     }
 
-    /// Takes a prediction that `is_trusted`, or not, and returns what the arm should do beside going on. `votes` is
+    /// Takes a prediction, and returns the action that the arm should take, if any. A prediction that is not trusted has no
+    /// vote. `votes` is
     /// [`ArbiterOptions::votes`](crate::lift_arbiter::ArbiterOptions::votes).
     pub(crate) fn on_prediction(
         &mut self,
@@ -76,7 +80,10 @@ impl LiftWatch {
                 self.has_tightened |= tightens;
                 tightens.then(|| self.says(Action::Tighten, Reason::Slipping))
             }
-            Phase::Ended if self.has_begun => Some(self.says(Action::GoOn, Reason::Stable)),
+            Phase::Ended if self.has_begun => {
+                let is_stable = std::mem::take(&mut self.is_judged) && self.n_slipping == 0;
+                Some(self.says(Action::GoOn, if is_stable { Reason::Stable } else { Reason::NoAgreement }))
+            }
             _ => None,
         }
     }
@@ -90,6 +97,7 @@ impl LiftWatch {
         let counted = |n: u32, is_one: bool| if is_one { u32::from(is_same) * n + 1 } else { 0 };
         self.n_slipping = counted(self.n_slipping, is_slipping);
         self.n_unstable = counted(self.n_unstable, is_unstable);
+        self.is_judged |= votes;
         if votes {
             self.probability_stable = prediction.probability_stable;
         }

@@ -63,7 +63,9 @@ mod tests {
 
     #[test]
     fn only_what_the_machine_held_is_late() {
-        let records = records(&[("box-02", "box", 0.1, "----h")]);
+        let mut records = records(&[("box-02", "box", 0.1, "-----h")]);
+        // Its lift was broken off in time.
+        records[5 - 1].set_down = true;
         let decision = |grasp_id: u64, action: Action, reason: Reason| {
             (grasp_id, LiftDecision { grasp_id, action, reason, ..LiftDecision::default() })
         };
@@ -73,6 +75,7 @@ mod tests {
             // Too late for the hand; of grasp 3 there is none.
             decision(2, Action::Lift, Reason::Stable),
             decision(4, Action::Lift, Reason::Stable),
+            decision(5, Action::Lift, Reason::Stable),
         ]);
         let late = LateDecisions::new(&records, &decisions);
         assert_eq!(late, LateDecisions { n_stale: 1, n_undecided: 2 });

@@ -384,7 +384,7 @@ impl<'a> Attempt<'a> {
         self.holds_force = true;
     }
 
-    /// What has become of the target when a lift is over.
+    /// The outcome of a lift that is over.
     pub fn lift_result(&self) -> LiftResult {
         let end = self.engine.palm_from_target();
         let slip_m = self.slip_m();
