@@ -46,6 +46,7 @@ class Fault(enum.IntEnum):
     NO_BASELINE = 10
     UNLIKE_DAY = 11
     SENSOR_FAULT = 12
+    CHANGED = 13
 
 
 class Action(enum.IntEnum):

@@ -1,19 +1,23 @@
 //! From the feature to a calibrated probability.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use blindgrasp_messages::{GraspFeature, GraspFeatureHead, Prediction, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::operator::Operator;
+use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
 use blindgrasp_stages::model::{Memory, Model};
+use blindgrasp_stages::own_lifts::{Adapt, OwnLifts};
 use blindgrasp_stages::steps;
 use serde::Deserialize;
+use serde_json::{Map, Value};
 
 #[derive(Deserialize)]
 struct Params {
     model: PathBuf,
+    adapt: Adapt,
 }
 
 pub(crate) fn describe() -> OperatorDescription {
@@ -28,21 +32,34 @@ pub(crate) fn describe() -> OperatorDescription {
             "The model file. It says what is judged: settled grasps, and with a memory of earlier frames also probes, and grasps \
              by the earlier ones of their day",
         )
+        .live_param(
+            "adapt",
+            ParamKind::Choice { values: ["off", "on", "frozen"].map(String::from).into() },
+            Some("off".into()),
+            "Whether the outcomes of lifts (frames of the phases kept and dropped) correct the probabilities of the look that decided: \
+             off keeps them and judges as the model does, on corrects after each one, frozen takes no more",
+        )
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let model = Model::load(&params.model)?;
     let (identity, dictionary_id) = (model.identity(), model.dictionary_id());
-    let classify = Classify { model, dictionary_id, memory: Memory::default() };
+    let memory = Memory::new(params.adapt);
+    let classify =
+        Classify { operator: operator.clone(), model, dictionary_id, memory, adapt: params.adapt, reported: [0; 3] };
     stage::run(operator, "feature", "prediction", 0, identity, classify)
 }
 
 struct Classify {
+    operator: Operator,
     model: Model,
     dictionary_id: u64,
     /// Earlier frames of the open grasp, or of the day. It stays empty if the model judges each frame alone.
     memory: Memory,
+    adapt: Adapt,
+    /// Kept and dropped lifts, and changes of the readings, in the node's status.
+    reported: [u64; 3],
 }
 
 impl Stage for Classify {
@@ -50,7 +67,7 @@ impl Stage for Classify {
     type Out = Prediction;
 
     fn has_state(&self) -> bool {
-        self.model.has_memory()
+        self.model.has_memory() || self.adapt != Adapt::Off
     }
 
     fn answer(&mut self, head: &GraspFeatureHead, values: &[f64], _now_nanos: u64, answers: &mut Answers<Prediction>) {
@@ -58,19 +75,61 @@ impl Stage for Classify {
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
-        encode_state((self.dictionary_id, &self.memory), bytes)
+        encode_state((self.dictionary_id, &self.model.checksum, &self.memory), bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
         self.memory = Memory::default();
         if let Some(bytes) = state {
-            let ((dictionary_id, memory), _) =
-                bincode::serde::decode_from_slice::<(u64, Memory), _>(bytes, STATE_FORMAT)?;
+            let ((dictionary_id, checksum, memory), _) =
+                bincode::serde::decode_from_slice::<(u64, String, Memory), _>(bytes, STATE_FORMAT)?;
             // Features of another model say nothing to this one.
             if dictionary_id == self.dictionary_id {
                 self.memory = memory;
             }
+            // Another model has other log-odds.
+            if checksum != self.model.checksum {
+                self.memory.lifts = OwnLifts::default();
+            }
         }
+        self.memory.adapt = self.adapt;
+        self.report();
         Ok(())
+    }
+
+    fn look(&mut self) {
+        self.report();
+    }
+
+    fn set(&mut self, params: &Map<String, Value>) -> anyhow::Result<()> {
+        let adapt = parse_params::<Params>(params)?.adapt;
+        anyhow::ensure!(
+            adapt == Adapt::Off || self.has_state(),
+            "adapt: this classifier has kept no outcomes, because its model judges each frame alone: swap it with \
+             --set adapt={}",
+            if adapt == Adapt::On { "on" } else { "frozen" }
+        );
+        (self.adapt, self.memory.adapt) = (adapt, adapt);
+        Ok(())
+    }
+}
+
+impl Classify {
+    /// Counts the outcomes that it has learned from in the node's status.
+    fn report(&mut self) {
+        let lifts = &self.memory.lifts;
+        let counts = [lifts.n_kept(), lifts.n_dropped(), lifts.n_changes()];
+        if counts == self.reported {
+            return;
+        }
+        if counts[2] > self.reported[2] && self.adapt == Adapt::On {
+            tracing::warn!(
+                "the hand's readings have changed (another skin, another gain): outcomes of lifts before are forgotten, and the \
+                 model judges as it was trained until there are new ones"
+            );
+        }
+        self.reported = counts;
+        let names = ["outcomes/kept", "outcomes/dropped", "outcomes/changes"].map(String::from);
+        self.operator.has_counted_in_all(names.into_iter().zip(counts).collect::<BTreeMap<_, _>>());
     }
 }

@@ -2,14 +2,16 @@
 
 use std::collections::BTreeMap;
 
-use blindgrasp_messages::{Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Recorded};
+use blindgrasp_messages::{
+    Fault, Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Recorded,
+};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter, Probe};
-use blindgrasp_stages::promise_monitor::PromiseMonitor;
+use blindgrasp_stages::promise_monitor::{OUTCOME_COUNTS, PromiseMonitor};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
@@ -137,11 +139,16 @@ impl Stage for Arbiter {
         self.last = head.header;
         match Prediction::from_parts(head, items) {
             Ok(prediction) => {
+                let promise = (prediction.fault == Fault::Changed).then(|| self.arbiter.state().promise().clone());
                 // The clock of a frame from the future cannot be trusted: the frame counts as infinitely old.
                 let has_expired = head.header.valid_until_nanos().is_some_and(|until_nanos| now_nanos > until_nanos);
                 let age_nanos = if has_expired { None } else { now_nanos.checked_sub(head.header.origin_nanos) };
                 let age_nanos = age_nanos.unwrap_or(u64::MAX);
                 self.arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut self.decided);
+                if let Some(before) = promise.filter(|before| !before.is_withdrawn()) {
+                    tracing::warn!("the hand's readings have changed: the promise of its lifts begins anew");
+                    self.has_replaced(&before);
+                }
             }
             Err(error) => {
                 tracing::warn!(seq = head.header.seq, "a prediction cannot be read: {error}");
@@ -244,7 +251,17 @@ impl Arbiter {
                 n_kept + n_dropped
             );
         }
+        if promise.is_doubted() && !self.reported.0.is_doubted() && !promise.is_withdrawn() {
+            tracing::warn!(
+                "lifts seem to drop the object more often than the promised {} %: {n_dropped} of {} that were reported; if this \
+                 goes on, every grasp will be held",
+                100.0 * self.arbiter.options().promised_drops,
+                n_kept + n_dropped
+            );
+        }
         self.operator.has_counted_in_all(BTreeMap::from([
+            (OUTCOME_COUNTS[0].into(), n_kept),
+            (OUTCOME_COUNTS[1].into(), n_dropped),
             ("lifts/kept".into(), self.ended.n_kept + n_kept),
             ("lifts/dropped".into(), self.ended.n_dropped + n_dropped),
             ("lifts/unreported".into(), state.n_unreported()),

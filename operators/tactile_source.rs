@@ -10,7 +10,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, bail};
-use blindgrasp_messages::{Header, MAX_CELLS, MAX_JOINTS, Recorded, TactileFrame};
+use blindgrasp_messages::{GraspTruth, Header, MAX_CELLS, MAX_JOINTS, MAX_NAME_BYTES, Recorded, TactileFrame};
 use blindgrasp_operator::control_socket;
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -129,6 +129,7 @@ pub(crate) fn describe() -> OperatorDescription {
     };
     let description = OperatorDescription::new("tactile_source", "Publishes a hand's live tactile frames")
         .uses_network()
+        .output("truth", GraspTruth::TYPE_NAME, "How each lift ended whose object the bridge names")
         .output(
             "tactile",
             TactileFrame::TYPE_NAME,
@@ -229,6 +230,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let mut source = TactileSource {
         operator,
         tactile: operator.publisher("tactile", TactileFrame::max_items(n_joints, n_cells))?,
+        truths: operator.publisher("truth", 2 * MAX_NAME_BYTES)?,
         driver,
         hand_id: hand.id(),
         gate: FrameFilter::new(shape, params.max_delay_nanos(), wall_offset_nanos, Place::default(), None),
@@ -406,6 +408,7 @@ fn wall_nanos() -> u64 {
 struct TactileSource<'a> {
     operator: &'a Operator,
     tactile: Publisher<TactileFrame>,
+    truths: Publisher<GraspTruth>,
     driver: Box<dyn TactileDriver>,
     hand_id: u64,
     gate: FrameFilter,
@@ -447,6 +450,7 @@ impl Source for TactileSource<'_> {
 
     fn look(&mut self) -> anyhow::Result<()> {
         self.tactile.look_for_readers()?;
+        self.truths.look_for_readers()?;
         let now_nanos = monotonic_nanos();
         self.log.flush(now_nanos);
         if now_nanos >= self.report_due_nanos && self.counts() != self.reported {
@@ -523,6 +527,13 @@ impl TactileSource<'_> {
             self.refuse(&Refusal { kind: RefusalKind::OutOfOrder, why });
             return Ok(());
         }
+        let (epoch, hand_id) = (self.epoch, self.hand_id);
+        let header =
+            Header { seq: accepted.seq, stamp_nanos: accepted.stamp_nanos, epoch, hand_id, ..Header::default() };
+        if let Some(truth) = reading.truth(accepted.grasp_id) {
+            let seq = self.truths.last().map_or(0, |last| last.seq + 1);
+            let _ = send(self.operator, &mut self.truths, &truth, Header { seq, ..header })?;
+        }
         let frame = TactileFrame {
             grasp_id: accepted.grasp_id,
             phase: reading.phase,
@@ -531,9 +542,6 @@ impl TactileSource<'_> {
             senses: reading.senses,
             day: reading.day.unwrap_or(self.day),
         };
-        let (epoch, hand_id) = (self.epoch, self.hand_id);
-        let header =
-            Header { seq: accepted.seq, stamp_nanos: accepted.stamp_nanos, epoch, hand_id, ..Header::default() };
         // A frame that was not sent, because this instance gives way, is a gap before the next one.
         let _ = send(self.operator, &mut self.tactile, &frame, header)?;
         Ok(())

@@ -80,7 +80,7 @@ class Study:
         first = self.record("first", header, rows[:N_LABELLED], pitch_rad, day, 50_000)
         rest = self.record("rest", header, rows[N_LABELLED:], pitch_rad, day, 50_000 + N_LABELLED)
         corrected = self.folder / "corrected.json"
-        programs.blindgrasp("model", "recalibrate", model, first, "--overwrite", "--out", corrected)
+        programs.blindgrasp("model", "adapt", model, first, "--overwrite", "--out", corrected)
         return {"no labels": self.judge(model, whole), f"{N_LABELLED} labels": self.judge(corrected, rest)}
 
 
@@ -128,7 +128,7 @@ def left_out_table(study, options):
     tables = {name: study.rows(name) for name in PITCH_RAD}
     objects = sorted({row[0] for _, rows in tables.values() for row in rows})
     random.Random(7).shuffle(objects)
-    judged = []
+    judged = {"in random order": [], "object by object": []}
     for left_out in PITCH_RAD:
         for quarter in range(options.quarters):
             figures.progress(f"{left_out} left out, quarter {quarter + 1}")
@@ -143,9 +143,11 @@ def left_out_table(study, options):
             model = study.train("left-out", recordings, "--recipe", "blend", "--day-baseline")
             header, rows = tables[left_out]
             rows = [row for row in rows if row[0] in new]
-            random.Random(quarter).shuffle(rows)
-            judged.append(study.judge_in_order(model, header, rows, 0, left_out))
-    yield from means("a table left out, new objects", judged)
+            for order, of_order in judged.items():
+                shuffled = in_order(rows, random.Random(quarter), order == "object by object")
+                of_order.append(study.judge_in_order(model, header, shuffled, 0, left_out))
+    for order, of_order in judged.items():
+        yield from means(f"a table left out, new objects, {order}", of_order)
 
 
 def means(grasps, judged):

@@ -5,18 +5,19 @@ use std::path::PathBuf;
 use anyhow::bail;
 use clap::{Args, ValueEnum};
 
+use super::frame_lines::{FrameLines, read_frames};
 use super::hand_cells::joint;
 use super::{Outcome, check_new, number_in, percent, print_line};
-use blindgrasp_learning::import::{AngleUnit, Day, ImportOptions, ImportReport, Joints, import_table};
+use blindgrasp_learning::import::{AngleUnit, Day, ImportOptions, ImportReport, Joints, import_frames, import_table};
 use blindgrasp_stages::hand::{CellUnit, Hand};
 
 /// The most left-out rows that are printed.
 const MAX_SHOWN_ROWS: usize = 20;
 
-/// Turn a table of tactile readings (CSV) into a recording
+/// Turn a table (CSV) or lines of frames into a recording
 ///
 /// Turn a table of tactile readings (CSV), a robot's own or a published one, into a recording: one grasp a row, or one frame a row
-/// with --grasp-column.
+/// with --grasp-column. Or the frames that a bridge sends as lines of JSON, with --lines.
 #[derive(Debug, Args)]
 #[command(
     after_help = "Example: blindgrasp import grasps.csv --hand shadow-biotac-sp --joints palm_pitch=0 \\\n           \
@@ -25,13 +26,18 @@ const MAX_SHOWN_ROWS: usize = 20;
                   A row that is a grasp is one reading: its frames are alike, so the arbiter's votes always agree."
 )]
 pub(super) struct Arguments {
-    /// The table: CSV with a header, UTF-8.
+    /// The table: CSV with a header, UTF-8. With --lines, the lines (- for stdin).
     table: PathBuf,
+    /// The file has frames as lines of JSON, of a bridge (docs/hardware.md) or of blindgrasp export: phases, senses and outcomes
+    /// of lifts are read as they are. Every line needs its grasp_id.
+    #[arg(long, conflicts_with_all = ["cells", "unit", "newtons_per_unit", "joints", "joint_columns", "label", "stable_value",
+        "group", "class", "day", "day_column", "grasp_column", "delimiter", "frames", "grasp_id_start", "skip_bad_rows"])]
+    lines: bool,
     /// Pad layout (YAML) of the hand, or the name of a built-in one.
     #[arg(long)]
     hand: PathBuf,
     /// Columns of the cells, names or patterns with *, separated by commas; they fill the hand's pads in order.
-    #[arg(long, required = true, value_delimiter = ',', value_name = "PATTERNS")]
+    #[arg(long, required_unless_present = "lines", value_delimiter = ',', value_name = "PATTERNS")]
     cells: Vec<String>,
     /// The unit of the cells' columns [default: the unit of the hand's cells].
     #[arg(long, value_enum)]
@@ -40,7 +46,7 @@ pub(super) struct Arguments {
     #[arg(long, conflicts_with = "unit", value_parser = |text: &str| number_in(text, 1e-12..=1e12))]
     newtons_per_unit: Option<f64>,
     /// The posture of all grasps, NAME=VALUE,…; joints not given are 0, or follow their coupling.
-    #[arg(long, value_delimiter = ',', value_parser = joint, required_unless_present = "joint_columns",
+    #[arg(long, value_delimiter = ',', value_parser = joint, required_unless_present_any = ["joint_columns", "lines"],
         conflicts_with = "joint_columns")]
     joints: Vec<(String, f64)>,
     /// Columns of the joint angles, names or patterns with *, separated by commas, in the hand's order of joints.
@@ -50,13 +56,19 @@ pub(super) struct Arguments {
     #[arg(long, value_enum, requires = "joint_columns", conflicts_with = "joints")]
     joint_unit: Option<JointUnit>,
     /// Column of the label: how the grasp ended, one of two values.
-    #[arg(long, value_name = "COLUMN")]
+    #[arg(long, value_name = "COLUMN", required_unless_present = "lines", default_value = "")]
     label: String,
     /// The label's value that means stable, to the letter.
-    #[arg(long, value_name = "TEXT", allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "TEXT",
+        allow_hyphen_values = true,
+        required_unless_present = "lines",
+        default_value = ""
+    )]
     stable_value: String,
     /// Column of the object: training keeps the grasps of an object in one fold.
-    #[arg(long, value_name = "COLUMN")]
+    #[arg(long, value_name = "COLUMN", required_unless_present = "lines", default_value = "")]
     group: String,
     /// Column of the object's class, by which evaluation lists results [default: the group's].
     #[arg(long, value_name = "COLUMN")]
@@ -112,6 +124,9 @@ enum JointUnit {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let hand = Hand::load(&arguments.hand)?;
+    if arguments.lines {
+        return import_lines(arguments, &hand);
+    }
     check_new(&arguments.out, std::slice::from_ref(&arguments.table), arguments.overwrite)?;
     let options = ImportOptions {
         cells: arguments.cells.iter().map(|pattern| pattern.trim().into()).collect(),
@@ -138,6 +153,29 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         print_line(&serde_json::to_string_pretty(&report)?)?;
     } else {
         print_report(arguments, &hand, &options, &report)?;
+    }
+    Ok(Outcome::Done)
+}
+
+fn import_lines(arguments: &Arguments, hand: &Hand) -> anyhow::Result<Outcome> {
+    // Stdin has no name.
+    let inputs: &[PathBuf] = if arguments.table.is_file() { std::slice::from_ref(&arguments.table) } else { &[] };
+    check_new(&arguments.out, inputs, arguments.overwrite)?;
+    let FrameLines { frames, truths } = read_frames(&arguments.table, hand)?;
+    let name = arguments.table.file_name().unwrap_or(arguments.table.as_os_str()).to_string_lossy();
+    let report = import_frames(&name, hand, &frames, &truths, &arguments.out)?;
+    if arguments.json {
+        print_line(&serde_json::to_string_pretty(&report)?)?;
+        return Ok(Outcome::Done);
+    }
+    for (what, value) in [
+        ("recorded to", arguments.out.display().to_string()),
+        ("grasps", format!("{} in {} frames", report.n_grasps, report.n_frames)),
+        ("outcomes", format!("{} kept, {} dropped", report.n_kept, report.n_dropped)),
+        ("objects", format!("{} named", report.n_objects)),
+        ("senses", if report.senses.is_empty() { "none".into() } else { report.senses.join(", ") }),
+    ] {
+        print_line(&format!("{what:<17} {value}"))?;
     }
     Ok(Outcome::Done)
 }

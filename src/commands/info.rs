@@ -10,7 +10,7 @@ use serde::Serialize;
 use super::simulate::report_in;
 use super::{Outcome, cases, hand_cells, percent, print_line};
 use blindgrasp_graph::log::printable;
-use blindgrasp_learning::dataset::{REPORT_METADATA, hand_of, label_of};
+use blindgrasp_learning::dataset::{REPORT_METADATA, hand_of, label_of, reported_truth};
 use blindgrasp_learning::evaluation::paper_label::PaperLabel;
 use blindgrasp_learning::evaluation::statistics::Interval;
 use blindgrasp_messages::{GraspTruth, Phase, TactileFrame};
@@ -324,6 +324,9 @@ fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow:
             _ => reports = None,
         }
         let mut last: Option<TactileFrame> = None;
+        // The outcomes of lifts that frames report, for grasps without a label.
+        let mut reported = BTreeMap::new();
+        let mut labelled = BTreeSet::new();
         let mut seen = BTreeSet::new();
         let mut problems = Problems::default();
         for record in reader {
@@ -336,11 +339,15 @@ fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow:
                         summary.count_contacts(hand, last.take());
                     }
                     summary.n_grasps += usize::from(seen.insert(frame.message.grasp_id));
+                    if matches!(frame.message.phase, Phase::Kept | Phase::Dropped) {
+                        reported.entry(frame.message.grasp_id).or_insert(frame.message.phase == Phase::Kept);
+                    }
                     if frame.message.phase == Phase::Settled || last.is_none() {
                         last = Some(frame.message);
                     }
                 }
                 Record::Truth(truth) => {
+                    labelled.insert(truth.message.grasp_id);
                     summary.count_truth(&truth.message, &mut qualities);
                     truths.push(truth.message);
                 }
@@ -348,6 +355,9 @@ fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow:
             }
         }
         summary.count_contacts(hand, last);
+        for (grasp_id, is_kept) in reported.into_iter().filter(|(grasp_id, _)| !labelled.contains(grasp_id)) {
+            summary.count_truth(&reported_truth(path, grasp_id, is_kept), &mut qualities);
+        }
         summary.problems.extend(problems.found().into_iter().map(|problem| FoundProblem {
             recording: path.clone(),
             message: problem.to_string(),

@@ -10,7 +10,7 @@ use super::train::{probe_lines, threshold_line};
 use super::{Outcome, check_new, check_output, percent, print_line};
 use blindgrasp_learning::dataset::{hand_of, label_line};
 use blindgrasp_learning::learners::libsvm_format::{parse_libsvm, write_libsvm};
-use blindgrasp_learning::training::recalibrate;
+use blindgrasp_learning::training::adapt;
 use blindgrasp_messages::files::{read_regular, write_whole};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
@@ -20,10 +20,12 @@ use blindgrasp_stages::classifier::{Blend, Predictor};
 use blindgrasp_stages::day::{Baseline, DayMethod};
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
+use blindgrasp_stages::own_lifts::Correction;
 use blindgrasp_stages::probe::ProbeModel;
 use blindgrasp_stages::recipe::Learner;
+use blindgrasp_stages::training_summary::OwnLiftsSummary;
 
-/// Describe, recalibrate or exchange a model, or rate approaches
+/// Describe, adapt or exchange a model, or rate approaches
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(subcommand)]
@@ -35,7 +37,7 @@ enum Command {
     Show(ShowArguments),
     Export(ExportArguments),
     Import(ImportArguments),
-    Recalibrate(RecalibrateArguments),
+    Adapt(AdaptArguments),
     Approaches(super::approaches::Arguments),
 }
 
@@ -94,17 +96,21 @@ struct ImportArguments {
     overwrite: bool,
 }
 
-/// Correct a model for one day, by labelled grasps of that day.
+/// Correct a model by the robot's own outcomes: lifts, or labelled grasps of one day.
 ///
-/// The model must look at days: trained with --day-baseline, or on recordings with days (import --day). It then judges this day
-/// from its first grasp, with corrected probabilities; other days as before. Swap it in: blindgrasp swap classifier --set
-/// model=NEW.
+/// Recordings of lifts that end with a frame of the phase kept or dropped correct the probabilities of the look that decides, and
+/// widen limits that held the robot's own grasps; objects are the unit of the cross-fit. A model that looks at days (--day-baseline,
+/// import --day) is corrected for the day of the recordings; other days are judged as before. The thresholds stay. Use the new
+/// model in place of the old one: blindgrasp run --set model=NEW, or blindgrasp swap.
 #[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp model recalibrate hand.json today.mcap --out today.json")]
-struct RecalibrateArguments {
+#[command(
+    after_help = "Example: blindgrasp model adapt models/barrett-bh8-280-lifts.json my-lifts.mcap --out mine.json"
+)]
+struct AdaptArguments {
     /// The model.
     model: PathBuf,
-    /// Recordings of the day (MCAP) with 20 labelled grasps or more, some stable and some not; 30 of several objects are good.
+    /// Recordings (MCAP) of the robot: 20 outcomes of lifts or more, of several objects; or, of a model that looks at days, 20
+    /// labelled grasps of one day or more, some stable and some not.
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
@@ -134,7 +140,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         Command::Show(arguments) => show(arguments),
         Command::Export(arguments) => export(arguments),
         Command::Import(arguments) => import(arguments),
-        Command::Recalibrate(arguments) => recalibrate_model(arguments),
+        Command::Adapt(arguments) => adapt_model(arguments),
         Command::Approaches(arguments) => super::approaches::run(arguments),
     }
 }
@@ -215,15 +221,16 @@ fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-fn recalibrate_model(arguments: &RecalibrateArguments) -> anyhow::Result<Outcome> {
+fn adapt_model(arguments: &AdaptArguments) -> anyhow::Result<Outcome> {
     let recordings = recordings_in(&arguments.recordings)?;
     let first = recordings.first().context("expected a recording")?;
     let hand = hand_of(first, arguments.hand.as_deref())?;
     let inputs = [recordings.as_slice(), std::slice::from_ref(&arguments.model)].concat();
     check_new(&arguments.out, &inputs, arguments.overwrite)?;
-    let model = recalibrate(&hand, &Model::load(&arguments.model)?, &recordings)?;
+    let model = adapt(&hand, &Model::load(&arguments.model)?, &recordings)?;
     model.save(&arguments.out)?;
-    print_line(&format!("{}: {}", arguments.out.display(), recalibration_line(&model).unwrap_or_default()))?;
+    let lines: Vec<String> = recalibration_line(&model).into_iter().chain(own_lifts_lines(&model)).collect();
+    print_line(&format!("{}: {}", arguments.out.display(), lines.join("\n")))?;
     Ok(Outcome::Done)
 }
 
@@ -243,14 +250,31 @@ fn day_line(model: &Model) -> Option<String> {
 
 fn recalibration_line(model: &Model) -> Option<String> {
     let known = model.day.as_ref()?.recalibration.as_ref()?;
-    Some(format!(
-        "on day {}, log-odds are {:.3} x those of the model {} {:.3}, by {} labelled grasps",
-        known.day,
-        known.a,
-        if known.b < 0.0 { '-' } else { '+' },
-        known.b.abs(),
-        known.n_labelled
-    ))
+    Some(format!("log-odds of day {} are corrected by {} labelled grasps like them", known.day, known.grasps.len()))
+}
+
+/// The lifts of a robot that corrected the model, for people.
+fn own_lifts_lines(model: &Model) -> Vec<String> {
+    let Some(own) = &model.training.own_lifts else { return Vec::new() };
+    let OwnLiftsSummary { n_lifts, n_kept, n_objects, correction, log_loss_before, log_loss_after, .. } = own;
+    let losses = format!("log loss {log_loss_before:.3} before, {log_loss_after:.3} after, over folds of objects");
+    let corrected = if *correction == Correction::default() {
+        format!("the probabilities stay, because a correction makes them no better ({losses})")
+    } else {
+        let sign = if correction.b < 0.0 { '-' } else { '+' };
+        let (a, b) = (correction.a, correction.b.abs());
+        format!("when {}, log-odds are {a:.3} x those of the model {sign} {b:.3} ({losses})", own.look)
+    };
+    let mut lines =
+        vec![format!("by {n_lifts} lifts of {n_objects} objects on this robot, {n_kept} kept: {corrected}")];
+    if own.n_outside > 0 {
+        lines.push(format!("limits are wider, because they held {} of these grasps", own.n_outside));
+    }
+    lines.push(match &own.promise {
+        Some(promise) => format!("of these lifts it makes {}; promised on this robot: {promise}", own.n_lifted),
+        None => "of these lifts it makes none".into(),
+    });
+    lines
 }
 
 fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
@@ -343,6 +367,7 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
     for (what, line) in [("day", day_line(&model)), ("recalibrated", recalibration_line(&model))] {
         line.map_or(Ok(()), |line| print_line(&format!("{what:<16} {line}")))?;
     }
+    own_lifts_lines(&model).iter().try_for_each(|line| print_line(&format!("{:<16} {line}", "adapted")))?;
     probe_lines(&model).iter().try_for_each(|line| print_line(line))?;
     Ok(Outcome::Done)
 }

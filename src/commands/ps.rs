@@ -7,6 +7,7 @@ use clap::Args;
 use serde::Serialize;
 
 use super::elsewhere::MachineArgument;
+use super::promises::RobotPromise;
 use super::text_table::TextTable;
 use super::top::screen::short_time;
 use super::{Outcome, completions, print_line};
@@ -48,6 +49,8 @@ struct RunningGraph {
     status: GraphStatus,
     /// The use of the active processes, by node.
     usage: BTreeMap<String, ProcessUsage>,
+    /// The promise that the robot's lifts allow, by the node that counts them.
+    promises: BTreeMap<String, RobotPromise>,
 }
 
 /// A graph that holds its name and does not answer.
@@ -103,11 +106,13 @@ fn listing() -> anyhow::Result<Listing> {
 /// Adds the use of the processes.
 fn completed(status: GraphStatus) -> RunningGraph {
     let usage = status.nodes.iter().filter_map(|node| Some((node.node.clone(), usage(node.pid?)?))).collect();
-    RunningGraph { status, usage }
+    let promise = |node: &NodeStatus| Some((node.node.clone(), RobotPromise::of(&node.counts)?));
+    let promises = status.nodes.iter().filter_map(promise).collect();
+    RunningGraph { status, usage, promises }
 }
 
 fn formatted(graph: &RunningGraph) -> Vec<String> {
-    let RunningGraph { status, usage } = graph;
+    let RunningGraph { status, usage, promises } = graph;
     let uptime = humantime::format_duration(Duration::from_secs(status.uptime_secs.max(0.0) as u64));
     let on = status.link.as_ref().map_or(String::new(), |link| match &link.namespace {
         Some(namespace) => format!(" on {} of {namespace}", link.machine),
@@ -121,6 +126,7 @@ fn formatted(graph: &RunningGraph) -> Vec<String> {
         status.file.display()
     )];
     lines.extend(warnings(status).into_iter().map(|warning| format!("  {}", printable(&warning))));
+    lines.extend(promises.iter().map(|(node, promise)| format!("  {}: {promise}", printable(node))));
     if let Some(link) = &status.link {
         lines.extend(link_tables(link));
     }
@@ -310,7 +316,7 @@ mod tests {
     fn made() -> RunningGraph {
         let usage = ProcessUsage { cpu_secs: 1.25, resident_bytes: 3 << 20 };
         let usage = [("contacts".to_string(), usage)].into();
-        RunningGraph { status: made_status("gate"), usage }
+        RunningGraph { status: made_status("gate"), usage, promises: BTreeMap::new() }
     }
 
     fn linked() -> LinkStatus {

@@ -196,6 +196,8 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
             format!("approaches: ROC area {:.3} before anything is touched", prior.cross_validated_roc_area)
         }),
     );
+    // A promise holds for the world that the lifts were made in.
+    let world = if model.training.labels.is_empty() { "as recorded" } else { "in simulation" };
     for policy in &model.training.policies {
         lines.push(format!(
             "expected of trials decided when {} (ROC area {:.3}; a drop costs {} s): {} of the lifted objects kept, {:.2} \
@@ -208,7 +210,7 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
             percent(Some(policy.given_up)),
             policy.secs_per_kept
         ));
-        lines.extend(policy.promise.map(|promise| format!("promised for new objects: {promise}")));
+        lines.extend(policy.promise.map(|promise| format!("promised for new objects {world}: {promise}")));
     }
     lines
 }

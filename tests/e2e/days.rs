@@ -174,15 +174,15 @@ fn labelled_grasps_of_a_day_correct_a_model_for_it() {
     // The same day again, by its name.
     let today = lab.import(&table(&[("c", [2.0, 2.0, 1.0])], 6, 5, 5), "today.mcap", &["--day", "2026-11-24"]);
     let later = lab.import(&table(&[("c", [2.0, 2.0, 1.0])], 6, 10, 6), "later.mcap", &["--day", "20261124"]);
-    let recalibrated = lab.at("today.json");
-    let recalibrate = |recordings: &[&str], exit_code| {
-        let fixed = ["--hand", &lab.hand, "--overwrite", "--out", &recalibrated];
-        run(&[&["model", "recalibrate", &model], recordings, &fixed].concat(), exit_code)
+    let adapted = lab.at("today.json");
+    let adapt = |recordings: &[&str], exit_code| {
+        let fixed = ["--hand", &lab.hand, "--overwrite", "--out", &adapted];
+        run(&[&["model", "adapt", &model], recordings, &fixed].concat(), exit_code)
     };
-    let said = text(&recalibrate(&[&today], 0).stdout).to_string();
-    assert!(said.contains("on day 20261124") && said.contains("by 30 labelled grasps"), "{said}");
+    let said = text(&adapt(&[&today], 0).stdout).to_string();
+    assert!(said.contains("of day 20261124") && said.contains("by 30 labelled grasps"), "{said}");
     // The day has its baseline from the first grasp on, and its labelled grasps are left out.
-    let evaluation = lab.evaluate(&recalibrated, &later);
+    let evaluation = lab.evaluate(&adapted, &later);
     assert!(
         evaluation["by_reason"].get("no_baseline").is_none(),
         "{} {}",
@@ -190,19 +190,20 @@ fn labelled_grasps_of_a_day_correct_a_model_for_it() {
         evaluation["score_judged"]
     );
     assert!(share_right(&evaluation) > 0.85, "{} {}", evaluation["by_reason"], evaluation["score_judged"]);
-    let output = run(&["evaluate", &recalibrated, &today, "--hand", &lab.hand], 1);
+    let output = run(&["evaluate", &adapted, &today, "--hand", &lab.hand], 1);
     assert!(text(&output.stderr).contains("trained on every grasp"), "{}", text(&output.stderr));
     assert_eq!(lab.evaluate(&model, &later)["by_reason"]["no_baseline"], 30);
     // Another day is as before.
     let other = lab.import(&table(&[("d", [2.0, 2.0, 1.0])], 6, 10, 7), "other.mcap", &["--day", "2026-11-25"]);
-    assert_eq!(lab.evaluate(&recalibrated, &other)["by_reason"], lab.evaluate(&model, &other)["by_reason"]);
-    for (recordings, expected) in [(vec![&today, &other], "grasps of one day"), (vec![&training], "grasps of one day")]
+    assert_eq!(lab.evaluate(&adapted, &other)["by_reason"], lab.evaluate(&model, &other)["by_reason"]);
+    for (recordings, expected) in
+        [(vec![&today, &other], "grasps of one day"), (vec![&training], "the model was trained on")]
     {
         let recordings: Vec<&str> = recordings.into_iter().map(String::as_str).collect();
-        let refused = recalibrate(&recordings, 1);
+        let refused = adapt(&recordings, 1);
         assert!(text(&refused.stderr).contains(expected), "{}", text(&refused.stderr));
     }
-    assert!(Path::new(&recalibrated).exists());
+    assert!(Path::new(&adapted).exists());
 }
 
 #[test]

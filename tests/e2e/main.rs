@@ -29,6 +29,7 @@ mod meshes;
 mod metrics;
 mod mujoco;
 mod over_ssh;
+mod own_lifts;
 mod own_program;
 mod package;
 mod partners;

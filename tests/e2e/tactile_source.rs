@@ -44,7 +44,7 @@ pub(crate) fn live_dataflow(folder: &Path, params: &str) -> PathBuf {
 }
 
 /// A free port of this machine.
-fn free_port() -> u16 {
+pub(crate) fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr()).expect("a port").port()
 }
 
@@ -77,14 +77,14 @@ fn line(frame: &Stamped<TactileFrame>) -> Value {
 }
 
 /// A connection to a source.
-struct Bridge {
+pub(crate) struct Bridge {
     stream: TcpStream,
     answers: BufReader<TcpStream>,
     greeting: Value,
 }
 
 impl Bridge {
-    fn connect(port: u16) -> Bridge {
+    pub(crate) fn connect(port: u16) -> Bridge {
         let start = Instant::now();
         loop {
             if let Ok(stream) = TcpStream::connect(("127.0.0.1", port)) {
@@ -100,7 +100,7 @@ impl Bridge {
         }
     }
 
-    fn send(&mut self, bytes: &[u8]) {
+    pub(crate) fn send(&mut self, bytes: &[u8]) {
         self.stream.write_all(bytes).expect("sent");
     }
 
@@ -204,7 +204,7 @@ fn frames_have_their_own_day_or_that_of_the_source() {
 /// A fault of a frame: the counter that counts it, and the bytes that have it.
 type Wrong = (&'static str, fn(&Stamped<TactileFrame>) -> Vec<u8>);
 
-fn changed(frame: &Stamped<TactileFrame>, change: impl FnOnce(&mut Value)) -> Vec<u8> {
+pub(crate) fn changed(frame: &Stamped<TactileFrame>, change: impl FnOnce(&mut Value)) -> Vec<u8> {
     let mut line = line(frame);
     change(&mut line);
     format!("{line}\n").into_bytes()
@@ -382,7 +382,8 @@ fn outcomes_of_lifts_withdraw_a_promise_that_they_refute() {
     };
     tell(0..n_before);
     wait_until(|| graph.n_decisions() == n_before, || graph.said());
-    let counts = json!({"lifts/kept": 0, "lifts/dropped": 4, "lifts/unreported": 0, "promise_withdrawn": 1});
+    let counts = json!({"lifts/kept": 0, "lifts/dropped": 4, "lifts/unreported": 0, "promise_withdrawn": 1,
+        "promise/kept": 0, "promise/dropped": 4});
     wait_until(|| graph.node("lift_arbiter")["counts"] == counts, || graph.node("lift_arbiter").to_string());
     assert!(
         graph.said().contains("more lifts drop the object than the promised 5 %: 4 of 4 that were reported"),
@@ -406,6 +407,9 @@ fn outcomes_of_lifts_withdraw_a_promise_that_they_refute() {
     assert!(!lifts.is_empty(), "grasps that are lifted under the new promise");
     let n_dropped = || graph.node("lift_arbiter")["counts"]["lifts/dropped"].as_u64();
     wait_until(|| n_dropped() == Some(4 + lifts.len() as u64), || graph.node("lift_arbiter").to_string());
+    // The promise of the lifts begins anew with it.
+    let promise = |name: &str| graph.node("lift_arbiter")["counts"][name].as_u64();
+    assert_eq!(promise("promise/dropped"), Some(lifts.len() as u64));
     graph.kill("lift_arbiter");
     graph.wait_for_restart("lift_arbiter", 4);
     assert_eq!(n_dropped(), Some(4 + lifts.len() as u64));

@@ -178,7 +178,7 @@ fn a_promise_about_drops_holds_for_new_objects_or_nothing_is_lifted() {
     };
     for (flags, most) in [(["--drop-secs", "120"], 1.0), (["--max-drops", "0.25"], 0.25)] {
         let trained = train(&flags, 0);
-        let promised = "promised for new objects: at most";
+        let promised = "promised for new objects as recorded: at most";
         assert!(text(&trained.stdout).contains(promised), "{}", text(&trained.stdout));
         let shown = run(&["model", "show", &model], 0);
         assert!(text(&shown.stdout).contains(promised), "{}", text(&shown.stdout));

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use blindgrasp_messages::{GraspTruth, Stamped, TactileFrame};
+use blindgrasp_messages::{GraspTruth, Phase, Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingError, RecordingReader};
 use blindgrasp_stages::OtherHand;
 use blindgrasp_stages::hand::{Hand, HandError};
@@ -111,7 +111,29 @@ pub fn label_line(labels: &BTreeMap<Label, usize>) -> Option<String> {
     Some(format!("mixed: {} of the simulated recordings", counts.join(", ")))
 }
 
-/// Reads a recording's grasps in order. `reduce` is called with the frames of each complete grasp, so that memory holds
+/// What the outcome of a lift says, if the frames of a grasp have one and no label does: a robot reports how it ended by a frame
+/// of the phase kept or dropped. The object is not known, so each such grasp counts as one of another object. `recording` names
+/// the file.
+pub fn reported_truth(recording: &Path, grasp_id: u64, is_kept: bool) -> GraspTruth {
+    let name = recording.file_stem().unwrap_or_default().to_string_lossy();
+    GraspTruth {
+        grasp_id,
+        epsilon: f64::NAN,
+        volume: f64::NAN,
+        stable: is_kept,
+        object: format!("lift {grasp_id} of {name}"),
+        class: "not named".into(),
+    }
+}
+
+/// The outcome that the frames of a grasp report: the first one counts.
+fn reported_outcome(frames: &[Stamped<TactileFrame>]) -> Option<bool> {
+    let phase = |frame: &Stamped<TactileFrame>| frame.message.phase;
+    let outcome = frames.iter().map(phase).find(|phase| matches!(phase, Phase::Kept | Phase::Dropped))?;
+    Some(outcome == Phase::Kept)
+}
+
+/// Reads a recording's grasps in order. A grasp without a label has the outcome of its lift, if a frame reports it. `reduce` is called with the frames of each complete grasp, so that memory holds
 /// the frames of one grasp at a time.
 ///
 /// # Errors
@@ -132,7 +154,8 @@ pub fn read_grasps<T>(
     let mut finish = |frames: Vec<Stamped<TactileFrame>>, grasps: &mut Vec<Grasp<T>>| {
         if let Some(first) = frames.first() {
             let grasp_id = first.message.grasp_id;
-            grasps.push(Grasp { grasp_id, value: reduce(grasp_id, frames), truth: None });
+            let truth = reported_outcome(&frames).map(|is_kept| reported_truth(path, grasp_id, is_kept));
+            grasps.push(Grasp { grasp_id, value: reduce(grasp_id, frames), truth });
         }
     };
     for record in reader {
@@ -158,7 +181,7 @@ pub fn read_grasps<T>(
     }
     finish(frames, &mut grasps);
     for grasp in &mut grasps {
-        grasp.truth = truths.remove(&grasp.grasp_id);
+        grasp.truth = truths.remove(&grasp.grasp_id).or(grasp.truth.take());
     }
     Ok(grasps)
 }

@@ -1,11 +1,14 @@
 //! Upper bounds for the share of lifts that drop and of trials that end in a drop, for new objects.
 //!
 //! Grasps of one object succeed or fail together, so the object is the unit. Its loss is a number from 0 to 1, and the bound is
-//! the smallest mean that a test at the level 1 - confidence rejects: the binomial test if each object's loss is 0 or 1,
-//! otherwise the Hoeffding-Bentkus test of Angelopoulos et al., "Learn then Test" (2021), Proposition 2; for the ratio of drops to
-//! lifts Hoeffding's alone, whose p-value falls steadily as the share grows. The bounds hold for any number of objects, without a
-//! normal approximation. They need objects that are drawn like the new ones and that had no part in training or in the choice of
-//! a threshold.
+//! the smallest mean that a test at the level 1 - confidence rejects: the exact binomial test if each object's loss is 0 or 1,
+//! otherwise a test by betting (Waudby-Smith and Ramdas, "Estimating means of bounded random variables by betting", 2024). The
+//! bounds hold for any number of objects, without a normal approximation. They need objects that are drawn like the new ones and
+//! that had no part in training or in the choice of a threshold.
+
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
 
 use blindgrasp_stages::training_summary::{Bounded, Promise};
 
@@ -25,61 +28,58 @@ pub fn promise(objects: &[ObjectTrials]) -> Option<Promise> {
     let lifted: Vec<ObjectTrials> = objects.iter().copied().filter(|object| object.lifted > 0.0).collect();
     let sum = |of: fn(&ObjectTrials) -> f64| lifted.iter().map(of).sum::<f64>();
     let (n_lifted, n_dropped) = (sum(|object| object.lifted), sum(|object| object.dropped));
-    let dropped: Vec<f64> = objects.iter().map(|object| object.dropped).collect();
+    // Of trials all count, also those that are given up.
+    let trials: Vec<_> = objects.iter().map(|object| ObjectTrials { lifted: 1.0, ..*object }).collect();
     (n_lifted > 0.0).then(|| Promise {
         confidence: CONFIDENCE,
         n_attempts: None,
         drops_of_lifts: Bounded {
             estimate: n_dropped / n_lifted,
-            at_most: smallest_rejected(|share| p_value_of_lifts(&lifted, share)),
+            at_most: smallest_rejected(|share| p_value(&lifted, share)),
             n_objects: lifted.len(),
         },
         drops_of_trials: Bounded {
             estimate: n_dropped / objects.len() as f64,
-            at_most: smallest_rejected(|share| p_value(&dropped, share)),
+            at_most: smallest_rejected(|share| p_value(&trials, share)),
             n_objects: objects.len(),
         },
     })
 }
 
-/// The p-value of "at least this share of the lifts drops". The share is a ratio of two means, lifts that drop and lifts. The
-/// test is therefore of the mean of `share + dropped - share * lifted`: it is at least `share` if and only if the statement is
-/// true, and each object's value lies between 0 and 1.
-fn p_value_of_lifts(objects: &[ObjectTrials], share: f64) -> f64 {
-    let dropped: Vec<f64> = objects.iter().map(|object| object.dropped).collect();
-    if objects.iter().all(|object| object.lifted == 1.0) {
-        return p_value(&dropped, share);
+/// The p-value of "at least this share of the lifts drops"; of the trials, if each object has a whole trial.
+fn p_value(objects: &[ObjectTrials], share: f64) -> f64 {
+    let is_whole = |object: &ObjectTrials| object.lifted == 1.0 && (object.dropped == 0.0 || object.dropped == 1.0);
+    if objects.iter().all(is_whole) {
+        let n_dropped = objects.iter().filter(|object| object.dropped == 1.0).count();
+        return binomial_tail(n_dropped, objects.len(), share);
     }
+    // The mean of tests with the objects in several orders is a test too; one order alone would be luck.
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let mut order = objects.to_vec();
+    let capital = (0..N_ORDERS).map(|_| {
+        order.shuffle(&mut random);
+        final_capital(&order, share)
+    });
+    (f64::from(N_ORDERS) / capital.sum::<f64>()).min(1.0)
+}
+
+const N_ORDERS: u32 = 20;
+
+/// The capital of a gambler who begins with 1 and bets on each object that fewer of its lifts drop than the share (the predictable
+/// plug-in bets of section 4.1 there). If at least this share of the lifts drops, `share * lifted - dropped` has a mean of 0 at
+/// most, and so the capital one of 1. A bet is at most 1, so that no object ruins him; bets do not depend on the share, so a
+/// greater one makes him richer.
+fn final_capital(objects: &[ObjectTrials], share: f64) -> f64 {
     let n = objects.len() as f64;
-    let (n_lifted, n_dropped) = (objects.iter().map(|object| object.lifted).sum::<f64>(), dropped.iter().sum::<f64>());
-    hoeffding(n, share + (n_dropped - share * n_lifted) / n, share)
-}
-
-/// The p-value of "the mean of the losses is `mean` or more".
-fn p_value(losses: &[f64], mean: f64) -> f64 {
-    let n = losses.len() as f64;
-    let found = losses.iter().sum::<f64>() / n;
-    if found >= mean {
-        return 1.0;
-    }
-    // The sum of whole losses may be off by a rounding error.
-    let n_lost = (n * found - 1e-9).ceil().max(0.0) as usize;
-    let tail = binomial_tail(n_lost, losses.len(), mean);
-    if losses.iter().all(|loss| *loss == 0.0 || *loss == 1.0) {
-        return tail;
-    }
-    hoeffding(n, found, mean).min(std::f64::consts::E * tail)
-}
-
-/// Hoeffding's bound (1963, Theorem 1) for the probability of finding a mean of `n` losses of `found` or less.
-fn hoeffding(n: f64, found: f64, mean: f64) -> f64 {
-    if found >= mean { 1.0 } else { (-n * divergence(found, mean)).exp() }
-}
-
-/// The divergence of a coin with `p` from one with `q`, nats.
-fn divergence(p: f64, q: f64) -> f64 {
-    let term = |p: f64, q: f64| if p > 0.0 { p * (p / q).ln() } else { 0.0 };
-    term(p, q) + term(1.0 - p, 1.0 - q)
+    let log_of_rejection = (1.0 / (1.0 - CONFIDENCE)).ln();
+    let (mut n_seen, mut sum, mut squares) = (1.0, 0.5, 0.25);
+    objects.iter().fold(1.0, |capital, ObjectTrials { lifted, dropped }| {
+        let bet = (2.0 * log_of_rejection / (n * squares / n_seen)).sqrt().min(1.0);
+        n_seen += 1.0;
+        sum += dropped;
+        squares += (dropped - sum / n_seen).powi(2);
+        capital * (1.0 + bet * (share * lifted - dropped))
+    })
 }
 
 /// The probability of at most `k` heads in `n` throws.

@@ -151,6 +151,8 @@ coded_enums! {
         UnlikeDay = 11, "unlike_day";
         /// Joints or cells of the hand do not work as they should.
         SensorFault = 12, "sensor_fault";
+        /// Of the outcome of a lift: the hand's readings have changed, so outcomes before it say nothing of it.
+        Changed = 13, "changed";
     }
 
     /// What the arm should do.

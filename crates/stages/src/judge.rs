@@ -6,6 +6,7 @@ use crate::contacts::ContactFinder;
 use crate::hand::Hand;
 use crate::lift_arbiter::{ArbiterOptions, LiftArbiter};
 use crate::model::{Memory, Model, OtherHand};
+use crate::own_lifts::{Adapt, OwnLifts};
 use crate::steps;
 
 /// Judges the frames of a hand one after the other, and decides each grasp once.
@@ -64,6 +65,16 @@ impl Judge {
         })
     }
 
+    /// Corrects its probabilities by the outcomes of lifts (frames of the phases kept and dropped), or judges as the model does.
+    pub fn adapt(&mut self, adapt: Adapt) {
+        self.memory.adapt = adapt;
+    }
+
+    /// The outcomes of lifts so far, and what they have taught.
+    pub fn own_lifts(&self) -> &OwnLifts {
+        &self.memory.lifts
+    }
+
     pub fn hand(&self) -> &Hand {
         &self.hand
     }
@@ -116,7 +127,7 @@ impl Judge {
 
     /// Begins anew, as if it had seen nothing.
     pub fn reset(&mut self) {
-        self.memory = Memory::default();
+        self.memory = Memory::new(self.memory.adapt);
         self.forget_grasps();
     }
 

@@ -31,7 +31,8 @@
 //!   [`steps`] - the first three, from message to message.
 //! * [`out_of_distribution`] - whether a grasp is like those that the model was trained on.
 //! * [`model`] - the model file. [`recipe`] and [`training_summary`] - how a model was trained, as the file says.
-//! * [`promise_monitor`] - whether lifts drop more often than was promised.
+//! * [`own_lifts`] - what the lifts of the robot itself say of the model. [`promise_monitor`] - whether they drop more often
+//!   than was promised, and what they promise.
 //!
 //! Units are SI and `f64` throughout. Frames are named target first: `palm_from_link`. Every contact is in the
 //! **palm frame**: its origin the centre of the palm pad's surface, +z out of the palm.
@@ -51,10 +52,12 @@ pub mod lift_arbiter;
 mod lift_watch;
 pub mod model;
 pub mod out_of_distribution;
+pub mod own_lifts;
 pub mod probe;
 pub mod promise_monitor;
 pub mod recipe;
 pub mod sensors;
+mod shift_test;
 pub mod steps;
 pub mod training_summary;
 

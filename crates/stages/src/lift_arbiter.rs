@@ -274,6 +274,10 @@ impl LiftArbiter {
             && break_in_order != Some(Reason::WrongHand)
             && self.state.decided.contains((header.epoch, prediction.grasp_id));
         if is_of_a_lift && self.state.lifted.take_if(|lifted| *lifted == prediction.grasp_id).is_some() {
+            // Lifts of another skin say nothing for the promise, but a promise that is withdrawn stays so.
+            if prediction.fault == Fault::Changed && !self.state.promise.is_withdrawn() {
+                self.state.promise = PromiseMonitor::default();
+            }
             self.state.promise.observe(prediction.phase == Phase::Dropped, options.promised_drops);
         }
         // The samples of a grasp are not mixed with those of the next one, so the doubtful samples were not of that one.
@@ -481,6 +485,8 @@ fn reason_of(fault: Fault, votes: bool) -> Option<Reason> {
         Fault::NoBaseline => votes.then_some(Reason::NoBaseline),
         Fault::UnlikeDay => votes.then_some(Reason::UnlikeDay),
         Fault::SensorFault => Some(Reason::SensorFault),
+        // It is of an outcome, which decides nothing.
+        Fault::Changed => None,
     }
 }
 

@@ -16,7 +16,9 @@ use crate::day::{DayMemory, DayModel, GraspPlace};
 use crate::encoder::{FeatureExtractor, FeltReading};
 use crate::hand::Hand;
 use crate::out_of_distribution::TrainingRange;
+use crate::own_lifts::{Adapt, Looked, OwnLifts};
 use crate::probe::{GraspHistory, ProbeModel, pad_newtons, signals};
+use crate::shift_test::numbers;
 use crate::training_summary::TrainingSummary;
 use blindgrasp_messages::files::{open_regular, write_whole};
 use blindgrasp_messages::{Fault, Phase};
@@ -66,9 +68,19 @@ pub struct Memory {
     grasp: GraspHistory,
     /// The day, for models that judge a grasp by others.
     day: DayMemory,
+    /// The outcomes of the robot's lifts.
+    pub lifts: OwnLifts,
+    /// What is done with them: an option, and no memory.
+    #[serde(skip)]
+    pub adapt: Adapt,
 }
 
 impl Memory {
+    /// An empty memory.
+    pub fn new(adapt: Adapt) -> Memory {
+        Memory { adapt, ..Memory::default() }
+    }
+
     /// Begins with a recording: its grasps belong to those before only if both say the same day.
     pub fn begin_recording(&mut self) {
         self.grasp = GraspHistory::default();
@@ -291,6 +303,25 @@ impl Model {
         if let (true, Phase::Settled, Ok(values)) = (self.day.is_some(), phase, values) {
             memory.day.settle(place, values);
         }
+        match (phase, verdict) {
+            (Phase::Kept | Phase::Dropped, _) if memory.adapt != Adapt::Frozen && values != Err(Fault::WrongHand) => {
+                let classifier = |look: Phase| Some((self.look(look)?, self.drop_secs(look)));
+                let has_changed = memory.lifts.lifted(place.grasp_id, phase == Phase::Kept, classifier);
+                if has_changed && memory.adapt == Adapt::On {
+                    return Err(Fault::Changed);
+                }
+            }
+            (_, Ok(verdict)) => {
+                if let (Some(classifier), Ok(values)) = (self.look(phase), values) {
+                    let settled = if phase == Phase::Settled { numbers(&self.features, values) } else { None };
+                    let log_odds = classifier.log_odds(verdict.decision_value);
+                    let is_unstable = !verdict.stable && !verdict.unsure;
+                    let grasp_id = place.grasp_id;
+                    memory.lifts.look(Looked { grasp_id, look: phase, log_odds, is_unstable, settled });
+                }
+            }
+            _ => {}
+        }
         if self.has_probes() {
             // A frame that is at fault leaves no feature behind, but its fault.
             let values = verdict.and(values);
@@ -309,22 +340,46 @@ impl Model {
     /// # Errors
     /// As of [`Model::judge`].
     pub fn classify(&self, phase: Phase, values: &[f64], day: u32, memory: &Memory) -> Result<Verdict, Fault> {
-        let probe = match (phase, &self.day) {
-            (Phase::Squeezed, _) => &self.squeezed,
-            (Phase::TestLifted, _) => &self.test_lifted,
+        let classify = |classifier: &Classifier, values: &[f64]| match memory
+            .lifts
+            .learned(phase)
+            .filter(|_| memory.adapt != Adapt::Off)
+        {
+            Some(learned) => classifier.classify_by(learned.apply(classifier), values),
+            None => classifier.classify(values),
+        };
+        match (phase, &self.day) {
+            (Phase::Squeezed | Phase::TestLifted, _) => {
+                let classifier = self.look(phase).ok_or(Fault::WrongModel)?;
+                let mut composed = Vec::new();
+                memory.grasp.compose(phase, values, &signals(&self.features), &mut composed)?;
+                classify(classifier, &composed)
+            }
             (Phase::Lifting, _) => {
                 if self.test_lifted.is_none() {
                     return Err(Fault::WrongModel);
                 }
-                return memory.grasp.judge_lifting(pad_newtons(&self.features, values).ok_or(Fault::WrongModel)?);
+                memory.grasp.judge_lifting(pad_newtons(&self.features, values).ok_or(Fault::WrongModel)?)
             }
-            (_, None) => return self.classifier.classify(values),
-            (_, Some(model)) => return model.classify(&self.classifier, values, day, &memory.day),
-        };
-        let probe = probe.as_ref().ok_or(Fault::WrongModel)?;
-        let mut composed = Vec::new();
-        memory.grasp.compose(phase, values, &signals(&self.features), &mut composed)?;
-        probe.classifier.classify(&composed)
+            (_, None) => classify(&self.classifier, values),
+            (_, Some(model)) => model.classify(&self.classifier, values, day, &memory.day),
+        }
+    }
+
+    /// The price of a drop that the threshold of a look was chosen for, seconds.
+    pub fn drop_secs(&self, look: Phase) -> Option<f64> {
+        self.training.policies.iter().find(|policy| policy.look == look.as_str()).map(|policy| policy.drop_secs)
+    }
+
+    /// The classifier of a look at a grasp that a lift can follow; `None` for the frames between looks. A grasp that is judged by
+    /// its day has none: its probability is that day's.
+    pub fn look(&self, phase: Phase) -> Option<&Classifier> {
+        match phase {
+            Phase::Settled if self.day.is_none() => Some(&self.classifier),
+            Phase::Squeezed => self.squeezed.as_ref().map(|probe| &probe.classifier),
+            Phase::TestLifted => self.test_lifted.as_ref().map(|probe| &probe.classifier),
+            _ => None,
+        }
     }
 
     fn validate(&self) -> Result<(), String> {

@@ -5,11 +5,15 @@
 //! with a greater probability than p, whatever came before it, the expectation of R after n lifts is at most n. So the mean
 //! number of lifts until the promise is withdrawn wrongly is at least `WITHDRAWN_FROM`. Good lifts of the past do not make up
 //! for drops, because the sum allows for a change at each lift (Pollak, "Optimal detection of a change in distribution", 1985).
+//!
+//! [`drops_at_most`] is the promise that the outcomes themselves allow.
 
 use serde::{Deserialize, Serialize};
 
 /// The evidence from which the promise is withdrawn: the least mean number of lifts between two false alarms.
 const WITHDRAWN_FROM: f64 = 1000.0;
+/// The evidence from which the promise is in doubt, which changes no decision.
+const DOUBTED_FROM: f64 = 100.0;
 /// The shares of drops that are looked for, as parts of the way from the promised share to 1.
 const WAYS: [f64; 6] = [0.02, 0.05, 0.1, 0.2, 0.4, 0.8];
 
@@ -35,13 +39,58 @@ impl PromiseMonitor {
                 if is_dropped { suspected / promised_drops } else { (1.0 - suspected) / (1.0 - promised_drops) };
             *evidence = (1.0 + *evidence) * ratio;
         }
-        self.is_withdrawn |= self.evidence.iter().sum::<f64>() >= WITHDRAWN_FROM * WAYS.len() as f64;
+        self.is_withdrawn |= self.mean_evidence() >= WITHDRAWN_FROM;
+    }
+
+    fn mean_evidence(&self) -> f64 {
+        self.evidence.iter().sum::<f64>() / WAYS.len() as f64
+    }
+
+    /// Whether the outcomes speak against the promise, and do not refute it yet: a warning.
+    pub fn is_doubted(&self) -> bool {
+        self.is_withdrawn || self.mean_evidence() >= DOUBTED_FROM
     }
 
     /// Whether outcomes have refuted the promise. It stays withdrawn.
     pub fn is_withdrawn(&self) -> bool {
         self.is_withdrawn
     }
+}
+
+/// The counts of an arbiter's node, kept and dropped, under the present promise: the numbers that [`drops_at_most`] takes.
+pub const OUTCOME_COUNTS: [&str; 2] = ["promise/kept", "promise/dropped"];
+
+/// The confidence of [`drops_at_most`].
+pub const CONFIDENCE: f64 = 0.95;
+/// The bets of [`drops_at_most`]: on these parts of the share that is tested.
+const PARTS: [f64; 6] = [0.0, 0.2, 0.35, 0.5, 0.65, 0.8];
+
+/// The largest share of the lifts that may drop, given how so many of them ended: with a probability of [`CONFIDENCE`] it is at
+/// least the true share after every lift, so it may be looked at whenever one likes. Lifts are taken for draws of the same
+/// mixture of objects.
+///
+/// It is a confidence sequence by betting (Waudby-Smith and Ramdas, "Estimating means of bounded random variables by betting",
+/// 2024). For a share m, six bets start with equal capital, each on a part w of m: a drop multiplies its capital by w, an object
+/// that was kept by (1 - w m) / (1 - m). While lifts drop with a probability of m or more, the capital of all together is
+/// expected to grow by nothing, so it is seldom ever 20 times as large (Ville's inequality); shares where it is are ruled out.
+pub fn drops_at_most(n_kept: u64, n_dropped: u64) -> f64 {
+    let n = n_kept + n_dropped;
+    if n == 0 {
+        return 1.0;
+    }
+    let is_ruled_out = |share: f64| {
+        let bets = PARTS.iter().map(|part| {
+            let of_drops = if n_dropped == 0 { 0.0 } else { n_dropped as f64 * part.ln() };
+            (of_drops + n_kept as f64 * ((1.0 - part * share) / (1.0 - share)).ln()).exp()
+        });
+        bets.sum::<f64>() >= PARTS.len() as f64 / (1.0 - CONFIDENCE)
+    };
+    let (mut possible, mut ruled_out) = (n_dropped as f64 / n as f64, 1.0);
+    for _ in 0..50 {
+        let middle = f64::midpoint(possible, ruled_out);
+        if middle < 1.0 && is_ruled_out(middle) { ruled_out = middle } else { possible = middle }
+    }
+    ruled_out
 }
 
 #[cfg(test)]
@@ -99,5 +148,43 @@ mod tests {
         let mut nothing = PromiseMonitor::default();
         (0..1000).for_each(|_| nothing.observe(true, 1.0));
         assert!(!nothing.is_withdrawn());
+    }
+
+    #[test]
+    fn a_doubt_comes_before_the_promise_is_withdrawn() {
+        let mut monitor = PromiseMonitor::default();
+        let mut seen = Vec::new();
+        while !monitor.is_withdrawn() {
+            monitor.observe(true, 0.1);
+            seen.push((monitor.is_doubted(), monitor.is_withdrawn()));
+        }
+        assert_eq!(seen, [(false, false), (false, false), (true, false), (true, true)]);
+    }
+
+    #[test]
+    fn the_bound_after_every_lift_holds_in_95_of_100_runs() {
+        let mut random = ChaCha8Rng::seed_from_u64(11);
+        for (share, n_runs) in [(0.02, 400), (0.1, 400), (0.5, 200)] {
+            let n_broken = (0..n_runs).filter(|_| {
+                let (mut n_kept, mut n_dropped) = (0, 0);
+                // Each of 1,000 looks may find a bound that is too low.
+                (0..1000).any(|_| {
+                    *(if random.random::<f64>() < share { &mut n_dropped } else { &mut n_kept }) += 1;
+                    drops_at_most(n_kept, n_dropped) < share
+                })
+            });
+            let n_broken = n_broken.count();
+            assert!(n_broken * 20 <= n_runs, "{n_broken} of {n_runs} runs at a share of {share}");
+        }
+    }
+
+    #[test]
+    fn the_bound_of_some_counts() {
+        for (n_kept, n_dropped, expected) in
+            [(0, 0, 1.0), (20, 0, 0.185), (100, 0, 0.041), (98, 2, 0.085), (294, 6, 0.051), (0, 30, 1.0)]
+        {
+            let found = drops_at_most(n_kept, n_dropped);
+            assert!((found - expected).abs() < 6e-4, "{n_kept} kept, {n_dropped} dropped: {found}");
+        }
     }
 }

@@ -7,6 +7,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error as _};
 use sha2::{Digest, Sha256};
 
 use crate::label::Label;
+use crate::own_lifts::Correction;
 use crate::recipe::Recipe;
 
 /// How a model was trained.
@@ -62,6 +63,34 @@ pub struct TrainingSummary {
     /// not have it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trained_on: Option<TrainedOn>,
+    /// The lifts of a robot that corrected the model, if `blindgrasp model adapt` did.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub own_lifts: Option<OwnLiftsSummary>,
+}
+
+/// What the lifts of one robot say of a model, and how they corrected it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OwnLiftsSummary {
+    pub recordings: Vec<String>,
+    /// The phase of the look that decides.
+    pub look: String,
+    /// Lifts with an outcome that the model can judge at this look.
+    pub n_lifts: usize,
+    pub n_kept: usize,
+    /// Different objects among them. A lift whose object is not named counts as one of another object.
+    pub n_objects: usize,
+    /// The correction of the look's log-odds. It is none if it made the log loss no smaller.
+    pub correction: Correction,
+    /// The mean log loss of these lifts, nats: by the model before, and corrected by lifts of other objects.
+    pub log_loss_before: f64,
+    pub log_loss_after: f64,
+    /// Of these lifts, those that the corrected model makes, each judged with the correction by other objects.
+    pub n_lifted: usize,
+    /// Grasps that a limit of the model's training range had held; the limits are wider now.
+    pub n_outside: usize,
+    /// The bounds of drops of this robot; `None` if no lift is made.
+    pub promise: Option<Promise>,
 }
 
 impl TrainingSummary {

@@ -40,7 +40,7 @@ pub mod zenoh_key;
 use rustix::event::PollFd;
 use serde::{Deserialize, Serialize};
 
-use blindgrasp_messages::{OwnedSenses, Phase};
+use blindgrasp_messages::{GraspTruth, OwnedSenses, Phase};
 use blindgrasp_stages::hand::Hand;
 
 /// Reads a hand's frames: from a socket, a device, a vendor's library.
@@ -111,6 +111,23 @@ pub struct Reading {
     /// Number of the recording day, like 20261124; the source's own without it.
     #[serde(default)]
     pub day: Option<u32>,
+    /// The object's name. It counts in frames of the phases kept and dropped.
+    #[serde(default)]
+    pub object: Option<String>,
+}
+
+impl Reading {
+    /// The outcome of a lift whose object the frame names, as a label of its grasp.
+    pub fn truth(&self, grasp_id: u64) -> Option<GraspTruth> {
+        let stable = match self.phase {
+            Phase::Kept => true,
+            Phase::Dropped => false,
+            _ => return None,
+        };
+        let object = self.object.clone()?;
+        let class = object.clone();
+        Some(GraspTruth { grasp_id, epsilon: f64::NAN, volume: f64::NAN, stable, object, class })
+    }
 }
 
 /// The time of a reading's arrival.

@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use blindgrasp_messages::TactileFrame;
+use blindgrasp_messages::{MAX_NAME_BYTES, TactileFrame};
 use serde::Serialize;
 
 use super::{ExpectedHand, Place, Reading, Refusal, RefusalKind};
@@ -35,8 +35,16 @@ pub fn parse(line: &[u8]) -> Result<Reading, Refusal> {
     if !text.trim_start().starts_with('{') {
         return Err(malformed("not a frame: expected an object with joints, cells_newtons and phase".into()));
     }
-    serde_json::from_str(text).map_err(|error| malformed(format!("not a frame: {error}")))
+    let reading: Reading = serde_json::from_str(text).map_err(|error| malformed(format!("not a frame: {error}")))?;
+    match reading.object.as_ref().map(String::len) {
+        Some(n_bytes @ (0 | NAME_TOO_LONG..)) => {
+            Err(malformed(format!("object has {n_bytes} bytes: expected a name of 1 to {MAX_NAME_BYTES}")))
+        }
+        _ => Ok(reading),
+    }
 }
+
+const NAME_TOO_LONG: usize = MAX_NAME_BYTES + 1;
 
 /// A line without its checksum: the last key `crc`, if it has one, is the CRC-32 of the line without that key.
 fn without_checksum(text: &str) -> Result<Cow<'_, str>, String> {

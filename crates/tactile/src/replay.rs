@@ -63,6 +63,7 @@ impl Replay {
                     seq: Some(frame.header.seq),
                     stamp_nanos: Some(frame.header.stamp_nanos),
                     day: Some(message.day),
+                    object: None,
                 });
                 return Ok(());
             }

@@ -76,6 +76,7 @@ impl ZenohKey {
             seq: Some(header.seq),
             stamp_nanos: Some(header.stamp_nanos).filter(|nanos| *nanos > 0),
             day: Some(frame.day).filter(|day| *day > 0),
+            object: None,
         })
     }
 }

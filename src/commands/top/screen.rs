@@ -11,6 +11,7 @@ use ratatui::widgets::{Block, Clear, Paragraph, RenderDirection, Sparkline};
 use super::sample::{Measured, MeasuredEdge, MeasuredNode, Quantiles, RUN};
 use super::table::{Cell, Column, table};
 use super::view::{Condition, Table, View};
+use crate::commands::promises::shown_counts;
 use crate::commands::ps;
 use blindgrasp_graph::control::{DecidedGrasp, GraphState, NodeState};
 use blindgrasp_graph::log::printable;
@@ -199,7 +200,7 @@ fn node_row(node: &MeasuredNode) -> Vec<Cell> {
         _ => Style::new(),
     };
     let pid = node.pid.map_or("-".into(), |pid| pid.to_string());
-    let counts: Vec<String> = node.counts.iter().map(|(name, count)| printable(&format!("{name} {count}"))).collect();
+    let counts = shown_counts(&node.counts);
     vec![
         Cell::new(printable(&node.node)),
         Cell::styled(ps::node_state_word(node.state), state_style),

@@ -64,6 +64,11 @@ impl Setup {
             if is_short && !overrides.iter().any(|set| set.is_of(&judge.id) && set.param == "max_age_ms") {
                 overrides.push(set(&judge.id, "max_age_ms", LEAST_MAX_AGE_MS.to_string()));
             }
+            // Trials count the drops; a promise that is withdrawn would end them.
+            let is_given = overrides.iter().any(|set| set.is_of(&judge.id) && set.param == "promised_drops");
+            if judge.params.contains_key("promised_drops") && !is_given {
+                overrides.push(set(&judge.id, "promised_drops", "1".into()));
+            }
         }
         if let Some(set) = overrides.iter().find(|set| set.is_of(&node.id) && own_option(&set.param).is_some()) {
             bail!("--set {set}: use {} instead", own_option(&set.param).unwrap_or_default());

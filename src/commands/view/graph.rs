@@ -9,6 +9,7 @@ use std::time::Duration;
 use anyhow::Context;
 use serde::Serialize;
 
+use super::super::promises::shown_counts;
 use super::super::top::poller::Poller;
 use super::super::top::sample::{Measured, MeasuredEdge, MeasuredNode, RUN, Window, measure};
 use super::super::top::screen::{short_rate, short_time};
@@ -302,7 +303,7 @@ fn drawn_node(node: &PictureNode, group: Option<usize>) -> DrawnNode {
         if running.n_swaps > 0 {
             notes.push(format!("swaps: {}", running.n_swaps));
         }
-        notes.extend(running.counts.iter().map(|(name, count)| format!("{name}: {count}")));
+        notes.extend(shown_counts(&running.counts));
     }
     let harmless = |lines: Vec<String>| lines.iter().map(|line| printable(line)).collect();
     DrawnNode {

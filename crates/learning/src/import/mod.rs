@@ -5,6 +5,7 @@
 //! row that cannot be read, is an error.
 
 mod columns;
+mod frames;
 mod grasps;
 mod lines;
 
@@ -13,6 +14,8 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
+
+pub use self::frames::{FramesReport, import_frames};
 
 use self::columns::{Columns, shortened};
 use self::grasps::{Grasps, TableGrasp, TableReading};

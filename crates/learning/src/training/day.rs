@@ -17,7 +17,7 @@ use blindgrasp_stages::day::{
     Baseline, DayMethod, DayModel, DayStatistics, MIN_BASELINE_GRASPS, MIN_NOVELTY_GRASPS, TrainingDays, day_distance,
     root_mean_square,
 };
-use blindgrasp_stages::encoder::{FeatureExtractor, Scaling};
+use blindgrasp_stages::encoder::FeatureExtractor;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::recipe::Recipe;
 
@@ -61,15 +61,29 @@ fn by_day(examples: &[&Example]) -> BTreeMap<Day, Vec<usize>> {
     days
 }
 
-/// Scales the features of each day to mean 0 and standard deviation 1.
-pub(super) fn scale_by_day(rows: &mut [f64], n_values: usize, examples: &[&Example]) {
-    for idxs in by_day(examples).into_values() {
-        let of_day: Vec<f64> = idxs.iter().flat_map(|idx| &rows[idx * n_values..][..n_values]).copied().collect();
-        let scaling = Scaling::of(&of_day, n_values);
-        for idx in idxs {
-            scaling.apply(&mut rows[idx * n_values..][..n_values]);
-        }
+/// Scales the features of each day as later days are scaled, and returns the variance of each value within a day: the mean over the
+/// days.
+pub(super) fn scale_by_day(rows: &mut [f64], n_values: usize, examples: &[&Example]) -> Vec<f64> {
+    let days: Vec<Vec<usize>> = by_day(examples).into_values().collect();
+    let statistics: Vec<DayStatistics> =
+        days.iter().map(|idxs| statistics_of(rows, n_values, idxs.iter().copied())).collect();
+    let variance = |value_idx: usize| {
+        let of_day = |day: &DayStatistics| day.squares[value_idx] / day.n_grasps as f64;
+        statistics.iter().map(of_day).sum::<f64>() / statistics.len() as f64
+    };
+    let variances: Vec<f64> = (0..n_values).map(variance).collect();
+    for (idxs, statistics) in days.iter().zip(&statistics) {
+        let scaling = statistics.scaling(&variances);
+        idxs.iter().for_each(|idx| scaling.apply(&mut rows[idx * n_values..][..n_values]));
     }
+    variances
+}
+
+/// The statistics of some rows.
+fn statistics_of(rows: &[f64], n_values: usize, idxs: impl Iterator<Item = usize>) -> DayStatistics {
+    let mut statistics = DayStatistics::default();
+    idxs.for_each(|idx| statistics.add(&rows[idx * n_values..][..n_values]));
+    statistics
 }
 
 /// The part of a model that is about days; `None` if no baseline is asked for, and the recordings do not say days or each day
@@ -79,14 +93,14 @@ pub(super) fn scale_by_day(rows: &mut [f64], n_values: usize, examples: &[&Examp
 /// An example without a feature.
 pub(super) fn learn(
     recipe: &Recipe,
-    features: &FeatureExtractor,
+    fitted: &Fitted,
     examples: &[&Example],
     seed: u64,
 ) -> Result<Option<DayModel>, TrainingError> {
     let method = if recipe.day_baseline {
-        DayMethod::Baseline(baseline(features, examples, seed)?)
+        DayMethod::Baseline(baseline(fitted, examples, seed)?)
     } else if examples.iter().all(|example| example.day != 0) {
-        match training_days(features, examples, seed)? {
+        match training_days(&fitted.features, examples, seed)? {
             Some(days) => DayMethod::Novelty(days),
             None => return Ok(None),
         }
@@ -96,12 +110,12 @@ pub(super) fn learn(
     Ok(Some(DayModel { method, recalibration: None }))
 }
 
-fn baseline(features: &FeatureExtractor, examples: &[&Example], seed: u64) -> Result<Baseline, TrainingError> {
-    let rows = pseudo_days(features, examples, seed)?.1;
-    let mut sizes: Vec<f64> = rows.chunks(features.len()).map(root_mean_square).collect();
+fn baseline(fitted: &Fitted, examples: &[&Example], seed: u64) -> Result<Baseline, TrainingError> {
+    let rows = pseudo_days(fitted, examples, seed)?.1;
+    let mut sizes: Vec<f64> = rows.chunks(fitted.features.len()).map(root_mean_square).collect();
     sizes.sort_by(f64::total_cmp);
     let limit = sizes.get(((1.0 - FALSE_ALARM_SHARE) * sizes.len() as f64) as usize).copied().unwrap_or(f64::MAX);
-    Ok(Baseline { min_grasps: MIN_BASELINE_GRASPS, limit })
+    Ok(Baseline { min_grasps: MIN_BASELINE_GRASPS, limit, variances: fitted.day_variances.clone() })
 }
 
 fn training_days(
@@ -110,11 +124,7 @@ fn training_days(
     seed: u64,
 ) -> Result<Option<TrainingDays>, TrainingError> {
     let (rows, n_values) = (super::rows(features, examples)?, features.len());
-    let statistics = |idxs: &mut dyn Iterator<Item = usize>| {
-        let mut statistics = DayStatistics::default();
-        idxs.for_each(|idx| statistics.add(&rows[idx * n_values..][..n_values]));
-        statistics
-    };
+    let statistics = |idxs: &mut dyn Iterator<Item = usize>| statistics_of(&rows, n_values, idxs);
     let days: Vec<Vec<usize>> = by_day(examples).into_values().collect();
     let of_days: Vec<DayStatistics> = days.iter().map(|idxs| statistics(&mut idxs.iter().copied())).collect();
     let variance = |value_idx: usize| {
@@ -196,19 +206,19 @@ pub(super) fn cross_validate<'a>(
 /// # Errors
 /// An example without a feature.
 fn judge<'a>(fitted: &Fitted, examples: &[&'a Example], seed: u64) -> Result<OutOfFold<'a>, TrainingError> {
-    let (examples, rows) = pseudo_days(&fitted.features, examples, seed)?;
+    let (examples, rows) = pseudo_days(fitted, examples, seed)?;
     let decision_values = decision_values(&fitted.predictor, &rows)?;
     Ok(OutOfFold { examples, decision_values, folds: Vec::new() })
 }
 
 /// The grasps of pseudo-days after the first ones, and their values relative to those before them, row after row.
 fn pseudo_days<'a>(
-    features: &FeatureExtractor,
+    fitted: &Fitted,
     examples: &[&'a Example],
     seed: u64,
 ) -> Result<(Vec<&'a Example>, Vec<f64>), TrainingError> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let (rows, n_values) = (super::rows(features, examples)?, features.len());
+    let (rows, n_values) = (super::rows(&fitted.features, examples)?, fitted.features.len());
     let (mut judged, mut judged_rows) = (Vec::new(), Vec::new());
     for idxs in by_day(examples).into_values() {
         for _ in 0..idxs.len().div_ceil(GRASPS_PER_PSEUDO_DAY) {
@@ -226,7 +236,7 @@ fn pseudo_days<'a>(
                 if statistics.n_grasps >= MIN_BASELINE_GRASPS {
                     let start = judged_rows.len();
                     judged_rows.extend_from_slice(row);
-                    statistics.scaling().apply(&mut judged_rows[start..]);
+                    statistics.scaling(&fitted.day_variances).apply(&mut judged_rows[start..]);
                     judged.push(examples[idx]);
                 }
                 statistics.add(row);

@@ -4,6 +4,7 @@
 //! cross-validated figures come from folds whose dictionary, scaling and learner have seen no object of the fold. The
 //! calibration is fitted on the same out-of-fold decision values.
 
+mod adaptation;
 mod approach;
 mod day;
 mod examples;
@@ -11,17 +12,16 @@ mod feature_table;
 mod friction;
 pub mod grid;
 mod probes;
-mod recalibration;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+pub use adaptation::adapt;
 pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 pub use blindgrasp_stages::training_summary::{PolicySummary, TrainingSummary};
 pub use examples::{Example, Examples, Felt, Relabelling, Signals};
 pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
 pub(crate) use probes::composed;
-pub use recalibration::recalibrate;
 
 use crate::dataset::DatasetError;
 use crate::evaluation::measures::{area_under_roc, curve};
@@ -122,6 +122,8 @@ pub struct Fitted {
     pub n_iterations: usize,
     /// Whether the SVM's solver reached its tolerance.
     pub converged: bool,
+    /// With a baseline of the day, the variance of each value within a day.
+    pub(crate) day_variances: Vec<f64>,
 }
 
 /// Trains a model on labelled recordings. `progress` gets a description of each step.
@@ -177,7 +179,7 @@ pub fn train_on(
     }
     let threshold_probability = options.threshold_probability;
     let validated = CrossValidated::of(&judged, &calibration, threshold_probability)?;
-    let day = day::learn(recipe, &fitted.features, &examples, options.seed)?;
+    let day = day::learn(recipe, &fitted, &examples, options.seed)?;
     if day.is_none() && examples.iter().any(|example| example.day != 0) {
         progress(
             "not learned: whether a day is like those of the training; every recording must say its days, with several objects each",
@@ -252,6 +254,7 @@ pub fn train_on(
         version: env!("CARGO_PKG_VERSION").into(),
         grid: None,
         trained_on: Some(read.trained_on()),
+        own_lifts: None,
     };
     Ok(Model {
         format: FORMAT.into(),
@@ -594,7 +597,7 @@ pub fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usiz
 /// # Errors
 /// Too few contacts for the dictionary, or one class only.
 pub fn fit(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Result<Fitted, TrainingError> {
-    let Prepared { features, inertia, rows, labels, targets } = prepare(hand, recipe, examples, seed)?;
+    let Prepared { features, inertia, rows, labels, targets, day_variances } = prepare(hand, recipe, examples, seed)?;
     let (predictor, n_iterations, converged) = match &recipe.learner {
         Learner::Svm(params) => {
             let (svm, report) = train_svm(&rows, features.len(), &labels, params)?;
@@ -612,7 +615,7 @@ pub fn fit(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Re
             (Predictor::Blend(blend), report.n_iterations, report.converged)
         }
     };
-    Ok(Fitted { features, predictor, inertia, n_iterations, converged })
+    Ok(Fitted { features, predictor, inertia, n_iterations, converged, day_variances })
 }
 
 /// The training data of a learner.
@@ -624,6 +627,7 @@ struct Prepared {
     labels: Vec<bool>,
     /// [`Example::target`] of each example, which boosting learns.
     targets: Vec<f64>,
+    day_variances: Vec<f64>,
 }
 
 /// Learns dictionary and scaling, and encodes the examples.
@@ -635,8 +639,9 @@ fn prepare(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Re
     let mut features = FeatureExtractor::new(hand, &recipe.blocks, k_means.dictionary, recipe.sigma_m);
     features.validate().map_err(|error| TrainingError::Data(format!("the recipe {}: {error}", recipe.name)))?;
     let mut rows = rows(&features, examples)?;
+    let mut day_variances = Vec::new();
     if recipe.day_baseline {
-        day::scale_by_day(&mut rows, features.len(), examples);
+        day_variances = day::scale_by_day(&mut rows, features.len(), examples);
     } else if recipe.scaled {
         let scaling = Scaling::of(&rows, features.len());
         scaling.apply(&mut rows);
@@ -644,7 +649,7 @@ fn prepare(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Re
     }
     let labels = examples.iter().map(|example| example.stable).collect();
     let targets = examples.iter().map(|example| example.target()).collect();
-    Ok(Prepared { features, inertia: k_means.inertia, rows, labels, targets })
+    Ok(Prepared { features, inertia: k_means.inertia, rows, labels, targets, day_variances })
 }
 
 impl Fitted {

@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use blindgrasp_messages::Fault;
 use boosting::BoostedTrees;
-use calibration::PlattCalibration;
+use calibration::{PlattCalibration, positive_probability};
 use svm::{PreparedSvm, SvmError};
 
 /// A trained function from a feature to a decision value, above 0 on the stable side.
@@ -181,24 +181,48 @@ impl Classifier {
         Ok(())
     }
 
+    /// The log-odds of "stable" of a decision value.
+    pub fn log_odds(&self, decision_value: f64) -> f64 {
+        -(self.calibration.a * decision_value + self.calibration.b)
+    }
+
     /// # Errors
     /// The fault: [`Fault::WrongLength`], or [`Fault::InvalidValue`] for a value that is not finite.
     pub fn classify(&self, values: &[f64]) -> Result<Verdict, Fault> {
-        self.classify_with(&self.calibration, values)
+        self.classify_by((self.calibration, self.threshold_probability, self.unsure_from_probability), values)
     }
 
-    /// [`Classifier::classify`] with another calibration.
-    pub(crate) fn classify_with(&self, calibration: &PlattCalibration, values: &[f64]) -> Result<Verdict, Fault> {
+    /// [`Classifier::classify`] with another calibration and other thresholds, for stable and for unsure.
+    pub(crate) fn classify_by(
+        &self,
+        (calibration, threshold_probability, unsure_from_probability): (PlattCalibration, f64, f64),
+        values: &[f64],
+    ) -> Result<Verdict, Fault> {
         let decision_value = self.predictor.decision_value(values)?;
         let probability_stable = calibration.probability(decision_value);
-        if !(decision_value.is_finite() && probability_stable.is_finite()) {
-            return Err(Fault::InvalidValue);
-        }
-        // A probability of 1 is a rounded one.
-        let stable = probability_stable >= self.threshold_probability && self.threshold_probability < 1.0;
-        let unsure = !stable && probability_stable >= self.unsure_from_probability;
-        Ok(Verdict { decision_value, probability_stable, stable, unsure })
+        verdict(decision_value, probability_stable, threshold_probability, unsure_from_probability)
     }
+
+    /// The verdict of a decision value whose log-odds are corrected.
+    pub(crate) fn verdict(&self, decision_value: f64, log_odds: f64) -> Result<Verdict, Fault> {
+        let probability = positive_probability(-log_odds);
+        verdict(decision_value, probability, self.threshold_probability, self.unsure_from_probability)
+    }
+}
+
+fn verdict(
+    decision_value: f64,
+    probability_stable: f64,
+    threshold_probability: f64,
+    unsure_from_probability: f64,
+) -> Result<Verdict, Fault> {
+    if !(decision_value.is_finite() && probability_stable.is_finite()) {
+        return Err(Fault::InvalidValue);
+    }
+    // A probability of 1 is a rounded one.
+    let stable = probability_stable >= threshold_probability && threshold_probability < 1.0;
+    let unsure = !stable && probability_stable >= unsure_from_probability;
+    Ok(Verdict { decision_value, probability_stable, stable, unsure })
 }
 
 #[cfg(test)]

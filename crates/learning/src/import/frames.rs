@@ -1,0 +1,92 @@
+//! Frames of a robot's own to a recording, as they are.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::ImportError;
+use blindgrasp_messages::{GraspTruth, Header, Phase, Recorded, Stamped, TactileFrame};
+use blindgrasp_recording::{RecordingInfo, RecordingWriter};
+use blindgrasp_stages::hand::Hand;
+
+/// What was recorded.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+pub struct FramesReport {
+    pub hand: String,
+    pub n_grasps: usize,
+    pub n_frames: usize,
+    /// Grasps whose lift has an outcome: by a frame of the phase kept or dropped, or by a label.
+    pub n_kept: usize,
+    pub n_dropped: usize,
+    /// Different objects that the labels name.
+    pub n_objects: usize,
+    /// The senses that all frames have.
+    pub senses: Vec<String>,
+}
+
+/// Writes frames and the labels of their grasps to a recording at `out`. `name` says where they are from. After an error there
+/// is no recording.
+///
+/// # Errors
+/// A frame that does not fit the hand, frames of a grasp on both sides of another one, or a recording that cannot be written.
+pub fn import_frames(
+    name: &str,
+    hand: &Hand,
+    frames: &[Stamped<TactileFrame>],
+    truths: &BTreeMap<u64, GraspTruth>,
+    out: &Path,
+) -> Result<FramesReport, ImportError> {
+    let refused = |message: String| ImportError::Table { path: name.into(), message };
+    let info = RecordingInfo {
+        hand: hand.name.clone(),
+        hand_id: hand.id(),
+        made_by: format!("import of {name}"),
+        version: env!("CARGO_PKG_VERSION").into(),
+    };
+    let mut recording = RecordingWriter::create(out, &info)?;
+    let mut outcomes = BTreeMap::new();
+    let mut senses: Option<BTreeSet<&'static str>> = None;
+    let (mut last, mut seen) = (None, BTreeSet::new());
+    for frame in frames {
+        let TactileFrame { grasp_id, phase, joints, cells_newtons, .. } = &frame.message;
+        let place = format!("grasp {grasp_id}, frame {} ({})", frame.header.seq, phase.as_str());
+        for (what, found, expected) in
+            [("joints", joints.len(), hand.joints.len()), ("cells_newtons", cells_newtons.len(), hand.n_cells())]
+        {
+            if found != expected {
+                return Err(refused(format!("{place}: {what} has {found} numbers, the hand {} {expected}", hand.name)));
+            }
+        }
+        if frame.header.hand_id != hand.id() {
+            return Err(refused(format!("{place}: it is of another hand than {}", hand.name)));
+        }
+        if last.replace(grasp_id) != Some(grasp_id) && !seen.insert(grasp_id) {
+            return Err(refused(format!(
+                "{place}: frames of another grasp come before it; expected each grasp's together"
+            )));
+        }
+        if matches!(phase, Phase::Kept | Phase::Dropped) {
+            outcomes.entry(grasp_id).or_insert(*phase == Phase::Kept);
+        }
+        let has: BTreeSet<_> = frame.message.senses.view().iter().map(|(sense, _)| sense.name()).collect();
+        senses = Some(senses.map_or(has.clone(), |known| &known & &has));
+        recording.write(TactileFrame::TOPIC, frame)?;
+    }
+    for (seq, (grasp_id, truth)) in truths.iter().filter(|(grasp_id, _)| seen.contains(grasp_id)).enumerate() {
+        outcomes.insert(grasp_id, truth.stable);
+        let header = Header { seq: seq as u64, hand_id: hand.id(), ..Header::default() };
+        recording.write(GraspTruth::TOPIC, &Stamped { header, message: truth.clone() })?;
+    }
+    recording.finish()?;
+    let n_kept = outcomes.values().filter(|is_kept| **is_kept).count();
+    Ok(FramesReport {
+        hand: hand.name.clone(),
+        n_grasps: seen.len(),
+        n_frames: frames.len(),
+        n_kept,
+        n_dropped: outcomes.len() - n_kept,
+        n_objects: truths.values().map(|truth| &truth.object).collect::<BTreeSet<_>>().len(),
+        senses: senses.unwrap_or_default().into_iter().map(String::from).collect(),
+    })
+}

@@ -1,0 +1,392 @@
+//! Corrects a model by the labelled grasps of a robot: by the outcomes of its lifts, or for one day of a model that looks at days.
+//!
+//! Lifts correct the look that decides ([`blindgrasp_stages::own_lifts`]), as in a running graph, and widen limits of the training
+//! range that the robot's own grasps violate. Objects are the unit of a cross-fit: if the correction or the threshold is no better
+//! for objects that it was not learned from, the model keeps its own. The labelled grasps of a day correct the log-odds of grasps that
+//! are like them ([`Recalibration`]).
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+
+use nalgebra::{DMatrix, DVector};
+
+use super::{Example, Examples, Felt, Relabelling, TrainingError, composed, file_name, folds_by_object};
+use crate::learners::decision_values;
+use crate::learners::training_range::learn_training_range;
+use crate::promise::{ObjectTrials, promise};
+use blindgrasp_messages::Phase;
+use blindgrasp_stages::classifier::Classifier;
+use blindgrasp_stages::day::{DayMethod, DayModel, DayStatistics, LabelledGrasp, Recalibration, covariance};
+use blindgrasp_stages::encoder::FeltReading;
+use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::model::Model;
+use blindgrasp_stages::out_of_distribution::TrainingRange;
+use blindgrasp_stages::own_lifts::{Correction, FEWEST_OUTCOMES, Learned, log_loss, secs_per_kept};
+use blindgrasp_stages::training_summary::{OwnLiftsSummary, Promise};
+
+/// The fewest labelled grasps of a day.
+const MIN_LABELLED: usize = 20;
+/// Folds of objects, or as many as there are objects.
+const N_FOLDS: usize = 5;
+/// Own grasps without which no limit is widened.
+const FEWEST_FOR_LIMITS: usize = 30;
+
+/// The model, corrected by the labelled grasps of recordings: lifts of one robot, or grasps of one day for a model that looks at
+/// days. The grasps count as trained on.
+///
+/// # Errors
+/// Recordings that cannot be used, that the model was trained on, or with too few labelled grasps.
+pub fn adapt(hand: &Hand, model: &Model, recordings: &[PathBuf]) -> Result<Model, TrainingError> {
+    if model.hand.id != hand.id() {
+        return refused(format!("the recordings are of the hand '{}', the model of '{}'", hand.name, model.hand.name));
+    }
+    let read = Examples::read(hand, recordings, &Relabelling::default(), |_, _| {})?;
+    let mut trained_on = model.training.trained_on.clone().unwrap_or_default();
+    if let Some(known) = read.examples.iter().find(|example| trained_on.grasps.contains(&example.reading_id)) {
+        return refused(format!("the model was trained on grasp {} of these: expected new grasps", known.grasp_id));
+    }
+    let mut adapted = match &model.day {
+        Some(day) => adapt_to_day(model, day, &read)?,
+        None => adapt_to_lifts(hand, model, &read, recordings)?,
+    };
+    // They were for the probabilities before.
+    adapted.training.withdraw_promises();
+    let new = read.trained_on();
+    trained_on.objects.extend(new.objects);
+    trained_on.grasps.extend(new.grasps);
+    adapted.training.trained_on = Some(trained_on);
+    Ok(adapted)
+}
+
+fn refused<T>(message: String) -> Result<T, TrainingError> {
+    Err(TrainingError::Data(message))
+}
+
+/// A lift that the model judges at the look that decides.
+struct JudgedLift<'a> {
+    example: &'a Example,
+    /// By the model itself.
+    log_odds: f64,
+}
+
+fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[PathBuf]) -> Result<Model, TrainingError> {
+    let looks = [Phase::TestLifted, Phase::Squeezed, Phase::Settled];
+    let look = looks.into_iter().find(|look| {
+        model.look(*look).is_some_and(|classifier| classifier.threshold_probability < 1.0)
+            && read.examples.iter().any(|example| felt(*look, example).is_some())
+    });
+    let Some((look, classifier)) = look.and_then(|look| Some((look, model.look(look)?))) else {
+        return refused("no grasp with an outcome has frames that the model decides by: record whole grasps".into());
+    };
+    let judge = |example| Some(JudgedLift { example, log_odds: log_odds(model, look, example)? });
+    // A robot that obeys gives up the others.
+    let goes_on = |example: &&Example| {
+        looks
+            .iter()
+            .skip_while(|earlier| **earlier != look)
+            .skip(1)
+            .all(|earlier| !is_unstable(model, *earlier, example))
+    };
+    let lifts: Vec<JudgedLift<'_>> = read.examples.iter().filter(goes_on).filter_map(judge).collect();
+    if lifts.len() < FEWEST_OUTCOMES {
+        return refused(format!(
+            "{} lifts with an outcome that the model can judge when the hand is {}: expected {FEWEST_OUTCOMES} or more (left \
+             out: {:?})",
+            lifts.len(),
+            look.as_str(),
+            read.n_excluded
+        ));
+    }
+    let examples: Vec<&Example> = lifts.iter().map(|lift| lift.example).collect();
+    let n_objects = examples.iter().map(|example| &example.object).collect::<BTreeSet<_>>().len();
+    if n_objects < 2 {
+        return refused("all lifts are of one object: expected several, so that some can judge the others".into());
+    }
+    let folds = folds_by_object(&examples, N_FOLDS.min(n_objects))?;
+    let n_grasps = read.examples.len() + read.n_excluded.values().sum::<usize>();
+    let judged = Judged { classifier, drop_secs: model.drop_secs(look), n_grasps: n_grasps as f64, lifts: &lifts };
+    let own = judged.learn(&folds);
+    let mut adapted = model.clone();
+    let all: Vec<&Example> = read.examples.iter().collect();
+    let n_outside = widen(hand, &mut adapted, &all)?;
+    let of_look = match look {
+        Phase::TestLifted => adapted.test_lifted.as_mut().map(|probe| &mut probe.classifier),
+        Phase::Squeezed => adapted.squeezed.as_mut().map(|probe| &mut probe.classifier),
+        _ => Some(&mut adapted.classifier),
+    };
+    if let Some(of_look) = of_look {
+        (of_look.calibration, of_look.threshold_probability, of_look.unsure_from_probability) =
+            own.learned.apply(classifier);
+    }
+    adapted.training.own_lifts = Some(OwnLiftsSummary {
+        recordings: recordings.iter().map(|path| file_name(path)).collect(),
+        look: look.as_str().into(),
+        n_lifts: lifts.len(),
+        n_kept: examples.iter().filter(|example| example.stable).count(),
+        n_objects,
+        correction: own.learned.correction,
+        log_loss_before: own.log_losses[0],
+        log_loss_after: own.log_losses[1],
+        n_lifted: own.n_lifted,
+        n_outside,
+        promise: own.promise,
+    });
+    Ok(adapted)
+}
+
+/// The lifts that a look decides.
+struct Judged<'a> {
+    classifier: &'a Classifier,
+    drop_secs: Option<f64>,
+    /// Grasps that the lifts were chosen from.
+    n_grasps: f64,
+    lifts: &'a [JudgedLift<'a>],
+}
+
+/// What the lifts have taught, and how it is borne out by objects that it was not learned from.
+struct Own {
+    learned: Learned,
+    /// The mean log loss of the model, and of what was learned, nats.
+    log_losses: [f64; 2],
+    /// Of the lifts, those that would be made.
+    n_lifted: usize,
+    promise: Option<Promise>,
+}
+
+impl Judged<'_> {
+    /// Learns a correction and a threshold, and keeps each only if it is better for objects of other folds: by the log loss, and
+    /// by the time for each kept object.
+    fn learn(&self, folds: &[usize]) -> Own {
+        let of_model =
+            Learned { correction: Correction::default(), threshold_probability: self.classifier.threshold_probability };
+        let n_folds = folds.iter().max().map_or(0, |last| last + 1);
+        let by_fold: Vec<Learned> = (0..n_folds).map(|fold| self.learned(|idx| folds[idx] != fold)).collect();
+        let lifts = self.lifts;
+        let [before, after] = [false, true].map(|is_after| {
+            let by = |idx: usize| if is_after { by_fold[folds[idx]] } else { of_model };
+            self.tried(by)
+        });
+        let log_losses = [before.log_loss, after.log_loss];
+        let learned = self.learned(|_| true);
+        let is_worth_it = self.drop_secs.is_none() || after.secs_per_kept < before.secs_per_kept;
+        let (learned, tried) = match (after.log_loss < before.log_loss, is_worth_it) {
+            (true, true) => (learned, after),
+            // The same grasps are lifted as before, with other probabilities.
+            (true, false) => (self.at_the_same_place(learned), before),
+            (false, _) => (of_model, before),
+        };
+        let mut of_objects: BTreeMap<&String, [f64; 3]> = BTreeMap::new();
+        for (lift, is_lifted) in lifts.iter().zip(&tried.is_lifted) {
+            let [n, lifted, dropped] = of_objects.entry(&lift.example.object).or_default();
+            *n += 1.0;
+            *lifted += f64::from(u8::from(*is_lifted));
+            *dropped += f64::from(u8::from(*is_lifted && !lift.example.stable));
+        }
+        let trials =
+            of_objects.values().map(|[n, lifted, dropped]| ObjectTrials { lifted: lifted / n, dropped: dropped / n });
+        Own {
+            learned,
+            log_losses,
+            n_lifted: tried.is_lifted.iter().filter(|is_lifted| **is_lifted).count(),
+            promise: promise(&trials.collect::<Vec<_>>()),
+        }
+    }
+
+    /// What those of the lifts teach that are used.
+    fn learned(&self, is_used: impl Fn(usize) -> bool) -> Learned {
+        let used: Vec<(f64, bool)> = (self.lifts.iter().enumerate())
+            .filter(|(idx, _)| is_used(*idx))
+            .map(|(_, lift)| (lift.log_odds, lift.example.stable))
+            .collect();
+        let n_grasps = self.n_grasps * used.len() as f64 / self.lifts.len() as f64;
+        Learned::of(self.classifier, used.iter().copied(), n_grasps as u64, self.drop_secs)
+    }
+
+    /// The same correction with a threshold that lifts the grasps that the model lifts.
+    fn at_the_same_place(&self, learned: Learned) -> Learned {
+        let before = self.classifier.threshold_probability;
+        let log_odds = learned.correction.apply((before / (1.0 - before)).ln());
+        Learned { threshold_probability: 1.0 / (1.0 + (-log_odds).exp()), ..learned }
+    }
+
+    /// The lifts as each would be judged.
+    fn tried(&self, by: impl Fn(usize) -> Learned) -> Tried {
+        let log_odds = |idx: usize| by(idx).correction.apply(self.lifts[idx].log_odds);
+        let is_lifted = |idx: usize| 1.0 / (1.0 + (-log_odds(idx)).exp()) >= by(idx).threshold_probability;
+        let idxs = 0..self.lifts.len();
+        let is_lifted: Vec<bool> = idxs.clone().map(is_lifted).collect();
+        let n_lifted = is_lifted.iter().filter(|is_lifted| **is_lifted).count() as f64;
+        let is_kept = |idx: &usize| is_lifted[*idx] && self.lifts[*idx].example.stable;
+        let n_kept = idxs.clone().filter(is_kept).count() as f64;
+        let losses = idxs.map(|idx| log_loss(log_odds(idx), self.lifts[idx].example.stable));
+        Tried {
+            log_loss: losses.sum::<f64>() / self.lifts.len() as f64,
+            // Without a lift, it takes for ever.
+            secs_per_kept: if n_kept > 0.0 {
+                secs_per_kept(n_lifted / self.n_grasps, n_kept / n_lifted, self.drop_secs.unwrap_or(0.0))
+            } else {
+                f64::INFINITY
+            },
+            is_lifted,
+        }
+    }
+}
+
+struct Tried {
+    log_loss: f64,
+    secs_per_kept: f64,
+    is_lifted: Vec<bool>,
+}
+
+/// Whether the model calls a grasp unstable at a look before the one that decides.
+fn is_unstable(model: &Model, look: Phase, example: &Example) -> bool {
+    let judged = model.look(look).zip(log_odds(model, look, example));
+    judged.is_some_and(|(classifier, log_odds)| 1.0 / (1.0 + (-log_odds).exp()) < classifier.unsure_from_probability)
+}
+
+/// The frame of a look, as it was felt.
+fn felt(look: Phase, example: &Example) -> Option<FeltReading<'_>> {
+    match look {
+        Phase::Settled => Some(example.reading()),
+        Phase::Squeezed => example.squeezed.as_ref().map(Felt::reading),
+        _ => example.test_lifted.as_ref().map(Felt::reading),
+    }
+}
+
+/// The model's log-odds of an example at a look; `None` if it has no feature there.
+fn log_odds(model: &Model, look: Phase, example: &Example) -> Option<f64> {
+    let classifier = model.look(look)?;
+    let values = if look == Phase::Settled {
+        let mut values = Vec::new();
+        model.features.extract(&example.reading(), &mut values).ok()?;
+        values
+    } else {
+        composed(&model.features, look, example)?
+    };
+    Some(classifier.log_odds(classifier.predictor.decision_value(&values).ok()?))
+}
+
+/// Widens the limits that own grasps violate, of every look, so that they hold the own grasps. Returns how many grasps a limit
+/// held out.
+fn widen(hand: &Hand, model: &mut Model, examples: &[&Example]) -> Result<usize, TrainingError> {
+    if examples.len() < FEWEST_FOR_LIMITS {
+        return Ok(0);
+    }
+    let n_objects = examples.iter().map(|example| &example.object).collect::<BTreeSet<_>>().len();
+    let folds = folds_by_object(examples, N_FOLDS.min(n_objects))?;
+    let Model { features, training_range, squeezed, test_lifted, .. } = model;
+    let probes = [(Phase::Squeezed, squeezed), (Phase::TestLifted, test_lifted)];
+    let of_probes = probes.into_iter().filter_map(|(look, probe)| Some((look, &mut probe.as_mut()?.training_range)));
+    let mut outside = BTreeSet::new();
+    for (look, range) in std::iter::once((Phase::Settled, training_range)).chain(of_probes) {
+        let own: Vec<(usize, FeltReading<'_>, usize)> = examples
+            .iter()
+            .zip(&folds)
+            .enumerate()
+            .filter_map(|(idx, (example, fold))| Some((idx, felt(look, example)?, *fold)))
+            .collect();
+        let (readings, folds): (Vec<_>, Vec<_>) = own.iter().map(|(_, reading, fold)| (*reading, *fold)).unzip();
+        let violated = own.iter().flat_map(|(idx, FeltReading { joints, contacts, .. }, _)| {
+            range.violations(features, joints, contacts).into_iter().map(|(limits, _)| (*idx, limits.quantity.clone()))
+        });
+        let (held, quantities): (BTreeSet<usize>, BTreeSet<String>) = violated.unzip();
+        outside.extend(held);
+        let TrainingRange { limits: own, .. } = learn_training_range(hand, features, &readings, &folds);
+        for (limits, own) in
+            range.limits.iter_mut().zip(&own).filter(|(limits, _)| quantities.contains(&limits.quantity))
+        {
+            (limits.lower, limits.upper) = (limits.lower.min(own.lower), limits.upper.max(own.upper));
+        }
+    }
+    Ok(outside.len())
+}
+
+/// The model, corrected for the day of the examples.
+fn adapt_to_day(model: &Model, day_model: &DayModel, read: &Examples) -> Result<Model, TrainingError> {
+    let day = match &read.examples[..] {
+        [first, rest @ ..] if first.day != 0 && rest.iter().all(|example| example.day == first.day) => first.day,
+        _ => return refused("expected labelled grasps of one day, which each frame says (import --day)".into()),
+    };
+    let variances = match &day_model.method {
+        DayMethod::Baseline(baseline) => baseline.variances.clone(),
+        DayMethod::Novelty(days) => days.deviations.iter().map(|deviation| deviation.powi(2)).collect(),
+    };
+    let (rows, log_odds, stable, statistics) = judged(model, &day_model.method, &read.examples)?;
+    let n_stable = stable.iter().filter(|stable| **stable).count();
+    if stable.len() < MIN_LABELLED || n_stable == 0 || n_stable == stable.len() {
+        return refused(format!(
+            "of {} labelled grasps of the day the model can judge {}, {n_stable} of them stable: expected at least \
+             {MIN_LABELLED}, some stable and some not (the others are unlike those that it was trained on)",
+            read.examples.len(),
+            stable.len()
+        ));
+    }
+    let grasps: Vec<(&[f64], f64)> = rows.chunks(model.features.len()).zip(log_odds.iter().copied()).collect();
+    let covariances = DMatrix::from_fn(grasps.len(), grasps.len(), |a, b| covariance(grasps[a], grasps[b], &variances));
+    let weights = most_probable_weights(&covariances, &log_odds, &stable);
+    let labelled = |((values, log_odds), weight): (&(&[f64], f64), &f64)| LabelledGrasp {
+        values: values.to_vec(),
+        log_odds: *log_odds,
+        weight: *weight,
+    };
+    let grasps = grasps.iter().zip(weights.iter()).map(labelled).collect();
+    let mut corrected = model.clone();
+    let mut day_model = day_model.clone();
+    day_model.recalibration = Some(Recalibration { day, statistics, variances, grasps });
+    corrected.day = Some(day_model);
+    Ok(corrected)
+}
+
+/// The weights of labelled grasps whose corrections, covariances times weights, are the most probable given the labels: Newton's
+/// method (Rasmussen and Williams, "Gaussian Processes for Machine Learning", 2006, section 3.4).
+fn most_probable_weights(covariances: &DMatrix<f64>, log_odds: &[f64], stable: &[bool]) -> DVector<f64> {
+    let mut weights = DVector::zeros(log_odds.len());
+    for round in 0..40 {
+        let corrections = covariances * &weights;
+        let probability = |idx: usize| 1.0 / (1.0 + (-(log_odds[idx] + corrections[idx])).exp());
+        let curvature = |idx: usize| (probability(idx) * (1.0 - probability(idx))).max(1e-4);
+        let miss = |idx: usize| f64::from(u8::from(stable[idx])) - probability(idx);
+        let aim = DVector::from_fn(log_odds.len(), |idx, _| corrections[idx] + miss(idx) / curvature(idx));
+        let mut system = covariances.clone();
+        (0..log_odds.len()).for_each(|idx| system[(idx, idx)] += 1.0 / curvature(idx));
+        // It is positive definite: a covariance and a positive diagonal.
+        let Some(cholesky) = system.cholesky() else { break };
+        let next = cholesky.solve(&aim);
+        // Half steps do not overshoot at first.
+        let next = if round < 12 { (&weights + next) / 2.0 } else { next };
+        let change = (&next - &weights).amax();
+        weights = next;
+        if change < 1e-7 {
+            break;
+        }
+    }
+    weights
+}
+
+/// The values, the log-odds and the outcome of each grasp that can be judged, and the statistics of all of these. Against a baseline each is
+/// judged by all of them: in the graph only later grasps of the day are judged.
+fn judged(
+    model: &Model,
+    method: &DayMethod,
+    examples: &[Example],
+) -> Result<(Vec<f64>, Vec<f64>, Vec<bool>, DayStatistics), TrainingError> {
+    let mut statistics = DayStatistics::default();
+    let (mut rows, mut stable, mut values) = (Vec::new(), Vec::new(), Vec::new());
+    for example in examples {
+        // A grasp without a feature is held in the graph too.
+        if model.extract(Phase::Settled, &example.reading(), &mut values).is_ok() {
+            statistics.add(&values);
+            rows.extend_from_slice(&values);
+            stable.push(example.stable);
+        }
+    }
+    let mut scaled = rows.clone();
+    if let DayMethod::Baseline(baseline) = method
+        && !rows.is_empty()
+    {
+        statistics.scaling(&baseline.variances).apply(&mut scaled);
+    }
+    let decision_values = decision_values(&model.classifier.predictor, &scaled)?;
+    let log_odds = decision_values.iter().map(|value| model.classifier.log_odds(*value));
+    Ok((rows, log_odds.collect(), stable, statistics))
+}

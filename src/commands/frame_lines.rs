@@ -1,0 +1,173 @@
+//! Frames as lines of JSON: those of a bridge, or of `blindgrasp export`.
+
+use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+
+use anyhow::{Context, bail};
+use serde::Deserialize;
+use serde_json::Value;
+
+use blindgrasp_messages::{GraspTruth, Header, OwnedSenses, Phase, Recorded, Stamped, TactileFrame};
+use blindgrasp_stages::Hand;
+use blindgrasp_tactile::line_protocol;
+
+/// The time between two frames that have no stamp.
+const PERIOD_NANOS: u64 = 10_000_000;
+
+/// The frames of lines, and the labels of their grasps by number.
+pub(super) struct FrameLines {
+    pub(super) frames: Vec<Stamped<TactileFrame>>,
+    pub(super) truths: BTreeMap<u64, GraspTruth>,
+}
+
+/// A line: a frame, with the outcome of its lift if it says it and names the object; a label; or a sample of another topic.
+enum Line {
+    Frame(Stamped<TactileFrame>, Option<GraspTruth>),
+    Truth(GraspTruth),
+    Other,
+}
+
+/// Reads a file of lines, or stdin if it is `-`. Empty lines, and samples of other topics, are left out.
+///
+/// # Errors
+/// A line that is no frame, or no frame at all. The text names the line.
+pub(super) fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines> {
+    let input: Box<dyn BufRead> = match file.to_str() {
+        Some("-") => Box::new(std::io::stdin().lock()),
+        _ => Box::new(BufReader::new(std::fs::File::open(file).with_context(|| file.display().to_string())?)),
+    };
+    let mut frames: Vec<Stamped<TactileFrame>> = Vec::new();
+    let mut truths = BTreeMap::new();
+    // Of lines of a bridge: whether they have numbers.
+    let mut has_seq = None;
+    for (line_idx, line) in input.lines().enumerate() {
+        let line = line.with_context(|| file.display().to_string())?;
+        if line.trim().is_empty() {
+            continue;
+        }
+        let place = || format!("{}, line {}", file.display(), line_idx + 1);
+        let (frame, truth) = match read_line(&line, &frames, hand).with_context(place)? {
+            Line::Frame(frame, truth) => (Some(frame), truth),
+            Line::Truth(truth) => (None, Some(truth)),
+            Line::Other => (None, None),
+        };
+        let has_seq_here = line.contains("\"seq\"");
+        if !line.contains("\"data\"") && *has_seq.get_or_insert(has_seq_here) != has_seq_here {
+            bail!("{}: expected seq in all lines or in none", place());
+        }
+        frames.extend(frame);
+        if let Some(truth) = truth {
+            truths.entry(truth.grasp_id).or_insert(truth);
+        }
+    }
+    if let (Some(has_seq), Some(first)) = (has_seq, frames.first()) {
+        // As the source of a graph numbers them: if the first frames are missing, so is number 0, and the grasp is held.
+        let first_seq = first.header.seq;
+        let is_whole = first.message.phase == Phase::Open || (has_seq && first_seq == 0);
+        for frame in &mut frames {
+            frame.header.seq = frame.header.seq.wrapping_sub(first_seq).wrapping_add(u64::from(!is_whole));
+        }
+    }
+    if frames.is_empty() {
+        bail!("{}: expected lines with tactile frames, found none", file.display());
+    }
+    Ok(FrameLines { frames, truths })
+}
+
+fn read_line(line: &str, earlier: &[Stamped<TactileFrame>], hand: &Hand) -> anyhow::Result<Line> {
+    let value: Value = serde_json::from_str(line).context("not a line of JSON")?;
+    if value.get("data").is_none() {
+        return of_bridge(line, earlier, hand);
+    }
+    let line: ExportedLine = serde_json::from_value(value)
+        .context("not a line of 'blindgrasp export': expected topic, seq, stamp_nanos and data")?;
+    if line.topic == GraspTruth::TOPIC {
+        let truth: TruthLine = serde_json::from_value(line.data)
+            .context("not a label: expected grasp_id, epsilon, volume, stable, object and class")?;
+        let unknown = |number: Option<f64>| number.unwrap_or(f64::NAN);
+        let TruthLine { grasp_id, epsilon, volume, stable, object, class } = truth;
+        let (epsilon, volume) = (unknown(epsilon), unknown(volume));
+        return Ok(Line::Truth(GraspTruth { grasp_id, epsilon, volume, stable, object, class }));
+    }
+    if line.topic != TactileFrame::TOPIC {
+        return Ok(Line::Other);
+    }
+    let hand_id = match &line.hand_id {
+        Some(id) => u64::from_str_radix(id, 16).context("hand_id: expected 16 hexadecimal digits")?,
+        None => hand.id(),
+    };
+    let header =
+        Header { hand_id, seq: line.seq, stamp_nanos: line.stamp_nanos, epoch: line.epoch, ..Header::default() };
+    let frame: FrameLine = serde_json::from_value(line.data)
+        .context("not a tactile frame: expected grasp_id, phase, joints and cells_newtons")?;
+    let message = TactileFrame {
+        grasp_id: frame.grasp_id,
+        phase: frame.phase,
+        joints: numbers(frame.joints),
+        cells_newtons: numbers(frame.cells_newtons),
+        senses: frame.senses,
+        day: frame.day,
+    };
+    Ok(Line::Frame(Stamped { header, message }, None))
+}
+
+/// As a graph's source numbers the frames of a bridge: from 0, with the bridge's gaps.
+fn of_bridge(line: &str, earlier: &[Stamped<TactileFrame>], hand: &Hand) -> anyhow::Result<Line> {
+    let reading = line_protocol::parse(line.as_bytes()).map_err(|refusal| anyhow::anyhow!("{}", refusal.why))?;
+    let grasp_id = reading.grasp_id.context("the frame lacks grasp_id")?;
+    let truth = reading.truth(grasp_id);
+    // Without the bridge's numbers, no frame is missed.
+    let seq = reading.seq.unwrap_or(earlier.last().map_or(0, |frame| frame.header.seq + 1));
+    let stamp_nanos = reading.stamp_nanos.unwrap_or(seq.wrapping_mul(PERIOD_NANOS));
+    let message = TactileFrame {
+        grasp_id,
+        phase: reading.phase,
+        joints: reading.joints,
+        cells_newtons: reading.cells_newtons,
+        senses: reading.senses,
+        day: reading.day.unwrap_or(0),
+    };
+    let header = Header { hand_id: hand.id(), seq, stamp_nanos, ..Header::default() };
+    Ok(Line::Frame(Stamped { header, message }, truth))
+}
+
+/// A line of `blindgrasp export`.
+#[derive(Deserialize)]
+struct ExportedLine {
+    topic: String,
+    seq: u64,
+    stamp_nanos: u64,
+    #[serde(default)]
+    epoch: u64,
+    hand_id: Option<String>,
+    data: Value,
+}
+
+/// A frame as lines of JSON have it: a number that is not finite is null there.
+#[derive(Deserialize)]
+struct FrameLine {
+    grasp_id: u64,
+    phase: Phase,
+    joints: Vec<Option<f64>>,
+    cells_newtons: Vec<Option<f64>>,
+    #[serde(flatten)]
+    senses: OwnedSenses,
+    #[serde(default)]
+    day: u32,
+}
+
+/// A label as lines of JSON have it.
+#[derive(Deserialize)]
+struct TruthLine {
+    grasp_id: u64,
+    epsilon: Option<f64>,
+    volume: Option<f64>,
+    stable: bool,
+    object: String,
+    class: String,
+}
+
+fn numbers(values: Vec<Option<f64>>) -> Vec<f64> {
+    values.into_iter().map(|value| value.unwrap_or(f64::NAN)).collect()
+}

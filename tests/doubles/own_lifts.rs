@@ -1,0 +1,145 @@
+//! What a robot's own lifts are worth to a model: the figures of docs/results.md, "Own lifts".
+//!
+//! `own_lifts MODEL every|gate N_ORDERS N_OUTCOMES,… RECORDING…` takes recordings of one robot whose grasps were all lifted. In each
+//! order half of the objects, drawn at random, give outcomes: of every grasp after its test lift, or of those that the gate
+//! lifts. After so many outcomes the grasps of the other half are decided with what was learned until then.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use blindgrasp_learning::dataset::{hand_of, read_grasps};
+use blindgrasp_messages::{Action, GraspTruth, Header, Phase, Stamped, TactileFrame};
+use blindgrasp_stages::own_lifts::Adapt;
+use blindgrasp_stages::promise_monitor::drops_at_most;
+use blindgrasp_stages::{ArbiterOptions, Judge, Model, Probe};
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+use rayon::prelude::*;
+
+struct Grasp {
+    frames: Vec<Stamped<TactileFrame>>,
+    truth: GraspTruth,
+}
+
+/// Sums over orders, at one number of outcomes.
+#[derive(Default, Clone, Copy)]
+struct Sums {
+    n_outcomes: usize,
+    n_lifted: usize,
+    n_kept: usize,
+    n_stable: usize,
+    at_most: f64,
+}
+
+fn main() -> anyhow::Result<()> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [model, which, n_orders, numbers, recordings @ ..] = &arguments[..] else {
+        anyhow::bail!("usage: own_lifts MODEL every|gate N_ORDERS N_OUTCOMES,… RECORDING…");
+    };
+    let model = Model::load(Path::new(model))?;
+    let recordings: Vec<PathBuf> = recordings.iter().map(PathBuf::from).collect();
+    let hand = hand_of(recordings.first().context("no recording")?, None)?;
+    let numbers: Vec<usize> = numbers.split(',').map(str::parse).collect::<Result<_, _>>()?;
+    let mut grasps = Vec::new();
+    for path in &recordings {
+        let read = read_grasps(path, &hand, |_, frames| frames)?;
+        grasps.extend(read.into_iter().filter_map(|grasp| Some(Grasp { frames: grasp.value, truth: grasp.truth? })));
+    }
+    let of_order = |seed: u64| -> anyhow::Result<Vec<Sums>> {
+        let options = ArbiterOptions { probe: Probe::TestLift, ..ArbiterOptions::default() };
+        let judge = Judge::with_options(hand.clone(), model.clone(), options)?;
+        Ok(Robot { judge, n_grasps: 0, is_gated: which == "gate" }.learn(&grasps, &numbers, seed))
+    };
+    let orders: anyhow::Result<Vec<Vec<Sums>>> = (0..n_orders.parse()?).into_par_iter().map(of_order).collect();
+    let orders = orders?;
+    println!("outcomes  (mean)  lifts  kept  of lifts  recall  promise");
+    for (idx, number) in numbers.iter().enumerate() {
+        let of = |part: fn(&Sums) -> f64| orders.iter().map(|order| part(&order[idx])).sum::<f64>();
+        let (n_lifted, n_kept) = (of(|sums| sums.n_lifted as f64), of(|sums| sums.n_kept as f64));
+        let n = orders.len() as f64;
+        println!(
+            "{number:>8} {:>7.1} {:>6.1} {:>5.1} {:>7.1} % {:>7.3} {:>6.1} %",
+            of(|sums| sums.n_outcomes as f64) / n,
+            n_lifted / n,
+            n_kept / n,
+            100.0 * n_kept / n_lifted,
+            n_kept / of(|sums| sums.n_stable as f64),
+            100.0 * of(|sums| sums.at_most) / n
+        );
+    }
+    Ok(())
+}
+
+struct Robot {
+    judge: Judge,
+    n_grasps: u64,
+    is_gated: bool,
+}
+
+impl Robot {
+    fn learn(mut self, grasps: &[Grasp], numbers: &[usize], seed: u64) -> Vec<Sums> {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let mut objects: Vec<&String> =
+            grasps.iter().map(|grasp| &grasp.truth.object).collect::<BTreeSet<_>>().into_iter().collect();
+        objects.shuffle(&mut random);
+        let own: BTreeSet<&String> = objects[..objects.len() / 2].iter().copied().collect();
+        let (mut own, others): (Vec<&Grasp>, Vec<&Grasp>) =
+            grasps.iter().partition(|grasp| own.contains(&grasp.truth.object));
+        own.shuffle(&mut random);
+        let mut own = own.into_iter();
+        let [mut n_kept, mut n_dropped] = [0, 0];
+        let mut found = Vec::new();
+        for number in numbers {
+            self.judge.adapt(Adapt::On);
+            while n_kept + n_dropped < *number as u64
+                && let Some(grasp) = own.next()
+            {
+                let is_lifted = self.decide(grasp);
+                let has_outcome = grasp.frames.iter().any(|frame| frame.message.phase == Phase::TestLifted);
+                if if self.is_gated { is_lifted } else { has_outcome } {
+                    self.report(grasp);
+                    *(if grasp.truth.stable { &mut n_kept } else { &mut n_dropped }) += 1;
+                }
+            }
+            self.judge.adapt(Adapt::Frozen);
+            let mut sums = Sums {
+                n_outcomes: (n_kept + n_dropped) as usize,
+                at_most: drops_at_most(n_kept, n_dropped),
+                ..Sums::default()
+            };
+            for grasp in &others {
+                let is_lifted = self.decide(grasp);
+                sums.n_lifted += usize::from(is_lifted);
+                sums.n_kept += usize::from(is_lifted && grasp.truth.stable);
+                sums.n_stable += usize::from(grasp.truth.stable);
+            }
+            found.push(sums);
+        }
+        found
+    }
+
+    /// Whether the grasp is lifted: its frames as a source of their own that begins with them.
+    fn decide(&mut self, grasp: &Grasp) -> bool {
+        self.n_grasps += 1;
+        let frames = grasp.frames.iter().filter(|frame| frame.message.phase != Phase::Lifting);
+        let mut is_lifted = false;
+        for (seq, frame) in frames.enumerate() {
+            let header = Header { seq: seq as u64, epoch: self.n_grasps, ..frame.header };
+            let message = TactileFrame { grasp_id: self.n_grasps, ..frame.message.clone() };
+            let judged = self.judge.sample(&Stamped { header, message });
+            is_lifted |= judged.decisions.iter().any(|decision| decision.action == Action::Lift);
+        }
+        is_lifted
+    }
+
+    /// Reports how the lift of the grasp that was decided last ended.
+    fn report(&mut self, grasp: &Grasp) {
+        let Some(last) = grasp.frames.last() else { return };
+        let phase = if grasp.truth.stable { Phase::Kept } else { Phase::Dropped };
+        let header = Header { seq: u64::MAX, epoch: self.n_grasps, ..last.header };
+        let message = TactileFrame { grasp_id: self.n_grasps, phase, ..last.message.clone() };
+        self.judge.sample(&Stamped { header, message });
+    }
+}
