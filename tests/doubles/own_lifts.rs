@@ -1,14 +1,18 @@
 //! What a robot's own lifts are worth to a model: the figures of docs/results.md, "Own lifts".
 //!
-//! `own_lifts MODEL every|gate N_ORDERS N_OUTCOMES,… RECORDING…` takes recordings of one robot whose grasps were all lifted. In each
-//! order half of the objects, drawn at random, give outcomes: of every grasp after its test lift, or of those that the gate
-//! lifts. After so many outcomes the grasps of the other half are decided with what was learned until then.
+//! `own_lifts MODEL live|adapt|scratch N_ORDERS N_OUTCOMES,… RECORDING…` takes recordings of one robot whose grasps were all lifted.
+//! In each order half of the objects, drawn at random, give outcomes. After so many the grasps of the other half are decided.
+//!
+//! * `live`: as a graph with `classifier.adapt=on` learns, of the grasps that its gate lifts.
+//! * `adapt`: as `blindgrasp model adapt` learns, of the first grasps, each lifted whatever the gate would say.
+//! * `scratch`: a model that was trained on the same grasps alone.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use blindgrasp_learning::dataset::{hand_of, read_grasps};
+use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, adapt_on, train_on};
 use blindgrasp_messages::{Action, GraspTruth, Header, Phase, Stamped, TactileFrame};
 use blindgrasp_stages::own_lifts::Adapt;
 use blindgrasp_stages::promise_monitor::drops_at_most;
@@ -36,7 +40,7 @@ struct Sums {
 fn main() -> anyhow::Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let [model, which, n_orders, numbers, recordings @ ..] = &arguments[..] else {
-        anyhow::bail!("usage: own_lifts MODEL every|gate N_ORDERS N_OUTCOMES,… RECORDING…");
+        anyhow::bail!("usage: own_lifts MODEL live|adapt|scratch N_ORDERS N_OUTCOMES,… RECORDING…");
     };
     let model = Model::load(Path::new(model))?;
     let recordings: Vec<PathBuf> = recordings.iter().map(PathBuf::from).collect();
@@ -49,8 +53,25 @@ fn main() -> anyhow::Result<()> {
     }
     let of_order = |seed: u64| -> anyhow::Result<Vec<Sums>> {
         let options = ArbiterOptions { probe: Probe::TestLift, ..ArbiterOptions::default() };
-        let judge = Judge::with_options(hand.clone(), model.clone(), options)?;
-        Ok(Robot { judge, n_grasps: 0, is_gated: which == "gate" }.learn(&grasps, &numbers, seed))
+        let judge = |model: Model| Judge::with_options(hand.clone(), model, options);
+        if which == "live" {
+            return Ok(Robot { judge: judge(model.clone())?, n_grasps: 0 }.learn(&grasps, &numbers, seed));
+        }
+        let (own, others) = halves(&grasps, seed);
+        let of_number = |number: &usize| -> anyhow::Result<Sums> {
+            let own = own.iter().take(*number).map(|grasp| (grasp.frames.clone(), grasp.truth.clone()));
+            let examples = Examples::of_grasps(&hand, own)?;
+            let training = TrainingOptions { aim: Some(Aim::DropSecs(300.0)), ..TrainingOptions::default() };
+            let model = match which.as_str() {
+                "scratch" => train_on(&hand, &examples, &[], &training, |_| {})?,
+                _ if *number == 0 => model.clone(),
+                // So few grasps may have too few that can be judged: then the model stays.
+                _ => adapt_on(&hand, &model, &examples, &[]).unwrap_or(model.clone()),
+            };
+            let judged = Robot { judge: judge(model)?, n_grasps: 0 }.judge_all(&others);
+            Ok(Sums { n_outcomes: examples.examples.len(), ..judged })
+        };
+        numbers.iter().map(of_number).collect()
     };
     let orders: anyhow::Result<Vec<Vec<Sums>>> = (0..n_orders.parse()?).into_par_iter().map(of_order).collect();
     let orders = orders?;
@@ -72,22 +93,27 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
+/// The grasps of half of the objects in random order, and those of the others.
+fn halves(grasps: &[Grasp], seed: u64) -> (Vec<&Grasp>, Vec<&Grasp>) {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let objects: BTreeSet<&String> = grasps.iter().map(|grasp| &grasp.truth.object).collect();
+    let mut objects: Vec<&String> = objects.into_iter().collect();
+    objects.shuffle(&mut random);
+    let own: BTreeSet<&String> = objects[..objects.len() / 2].iter().copied().collect();
+    let (mut own, others): (Vec<&Grasp>, Vec<&Grasp>) =
+        grasps.iter().partition(|grasp| own.contains(&grasp.truth.object));
+    own.shuffle(&mut random);
+    (own, others)
+}
+
 struct Robot {
     judge: Judge,
     n_grasps: u64,
-    is_gated: bool,
 }
 
 impl Robot {
     fn learn(mut self, grasps: &[Grasp], numbers: &[usize], seed: u64) -> Vec<Sums> {
-        let mut random = ChaCha8Rng::seed_from_u64(seed);
-        let mut objects: Vec<&String> =
-            grasps.iter().map(|grasp| &grasp.truth.object).collect::<BTreeSet<_>>().into_iter().collect();
-        objects.shuffle(&mut random);
-        let own: BTreeSet<&String> = objects[..objects.len() / 2].iter().copied().collect();
-        let (mut own, others): (Vec<&Grasp>, Vec<&Grasp>) =
-            grasps.iter().partition(|grasp| own.contains(&grasp.truth.object));
-        own.shuffle(&mut random);
+        let (own, others) = halves(grasps, seed);
         let mut own = own.into_iter();
         let [mut n_kept, mut n_dropped] = [0, 0];
         let mut found = Vec::new();
@@ -96,28 +122,27 @@ impl Robot {
             while n_kept + n_dropped < *number as u64
                 && let Some(grasp) = own.next()
             {
-                let is_lifted = self.decide(grasp);
-                let has_outcome = grasp.frames.iter().any(|frame| frame.message.phase == Phase::TestLifted);
-                if if self.is_gated { is_lifted } else { has_outcome } {
+                if self.decide(grasp) {
                     self.report(grasp);
                     *(if grasp.truth.stable { &mut n_kept } else { &mut n_dropped }) += 1;
                 }
             }
             self.judge.adapt(Adapt::Frozen);
-            let mut sums = Sums {
-                n_outcomes: (n_kept + n_dropped) as usize,
-                at_most: drops_at_most(n_kept, n_dropped),
-                ..Sums::default()
-            };
-            for grasp in &others {
-                let is_lifted = self.decide(grasp);
-                sums.n_lifted += usize::from(is_lifted);
-                sums.n_kept += usize::from(is_lifted && grasp.truth.stable);
-                sums.n_stable += usize::from(grasp.truth.stable);
-            }
-            found.push(sums);
+            let (n_outcomes, at_most) = ((n_kept + n_dropped) as usize, drops_at_most(n_kept, n_dropped));
+            found.push(Sums { n_outcomes, at_most, ..self.judge_all(&others) });
         }
         found
+    }
+
+    fn judge_all(&mut self, grasps: &[&Grasp]) -> Sums {
+        let mut sums = Sums::default();
+        for grasp in grasps {
+            let is_lifted = self.decide(grasp);
+            sums.n_lifted += usize::from(is_lifted);
+            sums.n_kept += usize::from(is_lifted && grasp.truth.stable);
+            sums.n_stable += usize::from(grasp.truth.stable);
+        }
+        sums
     }
 
     /// Whether the grasp is lifted: its frames as a source of their own that begins with them.

@@ -38,10 +38,6 @@ pub fn day_number(name: &str) -> u32 {
     }
 }
 
-/// Grasps that the variances within the training's days count as, beside those of the day. Chosen on the training tables of
-/// the BioTac SP set, one left out in turn.
-const SHRINKING_GRASPS: f64 = 30.0;
-
 /// Number, mean and sum of squared differences from the mean (Welford) of the features of grasps.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -65,13 +61,9 @@ impl DayStatistics {
         }
     }
 
-    /// The map of each value to mean 0 and standard deviation 1 over these grasps. The deviations of a few grasps are uncertain, so
-    /// they are shrunken towards `variances`, those within the training's days, as if [`SHRINKING_GRASPS`] grasps had these.
-    /// The mean is not: it is what moves from day to day.
-    pub fn scaling(&self, variances: &[f64]) -> Scaling {
-        let n = self.n_grasps as f64 + SHRINKING_GRASPS;
-        let variance = |(squares, variance): (&f64, &f64)| (squares + SHRINKING_GRASPS * variance) / n;
-        let deviations = self.squares.iter().zip(variances).map(variance).map(|variance| variance.max(0.0).sqrt());
+    /// The map of each value to mean 0 and standard deviation 1 over these grasps.
+    pub fn scaling(&self) -> Scaling {
+        let deviations = self.squares.iter().map(|squares| (squares / self.n_grasps.max(1) as f64).max(0.0).sqrt());
         Scaling::new(self.mean.clone(), deviations)
     }
 
@@ -293,7 +285,7 @@ impl DayModel {
                 if statistics.n_grasps < baseline.min_grasps || statistics.mean.len() != values.len() {
                     return Err(Fault::NoBaseline);
                 }
-                statistics.scaling(&baseline.variances).apply(&mut scaled);
+                statistics.scaling().apply(&mut scaled);
                 if root_mean_square(&scaled) >= baseline.limit {
                     return Err(Fault::OutOfDistribution);
                 }
@@ -362,11 +354,7 @@ mod tests {
         let rows = [[1.0, 5.0, 7.0], [2.0, 5.0, -7.0], [6.0, 5.0, 0.5]];
         let mut statistics = DayStatistics::default();
         rows.iter().for_each(|row| statistics.add(row));
-        let whole = Scaling::of(&rows.concat(), 3);
-        // Variances that are those of the grasps change nothing.
-        let variances: Vec<f64> =
-            whole.per_deviation.iter().map(|per| if *per > 0.0 { per.powi(-2) } else { 0.0 }).collect();
-        let (found, expected) = (statistics.scaling(&variances), whole);
+        let (found, expected) = (statistics.scaling(), Scaling::of(&rows.concat(), 3));
         for (a, b) in
             found.mean.iter().zip(&expected.mean).chain(found.per_deviation.iter().zip(&expected.per_deviation))
         {

@@ -340,11 +340,8 @@ impl Model {
     /// # Errors
     /// As of [`Model::judge`].
     pub fn classify(&self, phase: Phase, values: &[f64], day: u32, memory: &Memory) -> Result<Verdict, Fault> {
-        let classify = |classifier: &Classifier, values: &[f64]| match memory
-            .lifts
-            .learned(phase)
-            .filter(|_| memory.adapt != Adapt::Off)
-        {
+        let learned = if memory.adapt == Adapt::Off { None } else { memory.lifts.learned(phase) };
+        let classify = |classifier: &Classifier, values: &[f64]| match learned {
             Some(learned) => classifier.classify_by(learned.apply(classifier), values),
             None => classifier.classify(values),
         };

@@ -59,6 +59,9 @@ pub struct Prior {
 /// (docs/results.md).
 pub const OF_A_ROBOT: Prior = Prior { slope_deviation: 0.1, offset_deviation: 0.5 };
 
+/// The prior for a robot whose grasps are mostly unlike those of the training: the model's probabilities say little of them.
+pub const OF_AN_UNLIKE_ROBOT: Prior = Prior { slope_deviation: 0.3, offset_deviation: 1.5 };
+
 impl Default for Correction {
     fn default() -> Self {
         Correction { a: 1.0, b: 0.0 }
@@ -132,29 +135,22 @@ pub fn secs_per_kept(lifted: f64, kept: f64, drop_secs: f64) -> f64 {
 }
 
 /// The log-odds from which a grasp is lifted at the least cost. `log_odds` are those of grasps with an outcome, out of
-/// `n_grasps`; their probabilities say how many are kept. It is `present` unless another threshold costs clearly less.
+/// `n_grasps`; their probabilities say how many are kept. It is `present` unless a higher one costs clearly less: outcomes of a few
+/// grasps are no reason to lift what was held before.
 pub fn threshold(log_odds: &[f64], n_grasps: u64, present: f64, drop_secs: f64) -> f64 {
-    let mut sorted = log_odds.to_vec();
-    sorted.sort_by(|a, b| b.total_cmp(a));
-    let probability = |log_odds: &f64| 1.0 / (1.0 + (-log_odds).exp());
-    let (mut n_lifted, mut kept) = (0, 0.0);
-    let mut cost_of_present = f64::INFINITY;
-    let mut best = (f64::INFINITY, present);
-    for (idx, candidate) in sorted.iter().enumerate() {
-        (n_lifted, kept) = (n_lifted + 1, kept + probability(candidate));
-        if n_lifted < FEWEST_LIFTS {
-            continue;
-        }
-        let (n, n_grasps) = (n_lifted as f64, (n_grasps as f64).max(n_lifted as f64));
-        let cost = secs_per_kept(n / n_grasps, kept / n, drop_secs);
-        if *candidate >= present && sorted.get(idx + 1).is_none_or(|next| *next < present) {
-            cost_of_present = cost;
-        }
-        if cost < best.0 {
-            best = (cost, *candidate);
-        }
+    let mut lifted: Vec<f64> = log_odds.iter().copied().filter(|log_odds| *log_odds >= present).collect();
+    lifted.sort_by(|a, b| b.total_cmp(a));
+    let n_grasps = (n_grasps as f64).max(lifted.len() as f64);
+    let mut kept = 0.0;
+    let mut costs = Vec::with_capacity(lifted.len());
+    for (idx, log_odds) in lifted.iter().enumerate() {
+        kept += 1.0 / (1.0 + (-log_odds).exp());
+        let n = (idx + 1) as f64;
+        costs.push((secs_per_kept(n / n_grasps, kept / n, drop_secs), *log_odds));
     }
-    if best.0 < (1.0 - WORTH_A_CHANGE) * cost_of_present { best.1 } else { present }
+    let cost_of_present = costs.last().map_or(0.0, |(cost, _)| *cost);
+    let least = costs.into_iter().skip(FEWEST_LIFTS - 1).min_by(|a, b| a.0.total_cmp(&b.0));
+    least.filter(|(cost, _)| *cost < (1.0 - WORTH_A_CHANGE) * cost_of_present).map_or(present, |(_, log_odds)| log_odds)
 }
 
 /// What own lifts have taught of a look.
@@ -170,11 +166,12 @@ impl Learned {
     /// `n_grasps`. Without a price of a drop, the threshold keeps its probability.
     pub fn of(
         classifier: &Classifier,
+        prior: Prior,
         outcomes: impl Iterator<Item = (f64, bool)> + Clone,
         n_grasps: u64,
         drop_secs: Option<f64>,
     ) -> Learned {
-        let correction = Correction::fit(OF_A_ROBOT, outcomes.clone());
+        let correction = Correction::fit(prior, outcomes.clone());
         let before = classifier.threshold_probability;
         let threshold_probability = match drop_secs {
             Some(drop_secs) if before < 1.0 => {
@@ -323,7 +320,7 @@ impl OwnLifts {
         {
             let n_grasps = self.outcomes.iter().map(|outcome| u64::from(outcome.n_grasps)).sum();
             let outcomes = of_look().map(|outcome| (f64::from(outcome.log_odds), outcome.is_kept));
-            let learned = Learned::of(classifier, outcomes, n_grasps, drop_secs);
+            let learned = Learned::of(classifier, OF_A_ROBOT, outcomes, n_grasps, drop_secs);
             self.learned.retain(|(known, _)| *known != look);
             self.learned.push((look, learned));
         }
@@ -423,7 +420,7 @@ mod tests {
         let choose = |present, drop_secs| threshold(&grasps, 100, present, drop_secs);
         assert_eq!(choose(0.0, 300.0), log_odds(0.99));
         assert_eq!(choose(0.0, 0.0), 0.0, "a drop costs nothing: it stays");
-        assert_eq!(choose(log_odds(0.9), 0.0), log_odds(0.6), "it falls where drops are cheap");
+        assert_eq!(choose(log_odds(0.9), 0.0), log_odds(0.9), "it never falls");
         // Where all look alike, and with a few grasps, it stays.
         assert_eq!(threshold(&[2.0; 30], 100, 1.0, 300.0), 1.0);
         assert_eq!(threshold(&grasps[..4], 100, 0.0, 300.0), 0.0);

@@ -69,7 +69,14 @@ pub fn import_frames(
         if matches!(phase, Phase::Kept | Phase::Dropped) {
             outcomes.entry(grasp_id).or_insert(*phase == Phase::Kept);
         }
-        let has: BTreeSet<_> = frame.message.senses.view().iter().map(|(sense, _)| sense.name()).collect();
+        let has: BTreeSet<_> = frame
+            .message
+            .senses
+            .view()
+            .iter()
+            .filter(|(_, values)| !values.is_empty())
+            .map(|(sense, _)| sense.name())
+            .collect();
         senses = Some(senses.map_or(has.clone(), |known| &known & &has));
         recording.write(TactileFrame::TOPIC, frame)?;
     }

@@ -21,13 +21,17 @@ use blindgrasp_stages::encoder::FeltReading;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::out_of_distribution::TrainingRange;
-use blindgrasp_stages::own_lifts::{Correction, FEWEST_OUTCOMES, Learned, log_loss, secs_per_kept};
+use blindgrasp_stages::own_lifts::{
+    Correction, FEWEST_OUTCOMES, Learned, OF_A_ROBOT, OF_AN_UNLIKE_ROBOT, Prior, log_loss, secs_per_kept,
+};
 use blindgrasp_stages::training_summary::{OwnLiftsSummary, Promise};
 
 /// The fewest labelled grasps of a day.
 const MIN_LABELLED: usize = 20;
 /// Folds of objects, or as many as there are objects.
 const N_FOLDS: usize = 5;
+/// From this share of own grasps outside the limits on, the robot is unlike those that the model learned from.
+const UNLIKE_SHARE: f64 = 0.1;
 /// Own grasps without which no limit is widened.
 const FEWEST_FOR_LIMITS: usize = 30;
 
@@ -37,17 +41,24 @@ const FEWEST_FOR_LIMITS: usize = 30;
 /// # Errors
 /// Recordings that cannot be used, that the model was trained on, or with too few labelled grasps.
 pub fn adapt(hand: &Hand, model: &Model, recordings: &[PathBuf]) -> Result<Model, TrainingError> {
+    adapt_on(hand, model, &Examples::read(hand, recordings, &Relabelling::default(), |_, _| {})?, recordings)
+}
+
+/// Corrects a model by examples. `recordings` names the files that they are from; it is empty for examples out of memory.
+///
+/// # Errors
+/// As of [`adapt`].
+pub fn adapt_on(hand: &Hand, model: &Model, read: &Examples, recordings: &[PathBuf]) -> Result<Model, TrainingError> {
     if model.hand.id != hand.id() {
         return refused(format!("the recordings are of the hand '{}', the model of '{}'", hand.name, model.hand.name));
     }
-    let read = Examples::read(hand, recordings, &Relabelling::default(), |_, _| {})?;
     let mut trained_on = model.training.trained_on.clone().unwrap_or_default();
     if let Some(known) = read.examples.iter().find(|example| trained_on.grasps.contains(&example.reading_id)) {
         return refused(format!("the model was trained on grasp {} of these: expected new grasps", known.grasp_id));
     }
     let mut adapted = match &model.day {
-        Some(day) => adapt_to_day(model, day, &read)?,
-        None => adapt_to_lifts(hand, model, &read, recordings)?,
+        Some(day) => adapt_to_day(model, day, read)?,
+        None => adapt_to_lifts(hand, model, read, recordings)?,
     };
     // They were for the probabilities before.
     adapted.training.withdraw_promises();
@@ -104,11 +115,13 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
     }
     let folds = folds_by_object(&examples, N_FOLDS.min(n_objects))?;
     let n_grasps = read.examples.len() + read.n_excluded.values().sum::<usize>();
-    let judged = Judged { classifier, drop_secs: model.drop_secs(look), n_grasps: n_grasps as f64, lifts: &lifts };
-    let own = judged.learn(&folds);
     let mut adapted = model.clone();
     let all: Vec<&Example> = read.examples.iter().collect();
     let n_outside = widen(hand, &mut adapted, &all)?;
+    let is_unlike = n_outside as f64 > UNLIKE_SHARE * all.len() as f64;
+    let prior = if is_unlike { OF_AN_UNLIKE_ROBOT } else { OF_A_ROBOT };
+    let (drop_secs, n_grasps) = (model.drop_secs(look), n_grasps as f64);
+    let own = Judged { classifier, prior, drop_secs, n_grasps, lifts: &lifts }.learn(&folds);
     let of_look = match look {
         Phase::TestLifted => adapted.test_lifted.as_mut().map(|probe| &mut probe.classifier),
         Phase::Squeezed => adapted.squeezed.as_mut().map(|probe| &mut probe.classifier),
@@ -137,6 +150,7 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
 /// The lifts that a look decides.
 struct Judged<'a> {
     classifier: &'a Classifier,
+    prior: Prior,
     drop_secs: Option<f64>,
     /// Grasps that the lifts were chosen from.
     n_grasps: f64,
@@ -199,7 +213,7 @@ impl Judged<'_> {
             .map(|(_, lift)| (lift.log_odds, lift.example.stable))
             .collect();
         let n_grasps = self.n_grasps * used.len() as f64 / self.lifts.len() as f64;
-        Learned::of(self.classifier, used.iter().copied(), n_grasps as u64, self.drop_secs)
+        Learned::of(self.classifier, self.prior, used.iter().copied(), n_grasps as u64, self.drop_secs)
     }
 
     /// The same correction with a threshold that lifts the grasps that the model lifts.
@@ -381,10 +395,8 @@ fn judged(
         }
     }
     let mut scaled = rows.clone();
-    if let DayMethod::Baseline(baseline) = method
-        && !rows.is_empty()
-    {
-        statistics.scaling(&baseline.variances).apply(&mut scaled);
+    if matches!(method, DayMethod::Baseline(_)) && !rows.is_empty() {
+        statistics.scaling().apply(&mut scaled);
     }
     let decision_values = decision_values(&model.classifier.predictor, &scaled)?;
     let log_odds = decision_values.iter().map(|value| model.classifier.log_odds(*value));

@@ -61,8 +61,8 @@ fn by_day(examples: &[&Example]) -> BTreeMap<Day, Vec<usize>> {
     days
 }
 
-/// Scales the features of each day as later days are scaled, and returns the variance of each value within a day: the mean over the
-/// days.
+/// Scales the features of each day to mean 0 and standard deviation 1, and returns the variance of each value within a day: the mean
+/// over the days.
 pub(super) fn scale_by_day(rows: &mut [f64], n_values: usize, examples: &[&Example]) -> Vec<f64> {
     let days: Vec<Vec<usize>> = by_day(examples).into_values().collect();
     let statistics: Vec<DayStatistics> =
@@ -73,7 +73,7 @@ pub(super) fn scale_by_day(rows: &mut [f64], n_values: usize, examples: &[&Examp
     };
     let variances: Vec<f64> = (0..n_values).map(variance).collect();
     for (idxs, statistics) in days.iter().zip(&statistics) {
-        let scaling = statistics.scaling(&variances);
+        let scaling = statistics.scaling();
         idxs.iter().for_each(|idx| scaling.apply(&mut rows[idx * n_values..][..n_values]));
     }
     variances
@@ -236,7 +236,7 @@ fn pseudo_days<'a>(
                 if statistics.n_grasps >= MIN_BASELINE_GRASPS {
                     let start = judged_rows.len();
                     judged_rows.extend_from_slice(row);
-                    statistics.scaling(&fitted.day_variances).apply(&mut judged_rows[start..]);
+                    statistics.scaling().apply(&mut judged_rows[start..]);
                     judged.push(examples[idx]);
                 }
                 statistics.add(row);

@@ -16,7 +16,7 @@ mod probes;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-pub use adaptation::adapt;
+pub use adaptation::{adapt, adapt_on};
 pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 pub use blindgrasp_stages::training_summary::{PolicySummary, TrainingSummary};
 pub use examples::{Example, Examples, Felt, Relabelling, Signals};
