@@ -291,14 +291,17 @@ fn widen(hand: &Hand, model: &mut Model, examples: &[&Example]) -> Result<usize,
     let Model { features, training_range, squeezed, test_lifted, .. } = model;
     let probes = [(Phase::Squeezed, squeezed), (Phase::TestLifted, test_lifted)];
     let of_probes = probes.into_iter().filter_map(|(look, probe)| Some((look, &mut probe.as_mut()?.training_range)));
-    let mut outside = BTreeSet::new();
+    let (mut outside, mut values) = (BTreeSet::new(), Vec::new());
     for (look, range) in std::iter::once((Phase::Settled, training_range)).chain(of_probes) {
-        let own: Vec<(usize, FeltReading<'_>, usize)> = examples
-            .iter()
-            .zip(&folds)
-            .enumerate()
-            .filter_map(|(idx, (example, fold))| Some((idx, felt(look, example)?, *fold)))
-            .collect();
+        let mut own = Vec::new();
+        for (idx, (example, fold)) in examples.iter().zip(&folds).enumerate() {
+            // A hand that feels nothing is held for that, and not by a limit.
+            if let Some(reading) = felt(look, example)
+                && features.extract(&reading, &mut values).is_ok()
+            {
+                own.push((idx, reading, *fold));
+            }
+        }
         let (readings, folds): (Vec<_>, Vec<_>) = own.iter().map(|(_, reading, fold)| (*reading, *fold)).unzip();
         let violated = own.iter().flat_map(|(idx, FeltReading { joints, contacts, .. }, _)| {
             range.violations(features, joints, contacts).into_iter().map(|(limits, _)| (*idx, limits.quantity.clone()))
@@ -325,7 +328,7 @@ fn adapt_to_day(model: &Model, day_model: &DayModel, read: &Examples) -> Result<
         DayMethod::Baseline(baseline) => baseline.variances.clone(),
         DayMethod::Novelty(days) => days.deviations.iter().map(|deviation| deviation.powi(2)).collect(),
     };
-    let (rows, log_odds, stable, statistics) = judged(model, &day_model.method, &read.examples)?;
+    let DayGrasps { rows, log_odds, stable, statistics } = judged(model, &day_model.method, &read.examples)?;
     let n_stable = stable.iter().filter(|stable| **stable).count();
     if stable.len() < MIN_LABELLED || n_stable == 0 || n_stable == stable.len() {
         return refused(format!(
@@ -377,13 +380,17 @@ fn most_probable_weights(covariances: &DMatrix<f64>, log_odds: &[f64], stable: &
     weights
 }
 
-/// The values, the log-odds and the outcome of each grasp that can be judged, and the statistics of all of these. Against a baseline each is
-/// judged by all of them: in the graph only later grasps of the day are judged.
-fn judged(
-    model: &Model,
-    method: &DayMethod,
-    examples: &[Example],
-) -> Result<(Vec<f64>, Vec<f64>, Vec<bool>, DayStatistics), TrainingError> {
+/// The grasps of a day that can be judged.
+struct DayGrasps {
+    /// Their values, one grasp after the other.
+    rows: Vec<f64>,
+    log_odds: Vec<f64>,
+    stable: Vec<bool>,
+    statistics: DayStatistics,
+}
+
+/// Judges the grasps of a day. Against a baseline each is judged by all of them: in the graph only later grasps of the day are.
+fn judged(model: &Model, method: &DayMethod, examples: &[Example]) -> Result<DayGrasps, TrainingError> {
     let mut statistics = DayStatistics::default();
     let (mut rows, mut stable, mut values) = (Vec::new(), Vec::new(), Vec::new());
     for example in examples {
@@ -399,6 +406,6 @@ fn judged(
         statistics.scaling().apply(&mut scaled);
     }
     let decision_values = decision_values(&model.classifier.predictor, &scaled)?;
-    let log_odds = decision_values.iter().map(|value| model.classifier.log_odds(*value));
-    Ok((rows, log_odds.collect(), stable, statistics))
+    let log_odds = decision_values.iter().map(|value| model.classifier.log_odds(*value)).collect();
+    Ok(DayGrasps { rows, log_odds, stable, statistics })
 }
