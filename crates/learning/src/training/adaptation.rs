@@ -119,8 +119,9 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
     let all: Vec<&Example> = read.examples.iter().collect();
     let n_outside = widen(hand, &mut adapted, &all)?;
     let is_unlike = n_outside as f64 > UNLIKE_SHARE * all.len() as f64;
-    let prior = if is_unlike { OF_AN_UNLIKE_ROBOT } else { OF_A_ROBOT };
-    let (drop_secs, n_grasps) = (model.drop_secs(look), n_grasps as f64);
+    // The place of a threshold among grasps that the model does not know means nothing: there it keeps its probability.
+    let (prior, drop_secs) = if is_unlike { (OF_AN_UNLIKE_ROBOT, None) } else { (OF_A_ROBOT, model.drop_secs(look)) };
+    let n_grasps = n_grasps as f64;
     let own = Judged { classifier, prior, drop_secs, n_grasps, lifts: &lifts }.learn(&folds);
     let of_look = match look {
         Phase::TestLifted => adapted.test_lifted.as_mut().map(|probe| &mut probe.classifier),
