@@ -45,14 +45,22 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let model = Model::load(&params.model)?;
     let (identity, dictionary_id) = (model.identity(), model.dictionary_id());
-    let memory = Memory::new(params.adapt);
-    let classify =
-        Classify { operator: operator.clone(), model, dictionary_id, memory, adapt: params.adapt, reported: [0; 3] };
+    let classify = Classify {
+        operator: operator.clone(),
+        has_state: model.has_memory() || params.adapt != Adapt::Off,
+        model,
+        dictionary_id,
+        memory: Memory::new(params.adapt),
+        adapt: params.adapt,
+        reported: [0; 3],
+    };
     stage::run(operator, "feature", "prediction", 0, identity, classify)
 }
 
 struct Classify {
     operator: Operator,
+    /// It is fixed at the start, because the instance after this one reads the state.
+    has_state: bool,
     model: Model,
     dictionary_id: u64,
     /// Earlier frames of the open grasp, or of the day. It stays empty if the model judges each frame alone.
@@ -67,7 +75,7 @@ impl Stage for Classify {
     type Out = Prediction;
 
     fn has_state(&self) -> bool {
-        self.model.has_memory() || self.adapt != Adapt::Off
+        self.has_state
     }
 
     fn answer(&mut self, head: &GraspFeatureHead, values: &[f64], _now_nanos: u64, answers: &mut Answers<Prediction>) {
@@ -104,7 +112,7 @@ impl Stage for Classify {
     fn set(&mut self, params: &Map<String, Value>) -> anyhow::Result<()> {
         let adapt = parse_params::<Params>(params)?.adapt;
         anyhow::ensure!(
-            adapt == Adapt::Off || self.has_state(),
+            adapt == Adapt::Off || self.has_state,
             "adapt: this classifier has kept no outcomes, because its model judges each frame alone: swap it with \
              --set adapt={}",
             if adapt == Adapt::On { "on" } else { "frozen" }
