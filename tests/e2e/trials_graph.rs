@@ -143,7 +143,7 @@ fn decisions_are_carried_out_and_the_same_seed_gives_the_same_outcomes() {
     // The arbiter hears of each lift from the hand's own frames.
     let n_kept = first.iter().filter(|it| it["held"] == true).count();
     let counts = serde_json::json!({"lifts/kept": n_kept, "lifts/dropped": n_lifted - n_kept, "lifts/unreported": 0,
-        "promise_withdrawn": 0});
+        "promise/kept": n_kept, "promise/dropped": n_lifted - n_kept, "promise_withdrawn": 0});
     assert_eq!(summary["counts"]["lift_arbiter"], counts, "{summary}");
     for outcome in first {
         assert!(outcome["lifted"] == true || outcome["held"] == false, "{outcome}");
