@@ -2,9 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use blindgrasp_messages::{
-    Fault, Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Recorded,
-};
+use blindgrasp_messages::{Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
@@ -139,16 +137,11 @@ impl Stage for Arbiter {
         self.last = head.header;
         match Prediction::from_parts(head, items) {
             Ok(prediction) => {
-                let promise = (prediction.fault == Fault::Changed).then(|| self.arbiter.state().promise().clone());
                 // The clock of a frame from the future cannot be trusted: the frame counts as infinitely old.
                 let has_expired = head.header.valid_until_nanos().is_some_and(|until_nanos| now_nanos > until_nanos);
                 let age_nanos = if has_expired { None } else { now_nanos.checked_sub(head.header.origin_nanos) };
                 let age_nanos = age_nanos.unwrap_or(u64::MAX);
                 self.arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut self.decided);
-                if let Some(before) = promise.filter(|before| !before.is_withdrawn()) {
-                    tracing::warn!("the hand's readings have changed: the promise of its lifts begins anew");
-                    self.has_replaced(&before);
-                }
             }
             Err(error) => {
                 tracing::warn!(seq = head.header.seq, "a prediction cannot be read: {error}");
@@ -243,6 +236,7 @@ impl Arbiter {
             return;
         }
         let (n_kept, n_dropped) = (promise.n_kept, promise.n_dropped);
+        let [kept_since_change, dropped_since_change] = promise.since_change();
         if promise.is_withdrawn() && !self.reported.0.is_withdrawn() {
             let promised = 100.0 * self.arbiter.options().promised_drops;
             tracing::warn!(
@@ -260,8 +254,8 @@ impl Arbiter {
             );
         }
         self.operator.has_counted_in_all(BTreeMap::from([
-            (OUTCOME_COUNTS[0].into(), n_kept),
-            (OUTCOME_COUNTS[1].into(), n_dropped),
+            (OUTCOME_COUNTS[0].into(), kept_since_change),
+            (OUTCOME_COUNTS[1].into(), dropped_since_change),
             ("lifts/kept".into(), self.ended.n_kept + n_kept),
             ("lifts/dropped".into(), self.ended.n_dropped + n_dropped),
             ("lifts/unreported".into(), state.n_unreported()),

@@ -8,7 +8,7 @@ use serde::Serialize;
 use blindgrasp_graph::log::printable;
 use blindgrasp_stages::promise_monitor::{CONFIDENCE, OUTCOME_COUNTS, drops_at_most};
 
-/// What the reported lifts of a robot promise, since `promised_drops` was set.
+/// The bound that the reported lifts of a robot allow, since `promised_drops` was set and the readings changed.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub(super) struct RobotPromise {
     n_kept: u64,

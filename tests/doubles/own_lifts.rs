@@ -6,6 +6,10 @@
 //! * `live`: as a graph with `classifier.adapt=on` learns, of the grasps that its gate lifts.
 //! * `adapt`: as `blindgrasp model adapt` learns, of the first grasps, each lifted whatever the gate would say.
 //! * `scratch`: a model that was trained on the same grasps alone.
+//!
+//! `own_lifts MODEL changed N_ORDERS N_BEFORE,… GAIN RECORDING… -- OTHER…` says after how many grasps of `OTHER`, with cells that read so
+//! many times as much, the change from `RECORDING` is noticed, and how often one is noticed within `RECORDING`. Each grasp counts
+//! as a lift.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -16,7 +20,7 @@ use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, adapt_on, tr
 use blindgrasp_messages::{Action, GraspTruth, Header, Phase, Stamped, TactileFrame};
 use blindgrasp_stages::own_lifts::Adapt;
 use blindgrasp_stages::promise_monitor::drops_at_most;
-use blindgrasp_stages::{ArbiterOptions, Judge, Model, Probe};
+use blindgrasp_stages::{ArbiterOptions, Hand, Judge, Model, Probe};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
@@ -43,14 +47,13 @@ fn main() -> anyhow::Result<()> {
         anyhow::bail!("usage: own_lifts MODEL live|adapt|scratch N_ORDERS N_OUTCOMES,… RECORDING…");
     };
     let model = Model::load(Path::new(model))?;
+    if which == "changed" {
+        return changed(model, n_orders.parse()?, numbers, recordings);
+    }
     let recordings: Vec<PathBuf> = recordings.iter().map(PathBuf::from).collect();
     let hand = hand_of(recordings.first().context("no recording")?, None)?;
     let numbers: Vec<usize> = numbers.split(',').map(str::parse).collect::<Result<_, _>>()?;
-    let mut grasps = Vec::new();
-    for path in &recordings {
-        let read = read_grasps(path, &hand, |_, frames| frames)?;
-        grasps.extend(read.into_iter().filter_map(|grasp| Some(Grasp { frames: grasp.value, truth: grasp.truth? })));
-    }
+    let grasps = read(&recordings, &hand)?;
     let of_order = |seed: u64| -> anyhow::Result<Vec<Sums>> {
         let options = ArbiterOptions { probe: Probe::TestLift, ..ArbiterOptions::default() };
         let judge = |model: Model| Judge::with_options(hand.clone(), model, options);
@@ -88,6 +91,72 @@ fn main() -> anyhow::Result<()> {
             100.0 * n_kept / n_lifted,
             n_kept / of(|sums| sums.n_stable as f64),
             100.0 * of(|sums| sums.at_most) / n
+        );
+    }
+    Ok(())
+}
+
+fn read(recordings: &[PathBuf], hand: &Hand) -> anyhow::Result<Vec<Grasp>> {
+    let mut grasps = Vec::new();
+    for path in recordings {
+        let read = read_grasps(path, hand, |_, frames| frames)?;
+        grasps.extend(read.into_iter().filter_map(|grasp| Some(Grasp { frames: grasp.value, truth: grasp.truth? })));
+    }
+    Ok(grasps)
+}
+
+/// Grasps of another hand or skin after those of a robot.
+fn changed(model: Model, n_orders: u64, numbers: &str, arguments: &[String]) -> anyhow::Result<()> {
+    let [gain, recordings @ ..] = arguments else { anyhow::bail!("no gain") };
+    let (gain, split) = (gain.parse::<f64>()?, recordings.iter().position(|word| word == "--").context("no --")?);
+    let paths = |words: &[String]| words.iter().map(PathBuf::from).collect::<Vec<_>>();
+    let (own, other) = (paths(&recordings[..split]), paths(&recordings[split + 1..]));
+    let hand = hand_of(own.first().context("no recording")?, None)?;
+    let (own, mut other) = (read(&own, &hand)?, read(&other, &hand)?);
+    for frame in other.iter_mut().flat_map(|grasp| &mut grasp.frames) {
+        frame.message.cells_newtons.iter_mut().for_each(|newtons| *newtons *= gain);
+    }
+    let robot = |n_grasps| -> anyhow::Result<Robot> {
+        let mut judge = Judge::new(hand.clone(), model.clone())?;
+        judge.adapt(Adapt::On);
+        Ok(Robot { judge, n_grasps })
+    };
+    let shuffled = |grasps: &'_ [Grasp], seed: u64| {
+        let mut idxs: Vec<usize> = (0..grasps.len()).collect();
+        idxs.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
+        idxs
+    };
+    let (mut n_false, mut n_all) = (0, 0);
+    for order in 0..n_orders {
+        let mut robot = robot(0)?;
+        for idx in shuffled(&own, order) {
+            robot.lift(&own[idx]);
+        }
+        (n_false, n_all) = (n_false + robot.judge.own_lifts().n_changes(), n_all + own.len());
+    }
+    println!("noticed without a change: {n_false} times in {n_all} grasps");
+    for number in numbers.split(',') {
+        let n_before: usize = number.parse()?;
+        let mut waited = Vec::new();
+        for order in 0..n_orders {
+            let mut robot = robot(0)?;
+            for idx in shuffled(&own, order).into_iter().take(n_before) {
+                robot.lift(&own[idx]);
+            }
+            let n_changes = robot.judge.own_lifts().n_changes();
+            let noticed = shuffled(&other, 1000 + order).into_iter().position(|idx| {
+                robot.lift(&other[idx]);
+                robot.judge.own_lifts().n_changes() > n_changes
+            });
+            waited.push(noticed.map_or(usize::MAX, |idx| idx + 1));
+        }
+        waited.sort_unstable();
+        let part = |share: usize| waited[(waited.len() * share / 100).min(waited.len() - 1)];
+        let n_missed = waited.iter().filter(|n| **n == usize::MAX).count();
+        println!(
+            "after {n_before} grasps: {} in the median, {} in nine of ten, missed in {n_missed}",
+            part(50),
+            part(90)
         );
     }
     Ok(())
@@ -143,6 +212,11 @@ impl Robot {
             sums.n_stable += usize::from(grasp.truth.stable);
         }
         sums
+    }
+
+    fn lift(&mut self, grasp: &Grasp) {
+        self.decide(grasp);
+        self.report(grasp);
     }
 
     /// Whether the grasp is lifted: its frames as a source of their own that begins with them.

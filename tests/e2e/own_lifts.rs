@@ -106,8 +106,10 @@ fn the_outcomes_of_a_bridge_are_labels_and_correct_a_model() {
     assert!(adapt(&before, &nameless, 1).1.contains("the model was trained on grasp 0 of these"));
     let (few, _) = imported("few", &bridge_lines(4, 10, 0.0, true), 0);
     assert!(adapt(&model, &few, 1).1.contains("10 lifts with an outcome"), "a few");
-    let (one, _) = imported("one", &bridge_lines(5, 40, 0.0, true).replace("\"thing-", "\"thing\",\"x-"), 1);
-    assert!(!Path::new(&one).exists(), "an unknown key is refused");
+    let of_one =
+        (0..8).fold(bridge_lines(5, 40, 0.0, true), |lines, idx| lines.replace(&format!("thing-{idx}"), "thing"));
+    let (one, _) = imported("one", &of_one, 0);
+    assert!(adapt(&model, &one, 1).1.contains("all lifts are of one object"), "one object");
 
     // Lines that do not fit the hand, or that are no lines, are named.
     for (lines, expected) in [
@@ -115,6 +117,7 @@ fn the_outcomes_of_a_bridge_are_labels_and_correct_a_model() {
         ("{}\n".into(), "line 1"),
         (String::new(), "found none"),
         (bridge_lines(6, 2, 0.0, true).replace("thing-0", &"x".repeat(65)), "object has 65 bytes"),
+        (bridge_lines(6, 2, 0.0, true).replace("\"object\"", "\"thing\""), "unknown field"),
     ] {
         let (out, output) = imported("bad", &lines, 1);
         let stderr = text(&output.stderr);

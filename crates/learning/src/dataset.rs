@@ -111,9 +111,8 @@ pub fn label_line(labels: &BTreeMap<Label, usize>) -> Option<String> {
     Some(format!("mixed: {} of the simulated recordings", counts.join(", ")))
 }
 
-/// What the outcome of a lift says, if the frames of a grasp have one and no label does: a robot reports how it ended by a frame
-/// of the phase kept or dropped. The object is not known, so each such grasp counts as one of another object. `recording` names
-/// the file.
+/// The label of a grasp whose outcome a frame reports, of the phase kept or dropped. The object is not known, so each such grasp
+/// counts as one of another object. `recording` names the file.
 pub fn reported_truth(recording: &Path, grasp_id: u64, is_kept: bool) -> GraspTruth {
     let name = recording.file_stem().unwrap_or_default().to_string_lossy();
     GraspTruth {
@@ -133,8 +132,8 @@ fn reported_outcome(frames: &[Stamped<TactileFrame>]) -> Option<bool> {
     Some(outcome == Phase::Kept)
 }
 
-/// Reads a recording's grasps in order. A grasp without a label has the outcome of its lift, if a frame reports it. `reduce` is called with the frames of each complete grasp, so that memory holds
-/// the frames of one grasp at a time.
+/// Reads a recording's grasps in order. A grasp without a label has the outcome of its lift, if a frame reports it. `reduce` is
+/// called with the frames of each complete grasp, so that memory holds the frames of one grasp at a time.
 ///
 /// # Errors
 /// The recording cannot be read, was made with another hand, has frames of a grasp on both sides of another grasp, or has

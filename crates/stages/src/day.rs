@@ -149,9 +149,8 @@ fn ratio(difference: f64, deviation: f64) -> f64 {
     }
 }
 
-/// The correction of the log-odds of a day by its labelled grasps: a grasp's is the sum over these of their weight times how alike
-/// the two are. It is the mean of a Gaussian process given the labels, which learns where the model errs on this day,
-/// and not only by how much.
+/// The correction of the log-odds of a day's grasps by its labelled ones. A grasp's correction is the sum over the labelled grasps of
+/// their weight times their covariance with it: the most probable value of a Gaussian process given the labels.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Recalibration {
@@ -174,9 +173,9 @@ pub struct LabelledGrasp {
     pub weight: f64,
 }
 
-/// The standard deviation of the correction, log-odds, of its part that is the same for all grasps of a day, and of that in
-/// proportion to the log-odds; and how fast grasps stop being alike. Chosen on the training tables of the BioTac SP set, one left
-/// out in turn.
+/// The covariance of two corrections is this variance times exp(-rate × d²), where d² is the mean squared difference of the two
+/// grasps' values in units of `variances`; plus that of an offset, the same for all grasps, and of a slope, in proportion to the
+/// log-odds. Chosen on the training tables of the BioTac SP set, one left out in turn.
 const KERNEL_VARIANCE: f64 = 8.0;
 const KERNEL_RATE: f64 = 3.0;
 const OFFSET_DEVIATION: f64 = 0.5;

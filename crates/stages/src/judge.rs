@@ -70,7 +70,7 @@ impl Judge {
         self.memory.adapt = adapt;
     }
 
-    /// The outcomes of lifts so far, and what they have taught.
+    /// The outcomes of lifts so far, and the corrections that follow from them.
     pub fn own_lifts(&self) -> &OwnLifts {
         &self.memory.lifts
     }

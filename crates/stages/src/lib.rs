@@ -31,8 +31,8 @@
 //!   [`steps`] - the first three, from message to message.
 //! * [`out_of_distribution`] - whether a grasp is like those that the model was trained on.
 //! * [`model`] - the model file. [`recipe`] and [`training_summary`] - how a model was trained, as the file says.
-//! * [`own_lifts`] - what the lifts of the robot itself say of the model. [`promise_monitor`] - whether they drop more often
-//!   than was promised, and what they promise.
+//! * [`own_lifts`] - corrections of a model by the lifts of its robot. [`promise_monitor`] - whether lifts drop more often than was
+//!   promised, and the bound that they allow.
 //!
 //! Units are SI and `f64` throughout. Frames are named target first: `palm_from_link`. Every contact is in the
 //! **palm frame**: its origin the centre of the palm pad's surface, +z out of the palm.

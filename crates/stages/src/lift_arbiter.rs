@@ -274,9 +274,8 @@ impl LiftArbiter {
             && break_in_order != Some(Reason::WrongHand)
             && self.state.decided.contains((header.epoch, prediction.grasp_id));
         if is_of_a_lift && self.state.lifted.take_if(|lifted| *lifted == prediction.grasp_id).is_some() {
-            // Lifts of another skin say nothing for the promise, but a promise that is withdrawn stays so.
-            if prediction.fault == Fault::Changed && !self.state.promise.is_withdrawn() {
-                self.state.promise = PromiseMonitor::default();
+            if prediction.fault == Fault::Changed {
+                self.state.promise.begin_anew();
             }
             self.state.promise.observe(prediction.phase == Phase::Dropped, options.promised_drops);
         }
@@ -636,6 +635,15 @@ mod tests {
         assert_eq!(try_grasp(&mut s, 9, None), Some((9, Action::Hold, Reason::PromiseWithdrawn)));
         s.arbiter.set_options(ArbiterOptions { promised_drops: 0.5, ..options });
         assert_eq!(try_grasp(&mut s, 10, None), Some((10, Action::Lift, Reason::Stable)));
+        // Another skin has no outcomes yet that speak for it, but a change hides no drops.
+        let mut s = Stream { arbiter: LiftArbiter::new(options), ..stream() };
+        for grasp_id in 0..5 {
+            try_grasp(&mut s, grasp_id, None);
+            let fault = Fault::Changed;
+            s.push(Prediction { grasp_id, phase: Phase::Dropped, fault, ..Prediction::default() });
+            assert_eq!(s.arbiter.state().promise().since_change(), [0, 1]);
+        }
+        assert!(s.arbiter.state().promise().is_withdrawn());
         // Without a promise nothing is withdrawn.
         let mut s = stream();
         (0..50).for_each(|grasp_id| _ = try_grasp(&mut s, grasp_id, Some(Phase::Dropped)));

@@ -70,7 +70,7 @@ pub struct Memory {
     day: DayMemory,
     /// The outcomes of the robot's lifts.
     pub lifts: OwnLifts,
-    /// What is done with them: an option, and no memory.
+    /// The option that says how outcomes are used. It is not part of the state.
     #[serde(skip)]
     pub adapt: Adapt,
 }
@@ -306,8 +306,8 @@ impl Model {
         match (phase, verdict) {
             (Phase::Kept | Phase::Dropped, _) if memory.adapt != Adapt::Frozen && values != Err(Fault::WrongHand) => {
                 let classifier = |look: Phase| Some((self.look(look)?, self.drop_secs(look)));
-                let has_changed = memory.lifts.lifted(place.grasp_id, phase == Phase::Kept, classifier);
-                if has_changed && memory.adapt == Adapt::On {
+                let is_kept = phase == Phase::Kept;
+                if memory.lifts.lifted(place.grasp_id, is_kept, memory.adapt == Adapt::On, classifier) {
                     return Err(Fault::Changed);
                 }
             }

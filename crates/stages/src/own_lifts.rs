@@ -17,17 +17,17 @@ use std::collections::VecDeque;
 use serde::{Deserialize, Serialize};
 
 use crate::classifier::Classifier;
-use crate::classifier::calibration::PlattCalibration;
+use crate::classifier::calibration::{PlattCalibration, positive_probability};
 use crate::shift_test::{Numbers, ShiftTest};
 use blindgrasp_messages::Phase;
 
 /// Outcomes that are remembered; older ones are forgotten.
 pub const MOST_OUTCOMES: usize = 500;
 
-/// Outcomes without which nothing is corrected: fewer say less than the prior.
+/// The fewest outcomes that correct a model: fewer say less than the prior.
 pub const FEWEST_OUTCOMES: usize = 20;
 
-/// What a classifier does with the outcomes of its robot's lifts.
+/// The use that a classifier makes of the outcomes of its robot's lifts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Adapt {
@@ -59,7 +59,7 @@ pub struct Prior {
 /// (docs/results.md).
 pub const OF_A_ROBOT: Prior = Prior { slope_deviation: 0.1, offset_deviation: 0.5 };
 
-/// The prior for a robot whose grasps are mostly unlike those of the training: the model's probabilities say little of them.
+/// The prior for a robot of whose grasps many are unlike those of the training: the model's probabilities say little of them.
 pub const OF_AN_UNLIKE_ROBOT: Prior = Prior { slope_deviation: 0.3, offset_deviation: 1.5 };
 
 impl Default for Correction {
@@ -83,7 +83,7 @@ impl Correction {
             let (mut ga, mut gb) = (slope_weight * (a - 1.0), offset_weight * b);
             let (mut haa, mut hab, mut hbb) = (slope_weight, 0.0, offset_weight);
             for (l, stable) in grasps.clone() {
-                let probability = 1.0 / (1.0 + (-(a * l + b)).exp());
+                let probability = probability(a * l + b);
                 let (miss, weight) = (probability - f64::from(u8::from(stable)), probability * (1.0 - probability));
                 (ga, gb) = (ga + miss * l, gb + miss);
                 (haa, hab, hbb) = (haa + weight * l * l, hab + weight * l, hbb + weight);
@@ -115,23 +115,38 @@ impl Correction {
     }
 }
 
+/// The probability of log-odds.
+pub fn probability(log_odds: f64) -> f64 {
+    positive_probability(-log_odds)
+}
+
+/// The log-odds of a probability.
+pub fn log_odds_of(probability: f64) -> f64 {
+    (probability / (1.0 - probability)).ln()
+}
+
 /// The log loss of log-odds, nats.
 pub fn log_loss(log_odds: f64, stable: bool) -> f64 {
     let z = if stable { log_odds } else { -log_odds };
     (-z.abs()).exp().ln_1p() + (-z).max(0.0)
 }
 
-/// Time of an attempt with its probe, and of a lift, seconds: as the simulated hand takes.
-const ATTEMPT_SECS: f64 = 4.2;
-const LIFT_SECS: f64 = 4.0;
+/// Time of an attempt until the hand has settled, of tightening it, of a test lift, and of a lift, seconds: as the simulated
+/// hand takes.
+pub const ATTEMPT_SECS: f64 = 3.0;
+pub const SQUEEZE_SECS: f64 = 0.4;
+pub const TEST_LIFT_SECS: f64 = 0.8;
+pub const LIFT_SECS: f64 = 4.0;
 /// Fewer lifts than this say nothing of the share that is kept.
 const FEWEST_LIFTS: usize = 5;
 /// The part by which another threshold must cost less than the present one.
 const WORTH_A_CHANGE: f64 = 0.02;
 
-/// Time for each kept object, seconds, if a drop takes so many more: `lifted` of the grasps are lifted, and `kept` of these are kept.
+/// Time for each kept object, seconds, if a drop takes `drop_secs` more: `lifted` is the share of the grasps that are lifted, and `kept`
+/// the share of the lifts that keep their object. Each grasp counts with its probes.
 pub fn secs_per_kept(lifted: f64, kept: f64, drop_secs: f64) -> f64 {
-    (ATTEMPT_SECS / lifted + LIFT_SECS + drop_secs * (1.0 - kept)) / kept
+    let attempt_secs = ATTEMPT_SECS + SQUEEZE_SECS + TEST_LIFT_SECS;
+    (attempt_secs / lifted + LIFT_SECS + drop_secs * (1.0 - kept)) / kept
 }
 
 /// The log-odds from which a grasp is lifted at the least cost. `log_odds` are those of grasps with an outcome, out of
@@ -144,7 +159,7 @@ pub fn threshold(log_odds: &[f64], n_grasps: u64, present: f64, drop_secs: f64) 
     let mut kept = 0.0;
     let mut costs = Vec::with_capacity(lifted.len());
     for (idx, log_odds) in lifted.iter().enumerate() {
-        kept += 1.0 / (1.0 + (-log_odds).exp());
+        kept += probability(*log_odds);
         let n = (idx + 1) as f64;
         costs.push((secs_per_kept(n / n_grasps, kept / n, drop_secs), *log_odds));
     }
@@ -153,7 +168,7 @@ pub fn threshold(log_odds: &[f64], n_grasps: u64, present: f64, drop_secs: f64) 
     least.filter(|(cost, _)| *cost < (1.0 - WORTH_A_CHANGE) * cost_of_present).map_or(present, |(_, log_odds)| log_odds)
 }
 
-/// What own lifts have taught of a look.
+/// The correction and the threshold of a look that follow from own lifts.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Learned {
     pub correction: Correction,
@@ -162,8 +177,8 @@ pub struct Learned {
 }
 
 impl Learned {
-    /// Learns from outcomes of lifts that a look decided: the model's own log-odds and whether the object was kept, out of
-    /// `n_grasps`. Without a price of a drop, the threshold keeps its probability.
+    /// Learns from outcomes of lifts that a look decided, out of `n_grasps`. Each has the model's own log-odds and says whether the
+    /// object was kept. Without a price of a drop, the threshold keeps its probability.
     pub fn of(
         classifier: &Classifier,
         prior: Prior,
@@ -176,9 +191,9 @@ impl Learned {
         let threshold_probability = match drop_secs {
             Some(drop_secs) if before < 1.0 => {
                 let log_odds: Vec<f64> = outcomes.map(|(log_odds, _)| correction.apply(log_odds)).collect();
-                let present = correction.apply((before / (1.0 - before)).ln());
+                let present = correction.apply(log_odds_of(before));
                 let chosen = threshold(&log_odds, n_grasps, present, drop_secs);
-                1.0 / (1.0 + (-chosen).exp())
+                probability(chosen)
             }
             _ => before,
         };
@@ -191,8 +206,7 @@ impl Learned {
         let unsure_from = if before >= classifier.threshold_probability {
             self.threshold_probability
         } else {
-            let log_odds = self.correction.apply((before / (1.0 - before)).ln());
-            (1.0 / (1.0 + (-log_odds).exp())).min(self.threshold_probability)
+            probability(self.correction.apply(log_odds_of(before))).min(self.threshold_probability)
         };
         (self.correction.of(&classifier.calibration), self.threshold_probability, unsure_from)
     }
@@ -208,7 +222,7 @@ struct Outcome {
     n_grasps: u32,
 }
 
-/// The outcomes of a robot's lifts, and what they have taught.
+/// The outcomes of a robot's lifts, and the corrections that follow from them.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct OwnLifts {
     /// The grasp whose looks come.
@@ -230,8 +244,9 @@ struct LookedAt {
     /// The last look, and the log-odds of its first frame.
     look: Phase,
     log_odds: f64,
-    /// Whether the last frame was called unstable, and whether that was so when a later look began: no robot that obeys goes on.
+    /// Whether the last frame was called unstable.
     is_unstable: bool,
+    /// Whether the last frame before a later look was called unstable: a robot that obeys does not go on.
     is_given_up: bool,
     settled: Option<Numbers>,
 }
@@ -243,7 +258,7 @@ pub(crate) struct Looked {
     /// By the model itself.
     pub(crate) log_odds: f64,
     pub(crate) is_unstable: bool,
-    /// What the test of a change compares, of a settled hand.
+    /// Of a settled hand, the numbers that the test of a change compares.
     pub(crate) settled: Option<Numbers>,
 }
 
@@ -262,7 +277,7 @@ impl OwnLifts {
         self.n_changes
     }
 
-    /// What was learned of a look; nothing before there are [`FEWEST_OUTCOMES`] of lifts that it decided.
+    /// The correction of a look; `None` until [`FEWEST_OUTCOMES`] lifts were decided by it.
     pub fn learned(&self, look: Phase) -> Option<Learned> {
         self.learned.iter().find(|(phase, _)| *phase == look).map(|(_, found)| *found)
     }
@@ -285,13 +300,14 @@ impl OwnLifts {
         }
     }
 
-    /// Takes the outcome of a lift, and says whether the readings have changed: then the outcomes before it are forgotten. The
-    /// outcome of another grasp, or a second one of the same lift, is none. `classifier` gives the classifier of a look, and the
-    /// price of a drop that its threshold was chosen for.
+    /// Takes the outcome of a lift. If it looks for changes, it says whether the readings have changed; the outcomes before that
+    /// are forgotten then. The outcome of another grasp, and a second outcome of the same lift, do not count. `classifier` gives
+    /// the classifier of a look, and the price of a drop for which its threshold was chosen.
     pub(crate) fn lifted<'a>(
         &mut self,
         grasp_id: u64,
         is_kept: bool,
+        looks_for_changes: bool,
         classifier: impl Fn(Phase) -> Option<(&'a Classifier, Option<f64>)>,
     ) -> bool {
         let Some(LookedAt { look, log_odds, is_given_up, settled, .. }) =
@@ -299,7 +315,7 @@ impl OwnLifts {
         else {
             return false;
         };
-        let has_changed = settled.is_some_and(|settled| self.shift.observe(settled));
+        let has_changed = looks_for_changes && settled.is_some_and(|settled| self.shift.observe(settled));
         if has_changed {
             (self.outcomes, self.learned, self.n_grasps) = (VecDeque::new(), Vec::new(), 1);
             (self.n_kept, self.n_dropped, self.n_changes) = (0, 0, self.n_changes + 1);
@@ -383,9 +399,9 @@ mod tests {
             lifts.look(looked(grasp_id, Phase::Settled, 1.0));
             lifts.look(looked(grasp_id, Phase::TestLifted, 3.0));
             lifts.look(looked(grasp_id, Phase::TestLifted, -9.0));
-            lifts.lifted(grasp_id + 1, false, |_| Some((&own, None)));
-            lifts.lifted(grasp_id, grasp_id % 4 != 0, |_| Some((&own, None)));
-            lifts.lifted(grasp_id, false, |_| Some((&own, None)));
+            lifts.lifted(grasp_id + 1, false, true, |_| Some((&own, None)));
+            lifts.lifted(grasp_id, grasp_id % 4 != 0, true, |_| Some((&own, None)));
+            lifts.lifted(grasp_id, false, true, |_| Some((&own, None)));
             let has_learned = lifts.learned(Phase::TestLifted).is_some();
             assert_eq!(has_learned, grasp_id + 1 >= FEWEST_OUTCOMES as u64);
         }
@@ -407,7 +423,7 @@ mod tests {
         for grasp_id in 0..40 {
             lifts.look(Looked { is_unstable: true, ..looked(grasp_id, Phase::Settled, -2.0) });
             lifts.look(looked(grasp_id, Phase::TestLifted, 3.0));
-            lifts.lifted(grasp_id, false, |_| None);
+            lifts.lifted(grasp_id, false, true, |_| None);
         }
         assert_eq!((lifts.n_dropped(), lifts.outcomes.len()), (40, 0));
     }
@@ -432,7 +448,7 @@ mod tests {
         let own = classifier(0.9);
         for grasp_id in 0..2 * MOST_OUTCOMES as u64 {
             lifts.look(looked(grasp_id, Phase::TestLifted, 2.0));
-            lifts.lifted(grasp_id, grasp_id >= MOST_OUTCOMES as u64, |_| Some((&own, Some(60.0))));
+            lifts.lifted(grasp_id, grasp_id >= MOST_OUTCOMES as u64, true, |_| Some((&own, Some(60.0))));
         }
         assert_eq!((lifts.outcomes.len(), lifts.n_kept()), (MOST_OUTCOMES, MOST_OUTCOMES as u64));
         let learned = lifts.learned(Phase::TestLifted).expect("learned");
@@ -446,7 +462,7 @@ mod tests {
             .map(|grasp_id| {
                 let load = if grasp_id < 80 { 0.0 } else { 4.0 } + (grasp_id % 7) as f32 / 7.0;
                 lifts.look(Looked { settled: Some([load, 1.0, load]), ..looked(grasp_id, Phase::Settled, 2.0) });
-                lifts.lifted(grasp_id, true, |_| None)
+                lifts.lifted(grasp_id, true, true, |_| None)
             })
             .collect();
         let noticed = has_changed.iter().position(|changed| *changed).expect("noticed");

@@ -69,13 +69,18 @@ pub fn signals(features: &FeatureExtractor) -> Vec<usize> {
 
 /// What all pads together feel, by the values of a feature that is not scaled: newtons; `None` if it does not have it.
 pub fn pad_newtons(features: &FeatureExtractor, values: &[f64]) -> Option<f64> {
+    Some(pads(features, values)?.map(|pad| pad[0]).sum())
+}
+
+/// The values of each pad, of a feature that is not scaled: its load, its number of contacts, and the others of [`Block::Pads`];
+/// `None` if the feature does not have them.
+pub(crate) fn pads<'a>(features: &FeatureExtractor, values: &'a [f64]) -> Option<impl Iterator<Item = &'a [f64]>> {
     if features.scaling.is_some() {
         return None;
     }
     let place = features.blocks.iter().position(|block| *block == Block::Pads)?;
     let start: usize = features.blocks[..place].iter().map(|block| features.block_len(*block)).sum();
-    let of_pads = values.get(start..start + features.block_len(Block::Pads))?;
-    Some(of_pads.iter().step_by(N_PAD_VALUES).sum())
+    Some(values.get(start..start + features.block_len(Block::Pads))?.chunks_exact(N_PAD_VALUES))
 }
 
 /// The course of the signals while the hand moves.

@@ -22,6 +22,8 @@ const WAYS: [f64; 6] = [0.02, 0.05, 0.1, 0.2, 0.4, 0.8];
 pub struct PromiseMonitor {
     pub n_kept: u64,
     pub n_dropped: u64,
+    /// The outcomes before the hand's readings changed: they are evidence against the promise, and say nothing for it.
+    n_before_change: [u64; 2],
     evidence: [f64; WAYS.len()],
     is_withdrawn: bool,
 }
@@ -42,6 +44,17 @@ impl PromiseMonitor {
         self.is_withdrawn |= self.mean_evidence() >= WITHDRAWN_FROM;
     }
 
+    /// Forgets outcomes that speak for the promise, because the hand's readings have changed. The evidence against it stays, so that
+    /// frequent changes hide no drops.
+    pub fn begin_anew(&mut self) {
+        self.n_before_change = [self.n_kept, self.n_dropped];
+    }
+
+    /// The outcomes since the readings changed, kept and dropped: the numbers that [`drops_at_most`] takes.
+    pub fn since_change(&self) -> [u64; 2] {
+        [self.n_kept - self.n_before_change[0], self.n_dropped - self.n_before_change[1]]
+    }
+
     fn mean_evidence(&self) -> f64 {
         self.evidence.iter().sum::<f64>() / WAYS.len() as f64
     }
@@ -57,7 +70,7 @@ impl PromiseMonitor {
     }
 }
 
-/// The counts of an arbiter's node, kept and dropped, under the present promise: the numbers that [`drops_at_most`] takes.
+/// The counts of an arbiter's node under the present promise: [`PromiseMonitor::since_change`].
 pub const OUTCOME_COUNTS: [&str; 2] = ["promise/kept", "promise/dropped"];
 
 /// The confidence of [`drops_at_most`].

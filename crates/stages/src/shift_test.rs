@@ -1,4 +1,4 @@
-//! Notices that the readings of a robot have changed: another skin, another gain, another hand.
+//! Notices that the readings of a robot have changed: another skin, another gain.
 //!
 //! Outcomes of lifts before such a change say little of the lifts after it. The test is conformal (Vovk, Gammerman and Shafer,
 //! "Algorithmic Learning in a Random World", 2005, chapter 7): while grasps come in random order, each rank of a new grasp
@@ -10,7 +10,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::encoder::{Block, FeatureExtractor, N_PAD_VALUES};
+use crate::encoder::FeatureExtractor;
+use crate::probe::pads;
 
 /// The evidence from which a change is noticed: the least mean number of grasps between two false alarms.
 const NOTICED_FROM: f64 = 1000.0;
@@ -19,23 +20,16 @@ const MOST_GRASPS: usize = 200;
 /// The gambler's gain at the rank p is this exponent times p to the exponent less 1: its mean over all ranks is 1.
 const EXPONENT: f64 = 0.35;
 
-/// What is compared of a settled grasp: the logarithm of the load of all pads, the number of contacts of a pad that touches, and
-/// the logarithm of the load of a contact.
 const N_NUMBERS: usize = 3;
 
-/// What is compared of a grasp.
+/// The numbers of a settled grasp that the test compares: the logarithm of the load of all pads, the number of contacts of a pad
+/// that touches, and the logarithm of the load of a contact.
 pub(crate) type Numbers = [f32; N_NUMBERS];
 
 /// The numbers of a grasp; `None` if the feature does not have them, or nothing is touched.
 pub(crate) fn numbers(features: &FeatureExtractor, values: &[f64]) -> Option<Numbers> {
-    if features.scaling.is_some() {
-        return None;
-    }
-    let place = features.blocks.iter().position(|block| *block == Block::Pads)?;
-    let start: usize = features.blocks[..place].iter().map(|block| features.block_len(*block)).sum();
-    let pads = values.get(start..start + features.block_len(Block::Pads))?.chunks(N_PAD_VALUES);
     let (mut load, mut n_contacts, mut n_pads) = (0.0, 0.0, 0.0);
-    for pad in pads.filter(|pad| pad[0] > 0.0) {
+    for pad in pads(features, values)?.filter(|pad| pad[0] > 0.0) {
         load += pad[0];
         n_contacts += pad[1];
         n_pads += 1.0;

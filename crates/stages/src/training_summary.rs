@@ -68,7 +68,7 @@ pub struct TrainingSummary {
     pub own_lifts: Option<OwnLiftsSummary>,
 }
 
-/// What the lifts of one robot say of a model, and how they corrected it.
+/// The lifts of one robot that corrected a model, and the figures of the corrected model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OwnLiftsSummary {
@@ -82,12 +82,12 @@ pub struct OwnLiftsSummary {
     pub n_objects: usize,
     /// The correction of the look's log-odds. It is none if it made the log loss no smaller.
     pub correction: Correction,
-    /// The mean log loss of these lifts, nats: by the model before, and corrected by lifts of other objects.
+    /// The mean log loss of these lifts, nats: of the model before, and of a model that lifts of other objects corrected.
     pub log_loss_before: f64,
     pub log_loss_after: f64,
     /// Of these lifts, those that the corrected model makes, each judged with the correction by other objects.
     pub n_lifted: usize,
-    /// Grasps that a limit of the model's training range had held; the limits are wider now.
+    /// Grasps that a limit of the model's training range held before; 0 if the limits are those of the model.
     pub n_outside: usize,
     /// The bounds of drops of this robot; `None` if no lift is made.
     pub promise: Option<Promise>,

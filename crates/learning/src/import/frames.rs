@@ -1,4 +1,4 @@
-//! Frames of a robot's own to a recording, as they are.
+//! The import of a robot's frames to a recording, unchanged.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -10,7 +10,7 @@ use blindgrasp_messages::{GraspTruth, Header, Phase, Recorded, Stamped, TactileF
 use blindgrasp_recording::{RecordingInfo, RecordingWriter};
 use blindgrasp_stages::hand::Hand;
 
-/// What was recorded.
+/// The report of an import of frames.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct FramesReport {
     pub hand: String,

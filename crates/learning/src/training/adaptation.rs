@@ -1,7 +1,7 @@
 //! Corrects a model by the labelled grasps of a robot: by the outcomes of its lifts, or for one day of a model that looks at days.
 //!
-//! Lifts correct the look that decides ([`blindgrasp_stages::own_lifts`]), as in a running graph, and widen limits of the training
-//! range that the robot's own grasps violate. Objects are the unit of a cross-fit: if the correction or the threshold is no better
+//! Lifts correct the look that decides ([`blindgrasp_stages::own_lifts`]), as in a running graph, and widen the limits of the training
+//! range if they hold many of the robot's own grasps. Objects are the unit of a cross-fit: if the correction or the threshold is no better
 //! for objects that it was not learned from, the model keeps its own. The labelled grasps of a day correct the log-odds of grasps that
 //! are like them ([`Recalibration`]).
 
@@ -22,7 +22,8 @@ use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::out_of_distribution::TrainingRange;
 use blindgrasp_stages::own_lifts::{
-    Correction, FEWEST_OUTCOMES, Learned, OF_A_ROBOT, OF_AN_UNLIKE_ROBOT, Prior, log_loss, secs_per_kept,
+    Correction, FEWEST_OUTCOMES, Learned, OF_A_ROBOT, OF_AN_UNLIKE_ROBOT, Prior, log_loss, log_odds_of, probability,
+    secs_per_kept,
 };
 use blindgrasp_stages::training_summary::{OwnLiftsSummary, Promise};
 
@@ -30,7 +31,8 @@ use blindgrasp_stages::training_summary::{OwnLiftsSummary, Promise};
 const MIN_LABELLED: usize = 20;
 /// Folds of objects, or as many as there are objects.
 const N_FOLDS: usize = 5;
-/// From this share of own grasps outside the limits on, the robot is unlike those that the model learned from.
+/// From this share of own grasps outside the limits on, the robot is unlike those that the model learned from, and the limits are
+/// widened. A few grasps outside are as expected.
 const UNLIKE_SHARE: f64 = 0.1;
 /// Own grasps without which no limit is widened.
 const FEWEST_FOR_LIMITS: usize = 30;
@@ -115,10 +117,11 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
     }
     let folds = folds_by_object(&examples, N_FOLDS.min(n_objects))?;
     let n_grasps = read.examples.len() + read.n_excluded.values().sum::<usize>();
-    let mut adapted = model.clone();
+    let mut wider = model.clone();
     let all: Vec<&Example> = read.examples.iter().collect();
-    let n_outside = widen(hand, &mut adapted, &all)?;
+    let n_outside = widen(hand, &mut wider, &all)?;
     let is_unlike = n_outside as f64 > UNLIKE_SHARE * all.len() as f64;
+    let mut adapted = if is_unlike { wider } else { model.clone() };
     // The place of a threshold among grasps that the model does not know means nothing: there it keeps its probability.
     let (prior, drop_secs) = if is_unlike { (OF_AN_UNLIKE_ROBOT, None) } else { (OF_A_ROBOT, model.drop_secs(look)) };
     let n_grasps = n_grasps as f64;
@@ -142,13 +145,13 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
         log_loss_before: own.log_losses[0],
         log_loss_after: own.log_losses[1],
         n_lifted: own.n_lifted,
-        n_outside,
+        n_outside: if is_unlike { n_outside } else { 0 },
         promise: own.promise,
     });
     Ok(adapted)
 }
 
-/// The lifts that a look decides.
+/// The lifts that a look decides, with all that learning from them needs.
 struct Judged<'a> {
     classifier: &'a Classifier,
     prior: Prior,
@@ -158,10 +161,10 @@ struct Judged<'a> {
     lifts: &'a [JudgedLift<'a>],
 }
 
-/// What the lifts have taught, and how it is borne out by objects that it was not learned from.
+/// The correction that follows from the lifts, and its figures for objects that it was not learned from.
 struct Own {
     learned: Learned,
-    /// The mean log loss of the model, and of what was learned, nats.
+    /// The mean log loss of the model and of the corrected model, nats.
     log_losses: [f64; 2],
     /// Of the lifts, those that would be made.
     n_lifted: usize,
@@ -176,11 +179,7 @@ impl Judged<'_> {
             Learned { correction: Correction::default(), threshold_probability: self.classifier.threshold_probability };
         let n_folds = folds.iter().max().map_or(0, |last| last + 1);
         let by_fold: Vec<Learned> = (0..n_folds).map(|fold| self.learned(|idx| folds[idx] != fold)).collect();
-        let lifts = self.lifts;
-        let [before, after] = [false, true].map(|is_after| {
-            let by = |idx: usize| if is_after { by_fold[folds[idx]] } else { of_model };
-            self.tried(by)
-        });
+        let (before, after) = (self.tried(|_| of_model), self.tried(|idx| by_fold[folds[idx]]));
         let log_losses = [before.log_loss, after.log_loss];
         let learned = self.learned(|_| true);
         let is_worth_it = self.drop_secs.is_none() || after.secs_per_kept < before.secs_per_kept;
@@ -191,7 +190,7 @@ impl Judged<'_> {
             (false, _) => (of_model, before),
         };
         let mut of_objects: BTreeMap<&String, [f64; 3]> = BTreeMap::new();
-        for (lift, is_lifted) in lifts.iter().zip(&tried.is_lifted) {
+        for (lift, is_lifted) in self.lifts.iter().zip(&tried.is_lifted) {
             let [n, lifted, dropped] = of_objects.entry(&lift.example.object).or_default();
             *n += 1.0;
             *lifted += f64::from(u8::from(*is_lifted));
@@ -203,11 +202,12 @@ impl Judged<'_> {
             learned,
             log_losses,
             n_lifted: tried.is_lifted.iter().filter(|is_lifted| **is_lifted).count(),
-            promise: promise(&trials.collect::<Vec<_>>()),
+            // Each grasp counts as a trial of its own.
+            promise: promise(&trials.collect::<Vec<_>>()).map(|promise| Promise { n_attempts: Some(1), ..promise }),
         }
     }
 
-    /// What those of the lifts teach that are used.
+    /// Learns from those of the lifts that are used.
     fn learned(&self, is_used: impl Fn(usize) -> bool) -> Learned {
         let used: Vec<(f64, bool)> = (self.lifts.iter().enumerate())
             .filter(|(idx, _)| is_used(*idx))
@@ -220,14 +220,14 @@ impl Judged<'_> {
     /// The same correction with a threshold that lifts the grasps that the model lifts.
     fn at_the_same_place(&self, learned: Learned) -> Learned {
         let before = self.classifier.threshold_probability;
-        let log_odds = learned.correction.apply((before / (1.0 - before)).ln());
-        Learned { threshold_probability: 1.0 / (1.0 + (-log_odds).exp()), ..learned }
+        let threshold_probability = probability(learned.correction.apply(log_odds_of(before)));
+        Learned { threshold_probability, ..learned }
     }
 
     /// The lifts as each would be judged.
     fn tried(&self, by: impl Fn(usize) -> Learned) -> Tried {
         let log_odds = |idx: usize| by(idx).correction.apply(self.lifts[idx].log_odds);
-        let is_lifted = |idx: usize| 1.0 / (1.0 + (-log_odds(idx)).exp()) >= by(idx).threshold_probability;
+        let is_lifted = |idx: usize| probability(log_odds(idx)) >= by(idx).threshold_probability;
         let idxs = 0..self.lifts.len();
         let is_lifted: Vec<bool> = idxs.clone().map(is_lifted).collect();
         let n_lifted = is_lifted.iter().filter(|is_lifted| **is_lifted).count() as f64;
@@ -236,7 +236,7 @@ impl Judged<'_> {
         let losses = idxs.map(|idx| log_loss(log_odds(idx), self.lifts[idx].example.stable));
         Tried {
             log_loss: losses.sum::<f64>() / self.lifts.len() as f64,
-            // Without a lift, it takes for ever.
+            // A robot that keeps nothing takes for ever.
             secs_per_kept: if n_kept > 0.0 {
                 secs_per_kept(n_lifted / self.n_grasps, n_kept / n_lifted, self.drop_secs.unwrap_or(0.0))
             } else {
@@ -256,7 +256,7 @@ struct Tried {
 /// Whether the model calls a grasp unstable at a look before the one that decides.
 fn is_unstable(model: &Model, look: Phase, example: &Example) -> bool {
     let judged = model.look(look).zip(log_odds(model, look, example));
-    judged.is_some_and(|(classifier, log_odds)| 1.0 / (1.0 + (-log_odds).exp()) < classifier.unsure_from_probability)
+    judged.is_some_and(|(classifier, log_odds)| probability(log_odds) < classifier.unsure_from_probability)
 }
 
 /// The frame of a look, as it was felt.
@@ -361,7 +361,7 @@ fn most_probable_weights(covariances: &DMatrix<f64>, log_odds: &[f64], stable: &
     let mut weights = DVector::zeros(log_odds.len());
     for round in 0..40 {
         let corrections = covariances * &weights;
-        let probability = |idx: usize| 1.0 / (1.0 + (-(log_odds[idx] + corrections[idx])).exp());
+        let probability = |idx: usize| probability(log_odds[idx] + corrections[idx]);
         let curvature = |idx: usize| (probability(idx) * (1.0 - probability(idx))).max(1e-4);
         let miss = |idx: usize| f64::from(u8::from(stable[idx])) - probability(idx);
         let aim = DVector::from_fn(log_odds.len(), |idx, _| corrections[idx] + miss(idx) / curvature(idx));

@@ -17,18 +17,13 @@ use blindgrasp_stages::classifier::boosting::BoostingParams;
 use blindgrasp_stages::classifier::{Classifier, Predictor};
 use blindgrasp_stages::encoder::{Block, FeatureExtractor, FeltReading};
 use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::own_lifts::{ATTEMPT_SECS, LIFT_SECS, SQUEEZE_SECS, TEST_LIFT_SECS};
 use blindgrasp_stages::probe::{GraspHistory, ProbeModel, n_values, signals};
 use blindgrasp_stages::recipe::{Learner, Recipe};
 use blindgrasp_stages::training_summary::Promise;
 
 /// The attempts of a trial that is never lifted.
 const MOST_ATTEMPTS: u32 = 20;
-/// Time of an attempt until the hand has settled, of tightening it, of a test lift, and of a lift, seconds: as the simulated
-/// hand takes.
-const ATTEMPT_SECS: f64 = 3.0;
-const SQUEEZE_SECS: f64 = 0.4;
-const TEST_LIFT_SECS: f64 = 0.8;
-const LIFT_SECS: f64 = 4.0;
 /// Costs that differ by a smaller part than this count as equal. The cost is flat near its least value: two simulations of the same
 /// 10,000 lifts, with other noise of the cells, had their least costs where 3.1 and 5.1 % of the lifts drop.
 const EQUAL_COST: f64 = 0.02;
