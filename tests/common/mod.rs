@@ -435,6 +435,7 @@ pub(crate) fn decisions_of(dataflow: &Path) -> Vec<(String, String)> {
 }
 
 /// Sends a signal to a process.
+#[track_caller]
 pub(crate) fn signal(pid: i32, signal: rustix::process::Signal) {
     let pid = rustix::process::Pid::from_raw(pid).expect("a pid");
     rustix::process::kill_process(pid, signal).expect("signalled");

@@ -566,11 +566,12 @@ fn a_swap_that_is_taken_back_before_all_is_sent_again() {
     swap_before_all_is_sent_again(&["contacts", "encoder"]);
 }
 
-/// The default graph with classifier and arbiter in one process, and the graph without that group.
+/// The default graph with classifier and arbiter in one process, which may stand still for as long as a test wants, and the
+/// graph without that group.
 fn grouped(folder: &Path, changes: &[(String, String)]) -> (PathBuf, PathBuf) {
     let alone = folder.join("alone");
     std::fs::create_dir(&alone).expect("a folder");
-    let group = ["classifier", "lift_arbiter"].map(|node| of_node(node, &["group: judge"]));
+    let group = ["classifier", "lift_arbiter"].map(|node| of_node(node, &["group: judge", "heartbeat_ms: 60000"]));
     (dataflow_with(folder, &[changes, &group].concat()), dataflow_with(&alone, changes))
 }
 
