@@ -9,10 +9,15 @@ pub enum MeshError {
     Read { path: PathBuf, source: std::io::Error },
     #[error("cannot write mesh {}: {source}", path.display())]
     Write { path: PathBuf, source: std::io::Error },
-    #[error("{}: expected a mesh file that ends in .off, .obj, .stl or .ply", path.display())]
+    #[error("{}: expected a mesh file that ends in .off, .obj, .stl, .ply, .dae or .glb", path.display())]
     UnknownFormat { path: PathBuf },
     #[error("{}: the file is empty", path.display())]
     Empty { path: PathBuf },
+    #[error(
+        "{}: it is a pointer of Git LFS, not the mesh itself: run `git lfs pull`, or check out with LFS",
+        path.display()
+    )]
+    GitLfsPointer { path: PathBuf },
     #[error("{}: no triangles: expected a surface, found {n_vertices} vertices only", path.display())]
     NoTriangles { path: PathBuf, n_vertices: usize },
     /// The file does not have its extension's format, or is damaged. `line` counts from 1; binary files have none.

@@ -11,6 +11,8 @@ pub(crate) enum Format {
     Obj,
     Stl,
     Ply,
+    Dae,
+    Glb,
 }
 
 impl Format {
@@ -25,6 +27,8 @@ impl Format {
             "obj" => Ok(Format::Obj),
             "stl" => Ok(Format::Stl),
             "ply" => Ok(Format::Ply),
+            "dae" => Ok(Format::Dae),
+            "glb" => Ok(Format::Glb),
             _ => Err(MeshError::UnknownFormat { path: path.into() }),
         }
     }

@@ -1,6 +1,6 @@
 //! Triangle meshes: read from files, checked, repaired and weighed.
 //!
-//! The path of a mesh: [`read`] (OFF, OBJ, STL, PLY) -> [`check`] (size, faults of the surface, repair) -> [`mass`]
+//! The path of a mesh: [`read`] (OFF, OBJ, STL, PLY, COLLADA, glTF) -> [`check`] (size, faults of the surface, repair) -> [`mass`]
 //! (volume, centre of mass). Colours, normals, textures and materials of the files are not read; shapes are not
 //! simplified.
 //!
@@ -29,6 +29,7 @@ mod obj;
 mod off;
 mod ply;
 pub mod read;
+mod scene;
 mod stl;
 #[cfg(test)]
 mod tests;

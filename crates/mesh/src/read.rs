@@ -1,4 +1,4 @@
-//! Reading meshes: OFF, OBJ, STL (ASCII and binary) and PLY (ASCII and binary).
+//! Reading meshes: OFF, OBJ, STL (ASCII and binary), PLY (ASCII and binary), COLLADA and binary glTF.
 //!
 //! Only the shape is read. No memory is allocated because of a header's counts: it is bounded by the file's length.
 
@@ -9,7 +9,7 @@ use std::path::Path;
 use nalgebra::Point3;
 
 use crate::format::Format;
-use crate::{Mesh, MeshError, obj, off, ply, stl};
+use crate::{Mesh, MeshError, obj, off, ply, scene, stl};
 
 /// Greatest size of a mesh file: scans of a million triangles take 50 to 100 MiB.
 const MAX_BYTES: u64 = 256 << 20;
@@ -30,11 +30,16 @@ pub fn read_mesh(path: &Path, scale: f64) -> Result<Mesh, MeshError> {
     if bytes.is_empty() {
         return Err(MeshError::Empty { path: path.into() });
     }
+    if bytes.starts_with(b"version https://git-lfs.github.com/spec/") {
+        return Err(MeshError::GitLfsPointer { path: path.into() });
+    }
     let parsed = match format {
         Format::Off => off::parse(&bytes),
         Format::Obj => obj::parse(&bytes),
         Format::Stl => stl::parse(&bytes),
         Format::Ply => ply::parse(&bytes),
+        Format::Dae => scene::parse_dae(&bytes),
+        Format::Glb => scene::parse_glb(&bytes),
     };
     let mesh = parsed.and_then(|soup| soup.into_mesh(scale)).map_err(|Problem { line, expected, found }| {
         MeshError::Malformed { path: path.into(), line, expected, found }

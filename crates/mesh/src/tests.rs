@@ -94,8 +94,101 @@ fn files_of(mesh: &Mesh) -> Vec<(&'static str, Vec<u8>)> {
         ("a.ply", ply.into_bytes()),
         ("b.ply", binary_ply),
         ("a.Stl", stl.into_bytes()),
+        ("a.dae", dae_of(mesh)),
+        ("a.glb", glb_of(mesh)),
         ("b.stl", binary_stl),
     ]
+}
+
+fn words(numbers: impl Iterator<Item = impl ToString>) -> String {
+    numbers.map(|number| number.to_string()).collect::<Vec<_>>().join(" ")
+}
+
+/// A COLLADA file with normals between the indices.
+fn dae_of(mesh: &Mesh) -> Vec<u8> {
+    let positions = words(mesh.vertices_m.iter().flat_map(|vertex| vertex.iter()));
+    let idxs = words(mesh.triangles.iter().flatten().flat_map(|idx| [*idx, 0]));
+    format!(
+        "<?xml version='1.0'?>\n<COLLADA xmlns='http://www.collada.org/2005/11/COLLADASchema' version='1.4.1'>\
+         <asset><unit meter='1'/><up_axis>Z_UP</up_axis></asset><library_geometries><geometry id='g'><mesh>\
+         <source id='p'><float_array id='pa' count='1'>{positions}</float_array></source>\
+         <source id='n'><float_array id='na' count='3'>0 0 1</float_array></source>\
+         <vertices id='v'><input semantic='POSITION' source='#p'/></vertices>\
+         <triangles count='1'><input semantic='VERTEX' source='#v' offset='0'/>\
+         <input semantic='NORMAL' source='#n' offset='1'/><p>{idxs}</p></triangles></mesh></geometry></library_geometries>\
+         <library_visual_scenes><visual_scene id='s'><node><instance_geometry url='#g'/></node></visual_scene>\
+         </library_visual_scenes><scene><instance_visual_scene url='#s'/></scene></COLLADA>"
+    )
+    .into_bytes()
+}
+
+fn glb_of(mesh: &Mesh) -> Vec<u8> {
+    let (n_vertices, n_triangles) = (mesh.vertices_m.len(), mesh.triangles.len());
+    let positions = mesh.vertices_m.iter().flat_map(|vertex| vertex.iter().map(|value| *value as f32));
+    let mut binary: Vec<u8> = positions.flat_map(f32::to_le_bytes).collect();
+    mesh.triangles.iter().flatten().for_each(|idx| binary.extend((*idx as u16).to_le_bytes()));
+    let idxs_at = 12 * n_vertices;
+    binary.resize(binary.len().next_multiple_of(4), 0);
+    let json = format!(
+        "{{\"scene\": 0, \"scenes\": [{{\"nodes\": [0]}}], \"nodes\": [{{\"children\": [1]}}, {{\"mesh\": 0}}], \
+         \"meshes\": [{{\"primitives\": [{{\"attributes\": {{\"POSITION\": 0}}, \"indices\": 1}}]}}], \
+         \"buffers\": [{{\"byteLength\": {}}}], \"bufferViews\": [{{\"buffer\": 0}}, {{\"buffer\": 0, \"byteOffset\": \
+         {idxs_at}}}], \"accessors\": [{{\"bufferView\": 0, \"componentType\": 5126, \"count\": {n_vertices}}}, \
+         {{\"bufferView\": 1, \"componentType\": 5123, \"count\": {}}}]}}",
+        binary.len(),
+        3 * n_triangles
+    );
+    let json = format!("{json:width$}", width = json.len().next_multiple_of(4)).into_bytes();
+    let part = |kind: &[u8; 4], content: &[u8]| [&(content.len() as u32).to_le_bytes()[..], kind, content].concat();
+    let parts = [part(b"JSON", &json), part(b"BIN\0", &binary)].concat();
+    [b"glTF", &2_u32.to_le_bytes()[..], &(parts.len() as u32 + 12).to_le_bytes(), &parts].concat()
+}
+
+#[test]
+fn a_scene_places_its_meshes() {
+    let cube = block([0.0; 3], [1.0, 2.0, 3.0]);
+    let bounds = |mesh: &Mesh| {
+        let of = |axis: usize, pick: fn(f64, f64) -> f64, from: f64| {
+            let value = mesh.vertices_m.iter().map(|vertex| vertex[axis]).fold(from, pick);
+            (value * 1e6).round() / 1e6
+        };
+        [0, 1, 2].map(|axis| [of(axis, f64::min, f64::INFINITY), of(axis, f64::max, f64::NEG_INFINITY)])
+    };
+    let dae = String::from_utf8(dae_of(&cube)).expect("text");
+    let instance = "<instance_geometry url='#g'/>";
+    let polylist = "<polylist count='1'><input semantic='VERTEX' source='#v' offset='0'/><vcount>4 2 4</vcount>\
+                    <p>0 2 3 1 0 1 4 5 7 6</p></polylist>";
+    let triangles = &dae[dae.find("<triangles").expect("some")..dae.find("</mesh>").expect("an end")];
+    for (from, to, expected) in [
+        ("", "", [[0.0, 1.0], [0.0, 2.0], [0.0, 3.0]]),
+        ("meter='1'", "name='millimeter' meter='0.001'", [[0.0, 0.001], [0.0, 0.002], [0.0, 0.003]]),
+        // +y of the file is up, so its +z looks to the front.
+        ("Z_UP", "Y_UP", [[0.0, 1.0], [-3.0, 0.0], [0.0, 2.0]]),
+        ("Z_UP", "X_UP", [[-3.0, 0.0], [0.0, 2.0], [0.0, 1.0]]),
+        (instance, "<translate>1 0 0</translate><rotate>0 0 1 90</rotate><scale>2 1 1</scale><node>\
+                    <matrix>1 0 0 0 0 1 0 0 0 0 1 5 0 0 0 1</matrix><instance_geometry url='#g'/></node>",
+            [[-1.0, 1.0], [0.0, 2.0], [5.0, 8.0]]),
+        (triangles, polylist, [[0.0, 1.0], [0.0, 2.0], [0.0, 3.0]]),
+        ("<instance_visual_scene url='#s'/>", "", [[0.0, 1.0], [0.0, 2.0], [0.0, 3.0]]),
+    ] {
+        assert!(dae.contains(from), "{from}");
+        let read = read_text("a.dae", dae.replacen(from, to, 1)).unwrap_or_else(|error| panic!("{to}: {error}"));
+        assert_eq!(bounds(&read), expected, "{to}");
+    }
+    for (name, text, expected) in [
+        ("a.dae", dae.replacen("'#g'", "'#h'", 1), "expected the id of an element of the file, found \"#h\""),
+        ("a.dae", dae.replacen("meter='1'", "meter='0'", 1), "<unit meter> of more than 0"),
+        ("a.dae", dae.replacen(instance, "", 1), "no triangles"),
+        ("a.dae", dae[..300].to_owned(), "cut off"),
+        ("a.dae", "<svg/>".to_owned(), "expected XML with one <COLLADA>, found <svg>"),
+        ("a.glb", "gltf".to_owned(), "a binary glTF file of version 2"),
+        ("a.obj", "version https://git-lfs.github.com/spec/v1\n".to_owned(), "git lfs pull"),
+    ] {
+        let error = error_of(name, &text);
+        assert!(error.contains(expected), "{error}");
+    }
+    let own = dae.replacen(instance, "<instance_node url='#n'/>", 1).replacen("<node>", "<node id='n'>", 1);
+    assert!(error_of("a.dae", own).contains("at most 10,000 nodes"), "a node in itself");
 }
 
 #[test]
@@ -107,7 +200,7 @@ fn every_format_is_read_without_loss() {
         assert_eq!((read.vertices_m.len(), read.triangles.len()), (8, 12), "{name}: equal corners are merged");
         for (read, written) in read.corners().flatten().zip(mesh.corners().flatten()) {
             match name {
-                "b.stl" => assert_eq!(read.map(|x| x as f32), written.map(|x| x as f32)),
+                "b.stl" | "a.glb" => assert_eq!(read.map(|x| x as f32), written.map(|x| x as f32)),
                 _ => assert_eq!(read, written, "{name}"),
             }
         }

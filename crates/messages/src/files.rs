@@ -1,7 +1,7 @@
 //! Files that are complete or not there, and files that can be read to their end.
 
 use std::fs::File;
-use std::io::{ErrorKind, Read, Write};
+use std::io::{ErrorKind, Read, Seek, Write};
 use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 
@@ -15,11 +15,13 @@ pub fn partial_path(path: &Path) -> PathBuf {
 /// Opens a file to read it. A pipe, a device, a socket or a folder is refused: its reading might wait for ever, or never end.
 ///
 /// # Errors
-/// The file cannot be opened, or is no regular file.
+/// The file cannot be opened, is no regular file, or is a pointer of Git LFS in the place of the file.
 pub fn open_regular(path: &Path) -> std::io::Result<File> {
     let kind = std::fs::metadata(path)?.file_type();
     if kind.is_file() {
-        return File::open(path);
+        let mut file = File::open(path)?;
+        refuse_git_lfs_pointer(&mut file)?;
+        return Ok(file);
     }
     let found = if kind.is_dir() {
         "a folder"
@@ -31,6 +33,18 @@ pub fn open_regular(path: &Path) -> std::io::Result<File> {
         "a device"
     };
     Err(std::io::Error::new(ErrorKind::InvalidInput, format!("it is {found}, expected a regular file")))
+}
+
+/// Refuses the text that a checkout without Git LFS has in the place of a large file.
+fn refuse_git_lfs_pointer(file: &mut File) -> std::io::Result<()> {
+    const BEGIN: &[u8] = b"version https://git-lfs.github.com/spec/";
+    let mut begin = Vec::new();
+    file.take(BEGIN.len() as u64).read_to_end(&mut begin)?;
+    if begin == BEGIN {
+        let what = "it is a pointer of Git LFS, not the file itself: run `git lfs pull`, or check out with LFS";
+        return Err(std::io::Error::new(ErrorKind::InvalidData, what));
+    }
+    file.rewind()
 }
 
 /// Reads a text by [`open_regular`].
@@ -74,6 +88,10 @@ mod tests {
             let error = open_regular(path).expect_err(found).to_string();
             assert_eq!(error, format!("it is {found}, expected a regular file"));
         }
+        let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 9\n";
+        std::fs::write(&file, pointer).expect("written");
+        let error = open_regular(&file).expect_err("a pointer").to_string();
+        assert!(error.contains("git lfs pull"), "{error}");
         let missing = open_regular(&folder.path().join("missing")).expect_err("missing");
         assert_eq!(missing.kind(), ErrorKind::NotFound);
     }

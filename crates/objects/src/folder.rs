@@ -39,9 +39,9 @@ pub struct MeshEntry {
 pub enum FolderError {
     #[error("cannot read {}: {source}", path.display())]
     Read { path: PathBuf, source: std::io::Error },
-    #[error("{}: expected a folder, or a mesh file that ends in .off, .obj, .stl or .ply", path.display())]
+    #[error("{}: expected a folder, or a mesh file that ends in .off, .obj, .stl, .ply, .dae or .glb", path.display())]
     NoMeshFile { path: PathBuf },
-    #[error("{}: no meshes: expected a {CATALOGUE_FILE} with rows, or files that end in .off, .obj, .stl or .ply, here or below",
+    #[error("{}: no meshes: expected a {CATALOGUE_FILE} with rows, or files that end in .off, .obj, .stl, .ply, .dae or .glb, here or below",
         path.display())]
     NoMeshes { path: PathBuf },
     /// The catalogue is not CSV, or lacks its header.
@@ -198,7 +198,7 @@ fn read_row(
         ));
     }
     if !is_mesh_file(&file) {
-        return Err(format!("file: expected a name that ends in .off, .obj, .stl or .ply, found {}", file.display()));
+        return Err(format!("file: expected a name that ends in .off, .obj, .stl, .ply, .dae or .glb, found {}", file.display()));
     }
     if !folder.join(&file).is_file() {
         return Err(format!("file: there is no file {} in the folder", file.display()));
@@ -385,7 +385,7 @@ mod tests {
             "line 5: split: expected train or held-out, found \"test\"",
             "line 6: split: expected train or held-out, found \"\"",
             "line 7: file: expected the path of a mesh file, found nothing",
-            "line 8: file: expected a name that ends in .off, .obj, .stl or .ply, found a.txt",
+            "line 8: file: expected a name that ends in .off, .obj, .stl, .ply, .dae or .glb, found a.txt",
             "line 9: file: there is no file b.off in the folder",
             "line 10: file: expected a path relative to the folder, found /a.off",
             "line 11: expected 6 columns, as the header has, found 3",

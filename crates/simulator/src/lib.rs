@@ -40,6 +40,7 @@ pub mod mechanism;
 pub(crate) mod option_check;
 pub mod options;
 pub mod pad_grid;
+pub mod palm_frame;
 pub mod planner;
 pub mod protocol;
 pub mod simulator;

@@ -1,5 +1,7 @@
 //! A hand as the protocol moves it: the joints that close, the links that they move, and the links that may touch.
 
+use std::ops::Range;
+
 use nalgebra::{Isometry3, Point3, Vector3};
 use parry3d_f64::math::Vector;
 
@@ -21,7 +23,10 @@ pub struct ClosingJoint {
 /// A hand prepared for exploring.
 pub struct Mechanism<'a> {
     pub hand: &'a Hand,
+    /// Link after link.
     pub shapes: Vec<PlacedShape<'a>>,
+    /// Per link: its shapes, as indices into `shapes`.
+    shapes_of_links: Vec<Range<usize>>,
     pub joints: Vec<ClosingJoint>,
     /// Per link: the closing joints that move it.
     movers: Vec<Vec<Mover>>,
@@ -84,6 +89,12 @@ impl<'a> Mechanism<'a> {
             .enumerate()
             .flat_map(|(link_idx, link)| link.shapes.iter().map(move |shape| PlacedShape::new(link_idx, shape)))
             .collect();
+        let mut end = 0;
+        let ranges = hand.links.iter().map(|link| {
+            end += link.shapes.len();
+            end - link.shapes.len()..end
+        });
+        let shapes_of_links = ranges.collect();
         let movers: Vec<Vec<Mover>> = (0..hand.links.len()).map(|link_idx| movers(hand, &joints, link_idx)).collect();
         let top_speed = (0..hand.links.len())
             .map(|link_idx| {
@@ -109,7 +120,7 @@ impl<'a> Mechanism<'a> {
             })
             .collect();
         let fingers = joints.iter().map(|joint| fingers(hand, joint.joint_idx)).collect();
-        let mut mechanism = Mechanism { hand, shapes, joints, movers, top_speed, fingers, pairs: Vec::new() };
+        let mut mechanism = Mechanism { hand, shapes, shapes_of_links, joints, movers, top_speed, fingers, pairs: Vec::new() };
         mechanism.pairs = mechanism.pairs();
         mechanism
     }
@@ -174,16 +185,38 @@ impl<'a> Mechanism<'a> {
         Vector::new(velocity.x, velocity.y, velocity.z)
     }
 
-    /// Speed of a link's point (palm frame) per speed of the value of a closing joint.
-    pub(crate) fn speed(
+    /// Of the closing joints that move a link, the one nearest to it.
+    pub(crate) fn nearest_closing_joint(&self, link_idx: usize) -> Option<&ClosingJoint> {
+        self.movers[link_idx].first().map(|mover| &self.joints[mover.closing_idx])
+    }
+
+    /// The pairs of closing joints of which the second one moves the first one's links and turns against it as the hand closes.
+    pub(crate) fn opposed_joints(&self, palm_from_links: &[Isometry3<f64>]) -> Vec<(usize, usize)> {
+        /// Cosine of the angle between axes that count as parallel, and opposite.
+        const OPPOSED: f64 = -0.9;
+        let turn = |mover: &Mover| {
+            let joint = &self.joints[mover.closing_idx];
+            let axis = palm_from_links[mover.moved_link_idx].rotation * mover.axis;
+            (joint.joint_idx, axis * (joint.rate * mover.multiplier).signum())
+        };
+        let chains = self.movers.iter().map(|movers| {
+            let turns: Vec<_> = movers.iter().filter(|mover| mover.kind == JointKind::Revolute).map(turn).collect();
+            turns.windows(2).filter(|pair| pair[0].1.dot(&pair[1].1) < OPPOSED && pair[0].0 != pair[1].0).map(|pair| (pair[0].0, pair[1].0)).collect()
+        });
+        let chains: Vec<Vec<(usize, usize)>> = chains.collect();
+        chains.concat()
+    }
+
+    /// Velocity of a link's point (palm frame) per speed of the value of a closing joint.
+    pub(crate) fn velocity_of_joint(
         &self,
         link_idx: usize,
         point: &Point3<f64>,
         joint_idx: usize,
         palm_from_links: &[Isometry3<f64>],
-    ) -> f64 {
+    ) -> Vector3<f64> {
         let movers = self.movers[link_idx].iter().filter(|mover| self.joints[mover.closing_idx].joint_idx == joint_idx);
-        movers.map(|mover| mover.velocity(point, mover.multiplier, palm_from_links)).sum::<Vector3<f64>>().norm()
+        movers.map(|mover| mover.velocity(point, mover.multiplier, palm_from_links)).sum()
     }
 
     /// The closest points of two links. Shapes that are far apart count with the distance of their bounding spheres.
@@ -194,7 +227,10 @@ impl<'a> Mechanism<'a> {
         palm_from_links: &[Isometry3<f64>],
     ) -> Option<ClosestLinks> {
         let mut nearest: Option<ClosestLinks> = None;
-        let shapes_of = |link_idx| self.shapes.iter().enumerate().filter(move |(_, shape)| shape.link_idx == link_idx);
+        let shapes_of = |link_idx: usize| {
+            let range = self.shapes_of_links[link_idx].clone();
+            range.clone().zip(&self.shapes[range])
+        };
         for (idx_a, shape_a) in shapes_of(a) {
             let centre_a = palm_from_links[a] * shape_a.centre_in_link;
             for (idx_b, shape_b) in shapes_of(b) {

@@ -2,8 +2,9 @@
 
 use blindgrasp_stages::hand::{Cell, Hand, JointError, pose_from_isometry};
 use nalgebra::{Point3, Unit, UnitVector3, Vector3};
-use parry3d_f64::math::Vector;
+use parry3d_f64::math::{Pose, Vector};
 use parry3d_f64::query::Ray;
+use parry3d_f64::shape::SharedShape;
 
 use crate::mechanism::Mechanism;
 
@@ -12,12 +13,16 @@ const SHARE_OF_FACE: f64 = 0.85;
 /// The part of a cell's place that the cell takes, along each direction.
 const SHARE_OF_PITCH: f64 = 0.85;
 
+/// A cell that looks farther aside than this from the side that it is on is left out: it lies on a flank. 65°.
+const LEAST_FACING: f64 = 0.42;
+
 /// Cells in a grid of `rows` × `columns` on a link: on the side towards which it moves as the open hand closes, of the palm
 /// on the side of +z. The rows follow the longer direction of that side, outwards. Each cell lies on the link's collision
-/// shapes, where a line against the direction of closing meets them.
+/// shapes, where a line against the direction of closing meets them. Cells that would lie beside the shapes, or on their flanks,
+/// are left out, as at a tapered tip.
 ///
 /// # Errors
-/// A link without collision shapes, or a grid that leaves the shapes.
+/// A link without collision shapes, or a grid of which no cell lies on them.
 pub fn pad_grid(
     mechanism: &Mechanism<'_>,
     link_idx: usize,
@@ -40,38 +45,53 @@ pub fn pad_grid(
     let pitch_m = |[least, most]: [f64; 2], n: usize| (most - least) * SHARE_OF_FACE / n as f64;
     let size_m = [pitch_m(row_range, n_rows), pitch_m(column_range, n_columns)].map(|pitch_m| pitch_m * SHARE_OF_PITCH);
     let [_, outermost_m] = extent(hand, link_idx, &inner);
-    (0..n_rows * n_columns)
-        .map(|idx| {
+    let surfaces: Vec<(Pose, SharedShape)> =
+        link.shapes.iter().map(|shape| (pose_from_isometry(&shape.link_from_shape), shape.rounded())).collect();
+    let cells: Vec<Cell> = (0..n_rows * n_columns)
+        .filter_map(|idx| {
             let (row, column) = (idx / n_columns, idx % n_columns);
             let from = along.into_inner() * place(row_range, row, n_rows)
                 + across.into_inner() * place(column_range, column, n_columns)
                 + inner.into_inner() * (outermost_m + 0.01);
-            let (position_in_link_m, normal_in_link) = meet(hand, link_idx, &from, &inner)
-                .ok_or_else(|| format!("row {row}, column {column} of the grid is beside the link's shapes"))?;
-            let along_in_link =
-                Unit::new_normalize(along.into_inner() - normal_in_link.into_inner() * normal_in_link.dot(&along));
-            Ok(Cell { position_in_link_m, normal_in_link, along_in_link, size_m, noise_threshold_newtons })
+            let (position_in_link_m, normal_in_link) = meet(&surfaces, &from, &inner)?;
+            let along = along.into_inner() - normal_in_link.into_inner() * normal_in_link.dot(&along);
+            let along_in_link = Unit::try_new(along, 1e-6)?;
+            (normal_in_link.dot(&inner) >= LEAST_FACING).then_some(Cell {
+                position_in_link_m,
+                normal_in_link,
+                along_in_link,
+                size_m,
+                noise_threshold_newtons,
+            })
         })
-        .collect()
+        .collect();
+    if cells.is_empty() {
+        return Err(format!(
+            "no cell of {n_rows} x {n_columns} lies on its shapes: give another size, or a table of cells with --cells"
+        ));
+    }
+    Ok(cells)
 }
 
 /// The mean direction in the link's frame in which its middle moves until the hand is half closed, along the nearest axis of
-/// the frame, so that a grid lies flat on a box; the palm's +z of a link that does not move.
+/// the frame, so that a grid lies flat on a box; the palm's +z of a link that does not move. Of the joints that move the link,
+/// the nearest one that closes counts: those above it may spread the finger.
 fn inner_direction(mechanism: &Mechanism<'_>, link_idx: usize) -> Result<UnitVector3<f64>, JointError> {
     /// Postures from open to closed, of which the first half counts.
     const N_STEPS: usize = 20;
     let hand = mechanism.hand;
     let middle = middle(hand, link_idx);
+    let nearest = mechanism.nearest_closing_joint(link_idx);
     let mut sum = Vector3::zeros();
     let postures = mechanism.closing_postures(&hand.open_joints_rad(), N_STEPS);
     for posture in &postures[..=N_STEPS / 2] {
         let palm_from_links = hand.palm_from_links(posture)?;
         let palm_from_link = &palm_from_links[link_idx];
-        let point = palm_from_link * middle;
-        let point = Vector::new(point.x, point.y, point.z);
-        let velocity = mechanism.velocity(link_idx, point, &palm_from_links, &mechanism.joints, 0.0);
-        let in_palm = Unit::try_new(Vector3::new(velocity.x, velocity.y, velocity.z), 1e-9);
-        sum += palm_from_link.rotation.inverse() * in_palm.unwrap_or_else(Vector3::z_axis).into_inner();
+        let in_palm = nearest.map_or_else(Vector3::z, |joint| {
+            let velocity = mechanism.velocity_of_joint(link_idx, &(palm_from_link * middle), joint.joint_idx, &palm_from_links);
+            (velocity * joint.rate).try_normalize(1e-9).unwrap_or_else(Vector3::z)
+        });
+        sum += palm_from_link.rotation.inverse() * in_palm;
     }
     let axes = [Vector3::x_axis(), Vector3::y_axis(), Vector3::z_axis()];
     let axes = axes.into_iter().flat_map(|axis| [axis, -axis]);
@@ -96,7 +116,7 @@ fn middle(hand: &Hand, link_idx: usize) -> Point3<f64> {
 }
 
 /// The least and the greatest coordinate of the link's shapes along a direction.
-fn extent(hand: &Hand, link_idx: usize, direction: &UnitVector3<f64>) -> [f64; 2] {
+pub(crate) fn extent(hand: &Hand, link_idx: usize, direction: &UnitVector3<f64>) -> [f64; 2] {
     let mut ends = [f64::INFINITY, f64::NEG_INFINITY];
     for shape in &hand.links[link_idx].shapes {
         let in_shape = shape.link_from_shape.inverse() * direction;
@@ -111,18 +131,14 @@ fn extent(hand: &Hand, link_idx: usize, direction: &UnitVector3<f64>) -> [f64; 2
     ends
 }
 
-/// Where a line from `from` against `inner` meets the link's shapes, and the normal there.
+/// Where a line from `from` against `inner` meets the surfaces, and the normal there.
 fn meet(
-    hand: &Hand,
-    link_idx: usize,
+    surfaces: &[(Pose, SharedShape)],
     from: &Vector3<f64>,
     inner: &UnitVector3<f64>,
 ) -> Option<(Point3<f64>, UnitVector3<f64>)> {
     let ray = Ray::new(Vector::new(from.x, from.y, from.z), Vector::new(-inner.x, -inner.y, -inner.z));
-    let hits = hand.links[link_idx].shapes.iter().filter_map(|shape| {
-        let pose = pose_from_isometry(&shape.link_from_shape);
-        shape.rounded().cast_ray_and_get_normal(&pose, &ray, 1.0, true)
-    });
+    let hits = surfaces.iter().filter_map(|(pose, surface)| surface.cast_ray_and_get_normal(pose, &ray, 1.0, true));
     let hit = hits.min_by(|a, b| a.time_of_impact.total_cmp(&b.time_of_impact))?;
     let normal = Unit::try_new(Vector3::new(hit.normal.x, hit.normal.y, hit.normal.z), 1e-9)?;
     Some((Point3::from(from - inner.into_inner() * hit.time_of_impact), normal))

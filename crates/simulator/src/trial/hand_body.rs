@@ -17,7 +17,7 @@ use rapier3d_f64::parry::shape::SharedShape;
 
 use super::engine::{AxleCommand, BodyPlan, Engine, HandPlan, ShapePlan};
 use crate::mechanism::{Mechanism, first_moved};
-use crate::trial::world::MAX_LINKS_WITH_SHAPES;
+use crate::trial::world::MAX_LINKS_APART;
 use crate::trial::{PhysicsOptions, TrialError};
 use blindgrasp_stages::hand::{Hand, JointKind, Motion, pose_from_isometry};
 
@@ -209,7 +209,11 @@ impl HandBody {
             body_a == body_b || body_above(a) == body_b || body_above(b) == body_a
         };
         let groups = link_groups(mechanism, &palm_from_links, are_joined).ok_or_else(|| {
-            refuse(format!("more than {MAX_LINKS_WITH_SHAPES} links have collision shapes: that is not simulated"))
+            let n = MAX_LINKS_APART - 1;
+            refuse(format!(
+                "more than {n} links overlap others in the open hand, which no joint joins: give another open hand (--open of \
+                 new hand), or simpler collision shapes"
+            ))
         })?;
         for (shape_idx, placed) in mechanism.shapes.iter().enumerate() {
             let link_idx = placed.link_idx;
@@ -362,33 +366,35 @@ impl HandBody {
     }
 }
 
-/// For each link its own collision group, and those of the links that it may touch: all but those that it overlaps in the
-/// open hand, which are built into each other. Of joined links the engine itself disables the contacts. `None` if there are
-/// too few groups.
+/// For each link its collision group, and those of the links that it may touch: all but those that it overlaps in the open
+/// hand, which are built into each other. Of joined links the engine itself disables the contacts. Links that may touch all
+/// others share a group. `None` if there are too few groups.
 fn link_groups(
     mechanism: &Mechanism<'_>,
     palm_from_links: &[Isometry3<f64>],
     are_joined: impl Fn(usize, usize) -> bool,
 ) -> Option<Vec<(Group, Group)>> {
-    let mut n_used = 0;
-    let own: Vec<Group> = mechanism
-        .hand
-        .links
-        .iter()
-        .map(|link| {
-            let group = Group::from_bits_truncate(1_u32.checked_shl(n_used).unwrap_or(0));
-            n_used += u32::from(!link.shapes.is_empty());
-            if link.shapes.is_empty() { Group::NONE } else { group }
+    let links = &mechanism.hand.links;
+    let overlaps = |a: usize, b: usize| {
+        let closest = || mechanism.closest_of_links(a, b, palm_from_links);
+        !are_joined(a, b) && closest().is_some_and(|closest| closest.points.distance_m <= 0.0)
+    };
+    let overlapped: Vec<Vec<usize>> =
+        (0..links.len()).map(|idx| (0..links.len()).filter(|other| overlaps(idx, *other)).collect()).collect();
+    let mut n_used = 1;
+    let own: Vec<Group> = (0..links.len())
+        .map(|idx| match () {
+            () if links[idx].shapes.is_empty() => Group::NONE,
+            () if overlapped[idx].is_empty() => Group::GROUP_1,
+            () => {
+                n_used += 1;
+                Group::from_bits_truncate(1_u32.checked_shl(n_used - 1).unwrap_or(0))
+            }
         })
         .collect();
-    let touched_by = |idx: usize| {
-        let may_touch = |other: &usize| {
-            let closest = mechanism.closest_of_links(idx, *other, palm_from_links);
-            are_joined(idx, *other) || closest.is_none_or(|closest| closest.points.distance_m > 0.0)
-        };
-        (0..own.len()).filter(may_touch).fold(Group::NONE, |all, other| all | own[other])
-    };
-    (n_used <= MAX_LINKS_WITH_SHAPES).then(|| (0..own.len()).map(|idx| (own[idx], touched_by(idx))).collect())
+    let all = own.iter().fold(Group::NONE, |all, group| all | *group);
+    let touched = |idx: usize| overlapped[idx].iter().fold(all, |rest, other| rest & !own[*other]);
+    (n_used <= MAX_LINKS_APART).then(|| (0..own.len()).map(|idx| (own[idx], touched(idx))).collect())
 }
 
 /// The motor's torque or force for each newton at the fingertips that a joint with several links moves: the sum of the
@@ -399,7 +405,7 @@ fn lever(mechanism: &Mechanism<'_>, joint_idx: usize, palm_from_links: &[Isometr
     for pad in &hand.pads {
         let Some(finger) = first_moved(hand, pad.link_idx, joint_idx) else { continue };
         let middle = palm_from_links[pad.link_idx] * pad.middle_in_link_m();
-        let speed = mechanism.speed(pad.link_idx, &middle, joint_idx, palm_from_links);
+        let speed = mechanism.velocity_of_joint(pad.link_idx, &middle, joint_idx, palm_from_links).norm();
         match fingers.iter_mut().find(|(other, _)| *other == finger) {
             Some((_, most)) => *most = most.max(speed),
             None => fingers.push((finger, speed)),

@@ -23,8 +23,8 @@ use blindgrasp_stages::hand::{JointKind, pose_from_isometry};
 
 /// Groups of colliders, as bits.
 /// Each link of the hand has a group of its own among the first; the last four are for other things.
-pub(super) const MAX_LINKS_WITH_SHAPES: u32 = 28;
-const HAND: Group = Group::from_bits_truncate((1 << MAX_LINKS_WITH_SHAPES) - 1);
+pub(super) const MAX_LINKS_APART: u32 = 28;
+const HAND: Group = Group::from_bits_truncate((1 << MAX_LINKS_APART) - 1);
 const TARGET: Group = Group::GROUP_29;
 const STAND: Group = Group::GROUP_30;
 /// The target as the stand sees it: its convex hull, which rests without rattling.

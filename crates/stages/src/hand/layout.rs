@@ -7,7 +7,7 @@ use nalgebra::{Isometry3, UnitVector3, Vector3};
 use parry3d_f64::math::Vector;
 use serde::Deserialize;
 
-use super::urdf::{Tree, TreeLink};
+use super::urdf::{Mimic, Tree, TreeLink};
 use super::{
     BareHand, Cell, CellUnit, Coupling, Hand, HandError, Joint, JointKind, Link, LinkShape, Motion, Pad,
     pose_from_isometry,
@@ -116,6 +116,11 @@ impl Layout {
         }
     }
 
+    /// Whether a link has a pad.
+    pub(super) fn pads_link(&self, link: &str) -> bool {
+        self.pads.iter().any(|pad| pad.link == link)
+    }
+
     pub(super) fn into_hand(self, path: &Path, tree: Tree, least_cells: usize) -> Result<Hand, HandError> {
         self.build(tree, least_cells).map_err(|message| HandError::Invalid { path: path.into(), message })
     }
@@ -190,7 +195,8 @@ impl Layout {
                 .flat_map(|pad| pad.cells.iter().map(|cell| cell.noise_threshold_newtons))
                 .collect(),
             pads,
-            ignored_meshes: tree.ignored_meshes,
+            ignored_shapes: tree.ignored_shapes,
+            fixed_joints: tree.fixed_joints,
             cell_unit: self.cell_unit,
             id: 0,
             description_id: 0,
@@ -382,7 +388,8 @@ fn links(
                 Some((name, axis)) => {
                     let mimic = tree_joints.get(&name).and_then(|joint| joint.mimic.clone());
                     let kind = tree_joints.get(&name).map_or(JointKind::Revolute, |joint| joint.kind);
-                    let (moved_by, multiplier, offset) = mimic.unwrap_or((name, 1.0, 0.0));
+                    let Mimic { joint: moved_by, multiplier, offset } =
+                        mimic.unwrap_or(Mimic { joint: name, multiplier: 1.0, offset: 0.0 });
                     let joint_idx = joints
                         .iter()
                         .position(|joint| joint.name == moved_by)

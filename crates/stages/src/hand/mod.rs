@@ -10,6 +10,7 @@ mod meshes;
 mod self_collision;
 mod urdf;
 mod urdf_part;
+mod urdf_text;
 mod urdf_xml;
 
 use std::collections::BTreeMap;
@@ -26,10 +27,11 @@ use sha2::{Digest, Sha256};
 use layout::Layout;
 
 pub use kinematics::{CellPose, JointError};
-pub use meshes::find as find_mesh;
+pub use meshes::{find as find_mesh, find_package};
 pub(crate) use self_collision::PosedShapes;
 pub use self_collision::pose_from_isometry;
-pub use urdf_part::part_below;
+pub use urdf_part::{part_below, with_meshes_renamed};
+pub use urdf_text::{decode_urdf, read_urdf};
 
 /// A hand of any make: kinematic tree, collision shapes and tactile pads.
 #[derive(Debug, Clone)]
@@ -42,8 +44,10 @@ pub struct Hand {
     pub links: Vec<Link>,
     /// The pads in the order of the layout; cells are numbered through them in order.
     pub pads: Vec<Pad>,
-    /// Collision meshes that could not be used, each with its link and the reason.
-    pub ignored_meshes: Vec<String>,
+    /// Collision shapes that could not be used, each with its link and the reason.
+    pub ignored_shapes: Vec<String>,
+    /// Joints of the URDF that could move but count as fixed, each with the reason.
+    pub fixed_joints: Vec<String>,
     /// The unit of the cells' readings.
     pub cell_unit: CellUnit,
     /// The noise threshold of each cell, through all pads: in a row, because each frame is compared with all of them.
@@ -137,6 +141,16 @@ impl JointKind {
         }
     }
 
+    /// The pose of a link relative to its joint's origin, at a value of the joint.
+    fn displacement(self, axis: &UnitVector3<f64>, value: f64) -> Isometry3<f64> {
+        match self {
+            JointKind::Revolute => {
+                Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_axis_angle(axis, value))
+            }
+            JointKind::Prismatic => Translation3::from(axis.into_inner() * value).into(),
+        }
+    }
+
     /// The change of value that counts as a radian where speeds and tolerances of all joints are given in radians. A
     /// slide's is 0.1 m: the tip of a finger of that length moves as far.
     pub fn per_radian(self) -> f64 {
@@ -194,13 +208,7 @@ impl Motion {
     /// `joint_from_link` for the joints' values.
     pub fn joint_from_link(&self, joints: &[f64]) -> Isometry3<f64> {
         let Motion::Joint { joint_idx, kind, multiplier, offset, axis } = *self else { return Isometry3::identity() };
-        let value = multiplier * joints[joint_idx] + offset;
-        match kind {
-            JointKind::Revolute => {
-                Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_axis_angle(&axis, value))
-            }
-            JointKind::Prismatic => Translation3::from(axis.into_inner() * value).into(),
-        }
+        kind.displacement(&axis, multiplier * joints[joint_idx] + offset)
     }
 }
 
@@ -299,6 +307,9 @@ pub struct Cell {
     pub noise_threshold_newtons: f64,
 }
 
+/// The name of the link that stands for a palm frame that no link of the URDF has.
+pub const PALM_FRAME: &str = "blindgrasp_palm";
+
 /// A hand as its URDF alone does not say it.
 #[derive(Debug, Clone, Default)]
 pub struct BareHand {
@@ -308,6 +319,8 @@ pub struct BareHand {
     /// Values of joints of the open hand.
     pub open: BTreeMap<String, f64>,
     pub preshape_joints: Vec<String>,
+    /// Links that will have pads: the hulls of their meshes are finer.
+    pub padded_links: Vec<String>,
 }
 
 /// Why a hand could not be read.
@@ -354,6 +367,44 @@ impl Hand {
         &self.links[self.reference_link_idx]
     }
 
+    /// Index of the link whose frame is the palm frame.
+    pub fn palm_link_idx(&self) -> usize {
+        self.reference_link_idx
+    }
+
+    /// The same hand with another palm frame, at a pose in the frame of its palm link. Its identity stays that of this hand.
+    pub fn with_palm_frame(&self, link_from_palm: Isometry3<f64>) -> Hand {
+        let mut hand = self.clone();
+        hand.reference_link_idx = hand.links.len();
+        hand.links.push(Link {
+            name: PALM_FRAME.into(),
+            parent_idx: Some(self.reference_link_idx),
+            parent_from_joint: link_from_palm,
+            motion: Motion::Fixed,
+            shapes: Vec::new(),
+        });
+        hand
+    }
+
+    /// The same hand with another value of a joint in the open hand.
+    pub fn with_open_joint(&self, joint_idx: usize, value: f64) -> Hand {
+        let mut hand = self.clone();
+        hand.joints[joint_idx].open = Some(value);
+        hand.self_collision_pairs = self_collision::pairs(&hand);
+        hand
+    }
+
+    /// The same hand without the pads of links that do not move against the palm.
+    pub fn with_moving_pads(&self) -> Hand {
+        let moves = |link_idx: usize| {
+            let above = std::iter::successors(Some(link_idx), |idx| self.links[*idx].parent_idx);
+            above.into_iter().any(|idx| matches!(self.links[idx].motion, Motion::Joint { .. }))
+        };
+        let mut hand = self.clone();
+        hand.pads.retain(|pad| moves(pad.link_idx));
+        hand
+    }
+
     /// A joint that moves the palm itself, as those of an arm do.
     pub fn joint_above_palm(&self) -> Option<&Joint> {
         let above = std::iter::successors(Some(self.palm_link()), |link| Some(&self.links[link.parent_idx?]));
@@ -386,11 +437,11 @@ impl Hand {
         }
         let layout = read(path_or_name)?;
         let folder = path_or_name.parent().unwrap_or(Path::new("")).to_path_buf();
-        let hull = |urdf: &Path, mesh: &str, scale| {
+        let hull = |urdf: &Path, mesh: &str, scale, has_pad| {
             let urdf_folder = folder.join(urdf).parent().unwrap_or(Path::new("")).to_path_buf();
-            meshes::hull(&meshes::find(mesh, &urdf_folder)?, scale)
+            meshes::hull(&meshes::find(mesh, &urdf_folder)?, scale, has_pad)
         };
-        Hand::parse_with_meshes(path_or_name, &layout, |urdf| read(&folder.join(urdf)), hull)
+        Hand::parse_with_meshes(path_or_name, &layout, |urdf| read_urdf(&folder.join(urdf)), hull)
     }
 
     /// A hand from the texts of a pad layout and of the URDF it names, which `read_urdf` supplies. Collision meshes are
@@ -403,7 +454,7 @@ impl Hand {
         layout_text: &str,
         read_urdf: impl FnOnce(&Path) -> Result<String, HandError>,
     ) -> Result<Hand, HandError> {
-        let no_hull = |_: &Path, mesh: &str, _| Err(format!("{mesh} is not read"));
+        let no_hull = |_: &Path, mesh: &str, _, _| Err(format!("{mesh} is not read"));
         Hand::parse_with_meshes(layout_path, layout_text, read_urdf, no_hull)
     }
 
@@ -413,7 +464,9 @@ impl Hand {
     /// A URDF that is inconsistent, or names in `bare` that it does not have.
     pub fn without_cells(urdf_path: &Path, urdf: &str, bare: &BareHand) -> Result<Hand, HandError> {
         let folder = urdf_path.parent().unwrap_or(Path::new(""));
-        let tree = urdf::parse(urdf_path, urdf, |mesh, scale| meshes::hull(&meshes::find(mesh, folder)?, scale))?;
+        let tree = urdf::parse(urdf_path, urdf, |link, mesh, scale| {
+            meshes::hull(&meshes::find(mesh, folder)?, scale, bare.padded_links.iter().any(|padded| padded == link))
+        })?;
         let mut hand = Layout::without_cells(&tree, bare).into_hand(urdf_path, tree, 0)?;
         hand.self_collision_pairs = self_collision::pairs(&hand);
         Ok(hand)
@@ -423,12 +476,14 @@ impl Hand {
         layout_path: &Path,
         layout_text: &str,
         read_urdf: impl FnOnce(&Path) -> Result<String, HandError>,
-        hull: impl Fn(&Path, &str, [f64; 3]) -> Result<SharedShape, String>,
+        hull: impl Fn(&Path, &str, [f64; 3], bool) -> Result<SharedShape, String>,
     ) -> Result<Hand, HandError> {
         let layout = layout::parse(layout_path, layout_text)?;
         let urdf_path = layout_path.parent().unwrap_or(Path::new("")).join(&layout.urdf);
         let urdf = read_urdf(Path::new(&layout.urdf))?;
-        let tree = urdf::parse(&urdf_path, &urdf, |mesh, scale| hull(Path::new(&layout.urdf), mesh, scale))?;
+        let tree = urdf::parse(&urdf_path, &urdf, |link, mesh, scale| {
+            hull(Path::new(&layout.urdf), mesh, scale, layout.pads_link(link))
+        })?;
         let mut hand = layout.into_hand(layout_path, tree, 1)?;
         let mut description = Sha256::new().chain_update(layout_text).chain_update(urdf);
         let shapes = hand.links.iter().flat_map(|link| &link.shapes);
@@ -444,8 +499,8 @@ impl Hand {
     /// Warnings about self-collision: collision shapes that were not read, or a hand without any.
     pub fn warnings(&self) -> Vec<String> {
         let mut warnings = Vec::new();
-        warnings.extend(self.ignored_meshes.iter().map(|ignored| {
-            format!("{}: a collision mesh is left out, and its link touches nothing with it: {ignored}", self.name)
+        warnings.extend(self.ignored_shapes.iter().map(|ignored| {
+            format!("{}: a collision shape is left out, and its link touches nothing with it: {ignored}", self.name)
         }));
         if self.self_collision_pairs.is_empty() {
             warnings.push(format!(
@@ -554,6 +609,13 @@ pub fn builtin_names() -> Vec<&'static str> {
 const MAX_BYTES: u64 = 16 << 20;
 
 fn read(path: &Path) -> Result<String, HandError> {
+    String::from_utf8(read_bytes(path)?).map_err(|_| HandError::Invalid {
+        path: path.into(),
+        message: "not UTF-8: expected a pad layout (YAML)".into(),
+    })
+}
+
+fn read_bytes(path: &Path) -> Result<Vec<u8>, HandError> {
     let mut bytes = Vec::new();
     open_regular(path)
         .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
@@ -562,7 +624,7 @@ fn read(path: &Path) -> Result<String, HandError> {
     if bytes.len() as u64 > MAX_BYTES {
         return Err(invalid("more than 16 MiB: expected a pad layout (YAML) or a URDF"));
     }
-    String::from_utf8(bytes).map_err(|_| invalid("not UTF-8: expected a pad layout (YAML) or a URDF"))
+    Ok(bytes)
 }
 
 fn isometry(xyz: [f64; 3], rpy: [f64; 3]) -> Isometry3<f64> {

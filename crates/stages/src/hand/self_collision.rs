@@ -50,9 +50,17 @@ impl Hand {
     /// # Errors
     /// Not one finite angle per joint.
     pub fn self_collides(&self, joints: &[f64]) -> Result<bool, JointError> {
+        Ok(!self.touching_links(joints)?.is_empty())
+    }
+
+    /// The pairs of links (indices) that touch but should not.
+    ///
+    /// # Errors
+    /// As [`Hand::self_collides`].
+    pub fn touching_links(&self, joints: &[f64]) -> Result<Vec<(usize, usize)>, JointError> {
         let mut shapes = PosedShapes::default();
         shapes.place(self, &self.palm_from_links(joints)?);
-        Ok(self.touching_pairs(&shapes).next().is_some())
+        Ok(self.touching_pairs(&shapes).collect())
     }
 
     /// The pairs of links (indices) that should not touch.

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use nalgebra::{UnitVector3, Vector3};
+use nalgebra::{Isometry3, UnitVector3, Vector3};
 use parry3d_f64::shape::SharedShape;
 
 use super::urdf_xml::{self, Collision, Geometry, MAX_LENGTH_M, MAX_LIMIT_RAD};
@@ -20,32 +20,44 @@ const MAX_MIMIC: f64 = 100.0;
 pub(super) struct Tree {
     pub(super) links: Vec<TreeLink>,
     pub(super) joints: BTreeMap<String, TreeJoint>,
-    /// Meshes that cannot be used, with the reasons.
-    pub(super) ignored_meshes: Vec<String>,
+    /// Collision shapes that cannot be used, with the reasons.
+    pub(super) ignored_shapes: Vec<String>,
+    /// Moving joints that count as fixed, with the reasons.
+    pub(super) fixed_joints: Vec<String>,
 }
 
 pub(super) struct TreeLink {
     pub(super) name: String,
     pub(super) parent_idx: Option<usize>,
-    pub(super) parent_from_joint: nalgebra::Isometry3<f64>,
+    pub(super) parent_from_joint: Isometry3<f64>,
     /// The moving joint's name and axis.
     pub(super) joint: Option<(String, UnitVector3<f64>)>,
     pub(super) shapes: Vec<LinkShape>,
 }
 
+/// A joint that can move.
 pub(super) struct TreeJoint {
     pub(super) kind: JointKind,
     pub(super) lower: f64,
     pub(super) upper: f64,
-    /// Joint, multiplier, offset.
-    pub(super) mimic: Option<(String, f64, f64)>,
+    /// A joint that mimics no other, multiplier, offset.
+    pub(super) mimic: Option<Mimic>,
 }
 
-/// Reads a URDF. `hull` supplies the convex hull of a mesh file, or the reason why there is none.
+/// The value of a joint that mimics another one is `multiplier` times that joint's value, plus `offset`.
+#[derive(Clone)]
+pub(super) struct Mimic {
+    pub(super) joint: String,
+    pub(super) multiplier: f64,
+    pub(super) offset: f64,
+}
+
+/// Reads a URDF. `hull` supplies the convex hull of a mesh file of a link, by the link's name, the file's and the scale, or the
+/// reason why there is none.
 pub(super) fn parse(
     path: &Path,
     text: &str,
-    mut hull: impl FnMut(&str, [f64; 3]) -> Result<SharedShape, String>,
+    mut hull: impl FnMut(&str, &str, [f64; 3]) -> Result<SharedShape, String>,
 ) -> Result<Tree, HandError> {
     let invalid = |message: String| HandError::Invalid { path: path.into(), message };
     let robot = urdf_xml::read(text).map_err(invalid)?;
@@ -76,35 +88,36 @@ pub(super) fn parse(
         let names: Vec<_> = roots.iter().map(|link| format!("'{}'", link.name)).collect();
         return Err(invalid(format!("expected one root link (child of no joint), found {}", names.join(", "))));
     };
-    let mut tree = Tree { links: Vec::new(), joints: BTreeMap::new(), ignored_meshes: Vec::new() };
+    let joints = motions(&robot.joints).map_err(invalid)?;
+    let mut tree =
+        Tree { links: Vec::new(), joints: BTreeMap::new(), ignored_shapes: Vec::new(), fixed_joints: Vec::new() };
     let mut pending = vec![(root, None)];
     while let Some((link, parent_idx)) = pending.pop() {
         let link_idx = tree.links.len();
-        let above = joint_above.get(link.name.as_str()).copied();
         let mut tree_link = TreeLink {
             name: link.name.clone(),
             parent_idx,
-            parent_from_joint: nalgebra::Isometry3::identity(),
+            parent_from_joint: Isometry3::identity(),
             joint: None,
             shapes: Vec::new(),
         };
-        if let Some(joint) = above {
+        if let Some(joint) = joint_above.get(link.name.as_str()) {
             tree_link.parent_from_joint = joint.parent_from_joint;
-            tree_link.joint = moving_joint(joint, &mut tree.joints).map_err(invalid)?;
+            match &joints[joint.name.as_str()] {
+                JointMotion::Fixed => {}
+                JointMotion::Standing { pose, why } => {
+                    tree_link.parent_from_joint *= pose;
+                    tree.fixed_joints.push(format!("joint '{}' {why}", joint.name));
+                }
+                JointMotion::Moving { axis, .. } => tree_link.joint = Some((joint.name.clone(), *axis)),
+            }
         }
         for collision in &link.collisions {
-            if let Some(Geometry::Mesh { file, scale }) = &collision.geometry {
-                match hull(file, *scale) {
-                    Ok(core) => {
-                        let link_from_shape = collision.link_from_shape;
-                        tree_link.shapes.push(LinkShape { link_from_shape, core, edge_radius_m: 0.0 });
-                    }
-                    Err(reason) => tree.ignored_meshes.push(format!("link '{}': {reason}", link.name)),
-                }
-                continue;
+            let of_link = |file: &str, scale| hull(&link.name, file, scale);
+            match shape(collision, of_link).map_err(|what| invalid(format!("link '{}': {what}", link.name)))? {
+                Ok(shape) => tree_link.shapes.push(shape),
+                Err(reason) => tree.ignored_shapes.push(format!("link '{}': {reason}", link.name)),
             }
-            let shape = shape(collision).map_err(|what| invalid(format!("link '{}': {what}", link.name)))?;
-            tree_link.shapes.extend(shape);
         }
         tree.links.push(tree_link);
         // Reversed, so that popping visits the children in the file's order.
@@ -116,94 +129,161 @@ pub(super) fn parse(
     if tree.links.len() != robot.links.len() {
         return Err(invalid("the joints form a cycle".into()));
     }
-    for (name, joint) in &tree.joints {
-        if let Some((followed, _, _)) = &joint.mimic
-            && tree.joints.get(followed).is_none_or(|followed| followed.mimic.is_some())
-        {
-            return Err(invalid(format!(
-                "joint '{name}' mimics '{followed}': expected a moving joint that mimics no other"
-            )));
-        }
-    }
+    tree.joints = joints
+        .into_iter()
+        .filter_map(|(name, motion)| match motion {
+            JointMotion::Moving { joint, .. } => Some((name.to_owned(), joint)),
+            _ => None,
+        })
+        .collect();
     Ok(tree)
 }
 
-fn moving_joint(
-    joint: &urdf_xml::Joint,
-    joints: &mut BTreeMap<String, TreeJoint>,
-) -> Result<Option<(String, UnitVector3<f64>)>, String> {
-    let (kind, (lower, upper)) = match (joint.kind.as_str(), joint.limits) {
-        ("fixed", _) => return Ok(None),
-        ("continuous", _) => (JointKind::Revolute, (-std::f64::consts::PI, std::f64::consts::PI)),
-        ("revolute", Some(limits)) if limits != (0.0, 0.0) => (JointKind::Revolute, limits),
-        ("prismatic", Some(limits)) if limits != (0.0, 0.0) => (JointKind::Prismatic, limits),
-        (kind @ ("revolute" | "prismatic"), _) => {
-            return Err(format!("joint '{}' is {kind} and has no <limit lower upper>", joint.name));
-        }
-        (kind, _) => {
-            return Err(format!("joint '{}' is {kind}: expected revolute, prismatic, continuous or fixed", joint.name));
-        }
-    };
-    let most = match kind {
-        JointKind::Revolute => MAX_LIMIT_RAD,
-        JointKind::Prismatic => MAX_SLIDE_M,
-    };
-    if !(lower >= -most && upper <= most && lower < upper) {
-        return Err(format!(
-            "joint '{}': limits {lower}..{upper}, expected lower < upper, within {most:.2} {} of 0",
-            joint.name,
-            kind.unit()
-        ));
-    }
-    let axis = UnitVector3::try_new(Vector3::from(joint.axis), 1e-6)
-        .filter(|axis| axis.iter().all(|number| number.is_finite()))
-        .ok_or_else(|| format!("joint '{}': its axis is {:?}, expected a direction", joint.name, joint.axis))?;
-    let mimic = joint.mimic.clone();
-    if let Some((_, multiplier, offset)) = &mimic
-        && !(multiplier.abs() <= MAX_MIMIC && offset.abs() <= MAX_LIMIT_RAD)
-    {
-        return Err(format!(
-            "joint '{}': mimic multiplier {multiplier}, offset {offset}: expected at most {MAX_MIMIC} and {MAX_LIMIT_RAD:.2}",
-            joint.name
-        ));
-    }
-    if joints.insert(joint.name.clone(), TreeJoint { kind, lower, upper, mimic }).is_some() {
-        return Err(format!("two joints are called '{}'", joint.name));
-    }
-    Ok(Some((joint.name.clone(), axis)))
+/// The motion that a joint of the URDF allows.
+enum JointMotion {
+    /// A joint of the kind `fixed`.
+    Fixed,
+    /// A joint of another kind that cannot move, or whose motion no hand has. It adds `pose` to its origin.
+    Standing { pose: Isometry3<f64>, why: String },
+    Moving { axis: UnitVector3<f64>, joint: TreeJoint },
 }
 
-/// `None` for a mesh.
-fn shape(collision: &Collision) -> Result<Option<LinkShape>, String> {
-    let geometry = collision
-        .geometry
-        .as_ref()
-        .ok_or("a <collision> without a shape: expected a <geometry> with a box, cylinder, capsule, sphere or mesh")?;
-    // Sizes are checked first, because parry panics on invalid ones.
-    let sizes: Vec<f64> = match *geometry {
-        Geometry::Box { size_m } => size_m.to_vec(),
-        Geometry::Sphere { radius_m } => vec![radius_m],
-        Geometry::Cylinder { radius_m, length_m } | Geometry::Capsule { radius_m, length_m } => {
-            vec![radius_m, length_m]
+/// The motion of each joint, by name.
+fn motions(joints: &[urdf_xml::Joint]) -> Result<BTreeMap<&str, JointMotion>, String> {
+    let mut by_name: BTreeMap<&str, &urdf_xml::Joint> = BTreeMap::new();
+    for joint in joints {
+        if by_name.insert(&joint.name, joint).is_some() {
+            return Err(format!("two joints are called '{}'", joint.name));
         }
-        Geometry::Mesh { .. } => return Ok(None),
+    }
+    let motion = |joint| motion(joint, &by_name).map_err(|what| format!("joint '{}' {what}", joint.name));
+    by_name.iter().map(|(name, joint)| Ok((*name, motion(joint)?))).collect()
+}
+
+fn motion(joint: &urdf_xml::Joint, by_name: &BTreeMap<&str, &urdf_xml::Joint>) -> Result<JointMotion, String> {
+    let kind = match joint.kind.as_str() {
+        "fixed" => return Ok(JointMotion::Fixed),
+        "continuous" | "revolute" => JointKind::Revolute,
+        "prismatic" => JointKind::Prismatic,
+        "floating" | "planar" => {
+            let why = format!("is {}: it counts as fixed", joint.kind);
+            return Ok(JointMotion::Standing { pose: Isometry3::identity(), why });
+        }
+        other => return Err(format!("is {other}: expected revolute, prismatic, continuous or fixed")),
     };
-    if !sizes.iter().all(|size| (MIN_SIZE_M..=MAX_LENGTH_M).contains(size)) {
-        return Err(format!("a collision shape of size {sizes:?}: expected {MIN_SIZE_M} to {MAX_LENGTH_M} metres"));
+    let mimic = mimic(joint, by_name)?;
+    // A joint that mimics another one needs no limits: it has no value of its own.
+    let (lower, upper) = if mimic.is_some() { (0.0, 0.0) } else { range(joint)? };
+    let still = match &mimic {
+        None => (lower == upper).then(|| (lower, format!("has the limits {lower} and {upper}"))),
+        Some(mimic) => match by_name[mimic.joint.as_str()] {
+            followed if can_move(followed)? => None,
+            followed => {
+                let value = followed.limits.map_or(0.0, |(lower, _)| lower);
+                Some((mimic.multiplier * value + mimic.offset, format!("mimics '{}', which stands", mimic.joint)))
+            }
+        },
+    };
+    let axis = UnitVector3::try_new(Vector3::from(joint.axis), 1e-6)
+        .filter(|axis| axis.iter().all(|number| number.is_finite()))
+        .ok_or_else(|| format!("has the axis {:?}, expected a direction", joint.axis))?;
+    Ok(match still {
+        Some((value, why)) => JointMotion::Standing {
+            pose: kind.displacement(&axis, value),
+            why: format!("{why}: it counts as fixed at {value} {}", kind.unit()),
+        },
+        None => JointMotion::Moving { axis, joint: TreeJoint { kind, lower, upper, mimic } },
+    })
+}
+
+/// Whether a joint that mimics no other has a range.
+fn can_move(joint: &urdf_xml::Joint) -> Result<bool, String> {
+    match joint.kind.as_str() {
+        "continuous" | "revolute" | "prismatic" => range(joint).map(|(lower, upper)| lower < upper),
+        _ => Ok(false),
+    }
+}
+
+/// The limits of a joint that mimics no other.
+fn range(joint: &urdf_xml::Joint) -> Result<(f64, f64), String> {
+    let (most, unit) = match joint.kind.as_str() {
+        "continuous" => return Ok((-std::f64::consts::PI, std::f64::consts::PI)),
+        "prismatic" => (MAX_SLIDE_M, JointKind::Prismatic.unit()),
+        _ => (MAX_LIMIT_RAD, JointKind::Revolute.unit()),
+    };
+    let (lower, upper) = joint.limits.ok_or_else(|| format!("is {} and has no <limit lower upper>", joint.kind))?;
+    if !(lower >= -most && upper <= most && lower <= upper) {
+        return Err(format!("has the limits {lower}..{upper}, expected lower <= upper, within {most:.2} {unit} of 0"));
+    }
+    Ok((lower, upper))
+}
+
+/// The joint that a joint mimics in the end, where joints mimic joints that mimic others: multipliers are multiplied, offsets
+/// passed on.
+fn mimic(joint: &urdf_xml::Joint, by_name: &BTreeMap<&str, &urdf_xml::Joint>) -> Result<Option<Mimic>, String> {
+    let Some((first, mut multiplier, mut offset)) = joint.mimic.clone() else { return Ok(None) };
+    let mut followed = first;
+    for _ in 0..by_name.len() {
+        if !(multiplier.abs() <= MAX_MIMIC && offset.abs() <= MAX_LIMIT_RAD) {
+            return Err(format!(
+                "mimics with multiplier {multiplier} and offset {offset}: expected at most {MAX_MIMIC} and {MAX_LIMIT_RAD:.2}"
+            ));
+        }
+        let next = by_name.get(followed.as_str()).ok_or_else(|| {
+            format!("mimics '{followed}', which the URDF does not have: add that joint, or remove the <mimic>")
+        })?;
+        match &next.mimic {
+            Some((name, by, plus)) if next.kind != "fixed" => {
+                offset += multiplier * plus;
+                multiplier *= by;
+                followed = name.clone();
+            }
+            _ => return Ok(Some(Mimic { joint: followed, multiplier, offset })),
+        }
+    }
+    Err(format!("mimics '{followed}', and that joint mimics it: expected a joint that mimics no other at the end"))
+}
+
+/// The shape of a `<collision>`, or the reason why it has none that can be used.
+///
+/// # Errors
+/// A size that is no length of a hand in metres.
+fn shape(
+    collision: &Collision,
+    hull: impl FnOnce(&str, [f64; 3]) -> Result<SharedShape, String>,
+) -> Result<Result<LinkShape, String>, String> {
+    let Some(geometry) = &collision.geometry else {
+        return Ok(Err("a <collision> without a shape: expected a box, cylinder, capsule, sphere or mesh".into()));
+    };
+    let (sizes, name) = match *geometry {
+        Geometry::Box { size_m } => (size_m.to_vec(), "box"),
+        Geometry::Sphere { radius_m } => (vec![radius_m], "sphere"),
+        Geometry::Cylinder { radius_m, length_m } => (vec![radius_m, length_m], "cylinder"),
+        Geometry::Capsule { radius_m, length_m } => (vec![radius_m, length_m], "capsule"),
+        Geometry::Mesh { ref file, scale } => {
+            let link_from_shape = collision.link_from_shape;
+            return Ok(hull(file, scale).map(|core| LinkShape { link_from_shape, core, edge_radius_m: 0.0 }));
+        }
+    };
+    // Sizes are checked first, because parry panics on invalid ones.
+    if sizes.iter().any(|size| *size > MAX_LENGTH_M) {
+        return Err(format!("a collision shape of size {sizes:?}: expected at most {MAX_LENGTH_M} metres"));
+    }
+    if !sizes.iter().all(|size| *size >= MIN_SIZE_M) {
+        return Ok(Err(format!("a {name} of size {sizes:?}: expected at least {MIN_SIZE_M} metres")));
     }
     let link_from_origin = collision.link_from_shape;
     let upright = link_from_origin * z_from_y();
     let (link_from_shape, core) = match *geometry {
         Geometry::Box { size_m: [x, y, z] } => (link_from_origin, SharedShape::cuboid(x / 2.0, y / 2.0, z / 2.0)),
-        Geometry::Sphere { radius_m } => (link_from_origin, SharedShape::ball(radius_m)),
         Geometry::Cylinder { radius_m, length_m } => (upright, SharedShape::cylinder(length_m / 2.0, radius_m)),
         Geometry::Capsule { radius_m, length_m } => (upright, SharedShape::capsule_y(length_m / 2.0, radius_m)),
-        Geometry::Mesh { .. } => return Ok(None),
+        Geometry::Sphere { .. } | Geometry::Mesh { .. } => (link_from_origin, SharedShape::ball(sizes[0])),
     };
-    Ok(Some(LinkShape { link_from_shape, core, edge_radius_m: 0.0 }))
+    Ok(Ok(LinkShape { link_from_shape, core, edge_radius_m: 0.0 }))
 }
 
 /// URDF's cylinders and capsules stand along z, parry's along y.
-fn z_from_y() -> nalgebra::Isometry3<f64> {
+fn z_from_y() -> Isometry3<f64> {
     isometry([0.0; 3], [std::f64::consts::FRAC_PI_2, 0.0, 0.0])
 }

@@ -37,7 +37,9 @@ pub(super) struct Link {
 #[derive(Default)]
 pub(super) struct Collision {
     pub(super) link_from_shape: Isometry3<f64>,
+    /// The first known shape.
     pub(super) geometry: Option<Geometry>,
+    has_origin: bool,
 }
 
 /// A shape with its sizes in metres.
@@ -64,6 +66,8 @@ pub(super) struct Joint {
     pub(super) limits: Option<(f64, f64)>,
     /// Joint, multiplier, offset.
     pub(super) mimic: Option<(String, f64, f64)>,
+    /// The elements that have been read: of several of one name the first counts, as urdfdom reads it.
+    parts: Vec<String>,
 }
 
 /// Reads the text of a URDF.
@@ -181,11 +185,11 @@ impl UrdfReading {
 impl Collision {
     fn read_part(&mut self, path: &[&str], attributes: &Attributes) -> Result<(), String> {
         match path {
-            ["origin"] => self.link_from_shape = attributes.origin()?,
-            ["geometry", _] if self.geometry.is_some() => {
-                return Err("a second shape in one <collision>: expected a <collision> for each shape".into());
+            ["origin"] if !self.has_origin => {
+                self.link_from_shape = attributes.origin()?;
+                self.has_origin = true;
             }
-            ["geometry", shape] => self.geometry = Geometry::read(shape, attributes)?,
+            ["geometry", shape] if self.geometry.is_none() => self.geometry = Geometry::read(shape, attributes)?,
             _ => {}
         }
         Ok(())
@@ -221,10 +225,16 @@ impl Joint {
             axis: [1.0, 0.0, 0.0],
             limits: None,
             mimic: None,
+            parts: Vec::new(),
         })
     }
 
     fn read_part(&mut self, part: &str, attributes: &Attributes) -> Result<(), String> {
+        const READ: [&str; 6] = ["parent", "child", "origin", "axis", "limit", "mimic"];
+        if !READ.contains(&part) || self.parts.iter().any(|read| read == part) {
+            return Ok(());
+        }
+        self.parts.push(part.into());
         match part {
             "parent" => self.parent = attributes.required("link")?,
             "child" => self.child = attributes.required("link")?,
@@ -258,6 +268,10 @@ impl Attributes {
             }
         }
         Ok(Attributes(by_name))
+    }
+
+    pub(super) fn iter(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.0.iter().map(|(name, value)| (name.as_str(), value.as_str()))
     }
 
     pub(super) fn required(&self, name: &str) -> Result<String, String> {

@@ -1,21 +1,20 @@
 //! `blindgrasp new hand`: a pad layout from a URDF and a table of cells or grids of cells.
 
+mod draft;
+mod xacro;
+
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{RecordedGrasp, grasp_svg};
 use blindgrasp_ros::cdr::{self, Value};
 use blindgrasp_ros::node::{MAX_RECEIVED_BYTES, MessageType, Quality, Rights, RosNode, topic_key, topic_name};
 use blindgrasp_ros::standard;
-use blindgrasp_simulator::mechanism::Mechanism;
-use blindgrasp_simulator::pad_grid::pad_grid;
-use blindgrasp_stages::hand::{BareHand, Cell, Hand, find_mesh, part_below};
+use blindgrasp_stages::hand::{BareHand, Cell, Hand, find_mesh, part_below, read_urdf, with_meshes_renamed};
 use clap::Args;
 use nalgebra::{Unit, Vector3};
 use serde::Deserialize;
@@ -24,6 +23,7 @@ use super::super::hand_cells::joint;
 use super::super::ros2_network::Ros2Network;
 use super::super::{Outcome, print_line};
 use super::{check_free, in_shell};
+use draft::Draft;
 
 /// A hand: its URDF, a pad layout, and a picture.
 ///
@@ -45,6 +45,9 @@ pub(super) struct Arguments {
     /// The hand's URDF. A name that ends in .xacro is expanded by the program xacro (from PyPI or ROS).
     #[arg(long, value_name = "FILE", required_unless_present = "robot_description")]
     urdf: Option<PathBuf>,
+    /// An argument of the xacro file. Can be repeated.
+    #[arg(long, value_name = "NAME:=VALUE", value_parser = xacro::argument, requires = "urdf")]
+    xacro_arg: Vec<String>,
     /// The URDF that a robot in ROS 2 publishes on this topic [default: /robot_description]
     #[arg(
         long,
@@ -69,7 +72,8 @@ pub(super) struct Arguments {
     /// The link in whose frame contacts are given, +z out of the palm [default: the root].
     #[arg(long, value_name = "LINK")]
     palm: Option<String>,
-    /// Pose of the palm frame in that link, if its own +z does not point out of the palm: metres and radians.
+    /// Pose of the palm frame in that link, if its own +z does not point out of the palm: metres and radians [default: the
+    /// link's own frame, or one in which the hand closes better on a ball, which is told].
     #[arg(
         long,
         value_name = "X,Y,Z,ROLL,PITCH,YAW",
@@ -81,7 +85,7 @@ pub(super) struct Arguments {
     /// The value of a joint of the open hand [default: 0]. The hand closes towards the limit that is farther from it.
     #[arg(long, value_name = "JOINT=VALUE,…", value_delimiter = ',', value_parser = joint)]
     open: Vec<(String, f64)>,
-    /// Joints that are set before a grasp and do not close.
+    /// Joints that are set before a grasp and do not close [default: those that move no pad towards an object, which are told].
     #[arg(long, value_name = "JOINT,…", value_delimiter = ',')]
     preshape: Vec<String>,
     /// Noise threshold of the cells, newtons.
@@ -93,6 +97,7 @@ pub(super) struct Arguments {
 const DESCRIPTION_LIMIT: Duration = Duration::from_secs(10);
 
 /// A pad of the layout to be written.
+#[derive(Clone)]
 struct NewPad {
     name: String,
     link: String,
@@ -126,7 +131,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         (Some(_), _) if arguments.network.is_given() => {
             bail!("--connect, --keys and --domain are of no use to --urdf: they belong to --robot-description")
         }
-        (Some(path), _) => (path.clone(), urdf_text(path)?),
+        (Some(path), _) => (path.clone(), urdf_text(path, &arguments.xacro_arg)?),
         (None, topic) => {
             let topic = topic.as_deref().unwrap_or("/robot_description");
             (PathBuf::from("robot_description.urdf"), described(topic, &arguments.network)?)
@@ -135,36 +140,33 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(base) = &arguments.base {
         urdf = part_below(&urdf, base).map_err(|reason| anyhow::anyhow!("--base: {reason}"))?;
     }
-    let mut bare = BareHand {
+    let table =
+        arguments.cells.as_deref().map(|table| read_table(table, arguments.threshold)).transpose()?.unwrap_or_default();
+    let of_table = table.iter().map(|pad| pad.link.clone());
+    let bare = BareHand {
+        padded_links: of_table.chain(arguments.grids.iter().map(|(link, _)| link.clone())).collect(),
         name: name.clone(),
         palm: arguments.palm.clone(),
         open: arguments.open.iter().cloned().collect(),
         preshape_joints: arguments.preshape.clone(),
     };
-    if let Some(palm) = with_palm_frame(&mut urdf, arguments)? {
-        bare.palm = Some(palm);
-    }
-    let hand = Hand::without_cells(&source, &urdf, &bare)?;
-    print_parts(&hand)?;
-    if let Some(joint) = hand.joint_above_palm() {
+    let palm_pose = palm_pose(arguments)?;
+    let mut draft = Draft::new(&source, urdf, bare, palm_pose)?;
+    print_parts(&draft.hand)?;
+    if let Some(joint) = draft.hand.joint_above_palm() {
         bail!("joint '{}' moves the palm: give the first link of the hand with --base", joint.name);
     }
-    let mechanism = Mechanism::new(&hand);
-    let mut pads =
-        arguments.cells.as_deref().map(|table| read_table(table, arguments.threshold)).transpose()?.unwrap_or_default();
-    for (link, grid) in &arguments.grids {
-        let known = || hand.links.iter().map(|link| link.name.as_str()).collect::<Vec<_>>().join(", ");
-        let link_idx = hand.links.iter().position(|other| other.name == *link);
-        let link_idx =
-            link_idx.with_context(|| format!("--grid: the URDF has no link '{link}' (it has {})", known()))?;
-        let cells = pad_grid(&mechanism, link_idx, *grid, arguments.threshold);
-        let cells = cells.map_err(|reason| anyhow::anyhow!("--grid {link}: {reason}"))?;
-        pads.push(NewPad { name: link.clone(), link: link.clone(), cells });
+    if arguments.cells.is_none() && arguments.grids.is_empty() {
+        print_line(
+            "\nnothing is made yet: give a table of the cells with --cells, or pads with --grid LINK=ROWSxCOLUMNS",
+        )?;
+        return Ok(Outcome::Done);
     }
-    if pads.is_empty() {
-        bail!("the cells are missing: give a table with --cells, or pads with --grid LINK=ROWSxCOLUMNS");
-    }
-    let (urdf, meshes) = with_meshes_beside(&urdf, source.parent().unwrap_or(Path::new("")));
+    draft.fit(&table, arguments)?;
+    let pads = draft.pads(&table, arguments, true)?;
+    draft.warn(&pads)?;
+    let Draft { urdf, hand, bare, .. } = draft;
+    let (urdf, meshes) = with_meshes_beside(&urdf, source.parent().unwrap_or(Path::new("")))?;
     let layout = layout(&name, &hand, &pads, &bare);
     std::fs::create_dir(folder).with_context(|| format!("cannot make {}", folder.display()))?;
     let written = write_folder(folder, &name, &urdf, &layout, &meshes);
@@ -172,7 +174,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         let _ = std::fs::remove_dir_all(folder);
     }
     let hand = written?;
-    warn_of_the_palm(&hand)?;
     let layout_path = folder.join(format!("{name}.yaml"));
     let shown = in_shell(&layout_path.display().to_string());
     print_line(&format!(
@@ -245,42 +246,25 @@ fn described(topic: &str, network: &Ros2Network) -> anyhow::Result<String> {
 }
 
 /// The text of the URDF. A xacro file is expanded.
-fn urdf_text(path: &Path) -> anyhow::Result<String> {
-    if path.extension().is_none_or(|extension| extension != "xacro") {
-        return read_regular(path).with_context(|| format!("cannot read {}", path.display()));
+fn urdf_text(path: &Path, xacro_arguments: &[String]) -> anyhow::Result<String> {
+    if path.extension().is_some_and(|extension| extension == "xacro") {
+        return xacro::expanded(path, xacro_arguments);
     }
-    let output = Command::new("xacro").arg(path).output().map_err(|error| match error.kind() {
-        std::io::ErrorKind::NotFound => {
-            anyhow::anyhow!("{}: the program xacro is not installed: pip install xacro, or source ROS", path.display())
-        }
-        _ => anyhow::anyhow!("cannot run xacro: {error}"),
-    })?;
-    if !output.status.success() {
-        bail!("xacro {}: {}", path.display(), String::from_utf8_lossy(&output.stderr).trim());
+    if !xacro_arguments.is_empty() {
+        bail!("--xacro-arg is of no use to {}: its name does not end in .xacro", path.display());
     }
-    String::from_utf8(output.stdout).with_context(|| format!("xacro {}: its output is no text", path.display()))
+    Ok(read_urdf(path)?)
 }
 
-/// Adds a link at --palm-pose to the URDF; its name.
-fn with_palm_frame(urdf: &mut String, arguments: &Arguments) -> anyhow::Result<Option<String>> {
+/// The pose of --palm-pose.
+fn palm_pose(arguments: &Arguments) -> anyhow::Result<Option<[f64; 6]>> {
     let pose = &arguments.palm_pose;
-    if pose.is_empty() {
-        return Ok(None);
+    match <[f64; 6]>::try_from(pose.as_slice()) {
+        Ok(pose) if arguments.palm.is_some() => Ok(Some(pose)),
+        Ok(_) => bail!("--palm-pose needs --palm: the link in which it is given"),
+        Err(_) if pose.is_empty() => Ok(None),
+        Err(_) => bail!("--palm-pose: expected X,Y,Z,ROLL,PITCH,YAW, found {} numbers", pose.len()),
     }
-    let [x, y, z, roll, pitch, yaw] = pose[..] else {
-        bail!("--palm-pose: expected X,Y,Z,ROLL,PITCH,YAW, found {} numbers", pose.len());
-    };
-    let Some(palm) = &arguments.palm else { bail!("--palm-pose needs --palm: the link in which it is given") };
-    let end = urdf.rfind("</robot>").context("the URDF does not end with </robot>")?;
-    let frame = "blindgrasp_palm";
-    urdf.insert_str(
-        end,
-        &format!(
-            "  <link name=\"{frame}\"/>\n  <joint name=\"{frame}_joint\" type=\"fixed\">\n    <parent link=\"{palm}\"/>\
-             <child link=\"{frame}\"/>\n    <origin xyz=\"{x} {y} {z}\" rpy=\"{roll} {pitch} {yaw}\"/>\n  </joint>\n"
-        ),
-    );
-    Ok(Some(frame.into()))
 }
 
 fn print_parts(hand: &Hand) -> anyhow::Result<()> {
@@ -296,8 +280,11 @@ fn print_parts(hand: &Hand) -> anyhow::Result<()> {
     for link in &hand.links {
         print_line(&format!("{:<16} {}", link.name, link.shapes.len()))?;
     }
-    for ignored in &hand.ignored_meshes {
-        print_diagnostic(&format!("a collision mesh is left out: {ignored}"));
+    for fixed in &hand.fixed_joints {
+        print_diagnostic(fixed);
+    }
+    for ignored in &hand.ignored_shapes {
+        print_diagnostic(&format!("a collision shape is left out: {ignored}"));
     }
     Ok(())
 }
@@ -363,38 +350,18 @@ fn size_by_neighbours(pad: &mut NewPad) {
 }
 
 /// The URDF with the names of collision meshes changed to files beside it, and the files to copy there.
-fn with_meshes_beside(urdf: &str, urdf_folder: &Path) -> (String, Vec<(PathBuf, String)>) {
+fn with_meshes_beside(urdf: &str, urdf_folder: &Path) -> anyhow::Result<(String, Vec<(PathBuf, String)>)> {
     let mut copies: BTreeMap<PathBuf, String> = BTreeMap::new();
-    let mut text = String::new();
-    for (idx, part) in urdf.split("<collision").enumerate() {
-        if idx == 0 {
-            text.push_str(part);
-            continue;
-        }
-        text.push_str("<collision");
-        let (inside, after) = part.split_once("</collision>").unwrap_or((part, ""));
-        let quoted = inside.split_once("filename=\"").and_then(|(before, rest)| {
-            let (named, after) = rest.split_once('"')?;
-            Some((before, named, after))
-        });
-        match quoted.and_then(|(before, named, after)| Some((before, find_mesh(named, urdf_folder).ok()?, after))) {
-            Some((before, file, after)) if file.is_file() => {
-                let n = copies.len();
-                let name = file.file_name().and_then(|name| name.to_str()).unwrap_or("mesh.stl").to_owned();
-                let taken = copies.values().any(|other| *other == format!("meshes/{name}"));
-                let beside = copies
-                    .entry(file)
-                    .or_insert_with(|| if taken { format!("meshes/{n}-{name}") } else { format!("meshes/{name}") });
-                let _ = write!(text, "{before}filename=\"{beside}\"{after}");
-            }
-            _ => text.push_str(inside),
-        }
-        if part.contains("</collision>") {
-            text.push_str("</collision>");
-        }
-        text.push_str(after);
-    }
-    (text, copies.into_iter().collect())
+    let text = with_meshes_renamed(urdf, |named| {
+        let Some(file) = find_mesh(named, urdf_folder).ok().filter(|file| file.is_file()) else { return Ok(None) };
+        let name = file.file_name().and_then(|name| name.to_str()).unwrap_or("mesh.stl").to_owned();
+        let (n, taken) = (copies.len(), copies.values().any(|other| *other == format!("meshes/{name}")));
+        let beside = copies
+            .entry(file)
+            .or_insert_with(|| if taken { format!("meshes/{n}-{name}") } else { format!("meshes/{name}") });
+        Ok(Some(beside.clone()))
+    });
+    Ok((text.map_err(anyhow::Error::msg)?, copies.into_iter().collect()))
 }
 
 fn layout(name: &str, hand: &Hand, pads: &[NewPad], bare: &BareHand) -> String {
@@ -450,20 +417,6 @@ fn numbers(values: &[f64], per_unit: f64) -> String {
     // Adding 0 makes a 0 of a -0.
     let rounded = values.iter().map(|value| ((value * per_unit).round() / per_unit + 0.0).to_string());
     format!("[{}]", rounded.collect::<Vec<_>>().join(", "))
-}
-
-/// Says so if the cells look as if the palm's frame pointed the other way.
-fn warn_of_the_palm(hand: &Hand) -> anyhow::Result<()> {
-    let cells = hand.cells_in_palm(&hand.open_joints_rad())?;
-    let n_behind = cells.iter().filter(|cell| cell.position_in_palm_m.z < -0.005).count();
-    if 2 * n_behind > cells.len() {
-        print_diagnostic(&format!(
-            "{n_behind} of {} cells lie behind the palm: expected +z of the palm frame to point out of the palm, towards the \
-             object; give another link with --palm, or a pose with --palm-pose",
-            cells.len()
-        ));
-    }
-    Ok(())
 }
 
 fn grid(text: &str) -> Result<(String, [usize; 2]), String> {

@@ -1,0 +1,282 @@
+//! The palm frame in which a hand closes on an object: many URDFs have a palm link whose +z runs along the fingers.
+//!
+//! The hand closes on balls that lie before the palm, in one frame after the other. A frame is good if many pads come to lie on
+//! the balls, and if the links press on them from all sides.
+
+use std::collections::BTreeSet;
+
+use nalgebra::{Isometry3, Point3, Translation3, Unit, UnitQuaternion, UnitVector3, Vector3};
+use parry3d_f64::shape::SharedShape;
+
+use crate::mechanism::Mechanism;
+use crate::pad_grid::extent;
+use crate::protocol::{ProtocolOptions, Start};
+use blindgrasp_objects::Object;
+use blindgrasp_stages::hand::{Cell, Hand, JointError, Pad, pose_from_isometry};
+
+/// Radii of the balls, metres: those of a golf ball and of an apple.
+const BALL_RADII_M: [f64; 2] = [0.02, 0.035];
+/// How far the palm draws back from the ball before the fingers close, metres. The better distance counts.
+const BACK_OFFS_M: [f64; 2] = [0.0, 0.025];
+/// The frame is moved across its axis in these steps, metres, the larger ones first.
+const STEPS_M: [f64; 2] = [0.02, 0.01];
+/// A cell farther from the ball than this does not feel it, metres.
+const NEAR_M: f64 = 0.01;
+/// A link this near to the ball touches it, metres.
+const TOUCHES_M: f64 = 0.001;
+/// A frame must have a score that is better than the hand's own by this much.
+const LEAST_GAIN: f64 = 0.05;
+/// A step must make the score better by this much.
+const LEAST_STEP: f64 = 0.005;
+/// Frames that are moved, of those in each direction.
+const N_MOVED: usize = 2;
+
+/// A palm frame and what the hand does in it.
+#[derive(Debug, Clone)]
+pub struct PalmFit {
+    /// The frame in the palm link's own.
+    pub link_from_palm: Isometry3<f64>,
+    /// Mean over the balls: 1 if all pads lie on the ball and the hand holds it from all sides, 0 if none or from one side.
+    pub score: f64,
+    /// Whether the hand closes better in this frame than in the palm link's own.
+    pub is_better: bool,
+}
+
+/// The palm frame that suits the pads, or the palm link's own if that does as well. A hand without pads keeps its own.
+///
+/// # Errors
+/// The hand's joints do not fit together.
+pub fn palm_fit(hand: &Hand) -> Result<PalmFit, JointError> {
+    if hand.pads.is_empty() {
+        return Ok(PalmFit { link_from_palm: Isometry3::identity(), score: 0.0, is_better: false });
+    }
+    let own = Trial::of(hand, Isometry3::identity())?;
+    let mut tried: Vec<Trial> = Vec::new();
+    for direction in directions(hand)? {
+        tried.push(Trial::of(hand, frame_along(hand, &direction)?)?);
+    }
+    tried.sort_by(|a, b| b.score.total_cmp(&a.score));
+    tried.truncate(N_MOVED);
+    for trial in &mut tried {
+        *trial = trial.moved(hand)?;
+    }
+    let best = tried.into_iter().max_by(|a, b| a.score.total_cmp(&b.score)).unwrap_or_else(|| own.clone());
+    let is_better = best.score > own.score + LEAST_GAIN;
+    let chosen = if is_better { best } else { own };
+    Ok(PalmFit { link_from_palm: chosen.link_from_palm, score: chosen.score, is_better })
+}
+
+/// Indices of the pads that come near to no ball before the palm.
+///
+/// # Errors
+/// The hand's joints do not fit together.
+pub fn idle_pads(hand: &Hand) -> Result<Vec<usize>, JointError> {
+    let trial = Trial::of(hand, Isometry3::identity())?;
+    Ok((0..hand.pads.len()).filter(|pad_idx| !trial.near.contains(pad_idx)).collect())
+}
+
+/// The part of the postures between the open and the closed hand in which links press on each other, and of the pairs that do
+/// so the one that does it most often, by the links' indices.
+///
+/// # Errors
+/// The hand's joints do not fit together.
+pub fn self_pressing(hand: &Hand) -> Result<(f64, Option<(usize, usize)>), JointError> {
+    const N_STEPS: usize = 20;
+    let postures = Mechanism::new(hand).closing_postures(&hand.open_joints_rad(), N_STEPS);
+    // The second half of an empty closing is always fingers on fingers.
+    let postures = &postures[..=N_STEPS / 2];
+    let mut pressing = Vec::new();
+    for posture in postures {
+        pressing.extend(hand.touching_links(posture)?.into_iter().take(1));
+    }
+    let commonest = pressing.iter().max_by_key(|pair| pressing.iter().filter(|other| other == pair).count()).copied();
+    Ok((pressing.len() as f64 / postures.len() as f64, commonest))
+}
+
+/// A frame that was tried.
+#[derive(Clone)]
+struct Trial {
+    link_from_palm: Isometry3<f64>,
+    score: f64,
+    /// Pads that came near to a ball.
+    near: BTreeSet<usize>,
+}
+
+impl Trial {
+    fn of(hand: &Hand, link_from_palm: Isometry3<f64>) -> Result<Trial, JointError> {
+        let hand = hand.with_palm_frame(link_from_palm);
+        let mechanism = Mechanism::new(&hand);
+        let protocol = ProtocolOptions::default();
+        let mut near = BTreeSet::new();
+        let mut sum = 0.0;
+        for radius_m in BALL_RADII_M {
+            let ball = Object::new("ball".into(), "ball".into(), SharedShape::ball(radius_m), 1000.0, false);
+            let mut most = 0.0_f64;
+            for back_off_m in BACK_OFFS_M {
+                let start = Start {
+                    open_joints_rad: hand.open_joints_rad(),
+                    palm_from_object_rotation: UnitQuaternion::identity(),
+                    lateral_offset_m: [0.0; 2],
+                    back_off_m,
+                };
+                let Some(exploration) = mechanism.explore(&ball, &start, &protocol)? else { continue };
+                let palm_from_links = hand.palm_from_links(&exploration.posture(exploration.end))?;
+                let centre = exploration.palm_from_object * Point3::origin();
+                let felt = felt(&hand, &palm_from_links, &centre, radius_m);
+                near.extend((0..felt.len()).filter(|pad_idx| felt[*pad_idx] > 0.0));
+                let mean = felt.iter().sum::<f64>() / felt.len() as f64;
+                most = most.max(mean * balance(&mechanism, &palm_from_links, &ball, &exploration.palm_from_object));
+            }
+            sum += most;
+        }
+        Ok(Trial { link_from_palm, score: sum / BALL_RADII_M.len() as f64, near })
+    }
+
+    /// The best frame that steps across its axis lead to.
+    fn moved(&self, hand: &Hand) -> Result<Trial, JointError> {
+        let mut best = self.clone();
+        for step_m in STEPS_M {
+            loop {
+                let mut next = best.clone();
+                for [x, y] in [[step_m, 0.0], [-step_m, 0.0], [0.0, step_m], [0.0, -step_m]] {
+                    let trial = Trial::of(hand, best.link_from_palm * Translation3::new(x, y, 0.0))?;
+                    if trial.score > next.score + LEAST_STEP {
+                        next = trial;
+                    }
+                }
+                if next.score <= best.score {
+                    break;
+                }
+                best = next;
+            }
+        }
+        Ok(best)
+    }
+}
+
+/// For each pad, how well it lies on the ball: 1 where a cell touches it and faces its centre, 0 where none is near or faces it.
+fn felt(hand: &Hand, palm_from_links: &[Isometry3<f64>], centre: &Point3<f64>, radius_m: f64) -> Vec<f64> {
+    let of_pad = |pad: &Pad| {
+        let of_cell = |cell: &Cell| {
+            let to_centre = centre - palm_from_links[pad.link_idx] * cell.position_in_link_m;
+            let normal = palm_from_links[pad.link_idx].rotation * cell.normal_in_link;
+            let off_m = (to_centre.norm() - radius_m).abs();
+            (1.0 - off_m / NEAR_M).max(0.0) * (normal.dot(&to_centre) / to_centre.norm()).max(0.0)
+        };
+        pad.cells.iter().map(of_cell).fold(0.0, f64::max)
+    };
+    hand.pads.iter().map(of_pad).collect()
+}
+
+/// 1 if the links that touch an object press on it from all sides, 0 if from one side only.
+fn balance(
+    mechanism: &Mechanism<'_>,
+    palm_from_links: &[Isometry3<f64>],
+    object: &Object,
+    palm_from_object: &Isometry3<f64>,
+) -> f64 {
+    let object_pose = pose_from_isometry(palm_from_object);
+    let (mut sum, mut n) = (Vector3::zeros(), 0.0);
+    for shape in &mechanism.shapes {
+        let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
+        if let Some(closest) = shape.closest_to_object(&pose, &object_pose, object, TOUCHES_M) {
+            sum += Vector3::new(closest.direction.x, closest.direction.y, closest.direction.z);
+            n += 1.0;
+        }
+    }
+    if n > 0.0 { 1.0 - sum.norm() / n } else { 0.0 }
+}
+
+/// The directions that may lead out of the palm, in the palm link's frame: its axes, and the mean normal of the pads in the
+/// open hand, if they agree and face between the axes.
+fn directions(hand: &Hand) -> Result<Vec<UnitVector3<f64>>, JointError> {
+    let axes = [Vector3::z_axis(), Vector3::x_axis(), Vector3::y_axis()];
+    let mut directions: Vec<UnitVector3<f64>> = axes.into_iter().flat_map(|axis| [axis, -axis]).collect();
+    let cells = hand.cells_in_palm(&hand.open_joints_rad())?;
+    let mean: Vector3<f64> = cells.iter().map(|cell| cell.normal_in_palm.into_inner()).sum::<Vector3<f64>>() / cells.len() as f64;
+    let between = directions.iter().all(|axis| axis.dot(&mean) < 0.94 * mean.norm());
+    directions.extend(Unit::try_new(mean, 0.5).filter(|_| between));
+    Ok(directions)
+}
+
+/// The frame whose +z points in a direction, and whose axis goes through the middle of the half-closed hand's pads. Its origin
+/// lies where the palm's shapes end in that direction.
+fn frame_along(hand: &Hand, direction: &UnitVector3<f64>) -> Result<Isometry3<f64>, JointError> {
+    let rotation = UnitQuaternion::rotation_between(&Vector3::z(), direction)
+        .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
+    let postures = Mechanism::new(hand).closing_postures(&hand.open_joints_rad(), 2);
+    let palm_from_links = hand.palm_from_links(&postures[1])?;
+    let middles = hand.pads.iter().map(|pad| (palm_from_links[pad.link_idx] * pad.middle_in_link_m()).coords);
+    let middle = middles.sum::<Vector3<f64>>() / hand.pads.len() as f64;
+    let [_, outermost_m] = extent(hand, hand.palm_link_idx(), direction);
+    let outermost_m = if outermost_m.is_finite() { outermost_m } else { 0.0 };
+    let origin = middle + direction.into_inner() * (outermost_m - middle.dot(direction));
+    Ok(Isometry3::from_parts(origin.into(), rotation))
+}
+
+/// Joints that do not close the hand on an object: those that move the pads of the open hand along their faces, to spread fingers
+/// or to turn a thumb, and those that turn back as the joint above them closes.
+///
+/// # Errors
+/// The hand's joints do not fit together.
+pub fn joints_that_do_not_close(hand: &Hand) -> Result<Vec<usize>, JointError> {
+    /// Of a pad's motion, the part towards its normal.
+    const LEAST_TOWARDS: f64 = 0.35;
+    let mechanism = Mechanism::new(hand);
+    let palm_from_links = hand.palm_from_links(&hand.open_joints_rad())?;
+    let opposed = mechanism.opposed_joints(&palm_from_links);
+    let does_not_close = |joint_idx: usize| {
+        let (mut towards, mut all) = (0.0, 0.0);
+        for pad in &hand.pads {
+            let palm_from_link = &palm_from_links[pad.link_idx];
+            let middle = palm_from_link * pad.middle_in_link_m();
+            let velocity = mechanism.velocity_of_joint(pad.link_idx, &middle, joint_idx, &palm_from_links);
+            let normal = pad.cells.iter().map(|cell| cell.normal_in_link.into_inner()).sum::<Vector3<f64>>();
+            let normal = palm_from_link.rotation * normal.try_normalize(1e-9).unwrap_or_else(Vector3::z);
+            towards += velocity.dot(&normal).abs();
+            all += velocity.norm();
+        }
+        let is_sideways = all > 1e-9 && towards < LEAST_TOWARDS * all;
+        is_sideways || opposed.iter().any(|(below, _)| *below == joint_idx)
+    };
+    Ok((0..hand.joints.len()).filter(|idx| does_not_close(*idx)).collect())
+}
+
+/// The value of a joint that is set before the grasp with which the hand closes best on a ball: 0 of a joint that goes to both
+/// sides of it.
+///
+/// # Errors
+/// The hand's joints do not fit together.
+pub fn best_value(hand: &Hand, joint_idx: usize) -> Result<f64, JointError> {
+    const N_VALUES: usize = 5;
+    let joint = &hand.joints[joint_idx];
+    if joint.lower < 0.0 && joint.upper > 0.0 {
+        return Ok(joint.open());
+    }
+    let mut best = (0.0, joint.open());
+    for idx in 0..N_VALUES {
+        let part = idx as f64 / (N_VALUES - 1) as f64;
+        let value = joint.lower + part * (joint.upper - joint.lower);
+        let trial = Trial::of(&hand.with_open_joint(joint_idx, value), Isometry3::identity())?;
+        if trial.score > best.0 + LEAST_STEP {
+            best = (trial.score, value);
+        }
+    }
+    Ok(best.1)
+}
+#[cfg(test)]
+mod dbg {
+    use super::*;
+    #[test]
+    fn dbg() {
+        let hand = Hand::load(std::path::Path::new(&std::env::var("DBG_HAND").unwrap())).unwrap().with_moving_pads();
+        println!("collides {:?}", hand.touching_links(&hand.open_joints_rad()).unwrap());
+        for direction in directions(&hand).unwrap() {
+            let f = frame_along(&hand, &direction).unwrap();
+            let t = Trial::of(&hand, f).unwrap();
+            println!("{:?} {:?} e {}", direction.into_inner().as_slice(), f.translation.vector.as_slice(), t.score);
+            let m = t.moved(&hand).unwrap();
+            println!("    moved {:?} e {}", m.link_from_palm.translation.vector.as_slice(), m.score);
+        }
+    }
+}
