@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use clap::Args;
@@ -153,6 +154,20 @@ fn print_mesh_warnings(warnings: &[String]) {
     }
 }
 
+/// Time between two lines of progress where there is no terminal.
+const TELL_EVERY: Duration = Duration::from_secs(30);
+/// So many grasps without a stable one are told.
+const MANY_UNSTABLE: usize = 50;
+
+/// What to do where no candidate is stable.
+fn none_is_stable(n: usize) -> String {
+    format!(
+        "none of the first {n} grasps is stable, but stable ones are asked for: --stable-fraction natural keeps grasps as they \
+         come, --label lift and --thresholds call others stable; blindgrasp view --hand draws the hand: does it close on what lies \
+         before +z of its palm frame?"
+    )
+}
+
 /// Everything that all parts have in common.
 struct Job<'a> {
     simulation: Simulation<'a>,
@@ -168,13 +183,26 @@ impl Job<'_> {
         let bar = progress_bar(self.simulation.options.n_grasps);
         let mut report = SimulationReport::default();
         for part in self.simulation.options.parts() {
-            let done = self.simulate(&part, &bar, &mut writer).map_err(|error| match error {
-                SimulateError::Stopped => {
-                    anyhow::anyhow!("interrupted: nothing is recorded (--out with a folder keeps what is done)")
+            let (why, done) = match self.simulate(&part, &bar, &mut writer) {
+                Ok(done) => {
+                    report.add(&done);
+                    continue;
                 }
-                other => other.into(),
-            })?;
+                Err(SimulateError::Stopped { done }) => ("interrupted".to_owned(), done),
+                Err(ref error @ SimulateError::GaveUp { ref done, .. }) => (error.to_string(), done.clone()),
+                Err(error) => return Err(error.into()),
+            };
             report.add(&done);
+            if report.n_grasps == 0 {
+                bail!("{why}: nothing is recorded");
+            }
+            writer.finish(&report)?;
+            bail!(
+                "{why}: the first {} of {} grasps are in {} (--out with a folder goes on from what is done)",
+                report.n_grasps,
+                self.simulation.options.n_grasps,
+                out.display()
+            );
         }
         bar.finish_and_clear();
         writer.finish(&report)?;
@@ -199,7 +227,7 @@ impl Job<'_> {
             let path = part_path(out, part.idx);
             let mut writer = GraspWriter::create(&path, self.info)?;
             let done = self.simulate(part, &bar, &mut writer).map_err(|error| match error {
-                SimulateError::Stopped => anyhow::anyhow!(
+                SimulateError::Stopped { .. } => anyhow::anyhow!(
                     "interrupted: {} of {} parts are in {}; the same command goes on from there",
                     there.len() + n_done,
                     mine.len(),
@@ -228,13 +256,28 @@ impl Job<'_> {
         writer: &mut GraspWriter,
     ) -> Result<SimulationReport, SimulateError<RecordingError>> {
         let before = bar.position();
+        let options = self.simulation.options;
+        let (mut told_at, mut is_warned) = (Instant::now(), false);
         let report = self.simulation.part(
             part,
             || self.stop.load(Ordering::Relaxed),
-            |n_kept, n_tried| {
-                bar.set_position(before + n_kept as u64);
-                let lifted = if self.simulation.options.label == Label::Lift { " by lifts" } else { "" };
-                bar.set_message(format!("part {}, {n_tried} tried{lifted}", part.idx));
+            |report| {
+                bar.set_position(before + report.n_grasps as u64);
+                let lifted = if options.label == Label::Lift { " by lifts" } else { "" };
+                bar.set_message(format!("part {}, {} tried{lifted}", part.idx, report.n_candidates));
+                let wants_stable = options.stable_fraction.is_some_and(|fraction| fraction > 0.0);
+                if !is_warned && wants_stable && report.n_judged >= MANY_UNSTABLE && report.n_judged_stable == 0 {
+                    is_warned = true;
+                    let n = report.n_judged;
+                    bar.suspend(|| print_diagnostic(&none_is_stable(n)));
+                }
+                // Without a terminal there is no bar.
+                if bar.is_hidden() && told_at.elapsed() >= TELL_EVERY {
+                    told_at = Instant::now();
+                    let (n, n_all) = (before as usize + report.n_grasps, options.n_grasps);
+                    let (n_tried, rate) = (report.n_candidates, 100.0 * report.natural_stable_rate());
+                    print_diagnostic(&format!("{n} of {n_all} grasps, {n_tried} candidates tried, {rate:.1} % stable by nature"));
+                }
             },
             |grasp| writer.write(grasp),
         );

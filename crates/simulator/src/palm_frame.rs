@@ -26,6 +26,8 @@ const NEAR_M: f64 = 0.01;
 const TOUCHES_M: f64 = 0.001;
 /// A frame must have a score that is better than the hand's own by this much.
 const LEAST_GAIN: f64 = 0.05;
+/// Cosine of the angle between directions that are alike: 30°.
+const ALIKE: f64 = 0.87;
 /// A step must make the score better by this much.
 const LEAST_STEP: f64 = 0.005;
 /// Frames that are moved, of those in each direction.
@@ -61,7 +63,9 @@ pub fn palm_fit(hand: &Hand) -> Result<PalmFit, JointError> {
         *trial = trial.moved(hand)?;
     }
     let best = tried.into_iter().max_by(|a, b| a.score.total_cmp(&b.score)).unwrap_or_else(|| own.clone());
-    let is_better = best.score > own.score + LEAST_GAIN;
+    // A hand whose own axis leads out of the palm, and that holds a ball on it, need not be moved aside.
+    let looks_the_same_way = (best.link_from_palm * Vector3::z()).z > ALIKE;
+    let is_better = best.score > own.score + LEAST_GAIN && !(looks_the_same_way && own.score > LEAST_GAIN);
     let chosen = if is_better { best } else { own };
     Ok(PalmFit { link_from_palm: chosen.link_from_palm, score: chosen.score, is_better })
 }
@@ -214,18 +218,26 @@ fn frame_along(hand: &Hand, direction: &UnitVector3<f64>) -> Result<Isometry3<f6
     Ok(Isometry3::from_parts(origin.into(), rotation))
 }
 
-/// Joints that do not close the hand on an object: those that move the pads of the open hand along their faces, to spread fingers
-/// or to turn a thumb, and those that turn back as the joint above them closes.
+/// Joints that do not close the hand on an object.
+#[derive(Debug, Clone, Default)]
+pub struct OddJoints {
+    /// Those that move the pads of the open hand along their faces, to spread fingers or to turn a thumb.
+    pub sideways: Vec<usize>,
+    /// Of the others those that turn back as the joint above them closes.
+    pub opposed: Vec<usize>,
+}
+
+/// The joints that do not close the hand on an object.
 ///
 /// # Errors
 /// The hand's joints do not fit together.
-pub fn joints_that_do_not_close(hand: &Hand) -> Result<Vec<usize>, JointError> {
+pub fn odd_joints(hand: &Hand) -> Result<OddJoints, JointError> {
     /// Of a pad's motion, the part towards its normal.
     const LEAST_TOWARDS: f64 = 0.35;
     let mechanism = Mechanism::new(hand);
     let palm_from_links = hand.palm_from_links(&hand.open_joints_rad())?;
     let opposed = mechanism.opposed_joints(&palm_from_links);
-    let does_not_close = |joint_idx: usize| {
+    let is_sideways = |joint_idx: usize| {
         let (mut towards, mut all) = (0.0, 0.0);
         for pad in &hand.pads {
             let palm_from_link = &palm_from_links[pad.link_idx];
@@ -236,10 +248,12 @@ pub fn joints_that_do_not_close(hand: &Hand) -> Result<Vec<usize>, JointError> {
             towards += velocity.dot(&normal).abs();
             all += velocity.norm();
         }
-        let is_sideways = all > 1e-9 && towards < LEAST_TOWARDS * all;
-        is_sideways || opposed.iter().any(|(below, _)| *below == joint_idx)
+        all > 1e-9 && towards < LEAST_TOWARDS * all
     };
-    Ok((0..hand.joints.len()).filter(|idx| does_not_close(*idx)).collect())
+    let (sideways, others): (Vec<usize>, Vec<usize>) = (0..hand.joints.len()).partition(|idx| is_sideways(*idx));
+    let is_opposed = |idx: &usize| opposed.iter().any(|(below, above)| below == idx && !sideways.contains(above));
+    let opposed = others.into_iter().filter(is_opposed).collect();
+    Ok(OddJoints { sideways, opposed })
 }
 
 /// The value of a joint that is set before the grasp with which the hand closes best on a ball: 0 of a joint that goes to both
@@ -265,18 +279,47 @@ pub fn best_value(hand: &Hand, joint_idx: usize) -> Result<f64, JointError> {
     Ok(best.1)
 }
 #[cfg(test)]
-mod dbg {
+mod tests {
     use super::*;
+    use std::path::Path;
+
+    fn built_in(name: &str) -> Hand {
+        Hand::load(Path::new(name)).expect("built in").with_moving_pads()
+    }
+
     #[test]
-    fn dbg() {
-        let hand = Hand::load(std::path::Path::new(&std::env::var("DBG_HAND").unwrap())).unwrap().with_moving_pads();
-        println!("collides {:?}", hand.touching_links(&hand.open_joints_rad()).unwrap());
-        for direction in directions(&hand).unwrap() {
-            let f = frame_along(&hand, &direction).unwrap();
-            let t = Trial::of(&hand, f).unwrap();
-            println!("{:?} {:?} e {}", direction.into_inner().as_slice(), f.translation.vector.as_slice(), t.score);
-            let m = t.moved(&hand).unwrap();
-            println!("    moved {:?} e {}", m.link_from_palm.translation.vector.as_slice(), m.score);
+    fn a_hand_keeps_a_palm_frame_that_suits_it() {
+        for name in ["barrett-bh8-280", "parallel-gripper"] {
+            let fit = palm_fit(&built_in(name)).expect("fits");
+            assert!(!fit.is_better && fit.score > 0.05, "{name}: {fit:?}");
+            assert_eq!(idle_pads(&built_in(name)).expect("fits"), [0; 0], "{name}");
         }
+    }
+
+    #[test]
+    fn a_turned_palm_frame_is_turned_back() {
+        for name in ["barrett-bh8-280", "parallel-gripper"] {
+            let hand = built_in(name);
+            let turned = Isometry3::rotation(Vector3::y() * std::f64::consts::FRAC_PI_2);
+            let fit = palm_fit(&hand.with_palm_frame(turned)).expect("fits");
+            let out_of_palm = turned * fit.link_from_palm * Vector3::z();
+            assert!(fit.is_better && out_of_palm.z > 0.9, "{name}: {fit:?} {out_of_palm}");
+        }
+    }
+
+    #[test]
+    fn joints_that_spread_fingers_do_not_close() {
+        let mut hand = built_in("barrett-bh8-280");
+        hand.joints.iter_mut().for_each(|joint| joint.is_preshape = false);
+        let odd = odd_joints(&hand).expect("fits");
+        assert_eq!((odd.sideways, odd.opposed), (vec![hand.joint_idx("spread").expect("a joint")], vec![]));
+        let odd = odd_joints(&built_in("parallel-gripper")).expect("fits");
+        assert_eq!((odd.sideways, odd.opposed), (vec![], vec![]));
+    }
+
+    #[test]
+    fn fingers_press_on_each_other_only_late() {
+        let (share, _) = self_pressing(&built_in("barrett-bh8-280")).expect("fits");
+        assert!(share < 0.5, "{share}");
     }
 }

@@ -55,14 +55,15 @@ impl SimulatorOptions {
     }
 }
 
-/// The counts of a simulation.
+/// The counts of a simulation. Counts that another version has not written are 0.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default)]
 pub struct SimulationReport {
     /// The meaning of stable.
-    #[serde(default, skip_serializing_if = "Label::is_default")]
+    #[serde(skip_serializing_if = "Label::is_default")]
     pub label: Label,
     /// The least qualities of a stable grasp, with label `wrench-space`.
-    #[serde(default, skip_serializing_if = "Thresholds::is_default")]
+    #[serde(skip_serializing_if = "Thresholds::is_default")]
     pub thresholds: Thresholds,
     /// Candidates tried, up to the last one kept.
     pub n_candidates: usize,
@@ -75,7 +76,6 @@ pub struct SimulationReport {
     /// Candidates dropped because their hull failed.
     pub n_hull_failures: usize,
     /// Candidates dropped because the physics of their lift diverged.
-    #[serde(default)]
     pub n_diverged: usize,
     /// Candidates whose hull needed a joggle. They count.
     pub n_joggled: usize,
@@ -97,6 +97,7 @@ pub struct SimulationReport {
 
 /// The counts of an object.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
 pub struct ObjectReport {
     pub class: String,
     /// Candidates that touched and have a quality.
@@ -159,10 +160,20 @@ pub enum SimulateError<E> {
          stable by nature; ask for a stable fraction nearer to that, or for other objects",
         natural_stable_rate * 100.0
     )]
-    GaveUp { n_candidates: usize, n_grasps: usize, n_wanted: usize, natural_stable_rate: f64 },
+    GaveUp {
+        n_candidates: usize,
+        n_grasps: usize,
+        n_wanted: usize,
+        natural_stable_rate: f64,
+        /// Of the grasps that the sink has got.
+        done: Box<SimulationReport>,
+    },
     /// The observer asked to stop.
     #[error("interrupted")]
-    Stopped,
+    Stopped {
+        /// Of the grasps that the sink has got.
+        done: Box<SimulationReport>,
+    },
     /// The observer refused a grasp.
     #[error("{0}")]
     Sink(E),
@@ -180,8 +191,8 @@ pub struct Simulation<'a> {
 }
 
 impl Simulation<'_> {
-    /// Simulates a part's grasps and gives each to `sink`, in order. `progress` hears the numbers of grasps kept and
-    /// candidates tried now and then; `should_stop` is asked before each candidate.
+    /// Simulates a part's grasps and gives each to `sink`, in order. `progress` hears the counts so far now and then;
+    /// `should_stop` is asked before each candidate.
     ///
     /// # Errors
     /// Options or a hand that cannot be used, no objects, the sink's error, a stable fraction that is out of reach, or
@@ -190,7 +201,7 @@ impl Simulation<'_> {
         &self,
         part: &Part,
         should_stop: impl Fn() -> bool + Sync,
-        mut progress: impl FnMut(usize, usize),
+        mut progress: impl FnMut(&SimulationReport),
         mut sink: impl FnMut(SimulatedGrasp) -> Result<(), E>,
     ) -> Result<SimulationReport, SimulateError<E>> {
         let Simulation { hand, objects, options } = *self;
@@ -211,12 +222,16 @@ impl Simulation<'_> {
                 .into_par_iter()
                 .map(|candidate| (!should_stop()).then(|| try_candidate(&mechanism, objects, options, candidate)))
                 .collect();
-            let mut kept = Vec::new();
+            let (mut kept, mut is_stopped) = (Vec::new(), false);
             for outcome in outcomes {
                 if run.report.n_grasps == part.n_grasps {
                     break;
                 }
-                run.count(outcome.ok_or(SimulateError::Stopped)??, objects);
+                let Some(outcome) = outcome else {
+                    is_stopped = true;
+                    break;
+                };
+                run.count(outcome?, objects);
                 kept.extend(std::iter::from_fn(|| run.next_kept()));
             }
             let made: Vec<SimulatedGrasp> = kept
@@ -227,7 +242,10 @@ impl Simulation<'_> {
                 run.report.count(&grasp, hand);
                 sink(grasp).map_err(SimulateError::Sink)?;
             }
-            progress(run.report.n_grasps, run.report.n_candidates);
+            if is_stopped {
+                return Err(SimulateError::Stopped { done: Box::new(run.report) });
+            }
+            progress(&run.report);
         }
         run.report.n_over_quota += run.order.waiting.iter().map(VecDeque::len).sum::<usize>();
         Ok(run.report)
@@ -247,7 +265,7 @@ pub fn simulate_all<E>(
     let simulation = Simulation { hand, objects, options };
     let mut report = SimulationReport::default();
     for part in options.parts() {
-        report.add(&simulation.part(&part, || false, |_, _| {}, &mut sink)?);
+        report.add(&simulation.part(&part, || false, |_| {}, &mut sink)?);
     }
     Ok(report)
 }
@@ -272,7 +290,8 @@ impl<'a> PartRun<'a> {
         let n_wanted = self.part.n_grasps;
         if n_candidates >= n_wanted.saturating_mul(options.max_candidates_per_grasp).saturating_add(1000) {
             let natural_stable_rate = self.report.natural_stable_rate();
-            return Err(SimulateError::GaveUp { n_candidates, n_grasps, n_wanted, natural_stable_rate });
+            let done = Box::new(self.report.clone());
+            return Err(SimulateError::GaveUp { n_candidates, n_grasps, n_wanted, natural_stable_rate, done });
         }
         let (n_missing, n_threads) = (n_wanted - n_grasps, rayon::current_num_threads());
         let n_batch = match options.label {
@@ -452,7 +471,7 @@ mod tests {
             Ok::<_, Infallible>(())
         };
         let simulation = Simulation { hand: &hand, objects: &objects, options: &options };
-        simulation.part(&parts[1], || false, |_, _| {}, keep).expect("simulated");
+        simulation.part(&parts[1], || false, |_| {}, keep).expect("simulated");
         for (a, b) in alone.iter().zip(&all[10..20]) {
             assert_eq!((&a.frames, &a.truth, &a.scene), (&b.frames, &b.truth, &b.scene));
         }
@@ -497,7 +516,7 @@ mod tests {
         let sink = |_| Ok::<_, Infallible>(());
         let first = Part { idx: 0, first_grasp_id: 0, n_grasps: 2, n_stable: Some(2) };
         let simulate = |objects: &[Object], options: &SimulatorOptions| {
-            Simulation { hand: &hand, objects, options }.part(&first, || false, |_, _| {}, sink)
+            Simulation { hand: &hand, objects, options }.part(&first, || false, |_| {}, sink)
         };
         let none = simulate(&[], &SimulatorOptions::default());
         assert!(matches!(none, Err(SimulateError::NoObjects)));

@@ -92,7 +92,7 @@ pub fn pose_from_isometry(isometry: &Isometry3<f64>) -> Pose {
     Pose { rotation: Rotation::from_xyzw(q.x, q.y, q.z, q.w), translation: Vector::new(t.x, t.y, t.z) }
 }
 
-/// The pairs to check: not joined to each other, and apart in the open hand (links that overlap there are built into each
+/// The pairs to check: with shapes, not joined to each other, and apart in the open hand (links that overlap there are built into each
 /// other, as in MoveIt's setup assistant).
 pub(super) fn pairs(hand: &Hand) -> Vec<(usize, usize)> {
     let Ok(palm_from_links) = hand.palm_from_links(&hand.open_joints_rad()) else {
@@ -114,7 +114,8 @@ pub(super) fn pairs(hand: &Hand) -> Vec<(usize, usize)> {
     let mut pairs = Vec::new();
     for a in 0..hand.links.len() {
         for b in a + 1..hand.links.len() {
-            if !joined(a, b) && !links_touch(hand, a, b, &shapes) {
+            let have_shapes = [a, b].iter().all(|idx| !hand.links[*idx].shapes.is_empty());
+            if have_shapes && !joined(a, b) && !links_touch(hand, a, b, &shapes) {
                 pairs.push((a, b));
             }
         }

@@ -1,25 +1,49 @@
 //! A hand on its way to a layout: the palm frame and the joints that are set before a grasp, where the user gave none.
 
-use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_simulator::mechanism::Mechanism;
 use blindgrasp_simulator::pad_grid::pad_grid;
-use blindgrasp_simulator::palm_frame::{best_value, idle_pads, joints_that_do_not_close, palm_fit, self_pressing};
-use blindgrasp_stages::hand::{BareHand, Hand, PALM_FRAME, Pad};
+use blindgrasp_simulator::palm_frame::{best_value, idle_pads, odd_joints, palm_fit, self_pressing};
+use blindgrasp_stages::hand::{BareHand, Hand, Joint, Motion, PALM_FRAME, Pad};
 use nalgebra::Isometry3;
 
 use super::{Arguments, NewPad};
 
+/// A draft must have a score that is better than another's by this much.
+const LEAST_GAIN: f64 = 0.05;
+
+/// A joint of which both limits are as far from the open value closes to the upper one. Opened by this part of its range, it closes
+/// to the lower one.
+const TURNED: f64 = 0.1;
+
 /// A hand without cells, and the texts that it is made from.
+#[derive(Clone)]
 pub(super) struct Draft {
     source: PathBuf,
     pub(super) urdf: String,
     pub(super) bare: BareHand,
     pub(super) hand: Hand,
     has_palm_pose: bool,
+}
+
+/// The open hand that a draft has.
+#[derive(Clone, Copy)]
+enum Opening {
+    AsGiven,
+    /// Joints that could close either way are opened by a part of their range.
+    TwoWay(f64),
+    /// Each joint is open at the limit to which it would close.
+    Reversed,
+}
+
+/// A draft with a palm frame, how well the hand closes in it, and what there is to say of it.
+struct Fitted {
+    draft: Draft,
+    score: f64,
+    told: Vec<String>,
 }
 
 impl Draft {
@@ -67,55 +91,129 @@ impl Draft {
     }
 
     /// Finds the palm frame and the joints that do not close, if the user named none, and says what it found.
+    ///
+    /// # Errors
+    /// A joint that moves all pads together, as a wrist does.
     pub(super) fn fit(&mut self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<()> {
-        let mut still = Vec::new();
+        let hand = self.with_pads(&self.pads(table, arguments, false)?);
+        if let Some((joint, link)) = wrist(&hand) {
+            bail!("joint '{joint}' moves all pads together, as a wrist does: give the hand alone with --base {link}");
+        }
+        let mut best = self.fitted(table, arguments, Opening::AsGiven)?;
+        let mut others = Vec::new();
+        // Joints with as much way to one limit as to the other may close either way.
+        if !self.two_way_joints(arguments).is_empty() {
+            others.extend([Opening::TwoWay(-0.25), Opening::TwoWay(0.25)]);
+        }
+        // 0 is the closed hand of many grippers.
+        if best.score < LEAST_GAIN {
+            others.push(Opening::Reversed);
+        }
+        for opening in others {
+            let other = self.fitted(table, arguments, opening)?;
+            if other.score > best.score + LEAST_GAIN {
+                best = other;
+            }
+        }
+        best.told.iter().for_each(|line| print_diagnostic(line));
+        *self = best.draft;
+        Ok(())
+    }
+
+    /// Names of closing joints whose limits are as far from the open value on both sides, and whose open value nobody gave.
+    fn two_way_joints(&self, arguments: &Arguments) -> Vec<String> {
+        let is_two_way = |joint: &&Joint| {
+            let (below, above) = (joint.open() - joint.lower, joint.upper - joint.open());
+            let is_given = arguments.open.iter().any(|(name, _)| *name == joint.name);
+            !joint.is_preshape && !is_given && below > 0.8 * above && above > 0.8 * below
+        };
+        self.hand.joints.iter().filter(is_two_way).map(|joint| joint.name.clone()).collect()
+    }
+
+    /// The draft with an open hand, its palm frame and the joints that do not close.
+    fn fitted(&self, table: &[NewPad], arguments: &Arguments, opening: Opening) -> anyhow::Result<Fitted> {
+        let mut draft = self.clone();
+        let mut told = Vec::new();
+        if let Opening::Reversed = opening {
+            let is_given = |joint: &&Joint| arguments.open.iter().any(|(name, _)| *name == joint.name);
+            let joints = self.hand.joints.iter().filter(|joint| !joint.is_preshape && !is_given(joint));
+            let opened: Vec<(String, f64)> = joints.map(|joint| (joint.name.clone(), joint.closed())).collect();
+            told.push(format!("the hand is open where it could be taken for closed: as by --open {}", listed(&opened)));
+            draft.bare.open.extend(opened);
+            draft.read()?;
+        }
+        let (mut still, mut turned) = (Vec::new(), Vec::new());
         if arguments.preshape.is_empty() {
-            let names: Vec<&str> = arguments.open.iter().map(|(name, _)| name.as_str()).collect();
-            let hand = self.with_pads(&self.pads(table, arguments, false)?);
-            still = joints_that_do_not_close(&hand)?;
-            still.retain(|idx| !names.contains(&hand.joints[*idx].name.as_str()));
+            let hand = draft.with_pads(&draft.pads(table, arguments, false)?);
+            let mut odd = odd_joints(&hand)?;
+            let two_way = draft.two_way_joints(arguments);
+            // A joint that turns back and can close the other way does so.
+            odd.opposed.retain(|idx| {
+                let joint = &hand.joints[*idx];
+                let is_two_way = two_way.contains(&joint.name);
+                if is_two_way {
+                    let value = round(joint.open() + TURNED * (joint.upper - joint.lower), 1e4);
+                    turned.push((joint.name.clone(), value));
+                    draft.bare.open.insert(joint.name.clone(), value);
+                }
+                !is_two_way
+            });
+            still = [odd.sideways, odd.opposed].concat();
+            still.retain(|idx| !arguments.open.iter().any(|(name, _)| *name == hand.joints[*idx].name));
             // A hand that closes with no joint at all is judged wrongly.
             if still.len() == hand.joints.len() {
                 still.clear();
             }
         }
+        if !turned.is_empty() {
+            told.push(format!("these joints close towards their lower limits: as by --open {}", listed(&turned)));
+        }
         for idx in &still {
-            let joint = &self.hand.joints[*idx];
-            self.bare.preshape_joints.push(joint.name.clone());
-            self.bare.open.insert(joint.name.clone(), joint.open());
+            let joint = &draft.hand.joints[*idx];
+            draft.bare.preshape_joints.push(joint.name.clone());
+            draft.bare.open.insert(joint.name.clone(), joint.open());
         }
-        self.read()?;
-        let palm = self.hand.palm_link().name.clone();
-        if !self.has_palm_pose {
-            let hand = self.with_pads(&self.pads(table, arguments, false)?);
-            let fit = palm_fit(&hand.with_moving_pads())?;
-            if fit.is_better {
-                let pose = rounded(&fit.link_from_palm);
-                let text = pose.map(|number| number.to_string()).join(",");
-                print_diagnostic(&format!(
-                    "the hand closes on an object before --palm {palm} --palm-pose {text}, not before +z of link '{palm}': \
-                     the layout has that palm frame; give --palm {palm} --palm-pose 0,0,0,0,0,0 to keep the link's own"
-                ));
-                self.put_palm_frame(pose)?;
+        draft.read()?;
+        if let Opening::TwoWay(part) = opening {
+            let mut opened = Vec::new();
+            for name in draft.two_way_joints(arguments) {
+                let joint = draft.hand.joint_idx(&name).map(|idx| &draft.hand.joints[idx]).context("a joint")?;
+                opened.push((name, round(joint.open() + part * (joint.upper - joint.lower), 1e4)));
             }
+            told.push(format!("these joints could close either way: the hand closes as by --open {}", listed(&opened)));
+            draft.bare.open.extend(opened);
+            draft.read()?;
         }
-        let mut told = String::new();
+        let palm = draft.hand.palm_link().name.clone();
+        let hand = draft.with_pads(&draft.pads(table, arguments, false)?).with_moving_pads();
+        let fit = palm_fit(&hand)?;
+        let pose = rounded(&fit.link_from_palm);
+        if fit.is_better && !draft.has_palm_pose && pose != [0.0; 6] {
+            let text = pose.map(|number| number.to_string()).join(",");
+            told.push(format!(
+                "the hand closes on an object before --palm {palm} --palm-pose {text}, not before +z of link '{palm}': the layout \
+                 has that palm frame; give --palm {palm} --palm-pose 0,0,0,0,0,0 to keep the link's own"
+            ));
+            draft.put_palm_frame(pose)?;
+        }
+        let mut values = Vec::new();
         for idx in still {
-            let hand = self.with_pads(&self.pads(table, arguments, false)?).with_moving_pads();
+            let hand = draft.with_pads(&draft.pads(table, arguments, false)?).with_moving_pads();
             let value = round(best_value(&hand, idx)?, 1e4);
-            let name = self.hand.joints[idx].name.clone();
-            let _ = write!(told, "{}{name}={value}", if told.is_empty() { "" } else { "," });
-            self.bare.open.insert(name, value);
-            self.read()?;
+            let name = draft.hand.joints[idx].name.clone();
+            values.push((name.clone(), value));
+            draft.bare.open.insert(name, value);
+            draft.read()?;
         }
-        if !told.is_empty() {
-            print_diagnostic(&format!(
-                "these joints move no pad towards an object, so they are set before a grasp and do not close: as by --preshape {} \
-                 --open {told}",
-                self.bare.preshape_joints.join(",")
+        if !values.is_empty() {
+            told.push(format!(
+                "these joints move no pad towards an object, so they are set before a grasp and do not close: as by --preshape \
+                 {} --open {}",
+                draft.bare.preshape_joints.join(","),
+                listed(&values)
             ));
         }
-        Ok(())
+        Ok(Fitted { draft, score: fit.score, told })
     }
 
     /// Says which pads come to no object, and whether the hand closes on itself.
@@ -180,11 +278,30 @@ impl Draft {
     }
 }
 
+/// A joint that moves all pads as one, where they lie on several links that move against each other, and the link that it moves.
+fn wrist(hand: &Hand) -> Option<(String, String)> {
+    let movers = |link_idx: usize| {
+        let above = std::iter::successors(Some(link_idx), |idx| hand.links[*idx].parent_idx);
+        above.filter(|idx| matches!(hand.links[*idx].motion, Motion::Joint { .. })).collect::<Vec<_>>()
+    };
+    let chains: Vec<Vec<usize>> = hand.pads.iter().map(|pad| movers(pad.link_idx)).collect();
+    let (first, others) = chains.split_first()?;
+    let lowest = *first.iter().find(|idx| others.iter().all(|chain| chain.contains(idx)))?;
+    let is_one_finger = chains.iter().all(|chain| chain[0] == first[0]);
+    let Motion::Joint { joint_idx, .. } = hand.links[lowest].motion else { return None };
+    (!is_one_finger).then(|| (hand.joints[joint_idx].name.clone(), hand.links[lowest].name.clone()))
+}
+
 /// X, Y, Z in millimetres' precision, roll, pitch and yaw.
 fn rounded(pose: &Isometry3<f64>) -> [f64; 6] {
     let t = &pose.translation.vector;
     let (roll, pitch, yaw) = pose.rotation.euler_angles();
     [round(t.x, 1e3), round(t.y, 1e3), round(t.z, 1e3), round(roll, 1e4), round(pitch, 1e4), round(yaw, 1e4)]
+}
+
+/// `JOINT=VALUE,…`, as --open takes it.
+fn listed(values: &[(String, f64)]) -> String {
+    values.iter().map(|(name, value)| format!("{name}={value}")).collect::<Vec<_>>().join(",")
 }
 
 fn round(value: f64, per_unit: f64) -> f64 {

@@ -151,7 +151,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         preshape_joints: arguments.preshape.clone(),
     };
     let palm_pose = palm_pose(arguments)?;
-    let mut draft = Draft::new(&source, urdf, bare, palm_pose)?;
+    let draft = Draft::new(&source, urdf, bare, palm_pose);
+    let mut draft = draft.map_err(|error| with_base_advice(error, arguments))?;
     print_parts(&draft.hand)?;
     if let Some(joint) = draft.hand.joint_above_palm() {
         bail!("joint '{}' moves the palm: give the first link of the hand with --base", joint.name);
@@ -254,6 +255,16 @@ fn urdf_text(path: &Path, xacro_arguments: &[String]) -> anyhow::Result<String> 
         bail!("--xacro-arg is of no use to {}: its name does not end in .xacro", path.display());
     }
     Ok(read_urdf(path)?)
+}
+
+/// Says what helps where a URDF is that of a whole robot.
+fn with_base_advice(error: anyhow::Error, arguments: &Arguments) -> anyhow::Error {
+    let text = format!("{error:#}");
+    let is_large = text.contains("more than 256 links") || text.contains("joints, expected 1 to");
+    if !is_large || arguments.base.is_some() || text.contains(" 0 joints") {
+        return error;
+    }
+    anyhow::anyhow!("{text}; if it is a whole robot, give the first link of the hand with --base LINK")
 }
 
 /// The pose of --palm-pose.
