@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use anyhow::{Context as _, bail};
+use anyhow::{Context as _, anyhow, bail};
 use blindgrasp_messages::{GraspTruth, Header, MAX_CELLS, MAX_JOINTS, MAX_NAME_BYTES, Recorded, TactileFrame};
 use blindgrasp_operator::control_socket;
 use blindgrasp_operator::description::OperatorDescription;
@@ -23,10 +23,10 @@ use blindgrasp_operator::stage::STATE_FORMAT;
 use blindgrasp_operator::waiter::PollFd;
 use blindgrasp_ros::node::topic_name;
 use blindgrasp_stages::day::MAX_DAY;
-use blindgrasp_stages::hand::{CellUnit, Hand};
+use blindgrasp_stages::hand::Hand;
 use blindgrasp_tactile::gate::{Accepted, Counts, FrameFilter, Shape};
 use blindgrasp_tactile::line_protocol::max_line_bytes;
-use blindgrasp_tactile::open_hand::OpenHand;
+use blindgrasp_tactile::open_hand::{CellZeros, Zeroed};
 use blindgrasp_tactile::phases::PhaseFinder;
 use blindgrasp_tactile::replay::Replay;
 use blindgrasp_tactile::ros2::{Ros2, Topics};
@@ -67,6 +67,8 @@ const ROS2_PARAMS: [&str; 21] = [
 ];
 /// The shortest pause between two reports of counts.
 const COUNTS_PAUSE_NANOS: u64 = 250_000_000;
+/// ROS 2: a joint that is slower stands still.
+const MOVING_RAD_PER_S: f64 = 0.05;
 /// The shortest pause between two refusals that are logged.
 const LOG_PAUSE_NANOS: u64 = 1_000_000_000;
 
@@ -218,12 +220,8 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         bail!("hand {}: {n_joints} joints and {n_cells} cells, at most {MAX_JOINTS} and {MAX_CELLS}", hand.name);
     }
     let driver = driver(&params, &hand, operator.has_sandbox())?;
-    if params.zero_when_open && hand.cell_unit == CellUnit::Counts {
-        bail!(
-            "zero_when_open: the cells of {} read counts, and whether they rise or fall under force is not known: leave it out",
-            hand.name
-        );
-    }
+    let zeros =
+        CellZeros::new(&hand, params.zero_when_open).map_err(|reason| anyhow!("hand {}: {reason}", hand.name))?;
     operator.reserve_state()?;
     let shape = Shape { n_joints, n_cells };
     let wall_offset_nanos = wall_nanos().saturating_sub(monotonic_nanos());
@@ -233,11 +231,13 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         truths: operator.publisher("truth", 2 * MAX_NAME_BYTES)?,
         driver,
         hand_id: hand.id(),
-        gate: FrameFilter::new(shape, params.max_delay_nanos(), wall_offset_nanos, Place::default(), None),
+        gate: FrameFilter::new(shape, params.max_delay_nanos(), wall_offset_nanos, Place::default(), None)
+            .with_least_readings(&zeros.least_readings()),
         epoch: 0,
         day: params.day.unwrap_or_else(today),
-        open_hand: params.zero_when_open.then(OpenHand::default),
+        zeros,
         n_unzeroed: 0,
+        n_below_zero: 0,
         poll_pause: params.poll_pause(),
         reported: Default::default(),
         report_due_nanos: 0,
@@ -376,10 +376,11 @@ fn ros2(params: &Params, hand: &Hand) -> anyhow::Result<Ros2> {
             })
             .collect(),
         tolerance_nanos: (topics.tolerance_ms.unwrap_or(20.0) * 1e6) as u64,
+        still_per_s: topics.moving_rad_per_s.unwrap_or(MOVING_RAD_PER_S),
         namespace,
     };
     let still_nanos = (params.topics.still_ms.unwrap_or(200.0) * 1e6) as u64;
-    let finder = PhaseFinder::new(params.topics.moving_rad_per_s.unwrap_or(0.05), still_nanos);
+    let finder = PhaseFinder::new(params.topics.moving_rad_per_s.unwrap_or(MOVING_RAD_PER_S), still_nanos);
     Ok(Ros2::new(topics, finder))
 }
 
@@ -416,11 +417,13 @@ struct TactileSource<'a> {
     /// For frames that do not say it.
     day: u32,
     /// The zero of each cell, if the open hand gives it.
-    open_hand: Option<OpenHand>,
+    zeros: CellZeros,
     /// Accepted frames that were not sent, because no zero was known.
     n_unzeroed: u64,
+    n_below_zero: u64,
     poll_pause: Duration,
-    reported: (Counts, u64),
+    /// Accepted, unzeroed, below zero.
+    reported: (Counts, u64, u64),
     report_due_nanos: u64,
     log: RefusalLog,
 }
@@ -520,12 +523,17 @@ impl TactileSource<'_> {
     fn send(&mut self, mut reading: Reading, accepted: Accepted) -> anyhow::Result<()> {
         // Saved first: an instance that takes over must not use the number of a grasp again.
         self.operator.save_state(&bincode::serde::encode_to_vec(self.gate.place(), STATE_FORMAT)?)?;
-        if self.open_hand.as_mut().is_some_and(|open_hand| !open_hand.subtract_from(&mut reading)) {
-            // The gap in the numbers holds its grasp.
-            self.n_unzeroed += 1;
-            let why = "zero_when_open: no frame of the open hand came before it, expected the phase open first".into();
-            self.refuse(&Refusal { kind: RefusalKind::OutOfOrder, why });
-            return Ok(());
+        match self.zeros.apply(&mut reading) {
+            Zeroed::Unknown => {
+                // The gap in the numbers holds its grasp.
+                self.n_unzeroed += 1;
+                let why =
+                    "zero_when_open: no frame of the open hand came before it, expected the phase open first".into();
+                self.refuse(&Refusal { kind: RefusalKind::OutOfOrder, why });
+                return Ok(());
+            }
+            Zeroed::BelowZero => self.n_below_zero += 1,
+            Zeroed::Forces => {}
         }
         let (epoch, hand_id) = (self.epoch, self.hand_id);
         let header =
@@ -553,14 +561,15 @@ impl TactileSource<'_> {
         self.log.refused(refusal, now_nanos);
     }
 
-    fn counts(&self) -> (Counts, u64) {
-        (*self.gate.counts(), self.n_unzeroed)
+    fn counts(&self) -> (Counts, u64, u64) {
+        (*self.gate.counts(), self.n_unzeroed, self.n_below_zero)
     }
 
     fn report_counts(&mut self) {
         self.reported = self.counts();
         let mut counts = self.reported.0.by_name();
         counts.insert("unzeroed".into(), self.n_unzeroed);
+        counts.insert("below_zero".into(), self.n_below_zero);
         self.operator.has_counted(counts);
     }
 }

@@ -31,7 +31,7 @@ pub(super) struct Arguments {
     /// The file has frames as lines of JSON, of a bridge (docs/hardware.md) or of blindgrasp export: phases, senses and outcomes
     /// of lifts are read as they are. Every line needs its grasp_id.
     #[arg(long, conflicts_with_all = ["cells", "unit", "newtons_per_unit", "joints", "joint_columns", "label", "stable_value",
-        "group", "class", "day", "day_column", "grasp_column", "delimiter", "frames", "grasp_id_start", "skip_bad_rows"])]
+        "group", "class", "day", "day_column", "grasp_column", "delimiter", "frames", "grasp_id_start", "clip_negative", "skip_bad_rows"])]
     lines: bool,
     /// Pad layout (YAML) of the hand, or the name of a built-in one.
     #[arg(long)]
@@ -94,6 +94,9 @@ pub(super) struct Arguments {
     /// Number of the first grasp, so that the grasps of several tables can be told apart.
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=1 << 52))]
     grasp_id_start: u64,
+    /// Take readings below zero, of tared or signed sensors, for 0; otherwise only those within a cell's noise threshold.
+    #[arg(long)]
+    clip_negative: bool,
     /// Leave out rows that cannot be used, and list them, instead of refusing the table.
     #[arg(long)]
     skip_bad_rows: bool,
@@ -146,6 +149,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         scale: scale(arguments, &hand)?,
         n_frames: arguments.frames,
         first_grasp_id: arguments.grasp_id_start,
+        clip_negative: arguments.clip_negative,
         skip_bad_rows: arguments.skip_bad_rows,
     };
     let report = import_table(&arguments.table, &hand, &options, &arguments.out)?;
@@ -273,6 +277,9 @@ fn print_report(
         Joints::Fixed(_) => ("posture, rad", joints.join(", ")),
         Joints::Columns { .. } => ("joints", joints.join(", ")),
     });
+    if report.n_below_zero > 0 {
+        lines.push(("below zero", format!("{} rows have readings below zero, which count as 0", report.n_below_zero)));
+    }
     if !report.skipped.is_empty() {
         lines.push(("left out", format!("{} rows", report.skipped.len())));
     }

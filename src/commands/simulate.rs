@@ -276,7 +276,9 @@ impl Job<'_> {
                     told_at = Instant::now();
                     let (n, n_all) = (before as usize + report.n_grasps, options.n_grasps);
                     let (n_tried, rate) = (report.n_candidates, 100.0 * report.natural_stable_rate());
-                    print_diagnostic(&format!("{n} of {n_all} grasps, {n_tried} candidates tried, {rate:.1} % stable by nature"));
+                    print_diagnostic(&format!(
+                        "{n} of {n_all} grasps, {n_tried} candidates tried, {rate:.1} % stable by nature"
+                    ));
                 }
             },
             |grasp| writer.write(grasp),

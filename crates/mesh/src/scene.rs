@@ -31,7 +31,11 @@ impl Surface {
         }
         for polygon in &self.polygons {
             if polygon.iter().any(|idx| !(0..self.vertices.len() as i64).contains(idx)) {
-                return Err(Problem::new(None, format!("indices below {}", self.vertices.len()), format!("{polygon:?}")));
+                return Err(Problem::new(
+                    None,
+                    format!("indices below {}", self.vertices.len()),
+                    format!("{polygon:?}"),
+                ));
             }
             let placed: Vec<i64> = polygon.iter().map(|idx| first + idx).collect();
             soup.push_polygon(&placed, None)?;
@@ -117,7 +121,8 @@ impl Element {
     }
 
     fn numbers<T: std::str::FromStr>(&self) -> Result<Vec<T>, Problem> {
-        let number = |word: &str| word.parse().map_err(|_| missing(&format!("numbers in <{}>", self.name), quoted(word)));
+        let number =
+            |word: &str| word.parse().map_err(|_| missing(&format!("numbers in <{}>", self.name), quoted(word)));
         self.text.split_whitespace().map(number).collect()
     }
 
@@ -139,13 +144,16 @@ impl Document {
         let mut open: Vec<Element> = Vec::new();
         loop {
             let event = reader.read_event();
-            let line = || 1 + text.as_bytes()[..reader.buffer_position() as usize].iter().filter(|b| **b == b'\n').count();
+            let line =
+                || 1 + text.as_bytes()[..reader.buffer_position() as usize].iter().filter(|b| **b == b'\n').count();
             let closed = match event {
                 Ok(Event::Start(start)) if open.len() < MAX_DEPTH => {
                     open.push(Element::begun(&start));
                     None
                 }
-                Ok(Event::Start(_)) => return Err(Problem::new(Some(line()), "elements nested at most 256 deep", "more")),
+                Ok(Event::Start(_)) => {
+                    return Err(Problem::new(Some(line()), "elements nested at most 256 deep", "more"));
+                }
                 Ok(Event::Empty(start)) => Some(Element::begun(&start)),
                 Ok(Event::End(_)) => open.pop(),
                 Ok(Event::Text(text)) => {
@@ -234,10 +242,8 @@ impl Dae {
     fn place(&self, geometry: &Element, soup: &mut Soup, scene_from_mesh: &Matrix4<f64>) -> Result<(), Problem> {
         let Some(mesh) = geometry.child("mesh") else { return Ok(()) };
         for primitive in &mesh.children {
-            let is_surface = matches!(
-                primitive.name.as_str(),
-                "triangles" | "polylist" | "polygons" | "tristrips" | "trifans"
-            );
+            let is_surface =
+                matches!(primitive.name.as_str(), "triangles" | "polylist" | "polygons" | "tristrips" | "trifans");
             if let Some(input) = primitive.inputs("VERTEX").next().filter(|_| is_surface) {
                 let vertices = self.positions(input)?;
                 let polygons = polygons(primitive, input)?;
@@ -250,7 +256,8 @@ impl Dae {
     /// The positions that the input of a primitive names.
     fn positions(&self, input: &Element) -> Result<Vec<[f64; 3]>, Problem> {
         let vertices = self.document.by_url(input.attribute("source"))?;
-        let position = vertices.inputs("POSITION").next().ok_or_else(|| missing("<vertices> with a POSITION", "none"))?;
+        let position =
+            vertices.inputs("POSITION").next().ok_or_else(|| missing("<vertices> with a POSITION", "none"))?;
         let source = self.document.by_url(position.attribute("source"))?;
         let accessor = source.child("technique_common").and_then(|common| common.child("accessor"));
         let number = |name: &str, default: usize| {
@@ -398,7 +405,9 @@ impl<'a> Glb<'a> {
             let content = bytes.get(at + 8..).and_then(|rest| rest.get(..length as usize));
             let content = content.ok_or_else(|| Problem::cut_off(None, format!("a part of {length} bytes")))?;
             match &kind.to_le_bytes() {
-                b"JSON" => json = Some(serde_json::from_slice(content).map_err(|error| missing("JSON", error.to_string()))?),
+                b"JSON" => {
+                    json = Some(serde_json::from_slice(content).map_err(|error| missing("JSON", error.to_string()))?)
+                }
                 b"BIN\0" => binary = content,
                 _ => {}
             }

@@ -165,9 +165,12 @@ fn a_scene_places_its_meshes() {
         // +y of the file is up, so its +z looks to the front.
         ("Z_UP", "Y_UP", [[0.0, 1.0], [-3.0, 0.0], [0.0, 2.0]]),
         ("Z_UP", "X_UP", [[-3.0, 0.0], [0.0, 2.0], [0.0, 1.0]]),
-        (instance, "<translate>1 0 0</translate><rotate>0 0 1 90</rotate><scale>2 1 1</scale><node>\
+        (
+            instance,
+            "<translate>1 0 0</translate><rotate>0 0 1 90</rotate><scale>2 1 1</scale><node>\
                     <matrix>1 0 0 0 0 1 0 0 0 0 1 5 0 0 0 1</matrix><instance_geometry url='#g'/></node>",
-            [[-1.0, 1.0], [0.0, 2.0], [5.0, 8.0]]),
+            [[-1.0, 1.0], [0.0, 2.0], [5.0, 8.0]],
+        ),
         (triangles, polylist, [[0.0, 1.0], [0.0, 2.0], [0.0, 3.0]]),
         ("<instance_visual_scene url='#s'/>", "", [[0.0, 1.0], [0.0, 2.0], [0.0, 3.0]]),
     ] {

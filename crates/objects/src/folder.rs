@@ -198,7 +198,10 @@ fn read_row(
         ));
     }
     if !is_mesh_file(&file) {
-        return Err(format!("file: expected a name that ends in .off, .obj, .stl, .ply, .dae or .glb, found {}", file.display()));
+        return Err(format!(
+            "file: expected a name that ends in .off, .obj, .stl, .ply, .dae or .glb, found {}",
+            file.display()
+        ));
     }
     if !folder.join(&file).is_file() {
         return Err(format!("file: there is no file {} in the folder", file.display()));

@@ -58,6 +58,7 @@ pub mod operator;
 mod outbox;
 pub mod param;
 pub mod partner;
+pub mod peer;
 pub mod port;
 #[cfg(test)]
 mod recovery_model;

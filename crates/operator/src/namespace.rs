@@ -54,11 +54,24 @@ const N_ID_TRIES: u32 = 8;
 const MAX_PATH_BYTES: usize = 255;
 /// iceoryx2 0.10 adds to the prefix of a connection the digits of a hash, two numbers of up to 33 digits, and an ending.
 const MAX_NAME_BYTES: usize = 40 + 1 + 33 + 1 + 33 + ".connection".len();
+/// The longest path of a folder in which the folders of graphs may be: behind it come the folder, and in that a file.
+const MAX_FOLDER_BYTES: usize = MAX_PATH_BYTES
+    - (1 + FOLDER_PREFIX.len() + MAX_ID_BYTES)
+    - (1 + FILE_PREFIX.len() + MAX_ID_BYTES + 1)
+    - MAX_NAME_BYTES;
+const MAX_ID_BYTES: usize = MAX_ID_NAME_BYTES + 1 + N_ID_LETTERS;
 /// The file in which iceoryx2 0.10 counts the processes of a graph. iceoryx2 lets all users of the machine write to it, so the
 /// launcher makes it before the first process joins. The name has the hash of a type.
 const COUNTER_NAME: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.global_mgmt";
 /// The version of iceoryx2 (0.10.0, 16 bits a part), and the count, which is 0, with its padding.
 const COUNTER: [u64; 2] = [10 << 16, 0];
+
+/// The folder in which the folders of graphs are: the one for temporary files (`TMPDIR`), or `/tmp` where the path of that one is
+/// too long for the files below it.
+pub fn graphs_folder() -> PathBuf {
+    let folder = std::env::temp_dir();
+    if folder.as_os_str().len() <= MAX_FOLDER_BYTES { folder } else { "/tmp".into() }
+}
 
 /// Why a graph has no namespace, or a process cannot join it.
 #[derive(Debug, thiserror::Error)]
@@ -81,12 +94,6 @@ pub enum NamespaceError {
          there, stop other graphs, or make it larger (mount -o remount,size=…; docker run --shm-size=…)"
     )]
     NoRoom { missing_mib: f64 },
-    #[error(
-        "the path of the folder for temporary files, {}, is {excess} bytes too long for the files below it: set TMPDIR to a \
-         shorter one",
-        folder.display()
-    )]
-    TooDeep { folder: PathBuf, excess: usize },
     #[error(
         "the graph's folder cannot be made in the folder for temporary files, {}: set TMPDIR to a folder that this user may \
          write to",
@@ -113,7 +120,7 @@ impl Namespace {
     ///
     /// # Errors
     /// A graph of that name is running, the name has forbidden characters, shared memory is full, or the folder for temporary
-    /// files has too long a path.
+    /// files cannot be written to.
     pub fn reserve(name: &str) -> Result<Namespace, NamespaceError> {
         if !is_name(name) {
             return Err(NamespaceError::Name { name: name.into() });
@@ -137,12 +144,7 @@ impl Namespace {
         for attempt in 1.. {
             let id = Id::new(name);
             let wiring = id.wiring();
-            let n_bytes = wiring.root_path.len() + 1 + wiring.prefix.len() + MAX_NAME_BYTES;
-            if n_bytes > MAX_PATH_BYTES {
-                let excess = n_bytes - MAX_PATH_BYTES;
-                return Err(NamespaceError::TooDeep { folder: std::env::temp_dir(), excess });
-            }
-            let folder = std::env::temp_dir();
+            let folder = graphs_folder();
             match DirBuilder::new().mode(0o700).create(&wiring.root_path) {
                 Ok(()) => {}
                 Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists && attempt < N_ID_TRIES => continue,
@@ -208,7 +210,7 @@ impl Id {
     }
 
     fn wiring(&self) -> NamespaceWiring {
-        let root_path = std::env::temp_dir().join(format!("{FOLDER_PREFIX}{}", self.0)).to_string_lossy().into_owned();
+        let root_path = graphs_folder().join(format!("{FOLDER_PREFIX}{}", self.0)).to_string_lossy().into_owned();
         let prefix = format!("{FILE_PREFIX}{}.", self.0);
         // The prefix lets it be removed with the other files.
         let cursors = format!("{SHARED_MEMORY_FOLDER}/{prefix}cursors");
@@ -327,7 +329,7 @@ fn ids() -> BTreeSet<Id> {
 /// This user's files and folders of graphs.
 fn entries() -> Vec<(Id, PathBuf)> {
     let uid = rustix::process::getuid().as_raw();
-    let folders = [PathBuf::from(SHARED_MEMORY_FOLDER), std::env::temp_dir()];
+    let folders = [PathBuf::from(SHARED_MEMORY_FOLDER), graphs_folder()];
     let all = folders.iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flat_map(Iterator::flatten);
     let of_graphs = all.filter_map(|entry| Some((Id::of(entry.file_name().to_str()?)?, entry)));
     let own = of_graphs.filter(|(_, entry)| entry.metadata().is_ok_and(|metadata| metadata.uid() == uid));

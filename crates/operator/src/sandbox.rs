@@ -29,6 +29,7 @@ use serde_json::{Map, Value};
 
 use crate::description::OperatorDescription;
 use crate::namespace::SHARED_MEMORY_FOLDER;
+use crate::namespace::graphs_folder;
 use crate::param::ParamKind;
 use crate::wiring::{Enforcement, NamespaceWiring};
 
@@ -196,7 +197,7 @@ impl Sandbox {
         }
         let ruleset = ruleset.create()?.add_rules(path_beneath_rules(&self.writable, rights & !AccessFs::Execute))?;
         // The last process of a graph removes its folder, which is in this one.
-        enforce(ruleset.add_rules(path_beneath_rules([std::env::temp_dir()], AccessFs::RemoveDir))?)
+        enforce(ruleset.add_rules(path_beneath_rules([graphs_folder()], AccessFs::RemoveDir))?)
     }
 
     /// The families of the sockets that it may make.
@@ -208,7 +209,7 @@ impl Sandbox {
     pub(crate) fn close(&self) -> Result<Enforcement, SandboxError> {
         let kept = self.readable.iter().chain(&self.writable);
         let ruleset = Ruleset::default().handle_access(READ)?.create()?.add_rules(path_beneath_rules(kept, READ))?;
-        enforce(ruleset.add_rules(path_beneath_rules([std::env::temp_dir()], AccessFs::ReadDir))?)
+        enforce(ruleset.add_rules(path_beneath_rules([graphs_folder()], AccessFs::ReadDir))?)
     }
 }
 

@@ -505,11 +505,11 @@ fn report_of_whole(path: &Path) -> Option<RepairReport> {
     Some(report)
 }
 
-fn unknown_info() -> RecordingInfo {
+pub(super) fn unknown_info() -> RecordingInfo {
     RecordingInfo {
         hand: "unknown".into(),
         hand_id: 0,
-        made_by: "blindgrasp info --repair".into(),
+        made_by: "unknown".into(),
         version: env!("CARGO_PKG_VERSION").into(),
     }
 }

@@ -10,6 +10,7 @@ use mcap::records::{ChunkIndex, MetadataIndex, Record as McapRecord, Statistics,
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
 
 use super::channels::Channels;
+use super::repair::unknown_info;
 use super::source::{Growth, MAX_RECORD_BYTES, longest_record, parse_record, read_records};
 use super::{METADATA_NAME, RecordingError, RecordingInfo};
 
@@ -70,9 +71,24 @@ pub(super) fn open(path: &Path) -> Result<(File, FileSummary), RecordingError> {
             metadata.insert(index.name.clone(), found);
         }
     }
-    let info = info.ok_or_else(|| {
-        invalid(format!("it has no '{METADATA_NAME}' metadata: expected a recording made by blindgrasp"))
-    })?;
+    for (name, found) in raw.metadata_in_data {
+        if name == METADATA_NAME {
+            info = info_from_metadata(found).ok();
+        } else {
+            metadata.insert(name, found);
+        }
+    }
+    // Other MCAP tools copy samples without metadata. The samples still say which hand they are of.
+    let info = match info {
+        Some(info) => info,
+        None if raw.channels.iter().any(|known| known.ours.is_some()) => unknown_info(),
+        None => {
+            let message = format!(
+                "it has no '{METADATA_NAME}' metadata and no topic of blindgrasp: expected a recording made by blindgrasp"
+            );
+            return Err(invalid(message));
+        }
+    };
     if let Some(difference) = raw.channels.other_version() {
         return Err(invalid(other_version(difference, &info)));
     }
@@ -110,6 +126,47 @@ pub(super) struct RawSummary {
     pub(super) statistics: Option<Statistics>,
     pub(super) chunks: Vec<ChunkIndex>,
     metadata: Vec<MetadataIndex>,
+    /// By name: of a file without an index.
+    metadata_in_data: BTreeMap<String, BTreeMap<String, String>>,
+}
+
+impl RawSummary {
+    fn empty() -> RawSummary {
+        RawSummary {
+            channels: Channels::default(),
+            statistics: None,
+            chunks: Vec::new(),
+            metadata: Vec::new(),
+            metadata_in_data: BTreeMap::new(),
+        }
+    }
+}
+
+/// What a summary would say, from a file that has none but is whole otherwise, as some programs write it: all of it is read.
+fn summary_of_data(file: &mut File) -> Result<RawSummary, String> {
+    file.rewind().map_err(|error| error.to_string())?;
+    let options = LinearReaderOptions::default()
+        .with_prevalidate_chunk_crcs(true)
+        .with_check_finishes_after_end_magic(true)
+        .with_record_length_limit(MAX_RECORD_BYTES);
+    let mut reader = LinearReader::new_with_options(options);
+    let mut input = std::io::BufReader::new(file);
+    let mut summary = RawSummary::empty();
+    let refused = read_records(&mut reader, &mut input, &mut Growth::default(), |opcode, data| match opcode {
+        op::SCHEMA | op::CHANNEL => summary.channels.add(opcode, data).err(),
+        op::METADATA => match parse_record(opcode, data) {
+            Ok(McapRecord::Metadata(found)) => {
+                summary.metadata_in_data.insert(found.name, found.metadata);
+                None
+            }
+            _ => Some("a metadata record cannot be read".into()),
+        },
+        _ => None,
+    });
+    match refused.map_err(|error| error.to_string())? {
+        Some(refused) => Err(refused),
+        None => Ok(summary),
+    }
 }
 
 /// Reads the summary and checks that all of it is there and right.
@@ -124,6 +181,9 @@ pub(super) fn raw_summary(file: &mut File, n_file_bytes: u64) -> Result<RawSumma
     let McapRecord::Footer(found) = parse_record(op::FOOTER, &footer[9..29])? else {
         return Err("it does not end as MCAP does".into());
     };
+    if found.summary_start == 0 {
+        return summary_of_data(file);
+    }
     let data_end = match found.summary_start.checked_sub(DATA_END_BYTES) {
         Some(data_end) if found.summary_start <= footer_at => data_end,
         _ => return Err("it has none".into()),
@@ -137,8 +197,7 @@ pub(super) fn raw_summary(file: &mut File, n_file_bytes: u64) -> Result<RawSumma
             .with_record_length_limit(longest_record(n_file_bytes)),
     );
     let mut input = std::io::BufReader::new(file);
-    let mut summary =
-        RawSummary { channels: Channels::default(), statistics: None, chunks: Vec::new(), metadata: Vec::new() };
+    let mut summary = RawSummary::empty();
     let mut is_first = true;
     let refused = read_records(&mut reader, &mut input, &mut Growth::default(), |opcode, data| {
         if std::mem::take(&mut is_first) && opcode != op::DATA_END {

@@ -92,7 +92,9 @@ impl RecordingWriter {
     /// The file cannot be written.
     pub fn finish(mut self) -> Result<BTreeMap<String, u64>, RecordingError> {
         if let Some(writer) = self.writer.take() {
-            complete(writer, &self.path)?;
+            complete(writer, &self.path).inspect_err(|_| {
+                let _ = std::fs::remove_file(partial_path(&self.path));
+            })?;
         }
         let channels = std::mem::take(&mut self.channels);
         Ok(channels.into_iter().map(|(topic, channel)| (topic, channel.n_samples)).collect())

@@ -3,6 +3,8 @@
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+use blindgrasp_messages::files::write_whole;
+
 /// As [`check_output`], for a file that another one takes the place of once it is complete. It also refuses to replace a
 /// file, unless the user has asked for that, and anything else that bears the name.
 pub fn check_new(out: &Path, inputs: &[PathBuf], overwrite: bool) -> anyhow::Result<()> {
@@ -46,4 +48,14 @@ pub fn check_output(out: &Path, inputs: &[PathBuf]) -> anyhow::Result<()> {
         None if out.is_dir() => anyhow::bail!("{} is a folder: expected the name of a file to write", out.display()),
         None => Ok(()),
     }
+}
+
+/// Writes a text as an output file: whole or not at all. A link, a pipe or a device is written to as it is.
+///
+/// # Errors
+/// It cannot be written; nothing is left of it.
+pub fn write_out(path: &Path, text: &str) -> anyhow::Result<()> {
+    let is_special = std::fs::symlink_metadata(path).is_ok_and(|found| !found.is_file());
+    let written = if is_special { std::fs::write(path, text) } else { write_whole(path, text) };
+    written.map_err(|error| anyhow::anyhow!("cannot write {}: {error}", path.display()))
 }

@@ -120,7 +120,8 @@ impl<'a> Mechanism<'a> {
             })
             .collect();
         let fingers = joints.iter().map(|joint| fingers(hand, joint.joint_idx)).collect();
-        let mut mechanism = Mechanism { hand, shapes, shapes_of_links, joints, movers, top_speed, fingers, pairs: Vec::new() };
+        let mut mechanism =
+            Mechanism { hand, shapes, shapes_of_links, joints, movers, top_speed, fingers, pairs: Vec::new() };
         mechanism.pairs = mechanism.pairs();
         mechanism
     }
@@ -201,7 +202,11 @@ impl<'a> Mechanism<'a> {
         };
         let chains = self.movers.iter().map(|movers| {
             let turns: Vec<_> = movers.iter().filter(|mover| mover.kind == JointKind::Revolute).map(turn).collect();
-            turns.windows(2).filter(|pair| pair[0].1.dot(&pair[1].1) < OPPOSED && pair[0].0 != pair[1].0).map(|pair| (pair[0].0, pair[1].0)).collect()
+            turns
+                .windows(2)
+                .filter(|pair| pair[0].1.dot(&pair[1].1) < OPPOSED && pair[0].0 != pair[1].0)
+                .map(|pair| (pair[0].0, pair[1].0))
+                .collect()
         });
         let chains: Vec<Vec<(usize, usize)>> = chains.collect();
         chains.concat()

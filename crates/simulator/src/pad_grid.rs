@@ -88,7 +88,8 @@ fn inner_direction(mechanism: &Mechanism<'_>, link_idx: usize) -> Result<UnitVec
         let palm_from_links = hand.palm_from_links(posture)?;
         let palm_from_link = &palm_from_links[link_idx];
         let in_palm = nearest.map_or_else(Vector3::z, |joint| {
-            let velocity = mechanism.velocity_of_joint(link_idx, &(palm_from_link * middle), joint.joint_idx, &palm_from_links);
+            let velocity =
+                mechanism.velocity_of_joint(link_idx, &(palm_from_link * middle), joint.joint_idx, &palm_from_links);
             (velocity * joint.rate).try_normalize(1e-9).unwrap_or_else(Vector3::z)
         });
         sum += palm_from_link.rotation.inverse() * in_palm;

@@ -197,7 +197,8 @@ fn directions(hand: &Hand) -> Result<Vec<UnitVector3<f64>>, JointError> {
     let axes = [Vector3::z_axis(), Vector3::x_axis(), Vector3::y_axis()];
     let mut directions: Vec<UnitVector3<f64>> = axes.into_iter().flat_map(|axis| [axis, -axis]).collect();
     let cells = hand.cells_in_palm(&hand.open_joints_rad())?;
-    let mean: Vector3<f64> = cells.iter().map(|cell| cell.normal_in_palm.into_inner()).sum::<Vector3<f64>>() / cells.len() as f64;
+    let mean: Vector3<f64> =
+        cells.iter().map(|cell| cell.normal_in_palm.into_inner()).sum::<Vector3<f64>>() / cells.len() as f64;
     let between = directions.iter().all(|axis| axis.dot(&mean) < 0.94 * mean.norm());
     directions.extend(Unit::try_new(mean, 0.5).filter(|_| between));
     Ok(directions)

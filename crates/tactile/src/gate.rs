@@ -23,6 +23,7 @@
 //! A wrong number leaves a gap, so that the grasp is held.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use super::{Arrival, Place, Reading, Refusal, RefusalKind};
 use blindgrasp_messages::{Phase, Sense};
@@ -110,6 +111,8 @@ pub struct Accepted {
 #[derive(Debug, Clone)]
 pub struct FrameFilter {
     shape: Shape,
+    /// The least reading that each cell may have; 0 for all where it is absent.
+    least_readings: Option<Arc<[f64]>>,
     max_delay_nanos: u64,
     /// The wall clock's time less CLOCK_BOOTTIME's, to stamp readings that have none.
     wall_offset_nanos: u64,
@@ -189,6 +192,7 @@ impl FrameFilter {
     ) -> Self {
         FrameFilter {
             shape,
+            least_readings: None,
             max_delay_nanos,
             wall_offset_nanos,
             counts: Counts::default(),
@@ -213,6 +217,11 @@ impl FrameFilter {
             counts,
             ..FrameFilter::new(self.shape, self.max_delay_nanos, self.wall_offset_nanos, place, last_seq)
         };
+    }
+
+    /// Takes readings of the cells down to these.
+    pub fn with_least_readings(self, least_readings: &[f64]) -> Self {
+        FrameFilter { least_readings: Some(least_readings.into()), ..self }
     }
 
     pub fn set_max_delay_nanos(&mut self, max_delay_nanos: u64) {
@@ -286,7 +295,9 @@ impl FrameFilter {
         }
         let last = self.place.grasp_id;
         let is_far = |id: u64| last.is_none_or(|last| id > last.saturating_add(1) && id - last <= MAX_GRASP_JUMP);
-        if reading.grasp_id.is_some_and(is_far) && check_values(reading, self.shape).is_ok() {
+        if reading.grasp_id.is_some_and(is_far)
+            && check_values(reading, self.shape, self.least_readings.as_deref()).is_ok()
+        {
             self.waiting = Some((reading.clone(), *arrival));
             return Ok(None);
         }
@@ -372,7 +383,7 @@ impl FrameFilter {
 
     fn judge_next(&mut self, reading: &Reading, arrival: &Arrival) -> Result<Accepted, Refusal> {
         let malformed = |why: String| Refusal { kind: RefusalKind::Malformed, why };
-        check_values(reading, self.shape).map_err(malformed)?;
+        check_values(reading, self.shape, self.least_readings.as_deref()).map_err(malformed)?;
         let keys = Keys {
             grasp_id: reading.grasp_id.is_some(),
             seq: reading.seq.is_some(),
@@ -552,7 +563,7 @@ impl FrameFilter {
     }
 }
 
-fn check_values(reading: &Reading, shape: Shape) -> Result<(), String> {
+fn check_values(reading: &Reading, shape: Shape, least_readings: Option<&[f64]>) -> Result<(), String> {
     let Reading { joints, cells_newtons, .. } = reading;
     for (name, found, expected) in
         [("joints", joints.len(), shape.n_joints), ("cells_newtons", cells_newtons.len(), shape.n_cells)]
@@ -567,10 +578,19 @@ fn check_values(reading: &Reading, shape: Shape) -> Result<(), String> {
     if let Some((idx, angle)) = joints.iter().enumerate().find(|(_, angle)| !angle.is_finite()) {
         return Err(format!("joints[{idx}] is {angle}: expected an angle in radians"));
     }
+    let least = |idx: usize| least_readings.map_or(0.0, |readings| readings[idx]);
     if let Some((idx, force)) =
-        cells_newtons.iter().enumerate().find(|(_, force)| !(force.is_finite() && **force >= 0.0))
+        cells_newtons.iter().enumerate().find(|(idx, force)| !(force.is_finite() && **force >= least(*idx)))
     {
-        return Err(format!("cells_newtons[{idx}] is {force}: expected a force, which is not negative"));
+        let expected = match least(idx) {
+            f64::NEG_INFINITY => "expected a finite number".into(),
+            least if force.is_finite() => format!(
+                "expected at least {least}, the cell's noise threshold below 0: a sensor that is tared or drifts needs \
+                 zero_when_open"
+            ),
+            _ => "expected a force, which is not negative".to_owned(),
+        };
+        return Err(format!("cells_newtons[{idx}] is {force}: {expected}"));
     }
     for (sense, values) in reading.senses.view().iter() {
         let (name, expected) = (sense.name(), sense.len(shape.n_joints));

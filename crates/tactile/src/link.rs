@@ -10,6 +10,7 @@ use std::path::Path;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
 
+use blindgrasp_operator::peer::peer_of;
 use rustix::fs::{Mode, OFlags};
 use rustix::net::sockopt;
 use rustix::termios::{ControlModes, OptionalActions, QueueSelector};
@@ -107,12 +108,14 @@ fn is_left_over(path: &Path) -> bool {
 
 /// The process at the other end, if it is of this user or of root.
 fn check_user(stream: &UnixStream) -> io::Result<i32> {
-    let peer = sockopt::socket_peercred(stream)?;
-    if peer.uid != rustix::process::getuid() && !peer.uid.is_root() {
-        let message = format!("process {} belongs to user {}", peer.pid.as_raw_nonzero(), peer.uid.as_raw());
+    let peer = peer_of(stream)?;
+    // 0 for a process in another PID namespace.
+    let pid = peer.pid.unwrap_or(0);
+    if peer.uid != rustix::process::getuid().as_raw() && peer.uid != 0 {
+        let message = format!("process {pid} belongs to user {}", peer.uid);
         return Err(io::Error::new(io::ErrorKind::PermissionDenied, message));
     }
-    Ok(peer.pid.as_raw_nonzero().get())
+    Ok(pid)
 }
 
 /// Sets a connection so that no call waits and a dead peer is noticed.

@@ -27,6 +27,9 @@ const SILENT_NANOS: u64 = 2_000_000_000;
 const TRANSFORM_NANOS: u64 = 100_000_000;
 /// The static transforms of a publisher that come to a subscriber later.
 const N_STATIC: usize = 100;
+/// Angles of a topic that is slower than this are missed.
+const SLOWEST_NANOS: u64 = 150_000_000;
+const SEC_NANOS: u64 = 1_000_000_000;
 /// Gravity at sea level, in metres per second squared.
 const GRAVITY_M_PER_S2: f64 = 9.81;
 
@@ -54,8 +57,10 @@ pub struct Topics {
     /// The hand's joints as ROS names them, in the hand's order, each with the change of its value while the hand closes by a
     /// radian; `None` for a joint that does not close.
     pub joint_names: Vec<(String, Option<f64>)>,
-    /// Joint angles and senses must be this near to the cells in time.
+    /// Joint angles and senses must be this near to the cells in time. Angles of a slower topic hold until the next one is due.
     pub tolerance_nanos: u64,
+    /// A joint that is slower stands still, per second.
+    pub still_per_s: f64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -69,14 +74,39 @@ enum Topic {
     StaticTransforms,
 }
 
+/// The last angle of a joint.
+#[derive(Debug, Clone, Copy)]
+struct JointAngle {
+    /// Radians, or metres.
+    value: f64,
+    stamp_nanos: u64,
+    sender: [u8; 16],
+    at_nanos: u64,
+    /// Time since the angle before, and the change since then.
+    period_nanos: u64,
+    change: f64,
+}
+
+impl JointAngle {
+    /// Whether it holds for cells of that time, though it is older than the tolerance: the topic is slower than the cells, and the
+    /// next angle is not due yet. Of a hand that holds an object, the joint must stand still.
+    fn is_last_of_a_slow_topic(&self, cells_nanos: u64, is_held: bool, still_per_s: f64) -> bool {
+        let due_nanos = (self.period_nanos + self.period_nanos / 2).min(SLOWEST_NANOS);
+        let is_due = cells_nanos.saturating_sub(self.stamp_nanos) > due_nanos || cells_nanos < self.stamp_nanos;
+        let stands = self.change.abs() <= still_per_s * self.period_nanos as f64 / SEC_NANOS as f64;
+        !is_due && (stands || !is_held)
+    }
+}
+
 /// Reads frames from topics of ROS 2.
 pub struct Ros2 {
     topics: Topics,
     definitions: BTreeMap<Topic, (String, Definition, String)>,
     finder: PhaseFinder,
     inbox: Option<Arc<Inbox<(Topic, Received)>>>,
-    /// The last angle of each joint, radians, and its time.
-    joints: Vec<Option<(f64, u64)>>,
+    joints: Vec<Option<JointAngle>>,
+    /// The joint that two nodes sent, and when.
+    contradiction: Option<(String, u64)>,
     /// The phase and its arrival; `None` until one is known.
     phase: Option<(Phase, u64)>,
     wrench: Option<(Vec<f64>, u64)>,
@@ -114,6 +144,7 @@ impl Ros2 {
             finder,
             inbox: None,
             joints,
+            contradiction: None,
             phase: None,
             wrench: None,
             gravity: None,
@@ -175,7 +206,9 @@ impl Ros2 {
         let stamp = value.stamp_nanos().filter(|stamp| *stamp > 0).or(received.source_nanos);
         let stamp_nanos = stamp.unwrap_or(at_nanos);
         match topic {
-            Topic::Joints => self.take_joints(&value, stamp_nanos, at_nanos)?,
+            Topic::Joints => {
+                self.take_joints(&value, received.sender.unwrap_or_default(), stamp_nanos, at_nanos)?;
+            }
             Topic::Phase => self.phase = Some((phase_of(&value)?, at_nanos)),
             Topic::Wrench => {
                 let wrench = value.at("wrench").and_then(|wrench| wrench.numbers()).ok_or("it has no wrench")?;
@@ -196,7 +229,7 @@ impl Ros2 {
         Ok(None)
     }
 
-    fn take_joints(&mut self, value: &Value, stamp_nanos: u64, at_nanos: u64) -> Result<(), String> {
+    fn take_joints(&mut self, value: &Value, sender: [u8; 16], stamp_nanos: u64, at_nanos: u64) -> Result<(), String> {
         let names = value.at("name");
         let names = names.as_ref().and_then(Value::texts).unwrap_or_default();
         let angles = value.at("position").and_then(|position| position.numbers()).unwrap_or_default();
@@ -206,14 +239,29 @@ impl Ros2 {
         let mut has_any = false;
         for ((wanted, _), joint) in self.topics.joint_names.iter().zip(&mut self.joints) {
             if let Some(idx) = names.iter().position(|name| name == wanted) {
-                *joint = Some((angles[idx], stamp_nanos));
+                let value = angles[idx];
+                let before = joint.filter(|before| before.sender == sender && before.stamp_nanos <= stamp_nanos);
+                if joint.is_some_and(|other| {
+                    other.sender != sender && at_nanos.saturating_sub(other.at_nanos) < SILENT_NANOS
+                }) {
+                    self.contradiction = Some((wanted.clone(), at_nanos));
+                }
+                let (period_nanos, change) = before.map_or((0, f64::INFINITY), |before| {
+                    match stamp_nanos - before.stamp_nanos {
+                        // A message that repeats an angle says nothing new.
+                        0 => (before.period_nanos, before.change),
+                        period_nanos => (period_nanos, value - before.value),
+                    }
+                });
+                *joint = Some(JointAngle { value, stamp_nanos, sender, at_nanos, period_nanos, change });
                 has_any = true;
             }
         }
         if has_any && self.topics.phase.is_none() {
             let joints = self.topics.joint_names.iter().zip(&self.joints);
             let fingers = joints.filter_map(|((_, closing_rate), joint)| Some((closing_rate.as_ref()?, joint)));
-            let fingers: Option<Vec<f64>> = fingers.map(|(rate, joint)| joint.map(|(value, _)| value / rate)).collect();
+            let fingers: Option<Vec<f64>> =
+                fingers.map(|(rate, joint)| joint.map(|joint| joint.value / rate)).collect();
             if let Some(fingers) = fingers {
                 self.phase = Some((self.finder.phase(stamp_nanos, &fingers), at_nanos));
             }
@@ -252,15 +300,33 @@ impl Ros2 {
         let cells_newtons = cells(value, &self.topics.cells_field)?;
         self.take_gravity(stamp_nanos, at_nanos)?;
         let is_near = |other: u64| other.abs_diff(stamp_nanos) <= self.topics.tolerance_nanos;
+        if let Some((joint, since)) = &self.contradiction
+            && at_nanos.saturating_sub(*since) < SILENT_NANOS
+        {
+            return Err(format!(
+                "two nodes send the angle of joint '{joint}' on {}: end one of them (joint_state_publisher beside the hand's own \
+                 driver?), or give another joints_topic",
+                self.topics.joints
+            ));
+        }
+        let is_held = self.phase.is_none_or(|(phase, _)| !matches!(phase, Phase::Open | Phase::Closing));
         let mut joints = Vec::with_capacity(self.joints.len());
         for ((name, _), joint) in self.topics.joint_names.iter().zip(&self.joints) {
-            let (angle, at) =
+            let angle =
                 joint.ok_or_else(|| format!("no angle of joint '{name}' has come on {}", self.topics.joints))?;
-            if !is_near(at) {
-                let millis = at.abs_diff(stamp_nanos) as f64 / 1e6;
-                return Err(format!("the angle of joint '{name}' is {millis:.1} ms from the cells in time"));
+            let is_slow = angle.is_last_of_a_slow_topic(stamp_nanos, is_held, self.topics.still_per_s);
+            if !(is_near(angle.stamp_nanos) || is_slow) {
+                let millis = |nanos: u64| nanos as f64 / 1e6;
+                return Err(format!(
+                    "the angle of joint '{name}' is {:.1} ms from the cells in time, tolerance_ms is {:.1}, and {} comes each \
+                     {:.1} ms",
+                    millis(angle.stamp_nanos.abs_diff(stamp_nanos)),
+                    millis(self.topics.tolerance_nanos),
+                    self.topics.joints,
+                    millis(angle.period_nanos)
+                ));
             }
-            joints.push(angle);
+            joints.push(angle.value);
         }
         let (phase, _) = self
             .phase
@@ -373,8 +439,6 @@ mod tests {
 
     use super::*;
 
-    const SEC_NANOS: u64 = 1_000_000_000;
-
     /// A driver for a hand with the joints `a` and `b`, whose cells have this type.
     fn driver(cells_type: &str, cells_field: &str) -> Ros2 {
         let topics = Topics {
@@ -391,6 +455,7 @@ mod tests {
             gravity: None,
             joint_names: vec![("a".into(), Some(1.0)), ("b".into(), Some(1.0))],
             tolerance_nanos: 20_000_000,
+            still_per_s: 0.05,
         };
         Ros2::new(topics, PhaseFinder::new(0.05, 200_000_000))
     }
@@ -474,6 +539,72 @@ mod tests {
         assert!(
             why(take(&mut driver, Topic::Cells, old, later, Some(8))).contains("is 30.0 ms from the cells in time")
         );
+    }
+
+    /// A driver of joints and cells alone, whose phase is this.
+    fn plain(phase: &str) -> Ros2 {
+        let mut topics = driver("std_msgs/msg/Float64MultiArray", "data").topics;
+        (topics.imu, topics.wrench) = (None, None);
+        let mut driver = Ros2::new(topics, PhaseFinder::new(0.05, 200_000_000));
+        let phase = message(&driver, Topic::Phase, &phase, SEC_NANOS);
+        assert_eq!(take(&mut driver, Topic::Phase, phase, SEC_NANOS, None), None);
+        driver
+    }
+
+    #[test]
+    fn angles_of_a_slow_topic_hold_until_the_next_ones_are_due() {
+        let millis = 1_000_000;
+        // Each 40 ms; the joints move, or stand.
+        for (phase, moves, age, is_taken) in [
+            ("settled", false, 38, true),
+            ("settled", true, 38, false),
+            ("settled", true, 19, true),
+            ("closing", true, 38, true),
+            ("settled", false, 70, false),
+        ] {
+            let mut driver = plain(phase);
+            let mut t = 5 * SEC_NANOS;
+            for step in 0..3 {
+                t += 40 * millis;
+                let angle = if moves { 0.1 * f64::from(step) } else { 0.1 };
+                let angles = joints(&driver, &["a", "b"], &[angle, 0.2], t);
+                assert_eq!(take(&mut driver, Topic::Joints, angles, t, None), None);
+            }
+            let at = t + age * millis;
+            let frame = floats(&driver, &[1.0, 2.0], at, 8);
+            assert_eq!(take(&mut driver, Topic::Cells, frame, at, Some(7)), Some(Event::Began));
+            match driver.pending.take() {
+                Some(Event::Frame(..)) => assert!(is_taken, "{phase} {moves} {age}"),
+                other => {
+                    let why = why(other);
+                    assert!(!is_taken && why.contains("tolerance_ms is 20.0") && why.contains("each 40.0 ms"), "{why}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn two_nodes_that_send_one_joint_are_told() {
+        let mut driver = plain("settled");
+        let t = 5 * SEC_NANOS;
+        for (sender, names) in [([1; 16], ["a", "elbow"]), ([2; 16], ["b", "wrist"]), ([3; 16], ["a", "b"])] {
+            let angles = Received { sender: Some(sender), ..joints(&driver, &names, &[0.1, 0.2], t) };
+            assert_eq!(take(&mut driver, Topic::Joints, angles, t, None), None);
+            let frame = floats(&driver, &[1.0, 2.0], t, 8);
+            let _ = take(&mut driver, Topic::Cells, frame, t, Some(7));
+            let is_whole = driver.pending.take().is_none_or(|event| !matches!(event, Event::Refused(_)));
+            assert!(is_whole || sender != [2; 16], "each joint has one node");
+        }
+        let frame = floats(&driver, &[1.0, 2.0], t, 9);
+        assert!(
+            why(take(&mut driver, Topic::Cells, frame, t, Some(8))).contains("two nodes send the angle of joint 'a'")
+        );
+        let later = t + 3 * SEC_NANOS;
+        let angles = Received { sender: Some([3; 16]), ..joints(&driver, &["a", "b"], &[0.1, 0.2], later) };
+        assert_eq!(take(&mut driver, Topic::Joints, angles, later, None), None);
+        let frame = floats(&driver, &[1.0, 2.0], later, 10);
+        let taken = take(&mut driver, Topic::Cells, frame, later, Some(9));
+        assert!(matches!(taken, Some(Event::Frame(..))), "one of them has ended: {taken:?}");
     }
 
     #[test]

@@ -14,7 +14,7 @@ mod foxglove;
 mod serving;
 
 use std::convert::Infallible;
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -107,9 +107,13 @@ impl Viewer {
     pub fn serve(port: u16, abilities: Abilities) -> Result<Viewer, ViewerError> {
         let refused = |source| ViewerError::Listen { port, source };
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(refused)?;
-        let listener = runtime
-            .block_on(tokio::net::TcpListener::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, port))))
-            .map_err(refused)?;
+        let bind = |host: IpAddr| runtime.block_on(tokio::net::TcpListener::bind(SocketAddr::from((host, port))));
+        // A machine of IPv6 alone has only the other address.
+        let listener = bind(Ipv4Addr::LOCALHOST.into()).or_else(|error| match error.kind() {
+            std::io::ErrorKind::AddrNotAvailable => bind(Ipv6Addr::LOCALHOST.into()),
+            _ => Err(error),
+        });
+        let listener = listener.map_err(refused)?;
         let address = listener.local_addr().map_err(refused)?;
         let shared = Arc::new(Shared {
             events: broadcast::channel(MAX_WAITING).0,

@@ -13,7 +13,7 @@ use super::super::promises::shown_counts;
 use super::super::top::poller::Poller;
 use super::super::top::sample::{Measured, MeasuredEdge, MeasuredNode, RUN, Window, measure};
 use super::super::top::screen::{short_rate, short_time};
-use super::super::{Outcome, check_output, print_line, ps};
+use super::super::{Outcome, check_output, print_line, ps, write_out};
 use super::{Format, GraphArguments};
 use blindgrasp_graph::client::pick_graph;
 use blindgrasp_graph::control::NodeState;
@@ -102,8 +102,7 @@ fn draw(
         Format::Svg => svg(&graph_dot(&drawn(&picture)))?,
     };
     match out {
-        Some(out) => std::fs::write(out, format!("{}\n", text.trim_end()))
-            .with_context(|| format!("cannot write {}", out.display()))?,
+        Some(out) => write_out(out, &format!("{}\n", text.trim_end()))?,
         None => print_line(text.trim_end())?,
     }
     Ok(Outcome::Done)

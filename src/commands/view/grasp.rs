@@ -5,7 +5,7 @@ use std::path::Path;
 
 use anyhow::{Context, bail};
 
-use super::super::{Outcome, check_output, print_line};
+use super::super::{Outcome, check_output, print_line, write_out};
 use super::GraspArguments;
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::evaluation::decide_alone;
@@ -34,7 +34,7 @@ pub(super) fn draw(recording: &Path, out: &Path, arguments: &GraspArguments) -> 
         Format::Svg => grasp_svg(&hand, &grasp)?,
         Format::Html => grasp_html(&hand, &grasp)?,
     };
-    std::fs::write(out, picture).map_err(|error| anyhow::anyhow!("cannot write {}: {error}", out.display()))?;
+    write_out(out, &picture)?;
     print_line(&format!("grasp {} drawn to {}", grasp.grasp_id, out.display()))?;
     Ok(Outcome::Done)
 }
@@ -66,7 +66,7 @@ pub(super) fn animate(recording: &Path, out: &Path, arguments: &GraspArguments) 
         });
     }
     let picture = animation_svg(&hand, &animated)?;
-    std::fs::write(out, picture).map_err(|error| anyhow::anyhow!("cannot write {}: {error}", out.display()))?;
+    write_out(out, &picture)?;
     print_line(&format!("{} grasps drawn to {}", animated.len(), out.display()))?;
     Ok(Outcome::Done)
 }

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::super::{Outcome, check_output, print_line};
+use super::super::{Outcome, check_output, print_line, write_out};
 use super::grasp::{Format, format_of};
 use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -38,7 +38,7 @@ pub(super) fn draw(path: &Path, out: &Path, joints: &[(String, f64)]) -> anyhow:
             grasp_html(&hand, &RecordedGrasp::hand_alone(&hand, &postures))?
         }
     };
-    std::fs::write(out, picture).map_err(|error| anyhow::anyhow!("cannot write {}: {error}", out.display()))?;
+    write_out(out, &picture)?;
     print_line(&format!("hand {} drawn to {}", hand.name, out.display()))?;
     Ok(Outcome::Done)
 }

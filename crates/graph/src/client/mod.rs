@@ -6,7 +6,6 @@ pub mod shadow_comparison;
 pub mod usage;
 
 use std::io::{Read, Write};
-use std::os::fd::AsFd;
 use std::os::unix::net::UnixStream;
 use std::time::{Duration, Instant};
 
@@ -14,10 +13,13 @@ use rustix::io::Errno;
 
 use crate::control::{GraphStatus, Reply, Request};
 use blindgrasp_operator::control_socket;
+use blindgrasp_operator::peer::peer_of;
 use blindgrasp_operator::text::is_name;
 
 /// The time limit of requests that a graph answers at once.
 pub const ANSWER_LIMIT: Duration = Duration::from_secs(3);
+/// A launcher that has closed its connections frees its name within this time.
+const CLEANUP_LIMIT: Duration = Duration::from_secs(60);
 
 /// A client checks this often whether it was interrupted or the graph has ended.
 const POLL: Duration = Duration::from_millis(50);
@@ -71,6 +73,7 @@ const NAME_POLL: Duration = Duration::from_millis(10);
 pub struct Connection {
     graph: String,
     stream: UnixStream,
+    /// 0 if it is in another PID namespace.
     launcher_pid: i32,
     received: Vec<u8>,
     /// So many of the received bytes hold no end of a line.
@@ -150,12 +153,12 @@ impl Connection {
         };
         let uid = rustix::process::getuid().as_raw();
         let socket = control_socket::connect(graph).map_err(failed)?;
-        let peer = rustix::net::sockopt::socket_peercred(socket.as_fd()).map_err(failed)?;
-        if peer.uid.as_raw() != uid {
-            return Err(ClientError::OtherUser { graph: graph.into(), uid: peer.uid.as_raw() });
+        let peer = peer_of(&socket).map_err(|source| ClientError::Io { graph: graph.into(), source })?;
+        if peer.uid != uid {
+            return Err(ClientError::OtherUser { graph: graph.into(), uid: peer.uid });
         }
         let stream = UnixStream::from(socket);
-        let launcher_pid = peer.pid.as_raw_nonzero().get();
+        let launcher_pid = peer.pid.unwrap_or(0);
         let connection = Connection { graph: graph.into(), stream, launcher_pid, received: Vec::new(), n_searched: 0 };
         connection.stream.set_nonblocking(false).map_err(|error| connection.broken(error))?;
         // Requests are short: one that cannot be sent has no reader.
@@ -242,7 +245,7 @@ impl Connection {
     /// Waits until the graph has ended: its name is free, or another launcher has it.
     ///
     /// # Errors
-    /// The connection failed.
+    /// The connection failed, or the launcher has closed it and does not end.
     pub fn wait_until_ended(mut self) -> Result<(), ClientError> {
         loop {
             match self.receive_within(Duration::from_secs(1)) {
@@ -252,7 +255,12 @@ impl Connection {
             }
         }
         // The launcher frees the name after it has cleaned up.
+        let closed = Instant::now();
         loop {
+            if closed.elapsed() > CLEANUP_LIMIT {
+                let (graph, pid) = (self.graph, self.launcher_pid);
+                return Err(ClientError::NotAnswering { graph, pid, limit_secs: CLEANUP_LIMIT.as_secs_f64() });
+            }
             match Connection::open(&self.graph) {
                 Ok(other) if other.launcher_pid == self.launcher_pid => std::thread::sleep(POLL),
                 Err(ClientError::QueueFull { .. }) => std::thread::sleep(POLL),

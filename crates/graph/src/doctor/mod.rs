@@ -17,6 +17,7 @@ use crate::log::LogFolder;
 use crate::operators::Operators;
 use blindgrasp_operator::diagnostics::ENOUGH_FILES;
 use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::namespace::graphs_folder;
 use blindgrasp_operator::namespace::{LEAST_FREE_BYTES, SHARED_MEMORY_FOLDER, left_over};
 use blindgrasp_operator::sandbox::supported;
 use blindgrasp_operator::wiring::Enforcement;
@@ -145,7 +146,7 @@ fn folders() -> Vec<Finding> {
     let logs = logs.ancestors().find(|folder| folder.is_dir()).unwrap_or(Path::new("/")).to_path_buf();
     let places = [
         ("permissions: shared memory", SHARED_MEMORY_FOLDER.into()),
-        ("permissions: temporary files", std::env::temp_dir()),
+        ("permissions: temporary files", graphs_folder()),
         ("permissions: logs", logs),
     ];
     let writable = |(check, folder): (&str, std::path::PathBuf)| {

@@ -15,6 +15,7 @@ use crate::launcher::Event;
 use crate::launcher::audit::Trail;
 use crate::launcher::log_writer::Log;
 use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::peer::peer_of;
 
 /// Longer requests are refused.
 const MAX_REQUEST_BYTES: u64 = 1 << 20;
@@ -112,9 +113,9 @@ pub(super) fn serve(
 
 /// The client for the audit log, if it is of this user.
 fn own_user(stream: &UnixStream) -> Option<String> {
-    let peer = rustix::net::sockopt::socket_peercred(stream).ok()?;
-    (peer.uid == rustix::process::getuid())
-        .then(|| format!("uid {} pid {}", peer.uid.as_raw(), peer.pid.as_raw_nonzero()))
+    let peer = peer_of(stream).ok()?;
+    let pid = peer.pid.map_or("of another namespace".into(), |pid| pid.to_string());
+    (peer.uid == rustix::process::getuid().as_raw()).then(|| format!("uid {} pid {pid}", peer.uid))
 }
 
 /// Tells a client that there is no place for it.

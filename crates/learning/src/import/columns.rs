@@ -26,7 +26,6 @@ pub(super) struct Columns {
 impl Columns {
     /// Finds the columns of the options. Errors do not name the file.
     pub(super) fn find(header: &[String], hand: &Hand, options: &ImportOptions) -> Result<Columns, String> {
-        check_header(header)?;
         let label = column(header, &options.label, "--label")?;
         let group = column(header, &options.group, "--group")?;
         let day = match &options.day {
@@ -62,22 +61,27 @@ impl Columns {
                 return Err(format!("column '{}' is read twice, by {first} and by {what}", header[*idx]));
             }
         }
+        check_names(header, &uses.iter().map(|(idx, _)| *idx).collect::<Vec<_>>())?;
         Ok(Columns { cells, joints, label, group, class, day, grasp, phase })
     }
 }
 
-fn check_header(header: &[String]) -> Result<(), String> {
-    let mut first_idxs = HashMap::new();
+/// Refuses a column that is read and whose name another one has, too.
+fn check_names(header: &[String], used: &[usize]) -> Result<(), String> {
+    let mut by_name: HashMap<&String, Vec<usize>> = HashMap::new();
     for (idx, name) in header.iter().enumerate().filter(|(_, name)| !name.is_empty()) {
-        if let Some(first_idx) = first_idxs.insert(name, idx) {
-            let (first, second) = (first_idx + 1, idx + 1);
-            return Err(format!(
-                "line 1: columns {first} and {second} are both called '{}': expected names that differ",
-                shortened(name)
-            ));
-        }
+        by_name.entry(name).or_default().push(idx);
     }
-    Ok(())
+    let twins = used.iter().filter_map(|idx| by_name.get(&header[*idx]).filter(|idxs| idxs.len() > 1));
+    match twins.into_iter().next() {
+        Some(idxs) => Err(format!(
+            "line 1: columns {} and {} are both called '{}': expected names that differ",
+            idxs[0] + 1,
+            idxs[1] + 1,
+            shortened(&header[idxs[0]])
+        )),
+        None => Ok(()),
+    }
 }
 
 fn column(header: &[String], name: &str, flag: &str) -> Result<usize, String> {
@@ -217,11 +221,12 @@ mod tests {
     #[test]
     fn names_of_columns_differ() {
         let twice = ["", "a", "", "b", "a"].map(String::from);
-        let error = check_header(&twice).expect_err("twice");
+        let error = check_names(&twice, &[0, 4]).expect_err("twice");
         assert!(error.contains("columns 2 and 5 are both called 'a'"), "{error}");
         // Every name was compared with every other: minutes.
         let many: Vec<String> = (0..500_000).map(|idx| format!("column_{idx}")).collect();
-        assert_eq!(check_header(&many), Ok(()));
+        assert_eq!(check_names(&many, &(0..500_000).collect::<Vec<_>>()), Ok(()));
+        assert_eq!(check_names(&twice, &[0, 2]), Ok(()), "no column of that name is read");
     }
 
     #[test]

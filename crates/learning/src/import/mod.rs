@@ -66,6 +66,8 @@ pub struct ImportOptions {
     /// The frames of a grasp that is one row.
     pub n_frames: u32,
     pub first_grasp_id: u64,
+    /// Takes readings below zero, of tared or signed sensors, for 0; otherwise only those within a cell's noise threshold.
+    pub clip_negative: bool,
     /// Leaves out rows that cannot be used, instead of refusing the table.
     pub skip_bad_rows: bool,
 }
@@ -108,6 +110,8 @@ pub struct ImportReport {
     pub cell_unit: CellUnit,
     /// Rows of the table, without its header.
     pub n_rows: usize,
+    /// Rows with a reading below zero, which counts as 0.
+    pub n_below_zero: usize,
     /// Recorded frames.
     pub n_frames: u64,
     pub n_grasps: usize,
@@ -204,6 +208,7 @@ pub fn import_table(
         let row = match record {
             Ok(record) => {
                 let name = columns.grasp.map(|idx| record[idx].to_string()).filter(|name| !name.is_empty());
+                report.n_below_zero += usize::from(row_reader.is_below_zero(&record));
                 (name, row_reader.read(&record, line).map_err(|problem| BadRow { line, problem }))
             }
             Err(error) => (None, Err(bad_row(&error, line).ok_or_else(|| table_error(table, error))?)),
@@ -248,7 +253,9 @@ impl RowReader<'_> {
         }
         let object = self.name(record, self.columns.group)?;
         let class = self.columns.class.map_or(Ok(object.clone()), |class| self.name(record, class))?;
-        let cells = self.columns.cells.iter().map(|idx| self.reading(record, *idx)).collect::<Result<_, _>>()?;
+        let thresholds = self.hand.cells().map(|(_, cell)| cell.noise_threshold_newtons);
+        let cells = self.columns.cells.iter().zip(thresholds);
+        let cells = cells.map(|(idx, threshold)| self.reading(record, *idx, threshold)).collect::<Result<_, _>>()?;
         let joints = match &options.joints {
             Joints::Fixed(joints) => joints.clone(),
             Joints::Columns { unit, .. } => (0..self.columns.joints.len())
@@ -288,13 +295,26 @@ impl RowReader<'_> {
         }
     }
 
-    fn reading(&self, record: &csv::StringRecord, idx: usize) -> Result<f64, String> {
+    fn reading(&self, record: &csv::StringRecord, idx: usize, threshold: f64) -> Result<f64, String> {
+        let least = if self.options.clip_negative { -MAX_CELL_NEWTONS } else { -threshold };
         // The stages take larger readings for those of a broken sensor.
         let reading = record[idx].parse().ok().map(|reading: f64| reading * self.options.scale);
-        reading.filter(|reading| (0.0..=MAX_CELL_NEWTONS).contains(reading)).ok_or_else(|| {
-            let most = MAX_CELL_NEWTONS / self.options.scale;
-            format!("column '{}': expected a number from 0 to {most}, found {}", self.header[idx], found(&record[idx]))
-        })
+        let reading = reading.filter(|reading| (least..=MAX_CELL_NEWTONS).contains(reading)).ok_or_else(|| {
+            let [least, most] = [least, MAX_CELL_NEWTONS].map(|limit| limit / self.options.scale);
+            let (column, found) = (&self.header[idx], found(&record[idx]));
+            let is_negative = reading.is_some_and(|reading| reading < least && !self.options.clip_negative);
+            let advice = if is_negative { " (--clip-negative takes readings below zero for 0)" } else { "" };
+            format!("column '{column}': expected a number from {least} to {most}, found {found}{advice}")
+        })?;
+        Ok(reading.max(0.0))
+    }
+
+    /// Whether a row has a reading below zero, which counts as 0 if the row can be used.
+    fn is_below_zero(&self, record: &csv::StringRecord) -> bool {
+        self.columns
+            .cells
+            .iter()
+            .any(|idx| record.get(*idx).and_then(|cell| cell.parse().ok()).is_some_and(|cell: f64| cell < 0.0))
     }
 
     fn joint_value(&self, record: &csv::StringRecord, joint_idx: usize, unit: AngleUnit) -> Result<f64, String> {

@@ -635,7 +635,13 @@ fn prepare(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Re
     let positions_m: Vec<[f64; 3]> =
         examples.iter().flat_map(|example| example.contacts.iter().map(|contact| contact.position_m)).collect();
     let params = KMeansParams { n_clusters: recipe.n_words, seed, ..KMeansParams::default() };
-    let k_means = learn_dictionary(&positions_m, &params)?;
+    let k_means = match learn_dictionary(&positions_m, &params) {
+        // A hand of few cells in one posture has no more positions: each is a word.
+        Err(DictionaryError::TooFewDistinct { n_distinct, .. }) if n_distinct > 0 => {
+            learn_dictionary(&positions_m, &KMeansParams { n_clusters: n_distinct, ..params })?
+        }
+        learned => learned?,
+    };
     let mut features = FeatureExtractor::new(hand, &recipe.blocks, k_means.dictionary, recipe.sigma_m);
     features.validate().map_err(|error| TrainingError::Data(format!("the recipe {}: {error}", recipe.name)))?;
     let mut rows = rows(&features, examples)?;

@@ -60,6 +60,8 @@ struct LayoutPad {
     link: String,
     layout: String,
     noise_threshold_newtons: f64,
+    #[serde(default)]
+    falls_under_load: bool,
 }
 
 #[derive(Deserialize)]
@@ -161,7 +163,8 @@ impl Layout {
                 check_place(cell, &tree.links[link_idx])
                     .map_err(|what| format!("{used_by}, cell {idx}, on link '{}': {what}", pad.link))?;
             }
-            pads.push(Pad { name: pad.name.clone(), link_idx, first_cell_idx, cells });
+            let (name, falls_under_load) = (pad.name.clone(), pad.falls_under_load);
+            pads.push(Pad { name, link_idx, first_cell_idx, cells, falls_under_load });
             first_cell_idx += n_cells;
         }
         for (what, found, least, most) in [

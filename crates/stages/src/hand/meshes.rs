@@ -118,7 +118,8 @@ fn folders_in(folder: &Path) -> Vec<PathBuf> {
 /// Whether a folder has a `package.xml` with this name.
 fn declares(folder: &Path, package: &str) -> bool {
     let text = read_regular(&folder.join("package.xml")).unwrap_or_default();
-    let name = text.split_once("<name>").and_then(|(_, after)| after.split_once("</name>")).map(|(name, _)| name.trim());
+    let name =
+        text.split_once("<name>").and_then(|(_, after)| after.split_once("</name>")).map(|(name, _)| name.trim());
     name == Some(package)
 }
 

@@ -282,6 +282,8 @@ pub struct Pad {
     /// Index of its first cell among all cells of the hand.
     pub first_cell_idx: usize,
     pub cells: Vec<Cell>,
+    /// Whether a cell reads less the more it is loaded. Messages hold forces, which rise.
+    pub falls_under_load: bool,
 }
 
 impl Pad {

@@ -144,8 +144,14 @@ enum JointMotion {
     /// A joint of the kind `fixed`.
     Fixed,
     /// A joint of another kind that cannot move, or whose motion no hand has. It adds `pose` to its origin.
-    Standing { pose: Isometry3<f64>, why: String },
-    Moving { axis: UnitVector3<f64>, joint: TreeJoint },
+    Standing {
+        pose: Isometry3<f64>,
+        why: String,
+    },
+    Moving {
+        axis: UnitVector3<f64>,
+        joint: TreeJoint,
+    },
 }
 
 /// The motion of each joint, by name.

@@ -192,7 +192,8 @@ mod tests {
                  <collision><geometry>{nail}</geometry></collision></link></robot>"
             )
         };
-        let urdf = of("<mesh\n  filename = 'tip &amp; \"pad\".stl' scale='1 1 1'/>", "<mesh filename=\"nail.stl\"></mesh>");
+        let urdf =
+            of("<mesh\n  filename = 'tip &amp; \"pad\".stl' scale='1 1 1'/>", "<mesh filename=\"nail.stl\"></mesh>");
         let mut seen = Vec::new();
         let renamed = with_meshes_renamed(&urdf, |name| {
             seen.push(name.to_owned());

@@ -271,7 +271,8 @@ impl Draft {
             let Some(link_idx) = hand.links.iter().position(|link| link.name == pad.link) else { continue };
             let cells = pad.cells.clone();
             let n_cells = cells.len();
-            hand.pads.push(Pad { name: pad.name.clone(), link_idx, first_cell_idx, cells });
+            let name = pad.name.clone();
+            hand.pads.push(Pad { name, link_idx, first_cell_idx, cells, falls_under_load: false });
             first_cell_idx += n_cells;
         }
         hand

@@ -50,8 +50,10 @@ pub(super) fn expanded(path: &Path, arguments: &[String]) -> anyhow::Result<Stri
             }
             return Ok(urdf);
         }
-        let wanted = said.split_once("<<").and_then(|(_, after)| after.split_once(">>")).map(|(name, _)| name.to_owned());
-        let Some(package) = wanted.filter(|package| packages.len() < MAX_PACKAGES && !packages.contains_key(package)) else {
+        let wanted =
+            said.split_once("<<").and_then(|(_, after)| after.split_once(">>")).map(|(name, _)| name.to_owned());
+        let Some(package) = wanted.filter(|package| packages.len() < MAX_PACKAGES && !packages.contains_key(package))
+        else {
             bail!("xacro {}: {}{}", path.display(), said.trim(), advice(&said));
         };
         let from = path.parent().unwrap_or(Path::new(""));
