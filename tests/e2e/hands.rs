@@ -193,8 +193,7 @@ fn a_hand_is_made_from_a_table_of_cells() {
     from_table(&table.replace("0,-1,0", "0,0,0"), &["a normal without a direction"]);
     from_table(&table.replace("nx", "normal"), &["cells.csv", "nx"]);
     for (more, expected) in [
-        (&[][..], "the cells are missing"),
-        (&["--grid", "thumb=2x2"], "no link 'thumb'"),
+        (&["--grid", "thumb=2x2"][..], "no link 'thumb'"),
         (&["--grid", "left_jaw=2x2", "--open", "jaw=1"], "open: 'jaw' is 1"),
         (&["--grid", "left_jaw=2x2", "--preshape", "wrist"], "'wrist' is not listed"),
         (&["--grid", "left_jaw=2x2", "--palm-pose", "0,0,0,0,0,0"], "--palm-pose needs --palm"),
@@ -203,10 +202,125 @@ fn a_hand_is_made_from_a_table_of_cells() {
         assert!(stderr.contains(expected), "{more:?}: {stderr}");
         assert!(!folder.path().join("other").exists());
     }
-    // A palm frame that looks into the gripper is said.
+    // Without cells, joints and links are listed.
+    let (stdout, _) = run_in(folder.path(), &other(&[]), 0);
+    assert!(stdout.contains("jaw") && stdout.contains("nothing is made yet"), "{stdout}");
+    // A palm frame that looks into the gripper is said, with the one that fits.
     let grid = ["--grid", "left_jaw=2x2", "--grid", "right_jaw=2x2", "--palm", "palm"];
     let (_, stderr) = run_in(folder.path(), &other(&[&grid[..], &["--palm-pose", "0,0,0,3.14159,0,0"]].concat()), 0);
-    assert!(stderr.contains("8 of 8 cells lie behind the palm"), "{stderr}");
+    assert!(stderr.contains("closes on an object before --palm-pose 0,0,0,0,0,0"), "{stderr}");
+    assert!(stderr.contains("these pads come near to none: left_jaw, right_jaw"), "{stderr}");
+}
+
+/// A COLLADA file of a box of a finger, in millimetres.
+fn finger_dae() -> String {
+    let corners = (0..8).map(|idx| {
+        let side = |bit: usize, half: i32| if idx & bit == 0 { -half } else { half };
+        format!("{} {} {}", side(1, 7), side(2, 8), side(4, 22))
+    });
+    let faces = ["0 2 3 1", "4 5 7 6", "0 1 5 4", "2 6 7 3", "0 4 6 2", "1 3 7 5"];
+    format!(
+        "<COLLADA><asset><unit meter='0.001'/><up_axis>Z_UP</up_axis></asset><library_geometries><geometry id='g'><mesh>\
+         <source id='p'><float_array id='a' count='24'>{}</float_array></source><vertices id='v'><input semantic='POSITION' \
+         source='#p'/></vertices><polylist count='6'><input semantic='VERTEX' source='#v' offset='0'/><vcount>4 4 4 4 4 4\
+         </vcount><p>{}</p></polylist></mesh></geometry></library_geometries></COLLADA>",
+        corners.collect::<Vec<_>>().join(" "),
+        faces.join(" ")
+    )
+}
+
+/// A hand of three fingers and a thumb, whose fingers run along +z of the palm and close towards +x, as many makers write it:
+/// in the encoding of their country, with joints that mimic joints that mimic others, with joints and shapes that are none.
+fn makers_urdf() -> Vec<u8> {
+    let link = |name: &str| {
+        format!(
+            "<link name='{name}'><collision><origin xyz='0 0 0.022'/><geometry><mesh filename = 'finger.dae'/><other:convex/>\
+             </geometry></collision><collision><geometry><sphere radius='0'/></geometry></collision></link>"
+        )
+    };
+    let mut parts = String::new();
+    let fingers = [
+        ("f1", "-0.007 -0.03 0.091' rpy='0 0 0", "0 1 0", "0"),
+        ("f2", "-0.007 0 0.091' rpy='0 0 0", "0 1 0", "0"),
+        ("f3", "-0.007 0.03 0.091' rpy='0 0 0", "0 1 0", "0"),
+        // The thumb stands at right angles to the palm.
+        ("t", "0.002 0 0.007' rpy='0 1.5708 0", "0 -1 0", "-0.6"),
+    ];
+    for (finger, origin, axis, lower) in fingers {
+        parts += &[link(&format!("{finger}_1")), link(&format!("{finger}_2"))].concat();
+        parts += &format!(
+            "<joint name='{finger}_a' type='revolute'><parent link='palm'/><child link='{finger}_1'/><origin xyz='{origin}'/>\
+             <axis xyz='{axis}'/><limit lower='{lower}' upper='1.5'/><limit effort='1'/></joint>\
+             <joint name='{finger}_b' type='revolute'><parent link='{finger}_1'/><child link='{finger}_2'/><origin xyz='0 0 \
+             0.045'/><axis xyz='{axis}'/><mimic joint='{finger}_a' multiplier='0.5'/></joint>"
+        );
+    }
+    let nail = "<link name='nail'/><joint name='nail' type='revolute'><parent link='f1_2'/><child link='nail'/>\
+                <axis xyz='0 1 0'/><mimic joint='f1_b' multiplier='2'/></joint>\
+                <link name='camera'/><joint name='tilt' type='revolute'><parent link='palm'/><child link='camera'/>\
+                <axis xyz='0 1 0'/><limit lower='0.2' upper='0.2'/></joint>";
+    let text = format!(
+        "<?xml version='1.0' encoding='iso-8859-1'?>\n<!-- H\u{e4}nde --><robot name='maker'><link name='palm'><collision>\
+         <origin xyz='-0.01 0 0.045'/><geometry><box size='0.02 0.09 0.09'/></geometry></collision></link>{parts}{nail}</robot>"
+    );
+    text.chars().map(|char| char as u8).collect()
+}
+
+#[test]
+fn a_makers_urdf_becomes_a_hand_that_closes_on_objects() {
+    let folder = tempfile::tempdir().expect("a folder");
+    std::fs::write(folder.path().join("maker.urdf"), makers_urdf()).expect("written");
+    std::fs::write(folder.path().join("finger.dae"), finger_dae()).expect("written");
+    let mut new: Vec<String> = ["new", "hand", "mine", "--urdf", "maker.urdf"].map(String::from).into();
+    for link in ["palm", "f1_2", "f2_2", "f3_2", "t_2"] {
+        new.extend(["--grid".into(), format!("{link}=3x2")]);
+    }
+    let new: Vec<&str> = new.iter().map(String::as_str).collect();
+    let (stdout, stderr) = run_in(folder.path(), &new, 0);
+    assert!(stdout.contains("5 pads, 30 cells") && !stdout.contains("f1_b "), "{stdout}");
+    for expected in [
+        "joint 'tilt' has the limits 0.2 and 0.2: it counts as fixed at 0.2 rad",
+        "link 'f1_1': a sphere of size [0.0]",
+        "the hand closes on an object before --palm palm --palm-pose",
+    ] {
+        assert!(stderr.contains(expected), "{expected}: {stderr}");
+    }
+    let made = folder.path().join("mine");
+    let urdf = std::fs::read_to_string(made.join("mine.urdf")).expect("UTF-8");
+    assert!(urdf.contains("encoding=\"UTF-8\"") && urdf.contains("H\u{e4}nde"), "{urdf}");
+    assert!(urdf.contains("<mesh filename=\"meshes/finger.dae\"/>") && made.join("meshes/finger.dae").is_file());
+    let layout = std::fs::read_to_string(made.join("mine.yaml")).expect("a layout");
+    assert!(layout.contains("reference_link: \"blindgrasp_palm\""), "{layout}");
+    let simulate = ["simulate", "--hand", "mine/mine.yaml", "--protocol", "planned", "--grasps", "12", "--json"];
+    let (report, _) =
+        run_in(folder.path(), &[&simulate[..], &["--stable-fraction", "natural", "--out", "grasps.mcap"]].concat(), 0);
+    let report: serde_json::Value = serde_json::from_str(&report).expect("JSON");
+    let report = report.get("report").unwrap_or(&report);
+    assert!(report["n_stable"].as_u64().expect("a count") > 0, "{report}");
+}
+
+/// $(find) by package.xml, as ROS finds it, and an argument without which the hand has no side.
+#[test]
+fn xacro_needs_no_ros() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let package = folder.path().join("my_gripper-main");
+    std::fs::create_dir_all(package.join("urdf")).expect("made");
+    std::fs::write(package.join("package.xml"), "<package><name>my_gripper</name></package>").expect("written");
+    let of = |text: &str| format!("<robot name='g' xmlns:xacro='http://www.ros.org/wiki/xacro'>{text}</robot>");
+    let joint = "<link name='$(arg side)_palm'/><link name='finger'/><joint name='j' type='revolute'><parent \
+                 link='$(arg side)_palm'/><child link='finger'/><axis xyz='0 0 1'/><limit lower='0' upper='1'/></joint>";
+    std::fs::write(package.join("urdf/parts.xacro"), of(joint)).expect("written");
+    let top = "<xacro:arg name='side' default=''/><xacro:include filename='$(find my_gripper)/urdf/parts.xacro'/>";
+    std::fs::write(package.join("urdf/top.urdf.xacro"), of(top)).expect("written");
+    let new = ["new", "hand", "mine", "--urdf", "my_gripper-main/urdf/top.urdf.xacro", "--xacro-arg", "side:=left"];
+    let (stdout, _) = run_in(folder.path(), &new, 0);
+    assert!(stdout.contains("left_palm"), "{stdout}");
+    let (_, stderr) =
+        run_in(folder.path(), &["new", "hand", "mine", "--urdf", "my_gripper-main/urdf/none.urdf.xacro"], 1);
+    assert!(stderr.contains("none.urdf.xacro"), "{stderr}");
+    std::fs::write(package.join("urdf/top.urdf.xacro"), of(&top.replace("my_gripper", "nowhere"))).expect("written");
+    let (_, stderr) = run_in(folder.path(), &new, 1);
+    assert!(stderr.contains("$(find nowhere): no package 'nowhere'"), "{stderr}");
 }
 
 /// The arm does not become a part of the hand.

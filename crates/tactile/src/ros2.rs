@@ -587,24 +587,24 @@ mod tests {
     fn two_nodes_that_send_one_joint_are_told() {
         let mut driver = plain("settled");
         let t = 5 * SEC_NANOS;
-        for (sender, names) in [([1; 16], ["a", "elbow"]), ([2; 16], ["b", "wrist"]), ([3; 16], ["a", "b"])] {
-            let angles = Received { sender: Some(sender), ..joints(&driver, &names, &[0.1, 0.2], t) };
-            assert_eq!(take(&mut driver, Topic::Joints, angles, t, None), None);
-            let frame = floats(&driver, &[1.0, 2.0], t, 8);
-            let _ = take(&mut driver, Topic::Cells, frame, t, Some(7));
-            let is_whole = driver.pending.take().is_none_or(|event| !matches!(event, Event::Refused(_)));
-            assert!(is_whole || sender != [2; 16], "each joint has one node");
-        }
-        let frame = floats(&driver, &[1.0, 2.0], t, 9);
+        let sent = |driver: &mut Ros2, sender: u8, names: [&str; 2], at: u64, seq: u64| {
+            let angles = Received { sender: Some([sender; 16]), ..joints(driver, &names, &[0.1, 0.2], at) };
+            assert_eq!(take(driver, Topic::Joints, angles, at, None), None);
+            let frame = floats(driver, &[1.0, 2.0], at, seq);
+            let event = take(driver, Topic::Cells, frame, at, Some(seq - 1));
+            if event == Some(Event::Began) { driver.pending.take() } else { event }
+        };
+        assert!(why(sent(&mut driver, 1, ["a", "elbow"], t, 8)).contains("no angle of joint 'b'"));
         assert!(
-            why(take(&mut driver, Topic::Cells, frame, t, Some(8))).contains("two nodes send the angle of joint 'a'")
+            matches!(sent(&mut driver, 2, ["b", "wrist"], t, 9), Some(Event::Frame(..))),
+            "each joint has one node"
         );
+        let told = why(sent(&mut driver, 3, ["a", "elbow"], t, 10));
+        assert!(told.contains("two nodes send the angle of joint 'a' on /joint_states"), "{told}");
         let later = t + 3 * SEC_NANOS;
-        let angles = Received { sender: Some([3; 16]), ..joints(&driver, &["a", "b"], &[0.1, 0.2], later) };
-        assert_eq!(take(&mut driver, Topic::Joints, angles, later, None), None);
-        let frame = floats(&driver, &[1.0, 2.0], later, 10);
-        let taken = take(&mut driver, Topic::Cells, frame, later, Some(9));
-        assert!(matches!(taken, Some(Event::Frame(..))), "one of them has ended: {taken:?}");
+        let is_old = why(sent(&mut driver, 3, ["a", "elbow"], later, 11));
+        assert!(is_old.contains("the angle of joint 'b' is 3000.0 ms"), "one of them has ended: {is_old}");
+        assert!(matches!(sent(&mut driver, 3, ["a", "b"], later, 12), Some(Event::Frame(..))));
     }
 
     #[test]

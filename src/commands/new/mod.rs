@@ -22,7 +22,7 @@ pub(super) struct Arguments {
 #[derive(Debug, Subcommand)]
 enum What {
     Operator(OperatorArguments),
-    Hand(hand::Arguments),
+    Hand(Box<hand::Arguments>),
 }
 
 /// An operator in Rust, or in Python: program, test, README with the next commands.

@@ -26,7 +26,8 @@ pub(super) struct Draft {
     pub(super) urdf: String,
     pub(super) bare: BareHand,
     pub(super) hand: Hand,
-    has_palm_pose: bool,
+    /// The palm frame that the user gave, in the palm link's.
+    palm_pose: Option<[f64; 6]>,
 }
 
 /// The open hand that a draft has.
@@ -54,7 +55,7 @@ impl Draft {
         palm_pose: Option<[f64; 6]>,
     ) -> anyhow::Result<Draft> {
         let hand = Hand::without_cells(source, &urdf, &bare)?;
-        let mut draft = Draft { source: source.into(), urdf, bare, hand, has_palm_pose: palm_pose.is_some() };
+        let mut draft = Draft { source: source.into(), urdf, bare, hand, palm_pose };
         if let Some(pose) = palm_pose {
             draft.put_palm_frame(pose)?;
         }
@@ -188,7 +189,12 @@ impl Draft {
         let hand = draft.with_pads(&draft.pads(table, arguments, false)?).with_moving_pads();
         let fit = palm_fit(&hand)?;
         let pose = rounded(&fit.link_from_palm);
-        if fit.is_better && !draft.has_palm_pose && pose != [0.0; 6] {
+        if let Some(given) = draft.palm_pose.filter(|_| fit.is_better) {
+            let better = rounded(&(isometry(given) * fit.link_from_palm)).map(|number| number.to_string()).join(",");
+            told.push(format!(
+                "the hand closes on an object before --palm-pose {better}, not before the one that is given"
+            ));
+        } else if fit.is_better && pose != [0.0; 6] {
             let text = pose.map(|number| number.to_string()).join(",");
             told.push(format!(
                 "the hand closes on an object before --palm {palm} --palm-pose {text}, not before +z of link '{palm}': the layout \
@@ -291,6 +297,10 @@ fn wrist(hand: &Hand) -> Option<(String, String)> {
     let is_one_finger = chains.iter().all(|chain| chain[0] == first[0]);
     let Motion::Joint { joint_idx, .. } = hand.links[lowest].motion else { return None };
     (!is_one_finger).then(|| (hand.joints[joint_idx].name.clone(), hand.links[lowest].name.clone()))
+}
+
+fn isometry([x, y, z, roll, pitch, yaw]: [f64; 6]) -> Isometry3<f64> {
+    Isometry3::from_parts([x, y, z].into(), nalgebra::UnitQuaternion::from_euler_angles(roll, pitch, yaw))
 }
 
 /// X, Y, Z in millimetres' precision, roll, pitch and yaw.
