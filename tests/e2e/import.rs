@@ -303,7 +303,10 @@ fn each_bad_row_is_named() {
         ("cup,,yes,0.5,NaN,2", "column 'l_2': expected a number from 0 to 1000000, found 'NaN'"),
         ("cup,,yes,0.5,inf,2", "column 'l_2': expected a number from 0 to 1000000, found 'inf'"),
         ("cup,,yes,0.5,1e300,2", "column 'l_2': expected a number from 0 to 1000000, found '1e300'"),
-        ("cup,,yes,-0.5,1.25,2", "column 'l_1': expected a number from 0 to 1000000, found '-0.5'"),
+        (
+            "cup,,yes,-0.5,1.25,2",
+            "column 'l_1': expected a number from 0 to 1000000, found '-0.5' (--clip-negative takes readings below zero for 0)",
+        ),
         (",,yes,0.5,1.25,2", "column 'object': expected a name, found nothing"),
         ("cup,,,0.5,1.25,2", "column 'held': expected a label, found nothing"),
         (&format!("{too_long},,no,0.5,1.25,2"), "column 'object': expected a name of at most 64 bytes, found 66"),
@@ -318,6 +321,13 @@ fn each_bad_row_is_named() {
     let named: Vec<&str> = expected.iter().map(String::as_str).collect();
     let summary = ["table.csv: 11 of 13 rows cannot be used", "--skip-bad-rows"];
     folder.refuse(&table, &[], 1, &[&named[..], &summary].concat());
+
+    // Noise around a tared zero is no bad row, and a larger reading is 0 where the user says so.
+    let below = TABLE.replacen("0.5", "-0.001", 1);
+    let report = folder.import(&below, &[]);
+    assert_eq!((&report["n_below_zero"], &report["skipped"]), (&json!(1), &json!([])));
+    let report = folder.import(&TABLE.replacen("0.5", "-50", 1), &["--clip-negative"]);
+    assert_eq!((&report["n_below_zero"], &report["n_grasps"]), (&json!(1), &json!(2)));
 
     let report = folder.import(&table, &["--skip-bad-rows"]);
     assert_eq!((&report["n_rows"], &report["n_grasps"]), (&json!(13), &json!(2)));

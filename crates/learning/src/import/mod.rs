@@ -299,14 +299,14 @@ impl RowReader<'_> {
         let least = if self.options.clip_negative { -MAX_CELL_NEWTONS } else { -threshold };
         // The stages take larger readings for those of a broken sensor.
         let reading = record[idx].parse().ok().map(|reading: f64| reading * self.options.scale);
-        let reading = reading.filter(|reading| (least..=MAX_CELL_NEWTONS).contains(reading)).ok_or_else(|| {
-            let [least, most] = [least, MAX_CELL_NEWTONS].map(|limit| limit / self.options.scale);
+        let usable = reading.filter(|reading| (least..=MAX_CELL_NEWTONS).contains(reading)).ok_or_else(|| {
+            let most = MAX_CELL_NEWTONS / self.options.scale;
             let (column, found) = (&self.header[idx], found(&record[idx]));
-            let is_negative = reading.is_some_and(|reading| reading < least && !self.options.clip_negative);
-            let advice = if is_negative { " (--clip-negative takes readings below zero for 0)" } else { "" };
-            format!("column '{column}': expected a number from {least} to {most}, found {found}{advice}")
+            let is_below = reading.is_some_and(|reading| reading < least && !self.options.clip_negative);
+            let advice = if is_below { " (--clip-negative takes readings below zero for 0)" } else { "" };
+            format!("column '{column}': expected a number from 0 to {most}, found {found}{advice}")
         })?;
-        Ok(reading.max(0.0))
+        Ok(usable.max(0.0))
     }
 
     /// Whether a row has a reading below zero, which counts as 0 if the row can be used.
