@@ -15,6 +15,7 @@ import tempfile
 import unittest
 from pathlib import Path
 from unittest import mock
+from xml.etree import ElementTree
 
 import blindgrasp
 import numpy as np
@@ -302,6 +303,89 @@ class Graphs(Folder):
         self.assertFalse(blindgrasp.Decision.from_json(live).may_lift())
         label = blindgrasp.Decision.from_json(live | {"truth": {"stable": True, "epsilon": None}}).label
         self.assertTrue(label.is_stable and math.isnan(label.epsilon) and label.object_id == "")
+
+
+MJCF = """<mujoco model="hand"><compiler angle="radian"/>
+<asset><mesh name="tip" vertex="0 0 0 .01 0 0 0 .01 0 0 0 .01"/></asset>
+<worldbody><body name="palm" pos="0 0 .3" quat=".7071 0 .7071 0"><geom type="box" size=".04 .04 .01"/>
+  <body name="f1" pos=".05 0 .01"><joint name="j1" axis="0 -1 0" range="-.4 1.2" pos="0 0 -.005"/>
+    <geom type="capsule" size=".008 .03" pos="0 0 .03"/>
+    <body name="f2" pos="0 0 .06" euler="0 .1 .2"><joint name="j2" axis="0 -1 0" range="0 1.5"/>
+      <geom type="mesh" mesh="tip"/><geom type="ellipsoid" size=".01 .008 .012" contype="0" conaffinity="0"/></body></body>
+  <body name="t" pos="-.05 0 .01"><joint name="a" axis="0 0 1" range="-1 1"/>
+    <joint name="b" axis="0 1 0" range="-.4 1.2" pos="0 .002 0"/><geom type="sphere" size=".01" pos="0 0 .05"/></body>
+</body></worldbody>
+<equality><joint joint1="j2" joint2="j1" polycoef="0.1 0.8 0 0 0"/></equality>
+<actuator><position joint="j1"/><position joint="a"/><position joint="b"/></actuator></mujoco>"""
+
+
+def urdf_shapes(root, values):
+    """Where the collision shapes of each link of a URDF are, for the values of its joints."""
+
+    def pose(element):
+        (roll, pitch, yaw), matrix = map(float, element.get("rpy").split()), np.eye(4)
+        turns = [turn([0, 0, 1], yaw), turn([0, 1, 0], pitch), turn([1, 0, 0], roll)]
+        matrix[:3, :3] = turns[0] @ turns[1] @ turns[2]
+        matrix[:3, 3] = list(map(float, element.get("xyz").split()))
+        return matrix
+
+    def turn(axis, angle):
+        x, y, z = np.array(axis) / np.linalg.norm(axis)
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+    links = {"world": np.eye(4)}
+    for joint in root.iter("joint"):
+        motion = np.eye(4)
+        if joint.get("type") != "fixed":
+            motion[:3, :3] = turn(list(map(float, joint.find("axis").get("xyz").split())), values[joint.get("name")])
+        above = links[joint.find("parent").get("link")]
+        links[joint.find("child").get("link")] = above @ pose(joint.find("origin")) @ motion
+    shapes = {link.get("name"): link.findall("collision") for link in root.iter("link")}
+    return {name: [links[name] @ pose(shape.find("origin")) for shape in found] for name, found in shapes.items()}
+
+
+@unittest.skipUnless(importlib.util.find_spec("mujoco"), "the package mujoco is not installed")
+class Mjcf(Folder):
+    def test_a_mujoco_model_becomes_a_urdf_of_the_same_motion(self):
+        import mujoco
+        from blindgrasp.mjcf import urdf_of
+
+        path, urdf = self.folder / "hand.xml", self.folder / "urdf/hand.urdf"
+        path.write_text(MJCF)
+        self.assertEqual(urdf_of(path, urdf), [])
+        root = ElementTree.parse(urdf).getroot()
+        model = mujoco.MjModel.from_xml_path(str(path))
+        data = mujoco.MjData(model)
+        for j1, a, b in [(0, 0, 0), (1.1, -0.9, 0.7), (-0.4, 0.5, 1.2)]:
+            values = {"j1": j1, "j2": 0.8 * j1 + 0.1, "a": a, "b": b}
+            for name, value in values.items():
+                data.joint(name).qpos = value
+            mujoco.mj_kinematics(model, data)
+            shapes = urdf_shapes(root, values)
+            for geom in range(model.ngeom):
+                if model.geom_contype[geom]:
+                    link = shapes[model.body(model.geom_bodyid[geom]).name]
+                    np.testing.assert_allclose(link[0][:3, 3], data.geom_xpos[geom], atol=1e-7)
+                    np.testing.assert_allclose(link[0][:3, :3], data.geom_xmat[geom].reshape(3, 3), atol=1e-7)
+        self.assertEqual(sum(map(len, shapes.values())), 4)
+        listed = subprocess.run(
+            [blindgrasp.program(), "new", "hand", str(self.folder / "mine"), "--urdf", str(urdf)],
+            stdout=subprocess.PIPE, text=True, check=True,
+        ).stdout
+        self.assertIn("revolute", listed)
+
+    def test_a_loop_is_told(self):
+        from blindgrasp.mjcf import urdf_of
+
+        path = self.folder / "hand.xml"
+        path.write_text(MJCF.replace("<equality>", '<equality><connect body1="f2" body2="t" anchor="0 0 0"/>'))
+        told = urdf_of(path, self.folder / "hand.urdf")
+        self.assertEqual(len(told), 1)
+        self.assertIn("'f2' and 't' make a loop (connect)", told[0])
+        path.write_text("<mujoco><nothing/></mujoco>")
+        with self.assertRaises(ValueError):
+            urdf_of(path, self.folder / "hand.urdf")
 
 
 class Program(Folder):
