@@ -1,0 +1,153 @@
+"""Tests of examples/ros2_hand_bridge.py with stand-ins for rclpy and for the source that it feeds."""
+
+import importlib.util
+import json
+import socket
+import sys
+import tempfile
+import threading
+import types
+import unittest
+from pathlib import Path
+from types import SimpleNamespace as Message
+from unittest import mock
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples/ros2_hand_bridge.py"
+SPEC = importlib.util.spec_from_file_location("ros2_hand_bridge", EXAMPLE)
+bridge = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(bridge)
+
+HAND = {"hand": "gripper", "n_joints": 2, "n_cells": 4, "joints": ["jaw", "wrist"]}
+TABLE = {
+    "joints": {"map": {"jaw": {"from": "finger_joint", "scale": -0.5, "offset": 0.04}}},
+    "cells": [
+        {"topic": "/left", "type": "my_msgs/msg/Touch", "field": "taxels.force.z", "scale": 0.01},
+        {"topic": "/right", "order": [1, 0]},
+    ],
+    "phase": {"topic": "/status", "type": "my_msgs/msg/Status", "field": "states", "words": {0: "open", 1: "closing", 2: "settled"}},
+}
+MILLI = 1_000_000
+
+
+def header(nanos):
+    return Message(stamp=Message(sec=nanos // 10**9, nanosec=nanos % 10**9))
+
+
+def joints(nanos, finger=0.02, wrist=0.1):
+    return Message(header=header(nanos), name=["elbow", "finger_joint", "wrist"], position=[9.0, finger, wrist])
+
+
+def left(nanos, *forces):
+    return Message(header=header(nanos), taxels=[Message(force=Message(z=force)) for force in forces])
+
+
+class Frames(unittest.TestCase):
+    def setUp(self):
+        self.frames = bridge.Frames(TABLE, HAND)
+        self.t = 5 * 10**9
+
+    def send(self, at, right_at=None, states=(2, 2)):
+        self.frames.take_phase(Message(states=list(states)))
+        self.frames.take_cells(1, Message(data=[3.0, 4.0]), right_at or at)
+        return self.frames.take_cells(0, left(at, 100, 250), at)
+
+    def test_topics_become_a_frame(self):
+        self.assertIsNone(self.send(self.t))
+        self.assertEqual(self.frames.lacks(), "no angle of jaw, wrist")
+        self.frames.take_joints(joints(self.t), self.t)
+        frame = self.send(self.t)
+        self.assertAlmostEqual(frame.pop("joints")[0], 0.03)
+        # The frame that was not sent has used up a number.
+        expected = {"cells_newtons": [1.0, 2.5, 4.0, 3.0], "phase": "settled", "seq": 1, "stamp_nanos": self.t}
+        self.assertEqual(frame, expected)
+
+    def test_old_topics_make_no_frame(self):
+        self.frames.take_joints(joints(self.t), self.t)
+        self.assertIsNotNone(self.send(self.t + 100 * MILLI))
+        self.assertIsNone(self.send(self.t + 100 * MILLI, right_at=self.t + 79 * MILLI))
+        self.assertIsNone(self.send(self.t + 151 * MILLI))
+        self.assertEqual(self.frames.dropped, 2)
+        self.assertIn("tolerance_ms", self.frames.lacks())
+
+    def test_a_hand_is_settled_if_all_its_fingers_are(self):
+        self.frames.take_joints(joints(self.t), self.t)
+        for states, phase in [((0, 0), "open"), ((2, 1), "closing"), ((2, 0), "closing"), ((2, 2), "settled")]:
+            self.assertEqual(self.send(self.t, states=states)["phase"], phase)
+        with self.assertRaisesRegex(ValueError, "stands for none of open, closing"):
+            self.send(self.t, states=(7, 7))
+
+    def test_the_phase_is_inferred_from_the_motion(self):
+        table = {"cells": TABLE["cells"], "joints": {"map": {**TABLE["joints"]["map"], "wrist": {"closes": 0}}}}
+        frames = bridge.Frames(table, HAND)
+        found = []
+        for step in range(200):
+            # The jaw's value falls as the finger's grows: scale is negative, and so is the sign of closing.
+            finger = min(max(0, step - 50), 50) * 0.002
+            frames.closing[0] = -1
+            frames.take_joints(joints(self.t + step * 10 * MILLI, finger), 0)
+            if frames.phase not in found:
+                found.append(frames.phase)
+        self.assertEqual(found, ["open", "closing", "settled"])
+
+    def test_an_unknown_joint_is_told(self):
+        with self.assertRaisesRegex(ValueError, "the hand has no joint thumb"):
+            bridge.Frames({"cells": [], "joints": {"map": {"thumb": {}}}}, HAND)
+
+
+class Node:
+    """A stand-in for a node of rclpy: it keeps its subscriptions."""
+
+    def __init__(self):
+        self.subscriptions = {}
+
+    def create_subscription(self, kind, topic, callback, qos):
+        self.subscriptions[topic] = (kind, callback)
+
+    def get_clock(self):
+        return Message(now=lambda: Message(nanoseconds=5 * 10**9))
+
+
+class Bridge(unittest.TestCase):
+    def test_it_sends_lines_to_the_source(self):
+        node, t = Node(), 5 * 10**9
+
+        def spin(_):
+            calls = {topic: callback for topic, (_, callback) in node.subscriptions.items()}
+            calls["/joint_states"](joints(t))
+            calls["/status"](Message(states=[2]))
+            calls["/right"](Message(data=[3.0, 4.0]))
+            calls["/left"](left(t, 100, 250))
+
+        rclpy = types.ModuleType("rclpy")
+        rclpy.init, rclpy.try_shutdown = lambda: None, lambda: None
+        rclpy.create_node, rclpy.spin = lambda name: node, spin
+        qos, utilities = types.ModuleType("rclpy.qos"), types.ModuleType("rosidl_runtime_py.utilities")
+        qos.qos_profile_sensor_data, utilities.get_message = None, lambda kind: kind
+        modules = {"rclpy": rclpy, "rclpy.qos": qos, "rosidl_runtime_py": types.ModuleType("rosidl_runtime_py")}
+        modules["rosidl_runtime_py.utilities"] = utilities
+        with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX) as source:
+            path = f"{folder}/tactile.hand"
+            source.bind(path)
+            source.listen()
+            lines = []
+
+            def serve():
+                connection, _ = source.accept()
+                connection.sendall(json.dumps(HAND).encode() + b"\n")
+                with connection, connection.makefile() as sent:
+                    lines.append(json.loads(sent.readline()))
+
+            thread = threading.Thread(target=serve)
+            thread.start()
+            with mock.patch.dict(sys.modules, modules), mock.patch("sys.stderr"):
+                bridge.bridge(TABLE, f"unix:{path}")
+            thread.join()
+        self.assertEqual(lines[0]["cells_newtons"], [1.0, 2.5, 4.0, 3.0])
+        self.assertEqual((lines[0]["phase"], lines[0]["seq"]), ("settled", 0))
+        kinds = {topic: kind for topic, (kind, _) in node.subscriptions.items()}
+        self.assertEqual(kinds["/right"], "std_msgs/msg/Float64MultiArray")
+        self.assertEqual(kinds["/joint_states"], "sensor_msgs/msg/JointState")
+
+
+if __name__ == "__main__":
+    unittest.main()
