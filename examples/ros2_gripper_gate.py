@@ -5,8 +5,9 @@
         blindgrasp run dataflow-live.yaml --json
 
 It serves the action `/grasp_gate/gripper_cmd` (control_msgs GripperCommand, or ParallelGripperCommand with --parallel), and
-passes each goal on to the real controller. A goal whose position is below --grasps-below closes on an object: it succeeds
-only if the controller has closed the hand and a fresh LIFT of blindgrasp follows; everything else aborts it. MoveIt
+passes each goal on to the real controller. A goal whose position is below --grasps-below (or above --grasps-above, for a
+gripper whose value grows as it closes) closes on an object: it succeeds only if the controller has closed the hand and a
+fresh LIFT of blindgrasp follows; everything else aborts it. MoveIt
 executes no step after a controller that does not succeed, so the arm stays. Name the gate in moveit_controllers.yaml:
 
     grasp_gate: {type: GripperCommand, action_ns: gripper_cmd, joints: [finger_joint], default: true}
@@ -26,6 +27,8 @@ import threading
 import time
 
 LIFT = "lift"
+# action_msgs/msg/GoalStatus
+SUCCEEDED = 4
 # Decisions that say what to do next, and end nothing.
 UNDECIDED = ("squeeze", "test_lift", "tighten", "set_down", "go_on")
 
@@ -41,6 +44,8 @@ class Decisions:
     def __init__(self, lines):
         self.condition = threading.Condition()
         self.waiting = collections.deque()
+        # The number of the newest grasp that was decided, or is being decided.
+        self.newest = -1
         self.has_ended = False
         threading.Thread(target=self.read, args=(lines,), daemon=True).start()
 
@@ -52,99 +57,141 @@ class Decisions:
                 continue
             if isinstance(decision, dict) and "action" in decision:
                 with self.condition:
-                    self.waiting.append(decision)
+                    self.waiting.append((time.monotonic(), decision))
                     self.condition.notify_all()
         with self.condition:
             self.has_ended = True
             self.condition.notify_all()
 
     def begin(self):
-        """Forgets the decisions so far: those of the next grasp come after them."""
+        """Forgets the decisions so far: those of the next grasp have a greater number."""
         with self.condition:
+            ids = [decision.get("grasp_id", -1) for _, decision in self.waiting]
+            self.newest = max([self.newest, *ids])
             self.waiting.clear()
 
     def may_lift(self, wait_s, now_nanos=boottime_nanos):
-        """Whether the first final decision is a LIFT that is still valid, and the reason."""
-        deadline = time.monotonic() + wait_s
+        """Whether the final decision of the newest grasp is a LIFT that is still valid, and the reason.
+
+        A hold that came while the hand still closed may be of the grasp before: it counts if nothing follows it.
+        """
+        closed = time.monotonic()
+        deadline = closed + wait_s
+        why = f"no decision within {wait_s:g} s"
         with self.condition:
             while True:
-                while self.waiting:
-                    decision = self.waiting.popleft()
+                final = [
+                    (decision.get("grasp_id", -1), came, decision)
+                    for came, decision in self.waiting
+                    if decision["action"] not in UNDECIDED and decision.get("grasp_id", -1) > self.newest
+                ]
+                if final:
+                    _, came, decision = max(final, key=lambda found: found[:2])
                     if decision["action"] == LIFT:
                         is_valid = now_nanos() < decision.get("valid_until_nanos", 0)
                         return is_valid, decision.get("reason", "") if is_valid else "no longer valid"
-                    if decision["action"] not in UNDECIDED:
-                        return False, decision.get("reason", "")
+                    why = decision.get("reason", "")
+                    if came >= closed:
+                        return False, why
                 left = deadline - time.monotonic()
                 if self.has_ended or left <= 0:
-                    return False, "the graph has ended" if self.has_ended else f"no decision within {wait_s:g} s"
+                    return False, "the graph has ended" if self.has_ended else why
                 self.condition.wait(left)
 
 
 class Gate:
     """Decides how a goal of the gripper ends."""
 
-    def __init__(self, decisions, grasps_below, wait_s):
-        self.decisions, self.grasps_below, self.wait_s = decisions, grasps_below, wait_s
-        self.one_at_a_time = threading.Lock()
+    def __init__(self, decisions, is_grasp, wait_s):
+        self.decisions, self.is_grasp, self.wait_s = decisions, is_grasp, wait_s
 
-    def run(self, position, close):
-        """Closes the hand by `close`, which tells whether the controller succeeded. Whether the goal succeeds, and why."""
-        with self.one_at_a_time:
-            return self.run_alone(position, close)
-
-    def run_alone(self, position, close):
+    def run(self, position, move):
+        """Moves the hand by `move`, which tells whether the controller succeeded, or stalled. Whether the goal succeeds, and why."""
         self.decisions.begin()
-        if not close():
+        has_succeeded, has_stalled = move()
+        if not self.is_grasp(position):
+            return has_succeeded, "no grasp" if has_succeeded else "the controller did not succeed"
+        # A hand that an object stops has closed on it, though it has not reached its goal.
+        if not (has_succeeded or has_stalled):
             return False, "the controller did not succeed"
-        if position >= self.grasps_below:
-            return True, "no grasp"
         return self.decisions.may_lift(self.wait_s)
 
 
+def grasps(arguments):
+    """Whether a position closes on an object."""
+    if arguments.grasps_below is not None:
+        return lambda position: position < arguments.grasps_below
+    return lambda position: position > arguments.grasps_above
+
+
 def serve(arguments, decisions):
+    import control_msgs.action
     import rclpy
-    from control_msgs.action import GripperCommand, ParallelGripperCommand
-    from rclpy.action import ActionClient, ActionServer
+    from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
     from rclpy.executors import MultiThreadedExecutor
 
-    kind = ParallelGripperCommand if arguments.parallel else GripperCommand
+    # Humble has no ParallelGripperCommand.
+    kind = getattr(control_msgs.action, "ParallelGripperCommand" if arguments.parallel else "GripperCommand")
     rclpy.init()
     node = rclpy.create_node("grasp_gate")
     controller = ActionClient(node, kind, arguments.controller)
-    gate = Gate(decisions, arguments.grasps_below, arguments.wait)
+    gate = Gate(decisions, grasps(arguments), arguments.wait)
+    busy = threading.Lock()
 
-    def wait_for(future):
+    def wait_for(future, meanwhile=lambda: None):
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
-        done.wait()
+        while not done.wait(0.05):
+            meanwhile()
         return future.result()
 
+    def take(_):
+        return GoalResponse.REJECT if busy.locked() else GoalResponse.ACCEPT
+
     def execute(handle):
+        with busy:
+            return execute_alone(handle)
+
+    def execute_alone(handle):
         command = handle.request.command
         position = command.position[0] if arguments.parallel else command.position
         answers = []
 
-        def close():
+        def move():
             if not controller.wait_for_server(timeout_sec=arguments.wait):
-                return False
+                return False, False
             accepted = wait_for(controller.send_goal_async(handle.request))
             if not accepted.accepted:
-                return False
-            answer = wait_for(accepted.get_result_async())
-            answers.append(answer.result)
-            # A hand that an object stops has closed on it, though it has not reached its goal.
-            return answer.result.reached_goal or answer.result.stalled
+                return False, False
 
-        succeeds, why = gate.run(position, close)
-        node.get_logger().info(f"goal {position:g}: {'succeeded' if succeeds else 'aborted'}, {why}")
-        (handle.succeed if succeeds else handle.abort)()
+            def pass_cancel_on():
+                if handle.is_cancel_requested:
+                    accepted.cancel_goal_async()
+
+            answer = wait_for(accepted.get_result_async(), pass_cancel_on)
+            answers.append(answer.result)
+            return answer.status == SUCCEEDED, answer.result.stalled
+
+        succeeds, why = gate.run(position, move)
+        if handle.is_cancel_requested:
+            succeeds, why, end = False, "cancelled", handle.canceled
+        else:
+            end = handle.succeed if succeeds else handle.abort
+        node.get_logger().info(f"goal {position:g}: {'succeeded' if succeeds else 'not succeeded'}, {why}")
+        end()
         return answers[0] if answers else kind.Result()
 
-    ActionServer(node, kind, "/grasp_gate/gripper_cmd", execute)
+    ActionServer(
+        node,
+        kind,
+        "/grasp_gate/gripper_cmd",
+        execute,
+        goal_callback=take,
+        cancel_callback=lambda _: CancelResponse.ACCEPT,
+    )
     try:
         # The answers of the controller come while a goal is executed.
-        rclpy.spin(node, MultiThreadedExecutor())
+        rclpy.spin(node, MultiThreadedExecutor(num_threads=4))
     finally:
         rclpy.try_shutdown()
 
@@ -152,7 +199,9 @@ def serve(arguments, decisions):
 def main():
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--controller", required=True, help="the action of the real gripper controller")
-    options.add_argument("--grasps-below", type=float, required=True, help="positions below this close on an object")
+    closing = options.add_mutually_exclusive_group(required=True)
+    closing.add_argument("--grasps-below", type=float, help="positions below this close on an object")
+    closing.add_argument("--grasps-above", type=float, help="positions above this close on an object")
     options.add_argument("--wait", type=float, default=3.0, help="seconds for a decision after the hand has closed")
     options.add_argument("--parallel", action="store_true", help="ParallelGripperCommand instead of GripperCommand")
     options.add_argument("graph", nargs=argparse.REMAINDER, help="the command whose lines are the decisions")

@@ -14,8 +14,10 @@ It runs where ROS 2 is sourced and needs only rclpy. A table says which topics t
 
 A joint's value is `scale` times the topic's, plus `offset`; without an entry it is the value of the same name. Cells are
 `scale` times the field's numbers; `order` picks them. A phase is one word for one value; of several values (a list of
-states, one a finger) the hand is settled if all are. Without `phase` it is inferred from the fingers' motion: a joint whose
-value falls as the hand closes then has `closes: -1` in the map, and one that does not close `closes: 0`.
+states, one a finger) the hand is settled if all are. It counts for `max_age_ms` (1000; 0 for a topic that speaks on change
+alone). Without `phase` it is inferred from the fingers' motion: `closes` in the map is then the change of a joint's value
+while the hand closes by a radian: 1 if it is not given, -1 where the value falls, 0.1 or -0.1 for a slide in metres, 0 for
+a joint that does not close.
 
 A frame is made for each message of the first topic of cells, with the others that are within `tolerance_ms` of it (20) and
 angles of the last 150 ms. Frames that lack something are not sent, and counted; the source sees the gap.
@@ -96,23 +98,26 @@ class Frames:
             raise ValueError(f"joints: map: the hand has no joint {', '.join(sorted(unknown))}")
         self.tolerance_nanos = float(table.get("tolerance_ms", 20.0)) * 1e6
         self.motion = MotionPhase(table.get("moving_rad_per_s", 0.05), table.get("still_ms", 200.0))
-        # The change of each joint while the hand closes, of unknown size: its sign; 0 for joints that do not close.
         self.closing = [float((self.map.get(name) or {}).get("closes", 1)) for name in hand["joints"]]
-        self.values, self.joints_stamp = {}, None
+        self.sources = {(self.map.get(name) or {}).get("from", name) for name in hand["joints"]}
+        # The last value of each joint of the hand, by the topic's name, and its time.
+        self.values = {}
         self.cells = [None] * len(table["cells"])
-        self.phase = None
+        self.phase, self.phase_nanos = None, 0
+        self.phase_age_nanos = float((table.get("phase") or {}).get("max_age_ms", 1000.0)) * 1e6
         self.seq = 0
         self.dropped = 0
 
     def take_joints(self, message, now_nanos):
-        self.joints_stamp = stamp_of(message, now_nanos)
-        self.values.update(zip(message.name, message.position))
-        joints = self.joints()
-        if joints is not None and "phase" not in self.table:
-            fingers = [value * sign for value, sign in zip(joints, self.closing)]
-            self.phase = self.motion.of(self.joints_stamp, fingers)
+        stamp = stamp_of(message, now_nanos)
+        ours = {name: (value, stamp) for name, value in zip(message.name, message.position) if name in self.sources}
+        self.values.update(ours)
+        joints = self.joints(stamp)
+        if ours and joints is not None and "phase" not in self.table:
+            fingers = [value / rate for value, rate in zip(joints, self.closing) if rate]
+            self.phase, self.phase_nanos = self.motion.of(stamp, fingers), now_nanos
 
-    def take_phase(self, message):
+    def take_phase(self, message, now_nanos):
         """One word for one value; of a list, the hand is settled if all fingers are, and open if all are."""
         entry = self.table["phase"]
         found = at(message, entry.get("field", "data"))
@@ -121,7 +126,7 @@ class Frames:
         named = [str(state) if words is None else words.get(state, words.get(str(state))) for state in states]
         if any(word not in WORDS for word in named):
             raise ValueError(f"phase: {found!r} stands for none of {', '.join(WORDS)}: name it in `words`")
-        self.phase = named[0] if len(set(named)) == 1 else "closing"
+        self.phase, self.phase_nanos = named[0] if len(set(named)) == 1 else "closing", now_nanos
 
     def take_cells(self, idx, message, now_nanos):
         """The frame that the message completes: that of the table's first topic of cells, with the others near it."""
@@ -131,26 +136,27 @@ class Frames:
             values = [values[place] for place in entry["order"]]
         stamp = stamp_of(message, now_nanos)
         self.cells[idx] = (values, stamp)
-        return self.frame(stamp) if idx == 0 else None
+        return self.frame(stamp, now_nanos) if idx == 0 else None
 
-    def joints(self):
+    def joints(self, stamp):
+        """The hand's joints, if each was heard of lately."""
         values = []
         for name in self.hand["joints"]:
             entry = self.map.get(name) or {}
-            source = entry.get("from", name)
-            if source not in self.values:
+            value, at_nanos = self.values.get(entry.get("from", name), (None, 0))
+            if value is None or abs(at_nanos - stamp) > JOINTS_NANOS:
                 return None
-            values.append(float(entry.get("scale", 1.0)) * self.values[source] + float(entry.get("offset", 0.0)))
+            values.append(float(entry.get("scale", 1.0)) * value + float(entry.get("offset", 0.0)))
         return values
 
-    def frame(self, stamp):
-        joints = self.joints()
+    def frame(self, stamp, now_nanos):
+        joints = self.joints(stamp)
+        is_phase_old = "phase" in self.table and 0 < self.phase_age_nanos < now_nanos - self.phase_nanos
         # Its number is used up also if it is not sent: the source sees the gap and holds the grasp.
         seq, self.seq = self.seq, self.seq + 1
         missing = [entry["topic"] for entry, cells in zip(self.table["cells"], self.cells) if cells is None]
         is_near = all(cells is not None and abs(cells[1] - stamp) <= self.tolerance_nanos for cells in self.cells)
-        is_near = is_near and joints is not None and abs(self.joints_stamp - stamp) <= JOINTS_NANOS
-        if missing or not is_near or self.phase is None:
+        if missing or not is_near or joints is None or self.phase is None or is_phase_old:
             self.dropped += 1
             return None
         return {
@@ -169,8 +175,8 @@ class Frames:
         found += [f"no message on {', '.join(cells)}"] if cells else []
         found += ["no phase"] if self.phase is None else []
         return "; ".join(found) or (
-            f"cells more than {self.tolerance_nanos / 1e6:g} ms apart (tolerance_ms), or angles older than "
-            f"{JOINTS_NANOS / 1e6:g} ms"
+            f"cells more than {self.tolerance_nanos / 1e6:g} ms apart (tolerance_ms), angles older than "
+            f"{JOINTS_NANOS / 1e6:g} ms, or an old phase (max_age_ms)"
         )
 
 
@@ -224,7 +230,7 @@ def bridge(table, address):
     joints = {"topic": "/joint_states", **(table.get("joints") or {})}
     subscribe(joints, "sensor_msgs/msg/JointState", lambda message: frames.take_joints(message, now_nanos()))
     if "phase" in table:
-        subscribe(table["phase"], "std_msgs/msg/String", frames.take_phase)
+        subscribe(table["phase"], "std_msgs/msg/String", lambda message: frames.take_phase(message, now_nanos()))
     for idx, entry in enumerate(table["cells"]):
         take = lambda message, idx=idx: send(frames.take_cells(idx, message, now_nanos()))
         subscribe(entry, "std_msgs/msg/Float64MultiArray", take)

@@ -4,6 +4,7 @@ import importlib.util
 import json
 import queue
 import sys
+import threading
 import time
 import types
 import unittest
@@ -21,11 +22,15 @@ class Lines:
     """The lines of a graph, as the test says them."""
 
     def __init__(self):
-        self.queue = queue.Queue()
+        self.queue, self.n_said, self.grasp_id = queue.Queue(), 0, 0
 
-    def say(self, action, valid_for_s=10, reason="told"):
+    def say(self, action, valid_for_s=10, reason="told", grasp_id=None):
+        if action not in example.UNDECIDED:
+            self.grasp_id += 1
         valid_until = example.boottime_nanos() + int(valid_for_s * 1e9)
-        self.queue.put(json.dumps({"action": action, "reason": reason, "valid_until_nanos": valid_until}))
+        grasp_id = self.grasp_id if grasp_id is None else grasp_id
+        decision = {"action": action, "reason": reason, "grasp_id": grasp_id, "valid_until_nanos": valid_until}
+        self.queue.put(json.dumps(decision))
 
     def __iter__(self):
         return iter(self.queue.get, None)
@@ -36,25 +41,35 @@ class Gate(unittest.TestCase):
         self.lines = Lines()
         self.decisions = example.Decisions(self.lines)
         self.addCleanup(self.lines.queue.put, None)
-        self.gate = example.Gate(self.decisions, grasps_below=0.03, wait_s=20)
+        self.gate = example.Gate(self.decisions, lambda position: position < 0.03, wait_s=20)
 
     def close(self, *actions, **how):
         """Closes the hand; the graph decides then."""
 
-        def close():
-            for action in actions:
-                self.lines.say(action, **how)
-            return True
+        def move():
+            # The graph decides when the hand has closed.
+            threading.Timer(0.05, lambda: [self.lines.say(action, **how) for action in actions]).start()
+            return False, True
 
-        return self.gate.run(0.0, close)
+        return self.gate.run(0.0, move)
 
     def test_only_a_fresh_lift_succeeds(self):
         self.assertEqual(self.close("lift", reason="stable"), (True, "stable"))
         self.assertEqual(self.close("hold", reason="unstable"), (False, "unstable"))
         self.assertEqual(self.close("lift", valid_for_s=-1), (False, "no longer valid"))
         self.assertEqual(self.close("test_lift", "hold"), (False, "told"))
-        # The lift of a later grasp does not count.
-        self.assertEqual(self.close("hold", "lift"), (False, "told"))
+        # A hand that closed again: the hold of the later grasp counts.
+        self.assertEqual(self.close("lift", "hold"), (False, "told"))
+
+    def test_a_late_hold_of_the_grasp_before_does_not_end_this_one(self):
+        def move():
+            self.lines.say("hold")
+            while not self.decisions.waiting:
+                time.sleep(0.001)
+            threading.Timer(0.05, lambda: self.lines.say("lift", reason="stable")).start()
+            return True, False
+
+        self.assertEqual(self.gate.run(0.0, move), (True, "stable"))
 
     def test_a_decision_of_an_earlier_grasp_does_not_count(self):
         self.lines.say("lift")
@@ -62,10 +77,16 @@ class Gate(unittest.TestCase):
             time.sleep(0.001)
         self.gate.wait_s = 0.05
         self.assertEqual(self.close(), (False, "no decision within 0.05 s"))
+        self.gate.wait_s = 0.3
+        self.assertEqual(self.close("lift", grasp_id=1), (False, "no decision within 0.3 s"))
 
     def test_opening_needs_no_decision_and_a_failed_close_is_none(self):
-        self.assertEqual(self.gate.run(0.08, lambda: True), (True, "no grasp"))
-        self.assertEqual(self.gate.run(0.0, lambda: False), (False, "the controller did not succeed"))
+        self.assertEqual(self.gate.run(0.08, lambda: (True, False)), (True, "no grasp"))
+        # A hand that is stuck as it opens still holds the object.
+        self.assertEqual(self.gate.run(0.08, lambda: (False, True)), (False, "the controller did not succeed"))
+        self.assertEqual(self.gate.run(0.0, lambda: (False, False)), (False, "the controller did not succeed"))
+        opposite = example.grasps(Message(grasps_below=None, grasps_above=0.5))
+        self.assertEqual([opposite(0.7), opposite(0.1)], [True, False])
 
     def test_a_graph_that_ends_aborts(self):
         self.lines.queue.put("grasp 3 HOLD")
@@ -93,17 +114,23 @@ class Gate(unittest.TestCase):
                 return True
 
             def send_goal_async(self, goal):
-                stalled = Message(result=Message(reached_goal=False, stalled=True))
-                return Future(Message(accepted=True, get_result_async=lambda: Future(stalled)))
+                answer = Message(status=example.SUCCEEDED, result=Message(stalled=True))
+                return Future(Message(accepted=True, get_result_async=lambda: Future(answer)))
 
-        def server(node, kind, name, execute):
+        def server(node, kind, name, execute, goal_callback, cancel_callback):
             served["name"], served["execute"] = name, execute
+            self.assertEqual((goal_callback(None), cancel_callback(None)), ("accept", "accept"))
 
         def spin(node, executor):
             for action, position in [("lift", 0.0), ("hold", 0.0), (None, 0.08)]:
                 ends = []
                 command = Message(position=position)
-                handle = Message(request=Message(command=command), succeed=lambda: ends.append(True), abort=lambda: ends.append(False))
+                handle = Message(
+                    request=Message(command=command),
+                    is_cancel_requested=False,
+                    succeed=lambda: ends.append(True),
+                    abort=lambda: ends.append(False),
+                )
                 # The graph decides while the hand closes.
                 sender = Client.send_goal_async
 
@@ -123,12 +150,15 @@ class Gate(unittest.TestCase):
         rclpy.init, rclpy.try_shutdown, rclpy.spin = lambda: None, lambda: None, spin
         rclpy.create_node = lambda name: Message(get_logger=lambda: logger)
         action, executors = types.ModuleType("rclpy.action"), types.ModuleType("rclpy.executors")
-        action.ActionClient, action.ActionServer, executors.MultiThreadedExecutor = Client, server, object
+        action.ActionClient, action.ActionServer = Client, server
+        executors.MultiThreadedExecutor = lambda num_threads: None
+        action.GoalResponse = Message(ACCEPT="accept", REJECT="reject")
+        action.CancelResponse = Message(ACCEPT="accept")
         control, actions = types.ModuleType("control_msgs"), types.ModuleType("control_msgs.action")
-        actions.GripperCommand = actions.ParallelGripperCommand = Message(Result=Message)
+        actions.GripperCommand, control.action = Message(Result=Message), actions
         modules = {"rclpy": rclpy, "rclpy.action": action, "rclpy.executors": executors}
         modules.update({"control_msgs": control, "control_msgs.action": actions})
-        arguments = Message(parallel=False, controller="/gripper/cmd", grasps_below=0.03, wait=20.0)
+        arguments = Message(parallel=False, controller="/gripper/cmd", grasps_below=0.03, grasps_above=None, wait=20.0)
         with mock.patch.dict(sys.modules, modules):
             example.serve(arguments, self.decisions)
         self.assertEqual(served["ends"], [True, False, True])

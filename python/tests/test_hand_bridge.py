@@ -47,7 +47,7 @@ class Frames(unittest.TestCase):
         self.t = 5 * 10**9
 
     def send(self, at, right_at=None, states=(2, 2)):
-        self.frames.take_phase(Message(states=list(states)))
+        self.frames.take_phase(Message(states=list(states)), at)
         self.frames.take_cells(1, Message(data=[3.0, 4.0]), right_at or at)
         return self.frames.take_cells(0, left(at, 100, 250), at)
 
@@ -69,6 +69,18 @@ class Frames(unittest.TestCase):
         self.assertEqual(self.frames.dropped, 2)
         self.assertIn("tolerance_ms", self.frames.lacks())
 
+    def test_a_dead_driver_beside_a_live_arm_is_noticed(self):
+        self.frames.take_joints(joints(self.t), self.t)
+        later = self.t + 200 * MILLI
+        self.frames.take_joints(Message(header=header(later), name=["elbow"], position=[1.0]), later)
+        self.assertIsNone(self.send(later))
+        self.frames.take_joints(joints(later), later)
+        self.assertIsNotNone(self.send(later))
+        # The phase is of the last second.
+        at = later + 100 * MILLI
+        self.frames.take_cells(1, Message(data=[3.0, 4.0]), at)
+        self.assertIsNone(self.frames.take_cells(0, left(at, 100, 250), at + 2000 * MILLI))
+
     def test_a_hand_is_settled_if_all_its_fingers_are(self):
         self.frames.take_joints(joints(self.t), self.t)
         for states, phase in [((0, 0), "open"), ((2, 1), "closing"), ((2, 0), "closing"), ((2, 2), "settled")]:
@@ -77,13 +89,12 @@ class Frames(unittest.TestCase):
             self.send(self.t, states=(7, 7))
 
     def test_the_phase_is_inferred_from_the_motion(self):
-        table = {"cells": TABLE["cells"], "joints": {"map": {**TABLE["joints"]["map"], "wrist": {"closes": 0}}}}
-        frames = bridge.Frames(table, HAND)
+        # The jaw slides by 10 mm/s, and its value falls: 0.1 rad/s of a hand that closes.
+        jaw = {**TABLE["joints"]["map"]["jaw"], "closes": -0.1}
+        frames = bridge.Frames({"cells": TABLE["cells"], "joints": {"map": {"jaw": jaw, "wrist": {"closes": 0}}}}, HAND)
         found = []
         for step in range(200):
-            # The jaw's value falls as the finger's grows: scale is negative, and so is the sign of closing.
-            finger = min(max(0, step - 50), 50) * 0.002
-            frames.closing[0] = -1
+            finger = min(max(0, step - 50), 50) * 0.0002
             frames.take_joints(joints(self.t + step * 10 * MILLI, finger), 0)
             if frames.phase not in found:
                 found.append(frames.phase)
