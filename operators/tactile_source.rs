@@ -220,8 +220,13 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         bail!("hand {}: {n_joints} joints and {n_cells} cells, at most {MAX_JOINTS} and {MAX_CELLS}", hand.name);
     }
     let driver = driver(&params, &hand, operator.has_sandbox())?;
+    let mut sensed = hand.clone();
+    if let DriverWord::Recording = params.driver {
+        // A recording holds forces, which rise.
+        sensed.pads.iter_mut().for_each(|pad| pad.falls_under_load = false);
+    }
     let zeros =
-        CellZeros::new(&hand, params.zero_when_open).map_err(|reason| anyhow!("hand {}: {reason}", hand.name))?;
+        CellZeros::new(&sensed, params.zero_when_open).map_err(|reason| anyhow!("hand {}: {reason}", hand.name))?;
     operator.reserve_state()?;
     let shape = Shape { n_joints, n_cells };
     let wall_offset_nanos = wall_nanos().saturating_sub(monotonic_nanos());

@@ -79,7 +79,7 @@ class _Conversion:
             joints = [model.body_jntadr[body] + nth for nth in range(model.body_jntnum[body])]
             moving = [joint for joint in joints if self._moves(joint)]
             for nth, joint in enumerate(moving):
-                link = name if nth == len(moving) - 1 else f"{name}_{nth + 1}"
+                link = name if nth == len(moving) - 1 else self._free_name(f"{name}_{nth + 1}")
                 anchor = np.array(model.jnt_pos[joint])
                 self._add_link(link)
                 self._add_joint(joint, above, link, xyz + rotation @ (anchor - origin), rotation)
@@ -99,6 +99,12 @@ class _Conversion:
             self.told.append(f"joint '{self.name('joint', joint)}' is a ball: it counts as fixed")
         kinds = self.mujoco.mjtJoint
         return kind in (int(kinds.mjJNT_HINGE), int(kinds.mjJNT_SLIDE))
+
+    def _free_name(self, name: str) -> str:
+        taken = {self.name("body", body) for body in range(self.model.nbody)}
+        while name in taken:
+            name += "_"
+        return name
 
     def _add_link(self, name: str) -> None:
         ElementTree.SubElement(self.robot, "link", name=name)
@@ -163,11 +169,18 @@ class _Conversion:
             begin, n = int(model.tendon_adr[tendon]), int(model.tendon_num[tendon])
             wraps = range(begin, begin + n)
             is_fixed = all(int(model.wrap_type[wrap]) == int(mujoco.mjtWrap.mjWRAP_JOINT) for wrap in wraps)
-            joints = [int(model.wrap_objid[wrap]) for wrap in wraps] if is_fixed else []
-            # One motor pulls them all, as a finger's last two joints: they move alike.
-            for joint in joints[1:]:
-                if joint not in driven and joint not in mimics and joints[0] not in mimics:
-                    mimics[joint] = (joints[0], 1.0, 0.0)
+            pulled = [(int(model.wrap_objid[wrap]), float(model.wrap_prm[wrap])) for wrap in wraps] if is_fixed else []
+            # One motor pulls them all, as a finger's last two joints or a gripper's jaws: they move alike.
+            for joint, arm in pulled[1:]:
+                first, first_arm = pulled[0]
+                if joint in driven or joint in mimics or first in mimics or not arm * first_arm:
+                    continue
+                mimics[joint] = (first, 1.0 if arm * first_arm > 0 else -1.0, 0.0)
+                if abs(abs(arm) - abs(first_arm)) > 1e-9:
+                    self.told.append(
+                        f"joints '{self.name('joint', first)}' and '{self.name('joint', joint)}' share a tendon with other "
+                        "arms: the URDF lets them move alike"
+                    )
         return mimics
 
     def _tell_loops(self) -> None:

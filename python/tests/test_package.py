@@ -375,6 +375,16 @@ class Mjcf(Folder):
         ).stdout
         self.assertIn("revolute", listed)
 
+    def test_jaws_that_one_tendon_pulls_move_against_each_other(self):
+        from blindgrasp.mjcf import urdf_of
+
+        path, urdf = self.folder / "hand.xml", self.folder / "hand.urdf"
+        tendon = "<tendon><fixed name='t'><joint joint='j1' coef='1'/><joint joint='b' coef='-1'/></fixed></tendon>"
+        path.write_text(re.sub("<equality>.*</mujoco>", f"{tendon}<actuator><motor tendon='t'/></actuator></mujoco>", MJCF, flags=re.S))
+        self.assertEqual(urdf_of(path, urdf), [])
+        mimic = ElementTree.parse(urdf).find("joint[@name='b']/mimic")
+        self.assertEqual((mimic.get("joint"), float(mimic.get("multiplier"))), ("j1", -1.0))
+
     def test_a_loop_is_told(self):
         from blindgrasp.mjcf import urdf_of
 

@@ -193,6 +193,9 @@ impl Job<'_> {
                 Err(error) => return Err(error.into()),
             };
             report.add(&done);
+            if out.exists() {
+                bail!("{why}: {} stays as it was (--out with a folder keeps what is done)", out.display());
+            }
             if report.n_grasps == 0 {
                 bail!("{why}: nothing is recorded");
             }

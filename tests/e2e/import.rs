@@ -326,7 +326,7 @@ fn each_bad_row_is_named() {
     let below = TABLE.replacen("0.5", "-0.001", 1);
     let report = folder.import(&below, &[]);
     assert_eq!((&report["n_below_zero"], &report["skipped"]), (&json!(1), &json!([])));
-    let report = folder.import(&TABLE.replacen("0.5", "-50", 1), &["--clip-negative"]);
+    let report = folder.import(TABLE.replacen("0.5", "-50", 1), &["--clip-negative"]);
     assert_eq!((&report["n_below_zero"], &report["n_grasps"]), (&json!(1), &json!(2)));
 
     let report = folder.import(&table, &["--skip-bad-rows"]);

@@ -107,6 +107,10 @@ impl Soup {
         self.vertices.len()
     }
 
+    pub(crate) fn n_corners(&self) -> usize {
+        3 * self.triangles.len()
+    }
+
     pub(crate) fn push_vertex(&mut self, position: [f64; 3], line: Option<usize>) {
         self.vertices.push((position.into(), line));
     }

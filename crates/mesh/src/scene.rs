@@ -1,5 +1,6 @@
 //! Files that hold a scene of meshes: COLLADA (.dae) and binary glTF (.glb). Their meshes become one, as the scene places them.
 
+use std::cell::Cell;
 use std::collections::HashMap;
 
 use nalgebra::{Matrix4, Point3, Rotation3, Unit, Vector3};
@@ -12,6 +13,7 @@ use crate::read::{Problem, Soup, quoted};
 /// Most places of meshes in a scene, and most vertices of all of them: a scene may name a mesh as often as it likes.
 const MAX_PLACES: usize = 10_000;
 const MAX_VERTICES: usize = 20_000_000;
+const MAX_CORNERS: usize = 60_000_000;
 
 /// A surface: vertices, and polygons as indices into them.
 struct Surface {
@@ -22,8 +24,9 @@ struct Surface {
 impl Surface {
     fn place(&self, soup: &mut Soup, scene_from_mesh: &Matrix4<f64>) -> Result<(), Problem> {
         let first = soup.n_vertices() as i64;
-        if soup.n_vertices() + self.vertices.len() > MAX_VERTICES {
-            return Err(Problem::new(None, format!("at most {MAX_VERTICES} vertices"), "more"));
+        let n_corners: usize = self.polygons.iter().map(Vec::len).sum();
+        if soup.n_vertices() + self.vertices.len() > MAX_VERTICES || soup.n_corners() + n_corners > MAX_CORNERS {
+            return Err(Problem::new(None, format!("at most {MAX_VERTICES} vertices, {MAX_CORNERS} corners"), "more"));
         }
         for vertex in &self.vertices {
             let placed = scene_from_mesh.transform_point(&Point3::from(*vertex));
@@ -54,7 +57,7 @@ fn missing(what: &str, found: impl Into<String>) -> Problem {
 /// # Errors
 /// A damaged file, or one without such geometries.
 pub(crate) fn parse_dae(bytes: &[u8]) -> Result<Soup, Problem> {
-    let dae = Dae { document: Document::read(&String::from_utf8_lossy(bytes))? };
+    let dae = Dae { document: Document::read(&String::from_utf8_lossy(bytes))?, n_places: Cell::new(0) };
     let mut soup = Soup::default();
     let root = dae.root_transform()?;
     let mut pending: Vec<(&Element, Matrix4<f64>)> = dae.scene_nodes().into_iter().map(|node| (node, root)).collect();
@@ -64,12 +67,8 @@ pub(crate) fn parse_dae(bytes: &[u8]) -> Result<Soup, Problem> {
         }
         return Ok(soup);
     }
-    let mut n_places = 0;
     while let Some((node, scene_from_parent)) = pending.pop() {
-        n_places += 1;
-        if n_places > MAX_PLACES {
-            return Err(missing("a scene of at most 10,000 nodes", "more, or nodes that name each other"));
-        }
+        dae.count_place()?;
         let scene_from_node = scene_from_parent * transform_of(node)?;
         for child in &node.children {
             match child.name.as_str() {
@@ -206,9 +205,19 @@ impl Document {
 
 struct Dae {
     document: Document,
+    /// Nodes, and surfaces, so far. Each of them looks for names in the whole file.
+    n_places: Cell<usize>,
 }
 
 impl Dae {
+    fn count_place(&self) -> Result<(), Problem> {
+        self.n_places.set(self.n_places.get() + 1);
+        if self.n_places.get() > MAX_PLACES {
+            return Err(missing("a scene of at most 10,000 nodes and surfaces", "more, or nodes that name each other"));
+        }
+        Ok(())
+    }
+
     fn named(&self, instance: &Element) -> Result<&Element, Problem> {
         self.document.by_url(instance.attribute("url"))
     }
@@ -240,11 +249,12 @@ impl Dae {
     }
 
     fn place(&self, geometry: &Element, soup: &mut Soup, scene_from_mesh: &Matrix4<f64>) -> Result<(), Problem> {
-        let Some(mesh) = geometry.child("mesh") else { return Ok(()) };
+        let Some(mesh) = geometry.child("mesh") else { return self.count_place() };
         for primitive in &mesh.children {
             let is_surface =
                 matches!(primitive.name.as_str(), "triangles" | "polylist" | "polygons" | "tristrips" | "trifans");
             if let Some(input) = primitive.inputs("VERTEX").next().filter(|_| is_surface) {
+                self.count_place()?;
                 let vertices = self.positions(input)?;
                 let polygons = polygons(primitive, input)?;
                 Surface { vertices, polygons }.place(soup, scene_from_mesh)?;
@@ -355,6 +365,7 @@ pub(crate) fn parse_glb(bytes: &[u8]) -> Result<Soup, Problem> {
         let scene_from_node = scene_from_parent * node_transform(node);
         if let Some(mesh) = node["mesh"].as_u64() {
             for primitive in glb.json["meshes"][mesh as usize]["primitives"].as_array().into_iter().flatten() {
+                n_places += 1;
                 if let Some(surface) = glb.surface(primitive)? {
                     surface.place(&mut soup, &scene_from_node)?;
                 }
@@ -449,12 +460,17 @@ impl<'a> Glb<'a> {
         let is_float = accessor["componentType"] == 5126;
         let view = &self.json["bufferViews"][accessor["bufferView"].as_u64().unwrap_or(u64::MAX) as usize];
         let buffer = &self.json["buffers"][view["buffer"].as_u64().unwrap_or(u64::MAX) as usize];
-        if !view.is_object() || !buffer.is_object() || buffer.get("uri").is_some() {
-            return Err(missing("numbers in the file itself, without compression", "others"));
+        let is_other = accessor["normalized"] == true || accessor.get("sparse").is_some();
+        if is_other || !view.is_object() || !buffer.is_object() || buffer.get("uri").is_some() {
+            return Err(missing("plain numbers in the file itself, without compression", "others"));
         }
         let number = |value: &Value, default: usize| value.as_u64().map_or(default, |number| number as usize);
         let begin = number(&view["byteOffset"], 0).saturating_add(number(&accessor["byteOffset"], 0));
-        let stride = number(&view["byteStride"], size * n_columns);
+        let stride = match number(&view["byteStride"], 0) {
+            0 => size * n_columns,
+            stride if stride >= size * n_columns => stride,
+            stride => return Err(missing("a stride of at least a row", stride.to_string())),
+        };
         (0..number(&accessor["count"], 0))
             .map(|row| {
                 let at = begin.saturating_add(row.saturating_mul(stride));

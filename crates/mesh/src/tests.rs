@@ -190,8 +190,10 @@ fn a_scene_places_its_meshes() {
         let error = error_of(name, &text);
         assert!(error.contains(expected), "{error}");
     }
+    let many = dae.replacen(instance, &instance.repeat(20_000), 1);
+    assert!(error_of("a.dae", many).contains("at most 10,000 nodes"), "a mesh as often as it likes");
     let own = dae.replacen(instance, "<instance_node url='#n'/>", 1).replacen("<node>", "<node id='n'>", 1);
-    assert!(error_of("a.dae", own).contains("at most 10,000 nodes"), "a node in itself");
+    assert!(error_of("a.dae", own).contains("at most 10,000 nodes and surfaces"), "a node in itself");
 }
 
 #[test]

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::ImportError;
+use super::{ImportError, require_forces};
 use blindgrasp_messages::{GraspTruth, Header, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::{RecordingInfo, RecordingWriter};
 use blindgrasp_stages::hand::Hand;
@@ -38,6 +38,7 @@ pub fn import_frames(
     out: &Path,
 ) -> Result<FramesReport, ImportError> {
     let refused = |message: String| ImportError::Table { path: name.into(), message };
+    require_forces(hand).map_err(refused)?;
     let info = RecordingInfo {
         hand: hand.name.clone(),
         hand_id: hand.id(),

@@ -183,6 +183,7 @@ pub fn import_table(
     out: &Path,
 ) -> Result<ImportReport, ImportError> {
     let refused = |message: String| ImportError::Table { path: table.into(), message };
+    require_forces(hand).map_err(refused)?;
     let bytes = read(table)?;
     let text = bytes.strip_prefix(BYTE_ORDER_MARK).unwrap_or(&bytes);
     let mut reader = csv::ReaderBuilder::new().delimiter(options.delimiter).trim(csv::Trim::All).from_reader(text);
@@ -234,6 +235,18 @@ pub fn import_table(
     report.n_frames = writer.header.seq;
     writer.recording.finish()?;
     Ok(report)
+}
+
+/// A table and a bridge's lines hold readings as they are, of which nobody knows the zero.
+fn require_forces(hand: &Hand) -> Result<(), String> {
+    match hand.pads.iter().find(|pad| pad.falls_under_load) {
+        Some(pad) => Err(format!(
+            "the readings of pad '{}' fall under load: subtract each from that of the open hand, and give a layout without \
+             falls_under_load",
+            pad.name
+        )),
+        None => Ok(()),
+    }
 }
 
 /// Reads rows. Errors do not name the line.

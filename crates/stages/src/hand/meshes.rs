@@ -87,7 +87,9 @@ pub fn find_package<'a>(package: &'a str, from: &Path) -> impl Iterator<Item = P
         let itself = folder.file_name().is_some_and(|name| name == package).then(|| folder.clone());
         itself.into_iter().chain([folder.join(package)])
     });
-    let declared = above.into_iter().take(MAX_ABOVE).flat_map(move |folder| {
+    // The root is no workspace.
+    let above = above.into_iter().take(MAX_ABOVE).filter(|folder| folder.parent().is_some());
+    let declared = above.flat_map(move |folder| {
         let beside = folders_in(&folder).into_iter().flat_map(|folder| {
             let below = folders_in(&folder);
             std::iter::once(folder).chain(below)
@@ -105,7 +107,7 @@ pub fn find_package<'a>(package: &'a str, from: &Path) -> impl Iterator<Item = P
 /// Folders above a URDF in which packages are sought by their `package.xml`: a workspace is at most so far away.
 const MAX_ABOVE: usize = 5;
 /// Folders that are looked into for each of those.
-const MAX_SOUGHT: usize = 2000;
+const MAX_SOUGHT: usize = 500;
 
 fn folders_in(folder: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();

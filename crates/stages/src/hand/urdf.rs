@@ -185,7 +185,9 @@ fn motion(joint: &urdf_xml::Joint, by_name: &BTreeMap<&str, &urdf_xml::Joint>) -
         Some(mimic) => match by_name[mimic.joint.as_str()] {
             followed if can_move(followed)? => None,
             followed => {
-                let value = followed.limits.map_or(0.0, |(lower, _)| lower);
+                // Limits that a fixed joint has kept mean nothing.
+                let moves = matches!(followed.kind.as_str(), "revolute" | "prismatic");
+                let value = followed.limits.filter(|_| moves).map_or(0.0, |(lower, _)| lower);
                 Some((mimic.multiplier * value + mimic.offset, format!("mimics '{}', which stands", mimic.joint)))
             }
         },

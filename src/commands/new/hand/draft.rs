@@ -97,7 +97,7 @@ impl Draft {
     /// A joint that moves all pads together, as a wrist does.
     pub(super) fn fit(&mut self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<()> {
         let hand = self.with_pads(&self.pads(table, arguments, false)?);
-        if let Some((joint, link)) = wrist(&hand) {
+        if let Some((joint, link)) = wrist(&hand).filter(|(joint, _)| !arguments.preshape.contains(joint)) {
             bail!("joint '{joint}' moves all pads together, as a wrist does: give the hand alone with --base {link}");
         }
         let mut best = self.fitted(table, arguments, Opening::AsGiven)?;
@@ -111,7 +111,8 @@ impl Draft {
             others.push(Opening::Reversed);
         }
         for opening in others {
-            let other = self.fitted(table, arguments, opening)?;
+            // Another open hand may leave a grid without cells.
+            let Ok(other) = self.fitted(table, arguments, opening) else { continue };
             if other.score > best.score + LEAST_GAIN {
                 best = other;
             }
@@ -257,15 +258,20 @@ impl Draft {
     fn put_palm_frame(&mut self, [x, y, z, roll, pitch, yaw]: [f64; 6]) -> anyhow::Result<()> {
         let palm = self.hand.palm_link().name.clone();
         let end = self.urdf.rfind("</robot>").context("the URDF does not end with </robot>")?;
+        // The URDF of a hand that was made by this command has such a link already.
+        let mut frame = PALM_FRAME.to_owned();
+        while self.hand.links.iter().any(|link| link.name == frame) {
+            frame.push('_');
+        }
         self.urdf.insert_str(
             end,
             &format!(
-                "  <link name=\"{PALM_FRAME}\"/>\n  <joint name=\"{PALM_FRAME}_joint\" type=\"fixed\">\n    \
-                 <parent link=\"{palm}\"/><child link=\"{PALM_FRAME}\"/>\n    <origin xyz=\"{x} {y} {z}\" rpy=\"{roll} {pitch} \
+                "  <link name=\"{frame}\"/>\n  <joint name=\"{frame}_joint\" type=\"fixed\">\n    \
+                 <parent link=\"{palm}\"/><child link=\"{frame}\"/>\n    <origin xyz=\"{x} {y} {z}\" rpy=\"{roll} {pitch} \
                  {yaw}\"/>\n  </joint>\n"
             ),
         );
-        self.bare.palm = Some(PALM_FRAME.into());
+        self.bare.palm = Some(frame);
         self.read()
     }
 
@@ -294,7 +300,8 @@ fn wrist(hand: &Hand) -> Option<(String, String)> {
     let chains: Vec<Vec<usize>> = hand.pads.iter().map(|pad| movers(pad.link_idx)).collect();
     let (first, others) = chains.split_first()?;
     let lowest = *first.iter().find(|idx| others.iter().all(|chain| chain.contains(idx)))?;
-    let is_one_finger = chains.iter().all(|chain| chain[0] == first[0]);
+    // A link with a pad of its own is a finger's.
+    let is_one_finger = chains.iter().any(|chain| chain.first() == Some(&lowest));
     let Motion::Joint { joint_idx, .. } = hand.links[lowest].motion else { return None };
     (!is_one_finger).then(|| (hand.joints[joint_idx].name.clone(), hand.links[lowest].name.clone()))
 }

@@ -7,8 +7,8 @@ use std::process::{Command, Output};
 use anyhow::{Context, bail};
 use blindgrasp_stages::hand::{decode_urdf, find_package};
 
-/// A stand-in for the module of ROS 2 by which xacro finds packages. It is the last place where Python looks, so that ROS's own
-/// counts.
+/// A stand-in for the module of ROS 2 by which xacro finds packages. Packages are sought by [`find_package`], also where ROS is
+/// sourced: a package that is only checked out is none for ROS.
 const AMENT_INDEX: &str = "import json, os\n\
     class PackageNotFoundError(KeyError):\n    pass\n\
     def get_package_share_directory(package, print_warning=True):\n    \
@@ -75,8 +75,8 @@ fn run(
     packages: &BTreeMap<String, PathBuf>,
 ) -> anyhow::Result<Output> {
     let own = std::env::var_os("PYTHONPATH").unwrap_or_default();
-    let places = std::env::split_paths(&own).filter(|place| !place.as_os_str().is_empty());
-    let places = std::env::join_paths(places.chain([stand_in.to_path_buf()]))?;
+    let own = std::env::split_paths(&own).filter(|place| !place.as_os_str().is_empty());
+    let places = std::env::join_paths([stand_in.to_path_buf()].into_iter().chain(own))?;
     let output = Command::new("xacro")
         .arg(path)
         .args(arguments)
