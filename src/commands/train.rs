@@ -138,6 +138,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     } else {
         print_label(&recordings)?
     }
+    let (n_words, n_asked) = (model.features.dictionary.len(), training.recipe.n_words);
+    if n_words < n_asked {
+        print_diagnostic(&format!(
+            "the dictionary has {n_words} words, not {n_asked}: the contacts have no more places in the palm frame"
+        ));
+    }
     for (reason, n) in &training.n_excluded {
         print_line(&format!("left out: {n} with {reason}"))?;
     }

@@ -345,13 +345,17 @@ fn the_open_hand_gives_the_zero_of_cells_that_have_drifted() {
         assert_eq!(n_same >= 37, is_undisturbed, "zero_when_open {zero}: {n_same} of 38 as without drift");
         assert_eq!(decided[0]["reason"], "out_of_order");
     }
-    let counting = live_dataflow(folder.path(), "driver: listen\n      zero_when_open: true");
-    let of_counts =
-        std::fs::read_to_string(&counting).expect("read").replace("barrett-bh8-280.yaml", "shadow-biotac-sp.yaml");
-    std::fs::write(&counting, of_counts).expect("written");
-    let counting = counting.to_str().expect("UTF-8");
-    let refused = run(&["run", "--allow-mismatch", "--name", &unique_name(), counting], 1);
-    assert!(text(&refused.stderr).contains("the cells of shadow-biotac-sp read counts"), "{}", text(&refused.stderr));
+    // Cells that read less the more they are loaded have no force without a zero.
+    let layout = std::fs::read_to_string(project().join("hands/barrett-bh8-280.yaml")).expect("a layout");
+    let layout = layout.replacen("_newtons: 0.05}", "_newtons: 0.05, falls_under_load: true}", 1);
+    let urdf = project().join("hands/barrett-bh8-280.urdf");
+    std::fs::write(folder.path().join("falling.yaml"), layout).expect("written");
+    std::fs::copy(urdf, folder.path().join("barrett-bh8-280.urdf")).expect("copied");
+    let flow = live_dataflow(folder.path(), "driver: listen");
+    let hand = format!("hand={}", folder.path().join("falling.yaml").display());
+    let flow = flow.to_str().expect("UTF-8");
+    let refused = run(&["run", "--allow-mismatch", "--name", &unique_name(), "--set", &hand, flow], 1);
+    assert!(text(&refused.stderr).contains("fall under load: set zero_when_open"), "{}", text(&refused.stderr));
 }
 
 #[test]

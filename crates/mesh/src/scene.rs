@@ -253,7 +253,9 @@ impl Dae {
         for primitive in &mesh.children {
             let is_surface =
                 matches!(primitive.name.as_str(), "triangles" | "polylist" | "polygons" | "tristrips" | "trifans");
-            if let Some(input) = primitive.inputs("VERTEX").next().filter(|_| is_surface) {
+            if let Some(input) = primitive.inputs("VERTEX").next()
+                && is_surface
+            {
                 self.count_place()?;
                 let vertices = self.positions(input)?;
                 let polygons = polygons(primitive, input)?;
@@ -431,9 +433,8 @@ impl<'a> Glb<'a> {
     /// `None` for points and lines.
     fn surface(&self, primitive: &Value) -> Result<Option<Surface>, Problem> {
         let mode = primitive["mode"].as_u64().unwrap_or(4);
-        let Some(position) = primitive["attributes"]["POSITION"].as_u64().filter(|_| (4..=6).contains(&mode)) else {
-            return Ok(None);
-        };
+        let position = primitive["attributes"]["POSITION"].as_u64();
+        let (Some(position), 4..=6) = (position, mode) else { return Ok(None) };
         let rows = self.rows(position, 3)?;
         let vertices: Vec<[f64; 3]> = rows.iter().map(|row| [row[0], row[1], row[2]]).collect();
         let idxs: Vec<i64> = match primitive["indices"].as_u64() {

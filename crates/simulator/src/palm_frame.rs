@@ -200,7 +200,9 @@ fn directions(hand: &Hand) -> Result<Vec<UnitVector3<f64>>, JointError> {
     let mean: Vector3<f64> =
         cells.iter().map(|cell| cell.normal_in_palm.into_inner()).sum::<Vector3<f64>>() / cells.len() as f64;
     let between = directions.iter().all(|axis| axis.dot(&mean) < 0.94 * mean.norm());
-    directions.extend(Unit::try_new(mean, 0.5).filter(|_| between));
+    if between {
+        directions.extend(Unit::try_new(mean, 0.5));
+    }
     Ok(directions)
 }
 

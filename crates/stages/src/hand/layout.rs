@@ -212,11 +212,12 @@ impl Layout {
     fn joints(&self, tree: &Tree) -> Result<Vec<Joint>, String> {
         let mut joints: Vec<Joint> = Vec::new();
         for name in &self.joints {
-            let joint = tree
-                .joints
-                .get(name)
-                .filter(|joint| joint.mimic.is_none())
-                .ok_or_else(|| format!("joints: the URDF has no moving joint '{name}' with a value of its own"))?;
+            let joint = tree.joints.get(name).filter(|joint| joint.mimic.is_none()).ok_or_else(|| {
+                let counts_as_fixed =
+                    tree.fixed_joints.iter().find(|told| told.starts_with(&format!("joint '{name}'")));
+                let why = counts_as_fixed.map_or(String::new(), |told| format!(": {told}"));
+                format!("joints: the URDF has no moving joint '{name}' with a value of its own{why}")
+            })?;
             if joints.iter().any(|other| other.name == *name) {
                 return Err(format!("joints: '{name}' is listed twice"));
             }

@@ -187,7 +187,7 @@ fn motion(joint: &urdf_xml::Joint, by_name: &BTreeMap<&str, &urdf_xml::Joint>) -
             followed => {
                 // Limits that a fixed joint has kept mean nothing.
                 let moves = matches!(followed.kind.as_str(), "revolute" | "prismatic");
-                let value = followed.limits.filter(|_| moves).map_or(0.0, |(lower, _)| lower);
+                let value = if moves { followed.limits.map_or(0.0, |(lower, _)| lower) } else { 0.0 };
                 Some((mimic.multiplier * value + mimic.offset, format!("mimics '{}', which stands", mimic.joint)))
             }
         },
@@ -274,8 +274,8 @@ fn shape(
         }
     };
     // Sizes are checked first, because parry panics on invalid ones.
-    if sizes.iter().any(|size| *size > MAX_LENGTH_M) {
-        return Err(format!("a collision shape of size {sizes:?}: expected at most {MAX_LENGTH_M} metres"));
+    if !sizes.iter().all(|size| (0.0..=MAX_LENGTH_M).contains(size)) {
+        return Err(format!("a collision shape of size {sizes:?}: expected {MIN_SIZE_M} to {MAX_LENGTH_M} metres"));
     }
     if !sizes.iter().all(|size| *size >= MIN_SIZE_M) {
         return Ok(Err(format!("a {name} of size {sizes:?}: expected at least {MIN_SIZE_M} metres")));

@@ -190,7 +190,9 @@ impl Draft {
         let hand = draft.with_pads(&draft.pads(table, arguments, false)?).with_moving_pads();
         let fit = palm_fit(&hand)?;
         let pose = rounded(&fit.link_from_palm);
-        if let Some(given) = draft.palm_pose.filter(|_| fit.is_better) {
+        if let Some(given) = draft.palm_pose
+            && fit.is_better
+        {
             let better = rounded(&(isometry(given) * fit.link_from_palm)).map(|number| number.to_string()).join(",");
             told.push(format!(
                 "the hand closes on an object before --palm-pose {better}, not before the one that is given"
@@ -237,7 +239,9 @@ impl Draft {
             ));
         }
         let (share, pair) = self_pressing(&hand)?;
-        if let Some((a, b)) = pair.filter(|_| share > 0.5) {
+        if let Some((a, b)) = pair
+            && share > 0.5
+        {
             print_diagnostic(&format!(
                 "links press on each other in {:.0} % of the postures until the hand is half closed, mostly '{}' on '{}': give \
                  an open hand with --open, keep joints still with --preshape, or simplify the collision shapes",
