@@ -1,6 +1,7 @@
 //! Other users of the machine, and files and programs of strangers: they reach no graph, no terminal and no other file.
 
 use std::os::unix::fs::MetadataExt;
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
@@ -226,7 +227,9 @@ fn a_graph_goes_on_when_shared_memory_was_full() {
     // It fills what becomes free, again and again.
     let fill = "while :; do dd if=/dev/zero of=/dev/shm/filler bs=64k oflag=append conv=notrunc 2> /dev/null; done";
     let target = format!("--target={}", graph.pid());
-    let mut filler = Command::new("nsenter").args([&target, "--mount", "sh", "-c", fill]).spawn().expect("started");
+    let mut filler = Command::new("nsenter");
+    // A group of its own: what the shell has started would go on filling.
+    let mut filler = filler.args([&target, "--mount", "sh", "-c", fill]).process_group(0).spawn().expect("started");
     let n_free_kib = || {
         let free = text(&in_shm(&["df", "--output=avail", "/dev/shm"]).stdout);
         free.lines().last().and_then(|line| line.trim().parse::<u64>().ok()).expect("a number")
@@ -238,7 +241,9 @@ fn a_graph_goes_on_when_shared_memory_was_full() {
     // A process that is started again has no room, and waits for it.
     crate::common::signal(graph.pid_of("contacts"), Signal::KILL);
     wait_until(|| graph.said().contains("when there is room in /dev/shm"), || graph.said());
-    filler.kill().and_then(|()| filler.wait()).expect("killed");
+    let group = rustix::process::Pid::from_child(&filler);
+    rustix::process::kill_process_group(group, Signal::KILL).expect("killed");
+    filler.wait().expect("ended");
     in_shm(&["rm", "/dev/shm/filler"]);
     wait_until(|| graph.node("contacts")["state"] == "running", || graph.said());
     graph.wait_for_decisions(A_FEW_GRASPS);
