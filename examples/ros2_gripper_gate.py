@@ -29,7 +29,7 @@ import time
 LIFT = "lift"
 # action_msgs/msg/GoalStatus
 SUCCEEDED = 4
-# Decisions that say what to do next, and end nothing.
+# Decisions after which another one follows.
 UNDECIDED = ("squeeze", "test_lift", "tighten", "set_down", "go_on")
 
 

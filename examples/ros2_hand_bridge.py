@@ -168,7 +168,7 @@ class Frames:
         }
 
     def lacks(self):
-        """What is missing for a frame, for a person."""
+        """The parts that a frame lacks, for a person."""
         joints = [name for name in self.hand["joints"] if (self.map.get(name) or {}).get("from", name) not in self.values]
         cells = [entry["topic"] for entry, cells in zip(self.table["cells"], self.cells) if cells is None]
         found = [f"no angle of {', '.join(joints)}"] if joints else []

@@ -29,7 +29,7 @@ def urdf_of(model_path: str | os.PathLike[str], urdf_path: str | os.PathLike[str
         urdf_path: where to write the URDF.
 
     Returns:
-        What a URDF cannot hold, a line each.
+        The parts of the model that a URDF cannot hold, a line for each.
 
     Raises:
         ImportError: the package ``mujoco`` is missing.

@@ -10,6 +10,7 @@ use serde_json::Value;
 
 use blindgrasp_messages::{GraspTruth, Header, OwnedSenses, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_stages::Hand;
+use blindgrasp_tactile::cell_zeros::{CellZeros, check_readings};
 use blindgrasp_tactile::line_protocol;
 
 /// The time between two frames that have no stamp.
@@ -41,13 +42,14 @@ pub(super) fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines
     let mut truths = BTreeMap::new();
     // Of lines of a bridge: whether they have numbers.
     let mut has_seq = None;
+    let mut zeros = CellZeros::new(hand, false);
     for (line_idx, line) in input.lines().enumerate() {
         let line = line.with_context(|| file.display().to_string())?;
         if line.trim().is_empty() {
             continue;
         }
         let place = || format!("{}, line {}", file.display(), line_idx + 1);
-        let (frame, truth) = match read_line(&line, &frames, hand).with_context(place)? {
+        let (frame, truth) = match read_line(&line, &frames, hand, &mut zeros).with_context(place)? {
             Line::Frame(frame, truth) => (Some(frame), truth),
             Line::Truth(truth) => (None, Some(truth)),
             Line::Other => (None, None),
@@ -75,10 +77,15 @@ pub(super) fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines
     Ok(FrameLines { frames, truths })
 }
 
-fn read_line(line: &str, earlier: &[Stamped<TactileFrame>], hand: &Hand) -> anyhow::Result<Line> {
+fn read_line(
+    line: &str,
+    earlier: &[Stamped<TactileFrame>],
+    hand: &Hand,
+    zeros: &mut Result<CellZeros, String>,
+) -> anyhow::Result<Line> {
     let value: Value = serde_json::from_str(line).context("not a line of JSON")?;
     if value.get("data").is_none() {
-        return of_bridge(line, earlier, hand);
+        return of_bridge(line, earlier, hand, zeros.as_mut().map_err(|reason| anyhow::anyhow!("{reason}"))?);
     }
     let line: ExportedLine = serde_json::from_value(value)
         .context("not a line of 'blindgrasp export': expected topic, seq, stamp_nanos and data")?;
@@ -112,9 +119,21 @@ fn read_line(line: &str, earlier: &[Stamped<TactileFrame>], hand: &Hand) -> anyh
     Ok(Line::Frame(Stamped { header, message }, None))
 }
 
-/// As a graph's source numbers the frames of a bridge: from 0, with the bridge's gaps.
-fn of_bridge(line: &str, earlier: &[Stamped<TactileFrame>], hand: &Hand) -> anyhow::Result<Line> {
-    let reading = line_protocol::parse(line.as_bytes()).map_err(|refusal| anyhow::anyhow!("{}", refusal.why))?;
+/// As a graph's source takes the frames of a bridge: numbered from 0 with the bridge's gaps, and noise below 0 as 0.
+fn of_bridge(
+    line: &str,
+    earlier: &[Stamped<TactileFrame>],
+    hand: &Hand,
+    zeros: &mut CellZeros,
+) -> anyhow::Result<Line> {
+    let mut reading = line_protocol::parse(line.as_bytes()).map_err(|refusal| anyhow::anyhow!("{}", refusal.why))?;
+    let least_readings = zeros.least_readings();
+    // A frame of another hand is refused later.
+    if reading.cells_newtons.len() == least_readings.len() {
+        let checked = check_readings(&reading.cells_newtons, Some(&least_readings));
+        checked.map_err(|why| anyhow::anyhow!("{why}, which a graph has: record its frames"))?;
+        zeros.apply(&mut reading);
+    }
     let grasp_id = reading.grasp_id.context("the frame lacks grasp_id")?;
     let truth = reading.truth(grasp_id);
     // Without the bridge's numbers, no frame is missed.

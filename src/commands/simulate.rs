@@ -159,7 +159,7 @@ const TELL_EVERY: Duration = Duration::from_secs(30);
 /// So many grasps without a stable one are told.
 const MANY_UNSTABLE: usize = 50;
 
-/// What to do where no candidate is stable.
+/// Advice where no candidate is stable.
 fn none_is_stable(n: usize) -> String {
     format!(
         "none of the first {n} grasps is stable, but stable ones are asked for: --stable-fraction natural keeps grasps as they \

@@ -73,6 +73,25 @@ fn the_outcomes_of_a_bridge_are_labels_and_correct_a_model() {
     let decided = json_lines(&run(&["predict", &model, &at("own.jsonl"), "--hand", &hand, "--json"], 0).stdout);
     assert_eq!((decided.len(), &decided[7]["truth"]["object"]), (300, &json!("thing-1")));
 
+    // Noise below zero is 0, as in a graph; a reading that is lower is refused with its line.
+    let first = |reading: f64| {
+        let mut lines = bridge_lines(2, 300, 0.4, true).lines().map(str::to_owned).collect::<Vec<_>>();
+        let mut line: Value = serde_json::from_str(&lines[0]).expect("JSON");
+        line["cells_newtons"][0] = json!(reading);
+        lines[0] = line.to_string();
+        lines.join("\n")
+    };
+    let (tared, _) = imported("tared", &first(-1e-4), 0);
+    let exported = text(&run(&["export", &tared, "--topic", "/tactile"], 0).stdout).to_owned();
+    let frame: Value = serde_json::from_str(exported.lines().next().expect("a frame")).expect("JSON");
+    assert_eq!(frame["data"]["cells_newtons"][0], 0.0);
+    let (_, output) = imported("negative", &first(-5.0), 1);
+    let said = text(&output.stderr);
+    assert!(
+        said.contains("line 1") && said.contains("cells_newtons[0] is -5") && said.contains("zero_when_open"),
+        "{said}"
+    );
+
     // This robot drops four of ten that the model takes for safe.
     let adapted = at("adapted.json");
     let adapt = |model: &str, recording: &str, code: i32| {

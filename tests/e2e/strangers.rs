@@ -228,7 +228,7 @@ fn a_graph_goes_on_when_shared_memory_was_full() {
     let fill = "while :; do dd if=/dev/zero of=/dev/shm/filler bs=64k oflag=append conv=notrunc 2> /dev/null; done";
     let target = format!("--target={}", graph.pid());
     let mut filler = Command::new("nsenter");
-    // A group of its own: what the shell has started would go on filling.
+    // A group of its own: a program that the shell has started would go on filling.
     let mut filler = filler.args([&target, "--mount", "sh", "-c", fill]).process_group(0).spawn().expect("started");
     let n_free_kib = || {
         let free = text(&in_shm(&["df", "--output=avail", "/dev/shm"]).stdout);

@@ -123,9 +123,28 @@ fn meshes() {
         stl.extend(numbers.flat_map(f32::to_le_bytes));
         stl.extend([0; 2]);
     }
-    for (name, original) in
-        [("a.off", std::fs::read(off).expect("read")), ("a.obj", obj), ("a.ply", ply), ("a.stl", stl)]
-    {
+    let dae = b"<COLLADA><asset><unit meter='1'/><up_axis>Y_UP</up_axis></asset><geometry id='g'><mesh><source id='p'>\
+                <float_array>0 0 0 1 0 0 0 1 0 0 0 1</float_array></source><vertices id='v'><input semantic='POSITION' \
+                source='#p'/></vertices><polylist><input semantic='VERTEX' source='#v' offset='0'/><vcount>3 3 3 3</vcount>\
+                <p>0 2 1 0 1 3 0 3 2 1 2 3</p></polylist></mesh></geometry><visual_scene id='s'><node><rotate>0 0 1 30</rotate>\
+                <instance_geometry url='#g'/></node></visual_scene><scene><instance_visual_scene url='#s'/></scene></COLLADA>"
+        .to_vec();
+    let json = br#"{"scenes":[{"nodes":[0]}],"nodes":[{"mesh":0}],"meshes":[{"primitives":[{"attributes":{"POSITION":0},
+        "indices":1}]}],"buffers":[{}],"bufferViews":[{"buffer":0},{"buffer":0,"byteOffset":48}],"accessors":[{"bufferView":0,
+        "componentType":5126,"count":4},{"bufferView":1,"componentType":5121,"count":12}]}"#;
+    let mut binary: Vec<u8> =
+        mesh.vertices_m.iter().flat_map(|point| point.iter().flat_map(|x| (*x as f32).to_le_bytes())).collect();
+    binary.extend(mesh.triangles.iter().flatten().map(|idx| *idx as u8));
+    let part = |kind: &[u8], content: &[u8]| [&(content.len() as u32).to_le_bytes(), kind, content].concat();
+    let glb = [&b"glTF\x02\0\0\0\0\0\0\0"[..], &part(b"JSON", json), &part(b"BIN\0", &binary)].concat();
+    for (name, original) in [
+        ("a.off", std::fs::read(off).expect("read")),
+        ("a.obj", obj),
+        ("a.ply", ply),
+        ("a.stl", stl),
+        ("a.dae", dae),
+        ("a.glb", glb),
+    ] {
         let path = folder.path().join(name);
         check(3000, &original, |bytes| {
             std::fs::write(&path, bytes).expect("written");

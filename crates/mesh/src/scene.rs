@@ -1,6 +1,5 @@
 //! Files that hold a scene of meshes: COLLADA (.dae) and binary glTF (.glb). Their meshes become one, as the scene places them.
 
-use std::cell::Cell;
 use std::collections::HashMap;
 
 use nalgebra::{Matrix4, Point3, Rotation3, Unit, Vector3};
@@ -57,15 +56,21 @@ fn missing(what: &str, found: impl Into<String>) -> Problem {
 /// # Errors
 /// A damaged file, or one without such geometries.
 pub(crate) fn parse_dae(bytes: &[u8]) -> Result<Soup, Problem> {
-    let dae = Dae { document: Document::read(&String::from_utf8_lossy(bytes))?, n_places: Cell::new(0) };
-    let mut soup = Soup::default();
-    let root = dae.root_transform()?;
-    let mut pending: Vec<(&Element, Matrix4<f64>)> = dae.scene_nodes().into_iter().map(|node| (node, root)).collect();
+    let root = Element::read(&String::from_utf8_lossy(bytes))?;
+    let elements = root.all();
+    let ids = elements.iter().map(|element| (element.attribute("id"), *element)).filter(|(id, _)| !id.is_empty());
+    let mut dae = Dae { root: &root, ids: ids.collect(), soup: Soup::default(), n_places: 0 };
+    let to_metres = dae.root_transform()?;
+    let scene = root.child("scene").and_then(|scene| scene.child("instance_visual_scene"));
+    let named = scene.and_then(|scene| dae.named(scene.attribute("url")).ok());
+    let first = || elements.iter().find(|element| element.name == "visual_scene").copied();
+    let nodes = named.or_else(first).into_iter().flat_map(|scene| &scene.children);
+    let mut pending: Vec<(&Element, Matrix4<f64>)> =
+        nodes.filter(|child| child.name == "node").map(|node| (node, to_metres)).collect();
     if pending.is_empty() {
-        for geometry in dae.document.all("geometry") {
-            dae.place(geometry, &mut soup, &root)?;
+        for geometry in elements.iter().filter(|element| element.name == "geometry") {
+            dae.place(geometry, &to_metres)?;
         }
-        return Ok(soup);
     }
     while let Some((node, scene_from_parent)) = pending.pop() {
         dae.count_place()?;
@@ -73,21 +78,21 @@ pub(crate) fn parse_dae(bytes: &[u8]) -> Result<Soup, Problem> {
         for child in &node.children {
             match child.name.as_str() {
                 "node" => pending.push((child, scene_from_node)),
-                "instance_node" => pending.push((dae.named(child)?, scene_from_node)),
-                "instance_geometry" => dae.place(dae.named(child)?, &mut soup, &scene_from_node)?,
+                "instance_node" => pending.push((dae.named(child.attribute("url"))?, scene_from_node)),
+                "instance_geometry" => dae.place(dae.named(child.attribute("url"))?, &scene_from_node)?,
                 "instance_controller" => {
-                    let controller = dae.named(child)?;
+                    let controller = dae.named(child.attribute("url"))?;
                     let skin = controller.child("skin").ok_or_else(|| missing("a controller with a <skin>", "none"))?;
-                    dae.place(dae.document.by_url(skin.attribute("source"))?, &mut soup, &scene_from_node)?;
+                    dae.place(dae.named(skin.attribute("source"))?, &scene_from_node)?;
                 }
                 _ => {}
             }
         }
     }
-    Ok(soup)
+    Ok(dae.soup)
 }
 
-/// An XML element, its text and what is in it.
+/// An XML element with its text and the elements in it.
 #[derive(Default)]
 struct Element {
     name: String,
@@ -132,12 +137,9 @@ impl Element {
     }
 }
 
-struct Document {
-    root: Element,
-}
-
-impl Document {
-    fn read(text: &str) -> Result<Document, Problem> {
+impl Element {
+    /// The root of a COLLADA file.
+    fn read(text: &str) -> Result<Element, Problem> {
         const MAX_DEPTH: usize = 256;
         let mut reader = Reader::from_str(text);
         let mut open: Vec<Element> = Vec::new();
@@ -169,7 +171,7 @@ impl Document {
             };
             match (closed, open.last_mut()) {
                 (Some(element), Some(parent)) => parent.children.push(element),
-                (Some(root), None) if root.name == "COLLADA" => return Ok(Document { root }),
+                (Some(root), None) if root.name == "COLLADA" => return Ok(root),
                 (Some(other), None) => {
                     return Err(Problem::new(Some(line()), "XML with one <COLLADA>", format!("<{}>", other.name)));
                 }
@@ -178,53 +180,44 @@ impl Document {
         }
     }
 
-    fn all(&self, name: &str) -> Vec<&Element> {
-        let (mut found, mut pending) = (Vec::new(), vec![&self.root]);
+    /// It and all elements in it, in the file's order.
+    fn all(&self) -> Vec<&Element> {
+        let (mut found, mut pending) = (Vec::new(), vec![self]);
         while let Some(element) = pending.pop() {
-            if element.name == name {
-                found.push(element);
-            }
+            found.push(element);
             pending.extend(element.children.iter().rev());
         }
         found
     }
-
-    /// The element that a URL (`#ID`) names.
-    fn by_url(&self, url: &str) -> Result<&Element, Problem> {
-        let id = url.strip_prefix('#').unwrap_or(url);
-        let mut pending = vec![&self.root];
-        while let Some(element) = pending.pop() {
-            if !id.is_empty() && element.attribute("id") == id {
-                return Ok(element);
-            }
-            pending.extend(&element.children);
-        }
-        Err(missing("the id of an element of the file", quoted(url)))
-    }
 }
 
-struct Dae {
-    document: Document,
-    /// Nodes, and surfaces, so far. Each of them looks for names in the whole file.
-    n_places: Cell<usize>,
+/// A COLLADA file as it is read.
+struct Dae<'a> {
+    root: &'a Element,
+    ids: HashMap<&'a str, &'a Element>,
+    soup: Soup,
+    /// Nodes and surfaces so far.
+    n_places: usize,
 }
 
-impl Dae {
-    fn count_place(&self) -> Result<(), Problem> {
-        self.n_places.set(self.n_places.get() + 1);
-        if self.n_places.get() > MAX_PLACES {
+impl<'a> Dae<'a> {
+    fn count_place(&mut self) -> Result<(), Problem> {
+        self.n_places += 1;
+        if self.n_places > MAX_PLACES {
             return Err(missing("a scene of at most 10,000 nodes and surfaces", "more, or nodes that name each other"));
         }
         Ok(())
     }
 
-    fn named(&self, instance: &Element) -> Result<&Element, Problem> {
-        self.document.by_url(instance.attribute("url"))
+    /// The element that a URL (`#ID`) names.
+    fn named(&self, url: &str) -> Result<&'a Element, Problem> {
+        let id = url.strip_prefix('#').unwrap_or(url);
+        self.ids.get(id).copied().ok_or_else(|| missing("the id of an element of the file", quoted(url)))
     }
 
     /// To metres, and to +z up.
     fn root_transform(&self) -> Result<Matrix4<f64>, Problem> {
-        let asset = self.document.root.child("asset");
+        let asset = self.root.child("asset");
         let unit = asset.and_then(|asset| asset.child("unit")).map_or("", |unit| unit.attribute("meter"));
         let metres: f64 = if unit.is_empty() { 1.0 } else { unit.parse().unwrap_or(f64::NAN) };
         if !(metres.is_finite() && metres > 0.0) {
@@ -240,15 +233,7 @@ impl Dae {
         Ok(upright.to_homogeneous() * Matrix4::new_scaling(metres))
     }
 
-    fn scene_nodes(&self) -> Vec<&Element> {
-        let scene = self.document.root.child("scene").and_then(|scene| scene.child("instance_visual_scene"));
-        let visual = scene.and_then(|scene| self.named(scene).ok());
-        let visual = visual.or_else(|| self.document.all("visual_scene").into_iter().next());
-        let nodes = visual.into_iter().flat_map(|scene| &scene.children).filter(|child| child.name == "node");
-        nodes.collect()
-    }
-
-    fn place(&self, geometry: &Element, soup: &mut Soup, scene_from_mesh: &Matrix4<f64>) -> Result<(), Problem> {
+    fn place(&mut self, geometry: &Element, scene_from_mesh: &Matrix4<f64>) -> Result<(), Problem> {
         let Some(mesh) = geometry.child("mesh") else { return self.count_place() };
         for primitive in &mesh.children {
             let is_surface =
@@ -259,7 +244,7 @@ impl Dae {
                 self.count_place()?;
                 let vertices = self.positions(input)?;
                 let polygons = polygons(primitive, input)?;
-                Surface { vertices, polygons }.place(soup, scene_from_mesh)?;
+                Surface { vertices, polygons }.place(&mut self.soup, scene_from_mesh)?;
             }
         }
         Ok(())
@@ -267,10 +252,10 @@ impl Dae {
 
     /// The positions that the input of a primitive names.
     fn positions(&self, input: &Element) -> Result<Vec<[f64; 3]>, Problem> {
-        let vertices = self.document.by_url(input.attribute("source"))?;
+        let vertices = self.named(input.attribute("source"))?;
         let position =
             vertices.inputs("POSITION").next().ok_or_else(|| missing("<vertices> with a POSITION", "none"))?;
-        let source = self.document.by_url(position.attribute("source"))?;
+        let source = self.named(position.attribute("source"))?;
         let accessor = source.child("technique_common").and_then(|common| common.child("accessor"));
         let number = |name: &str, default: usize| {
             accessor.and_then(|accessor| accessor.attribute(name).parse().ok()).unwrap_or(default)
@@ -288,10 +273,15 @@ impl Dae {
 
 /// The polygons of a primitive, as indices of its vertices.
 fn polygons(primitive: &Element, vertex: &Element) -> Result<Vec<Vec<i64>>, Problem> {
-    let offset_of = |input: &Element| input.attribute("offset").parse::<usize>().unwrap_or(0);
+    // No file has more inputs beside each other.
+    let offset_of = |input: &Element| match input.attribute("offset") {
+        "" => Ok(0),
+        offset => offset.parse::<u8>().map(usize::from).map_err(|_| missing("an offset below 256", quoted(offset))),
+    };
     let inputs = primitive.children.iter().filter(|child| child.name == "input");
-    let stride = inputs.map(offset_of).max().unwrap_or(0) + 1;
-    let offset = offset_of(vertex);
+    let offsets = inputs.map(offset_of).collect::<Result<Vec<_>, _>>()?;
+    let stride = offsets.iter().max().map_or(1, |last| last + 1);
+    let offset = offset_of(vertex)?;
     let of_vertices = |list: &Element| -> Result<Vec<i64>, Problem> {
         Ok(list.numbers::<i64>()?.into_iter().skip(offset).step_by(stride).collect())
     };

@@ -190,6 +190,8 @@ fn a_scene_places_its_meshes() {
         let error = error_of(name, &text);
         assert!(error.contains(expected), "{error}");
     }
+    let offset = format!("offset='{}'", usize::MAX);
+    assert!(error_of("a.dae", dae.replacen("offset='1'", &offset, 1)).contains("an offset below 256"));
     let many = dae.replacen(instance, &instance.repeat(20_000), 1);
     assert!(error_of("a.dae", many).contains("at most 10,000 nodes"), "a mesh as often as it likes");
     let own = dae.replacen(instance, "<instance_node url='#n'/>", 1).replacen("<node>", "<node id='n'>", 1);

@@ -73,7 +73,8 @@ pub(super) fn open(path: &Path) -> Result<(File, FileSummary), RecordingError> {
     }
     for (name, found) in raw.metadata_in_data {
         if name == METADATA_NAME {
-            info = info_from_metadata(found).ok();
+            let found = info_from_metadata(found);
+            info = Some(found.map_err(|message| invalid(format!("its '{METADATA_NAME}' metadata: {message}")))?);
         } else {
             metadata.insert(name, found);
         }
@@ -142,7 +143,7 @@ impl RawSummary {
     }
 }
 
-/// What a summary would say, from a file that has none but is whole otherwise, as some programs write it: all of it is read.
+/// The summary of a file that has none but is whole otherwise, as some programs write it. All of the file is read.
 fn summary_of_data(file: &mut File) -> Result<RawSummary, String> {
     file.rewind().map_err(|error| error.to_string())?;
     let options = LinearReaderOptions::default()

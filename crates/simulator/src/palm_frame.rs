@@ -33,7 +33,7 @@ const LEAST_STEP: f64 = 0.005;
 /// Frames that are moved, of those in each direction.
 const N_MOVED: usize = 2;
 
-/// A palm frame and what the hand does in it.
+/// A palm frame and how well the hand closes in it.
 #[derive(Debug, Clone)]
 pub struct PalmFit {
     /// The frame in the palm link's own.

@@ -25,6 +25,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use super::cell_zeros::check_readings;
 use super::{Arrival, Place, Reading, Refusal, RefusalKind};
 use blindgrasp_messages::{Phase, Sense};
 
@@ -578,20 +579,7 @@ fn check_values(reading: &Reading, shape: Shape, least_readings: Option<&[f64]>)
     if let Some((idx, angle)) = joints.iter().enumerate().find(|(_, angle)| !angle.is_finite()) {
         return Err(format!("joints[{idx}] is {angle}: expected an angle in radians"));
     }
-    let least = |idx: usize| least_readings.map_or(0.0, |readings| readings[idx]);
-    if let Some((idx, force)) =
-        cells_newtons.iter().enumerate().find(|(idx, force)| !(force.is_finite() && **force >= least(*idx)))
-    {
-        let expected = match least(idx) {
-            f64::NEG_INFINITY => "expected a finite number".into(),
-            least if force.is_finite() => format!(
-                "expected at least {least}, the cell's noise threshold below 0: a sensor that is tared or drifts needs \
-                 zero_when_open"
-            ),
-            _ => "expected a force, which is not negative".to_owned(),
-        };
-        return Err(format!("cells_newtons[{idx}] is {force}: {expected}"));
-    }
+    check_readings(cells_newtons, least_readings)?;
     for (sense, values) in reading.senses.view().iter() {
         let (name, expected) = (sense.name(), sense.len(shape.n_joints));
         if !values.is_empty() && values.len() != expected {

@@ -24,11 +24,11 @@
 //! The caller passes the time, in nanoseconds of CLOCK_BOOTTIME. Only messages of Zenoh get their time of arrival here, because
 //! they come on threads of its own.
 
+pub mod cell_zeros;
 pub mod gate;
 mod inbox;
 pub mod line_protocol;
 mod link;
-pub mod open_hand;
 pub mod phases;
 pub mod replay;
 pub mod ros2;

@@ -86,8 +86,8 @@ pub fn with_meshes_renamed(
 /// The places of a text, in bytes, between which something is put.
 type Span = (usize, usize);
 
-/// The text with what `edit` puts in the place of some parts. It is given each event, the names of the open elements including
-/// that of the event, and the event's place.
+/// The text with some parts replaced by `edit`, which is given each event, the names of the open elements including that of the
+/// event, and the event's place.
 fn edited(
     text: &str,
     mut edit: impl FnMut(&Event<'_>, &[String], Span) -> Result<Option<(Span, String)>, String>,

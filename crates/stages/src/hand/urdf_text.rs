@@ -1,4 +1,4 @@
-//! The text of a URDF file, in whichever encoding its XML declares.
+//! The text of a URDF file, in the encoding that its XML declares.
 
 use std::path::Path;
 

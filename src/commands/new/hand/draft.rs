@@ -40,7 +40,7 @@ enum Opening {
     Reversed,
 }
 
-/// A draft with a palm frame, how well the hand closes in it, and what there is to say of it.
+/// A draft with a palm frame, how well the hand closes in it, and the lines that tell the choices.
 struct Fitted {
     draft: Draft,
     score: f64,
@@ -91,7 +91,7 @@ impl Draft {
         Ok(pads)
     }
 
-    /// Finds the palm frame and the joints that do not close, if the user named none, and says what it found.
+    /// Finds the palm frame, the open hand and the joints that do not close, where the user gave none, and prints them.
     ///
     /// # Errors
     /// A joint that moves all pads together, as a wrist does.

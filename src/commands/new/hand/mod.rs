@@ -257,7 +257,7 @@ fn urdf_text(path: &Path, xacro_arguments: &[String]) -> anyhow::Result<String> 
     Ok(read_urdf(path)?)
 }
 
-/// Says what helps where a URDF is that of a whole robot.
+/// Adds the remedy to an error that the URDF of a whole robot makes.
 fn with_base_advice(error: anyhow::Error, arguments: &Arguments) -> anyhow::Error {
     let text = format!("{error:#}");
     let is_large = text.contains("more than 256 links") || text.contains("joints, expected 1 to");

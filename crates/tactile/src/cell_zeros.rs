@@ -26,7 +26,7 @@ struct OpenHand {
     mean: Vec<f64>,
 }
 
-/// What became of a reading.
+/// The result of zeroing a reading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Zeroed {
     /// No open frame has come yet: its zeros are not known.
@@ -35,6 +35,24 @@ pub enum Zeroed {
     Forces,
     /// A cell read less than 0 and counts as 0: with the open hand's zero, by more than its noise threshold; without, by less.
     BelowZero,
+}
+
+/// Refuses readings below the least that each cell may have, which is 0 where none is given.
+///
+/// # Errors
+/// The first such reading, for a person.
+pub fn check_readings(cells: &[f64], least_readings: Option<&[f64]>) -> Result<(), String> {
+    let least = |idx: usize| least_readings.map_or(0.0, |readings| readings[idx]);
+    let wrong = cells.iter().enumerate().find(|(idx, reading)| !(reading.is_finite() && **reading >= least(*idx)));
+    let Some((idx, reading)) = wrong else { return Ok(()) };
+    let expected = match least(idx) {
+        f64::NEG_INFINITY => "expected a finite number".into(),
+        least if reading.is_finite() => format!(
+            "expected at least {least}, the cell's noise threshold below 0: a sensor that is tared or drifts needs zero_when_open"
+        ),
+        _ => "expected a force, which is not negative".to_owned(),
+    };
+    Err(format!("cells_newtons[{idx}] is {reading}: {expected}"))
 }
 
 impl CellZeros {
