@@ -5,14 +5,14 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::Context as _;
+use anyhow::{Context as _, bail};
 use blindgrasp_messages::{ContactSet, GraspFeature, LiftDecision, Prediction, Recorded, Stamped, TactileFrame};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_recording::cdr;
 use blindgrasp_ros::definition::Definition;
-use blindgrasp_ros::node::{MAX_DOMAIN, MessageType, Network, Quality, Rights, RosNode, topic_key, topic_name};
+use blindgrasp_ros::node::{Convention, MAX_DOMAIN, MessageType, Network, Quality, Rights, RosNode, topic_name};
 use blindgrasp_ros::standard;
 use blindgrasp_stages::hand::Hand;
 use serde::Deserialize;
@@ -30,8 +30,16 @@ const MARKER_NANOS: u64 = 100_000_000;
 pub(crate) struct NetworkParams {
     #[serde(flatten)]
     pub(crate) connection: ConnectionParams,
+    pub(crate) convention: Option<ConventionWord>,
     pub(crate) domain: Option<u32>,
     pub(crate) namespace: Option<String>,
+}
+
+#[derive(Deserialize, Clone, Copy, PartialEq, Eq)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum ConventionWord {
+    RmwZenoh,
+    Ros2dds,
 }
 
 #[derive(Deserialize)]
@@ -44,6 +52,11 @@ struct Params {
 /// Adds the parameters of a connection to ROS 2.
 pub(crate) fn with_network_params(description: OperatorDescription) -> OperatorDescription {
     with_connection_params(description)
+        .optional_param(
+            "convention",
+            ParamKind::Choice { values: vec!["rmw_zenoh".into(), "ros2dds".into()] },
+            "Who speaks Zenoh: the nodes, by rmw_zenoh (default), or a zenoh-bridge-ros2dds for nodes of DDS",
+        )
         .optional_param(
             "domain",
             ParamKind::Integer { min: Some(0), max: Some(MAX_DOMAIN.into()) },
@@ -59,7 +72,19 @@ impl NetworkParams {
         let network = self.connection.network()?;
         let namespace = self.namespace.clone().unwrap_or_else(|| "/blindgrasp".into());
         topic_name(&namespace, "decision").with_context(|| format!("namespace '{namespace}'"))?;
+        if self.convention() == Convention::Ros2dds && self.domain.is_some() {
+            bail!(
+                "the keys of zenoh-bridge-ros2dds have no domain: give it to the bridge, and leave the param 'domain' out"
+            );
+        }
         Ok((network, self.domain.unwrap_or(0), namespace))
+    }
+
+    pub(crate) fn convention(&self) -> Convention {
+        match self.convention {
+            None | Some(ConventionWord::RmwZenoh) => Convention::RmwZenoh,
+            Some(ConventionWord::Ros2dds) => Convention::Ros2dds,
+        }
     }
 }
 
@@ -88,6 +113,7 @@ pub(crate) fn describe() -> OperatorDescription {
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let (network, domain, namespace) = params.network.network()?;
+    let convention = params.network.convention();
     let hand = params.hand.as_deref().map(Hand::load).transpose()?;
     let mut edges: Vec<Box<dyn Forward>> = Vec::new();
     let last = Arc::new(LastDecision::default());
@@ -133,14 +159,19 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     edges.extend(edge::<ContactSet>(operator, "contacts", vec![topic_of::<ContactSet>("contacts")?, points])?);
     edges.extend(edge::<GraspFeature>(operator, "feature", vec![topic_of::<GraspFeature>("feature")?])?);
     edges.extend(edge::<Prediction>(operator, "prediction", vec![topic_of::<Prediction>("prediction")?])?);
-    let opened = format!("publishes in {namespace}, domain {domain}");
+    let opened = match convention {
+        Convention::RmwZenoh => format!("publishes in {namespace}, domain {domain}"),
+        Convention::Ros2dds => format!("publishes in {namespace}, for zenoh-bridge-ros2dds"),
+    };
+    // A service of the bridge has another attachment than one of rmw_zenoh.
+    let decides = decides && convention == Convention::RmwZenoh;
     let service = if decides { Some(decide_type()?) } else { None };
     let prefix = namespace.clone();
-    let answers = if decides { vec![topic_key(domain, &topic_name(&namespace, "decide")?)] } else { vec![] };
-    let sends = vec![format!("{domain}{}/**", namespace.trim_end_matches('/'))];
+    let answers = if decides { vec![convention.key(domain, &topic_name(&namespace, "decide")?)] } else { vec![] };
+    let sends = vec![convention.keys_below(domain, &namespace)];
     let rights = Rights { takes: vec![], sends, answers };
     let open = Box::new(move || {
-        let mut node = RosNode::new(network.open(&rights)?, domain, &namespace, "blindgrasp")?;
+        let mut node = RosNode::new(network.open(&rights)?, convention, domain, &namespace, "blindgrasp")?;
         if let Some((message, request_type)) = service.clone() {
             let (name, last) = (topic_name(&namespace, "decide")?, Arc::clone(&last));
             node.service(&name, &message, move |request| last.answer(&request_type, request))?;

@@ -6,7 +6,7 @@
 //! after a crash, or swapped in, goes on with the numbers and grasps of the one before, after a gap.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, anyhow, bail};
@@ -29,7 +29,7 @@ use blindgrasp_tactile::gate::{Accepted, Counts, FrameFilter, Shape};
 use blindgrasp_tactile::line_protocol::max_line_bytes;
 use blindgrasp_tactile::phases::PhaseFinder;
 use blindgrasp_tactile::replay::Replay;
-use blindgrasp_tactile::ros2::{Ros2, Topics};
+use blindgrasp_tactile::ros2::{JointTopic, Ros2, Topics};
 use blindgrasp_tactile::stream::{Link, Stream};
 use blindgrasp_tactile::zenoh_key::ZenohKey;
 use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, RefusalKind, TactileDriver};
@@ -42,7 +42,8 @@ const DEFAULT_BAUD: u32 = 115_200;
 /// Half of the age that the arbiter allows by default, which counts from the source on.
 const DEFAULT_MAX_DELAY_MS: f64 = 100.0;
 /// The parameters of the driver ros2.
-const ROS2_PARAMS: [&str; 21] = [
+const ROS2_PARAMS: [&str; 23] = [
+    "convention",
     "domain",
     "namespace",
     "connect",
@@ -51,6 +52,7 @@ const ROS2_PARAMS: [&str; 21] = [
     "from",
     "joints_topic",
     "joint_prefix",
+    "joint_map",
     "cells_topic",
     "cells_type",
     "cells_field",
@@ -96,6 +98,7 @@ struct Params {
 struct TopicParams {
     joints_topic: Option<String>,
     joint_prefix: Option<String>,
+    joint_map: Option<PathBuf>,
     cells_topic: Option<String>,
     cells_type: Option<String>,
     cells_field: Option<String>,
@@ -191,6 +194,11 @@ pub(crate) fn describe() -> OperatorDescription {
     .fold(description, |description, (name, summary)| topic(description, name, summary));
     description
         .optional_param(
+            "joint_map",
+            file(true),
+            "ros2: the joints whose values or names differ on joints_topic (YAML): {JOINT: {from: NAME, scale: 1, offset: 0}}",
+        )
+        .optional_param(
             "cells_definition",
             file(true),
             "ros2: the definition of cells_type (ros2msg), if it is no standard one",
@@ -237,12 +245,11 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         driver,
         hand_id: hand.id(),
         gate: FrameFilter::new(shape, params.max_delay_nanos(), wall_offset_nanos, Place::default(), None)
-            .with_least_readings(&zeros.least_readings()),
+            .with_allowed(zeros.allowed()),
         epoch: 0,
         day: params.day.unwrap_or_else(today),
         zeros,
-        n_unzeroed: 0,
-        n_below_zero: 0,
+        of_zeros: ZeroCounts::default(),
         poll_pause: params.poll_pause(),
         reported: Default::default(),
         report_due_nanos: 0,
@@ -281,6 +288,8 @@ fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box
         ("namespace", params.network.namespace.is_some()),
         ("joints_topic", topics.joints_topic.is_some()),
         ("joint_prefix", topics.joint_prefix.is_some()),
+        ("joint_map", topics.joint_map.is_some()),
+        ("convention", params.network.convention.is_some()),
         ("cells_topic", topics.cells_topic.is_some()),
         ("cells_type", topics.cells_type.is_some()),
         ("cells_field", topics.cells_field.is_some()),
@@ -340,6 +349,7 @@ fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box
 fn ros2(params: &Params, hand: &Hand) -> anyhow::Result<Ros2> {
     let topics = &params.topics;
     let (network, domain, namespace) = params.network.network()?;
+    let convention = params.network.convention();
     let named = |name: &Option<String>| {
         name.as_ref().map(|name| topic_name(&namespace, name)).transpose().map_err(anyhow::Error::from)
     };
@@ -364,6 +374,7 @@ fn ros2(params: &Params, hand: &Hand) -> anyhow::Result<Ros2> {
     };
     let topics = Topics {
         network,
+        convention,
         domain,
         joints: named(&topics.joints_topic)?.unwrap_or_else(|| "/joint_states".into()),
         cells,
@@ -373,13 +384,7 @@ fn ros2(params: &Params, hand: &Hand) -> anyhow::Result<Ros2> {
         wrench: named(&topics.wrench_topic)?,
         imu: named(&topics.imu_topic)?,
         gravity,
-        joint_names: (0..hand.joints.len())
-            .map(|idx| {
-                let joint = &hand.joints[idx];
-                let closing_rate = Some(hand.closing_rate(idx)).filter(|rate| !joint.is_preshape && *rate != 0.0);
-                (format!("{prefix}{}", joint.name), closing_rate)
-            })
-            .collect(),
+        hand_joints: hand_joints(hand, prefix, topics.joint_map.as_deref())?,
         tolerance_nanos: (topics.tolerance_ms.unwrap_or(20.0) * 1e6) as u64,
         still_per_s: topics.moving_rad_per_s.unwrap_or(MOVING_RAD_PER_S),
         namespace,
@@ -387,6 +392,55 @@ fn ros2(params: &Params, hand: &Hand) -> anyhow::Result<Ros2> {
     let still_nanos = (params.topics.still_ms.unwrap_or(200.0) * 1e6) as u64;
     let finder = PhaseFinder::new(params.topics.moving_rad_per_s.unwrap_or(MOVING_RAD_PER_S), still_nanos);
     Ok(Ros2::new(topics, finder))
+}
+
+/// An entry of a joint map.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct MappedJoint {
+    from: Option<String>,
+    scale: f64,
+    offset: f64,
+}
+
+impl Default for MappedJoint {
+    fn default() -> Self {
+        MappedJoint { from: None, scale: 1.0, offset: 0.0 }
+    }
+}
+
+/// The hand's joints as a topic has them: by the map, else by their names behind the prefix.
+///
+/// # Errors
+/// The map cannot be read, has a joint that the hand has not, or a number that makes no value.
+fn hand_joints(hand: &Hand, prefix: &str, map: Option<&Path>) -> anyhow::Result<Vec<JointTopic>> {
+    let mut mapped: BTreeMap<String, MappedJoint> = match map {
+        Some(path) => {
+            let text = std::fs::read_to_string(path).with_context(|| format!("joint_map {}", path.display()))?;
+            serde_saphyr::from_str(&text).with_context(|| {
+                format!("joint_map {}: expected {{JOINT: {{from: NAME, scale: 1, offset: 0}}}}", path.display())
+            })?
+        }
+        None => BTreeMap::new(),
+    };
+    let joints = (0..hand.joints.len()).map(|idx| {
+        let joint = &hand.joints[idx];
+        let closing_rate = Some(hand.closing_rate(idx)).filter(|rate| !joint.is_preshape && *rate != 0.0);
+        let MappedJoint { from, scale, offset } = mapped.remove(&joint.name).unwrap_or_default();
+        if !(scale.is_finite() && scale != 0.0 && offset.is_finite()) {
+            bail!(
+                "joint_map: {}: scale {scale}, offset {offset}: expected finite numbers, and no scale of 0",
+                joint.name
+            );
+        }
+        Ok(JointTopic { name: from.unwrap_or(format!("{prefix}{}", joint.name)), scale, offset, closing_rate })
+    });
+    let joints = joints.collect::<anyhow::Result<_>>()?;
+    if let Some(name) = mapped.keys().next() {
+        let known: Vec<&str> = hand.joints.iter().map(|joint| joint.name.as_str()).collect();
+        bail!("joint_map: the hand {} has no joint '{name}': it has {}", hand.name, known.join(", "));
+    }
+    Ok(joints)
 }
 
 impl Params {
@@ -411,6 +465,15 @@ fn wall_nanos() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64
 }
 
+/// Accepted frames.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+struct ZeroCounts {
+    /// Not sent, because a zero was not known.
+    unzeroed: u64,
+    below_zero: u64,
+    missing_cells: u64,
+}
+
 struct TactileSource<'a> {
     operator: &'a Operator,
     tactile: Publisher<TactileFrame>,
@@ -423,12 +486,9 @@ struct TactileSource<'a> {
     day: u32,
     /// The zero of each cell, if the open hand gives it.
     zeros: CellZeros,
-    /// Accepted frames that were not sent, because no zero was known.
-    n_unzeroed: u64,
-    n_below_zero: u64,
+    of_zeros: ZeroCounts,
     poll_pause: Duration,
-    /// Accepted, unzeroed, below zero.
-    reported: (Counts, u64, u64),
+    reported: (Counts, ZeroCounts),
     report_due_nanos: u64,
     log: RefusalLog,
 }
@@ -529,16 +589,16 @@ impl TactileSource<'_> {
         // Saved first: an instance that takes over must not use the number of a grasp again.
         self.operator.save_state(&bincode::serde::encode_to_vec(self.gate.place(), STATE_FORMAT)?)?;
         match self.zeros.apply(&mut reading) {
-            Zeroed::Unknown => {
+            Ok(Zeroed { is_below_zero, has_missing }) => {
+                self.of_zeros.below_zero += u64::from(is_below_zero);
+                self.of_zeros.missing_cells += u64::from(has_missing);
+            }
+            Err(why) => {
                 // The gap in the numbers holds its grasp.
-                self.n_unzeroed += 1;
-                let why =
-                    "zero_when_open: no frame of the open hand came before it, expected the phase open first".into();
+                self.of_zeros.unzeroed += 1;
                 self.refuse(&Refusal { kind: RefusalKind::OutOfOrder, why });
                 return Ok(());
             }
-            Zeroed::BelowZero => self.n_below_zero += 1,
-            Zeroed::Forces => {}
         }
         let (epoch, hand_id) = (self.epoch, self.hand_id);
         let header =
@@ -566,15 +626,16 @@ impl TactileSource<'_> {
         self.log.refused(refusal, now_nanos);
     }
 
-    fn counts(&self) -> (Counts, u64, u64) {
-        (*self.gate.counts(), self.n_unzeroed, self.n_below_zero)
+    fn counts(&self) -> (Counts, ZeroCounts) {
+        (*self.gate.counts(), self.of_zeros)
     }
 
     fn report_counts(&mut self) {
         self.reported = self.counts();
         let mut counts = self.reported.0.by_name();
-        counts.insert("unzeroed".into(), self.n_unzeroed);
-        counts.insert("below_zero".into(), self.n_below_zero);
+        counts.insert("unzeroed".into(), self.of_zeros.unzeroed);
+        counts.insert("below_zero".into(), self.of_zeros.below_zero);
+        counts.insert("missing_cells".into(), self.of_zeros.missing_cells);
         self.operator.has_counted(counts);
     }
 }

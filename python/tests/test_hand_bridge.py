@@ -1,7 +1,8 @@
-"""Tests of examples/ros2_hand_bridge.py with stand-ins for rclpy and for the source that it feeds."""
+"""Tests of examples/bridges/ros2.py with stand-ins for rclpy and for the source that it feeds."""
 
 import importlib.util
 import json
+import math
 import socket
 import sys
 import tempfile
@@ -12,8 +13,9 @@ from pathlib import Path
 from types import SimpleNamespace as Message
 from unittest import mock
 
-EXAMPLE = Path(__file__).resolve().parents[2] / "examples/ros2_hand_bridge.py"
-SPEC = importlib.util.spec_from_file_location("ros2_hand_bridge", EXAMPLE)
+BRIDGES = Path(__file__).resolve().parents[2] / "examples/bridges"
+sys.path.insert(0, str(BRIDGES))
+SPEC = importlib.util.spec_from_file_location("ros2_bridge", BRIDGES / "ros2.py")
 bridge = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(bridge)
 
@@ -99,6 +101,24 @@ class Frames(unittest.TestCase):
             if frames.phase not in found:
                 found.append(frames.phase)
         self.assertEqual(found, ["open", "closing", "settled"])
+
+    def test_a_missing_cell_makes_no_frame(self):
+        table = {"cells": [{"topic": "/left", "order": [2, 0], "missing": 30000, "scale": 0.5, "offset": -1.0}]}
+        frames = bridge.Frames({**table, "joints": {"map": {"jaw": {"from": "finger_joint"}}}}, HAND)
+        frames.take_joints(joints(self.t), self.t)
+        frames.phase = "settled"
+        for number in (30000, math.nan):
+            self.assertIsNone(frames.take_cells(0, Message(data=[number, 7.0, 8.0]), self.t))
+            self.assertEqual(frames.lacks(), "no message on /left with cell 1")
+        # A number that is not picked may be anything.
+        frame = frames.take_cells(0, Message(data=[6.0, math.nan, 8.0]), self.t)
+        self.assertEqual((frame["cells_newtons"], frame["seq"]), ([3.0, 2.0], 2))
+
+    def test_joints_come_from_a_field(self):
+        table = {"cells": [{"topic": "/left"}], "joints": {"field": "motors.q", "names": ["wrist", "jaw"]}}
+        frames = bridge.Frames(table, HAND)
+        frames.take_joints(Message(header=header(self.t), motors=[Message(q=0.5), Message(q=0.25)]), self.t)
+        self.assertEqual(frames.joints(self.t), [0.25, 0.5])
 
     def test_an_unknown_joint_is_told(self):
         with self.assertRaisesRegex(ValueError, "the hand has no joint thumb"):

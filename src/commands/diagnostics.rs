@@ -8,7 +8,7 @@ use blindgrasp_graph::control::{EdgeStatus, GraphState, NodeState, NodeStatus};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_recording::cdr;
-use blindgrasp_ros::node::{MessageType, Quality, Rights, RosNode, RosPublisher, topic_key};
+use blindgrasp_ros::node::{Convention, MessageType, Quality, Rights, RosNode, RosPublisher};
 use blindgrasp_ros::standard;
 use clap::Args;
 use serde::Serialize;
@@ -73,9 +73,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let (network, domain) = arguments.network.network()?;
     let definition = standard::definition(TYPE).context("no definition of the diagnostics")?;
     let message = MessageType { name: TYPE.into(), hash: definition.hash() };
-    let rights = Rights { sends: vec![topic_key(domain, "/diagnostics")], ..Rights::default() };
+    let rights = Rights { sends: vec![Convention::RmwZenoh.key(domain, "/diagnostics")], ..Rights::default() };
     let open = || -> anyhow::Result<Publishing> {
-        let mut node = RosNode::new(network.open(&rights)?, domain, "/", "blindgrasp_diagnostics")?;
+        let mut node =
+            RosNode::new(network.open(&rights)?, Convention::RmwZenoh, domain, "/", "blindgrasp_diagnostics")?;
         let publisher = node.publisher("/diagnostics", &message, Quality::KeepLast(1))?;
         Ok((node, publisher))
     };

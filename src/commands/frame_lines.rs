@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use blindgrasp_messages::{GraspTruth, Header, OwnedSenses, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_stages::Hand;
-use blindgrasp_tactile::cell_zeros::{CellZeros, check_readings};
+use blindgrasp_tactile::cell_zeros::{AllowedReadings, CellZeros};
 use blindgrasp_tactile::line_protocol;
 
 /// The time between two frames that have no stamp.
@@ -127,12 +127,13 @@ fn of_bridge(
     zeros: &mut CellZeros,
 ) -> anyhow::Result<Line> {
     let mut reading = line_protocol::parse(line.as_bytes()).map_err(|refusal| anyhow::anyhow!("{}", refusal.why))?;
-    let least_readings = zeros.least_readings();
+    let allowed = zeros.allowed();
     // A frame of another hand is refused later.
-    if reading.cells_newtons.len() == least_readings.len() {
-        let checked = check_readings(&reading.cells_newtons, Some(&least_readings));
-        checked.map_err(|why| anyhow::anyhow!("{why}, which a graph has: record its frames"))?;
-        zeros.apply(&mut reading);
+    if allowed.has_cells(reading.cells_newtons.len()) {
+        let checked = AllowedReadings::check(Some(&allowed), &reading.cells_newtons);
+        checked
+            .and_then(|()| zeros.apply(&mut reading))
+            .map_err(|why| anyhow::anyhow!("{why}, which a graph has: record its frames"))?;
     }
     let grasp_id = reading.grasp_id.context("the frame lacks grasp_id")?;
     let truth = reading.truth(grasp_id);

@@ -174,9 +174,34 @@ pub fn topic_name(namespace: &str, topic: &str) -> Result<String, RosError> {
     if rest.split('/').all(is_word) { Ok(full) } else { Err(RosError::Topic(topic.into())) }
 }
 
-/// The key expression of a topic's messages, of all types.
-pub fn topic_key(domain: u32, topic: &str) -> String {
-    format!("{domain}{topic}/*/*")
+/// Who speaks Zenoh, and so how the keys of topics are named.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Convention {
+    /// The nodes do, by rmw_zenoh: `DOMAIN/TOPIC/TYPE/HASH`, with attachments, and nodes show themselves.
+    #[default]
+    RmwZenoh,
+    /// A `zenoh-bridge-ros2dds` does, for nodes of DDS: the topic's name alone, and messages in CDR alone. Types, numbers and
+    /// senders are not told.
+    Ros2dds,
+}
+
+impl Convention {
+    /// The key expression of a topic's messages, of all types.
+    pub fn key(self, domain: u32, topic: &str) -> String {
+        match self {
+            Convention::RmwZenoh => format!("{domain}{topic}/*/*"),
+            Convention::Ros2dds => topic.trim_start_matches('/').into(),
+        }
+    }
+
+    /// The key expression of all topics in a namespace.
+    pub fn keys_below(self, domain: u32, namespace: &str) -> String {
+        let namespace = namespace.trim_end_matches('/');
+        match self {
+            Convention::RmwZenoh => format!("{domain}{namespace}/**"),
+            Convention::Ros2dds => format!("{namespace}/**").trim_start_matches('/').into(),
+        }
+    }
 }
 
 /// The type of a topic's messages.
@@ -210,6 +235,7 @@ impl Quality {
 /// A node that other nodes see.
 pub struct RosNode {
     session: Session,
+    convention: Convention,
     domain: u32,
     /// `ENCLAVE/NAMESPACE/NODE`, as in tokens.
     place: String,
@@ -237,10 +263,17 @@ fn dds_name(message: &MessageType) -> Result<String, RosError> {
 impl RosNode {
     /// # Errors
     /// Zenoh refuses its token.
-    pub fn new(session: Session, domain: u32, namespace: &str, name: &str) -> Result<RosNode, RosError> {
+    pub fn new(
+        session: Session,
+        convention: Convention,
+        domain: u32,
+        namespace: &str,
+        name: &str,
+    ) -> Result<RosNode, RosError> {
         let namespace = Some(mangled(namespace.trim_end_matches('/'))).filter(|namespace| !namespace.is_empty());
         let place = format!("%/{}/{name}", namespace.as_deref().unwrap_or("%"));
-        let mut node = RosNode { session, domain, place, next_id: 1, tokens: Vec::new(), services: Vec::new() };
+        let mut node =
+            RosNode { session, convention, domain, place, next_id: 1, tokens: Vec::new(), services: Vec::new() };
         node.declare(&format!("0/NN/{}", node.place))?;
         Ok(node)
     }
@@ -249,6 +282,10 @@ impl RosNode {
     fn declare(&mut self, rest: &str) -> Result<[u8; 16], RosError> {
         let token = format!("@ros2_lv/{}/{}/0/{rest}", self.domain, self.session.zid());
         let gid = gid_of(&token);
+        if self.convention == Convention::Ros2dds {
+            // The bridge looks for other bridges there.
+            return Ok(gid);
+        }
         self.tokens.push(self.session.liveliness().declare_token(token).wait().map_err(of_zenoh)?);
         Ok(gid)
     }
@@ -275,10 +312,14 @@ impl RosNode {
         quality: Quality,
     ) -> Result<RosPublisher, RosError> {
         let gid = self.endpoint("MP", topic, message, quality)?;
-        let key = format!("{}{topic}/{}/{}", self.domain, dds_name(message)?, message.hash);
+        let key = match self.convention {
+            Convention::RmwZenoh => format!("{}{topic}/{}/{}", self.domain, dds_name(message)?, message.hash),
+            convention @ Convention::Ros2dds => convention.key(self.domain, topic),
+        };
         let builder = self.session.declare_publisher(key).encoding(Encoding::APPLICATION_CDR);
         let publisher = with_quality(builder, quality).wait().map_err(of_zenoh)?;
-        Ok(RosPublisher { publisher, gid, next_seq: 1 })
+        let attaches = self.convention == Convention::RmwZenoh;
+        Ok(RosPublisher { publisher, gid, next_seq: 1, attaches })
     }
 
     /// Calls `take` with each call of a service, from a thread of Zenoh, until the node is dropped.
@@ -316,10 +357,12 @@ impl RosNode {
         take: impl Fn(Received) + Send + Sync + 'static,
     ) -> Result<RosSubscriber, RosError> {
         self.endpoint("MS", topic, message, quality)?;
+        // Of a message of a bridge, the type is the one that is expected.
+        let told = (self.convention == Convention::Ros2dds).then(|| message.clone());
         let builder = self
             .session
-            .declare_subscriber(topic_key(self.domain, topic))
-            .callback(move |sample| take(Received::of(&sample)));
+            .declare_subscriber(self.convention.key(self.domain, topic))
+            .callback(move |sample| take(Received::of(&sample, told.as_ref())));
         let subscriber: Box<dyn Send> = match quality {
             Quality::Sensor => Box::new(builder.wait().map_err(of_zenoh)?),
             Quality::KeepLast(n) => {
@@ -387,6 +430,7 @@ pub struct RosPublisher {
     publisher: AdvancedPublisher<'static>,
     gid: [u8; 16],
     next_seq: i64,
+    attaches: bool,
 }
 
 impl RosPublisher {
@@ -395,6 +439,9 @@ impl RosPublisher {
     /// # Errors
     /// The session is closed.
     pub fn publish(&mut self, cdr: &[u8]) -> Result<(), RosError> {
+        if !self.attaches {
+            return self.publisher.put(cdr).wait().map_err(of_zenoh);
+        }
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as i64;
         let mut attachment = Vec::with_capacity(33);
         attachment.extend(self.next_seq.to_le_bytes());
@@ -455,11 +502,16 @@ pub struct Received {
 }
 
 impl Received {
-    fn of(sample: &Sample) -> Received {
+    /// A message of a sample, whose type is `told` or that of its key.
+    fn of(sample: &Sample, told: Option<&MessageType>) -> Received {
         let attachment = sample.attachment().map(|bytes| bytes.to_bytes().into_owned()).unwrap_or_default();
         let n_bytes = sample.payload().len();
         let bytes = if n_bytes > MAX_RECEIVED_BYTES { Vec::new() } else { sample.payload().to_bytes().into_owned() };
-        Received::new(sample.key_expr().as_str(), &attachment, bytes, n_bytes)
+        let received = Received::new(sample.key_expr().as_str(), &attachment, bytes, n_bytes);
+        match told {
+            Some(message) => Received { message: message.clone(), ..received },
+            None => received,
+        }
     }
 
     fn new(key: &str, attachment: &[u8], bytes: Vec<u8>, n_bytes: usize) -> Received {
@@ -485,6 +537,15 @@ impl Received {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn keys_are_those_of_the_convention() {
+        let keys = |convention: Convention| {
+            [convention.key(3, "/hand/touch"), convention.keys_below(3, "/hand"), convention.keys_below(3, "/")]
+        };
+        assert_eq!(keys(Convention::RmwZenoh), ["3/hand/touch/*/*", "3/hand/**", "3/**"]);
+        assert_eq!(keys(Convention::Ros2dds), ["hand/touch", "hand/**", "**"]);
+    }
 
     #[test]
     fn topics_are_names() {
@@ -556,7 +617,8 @@ mod tests {
         let tokens: Vec<String> = [(0, "/", "p_tl", "/q_transient"), (7, "/cell4", "gw", "/cell4/chatter")]
             .into_iter()
             .map(|(domain, namespace, name, topic)| {
-                let mut node = RosNode::new(session.clone(), domain, namespace, name).expect("a node");
+                let mut node =
+                    RosNode::new(session.clone(), Convention::RmwZenoh, domain, namespace, name).expect("a node");
                 let _publisher = node.publisher(topic, &message, Quality::KeepLast(10)).expect("a publisher");
                 let replies = session.liveliness().get("@ros2_lv/*/*/*/*/MP/**").wait().expect("tokens");
                 let reply = replies.recv().expect("a token").into_result().expect("a token");
@@ -581,19 +643,21 @@ mod tests {
         let port = std::net::TcpListener::bind("127.0.0.1:0").and_then(|it| it.local_addr()).expect("a port").port();
         let endpoint = format!("tcp/127.0.0.1:{port}");
         let listens = Network { listen: vec![endpoint.clone()], ..Network::default() };
-        let takes = Rights { takes: vec![topic_key(3, "/robot/words")], ..Rights::default() };
+        let takes = Rights { takes: vec![Convention::RmwZenoh.key(3, "/robot/words")], ..Rights::default() };
         let session = listens.open(&takes).expect("a session");
-        let mut heard_at = RosNode::new(session, 3, "/robot", "hearer").expect("a node");
+        let mut heard_at = RosNode::new(session, Convention::RmwZenoh, 3, "/robot", "hearer").expect("a node");
         let (sender, heard) = std::sync::mpsc::channel();
         let topic = topic_name("/robot", "words").expect("a topic");
         let _subscriber = heard_at
             .subscriber(&topic, &message, Quality::Sensor, move |received| drop(sender.send(received)))
             .expect("a subscriber");
         let connects = Network { connect: vec![endpoint], ..Network::default() };
-        let sends =
-            Rights { sends: [3, 4].map(|domain| topic_key(domain, "/robot/words")).to_vec(), ..Rights::default() };
+        let sends = Rights {
+            sends: [3, 4].map(|domain| Convention::RmwZenoh.key(domain, "/robot/words")).to_vec(),
+            ..Rights::default()
+        };
         let session = connects.open(&sends).expect("a session");
-        let mut said_at = RosNode::new(session, 3, "/robot", "sayer").expect("a node");
+        let mut said_at = RosNode::new(session, Convention::RmwZenoh, 3, "/robot", "sayer").expect("a node");
         let mut publisher = said_at.publisher(&topic, &message, Quality::KeepLast(1)).expect("a publisher");
         // Until the subscription is known, samples go nowhere.
         let received = (0..200).find_map(|_| {
@@ -612,7 +676,8 @@ mod tests {
         let kept = late.recv_timeout(std::time::Duration::from_secs(10)).expect("a message");
         assert_eq!((kept.message, kept.sender), (message.clone(), Some(publisher.gid)));
         // Another domain hears nothing.
-        let mut other = RosNode::new(said_at.session.clone(), 4, "/robot", "other").expect("a node");
+        let mut other =
+            RosNode::new(said_at.session.clone(), Convention::RmwZenoh, 4, "/robot", "other").expect("a node");
         let mut elsewhere = other.publisher(&topic, &message, Quality::Sensor).expect("a publisher");
         elsewhere.publish(&[0, 1, 0, 0, 9]).expect("sent");
         publisher.publish(&[0, 1, 0, 0, 1]).expect("sent");

@@ -13,46 +13,75 @@ const N_FRAMES: f64 = 50.0;
 /// Takes the readings of the open hand from those that follow, if it is to, and leaves none below 0.
 #[derive(Debug, Clone)]
 pub struct CellZeros {
-    /// Of each cell.
-    noise_thresholds: Vec<f64>,
-    /// Whether the reading of a cell falls under load.
-    falls: Vec<bool>,
-    open_hand: Option<OpenHand>,
+    cells: Vec<CellSense>,
+    open_hand: Option<Vec<OpenReading>>,
 }
 
-#[derive(Debug, Clone, Default)]
-struct OpenHand {
+/// The layout's word on a cell.
+#[derive(Debug, Clone, Copy)]
+struct CellSense {
+    noise_threshold: f64,
+    /// Whether its reading falls under load.
+    falls: bool,
+    may_be_missing: bool,
+    /// The reading that it has at its greatest load and above.
+    saturates_at: Option<f64>,
+}
+
+/// The mean reading of a cell while the hand was open.
+#[derive(Debug, Clone, Copy, Default)]
+struct OpenReading {
     n_frames: f64,
-    mean: Vec<f64>,
+    mean: f64,
 }
 
-/// The result of zeroing a reading.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Zeroed {
-    /// No open frame has come yet: its zeros are not known.
-    Unknown,
-    /// Forces, of which none was below 0 but by noise.
-    Forces,
+/// A reading of which forces were made.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Zeroed {
     /// A cell read less than 0 and counts as 0: with the open hand's zero, by more than its noise threshold; without, by less.
-    BelowZero,
+    pub is_below_zero: bool,
+    /// A cell that may be missing was, and counts as 0.
+    pub has_missing: bool,
 }
 
-/// Refuses readings below the least that each cell may have, which is 0 where none is given.
-///
-/// # Errors
-/// The first such reading, for a person.
-pub fn check_readings(cells: &[f64], least_readings: Option<&[f64]>) -> Result<(), String> {
-    let least = |idx: usize| least_readings.map_or(0.0, |readings| readings[idx]);
-    let wrong = cells.iter().enumerate().find(|(idx, reading)| !(reading.is_finite() && **reading >= least(*idx)));
-    let Some((idx, reading)) = wrong else { return Ok(()) };
-    let expected = match least(idx) {
-        f64::NEG_INFINITY => "expected a finite number".into(),
-        least if reading.is_finite() => format!(
-            "expected at least {least}, the cell's noise threshold below 0: a sensor that is tared or drifts needs zero_when_open"
-        ),
-        _ => "expected a force, which is not negative".to_owned(),
-    };
-    Err(format!("cells_newtons[{idx}] is {reading}: {expected}"))
+/// The readings that the cells of a hand may have.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AllowedReadings {
+    /// For each cell, the least reading, and whether it may be missing (not a number).
+    cells: Vec<(f64, bool)>,
+}
+
+impl AllowedReadings {
+    /// Refuses other readings. Where none are given, forces are allowed.
+    ///
+    /// # Errors
+    /// The first such reading, for a person.
+    pub fn check(allowed: Option<&AllowedReadings>, cells: &[f64]) -> Result<(), String> {
+        for (idx, reading) in cells.iter().enumerate() {
+            let (least, may_be_missing) = allowed.map_or((0.0, false), |allowed| allowed.cells[idx]);
+            let expected = if reading.is_nan() {
+                if may_be_missing {
+                    continue;
+                }
+                "expected a number; a pad whose cells may be missing says may_be_missing in the hand's layout".into()
+            } else if reading.is_finite() && *reading >= least {
+                continue;
+            } else if least == f64::NEG_INFINITY || !reading.is_finite() {
+                "expected a finite number".into()
+            } else {
+                let noise = if least < 0.0 { ", the cell's noise threshold below 0" } else { "" };
+                format!("expected at least {least}{noise}: a sensor that is tared or drifts needs zero_when_open")
+            };
+            let found = if reading.is_nan() { "missing".into() } else { reading.to_string() };
+            return Err(format!("cells_newtons[{idx}] is {found}: {expected}"));
+        }
+        Ok(())
+    }
+
+    /// Whether these are readings of so many cells.
+    pub fn has_cells(&self, n_cells: usize) -> bool {
+        self.cells.len() == n_cells
+    }
 }
 
 impl CellZeros {
@@ -64,42 +93,79 @@ impl CellZeros {
         if let Some(pad) = hand.pads.iter().find(|pad| pad.falls_under_load && !zero_when_open) {
             return Err(format!("the readings of pad '{}' fall under load: set zero_when_open", pad.name));
         }
-        Ok(CellZeros {
-            noise_thresholds: hand.cells().map(|(_, cell)| cell.noise_threshold_newtons).collect(),
-            falls: hand.cells().map(|(pad_idx, _)| hand.pads[pad_idx].falls_under_load).collect(),
-            open_hand: zero_when_open.then(OpenHand::default),
-        })
+        let cells = hand.cells().map(|(pad_idx, cell)| {
+            let pad = &hand.pads[pad_idx];
+            CellSense {
+                noise_threshold: cell.noise_threshold_newtons,
+                falls: pad.falls_under_load,
+                may_be_missing: pad.may_be_missing,
+                saturates_at: pad.saturates_at_newtons,
+            }
+        });
+        let cells: Vec<CellSense> = cells.collect();
+        let open_hand = zero_when_open.then(|| vec![OpenReading::default(); cells.len()]);
+        Ok(CellZeros { cells, open_hand })
     }
 
-    /// The least reading that each cell may have.
-    pub fn least_readings(&self) -> Vec<f64> {
-        let least = |threshold: &f64| if self.open_hand.is_some() { f64::NEG_INFINITY } else { -threshold };
-        self.noise_thresholds.iter().map(least).collect()
+    /// The readings that the cells may have.
+    pub fn allowed(&self) -> AllowedReadings {
+        let is_zeroed = self.open_hand.is_some();
+        let cells = self
+            .cells
+            .iter()
+            .map(|cell| (if is_zeroed { f64::NEG_INFINITY } else { -cell.noise_threshold }, cell.may_be_missing));
+        AllowedReadings { cells: cells.collect() }
     }
 
     /// Makes forces of the readings of the cells. An open hand's reading is counted first.
-    pub fn apply(&mut self, reading: &mut Reading) -> Zeroed {
-        let cells = &mut reading.cells_newtons;
-        if let Some(OpenHand { n_frames, mean }) = &mut self.open_hand {
-            if reading.phase == Phase::Open {
-                *n_frames = (*n_frames + 1.0).min(N_FRAMES);
-                mean.resize(cells.len(), 0.0);
-                mean.iter_mut().zip(&*cells).for_each(|(mean, cell)| *mean += (cell - *mean) / *n_frames);
-            }
-            if *n_frames == 0.0 {
-                return Zeroed::Unknown;
-            }
-            for ((cell, zero), falls) in cells.iter_mut().zip(mean).zip(&self.falls) {
-                *cell = if *falls { *zero - *cell } else { *cell - *zero };
-            }
-        }
+    ///
+    /// # Errors
+    /// The zero of a cell is not known, for a person: no open frame came, or the cell was at its greatest load in all of them.
+    pub fn apply(&mut self, reading: &mut Reading) -> Result<Zeroed, String> {
         let is_zeroed = self.open_hand.is_some();
-        let mut is_below = false;
-        for (cell, threshold) in cells.iter_mut().zip(&self.noise_thresholds) {
-            is_below |= *cell < if is_zeroed { -threshold } else { 0.0 };
-            *cell = cell.max(0.0);
+        if let Some(open_hand) = &mut self.open_hand {
+            if reading.phase == Phase::Open {
+                for ((open, cell), found) in open_hand.iter_mut().zip(&self.cells).zip(&reading.cells_newtons) {
+                    if found.is_finite() && !cell.is_saturated(*found) {
+                        open.n_frames = (open.n_frames + 1.0).min(N_FRAMES);
+                        open.mean += (found - open.mean) / open.n_frames;
+                    }
+                }
+            }
+            let cells = reading.cells_newtons.iter_mut().zip(open_hand).zip(&self.cells).enumerate();
+            for (idx, ((found, open), cell)) in cells {
+                if open.n_frames > 0.0 {
+                    *found = if cell.falls { open.mean - *found } else { *found - open.mean };
+                } else if cell.may_be_missing {
+                    *found = f64::NAN;
+                } else if reading.phase == Phase::Open {
+                    return Err(format!(
+                        "zero_when_open: cell {idx} reads {found}, its greatest load, while the hand is open: expected a cell \
+                         that nothing touches; free it, or see whether it is broken"
+                    ));
+                } else {
+                    return Err(
+                        "zero_when_open: no frame of the open hand came before it, expected the phase open first"
+                            .into(),
+                    );
+                }
+            }
         }
-        if is_below { Zeroed::BelowZero } else { Zeroed::Forces }
+        let mut zeroed = Zeroed::default();
+        for (found, cell) in reading.cells_newtons.iter_mut().zip(&self.cells) {
+            zeroed.has_missing |= found.is_nan();
+            zeroed.is_below_zero |= *found < if is_zeroed { -cell.noise_threshold } else { 0.0 };
+            // A missing reading becomes 0, too.
+            *found = found.max(0.0);
+        }
+        Ok(zeroed)
+    }
+}
+
+impl CellSense {
+    /// Whether a reading is that of the greatest load.
+    fn is_saturated(&self, reading: f64) -> bool {
+        self.saturates_at.is_some_and(|limit| if self.falls { reading <= limit } else { reading >= limit })
     }
 }
 
@@ -108,8 +174,15 @@ mod tests {
     use super::*;
     use std::path::Path;
 
+    const FORCES: Result<Zeroed, String> = Ok(Zeroed { is_below_zero: false, has_missing: false });
+    const BELOW_ZERO: Result<Zeroed, String> = Ok(Zeroed { is_below_zero: true, has_missing: false });
+
     /// Two pads of one cell each with a threshold of 0.1, the second of which may fall.
     fn zeros(falls: bool, zero_when_open: bool) -> Result<CellZeros, String> {
+        CellZeros::new(&hand(falls), zero_when_open)
+    }
+
+    fn hand(falls: bool) -> Hand {
         let mut hand = Hand::load(Path::new("parallel-gripper")).expect("built in");
         hand.pads.truncate(2);
         for pad in &mut hand.pads {
@@ -117,7 +190,7 @@ mod tests {
             pad.cells[0].noise_threshold_newtons = 0.1;
         }
         hand.pads[1].falls_under_load = falls;
-        CellZeros::new(&hand, zero_when_open)
+        hand
     }
 
     fn reading(phase: Phase, cells: &[f64]) -> Reading {
@@ -127,19 +200,15 @@ mod tests {
     #[test]
     fn the_mean_of_the_open_hand_is_zero() {
         let mut zeros = zeros(true, true).expect("zeros");
-        assert_eq!(zeros.least_readings(), [f64::NEG_INFINITY; 2]);
-        assert_eq!(
-            zeros.apply(&mut reading(Phase::Closing, &[1.0, 1.0])),
-            Zeroed::Unknown,
-            "no open frame came before"
-        );
+        let refused = zeros.apply(&mut reading(Phase::Closing, &[1.0, 1.0])).expect_err("no zero");
+        assert!(refused.contains("no frame of the open hand came before"), "{refused}");
         for cells in [[-0.375, 0.5], [-0.125, 0.5]] {
-            assert_eq!(zeros.apply(&mut reading(Phase::Open, &cells)), Zeroed::Forces);
+            assert_eq!(zeros.apply(&mut reading(Phase::Open, &cells)), FORCES);
         }
         for (cells, expected, zeroed) in [
-            ([0.75, 0.25], [1.0, 0.25], Zeroed::Forces),
-            ([-0.3125, 0.5625], [0.0, 0.0], Zeroed::Forces),
-            ([-0.5, 0.25], [0.0, 0.25], Zeroed::BelowZero),
+            ([0.75, 0.25], [1.0, 0.25], FORCES),
+            ([-0.3125, 0.5625], [0.0, 0.0], FORCES),
+            ([-0.5, 0.25], [0.0, 0.25], BELOW_ZERO),
         ] {
             let mut settled = reading(Phase::Settled, &cells);
             assert_eq!((zeros.apply(&mut settled), &settled.cells_newtons[..]), (zeroed, &expected[..]), "{cells:?}");
@@ -149,10 +218,12 @@ mod tests {
     #[test]
     fn without_it_noise_around_zero_is_no_force() {
         let mut plain = zeros(false, false).expect("zeros");
-        assert_eq!(plain.least_readings(), [-0.1; 2]);
+        assert_eq!(AllowedReadings::check(Some(&plain.allowed()), &[-0.05, 0.5]), Ok(()));
+        let refused = AllowedReadings::check(Some(&plain.allowed()), &[0.0, -0.125]).expect_err("below the noise");
+        assert!(refused.contains("cells_newtons[1] is -0.125: expected at least -0.1"), "{refused}");
         let mut settled = reading(Phase::Settled, &[-0.05, 0.5]);
-        assert_eq!((plain.apply(&mut settled), &settled.cells_newtons[..]), (Zeroed::BelowZero, &[0.0, 0.5][..]));
-        assert_eq!(plain.apply(&mut reading(Phase::Settled, &[0.0, 0.5])), Zeroed::Forces);
+        assert_eq!((plain.apply(&mut settled), &settled.cells_newtons[..]), (BELOW_ZERO, &[0.0, 0.5][..]));
+        assert_eq!(plain.apply(&mut reading(Phase::Settled, &[0.0, 0.5])), FORCES);
         assert!(zeros(true, false).expect_err("no zero").contains("zero_when_open"));
     }
 
@@ -160,10 +231,43 @@ mod tests {
     fn the_zero_follows_a_drift() {
         let mut zeros = zeros(false, true).expect("zeros");
         for step in 0..2000 {
-            assert_ne!(zeros.apply(&mut reading(Phase::Open, &[f64::from(step) * 1e-3, 0.0])), Zeroed::Unknown);
+            zeros.apply(&mut reading(Phase::Open, &[f64::from(step) * 1e-3, 0.0])).expect("a zero");
         }
         let mut settled = reading(Phase::Settled, &[3.0, 0.0]);
-        assert_eq!(zeros.apply(&mut settled), Zeroed::Forces);
+        assert_eq!(zeros.apply(&mut settled), FORCES);
         assert!((settled.cells_newtons[0] - 1.0).abs() < 0.06, "{settled:?}");
+    }
+
+    #[test]
+    fn a_missing_cell_feels_nothing_where_the_layout_allows_it() {
+        let mut hand = hand(false);
+        let zeros = CellZeros::new(&hand, true).expect("zeros");
+        let refused = AllowedReadings::check(Some(&zeros.allowed()), &[0.0, f64::NAN]).expect_err("a missing cell");
+        assert!(refused.contains("cells_newtons[1] is missing") && refused.contains("may_be_missing"), "{refused}");
+        hand.pads[1].may_be_missing = true;
+        for zero_when_open in [false, true] {
+            let mut zeros = CellZeros::new(&hand, zero_when_open).expect("zeros");
+            assert_eq!(AllowedReadings::check(Some(&zeros.allowed()), &[0.0, f64::NAN]), Ok(()));
+            zeros.apply(&mut reading(Phase::Open, &[0.0, f64::NAN])).expect("the zero of the other cell");
+            // Its zero is not known: what it reads now says nothing.
+            let mut settled = reading(Phase::Settled, &[0.5, if zero_when_open { 2.0 } else { f64::NAN }]);
+            assert_eq!(zeros.apply(&mut settled), Ok(Zeroed { is_below_zero: false, has_missing: true }));
+            assert_eq!(settled.cells_newtons, [0.5, 0.0]);
+        }
+    }
+
+    #[test]
+    fn a_saturated_cell_of_the_open_hand_has_no_zero() {
+        for (falls, full, light) in [(false, 4.0, 0.25), (true, 0.25, 4.0)] {
+            let mut hand = hand(falls);
+            hand.pads[1].saturates_at_newtons = Some(full);
+            let mut zeros = CellZeros::new(&hand, true).expect("zeros");
+            let refused = zeros.apply(&mut reading(Phase::Open, &[0.0, full])).expect_err("something presses it");
+            assert!(refused.contains("cell 1") && refused.contains("its greatest load"), "{refused}");
+            assert_eq!(zeros.apply(&mut reading(Phase::Open, &[0.0, light])), FORCES);
+            let mut settled = reading(Phase::Settled, &[0.0, full]);
+            assert_eq!(zeros.apply(&mut settled), FORCES);
+            assert_eq!(settled.cells_newtons, [0.0, 3.75]);
+        }
     }
 }

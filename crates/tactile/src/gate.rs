@@ -25,7 +25,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use super::cell_zeros::check_readings;
+use super::cell_zeros::AllowedReadings;
 use super::{Arrival, Place, Reading, Refusal, RefusalKind};
 use blindgrasp_messages::{Phase, Sense};
 
@@ -112,8 +112,8 @@ pub struct Accepted {
 #[derive(Debug, Clone)]
 pub struct FrameFilter {
     shape: Shape,
-    /// The least reading that each cell may have; 0 for all where it is absent.
-    least_readings: Option<Arc<[f64]>>,
+    /// Forces where it is absent.
+    allowed: Option<Arc<AllowedReadings>>,
     max_delay_nanos: u64,
     /// The wall clock's time less CLOCK_BOOTTIME's, to stamp readings that have none.
     wall_offset_nanos: u64,
@@ -193,7 +193,7 @@ impl FrameFilter {
     ) -> Self {
         FrameFilter {
             shape,
-            least_readings: None,
+            allowed: None,
             max_delay_nanos,
             wall_offset_nanos,
             counts: Counts::default(),
@@ -211,18 +211,19 @@ impl FrameFilter {
         }
     }
 
-    /// Continues where another instance stopped, with its own counts.
+    /// Continues where another instance stopped, with its own counts and allowed readings.
     pub fn resume(&mut self, place: Place, last_seq: Option<u64>) {
-        let counts = self.counts;
+        let (counts, allowed) = (self.counts, self.allowed.take());
         *self = FrameFilter {
             counts,
+            allowed,
             ..FrameFilter::new(self.shape, self.max_delay_nanos, self.wall_offset_nanos, place, last_seq)
         };
     }
 
-    /// Takes readings of the cells down to these.
-    pub fn with_least_readings(self, least_readings: &[f64]) -> Self {
-        FrameFilter { least_readings: Some(least_readings.into()), ..self }
+    /// Takes these readings of the cells.
+    pub fn with_allowed(self, allowed: AllowedReadings) -> Self {
+        FrameFilter { allowed: Some(allowed.into()), ..self }
     }
 
     pub fn set_max_delay_nanos(&mut self, max_delay_nanos: u64) {
@@ -296,9 +297,7 @@ impl FrameFilter {
         }
         let last = self.place.grasp_id;
         let is_far = |id: u64| last.is_none_or(|last| id > last.saturating_add(1) && id - last <= MAX_GRASP_JUMP);
-        if reading.grasp_id.is_some_and(is_far)
-            && check_values(reading, self.shape, self.least_readings.as_deref()).is_ok()
-        {
+        if reading.grasp_id.is_some_and(is_far) && check_values(reading, self.shape, self.allowed.as_deref()).is_ok() {
             self.waiting = Some((reading.clone(), *arrival));
             return Ok(None);
         }
@@ -384,7 +383,7 @@ impl FrameFilter {
 
     fn judge_next(&mut self, reading: &Reading, arrival: &Arrival) -> Result<Accepted, Refusal> {
         let malformed = |why: String| Refusal { kind: RefusalKind::Malformed, why };
-        check_values(reading, self.shape, self.least_readings.as_deref()).map_err(malformed)?;
+        check_values(reading, self.shape, self.allowed.as_deref()).map_err(malformed)?;
         let keys = Keys {
             grasp_id: reading.grasp_id.is_some(),
             seq: reading.seq.is_some(),
@@ -564,7 +563,7 @@ impl FrameFilter {
     }
 }
 
-fn check_values(reading: &Reading, shape: Shape, least_readings: Option<&[f64]>) -> Result<(), String> {
+fn check_values(reading: &Reading, shape: Shape, allowed: Option<&AllowedReadings>) -> Result<(), String> {
     let Reading { joints, cells_newtons, .. } = reading;
     for (name, found, expected) in
         [("joints", joints.len(), shape.n_joints), ("cells_newtons", cells_newtons.len(), shape.n_cells)]
@@ -579,7 +578,7 @@ fn check_values(reading: &Reading, shape: Shape, least_readings: Option<&[f64]>)
     if let Some((idx, angle)) = joints.iter().enumerate().find(|(_, angle)| !angle.is_finite()) {
         return Err(format!("joints[{idx}] is {angle}: expected an angle in radians"));
     }
-    check_readings(cells_newtons, least_readings)?;
+    AllowedReadings::check(allowed, cells_newtons)?;
     for (sense, values) in reading.senses.view().iter() {
         let (name, expected) = (sense.name(), sense.len(shape.n_joints));
         if !values.is_empty() && values.len() != expected {

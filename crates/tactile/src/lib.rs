@@ -93,7 +93,9 @@ pub enum Event {
 pub struct Reading {
     /// Radians, or metres for a joint that slides, in the hand's order.
     pub joints: Vec<f64>,
-    /// Force on each cell, pad after pad in the hand's order, newtons (or the unit of the hand's layout).
+    /// Force on each cell, pad after pad in the hand's order, newtons (or the unit of the hand's layout). A missing one, `null`
+    /// in a line, is not a number.
+    #[serde(deserialize_with = "with_missing")]
     pub cells_newtons: Vec<f64>,
     pub phase: Phase,
     /// Each sense under its own name in a line. They refuse a key that is unknown.
@@ -114,6 +116,11 @@ pub struct Reading {
     /// The object's name. It counts in frames of the phases kept and dropped.
     #[serde(default)]
     pub object: Option<String>,
+}
+
+fn with_missing<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Vec<f64>, D::Error> {
+    let cells: Vec<Option<f64>> = Deserialize::deserialize(deserializer)?;
+    Ok(cells.into_iter().map(|cell| cell.unwrap_or(f64::NAN)).collect())
 }
 
 impl Reading {

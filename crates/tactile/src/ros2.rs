@@ -17,7 +17,7 @@ use super::{Arrival, DriverError, Event, Place, Reading, Refusal, RefusalKind, T
 use blindgrasp_messages::{OwnedSenses, Phase, Sense};
 use blindgrasp_ros::cdr::{self, Value};
 use blindgrasp_ros::definition::Definition;
-use blindgrasp_ros::node::{MAX_RECEIVED_BYTES, MessageType, Network, Quality, Received, Rights, RosNode, topic_key};
+use blindgrasp_ros::node::{Convention, MAX_RECEIVED_BYTES, MessageType, Network, Quality, Received, Rights, RosNode};
 use blindgrasp_ros::standard;
 
 /// A sender that has sent nothing for so long gives way to another one.
@@ -37,6 +37,7 @@ const GRAVITY_M_PER_S2: f64 = 9.81;
 #[derive(Debug, Clone)]
 pub struct Topics {
     pub network: Network,
+    pub convention: Convention,
     pub domain: u32,
     pub namespace: String,
     /// Names of topics, with their namespace.
@@ -54,13 +55,24 @@ pub struct Topics {
     /// `tf2_msgs/msg/TFMessage`, and the frames that tell gravity: the z axis of the first points upwards, the second is the palm
     /// frame. The static transforms are on the topic of this name with `_static` behind it.
     pub gravity: Option<(String, [String; 2])>,
-    /// The hand's joints as ROS names them, in the hand's order, each with the change of its value while the hand closes by a
-    /// radian; `None` for a joint that does not close.
-    pub joint_names: Vec<(String, Option<f64>)>,
+    /// The hand's joints, in the hand's order.
+    pub hand_joints: Vec<JointTopic>,
     /// Joint angles and senses must be this near to the cells in time. Angles of a slower topic hold until the next one is due.
     pub tolerance_nanos: u64,
     /// A joint that is slower stands still, per second.
     pub still_per_s: f64,
+}
+
+/// A joint of the hand, as the topic has it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct JointTopic {
+    pub name: String,
+    /// The joint's value is this times that of the topic, plus `offset`.
+    pub scale: f64,
+    /// Radians, or metres.
+    pub offset: f64,
+    /// The change of the joint's value while the hand closes by a radian; `None` for a joint that does not close.
+    pub closing_rate: Option<f64>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -120,7 +132,7 @@ pub struct Ros2 {
 
 impl Ros2 {
     pub fn new(topics: Topics, finder: PhaseFinder) -> Self {
-        let joints = vec![None; topics.joint_names.len()];
+        let joints = vec![None; topics.hand_joints.len()];
         let mut definitions = BTreeMap::new();
         let mut add = |topic: Topic, name: &Option<String>, definition: Option<Definition>| {
             if let (Some(name), Some(definition)) = (name, definition) {
@@ -237,14 +249,14 @@ impl Ros2 {
             return Err(format!("{} names and {} positions", names.len(), angles.len()));
         }
         let mut has_any = false;
-        for ((wanted, _), joint) in self.topics.joint_names.iter().zip(&mut self.joints) {
-            if let Some(idx) = names.iter().position(|name| name == wanted) {
-                let value = angles[idx];
+        for (wanted, joint) in self.topics.hand_joints.iter().zip(&mut self.joints) {
+            if let Some(idx) = names.iter().position(|name| *name == wanted.name) {
+                let value = wanted.scale * angles[idx] + wanted.offset;
                 let before = joint.filter(|before| before.sender == sender && before.stamp_nanos <= stamp_nanos);
                 if joint.is_some_and(|other| {
                     other.sender != sender && at_nanos.saturating_sub(other.at_nanos) < SILENT_NANOS
                 }) {
-                    self.contradiction = Some((wanted.clone(), at_nanos));
+                    self.contradiction = Some((wanted.name.clone(), at_nanos));
                 }
                 let (period_nanos, change) = before.map_or((0, f64::INFINITY), |before| {
                     match stamp_nanos - before.stamp_nanos {
@@ -258,8 +270,8 @@ impl Ros2 {
             }
         }
         if has_any && self.topics.phase.is_none() {
-            let joints = self.topics.joint_names.iter().zip(&self.joints);
-            let fingers = joints.filter_map(|((_, closing_rate), joint)| Some((closing_rate.as_ref()?, joint)));
+            let joints = self.topics.hand_joints.iter().zip(&self.joints);
+            let fingers = joints.filter_map(|(it, joint)| Some((it.closing_rate?, joint)));
             let fingers: Option<Vec<f64>> =
                 fingers.map(|(rate, joint)| joint.map(|joint| joint.value / rate)).collect();
             if let Some(fingers) = fingers {
@@ -311,7 +323,7 @@ impl Ros2 {
         }
         let is_held = self.phase.is_none_or(|(phase, _)| !matches!(phase, Phase::Open | Phase::Closing));
         let mut joints = Vec::with_capacity(self.joints.len());
-        for ((name, _), joint) in self.topics.joint_names.iter().zip(&self.joints) {
+        for (JointTopic { name, .. }, joint) in self.topics.hand_joints.iter().zip(&self.joints) {
             let angle =
                 joint.ok_or_else(|| format!("no angle of joint '{name}' has come on {}", self.topics.joints))?;
             let is_slow = angle.is_last_of_a_slow_topic(stamp_nanos, is_held, self.topics.still_per_s);
@@ -366,10 +378,11 @@ impl TactileDriver for Ros2 {
             .collect();
         let name = wanted.iter().map(|(_, name, _)| name.as_str()).collect::<Vec<_>>().join(", ");
         inbox.keep(name, move |inbox| {
-            let takes = wanted.iter().map(|(_, name, _)| topic_key(topics.domain, name)).collect();
+            let takes = wanted.iter().map(|(_, name, _)| topics.convention.key(topics.domain, name)).collect();
             let rights = Rights { takes, ..Rights::default() };
             let session = topics.network.open(&rights).map_err(|error| error.to_string())?;
-            let node = RosNode::new(session, topics.domain, &topics.namespace, "blindgrasp_tactile_source");
+            let node =
+                RosNode::new(session, topics.convention, topics.domain, &topics.namespace, "blindgrasp_tactile_source");
             let mut node = node.map_err(|error| error.to_string())?;
             let mut subscribers = Vec::new();
             for (topic, name, message) in &wanted {
@@ -439,10 +452,15 @@ mod tests {
 
     use super::*;
 
+    fn joint(name: &str) -> JointTopic {
+        JointTopic { name: name.into(), scale: 1.0, offset: 0.0, closing_rate: Some(1.0) }
+    }
+
     /// A driver for a hand with the joints `a` and `b`, whose cells have this type.
     fn driver(cells_type: &str, cells_field: &str) -> Ros2 {
         let topics = Topics {
             network: Network::default(),
+            convention: Convention::default(),
             domain: 0,
             namespace: "/".into(),
             joints: "/joint_states".into(),
@@ -453,7 +471,7 @@ mod tests {
             wrench: Some("/wrench".into()),
             imu: Some("/imu".into()),
             gravity: None,
-            joint_names: vec![("a".into(), Some(1.0)), ("b".into(), Some(1.0))],
+            hand_joints: vec![joint("a"), joint("b")],
             tolerance_nanos: 20_000_000,
             still_per_s: 0.05,
         };
@@ -649,7 +667,7 @@ mod tests {
         let mut driver = driver("std_msgs/msg/Float64MultiArray", "data");
         driver.topics.phase = None;
         // 0.1 m count as a radian: 20 mm/s are a speed of 0.2 rad/s.
-        driver.topics.joint_names = vec![("jaw".into(), Some(-0.1))];
+        driver.topics.hand_joints = vec![JointTopic { closing_rate: Some(-0.1), ..joint("jaw") }];
         driver.joints = vec![None];
         let mut phases = Vec::new();
         for step in 0..20 {

@@ -62,6 +62,9 @@ struct LayoutPad {
     noise_threshold_newtons: f64,
     #[serde(default)]
     falls_under_load: bool,
+    #[serde(default)]
+    may_be_missing: bool,
+    saturates_at_newtons: Option<f64>,
 }
 
 #[derive(Deserialize)]
@@ -163,8 +166,20 @@ impl Layout {
                 check_place(cell, &tree.links[link_idx])
                     .map_err(|what| format!("{used_by}, cell {idx}, on link '{}': {what}", pad.link))?;
             }
-            let (name, falls_under_load) = (pad.name.clone(), pad.falls_under_load);
-            pads.push(Pad { name, link_idx, first_cell_idx, cells, falls_under_load });
+            if pad.saturates_at_newtons.is_some_and(|reading| !reading.is_finite()) {
+                return Err(format!("{used_by}: saturates_at_newtons is no finite number"));
+            }
+            let (name, falls_under_load, may_be_missing) = (pad.name.clone(), pad.falls_under_load, pad.may_be_missing);
+            let saturates_at_newtons = pad.saturates_at_newtons;
+            pads.push(Pad {
+                name,
+                link_idx,
+                first_cell_idx,
+                cells,
+                falls_under_load,
+                may_be_missing,
+                saturates_at_newtons,
+            });
             first_cell_idx += n_cells;
         }
         for (what, found, least, most) in [

@@ -273,7 +273,7 @@ impl std::fmt::Debug for LinkShape {
 }
 
 /// A tactile pad: cells on one link.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Pad {
     /// The layout's name, e.g. `finger_1`.
     pub name: String,
@@ -284,6 +284,10 @@ pub struct Pad {
     pub cells: Vec<Cell>,
     /// Whether a cell reads less the more it is loaded. Messages hold forces, which rise.
     pub falls_under_load: bool,
+    /// Whether a reading may be missing (null, or not a number). It then counts as 0.
+    pub may_be_missing: bool,
+    /// The reading of a cell at its greatest load. An open hand with such a reading has no zero.
+    pub saturates_at_newtons: Option<f64>,
 }
 
 impl Pad {
@@ -360,8 +364,16 @@ macro_rules! builtin {
 }
 
 /// The hands that come with the program.
-const BUILTIN: [(&str, &str, &str); 4] =
-    [builtin!("allegro"), builtin!("barrett-bh8-280"), builtin!("parallel-gripper"), builtin!("shadow-biotac-sp")];
+const BUILTIN: [(&str, &str, &str); 8] = [
+    builtin!("allegro"),
+    builtin!("barrett-bh8-280"),
+    builtin!("inspire-rh56dftp"),
+    builtin!("parallel-gripper"),
+    builtin!("robotiq-2f85-tsf85"),
+    builtin!("shadow-biotac-sp"),
+    builtin!("unitree-dex3-1"),
+    builtin!("uskin"),
+];
 
 impl Hand {
     /// The link whose frame is the palm frame.

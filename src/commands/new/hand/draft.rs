@@ -288,7 +288,7 @@ impl Draft {
             let cells = pad.cells.clone();
             let n_cells = cells.len();
             let name = pad.name.clone();
-            hand.pads.push(Pad { name, link_idx, first_cell_idx, cells, falls_under_load: false });
+            hand.pads.push(Pad { name, link_idx, first_cell_idx, cells, ..Pad::default() });
             first_cell_idx += n_cells;
         }
         hand

@@ -2,34 +2,34 @@
 """Feeds a running graph's tactile_source with frames from topics of ROS 2, in any RMW and any distribution since Humble.
 
     blindgrasp run dataflow-live.yaml
-    python3 examples/ros2_hand_bridge.py my_hand_topics.yaml
+    python3 examples/bridges/ros2.py my_hand_topics.yaml
 
-It runs where ROS 2 is sourced and needs only rclpy. A table says which topics the hand has:
+It runs where ROS 2 is sourced and needs only rclpy. A table says which topics the hand has; this folder has those of a Unitree
+Dex3-1, of uSkin sensors and of Robotiq's TSF-85:
 
     joints: {topic: /joint_states, map: {jaw: {from: finger_joint, scale: -0.5, offset: 0.04}}}
     cells:                     # pad after pad, in the order of `blindgrasp info HAND.yaml`
       - {topic: /touch/left, type: my_msgs/msg/Touch, field: taxels.force.z, scale: 0.01}
-      - {topic: /touch/right, type: my_msgs/msg/Touch, field: taxels.force.z, order: [3, 2, 1, 0]}
+      - {topic: /touch/right, type: my_msgs/msg/Touch, field: taxels.force.z, order: [3, 2, 1, 0], missing: 30000}
     phase: {topic: /hand/status, type: my_msgs/msg/Status, field: state, words: {0: open, 1: closing, 2: settled}}
 
-A joint's value is `scale` times the topic's, plus `offset`; without an entry it is the value of the same name. Cells are
-`scale` times the field's numbers; `order` picks them. A phase is one word for one value; of several values (a list of
-states, one a finger) the hand is settled if all are. It counts for `max_age_ms` (1000; 0 for a topic that speaks on change
-alone). Without `phase` it is inferred from the fingers' motion: `closes` in the map is then the change of a joint's value
-while the hand closes by a radian: 1 if it is not given, -1 where the value falls, 0.1 or -0.1 for a slide in metres, 0 for
-a joint that does not close.
+A joint's value is `scale` times the topic's, plus `offset`; without an entry it is the value of the same name. A topic of
+another `type` than sensor_msgs/msg/JointState has its values in a `field`, in the order of `names`. Cells are `scale` times the
+field's numbers, plus `offset`; `order` picks them, and a picked number that is `missing`, or none, makes no frame. A phase is
+one word for one value; of several values (a list of states, one a finger) the hand is settled if all are. It counts for
+`max_age_ms` (1000; 0 for a topic that speaks on change alone). Without `phase` it is inferred from the fingers' motion:
+`closes` in the map is then the change of a joint's value while the hand closes by a radian: 1 if it is not given, -1 where the
+value falls, 0.1 or -0.1 for a slide in metres, 0 for a joint that does not close.
 
 A frame is made for each message of the first topic of cells, with the others that are within `tolerance_ms` of it (20) and
 angles of the last 150 ms. Frames that lack something are not sent, and counted; the source sees the gap.
 """
 
-import argparse
-import json
-import os
-import socket
+import math
 import sys
-import threading
 import time
+
+import line_protocol
 
 WORDS = ("open", "closing", "settled", "ended")
 # Angles older than this are missed: joint_states often comes at 10 to 30 Hz.
@@ -57,36 +57,6 @@ def stamp_of(message, now_nanos):
     return nanos or now_nanos
 
 
-class MotionPhase:
-    """The phase by the fingers' motion, as the driver `ros2` of blindgrasp finds it (crates/tactile/src/phases.rs)."""
-
-    WINDOW_NANOS = 50_000_000
-
-    def __init__(self, moving_rad_per_s=0.05, still_ms=200.0):
-        self.moving, self.still_nanos = moving_rad_per_s, still_ms * 1e6
-        self.phase, self.anchor, self.still_since = "open", None, None
-
-    def of(self, stamp_nanos, fingers_rad):
-        since, before = self.anchor or (stamp_nanos, fingers_rad)
-        nanos = stamp_nanos - since
-        if self.anchor is None or nanos < 0:
-            self.anchor, self.still_since = (stamp_nanos, fingers_rad), None
-        elif nanos >= self.WINDOW_NANOS:
-            speeds = [(now - then) / nanos * 1e9 for now, then in zip(fingers_rad, before)]
-            if any(abs(speed) > self.moving for speed in speeds):
-                self.still_since = None
-                if sum(speeds) <= 0:
-                    self.phase = "open"
-                elif self.phase == "open":
-                    self.phase = "closing"
-            else:
-                self.still_since = since if self.still_since is None else self.still_since
-                if self.phase == "closing" and stamp_nanos - self.still_since >= self.still_nanos:
-                    self.phase = "settled"
-            self.anchor = (stamp_nanos, fingers_rad)
-        return self.phase
-
-
 class Frames:
     """Joins the messages of the table's topics to frames."""
 
@@ -97,12 +67,14 @@ class Frames:
         if unknown:
             raise ValueError(f"joints: map: the hand has no joint {', '.join(sorted(unknown))}")
         self.tolerance_nanos = float(table.get("tolerance_ms", 20.0)) * 1e6
-        self.motion = MotionPhase(table.get("moving_rad_per_s", 0.05), table.get("still_ms", 200.0))
+        self.motion = line_protocol.MotionPhase(table.get("moving_rad_per_s", 0.05), table.get("still_ms", 200.0))
         self.closing = [float((self.map.get(name) or {}).get("closes", 1)) for name in hand["joints"]]
         self.sources = {(self.map.get(name) or {}).get("from", name) for name in hand["joints"]}
         # The last value of each joint of the hand, by the topic's name, and its time.
         self.values = {}
         self.cells = [None] * len(table["cells"])
+        # The cells of each topic that its last message lacked.
+        self.missing = [[]] * len(table["cells"])
         self.phase, self.phase_nanos = None, 0
         self.phase_age_nanos = float((table.get("phase") or {}).get("max_age_ms", 1000.0)) * 1e6
         self.seq = 0
@@ -110,7 +82,12 @@ class Frames:
 
     def take_joints(self, message, now_nanos):
         stamp = stamp_of(message, now_nanos)
-        ours = {name: (value, stamp) for name, value in zip(message.name, message.position) if name in self.sources}
+        entry = self.table.get("joints") or {}
+        if "field" in entry:
+            names, values = entry["names"], numbers(at(message, entry["field"]))
+        else:
+            names, values = message.name, message.position
+        ours = {name: (value, stamp) for name, value in zip(names, values) if name in self.sources}
         self.values.update(ours)
         joints = self.joints(stamp)
         if ours and joints is not None and "phase" not in self.table:
@@ -131,11 +108,13 @@ class Frames:
     def take_cells(self, idx, message, now_nanos):
         """The frame that the message completes: that of the table's first topic of cells, with the others near it."""
         entry = self.table["cells"][idx]
-        values = [float(entry.get("scale", 1.0)) * number for number in numbers(at(message, entry.get("field", "data")))]
-        if "order" in entry:
-            values = [values[place] for place in entry["order"]]
+        found = numbers(at(message, entry.get("field", "data")))
+        found = [found[place] for place in entry["order"]] if "order" in entry else found
+        missing = [place for place, number in enumerate(found) if number == entry.get("missing") or not math.isfinite(number)]
+        scale, offset = float(entry.get("scale", 1.0)), float(entry.get("offset", 0.0))
         stamp = stamp_of(message, now_nanos)
-        self.cells[idx] = (values, stamp)
+        self.missing[idx] = missing
+        self.cells[idx] = None if missing else ([scale * number + offset for number in found], stamp)
         return self.frame(stamp, now_nanos) if idx == 0 else None
 
     def joints(self, stamp):
@@ -170,7 +149,11 @@ class Frames:
     def lacks(self):
         """The parts that a frame lacks, for a person."""
         joints = [name for name in self.hand["joints"] if (self.map.get(name) or {}).get("from", name) not in self.values]
-        cells = [entry["topic"] for entry, cells in zip(self.table["cells"], self.cells) if cells is None]
+        cells = [
+            entry["topic"] + "".join(f" with cell {place}" for place in places[:1])
+            for entry, cells, places in zip(self.table["cells"], self.cells, self.missing)
+            if cells is None
+        ]
         found = [f"no angle of {', '.join(joints)}"] if joints else []
         found += [f"no message on {', '.join(cells)}"] if cells else []
         found += ["no phase"] if self.phase is None else []
@@ -180,38 +163,15 @@ class Frames:
         )
 
 
-def connect(address):
-    while True:
-        try:
-            if address.startswith("unix:"):
-                connection = socket.socket(socket.AF_UNIX)
-                connection.connect(address.removeprefix("unix:"))
-                return connection
-            host, _, port = address.rpartition(":")
-            connection = socket.create_connection((host, int(port)))
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            return connection
-        except OSError as error:
-            print(f"{address}: {error}; trying again", file=sys.stderr)
-            time.sleep(1)
-
-
 def bridge(table, address):
     import rclpy
     from rclpy.qos import qos_profile_sensor_data
     from rosidl_runtime_py.utilities import get_message
 
-    connection = connect(address)
-    answers = connection.makefile()
-    hand = json.loads(answers.readline())
-    if "refused" in hand:
-        sys.exit(hand["why"])
-    print(f"connected: {hand['hand']}, {hand['n_joints']} joints, {hand['n_cells']} cells", file=sys.stderr)
-    threading.Thread(target=lambda: [print(line, end="", file=sys.stderr) for line in answers], daemon=True).start()
-
+    source = line_protocol.Source(address)
     rclpy.init()
     node = rclpy.create_node("blindgrasp_hand_bridge")
-    frames = Frames(table, hand)
+    frames = Frames(table, source.hand)
     told = [time.monotonic()]
 
     def now_nanos():
@@ -219,7 +179,7 @@ def bridge(table, address):
 
     def send(frame):
         if frame is not None:
-            connection.sendall(json.dumps(frame).encode() + b"\n")
+            source.send(frame)
         elif time.monotonic() - told[0] > 2.0:
             told[0] = time.monotonic()
             print(f"{frames.dropped} frames not sent: {frames.lacks()}", file=sys.stderr)
@@ -241,9 +201,8 @@ def bridge(table, address):
 
 
 def main():
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options = line_protocol.options(__doc__)
     options.add_argument("table", help="the topics (YAML)")
-    options.add_argument("--address", default=f"unix:/tmp/blindgrasp-{os.getuid()}/tactile.hand", help="or HOST:PORT")
     arguments = options.parse_args()
     import yaml
 
@@ -258,9 +217,4 @@ def main():
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (BrokenPipeError, ConnectionResetError):
-        sys.exit("the source has gone; start the bridge again")
-    except KeyboardInterrupt:
-        pass
+    line_protocol.run(main)

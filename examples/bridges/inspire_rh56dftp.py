@@ -1,0 +1,132 @@
+#!/usr/bin/env python3
+"""Feeds a running graph with frames of an Inspire RH56DFTP (right hand), read by Modbus TCP.
+
+    blindgrasp run dataflow-live.yaml --set hand=hands/inspire-rh56dftp.yaml --set model=MODEL.json --set source.zero_when_open=true
+    python3 examples/bridges/inspire_rh56dftp.py --host 192.168.11.210
+
+It reads the angles, the state and the 17 pads of the hand, and writes nothing: another program closes the hand. The phase
+comes from the state of the six drives: the hand is settled when all have stopped after closing. A drive with a fault ends the
+frames until it has none.
+
+Addresses, orders and codes are those of the maker's manual (HWKV1.0.0cn); it gives no newtons for the readings of 0 to 4095,
+so --newtons-per-count is assumed until you measure it. The angles of 0 to 1000 (open) are taken as parts of the joints' range.
+"""
+
+import socket
+import struct
+import sys
+import time
+
+import line_protocol
+
+HAND = "inspire-rh56dftp"
+# Address and number of 16-bit words. An address counts bytes; the hand wants it as it stands in the table.
+ANGLES, STATES = (1546, 6), (1612, 3)
+FINGER = ((0, 9), (18, 96), (210, 80))
+PADS = [(3000 + 370 * finger + offset, words) for finger in range(4) for offset, words in FINGER]
+PADS += [(4480, 9), (4498, 96), (4690, 9), (4708, 96), (4900, 112)]
+# Upper limits of the joints in the hand's order: little, ring, middle and index finger, the thumb's bend and its turn.
+CLOSED_RAD = (1.4381, 1.4381, 1.4381, 1.4381, 0.5864, 1.1641)
+MOTIONS = {0: "opens", 1: "closes", 2: "rests", 3: "rests", 5: "rests", 6: "rests"}
+SILENT_SECS = 1.0
+
+
+class ModbusError(Exception):
+    """The hand does not answer as it should."""
+
+
+class Modbus:
+    """Reads holding registers by Modbus TCP (function 3)."""
+
+    def __init__(self, host, port, unit):
+        self.connection = socket.create_connection((host, port), timeout=SILENT_SECS)
+        self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.unit, self.number = unit, 0
+
+    def receive(self, n_bytes):
+        received = b""
+        while len(received) < n_bytes:
+            part = self.connection.recv(n_bytes - len(received))
+            if not part:
+                raise ModbusError("it closed the connection")
+            received += part
+        return received
+
+    def read(self, address, n_words):
+        """The bytes of the words at an address."""
+        self.number = (self.number + 1) % 0x10000
+        self.connection.sendall(struct.pack(">HHHBBHH", self.number, 0, 6, self.unit, 3, address, n_words))
+        number, protocol, length, _unit = struct.unpack(">HHHB", self.receive(7))
+        answer = self.receive(length - 1)
+        if (number, protocol) != (self.number, 0):
+            raise ModbusError(f"answer {number} to request {self.number}")
+        if answer[0] != 3:
+            raise ModbusError(f"registers at {address}: exception {answer[1]}")
+        if answer[1] != 2 * n_words or len(answer) != 2 + 2 * n_words:
+            raise ModbusError(f"registers at {address}: {len(answer) - 2} bytes, expected {2 * n_words}")
+        return answer[2:]
+
+
+def joints_of(angles):
+    """The joints, radians, of angles from 0 (closed) to 1000 (open)."""
+    return [closed * (1.0 - min(max(angle, 0), 1000) / 1000.0) for closed, angle in zip(CLOSED_RAD, angles)]
+
+
+def motion_of(states):
+    """The motion of the hand: it opens if a finger does, and rests if all do. `None` if a drive has a fault."""
+    motions = {MOTIONS.get(state) for state in states}
+    return next((motion for motion in (None, "opens", "closes", "rests") if motion in motions), None)
+
+
+def frames(modbus, newtons_per_count, rate):
+    """Yields the hand's frames, `rate` a second; `None` for one that a fault of the hand has cost."""
+    phase = line_protocol.StatusPhase()
+    seq, begin = 0, time.monotonic()
+    while True:
+        stamp_nanos = line_protocol.now_nanos()
+        states = modbus.read(*STATES)
+        angles = struct.unpack(">6h", modbus.read(*ANGLES))
+        counts = [count for pad in PADS for count in struct.unpack(f">{pad[1]}h", modbus.read(*pad))]
+        motion = motion_of(states)
+        yield motion and {
+            "joints": joints_of(angles),
+            "cells_newtons": [count * newtons_per_count for count in counts],
+            "phase": phase.of(motion),
+            "seq": seq,
+            "stamp_nanos": stamp_nanos,
+        }
+        seq += 1
+        # Of a hand that is slower than the rate, no frame is skipped.
+        begin = max(begin + 1.0 / rate, time.monotonic() - 1.0 / rate)
+        time.sleep(max(0.0, begin - time.monotonic()))
+
+
+def main():
+    options = line_protocol.options(__doc__)
+    options.add_argument("--host", default="192.168.11.210", help="of the hand (%(default)s)")
+    options.add_argument("--port", type=int, default=6000, help="(%(default)s)")
+    options.add_argument("--unit", type=int, default=1, help="Modbus unit (%(default)s)")
+    options.add_argument("--rate", type=float, default=50.0, help="frames a second (%(default)s)")
+    options.add_argument("--newtons-per-count", type=float, default=0.001, help="assumed: %(default)s")
+    arguments = options.parse_args()
+    try:
+        modbus = Modbus(arguments.host, arguments.port, arguments.unit)
+    except OSError as error:
+        sys.exit(f"{arguments.host}:{arguments.port}: {error}; expected the hand's Modbus TCP server (--host, --port)")
+    source = line_protocol.Source(arguments.address, HAND)
+    n_faulty = 0
+    try:
+        for frame in frames(modbus, arguments.newtons_per_count, arguments.rate):
+            if frame is None:
+                n_faulty += 1
+                if n_faulty == 1:
+                    print("a drive has a fault: no frames until it is cleared", file=sys.stderr)
+                continue
+            n_faulty = 0
+            source.send(frame)
+    except (ModbusError, TimeoutError) as error:
+        sys.exit(f"{arguments.host}:{arguments.port}: {error}; start the bridge again")
+
+
+if __name__ == "__main__":
+    line_protocol.run(main)

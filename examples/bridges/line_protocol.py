@@ -1,0 +1,114 @@
+"""What the bridges of this folder share: the connection to a running tactile_source, and the phase by the fingers' motion."""
+
+import argparse
+import json
+import os
+import socket
+import sys
+import threading
+import time
+
+
+def options(description):
+    """The options that all bridges have."""
+    found = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    found.add_argument(
+        "--address", default=f"unix:/tmp/blindgrasp-{os.getuid()}/tactile.hand", help="of tactile_source; or HOST:PORT"
+    )
+    return found
+
+
+def now_nanos():
+    """The clock of the frames' stamps."""
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+def connect(address):
+    while True:
+        try:
+            if address.startswith("unix:"):
+                connection = socket.socket(socket.AF_UNIX)
+                connection.connect(address.removeprefix("unix:"))
+                return connection
+            host, _, port = address.rpartition(":")
+            connection = socket.create_connection((host, int(port)))
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return connection
+        except OSError as error:
+            print(f"{address}: {error}; trying again", file=sys.stderr)
+            time.sleep(1)
+
+
+class Source:
+    """A connection to tactile_source. `hand` is its first line: the hand that it expects."""
+
+    def __init__(self, address, hand_name=None):
+        self.connection = connect(address)
+        answers = self.connection.makefile()
+        self.hand = json.loads(answers.readline() or '{"refused": "gone", "why": "the source has gone"}')
+        if "refused" in self.hand:
+            sys.exit(self.hand["why"])
+        if hand_name is not None and self.hand["hand"] != hand_name:
+            sys.exit(f"the graph is for the hand {self.hand['hand']}, this bridge for {hand_name}: give --set hand=hands/{hand_name}.yaml")
+        print(f"connected: {self.hand['hand']}, {self.hand['n_joints']} joints, {self.hand['n_cells']} cells", file=sys.stderr)
+        # Every further line says what was wrong with a frame.
+        threading.Thread(target=lambda: [print(line, end="", file=sys.stderr) for line in answers], daemon=True).start()
+
+    def send(self, frame):
+        self.connection.sendall(json.dumps(frame).encode() + b"\n")
+
+
+class MotionPhase:
+    """The phase by the fingers' motion, as the driver `ros2` of blindgrasp finds it (crates/tactile/src/phases.rs)."""
+
+    WINDOW_NANOS = 50_000_000
+
+    def __init__(self, moving_rad_per_s=0.05, still_ms=200.0):
+        self.moving, self.still_nanos = moving_rad_per_s, still_ms * 1e6
+        self.phase, self.anchor, self.still_since = "open", None, None
+
+    def of(self, stamp_nanos, fingers_rad):
+        since, before = self.anchor or (stamp_nanos, fingers_rad)
+        nanos = stamp_nanos - since
+        if self.anchor is None or nanos < 0:
+            self.anchor, self.still_since = (stamp_nanos, fingers_rad), None
+        elif nanos >= self.WINDOW_NANOS:
+            speeds = [(now - then) / nanos * 1e9 for now, then in zip(fingers_rad, before)]
+            if any(abs(speed) > self.moving for speed in speeds):
+                self.still_since = None
+                if sum(speeds) <= 0:
+                    self.phase = "open"
+                elif self.phase == "open":
+                    self.phase = "closing"
+            else:
+                self.still_since = since if self.still_since is None else self.still_since
+                if self.phase == "closing" and stamp_nanos - self.still_since >= self.still_nanos:
+                    self.phase = "settled"
+            self.anchor = (stamp_nanos, fingers_rad)
+        return self.phase
+
+
+class StatusPhase:
+    """The phase by what the hand says of itself: it opens, it closes, or it is at rest."""
+
+    def __init__(self):
+        self.phase = "open"
+
+    def of(self, motion):
+        if motion == "opens":
+            self.phase = "open"
+        elif motion == "closes" and self.phase == "open":
+            self.phase = "closing"
+        elif motion == "rests" and self.phase == "closing":
+            self.phase = "settled"
+        return self.phase
+
+
+def run(work):
+    """Runs a bridge's `work` until the source goes or somebody ends it."""
+    try:
+        work()
+    except (BrokenPipeError, ConnectionResetError):
+        sys.exit("the source has gone; start the bridge again")
+    except KeyboardInterrupt:
+        pass
