@@ -3,7 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
+use blindgrasp_stages::hand::{builtin_files, builtin_names};
 use clap::Args;
+use clap::builder::PossibleValuesParser;
 use serde_json::json;
 
 use super::schema::schema;
@@ -17,13 +19,16 @@ use super::{Outcome, print_line};
 pub(super) struct Arguments {
     /// The project's folder; made if it is not there. Files that are there are not overwritten.
     folder: PathBuf,
+    /// Add the files of another built-in hand, and its bridge.
+    #[arg(long, value_name = "NAME", value_parser = PossibleValuesParser::new(builtin_names()))]
+    hand: Option<String>,
     /// Print JSON: {"folder", "files"}.
     #[arg(long)]
     json: bool,
 }
 
 /// The project's files: those that this repository's own default graph consists of.
-pub(super) const FILES: [(&str, &[u8]); 10] = [
+pub(super) const FILES: [File; 10] = [
     ("dataflow.yaml", include_bytes!("../../dataflow.yaml")),
     ("dataflow-live.yaml", include_bytes!("../../dataflow-live.yaml")),
     ("tactile_bridge.py", include_bytes!("../../examples/tactile_bridge.py")),
@@ -35,6 +40,43 @@ pub(super) const FILES: [(&str, &[u8]); 10] = [
     ("recordings/held-out.mcap", include_bytes!("../../recordings/held-out.mcap")),
     ("README.md", README.as_bytes()),
 ];
+
+/// A path in the project, and the content.
+type File = (&'static str, &'static [u8]);
+
+/// The bridges of built-in hands.
+const BRIDGES: [(&str, &[File]); 4] = [
+    (
+        "inspire-rh56dftp",
+        &[("bridges/inspire_rh56dftp.py", include_bytes!("../../examples/bridges/inspire_rh56dftp.py")), LINES],
+    ),
+    (
+        "robotiq-2f85-tsf85",
+        &[
+            ("bridges/robotiq_2f85_tsf85.py", include_bytes!("../../examples/bridges/robotiq_2f85_tsf85.py")),
+            ("bridges/robotiq-2f85-tsf85.yaml", include_bytes!("../../examples/bridges/robotiq-2f85-tsf85.yaml")),
+            ROS2,
+            LINES,
+        ],
+    ),
+    (
+        "unitree-dex3-1",
+        &[("bridges/unitree-dex3-1.yaml", include_bytes!("../../examples/bridges/unitree-dex3-1.yaml")), ROS2, LINES],
+    ),
+    ("uskin", &[("bridges/uskin.yaml", include_bytes!("../../examples/bridges/uskin.yaml")), ROS2, LINES]),
+];
+const LINES: File = ("bridges/line_protocol.py", include_bytes!("../../examples/bridges/line_protocol.py"));
+const ROS2: File = ("bridges/ros2.py", include_bytes!("../../examples/bridges/ros2.py"));
+
+/// The files of a built-in hand and of its bridge.
+fn of_hand(name: &str) -> Vec<(String, &'static [u8])> {
+    let layout_and_urdf = builtin_files(name).map(|(layout, urdf)| {
+        [(format!("hands/{name}.yaml"), layout.as_bytes()), (format!("hands/{name}.urdf"), urdf.as_bytes())]
+    });
+    let bridge = BRIDGES.iter().filter(|(hand, _)| *hand == name).flat_map(|(_, files)| *files);
+    let bridge = bridge.map(|(file, content)| ((*file).to_owned(), *content));
+    layout_and_urdf.into_iter().flatten().chain(bridge).collect()
+}
 
 const SCHEMA: &str = "docs/dataflow.schema.json";
 
@@ -65,17 +107,23 @@ a model; `blindgrasp --help` lists the rest.
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let folder = &arguments.folder;
-    let taken: Vec<&str> =
-        FILES.iter().map(|(name, _)| *name).chain([SCHEMA]).filter(|name| folder.join(name).exists()).collect();
+    let made_schema = schema();
+    let mut files: Vec<(String, &[u8])> = FILES.iter().map(|(name, content)| ((*name).to_owned(), *content)).collect();
+    // The dataflow files name it, for editors.
+    files.push((SCHEMA.into(), made_schema.as_bytes()));
+    for file in arguments.hand.iter().flat_map(|hand| of_hand(hand)) {
+        if files.iter().all(|(name, _)| *name != file.0) {
+            files.push(file);
+        }
+    }
+    let names: Vec<&str> = files.iter().map(|(name, _)| name.as_str()).collect();
+    let taken: Vec<&str> = names.iter().copied().filter(|name| folder.join(name).exists()).collect();
     if !taken.is_empty() {
         bail!("{} has {} already: choose a new folder, or move them away", folder.display(), taken.join(", "));
     }
-    for (name, content) in FILES {
+    for (name, content) in &files {
         write_new(&folder.join(name), content)?;
     }
-    // The dataflow files name it, for editors.
-    write_new(&folder.join(SCHEMA), schema().as_bytes())?;
-    let names: Vec<&str> = FILES.iter().map(|(name, _)| *name).chain([SCHEMA]).collect();
     print_line(&if arguments.json {
         json!({ "folder": folder, "files": names }).to_string()
     } else {

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::common::python::{python, utf8};
-use crate::common::{blindgrasp, project, run, text};
+use crate::common::{blindgrasp, project, run, text, unique_name};
 
 fn read(path: &str) -> String {
     std::fs::read_to_string(project().join(path)).expect("readable")
@@ -44,6 +44,42 @@ fn a_gripper_is_simulated_trained_and_run_by_one_command() {
     }
     // The model tells grasps of objects that it has not seen apart.
     assert!(said.contains("HOLD), 0 undecided") && !said.contains("(0 LIFT") && !said.contains(", 0 HOLD"), "{said}");
+}
+
+/// As in the pages of docs/hands, with fewer lifts, and with one of them to the end.
+#[test]
+fn hands_that_people_own_are_simulated_trained_and_run() {
+    for (hand, n_lifts) in
+        [("inspire-rh56dftp", 16), ("robotiq-2f85-tsf85", 16), ("uskin", 16), ("unitree-dex3-1", 120)]
+    {
+        let folder = tempfile::tempdir().expect("a folder");
+        run(&["init", utf8(folder.path()), "--hand", hand], 0);
+        let succeed = |line: &str| {
+            let words: Vec<&str> = line.split(' ').collect();
+            let mut command = Command::new(env!("CARGO_BIN_EXE_blindgrasp"));
+            let output = command.current_dir(folder.path()).args(&words).output().expect("started");
+            let said = format!("{}{}", text(&output.stdout), text(&output.stderr));
+            assert!(output.status.success(), "{hand}: {line}\n{said}");
+            said
+        };
+        let simulate = format!("simulate --hand {hand} --label lift --protocol planned --stable-fraction natural");
+        let said = succeed(&format!("{simulate} --objects train --grasps {n_lifts} --out lifts.mcap"));
+        assert!(
+            said.contains(&format!("grasps            {n_lifts}, ")) && !said.contains(" 0.0 % stable"),
+            "{hand}: {said}"
+        );
+        if hand != "unitree-dex3-1" {
+            continue;
+        }
+        succeed(&format!("train lifts.mcap --hand {hand} --out models/mine.json"));
+        let layout = format!("--set contacts.hand=hands/{hand}.yaml --set encoder.model=models/mine.json");
+        let recording = "--set recorded_source.recording=lifts.mcap --set recorded_source.rate=max";
+        let said = succeed(&format!(
+            "run dataflow.yaml --name {} {recording} {layout} --set classifier.model=models/mine.json",
+            unique_name()
+        ));
+        assert!(said.contains(", 0 undecided") && !said.contains("wrong_hand"), "{hand}: {said}");
+    }
 }
 
 #[test]

@@ -205,6 +205,114 @@ fn messages_of_another_type_or_without_joints_are_refused_in_words() {
     graph.stop();
 }
 
+/// Stands in for zenoh-bridge-ros2dds: it puts the messages of nodes of DDS on keys that are the names of topics, without
+/// attachments, and hears those of the graph.
+const DDS_BRIDGE: &str = r#"
+import json, sys, time, zenoh
+config = zenoh.Config()
+for key, value in (("mode", "peer"), ("listen/endpoints", [f"tcp/127.0.0.1:{sys.argv[1]}"]), ("scouting/multicast/enabled", False)):
+    config.insert_json5(key, json.dumps(value))
+session = zenoh.open(config)
+def heard(sample):
+    print(json.dumps([str(sample.key_expr), bytes(sample.payload).hex(), sample.attachment is None]), flush=True)
+subscriber = session.declare_subscriber("gate/decision", heard)
+print(json.dumps("ready"), flush=True)
+for line in sys.stdin:
+    key, payload = json.loads(line)
+    session.put(key, bytes.fromhex(payload))
+    time.sleep(0.002)
+time.sleep(600)
+"#;
+
+/// A message in CDR, hexadecimal.
+fn hex(message: &impl serde::Serialize) -> String {
+    let mut bytes = Vec::new();
+    cdr::encode(message, &mut bytes).expect("CDR");
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+#[test]
+fn nodes_of_dds_are_reached_through_their_bridge() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let mut bridge = Peer::of_script(DDS_BRIDGE, port, &[]);
+    assert_eq!(bridge.line(), "ready");
+    // A hand whose fingers are told from 1000 (open) to 0, under names of their own.
+    let hand = Hand::load(&project().join("hands/barrett-bh8-280.yaml")).expect("a hand");
+    let map = folder.path().join("map.yaml");
+    let entries: Vec<String> = hand
+        .joints
+        .iter()
+        .map(|joint| format!("{0}: {{from: motor_{0}, scale: -0.001, offset: 1.0}}", joint.name))
+        .collect();
+    std::fs::write(&map, entries.join("\n")).expect("written");
+    let connect = format!("connect: tcp/127.0.0.1:{port}\n      convention: ros2dds");
+    let params = format!(
+        "driver: ros2\n      {connect}\n      cells_topic: /hand/cells\n      phase_topic: /hand/phase\n      joint_map: {}\n      \
+         tolerance_ms: 20000\n      max_delay_ms: 20000",
+        map.display()
+    );
+    let flow = live_dataflow(folder.path(), &params);
+    let mut text = std::fs::read_to_string(&flow).expect("readable");
+    write!(
+        text,
+        "\n  ros2:\n    inputs:\n      decision: {{from: lift_arbiter/decision, policy: latest, capacity: 256}}\n    \
+         params: {{{}, namespace: /gate}}\n",
+        connect.replace("\n      ", ", ")
+    )
+    .expect("written");
+    std::fs::write(&flow, text).expect("written");
+    let graph = Graph::launch(&unique_name(), &flow, &[]);
+    wait_until_joined(&graph);
+    type Header = ((i32, u32), String);
+    let header = || -> Header { ((0, 0), String::new()) };
+    let names: Vec<String> = hand.joints.iter().map(|joint| format!("motor_{}", joint.name)).collect();
+    let mut stdin = bridge.0.stdin.take().expect("stdin");
+    let mut say = |key: &str, payload: String| writeln!(stdin, "{}", json!([key, payload])).expect("written");
+    for frame in grasps(N_GRASPS) {
+        let frame = frame.message;
+        let motors: Vec<f64> = frame.joints.iter().map(|angle| (1.0 - angle) * 1000.0).collect();
+        let none: Vec<f64> = vec![];
+        say("joint_states", hex(&(header(), &names, motors, &none, &none)));
+        let phase = serde_json::to_value(frame.phase).expect("a word");
+        say("hand/phase", hex(&phase.as_str().expect("a word")));
+        let layout: (Vec<u8>, u32) = (vec![], 0);
+        say("hand/cells", hex(&(layout, &frame.cells_newtons)));
+    }
+    wait_until(|| graph.n_decisions() as u64 >= N_GRASPS - 1, || graph.said());
+    for _ in 0..N_GRASPS - 1 {
+        let heard = bridge.line();
+        assert_eq!((&heard[0], &heard[2]), (&json!("gate/decision"), &json!(true)));
+    }
+    let found = graph.stop().decisions;
+    let is_same = |found: &&Value| {
+        let expected = found["grasp_id"].as_u64().map(|grasp_id| &undisturbed()[grasp_id as usize]);
+        expected.is_some_and(|(action, reason)| found["action"] == **action && found["reason"] == **reason)
+    };
+    // Angles lose digits on their way, which may turn a close decision.
+    assert!(found.iter().filter(is_same).count() as u64 >= N_GRASPS - 2, "{found:?}");
+}
+
+#[test]
+fn a_joint_map_of_another_hand_and_a_domain_of_the_bridge_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let map = folder.path().join("map.yaml");
+    for (joint, params, expected) in [
+        ("thumb", "", "has no joint 'thumb'"),
+        ("spread: {scale: 0}\n#", "", "no scale of 0"),
+        ("spread: {form: a}\n#", "", "{JOINT: {from: NAME, scale: 1, offset: 0}}"),
+        ("spread", "convention: ros2dds\n      domain: 3", "have no domain"),
+    ] {
+        std::fs::write(&map, format!("{joint}: {{}}")).expect("written");
+        let params =
+            format!("driver: ros2\n      cells_topic: /cells\n      joint_map: {}\n      {params}", map.display());
+        let flow = live_dataflow(folder.path(), &params);
+        let refused = run(&["run", "--name", &unique_name(), flow.to_str().expect("UTF-8")], 1);
+        let said = crate::common::text(&refused.stderr);
+        assert!(said.contains(expected), "{expected}: {said}");
+    }
+}
+
 #[test]
 fn a_lossless_input_or_a_wrong_endpoint_is_refused() {
     let folder = tempfile::tempdir().expect("a folder");

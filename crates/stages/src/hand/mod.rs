@@ -375,6 +375,11 @@ const BUILTIN: [(&str, &str, &str); 8] = [
     builtin!("uskin"),
 ];
 
+/// The pad layout and the URDF of a hand that comes with the program.
+pub fn builtin_files(name: &str) -> Option<(&'static str, &'static str)> {
+    BUILTIN.iter().find(|(known, ..)| *known == name).map(|(_, layout, urdf)| (*layout, *urdf))
+}
+
 impl Hand {
     /// The link whose frame is the palm frame.
     pub fn palm_link(&self) -> &Link {
