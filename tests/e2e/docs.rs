@@ -71,7 +71,9 @@ fn pages() -> Vec<PathBuf> {
 
 fn markdown_of(folder: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder).expect("a folder");
-    let mut pages: Vec<PathBuf> = entries.map(|entry| entry.expect("an entry").path()).collect();
+    let paths: Vec<PathBuf> = entries.map(|entry| entry.expect("an entry").path()).collect();
+    let below = paths.iter().filter(|path| path.is_dir()).flat_map(|folder| markdown_of(folder));
+    let mut pages: Vec<PathBuf> = below.chain(paths.clone()).collect();
     pages.retain(|path| path.extension().is_some_and(|extension| extension == "md"));
     pages.sort();
     pages
