@@ -19,7 +19,6 @@ import time
 
 import line_protocol
 
-HAND = "inspire-rh56dftp"
 # Address and number of 16-bit words. An address counts bytes; the hand wants it as it stands in the table.
 ANGLES, STATES = (1546, 6), (1612, 3)
 FINGER = ((0, 9), (18, 96), (210, 80))
@@ -28,6 +27,8 @@ PADS += [(4480, 9), (4498, 96), (4690, 9), (4708, 96), (4900, 112)]
 # Upper limits of the joints in the hand's order: little, ring, middle and index finger, the thumb's bend and its turn.
 CLOSED_RAD = (1.4381, 1.4381, 1.4381, 1.4381, 0.5864, 1.1641)
 MOTIONS = {0: "opens", 1: "closes", 2: "rests", 3: "rests", 5: "rests", 6: "rests"}
+# Fingers and thumb whose angles are all above this are open.
+OPEN_ANGLE = 900
 SILENT_SECS = 1.0
 
 
@@ -55,13 +56,16 @@ class Modbus:
     def read(self, address, n_words):
         """The bytes of the words at an address."""
         self.number = (self.number + 1) % 0x10000
-        self.connection.sendall(struct.pack(">HHHBBHH", self.number, 0, 6, self.unit, 3, address, n_words))
-        number, protocol, length, _unit = struct.unpack(">HHHB", self.receive(7))
-        answer = self.receive(length - 1)
+        try:
+            self.connection.sendall(struct.pack(">HHHBBHH", self.number, 0, 6, self.unit, 3, address, n_words))
+            number, protocol, length, _unit = struct.unpack(">HHHB", self.receive(7))
+            answer = self.receive(length - 1)
+        except OSError as error:
+            raise ModbusError(str(error)) from error
         if (number, protocol) != (self.number, 0):
             raise ModbusError(f"answer {number} to request {self.number}")
-        if answer[0] != 3:
-            raise ModbusError(f"registers at {address}: exception {answer[1]}")
+        if answer[:1] != b"\x03":
+            raise ModbusError(f"registers at {address}: exception {answer[1:2].hex()}")
         if answer[1] != 2 * n_words or len(answer) != 2 + 2 * n_words:
             raise ModbusError(f"registers at {address}: {len(answer) - 2} bytes, expected {2 * n_words}")
         return answer[2:]
@@ -79,7 +83,7 @@ def motion_of(states):
 
 
 def frames(modbus, newtons_per_count, rate):
-    """Yields the hand's frames, `rate` a second; `None` for one that a fault of the hand has cost."""
+    """Yields the hand's frames, `rate` a second; a word for one that a fault of the hand has cost."""
     phase = line_protocol.StatusPhase()
     seq, begin = 0, time.monotonic()
     while True:
@@ -88,13 +92,19 @@ def frames(modbus, newtons_per_count, rate):
         angles = struct.unpack(">6h", modbus.read(*ANGLES))
         counts = [count for pad in PADS for count in struct.unpack(f">{pad[1]}h", modbus.read(*pad))]
         motion = motion_of(states)
-        yield motion and {
-            "joints": joints_of(angles),
-            "cells_newtons": [count * newtons_per_count for count in counts],
-            "phase": phase.of(motion),
-            "seq": seq,
-            "stamp_nanos": stamp_nanos,
-        }
+        word = phase.of(motion, min(angles[:5]) > OPEN_ANGLE)
+        if motion is None:
+            yield "a drive has a fault: no frames until it is cleared"
+        elif word is None:
+            yield "the hand has not been open: no frames until it opens"
+        else:
+            yield {
+                "joints": joints_of(angles),
+                "cells_newtons": [count * newtons_per_count for count in counts],
+                "phase": word,
+                "seq": seq,
+                "stamp_nanos": stamp_nanos,
+            }
         seq += 1
         # Of a hand that is slower than the rate, no frame is skipped.
         begin = max(begin + 1.0 / rate, time.monotonic() - 1.0 / rate)
@@ -113,18 +123,10 @@ def main():
         modbus = Modbus(arguments.host, arguments.port, arguments.unit)
     except OSError as error:
         sys.exit(f"{arguments.host}:{arguments.port}: {error}; expected the hand's Modbus TCP server (--host, --port)")
-    source = line_protocol.Source(arguments.address, HAND)
-    n_faulty = 0
+    source = line_protocol.Source(arguments.address, len(CLOSED_RAD), sum(words for _, words in PADS))
     try:
-        for frame in frames(modbus, arguments.newtons_per_count, arguments.rate):
-            if frame is None:
-                n_faulty += 1
-                if n_faulty == 1:
-                    print("a drive has a fault: no frames until it is cleared", file=sys.stderr)
-                continue
-            n_faulty = 0
-            source.send(frame)
-    except (ModbusError, TimeoutError) as error:
+        source.send_all(frames(modbus, arguments.newtons_per_count, arguments.rate))
+    except ModbusError as error:
         sys.exit(f"{arguments.host}:{arguments.port}: {error}; start the bridge again")
 
 

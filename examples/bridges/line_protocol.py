@@ -42,20 +42,35 @@ def connect(address):
 class Source:
     """A connection to tactile_source. `hand` is its first line: the hand that it expects."""
 
-    def __init__(self, address, hand_name=None):
+    def __init__(self, address, n_joints=None, n_cells=None):
         self.connection = connect(address)
         answers = self.connection.makefile()
         self.hand = json.loads(answers.readline() or '{"refused": "gone", "why": "the source has gone"}')
         if "refused" in self.hand:
             sys.exit(self.hand["why"])
-        if hand_name is not None and self.hand["hand"] != hand_name:
-            sys.exit(f"the graph is for the hand {self.hand['hand']}, this bridge for {hand_name}: give --set hand=hands/{hand_name}.yaml")
+        found = self.hand["n_joints"], self.hand["n_cells"]
+        if n_cells is not None and found != (n_joints, n_cells):
+            sys.exit(
+                f"the graph is for the hand {self.hand['hand']} with {found[0]} joints and {found[1]} cells, this bridge for one with "
+                f"{n_joints} and {n_cells}: give the graph --set hand=HAND.yaml"
+            )
         print(f"connected: {self.hand['hand']}, {self.hand['n_joints']} joints, {self.hand['n_cells']} cells", file=sys.stderr)
         # Every further line says what was wrong with a frame.
         threading.Thread(target=lambda: [print(line, end="", file=sys.stderr) for line in answers], daemon=True).start()
 
     def send(self, frame):
         self.connection.sendall(json.dumps(frame).encode() + b"\n")
+
+    def send_all(self, frames):
+        """Sends frames. Of words in place of a frame, those that differ from the last ones are printed."""
+        told = None
+        for frame in frames:
+            if isinstance(frame, dict):
+                self.send(frame)
+                told = None
+            elif frame != told:
+                told = frame
+                print(frame, file=sys.stderr)
 
 
 class MotionPhase:
@@ -89,13 +104,14 @@ class MotionPhase:
 
 
 class StatusPhase:
-    """The phase by what the hand says of itself: it opens, it closes, or it is at rest."""
+    """The phase by what the hand says of itself: it opens, it closes, or it is at rest; `None` until it has been open. Otherwise a
+    bridge that is started while the hand holds something would take its load for that of the open hand."""
 
     def __init__(self):
-        self.phase = "open"
+        self.phase = None
 
-    def of(self, motion):
-        if motion == "opens":
+    def of(self, motion, is_open):
+        if motion == "opens" or (is_open and motion == "rests" and self.phase is None):
             self.phase = "open"
         elif motion == "closes" and self.phase == "open":
             self.phase = "closing"

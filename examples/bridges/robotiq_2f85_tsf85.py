@@ -22,7 +22,6 @@ import tty
 
 import line_protocol
 
-HAND = "robotiq-2f85-tsf85"
 N_CELLS = 28
 # Kinds of a block of sensor data (the high half of its first byte) and the bytes of its values.
 STATIC, SIZES = 1, {1: 2 * N_CELLS, 2: 2, 3: 6, 4: 6, 5: 6, 6: 2, 7: 8}
@@ -31,6 +30,8 @@ READ, AUTOSEND, AUTOSEND_ASYNC = 0x61, 0x58, 0x59
 # gPO of the open and of the closed gripper, and the knuckle's angle when it is closed (the maker's ROS driver).
 OPEN, CLOSED, CLOSED_RAD, LIMIT_RAD = 3, 230, 0.7929, 0.8
 SILENT_SECS = 1.0
+# The readings of both fingers in a frame are no farther apart.
+APART_SECS = 0.05
 
 
 class DeviceError(Exception):
@@ -49,12 +50,20 @@ def opened(path):
 
 def received(file, secs):
     """The bytes that come within so many seconds; none if none do."""
-    if not select.select([file], [], [], secs)[0]:
-        return b""
-    found = os.read(file, 4096)
-    if not found:
-        raise DeviceError("it is gone")
-    return found
+    try:
+        found = os.read(file, 4096) if select.select([file], [], [], secs)[0] else None
+    except OSError as error:
+        raise DeviceError(f"a device is gone: {error}") from error
+    if found == b"":
+        raise DeviceError("a device is gone")
+    return found or b""
+
+
+def send(file, data):
+    try:
+        os.write(file, data)
+    except OSError as error:
+        raise DeviceError(f"a device is gone: {error}") from error
 
 
 class Fingertips:
@@ -120,9 +129,11 @@ class Gripper:
         self.file, self.phase = file, line_protocol.StatusPhase()
 
     def ask(self):
-        """The knuckle's angle and the phase; `None` while the gripper is not activated."""
-        termios.tcflush(self.file, termios.TCIFLUSH)
-        os.write(self.file, self.REQUEST + crc(self.REQUEST))
+        """The knuckle's angle and the phase; words while there is none."""
+        # What is left of an answer that came too late.
+        while received(self.file, 0):
+            pass
+        send(self.file, self.REQUEST + crc(self.REQUEST))
         answer, until = b"", time.monotonic() + SILENT_SECS
         while len(answer) < 11:
             if time.monotonic() > until:
@@ -135,39 +146,47 @@ class Gripper:
     def state(self, registers):
         status, _, fault, requested, position, _ = registers
         is_active, goes, objects = status >> 4 & 3 == 3, bool(status & 8), status >> 6
-        if not is_active or fault >= 0x0A:
-            return None
+        if not is_active or fault & 0x0F >= 0x0A:
+            return "the gripper is not activated or has a fault: no frames until it is ready"
         if objects == 1 or position <= OPEN + 2 or (objects == 0 and goes and requested < position):
             motion = "opens"
         elif objects == 0 and goes and requested > position:
             motion = "closes"
         else:
             motion = "rests" if objects else None
+        phase = self.phase.of(motion, position <= OPEN + 2)
+        if phase is None:
+            return "the gripper has not been open: no frames until it opens"
         closed = min(max((position - OPEN) / (CLOSED - OPEN), 0.0), LIMIT_RAD / CLOSED_RAD)
-        return closed * CLOSED_RAD, self.phase.of(motion)
+        return closed * CLOSED_RAD, phase
 
 
 def frames(sensor, gripper, newtons_per_count):
-    """Yields a frame each time that both fingers have read their cells; `None` while the gripper is not activated."""
-    fingertips, cells, seq, heard = Fingertips(), {}, 0, time.monotonic()
-    os.write(sensor, bytes([0x9A, 0, AUTOSEND, 1, 1]))
+    """Yields a frame each time that both fingers have read their cells; words in place of one while the gripper is not ready."""
+    fingertips, cells, seq = Fingertips(), {}, 0
+    came = [time.monotonic()] * 2
+    send(sensor, bytes([0x9A, 0, AUTOSEND, 1, 1]))
     while True:
         for finger, counts in fingertips.take(received(sensor, SILENT_SECS)):
-            cells[finger] = counts
-            if len(cells) < 2:
+            cells[finger], came[finger] = counts, time.monotonic()
+            if len(cells) < 2 or abs(came[0] - came[1]) > APART_SECS:
                 continue
-            heard, stamp_nanos = time.monotonic(), line_protocol.now_nanos()
+            stamp_nanos = line_protocol.now_nanos()
             state = gripper.ask()
-            yield state and {
-                "joints": [state[0]],
-                "cells_newtons": [count * newtons_per_count for finger in (0, 1) for count in cells[finger]],
-                "phase": state[1],
-                "seq": seq,
-                "stamp_nanos": stamp_nanos,
-            }
+            if isinstance(state, str):
+                yield state
+            else:
+                yield {
+                    "joints": [state[0]],
+                    "cells_newtons": [count * newtons_per_count for finger in (0, 1) for count in cells[finger]],
+                    "phase": state[1],
+                    "seq": seq,
+                    "stamp_nanos": stamp_nanos,
+                }
             seq, cells = seq + 1, {}
-        if time.monotonic() - heard > SILENT_SECS:
-            raise DeviceError(f"no cells of finger {' and '.join(str(it) for it in (0, 1) if it not in cells)} have come for 1 s")
+        for finger in (0, 1):
+            if time.monotonic() - came[finger] > SILENT_SECS:
+                raise DeviceError(f"no cells of finger {finger} have come for {SILENT_SECS:g} s")
 
 
 def main():
@@ -180,15 +199,9 @@ def main():
         sensor, gripper = opened(arguments.sensor), Gripper(opened(arguments.gripper))
     except (OSError, termios.error) as error:
         sys.exit(f"{error}; expected two serial devices (--sensor, --gripper)")
-    source = line_protocol.Source(arguments.address, HAND)
-    is_told = False
+    source = line_protocol.Source(arguments.address, 1, 2 * N_CELLS)
     try:
-        for frame in frames(sensor, gripper, arguments.newtons_per_count):
-            if frame is not None:
-                source.send(frame)
-            elif not is_told:
-                is_told = True
-                print("the gripper is not activated or has a fault: no frames until it is ready", file=sys.stderr)
+        source.send_all(frames(sensor, gripper, arguments.newtons_per_count))
     except DeviceError as error:
         sys.exit(f"{error}; start the bridge again")
 

@@ -66,6 +66,10 @@ class Frames:
         unknown = set(self.map) - set(hand["joints"])
         if unknown:
             raise ValueError(f"joints: map: the hand has no joint {', '.join(sorted(unknown))}")
+        if "field" in (table.get("joints") or {}) and "names" not in table["joints"]:
+            raise ValueError("joints: the field has no names of joints: give `names`, in its order")
+        if any("topic" not in entry for entry in table["cells"]):
+            raise ValueError("cells: an entry has no topic")
         self.tolerance_nanos = float(table.get("tolerance_ms", 20.0)) * 1e6
         self.motion = line_protocol.MotionPhase(table.get("moving_rad_per_s", 0.05), table.get("still_ms", 200.0))
         self.closing = [float((self.map.get(name) or {}).get("closes", 1)) for name in hand["joints"]]

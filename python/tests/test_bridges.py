@@ -25,6 +25,7 @@ PROJECT = Path(__file__).resolve().parents[2]
 BRIDGES = PROJECT / "examples/bridges"
 sys.path.insert(0, str(BRIDGES))
 import inspire_rh56dftp as inspire  # noqa: E402
+import line_protocol  # noqa: E402
 import robotiq_2f85_tsf85 as robotiq  # noqa: E402
 import ros2  # noqa: E402
 
@@ -176,14 +177,21 @@ class Inspire(unittest.TestCase):
         self.assertAlmostEqual(joints[3], 1.4381 / 2, places=5)
         self.assertAlmostEqual(joints[4], 0.3 * 0.5864, places=5)
 
-    def test_a_device_that_refuses_is_told(self):
+    def test_a_hand_that_holds_something_is_not_open(self):
+        phase = line_protocol.StatusPhase()
+        found = [phase.of(*it) for it in [("rests", False), ("closes", False), ("rests", False), ("opens", False), ("rests", True)]]
+        self.assertEqual(found, [None, None, None, "open", "open"])
+
+    def test_a_device_that_refuses_or_goes_is_told(self):
         hand = Hand()
-        self.addCleanup(hand.stop)
         modbus = inspire.Modbus("127.0.0.1", hand.port, 1)
         self.addCleanup(modbus.connection.close)
         self.assertEqual(len(modbus.read(4900, 112)), 224)
-        with self.assertRaisesRegex(inspire.ModbusError, "registers at 7000: exception 2"):
+        with self.assertRaisesRegex(inspire.ModbusError, "registers at 7000: exception 02"):
             modbus.read(7000, 3)
+        hand.stop()
+        with self.assertRaises(inspire.ModbusError):
+            modbus.read(4900, 112)
 
 
 def packet(*blocks):
@@ -254,13 +262,14 @@ class Robotiq(unittest.TestCase):
         gripper = robotiq.Gripper(None)
         # gOBJ, gGTO and activation; the position that was asked for, and that of the gripper.
         state = lambda objects, requested, position, status=0x39: gripper.state([status & 0x3F | objects << 6, 0, 0, requested, position, 0])
+        self.assertIn("has not been open", state(2, 255, 116))
         self.assertEqual(state(3, 3, 3), (0.0, "open"))
         self.assertEqual(state(0, 255, 100)[1], "closing")
         knuckle, phase = state(2, 255, 116)
         self.assertAlmostEqual(knuckle, 0.7929 * 113 / 227)
         self.assertEqual(phase, "settled")
         self.assertEqual(state(0, 0, 100)[1], "open")
-        self.assertIsNone(state(0, 0, 0, status=0x00))
+        self.assertIn("not activated", state(0, 0, 0, status=0x00))
 
     def test_a_grasp_goes_from_the_gripper_to_the_graph(self):
         device = Gripper2F85()
