@@ -64,10 +64,10 @@ class Modbus:
             raise ModbusError(str(error)) from error
         if (number, protocol) != (self.number, 0):
             raise ModbusError(f"answer {number} to request {self.number}")
-        if answer[:1] != b"\x03":
-            raise ModbusError(f"registers at {address}: exception {answer[1:2].hex()}")
-        if answer[1] != 2 * n_words or len(answer) != 2 + 2 * n_words:
-            raise ModbusError(f"registers at {address}: {len(answer) - 2} bytes, expected {2 * n_words}")
+        if answer[:1] == b"\x83" and len(answer) == 2:
+            raise ModbusError(f"registers at {address}: exception {answer[1]}")
+        if answer[:2] != bytes([3, 2 * n_words]) or len(answer) != 2 + 2 * n_words:
+            raise ModbusError(f"registers at {address}: the answer {answer[:8].hex()}, expected {2 * n_words} bytes")
         return answer[2:]
 
 
@@ -77,9 +77,15 @@ def joints_of(angles):
 
 
 def motion_of(states):
-    """The motion of the hand: it opens if a finger does, and rests if all do. `None` if a drive has a fault."""
-    motions = {MOTIONS.get(state) for state in states}
-    return next((motion for motion in (None, "opens", "closes", "rests") if motion in motions), None)
+    """The motion of the hand: it closes if a drive does, opens if one does and none holds against a force, and rests if all do.
+    `None` if a drive has a fault."""
+    motions = [MOTIONS.get(state) for state in states]
+    if None in motions:
+        return None
+    if "closes" in motions:
+        return "closes"
+    # While a drive holds against a force, the hand is not open, though another drive opens.
+    return "opens" if "opens" in motions and 3 not in states else "closes" if "opens" in motions else "rests"
 
 
 def frames(modbus, newtons_per_count, rate):
@@ -92,7 +98,7 @@ def frames(modbus, newtons_per_count, rate):
         angles = struct.unpack(">6h", modbus.read(*ANGLES))
         counts = [count for pad in PADS for count in struct.unpack(f">{pad[1]}h", modbus.read(*pad))]
         motion = motion_of(states)
-        word = phase.of(motion, min(angles[:5]) > OPEN_ANGLE)
+        word = phase.of(stamp_nanos, motion, min(angles[:5]) > OPEN_ANGLE)
         if motion is None:
             yield "a drive has a fault: no frames until it is cleared"
         elif word is None:
@@ -119,6 +125,8 @@ def main():
     options.add_argument("--rate", type=float, default=50.0, help="frames a second (%(default)s)")
     options.add_argument("--newtons-per-count", type=float, default=0.001, help="assumed: %(default)s")
     arguments = options.parse_args()
+    if not arguments.rate > 0:
+        options.error("--rate: expected more than 0 frames a second")
     try:
         modbus = Modbus(arguments.host, arguments.port, arguments.unit)
     except OSError as error:

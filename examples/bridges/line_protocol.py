@@ -74,19 +74,23 @@ class Source:
 
 
 class MotionPhase:
-    """The phase by the fingers' motion, as the driver `ros2` of blindgrasp finds it (crates/tactile/src/phases.rs)."""
+    """The phase by the fingers' motion, as the driver `ros2` of blindgrasp finds it (crates/tactile/src/phases.rs), but for the
+    beginning: the hand must open first."""
 
     WINDOW_NANOS = 50_000_000
+    # After such a silence nobody knows what the hand did.
+    LOST_NANOS = 1_000_000_000
 
     def __init__(self, moving_rad_per_s=0.05, still_ms=200.0):
         self.moving, self.still_nanos = moving_rad_per_s, still_ms * 1e6
-        self.phase, self.anchor, self.still_since = "open", None, None
+        # None until the fingers have opened: a hand that holds something when the bridge starts is not open.
+        self.phase, self.anchor, self.still_since = None, None, None
 
     def of(self, stamp_nanos, fingers_rad):
         since, before = self.anchor or (stamp_nanos, fingers_rad)
         nanos = stamp_nanos - since
-        if self.anchor is None or nanos < 0:
-            self.anchor, self.still_since = (stamp_nanos, fingers_rad), None
+        if self.anchor is None or not 0 <= nanos <= self.LOST_NANOS:
+            self.anchor, self.still_since, self.phase = (stamp_nanos, fingers_rad), None, None
         elif nanos >= self.WINDOW_NANOS:
             speeds = [(now - then) / nanos * 1e9 for now, then in zip(fingers_rad, before)]
             if any(abs(speed) > self.moving for speed in speeds):
@@ -104,19 +108,30 @@ class MotionPhase:
 
 
 class StatusPhase:
-    """The phase by what the hand says of itself: it opens, it closes, or it is at rest; `None` until it has been open. Otherwise a
-    bridge that is started while the hand holds something would take its load for that of the open hand."""
+    """The phase by what the hand says of itself: it opens, it closes, or it is at rest; `None` until it has been open, and after a
+    fault. Otherwise a hand that holds something then would have its load taken for that of the open hand."""
+
+    # The hand must rest for so long to be settled.
+    REST_NANOS = 200_000_000
 
     def __init__(self):
-        self.phase = None
+        self.phase, self.rests_since = None, None
 
-    def of(self, motion, is_open):
-        if motion == "opens" or (is_open and motion == "rests" and self.phase is None):
+    def of(self, stamp_nanos, motion, is_open):
+        """`motion` is opens, closes, rests, or None for a fault; `is_open` says that the fingers are at their open end."""
+        if motion != "rests":
+            self.rests_since = None
+        if motion is None:
+            self.phase = None
+        elif motion == "opens" or (motion == "rests" and is_open):
             self.phase = "open"
-        elif motion == "closes" and self.phase == "open":
+        elif motion == "closes" and self.phase is not None:
+            # A hand that closes on is not settled: the phase goes back, which begins another grasp.
             self.phase = "closing"
         elif motion == "rests" and self.phase == "closing":
-            self.phase = "settled"
+            self.rests_since = stamp_nanos if self.rests_since is None else self.rests_since
+            if stamp_nanos - self.rests_since >= self.REST_NANOS:
+                self.phase = "settled"
         return self.phase
 
 

@@ -83,9 +83,11 @@ class Fingertips:
             command, length = self.buffer[2], self.buffer[3]
             blocks = None
             if command in (READ, AUTOSEND, AUTOSEND_ASYNC):
-                if len(self.buffer) < 4 + length:
+                # A packet has no checksum. One that lost a byte is not followed by the next packet's begin, which comes within 1 ms.
+                if len(self.buffer) < 5 + length:
                     return found
-                blocks = self.blocks(self.buffer[4 : 4 + length])
+                is_whole = self.buffer[4 + length] == 0x9A
+                blocks = self.blocks(self.buffer[4 : 4 + length]) if is_whole else None
             if blocks is None:
                 # This 0x9A was part of something else.
                 self.buffer = self.buffer[1:]
@@ -141,20 +143,21 @@ class Gripper:
             answer += received(self.file, 0.1)
         if answer[:3] != b"\x09\x03\x06" or answer[9:11] != crc(answer[:9]):
             raise DeviceError(f"the gripper answers {answer.hex()}: expected three registers and their checksum")
-        return self.state(answer[3:9])
+        return self.state(line_protocol.now_nanos(), answer[3:9])
 
-    def state(self, registers):
+    def state(self, stamp_nanos, registers):
         status, _, fault, requested, position, _ = registers
         is_active, goes, objects = status >> 4 & 3 == 3, bool(status & 8), status >> 6
         if not is_active or fault & 0x0F >= 0x0A:
+            self.phase.of(stamp_nanos, None, False)
             return "the gripper is not activated or has a fault: no frames until it is ready"
         if objects == 1 or position <= OPEN + 2 or (objects == 0 and goes and requested < position):
             motion = "opens"
         elif objects == 0 and goes and requested > position:
             motion = "closes"
         else:
-            motion = "rests" if objects else None
-        phase = self.phase.of(motion, position <= OPEN + 2)
+            motion = "rests" if objects else "closes"
+        phase = self.phase.of(stamp_nanos, motion, position <= OPEN + 2)
         if phase is None:
             return "the gripper has not been open: no frames until it opens"
         closed = min(max((position - OPEN) / (CLOSED - OPEN), 0.0), LIMIT_RAD / CLOSED_RAD)
@@ -162,16 +165,19 @@ class Gripper:
 
 
 def frames(sensor, gripper, newtons_per_count):
-    """Yields a frame each time that both fingers have read their cells; words in place of one while the gripper is not ready."""
+    """Yields a frame for the newest readings of both fingers; words in place of one while the gripper is not ready."""
     fingertips, cells, seq = Fingertips(), {}, 0
     came = [time.monotonic()] * 2
     send(sensor, bytes([0x9A, 0, AUTOSEND, 1, 1]))
     while True:
-        for finger, counts in fingertips.take(received(sensor, SILENT_SECS)):
+        # All that has come, of which the newest counts: while the gripper answered, readings may have waited.
+        data = received(sensor, SILENT_SECS)
+        while more := received(sensor, 0):
+            data += more
+        stamp_nanos = line_protocol.now_nanos()
+        for finger, counts in fingertips.take(data):
             cells[finger], came[finger] = counts, time.monotonic()
-            if len(cells) < 2 or abs(came[0] - came[1]) > APART_SECS:
-                continue
-            stamp_nanos = line_protocol.now_nanos()
+        if len(cells) == 2 and abs(came[0] - came[1]) <= APART_SECS:
             state = gripper.ask()
             if isinstance(state, str):
                 yield state

@@ -36,10 +36,15 @@ WORDS = ("open", "closing", "settled", "ended")
 JOINTS_NANOS = 150_000_000
 
 
+def part(value, name):
+    """A part of a message, or of each message of a list, however deep."""
+    return [part(item, name) for item in value] if isinstance(value, (list, tuple)) else getattr(value, name)
+
+
 def at(value, path):
     """The values at a path such as `taxels.force.z`: a list where a part of the path is a list."""
-    for part in path.split("."):
-        value = [getattr(item, part) for item in value] if isinstance(value, (list, tuple)) else getattr(value, part)
+    for name in path.split("."):
+        value = part(value, name)
     return value
 
 
@@ -113,6 +118,8 @@ class Frames:
         """The frame that the message completes: that of the table's first topic of cells, with the others near it."""
         entry = self.table["cells"][idx]
         found = numbers(at(message, entry.get("field", "data")))
+        if len(found) <= max(entry.get("order", [-1])):
+            raise ValueError(f"cells: {entry['topic']} has {len(found)} numbers, and `order` names the place {max(entry['order'])}")
         found = [found[place] for place in entry["order"]] if "order" in entry else found
         missing = [place for place, number in enumerate(found) if number == entry.get("missing") or not math.isfinite(number)]
         scale, offset = float(entry.get("scale", 1.0)), float(entry.get("offset", 0.0))

@@ -350,7 +350,7 @@ def main() -> int:
     add("--episodes", type=Path, metavar="FILE", help="more fields of episodes: CSV with a column episode_index")
     moment = parser.add_mutually_exclusive_group(required=True)
     moment.add_argument("--at", metavar="SECONDS", help="from the episode's start, or its end if negative; or its field")
-    moment.add_argument("--settled", metavar="FEATURE=VALUE", help="the first frames in which a feature has this value")
+    moment.add_argument("--settled", metavar="FEATURE=VALUE", help="the last frames of the first run with this value")
     add("--frames", type=int, default=3, metavar="N", help="settled frames of each grasp [default: 3]")
     add("--hand", default="HAND", help="the hand of the command that is printed")
     add("--skip-bad", action="store_true", help="leave out episodes with bad values, and list them")

@@ -1,6 +1,7 @@
 """Tests of the bridges of examples/bridges with stand-ins of the devices, written after the makers' manuals."""
 
 import asyncio
+import itertools
 import json
 import os
 import pty
@@ -133,7 +134,8 @@ class Inspire(unittest.TestCase):
         self.assertEqual(inspire.joints_of([1000] * 6), [0.0] * 6)
         self.assertEqual(inspire.joints_of([0] * 6), [1.4381, 1.4381, 1.4381, 1.4381, 0.5864, 1.1641])
         self.assertEqual(inspire.motion_of([2, 1, 2, 3, 6, 5]), "closes")
-        self.assertEqual(inspire.motion_of([2, 1, 2, 0, 2, 2]), "opens")
+        self.assertEqual(inspire.motion_of([2, 2, 2, 0, 2, 2]), "opens")
+        self.assertEqual(inspire.motion_of([3, 3, 3, 3, 3, 0]), "closes")
         self.assertEqual(inspire.motion_of([2, 3, 6, 5, 2, 2]), "rests")
         self.assertIsNone(inspire.motion_of([2, 7, 2, 2, 2, 2]))
 
@@ -162,6 +164,8 @@ class Inspire(unittest.TestCase):
         hand.set(4110, [500])
         hand.set(4900 + 111, [250])
         hand.state(3)
+        # The hand must rest for a while.
+        time.sleep(0.4)
         frames(5)
         hand.state(7)
         frames(5)
@@ -179,15 +183,18 @@ class Inspire(unittest.TestCase):
 
     def test_a_hand_that_holds_something_is_not_open(self):
         phase = line_protocol.StatusPhase()
-        found = [phase.of(*it) for it in [("rests", False), ("closes", False), ("rests", False), ("opens", False), ("rests", True)]]
-        self.assertEqual(found, [None, None, None, "open", "open"])
+        acts = [("rests", False), ("closes", False), ("opens", False), ("rests", True), ("closes", True), ("rests", True)]
+        acts += [("closes", False), ("rests", False), ("rests", False), ("closes", False), (None, False), ("rests", False)]
+        found = [phase.of(idx * 300_000_000, *act) for idx, act in enumerate(acts)]
+        expected = [None, None, "open", "open", "closing", "open", "closing", "closing", "settled", "closing", None, None]
+        self.assertEqual(found, expected)
 
     def test_a_device_that_refuses_or_goes_is_told(self):
         hand = Hand()
         modbus = inspire.Modbus("127.0.0.1", hand.port, 1)
         self.addCleanup(modbus.connection.close)
         self.assertEqual(len(modbus.read(4900, 112)), 224)
-        with self.assertRaisesRegex(inspire.ModbusError, "registers at 7000: exception 02"):
+        with self.assertRaisesRegex(inspire.ModbusError, "registers at 7000: exception 2"):
             modbus.read(7000, 3)
         hand.stop()
         with self.assertRaises(inspire.ModbusError):
@@ -253,18 +260,26 @@ class Robotiq(unittest.TestCase):
     def test_packets_are_taken_apart(self):
         counts = list(range(0x9A00, 0x9A00 + 28))
         sent = b"\x9a\x00" + packet(TIME, static(1, counts)) + packet(DYNAMIC, static(0, [7] * 28))
+        sent += b"\x9a"
         expected = [(1, tuple(counts)), (0, (7,) * 28)]
         self.assertEqual(robotiq.Fingertips().take(sent), expected)
         fingertips = robotiq.Fingertips()
         self.assertEqual([found for byte in sent for found in fingertips.take(bytes([byte]))], expected)
 
+    def test_a_packet_that_lost_a_byte_is_none(self):
+        whole = packet(static(0, [24] * 28))
+        for lost in range(4, len(whole)):
+            found = robotiq.Fingertips().take(whole[:lost] + whole[lost + 1 :] + whole + b"\x9a")
+            self.assertEqual(found, [(0, (24,) * 28)], lost)
+
     def test_states_have_their_meaning(self):
-        gripper = robotiq.Gripper(None)
+        gripper, clock = robotiq.Gripper(None), itertools.count(0, 300_000_000)
         # gOBJ, gGTO and activation; the position that was asked for, and that of the gripper.
-        state = lambda objects, requested, position, status=0x39: gripper.state([status & 0x3F | objects << 6, 0, 0, requested, position, 0])
+        state = lambda objects, requested, position, status=0x39: gripper.state(next(clock), [status & 0x3F | objects << 6, 0, 0, requested, position, 0])
         self.assertIn("has not been open", state(2, 255, 116))
         self.assertEqual(state(3, 3, 3), (0.0, "open"))
         self.assertEqual(state(0, 255, 100)[1], "closing")
+        self.assertEqual(state(2, 255, 116)[1], "closing")
         knuckle, phase = state(2, 255, 116)
         self.assertAlmostEqual(knuckle, 0.7929 * 113 / 227)
         self.assertEqual(phase, "settled")
@@ -287,6 +302,7 @@ class Robotiq(unittest.TestCase):
         frames(30)
         device.cells = [[24] * 27 + [124], [60] + [10] * 27]
         device.registers = bytes([0x39 | 2 << 6, 0, 0, 255, 116, 0])
+        time.sleep(0.4)
         frames(60)
         grasps, _ = received.end()
         [grasp] = grasps

@@ -15,6 +15,8 @@ const N_FRAMES: f64 = 50.0;
 pub struct CellZeros {
     cells: Vec<CellSense>,
     open_hand: Option<Vec<OpenReading>>,
+    /// Whether a frame of the open hand has come.
+    was_open: bool,
 }
 
 /// The layout's word on a cell.
@@ -104,7 +106,7 @@ impl CellZeros {
         });
         let cells: Vec<CellSense> = cells.collect();
         let open_hand = zero_when_open.then(|| vec![OpenReading::default(); cells.len()]);
-        Ok(CellZeros { cells, open_hand })
+        Ok(CellZeros { cells, open_hand, was_open: false })
     }
 
     /// The readings that the cells may have.
@@ -125,8 +127,12 @@ impl CellZeros {
         let is_zeroed = self.open_hand.is_some();
         if let Some(open_hand) = &mut self.open_hand {
             if reading.phase == Phase::Open {
+                self.was_open = true;
                 for ((open, cell), found) in open_hand.iter_mut().zip(&self.cells).zip(&reading.cells_newtons) {
-                    if found.is_finite() && !cell.is_saturated(*found) {
+                    if cell.is_saturated(*found) {
+                        // Something presses it, or it is stuck: an earlier zero says nothing any more.
+                        *open = OpenReading::default();
+                    } else if found.is_finite() {
                         open.n_frames = (open.n_frames + 1.0).min(N_FRAMES);
                         open.mean += (found - open.mean) / open.n_frames;
                     }
@@ -136,13 +142,13 @@ impl CellZeros {
             for (idx, ((found, open), cell)) in cells {
                 if open.n_frames > 0.0 {
                     *found = if cell.falls { open.mean - *found } else { *found - open.mean };
-                } else if cell.may_be_missing {
-                    *found = f64::NAN;
-                } else if reading.phase == Phase::Open {
+                } else if cell.is_saturated(*found) && self.was_open {
                     return Err(format!(
                         "zero_when_open: cell {idx} reads {found}, its greatest load, while the hand is open: expected a cell \
                          that nothing touches; free it, or see whether it is broken"
                     ));
+                } else if cell.may_be_missing && self.was_open {
+                    *found = f64::NAN;
                 } else {
                     return Err(
                         "zero_when_open: no frame of the open hand came before it, expected the phase open first"
@@ -248,6 +254,8 @@ mod tests {
         for zero_when_open in [false, true] {
             let mut zeros = CellZeros::new(&hand, zero_when_open).expect("zeros");
             assert_eq!(AllowedReadings::check(Some(&zeros.allowed()), &[0.0, f64::NAN]), Ok(()));
+            let early = zeros.apply(&mut reading(Phase::Settled, &[5.0, f64::NAN]));
+            assert_eq!(early.is_err(), zero_when_open, "no frame of the open hand came before it");
             zeros.apply(&mut reading(Phase::Open, &[0.0, f64::NAN])).expect("the zero of the other cell");
             // Its zero is not known: what it reads now says nothing.
             let mut settled = reading(Phase::Settled, &[0.5, if zero_when_open { 2.0 } else { f64::NAN }]);
@@ -268,6 +276,9 @@ mod tests {
             let mut settled = reading(Phase::Settled, &[0.0, full]);
             assert_eq!(zeros.apply(&mut settled), FORCES);
             assert_eq!(settled.cells_newtons, [0.0, 3.75]);
+            // It sticks later: the grasp is not judged by a load that nobody put on it.
+            zeros.apply(&mut reading(Phase::Open, &[0.0, full])).expect_err("it is stuck");
+            zeros.apply(&mut reading(Phase::Settled, &[0.0, full])).expect_err("its zero is not known");
         }
     }
 }
