@@ -10,6 +10,7 @@ pub mod connection;
 mod contacts;
 mod encoder;
 pub mod fit;
+mod joint_map;
 mod lift_arbiter;
 mod link;
 mod publishing;

@@ -30,16 +30,9 @@ const MARKER_NANOS: u64 = 100_000_000;
 pub(crate) struct NetworkParams {
     #[serde(flatten)]
     pub(crate) connection: ConnectionParams,
-    pub(crate) convention: Option<ConventionWord>,
+    pub(crate) convention: Option<Convention>,
     pub(crate) domain: Option<u32>,
     pub(crate) namespace: Option<String>,
-}
-
-#[derive(Deserialize, Clone, Copy, PartialEq, Eq)]
-#[serde(rename_all = "snake_case")]
-pub(crate) enum ConventionWord {
-    RmwZenoh,
-    Ros2dds,
 }
 
 #[derive(Deserialize)]
@@ -55,7 +48,7 @@ pub(crate) fn with_network_params(description: OperatorDescription) -> OperatorD
         .optional_param(
             "convention",
             ParamKind::Choice { values: vec!["rmw_zenoh".into(), "ros2dds".into()] },
-            "Who speaks Zenoh: the nodes, by rmw_zenoh (default), or a zenoh-bridge-ros2dds for nodes of DDS",
+            "The speaker of Zenoh: the nodes, by rmw_zenoh (default), or a zenoh-bridge-ros2dds for nodes of DDS",
         )
         .optional_param(
             "domain",
@@ -81,10 +74,7 @@ impl NetworkParams {
     }
 
     pub(crate) fn convention(&self) -> Convention {
-        match self.convention {
-            None | Some(ConventionWord::RmwZenoh) => Convention::RmwZenoh,
-            Some(ConventionWord::Ros2dds) => Convention::Ros2dds,
-        }
+        self.convention.unwrap_or_default()
     }
 }
 

@@ -6,7 +6,7 @@
 //! after a crash, or swapped in, goes on with the numbers and grasps of the one before, after a gap.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, anyhow, bail};
@@ -29,13 +29,14 @@ use blindgrasp_tactile::gate::{Accepted, Counts, FrameFilter, Shape};
 use blindgrasp_tactile::line_protocol::max_line_bytes;
 use blindgrasp_tactile::phases::PhaseFinder;
 use blindgrasp_tactile::replay::Replay;
-use blindgrasp_tactile::ros2::{JointTopic, Ros2, Topics};
+use blindgrasp_tactile::ros2::{Ros2, Topics};
 use blindgrasp_tactile::stream::{Link, Stream};
 use blindgrasp_tactile::zenoh_key::ZenohKey;
 use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, RefusalKind, TactileDriver};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
+use crate::joint_map::hand_joints;
 use crate::ros2::{NetworkParams, definition_of, with_network_params};
 
 const DEFAULT_BAUD: u32 = 115_200;
@@ -392,55 +393,6 @@ fn ros2(params: &Params, hand: &Hand) -> anyhow::Result<Ros2> {
     let still_nanos = (params.topics.still_ms.unwrap_or(200.0) * 1e6) as u64;
     let finder = PhaseFinder::new(params.topics.moving_rad_per_s.unwrap_or(MOVING_RAD_PER_S), still_nanos);
     Ok(Ros2::new(topics, finder))
-}
-
-/// An entry of a joint map.
-#[derive(Debug, Clone, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct MappedJoint {
-    from: Option<String>,
-    scale: f64,
-    offset: f64,
-}
-
-impl Default for MappedJoint {
-    fn default() -> Self {
-        MappedJoint { from: None, scale: 1.0, offset: 0.0 }
-    }
-}
-
-/// The hand's joints as a topic has them: by the map, else by their names behind the prefix.
-///
-/// # Errors
-/// The map cannot be read, has a joint that the hand has not, or a number that makes no value.
-fn hand_joints(hand: &Hand, prefix: &str, map: Option<&Path>) -> anyhow::Result<Vec<JointTopic>> {
-    let mut mapped: BTreeMap<String, MappedJoint> = match map {
-        Some(path) => {
-            let text = std::fs::read_to_string(path).with_context(|| format!("joint_map {}", path.display()))?;
-            serde_saphyr::from_str(&text).with_context(|| {
-                format!("joint_map {}: expected {{JOINT: {{from: NAME, scale: 1, offset: 0}}}}", path.display())
-            })?
-        }
-        None => BTreeMap::new(),
-    };
-    let joints = (0..hand.joints.len()).map(|idx| {
-        let joint = &hand.joints[idx];
-        let closing_rate = Some(hand.closing_rate(idx)).filter(|rate| !joint.is_preshape && *rate != 0.0);
-        let MappedJoint { from, scale, offset } = mapped.remove(&joint.name).unwrap_or_default();
-        if !(scale.is_finite() && scale != 0.0 && offset.is_finite()) {
-            bail!(
-                "joint_map: {}: scale {scale}, offset {offset}: expected finite numbers, and no scale of 0",
-                joint.name
-            );
-        }
-        Ok(JointTopic { name: from.unwrap_or(format!("{prefix}{}", joint.name)), scale, offset, closing_rate })
-    });
-    let joints = joints.collect::<anyhow::Result<_>>()?;
-    if let Some(name) = mapped.keys().next() {
-        let known: Vec<&str> = hand.joints.iter().map(|joint| joint.name.as_str()).collect();
-        bail!("joint_map: the hand {} has no joint '{name}': it has {}", hand.name, known.join(", "));
-    }
-    Ok(joints)
 }
 
 impl Params {

@@ -5,8 +5,8 @@
     python3 examples/bridges/inspire_rh56dftp.py --host 192.168.11.210
 
 It reads the angles, the state and the 17 pads of the hand, and writes nothing: another program closes the hand. The phase
-comes from the state of the six drives: the hand is settled when all have stopped after closing. A drive with a fault ends the
-frames until it has none.
+comes from the state of the six drives: the hand is settled when all have rested for 0.2 s after closing, and open when its
+fingers rest above 900. A drive with a fault ends the frames until it has none.
 
 Addresses, orders and codes are those of the maker's manual (HWKV1.0.0cn); it gives no newtons for the readings of 0 to 4095,
 so --newtons-per-count is assumed until you measure it. The angles of 0 to 1000 (open) are taken as parts of the joints' range.
@@ -26,7 +26,9 @@ PADS = [(3000 + 370 * finger + offset, words) for finger in range(4) for offset,
 PADS += [(4480, 9), (4498, 96), (4690, 9), (4708, 96), (4900, 112)]
 # Upper limits of the joints in the hand's order: little, ring, middle and index finger, the thumb's bend and its turn.
 CLOSED_RAD = (1.4381, 1.4381, 1.4381, 1.4381, 0.5864, 1.1641)
-MOTIONS = {0: "opens", 1: "closes", 2: "rests", 3: "rests", 5: "rests", 6: "rests"}
+# A drive that has reached its force holds against it.
+HOLDS = 3
+MOTIONS = {0: "opens", 1: "closes", 2: "rests", HOLDS: "rests", 5: "rests", 6: "rests"}
 # Fingers and thumb whose angles are all above this are open.
 OPEN_ANGLE = 900
 SILENT_SECS = 1.0
@@ -77,19 +79,18 @@ def joints_of(angles):
 
 
 def motion_of(states):
-    """The motion of the hand: it closes if a drive does, opens if one does and none holds against a force, and rests if all do.
-    `None` if a drive has a fault."""
+    """The motion of the hand, `None` if a drive has a fault. A hand of which one drive opens while another one holds against a
+    force still closes on something: it is not open."""
     motions = [MOTIONS.get(state) for state in states]
     if None in motions:
         return None
-    if "closes" in motions:
+    if "closes" in motions or ("opens" in motions and HOLDS in states):
         return "closes"
-    # While a drive holds against a force, the hand is not open, though another drive opens.
-    return "opens" if "opens" in motions and 3 not in states else "closes" if "opens" in motions else "rests"
+    return "opens" if "opens" in motions else "rests"
 
 
 def frames(modbus, newtons_per_count, rate):
-    """Yields the hand's frames, `rate` a second; a word for one that a fault of the hand has cost."""
+    """Yields the hand's frames, `rate` a second; a sentence in place of one that a fault of the hand has cost."""
     phase = line_protocol.StatusPhase()
     seq, begin = 0, time.monotonic()
     while True:
@@ -98,16 +99,16 @@ def frames(modbus, newtons_per_count, rate):
         angles = struct.unpack(">6h", modbus.read(*ANGLES))
         counts = [count for pad in PADS for count in struct.unpack(f">{pad[1]}h", modbus.read(*pad))]
         motion = motion_of(states)
-        word = phase.of(stamp_nanos, motion, min(angles[:5]) > OPEN_ANGLE)
+        phase_word = phase.of(stamp_nanos, motion, min(angles[:5]) > OPEN_ANGLE)
         if motion is None:
             yield "a drive has a fault: no frames until it is cleared"
-        elif word is None:
+        elif phase_word is None:
             yield "the hand has not been open: no frames until it opens"
         else:
             yield {
                 "joints": joints_of(angles),
                 "cells_newtons": [count * newtons_per_count for count in counts],
-                "phase": word,
+                "phase": phase_word,
                 "seq": seq,
                 "stamp_nanos": stamp_nanos,
             }

@@ -1,4 +1,4 @@
-"""What the bridges of this folder share: the connection to a running tactile_source, and the phase by the fingers' motion."""
+"""The parts that the bridges of this folder share: the connection to a running tactile_source, and the phase of a grasp."""
 
 import argparse
 import json
@@ -55,14 +55,14 @@ class Source:
                 f"{n_joints} and {n_cells}: give the graph --set hand=HAND.yaml"
             )
         print(f"connected: {self.hand['hand']}, {self.hand['n_joints']} joints, {self.hand['n_cells']} cells", file=sys.stderr)
-        # Every further line says what was wrong with a frame.
+        # Every further line names the fault of a frame.
         threading.Thread(target=lambda: [print(line, end="", file=sys.stderr) for line in answers], daemon=True).start()
 
     def send(self, frame):
         self.connection.sendall(json.dumps(frame).encode() + b"\n")
 
     def send_all(self, frames):
-        """Sends frames. Of words in place of a frame, those that differ from the last ones are printed."""
+        """Sends frames. A sentence in place of a frame is printed, once in a row."""
         told = None
         for frame in frames:
             if isinstance(frame, dict):

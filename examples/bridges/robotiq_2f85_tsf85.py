@@ -131,8 +131,8 @@ class Gripper:
         self.file, self.phase = file, line_protocol.StatusPhase()
 
     def ask(self):
-        """The knuckle's angle and the phase; words while there is none."""
-        # What is left of an answer that came too late.
+        """The knuckle's angle and the phase; a sentence while there is none."""
+        # The rest of an answer that came too late.
         while received(self.file, 0):
             pass
         send(self.file, self.REQUEST + crc(self.REQUEST))
@@ -165,7 +165,7 @@ class Gripper:
 
 
 def frames(sensor, gripper, newtons_per_count):
-    """Yields a frame for the newest readings of both fingers; words in place of one while the gripper is not ready."""
+    """Yields a frame for the newest readings of both fingers; a sentence in place of one while the gripper is not ready."""
     fingertips, cells, seq = Fingertips(), {}, 0
     came = [time.monotonic()] * 2
     send(sensor, bytes([0x9A, 0, AUTOSEND, 1, 1]))

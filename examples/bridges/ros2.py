@@ -167,7 +167,7 @@ class Frames:
         ]
         found = [f"no angle of {', '.join(joints)}"] if joints else []
         found += [f"no message on {', '.join(cells)}"] if cells else []
-        found += ["no phase"] if self.phase is None else []
+        found += ["no phase: without a topic of its own, the fingers must open once first"] if self.phase is None else []
         return "; ".join(found) or (
             f"cells more than {self.tolerance_nanos / 1e6:g} ms apart (tolerance_ms), angles older than "
             f"{JOINTS_NANOS / 1e6:g} ms, or an old phase (max_age_ms)"

@@ -47,7 +47,7 @@ TOLERANCE_S = 1e-4
 
 
 class _Refused(ValueError):
-    """What the user is told."""
+    """An error with words for the user."""
 
 
 class _LeftOut(Exception):
@@ -67,7 +67,7 @@ def _expecting(where, wanted: str):
 
 
 class _Dataset:
-    """What the folder meta says, and the file of the user's fields."""
+    """The content of the folder meta, and of the file of the user's fields."""
 
     def __init__(self, root: Path, fields_file: Path | None):
         self.info_path = root / "meta/info.json"

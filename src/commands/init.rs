@@ -96,7 +96,7 @@ blindgrasp stop
 | `dataflow-live.yaml` | the graph for a hand that lifts, with its model: a bridge sends the frames; `blindgrasp trials` tries it in simulated physics |
 | `tactile_bridge.py` | a bridge to begin with: `blindgrasp export recordings/held-out.mcap --topic /tactile \\| ./tactile_bridge.py` |
 | `dataflow-machines.yaml` | the same graph on two machines |
-| `hands/` | the Barrett hand BH8-280: kinematics (URDF) and pad layout; describe your own beside it |
+| `hands/` | the Barrett hand BH8-280: kinematics (URDF) and pad layout; describe your own beside it. `init --hand NAME` adds another one, with its bridge in `bridges/` |
 | `models/` | models of that hand: by the paper's label for `dataflow.yaml`, and of lifts (`…-lifts.json`) for an arm |
 | `recordings/` | 240 simulated grasps of objects that the model has not been trained on |
 | `docs/` | the schema of the dataflow files, with which an editor completes and checks them |

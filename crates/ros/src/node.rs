@@ -4,6 +4,7 @@
 use std::path::PathBuf;
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use serde::Deserialize;
 use serde_json::json;
 use twox_hash::XxHash3_128;
 use zenoh::bytes::Encoding;
@@ -174,13 +175,14 @@ pub fn topic_name(namespace: &str, topic: &str) -> Result<String, RosError> {
     if rest.split('/').all(is_word) { Ok(full) } else { Err(RosError::Topic(topic.into())) }
 }
 
-/// Who speaks Zenoh, and so how the keys of topics are named.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+/// The program that speaks Zenoh for the nodes. It decides how the keys of topics are named.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Convention {
-    /// The nodes do, by rmw_zenoh: `DOMAIN/TOPIC/TYPE/HASH`, with attachments, and nodes show themselves.
+    /// The nodes themselves, by rmw_zenoh: `DOMAIN/TOPIC/TYPE/HASH`, with attachments, and nodes show themselves.
     #[default]
     RmwZenoh,
-    /// A `zenoh-bridge-ros2dds` does, for nodes of DDS: the topic's name alone, and messages in CDR alone. Types, numbers and
+    /// A `zenoh-bridge-ros2dds`, for nodes of DDS: the topic's name alone, and messages in CDR alone. Types, numbers and
     /// senders are not told.
     Ros2dds,
 }

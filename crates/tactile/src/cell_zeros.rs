@@ -19,7 +19,7 @@ pub struct CellZeros {
     was_open: bool,
 }
 
-/// The layout's word on a cell.
+/// The keys of the layout for a cell.
 #[derive(Debug, Clone, Copy)]
 struct CellSense {
     noise_threshold: f64,
@@ -130,7 +130,7 @@ impl CellZeros {
                 self.was_open = true;
                 for ((open, cell), found) in open_hand.iter_mut().zip(&self.cells).zip(&reading.cells_newtons) {
                     if cell.is_saturated(*found) {
-                        // Something presses it, or it is stuck: an earlier zero says nothing any more.
+                        // Something presses it, or it is stuck: its earlier zero holds no longer.
                         *open = OpenReading::default();
                     } else if found.is_finite() {
                         open.n_frames = (open.n_frames + 1.0).min(N_FRAMES);
@@ -142,13 +142,14 @@ impl CellZeros {
             for (idx, ((found, open), cell)) in cells {
                 if open.n_frames > 0.0 {
                     *found = if cell.falls { open.mean - *found } else { *found - open.mean };
-                } else if cell.is_saturated(*found) && self.was_open {
-                    return Err(format!(
-                        "zero_when_open: cell {idx} reads {found}, its greatest load, while the hand is open: expected a cell \
-                         that nothing touches; free it, or see whether it is broken"
-                    ));
-                } else if cell.may_be_missing && self.was_open {
+                } else if cell.may_be_missing && self.was_open && !cell.is_saturated(*found) {
+                    // Its zero is not known, so its reading counts as missing.
                     *found = f64::NAN;
+                } else if self.was_open {
+                    return Err(format!(
+                        "zero_when_open: cell {idx} has no zero, because it was at its greatest load while the hand was open: \
+                         expected a cell that nothing touches; free it, or see whether it is broken"
+                    ));
                 } else {
                     return Err(
                         "zero_when_open: no frame of the open hand came before it, expected the phase open first"
@@ -257,7 +258,7 @@ mod tests {
             let early = zeros.apply(&mut reading(Phase::Settled, &[5.0, f64::NAN]));
             assert_eq!(early.is_err(), zero_when_open, "no frame of the open hand came before it");
             zeros.apply(&mut reading(Phase::Open, &[0.0, f64::NAN])).expect("the zero of the other cell");
-            // Its zero is not known: what it reads now says nothing.
+            // Its zero is not known, so its reading counts as missing.
             let mut settled = reading(Phase::Settled, &[0.5, if zero_when_open { 2.0 } else { f64::NAN }]);
             assert_eq!(zeros.apply(&mut settled), Ok(Zeroed { is_below_zero: false, has_missing: true }));
             assert_eq!(settled.cells_newtons, [0.5, 0.0]);
