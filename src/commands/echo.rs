@@ -71,7 +71,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let stop: Arc<AtomicBool> = stop_signal()?;
     let graph = pick_graph(arguments.graph.as_deref())?;
     let mut connection = Connection::open(&graph)?;
-    let attachment = match connection.ask(&Request::Attach { ports: arguments.edges.clone() }, ANSWER_LIMIT)? {
+    let attachment = match connection
+        .ask(&Request::Attach { ports: arguments.edges.clone(), is_flight_recorder: false }, ANSWER_LIMIT)?
+    {
         Reply::Attached(attachment) => attachment,
         other => return Err(connection.unexpected(&other).into()),
     };

@@ -25,6 +25,8 @@ use blindgrasp_session::recorder::{Recorded, Recorder};
 
 use self::span::{EdgeSpan, Span, SpanOfEdge};
 
+mod flight;
+mod keep;
 mod over_ssh;
 mod span;
 
@@ -37,14 +39,28 @@ const POLL: Duration = Duration::from_millis(50);
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp record grasp_gate --out /tmp/robot.mcap --rotate-size 1GB\n\n\
                         Ctrl-C ends the recording; the graph goes on. The graph does not wait for a recorder that is too slow.\n\
-                        With --machine, the files are written there and copied to --out at the end.\n\
+                        With --machine, the files are written there and copied to --out at the end.\n\n\
+                        With --keep it is a flight recorder: it writes nothing until a lift drops its object, a fault holds a \
+                        grasp, or `blindgrasp record GRAPH --write-kept` (or SIGUSR1) asks for it. `blindgrasp test --init FILE` \
+                        makes the file a test.\n  \
+                        blindgrasp record grasp_gate --keep 30s --out recordings/robot.mcap\n\n\
                         Exit code 3 if samples are missing, or if the disk was full.")]
 pub(super) struct Arguments {
     #[command(flatten)]
     graph: GraphArgument,
-    /// File to write
-    #[arg(short, long, value_name = "FILE")]
-    out: PathBuf,
+    /// File to write; with --keep, each file has the time and the reason behind its name
+    #[arg(short, long, value_name = "FILE", required_unless_present = "write_kept")]
+    out: Option<PathBuf>,
+    /// Hold the last so many seconds in memory, and write them when something has happened
+    #[arg(long, value_name = "TIME", value_parser = |text: &str| secs_in(text, 1.0..=3600.0),
+          conflicts_with_all = ["edges", "rotate_size", "rotate_every", "overwrite", "machine"])]
+    keep: Option<f64>,
+    /// With --keep, go on for so many seconds after it has happened
+    #[arg(long, value_name = "TIME", default_value = "3", requires = "keep", value_parser = |text: &str| secs_in(text, 0.0..=600.0))]
+    after: f64,
+    /// Ask the recorders of the graph that have --keep to write now
+    #[arg(long, conflicts_with_all = ["out", "keep", "edges", "for_secs", "machine"])]
+    write_kept: bool,
     /// Record only the edges from these outputs, separated by commas
     #[arg(long, value_name = "NODE/PORT", value_delimiter = ',')]
     edges: Vec<String>,
@@ -74,18 +90,31 @@ struct RecordSummary {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if arguments.write_kept {
+        return keep::ask(arguments);
+    }
     if is_over_ssh() {
         return over_ssh::record_for_caller(arguments);
     }
-    check_output(&arguments.out, &[])?;
-    arguments.recording.options().check(&arguments.out)?;
+    let out = arguments.out()?;
+    if let Some(secs) = arguments.keep {
+        return keep::keep(arguments, out, Duration::from_secs_f64(secs));
+    }
+    check_output(out, &[])?;
+    arguments.recording.options().check(out)?;
     if let Some(destination) = arguments.machine.destination()? {
         return over_ssh::record_there(arguments, &destination);
     }
-    let summary = record(arguments, &arguments.out)?;
+    let summary = record(arguments, out)?;
     // The exit code tells of a loss, even if stdout is closed.
     summary.lines(arguments.json).iter().try_for_each(|line| print_line(line))?;
     Ok(summary.outcome())
+}
+
+impl Arguments {
+    fn out(&self) -> anyhow::Result<&Path> {
+        self.out.as_deref().context("--out FILE is missing")
+    }
 }
 
 /// Records a graph of this machine to `out`.
@@ -95,19 +124,20 @@ fn record(arguments: &Arguments, out: &Path) -> anyhow::Result<RecordSummary> {
     record_from(arguments, out, connection, &|| stop.load(Ordering::Relaxed))
 }
 
-fn record_from(
-    arguments: &Arguments,
+/// Attaches to the edges of a graph that can be recorded. `out` must be no file that the graph reads.
+fn attach(
+    connection: &mut Connection,
+    ports: &[String],
     out: &Path,
-    mut connection: Connection,
-    is_interrupted: &dyn Fn() -> bool,
-) -> anyhow::Result<RecordSummary> {
-    let attachment = match connection.ask(&Request::Attach { ports: arguments.edges.clone() }, ANSWER_LIMIT)? {
+    is_flight_recorder: bool,
+) -> anyhow::Result<Attachment> {
+    let request = Request::Attach { ports: ports.to_vec(), is_flight_recorder };
+    let attachment = match connection.ask(&request, ANSWER_LIMIT)? {
         Reply::Attached(attachment) => attachment,
         other => return Err(connection.unexpected(&other).into()),
     };
-    let Attachment { domain, edges, graph, is_at_start } = attachment;
     let (edges, others): (Vec<AttachedEdge>, _) =
-        edges.into_iter().partition(|edge| can_observe(&edge.input.service.type_name));
+        attachment.edges.into_iter().partition(|edge| can_observe(&edge.input.service.type_name));
     for edge in others {
         print_diagnostic(&format!(
             "blindgrasp: {} is not recorded: its type {} is unknown",
@@ -118,20 +148,35 @@ fn record_from(
         bail!("graph '{}' has no edge that can be recorded", connection.graph());
     }
     // The files that the graph reads, its recording, hand or model, must not be written over.
-    let params = graph["nodes"].as_array().into_iter().flatten().filter_map(|node| node["params"].as_object());
+    let nodes = attachment.graph["nodes"].as_array().into_iter().flatten();
+    let params = nodes.filter_map(|node| node["params"].as_object());
     let inputs: Vec<PathBuf> =
         params.flat_map(|params| params.values()).filter_map(|value| value.as_str()).map(PathBuf::from).collect();
     check_output(out, &inputs)?;
-    let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
-    let about = of_graph(&graph, beginning)?;
-    let recorder = Recorder::create(out, about, &arguments.recording.options())?;
-    let cursors = SharedCursors::open(std::path::Path::new(&domain.cursors))?;
+    Ok(Attachment { edges, ..attachment })
+}
+
+fn observed(edges: &[AttachedEdge]) -> Vec<ObservedEdge> {
     let observed = edges.iter().map(|edge| ObservedEdge {
         topic: edge.topic.clone(),
         input: edge.input.clone(),
         is_prompt: false,
     });
-    let observed = observed.collect();
+    observed.collect()
+}
+
+fn record_from(
+    arguments: &Arguments,
+    out: &Path,
+    mut connection: Connection,
+    is_interrupted: &dyn Fn() -> bool,
+) -> anyhow::Result<RecordSummary> {
+    let Attachment { domain, edges, graph, is_at_start } = attach(&mut connection, &arguments.edges, out, false)?;
+    let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
+    let about = of_graph(&graph, beginning)?;
+    let recorder = Recorder::create(out, about, &arguments.recording.options())?;
+    let cursors = SharedCursors::open(std::path::Path::new(&domain.cursors))?;
+    let observed = observed(&edges);
     let failed = Arc::new(AtomicBool::new(false));
     let span = Span::new(cursors, edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
     let observer = Observer::start_attached(&domain, observed, span).context("cannot read the graph's edges")?;
@@ -140,7 +185,7 @@ fn record_from(
         "recording {} edges of graph '{}' to {}; Ctrl-C ends the recording",
         edges.len(),
         connection.graph(),
-        arguments.out.display()
+        out.display()
     ));
     let end = arguments.for_secs.map(|secs| start + Duration::from_secs_f64(secs));
     let ending = loop {

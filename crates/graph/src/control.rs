@@ -28,7 +28,12 @@ pub enum Request {
     Attach {
         /// Output ports as `NODE/PORT`; all if empty.
         ports: Vec<String>,
+        /// Whether the client is a flight recorder, which takes [`Reply::Keep`].
+        #[serde(default)]
+        is_flight_recorder: bool,
     },
+    /// Asks the flight recorders of the graph for a file. Answered with [`Reply::Asked`].
+    Keep,
     /// Replaces one or several operators. Answered with [`Reply::Progress`] any number of times, [`Reply::Shadowing`]
     /// if asked for, and [`Reply::Swapped`].
     Swap(SwapRequest),
@@ -42,13 +47,14 @@ pub enum Request {
 impl Request {
     /// Whether it changes the running graph; other requests only read.
     pub fn is_control(&self) -> bool {
-        !matches!(self, Request::Status | Request::Attach { .. })
+        !matches!(self, Request::Status | Request::Attach { .. } | Request::Keep)
     }
 
     pub fn word(&self) -> &'static str {
         match self {
             Request::Status => "status",
             Request::Attach { .. } => "attach",
+            Request::Keep => "keep",
             Request::Stop => "stop",
             Request::Set { .. } => "set",
             Request::Swap(_) => "swap",
@@ -100,6 +106,12 @@ pub enum Reply {
     /// To an attached client: the graph ends, and all its samples have been sent. It waits a little until the client
     /// has read them and closes the connection.
     Drained,
+    /// To a flight recorder: somebody asks for a file.
+    Keep,
+    /// To [`Request::Keep`].
+    Asked {
+        n_flight_recorders: usize,
+    },
     Progress {
         message: String,
     },

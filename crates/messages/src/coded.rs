@@ -253,6 +253,35 @@ impl Phase {
     }
 }
 
+impl Reason {
+    /// Whether it says that something does not work or does not fit together, rather than what the grasp is like.
+    pub fn is_fault(self) -> bool {
+        match self {
+            Reason::Missing
+            | Reason::OutOfOrder
+            | Reason::Stale
+            | Reason::Invalid
+            | Reason::WrongHand
+            | Reason::WrongModel
+            | Reason::LinkDown
+            | Reason::MissingReading
+            | Reason::SensorFault
+            | Reason::PromiseWithdrawn => true,
+            Reason::Stable
+            | Reason::Unstable
+            | Reason::NoAgreement
+            | Reason::NoContact
+            | Reason::SelfCollision
+            | Reason::OutOfDistribution
+            | Reason::Unsure
+            | Reason::Promising
+            | Reason::NoBaseline
+            | Reason::UnlikeDay
+            | Reason::Slipping => false,
+        }
+    }
+}
+
 impl Action {
     /// The word as people are shown it: `LIFT`.
     pub fn shown(self) -> &'static str {

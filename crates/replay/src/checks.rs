@@ -1,6 +1,7 @@
 //! The checks of a replay: its edges against the recorded ones, its decisions against the expectations.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
 use std::path::Path;
 
 use serde::Serialize;
@@ -50,8 +51,76 @@ pub struct EdgesInQuestion<'a> {
 pub struct Decisions {
     decisions: BTreeMap<u64, LiftDecision>,
     truths: BTreeMap<u64, GraspTruth>,
+    /// Of the grasps that were lifted, whether the object was kept.
+    outcomes: BTreeMap<u64, bool>,
     /// Decisions and labels of a grasp that had one already: a restarted source may number its grasps anew.
     n_again: usize,
+}
+
+/// The numbers of decisions.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct Tally {
+    pub n_lifts: usize,
+    pub n_holds: usize,
+    /// Decisions about grasps with a label.
+    pub n_labelled: usize,
+    /// Those that lift a stable grasp or hold an unstable one.
+    pub n_right: usize,
+    /// Those that lift an unstable grasp.
+    pub n_false_positive: usize,
+}
+
+impl Tally {
+    pub fn add(&mut self, other: Tally) {
+        self.n_lifts += other.n_lifts;
+        self.n_holds += other.n_holds;
+        self.n_labelled += other.n_labelled;
+        self.n_right += other.n_right;
+        self.n_false_positive += other.n_false_positive;
+    }
+}
+
+/// A grasp whose action is another one than before.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ChangedDecision {
+    pub grasp_id: u64,
+    /// Action and reason before; `None` if there was no decision.
+    pub before: Option<(Action, Reason)>,
+    pub after: Option<(Action, Reason)>,
+    /// The grasp's label, if it has one.
+    pub is_stable: Option<bool>,
+}
+
+impl ChangedDecision {
+    /// Whether the grasp is lifted only after the change.
+    pub fn is_lifted_now(&self) -> bool {
+        self.after.is_some_and(|(action, _)| action == Action::Lift)
+    }
+}
+
+impl fmt::Display for ChangedDecision {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let shown = |decision: Option<(Action, Reason)>| {
+            decision.map_or("no decision".into(), |(action, reason)| format!("{} {}", action.shown(), reason.as_str()))
+        };
+        write!(f, "grasp {}: {} -> {}", self.grasp_id, shown(self.before), shown(self.after))?;
+        match self.is_stable {
+            Some(true) => f.write_str(" (stable)"),
+            Some(false) => f.write_str(" (unstable)"),
+            None => Ok(()),
+        }
+    }
+}
+
+/// The changed actions as a text, the first ones by grasp; `None` if there are none.
+pub fn describe_changes(changed: &[ChangedDecision]) -> Option<String> {
+    const N_TOLD: usize = 10;
+    let (n, n_more) = (changed.len(), changed.len().saturating_sub(N_TOLD));
+    let told: Vec<String> = changed.iter().take(N_TOLD).map(ToString::to_string).collect();
+    let more = if n_more > 0 { format!("; and {n_more} more") } else { String::new() };
+    (n > 0).then(|| {
+        format!("{n} {}: {}{more}", if n == 1 { "action changed" } else { "actions changed" }, told.join("; "))
+    })
 }
 
 impl Check {
@@ -136,12 +205,71 @@ impl Decisions {
                 // A probe comes before the decision about its grasp.
                 Record::Decision(sample) if !sample.message.action.decides() => continue,
                 Record::Decision(sample) => read.decisions.insert(sample.message.grasp_id, sample.message).is_some(),
+                Record::Outcome(sample) if sample.message.lifted => {
+                    read.outcomes.insert(sample.message.grasp_id, sample.message.held);
+                    false
+                }
                 Record::Truth(sample) => read.truths.insert(sample.message.grasp_id, sample.message).is_some(),
                 _ => false,
             };
             read.n_again += usize::from(is_again);
         }
         Ok(read)
+    }
+
+    /// The grasps whose action differs from the one in `before`, where that has a decision of the grasp.
+    pub fn changed_since(&self, before: &Decisions) -> Vec<ChangedDecision> {
+        let said = |of: &Decisions, grasp_id| of.decisions.get(&grasp_id).map(|said| (said.action, said.reason));
+        let changed = before.decisions.keys().map(|&grasp_id| ChangedDecision {
+            grasp_id,
+            before: said(before, grasp_id),
+            after: said(self, grasp_id),
+            is_stable: self.truths.get(&grasp_id).or_else(|| before.truths.get(&grasp_id)).map(|truth| truth.stable),
+        });
+        let action = |decision: Option<(Action, Reason)>| decision.map(|(action, _)| action);
+        changed.filter(|changed| action(changed.before) != action(changed.after)).collect()
+    }
+
+    /// Counts the decisions, of which the labels say whether they are right.
+    pub fn tally(&self) -> Tally {
+        let mut tally = Tally::default();
+        for (grasp_id, decision) in &self.decisions {
+            let is_lift = decision.action == Action::Lift;
+            tally.n_lifts += usize::from(is_lift);
+            tally.n_holds += usize::from(!is_lift);
+            if let Some(truth) = self.truths.get(grasp_id) {
+                tally.n_labelled += 1;
+                tally.n_right += usize::from(is_lift == truth.stable);
+                tally.n_false_positive += usize::from(is_lift && !truth.stable);
+            }
+        }
+        tally
+    }
+
+    /// The decisions as expectations of later replays: a lift that dropped its object should have been held, and one that
+    /// kept it lifted. With labels, accuracy and false positives are expected as they are, and otherwise every decision.
+    pub fn to_expectations(&self) -> Expectations {
+        let mut expected = Expectations::default();
+        if self.truths.is_empty() {
+            let said = self.decisions.iter().map(|(id, said)| (*id, (said.action, Some(said.reason))));
+            expected.decisions.extend(said);
+        } else {
+            let Tally { n_right, n_false_positive, .. } = self.tally();
+            // Rounded down, so that the text reads back as a bound that is met.
+            let accuracy = n_right as f64 / self.truths.len() as f64;
+            expected.accuracy_at_least = Some((1e4 * accuracy).floor() / 1e4);
+            expected.false_positives_at_most = Some(n_false_positive);
+        }
+        for (grasp_id, is_kept) in &self.outcomes {
+            let action = if *is_kept { Action::Lift } else { Action::Hold };
+            expected.decisions.insert(*grasp_id, (action, None));
+        }
+        expected
+    }
+
+    /// The grasps that were lifted and dropped their objects.
+    pub fn dropped(&self) -> impl Iterator<Item = u64> + '_ {
+        self.outcomes.iter().filter(|(_, is_kept)| !**is_kept).map(|(grasp_id, _)| *grasp_id)
     }
 
     /// Checks the decisions against the expectations.
@@ -174,14 +302,7 @@ impl Decisions {
 
     fn check_labels(&self, expected: &Expectations) -> Vec<Check> {
         let mut checks = Vec::new();
-        let (mut n_decided, mut n_right, mut n_false_positive) = (0, 0, 0);
-        for (grasp_id, truth) in &self.truths {
-            let Some(decision) = self.decisions.get(grasp_id) else { continue };
-            let is_lift = decision.action == Action::Lift;
-            n_decided += 1;
-            n_right += usize::from(is_lift == truth.stable);
-            n_false_positive += usize::from(is_lift && !truth.stable);
-        }
+        let Tally { n_labelled: n_decided, n_right, n_false_positive, .. } = self.tally();
         if let Some(least) = expected.accuracy_at_least {
             // A grasp without a decision counts as a wrong decision.
             let n_grasps = self.truths.len();

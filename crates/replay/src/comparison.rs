@@ -160,6 +160,11 @@ impl Coverage {
         Ok(Coverage { first, first_grasp_id, last_grasp_id, hand_id, is_attached, is_detached, is_cut_off })
     }
 
+    /// Whether the recording has all frames on which the decision about a grasp depends.
+    pub fn covers_decision(&self, grasp_id: u64) -> bool {
+        !(self.is_attached && grasp_id == self.first_grasp_id)
+    }
+
     /// The decisions that cannot be compared, for a person to read.
     pub fn notes(&self) -> Vec<String> {
         let attached = "it was attached midway: the decision of its first grasp is not compared";
@@ -359,7 +364,7 @@ impl Sides<'_> {
 
     /// The decision about the grasp in which the recording begins depends on frames that were not recorded.
     fn is_uncovered(&self, record: &Record, grasp_id: u64) -> bool {
-        self.coverage.is_attached && record.is_said_once() && grasp_id == self.coverage.first_grasp_id
+        record.is_said_once() && !self.coverage.covers_decision(grasp_id)
     }
 
     fn compare_at(&mut self, recorded_idx: usize, found_idx: usize) -> Result<(), CompareError> {

@@ -130,6 +130,29 @@ impl Expectations {
         })
     }
 
+    /// The text of the file, which [`Expectations::parse`] reads; `remarks` stand behind the decisions of grasps.
+    pub fn to_yaml(&self, remarks: &BTreeMap<u64, String>) -> String {
+        let mut lines = vec!["version: 1".to_string()];
+        if let Some(dataflow) = &self.dataflow {
+            lines.push(format!("dataflow: {}", serde_json::json!(dataflow)));
+        }
+        if let Some(share) = self.accuracy_at_least {
+            lines.push(format!("accuracy_at_least: {share}"));
+        }
+        if let Some(n) = self.false_positives_at_most {
+            lines.push(format!("false_positives_at_most: {n}"));
+        }
+        if !self.decisions.is_empty() {
+            lines.push("decisions:".into());
+        }
+        for (grasp_id, (action, reason)) in &self.decisions {
+            let reason = reason.map_or(String::new(), |reason| format!(" {}", reason.as_str()));
+            let remark = remarks.get(grasp_id).map_or(String::new(), |remark| format!("    # {remark}"));
+            lines.push(format!("  {grasp_id}: {}{reason}{remark}", action.as_str()));
+        }
+        lines.join("\n") + "\n"
+    }
+
     /// Whether there are expectations of the decisions.
     pub fn has_demands(&self) -> bool {
         let is_counted = self.accuracy_at_least.is_some() || self.false_positives_at_most.is_some();

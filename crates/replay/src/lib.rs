@@ -7,11 +7,13 @@
 //! * [`comparison`] - two recordings of one graph, edge by edge.
 //! * [`expectations`] - the file beside a recording that says what its replay must come to.
 //! * [`checks`] - a replay held against recording and expectations.
+//! * [`faults`] - faults of sensors and transports, put into recorded frames.
 //! * [`update`] - a recording written anew with the results of a replay.
 
 pub mod checks;
 pub mod comparison;
 pub mod expectations;
+pub mod faults;
 pub mod playback;
 pub mod played;
 pub mod player;

@@ -187,7 +187,7 @@ pub fn covariance((a, a_log_odds): (&[f64], f64), (b, b_log_odds): (&[f64], f64)
     let of_value =
         |((a, b), variance): ((&f64, &f64), &f64)| if *variance > 0.0 { (a - b).powi(2) / variance } else { 0.0 };
     let distance = a.iter().zip(b).zip(variances).map(of_value).sum::<f64>() / variances.len().max(1) as f64;
-    KERNEL_VARIANCE * (-KERNEL_RATE * distance).exp()
+    KERNEL_VARIANCE * libm::exp(-KERNEL_RATE * distance)
         + OFFSET_DEVIATION.powi(2)
         + SLOPE_DEVIATION.powi(2) * a_log_odds * b_log_odds
 }

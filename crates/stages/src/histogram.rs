@@ -45,7 +45,7 @@ pub fn histogram(
             .iter()
             .map(|contact| {
                 let squared: f64 = contact.position_m.iter().zip(word).map(|(c, w)| (c - w) * (c - w)).sum();
-                (-squared / sigma_squared).exp() * (contact.force_newtons / pad_newtons[contact.pad as usize])
+                libm::exp(-squared / sigma_squared) * (contact.force_newtons / pad_newtons[contact.pad as usize])
             })
             .sum();
         distribution / n_pads_in_contact as f64
@@ -72,7 +72,7 @@ mod tests {
         // Pad 0: a contact on word 0 with a quarter of the pad's force, one on word 1 with three quarters.
         // Pad 2: one contact on word 0. exp(-1) between the words.
         let values = of(&[contact([0.0; 3], 1.0, 0), contact([0.03, 0.0, 0.0], 3.0, 0), contact([0.0; 3], 5.0, 2)]);
-        let e = (-1.0_f64).exp();
+        let e = libm::exp(-1.0);
         let expected = [(0.25 + 0.75 * e + 1.0) / 2.0, (0.25 * e + 0.75 + e) / 2.0];
         for (value, expected) in values.expect("valid").iter().zip(expected) {
             assert!((value - expected).abs() < 1e-15);

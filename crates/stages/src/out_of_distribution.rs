@@ -187,7 +187,7 @@ pub fn for_each_quantity(
         for word in &features.dictionary.words_m {
             let squared: f64 = contact.position_m.iter().zip(word).map(|(c, w)| (c - w) * (c - w)).sum();
             nearest_squared = nearest_squared.min(squared);
-            near_words += (-squared / sigma_squared).exp();
+            near_words += libm::exp(-squared / sigma_squared);
         }
         farthest_squared = farthest_squared.max(nearest_squared);
         mass += near_words * contact.force_newtons / pad_newtons[contact.pad as usize] / n_pads_in_contact;
@@ -253,7 +253,7 @@ mod tests {
         let value = |name: &str| found[quantities.iter().position(|of| of.name.contains(name)).expect(name)];
         // One row of cells lies 6 mm from the next; a quarter of the load is on the second.
         let spread = (0.75_f64 * 0.25).sqrt() * 0.006;
-        let e = |squared_mm: f64| (-squared_mm / 400.0).exp();
+        let e = |squared_mm: f64| libm::exp(-squared_mm / 400.0);
         let mass = 0.75 * (1.0 + e(1600.0)) + 0.25 * (e(900.0) + e(100.0));
         for (name, expected) in [
             ("position of joint 1", 1.4),

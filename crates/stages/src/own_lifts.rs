@@ -122,13 +122,13 @@ pub fn probability(log_odds: f64) -> f64 {
 
 /// The log-odds of a probability.
 pub fn log_odds_of(probability: f64) -> f64 {
-    (probability / (1.0 - probability)).ln()
+    libm::log(probability / (1.0 - probability))
 }
 
 /// The log loss of log-odds, nats.
 pub fn log_loss(log_odds: f64, stable: bool) -> f64 {
     let z = if stable { log_odds } else { -log_odds };
-    (-z.abs()).exp().ln_1p() + (-z).max(0.0)
+    libm::log1p(libm::exp(-z.abs())) + (-z).max(0.0)
 }
 
 /// Time of an attempt until the hand has settled, of tightening it, of a test lift, and of a lift, seconds: as the simulated
@@ -356,7 +356,7 @@ mod tests {
     fn grasps(n: u32, offset: f64) -> Vec<(f64, bool)> {
         let grasp = |idx: u32| {
             let l = 8.0 * (f64::from(idx % 400) / 400.0 - 0.5);
-            let probability = 1.0 / (1.0 + (-(l + offset)).exp());
+            let probability = 1.0 / (1.0 + libm::exp(-(l + offset)));
             // The digits of the golden ratio spread evenly.
             (l, (f64::from(idx) * 0.618_033_988_749_895).fract() < probability)
         };
@@ -408,7 +408,7 @@ mod tests {
         assert_eq!((lifts.n_kept(), lifts.n_dropped()), (30, 10));
         assert_eq!(lifts.learned(Phase::Settled), None);
         let learned = lifts.learned(Phase::TestLifted).expect("learned");
-        let probability = 1.0 / (1.0 + (-learned.correction.apply(3.0)).exp());
+        let probability = 1.0 / (1.0 + libm::exp(-learned.correction.apply(3.0)));
         assert!((0.75..0.9).contains(&probability), "{probability}");
         // Without a price of a drop the threshold stays at its probability.
         assert_eq!(learned.threshold_probability, 0.9);
@@ -431,7 +431,7 @@ mod tests {
     #[test]
     fn the_threshold_rises_where_surer_grasps_are_worth_the_attempts() {
         // Of 100 grasps, 20 are kept with a probability of 0.99 and 20 with 0.6.
-        let log_odds = |probability: f64| (probability / (1.0_f64 - probability)).ln();
+        let log_odds = |probability: f64| libm::log(probability / (1.0_f64 - probability));
         let grasps: Vec<f64> = (0..40).map(|idx| log_odds(if idx < 20 { 0.99 } else { 0.6 })).collect();
         let choose = |present, drop_secs| threshold(&grasps, 100, present, drop_secs);
         assert_eq!(choose(0.0, 300.0), log_odds(0.99));

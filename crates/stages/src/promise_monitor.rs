@@ -93,8 +93,8 @@ pub fn drops_at_most(n_kept: u64, n_dropped: u64) -> f64 {
     }
     let is_ruled_out = |share: f64| {
         let bets = PARTS.iter().map(|part| {
-            let of_drops = if n_dropped == 0 { 0.0 } else { n_dropped as f64 * part.ln() };
-            (of_drops + n_kept as f64 * ((1.0 - part * share) / (1.0 - share)).ln()).exp()
+            let of_drops = if n_dropped == 0 { 0.0 } else { n_dropped as f64 * libm::log(*part) };
+            libm::exp(of_drops + n_kept as f64 * libm::log((1.0 - part * share) / (1.0 - share)))
         });
         bets.sum::<f64>() >= PARTS.len() as f64 / (1.0 - CONFIDENCE)
     };

@@ -266,7 +266,7 @@ impl SensorCheck {
             memory.grasp.values(hand, joints, contacts, &mut values);
             let first = hand.n_cells() + hand.pads.len();
             for (evidence, detector) in memory.evidence[first..].iter_mut().zip(&self.detectors) {
-                *evidence *= (detector.power * detector.trees.decision_value(&values)).exp();
+                *evidence *= libm::exp(detector.power * detector.trees.decision_value(&values));
             }
         }
         memory.evidence.iter_mut().for_each(|evidence| *evidence = evidence.min(MOST));

@@ -34,7 +34,8 @@ pub(crate) fn numbers(features: &FeatureExtractor, values: &[f64]) -> Option<Num
         n_contacts += pad[1];
         n_pads += 1.0;
     }
-    (load > 0.0).then(|| [f64::ln(load), n_contacts / n_pads, f64::ln(load / n_contacts)].map(|number| number as f32))
+    (load > 0.0)
+        .then(|| [libm::log(load), n_contacts / n_pads, libm::log(load / n_contacts)].map(|number| number as f32))
 }
 
 /// The grasps so far, and the evidence for a change.
@@ -55,7 +56,7 @@ impl ShiftTest {
             // The ranks that it may have, as parts of all.
             let n = self.grasps.len() as f64 + 1.0;
             let (from, to) = (n_below / n, (n_below + n_equal + 1.0) / n);
-            let gain = |from: f64, to: f64| (to.powf(EXPONENT) - from.powf(EXPONENT)) / (to - from);
+            let gain = |from: f64, to: f64| (libm::pow(to, EXPONENT) - libm::pow(from, EXPONENT)) / (to - from);
             evidence[0] = (1.0 + evidence[0]) * gain(from, to);
             evidence[1] = (1.0 + evidence[1]) * gain(1.0 - to, 1.0 - from);
         }

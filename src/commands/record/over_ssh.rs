@@ -45,7 +45,7 @@ struct SentFile {
 
 /// Records on another machine, to files here.
 pub(super) fn record_there(arguments: &Arguments, destination: &Destination) -> anyhow::Result<Outcome> {
-    name_of(&arguments.out)?;
+    name_of(arguments.out()?)?;
     let mut there = destination.start(Stdio::piped())?;
     let stdout = there.take_stdout()?;
     let acknowledge = there.acknowledgement();
@@ -68,7 +68,7 @@ pub(super) fn record_there(arguments: &Arguments, destination: &Destination) -> 
 
 /// Records for [`record_there`], which runs on another machine.
 pub(super) fn record_for_caller(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let name = name_of(&arguments.out)?;
+    let name = name_of(arguments.out()?)?;
     let folder = Path::new(FOLDER).join(format!("blindgrasp-{}-{}", std::process::id(), monotonic_nanos()));
     let made = DirBuilder::new().mode(0o700).create(&folder);
     made.with_context(|| format!("{}: the folder for the recording cannot be made", folder.display()))?;
@@ -92,7 +92,7 @@ fn send(arguments: &Arguments, mut summary: super::RecordSummary) -> anyhow::Res
     for path in &mut summary.recorded.files {
         let file = File::open(&path).with_context(|| path.display().to_string())?;
         let name = name_of(path)?.to_owned();
-        *path = arguments.out.with_file_name(&name);
+        *path = arguments.out()?.with_file_name(&name);
         files.push(SentFile { name, n_bytes: file.metadata()?.len() });
         opened.push(file);
     }
@@ -124,15 +124,15 @@ fn receive(arguments: &Arguments, destination: &Destination, stdout: ChildStdout
 }
 
 fn receive_file(arguments: &Arguments, sent: &SentFile, stdout: &mut impl Read) -> anyhow::Result<()> {
-    let stem = arguments.out.file_stem().unwrap_or_default().to_string_lossy();
+    let stem = arguments.out()?.file_stem().unwrap_or_default().to_string_lossy();
     if name_of(Path::new(&sent.name))? != sent.name || !sent.name.starts_with(&*stem) {
         bail!("the other machine sends a file '{}', which does not belong to this recording", sent.name.escape_debug());
     }
-    let path = arguments.out.with_file_name(&sent.name);
+    let path = arguments.out()?.with_file_name(&sent.name);
     if !arguments.recording.options().overwrite && path.exists() {
         bail!("{}: the file exists", path.display());
     }
-    let part = arguments.out.with_file_name(format!("{}.{}.part", sent.name, std::process::id()));
+    let part = arguments.out()?.with_file_name(format!("{}.{}.part", sent.name, std::process::id()));
     let copied = copy_to(&part, stdout, sent.n_bytes).and_then(|()| Ok(std::fs::rename(&part, &path)?));
     if copied.is_err() {
         let _ = std::fs::remove_file(&part);

@@ -12,13 +12,13 @@ use super::super::graph_file::{OnMisfit, fitting};
 use super::scratch::Scratch;
 use super::settings;
 use crate::commands::replay::{Fed, Feed};
-use blindgrasp_graph::dataflow::{self, Graph};
+use blindgrasp_graph::dataflow::{self, Graph, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_graph::run::{RunSummary, observed_topics};
 use blindgrasp_messages::{LiftDecision, Recorded};
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_recording::RecordingReader;
-use blindgrasp_replay::checks::{Check, Decisions, EdgesInQuestion};
+use blindgrasp_replay::checks::{ChangedDecision, Check, Decisions, EdgesInQuestion, describe_changes};
 use blindgrasp_replay::comparison::{ComparedEdge, Coverage, compare_edge};
 use blindgrasp_replay::expectations::{self, Expectations};
 use blindgrasp_replay::selection::Selection;
@@ -29,6 +29,8 @@ use blindgrasp_session::run::Session;
 /// The options that all recordings have in common.
 pub(super) struct Runner<'a> {
     pub(super) dataflow: &'a Path,
+    /// Parameters that have other values than in the dataflow file.
+    pub(super) overrides: &'a [Override],
     pub(super) replace: Option<&'a str>,
     pub(super) scratch: Scratch,
     pub(super) n_stops: &'a AtomicUsize,
@@ -39,6 +41,8 @@ pub(super) struct Runner<'a> {
 pub(super) struct Case {
     pub(super) recording: PathBuf,
     pub(super) checks: Vec<Check>,
+    /// The grasps whose action is another one than recorded.
+    pub(super) changed: Vec<ChangedDecision>,
     /// The samples that could not be compared, and why.
     pub(super) notes: Vec<String>,
     pub(super) secs: f64,
@@ -54,7 +58,8 @@ impl Runner<'_> {
     /// Tests a recording. An error in it is a failed check; only a stop ends all tests.
     pub(super) fn test(&self, recording: &Path, is_update: bool) -> anyhow::Result<Case> {
         let start = Instant::now();
-        let mut case = Case { recording: recording.into(), checks: Vec::new(), notes: Vec::new(), secs: 0.0 };
+        let mut case =
+            Case { recording: recording.into(), checks: Vec::new(), changed: Vec::new(), notes: Vec::new(), secs: 0.0 };
         let outcome = self.fill(&mut case, is_update);
         self.check_stop()?;
         if let Err(error) = outcome {
@@ -67,10 +72,9 @@ impl Runner<'_> {
     fn fill(&self, case: &mut Case, is_update: bool) -> anyhow::Result<()> {
         let recording = case.recording.clone();
         let expected = Expectations::of(&recording)?.unwrap_or_default();
-        let file = dataflow::load(expected.dataflow.as_deref().unwrap_or(self.dataflow))?;
-        let graph = fitting(&file, &[], dataflow::Scope::Everything, OnMisfit::Warn)?;
+        let graph = self.graph(&expected, self.overrides)?;
         let found = self.scratch.path(&recording);
-        let (fed, summary) = self.replay(&recording, &graph, &found)?;
+        let (fed, summary) = self.replay(&recording, &graph, self.overrides, &found)?;
         let n_lost = summary.samples_lost + summary.samples_dropped;
         let has_lost = n_lost > 0 || summary.edges_unknown > 0;
         let text = if has_lost {
@@ -94,6 +98,13 @@ impl Runner<'_> {
             self.check_stop()?;
             case.checks.push(Check::of_edge(compare_edge(&recording, &found, edge, &coverage)?, is_update));
         }
+        let decisions = Decisions::read(&found)?;
+        if let Some(of_decisions) = decisions_edge(&recording, &mut case.checks)? {
+            let mut changed = decisions.changed_since(&Decisions::read(&recording)?);
+            changed.retain(|changed| coverage.covers_decision(changed.grasp_id));
+            of_decisions.text += &describe_changes(&changed).map_or(String::new(), |text| format!("; {text}"));
+            case.changed = changed;
+        }
         case.notes.extend(coverage.notes());
         if !case.has_passed() {
             case.notes.extend(settings::differing(&RecordingReader::open(&recording)?, &graph));
@@ -108,12 +119,24 @@ impl Runner<'_> {
                 graph.name
             );
         }
-        case.checks.extend(Decisions::read(&found)?.check(&expected));
+        case.checks.extend(decisions.check(&expected));
         Ok(())
     }
 
+    /// The graph of the dataflow file that is expected, or of the usual one.
+    pub(super) fn graph(&self, expected: &Expectations, overrides: &[Override]) -> anyhow::Result<Graph> {
+        let file = dataflow::load(expected.dataflow.as_deref().unwrap_or(self.dataflow))?;
+        fitting(&file, overrides, dataflow::Scope::Everything, OnMisfit::Warn)
+    }
+
     /// Plays a recording as fast as the graph takes it, and records every edge to `found`.
-    fn replay(&self, recording: &Path, graph: &Graph, found: &Path) -> anyhow::Result<(Fed, RunSummary)> {
+    pub(super) fn replay(
+        &self,
+        recording: &Path,
+        graph: &Graph,
+        overrides: &[Override],
+        found: &Path,
+    ) -> anyhow::Result<(Fed, RunSummary)> {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let feed = Feed {
             recording,
@@ -123,7 +146,7 @@ impl Runner<'_> {
             repeat: json!(1.0),
             steps: json!("unlimited"),
         };
-        let fed = feed.into_graph(graph, &[])?;
+        let fed = feed.into_graph(graph, overrides)?;
         let name = format!("test-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
         let session = Session {
             launch: LaunchOptions {
@@ -148,6 +171,14 @@ impl Runner<'_> {
         }
         Ok((fed, ended.summary.run))
     }
+}
+
+/// The check of the edge with the decisions, if the recording has one.
+fn decisions_edge<'a>(recording: &Path, checks: &'a mut [Check]) -> anyhow::Result<Option<&'a mut Check>> {
+    let reader = RecordingReader::open(recording)?;
+    let is_of_decisions =
+        |topic: &str| reader.topics().get(topic).is_some_and(|schema| schema.ends_with("/LiftDecision"));
+    Ok(checks.iter_mut().find(|check| check.edge.is_some() && is_of_decisions(&check.name)))
 }
 
 fn edges_to_compare(

@@ -1,9 +1,12 @@
 //! `blindgrasp test`
 
 mod case;
+mod faults;
+mod init;
 mod report;
 mod scratch;
 mod settings;
+mod sweep;
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
@@ -13,7 +16,9 @@ use clap::Args;
 
 use self::case::{Case, Runner};
 use self::scratch::Scratch;
+use self::sweep::Sweep;
 use super::{Outcome, check_output, stop_requests};
+use blindgrasp_graph::dataflow::Override;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_replay::expectations;
 
@@ -24,7 +29,10 @@ use blindgrasp_replay::expectations;
 #[command(after_help = "Examples:\n  \
                         blindgrasp test --junit report.xml\n  \
                         blindgrasp test recordings/slip-prone.mcap --replace contacts --keep /tmp/found\n  \
-                        blindgrasp test run.mcap --update\n\n\
+                        blindgrasp test run.mcap --update\n  \
+                        blindgrasp test --init recordings/robot-20261127T101500Z-dropped.mcap\n  \
+                        blindgrasp test --sweep lift_arbiter.votes=1,2,3,5\n  \
+                        blindgrasp test --faults\n\n\
                         NAME.expect.yaml beside NAME.mcap says what else is expected. Exit code 1 when anything fails.")]
 pub(super) struct Arguments {
     /// Recordings (MCAP); default: those in the folder recordings beside the dataflow file that have expectations.
@@ -39,6 +47,24 @@ pub(super) struct Arguments {
     /// Write a report (JUnit XML).
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
+    /// Append a summary (Markdown), as for $GITHUB_STEP_SUMMARY.
+    #[arg(long, value_name = "FILE")]
+    summary: Option<PathBuf>,
+    /// Give a param another value than the dataflow file does. Can be repeated.
+    #[arg(long = "set", value_name = "[NODE.]PARAM=VALUE", value_parser = Override::parse)]
+    overrides: Vec<Override>,
+    /// Write NAME.expect.yaml beside each recording, from the decisions of its replay; a lift that dropped its object is
+    /// expected to be held.
+    #[arg(long, conflicts_with_all = ["update", "junit", "summary"])]
+    init: bool,
+    /// Compare no samples: replay with each of these values, and print the decisions.
+    #[arg(long, value_name = "[NODE.]PARAM=V1,V2,…", value_parser = Sweep::parse,
+          conflicts_with_all = ["update", "junit", "summary", "keep", "init"])]
+    sweep: Option<Sweep>,
+    /// Compare no samples: replay with faults of sensors and transports, and print the decisions that change. Fails if a grasp
+    /// is lifted that is held without the fault.
+    #[arg(long, conflicts_with_all = ["update", "junit", "summary", "keep", "init", "sweep"])]
+    faults: bool,
     /// Replace the results in the recordings by those of the replay; expectations stay as they are.
     #[arg(long)]
     update: bool,
@@ -52,6 +78,7 @@ pub(super) struct Arguments {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let recordings = match arguments.recordings.as_slice() {
+        [] if arguments.init => init::without_expectations(&arguments.dataflow)?,
         [] => with_expectations(&arguments.dataflow)?,
         named => named.to_vec(),
     };
@@ -62,13 +89,26 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             anyhow::bail!("{} (--junit): the file exists, and only a file .xml is replaced", junit.display());
         }
     }
+    if let Some(summary) = &arguments.summary {
+        check_output(summary, &recordings)?;
+    }
     let n_stops = stop_requests()?;
     let runner = Runner {
         dataflow: &arguments.dataflow,
+        overrides: &arguments.overrides,
         replace: arguments.replace.as_deref(),
         scratch: Scratch::new(arguments.keep.as_deref(), &recordings)?,
         n_stops: &n_stops,
     };
+    if arguments.init {
+        return init::write(&runner, &recordings, arguments.json);
+    }
+    if let Some(sweep) = &arguments.sweep {
+        return sweep.run(&runner, &recordings, arguments.json);
+    }
+    if arguments.faults {
+        return faults::run(&runner, &recordings, arguments.json);
+    }
     let mut cases: Vec<Case> = Vec::new();
     for recording in &recordings {
         let case = runner.test(recording, arguments.update)?;
@@ -80,6 +120,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     if let Some(junit) = &arguments.junit {
         report::write_junit(junit, &cases)?;
+    }
+    if let Some(summary) = &arguments.summary {
+        report::append_markdown(summary, &cases)?;
     }
     let printed = report::print_summary(&cases, arguments.json);
     if let Some(folder) = &arguments.keep {
@@ -103,12 +146,9 @@ impl Runner<'_> {
 
 /// The project's recordings that have expectations.
 fn with_expectations(dataflow: &Path) -> anyhow::Result<Vec<PathBuf>> {
-    let folder = dataflow.parent().unwrap_or(Path::new("")).join("recordings");
-    let entries = std::fs::read_dir(&folder)
-        .with_context(|| format!("no folder {}: name the recordings to test", folder.display()))?;
     let mut found = Vec::new();
-    for entry in entries {
-        let path = entry.with_context(|| folder.display().to_string())?.path();
+    let (folder, files) = project_recordings(dataflow)?;
+    for path in files {
         // Expectations without their recording are a failed test.
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         if let Some(stem) = name.strip_suffix(expectations::SUFFIX) {
@@ -117,10 +157,20 @@ fn with_expectations(dataflow: &Path) -> anyhow::Result<Vec<PathBuf>> {
     }
     if found.is_empty() {
         bail!(
-            "no recording in {} has expectations: name the recordings to test, or write NAME.expect.yaml beside NAME.mcap",
+            "no recording in {} has expectations: `blindgrasp test --init` writes them from the decisions of today, or name the recordings to test",
             folder.display()
         );
     }
-    found.sort();
     Ok(found)
+}
+
+/// The folder of the project's recordings, and the files in it, by name.
+fn project_recordings(dataflow: &Path) -> anyhow::Result<(PathBuf, Vec<PathBuf>)> {
+    let folder = dataflow.parent().unwrap_or(Path::new("")).join("recordings");
+    let entries = std::fs::read_dir(&folder)
+        .with_context(|| format!("no folder {}: name the recordings to test", folder.display()))?;
+    let files = entries.map(|entry| Ok(entry.with_context(|| folder.display().to_string())?.path()));
+    let mut files = files.collect::<anyhow::Result<Vec<PathBuf>>>()?;
+    files.sort();
+    Ok((folder, files))
 }

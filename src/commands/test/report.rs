@@ -35,7 +35,7 @@ pub(super) fn print_summary(cases: &[Case], is_json: bool) -> anyhow::Result<()>
             .map(|case| {
                 json!({
                     "recording": case.recording, "has_passed": case.has_passed(), "checks": case.checks,
-                    "notes": case.notes, "secs": case.secs
+                    "changed_actions": case.changed, "notes": case.notes, "secs": case.secs
                 })
             })
             .collect();
@@ -118,6 +118,47 @@ fn write_suite<W: Write>(writer: &mut Writer<W>, case: &Case) -> std::io::Result
             Ok(())
         })?;
     Ok(())
+}
+
+/// Appends a summary in Markdown: a table of the recordings, then the failed checks and the changed actions.
+pub(super) fn append_markdown(path: &Path, cases: &[Case]) -> anyhow::Result<()> {
+    let n_failed = cases.iter().filter(|case| !case.has_passed()).count();
+    let mut text = format!("## blindgrasp test: {} passed, {n_failed} failed\n\n", cases.len() - n_failed);
+    text += "| recording | result | actions changed | failed checks |\n|---|---|---|---|\n";
+    for case in cases {
+        let failed: Vec<String> = failed(case).map(|check| cell(&check.name)).collect();
+        let result = if case.has_passed() { "passed" } else { "**failed**" };
+        let name = cell(&file_name(&case.recording));
+        text += &format!("| {name} | {result} | {} | {} |\n", case.changed.len(), failed.join(", "));
+    }
+    for case in cases.iter().filter(|case| !case.has_passed()) {
+        text += &format!("\n### {}\n\n", cell(&file_name(&case.recording)));
+        for check in failed(case) {
+            text += &format!("- {}: {}\n", cell(&check.name), cell(&check.text));
+        }
+        for note in &case.notes {
+            text += &format!("- {}\n", cell(note));
+        }
+    }
+    let file = std::fs::OpenOptions::new().create(true).append(true).open(path);
+    let written = file.and_then(|mut file| file.write_all(text.as_bytes()));
+    written.with_context(|| format!("{} (--summary) cannot be written", path.display()))
+}
+
+fn failed(case: &Case) -> impl Iterator<Item = &Check> {
+    case.checks.iter().filter(|check| !check.has_passed)
+}
+
+/// A text of one line that Markdown shows as it is.
+fn cell(text: &str) -> String {
+    let mut escaped = String::new();
+    for char in allowed(text).replace('\n', " ").chars() {
+        if matches!(char, '|' | '<' | '*' | '_' | '`' | '[' | '\\') {
+            escaped.push('\\');
+        }
+        escaped.push(char);
+    }
+    escaped
 }
 
 /// Without the characters that XML cannot hold.

@@ -99,10 +99,11 @@ fn watch(
     shadow: Option<&Path>,
     is_interrupted: &dyn Fn() -> bool,
 ) -> anyhow::Result<()> {
-    let attachment = match connection.ask(&Request::Attach { ports: Vec::new() }, ANSWER_LIMIT)? {
-        Reply::Attached(attachment) => attachment,
-        other => return Err(connection.unexpected(&other).into()),
-    };
+    let attachment =
+        match connection.ask(&Request::Attach { ports: Vec::new(), is_flight_recorder: false }, ANSWER_LIMIT)? {
+            Reply::Attached(attachment) => attachment,
+            other => return Err(connection.unexpected(&other).into()),
+        };
     let Attachment { domain, edges, graph, .. } = attachment;
     let hand = hand_of(&graph);
     let (mut poller, mut before) = Poller::connect(connection.graph())?;

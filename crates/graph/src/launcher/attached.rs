@@ -20,20 +20,35 @@ const RETIRE_LIMIT: Duration = Duration::from_secs(2);
 pub(super) struct AttachedReader {
     client: u64,
     reply: SyncSender<Reply>,
+    is_flight_recorder: bool,
 }
 
 impl Launcher {
     /// Attaches a client, and tells it how to read the edges.
-    pub(super) fn attach(&mut self, ports: &[String], client: u64, reply: &SyncSender<Reply>) {
+    pub(super) fn attach(
+        &mut self,
+        ports: &[String],
+        is_flight_recorder: bool,
+        client: u64,
+        reply: &SyncSender<Reply>,
+    ) {
         let attached = self.free_place(client).and_then(|place| Ok((place, self.attachment(ports, place)?)));
         let answer = match attached {
             Ok((place, attachment)) => {
-                self.clients.attached[place] = Some(AttachedReader { client, reply: reply.clone() });
+                self.clients.attached[place] =
+                    Some(AttachedReader { client, reply: reply.clone(), is_flight_recorder });
                 Reply::Attached(attachment)
             }
             Err(message) => Reply::Error { message, rolled_back: false },
         };
         let _ = reply.try_send(answer);
+    }
+
+    /// Asks the flight recorders for a file.
+    pub(super) fn ask_flight_recorders(&self) -> Reply {
+        let recorders = self.clients.attached.iter().flatten().filter(|reader| reader.is_flight_recorder);
+        let n_flight_recorders = recorders.filter(|reader| reader.reply.try_send(Reply::Keep).is_ok()).count();
+        Reply::Asked { n_flight_recorders }
     }
 
     fn free_place(&self, client: u64) -> Result<usize, String> {

@@ -61,8 +61,8 @@ impl Trail {
 pub fn summary(request: &Request) -> String {
     match request {
         Request::Set { node, param, value } => format!("set {node}.{param}={value}"),
-        Request::Attach { ports } if ports.is_empty() => "attach to all ports".into(),
-        Request::Attach { ports } => format!("attach to {}", ports.join(" ")),
+        Request::Attach { ports, .. } if ports.is_empty() => "attach to all ports".into(),
+        Request::Attach { ports, .. } => format!("attach to {}", ports.join(" ")),
         Request::Swap(SwapRequest { nodes, program, args, set, allow_mismatch, .. }) => {
             let mut words = format!("swap {}", nodes.join(","));
             if let Some(program) = program {
@@ -94,7 +94,7 @@ fn outcome(reply: &Reply) -> Option<(String, LogLevel)> {
             let word = if *rolled_back { "rolled back" } else { "refused" };
             Some((format!("{word}: {message}"), LogLevel::Warn))
         }
-        Reply::Status(_) | Reply::Drained | Reply::Progress { .. } => None,
+        Reply::Status(_) | Reply::Drained | Reply::Keep | Reply::Asked { .. } | Reply::Progress { .. } => None,
     }
 }
 

@@ -762,7 +762,12 @@ impl Launcher {
                 self.clients.stoppers.push(ask.reply);
                 self.clients.is_asked_to_stop = true;
             }
-            Request::Attach { ports } => self.attach(&ports, ask.client, &ask.reply),
+            Request::Attach { ports, is_flight_recorder } => {
+                self.attach(&ports, is_flight_recorder, ask.client, &ask.reply);
+            }
+            Request::Keep => {
+                let _ = ask.reply.try_send(self.ask_flight_recorders());
+            }
             _ => self.clients.waiting.push_back(ask),
         }
     }
@@ -882,7 +887,7 @@ impl Launcher {
     fn answer(&mut self, ask: Ask) {
         match ask.request {
             // Answered in `on_ask`.
-            Request::Status | Request::Stop | Request::Attach { .. } => {}
+            Request::Status | Request::Stop | Request::Attach { .. } | Request::Keep => {}
             Request::Set { node, param, value } => {
                 let reply = match self.set(&node, &param, &value) {
                     Ok(reply) => reply,

@@ -44,7 +44,7 @@ pub struct CalibrationError {
 
 /// `1 / (1 + exp(z))` without overflow.
 pub fn positive_probability(z: f64) -> f64 {
-    let e = (-z.abs()).exp();
+    let e = libm::exp(-z.abs());
     if z >= 0.0 { e / (1.0 + e) } else { 1.0 / (1.0 + e) }
 }
 

@@ -247,7 +247,7 @@ mod tests {
     #[test]
     fn a_blend_adds_both_decision_values() {
         // Trees: 0.25 + 1; SVM: 2 exp(-1) - 0.5, weighed with 3.
-        let expected = 1.25 + 3.0 * (2.0 * (-1.0_f64).exp() - 0.5);
+        let expected = 1.25 + 3.0 * (2.0 * libm::exp(-1.0) - 0.5);
         let predictor = blend(3.0);
         predictor.validate().expect("valid");
         let one = predictor.decision_value(&[0.0, 1.0]).expect("a value");

@@ -146,7 +146,7 @@ mod tests {
         // up; the distal link is turned up by 0.698132.
         let hand = barrett();
         let cells = hand.cells_in_palm(&[0.0; 7]).expect("7 joints");
-        let (sin, cos) = 0.698132_f64.sin_cos();
+        let (sin, cos) = libm::sincos(0.698132);
         let (x, y, z) = (0.02225, 0.0095, 0.0052);
         let along = 0.0699357 + cos * x - sin * y;
         let up = 0.003 + sin * x + cos * y;
@@ -164,7 +164,7 @@ mod tests {
                 let two = cells[48 + row * 3 + (2 - column)].position_in_palm_m;
                 // The proximal joint's 0.8 mm along y and the distal joint's 0.2 mm along z are the same for both, not
                 // mirrored, so the mirror holds to 2 * (0.8 - 0.2) mm.
-                let off = (one.x + two.x).hypot(one.y - two.y);
+                let off = libm::hypot(one.x + two.x, one.y - two.y);
                 assert!((off - 1.2e-3).abs() < 1e-9 && (one.z - two.z).abs() < 1e-9, "{one} {two}");
             }
         }

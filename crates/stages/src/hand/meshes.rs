@@ -46,7 +46,7 @@ fn directions(n_directions: usize) -> impl Iterator<Item = Vector3<f64>> {
     let golden_angle = std::f64::consts::PI * (3.0 - 5.0_f64.sqrt());
     (0..n_directions).map(move |idx| {
         let z = 1.0 - (2.0 * idx as f64 + 1.0) / n_directions as f64;
-        let (sin, cos) = (golden_angle * idx as f64).sin_cos();
+        let (sin, cos) = libm::sincos(golden_angle * idx as f64);
         let radius = (1.0 - z * z).sqrt();
         Vector3::new(radius * cos, radius * sin, z)
     })

@@ -18,7 +18,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use blindgrasp_messages::files::open_regular;
-use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, UnitVector3, Vector3};
+use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, UnitVector3, Vector3};
 use parry3d_f64::math::Vector;
 use parry3d_f64::shape::SharedShape;
 use serde::{Deserialize, Serialize};
@@ -144,9 +144,7 @@ impl JointKind {
     /// The pose of a link relative to its joint's origin, at a value of the joint.
     fn displacement(self, axis: &UnitVector3<f64>, value: f64) -> Isometry3<f64> {
         match self {
-            JointKind::Revolute => {
-                Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_axis_angle(axis, value))
-            }
+            JointKind::Revolute => Isometry3::from_parts(Translation3::identity(), rotation(axis, value)),
             JointKind::Prismatic => Translation3::from(axis.into_inner() * value).into(),
         }
     }
@@ -255,7 +253,7 @@ impl LinkShape {
         let points: Vec<Vector> = (0..=N_AROUND / 2)
             .flat_map(|latitude| (0..N_AROUND).map(move |longitude| (latitude, longitude)))
             .map(|(latitude, longitude)| {
-                let angle = |part: f64| (std::f64::consts::TAU * part / f64::from(N_AROUND)).sin_cos();
+                let angle = |part: f64| libm::sincos(std::f64::consts::TAU * part / f64::from(N_AROUND));
                 let ((sin, cos), (sin_around, cos_around)) = (angle(f64::from(latitude)), angle(f64::from(longitude)));
                 // Slightly off the axes, so that each direction has one point of the core.
                 let normal = Vector::new(sin * cos_around + 1e-3, sin * sin_around + 1e-3, cos + 1e-3).normalize();
@@ -649,6 +647,14 @@ fn read_bytes(path: &Path) -> Result<Vec<u8>, HandError> {
 fn isometry(xyz: [f64; 3], rpy: [f64; 3]) -> Isometry3<f64> {
     Isometry3::from_parts(
         Vector3::from(xyz).into(),
-        nalgebra::UnitQuaternion::from_euler_angles(rpy[0], rpy[1], rpy[2]),
+        rotation(&Vector3::z_axis(), rpy[2])
+            * rotation(&Vector3::y_axis(), rpy[1])
+            * rotation(&Vector3::x_axis(), rpy[0]),
     )
+}
+
+/// The rotation about an axis, the same bits on any processor: nalgebra's takes sine and cosine from the system's library.
+fn rotation(axis: &UnitVector3<f64>, angle_rad: f64) -> UnitQuaternion<f64> {
+    let (sin, cos) = libm::sincos(0.5 * angle_rad);
+    UnitQuaternion::new_unchecked(Quaternion::from_parts(cos, axis.into_inner() * sin))
 }

@@ -288,17 +288,17 @@ for_instruction_set! {
 }
 
 #[inline(always)]
-fn kernel_rows_body<const FUSED: bool>(columns: &Columns, rows: &Rows, gamma: f64, out: &mut [&mut [f32]]) {
+fn kernel_rows_body(columns: &Columns, rows: &Rows, gamma: f64, out: &mut [&mut [f32]]) {
     let n_features = columns.n_features;
     let mut done = 0;
     while done < out.len() {
         let (features, squared_norms) = (&rows.features[done * n_features..], &rows.squared_norms[done..]);
         let out = &mut out[done..];
         if out.len() >= 2 {
-            kernel_tiles::<FUSED, 2>(columns, features, squared_norms, gamma, out);
+            kernel_tiles::<2>(columns, features, squared_norms, gamma, out);
             done += 2;
         } else {
-            kernel_tiles::<FUSED, 1>(columns, features, squared_norms, gamma, out);
+            kernel_tiles::<1>(columns, features, squared_norms, gamma, out);
             done += 1;
         }
     }
@@ -306,7 +306,7 @@ fn kernel_rows_body<const FUSED: bool>(columns: &Columns, rows: &Rows, gamma: f6
 
 /// The first `N` rows. Their scalar products with a block of columns stay in registers.
 #[inline(always)]
-fn kernel_tiles<const FUSED: bool, const N: usize>(
+fn kernel_tiles<const N: usize>(
     columns: &Columns,
     features: &[f64],
     squared_norms: &[f64],
@@ -320,7 +320,7 @@ fn kernel_tiles<const FUSED: bool, const N: usize>(
     for (block_idx, (block, column_norms)) in blocks {
         let mut products = [[Lanes::splat(0.0); GROUPS]; N];
         for (feature_idx, column) in block.iter().enumerate() {
-            let column: [Lanes<FUSED>; GROUPS] = [Lanes::load(&column[0].0), Lanes::load(&column[1].0)];
+            let column: [Lanes; GROUPS] = [Lanes::load(&column[0].0), Lanes::load(&column[1].0)];
             for row in 0..N {
                 let value = Lanes::splat(rows[row][feature_idx]);
                 products[row][0] = value.multiply_add(column[0], products[row][0]);
@@ -345,12 +345,8 @@ for_instruction_set! {
 }
 
 #[inline(always)]
-fn add_weighted_body<const FUSED: bool>(
-    rows: &[&[f32]; ROWS_PER_PASS],
-    weights: &[f64; ROWS_PER_PASS],
-    sums: &mut [f64],
-) {
-    let weights: [Lanes<FUSED>; ROWS_PER_PASS] = weights.map(Lanes::splat);
+fn add_weighted_body(rows: &[&[f32]; ROWS_PER_PASS], weights: &[f64; ROWS_PER_PASS], sums: &mut [f64]) {
+    let weights: [Lanes; ROWS_PER_PASS] = weights.map(Lanes::splat);
     let rows: [&[[f32; LANES]]; ROWS_PER_PASS] = rows.map(|row| row.as_chunks().0);
     for (idx, sums) in sums.as_chunks_mut::<LANES>().0.iter_mut().enumerate() {
         let mut sum = Lanes::load(sums);

@@ -226,35 +226,30 @@ for_instruction_set! {
 }
 
 #[inline(always)]
-fn solve_inner_body<const FUSED: bool>(inner: &mut Inner<'_>) {
+fn solve_inner_body(inner: &mut Inner<'_>) {
     let any_row = inner.row(0);
-    let mut i = update_gradient::<FUSED>(inner, 0.0, any_row, any_row);
+    let mut i = update_gradient(inner, 0.0, any_row, any_row);
     while inner.n_iterations < inner.max_iterations {
         let Some(growing_idx) = i else { return };
-        let (violation, j) = select_shrinking::<FUSED>(inner, growing_idx);
+        let (violation, j) = select_shrinking(inner, growing_idx);
         if violation < inner.tolerance {
             return;
         }
         let Some(shrinking_idx) = j else { return };
         let Some(step) = inner.move_pair(growing_idx, shrinking_idx) else { return };
         inner.n_iterations += 1;
-        i = update_gradient::<FUSED>(inner, step, inner.row(growing_idx), inner.row(shrinking_idx));
+        i = update_gradient(inner, step, inner.row(growing_idx), inner.row(shrinking_idx));
     }
 }
 
 /// Adds `step (row_i - row_j)` to the gradient and returns the sample with the smallest gradient of those whose β can
 /// grow.
 #[inline(always)]
-fn update_gradient<const FUSED: bool>(
-    inner: &mut Inner<'_>,
-    step: f64,
-    row_i: &[[f32; LANES]],
-    row_j: &[[f32; LANES]],
-) -> Option<usize> {
-    let step = Lanes::<FUSED>::splat(step);
-    let mut smallest = Lanes::<FUSED>::splat(f64::INFINITY);
-    let mut chunk_of_smallest = Lanes::<FUSED>::splat(-1.0);
-    let (mut chunk_idx, one) = (Lanes::<FUSED>::splat(0.0), Lanes::splat(1.0));
+fn update_gradient(inner: &mut Inner<'_>, step: f64, row_i: &[[f32; LANES]], row_j: &[[f32; LANES]]) -> Option<usize> {
+    let step = Lanes::splat(step);
+    let mut smallest = Lanes::splat(f64::INFINITY);
+    let mut chunk_of_smallest = Lanes::splat(-1.0);
+    let (mut chunk_idx, one) = (Lanes::splat(0.0), Lanes::splat(1.0));
     let gradient = inner.gradient.as_chunks_mut::<LANES>().0.iter_mut();
     let rows = row_i.iter().zip(row_j);
     for ((gradient, growing), (k_i, k_j)) in gradient.zip(inner.growing.as_chunks().0).zip(rows) {
@@ -273,8 +268,8 @@ fn update_gradient<const FUSED: bool>(
 /// The largest violation of optimality, and the sample to pair with i: of those whose β can shrink, the one for which
 /// moving the pair without regard to bounds lowers the objective most, by (g_j - g_i)² / (2 curvature).
 #[inline(always)]
-fn select_shrinking<const FUSED: bool>(inner: &Inner<'_>, i: usize) -> (f64, Option<usize>) {
-    let gradient_i = Lanes::<FUSED>::splat(inner.gradient[i]);
+fn select_shrinking(inner: &Inner<'_>, i: usize) -> (f64, Option<usize>) {
+    let gradient_i = Lanes::splat(inner.gradient[i]);
     let (zero, one, two) = (Lanes::splat(0.0), Lanes::splat(1.0), Lanes::splat(2.0));
     let mut violation = zero;
     let mut largest = zero;
@@ -297,7 +292,7 @@ fn select_shrinking<const FUSED: bool>(inner: &Inner<'_>, i: usize) -> (f64, Opt
 }
 
 #[inline(always)]
-fn arrays<const FUSED: bool>(values: Lanes<FUSED>, chunks: Lanes<FUSED>) -> ([f64; LANES], [f64; LANES]) {
+fn arrays(values: Lanes, chunks: Lanes) -> ([f64; LANES], [f64; LANES]) {
     let mut stored = ([0.0; LANES], [0.0; LANES]);
     values.store(&mut stored.0);
     chunks.store(&mut stored.1);

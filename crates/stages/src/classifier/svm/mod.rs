@@ -198,7 +198,7 @@ pub fn check_finite(features: &[f64], n_features: usize) -> Result<(), SvmError>
 }
 
 fn rbf(gamma: f64, left: &[f64], right: &[f64]) -> f64 {
-    (-gamma * squared_distance(left, right)).exp()
+    libm::exp(-gamma * squared_distance(left, right))
 }
 
 /// ‖left - right‖². Eight sums side by side let the compiler use vector instructions, which a

@@ -1,0 +1,142 @@
+//! `record --keep` and `record --write-kept`: the commands of the flight recorder.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use serde_json::json;
+
+use super::flight::{Excerpt, FlightRecorder, SharedRecorder};
+use super::{Arguments, Outcome, POLL, attach, observed, print_line, stop_signal};
+use blindgrasp_graph::client::observer::Observer;
+use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
+use blindgrasp_graph::control::{Attachment, Reply, Request};
+use blindgrasp_graph::recorded_graph::{Beginning, Ending, RecordedGraph};
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_session::of_graph::of_graph;
+
+/// The reason in the names of files that somebody asked for.
+const ASKED: &str = "asked";
+
+/// `record --write-kept`
+pub(super) fn ask(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let mut connection = Connection::open(&pick_graph(arguments.graph.name())?)?;
+    let n_flight_recorders = match connection.ask(&Request::Keep, ANSWER_LIMIT)? {
+        Reply::Asked { n_flight_recorders } => n_flight_recorders,
+        other => return Err(connection.unexpected(&other).into()),
+    };
+    if n_flight_recorders == 0 {
+        bail!(
+            "no flight recorder reads graph '{0}': start one with `blindgrasp record {0} --keep 30s --out FILE.mcap`",
+            connection.graph()
+        );
+    }
+    let line = if arguments.json {
+        json!({"graph": connection.graph(), "asked": n_flight_recorders}).to_string()
+    } else {
+        format!("{n_flight_recorders} asked; each prints the name of its file where it runs")
+    };
+    print_line(&line)?;
+    Ok(Outcome::Done)
+}
+
+/// `record --keep`
+pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow::Result<Outcome> {
+    let stop = stop_signal()?;
+    let asked = Arc::new(AtomicBool::new(false));
+    signal_hook::flag::register(signal_hook::consts::SIGUSR1, Arc::clone(&asked))
+        .context("cannot listen for SIGUSR1")?;
+    let mut connection = Connection::open(&pick_graph(arguments.graph.name())?)?;
+    let Attachment { domain, edges, graph, .. } = attach(&mut connection, &[], out, true)?;
+    let about = of_graph(&graph, Beginning::Attached)?;
+    let recorder = FlightRecorder::new(&edges, kept, Duration::from_secs_f64(arguments.after));
+    let Some(recorder) = recorder.map(SharedRecorder::new) else {
+        bail!("graph '{}' has no edge with frames to keep", connection.graph());
+    };
+    let observer = Observer::start_attached(&domain, observed(&edges), recorder.clone());
+    let observer = observer.context("cannot read the graph's edges")?;
+    let start = Instant::now();
+    print_diagnostic(&format!(
+        "keeping the last {} s of graph '{}'; Ctrl-C ends it",
+        kept.as_secs_f64(),
+        connection.graph()
+    ));
+    let end = arguments.for_secs.map(|secs| start + Duration::from_secs_f64(secs));
+    let mut writer = Writer { out, about, is_json: arguments.json, has_loss: false };
+    let ending = loop {
+        if stop.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end) {
+            break Ending::Detached;
+        }
+        if asked.swap(false, Ordering::Relaxed) {
+            recorder.with(|recorder| recorder.ask(ASKED, monotonic_nanos()));
+        }
+        writer.write(recorder.with(|recorder| recorder.excerpt_when_due(monotonic_nanos())))?;
+        match connection.receive_within(POLL) {
+            Ok(None) if observer.has_failed() => break Ending::Broken,
+            Ok(None) => {}
+            Ok(Some(Reply::Keep)) => recorder.with(|recorder| recorder.ask(ASKED, monotonic_nanos())),
+            Ok(Some(Reply::Drained)) => break Ending::Graph,
+            Err(ClientError::Ended { .. }) => break Ending::Broken,
+            Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
+            Err(error) => return Err(error.into()),
+        }
+    };
+    let finished = if ending == Ending::Detached { observer.leave() } else { observer.finish() };
+    let graph = connection.graph().to_string();
+    drop(connection);
+    if ending == Ending::Broken {
+        recorder.with(|recorder| recorder.ask(Ending::Broken.word(), monotonic_nanos()));
+    }
+    writer.write(recorder.with(FlightRecorder::excerpt_now))?;
+    finished.context("cannot read the graph's edges any more")?;
+    let how = match ending {
+        Ending::Graph => "the graph has ended",
+        Ending::Broken => "the graph broke off",
+        Ending::Detached => "the graph goes on",
+    };
+    print_diagnostic(&format!("graph '{graph}' is kept no longer: {how}"));
+    Ok(Outcome::of(writer.has_loss))
+}
+
+struct Writer<'a> {
+    out: &'a Path,
+    about: RecordedGraph,
+    is_json: bool,
+    has_loss: bool,
+}
+
+impl Writer<'_> {
+    fn write(&mut self, excerpt: Option<Excerpt>) -> anyhow::Result<()> {
+        let Some(excerpt) = excerpt else { return Ok(()) };
+        let written = match excerpt.write(self.out, &self.about) {
+            Ok(written) => written,
+            Err(error) => {
+                // The next file may be written: the disk may have room again.
+                self.has_loss = true;
+                print_diagnostic(&format!("blindgrasp: the kept samples are not written: {error}"));
+                return Ok(());
+            }
+        };
+        self.has_loss |= written.missing > 0;
+        let line = if self.is_json {
+            json!(written).to_string()
+        } else {
+            let missing = match written.missing {
+                0 => String::new(),
+                missing => format!(", {missing} samples are missing"),
+            };
+            format!(
+                "{} ({}): {:.1} s, {} grasps, {} frames{missing}",
+                written.file.display(),
+                written.why.join(", "),
+                written.secs,
+                written.grasps,
+                written.frames
+            )
+        };
+        Ok(print_line(&line)?)
+    }
+}

@@ -1,0 +1,70 @@
+//! `test --faults`: the decisions about recordings with faults of sensors and transports.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use serde_json::json;
+
+use super::Outcome;
+use super::case::Runner;
+use crate::commands::print_line;
+use crate::commands::text_table::TextTable;
+use blindgrasp_graph::dataflow::Graph;
+use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_replay::checks::{ChangedDecision, Decisions};
+use blindgrasp_replay::expectations::Expectations;
+use blindgrasp_replay::faults::{Fault, write_with_fault};
+use blindgrasp_stages::hand::Hand;
+
+pub(super) fn run(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) -> anyhow::Result<Outcome> {
+    let (mut n_lifted_now, mut all) = (0, Vec::new());
+    for recording in recordings {
+        let shown = || recording.display().to_string();
+        let expected = Expectations::of(recording)?.unwrap_or_default();
+        let graph = runner.graph(&expected, runner.overrides)?;
+        let found = runner.scratch.path(recording);
+        let (fed, _) = runner.replay(recording, &graph, runner.overrides, &found).with_context(shown)?;
+        if fed.replaced.played_port != "tactile" {
+            bail!("{}: --faults are of frames, and the recording plays {}", shown(), fed.topic);
+        }
+        let whole = Decisions::read(&found)?;
+        let pad_of_cell: Vec<usize> = hand_of(&graph)?.cells().map(|(pad_idx, _)| pad_idx).collect();
+        let mut table = TextTable::new(["fault", "held -> lifted", "lifted -> held"], 1);
+        let mut told = Vec::new();
+        for fault in Fault::ALL {
+            let faulty = runner.scratch.path(Path::new("with-fault.mcap"));
+            write_with_fault(recording, &fed.topic, fault, &pad_of_cell, &faulty).with_context(shown)?;
+            let replayed = runner.replay(&faulty, &graph, runner.overrides, &found);
+            replayed.with_context(|| format!("{} with a fault: {}", shown(), fault.describe()))?;
+            let changed = Decisions::read(&found)?.changed_since(&whole);
+            let (lifted, held): (Vec<_>, Vec<_>) = changed.iter().partition(|changed| changed.is_lifted_now());
+            n_lifted_now += lifted.len();
+            table.row([fault.describe().into(), lifted.len().to_string(), held.len().to_string()]);
+            told.extend(lifted.into_iter().map(|changed: &ChangedDecision| format!("{}: {changed}", fault.describe())));
+            all.push(json!({"recording": recording, "fault": fault, "changed_actions": changed}));
+        }
+        if !is_json {
+            print_line(&format!("{}: {} lifts without a fault", shown(), whole.tally().n_lifts))?;
+            for line in table.lines().iter().chain(&told) {
+                print_line(&format!("  {line}"))?;
+            }
+        }
+    }
+    if is_json {
+        print_line(&serde_json::to_string_pretty(
+            &json!({"faults": all, "n_lifted_only_with_a_fault": n_lifted_now}),
+        )?)?;
+    }
+    if n_lifted_now > 0 {
+        bail!("{n_lifted_now} grasps are lifted with a fault and held without it");
+    }
+    print_diagnostic("no grasp is lifted with a fault that is held without it");
+    Ok(Outcome::Done)
+}
+
+/// The hand of the graph's first node that names one.
+fn hand_of(graph: &Graph) -> anyhow::Result<Hand> {
+    let path = graph.nodes.iter().find_map(|node| node.params.get("hand")?.as_str().map(PathBuf::from));
+    let path = path.with_context(|| format!("no node of graph '{}' names the hand", graph.name))?;
+    Ok(Hand::load(&path)?)
+}

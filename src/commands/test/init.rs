@@ -1,0 +1,91 @@
+//! `test --init`: expectations from the decisions of a replay.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, bail};
+use serde_json::json;
+
+use super::case::Runner;
+use super::{Outcome, project_recordings};
+use crate::commands::model::write_at_once;
+use crate::commands::print_line;
+use blindgrasp_replay::checks::{Decisions, describe_changes};
+use blindgrasp_replay::expectations::{Expectations, path_of};
+
+/// The file's first lines.
+const HEAD: &str = "# What `blindgrasp test` expects of the recording's replay (docs/replay.md#expectations).\n";
+
+/// The project's recordings that have no expectations.
+pub(super) fn without_expectations(dataflow: &Path) -> anyhow::Result<Vec<PathBuf>> {
+    let (folder, files) = project_recordings(dataflow)?;
+    let is_new = |path: &PathBuf| path.extension().is_some_and(|end| end == "mcap") && !path_of(path).exists();
+    let found: Vec<PathBuf> = files.into_iter().filter(is_new).collect();
+    if found.is_empty() {
+        bail!("each recording in {} has expectations: name the recording", folder.display());
+    }
+    Ok(found)
+}
+
+pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) -> anyhow::Result<Outcome> {
+    for recording in recordings {
+        let path = path_of(recording);
+        if path.exists() {
+            bail!("{}: the file exists: edit it, or remove it first", path.display());
+        }
+    }
+    let mut written = Vec::new();
+    for recording in recordings {
+        let found = runner.scratch.path(recording);
+        // The recording's own dataflow file is not known yet: all are replayed with the one of the command.
+        let graph = runner.graph(&Expectations::default(), runner.overrides)?;
+        runner.replay(recording, &graph, runner.overrides, &found).with_context(|| recording.display().to_string())?;
+        let decisions = Decisions::read(&found)?;
+        let mut expected = decisions.to_expectations();
+        expected.dataflow = other_dataflow(runner.dataflow, recording)?;
+        let remarks: BTreeMap<u64, String> =
+            decisions.dropped().map(|grasp_id| (grasp_id, "its lift dropped the object".into())).collect();
+        let path = path_of(recording);
+        write_at_once(&path, &(HEAD.to_string() + &expected.to_yaml(&remarks)))?;
+        let changed = decisions.changed_since(&Decisions::read(recording)?);
+        let fails = decisions.check(&expected).iter().any(|check| !check.has_passed);
+        if !is_json {
+            print_line(&format!(
+                "{}: {} grasps",
+                path.display(),
+                decisions.tally().n_lifts + decisions.tally().n_holds
+            ))?;
+            for grasp_id in remarks.keys() {
+                print_line(&format!("  grasp {grasp_id} dropped its object: it is expected to be held"))?;
+            }
+            if fails {
+                print_line("  the graph does not meet this yet: `blindgrasp test` fails until it does")?;
+            }
+            if let Some(text) = describe_changes(&changed) {
+                print_line(&format!("  the replay decides otherwise than the robot did, {text}"))?;
+            }
+        }
+        written.push(json!({
+            "recording": recording, "expectations": path, "dropped": remarks.keys().collect::<Vec<_>>(),
+            "is_met": !fails, "changed_actions": changed,
+        }));
+    }
+    if is_json {
+        print_line(&serde_json::to_string_pretty(&json!({ "recordings": written }))?)?;
+    }
+    Ok(Outcome::Done)
+}
+
+/// The dataflow file relative to the recording's folder; `None` if it is the one that `test` takes by itself.
+fn other_dataflow(dataflow: &Path, recording: &Path) -> anyhow::Result<Option<PathBuf>> {
+    if dataflow.file_name().is_some_and(|name| name == "dataflow.yaml") {
+        return Ok(None);
+    }
+    let absolute = |path: &Path| path.canonicalize().with_context(|| path.display().to_string());
+    let (dataflow, recording) = (absolute(dataflow)?, absolute(recording)?);
+    let folder = recording.parent().unwrap_or(Path::new("/"));
+    let n_common = dataflow.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
+    let up = folder.components().skip(n_common).map(|_component| "..");
+    let down = dataflow.components().skip(n_common);
+    Ok(Some(up.map(PathBuf::from).chain(down.map(|component| PathBuf::from(component.as_os_str()))).collect()))
+}
