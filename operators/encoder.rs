@@ -2,8 +2,9 @@
 
 use std::path::PathBuf;
 
-use blindgrasp_messages::{ContactSet, GraspFeature, Recorded};
+use blindgrasp_messages::{ContactSet, Fault, GraspFeature, Phase, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage;
@@ -30,8 +31,18 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let dictionary_id = model.dictionary_id();
     let n_features = model.features.len();
     let identity = model.identity();
+    let mut told = None;
     let encode = stage::from_fn::<ContactSet, GraspFeature, _>(move |head, contacts, values| {
-        steps::encode(&model, dictionary_id, head, contacts, values)
+        let feature = steps::encode(&model, dictionary_id, head, contacts, values);
+        let is_unusual = feature.fault == Fault::OutOfDistribution.code();
+        // Once for each grasp: its frames violate the same limits.
+        if is_unusual && told != Some(head.grasp_id) && Phase::from_code(head.phase).is_ok_and(Phase::decides) {
+            told = Some(head.grasp_id);
+            let violated: Vec<String> =
+                steps::violations(&model, head, contacts).iter().map(ToString::to_string).collect();
+            print_diagnostic(&format!("grasp {} is out of distribution: {}", head.grasp_id, violated.join("; ")));
+        }
+        feature
     });
     stage::run(operator, "contacts", "feature", n_features, identity, encode)
 }

@@ -9,7 +9,7 @@ use serde_json::json;
 use super::frame_lines::read_frames;
 use super::{Outcome, print_line};
 use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::evaluation::{decide, decide_frames};
+use blindgrasp_learning::evaluation::{Decided, decide, decide_frames};
 use blindgrasp_messages::{GraspTruth, LiftDecision};
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::{ArbiterOptions, Hand, Judge, Model, Probe};
@@ -86,14 +86,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             let judge = Judge::with_options(hand, model.clone(), options);
             let mut judge = judge.with_context(|| format!("recording {}", file.display()))?;
             for decided in decide(&mut judge, file)? {
-                print(arguments.json, file, &decided.decision, decided.truth.as_ref())?;
+                print(arguments.json, file, &decided, decided.truth.as_ref())?;
             }
         } else {
             let hand = hand_of_model(&model, arguments.hand.as_deref())?;
             let read = read_frames(file, &hand)?;
             let mut judge = Judge::with_options(hand, model.clone(), options)?;
-            for decision in decide_frames(&mut judge, &read.frames) {
-                print(arguments.json, file, &decision, read.truths.get(&decision.grasp_id))?;
+            for decided in decide_frames(&mut judge, &read.frames) {
+                print(arguments.json, file, &decided, read.truths.get(&decided.decision.grasp_id))?;
             }
         }
     }
@@ -111,8 +111,8 @@ fn hand_of_model(model: &Model, path: Option<&Path>) -> anyhow::Result<Hand> {
     Ok(hand)
 }
 
-fn print(json: bool, file: &Path, decision: &LiftDecision, truth: Option<&GraspTruth>) -> std::io::Result<()> {
-    let LiftDecision { grasp_id, action, reason, probability_stable, .. } = decision;
+fn print(json: bool, file: &Path, decided: &Decided, truth: Option<&GraspTruth>) -> std::io::Result<()> {
+    let LiftDecision { grasp_id, action, reason, probability_stable, .. } = &decided.decision;
     if json {
         return print_line(
             &json!({
@@ -122,6 +122,7 @@ fn print(json: bool, file: &Path, decision: &LiftDecision, truth: Option<&GraspT
                 "reason": reason.as_str(),
                 "probability_stable": probability_stable,
                 "truth": truth,
+                "violations": decided.violations,
             })
             .to_string(),
         );
@@ -131,5 +132,6 @@ fn print(json: bool, file: &Path, decision: &LiftDecision, truth: Option<&GraspT
     });
     let line =
         format!("grasp {grasp_id:>5}  {}  p {probability_stable:.3}  {:<14}{truth}", action.shown(), reason.as_str());
-    print_line(line.trim_end())
+    print_line(line.trim_end())?;
+    decided.violations.iter().try_for_each(|violation| print_line(&format!("             {violation}")))
 }

@@ -12,6 +12,7 @@ mod echo;
 mod evaluate;
 mod examples;
 mod export;
+mod flight_recorder;
 mod graph;
 mod grid;
 mod hands;

@@ -16,7 +16,7 @@ use rustix::pty::OpenptFlags;
 use serde_json::{Value, json};
 
 /// Limits that a busy machine does not reach.
-const PATIENT: &str = "max_delay_ms: 20000";
+pub(crate) const PATIENT: &str = "max_delay_ms: 20000";
 
 /// The project's live graph, its source with these parameters.
 pub(crate) fn live_dataflow(folder: &Path, params: &str) -> PathBuf {

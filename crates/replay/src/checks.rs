@@ -9,7 +9,7 @@ use serde::Serialize;
 use super::comparison::{ComparedEdge, EdgeComparison};
 use super::expectations::Expectations;
 use super::rewrite::{FedEdge, Origin};
-use blindgrasp_messages::{Action, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Reason, Recorded};
+use blindgrasp_messages::{Action, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Phase, Reason, Recorded};
 use blindgrasp_recording::{Record, RecordingError, RecordingReader};
 
 /// The outcome of one check.
@@ -51,7 +51,7 @@ pub struct EdgesInQuestion<'a> {
 pub struct Decisions {
     decisions: BTreeMap<u64, LiftDecision>,
     truths: BTreeMap<u64, GraspTruth>,
-    /// Of the grasps that were lifted, whether the object was kept.
+    /// Of the grasps whose lift was reported, whether the object was kept: by a robot's frames, or by a simulated hand.
     outcomes: BTreeMap<u64, bool>,
     /// Decisions and labels of a grasp that had one already: a restarted source may number its grasps anew.
     n_again: usize,
@@ -205,6 +205,10 @@ impl Decisions {
                 // A probe comes before the decision about its grasp.
                 Record::Decision(sample) if !sample.message.action.decides() => continue,
                 Record::Decision(sample) => read.decisions.insert(sample.message.grasp_id, sample.message).is_some(),
+                Record::Tactile(sample) if matches!(sample.message.phase, Phase::Kept | Phase::Dropped) => {
+                    read.outcomes.insert(sample.message.grasp_id, sample.message.phase == Phase::Kept);
+                    false
+                }
                 Record::Outcome(sample) if sample.message.lifted => {
                     read.outcomes.insert(sample.message.grasp_id, sample.message.held);
                     false
@@ -246,8 +250,8 @@ impl Decisions {
         tally
     }
 
-    /// The decisions as expectations of later replays: a lift that dropped its object should have been held, and one that
-    /// kept it lifted. With labels, accuracy and false positives are expected as they are, and otherwise every decision.
+    /// The decisions as expectations of later replays: a lift that dropped its object should have been held. With labels,
+    /// accuracy and false positives are expected as they are, and otherwise every decision.
     pub fn to_expectations(&self) -> Expectations {
         let mut expected = Expectations::default();
         if self.truths.is_empty() {
@@ -260,10 +264,7 @@ impl Decisions {
             expected.accuracy_at_least = Some((1e4 * accuracy).floor() / 1e4);
             expected.false_positives_at_most = Some(n_false_positive);
         }
-        for (grasp_id, is_kept) in &self.outcomes {
-            let action = if *is_kept { Action::Lift } else { Action::Hold };
-            expected.decisions.insert(*grasp_id, (action, None));
-        }
+        expected.decisions.extend(self.dropped().map(|grasp_id| (grasp_id, (Action::Hold, None))));
         expected
     }
 

@@ -1,11 +1,12 @@
 //! [`Judge`] decides grasps from frames, as the stages of a graph do, within one object.
 
-use blindgrasp_messages::{Contact, Fault, Header, LiftDecision, Message, Prediction, Stamped, TactileFrame};
+use blindgrasp_messages::{Contact, Fault, Header, LiftDecision, Message, Prediction, Reason, Stamped, TactileFrame};
 
 use crate::contacts::ContactFinder;
 use crate::hand::Hand;
 use crate::lift_arbiter::{ArbiterOptions, LiftArbiter};
 use crate::model::{Memory, Model, OtherHand};
+use crate::out_of_distribution::Violation;
 use crate::own_lifts::{Adapt, OwnLifts};
 use crate::steps;
 
@@ -25,6 +26,8 @@ pub struct Judge {
     next_seq: u64,
     contacts: Vec<Contact>,
     values: Vec<f64>,
+    /// Of the last frame at rest that was out of distribution: its grasp, and the limits that it violates.
+    unusual: (u64, Vec<Violation>),
 }
 
 /// The judgement of a frame.
@@ -62,6 +65,7 @@ impl Judge {
             next_seq: 0,
             contacts: Vec::new(),
             values: Vec::new(),
+            unusual: (0, Vec::new()),
         })
     }
 
@@ -104,6 +108,9 @@ impl Judge {
         let (summary, parts) = steps::find_contacts(&self.hand, &mut self.finder, &head, &items, &mut self.contacts);
         let contacts = steps::contact_set(&self.hand, &head, summary, parts.as_ref());
         let feature = steps::encode(&self.model, self.dictionary_id, &contacts, &self.contacts, &mut self.values);
+        if feature.fault == Fault::OutOfDistribution.code() && frame.phase.decides() {
+            self.unusual = (frame.grasp_id, steps::violations(&self.model, &contacts, &self.contacts));
+        }
         let head = steps::classify(&self.model, self.dictionary_id, &mut self.memory, &feature, &self.values);
         let mut decisions = Vec::new();
         // The phase is a frame's and the fault a step's, so the prediction can be read.
@@ -111,6 +118,13 @@ impl Judge {
         let prediction = Prediction::from_parts(&head, &[]).unwrap_or(unreadable);
         self.arbiter.on_prediction(&head.header, &prediction, 0, &mut decisions);
         Judged { prediction, decisions }
+    }
+
+    /// The limits that a grasp violates which has just been held as out of distribution; none for another decision.
+    pub fn violations(&self, decision: &LiftDecision) -> &[Violation] {
+        let (grasp_id, violations) = &self.unusual;
+        let is_of_it = decision.reason == Reason::OutOfDistribution && decision.grasp_id == *grasp_id;
+        if is_of_it { violations } else { &[] }
     }
 
     /// Holds the open grasp, if any, because no more frames come.
@@ -142,7 +156,7 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use blindgrasp_messages::{Action, Phase, Reason};
+    use blindgrasp_messages::{Action, Phase};
 
     fn hand(name: &str) -> Hand {
         Hand::load(Path::new(name)).expect("built in")

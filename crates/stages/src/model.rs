@@ -15,7 +15,7 @@ use crate::classifier::{Classifier, Verdict};
 use crate::day::{DayMemory, DayModel, GraspPlace};
 use crate::encoder::{FeatureExtractor, FeltReading};
 use crate::hand::Hand;
-use crate::out_of_distribution::TrainingRange;
+use crate::out_of_distribution::{TrainingRange, Violation};
 use crate::own_lifts::{Adapt, Looked, OwnLifts};
 use crate::probe::{GraspHistory, ProbeModel, pad_newtons, signals};
 use crate::shift_test::numbers;
@@ -250,16 +250,28 @@ impl Model {
     pub fn extract(&self, phase: Phase, reading: &FeltReading<'_>, values: &mut Vec<f64>) -> Result<u32, Fault> {
         // First, because a malformed frame has a fault of its own.
         let n_pads_in_contact = self.features.extract(reading, values)?;
-        let range = match phase {
-            // What the hand feels while it moves is part of no training range.
-            Phase::Squeezing | Phase::TestLifting | Phase::Lifting => return Ok(n_pads_in_contact),
+        let checked = self
+            .training_range_in(phase)
+            .map_or(Ok(()), |range| range.check(&self.features, reading.joints, reading.contacts));
+        checked.inspect_err(|_| values.clear())?;
+        Ok(n_pads_in_contact)
+    }
+
+    /// The limits that a frame is held to.
+    fn training_range_in(&self, phase: Phase) -> Option<&TrainingRange> {
+        match phase {
+            // The readings of a moving hand are part of no training range.
+            Phase::Squeezing | Phase::TestLifting | Phase::Lifting => None,
             Phase::Squeezed => self.squeezed.as_ref().map(|probe| &probe.training_range),
             Phase::TestLifted => self.test_lifted.as_ref().map(|probe| &probe.training_range),
             _ => Some(&self.training_range),
-        };
-        let checked = range.map_or(Ok(()), |range| range.check(&self.features, reading.joints, reading.contacts));
-        checked.inspect_err(|_| values.clear())?;
-        Ok(n_pads_in_contact)
+        }
+    }
+
+    /// The limits that a frame with [`Fault::OutOfDistribution`] violates, each with the value found.
+    pub fn violations(&self, phase: Phase, reading: &FeltReading<'_>) -> Vec<Violation> {
+        let range = self.training_range_in(phase);
+        range.map_or(Vec::new(), |range| range.violations(&self.features, reading.joints, reading.contacts))
     }
 
     /// Whether it judges anything but settled grasps.

@@ -10,6 +10,7 @@
 //!
 //! Pure: no clock, no I/O, no state, and no allocation in [`TrainingRange::check`].
 
+use std::fmt;
 use std::ops::RangeInclusive;
 
 use serde::{Deserialize, Serialize};
@@ -40,6 +41,28 @@ pub struct Limits {
     pub upper: f64,
 }
 
+/// A value outside its limits.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Violation {
+    #[serde(flatten)]
+    pub limits: Limits,
+    pub value: f64,
+}
+
+impl fmt::Display for Violation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Limits { quantity, lower, upper } = &self.limits;
+        write!(f, "{quantity}: {}, trained from {} to {}", short(self.value), short(*lower), short(*upper))
+    }
+}
+
+/// Four significant digits.
+fn short(value: f64) -> String {
+    // Without the sign of a zero.
+    let text = (format!("{value:.3e}").parse::<f64>().unwrap_or(value) + 0.0).to_string();
+    if text.len() > 12 { format!("{value:.3e}") } else { text }
+}
+
 impl TrainingRange {
     /// Whether a frame that has a feature lies within all limits.
     ///
@@ -55,13 +78,12 @@ impl TrainingRange {
     }
 
     /// The limits that a frame with a feature violates, each with the value found.
-    pub fn violations(&self, features: &FeatureExtractor, joints: &[f64], contacts: &[Contact]) -> Vec<(&Limits, f64)> {
+    pub fn violations(&self, features: &FeatureExtractor, joints: &[f64], contacts: &[Contact]) -> Vec<Violation> {
         let mut limits = self.limits.iter();
         let mut found = Vec::new();
         for_each_quantity(features, joints, contacts, |value| {
-            found.extend(
-                limits.next().filter(|limits| !(limits.lower..=limits.upper).contains(&value)).map(|of| (of, value)),
-            );
+            let violated = limits.next().filter(|limits| !(limits.lower..=limits.upper).contains(&value));
+            found.extend(violated.map(|limits| Violation { limits: limits.clone(), value }));
         });
         found
     }

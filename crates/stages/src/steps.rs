@@ -13,6 +13,7 @@ use crate::day::GraspPlace;
 use crate::encoder::FeltReading;
 use crate::hand::Hand;
 use crate::model::{Memory, Model};
+use crate::out_of_distribution::Violation;
 
 /// Finds the contacts of a frame. It also returns the frame's parts, if they can be read.
 pub fn find_contacts<'a>(
@@ -84,6 +85,14 @@ pub fn encode(
         fault: outcome.err().unwrap_or_default().code(),
         day: head.day,
     }
+}
+
+/// The limits that the contacts of a frame with [`Fault::OutOfDistribution`] violate.
+pub fn violations(model: &Model, head: &ContactSetHead, contacts: &[Contact]) -> Vec<Violation> {
+    let (Ok(joints), Ok(senses), Ok(phase)) = (head.joints(), head.senses(), Phase::from_code(head.phase)) else {
+        return Vec::new();
+    };
+    model.violations(phase, &FeltReading { joints, contacts, senses })
 }
 
 fn extract(model: &Model, head: &ContactSetHead, contacts: &[Contact], values: &mut Vec<f64>) -> Result<u32, Fault> {

@@ -14,7 +14,7 @@ use serde::Serialize;
 use blindgrasp_graph::client::observer::{Sink, bears_source_number};
 use blindgrasp_graph::control::AttachedEdge;
 use blindgrasp_graph::recorded_graph::{Ending, RecordedGraph};
-use blindgrasp_messages::{Action, Reason, Record};
+use blindgrasp_messages::{Action, Phase, Reason, Record};
 use blindgrasp_recording::{LiveOptions, LiveRecorder, RecordingError, RecordingInfo};
 
 /// Samples that are still under way when the file ends have this long to arrive.
@@ -23,6 +23,9 @@ const UNDER_WAY_NANOS: u64 = 500_000_000;
 const BEFORE_GRASP_NANOS: u64 = 1_000_000_000;
 /// The oldest samples go when more bytes than this are held: a hand of 1,000 cells at 1 kHz fills it in a minute.
 const MAX_BYTES: usize = 512 << 20;
+
+/// Why a file is written after a lift that dropped its object.
+const DROPPED: &str = "dropped";
 
 /// The moment that makes the flight recorder write.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -56,6 +59,8 @@ pub(super) struct FlightRecorder {
     n_bytes: usize,
     /// The grasp of the last frame, with its epoch.
     grasp: Option<(u64, u64)>,
+    /// The grasp that was last reported as dropped, with its epoch.
+    dropped: Option<(u64, u64)>,
     /// The fault that held the last grasp. The next grasps that it holds write no further files.
     last_fault: Option<Reason>,
     trigger: Option<Trigger>,
@@ -103,6 +108,7 @@ impl FlightRecorder {
             samples: VecDeque::new(),
             n_bytes: 0,
             grasp: None,
+            dropped: None,
             last_fault: None,
             trigger: None,
         })
@@ -133,7 +139,11 @@ impl FlightRecorder {
     /// A dropped object, an object that slips while the arm lifts, or a fault that did not hold the grasp before as well.
     fn reason_to_write(&mut self, record: &Record) -> Option<&'static str> {
         match record {
-            Record::Outcome(sample) => (sample.message.lifted && !sample.message.held).then_some("dropped"),
+            Record::Tactile(sample) if sample.message.phase == Phase::Dropped => {
+                let grasp = (record.header().epoch, record.grasp_id());
+                (self.dropped.replace(grasp) != Some(grasp)).then_some(DROPPED)
+            }
+            Record::Outcome(sample) => (sample.message.lifted && !sample.message.held).then_some(DROPPED),
             Record::Decision(sample) if sample.message.action == Action::SetDown => Some(Reason::Slipping.as_str()),
             Record::Decision(sample) if sample.message.action.decides() => {
                 let reason = sample.message.reason;
@@ -330,6 +340,7 @@ mod tests {
             samples: VecDeque::new(),
             n_bytes: 0,
             grasp: None,
+            dropped: None,
             last_fault: None,
             trigger: None,
         }
@@ -374,7 +385,7 @@ mod tests {
         assert_eq!((excerpt.missing, excerpt.n_grasps, excerpt.ending), (0, 8, Ending::Detached));
         assert!(recorder.excerpt_when_due(99 * SEC).is_none(), "a file is written once");
         feed(&mut recorder, 80..200);
-        assert!(recorder.samples.len() < 30, "older samples are forgotten");
+        assert!(recorder.samples.len() < 40, "older samples are forgotten");
     }
 
     #[test]
@@ -398,6 +409,12 @@ mod tests {
         decide(&mut recorder, 4, Reason::SensorFault, 8 * SEC);
         let excerpt = recorder.excerpt_now().expect("a drop, and a fault soon after it");
         assert_eq!(excerpt.why, ["dropped", "sensor_fault"]);
+        // A robot reports a drop by the phase of its frames, perhaps of several.
+        for (seq, expected) in [(8, true), (9, false)] {
+            let message = TactileFrame { grasp_id: 1, phase: Phase::Dropped, ..TactileFrame::default() };
+            recorder.take("/tactile", Stamped { header: header(seq, 8 * SEC), message }.into(), 8 * SEC);
+            assert_eq!(recorder.trigger.take().is_some(), expected);
+        }
     }
 
     #[test]

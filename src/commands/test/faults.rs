@@ -11,6 +11,7 @@ use crate::commands::print_line;
 use crate::commands::text_table::TextTable;
 use blindgrasp_graph::dataflow::Graph;
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_recording::RecordingReader;
 use blindgrasp_replay::checks::{ChangedDecision, Decisions};
 use blindgrasp_replay::expectations::Expectations;
 use blindgrasp_replay::faults::{Fault, write_with_fault};
@@ -22,13 +23,18 @@ pub(super) fn run(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) ->
         let shown = || recording.display().to_string();
         let expected = Expectations::of(recording)?.unwrap_or_default();
         let graph = runner.graph(&expected, runner.overrides)?;
+        let (hand, of_recording) = (hand_of(&graph)?, RecordingReader::open(recording)?.info().hand_id);
+        if of_recording != 0 && of_recording != hand.id() {
+            print_diagnostic(&format!("{}: left out: it is of another hand than graph '{}'", shown(), graph.name));
+            continue;
+        }
         let found = runner.scratch.path(recording);
         let (fed, _) = runner.replay(recording, &graph, runner.overrides, &found).with_context(shown)?;
         if fed.replaced.played_port != "tactile" {
             bail!("{}: --faults are of frames, and the recording plays {}", shown(), fed.topic);
         }
         let whole = Decisions::read(&found)?;
-        let pad_of_cell: Vec<usize> = hand_of(&graph)?.cells().map(|(pad_idx, _)| pad_idx).collect();
+        let pad_of_cell: Vec<usize> = hand.cells().map(|(pad_idx, _)| pad_idx).collect();
         let mut table = TextTable::new(["fault", "held -> lifted", "lifted -> held"], 1);
         let mut told = Vec::new();
         for fault in Fault::ALL {

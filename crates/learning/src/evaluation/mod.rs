@@ -29,6 +29,7 @@ use crate::training::TrainingError;
 use blindgrasp_messages::score::is_judged;
 pub use blindgrasp_messages::score::{Evaluation, Score};
 use blindgrasp_messages::{Action, GraspTruth, Header, LiftDecision, Phase, Prediction, Reason, Stamped, TactileFrame};
+use blindgrasp_stages::out_of_distribution::Violation;
 use blindgrasp_stages::training_summary::ReadingId;
 use blindgrasp_stages::{ArbiterOptions, Hand, Judge, Model};
 use decisions::JudgedGrasp;
@@ -87,7 +88,7 @@ pub fn evaluate(
             let message = "it is given twice: its grasps would count twice".into();
             return Err(DatasetError::Unusable { path: path.clone(), message });
         }
-        for Decided { decision, reading_id, truth } in decide_recording(&mut judge, path)? {
+        for Decided { decision, reading_id, truth, .. } in decide_recording(&mut judge, path)? {
             if let (Some(trained), Some(trained_on)) = (&mut evaluated.trained, trained_on) {
                 if reading_id.is_some_and(|id| trained_on.grasps.contains(&id)) {
                     trained.n_left_out += 1;
@@ -122,6 +123,8 @@ pub struct Decided {
     /// Of its first settled frame.
     reading_id: Option<ReadingId>,
     pub truth: Option<GraspTruth>,
+    /// The limits that it violates, if it was held as out of distribution.
+    pub violations: Vec<Violation>,
 }
 
 /// Decides every grasp of a recording in order, as a graph that begins with it. A grasp without a decision is held.
@@ -134,12 +137,28 @@ pub fn decide(judge: &mut Judge, recording: &Path) -> Result<Vec<Decided>, Datas
 }
 
 /// As [`decide`], for frames that are numbered without gaps (`seq`).
-pub fn decide_frames(judge: &mut Judge, frames: &[Stamped<TactileFrame>]) -> Vec<LiftDecision> {
+pub fn decide_frames(judge: &mut Judge, frames: &[Stamped<TactileFrame>]) -> Vec<Decided> {
     judge.reset();
-    let mut decisions: Vec<LiftDecision> = frames.iter().flat_map(|frame| judge.sample(frame).decisions).collect();
-    decisions.extend(judge.end());
-    decisions.retain(|decision| decision.action.decides());
-    decisions
+    let mut decided: Vec<Decided> = frames.iter().flat_map(|frame| sample(judge, frame)).collect();
+    decided.extend(judge.end().map(Decided::from));
+    decided.retain(|decided| decided.decision.action.decides());
+    decided
+}
+
+/// The decisions that come with a frame.
+fn sample(judge: &mut Judge, frame: &Stamped<TactileFrame>) -> Vec<Decided> {
+    let decisions = judge.sample(frame).decisions;
+    let explained = |decision: LiftDecision| {
+        let violations = judge.violations(&decision).to_vec();
+        Decided { violations, ..Decided::from(decision) }
+    };
+    decisions.into_iter().map(explained).collect()
+}
+
+impl From<LiftDecision> for Decided {
+    fn from(decision: LiftDecision) -> Self {
+        Decided { decision, reading_id: None, truth: None, violations: Vec::new() }
+    }
 }
 
 fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> JudgedGrasp {
@@ -162,24 +181,26 @@ fn decide_recording(judge: &mut Judge, path: &Path) -> Result<Vec<Decided>, Data
     let hand = judge.hand().clone();
     let grasps = read_grasps(path, &hand, |_, frames| {
         for frame in &frames {
-            decisions.extend(judge.sample(frame).decisions);
+            decisions.extend(sample(judge, frame));
         }
         let settled = frames.iter().map(|frame| &frame.message).find(|frame| frame.phase == Phase::Settled);
         settled.map(|frame| ReadingId::of(&frame.joints, &frame.cells_newtons))
     })?;
-    decisions.extend(judge.end());
+    decisions.extend(judge.end().map(Decided::from));
     if grasps.is_empty() {
         let message = "it holds no tactile frames to decide on".into();
         return Err(DatasetError::Unusable { path: path.into(), message });
     }
-    let mut by_grasp: BTreeMap<u64, LiftDecision> =
-        decisions.into_iter().filter(|it| it.action.decides()).map(|decision| (decision.grasp_id, decision)).collect();
-    let mut decide =
-        |grasp_id| by_grasp.remove(&grasp_id).unwrap_or(LiftDecision { grasp_id, ..LiftDecision::default() });
+    let deciding = decisions.into_iter().filter(|decided| decided.decision.action.decides());
+    let mut by_grasp: BTreeMap<u64, Decided> = deciding.map(|decided| (decided.decision.grasp_id, decided)).collect();
+    let mut decide = |grasp_id| {
+        let undecided = || Decided::from(LiftDecision { grasp_id, ..LiftDecision::default() });
+        by_grasp.remove(&grasp_id).unwrap_or_else(undecided)
+    };
     let decided = |grasp: Grasp<Option<ReadingId>>| Decided {
-        decision: decide(grasp.grasp_id),
         reading_id: grasp.value,
         truth: grasp.truth,
+        ..decide(grasp.grasp_id)
     };
     Ok(grasps.into_iter().map(decided).collect())
 }

@@ -187,7 +187,10 @@ mod tests {
         ] {
             assert_eq!(range.check(&features, &joints, &contacts), Err(Fault::OutOfDistribution));
             let violations = range.violations(&features, &joints, &contacts);
-            assert!(violations.iter().any(|(limits, _)| limits.quantity.contains(named)), "{named}: {violations:?}");
+            assert!(
+                violations.iter().any(|violation| violation.limits.quantity.contains(named)),
+                "{named}: {violations:?}"
+            );
         }
     }
 

@@ -305,7 +305,7 @@ fn widen(hand: &Hand, model: &mut Model, examples: &[&Example]) -> Result<usize,
         }
         let (readings, folds): (Vec<_>, Vec<_>) = own.iter().map(|(_, reading, fold)| (*reading, *fold)).unzip();
         let violated = own.iter().flat_map(|(idx, FeltReading { joints, contacts, .. }, _)| {
-            range.violations(features, joints, contacts).into_iter().map(|(limits, _)| (*idx, limits.quantity.clone()))
+            range.violations(features, joints, contacts).into_iter().map(|violation| (*idx, violation.limits.quantity))
         });
         let (held, quantities): (BTreeSet<usize>, BTreeSet<String>) = violated.unzip();
         outside.extend(held);
