@@ -29,8 +29,8 @@ use blindgrasp_stages::model::Model;
                         numbers that is equally long in all samples is a column per number, joints[0], joints[1], \
                         …; any other list is JSON in one column.\n\
                         features: a row for each grasp with a label and a contact, of its first settled frame: recording, \
-                        grasp_id, object, class, stable (1 or 0), hand_id, dictionary_id, then the values value_0, value_1, … \
-                        as the encoder sends them.")]
+                        grasp_id, object, class, stable (1 or 0), hand_id, dictionary_id, then the values as the encoder sends \
+                        them, each under its name: hist_3, finger_1.load, spread.position …")]
 pub(super) struct Arguments {
     /// The recording (MCAP); with --features, recordings or folders of them.
     #[arg(required = true, value_name = "RECORDING")]

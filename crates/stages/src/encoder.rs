@@ -7,15 +7,44 @@
 use serde::{Deserialize, Serialize};
 
 use crate::dictionary::Dictionary;
-use crate::hand::{Coupling, Hand};
+use crate::hand::{Coupling, Hand, Pad};
 use crate::histogram::histogram;
 use blindgrasp_messages::{Contact, Fault, MAX_FEATURES, Sense, Senses};
 
 /// Values of [`Block::Pads`] for each pad.
-pub(crate) const N_PAD_VALUES: usize = 15;
+pub(crate) const N_PAD_VALUES: usize = PAD_VALUES.len();
 
-/// Values of [`Block::Wrist`].
-const N_WRIST_VALUES: usize = 6;
+/// Names of the values of [`Block::Pads`], behind the name of the pad, in the order of `FeatureExtractor::write_pads`.
+const PAD_VALUES: [&str; 15] = [
+    "load",
+    "n_contacts",
+    "max_force",
+    "centre_x",
+    "centre_y",
+    "centre_z",
+    "normal_x",
+    "normal_y",
+    "normal_z",
+    "spread_x",
+    "spread_y",
+    "spread_z",
+    "centre_in_link_x",
+    "centre_in_link_y",
+    "centre_in_link_z",
+];
+
+/// Names of the values of [`Block::Gravity`].
+const GRAVITY_VALUES: [&str; 3] = ["gravity_x", "gravity_y", "gravity_z"];
+
+/// Names of the values of [`Block::Wrist`], in the order of [`wrist_values`].
+const WRIST_VALUES: [&str; 6] = [
+    "wrist_force_along_gravity",
+    "wrist_force_across_gravity",
+    "wrist_torque_x",
+    "wrist_torque_y",
+    "wrist_torque_z",
+    "wrist_torque",
+];
 
 /// A value with a smaller standard deviation is constant but for rounding.
 const LEAST_DEVIATION: f64 = 1e-12;
@@ -47,6 +76,23 @@ pub enum Block {
     Wrist,
     /// The torque of each joint, newton metres. It needs that sense.
     JointTorques,
+}
+
+impl Block {
+    /// The block in the words of reports.
+    pub fn about(self) -> &'static str {
+        match self {
+            Block::Histogram => "contact histogram",
+            Block::Cells => "force on each cell",
+            Block::RelativeCells => "force on each cell relative to its pad",
+            Block::Joints => "joint angles",
+            Block::Breakaways => "breakaway of coupled joints",
+            Block::Pads => "load of each pad",
+            Block::Gravity => "direction of gravity",
+            Block::Wrist => "load on the wrist",
+            Block::JointTorques => "joint torques",
+        }
+    }
 }
 
 /// A frame as the encoder sees it.
@@ -96,7 +142,7 @@ pub struct Scaling {
 impl FeatureExtractor {
     /// An extractor for a hand, without scaling.
     pub fn new(hand: &Hand, blocks: &[Block], dictionary: Dictionary, sigma_m: f64) -> Self {
-        let cells = |pad: &crate::hand::Pad| {
+        let cells = |pad: &Pad| {
             pad.cells.iter().map(|cell| cell.position_in_link_m.coords.into()).collect::<Vec<[f64; 3]>>()
         };
         FeatureExtractor {
@@ -127,8 +173,8 @@ impl FeatureExtractor {
             Block::Joints => self.couplings.len(),
             Block::Breakaways => self.couplings.iter().flatten().count(),
             Block::Pads => N_PAD_VALUES * self.cells_in_link_m.len(),
-            Block::Gravity => 3,
-            Block::Wrist => N_WRIST_VALUES,
+            Block::Gravity => GRAVITY_VALUES.len(),
+            Block::Wrist => WRIST_VALUES.len(),
             Block::JointTorques => self.couplings.len(),
         }
     }
@@ -212,6 +258,33 @@ impl FeatureExtractor {
             return Err(Fault::InvalidValue);
         }
         Ok(n_pads_in_contact)
+    }
+
+    /// The name of each value of a feature of this hand, in the order in which [`FeatureExtractor::extract`] writes them:
+    /// `hist_3`, `finger_1.load`, `spread.position`. A name begins with that of the pad or joint, and no name comes twice
+    /// unless a block does.
+    pub fn value_names(&self, hand: &Hand) -> Vec<String> {
+        self.blocks.iter().flat_map(|block| self.block_names(*block, hand)).collect()
+    }
+
+    fn block_names(&self, block: Block, hand: &Hand) -> Vec<String> {
+        match block {
+            Block::Histogram => (0..self.dictionary.len()).map(|word_idx| format!("hist_{word_idx}")).collect(),
+            Block::Cells => cell_names(hand, "cell"),
+            Block::RelativeCells => cell_names(hand, "relative_cell"),
+            Block::Joints => hand.joints.iter().map(|joint| format!("{}.position", joint.name)).collect(),
+            Block::Breakaways => {
+                let coupled = hand.joints.iter().filter(|joint| joint.coupling.is_some());
+                coupled.map(|joint| format!("{}.breakaway", joint.name)).collect()
+            }
+            Block::Pads => {
+                let of_pad = |pad: &Pad| PAD_VALUES.map(|value| format!("{}.{value}", pad.name));
+                hand.pads.iter().flat_map(of_pad).collect()
+            }
+            Block::Gravity => GRAVITY_VALUES.map(String::from).into(),
+            Block::Wrist => WRIST_VALUES.map(String::from).into(),
+            Block::JointTorques => hand.joints.iter().map(|joint| format!("{}.torque", joint.name)).collect(),
+        }
     }
 
     fn write_cells(&self, contacts: &[Contact], values: &mut Vec<f64>) {
@@ -299,6 +372,15 @@ impl FeatureExtractor {
     }
 }
 
+/// The names of the cells of all pads; a pad's cells are numbered from 0.
+fn cell_names(hand: &Hand, value: &str) -> Vec<String> {
+    let of_pad = |pad: &Pad| {
+        let name = pad.name.clone();
+        (0..pad.cells.len()).map(move |cell_idx| format!("{name}.{value}_{cell_idx}"))
+    };
+    hand.pads.iter().flat_map(of_pad).collect()
+}
+
 /// The direction of gravity in the palm frame.
 fn down(senses: &Senses<'_>) -> Result<[f64; 3], Fault> {
     let [x, y, z] = *senses.get(Sense::Gravity) else { return Err(Fault::MissingReading) };
@@ -310,7 +392,7 @@ fn down(senses: &Senses<'_>) -> Result<[f64; 3], Fault> {
 ///
 /// # Errors
 /// [`Fault::MissingReading`] without gravity or wrench, [`Fault::InvalidValue`] for a gravity of 0.
-pub fn wrist_values(senses: &Senses<'_>) -> Result<[f64; N_WRIST_VALUES], Fault> {
+pub fn wrist_values(senses: &Senses<'_>) -> Result<[f64; WRIST_VALUES.len()], Fault> {
     let down = down(senses)?;
     let [fx, fy, fz, tx, ty, tz] = *senses.get(Sense::WristWrench) else { return Err(Fault::MissingReading) };
     let along = fx * down[0] + fy * down[1] + fz * down[2];
@@ -349,7 +431,23 @@ impl Scaling {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::hand::builtin_names;
+    use crate::recipe::Recipe;
+    use blindgrasp_messages::OwnedSenses;
+    use std::collections::{BTreeMap, BTreeSet};
     use std::path::Path;
+
+    const ALL_BLOCKS: [Block; 9] = [
+        Block::Histogram,
+        Block::Cells,
+        Block::RelativeCells,
+        Block::Joints,
+        Block::Breakaways,
+        Block::Pads,
+        Block::Gravity,
+        Block::Wrist,
+        Block::JointTorques,
+    ];
 
     fn extractor(blocks: &[Block]) -> FeatureExtractor {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
@@ -414,6 +512,64 @@ mod tests {
         let one = extractor(&[Block::Histogram]);
         histogram(&one.dictionary, one.sigma_m, &contacts, &mut expected).expect("valid");
         assert_eq!(plain, expected);
+    }
+
+    #[test]
+    fn every_recipe_and_hand_has_a_name_for_each_value() {
+        for name in builtin_names() {
+            let hand = Hand::load(Path::new(name)).expect("built in");
+            let of_recipes = Recipe::NAMES.map(|recipe| Recipe::named(recipe).expect("known").blocks);
+            for blocks in of_recipes.into_iter().chain([ALL_BLOCKS.to_vec()]) {
+                let dictionary = Dictionary { words_m: vec![[0.0; 3]; 8] };
+                let extractor = FeatureExtractor::new(&hand, &blocks, dictionary, 0.03);
+                let names = extractor.value_names(&hand);
+                assert_eq!(names.len(), extractor.len(), "{name}, {blocks:?}");
+                let distinct: BTreeSet<&String> = names.iter().collect();
+                assert_eq!(distinct.len(), names.len(), "{name}, {blocks:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_name_says_what_its_value_is() {
+        let contacts = [
+            contact([0.0, 0.02, 0.0], [0.0, 0.0, 1.0], 1.0, 1, 0),
+            contact([0.0, 0.06, 0.0], [0.0, 1.0, 0.0], 3.0, 1, 5),
+        ];
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let all = extractor(&ALL_BLOCKS);
+        let senses = OwnedSenses::default()
+            .with(Sense::Gravity, &[0.0, 0.0, -9.81])
+            .with(Sense::WristWrench, &[3.0, 4.0, -5.0, 0.0, 0.3, 0.4])
+            .with(Sense::JointTorques, &[0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]);
+        let mut values = Vec::new();
+        let reading = FeltReading { senses: senses.view(), ..FeltReading::new(&JOINTS, &contacts) };
+        all.extract(&reading, &mut values).expect("valid");
+        let named: BTreeMap<String, f64> = all.value_names(&hand).into_iter().zip(values).collect();
+        let pad = &hand.pads[1].name;
+        let joint = |idx: usize| &hand.joints[idx].name;
+        for (name, expected) in [
+            (format!("{pad}.cell_5"), 3.0),
+            (format!("{pad}.load"), 4.0),
+            (format!("{pad}.n_contacts"), 2.0),
+            (format!("{pad}.max_force"), 3.0),
+            (format!("{pad}.centre_y"), 0.05),
+            (format!("{pad}.normal_z"), 0.25),
+            (format!("{pad}.centre_in_link_y"), 0.0095),
+            (format!("{}.position", joint(1)), 1.4),
+            (format!("{}.breakaway", joint(5)), 0.275),
+            (format!("{}.torque", joint(6)), 0.7),
+            ("gravity_z".into(), -1.0),
+            ("wrist_force_along_gravity".into(), 5.0),
+            ("wrist_force_across_gravity".into(), 5.0),
+            ("wrist_torque_z".into(), 0.4),
+            ("wrist_torque".into(), 0.5),
+        ] {
+            let found = named.get(&name).unwrap_or_else(|| panic!("no {name}: {:?}", named.keys()));
+            assert!((found - expected).abs() < 1e-6, "{name}: {found}");
+        }
+        assert!(named[&format!("{pad}.relative_cell_5")] > named[&format!("{pad}.relative_cell_0")]);
+        assert!(named["hist_0"] > 0.0 && named["hist_1"] > 0.0);
     }
 
     #[test]

@@ -5,7 +5,6 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use super::{Examples, Relabelling, TrainingError};
-use blindgrasp_messages::Phase;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 
@@ -28,7 +27,8 @@ pub enum FeatureTableError {
 }
 
 /// Writes a row (CSV) for each grasp with a label and a contact: where it was recorded, its label, the identities of
-/// hand and features, then the features of its first settled frame.
+/// hand and features, then the features of its first settled frame, each under its name. The limits of the model's training
+/// data are not applied.
 ///
 /// # Errors
 /// A recording cannot be read, or the table cannot be written.
@@ -43,12 +43,11 @@ pub fn write_feature_table(
     let identity = [format!("{:016x}", model.hand.id), format!("{:016x}", model.dictionary_id())];
     let mut table = csv::Writer::from_writer(to);
     let names = ["recording", "grasp_id", "object", "class", "stable", "hand_id", "dictionary_id"].map(String::from);
-    table.write_record(names.into_iter().chain((0..model.features.len()).map(|idx| format!("value_{idx}"))))?;
+    table.write_record(names.into_iter().chain(model.features.value_names(hand)))?;
     let mut n_rows = 0;
     let mut values = Vec::new();
     for example in &examples {
-        values.clear();
-        if let Err(fault) = model.extract(Phase::Settled, &example.reading(), &mut values) {
+        if let Err(fault) = model.features.extract(&example.reading(), &mut values) {
             *n_excluded.entry(fault.as_str().into()).or_default() += 1;
             continue;
         }
