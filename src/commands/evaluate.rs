@@ -7,13 +7,16 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::model::write_at_once;
-use super::{Outcome, check_page, percent, print_line};
+use super::{Outcome, check_output, check_page, number_in, percent, print_line};
 use blindgrasp_learning::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::looks::{Look, looks};
-use blindgrasp_learning::evaluation::page::{figures, report_page, table_1_csv};
-use blindgrasp_learning::evaluation::report::{Origin, Report, report_on_model, report_on_recipes};
-use blindgrasp_learning::evaluation::split::Split;
+use blindgrasp_learning::evaluation::page::{figures, report_page, tables};
+use blindgrasp_learning::evaluation::predictions::{OutsidePredictions, predictions_csv};
+use blindgrasp_learning::evaluation::report::{
+    Origin, Report, THRESHOLD_PROBABILITY, report_on_model, report_on_predictions, report_on_recipes,
+};
+use blindgrasp_learning::evaluation::split::{Split, split_into_folds};
 use blindgrasp_learning::evaluation::statistics::Estimate;
 use blindgrasp_learning::evaluation::{Evaluated, Score, Trained, evaluate};
 use blindgrasp_learning::training::{Example, Examples, Relabelling};
@@ -24,19 +27,25 @@ use blindgrasp_stages::lift_arbiter::{ArbiterOptions, Probe};
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::Recipe;
 
+/// The file among the figures with the probability of each grasp.
+const PREDICTIONS_FILE: &str = "predictions.csv";
+
 /// Compare decisions with labels, on recordings or by folds
 ///
 /// A model decides every grasp of the recordings as the graph would. Recipes (--split) are trained on a part of the
-/// grasps and judged on the rest, fold by fold, so that no machine judges a grasp that it was trained on.
+/// grasps and judged on the rest, fold by fold, so that no machine judges a grasp that it was trained on. Predictions of any
+/// other model (--predictions) are judged by the same figures, alone or beside a model or recipes.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                         blindgrasp evaluate models/barrett-bh8-280.json recordings/held-out.mcap\n  \
                         blindgrasp evaluate gate.json lifts --probe test_lift         the decisions after a test lift\n  \
                         blindgrasp evaluate data/paper --split object --folds 5 --report report.html\n  \
-                        blindgrasp evaluate data/paper --split class --recipe boosted,paper,raw --json\n\n\
+                        blindgrasp evaluate data/paper --split class --recipe boosted,paper,raw --json\n  \
+                        blindgrasp evaluate data/paper --split object --predictions mine.csv  a model of your own beside them\n\n\
                         Positive means lifted: a false positive is an object dropped.")]
 pub(super) struct Arguments {
-    /// A model (its name ends in .json) and recordings (MCAP), or folders of them; with --split, recordings only.
+    /// A model (its name ends in .json) and recordings (MCAP), or folders of them; with --split, recordings only. With
+    /// --predictions the model may be left out.
     #[arg(required = true, value_name = "[MODEL] RECORDING")]
     inputs: Vec<PathBuf>,
     /// The probe after which the model's arbiter decides: none, squeeze or test_lift; the recordings need its frames.
@@ -60,10 +69,19 @@ pub(super) struct Arguments {
     /// Also learn from 10, 20, 40 and 70 % of the training objects.
     #[arg(long, requires = "split")]
     learning_curve: bool,
+    /// Judge what other models say of these grasps (CSV): the columns grasp_id and probability_stable, for several recordings
+    /// also recording, for several models also model.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["repeats", "learning_curve"])]
+    predictions: Option<PathBuf>,
+    /// The models of --predictions lift from this probability on.
+    #[arg(long, value_name = "PROBABILITY", requires = "predictions", default_value_t = THRESHOLD_PROBABILITY,
+          value_parser = |text: &str| number_in(text, 1e-6..=1.0))]
+    threshold: f64,
     /// Write a report with tables and pictures (HTML).
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
-    /// Write Table I (CSV), Figure 1 and each recipe's Figure 2 (SVG) to this folder.
+    /// Write to this folder: roc.svg, pr.svg and reliability.svg with their points (CSV), the probability and fold of each grasp
+    /// (predictions.csv), Table I (CSV), Figure 1 and Figure 2 of each recipe or model (SVG).
     #[arg(long, value_name = "FOLDER")]
     figures: Option<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
@@ -86,11 +104,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             "{} is a model, and --split trains anew for each fold: give recordings only, or leave out --split",
             model.display()
         ),
-        (None, None) => bail!(
-            "{}: expected a model first (its name ends in .json), or --split grasp, object or class to train and judge \
-             on these recordings",
+        (None, None) if arguments.predictions.is_none() => bail!(
+            "{}: expected a model first (its name ends in .json), --split grasp, object or class to train and judge \
+             on these recordings, or --predictions of another model",
             arguments.inputs.first().map_or(Path::new(""), PathBuf::as_path).display()
         ),
+        (None, None) if arguments.probe != Probe::None => {
+            bail!("--probe: predictions are judged as they are: give a model as well, or leave out --probe")
+        }
         (Some(model), None) if recordings.is_empty() => {
             bail!("nothing to judge {} on: name recordings after it", model.display())
         }
@@ -99,8 +120,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     // Check files before the long work.
     let model = model.map(|path| Ok::<_, anyhow::Error>((path, Model::load(path)?))).transpose()?;
     let recordings = recordings_in(recordings)?;
+    let inputs = [recordings.as_slice(), &arguments.inputs, arguments.predictions.as_slice()].concat();
     if let Some(report) = &arguments.report {
-        check_page(report, &[recordings.as_slice(), &arguments.inputs].concat())?;
+        check_page(report, &inputs)?;
+    }
+    if let Some(folder) = arguments.figures.as_ref().filter(|folder| folder.is_dir()) {
+        check_output(&folder.join(PREDICTIONS_FILE), &inputs)?;
     }
     let first = recordings.first().context("expected a recording")?;
     let hand = hand_of(first, arguments.hand.as_deref())?;
@@ -114,7 +139,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     match (model, split) {
         (Some((path, model)), _) => job.model(path, &model),
         (None, Some(split)) => job.recipes(split),
-        (None, None) => Ok(Outcome::Done),
+        (None, None) => job.predictions(),
     }
 }
 
@@ -140,7 +165,9 @@ impl Job<'_> {
             print_label(self.recordings)?;
         }
         let has_probes = model.squeezed.is_some() || model.test_lifted.is_some();
-        if is_table && self.arguments.report.is_none() && self.arguments.figures.is_none() && !has_probes {
+        let is_asked_for_more =
+            self.arguments.report.is_some() || self.arguments.figures.is_some() || self.arguments.predictions.is_some();
+        if is_table && !is_asked_for_more && !has_probes {
             return Ok(Outcome::Done);
         }
         let mut read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
@@ -150,8 +177,38 @@ impl Job<'_> {
         if is_table {
             print_looks(&looks(model, &read.examples))?;
         }
-        let report = report_on_model(self.origin.clone(), &file_name(path), model, evaluated, &read);
+        let outside = self.outside(&read, &[file_name(path)])?;
+        let report = report_on_model(self.origin.clone(), &file_name(path), model, evaluated, &read, outside.as_ref());
+        if is_table && outside.is_some() {
+            print_judges(&report)?;
+        }
         self.deliver(&report)
+    }
+
+    fn predictions(self) -> anyhow::Result<Outcome> {
+        let read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
+        let outside = self.outside(&read, &[])?.context("expected predictions")?;
+        let report = report_on_predictions(self.origin.clone(), &read, &outside);
+        if !self.arguments.json {
+            print_judges(&report)?;
+            print_label(self.recordings)?;
+        }
+        self.deliver(&report)
+    }
+
+    /// The predictions of outside models for these examples, if there are any. `names` are those of blindgrasp's judges.
+    fn outside(&self, read: &Examples, names: &[String]) -> anyhow::Result<Option<OutsidePredictions>> {
+        let Some(path) = &self.arguments.predictions else { return Ok(None) };
+        let outside = OutsidePredictions::read(path, self.recordings, read, self.arguments.threshold)?;
+        outside.check_names(names)?;
+        if outside.n_unused > 0 {
+            print_diagnostic(&format!(
+                "{}: {} predictions are not used: no cell feels their grasps, or they are left out",
+                path.display(),
+                outside.n_unused
+            ));
+        }
+        Ok(Some(outside))
     }
 
     fn recipes(self, split: Split) -> anyhow::Result<Outcome> {
@@ -174,6 +231,11 @@ impl Job<'_> {
         };
         let read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
         let examples: Vec<&Example> = read.examples.iter().collect();
+        let outside = self.outside(&read, &arguments.recipe)?;
+        if let Some(outside) = &outside {
+            let folds = split_into_folds(split, &examples, options.n_folds, options.seed)?;
+            outside.check_folds(&read.examples, &folds)?;
+        }
         let bar = progress_bar();
         let held_out = judge_held_out(self.hand, &examples, &options, |step| {
             bar.set_length(step.n as u64);
@@ -184,7 +246,7 @@ impl Job<'_> {
             }
         });
         bar.finish_and_clear();
-        let report = report_on_recipes(self.origin.clone(), &read, &options, &held_out?);
+        let report = report_on_recipes(self.origin.clone(), &read, &options, &held_out?, outside.as_ref());
         if !arguments.json {
             print_judges(&report)?;
             print_label(self.recordings)?;
@@ -202,10 +264,10 @@ impl Job<'_> {
         }
         if let Some(folder) = &self.arguments.figures {
             std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
-            write_at_once(&folder.join("table-1.csv"), &table_1_csv(report)?)?;
-            for (name, text) in figures(self.hand, report)? {
+            for (name, text) in tables(report)?.into_iter().chain(figures(self.hand, report)?) {
                 write_at_once(&folder.join(name), &text)?;
             }
+            write_at_once(&folder.join(PREDICTIONS_FILE), &predictions_csv(&report.judges, self.recordings)?)?;
         }
         if self.arguments.json {
             print_line(&serde_json::to_string_pretty(report)?)?;
@@ -302,7 +364,7 @@ fn print_looks(looks: &[Look]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Prints the recipes and their comparisons.
+/// Prints the judges and their comparisons.
 fn print_judges(report: &Report) -> anyhow::Result<()> {
     let share = |estimate: Option<Estimate>| percent(estimate.map(|estimate| estimate.value));
     let with_interval = |estimate: Option<Estimate>| {
@@ -310,11 +372,15 @@ fn print_judges(report: &Report) -> anyhow::Result<()> {
         let interval = interval.map(|interval| format!(" ({:.1}..{:.1})", 100.0 * interval.low, 100.0 * interval.high));
         format!("{}{}", share(estimate), interval.unwrap_or_default())
     };
-    print_line("recipe      accuracy             of all grasps  false positives    of unstable  recall   ROC area")?;
+    let width = report.judges.iter().map(|judge| judge.name.chars().count()).max().unwrap_or(0).max(11);
+    let head = if report.made.predictions.is_some() { "model" } else { "recipe" };
+    print_line(&format!(
+        "{head:<width$} accuracy             of all grasps  false positives    of unstable  recall   ROC area"
+    ))?;
     for judge in &report.judges {
         let m = &judge.judged;
         print_line(&format!(
-            "{:<11} {:<20} {:>13}  {:<18} {:>11}  {:<8} {}",
+            "{:<width$} {:<20} {:>13}  {:<18} {:>11}  {:<8} {}",
             judge.name,
             with_interval(m.accuracy),
             share(judge.all.accuracy),

@@ -142,9 +142,8 @@ pub struct Scaling {
 impl FeatureExtractor {
     /// An extractor for a hand, without scaling.
     pub fn new(hand: &Hand, blocks: &[Block], dictionary: Dictionary, sigma_m: f64) -> Self {
-        let cells = |pad: &Pad| {
-            pad.cells.iter().map(|cell| cell.position_in_link_m.coords.into()).collect::<Vec<[f64; 3]>>()
-        };
+        let cells =
+            |pad: &Pad| pad.cells.iter().map(|cell| cell.position_in_link_m.coords.into()).collect::<Vec<[f64; 3]>>();
         FeatureExtractor {
             blocks: blocks.to_vec(),
             dictionary,

@@ -11,6 +11,12 @@ use super::statistics::{Estimate, Interval, bootstrap, wilson_interval};
 /// A labelled grasp and the decision on it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct JudgedGrasp {
+    /// Index of its recording in the list of recordings.
+    pub recording_idx: usize,
+    /// Its number in that recording.
+    pub grasp_id: u64,
+    /// The fold that holds it; `None` without folds, and for grasps that are held without a judgement.
+    pub fold: Option<usize>,
     pub object: String,
     pub class: String,
     pub stable: bool,
@@ -68,12 +74,12 @@ pub struct ClassErrors {
     pub false_positive_share: f64,
 }
 
-/// A recipe or a model, and its figures.
+/// A recipe, a model or the predictions of an outside model, and its figures.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct JudgedRecipe {
-    /// The recipe's name, or the model's file.
+    /// The recipe's name, the model's file, or the name of the outside model.
     pub name: String,
-    /// Its features and its learner.
+    /// Its features and its learner, or the file of predictions.
     pub about: String,
     /// The judge lifts from this probability on.
     pub threshold_probability: f64,
@@ -90,6 +96,9 @@ pub struct JudgedRecipe {
     /// The points of both curves, thinned for a picture.
     pub curve: Vec<CurvePoint>,
     pub reliability: Option<Reliability>,
+    /// The decisions that the figures are of. The JSON leaves them out.
+    #[serde(skip)]
+    pub decided: Vec<JudgedGrasp>,
 }
 
 impl JudgedRecipe {
@@ -98,7 +107,7 @@ impl JudgedRecipe {
         name: &str,
         about: String,
         threshold_probability: f64,
-        decided: &[JudgedGrasp],
+        decided: Vec<JudgedGrasp>,
         unit: Unit,
         seed: u64,
     ) -> JudgedRecipe {
@@ -116,6 +125,7 @@ impl JudgedRecipe {
             average_precision: average_precision(&curve),
             curve: thinned(&curve, CURVE_STEP),
             reliability: (!stable.is_empty()).then(|| reliability(&probabilities, &stable, N_RELIABILITY_BINS)),
+            decided,
         }
     }
 }
@@ -202,7 +212,10 @@ pub(super) mod tests {
         class: &str,
         grasps: &[(bool, Option<f64>)],
     ) -> Vec<JudgedGrasp> {
-        let decided = |(stable, probability): &(bool, Option<f64>)| JudgedGrasp {
+        let decided = |(idx, (stable, probability)): (usize, &(bool, Option<f64>))| JudgedGrasp {
+            recording_idx: 0,
+            grasp_id: idx as u64,
+            fold: None,
             object: object.into(),
             class: class.into(),
             stable: *stable,
@@ -210,14 +223,14 @@ pub(super) mod tests {
             judged: probability.is_some(),
             probability: *probability,
         };
-        grasps.iter().map(decided).collect()
+        grasps.iter().enumerate().map(decided).collect()
     }
 
     #[test]
     fn what_was_held_unjudged_counts_among_all_only() {
         let mut grasps = decided("a", "x", &[(true, Some(0.9)), (false, Some(0.7)), (true, None), (false, None)]);
         grasps.extend(decided("b", "y", &[(true, Some(0.2)), (false, Some(0.1))]));
-        let judge = JudgedRecipe::new("j", String::new(), 0.5, &grasps, Unit::Grasp, 1);
+        let judge = JudgedRecipe::new("j", String::new(), 0.5, grasps.clone(), Unit::Grasp, 1);
         let counts = |measures: &Measures| (measures.n_grasps, measures.counts.n_wrong(), measures.n_objects);
         assert_eq!((counts(&judge.judged), counts(&judge.all)), ((4, 2, 2), (6, 3, 2)));
         assert_eq!(judge.judged.accuracy.expect("some").value, 0.5);

@@ -4,6 +4,7 @@
 //! * [`split`] makes folds of grasps; [`cross_validation`] trains recipes on all folds but one and judges that one.
 //! * [`measures`], [`statistics`], [`decisions`] and [`comparison`] compute figures; [`report`] collects them, [`mod@page`]
 //!   shows them.
+//! * [`predictions`] reads what a model that is not blindgrasp's says of the same grasps, to judge it as the others.
 //! * [`looks`] judges the probes of models of lifts.
 //! * [`paper_label`] compares the paper's label with other labels.
 
@@ -14,6 +15,7 @@ pub mod looks;
 pub mod measures;
 pub mod page;
 pub mod paper_label;
+pub mod predictions;
 pub mod reliability;
 pub mod report;
 pub mod split;
@@ -83,7 +85,7 @@ pub fn evaluate(
     let mut evaluated = Evaluated { trained: trained_on.map(|_| Trained::default()), ..Evaluated::default() };
     let mut canonical = BTreeSet::new();
     let mut judge = Judge::with_options(hand.clone(), model.clone(), *options)?;
-    for path in recordings {
+    for (recording_idx, path) in recordings.iter().enumerate() {
         if !canonical.insert(path.canonicalize().unwrap_or(path.clone())) {
             let message = "it is given twice: its grasps would count twice".into();
             return Err(DatasetError::Unusable { path: path.clone(), message });
@@ -101,7 +103,7 @@ pub fn evaluate(
                 }
             }
             evaluated.evaluation.add(&decision, truth.as_ref());
-            evaluated.decided.extend(truth.map(|truth| decided_grasp(&decision, truth)));
+            evaluated.decided.extend(truth.map(|truth| decided_grasp(recording_idx, &decision, truth)));
         }
     }
     // Grasps that no cell feels are part of no training.
@@ -161,10 +163,13 @@ impl From<LiftDecision> for Decided {
     }
 }
 
-fn decided_grasp(decision: &LiftDecision, truth: GraspTruth) -> JudgedGrasp {
+fn decided_grasp(recording_idx: usize, decision: &LiftDecision, truth: GraspTruth) -> JudgedGrasp {
     // Without agreement of the votes, no single probability decided.
     let has_probability = is_judged(decision.reason) && decision.reason != Reason::NoAgreement;
     JudgedGrasp {
+        recording_idx,
+        grasp_id: truth.grasp_id,
+        fold: None,
         object: truth.object,
         class: truth.class,
         stable: truth.stable,

@@ -28,10 +28,10 @@ const FULL_WIDTH: f64 = 1152.0;
 /// A dictionary that cannot be drawn on this hand.
 pub fn report_page(hand: &Hand, report: &Report) -> Result<String, PictureError> {
     let mut page = ReportPage::begin(&title(report), &summary(report));
-    page.section("Table I: learning performance in simulation", &table_1(report));
+    page.section(&format!("Table I: learning performance{}", world(report)), &table_1(report));
     page.section("Decisions", &measures_table(report));
     if !report.comparisons.is_empty() {
-        page.section("Recipes against each other", &comparisons(report));
+        page.section("Compared with each other", &comparisons(report));
     }
     if !report.repeats.is_empty() {
         page.section("The same with other folds", &repeats(report));
@@ -66,11 +66,45 @@ pub fn report_page(hand: &Hand, report: &Report) -> Result<String, PictureError>
     Ok(page.finish())
 }
 
-/// Table I as CSV.
+/// The names and texts of tables (CSV): Table I, and the points of the curves.
 ///
 /// # Errors
 /// A row cannot be written.
-pub fn table_1_csv(report: &Report) -> Result<String, csv::Error> {
+pub fn tables(report: &Report) -> Result<Vec<(String, String)>, csv::Error> {
+    let roc = |judge: &JudgedRecipe| -> Vec<[f64; 3]> {
+        judge.curve.iter().map(|point| [point.threshold, point.false_positive_rate, point.recall]).collect()
+    };
+    let precision_recall = |judge: &JudgedRecipe| -> Vec<[f64; 3]> {
+        judge.curve.iter().map(|point| [point.threshold, point.recall, point.precision]).collect()
+    };
+    let reliability = |judge: &JudgedRecipe| -> Vec<[f64; 3]> {
+        let bins = judge.reliability.iter().flat_map(|reliability| &reliability.bins);
+        bins.map(|bin| [bin.mean_probability, bin.share_positive, bin.n as f64]).collect()
+    };
+    let points = |columns, of: &dyn Fn(&JudgedRecipe) -> Vec<[f64; 3]>| points_csv(&report.judges, columns, of);
+    Ok(vec![
+        ("table-1.csv".into(), table_1_csv(report)?),
+        ("roc.csv".into(), points(["threshold", "false_positive_rate", "recall"], &roc)?),
+        ("pr.csv".into(), points(["threshold", "recall", "precision"], &precision_recall)?),
+        ("reliability.csv".into(), points(["mean_probability", "share_stable", "n_grasps"], &reliability)?),
+    ])
+}
+
+/// The names and texts of figures (SVG): Figure 1 if there is a grasp, Figure 2 of each judge, and the curves.
+///
+/// # Errors
+/// As of [`report_page`].
+pub fn figures(hand: &Hand, report: &Report) -> Result<Vec<(String, String)>, PictureError> {
+    let figure_1 = figure_1(hand, report)?.map(|picture| ("figure-1.svg".to_string(), picture));
+    let judges = report.judges.iter().map(|judge| judge.name.replace('/', "_"));
+    let figures_2 = judges.zip(figure_2(report));
+    let figures_2 = figures_2.map(|(judge, chart)| (format!("figure-2-{judge}.svg"), bar_chart_svg(&chart)));
+    let curves = [("roc", roc(report)), ("pr", precision_recall(report)), ("reliability", reliability(report))];
+    let curves = curves.map(|(name, chart)| (format!("{name}.svg"), chart_svg(&chart)));
+    Ok(figure_1.into_iter().chain(figures_2).chain(curves).collect())
+}
+
+fn table_1_csv(report: &Report) -> Result<String, csv::Error> {
     let share = |estimate: Option<Estimate>| estimate.map(|estimate| estimate.value.to_string()).unwrap_or_default();
     let mut table = csv::Writer::from_writer(Vec::new());
     let head = ["of_paper", "data_set", "n_grasps", "n_stable", "n_unstable", "accuracy", "false_positive_share"];
@@ -90,16 +124,27 @@ pub fn table_1_csv(report: &Report) -> Result<String, csv::Error> {
     Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
-/// Figure 1, if there is a grasp, and Figure 2 of each judge: the names and texts of SVG files.
-///
-/// # Errors
-/// As of [`report_page`].
-pub fn figures(hand: &Hand, report: &Report) -> Result<Vec<(String, String)>, PictureError> {
-    let figure_1 = figure_1(hand, report)?.map(|picture| ("figure-1.svg".to_string(), picture));
-    let judges = report.judges.iter().map(|judge| judge.name.replace('/', "_"));
-    let figures_2 = judges.zip(figure_2(report));
-    let figures_2 = figures_2.map(|(judge, chart)| (format!("figure-2-{judge}.svg"), bar_chart_svg(&chart)));
-    Ok(figure_1.into_iter().chain(figures_2).collect())
+/// A row for each point of each judge.
+fn points_csv(
+    judges: &[JudgedRecipe],
+    columns: [&str; 3],
+    of: &dyn Fn(&JudgedRecipe) -> Vec<[f64; 3]>,
+) -> Result<String, csv::Error> {
+    let mut table = csv::Writer::from_writer(Vec::new());
+    table.write_record(["model"].into_iter().chain(columns))?;
+    for judge in judges {
+        for point in of(judge) {
+            table.write_record([judge.name.clone()].into_iter().chain(point.map(|number| number.to_string())))?;
+        }
+    }
+    let bytes = table.into_inner().map_err(|error| error.into_error())?;
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
+}
+
+/// Where the grasps were made, behind a title; empty unless all recordings are simulated.
+fn world(report: &Report) -> &'static str {
+    let n_simulated: usize = report.made.labels.values().sum();
+    if n_simulated > 0 && n_simulated == report.made.recordings.len() { " in simulation" } else { "" }
 }
 
 /// The contact dictionary; `None` if there is no grasp.
@@ -121,9 +166,14 @@ fn figure_1(hand: &Hand, report: &Report) -> Result<Option<String>, PictureError
 }
 
 fn title(report: &Report) -> String {
-    match (&report.made.split, report.judges.as_slice()) {
-        (None, [model]) => format!("What {} is worth", model.name),
-        _ => "Will the grasp hold? Recipes judged on grasps held out".into(),
+    let names: Vec<&str> = report.judges.iter().map(|judge| judge.name.as_str()).collect();
+    match (&report.made.split, names.as_slice()) {
+        (None, [model]) => format!("What {model} is worth"),
+        (None, _) => format!("Will the grasp hold? {} judged on the same grasps", names.join(", ")),
+        (Some(_), _) if report.made.predictions.is_some() => {
+            format!("Will the grasp hold? {} judged on grasps held out", names.join(", "))
+        }
+        (Some(_), _) => "Will the grasp hold? Recipes judged on grasps held out".into(),
     }
 }
 
@@ -303,8 +353,12 @@ fn comparisons(report: &Report) -> String {
         ("fewer", true),
     ];
     let mut text = report_table(&head, &report.comparisons.iter().map(row).collect::<Vec<_>>());
+    text.push_str("<p class=\"caption\">The same grasps");
+    if report.made.split.is_some() {
+        text.push_str(", the same folds");
+    }
     text.push_str(
-        "<p class=\"caption\">The same grasps, the same folds. Fewer errors: by which share of the second one's errors \
+        ". Fewer errors: by which share of the second one's errors \
          the first one's are fewer. Only one right: grasps that only the first, and only the second, decides rightly; \
          McNemar's exact test on them takes grasps as independent, the intervals do not. The last columns compare false \
          positives where both lift as many of the stable grasps, at the recall that the second has at its threshold.</p>\n",
@@ -387,12 +441,21 @@ fn how_made(report: &Report) -> String {
         items.push((
             "split",
             format!(
-                "by {}, {} folds, seed {}{repeats}. Dictionary, scaling and machine are learned from the other folds \
-                 alone; the calibration, too, on decision values out of {} inner folds, split alike.",
+                "by {}, {} folds, seed {}{repeats}. Dictionary, scaling and machine of a recipe are learned from the other \
+                 folds alone; the calibration, too, on decision values out of {} inner folds, split alike.",
                 split.by.word(),
                 split.n_folds,
                 split.seed,
                 split.n_calibration_folds
+            ),
+        ));
+    }
+    if let Some(predictions) = &made.predictions {
+        items.push((
+            "predictions",
+            format!(
+                "{}, taken as they are: the outside model must have made each one without having seen the grasp",
+                escape(predictions)
             ),
         ));
     }

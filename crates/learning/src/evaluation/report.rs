@@ -8,6 +8,7 @@ use super::comparison::{Comparison, compare};
 use super::cross_validation::{HeldOut, HeldOutOptions, N_INNER_FOLDS, Word, used_words};
 use super::decisions::{JudgedGrasp, JudgedRecipe, Unit, measure};
 use super::looks::{Look, looks};
+use super::predictions::{OutsideModel, OutsidePredictions};
 use super::split::Split;
 use super::statistics::{Estimate, N_RESAMPLES};
 use super::{Evaluated, Evaluation, Trained};
@@ -32,9 +33,9 @@ pub struct Report {
     pub data: Data,
     /// The paper's Table I, and the same rows for these data.
     pub table_1: Vec<TableRow>,
-    /// The recipes, or the model.
+    /// The outside models, then the recipes or the model.
     pub judges: Vec<JudgedRecipe>,
-    /// Each pair of recipes.
+    /// Each pair of judges.
     pub comparisons: Vec<Comparison>,
     /// The same with other folds, if repeats were asked for. All other figures are of the first repeat.
     pub repeats: Vec<RepeatSummary>,
@@ -52,6 +53,9 @@ pub struct Made {
     pub version: String,
     pub hand: String,
     pub recordings: Vec<String>,
+    /// The file with predictions of outside models.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub predictions: Option<String>,
     /// The programs that made the recordings, with the number of recordings of each.
     pub made_by: BTreeMap<String, usize>,
     /// The number of simulated recordings with each definition of stable.
@@ -163,50 +167,36 @@ pub struct Origin {
 
 /// A judged recipe lifts from this probability on.
 pub const THRESHOLD_PROBABILITY: f64 = 0.5;
+/// The seed of the intervals of predictions without recipes or a model.
+const INTERVAL_SEED: u64 = 1;
 
-/// Makes the report on recipes that were judged on grasps held out.
-pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptions, held_out: &HeldOut) -> Report {
+/// Makes the report on recipes that were judged on grasps held out, and on predictions of outside models if there are any.
+pub fn report_on_recipes(
+    origin: Origin,
+    read: &Examples,
+    options: &HeldOutOptions,
+    held_out: &HeldOut,
+    outside: Option<&OutsidePredictions>,
+) -> Report {
     let unit = if options.split == Split::Grasp { Unit::Grasp } else { Unit::Object };
-    let threshold = THRESHOLD_PROBABILITY;
-    let decide = |example: &Example, probability: f64| JudgedGrasp {
-        object: example.object.clone(),
-        class: example.class.clone(),
-        stable: example.stable,
-        lifted: probability >= threshold,
-        judged: true,
-        probability: Some(probability),
-    };
-    let unfelt: Vec<JudgedGrasp> = read
-        .unfelt
-        .iter()
-        .map(|(object, class, stable)| JudgedGrasp {
-            object: object.clone(),
-            class: class.clone(),
-            stable: *stable,
-            lifted: false,
-            judged: false,
-            probability: None,
-        })
-        .collect();
     let names: Vec<&str> = options.recipes.iter().map(|recipe| recipe.name.as_str()).collect();
+    let undecided = undecided(read);
     // The decisions of each repeat and recipe; the judged grasps come first.
     let decided: Vec<Vec<Vec<JudgedGrasp>>> = held_out
         .repeats
         .iter()
         .map(|repeat| {
-            let of_recipe = |probabilities: &Vec<f64>| {
-                let judged = read.examples.iter().zip(probabilities);
-                judged.map(|(example, probability)| decide(example, *probability)).chain(unfelt.clone()).collect()
-            };
+            let of_recipe = |probabilities: &Vec<f64>| decided(&undecided, probabilities, &repeat.folds);
             repeat.probabilities.iter().map(of_recipe).collect()
         })
         .collect();
     let main = decided.first().map_or(&[][..], Vec::as_slice);
+    let any = main.first().map_or(&[][..], Vec::as_slice);
     let judge = |(recipe, decided): (&Recipe, &Vec<JudgedGrasp>)| {
-        JudgedRecipe::new(&recipe.name, about(recipe), threshold, decided, unit, options.seed)
+        JudgedRecipe::new(&recipe.name, about(recipe), THRESHOLD_PROBABILITY, decided.clone(), unit, options.seed)
     };
-    let judges: Vec<JudgedRecipe> = options.recipes.iter().zip(main).map(judge).collect();
-    let pairs = || (0..names.len()).flat_map(|first| (first + 1..names.len()).map(move |second| (first, second)));
+    let mut judges = outside_judges(outside, any, unit, options.seed);
+    judges.extend(options.recipes.iter().zip(main).map(judge));
     let paired = |of: &[Vec<JudgedGrasp>], (first, second): (usize, usize)| {
         compare([(names[first], &of[first]), (names[second], &of[second])], unit, options.seed)
     };
@@ -215,22 +205,21 @@ pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptio
     let in_training = 1.0 - 1.0 / options.n_folds as f64;
     let training =
         row(format!("Training, mean of {} folds", options.n_folds), [n_examples, n_stable].map(|n| n * in_training));
-    let any = main.first().map_or(&[][..], Vec::as_slice);
     Report {
-        made: made(origin, read, unit, Some(options)),
+        made: made(origin, read, unit, Some(options), outside),
         graph: None,
         trained: None,
         looks: Vec::new(),
         data: data(any, read.n_excluded.clone()),
-        table_1: table_1(training, &judges),
-        comparisons: pairs().map(|pair| paired(main, pair)).collect(),
+        table_1: table_1(Some(training), &judges),
+        comparisons: comparisons(&judges, unit, options.seed),
         repeats: repeats(held_out, &names, &decided),
         repeated_comparisons: if decided.len() > 1 {
-            pairs().map(|pair| repeated(decided.iter().map(|of| paired(of, pair)).collect())).collect()
+            pairs(names.len()).map(|pair| repeated(decided.iter().map(|of| paired(of, pair)).collect())).collect()
         } else {
             Vec::new()
         },
-        learning_curve: learning_curve(&names, held_out, read, options, &decide, unit),
+        learning_curve: learning_curve(&names, held_out, read, options, unit),
         judges,
         dictionary: DictionaryUse {
             from: format!("what recipe {} learned from all folds but the first", names[0]),
@@ -240,29 +229,36 @@ pub fn report_on_recipes(origin: Origin, read: &Examples, options: &HeldOutOptio
     }
 }
 
-/// Makes the report on a model, whose decisions are those of the graph.
+/// Makes the report on a model, whose decisions are those of the graph, and on predictions of outside models if there are any.
 ///
 /// * `name` - the model's file.
 /// * `read` - the same recordings as examples without those that the model was trained on, for its looks and the dictionary's
 ///   picture.
-pub fn report_on_model(origin: Origin, name: &str, model: &Model, evaluated: Evaluated, read: &Examples) -> Report {
+pub fn report_on_model(
+    origin: Origin,
+    name: &str,
+    model: &Model,
+    evaluated: Evaluated,
+    read: &Examples,
+    outside: Option<&OutsidePredictions>,
+) -> Report {
     let Evaluated { evaluation: graph, decided, trained } = evaluated;
     let training = &model.training;
     let unit = Unit::Object;
     let recipe = &training.recipe;
     let about = format!("{}: {}", about(recipe), model.classifier.predictor.summary());
-    let judge = JudgedRecipe::new(name, about, model.classifier.threshold_probability, &decided, unit, training.seed);
     let without_truth = (graph.n_without_truth > 0).then(|| ("no truth".to_string(), graph.n_without_truth));
-    let judges = vec![judge];
+    let data = data(&decided, without_truth.into_iter().collect());
+    let mut judges = outside_judges(outside, &decided, unit, training.seed);
+    let threshold = model.classifier.threshold_probability;
+    judges.push(JudgedRecipe::new(name, about, threshold, decided, unit, training.seed));
+    let learned_from = row("Training, as the model says".into(), [training.n_grasps as f64, training.n_stable as f64]);
     Report {
-        made: made(origin, read, unit, None),
-        data: data(&decided, without_truth.into_iter().collect()),
-        table_1: table_1(
-            row("Training, as the model says".into(), [training.n_grasps as f64, training.n_stable as f64]),
-            &judges,
-        ),
+        made: made(origin, read, unit, None, outside),
+        data,
+        table_1: table_1(Some(learned_from), &judges),
+        comparisons: comparisons(&judges, unit, training.seed),
         judges,
-        comparisons: Vec::new(),
         repeats: Vec::new(),
         repeated_comparisons: Vec::new(),
         learning_curve: Vec::new(),
@@ -277,8 +273,107 @@ pub fn report_on_model(origin: Origin, name: &str, model: &Model, evaluated: Eva
     }
 }
 
+/// Makes the report on predictions of outside models alone.
+pub fn report_on_predictions(origin: Origin, read: &Examples, outside: &OutsidePredictions) -> Report {
+    let unit = Unit::Object;
+    let judges = outside_judges(Some(outside), &undecided(read), unit, INTERVAL_SEED);
+    Report {
+        made: made(origin, read, unit, None, Some(outside)),
+        graph: None,
+        trained: None,
+        looks: Vec::new(),
+        data: data(judges.first().map_or(&[][..], |judge| judge.decided.as_slice()), read.n_excluded.clone()),
+        table_1: table_1(None, &judges),
+        comparisons: comparisons(&judges, unit, INTERVAL_SEED),
+        judges,
+        repeats: Vec::new(),
+        repeated_comparisons: Vec::new(),
+        learning_curve: Vec::new(),
+        dictionary: DictionaryUse { from: String::new(), joints: Vec::new(), words: Vec::new() },
+    }
+}
+
+/// The labelled grasps without a decision: the examples, then those that no cell feels.
+fn undecided(read: &Examples) -> Vec<JudgedGrasp> {
+    let mut grasps: Vec<JudgedGrasp> = read.examples.iter().map(of_example).collect();
+    grasps.extend(read.unfelt.iter().map(|grasp| JudgedGrasp {
+        recording_idx: grasp.recording_idx,
+        grasp_id: grasp.grasp_id,
+        fold: None,
+        object: grasp.object.clone(),
+        class: grasp.class.clone(),
+        stable: grasp.stable,
+        lifted: false,
+        judged: false,
+        probability: None,
+    }));
+    grasps
+}
+
+fn of_example(example: &Example) -> JudgedGrasp {
+    JudgedGrasp {
+        recording_idx: example.recording_idx,
+        grasp_id: example.grasp_id,
+        fold: None,
+        object: example.object.clone(),
+        class: example.class.clone(),
+        stable: example.stable,
+        lifted: false,
+        judged: false,
+        probability: None,
+    }
+}
+
+/// The decisions of a recipe by its probabilities of the examples, which come first; the others stay held.
+fn decided(undecided: &[JudgedGrasp], probabilities: &[f64], folds: &[usize]) -> Vec<JudgedGrasp> {
+    let mut grasps = undecided.to_vec();
+    for ((grasp, probability), fold) in grasps.iter_mut().zip(probabilities).zip(folds) {
+        *grasp = decide(grasp, Some(*probability), THRESHOLD_PROBABILITY);
+        grasp.fold = Some(*fold);
+    }
+    grasps
+}
+
+/// A grasp with the decision by this probability. Without one it is held.
+fn decide(grasp: &JudgedGrasp, probability: Option<f64>, threshold_probability: f64) -> JudgedGrasp {
+    JudgedGrasp {
+        lifted: probability.is_some_and(|probability| probability >= threshold_probability),
+        judged: probability.is_some(),
+        probability,
+        ..grasp.clone()
+    }
+}
+
+/// The outside models as judges of the same grasps.
+fn outside_judges(
+    outside: Option<&OutsidePredictions>,
+    grasps: &[JudgedGrasp],
+    unit: Unit,
+    seed: u64,
+) -> Vec<JudgedRecipe> {
+    let Some(outside) = outside else { return Vec::new() };
+    let threshold = outside.threshold_probability;
+    let judge = |model: &OutsideModel| {
+        let decided = grasps.iter().map(|grasp| decide(grasp, model.probability(grasp), threshold)).collect();
+        let about = format!("predictions of {}", outside.file_name());
+        JudgedRecipe::new(&model.name, about, threshold, decided, unit, seed)
+    };
+    outside.models.iter().map(judge).collect()
+}
+
+/// Each pair of judges.
+fn comparisons(judges: &[JudgedRecipe], unit: Unit, seed: u64) -> Vec<Comparison> {
+    let side = |idx: usize| (judges[idx].name.as_str(), judges[idx].decided.as_slice());
+    pairs(judges.len()).map(|(first, second)| compare([side(first), side(second)], unit, seed)).collect()
+}
+
+/// Each pair of so many, by index.
+fn pairs(n: usize) -> impl Iterator<Item = (usize, usize)> {
+    (0..n).flat_map(move |first| (first + 1..n).map(move |second| (first, second)))
+}
+
 fn about(recipe: &Recipe) -> String {
-    let blocks: Vec<String> = recipe.blocks.iter().map(|block| format!("{block:?}").to_lowercase()).collect();
+    let blocks: Vec<&str> = recipe.blocks.iter().map(|block| block.about()).collect();
     let learner = match &recipe.learner {
         Learner::Svm(params) => format!("RBF SVM (C {}, gamma {})", params.c, params.gamma),
         Learner::Boosting(params) => format!("{} boosted trees", params.n_rounds),
@@ -289,7 +384,13 @@ fn about(recipe: &Recipe) -> String {
     format!("{learner} on {}", blocks.join(", "))
 }
 
-fn made(origin: Origin, read: &Examples, unit: Unit, options: Option<&HeldOutOptions>) -> Made {
+fn made(
+    origin: Origin,
+    read: &Examples,
+    unit: Unit,
+    options: Option<&HeldOutOptions>,
+    outside: Option<&OutsidePredictions>,
+) -> Made {
     let mut makers: BTreeMap<String, usize> = BTreeMap::new();
     read.made_by.iter().for_each(|maker| *makers.entry(maker.clone()).or_default() += 1);
     let intervals = match unit {
@@ -307,6 +408,7 @@ fn made(origin: Origin, read: &Examples, unit: Unit, options: Option<&HeldOutOpt
         version: env!("CARGO_PKG_VERSION").into(),
         hand: origin.hand,
         recordings: origin.recordings,
+        predictions: outside.map(OutsidePredictions::file_name),
         made_by: makers,
         labels: read.labels.clone(),
         split: options.map(|options| SplitMade {
@@ -349,7 +451,7 @@ fn row(data_set: String, [n_grasps, n_stable]: [f64; 2]) -> TableRow {
 }
 
 /// The paper's rows, then the rows of these data.
-fn table_1(training: TableRow, judges: &[JudgedRecipe]) -> Vec<TableRow> {
+fn table_1(training: Option<TableRow>, judges: &[JudgedRecipe]) -> Vec<TableRow> {
     let exactly = |value| Some(Estimate { value, interval: None });
     let paper = |data_set: &str, numbers| TableRow { of_paper: true, ..row(data_set.into(), numbers) };
     let mut rows = vec![
@@ -359,8 +461,8 @@ fn table_1(training: TableRow, judges: &[JudgedRecipe]) -> Vec<TableRow> {
             false_positive_share: exactly(0.086),
             ..paper("Test", [12_320.0, 5_914.0])
         },
-        training,
     ];
+    rows.extend(training);
     for judge in judges {
         for (what, measures) in [("", &judge.judged), (", and grasps held unjudged", &judge.all)] {
             if what.is_empty() || judge.all.n_grasps > judge.judged.n_grasps {
@@ -419,12 +521,13 @@ fn learning_curve(
     held_out: &HeldOut,
     read: &Examples,
     options: &HeldOutOptions,
-    decide: &dyn Fn(&Example, f64) -> JudgedGrasp,
     unit: Unit,
 ) -> Vec<LearningPoint> {
     let point = |step: &super::cross_validation::LearningStep| {
-        let decided: Vec<JudgedGrasp> =
-            step.judged.iter().flatten().map(|(idx, probability)| decide(&read.examples[*idx], *probability)).collect();
+        let decide = |(idx, probability): &(usize, f64)| {
+            decide(&of_example(&read.examples[*idx]), Some(*probability), THRESHOLD_PROBABILITY)
+        };
+        let decided: Vec<JudgedGrasp> = step.judged.iter().flatten().map(decide).collect();
         let measures = measure(&decided.iter().collect::<Vec<_>>(), unit, options.seed);
         LearningPoint {
             recipe: names[step.recipe_idx].into(),

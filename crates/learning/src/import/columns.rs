@@ -185,7 +185,7 @@ fn listed(names: &[String]) -> String {
 }
 
 /// The beginning of a name or value for an error: they may have any length.
-pub(super) fn shortened(text: &str) -> String {
+pub(crate) fn shortened(text: &str) -> String {
     const MAX_CHARS: usize = 60;
     match text.char_indices().nth(MAX_CHARS) {
         None => text.into(),

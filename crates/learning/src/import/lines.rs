@@ -5,20 +5,20 @@
 
 /// Counts lines on the way through a text.
 #[derive(Debug)]
-pub(super) struct Lines<'a> {
+pub(crate) struct Lines<'a> {
     text: &'a [u8],
     at: usize,
     line: u64,
 }
 
 impl<'a> Lines<'a> {
-    pub(super) fn new(text: &'a [u8]) -> Self {
+    pub(crate) fn new(text: &'a [u8]) -> Self {
         Lines { text, at: 0, line: 1 }
     }
 
     /// The line, from 1, of the row that begins at this byte, or behind the line ends at this byte. Call it in the order of
     /// the rows.
-    pub(super) fn line_of(&mut self, byte: u64) -> u64 {
+    pub(crate) fn line_of(&mut self, byte: u64) -> u64 {
         let is_end = |byte: u8| byte == b'\n' || byte == b'\r';
         while let Some(&found) = self.text.get(self.at).filter(|found| (self.at as u64) < byte || is_end(**found)) {
             let is_half = found == b'\r' && self.text.get(self.at + 1) == Some(&b'\n');

@@ -4,10 +4,10 @@
 //! stay unknown: epsilon and volume are NaN, and there is no scene. Nothing is guessed: a table that does not fit the hand, or a
 //! row that cannot be read, is an error.
 
-mod columns;
+pub(crate) mod columns;
 mod frames;
 mod grasps;
-mod lines;
+pub(crate) mod lines;
 
 use std::collections::BTreeMap;
 use std::io::Read;
@@ -28,7 +28,7 @@ use blindgrasp_stages::day::day_number;
 use blindgrasp_stages::hand::{CellUnit, Hand, JointKind};
 
 /// The first bytes of UTF-8 files by spreadsheets.
-const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
+pub(crate) const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
 /// The time between two frames of a grasp, as in the simulator.
 const PERIOD_NANOS: u64 = 10_000_000;
 /// The time between the last frame of a grasp and the first of the next.
@@ -471,7 +471,7 @@ fn check_label(
 }
 
 /// A field as an error shows it.
-fn found(field: &str) -> String {
+pub(crate) fn found(field: &str) -> String {
     if field.is_empty() { "nothing".into() } else { format!("'{}'", shortened(field)) }
 }
 
@@ -488,7 +488,7 @@ fn read(table: &Path) -> Result<Vec<u8>, ImportError> {
 }
 
 /// The bad row of an error; `None` if the whole file failed.
-fn bad_row(error: &csv::Error, line: u64) -> Option<BadRow> {
+pub(crate) fn bad_row(error: &csv::Error, line: u64) -> Option<BadRow> {
     let problem = match error.kind() {
         csv::ErrorKind::UnequalLengths { expected_len, len, .. } => {
             format!("expected {expected_len} fields, as the header has, found {len}")

@@ -120,6 +120,18 @@ impl FeltGrasp {
     }
 }
 
+/// A labelled grasp that no cell feels.
+#[derive(Debug, Clone, PartialEq)]
+pub struct UnfeltGrasp {
+    /// Index of its recording in the list it was read from.
+    pub recording_idx: usize,
+    /// Its number in that recording.
+    pub grasp_id: u64,
+    pub object: String,
+    pub class: String,
+    pub stable: bool,
+}
+
 /// The grasps of recordings to learn from, and the number of those left out.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Examples {
@@ -127,8 +139,10 @@ pub struct Examples {
     pub examples: Vec<Example>,
     /// Grasps left out, by reason.
     pub n_excluded: BTreeMap<String, usize>,
-    /// Labelled grasps that no cell feels, as (object, class, stable). They are always held.
-    pub unfelt: Vec<(String, String, bool)>,
+    /// Labelled grasps that no cell feels. They are always held.
+    pub unfelt: Vec<UnfeltGrasp>,
+    /// All grasps, those left out as well: the index of the recording and the number in it.
+    pub grasps: BTreeSet<(usize, u64)>,
     /// The program and options that made each recording, from its metadata.
     pub made_by: Vec<String>,
     /// Number of simulated recordings for each meaning of "stable".
@@ -233,6 +247,7 @@ impl Examples {
         let mut exclude = |reason: &str| *self.n_excluded.entry(reason.into()).or_default() += 1;
         for grasp in grasps {
             let grasp_id = grasp.grasp_id;
+            self.grasps.insert((recording_idx, grasp_id));
             let mut truth = grasp.truth;
             if let Some(truth) = truth.as_mut()
                 && by_wrench_space
@@ -275,7 +290,8 @@ impl Examples {
                     // Two grasps of one recording may have equal readings. In two recordings it is the same grasp.
                     let first = seen.entry(felt.reading_id).or_insert((recording_idx, truth.stable)).0;
                     if felt.fault == Fault::NoContact && first == recording_idx {
-                        self.unfelt.push((truth.object, truth.class, truth.stable));
+                        let GraspTruth { object, class, stable, .. } = truth;
+                        self.unfelt.push(UnfeltGrasp { recording_idx, grasp_id, object, class, stable });
                     }
                 }
             }

@@ -19,7 +19,7 @@ use std::path::{Path, PathBuf};
 pub use adaptation::{adapt, adapt_on};
 pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 pub use blindgrasp_stages::training_summary::{PolicySummary, TrainingSummary};
-pub use examples::{Example, Examples, Felt, Relabelling, Signals};
+pub use examples::{Example, Examples, Felt, Relabelling, Signals, UnfeltGrasp};
 pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
 pub(crate) use probes::composed;
 
