@@ -1,11 +1,14 @@
-//! `blindgrasp evaluate`: recipes judged on grasps held out, a model on recordings, and the report of either.
+//! `blindgrasp evaluate`: recipes judged on grasps held out, a model on recordings, predictions of other models, and the
+//! reports.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use serde_json::Value;
 
+use crate::common::python::{python, shell, utf8};
 use crate::common::{MODEL, RECORDING, project, run, text};
+use crate::import::pincer;
 
 const SPLIT: [&str; 9] =
     ["evaluate", RECORDING, "--split", "object", "--folds", "3", "--recipe", "boosted,paper", "--json"];
@@ -186,6 +189,245 @@ fn a_model_gets_the_same_report() {
     assert!(text(&refused.stderr).contains("is an input"), "{}", text(&refused.stderr));
 }
 
+/// The rows of a table, each by the names of its columns.
+fn rows(path: &Path) -> Vec<BTreeMap<String, String>> {
+    let mut table = csv::Reader::from_path(path).expect("a table");
+    table.deserialize().map(|row| row.expect("a row")).collect()
+}
+
+/// Writes the figures of recipes on held-out grasps to a folder; the report.
+fn figures(folder: &Path) -> Value {
+    json(&[&SPLIT[..], &["--figures", utf8(folder)]].concat())
+}
+
+#[test]
+fn figures_are_pictures_with_the_points_that_they_show() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let folder = folder.path().join("figures");
+    let report = figures(&folder);
+    let mut names: Vec<String> = std::fs::read_dir(&folder)
+        .expect("figures")
+        .map(|entry| entry.expect("an entry").file_name().into_string().expect("UTF-8"))
+        .collect();
+    names.sort();
+    let expected = [
+        "figure-1.svg",
+        "figure-2-boosted.svg",
+        "figure-2-paper.svg",
+        "pr.csv",
+        "pr.svg",
+        "predictions.csv",
+        "reliability.csv",
+        "reliability.svg",
+        "roc.csv",
+        "roc.svg",
+        "table-1.csv",
+    ];
+    assert_eq!(names, expected);
+    for (name, axes) in [
+        ("roc", ["unstable grasps that are lifted (%)", "stable grasps that are lifted (%)"]),
+        ("pr", ["recall: stable grasps that are lifted (%)", "precision: lifted grasps that are stable (%)"]),
+        ("reliability", ["probability of stable, mean of a bin (%)", "grasps of the bin that are stable (%)"]),
+    ] {
+        let svg = std::fs::read_to_string(folder.join(format!("{name}.svg"))).expect("a picture");
+        assert!(svg.starts_with("<svg ") && svg.trim_end().ends_with("</svg>"), "{name}");
+        for shown in axes.into_iter().chain([">boosted, ", ">paper, "]) {
+            assert!(svg.contains(shown), "{name}: {shown}");
+        }
+        let points = rows(&folder.join(format!("{name}.csv")));
+        let models: BTreeSet<&str> = points.iter().map(|row| row["model"].as_str()).collect();
+        assert_eq!(models, BTreeSet::from(["boosted", "paper"]), "{name}");
+    }
+    let of = |name: &str, model: &str| {
+        rows(&folder.join(name)).into_iter().filter(|row| row["model"] == model).collect::<Vec<_>>()
+    };
+    for judge in report["judges"].as_array().expect("judges") {
+        let model = judge["name"].as_str().expect("a name");
+        let roc = of("roc.csv", model);
+        let ends = [roc.first(), roc.last()].map(|row| row.map(|row| (&*row["false_positive_rate"], &*row["recall"])));
+        assert_eq!(ends, [Some(("0", "0")), Some(("1", "1"))]);
+        assert_eq!(of("pr.csv", model).last().map(|row| row["recall"].clone()).as_deref(), Some("1"));
+        let n_in_bins: f64 =
+            of("reliability.csv", model).iter().map(|bin| bin["n_grasps"].parse::<f64>().expect("a number")).sum();
+        assert_eq!(n_in_bins, number(&report["data"]["n_judged"]));
+        let grasps = of("predictions.csv", model);
+        assert_eq!(grasps.len() as f64, number(&report["data"]["n_judged"]));
+        let mut fold_of: BTreeMap<&str, &str> = BTreeMap::new();
+        for grasp in &grasps {
+            assert_eq!(
+                *fold_of.entry(&grasp["object"]).or_insert(&grasp["fold"]),
+                grasp["fold"],
+                "an object in two folds"
+            );
+        }
+        assert_eq!(fold_of.into_values().collect::<BTreeSet<_>>(), BTreeSet::from(["1", "2", "3"]));
+    }
+}
+
+#[test]
+fn predictions_of_any_model_are_judged_like_the_recipes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let report = figures(folder.path());
+    let at = |name: &str| folder.path().join(name);
+    // The predictions of the recipes themselves get the figures of the recipes.
+    let table = at("predictions.csv");
+    let page = at("report.html");
+    let alone = ["evaluate", RECORDING, "--predictions", utf8(&table), "--json", "--report", utf8(&page)];
+    let again = json(&alone);
+    let own = report["judges"].as_array().expect("judges");
+    assert_eq!(again["judges"].as_array().map(Vec::len), Some(2));
+    for (own, again) in own.iter().zip(again["judges"].as_array().expect("judges")) {
+        assert_eq!(again["about"], "predictions of predictions.csv");
+        for figure in ["name", "threshold_probability", "judged", "all", "by_class", "roc_auc", "curve", "reliability"]
+        {
+            assert_eq!(own[figure], again[figure], "{figure}");
+        }
+    }
+    assert_eq!((&report["data"], &report["comparisons"]), (&again["data"], &again["comparisons"]));
+    let page = std::fs::read_to_string(page).expect("a report");
+    assert_self_contained(&page);
+    assert!(page.contains("learning performance in simulation") && page.contains("<dt>predictions</dt>"));
+
+    // Under another name, beside the recipes: the outside model comes first, and is compared with each of them.
+    let mine = at("mine.csv");
+    let text_of_boosted: String = std::fs::read_to_string(&table)
+        .expect("predictions")
+        .lines()
+        .filter(|line| !line.contains(",paper,"))
+        .map(|line| line.replace(",boosted,", ",mine,") + "\n")
+        .collect();
+    std::fs::write(&mine, &text_of_boosted).expect("written");
+    let beside = json(&[&SPLIT[..], &["--predictions", utf8(&mine)]].concat());
+    let judges = beside["judges"].as_array().expect("judges");
+    let names: Vec<_> = judges.iter().filter_map(|judge| judge["name"].as_str()).collect();
+    assert_eq!(names, ["mine", "boosted", "paper"]);
+    assert_eq!(judges[0]["judged"], judges[1]["judged"]);
+    assert_eq!(beside["comparisons"].as_array().map(Vec::len), Some(3));
+    assert_eq!(
+        (&beside["comparisons"][0]["mcnemar_p"], &beside["comparisons"][0]["second"]),
+        (&1.0.into(), &"boosted".into())
+    );
+    assert_eq!(
+        beside["comparisons"][1]["relative_error_reduction"],
+        report["comparisons"][0]["relative_error_reduction"]
+    );
+
+    // A higher threshold lifts less, and the curves stay.
+    let strict = json(&["evaluate", RECORDING, "--predictions", utf8(&mine), "--threshold", "0.9", "--json"]);
+    let lifted =
+        |judge: &Value| number(&judge["judged"]["n_true_positive"]) + number(&judge["judged"]["n_false_positive"]);
+    assert!(lifted(&strict["judges"][0]) < lifted(&judges[0]));
+    assert_eq!(strict["judges"][0]["roc_auc"], judges[0]["roc_auc"]);
+
+    // Beside a model, without the column of models: the file gives the name.
+    let without_model: String =
+        text_of_boosted.lines().map(|line| line.replace(",mine,", ",").replace(",model,", ",") + "\n").collect();
+    std::fs::write(&mine, without_model).expect("written");
+    let of_model = json(&["evaluate", MODEL, RECORDING, "--predictions", utf8(&mine), "--json"]);
+    let names: Vec<_> =
+        of_model["judges"].as_array().expect("judges").iter().map(|judge| judge["name"].clone()).collect();
+    assert_eq!(names, ["mine", "barrett-bh8-280.json"]);
+    assert_eq!(of_model["comparisons"].as_array().map(Vec::len), Some(1));
+    let table = text(&run(&["evaluate", MODEL, RECORDING, "--predictions", utf8(&mine)], 0).stdout);
+    assert!(table.contains("\nmodel ") && table.contains("mine against barrett-bh8-280.json"), "{table}");
+}
+
+#[test]
+fn predictions_that_do_not_fit_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    figures(folder.path());
+    let table = folder.path().join("predictions.csv");
+    let whole = std::fs::read_to_string(&table).expect("predictions");
+    let whole: String =
+        whole.lines().filter(|line| !line.contains(",paper,")).map(|line| line.to_owned() + "\n").collect();
+    let second = whole.lines().nth(1).expect("a row").to_owned();
+    let mine = folder.path().join("mine.csv");
+    let refuse = |text_of: &str, arguments: &[&str], expected: &str| {
+        std::fs::write(&mine, text_of).expect("written");
+        let refused = run(&[&["evaluate", RECORDING, "--predictions", utf8(&mine)], arguments].concat(), 1);
+        let stderr = text(&refused.stderr);
+        assert!(
+            stderr.contains(expected) && stderr.contains("mine.csv") && refused.stdout.is_empty(),
+            "{expected}: {stderr}"
+        );
+    };
+    refuse(&whole.replace(&format!("{second}\n"), ""), &[], "model 'boosted' has no prediction for 1 of the");
+    refuse(&format!("{whole}{second}\n"), &[], "on line 2 already");
+    refuse(&whole.replace("held-out.mcap", "other.mcap"), &[], "line 2: column 'recording'");
+    refuse(
+        &(whole.clone() + &second.replacen("held-out.mcap,", "held-out.mcap,99", 1) + "\n"),
+        &[],
+        "held-out.mcap has no grasp 99",
+    );
+    let (before, _) = second.rsplit_once(',').expect("columns");
+    refuse(
+        &whole.replace(&second, &format!("{before},NaN")),
+        &[],
+        "line 2: column 'probability_stable': expected a number from 0",
+    );
+    let split = ["--split", "object", "--folds", "3", "--recipe", "boosted"];
+    refuse(&whole, &split, "a model is called 'boosted', as one of blindgrasp's");
+    // With another seed, grasps are in other folds.
+    let other = [&split[..], &["--seed", "2"]].concat();
+    refuse(&whole.replace(",boosted,", ",mine,"), &other, "in predictions.csv, which --figures writes");
+    refuse("grasp_id\n", &[], "line 1: there is no column 'probability_stable'");
+
+    let figures = ["--figures", utf8(folder.path())];
+    let refused = run(&[&["evaluate", RECORDING, "--predictions", utf8(&table)], &figures[..]].concat(), 1);
+    assert!(text(&refused.stderr).contains("is an input"), "{}", text(&refused.stderr));
+    let refused = run(&["evaluate", RECORDING, "--predictions", utf8(&table), "--probe", "squeeze"], 1);
+    assert!(text(&refused.stderr).contains("give a model as well"), "{}", text(&refused.stderr));
+}
+
+/// A robot's own table: the report must not say that it was simulated.
+#[test]
+fn a_report_on_a_real_hand_does_not_speak_of_simulation() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let hand = pincer(folder.path());
+    let write = |name: &str, content: &str| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, content).expect("written");
+        utf8(&path).to_owned()
+    };
+    let table = write(
+        "table.csv",
+        "object,held,l_1,l_2,r_1\ncup,yes,0.5,1.25,2\ncup,no,0.5,0,0.3\nbox,yes,1,1,2\nbox,no,0,0.2,0.5\n",
+    );
+    let recording = utf8(&folder.path().join("out.mcap")).to_owned();
+    let columns = ["--cells", "l_*,r_*", "--label", "held", "--stable-value", "yes", "--group", "object"];
+    let import = ["import", &table, "--hand", &hand, "--joints", "left=0.5", "--out", &recording];
+    run(&[&import[..], &columns].concat(), 0);
+    let predictions = write("forest.csv", "grasp_id,probability_stable\n0,0.9\n1,0.4\n2,0.7\n3,0.6\n");
+    let page = utf8(&folder.path().join("report.html")).to_owned();
+    let arguments = ["evaluate", &recording, "--hand", &hand, "--predictions", &predictions, "--report", &page];
+    let printed = text(&run(&arguments, 0).stdout);
+    assert!(printed.contains("\nforest") && printed.contains("75.0 %"), "{printed}");
+    let page = std::fs::read_to_string(page).expect("a report");
+    assert!(page.contains("Table I: learning performance<") && !page.contains("simulation"));
+    assert!(page.contains("What forest is worth") && page.contains("predictions of forest.csv"));
+}
+
+/// The block of Python in docs/learning.md, as a reader would run it.
+#[test]
+fn the_example_with_scikit_learn_is_judged_beside_the_recipes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    figures(&folder.path().join("figures"));
+    let features = folder.path().join("features.csv");
+    run(&["export", RECORDING, "--features", MODEL, "--out", utf8(&features)], 0);
+    let page = std::fs::read_to_string(project().join("docs/learning.md")).expect("a page");
+    let block = page.split("```python\n").nth(1).expect("an example").split("```").next().expect("its end");
+    let program = folder.path().join("mine.py");
+    std::fs::write(&program, block).expect("written");
+    let printed = text(&shell(folder.path(), python(), &[utf8(&program)], 0).stdout);
+    assert!(printed.contains("finger_") || printed.contains("hist_") || printed.contains("palm."), "{printed}");
+    let mine = folder.path().join("mine.csv");
+    let report = json(&[&SPLIT[..], &["--predictions", utf8(&mine)]].concat());
+    let names: Vec<_> =
+        report["judges"].as_array().expect("judges").iter().map(|judge| judge["name"].clone()).collect();
+    assert_eq!(names, ["forest", "boosted", "paper"]);
+    assert!(number(&report["judges"][0]["roc_auc"]) > 0.65, "{}", report["judges"][0]["roc_auc"]);
+}
+
 #[test]
 fn folds_by_grasp_and_by_class_are_judged_too() {
     for (split, interval) in [("grasp", "Wilson"), ("class", "objects")] {
@@ -208,6 +450,10 @@ fn arguments_that_do_not_fit_are_refused_with_a_way_out() {
         (vec!["absent.json"], 1, "nothing to judge"),
         (vec!["absent.json", RECORDING], 1, "absent.json"),
         (vec![RECORDING, "--split", "object", "--report", "absent/report.html"], 1, "no such folder"),
+        (vec![RECORDING, "--predictions", "absent.csv"], 1, "absent.csv"),
+        (vec![RECORDING, "--threshold", "0.5"], 2, "--predictions"),
+        (vec![RECORDING, "--predictions", "absent.csv", "--threshold", "1.5"], 2, "a number from"),
+        (vec![RECORDING, "--predictions", "absent.csv", "--split", "object", "--repeats", "2"], 2, "--repeats"),
         (vec![RECORDING, "--folds", "5"], 2, "--split"),
         (vec![RECORDING, "--split", "hand"], 2, "grasp, object, class"),
         (vec![RECORDING, "--split", "object", "--folds", "1"], 2, "2..=1000"),

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Stdio;
 
 use crate::common::python::utf8;
-use crate::common::{RECORDING, blindgrasp, json_lines, project, run, text};
+use crate::common::{MODEL, RECORDING, blindgrasp, json_lines, project, run, text};
 use blindgrasp_messages::{Header, Prediction, Stamped};
 use blindgrasp_recording::{RecordingInfo, RecordingWriter};
 
@@ -57,6 +57,27 @@ fn a_table_goes_to_stdout_a_file_or_a_folder() {
     std::fs::write(at("all/truth.csv"), "of yesterday").expect("written");
     run(&[&csv[..], &["--topic", "/truth", "--overwrite", "--out", utf8(&at("all"))]].concat(), 0);
     assert_eq!(std::fs::read(at("all/truth.csv")).expect("written"), stdout);
+}
+
+#[test]
+fn a_column_of_features_says_what_it_is() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("features.csv");
+    let made = text(&run(&["export", RECORDING, "--features", MODEL, "--out", utf8(&path)], 0).stdout);
+    let table = std::fs::read_to_string(&path).expect("written");
+    let header: Vec<&str> = table.lines().next().expect("a header").split(',').collect();
+    let named = ["recording", "grasp_id", "object", "class", "stable", "hand_id", "dictionary_id", "hist_0", "hist_1"];
+    assert_eq!(header[..named.len()], named);
+    for column in ["hist_7", "palm.load", "finger_1.max_force", "spread.position", "distal_3.breakaway"] {
+        assert!(header.contains(&column), "{column}: {header:?}");
+    }
+    // Every grasp with a label and a contact has a row, and every row as many numbers as the header says.
+    let data = run(&["evaluate", RECORDING, "--split", "object", "--folds", "2", "--recipe", "boosted", "--json"], 0);
+    let data: serde_json::Value = serde_json::from_slice(&data.stdout).expect("JSON");
+    let n_judged = data["data"]["n_judged"].as_u64().expect("a number");
+    assert_eq!(table.lines().count() as u64, 1 + n_judged);
+    assert!(made.contains(&format!("{n_judged} grasps, {} values each", header.len() - 7)), "{made}");
+    assert!(table.lines().all(|row| row.split(',').count() == header.len()));
 }
 
 #[test]

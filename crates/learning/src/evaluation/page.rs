@@ -72,7 +72,9 @@ pub fn report_page(hand: &Hand, report: &Report) -> Result<String, PictureError>
 /// A row cannot be written.
 pub fn tables(report: &Report) -> Result<Vec<(String, String)>, csv::Error> {
     let roc = |judge: &JudgedRecipe| -> Vec<[f64; 3]> {
-        judge.curve.iter().map(|point| [point.threshold, point.false_positive_rate, point.recall]).collect()
+        let points = judge.curve.iter().map(|point| [point.threshold, point.false_positive_rate, point.recall]);
+        // No threshold is so high: the corner from which the curve begins.
+        std::iter::once([f64::INFINITY, 0.0, 0.0]).chain(points).collect()
     };
     let precision_recall = |judge: &JudgedRecipe| -> Vec<[f64; 3]> {
         judge.curve.iter().map(|point| [point.threshold, point.recall, point.precision]).collect()

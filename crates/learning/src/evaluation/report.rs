@@ -555,3 +555,19 @@ fn median_joints(examples: &[Example]) -> Vec<f64> {
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_recipe_is_described_in_words() {
+        let of = |name: &str| about(&Recipe::named(name).expect("known"));
+        assert!(
+            of("boosted")
+                .ends_with("on contact histogram, load of each pad, joint angles, breakaway of coupled joints")
+        );
+        let expected = "on force on each cell, force on each cell relative to its pad, joint angles";
+        assert!(of("blend").ends_with(expected), "{}", of("blend"));
+    }
+}
