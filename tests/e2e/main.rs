@@ -12,6 +12,7 @@ mod echo;
 mod evaluate;
 mod examples;
 mod export;
+mod first_day;
 mod flight_recorder;
 mod graph;
 mod grid;
