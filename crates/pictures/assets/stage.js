@@ -1,6 +1,12 @@
 // A hand in three dimensions, with an object, contacts and gravity, on a canvas. All lengths are in metres in the palm frame.
 export const MAX_CONTACTS = 64;
 
+// The place of a cell's force among the colours of the scale that ends at `largest`; -1 if the cell feels nothing.
+export const colourStep = ({ cells, colours }, newtons, idx, largest) => {
+  if (newtons === null || !(newtons > cells[idx].threshold_newtons)) return -1;
+  return Math.round(Math.min(1, newtons / largest) * (colours.length - 1));
+};
+
 // `three` is the module of scripts/vendor-three. Without WebGL the stage has no `renderer` and draws nothing.
 export const makeStage = (three, canvas) => {
   const {
@@ -11,7 +17,7 @@ export const makeStage = (three, canvas) => {
   try {
     renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true });
   } catch {
-    return { renderer: null, build() {}, show() {}, surround() {}, showWords() {}, lookFrom() {}, project: () => null };
+    return { renderer: null, build() {}, show() {}, surround() {}, showWords() {}, wordCount: () => 0, lookFrom() {}, drawTo() {}, project: () => null };
   }
   const scene = new Scene(), camera = new PerspectiveCamera(35, 1, 0.01, 10);
   camera.up.set(0, 0, 1);
@@ -32,9 +38,11 @@ export const makeStage = (three, canvas) => {
     scene.add(made);
     return made;
   }
+  const guides = makeGuides(three, camera, controls, canvas);
   function render() {
     isDue = false;
     renderer.render(scene, camera);
+    guides();
     stage.onDrawn();
   }
   function draw() {
@@ -135,6 +143,12 @@ export const makeStage = (three, canvas) => {
       const { x, y } = new Vector3(...point).project(camera);
       return [canvas.clientWidth / 2 * (1 + x), canvas.clientHeight / 2 * (1 - y)];
     },
+    // Draws the present picture on another canvas as well.
+    drawTo(other) {
+      render();
+      const [width, height] = [other.width, other.width * canvas.height / Math.max(1, canvas.width)];
+      other.getContext("2d").drawImage(canvas, 0, (other.height - height) / 2, width, height);
+    },
     // Looks from this side of the hand.
     lookFrom(azimuth_rad) {
       side = new Vector3(Math.cos(0.35) * Math.cos(azimuth_rad), Math.cos(0.35) * Math.sin(azimuth_rad), Math.sin(0.35));
@@ -227,7 +241,45 @@ export const makeStage = (three, canvas) => {
       draw();
     },
   };
+  resize();
   new ResizeObserver(resize).observe(canvas);
   home();
   return stage;
+};
+
+// The axes of the palm and a bar of a round length, drawn over the canvas; the function that is returned draws them anew.
+const makeGuides = ({ Vector3 }, camera, controls, canvas) => {
+  const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+  svg.setAttribute("aria-hidden", "true");
+  Object.assign(svg.style, { position: "absolute", left: 0, bottom: 0, width: "100%", height: "80px", pointerEvents: "none" });
+  svg.setAttribute("class", "guides");
+  canvas.after(svg);
+  const add = (name, attributes) => {
+    const made = svg.appendChild(document.createElementNS("http://www.w3.org/2000/svg", name));
+    for (const [attribute, value] of Object.entries(attributes)) made.setAttribute(attribute, value);
+    return made;
+  };
+  const path = () => add("path", { fill: "none", stroke: "currentColor", "stroke-width": 1.4 });
+  const text = (content) => Object.assign(add("text", { fill: "currentColor", "font-size": 12, "text-anchor": "middle" }), { textContent: content });
+  const axes = ["x", "y", "z"].map((name, idx) => ({ direction: new Vector3().setComponent(idx, 1), line: path(), label: text(name) }));
+  const bar = path(), length = text("");
+  return () => {
+    camera.updateMatrixWorld();
+    for (const { direction, line, label } of axes) {
+      const { x, y } = direction.clone().transformDirection(camera.matrixWorldInverse);
+      line.setAttribute("d", `M40 40l${24 * x} ${-24 * y}`);
+      label.setAttribute("x", 40 + 33 * x);
+      label.setAttribute("y", 44 - 33 * y);
+      // An axis that points to the eye has no place for its name.
+      label.setAttribute("opacity", Math.hypot(x, y) > 0.3 ? 1 : 0);
+    }
+    const distance = camera.position.distanceTo(controls.target);
+    const pixels_per_m = canvas.clientHeight / (2 * distance * Math.tan(camera.fov * Math.PI / 360));
+    const metres = [1, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005].find((metres) => metres * pixels_per_m < 130) ?? 0.002;
+    const right = canvas.clientWidth - 14, width = metres * pixels_per_m;
+    bar.setAttribute("d", `M${right - width} 60v6h${width}v-6`);
+    length.textContent = `${metres * 1000} mm`;
+    length.setAttribute("x", right - width / 2);
+    length.setAttribute("y", 58);
+  };
 };

@@ -46,6 +46,8 @@ pub struct HandScene {
     /// The names of the pads.
     pad_names: Vec<String>,
     joints: Vec<String>,
+    /// The unit of each joint.
+    joint_units: Vec<&'static str>,
     cell_unit: &'static str,
     colours: Vec<[u8; 3]>,
     hand_colour: [u8; 3],
@@ -54,7 +56,6 @@ pub struct HandScene {
 
 impl HandScene {
     pub fn new(hand: &Hand) -> HandScene {
-        let colours = (0..N_COLOURS).map(|idx| force_colour(idx as f64 / (N_COLOURS - 1) as f64));
         HandScene {
             hand: hand.name.clone(),
             links: hand.links.iter().map(|link| surface(&link_mesh(link))).collect(),
@@ -62,8 +63,9 @@ impl HandScene {
             pads: pads(hand),
             pad_names: hand.pads.iter().map(|pad| pad.name.clone()).collect(),
             joints: hand.joints.iter().map(|joint| joint.name.clone()).collect(),
+            joint_units: hand.joints.iter().map(|joint| joint.kind.unit()).collect(),
             cell_unit: hand.cell_unit.symbol(),
-            colours: colours.map(|colour: Rgb| bytes(colour)).collect(),
+            colours: scale_colours(),
             hand_colour: bytes(HAND),
             silent_colour: bytes(SILENT_CELL),
         }
@@ -96,6 +98,18 @@ impl ObjectScene {
 /// The joint values are another hand's.
 pub fn link_poses(hand: &Hand, joints: &[f64]) -> Result<Vec<Vec<f64>>, JointError> {
     Ok(hand.palm_from_links(joints)?.iter().map(|pose: &Isometry3<f64>| rows(pose)).collect())
+}
+
+/// The colours of the scale of forces.
+fn scale_colours() -> Vec<[u8; 3]> {
+    let colours = (0..N_COLOURS).map(|idx| force_colour(idx as f64 / (N_COLOURS - 1) as f64));
+    colours.map(|colour: Rgb| bytes(colour)).collect()
+}
+
+/// The same, as the stops of a gradient of CSS.
+pub(super) fn scale_stops() -> String {
+    let stops = scale_colours().into_iter().map(|[red, green, blue]| format!("rgb({red} {green} {blue})"));
+    stops.collect::<Vec<_>>().join(",")
 }
 
 fn cells(hand: &Hand) -> Vec<CellData> {

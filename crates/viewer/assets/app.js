@@ -1,9 +1,7 @@
-// The page of a running graph or a recording: draws the events of /events, and grasps of a recording. With a token in its address it
-// sends orders.
-import * as three from "/three.js";
-import { MAX_CONTACTS, makeStage } from "/stage.js";
+// The page of a running graph or a recording: shows the events of /events. A running graph's last minutes are kept (history.js),
+// the grasps of a recording are asked for one by one (player.js), and with a token in the address orders are sent (control.js).
 
-const byId = (id) => document.getElementById(id);
+byId("unloaded").remove();
 const CHART_SECS = 20;
 // The least time between two decisions that a screen reader says.
 const SPOKEN_MS = 2000;
@@ -19,136 +17,110 @@ if (!hand.renderer) byId("without-webgl").hidden = false;
 shown.hand = hand;
 
 // --- a frame
-const cellColour = (newtons, idx) => {
-  const { cells, colours, silent_colour } = shown.scene;
-  if (newtons === null || !(newtons > cells[idx].threshold_newtons)) return silent_colour;
-  return colours[Math.round(Math.min(1, newtons / largest) * (colours.length - 1))];
-};
+const isActive = (newtons, idx) => newtons !== null && newtons > shown.scene.cells[idx].threshold_newtons;
+// The active cells of each pad, and their sum.
+const touchOf = (frame) => shown.scene.pads.map((pad) => {
+  let [n, sum] = [0, 0];
+  for (let idx = pad.first_cell; idx < pad.first_cell + pad.n_cells; idx++) {
+    if (isActive(frame.cells[idx], idx)) [n, sum] = [n + 1, sum + frame.cells[idx]];
+  }
+  return { n, sum };
+});
+const isShownHand = (frame) => Boolean(frame?.links && shown.scene && frame.cells.length === shown.scene.cells.length);
 // The end of the scale of forces: the greatest reading so far, rounded up.
 let largest = 1;
-const roundUp = (newtons) => {
-  const power = 10 ** Math.floor(Math.log10(newtons));
-  return power * ([1, 1.5, 2, 3, 4, 5, 6, 8].find((step) => step * power >= newtons) ?? 10);
+const cellColour = (newtons, idx) => {
+  const step = colourStep(shown.scene, newtons, idx, largest);
+  return step < 0 ? shown.scene.silent_colour : shown.scene.colours[step];
+};
+const showScale = () => {
+  const { colours, cell_unit } = shown.scene ?? { colours: [], cell_unit: "" };
+  byId("scale").hidden = colours.length === 0;
+  byId("bar").style.background = `linear-gradient(to right, ${colours.map((parts) => `rgb(${parts.join(" ")})`).join(", ")})`;
+  tell("half", Number((largest / 2).toPrecision(3)));
+  tell("largest", `${Number(largest.toPrecision(3))} ${cell_unit}`);
 };
 const showFrame = (frame) => {
   const scene = shown.scene;
-  if (!scene || frame.cells.length !== scene.cells.length) return;
+  if (!isShownHand(frame)) return;
   const greatest = Math.max(...frame.cells.map((newtons) => newtons ?? 0), 0);
-  if (greatest > largest) largest = roundUp(greatest);
+  if (greatest > largest) {
+    largest = roundUp(greatest);
+    showScale();
+  }
   shown.frame = frame;
   shown.frames += 1;
   shown.firstFrameMs ??= performance.now();
   shown.cellColours = frame.cells.map(cellColour);
   hand.show(frame, shown.cellColours);
-  byId("moment").textContent = `grasp ${frame.grasp_id}, ${frame.phase}`;
   const more = frame.contacts.length > MAX_CONTACTS ? `; ${MAX_CONTACTS} of ${frame.contacts.length} contacts have an arrow` : "";
-  byId("scale").textContent = `(the colours end at ${largest} ${scene.cell_unit}${more})`;
-  scene.pads.forEach((pad, idx) => {
-    const cells = frame.cells.slice(pad.first_cell, pad.first_cell + pad.n_cells);
-    const active = cells.filter((newtons, n) => newtons !== null && newtons > scene.cells[pad.first_cell + n].threshold_newtons);
-    const sum = active.reduce((total, newtons) => total + newtons, 0);
-    fill(byId("pads"), idx, [scene.pad_names[idx], `${active.length} of ${pad.n_cells}`, `${sum.toFixed(2)} ${scene.cell_unit}`], [1, 2]);
+  tell("moment", `grasp ${frame.grasp_id}, ${spoken(frame.phase)}${more}`);
+  byId("about-gravity").hidden = frame.gravity === null;
+  touchOf(frame).forEach(({ n, sum }, idx) => {
+    fill(byId("pads"), idx, [scene.pad_names[idx], `${n} of ${scene.pads[idx].n_cells}`, `${sum.toFixed(2)} ${scene.cell_unit}`], [1, 2]);
   });
-  scene.joints.forEach((name, idx) => fill(byId("joints"), idx, [name, frame.joints[idx].toFixed(4)], [1]));
+  scene.joints.forEach((name, idx) => fill(byId("joints"), idx, [name, `${frame.joints[idx].toFixed(4)} ${scene.joint_units[idx]}`], [1]));
 };
-
-// A row of a table: its texts are set, not made again, so that nothing flickers and a selection stays.
-const fill = (body, idx, texts, numbers, troubles = []) => {
-  while (body.rows.length <= idx) body.insertRow();
-  const row = body.rows[idx];
-  texts.forEach((text, n) => {
-    const cell = row.cells[n] ?? row.insertCell();
-    if (cell.textContent !== String(text)) cell.textContent = text;
-    cell.className = [numbers.includes(n) ? "num" : "", troubles.includes(n) ? "trouble" : ""].join(" ").trim();
-  });
-};
-const cut = (body, n) => { while (body.rows.length > n) body.deleteRow(n); };
 
 // --- decisions
-const colours = { lift: "--lift", hold: "--hold" };
-let spokenAt = -Infinity;
+let saidAt = -Infinity;
 const showDecision = (decision) => {
   shown.decision = decision;
-  const action = byId("action");
-  action.textContent = decision.action.replaceAll("_", " ");
-  action.className = `action ${decision.action in colours ? decision.action : "probe"}`;
+  const action = byId("action"), name = decision === null ? "none yet" : spoken(decision.action);
+  tell("action", name);
+  action.className = `action ${decision === null ? "" : ["lift", "hold"].includes(decision.action) ? decision.action : "probe"}`;
+  if (decision === null) return tell("why", "");
   const wrong = decision.action === "lift" && decision.truth === false ? " This lift is wrong: the grasp is known to be unstable." : "";
-  byId("why").textContent = `Grasp ${decision.grasp_id}: ${decision.reason.replaceAll("_", " ")}, probability ` +
-    `${decision.probability_stable.toFixed(2)}.${decision.why ?? wrong}`;
-  // When it was on the screen, which scripts/benchsuite view reads.
+  tell("why", `Grasp ${decision.grasp_id}: ${spoken(decision.reason)}, probability ` +
+    `${decision.probability_stable.toFixed(2)}.${decision.why ?? wrong}`);
+};
+// A new decision: when it was on the screen, which scripts/benchsuite view reads, and in words.
+const announce = (decision) => {
   requestAnimationFrame(() => setTimeout(() => {
     shown.painted.push([decision.grasp_id, Date.now()]);
     if (shown.painted.length > 100) shown.painted.shift();
   }));
-  if (performance.now() - spokenAt > SPOKEN_MS) {
-    spokenAt = performance.now();
-    byId("spoken").textContent = `${action.textContent}. ${byId("why").textContent}`;
+  if (performance.now() - saidAt > SPOKEN_MS) {
+    saidAt = performance.now();
+    byId("spoken").textContent = `${byId("action").textContent}. ${byId("why").textContent}`;
   }
 };
 
 // --- a model beside the graph
+let hasShadow = false;
 const showShadow = (decision) => {
-  byId("shadow").textContent = decision === null ? "" : `The model beside: ${decision.action.replaceAll("_", " ").toUpperCase()} for grasp ` +
-    `${decision.grasp_id}, ${decision.reason.replaceAll("_", " ")}, probability ${decision.probability_stable.toFixed(2)}.`;
+  hasShadow ||= decision !== null;
+  tell("shadow", decision === null ? "" : `The model beside: ${spoken(decision.action).toUpperCase()} for grasp ` +
+    `${decision.grasp_id}, ${spoken(decision.reason)}, probability ${decision.probability_stable.toFixed(2)}.`);
 };
-const showKey = (hasShadow) => { if (hasShadow) byId("chart-key").hidden = false; };
 
-// --- the chart: the last seconds by the page's clock, or the frames of a recorded grasp
-const points = [], shadows = [], marks = [];
-const trim = (now) => {
-  for (const list of [points, shadows, marks]) {
-    const n = list.findIndex((item) => now - item.at <= CHART_SECS * 1000);
-    if (n !== 0) list.splice(0, n < 0 ? list.length : n);
-  }
+// --- the chart: 20 s of a graph, or the frames of a recorded grasp
+const liveChart = () => {
+  const isPaused = past.at !== null, now = isPaused ? past.at : isOver() ? past.moments.at(-1)?.at ?? 0 : performance.now();
+  // A moment of the past has as much after it as there is, up to half of the chart.
+  const end = isPaused ? Math.min(Math.max(past.moments.at(-1).at, now), now + CHART_SECS * 500) : now;
+  const secs = (at) => (at - now) / 1000, from = secs(end) - CHART_SECS;
+  const moments = past.moments.filter((moment) => secs(moment.at) >= from && moment.at <= end).map((moment) => ({ ...moment, secs: secs(moment.at) }));
+  const ticks = [];
+  for (let n = Math.ceil(from / 5) * 5; n <= secs(end); n += 5) ticks.push([n, n === 0 ? isPaused ? "0" : "now" : `${n > 0 ? "+" : "−"}${Math.abs(n)} s`]);
+  const title = isPaused ? "seconds from the moment shown" : "seconds before now";
+  drawChart({ moments, from, to: secs(end), ticks, title, cursor: isPaused ? 0 : null, scene: shown.scene, model: shown.model, hasShadow });
 };
-const pen = (canvas) => {
-  const ratio = window.devicePixelRatio || 1;
-  [canvas.width, canvas.height] = [canvas.clientWidth * ratio, canvas.clientHeight * ratio];
-  const made = canvas.getContext("2d");
-  made.scale(ratio, ratio);
-  return made;
+const recordedChart = () => {
+  const { frames, grasps, at, n, decided } = player;
+  const to = frames.length ? Math.max(frames.at(-1).since_start_ms / 1000, 0.001) : 1, step = roundUp(to / 5), ticks = [];
+  for (let k = 0; k * step <= to * 1.0001; k++) ticks.push([k * step, `${Number((k * step).toPrecision(3))} s`]);
+  const moments = frames.map((frame, idx) => ({
+    secs: frame.since_start_ms / 1000,
+    probabilities: frame.probability === null ? [] : [frame.probability],
+    shadow: frame.shadow === null ? [] : [frame.shadow],
+    forces: isShownHand(frame) ? touchOf(frame).map(({ sum }) => sum) : null,
+    decisions: idx === decided && grasps[at].action !== null ? [grasps[at]] : [],
+  }));
+  drawChart({ moments, from: 0, to, ticks, title: "seconds since the grasp began", cursor: moments[n]?.secs ?? null, scene: shown.scene, model: null, hasShadow });
 };
-const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-const chart = () => {
-  const canvas = byId("chart"), draw = pen(canvas);
-  const [width, height] = [canvas.clientWidth, canvas.clientHeight], left = 30, bottom = 6;
-  const now = performance.now(), y = (p) => bottom + (height - 2 * bottom) * (1 - p);
-  const line = (colourName, ...corners) => {
-    draw.strokeStyle = colour(colourName);
-    draw.beginPath();
-    corners.forEach(([x, y], idx) => (idx ? draw.lineTo(x, y) : draw.moveTo(x, y)));
-    draw.stroke();
-  };
-  draw.font = "11px sans-serif";
-  draw.fillStyle = colour("--soft");
-  for (const p of [0, 0.5, 1]) {
-    draw.fillText(p.toFixed(1), 2, y(p) + 4);
-    line("--line", [left, y(p)], [width, y(p)]);
-  }
-  const x = (share) => left + (width - left) * share;
-  const dot = (at, p, size) => draw.fillRect(at - size / 2, y(p) - size / 2, size, size);
-  if (player.grasps.length) {
-    if (!player.frames.length) return;
-    const end = player.frames.at(-1).since_start_ms || 1, at = (frame) => x(frame.since_start_ms / end);
-    const present = player.frames[player.n];
-    line("--soft", [at(present), 0], [at(present), height]);
-    draw.fillStyle = colour("--probe");
-    for (const frame of player.frames) if (frame.shadow !== null) dot(at(frame), frame.shadow, 5);
-    draw.fillStyle = colour("--mark");
-    for (const frame of player.frames) if (frame.probability !== null) dot(at(frame), frame.probability, 5);
-    return;
-  }
-  trim(now);
-  draw.setLineDash([5, 4]);
-  for (const p of new Set(shown.model ? [shown.model.threshold, shown.model.unsure_from] : [])) line("--soft", [left, y(p)], [width, y(p)]);
-  draw.setLineDash([]);
-  const at = (item) => x(1 - (now - item.at) / 1000 / CHART_SECS);
-  for (const mark of marks) line(colours[mark.action] ?? "--probe", [at(mark), height], [at(mark), height - 14]);
-  draw.fillStyle = colour("--probe");
-  for (const point of shadows) dot(at(point), point.p, 2);
-  draw.fillStyle = colour("--mark");
-  for (const point of points) dot(at(point), point.p, 2);
-};
+const chart = () => (player.grasps.length ? recordedChart() : liveChart());
+byId("quantity").addEventListener("change", () => chart());
 
 // --- the feature: a bar for each value, up or down from 0, and the words on the hand
 let feature = null;
@@ -160,190 +132,69 @@ const showFeature = () => {
   const canvas = byId("feature"), draw = pen(canvas), [width, height] = [canvas.clientWidth, canvas.clientHeight];
   const most = Math.max(...feature, 1e-9), least = Math.min(...feature, 0), step = width / feature.length;
   const y = (value) => 4 + (height - 8) * (most - value) / (most - least);
-  // The parts of the feature have colours in turn.
-  const ends = [];
-  for (const block of shown.model?.blocks ?? []) ends.push((ends.at(-1) ?? 0) + block.n_values);
+  const blocks = shown.model?.blocks ?? [], ends = [];
+  for (const block of blocks) ends.push((ends.at(-1) ?? 0) + block.n_values);
   feature.forEach((value, idx) => {
-    const part = Math.max(0, ends.findIndex((end) => idx < end));
-    draw.fillStyle = colour(["--mark", "--soft"][part % 2]);
+    draw.fillStyle = colour(seriesColour(Math.max(0, ends.findIndex((end) => idx < end))));
     const [top, bottom] = [Math.min(y(value), y(0)), Math.max(y(value), y(0))];
     draw.fillRect(idx * step, top, Math.max(1, step - (step > 4 ? 1 : 0)), Math.max(1, bottom - top));
   });
-  const parts = (shown.model?.blocks ?? []).map(({ name, n_values }) => `${name.replaceAll("_", " ")} (${n_values})`).join(", ");
-  const text = `${feature.length} values from ${least.toFixed(2)} to ${most.toFixed(2)}${parts && `: ${parts}`}`;
-  if (byId("blocks").textContent !== text) byId("blocks").textContent = text;
+  tell("feature-range", `${feature.length} values from ${least.toFixed(2)} to ${most.toFixed(2)}`);
+  showKeys(byId("blocks"), blocks.map(({ name, n_values }, idx) => [`${spoken(name)} (${n_values})`, seriesColour(idx)]));
+};
+const showWords = () => {
+  hand.showWords(shown.model?.words_m ?? [], words ?? []);
+  byId("about-words").hidden = hand.wordCount() === 0;
+  words = null;
 };
 
 // --- votes: the arbiter waits for so many settled predictions that agree
 const showVotes = ({ side, n }, frame) => {
   const votes = Object.values(shown.graph?.params ?? {}).find((params) => "votes" in params)?.votes;
   if (!votes) return;
-  const isOpen = shown.decision?.grasp_id !== frame.grasp_id || ["squeeze", "test_lift"].includes(shown.decision.action);
   const isProbed = !["open", "closing", "settled", "ended", "lifting"].includes(frame.phase);
   const wanted = `${votes} settled predictions that agree`;
-  const text = !isOpen ? "" : isProbed ? `Grasp ${frame.grasp_id} is probed; the hand is ${frame.phase.replaceAll("_", " ")}.` : n === 0 ? `Grasp ${frame.grasp_id} waits for ${wanted}; the hand is ${frame.phase}.`
-    : `Grasp ${frame.grasp_id} waits for ${wanted}; the last ${n} say ${side}.`;
-  byId("waits").textContent = text;
+  tell("waits", past.isDecided(frame) ? "" : isProbed ? `Grasp ${frame.grasp_id} is probed; the hand is ${spoken(frame.phase)}.`
+    : n === 0 ? `Grasp ${frame.grasp_id} waits for ${wanted}; the hand is ${frame.phase}.`
+    : `Grasp ${frame.grasp_id} waits for ${wanted}; the last ${n} say ${side}.`);
 };
 
-// --- a recording
-const player = (() => {
-  const state = { grasps: [], at: -1, frames: [], n: 0, isPlaying: false, verdict };
-  let opening = 0, abort = null, run = 0, due = 0, wholeStep = 1;
-  // The outcome of a grasp, by decision and label.
-  function verdict({ action, truth }) {
-    if (action === null || truth === null) return "other";
-    if (action === "lift") return truth ? "right" : "false-positive";
-    if (action !== "hold") return "other";
-    return truth ? "false-negative" : "right";
-  }
-  const colourOf = { right: "--lift", "false-positive": "--hold", "false-negative": "--probe", other: "--soft" };
-  const bars = () => {
-    const canvas = byId("grasps"), draw = pen(canvas), width = canvas.clientWidth / state.grasps.length;
-    state.grasps.forEach((grasp, idx) => {
-      const isShown = idx === state.at;
-      draw.fillStyle = colour(colourOf[verdict(grasp)]);
-      draw.fillRect(idx * width, isShown ? 0 : 12, Math.max(1, width - (width > 4 ? 1 : 0)), isShown ? 40 : 22);
-    });
-  };
-  const showAt = (n) => {
-    const frame = state.frames[n], grasp = state.grasps[state.at];
-    if (!frame) return;
-    state.n = n;
-    byId("frame").value = n;
-    const nth = wholeStep > 1 ? ` (every ${wholeStep}th is shown)` : "";
-    byId("when").textContent = frame.links
-      ? `grasp ${grasp.id}, ${frame.since_start_ms.toFixed(0)} ms, frame ${n + 1} of ${state.frames.length}${nth}`
-      : `grasp ${grasp.id}, frame ${n + 1}: its joints are not those of the hand`;
-    if (frame.links) showFrame(frame);
-    chart();
-  };
-  // Shows a grasp; false if another one was asked for meanwhile, or there is no answer.
-  const open = async (idx) => {
-    const mine = ++opening, grasp = state.grasps[idx];
-    abort?.abort();
-    abort = new AbortController();
-    [state.at, state.frames, state.n] = [idx, [], 0];
-    byId("when").textContent = `loading grasp ${grasp.id}`;
-    hand.surround(null);
-    showShadow(null);
-    bars();
-    const label = grasp.truth === null ? "" : grasp.truth ? " It was stable." : " It was not stable.";
-    if (grasp.action !== null) showDecision({ ...grasp, grasp_id: grasp.id, why: label });
-    else {
-      byId("action").textContent = "not recorded";
-      byId("action").className = "action";
-      byId("why").textContent = `Grasp ${grasp.id}.${label}`;
+// --- a moment of a running graph, present or past
+const past = makeHistory({
+  chart: () => { if (!player.grasps.length) liveChart(); },
+  show: (moment, decision, isPaused) => {
+    showDecision(decision);
+    showFrame(moment.frame);
+    if (isPaused || !moment.frame) tell("waits", "");
+    else showVotes(moment.votes, moment.frame);
+    if (moment.feature) {
+      [feature, words] = [moment.feature, moment.words];
+      showFeature();
+      showWords();
     }
-    try {
-      const answer = await fetch(`/grasps/${idx}`, { signal: abort.signal });
-      if (!answer.ok) throw new Error(await answer.text());
-      const { frames, object, step, shadow } = await answer.json();
-      if (mine !== opening) return false;
-      [state.frames, wholeStep, due] = [frames, step, performance.now()];
-      byId("frame").max = Math.max(0, frames.length - 1);
-      hand.surround(object);
-      showShadow(shadow);
-      showKey(shadow !== null);
-      showAt(0);
-      return frames.length > 0;
-    } catch (error) {
-      if (mine === opening) byId("when").textContent = `grasp ${grasp.id} cannot be shown: ${error.message}`;
-      return false;
-    }
-  };
-  const setPlaying = (isPlaying) => {
-    state.isPlaying = isPlaying;
-    byId("play").textContent = isPlaying ? "Pause" : "Play";
-    byId("play").setAttribute("aria-pressed", String(isPlaying));
-  };
-  // Plays at the recording's own pace, and goes on with the next grasp.
-  const play = async () => {
-    const mine = ++run;
-    setPlaying(true);
-    if (state.n === state.frames.length - 1) showAt(0);
-    due = performance.now();
-    while (mine === run) {
-      const now = await new Promise(requestAnimationFrame);
-      if (mine !== run) return;
-      const speed = Number(byId("speed").value), frames = state.frames;
-      if (!frames.length) continue;
-      const pause = (n) => (frames[n + 1].since_start_ms - frames[n].since_start_ms) / speed;
-      let n = state.n;
-      while (n + 1 < frames.length && now - due >= pause(n)) {
-        due += pause(n);
-        n += 1;
-      }
-      if (n !== state.n) showAt(n);
-      else if (n + 1 >= frames.length && now - due > 500 / speed) {
-        if (state.at + 1 >= state.grasps.length) break;
-        const shownNext = await open(state.at + 1);
-        // Another grasp that was chosen meanwhile is played.
-        if (!shownNext && byId("when").textContent.includes("cannot be shown")) break;
-      }
-    }
-    if (mine === run) setPlaying(false);
-  };
-  const stop = () => {
-    run += 1;
-    setPlaying(false);
-  };
-  const go = (idx) => { if (idx >= 0 && idx < state.grasps.length) open(idx); };
-  byId("before").addEventListener("click", () => go(state.at - 1));
-  byId("after").addEventListener("click", () => go(state.at + 1));
-  byId("mistake").addEventListener("click", () => {
-    const isMistake = (grasp) => verdict(grasp).startsWith("false");
-    const idx = state.grasps.findIndex((grasp, idx) => idx > state.at && isMistake(grasp));
-    go(idx >= 0 ? idx : state.grasps.findIndex(isMistake));
-  });
-  byId("play").addEventListener("click", () => (state.isPlaying ? stop() : play()));
-  byId("frame").addEventListener("input", () => showAt(Number(byId("frame").value)));
-  byId("grasps").addEventListener("click", (event) => go(Math.floor(event.offsetX / byId("grasps").clientWidth * state.grasps.length)));
-  new ResizeObserver(() => { if (state.grasps.length) { bars(); chart(); } }).observe(byId("grasps"));
-  state.go = go;
-  state.start = ({ file, first, grasps }) => {
-    // The same recording, after a broken connection.
-    if (state.grasps.length) return;
-    document.body.classList.add("recorded");
-    byId("recording").hidden = false;
-    state.grasps = grasps;
-    const n = (kind) => grasps.filter((grasp) => verdict(grasp) === kind).length;
-    const isKnown = n("other") < grasps.length;
-    byId("graph").textContent = file.split("/").at(-1);
-    document.title = `${byId("graph").textContent} - blindgrasp`;
-    byId("mistake").disabled = !isKnown;
-    const without = grasps.every((grasp) => grasp.action === null) ? "no decisions" : "no labels of decided grasps";
-    const other = n("other") > 0 ? `, ${n("other")} not known` : "";
-    state.summary = isKnown
-      ? `${grasps.length} grasps, ${n("false-positive")} false positives, ${n("false-negative")} false negatives${other}`
-      : `${grasps.length} grasps, ${without} in the recording`;
-    say(state.summary, false);
-    open(first);
-  };
-  return state;
-})();
+  },
+});
+shown.past = past;
+const player = makePlayer({ surround: hand.surround, showFrame, showDecision, showShadow, chart });
 shown.player = player;
 setInterval(() => {
   if (document.hidden || player.grasps.length) return;
-  chart();
+  past.refresh();
+  if (past.at !== null) return;
+  liveChart();
   if (words === null) return;
   showFeature();
-  hand.showWords(shown.model?.words_m ?? [], words);
-  words = null;
+  showWords();
 }, 100);
 
 // --- the graph
-const time = (nanos) => nanos < 1e6 ? `${(nanos / 1e3).toFixed(0)} µs` : nanos < 1e9 ? `${(nanos / 1e6).toFixed(1)} ms` : `${(nanos / 1e9).toFixed(1)} s`;
-function say(text, isTrouble) {
-  if (byId("state").textContent !== text) byId("state").textContent = text;
-  byId("state").className = isTrouble ? "trouble" : "";
-}
 const showGraph = (graph) => {
   shown.graph = graph;
-  byId("graph").textContent = graph.graph;
+  tell("graph", graph.graph);
   document.title = `${graph.graph} - blindgrasp`;
   graphAt = performance.now();
-  byId("latency").textContent = graph.decision_latency_nanos ? `decisions in ${time(graph.decision_latency_nanos.p50)}` : "";
+  ended = null;
+  tell("latency", graph.decision_latency_nanos ? `decisions in ${time(graph.decision_latency_nanos.p50)}` : "");
   say(graph.warnings.length ? graph.warnings.join("; ") : graph.state, graph.warnings.length > 0);
   graph.nodes.forEach((node, idx) => {
     const counts = Object.entries(node.counts).filter(([, n]) => n > 0).map(([name, n]) => `${name} ${n}`).join(", ");
@@ -359,120 +210,31 @@ const showGraph = (graph) => {
       [...(lost ? [6] : []), ...(edge.missing ? [7] : [])]);
   });
   cut(byId("edges"), graph.edges.length);
-  if (token) showChoices(graph);
+  showChoices(graph);
 };
-
-// --- orders and the log: with the token that the command has printed in the address
-const remembered = (() => { try { return sessionStorage; } catch { return null; } })();
-let token = remembered?.getItem("token") ?? null;
-const takeToken = () => {
-  if (location.hash.length < 2) return;
-  token = location.hash.slice(1);
-  remembered?.setItem("token", token);
-  // It is not seen over a shoulder, nor kept in the history.
-  history.replaceState(null, "", location.pathname);
-};
-takeToken();
-window.addEventListener("hashchange", takeToken);
-const headers = () => ({ Authorization: `Bearer ${token}`, "Content-Type": "application/json" });
-const showLog = (lines) => {
-  const body = byId("log"), region = body.closest("div");
-  const isAtEnd = region.scrollTop + region.clientHeight >= region.scrollHeight - 4;
-  lines.forEach(({ time, operator, level, text, fields }, idx) => {
-    const values = Object.entries(fields ?? {}).map(([name, value]) => ` ${name}=${JSON.stringify(value)}`).join("");
-    fill(body, idx, [time, operator, level ?? "", text + values], [], ["error", "warn"].includes(level) ? [2] : []);
-  });
-  cut(body, lines.length);
-  if (isAtEnd) region.scrollTop = region.scrollHeight;
-};
-// A server that knows the token gives the log, and takes orders.
-const readLog = async () => {
-  let answer = null;
-  try {
-    if (token && !document.hidden) answer = await fetch("/log", { headers: headers() });
-  } catch { /* The stream of events says that the connection is broken. */ }
-  if (answer !== null) for (const id of ["control", "log-part"]) byId(id).hidden = !answer.ok;
-  if (answer?.ok) showLog(await answer.json());
-  setTimeout(readLog, 1000);
-};
-const order = async (order) => {
-  // To stop is possible at any time.
-  const buttons = byId("control").querySelectorAll("form button");
-  buttons.forEach((button) => { button.disabled = true; });
-  byId("answer").textContent = order.compare_secs > 0 ? `compares for ${order.compare_secs} s` : "…";
-  byId("answer").classList.remove("trouble");
-  try {
-    const answer = await fetch("/orders", { method: "POST", headers: headers(), body: JSON.stringify(order) });
-    byId("answer").textContent = await answer.text();
-    byId("answer").classList.toggle("trouble", !answer.ok);
-  } catch (error) {
-    byId("answer").textContent = `no answer: ${error.message}`;
-    byId("answer").classList.add("trouble");
-  }
-  buttons.forEach((button) => { button.disabled = false; });
-};
-// Choices are made again only if they are others, so that a choice stays.
-const choose = (id, texts) => {
-  const known = [...byId(id).options].map((option) => option.text);
-  if (known.join("\n") !== texts.join("\n")) byId(id).replaceChildren(...texts.map((text) => new Option(text)));
-};
-const presentValue = () => {
-  const [node, ...param] = byId("set-param").value.split(".");
-  byId("set-value").value = shown.graph?.params[node]?.[param.join(".")] ?? "";
-};
-const showChoices = ({ nodes, params }) => {
-  const before = byId("set-param").value;
-  choose("set-param", Object.entries(params).flatMap(([node, of]) => Object.keys(of).map((name) => `${node}.${name}`)));
-  choose("swap-node", nodes.map(({ node }) => node));
-  if (byId("set-param").value !== before) presentValue();
-};
-byId("set-param").addEventListener("change", presentValue);
-byId("set").addEventListener("submit", (event) => {
-  event.preventDefault();
-  const [node, ...param] = byId("set-param").value.split(".");
-  order({ order: "set", node, param: param.join("."), value: byId("set-value").value });
-});
-byId("swap").addEventListener("submit", (event) => {
-  event.preventDefault();
-  const changes = byId("swap-changes").value.split(/\s+/).filter((change) => change !== "");
-  order({
-    order: "swap", node: byId("swap-node").value, changes, compare_secs: Number(byId("swap-compare").value),
-    min_agreement: Number(byId("swap-agreement").value),
-  });
-});
-// The first click asks, the second stops.
-const unsure = () => {
-  byId("stop").textContent = "Stop the graph";
-  byId("stop").classList.remove("sure");
-};
-byId("stop").addEventListener("blur", unsure);
-byId("stop").addEventListener("click", () => {
-  if (!byId("stop").classList.contains("sure")) {
-    byId("stop").textContent = "Click again to stop the graph";
-    byId("stop").classList.add("sure");
-    return;
-  }
-  unsure();
-  order({ order: "stop" });
-});
 
 // --- ages: an old state must not look like the present one
 let graphAt = null, frameAt = null, decidedAt = null;
-const age = (at) => (at === null ? "" : `, ${Math.max(0, (performance.now() - at) / 1000).toFixed(0)} s ago`);
+// The event that says that there is nothing to come: `ended` may be followed by the next run, `finished` by another server.
+let ended = null;
+function isOver() { return ended !== null; }
+const age = (at) => `${Math.max(0, (performance.now() - at) / 1000).toFixed(0)} s`;
 setInterval(() => {
-  if (player.grasps.length) return;
+  // A recording is never old, nor is a moment that was chosen.
+  const isLive = !player.grasps.length && past.at === null;
   const isSilent = graphAt === null || performance.now() - graphAt > SILENT_MS;
-  if (graphAt !== null && isSilent) say(`no news of the graph${age(graphAt).replace(", ", " since ").replace(" ago", "")}`, true);
-  document.body.classList.toggle("stale", isSilent);
-  byId("decided").textContent = decidedAt === null ? "" : `decided${age(decidedAt).slice(1)}`;
-  byId("frame-age").textContent = frameAt !== null && performance.now() - frameAt > SILENT_MS ? `last frame${age(frameAt).slice(1)}` : "";
-  byId("stage").classList.toggle("old", frameAt === null || performance.now() - frameAt > SILENT_MS);
+  const isFrameOld = frameAt === null || performance.now() - frameAt > SILENT_MS;
+  if (isLive && graphAt !== null && isSilent) say(`no news of the graph since ${age(graphAt)}`, true);
+  document.body.classList.toggle("stale", isLive && isSilent);
+  byId("stage").classList.toggle("old", isLive && isFrameOld);
+  tell("decided", isLive && decidedAt !== null ? `decided ${age(decidedAt)} ago` : "");
+  tell("frame-age", isLive && frameAt !== null && isFrameOld ? `last frame ${age(frameAt)} ago` : "");
 }, 500);
 
 readLog();
 
 // --- the stream
-const source = new EventSource(token ? `/events?token=${encodeURIComponent(token)}` : "/events");
+const source = new EventSource(eventsAddress());
 const on = (name, take) => source.addEventListener(name, (event) => take(JSON.parse(event.data)));
 on("server", (server) => {
   // Another server at the same address: the page begins anew.
@@ -480,39 +242,46 @@ on("server", (server) => {
   shown.server = server;
 });
 on("scene", (scene) => {
+  // It comes again after a broken connection. The scene of the next run begins anew.
+  if (shown.scene && !isOver() && JSON.stringify(shown.scene) === JSON.stringify(scene)) return;
   shown.scene = scene;
-  [largest, shown.frame, shown.decision, feature, words] = [1, null, null, null, null];
-  hand.showWords([], []);
+  [largest, shown.frame, feature, words] = [1, null, null, null];
+  past.clear();
+  showWords();
   showFeature();
-  byId("waits").textContent = "";
+  showScale();
+  showDecision(null);
+  tell("waits", "");
   showShadow(null);
   for (const id of ["pads", "joints"]) cut(byId(id), 0);
-  byId("moment").textContent = scene ? "no frame yet" : "the graph has no hand that can be shown";
-  for (const id of ["scale", "why"]) byId(id).textContent = "";
-  byId("action").textContent = "none yet";
-  byId("action").className = "action";
+  tell("moment", scene ? "no frame yet" : "the graph has no hand that can be shown");
   hand.build(scene ?? { links: [], cells: [], hand_colour: [0, 0, 0] });
 });
-on("frame", (frame) => {
-  const now = performance.now();
-  trim(now);
-  for (const p of frame.probabilities) if (p !== null) points.push({ at: now, p });
-  for (const p of frame.shadow) if (p !== null) shadows.push({ at: now, p });
-  showKey(frame.shadow.length > 0);
-  for (const action of frame.actions) marks.push({ at: now, action });
-  if (frame.links) {
-    frameAt = now;
+on("frame", (event) => {
+  const now = performance.now(), { probabilities, shadow, decisions, labels, votes, feature: values, words: weights } = event;
+  const frame = isShownHand(event) ? event : undefined;
+  hasShadow ||= shadow.length > 0;
+  past.push({
+    at: now, probabilities: probabilities.filter((p) => p !== null), shadow: shadow.filter((p) => p !== null), decisions, votes, frame,
+    forces: frame && touchOf(frame).map(({ sum }) => sum), feature: values?.length ? values : undefined, words: values?.length ? weights : undefined,
+  });
+  labels.forEach(past.label);
+  if (frame) frameAt = now;
+  if (past.at !== null) return;
+  if (frame) {
     showFrame(frame);
-    showVotes(frame.votes, frame);
+    showVotes(votes, frame);
   }
-  if (frame.feature?.length) {
-    feature = frame.feature;
-    words = frame.words;
-  }
+  if (values?.length) [feature, words] = [values, weights];
 });
 on("decision", (decision) => {
   decidedAt = performance.now();
+  past.decide(decision);
+  if (past.at !== null) return;
   showDecision(decision);
+  // The grasp on the page waits no more.
+  if (shown.frame && past.isDecided(shown.frame)) tell("waits", "");
+  announce(decision);
 });
 on("shadow", showShadow);
 on("graph", showGraph);
@@ -523,11 +292,17 @@ on("model", (model) => {
 });
 on("recording", (recording) => player.start(recording));
 on("ended", (why) => {
-  graphAt = null;
+  [graphAt, ended] = [null, why];
   say(why, true);
+});
+// The server ends, too.
+on("finished", (why) => {
+  ended = why;
+  say(why, false);
+  past.end();
 });
 on("dropped", (n) => {
   shown.dropped += n;
   byId("missed").textContent = `This browser is too slow: it missed ${shown.dropped} updates of the page. The graph lost nothing.`;
 });
-source.addEventListener("error", () => say("the connection is broken; trying again", true));
+source.addEventListener("error", () => { if (!past.isOver()) say("the connection is broken; trying again", true); });

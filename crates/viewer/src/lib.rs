@@ -17,7 +17,7 @@ use std::convert::Infallible;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use axum::body::{Body, Bytes};
 use axum::extract::{DefaultBodyLimit, Path, Request, State};
@@ -42,6 +42,11 @@ const MAX_WAITING: usize = 64;
 const MAX_BROWSERS: usize = 64;
 /// Bytes of an order.
 const MAX_ORDER_BYTES: usize = 16 << 10;
+/// The event after which a browser's stream ends.
+const FINISHED: &str = "finished";
+/// The browsers have this time to read it.
+const FINISH_LIMIT: Duration = Duration::from_secs(1);
+const FINISH_PAUSE: Duration = Duration::from_millis(20);
 /// The address of orders.
 const ORDERS: &str = "/orders";
 /// The address of Foxglove's WebSocket.
@@ -51,10 +56,19 @@ const FOXGLOVE_ORIGINS: [&str; 3] = ["https://app.foxglove.dev", "https://studio
 /// Scripts and styles come from here alone, and no other page may frame this one.
 const CONTENT_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; \
                               base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+/// The parts of the page's script are one file for the browser: a round trip may take half a second.
+const APP_JS: &str = concat!(
+    include_str!("../assets/page.js"),
+    include_str!("../assets/chart.js"),
+    include_str!("../assets/history.js"),
+    include_str!("../assets/player.js"),
+    include_str!("../assets/control.js"),
+    include_str!("../assets/app.js"),
+);
 const FILES: [(&str, &str, &str); 5] = [
     ("/", "text/html; charset=utf-8", include_str!("../assets/index.html")),
     ("/app.css", "text/css; charset=utf-8", include_str!("../assets/app.css")),
-    ("/app.js", "text/javascript; charset=utf-8", include_str!("../assets/app.js")),
+    ("/app.js", "text/javascript; charset=utf-8", APP_JS),
     ("/stage.js", "text/javascript; charset=utf-8", STAGE_JS),
     ("/three.js", "text/javascript; charset=utf-8", THREE_JS),
 ];
@@ -198,6 +212,18 @@ impl Viewer {
         *self.shared.log.lock().unwrap_or_else(PoisonError::into_inner) = json;
     }
 
+    /// Tells the browsers that nothing more will come, and why. It waits until all have been told, but not for long: one may not
+    /// read.
+    pub fn finish(&self, why: &str) {
+        self.keep(FINISHED, &serde_json::Value::from(why).to_string());
+        let limit = Instant::now() + FINISH_LIMIT;
+        while self.n_browsers() > 0 && Instant::now() < limit {
+            std::thread::sleep(FINISH_PAUSE);
+        }
+        // The last bytes are on their way to the sockets.
+        std::thread::sleep(FINISH_PAUSE);
+    }
+
     /// Sends the kept event of this name to no browser any more.
     pub fn forget(&self, name: &str) {
         self.shared.kept().retain(|(known, _)| *known != name);
@@ -220,7 +246,11 @@ impl Shared {
 }
 
 fn event(name: &str, json: &str) -> Bytes {
-    format!("event: {name}\ndata: {}\n\n", json.replace('\n', " ")).into()
+    format!("{}data: {}\n\n", event_head(name), json.replace('\n', " ")).into()
+}
+
+fn event_head(name: &str) -> String {
+    format!("event: {name}\n")
 }
 
 /// Whether a request bears the token of the page's owner.
@@ -295,6 +325,8 @@ struct Reader {
     shared: Arc<Shared>,
     kept: Vec<Bytes>,
     receiver: broadcast::Receiver<Bytes>,
+    /// Whether it has read the last event.
+    is_finished: bool,
 }
 
 impl Drop for Reader {
@@ -311,7 +343,10 @@ async fn events(State(shared): State<Arc<Shared>>, Extension(IsOwner(is_owner)):
     }
     let receiver = shared.events.subscribe();
     let kept = shared.kept_reversed();
-    let stream = stream::unfold(Reader { shared, kept, receiver }, |mut reader| async {
+    let stream = stream::unfold(Reader { shared, kept, receiver, is_finished: false }, |mut reader| async {
+        if reader.is_finished {
+            return None;
+        }
         let next = match reader.kept.pop() {
             Some(kept) => kept,
             None => match reader.receiver.recv().await {
@@ -324,6 +359,7 @@ async fn events(State(shared): State<Arc<Shared>>, Extension(IsOwner(is_owner)):
                 Err(RecvError::Closed) => return None,
             },
         };
+        reader.is_finished = next.starts_with(event_head(FINISHED).as_bytes());
         Some((Ok::<_, Infallible>(next), reader))
     });
     ([(header::CONTENT_TYPE, "text/event-stream")], Body::from_stream(stream)).into_response()
@@ -473,6 +509,20 @@ mod tests {
         let n_dropped: usize =
             told.map(|pair| pair[1].trim_start_matches("data: ").parse::<usize>().expect("a number")).sum();
         assert!(n_dropped > 0 && n_frames + n_dropped == 400, "{n_frames} frames, {n_dropped} dropped");
+    }
+
+    #[test]
+    fn a_browser_is_told_of_the_end_and_its_stream_ends() {
+        let viewer = Viewer::serve(0, Abilities::default()).expect("served");
+        viewer.keep("scene", "1");
+        let mut reader = BufReader::new(asked(&viewer, "GET /events HTTP/1.1\r\nHost: localhost"));
+        read_until(&mut reader, "data: 1");
+        viewer.finish("the \"run\" has ended");
+        assert_eq!(viewer.n_browsers(), 0);
+        read_until(&mut reader, "event: finished");
+        let mut rest = String::new();
+        reader.read_line(&mut rest).expect("read");
+        assert_eq!(rest.trim_end(), r#"data: "the \"run\" has ended""#);
     }
 
     /// Strangers who read events, and others who never end the head of a request, keep the owner out of nothing.

@@ -42,6 +42,8 @@ const RETRY: Duration = Duration::from_millis(500);
 const MAX_PROBABILITIES: usize = 200;
 /// Lines of the log that are shown.
 const MAX_LOG_LINES: usize = 100;
+/// Frames that wait for the decisions about them.
+const MAX_RECENT: usize = 128;
 /// Labels of grasps that wait for their decision.
 const MAX_TRUTHS: usize = 256;
 
@@ -89,6 +91,11 @@ pub(super) fn show(
         }
         std::thread::sleep(RETRY);
     }
+    viewer.finish(if waits {
+        "the run has ended; its last minutes stay on this page"
+    } else {
+        "blindgrasp view has ended; the last minutes stay on this page"
+    });
     Ok(Outcome::Done)
 }
 
@@ -146,18 +153,19 @@ fn watch(
     let pass_on_decision = || {
         let mut latest = latest.lock().unwrap_or_else(PoisonError::into_inner);
         if std::mem::take(&mut latest.is_decided)
-            && let Some(decision) = latest.decisions.last()
+            && let Some(decided) = latest.decisions.last()
         {
-            let event = decision_event(decision, &latest.truths);
+            let event = decision_event(decided, &latest.truths);
             drop(latest);
-            viewer.keep("decision", &event);
+            viewer.keep("decision", &event.to_string());
         }
     };
     let pass_on = |model: &ShownModel| {
         let mut locked = latest.lock().unwrap_or_else(PoisonError::into_inner);
-        let taken = std::mem::take(&mut *locked);
+        let mut taken = std::mem::take(&mut *locked);
         // Labels wait for decisions that come later, and votes for more of their kind.
         locked.truths.clone_from(&taken.truths);
+        locked.recent = std::mem::take(&mut taken.recent);
         locked.votes = taken.votes;
         locked.min_probability_stable = taken.min_probability_stable;
         drop(locked);
@@ -257,21 +265,40 @@ fn hand_of(graph: &Value) -> Option<Hand> {
 /// A grasp: the source's epoch, and its number.
 type GraspKey = (u64, u64);
 
+/// A frame with its epoch and stamp.
+#[derive(Clone)]
+struct ShownFrame {
+    epoch: u64,
+    stamp_nanos: u64,
+    frame: Arc<TactileFrame>,
+}
+
+/// A decision, and the frame that it was made about if that is known.
+struct Decided {
+    key: GraspKey,
+    decision: LiftDecision,
+    frame: Option<ShownFrame>,
+}
+
 /// The samples since the last tick.
 #[derive(Default)]
 struct Latest {
-    frame: Option<TactileFrame>,
+    frame: Option<ShownFrame>,
+    /// The last frames, also of earlier ticks.
+    recent: VecDeque<ShownFrame>,
     contacts: Option<ContactSet>,
     feature: Option<GraspFeature>,
     probabilities: Vec<f64>,
     /// Those of the model beside.
     shadow_probabilities: Vec<f64>,
     shadow_decision: Option<LiftDecision>,
-    decisions: Vec<(GraspKey, LiftDecision)>,
+    decisions: Vec<Decided>,
     /// Whether the last one is not on the page yet.
     is_decided: bool,
     /// Whether a grasp was stable.
     truths: BTreeMap<GraspKey, bool>,
+    /// The labels that are new: their decision may be on the page already.
+    new_truths: Vec<(GraspKey, bool)>,
     votes: Votes,
     /// The arbiter's param.
     min_probability_stable: f64,
@@ -349,7 +376,15 @@ impl Sink for Reader {
             latest.shadow_decision = decided.or(latest.shadow_decision.take());
         }
         match record {
-            Record::Tactile(sample) if is_shown(sample.header.hand_id) => latest.frame = Some(sample.message),
+            Record::Tactile(sample) if is_shown(sample.header.hand_id) => {
+                let Header { epoch, stamp_nanos, .. } = sample.header;
+                let shown = ShownFrame { epoch, stamp_nanos, frame: Arc::new(sample.message) };
+                if latest.recent.len() >= MAX_RECENT {
+                    latest.recent.pop_front();
+                }
+                latest.recent.push_back(shown.clone());
+                latest.frame = Some(shown);
+            }
             Record::Contacts(sample) if is_shown(sample.header.hand_id) => latest.contacts = Some(sample.message),
             Record::Feature(sample) if is_shown(sample.header.hand_id) => latest.feature = Some(sample.message),
             Record::Prediction(sample) if is_shown(sample.header.hand_id) => {
@@ -363,10 +398,17 @@ impl Sink for Reader {
             Record::Decision(sample) if sample.message.action == Action::GoOn => {}
             Record::Decision(sample) if is_shown(sample.header.hand_id) => {
                 latest.is_decided = true;
-                latest.decisions.push(((sample.header.epoch, sample.message.grasp_id), sample.message));
+                // An arbiter decides under the stamp of the last prediction, and that is the frame's.
+                let Header { epoch, stamp_nanos, .. } = sample.header;
+                let is_it = |shown: &&ShownFrame| (shown.epoch, shown.stamp_nanos) == (epoch, stamp_nanos);
+                let frame = latest.recent.iter().rev().find(is_it).cloned();
+                let key = (epoch, sample.message.grasp_id);
+                latest.decisions.push(Decided { key, decision: sample.message, frame });
             }
             Record::Truth(sample) => {
-                latest.truths.insert((sample.header.epoch, sample.message.grasp_id), sample.message.stable);
+                let key = (sample.header.epoch, sample.message.grasp_id);
+                latest.truths.insert(key, sample.message.stable);
+                latest.new_truths.push((key, sample.message.stable));
                 if latest.truths.len() > MAX_TRUTHS {
                     latest.truths.pop_first();
                 }
@@ -377,13 +419,13 @@ impl Sink for Reader {
     }
 }
 
-/// Numbers of grasps are texts: JavaScript has no integers beyond 2^53.
-fn decision_event((key, decision): &(GraspKey, LiftDecision), truths: &BTreeMap<GraspKey, bool>) -> String {
+/// Numbers are texts: JavaScript has no integers beyond 2^53.
+fn decision_event(decided: &Decided, truths: &BTreeMap<GraspKey, bool>) -> Value {
+    let Decided { key, decision, .. } = decided;
     json!({
-        "grasp_id": decision.grasp_id.to_string(), "action": decision.action, "reason": decision.reason,
-        "probability_stable": decision.probability_stable, "truth": truths.get(key),
+        "epoch": key.0.to_string(), "grasp_id": decision.grasp_id.to_string(), "action": decision.action,
+        "reason": decision.reason, "probability_stable": decision.probability_stable, "truth": truths.get(key),
     })
-    .to_string()
 }
 
 /// The decision of the model beside.
@@ -396,20 +438,36 @@ pub(super) fn shadow_event(decision: &LiftDecision) -> Value {
 
 /// `None` if there is nothing new.
 fn frame_event(hand: Option<&Hand>, model: &ShownModel, latest: Latest) -> Option<String> {
-    let Latest { frame, contacts, feature, probabilities, shadow_probabilities, decisions, votes, .. } = latest;
-    if frame.is_none() && probabilities.is_empty() && decisions.is_empty() {
+    let Latest { frame, contacts, feature, probabilities, shadow_probabilities, decisions, truths, votes, .. } = latest;
+    if frame.is_none() && probabilities.is_empty() && decisions.is_empty() && latest.new_truths.is_empty() {
         return None;
     }
-    let actions: Vec<_> = decisions.iter().map(|(_, decision)| decision.action).collect();
+    let decisions = decisions.iter().map(|decided| {
+        let mut event = decision_event(decided, &truths);
+        if let (Some(hand), Some(shown)) = (hand, &decided.frame) {
+            let mut frame = json!({});
+            add_frame(&mut frame, hand, &shown.frame, contacts.as_ref());
+            event["frame"] = frame;
+        }
+        event
+    });
+    let decisions: Vec<Value> = decisions.collect();
+    let labels = latest
+        .new_truths
+        .iter()
+        .map(|((epoch, grasp_id), stable)| json!([epoch.to_string(), grasp_id.to_string(), stable]));
+    let labels: Vec<Value> = labels.collect();
     let mut event = json!({
-        "probabilities": probabilities, "shadow": shadow_probabilities, "actions": actions, "votes": votes,
+        "probabilities": probabilities, "shadow": shadow_probabilities, "decisions": decisions, "labels": labels,
+        "votes": votes,
     });
     if let Some(feature) = feature {
         event["feature"] = json!(feature.values);
         event["words"] = model.words(feature.dictionary_id, &feature.values).into();
     }
-    if let (Some(hand), Some(frame)) = (hand, frame) {
-        add_frame(&mut event, hand, &frame, contacts.as_ref());
+    if let (Some(hand), Some(shown)) = (hand, frame) {
+        event["epoch"] = shown.epoch.to_string().into();
+        add_frame(&mut event, hand, &shown.frame, contacts.as_ref());
     }
     Some(event.to_string())
 }

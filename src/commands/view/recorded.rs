@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::bail;
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::evaluation::decide_alone;
-use blindgrasp_messages::{Action, ContactSet, GraspTruth, LiftDecision, Recorded as _, Stamped, TactileFrame};
+use blindgrasp_messages::{Action, ContactSet, GraspTruth, LiftDecision, Phase, Recorded as _, Stamped, TactileFrame};
 use blindgrasp_objects::find_mesh;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, ObjectScene};
@@ -47,6 +47,9 @@ struct Listed {
     object: String,
     #[serde(skip)]
     stamps_nanos: [u64; 2],
+    /// The stamp of the frame that decided.
+    #[serde(skip)]
+    decided_nanos: Option<u64>,
 }
 
 /// Serves the page until the command is interrupted.
@@ -85,6 +88,7 @@ pub(super) fn show(
     while !stop.load(Ordering::Relaxed) {
         std::thread::sleep(POLL);
     }
+    viewer.finish("blindgrasp view has ended: the page can show no other grasp");
     Ok(Outcome::Done)
 }
 
@@ -105,6 +109,7 @@ fn list(recording: &Path) -> anyhow::Result<BTreeMap<u64, Listed>> {
             truth: None,
             object: String::new(),
             stamps_nanos: [stamp; 2],
+            decided_nanos: None,
         });
         grasp.stamps_nanos = [grasp.stamps_nanos[0].min(stamp), grasp.stamps_nanos[1].max(stamp)];
         if sample.schema == TactileFrame::SCHEMA {
@@ -117,6 +122,7 @@ fn list(recording: &Path) -> anyhow::Result<BTreeMap<u64, Listed>> {
                 grasp.object = truth.message.object;
             }
             Record::Decision(decision) if decision.message.action.decides() || grasp.action.is_none() => {
+                grasp.decided_nanos = Some(decision.header.stamp_nanos);
                 grasp.action = Some(decision.message.action);
                 grasp.reason = Some(decision.message.reason.as_str());
                 grasp.probability_stable = Some(decision.message.probability_stable);
@@ -159,6 +165,7 @@ impl ShownReading {
             Some(judge) if step == 1 => Some(decide_alone(judge, &frames)),
             _ => None,
         };
+        let decided = decided_at(&frames, listed.decided_nanos);
         let start_nanos = frames.first().map_or(0, |frame| frame.header.stamp_nanos);
         let events = frames.iter().enumerate().map(|(idx, Stamped { header, message })| {
             let mut event = json!({
@@ -171,7 +178,8 @@ impl ShownReading {
         });
         let events: Vec<Value> = events.collect();
         let decision = shadow.as_ref().and_then(|shadow| shadow.decision.as_ref()).map(shadow_event);
-        Ok(json!({"step": step, "frames": events, "object": object, "shadow": decision}).to_string())
+        Ok(json!({"step": step, "frames": events, "decided": decided, "object": object, "shadow": decision})
+            .to_string())
     }
 
     /// Every `step`th frame of a grasp, and what belongs to these.
@@ -208,5 +216,37 @@ impl ShownReading {
             }
         }
         Ok(found)
+    }
+}
+
+/// The frame that decided: the last one that was not stamped later than the decision. Without a decision it is the last frame of the
+/// settled hand, if there is one.
+fn decided_at(frames: &[Stamped<TactileFrame>], decided_nanos: Option<u64>) -> Option<usize> {
+    match decided_nanos {
+        Some(nanos) => frames.iter().rposition(|frame| frame.header.stamp_nanos <= nanos),
+        None => frames.iter().rposition(|frame| frame.message.phase == Phase::Settled),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use blindgrasp_messages::Header;
+
+    use super::*;
+
+    #[test]
+    fn the_frame_that_decided_is_the_last_one_up_to_the_decision() {
+        let phases = [Phase::Open, Phase::Settled, Phase::Settled, Phase::Ended];
+        let frames: Vec<_> = (0_u64..)
+            .zip(phases)
+            .map(|(idx, phase)| Stamped {
+                header: Header { stamp_nanos: 10 * idx, ..Header::default() },
+                message: TactileFrame { phase, ..TactileFrame::default() },
+            })
+            .collect();
+        for (decided_nanos, expected) in [(Some(10), 1), (Some(19), 1), (Some(900), 3), (None, 2)] {
+            assert_eq!(decided_at(&frames, decided_nanos), Some(expected), "{decided_nanos:?}");
+        }
+        assert_eq!(decided_at(&frames[..1], None), None);
     }
 }
