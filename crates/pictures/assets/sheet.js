@@ -2,16 +2,15 @@
 const data = JSON.parse(document.getElementById("grasp").textContent);
 const byId = (id) => document.getElementById(id);
 const load = (id) => import(URL.createObjectURL(new Blob([byId(id).textContent], { type: "text/javascript" })));
-const three = await load("three.js"), { makeStage } = await load("stage.js");
+const three = await load("three.js"), { colourStep, makeStage } = await load("stage.js");
 const slider = byId("frame");
 const rgb = (c) => `rgb(${c[0]} ${c[1]} ${c[2]})`;
 let frameIdx = data.shown;
 
 // Colour of a cell in a frame, and whether writing on it is white.
 const cellColour = (newtons, idx) => {
-  if (newtons === null || !(newtons > data.cells[idx].threshold_newtons)) return { colour: data.silent_colour, active: false };
-  const share = Math.min(1, newtons / data.scale_newtons);
-  const step = Math.round(share * (data.colours.length - 1));
+  const step = colourStep(data, newtons, idx, data.scale_newtons);
+  if (step < 0) return { colour: data.silent_colour, active: false };
   return { colour: data.colours[step], active: true, dark: step >= data.first_dark_colour };
 };
 
@@ -40,8 +39,10 @@ stage.onDrawn = () => numbers.forEach((number, idx) => {
 // --- heat maps and slider
 const pads = byId("pads");
 const cellRects = [...pads.querySelectorAll("[data-cell]")];
-const cellTexts = new Map([...pads.querySelectorAll("[data-force]")].map((text) => [Number(text.dataset.force), text]));
-const padTexts = [...pads.querySelectorAll("[data-pad]")];
+// A hand that is shown by itself feels nothing: its cells are coloured so that they are seen, and no force is written.
+const texts = (name) => (data.is_hand_alone ? [] : [...pads.querySelectorAll(`[data-${name}]`)]);
+const cellTexts = new Map(texts("force").map((text) => [Number(text.dataset.force), text]));
+const padTexts = texts("pad");
 const showFrame = (idx) => {
   frameIdx = idx;
   const frame = data.frames[idx];

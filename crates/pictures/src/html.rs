@@ -26,6 +26,8 @@ struct Data<'a> {
     scene: HandScene,
     object: Option<ObjectScene>,
     contacts: Vec<ContactData<'a>>,
+    /// The forces only show the cells' normals: they are not written.
+    is_hand_alone: bool,
     frames: Vec<FrameData<'a>>,
     /// The frame that the picture shows.
     shown: usize,
@@ -71,9 +73,9 @@ pub fn grasp_html(hand: &Hand, grasp: &RecordedGrasp) -> Result<String, PictureE
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>{title}</title>\n\
          <style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n<h1>{title}</h1>\n<figure>\n{picture}</figure>\n\
-         <section>\n<h2>To turn</h2>\n<div class=\"scene\">\n\
+         <section>\n<h2>3-D view</h2>\n<div class=\"scene\">\n\
          <div class=\"stage\"><canvas id=\"stage\" tabindex=\"0\" aria-label=\"the hand in three dimensions\"></canvas>\
-         <div id=\"numbers\"></div><p id=\"without-webgl\" hidden>This browser has no WebGL: the view to turn cannot be \
+         <div id=\"numbers\"></div><p id=\"without-webgl\" hidden>This browser has no WebGL: the 3-D view cannot be \
          shown.</p></div>\n<div id=\"pads\">{pads}</div>\n</div>\n\
          <div class=\"time\"><button id=\"play\" type=\"button\">Play</button>\
          <input id=\"frame\" type=\"range\" min=\"0\" step=\"1\" aria-label=\"frame\"><output id=\"when\"></output></div>\n\
@@ -131,6 +133,7 @@ fn data<'a>(placed: &'a Placed<'_>, azimuth_rad: f64) -> Result<Data<'a>, Pictur
                 force_newtons: rounded(contact.force_newtons),
             })
             .collect(),
+        is_hand_alone: placed.grasp.is_hand_alone,
         frames,
         azimuth_rad: rounded(azimuth_rad),
         shown: chosen.iter().position(|idx| *idx == shown).unwrap_or(0),
