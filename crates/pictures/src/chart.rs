@@ -171,13 +171,9 @@ pub fn chart_svg(chart: &Chart) -> String {
     let [width, height] = chart.size;
     let mut svg = Svg::default();
     svg.start("g", &[("class", &"chart")]);
-    let names: Vec<(&str, &str, bool)> = chart
-        .series
-        .iter()
-        .filter(|series| !series.name.is_empty())
-        .map(|series| (series.name.as_str(), series.colour, series.line == Line::Dashed))
-        .collect();
-    let top = draw_head(&mut svg, &chart.title, &names, width, false);
+    let named = chart.series.iter().filter(|series| !series.name.is_empty());
+    let names: Vec<Named<'_>> = named.map(|series| (series.name.as_str(), series.colour, swatch(series))).collect();
+    let top = draw_head(&mut svg, &chart.title, &names, width);
     let frame = Frame { left: LEFT, right: width - RIGHT, top, bottom: height - 56.0 };
     draw_y_axis(&mut svg, &frame, &chart.y);
     for (value, text) in chart.x.ticks() {
@@ -202,9 +198,9 @@ pub fn bar_chart_svg(chart: &BarChart) -> String {
     let [width, height] = chart.size;
     let mut svg = Svg::default();
     svg.start("g", &[("class", &"chart")]);
-    let names: Vec<(&str, &str, bool)> =
-        chart.series.iter().map(|(name, colour, _)| (name.as_str(), *colour, false)).collect();
-    let top = draw_head(&mut svg, &chart.title, &names, width, true);
+    let named = chart.series.iter().filter(|(name, _, _)| !name.is_empty());
+    let names: Vec<Named<'_>> = named.map(|(name, colour, _)| (name.as_str(), *colour, Swatch::Bar)).collect();
+    let top = draw_head(&mut svg, &chart.title, &names, width);
     let slot = (width - LEFT - RIGHT) / chart.groups.len().max(1) as f64;
     let longest = chart.groups.iter().map(|group| text_width(group, 12.0)).fold(0.0, f64::max).min(140.0);
     // Names that don't fit side by side hang down at a slant.
@@ -244,23 +240,45 @@ pub fn bar_chart_svg(chart: &BarChart) -> String {
     svg.finish(width, height, &chart.title, STYLE)
 }
 
+/// The sign of a series in the legend.
+#[derive(Clone, Copy)]
+enum Swatch {
+    Bar,
+    Line(Line),
+    Disc,
+}
+
+/// A series in the legend: name, colour, sign.
+type Named<'a> = (&'a str, &'a str, Swatch);
+
+fn swatch(series: &Series) -> Swatch {
+    if series.points.is_empty() && !series.discs.is_empty() { Swatch::Disc } else { Swatch::Line(series.line) }
+}
+
 /// Title and legend; returns where the axes may begin.
-fn draw_head(svg: &mut Svg, title: &str, names: &[(&str, &str, bool)], width: f64, bars: bool) -> f64 {
+fn draw_head(svg: &mut Svg, title: &str, names: &[Named<'_>], width: f64) -> f64 {
     svg.text([20.0, TITLE - 4.0], Anchor::Start, "chart-title", &fit_text(title, 15.0, width - 40.0));
     let (mut x, mut y) = (20.0, TITLE + 16.0);
-    for (name, colour, dashed) in names {
+    for (name, colour, swatch) in names {
         let name = fit_text(name, 12.5, width - 80.0);
         let needed = 30.0 + text_width(&name, 12.5) + 18.0;
         if x + needed > width - 10.0 && x > 20.0 {
             (x, y) = (20.0, y + LEGEND_ROW);
         }
-        if bars {
-            let (left, top) = (px(x + 5.0), px(y - 10.0));
-            svg.element("rect", &[("x", &left), ("y", &top), ("width", &14), ("height", &11), ("fill", colour)]);
-        } else {
-            let class = if *dashed { "series dashed" } else { "series" };
-            let line = format!("M{} {}h22", px(x), px(y - 4.0));
-            svg.element("path", &[("d", &line), ("class", &class), ("stroke", colour)]);
+        match swatch {
+            Swatch::Bar => {
+                let (left, top) = (px(x + 5.0), px(y - 10.0));
+                svg.element("rect", &[("x", &left), ("y", &top), ("width", &14), ("height", &11), ("fill", colour)]);
+            }
+            Swatch::Disc => {
+                let (cx, cy) = (px(x + 14.0), px(y - 4.0));
+                svg.element("circle", &[("cx", &cx), ("cy", &cy), ("r", &4.5), ("class", &"disc"), ("fill", colour)]);
+            }
+            Swatch::Line(line) => {
+                let class = if *line == Line::Dashed { "series dashed" } else { "series" };
+                let line = format!("M{} {}h22", px(x), px(y - 4.0));
+                svg.element("path", &[("d", &line), ("class", &class), ("stroke", colour)]);
+            }
         }
         svg.text([x + 28.0, y], Anchor::Start, "chart-legend", &name);
         x += needed;

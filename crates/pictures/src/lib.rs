@@ -24,6 +24,7 @@
 //! * [`graph_mermaid`], [`graph_dot`] - a graph of processes.
 //! * [`chart`] - lines, points and bars over axes.
 //! * [`ReportPage`] - a page of text, tables and pictures.
+//! * [`GraspCards`] - grasps that such a page draws by itself.
 //!
 //! Surfaces are rendered here, by a small z-buffered rasteriser (no graphics card, no fonts), and embedded as PNG; what
 //! must be sharp or read (arrows, numbers, text) lies over them as vectors. The same input gives the same
@@ -39,6 +40,7 @@ mod dictionary_picture;
 mod geometry;
 mod graph;
 mod grasp;
+mod grasp_cards;
 mod grasp_picture;
 mod html;
 mod pads;
@@ -57,6 +59,7 @@ pub use animation::{AnimatedGrasp, animation_svg};
 pub use dictionary_picture::{DrawnWord, dictionary_svg};
 pub use graph::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid};
 pub use grasp::{ObjectSurface, RecordedGrasp};
+pub use grasp_cards::GraspCards;
 pub use grasp_picture::grasp_svg;
 pub use html::grasp_html;
 pub use posed_scene::{PosedScene, posed_scene_images};

@@ -1,4 +1,4 @@
-//! A report as a page: one HTML file that asks the network for nothing and runs no script.
+//! A report as a page: one HTML file that asks the network for nothing. It runs no script but those that it is given.
 
 use std::fmt::Write;
 

@@ -13,7 +13,7 @@ use blindgrasp_operator::wiring::LogLevel;
 use blindgrasp_pictures::chart::{
     Axis, BarChart, COLOURS, Chart, Line, NumberFormat, Series, bar_chart_svg, chart_svg, range_from_zero,
 };
-use blindgrasp_pictures::{ObjectSurface, RecordedGrasp, ReportPage, escape, grasp_svg, report_table};
+use blindgrasp_pictures::{GraspCards, ObjectSurface, PictureError, RecordedGrasp, ReportPage, escape, report_table};
 use blindgrasp_stages::hand::Hand;
 
 /// Decisions in the chart, but for wrong ones; of more, every nth is drawn.
@@ -213,23 +213,36 @@ impl RunReport {
         }));
         page.section("Changes and messages", &changes(summary));
         if let Some(hand) = &self.hand {
-            for (title, wrong) in
-                [("Lifts of unstable grasps", &self.wrong_lifts), ("Holds of stable grasps", &self.wrong_holds)]
-            {
-                if wrong.n == 0 {
-                    continue;
-                }
-                let shown = wrong.pictures.len();
-                page.section(title, &format!("<p>{} in all; the first {shown} are shown.</p>\n", wrong.n));
-                for grasp in &wrong.pictures {
-                    match grasp_svg(hand, grasp) {
-                        Ok(picture) => page.figure(&picture, ""),
-                        Err(error) => page.raw(&format!("<p>{}</p>\n", escape(&error.to_string()))),
-                    }
-                }
-            }
+            self.add_wrong(&mut page, hand).unwrap_or_else(|error| {
+                page.raw(&format!("<p>{}</p>\n", escape(&error.to_string())));
+            });
         }
         page.finish()
+    }
+
+    /// The wrong decisions as cards, which the page draws.
+    fn add_wrong(&self, page: &mut ReportPage, hand: &Hand) -> Result<(), PictureError> {
+        let mut cards = GraspCards::new(hand);
+        let mut sections = Vec::new();
+        for (title, wrong) in
+            [("Lifts of unstable grasps", &self.wrong_lifts), ("Holds of stable grasps", &self.wrong_holds)]
+        {
+            if wrong.n > 0 {
+                let shown = wrong.pictures.len();
+                let count = format!("<p>{} in all; the first {shown} are shown.</p>\n", wrong.n);
+                sections.push((title, count + &cards.add(&wrong.pictures)?));
+            }
+        }
+        if !cards.is_empty() {
+            page.section("Wrong decisions", &cards.view());
+        }
+        for (title, body) in sections {
+            page.section(title, &body);
+        }
+        if !cards.is_empty() {
+            page.raw(&cards.scripts()?);
+        }
+        Ok(())
     }
 
     fn timeline(&self) -> Chart {
@@ -244,10 +257,10 @@ impl RunReport {
         let all = [&self.others, &self.wrong_holds.points, &self.wrong_lifts.points];
         Chart {
             title: "Probability of stable, by decision".into(),
-            size: [1152.0, 360.0],
+            size: [860.0, 340.0],
             x: Axis {
                 label: "seconds since the start".into(),
-                range: range_from_zero(all.into_iter().flatten().map(|[secs, _]| *secs)),
+                range: whole_seconds(all.into_iter().flatten().map(|[secs, _]| *secs)),
                 format: NumberFormat::Count,
             },
             y: Axis { label: "probability (%)".into(), range: [0.0, 1.0], format: NumberFormat::Percent },
@@ -269,6 +282,13 @@ impl RunReport {
             _ => others,
         }
     }
+}
+
+/// From the whole second before the first value to the one after the last value.
+fn whole_seconds(secs: impl Iterator<Item = f64>) -> [f64; 2] {
+    let [first, last] = secs.fold([f64::INFINITY, 0.0], |[first, last], secs| [secs.min(first), secs.max(last)]);
+    let first = if first.is_finite() { first.floor() } else { 0.0 };
+    [first, last.ceil().max(first + 1.0)]
 }
 
 fn lead(summary: &RunSummary) -> String {
@@ -353,7 +373,7 @@ fn histogram(title: &str, ages: &Ages) -> BarChart {
             format: NumberFormat::Percent,
         },
         groups: all.iter().map(|octave| format!("≤ {}", time(2_u64 << octave))).collect(),
-        series: vec![("samples".into(), COLOURS[0], shares)],
+        series: vec![(String::new(), COLOURS[0], shares)],
     }
 }
 
@@ -394,6 +414,13 @@ mod tests {
     use blindgrasp_messages::{Header, Reason};
 
     use super::*;
+
+    #[test]
+    fn the_time_axis_begins_near_the_first_decision() {
+        assert_eq!(whole_seconds([62.4, 61.9, 70.0].into_iter()), [61.0, 70.0]);
+        assert_eq!(whole_seconds([3.0].into_iter()), [3.0, 4.0]);
+        assert_eq!(whole_seconds(std::iter::empty()), [0.0, 1.0]);
+    }
 
     /// A source that starts again may count its grasps from 0, in an epoch that is not above the one before.
     #[test]
