@@ -3,7 +3,7 @@
 
 Opens URL and prints null. Then it reads lines from stdin: an expression in JavaScript, whose value is printed as a line of JSON;
 `axe`, for the list of problems that axe-core finds; `errors`, for what the console said; `picture FILE`, for a screenshot;
-`size WIDTH HEIGHT`.
+`size WIDTH HEIGHT`; `dark`, for a dark theme; `latency MS`, for a slow line from the next request on.
 
 Usage: browser.py URL
 """
@@ -50,6 +50,13 @@ def answer(driver, line):
         return driver.get_screenshot_as_file(rest)
     if word == "size":
         return driver.set_window_size(*map(int, rest.split()))
+    if word == "dark":
+        features = [{"name": "prefers-color-scheme", "value": "dark"}]
+        return driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+    if word == "latency":
+        conditions = {"offline": False, "latency": float(rest), "downloadThroughput": -1, "uploadThroughput": -1}
+        driver.execute_cdp_cmd("Network.enable", {})
+        return driver.execute_cdp_cmd("Network.emulateNetworkConditions", conditions)
     return driver.execute_script(f"return {line}")
 
 

@@ -92,6 +92,16 @@ impl Browser {
         self.ask(&format!("document.getElementById('{id}').textContent")).as_str().expect("a text").to_owned()
     }
 
+    /// Chooses an option, as a user does.
+    fn choose(&mut self, id: &str, value: &str) {
+        self.ask(&format!("document.getElementById('{id}').value = '{value}'"));
+        self.ask(&format!("document.getElementById('{id}').dispatchEvent(new Event('change'))"));
+    }
+
+    fn click(&mut self, selector: &str) {
+        self.ask(&format!("document.querySelector('{selector}').click()"));
+    }
+
     /// So many frames more than now.
     fn wait_for_frames(&mut self, n: u64) {
         let shown = self.ask("blindgrasp.frames").as_u64().expect("a number");
@@ -194,6 +204,16 @@ fn a_browser_shows_a_graph_as_it_runs() {
         browser.ask(&format!("picture {path}"));
     }
 
+    // The legends of chart and 3-D view.
+    assert!(browser.text("chart-key").contains("threshold") && browser.text("chart-key").contains("model beside"));
+    browser.choose("quantity", "force");
+    browser.wait_until("document.getElementById('chart-key').textContent.includes('palm')");
+    assert!(browser.text("largest").ends_with(" N"), "{}", browser.text("largest"));
+    let guides = browser.ask("document.querySelector('.guides').textContent");
+    let guides = guides.as_str().expect("a text");
+    assert!(guides.starts_with("xyz") && guides.ends_with(" mm"), "{guides}");
+    assert!(browser.text("joints").contains(" rad"), "{}", browser.text("joints"));
+
     // A swap, the end of the graph, and its next run.
     swap(&graph, &["classifier"], 0);
     browser.wait_until("blindgrasp.graph.nodes.some((node) => node.n_swaps === 1)");
@@ -214,6 +234,62 @@ fn a_browser_shows_a_graph_as_it_runs() {
     // The page loads again, because it is another server's.
     browser.wait_until("typeof blindgrasp === 'object' && blindgrasp.frames > 10");
     assert_eq!(graph.node("recorded_source")["n_restarts"], 0);
+    graph.stop();
+}
+
+/// The last minutes: a decision is chosen from the list and shows the frame that decided, and the page goes on live.
+#[test]
+fn a_browser_pauses_and_looks_at_past_decisions() {
+    if !Path::new("/usr/bin/chromedriver").exists() {
+        return skipped("no chromium-driver: scripts/test installs it on Debian");
+    }
+    let name = unique_name();
+    let graph = launch(&name);
+    graph.wait_for_decisions(1);
+    let (_page, address) = Running::page(&name, 0);
+    let mut browser = Browser::open(&address);
+    browser.wait_until("blindgrasp.past.decisions.filter((decision) => decision.frame?.links).length > 5");
+    // A grasp that is decided does not wait, at any moment.
+    browser.ask(
+        "(window.contradictions = [], setInterval(() => { \
+           const id = (element) => /Grasp (\\d+)/.exec(document.getElementById(element).textContent)?.[1]; \
+           const isFinal = ['lift', 'hold'].includes(document.getElementById('action').textContent); \
+           if (isFinal && id('why') === id('waits')) contradictions.push(id('why')); }, 3), null)",
+    );
+    browser.wait_for_frames(60);
+    assert_eq!(browser.ask("contradictions"), Value::Array(vec![]));
+
+    let rows = "[...document.querySelectorAll('#decisions tr')]";
+    let is_shown = |text: &str| format!("{rows}.some((row) => row.textContent.includes('{text}'))");
+    browser.wait_until(&is_shown("stable"));
+    browser.wait_until(&format!("!{}", is_shown("not known")));
+    browser.click("#decisions tr:nth-child(4) button");
+    let chosen = browser.ask("document.querySelector('#decisions .chosen button').textContent");
+    assert_eq!(browser.ask("document.getElementById('pause').textContent"), "Go on live");
+    assert!(browser.text("why").starts_with(&format!("Grasp {}:", chosen.as_str().expect("a number"))));
+    assert!(browser.text("ago").starts_with("the frame that decided grasp"), "{}", browser.text("ago"));
+    // The frame is the recording's: the one with the stamp of the decision.
+    assert_eq!(browser.ask("blindgrasp.frame.grasp_id"), chosen);
+    assert_ne!(browser.ask("blindgrasp.frame.phase"), "open");
+    // The page stands still, and the graph goes on.
+    let n_frames = browser.ask("blindgrasp.frames");
+    let n_kept = browser.ask("blindgrasp.past.moments.length").as_u64().expect("a number");
+    browser.wait_until(&format!("blindgrasp.past.moments.length > {}", n_kept + 20));
+    assert_eq!(browser.ask("blindgrasp.frames"), n_frames);
+    assert_eq!(browser.ask("document.body.className"), "");
+    // Back through the moments, one by one.
+    browser.ask("document.getElementById('moment-slider').value = 3");
+    browser.ask("document.getElementById('moment-slider').dispatchEvent(new Event('input'))");
+    assert_eq!(browser.ask("blindgrasp.past.at === blindgrasp.past.moments[3].at"), true);
+    assert!(browser.text("ago").ends_with("s before the last frame"), "{}", browser.text("ago"));
+    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
+    browser.ask("size 400 800");
+    browser.ask("dark");
+    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
+    assert_eq!(browser.ask("document.documentElement.scrollWidth <= window.innerWidth"), true);
+    browser.click("#pause");
+    browser.wait_for_frames(5);
+    assert_eq!(browser.ask("errors"), Value::Array(vec![]));
     graph.stop();
 }
 
@@ -283,11 +359,18 @@ fn a_browser_shows_the_grasps_of_a_recording() {
     let flow = flow.to_str().expect("UTF-8");
     run(&["run", flow, "--name", &unique_name(), "--set", "recorded_source.rate=max", "--record", path], 0);
     let (mut lifts, mut stable, mut frames) = (BTreeMap::new(), BTreeMap::new(), BTreeMap::<u64, Vec<_>>::new());
+    let (mut decided, mut stamps) = (BTreeMap::new(), BTreeMap::<u64, Vec<u64>>::new());
     for record in RecordingReader::open(&recording).expect("a recording") {
         match record.expect("a record").1 {
-            Record::Decision(it) => drop(lifts.insert(it.message.grasp_id, it.message.action == Action::Lift)),
+            Record::Decision(it) => {
+                lifts.insert(it.message.grasp_id, it.message.action == Action::Lift);
+                decided.insert(it.message.grasp_id, it.header.stamp_nanos);
+            }
             Record::Truth(it) => drop(stable.insert(it.message.grasp_id, it.message.stable)),
-            Record::Tactile(it) => frames.entry(it.message.grasp_id).or_default().push(it.message),
+            Record::Tactile(it) => {
+                stamps.entry(it.message.grasp_id).or_default().push(it.header.stamp_nanos);
+                frames.entry(it.message.grasp_id).or_default().push(it.message);
+            }
             _ => {}
         }
     }
@@ -308,6 +391,11 @@ fn a_browser_shows_the_grasps_of_a_recording() {
     let id: u64 = browser.ask("blindgrasp.frame.grasp_id").as_str().and_then(|id| id.parse().ok()).expect("a number");
     assert_ne!(lifts[&id], stable[&id]);
     assert!(browser.text("why").contains(if stable[&id] { "It was stable." } else { "It was not stable." }));
+    // It shows the frame that decided.
+    let expected = stamps[&id].iter().position(|stamp| *stamp == decided[&id]).expect("the frame of the decision");
+    assert_eq!(browser.ask("blindgrasp.player.n"), expected);
+    assert!(browser.text("when").ends_with(", which decided"), "{}", browser.text("when"));
+    assert!(browser.text("why").contains("Object: "), "{}", browser.text("why"));
     let expected = &frames[&id];
     assert_eq!(browser.ask("blindgrasp.player.frames.length"), expected.len());
     for (idx, frame) in expected.iter().enumerate().step_by(5) {
@@ -328,6 +416,13 @@ fn a_browser_shows_the_grasps_of_a_recording() {
     browser.ask("document.getElementById('play').click()");
     assert_eq!(browser.ask("blindgrasp.player.isPlaying"), false);
     assert_eq!(browser.ask("errors"), Value::Array(vec![]));
+    // A recording is not old, however late it comes over a slow line.
+    browser.ask("latency 600");
+    browser.ask("(window.isOld = true, location.reload())");
+    browser.wait_until("typeof isOld === 'undefined' && window.blindgrasp?.player?.frames.length > 0");
+    browser.ask("(window.n_checks = 0, setInterval(() => { n_checks += 1; }, 300), null)");
+    browser.wait_until("n_checks > 3");
+    assert_eq!(browser.ask("document.body.className"), "recorded");
     // Another model beside: the decisions of this one are those of the recording, grasp by grasp.
     let model = project().join("models/barrett-bh8-280.json");
     let (_page, address) = Running::page_with(path, 0, &["--shadow", model.to_str().expect("UTF-8")]);
@@ -345,7 +440,7 @@ fn a_browser_shows_the_grasps_of_a_recording() {
         let last = browser.ask("blindgrasp.player.frames.at(-1)");
         assert_eq!(last["shadow"], last["probability"]);
     }
-    assert_eq!(browser.ask("document.getElementById('chart-key').hidden"), false);
+    browser.wait_until("document.getElementById('chart-key').textContent.includes('model beside')");
     assert_eq!(browser.ask("axe"), Value::Array(vec![]));
     // A recording of the simulator has the object, and no decisions.
     let (_page, address) = Running::page(project().join(RECORDING).to_str().expect("UTF-8"), 0);
@@ -387,6 +482,60 @@ fn the_page_of_a_picture_draws_the_grasp() {
     assert_eq!(browser.ask(&format!("{n_numbers}.length")), 0);
     assert_ne!(browser.ask("JSON.stringify(blindgrasp.hand.colouredCells())"), drawn);
     assert_eq!(browser.ask("axe"), Value::Array(vec![]));
+    assert_eq!(browser.ask("errors"), Value::Array(vec![]));
+}
+
+/// The hand by itself touches nothing: no force is written.
+#[test]
+fn the_page_of_a_hand_writes_no_forces() {
+    if !Path::new("/usr/bin/chromedriver").exists() {
+        return skipped("no chromium-driver: scripts/test installs it on Debian");
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let page = folder.path().join("hand.html");
+    let page = page.to_str().expect("UTF-8");
+    run(&["view", "barrett-bh8-280", "--out", page], 0);
+    let mut browser = Browser::open(&format!("file://{page}"));
+    browser.wait_until("typeof blindgrasp === 'object' && document.getElementById('when').textContent !== ''");
+    let pads = browser.ask("[...document.querySelectorAll('#pads text')].map((text) => text.textContent).join('|')");
+    let pads = pads.as_str().expect("a text");
+    assert!(pads.contains("24 cells") && !pads.contains(" N") && !pads.contains("1.0"), "{pads}");
+    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
+    browser.ask("size 400 800");
+    assert_eq!(browser.ask("document.documentElement.scrollWidth <= window.innerWidth"), true);
+}
+
+/// The report of a run draws its wrong decisions in the browser.
+#[test]
+fn the_report_of_a_run_draws_the_wrong_decisions() {
+    if !Path::new("/usr/bin/chromedriver").exists() {
+        return skipped("no chromium-driver: scripts/test installs it on Debian");
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let page = folder.path().join("run.html");
+    let page = page.to_str().expect("UTF-8");
+    let flow = project().join("dataflow.yaml");
+    let flow = flow.to_str().expect("UTF-8");
+    run(&["run", flow, "--name", &unique_name(), "--set", "recorded_source.rate=max", "--report", page], 0);
+    let mut browser = Browser::open(&format!("file://{page}"));
+    let n_cards = browser.ask("document.querySelectorAll('.card').length").as_u64().expect("a number");
+    assert!(n_cards > 2);
+    browser.wait_until(&format!("blindgrasp.drawn === {n_cards} && blindgrasp.shown !== null"));
+    // Every card has a picture.
+    let is_drawn = "[...document.querySelectorAll('.card canvas')].every((canvas) => \
+                    canvas.getContext('2d').getImageData(0, 0, 280, 210).data.some((value) => value > 0))";
+    assert_eq!(browser.ask(is_drawn), true);
+    browser.click(".card:last-child");
+    let chosen = browser.ask("document.querySelector('.card[aria-pressed=true] b').textContent");
+    let shown = browser.ask("`Grasp ${blindgrasp.shown}`");
+    assert_eq!(chosen, shown);
+    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
+    browser.ask("dark");
+    let ground = "getComputedStyle(document.querySelector('figure svg > rect')).fill";
+    assert_eq!(browser.ask(ground), "rgb(29, 35, 42)", "charts are dark, too");
+    browser.ask("size 400 800");
+    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
+    assert_eq!(browser.ask("document.documentElement.scrollWidth <= window.innerWidth"), true);
     assert_eq!(browser.ask("errors"), Value::Array(vec![]));
 }
 
@@ -439,6 +588,32 @@ fn foxglove_reads_the_samples_of_a_graph() {
     let output = command.arg("foxglove.sdk.v1").output().expect("started");
     assert!(String::from_utf8_lossy(&output.stderr).contains("404"), "without --foxglove nothing is served");
     graph.stop().assert_undisturbed("clients of Foxglove");
+}
+
+/// The run is over, and nothing is wrong: the page says so, and its last minutes can be looked at.
+#[test]
+fn the_page_of_a_run_that_has_ended_keeps_its_last_minutes() {
+    if !Path::new("/usr/bin/chromedriver").exists() {
+        return skipped("no chromium-driver: scripts/test installs it on Debian");
+    }
+    let flow = project().join("dataflow.yaml");
+    let graph = Graph::launch(&unique_name(), &flow, &["--set", "recorded_source.repeat=forever", "--view"]);
+    wait_until(|| graph.said().contains("in a browser on this machine: http://"), || graph.said());
+    let said = graph.said();
+    let address = said.split("this machine: ").nth(1).and_then(|rest| rest.lines().next()).expect("an address");
+    let mut browser = Browser::open(address.trim());
+    browser.wait_until("blindgrasp.past.decisions.length > 3");
+    graph.stop();
+    browser.wait_until("document.getElementById('state').textContent.startsWith('the run has ended')");
+    browser.wait_until("document.body.className === ''");
+    // Also after it has tried to reach the server again, and has failed.
+    browser.wait_until("performance.getEntriesByName(`${location.origin}/events`).length > 1");
+    assert_eq!(browser.ask("document.getElementById('state').className"), "");
+    assert!(browser.text("state").starts_with("the run has ended"), "{}", browser.text("state"));
+    browser.click("#decisions tr:nth-child(2) button");
+    let chosen = browser.ask("document.querySelector('#decisions .chosen button').textContent");
+    assert!(browser.text("why").starts_with(&format!("Grasp {}:", chosen.as_str().expect("a number"))));
+    assert_eq!(browser.ask("document.body.className"), "");
 }
 
 #[test]

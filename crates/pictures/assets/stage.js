@@ -143,11 +143,12 @@ export const makeStage = (three, canvas) => {
       const { x, y } = new Vector3(...point).project(camera);
       return [canvas.clientWidth / 2 * (1 + x), canvas.clientHeight / 2 * (1 - y)];
     },
-    // Draws the present picture on another canvas as well.
+    // Draws the middle of the present picture on another canvas as well.
     drawTo(other) {
       render();
-      const [width, height] = [other.width, other.width * canvas.height / Math.max(1, canvas.width)];
-      other.getContext("2d").drawImage(canvas, 0, (other.height - height) / 2, width, height);
+      const width = Math.min(canvas.width, canvas.height * other.width / other.height), height = width * other.height / other.width;
+      const [left, top] = [(canvas.width - width) / 2, (canvas.height - height) / 2];
+      other.getContext("2d").drawImage(canvas, left, top, width, height, 0, 0, other.width, other.height);
     },
     // Looks from this side of the hand.
     lookFrom(azimuth_rad) {
@@ -241,9 +242,9 @@ export const makeStage = (three, canvas) => {
       draw();
     },
   };
+  home();
   resize();
   new ResizeObserver(resize).observe(canvas);
-  home();
   return stage;
 };
 

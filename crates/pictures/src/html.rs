@@ -72,7 +72,7 @@ pub fn grasp_html(hand: &Hand, grasp: &RecordedGrasp) -> Result<String, PictureE
     Ok(format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>{title}</title>\n\
-         <style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n<h1>{title}</h1>\n<figure>\n{picture}</figure>\n\
+         <style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n<h1>{title}</h1>\n<figure tabindex=\"0\">\n{picture}</figure>\n\
          <section>\n<h2>3-D view</h2>\n<div class=\"scene\">\n\
          <div class=\"stage\"><canvas id=\"stage\" tabindex=\"0\" aria-label=\"the hand in three dimensions\"></canvas>\
          <div id=\"numbers\"></div><p id=\"without-webgl\" hidden>This browser has no WebGL: the 3-D view cannot be \
@@ -147,7 +147,7 @@ fn contact_table(placed: &Placed<'_>) -> String {
         return String::new();
     }
     let mut table = String::from(
-        "<section>\n<h2>Contacts</h2>\n<table>\n<thead><tr><th>#</th><th>link</th><th>on</th>\
+        "<section tabindex=\"0\">\n<h2>Contacts</h2>\n<table>\n<thead><tr><th>#</th><th>link</th><th>on</th>\
          <th class=\"num\">point x, y, z (mm, palm frame)</th><th class=\"num\">force (N)</th>\
          <th class=\"num\">felt (N)</th><th>felt by cells</th></tr></thead>\n<tbody>\n",
     );

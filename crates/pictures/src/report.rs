@@ -33,7 +33,8 @@ impl ReportPage {
             "" => String::new(),
             caption => format!("<figcaption class=\"caption\">{caption}</figcaption>"),
         };
-        self.raw(&format!("<figure>\n{picture}{caption}</figure>\n"));
+        // On a small screen it is scrolled, also by keys.
+        self.raw(&format!("<figure tabindex=\"0\">\n{picture}{caption}</figure>\n"));
     }
 
     /// Pictures side by side.
@@ -56,7 +57,7 @@ impl ReportPage {
 /// A table: the heads with whether their column has numbers, and the rows, of which some are marked.
 pub fn report_table(head: &[(&str, bool)], rows: &[(bool, Vec<String>)]) -> String {
     let class = |number: bool| if number { " class=\"number\"" } else { "" };
-    let mut text = String::from("<div class=\"scroll\"><table>\n<thead><tr>");
+    let mut text = String::from("<div class=\"scroll\" tabindex=\"0\"><table>\n<thead><tr>");
     for (name, number) in head {
         let _ = write!(text, "<th{}>{name}</th>", class(*number));
     }

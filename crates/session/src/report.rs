@@ -260,7 +260,7 @@ impl RunReport {
             size: [860.0, 340.0],
             x: Axis {
                 label: "seconds since the start".into(),
-                range: whole_seconds(all.into_iter().flatten().map(|[secs, _]| *secs)),
+                range: range_around(all.into_iter().flatten().map(|[secs, _]| *secs)),
                 format: NumberFormat::Count,
             },
             y: Axis { label: "probability (%)".into(), range: [0.0, 1.0], format: NumberFormat::Percent },
@@ -284,11 +284,15 @@ impl RunReport {
     }
 }
 
-/// From the whole second before the first value to the one after the last value.
-fn whole_seconds(secs: impl Iterator<Item = f64>) -> [f64; 2] {
-    let [first, last] = secs.fold([f64::INFINITY, 0.0], |[first, last], secs| [secs.min(first), secs.max(last)]);
-    let first = if first.is_finite() { first.floor() } else { 0.0 };
-    [first, last.ceil().max(first + 1.0)]
+/// From a round value up to the first one to a round value from the last one on.
+fn range_around(values: impl Iterator<Item = f64>) -> [f64; 2] {
+    let [first, last] = values.fold([f64::INFINITY, 0.0], |[first, last], value| [value.min(first), value.max(last)]);
+    if !first.is_finite() {
+        return [0.0, 1.0];
+    }
+    let step = if last > first { 10_f64.powf((last - first).log10().floor()) } else { 1.0 };
+    let from = (first / step).floor() * step;
+    [from, ((last / step).ceil() * step).max(from + step)]
 }
 
 fn lead(summary: &RunSummary) -> String {
@@ -417,9 +421,11 @@ mod tests {
 
     #[test]
     fn the_time_axis_begins_near_the_first_decision() {
-        assert_eq!(whole_seconds([62.4, 61.9, 70.0].into_iter()), [61.0, 70.0]);
-        assert_eq!(whole_seconds([3.0].into_iter()), [3.0, 4.0]);
-        assert_eq!(whole_seconds(std::iter::empty()), [0.0, 1.0]);
+        assert_eq!(range_around([62.4, 61.9, 70.0].into_iter()), [61.0, 70.0]);
+        assert_eq!(range_around([3.0].into_iter()), [3.0, 4.0]);
+        assert_eq!(range_around(std::iter::empty()), [0.0, 1.0]);
+        let short = range_around([0.058, 0.097].into_iter());
+        assert!((short[0] - 0.05).abs() < 1e-9 && (short[1] - 0.1).abs() < 1e-9, "{short:?}");
     }
 
     /// A source that starts again may count its grasps from 0, in an epoch that is not above the one before.

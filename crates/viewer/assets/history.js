@@ -99,7 +99,8 @@ const makeHistory = ({ show, chart }) => {
   }
   function controls() {
     const isPaused = state.at !== null, slider = byId("moment-slider");
-    byId("pause").disabled = isOver || !state.moments.length;
+    byId("pause").hidden = isOver;
+    byId("pause").disabled = !state.moments.length;
     tell("pause", isPaused ? "Go on live" : "Pause");
     slider.max = Math.max(0, state.moments.length - 1);
     slider.value = isPaused ? idxAt(state.at) : slider.max;
