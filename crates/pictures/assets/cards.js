@@ -20,14 +20,14 @@ const show = (idx) => {
 };
 const choose = (idx) => {
   show(idx);
-  cards.forEach((card) => card.setAttribute("aria-pressed", String(card === cards[idx])));
+  cards.forEach((card) => card.setAttribute("aria-pressed", String(Number(card.dataset.grasp) === idx)));
   byId("chosen").textContent = `Grasp ${data.frames[idx].grasp_id}. A click on a card shows another one. Drag or arrow keys: turn. Double click: back.`;
 };
-cards.forEach((card, idx) => card.addEventListener("click", () => choose(idx)));
+cards.forEach((card) => card.addEventListener("click", () => choose(Number(card.dataset.grasp))));
 // One after the other, so that the page can be used meanwhile.
-for (const [idx, card] of cards.entries()) {
+for (const card of cards) {
   await new Promise(requestAnimationFrame);
-  show(idx);
+  show(Number(card.dataset.grasp));
   stage.drawTo(card.querySelector("canvas"));
   blindgrasp.drawn += 1;
 }
