@@ -115,7 +115,8 @@ fn card_text(placed: &Placed<'_>) -> String {
     let grasp = placed.grasp;
     let mut lines = Vec::new();
     if let Some(decision) = &grasp.decision {
-        let (action, reason) = (decision.action.as_str(), decision.reason.as_str().replace('_', " "));
+        let action = decision.action.as_str();
+        let reason = decision.reason.as_str().replace('_', " ");
         lines.push(format!("{action}: {reason}, probability {:.2}", decision.probability_stable));
     }
     if let Some(truth) = &grasp.truth {

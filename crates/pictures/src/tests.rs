@@ -162,3 +162,21 @@ fn frames_and_contacts_of_another_hand_are_refused() {
     refused(&with_contact(|contact| contact.link = 99), "link 99");
     refused(&with_contact(|contact| contact.other_link = 99), "link 99");
 }
+
+#[test]
+fn cards_hold_a_frame_each_and_hostile_names_are_only_text() {
+    let (hand, mut grasp) = simulated("can", 1);
+    grasp.truth.as_mut().expect("a truth").object = "</script><b>\"&".into();
+    let mut cards = GraspCards::new(&hand);
+    assert!(cards.is_empty());
+    let html = cards.add(&[grasp.clone(), grasp]).expect("cards") + &cards.add(&[]).expect("no cards");
+    assert_eq!(html.matches("data-grasp=").count(), 2);
+    assert!(html.contains("known to be stable; object &lt;/script&gt;") && !html.contains("<b>\""), "{html}");
+    let scripts = cards.scripts().expect("scripts");
+    assert_eq!(scripts.matches("\"grasp_id\"").count(), 2);
+    assert_eq!(scripts.matches("</script>").count(), 4, "only the page's own scripts end");
+    assert!(cards.view().contains("linear-gradient"));
+    let (_, mut other) = simulated("can", 1);
+    other.frames[0].message.cells_newtons.pop();
+    cards.add(&[other]).expect_err("a frame of another hand");
+}
