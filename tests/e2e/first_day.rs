@@ -5,7 +5,6 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::common::{Graph, blindgrasp, project, text, unique_name, wait_until};
-use serde_json::Value;
 
 /// The blocks of a language in a part of the page.
 fn blocks(part: &str, language: &str) -> String {
@@ -81,6 +80,6 @@ fn the_commands_of_the_first_day_make_a_graph_that_lifts() {
     run_script(&demo, folder.path(), &format!("{bridge} --address {socket}"));
     wait_until(|| graph.n_decisions() >= 20, || graph.said());
     let ended = graph.stop();
-    let n_lifts = ended.decisions.iter().filter(|decision| decision["action"] == Value::from("lift")).count();
+    let n_lifts = ended.decisions.iter().filter(|decision| decision["action"] == "lift").count();
     assert!(n_lifts > 0, "{:?}", ended.decisions);
 }
