@@ -7,6 +7,7 @@ use anyhow::{Context, bail};
 use serde::Serialize;
 
 use super::{Outcome, print_line};
+use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_simulator::case_file::parse_cases;
 use blindgrasp_simulator::wrench_space::{Quality, quality};
@@ -41,6 +42,9 @@ pub(super) fn are_at(path: &Path) -> bool {
 /// Prints epsilon and volume of the cases in a file; `-` is stdin.
 pub(super) fn print(path: &Path, as_json: bool) -> anyhow::Result<Outcome> {
     let shown = if path == Path::new("-") { "stdin".into() } else { path.display().to_string() };
+    if let Some(kind) = FileKind::at(path).filter(|kind| !matches!(kind, FileKind::GraspCases | FileKind::Json)) {
+        bail!("{shown}: expected grasp cases (JSON), found {}", kind.description());
+    }
     let text = read(path).with_context(|| shown.clone())?;
     let cases = parse_cases(&text).with_context(|| shown.clone())?;
     if !as_json {

@@ -8,6 +8,7 @@ use anyhow::{Context, bail};
 use serde::Deserialize;
 use serde_json::Value;
 
+use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::{GraspTruth, Header, OwnedSenses, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_stages::Hand;
 use blindgrasp_tactile::cell_zeros::{AllowedReadings, CellZeros};
@@ -34,6 +35,10 @@ enum Line {
 /// # Errors
 /// A line that is no frame, or no frame at all. The text names the line.
 pub(super) fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines> {
+    let is_other = |kind: &FileKind| !matches!(kind, FileKind::FrameLines | FileKind::Json | FileKind::Empty);
+    if let Some(kind) = FileKind::at(file).filter(is_other) {
+        bail!("{}: expected frames as lines of JSON, found {}", file.display(), kind.description());
+    }
     let input: Box<dyn BufRead> = match file.to_str() {
         Some("-") => Box::new(std::io::stdin().lock()),
         _ => Box::new(BufReader::new(std::fs::File::open(file).with_context(|| file.display().to_string())?)),

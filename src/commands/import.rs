@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use anyhow::bail;
-use clap::{Args, ValueEnum};
+use clap::{ArgGroup, Args, ValueEnum};
 
 use super::frame_lines::{FrameLines, read_frames};
 use super::hand_cells::joint;
@@ -20,6 +20,7 @@ const MAX_SHOWN_ROWS: usize = 20;
 /// with --grasp-column. Or the frames that a bridge sends as lines of JSON, with --lines.
 #[derive(Debug, Args)]
 #[command(
+    group = ArgGroup::new("posture").args(["joints", "joint_columns", "lines"]).required(true),
     after_help = "Example: blindgrasp import grasps.csv --hand shadow-biotac-sp --joints palm_pitch=0 \\\n           \
                   --cells 'ff_biotac_*,mf_biotac_*,th_biotac_*' --label slipped --stable-value 0 \\\n           \
                   --group object --out grasps.mcap\n\n\
@@ -46,8 +47,7 @@ pub(super) struct Arguments {
     #[arg(long, conflicts_with = "unit", value_parser = |text: &str| number_in(text, 1e-12..=1e12))]
     newtons_per_unit: Option<f64>,
     /// The posture of all grasps, NAME=VALUE,…; joints not given are 0, or follow their coupling.
-    #[arg(long, value_delimiter = ',', value_parser = joint, required_unless_present_any = ["joint_columns", "lines"],
-        conflicts_with = "joint_columns")]
+    #[arg(long, value_delimiter = ',', value_parser = joint, conflicts_with = "joint_columns")]
     joints: Vec<(String, f64)>,
     /// Columns of the joint angles, names or patterns with *, separated by commas, in the hand's order of joints.
     #[arg(long, value_delimiter = ',', value_name = "PATTERNS")]
@@ -279,6 +279,9 @@ fn print_report(
     });
     if report.n_below_zero > 0 {
         lines.push(("below zero", format!("{} rows have readings below zero, which count as 0", report.n_below_zero)));
+    }
+    for warning in &report.warnings {
+        lines.push(("warning", warning.clone()));
     }
     if !report.skipped.is_empty() {
         lines.push(("left out", format!("{} rows", report.skipped.len())));

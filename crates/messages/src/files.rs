@@ -5,6 +5,11 @@ use std::io::{ErrorKind, Read, Seek, Write};
 use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 
+/// The search for files beside a missing one ends after so many.
+const MAX_NEIGHBOURS: usize = 10_000;
+/// Most names of files that an error shows.
+const MAX_SHOWN_NEIGHBOURS: usize = 5;
+
 /// Where a file is written until it is complete: beside its place, so that a rename puts it there at once.
 pub fn partial_path(path: &Path) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
@@ -15,9 +20,14 @@ pub fn partial_path(path: &Path) -> PathBuf {
 /// Opens a file to read it. A pipe, a device, a socket or a folder is refused: its reading might wait for ever, or never end.
 ///
 /// # Errors
-/// The file cannot be opened, is no regular file, or is a pointer of Git LFS in the place of the file.
+/// The file cannot be opened, is no regular file, or is a pointer of Git LFS in the place of the file. Of a file that is not
+/// there the error names the files of its kind that are.
 pub fn open_regular(path: &Path) -> std::io::Result<File> {
-    let kind = std::fs::metadata(path)?.file_type();
+    let kind = match std::fs::metadata(path) {
+        Ok(found) => found.file_type(),
+        Err(error) if error.kind() == ErrorKind::NotFound => return Err(with_neighbours(path, error)),
+        Err(error) => return Err(error),
+    };
     if kind.is_file() {
         let mut file = File::open(path)?;
         refuse_git_lfs_pointer(&mut file)?;
@@ -33,6 +43,30 @@ pub fn open_regular(path: &Path) -> std::io::Result<File> {
         "a device"
     };
     Err(std::io::Error::new(ErrorKind::InvalidInput, format!("it is {found}, expected a regular file")))
+}
+
+/// The error of a file that is not there, with the files beside its place whose names end alike.
+fn with_neighbours(path: &Path, error: std::io::Error) -> std::io::Error {
+    let folder = match path.parent() {
+        Some(folder) if folder != Path::new("") => folder,
+        _ => Path::new("."),
+    };
+    let Ok(entries) = std::fs::read_dir(folder) else { return error };
+    let is_alike = |file: &PathBuf| file.extension().is_some() && file.extension() == path.extension();
+    let mut names: Vec<String> = entries
+        .take(MAX_NEIGHBOURS)
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .filter(is_alike)
+        .filter_map(|file| Some(file.file_name()?.to_string_lossy().into_owned()))
+        .collect();
+    if names.is_empty() {
+        return error;
+    }
+    names.sort_unstable();
+    let n_more = names.len().saturating_sub(MAX_SHOWN_NEIGHBOURS);
+    let more = if n_more == 0 { String::new() } else { format!(" and {n_more} more") };
+    names.truncate(MAX_SHOWN_NEIGHBOURS);
+    std::io::Error::new(error.kind(), format!("{error}; its folder has {}{more}", names.join(", ")))
 }
 
 /// Refuses the text that a checkout without Git LFS has in the place of a large file.
@@ -94,5 +128,11 @@ mod tests {
         assert!(error.contains("git lfs pull"), "{error}");
         let missing = open_regular(&folder.path().join("missing")).expect_err("missing");
         assert_eq!(missing.kind(), ErrorKind::NotFound);
+        for name in ["b.mcap", "a.mcap", "a.json"] {
+            std::fs::write(folder.path().join(name), "").expect("written");
+        }
+        let missing = open_regular(&folder.path().join("c.mcap")).expect_err("missing");
+        assert_eq!(missing.kind(), ErrorKind::NotFound);
+        assert!(missing.to_string().ends_with("; its folder has a.mcap, b.mcap"), "{missing}");
     }
 }

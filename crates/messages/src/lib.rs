@@ -36,6 +36,7 @@ mod declare;
 mod senses;
 mod coded;
 mod contact_set;
+pub mod file_kind;
 pub mod files;
 mod grasp_feature;
 mod grasp_scene;

@@ -22,7 +22,7 @@ const MAX_SHOWN: usize = 10;
 pub enum NamedError {
     /// The catalogue has no such object.
     #[error("{0}; nor is there a folder or a file of meshes of that name")]
-    Selection(#[from] SelectionError),
+    Selection(SelectionError),
     #[error(transparent)]
     Folder(#[from] FolderError),
     #[error(transparent)]
@@ -54,7 +54,7 @@ pub fn objects_named(text: &str) -> Result<(Vec<Object>, Vec<String>), NamedErro
     match select(text) {
         Ok(objects) => Ok((objects, Vec::new())),
         Err(SelectionError::Unknown { .. }) if Path::new(text).exists() => objects_in(Path::new(text)),
-        Err(error) => Err(error.into()),
+        Err(error) => Err(NamedError::Selection(error)),
     }
 }
 

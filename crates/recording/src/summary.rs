@@ -5,6 +5,7 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 
+use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::open_regular;
 use mcap::records::{ChunkIndex, MetadataIndex, Record as McapRecord, Statistics, op};
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
@@ -110,7 +111,9 @@ pub(super) fn open_mcap(path: &Path) -> Result<File, RecordingError> {
     let mut file = open_regular(path).map_err(|source| RecordingError::Io { path: path.into(), source })?;
     let mut magic = [0; 8];
     if file.read_exact(&mut magic).is_err() || magic != *mcap::MAGIC {
-        let message = "not a recording: expected an MCAP file".into();
+        let found = FileKind::at(path).filter(|kind| *kind != FileKind::Recording).map(FileKind::description);
+        let found = found.map(|found| format!(", found {found}")).unwrap_or_default();
+        let message = format!("not a recording: expected an MCAP file{found}");
         return Err(RecordingError::Invalid { path: path.into(), message });
     }
     Ok(file)

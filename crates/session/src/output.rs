@@ -46,8 +46,26 @@ pub fn check_output(out: &Path, inputs: &[PathBuf]) -> anyhow::Result<()> {
             out.parent().unwrap_or(out).display()
         ),
         None if out.is_dir() => anyhow::bail!("{} is a folder: expected the name of a file to write", out.display()),
-        None => Ok(()),
+        None => check_writable(out),
     }
+}
+
+/// Refuses a place where no file can be made, before work of hours ends there.
+fn check_writable(out: &Path) -> anyhow::Result<()> {
+    if out.exists() {
+        return Ok(());
+    }
+    let folder = match out.parent() {
+        Some(folder) if folder != Path::new("") => folder,
+        _ => Path::new("."),
+    };
+    let trial = folder.join(format!(".blindgrasp-{}.partial", std::process::id()));
+    if let Err(error) = std::fs::File::create(&trial) {
+        let folder = folder.display();
+        anyhow::bail!("{}: no file can be made in {folder}: {error}; choose another folder", out.display());
+    }
+    let _ = std::fs::remove_file(&trial);
+    Ok(())
 }
 
 /// Writes a text as an output file: whole or not at all. A link, a pipe or a device is written to as it is.
@@ -58,4 +76,20 @@ pub fn write_out(path: &Path, text: &str) -> anyhow::Result<()> {
     let is_special = std::fs::symlink_metadata(path).is_ok_and(|found| !found.is_file());
     let written = if is_special { std::fs::write(path, text) } else { write_whole(path, text) };
     written.map_err(|error| anyhow::anyhow!("cannot write {}: {error}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_place_where_nothing_can_be_written_is_refused_before_the_work() {
+        let error = check_output(Path::new("/proc/model.json"), &[]).expect_err("no file can be made there");
+        let text = error.to_string();
+        assert!(text.contains("/proc/model.json: no file can be made in /proc") && text.contains("choose"), "{text}");
+        let folder = std::env::temp_dir().join(format!("blindgrasp-output-{}", std::process::id()));
+        std::fs::create_dir(&folder).expect("made");
+        check_output(&folder.join("model.json"), &[]).expect("a place to write");
+        std::fs::remove_dir(&folder).expect("the trial leaves nothing");
+    }
 }

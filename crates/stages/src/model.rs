@@ -20,6 +20,7 @@ use crate::own_lifts::{Adapt, Looked, OwnLifts};
 use crate::probe::{GraspHistory, ProbeModel, pad_newtons, signals};
 use crate::shift_test::numbers;
 use crate::training_summary::TrainingSummary;
+use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::{open_regular, write_whole};
 use blindgrasp_messages::{Fault, Phase};
 
@@ -132,7 +133,10 @@ pub enum InvalidModel {
     TooLarge,
     #[error("not a model (not UTF-8): expected JSON made by blindgrasp train")]
     NotUtf8,
-    #[error("not a model, or cut off: {0}")]
+    /// It is a file of another kind, which the text describes.
+    #[error("not a model: expected JSON made by blindgrasp train, found {0}")]
+    OtherKind(&'static str),
+    #[error("not a model, or cut off: expected JSON made by blindgrasp train ({0})")]
     NotAModel(String),
     /// It has the format, but not what belongs to it.
     #[error("not a valid model: {0}")]
@@ -162,6 +166,10 @@ impl Model {
         let invalid = |reason| ModelError::Invalid { path: path.into(), reason };
         if bytes.len() as u64 > MAX_BYTES {
             return Err(invalid(InvalidModel::TooLarge));
+        }
+        // Other JSON may be a model of another version.
+        if let Some(kind) = FileKind::of(&bytes).filter(|kind| !matches!(kind, FileKind::Model | FileKind::Json)) {
+            return Err(invalid(InvalidModel::OtherKind(kind.description())));
         }
         let text = String::from_utf8(bytes).map_err(|_| invalid(InvalidModel::NotUtf8))?;
         Model::parse(&text).map_err(invalid)

@@ -35,7 +35,7 @@ pub enum ClientError {
     NoneRunning,
     #[error("no graph '{graph}' is running; {}", listed(running))]
     NotRunning { graph: String, running: Vec<String> },
-    #[error("several graphs are running: {}; name one", running.join(", "))]
+    #[error("several graphs are running: {}; name one, as with -g {}", running.join(", "), running[0])]
     SeveralRunning { running: Vec<String> },
     #[error("graph '{graph}' is run by another user ({uid})")]
     OtherUser { graph: String, uid: u32 },

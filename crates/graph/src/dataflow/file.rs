@@ -11,8 +11,9 @@ use crate::dataflow::machines_entry::{
 };
 use crate::dataflow::node::{NodeEntry, read_node};
 use crate::dataflow::yaml::{self, Content, Entry, Text, Value};
+use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::open_regular;
-use blindgrasp_operator::text::did_you_mean;
+use blindgrasp_operator::text::{did_you_mean, quote_path};
 
 /// Far above any graph that a machine can run; a file beyond it is not a dataflow file.
 const MAX_FILE_BYTES: usize = 1 << 20;
@@ -83,8 +84,14 @@ pub fn load_with(path: &Path, variables: &[(&str, &str)]) -> Result<DataflowFile
         Ok(bytes) => parse_with(path, &bytes, variables),
         Err(error) => {
             let mut diagnostics = Diagnostics::new(path);
-            let is_absent = error.kind() == std::io::ErrorKind::NotFound;
-            let help = is_absent.then(|| "blindgrasp init DIR makes a project with one".to_string());
+            let in_folder = path.join("dataflow.yaml");
+            let help = if in_folder.is_file() {
+                Some(format!("did you mean {}?", quote_path(&in_folder)))
+            } else if error.kind() == std::io::ErrorKind::NotFound || path.is_dir() {
+                Some("blindgrasp init DIR makes a project with one".to_string())
+            } else {
+                None
+            };
             diagnostics.push_with_help(None, format!("cannot read the file: {error}"), help);
             Err(diagnostics.into_error())
         }
@@ -127,12 +134,22 @@ fn read(path: &Path) -> std::io::Result<Vec<u8>> {
     Ok(content)
 }
 
+/// Whether a file is of a kind of its own. JSON is YAML as well.
+fn is_other(kind: FileKind) -> bool {
+    !matches!(kind, FileKind::Dataflow | FileKind::Empty | FileKind::Json)
+}
+
 fn read_file(
     path: &Path,
     content: &[u8],
     variables: &[(&str, &str)],
     diagnostics: &mut Diagnostics,
 ) -> Option<Written> {
+    if let Some(kind) = FileKind::of(content).filter(|kind| is_other(*kind)) {
+        let message = format!("not a dataflow file: expected YAML with operators, found {}", kind.description());
+        diagnostics.push(None, message);
+        return None;
+    }
     if content.len() > MAX_FILE_BYTES {
         diagnostics.push(None, "larger than 1 MiB, so it is not a dataflow file");
         return None;

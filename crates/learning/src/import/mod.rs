@@ -20,6 +20,7 @@ pub use self::frames::{FramesReport, import_frames};
 use self::columns::{Columns, shortened};
 use self::grasps::{Grasps, TableGrasp, TableReading};
 use self::lines::Lines;
+use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::open_regular;
 use blindgrasp_messages::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::{RecordingError, RecordingInfo, RecordingWriter};
@@ -35,6 +36,8 @@ const PERIOD_NANOS: u64 = 10_000_000;
 const PAUSE_NANOS: u64 = 100_000_000;
 /// The size limit of a table: millions of grasps.
 const MAX_BYTES: u64 = 1 << 30;
+/// No cell of a known sensor for hands reads so much.
+const UNLIKELY_NEWTONS: f64 = 200.0;
 /// The most bad rows that an error shows.
 const MAX_SHOWN_ROWS: usize = 20;
 /// The most values of the label that an error shows.
@@ -126,6 +129,8 @@ pub struct ImportReport {
     /// The columns of the joints in the hand's order; empty for a fixed posture.
     pub joint_columns: Vec<String>,
     pub skipped: Vec<BadRow>,
+    /// Units that are probably others than the options say.
+    pub warnings: Vec<String>,
 }
 
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
@@ -185,6 +190,9 @@ pub fn import_table(
     let refused = |message: String| ImportError::Table { path: table.into(), message };
     require_forces(hand).map_err(refused)?;
     let bytes = read(table)?;
+    if let Some(kind) = FileKind::of(&bytes).filter(|kind| !matches!(kind, FileKind::Table | FileKind::Empty)) {
+        return Err(refused(format!("expected a table (CSV), found {}", kind.description())));
+    }
     let text = bytes.strip_prefix(BYTE_ORDER_MARK).unwrap_or(&bytes);
     let mut reader = csv::ReaderBuilder::new().delimiter(options.delimiter).trim(csv::Trim::All).from_reader(text);
     let header = match reader.headers() {
@@ -202,6 +210,7 @@ pub fn import_table(
     let mut writer = GraspWriter::create(table, hand, options, out)?;
     let mut lines = Lines::new(text);
     let mut grasps = Grasps::new(columns.grasp.is_some());
+    let mut extremes = Extremes::default();
     for record in reader.records() {
         report.n_rows += 1;
         let place = record.as_ref().map_or_else(csv::Error::position, csv::StringRecord::position);
@@ -215,17 +224,20 @@ pub fn import_table(
             Err(error) => (None, Err(bad_row(&error, line).ok_or_else(|| table_error(table, error))?)),
         };
         if let Some(grasp) = grasps.add(row, line).map_err(refused)? {
+            extremes.add(hand, &grasp);
             report.count(&grasp);
             writer.write(grasp)?;
         }
     }
     if let Some(grasp) = grasps.close() {
+        extremes.add(hand, &grasp);
         report.count(&grasp);
         writer.write(grasp)?;
     }
     if report.n_rows == 0 {
         return Err(refused("there is no row below the header: expected one for each grasp or frame".into()));
     }
+    report.warnings = extremes.warnings(hand, options);
     let bad_rows = grasps.bad_rows;
     if !bad_rows.is_empty() && (!options.skip_bad_rows || report.n_grasps == 0) {
         return Err(ImportError::Rows { path: table.into(), n_rows: report.n_rows, rows: bad_rows });
@@ -316,7 +328,13 @@ impl RowReader<'_> {
             let most = MAX_CELL_NEWTONS / self.options.scale;
             let (column, found) = (&self.header[idx], found(&record[idx]));
             let is_below = reading.is_some_and(|reading| reading < least && !self.options.clip_negative);
-            let advice = if is_below { " (--clip-negative takes readings below zero for 0)" } else { "" };
+            let advice = if is_below {
+                " (--clip-negative takes readings below zero for 0)"
+            } else if record[idx].contains(',') && record[idx].replace(',', ".").parse::<f64>().is_ok() {
+                " (write the decimal point as a dot)"
+            } else {
+                ""
+            };
             format!("column '{column}': expected a number from 0 to {most}, found {found}{advice}")
         })?;
         Ok(usable.max(0.0))
@@ -342,8 +360,10 @@ impl RowReader<'_> {
         value.filter(|value| joint.allows(*value, LIMIT_TOLERANCE_RAD)).ok_or_else(|| {
             let tolerance = LIMIT_TOLERANCE_RAD * joint.kind.per_radian();
             let [least, most] = [joint.lower - tolerance, joint.upper + tolerance].map(|limit| limit / of_unit);
+            let is_degrees = value.is_some_and(|value| joint.degrees_hint(value).is_some());
+            let advice = if is_degrees { " (--joint-unit deg takes degrees)" } else { "" };
             format!(
-                "column '{}': expected {least:.3} to {most:.3} {unit} for the joint {}, found {}",
+                "column '{}': expected {least:.3} to {most:.3} {unit} for the joint {}, found {}{advice}",
                 self.header[idx],
                 joint.name,
                 found(&record[idx])
@@ -365,6 +385,44 @@ impl RowReader<'_> {
             joint_columns: names(&self.columns.joints),
             ..ImportReport::default()
         }
+    }
+}
+
+/// The largest values of a table, which show a wrong unit.
+#[derive(Debug, Default)]
+struct Extremes {
+    reading_newtons: f64,
+    angle_rad: f64,
+}
+
+impl Extremes {
+    fn add(&mut self, hand: &Hand, grasp: &TableGrasp) {
+        for reading in &grasp.readings {
+            self.reading_newtons = reading.cells.iter().fold(self.reading_newtons, |most, cell| most.max(*cell));
+            for (joint, value) in hand.joints.iter().zip(&reading.joints) {
+                if joint.kind == JointKind::Revolute {
+                    self.angle_rad = self.angle_rad.max(value.abs());
+                }
+            }
+        }
+    }
+
+    fn warnings(&self, hand: &Hand, options: &ImportOptions) -> Vec<String> {
+        let mut warnings = Vec::new();
+        if hand.cell_unit == CellUnit::Newtons && self.reading_newtons > UNLIKELY_NEWTONS {
+            warnings.push(format!(
+                "the largest reading of a cell is {:.0} N: if the table is in another unit, give --newtons-per-unit",
+                self.reading_newtons
+            ));
+        }
+        let is_deg = matches!(options.joints, Joints::Columns { unit: AngleUnit::Deg, .. });
+        let degrees = self.angle_rad.to_degrees();
+        if is_deg && degrees > 0.0 && degrees <= std::f64::consts::PI {
+            warnings.push(format!(
+                "the largest joint angle is {degrees:.2} degrees: if the table is in radians, leave out --joint-unit deg"
+            ));
+        }
+        warnings
     }
 }
 

@@ -15,8 +15,9 @@ pub enum JointError {
     Unknown { name: String, known: String },
     #[error("joint '{joint}' is given twice")]
     Twice { joint: String },
-    #[error("joint '{joint}' is {value} {unit}, expected {lower} to {upper}")]
-    OutOfRange { joint: String, value: f64, unit: &'static str, lower: f64, upper: f64 },
+    /// The hint is empty, or says which value was probably meant.
+    #[error("joint '{joint}' is {value} {unit}, expected {lower:.4} to {upper:.4}{hint}")]
+    OutOfRange { joint: String, value: f64, unit: &'static str, lower: f64, upper: f64, hint: String },
 }
 
 /// A cell's position and normal in the palm frame.
@@ -98,7 +99,8 @@ impl Hand {
             }
             if !joint.allows(value, 1e-6) {
                 let (unit, lower, upper) = (joint.kind.unit(), joint.lower, joint.upper);
-                return Err(JointError::OutOfRange { joint: name.into(), value, unit, lower, upper });
+                let hint = joint.degrees_hint(value).map(|hint| format!("; {hint}")).unwrap_or_default();
+                return Err(JointError::OutOfRange { joint: name.into(), value, unit, lower, upper, hint });
             }
             if values[joint_idx].replace(value).is_some() {
                 return Err(JointError::Twice { joint: name.into() });
@@ -178,6 +180,8 @@ mod tests {
         assert_eq!(posture[5], 0.5);
         assert!(matches!(hand.posture([("thumb", 0.0)]), Err(JointError::Unknown { .. })));
         assert!(matches!(hand.posture([("spread", 4.0)]), Err(JointError::OutOfRange { .. })));
+        let error = hand.posture([("spread", 45.0)]).expect_err("degrees").to_string();
+        assert!(error.ends_with("expected 0.0000 to 3.1416; 45 degrees are 0.7854 rad"), "{error}");
         assert!(matches!(hand.posture([("spread", f64::NAN)]), Err(JointError::NotFinite { .. })));
     }
 

@@ -88,7 +88,7 @@ fn default_self_collision_margin_m() -> f64 {
 pub(super) fn parse(path: &Path, text: &str) -> Result<Layout, HandError> {
     let invalid = |message: String| HandError::Invalid { path: path.into(), message };
     if text.trim_start().starts_with("<?xml") || text.trim_start().starts_with("<robot") {
-        return Err(invalid("this is a URDF: expected the pad layout (.yaml) that names it".into()));
+        return Err(invalid("this is a URDF: expected the pad layout (.yaml) that names it; blindgrasp new hand NAME --urdf FILE makes one".into()));
     }
     let options = serde_saphyr::options! { budget: serde_saphyr::budget! { max_nodes: MAX_NODES } };
     let layout: Layout = serde_saphyr::from_str_with_options(text, options)
@@ -242,7 +242,8 @@ impl Layout {
             let joint = Joint { name: name.clone(), kind, lower, upper, open, coupling: None, is_preshape };
             if !joint.allows(joint.open(), 1e-9) {
                 let unit = kind.unit();
-                return Err(format!("open: '{name}' is {}, expected {lower} to {upper} {unit}", joint.open()));
+                let hint = joint.degrees_hint(joint.open()).map(|hint| format!("; {hint}")).unwrap_or_default();
+                return Err(format!("open: '{name}' is {}, expected {lower} to {upper} {unit}{hint}", joint.open()));
             }
             joints.push(joint);
         }

@@ -17,6 +17,7 @@ use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
+use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::open_regular;
 use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, UnitVector3, Vector3};
 use parry3d_f64::math::Vector;
@@ -113,6 +114,14 @@ impl Joint {
     /// The limit towards which a joint that follows no other closes: the one farther from the open value.
     pub fn closed(&self) -> f64 {
         if self.upper - self.open() >= self.open() - self.lower { self.upper } else { self.lower }
+    }
+
+    /// The hint that a value beyond the limits, of which the same number of degrees is within them, needs radians.
+    pub fn degrees_hint(&self, value: f64) -> Option<String> {
+        let is_angle = self.kind == JointKind::Revolute;
+        let in_rad = value.to_radians();
+        (is_angle && !self.allows(value, 1e-6) && self.allows(in_rad, 1e-6))
+            .then(|| format!("{value} degrees are {in_rad:.4} rad"))
     }
 
     /// Whether `value` is within the limits, or beyond them by at most so many radians.
@@ -626,10 +635,16 @@ pub fn builtin_names() -> Vec<&'static str> {
 const MAX_BYTES: u64 = 16 << 20;
 
 fn read(path: &Path) -> Result<String, HandError> {
-    String::from_utf8(read_bytes(path)?).map_err(|_| HandError::Invalid {
-        path: path.into(),
-        message: "not UTF-8: expected a pad layout (YAML)".into(),
-    })
+    let invalid = |message: String| HandError::Invalid { path: path.into(), message };
+    let bytes = read_bytes(path)?;
+    // The layout's reader says what a URDF is; JSON is YAML as well.
+    let is_other = |kind: &FileKind| {
+        !matches!(kind, FileKind::PadLayout | FileKind::Urdf | FileKind::Empty | FileKind::Json)
+    };
+    if let Some(kind) = FileKind::of(&bytes).filter(is_other) {
+        return Err(invalid(format!("not a pad layout: expected YAML that names a URDF, found {}", kind.description())));
+    }
+    String::from_utf8(bytes).map_err(|_| invalid("not UTF-8: expected a pad layout (YAML)".into()))
 }
 
 fn read_bytes(path: &Path) -> Result<Vec<u8>, HandError> {

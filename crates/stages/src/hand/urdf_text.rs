@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use blindgrasp_messages::file_kind::FileKind;
 use encoding_rs::{Encoding, UTF_8};
 
 use super::{HandError, read_bytes};
@@ -11,9 +12,14 @@ const DECLARED_UTF_8: &str = "<?xml version=\"1.0\" encoding=\"UTF-8\"?>";
 /// Reads the text of a URDF.
 ///
 /// # Errors
-/// A file that cannot be read, or of more than 16 MiB.
+/// A file that cannot be read, is of more than 16 MiB, or is of another kind.
 pub fn read_urdf(path: &Path) -> Result<String, HandError> {
-    Ok(decode_urdf(&read_bytes(path)?))
+    let bytes = read_bytes(path)?;
+    if let Some(kind) = FileKind::of(&bytes).filter(|kind| !matches!(kind, FileKind::Urdf | FileKind::Empty)) {
+        let message = format!("not a URDF: expected XML with one <robot>, found {}", kind.description());
+        return Err(HandError::Invalid { path: path.into(), message });
+    }
+    Ok(decode_urdf(&bytes))
 }
 
 /// The text of a URDF in the encoding of its byte order mark or else of its XML declaration, which then declares UTF-8. Bytes

@@ -300,6 +300,9 @@ fn print_parts(hand: &Hand) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// The columns that a table of cells must have.
+const CELL_COLUMNS: [&str; 7] = ["link", "x", "y", "z", "nx", "ny", "nz"];
+
 /// Cells of the table, pad by pad.
 fn read_table(path: &Path, threshold_newtons: f64) -> anyhow::Result<Vec<NewPad>> {
     let mut reader = csv::ReaderBuilder::new()
@@ -307,6 +310,15 @@ fn read_table(path: &Path, threshold_newtons: f64) -> anyhow::Result<Vec<NewPad>
         .comment(Some(b'#'))
         .from_path(path)
         .with_context(|| format!("cannot read {}", path.display()))?;
+    let header = reader.headers().with_context(|| path.display().to_string())?;
+    if let Some(missing) = CELL_COLUMNS.iter().find(|column| !header.iter().any(|found| found == **column)) {
+        bail!(
+            "{}: line 1: the column '{missing}' is missing: expected {}, found {}",
+            path.display(),
+            CELL_COLUMNS.join(", "),
+            header.iter().take(12).collect::<Vec<_>>().join(", ")
+        );
+    }
     let mut pads: Vec<NewPad> = Vec::new();
     let mut is_sized = true;
     for row in reader.deserialize() {
