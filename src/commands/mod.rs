@@ -14,6 +14,7 @@ mod export;
 mod frame_lines;
 mod graph_file;
 mod grid;
+mod guesses;
 mod hand_cells;
 mod help;
 mod import;
@@ -47,6 +48,7 @@ mod train;
 mod trials;
 mod view;
 
+use std::ffi::OsString;
 use std::io::{IsTerminal, Write};
 use std::ops::RangeInclusive;
 use std::process::ExitCode;
@@ -162,9 +164,10 @@ impl Cli {
     pub(crate) fn read() -> Cli {
         completions::answer_shell();
         elsewhere::answer_caller();
-        let matches = help::grouped(Cli::command()).try_get_matches();
+        let words: Vec<OsString> = std::env::args_os().collect();
+        let matches = help::grouped(Cli::command()).try_get_matches_from(&words);
         let parsed = matches.and_then(|matches| Cli::from_arg_matches(&matches));
-        parsed.unwrap_or_else(|error| help::with_hint(error).exit())
+        parsed.unwrap_or_else(|error| guesses::with_hint(error, help::grouped(Cli::command()), &words).exit())
     }
 
     /// Runs the operator that this process is to be. An operator reports its end to the launcher, not to a person.

@@ -638,11 +638,13 @@ fn read(path: &Path) -> Result<String, HandError> {
     let invalid = |message: String| HandError::Invalid { path: path.into(), message };
     let bytes = read_bytes(path)?;
     // The layout's reader says what a URDF is; JSON is YAML as well.
-    let is_other = |kind: &FileKind| {
-        !matches!(kind, FileKind::PadLayout | FileKind::Urdf | FileKind::Empty | FileKind::Json)
-    };
+    let is_other =
+        |kind: &FileKind| !matches!(kind, FileKind::PadLayout | FileKind::Urdf | FileKind::Empty | FileKind::Json);
     if let Some(kind) = FileKind::of(&bytes).filter(is_other) {
-        return Err(invalid(format!("not a pad layout: expected YAML that names a URDF, found {}", kind.description())));
+        return Err(invalid(format!(
+            "not a pad layout: expected YAML that names a URDF, found {}",
+            kind.description()
+        )));
     }
     String::from_utf8(bytes).map_err(|_| invalid("not UTF-8: expected a pad layout (YAML)".into()))
 }
