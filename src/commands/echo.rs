@@ -22,13 +22,14 @@ const MAX_UNREAD_LINES: usize = 1 << 14;
 
 /// Print the samples of a running graph, one JSON object a line
 #[derive(Debug, Args)]
-#[command(after_help = "Examples: blindgrasp echo lift_arbiter/decision\n          \
+#[command(after_help = "Examples: blindgrasp echo decision\n          \
                         blindgrasp echo -n 1 classifier/prediction contacts/contacts\n\n\
                         The lines are those of blindgrasp export. The graph does not wait for a reader of stdout that is too slow:\n\
                         lines that are left out for that reason are counted. blindgrasp top shows rates.\n\
                         Two commands can read a graph at once: echo, record and view --foxglove.")]
 pub(super) struct Arguments {
-    /// Outputs to read [default: all]
+    /// Outputs to read, as NODE/PORT or by a port's name that no other node has; a node alone stands for all its outputs
+    /// [default: all]
     #[arg(value_name = "NODE/PORT", add = completions::outputs())]
     edges: Vec<String>,
     /// End after so many samples

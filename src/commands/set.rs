@@ -14,6 +14,7 @@ use super::{Outcome, completions, print_line};
 use blindgrasp_graph::client::{Connection, pick_graph, status};
 use blindgrasp_graph::control::{NodeStatus, Reply, Request};
 use blindgrasp_graph::describe::describe;
+use blindgrasp_operator::text::did_you_mean;
 
 /// The operator checks the value, and applies it between two samples.
 const LIMIT: Duration = Duration::from_secs(10);
@@ -31,7 +32,9 @@ const LIMIT: Duration = Duration::from_secs(10);
 )]
 pub(super) struct Arguments {
     /// NODE.PARAM=VALUE to change it, NODE.PARAM or NODE to show it; the value is a number, true, false or a text
-    #[arg(value_name = "NODE[.PARAM[=VALUE]]", add = completions::assignments())]
+    ///
+    /// Without NODE it is the parameter of each node that has it, as with run --set.
+    #[arg(value_name = "[NODE.]PARAM[=VALUE]", add = completions::assignments())]
     what: Option<What>,
     /// Graph [default: the only one running]
     #[arg(short, long, add = completions::graphs())]
@@ -45,14 +48,19 @@ pub(super) struct Arguments {
 
 #[derive(Debug, Clone, PartialEq)]
 enum What {
-    Node(String),
-    Param { node: String, param: String },
+    /// A node, or a parameter of any node.
+    Name(String),
+    Param {
+        node: String,
+        param: String,
+    },
     Assignment(Assignment),
 }
 
 #[derive(Debug, Clone, PartialEq)]
 struct Assignment {
-    node: String,
+    /// Without it, each node that has the parameter.
+    node: Option<String>,
     param: String,
     value: Value,
 }
@@ -63,14 +71,23 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     match &arguments.what {
         None => list(arguments, None),
-        Some(What::Node(node)) => list(arguments, Some(node)),
+        Some(What::Name(name)) => list(arguments, Some(name)),
         Some(What::Param { node, param }) => get(arguments, node, param),
-        Some(What::Assignment(assignment)) => assign(arguments, assignment.clone()),
+        Some(What::Assignment(assignment)) => assign(arguments, assignment),
     }
 }
 
-fn list(arguments: &Arguments, node: Option<&str>) -> anyhow::Result<Outcome> {
-    let nodes = nodes(arguments.graph.as_deref(), node)?;
+/// Lists all parameters, those of a node, or those of a name.
+fn list(arguments: &Arguments, named: Option<&str>) -> anyhow::Result<Outcome> {
+    let mut nodes = all_nodes(arguments.graph.as_deref())?;
+    if let Some(name) = named {
+        if !nodes.iter().any(|node| node.node == name) && nodes.iter().any(|node| node.params.contains_key(name)) {
+            nodes.iter_mut().for_each(|node| node.params.retain(|param, _| param == name));
+            nodes.retain(|node| !node.params.is_empty());
+        } else {
+            nodes = node_of(nodes, name)?;
+        }
+    }
     let mut table = TextTable::of_texts(["parameter", "value", ""]);
     for node in &nodes {
         let description = describe(&node.program, &node.args).ok();
@@ -94,7 +111,7 @@ fn list(arguments: &Arguments, node: Option<&str>) -> anyhow::Result<Outcome> {
 }
 
 fn get(arguments: &Arguments, node: &str, param: &str) -> anyhow::Result<Outcome> {
-    let nodes = nodes(arguments.graph.as_deref(), Some(node))?;
+    let nodes = node_of(all_nodes(arguments.graph.as_deref())?, node)?;
     let Some(value) = nodes.iter().find_map(|node| node.params.get(param)) else {
         let known: Vec<&str> = nodes.iter().flat_map(|node| node.params.keys().map(String::as_str)).collect();
         bail!("node '{node}' has no parameter '{param}' with a value; its parameters: {}", known.join(", "));
@@ -103,19 +120,19 @@ fn get(arguments: &Arguments, node: &str, param: &str) -> anyhow::Result<Outcome
     Ok(Outcome::Done)
 }
 
-/// The nodes of a graph, or one of them.
-fn nodes(graph: Option<&str>, node: Option<&str>) -> anyhow::Result<Vec<NodeStatus>> {
-    let graph = pick_graph(graph)?;
-    let status = status(&graph)?;
-    let mut nodes = status.nodes.clone();
-    if let Some(node) = node {
-        let known: Vec<&str> = status.nodes.iter().map(|node| node.node.as_str()).collect();
-        nodes.retain(|found| found.node == node);
-        if nodes.is_empty() {
-            bail!("graph '{graph}' has no node '{node}'; its nodes: {}", known.join(", "));
-        }
+fn all_nodes(graph: Option<&str>) -> anyhow::Result<Vec<NodeStatus>> {
+    Ok(status(&pick_graph(graph)?)?.nodes)
+}
+
+/// The node of that name.
+fn node_of(nodes: Vec<NodeStatus>, name: &str) -> anyhow::Result<Vec<NodeStatus>> {
+    let known: Vec<String> = nodes.iter().map(|node| node.node.clone()).collect();
+    let found: Vec<NodeStatus> = nodes.into_iter().filter(|node| node.node == name).collect();
+    if found.is_empty() {
+        let alike = did_you_mean(name, known.iter().map(String::as_str)).map(|alike| format!("{alike} "));
+        bail!("the graph has no node '{name}'; {}its nodes: {}", alike.unwrap_or_default(), known.join(", "));
     }
-    Ok(nodes)
+    Ok(found)
 }
 
 /// A text without quotes.
@@ -123,12 +140,37 @@ fn shown(value: &Value) -> String {
     value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
 
-fn assign(arguments: &Arguments, assignment: Assignment) -> anyhow::Result<Outcome> {
+/// Changes the parameter of a node, or of each node that has it, as `run --set` does.
+fn assign(arguments: &Arguments, assignment: &Assignment) -> anyhow::Result<Outcome> {
     let Assignment { node, param, value } = assignment;
     let graph = pick_graph(arguments.graph.as_deref())?;
-    warn_of_misfit(&graph, &node, &param, &value)?;
-    let mut connection = Connection::open(&graph)?;
-    let request = Request::Set { node: node.clone(), param: param.clone(), value };
+    let nodes = match node {
+        Some(node) => vec![node.clone()],
+        None => nodes_with(&graph, param)?,
+    };
+    for node in nodes {
+        assign_to(arguments, &graph, &node, param, value)?;
+    }
+    Ok(Outcome::Done)
+}
+
+/// The nodes that have a parameter.
+fn nodes_with(graph: &str, param: &str) -> anyhow::Result<Vec<String>> {
+    let nodes = status(graph)?.nodes;
+    let found: Vec<String> =
+        nodes.iter().filter(|node| node.params.contains_key(param)).map(|node| node.node.clone()).collect();
+    if found.is_empty() {
+        let known = nodes.iter().flat_map(|node| node.params.keys().map(String::as_str));
+        let alike = did_you_mean(param, known).map(|alike| format!("; {alike}")).unwrap_or_default();
+        bail!("no node of graph '{graph}' has the parameter '{param}'{alike}; blindgrasp set lists all");
+    }
+    Ok(found)
+}
+
+fn assign_to(arguments: &Arguments, graph: &str, node: &str, param: &str, value: &Value) -> anyhow::Result<()> {
+    warn_of_misfit(graph, node, param, value)?;
+    let mut connection = Connection::open(graph)?;
+    let request = Request::Set { node: node.into(), param: param.into(), value: value.clone() };
     let (old, new, from_seq) = match connection.ask(&request, LIMIT)? {
         Reply::Set { old, new, from_seq } => (old, new, from_seq),
         other => return Err(connection.unexpected(&other).into()),
@@ -143,7 +185,7 @@ fn assign(arguments: &Arguments, assignment: Assignment) -> anyhow::Result<Outco
         let from = from_seq.map_or("its first sample on".into(), |seq| format!("sample {seq} on"));
         print_line(&format!("{node}.{param}: {old} → {new}, from {from}"))?;
     }
-    Ok(Outcome::Done)
+    Ok(())
 }
 
 impl FromStr for What {
@@ -156,13 +198,17 @@ impl FromStr for What {
         };
         match (target.split_once('.'), value) {
             (Some((node, param)), Some(value)) if !node.is_empty() && !param.is_empty() => {
-                Ok(What::Assignment(Assignment { node: node.into(), param: param.into(), value: value_of(value) }))
+                let value = value_of(value);
+                Ok(What::Assignment(Assignment { node: Some(node.into()), param: param.into(), value }))
+            }
+            (None, Some(value)) if !target.is_empty() => {
+                Ok(What::Assignment(Assignment { node: None, param: target.into(), value: value_of(value) }))
             }
             (Some((node, param)), None) if !node.is_empty() && !param.is_empty() => {
                 Ok(What::Param { node: node.into(), param: param.into() })
             }
-            (None, None) if !text.is_empty() => Ok(What::Node(text.into())),
-            _ => Err("expected NODE.PARAM=VALUE, as in lift_arbiter.votes=5, or NODE.PARAM, or NODE".into()),
+            (None, None) if !text.is_empty() => Ok(What::Name(text.into())),
+            _ => Err("expected [NODE.]PARAM=VALUE, as in lift_arbiter.votes=5, or NODE.PARAM, NODE or PARAM".into()),
         }
     }
 }
@@ -193,10 +239,12 @@ mod tests {
             ("[1]", json!("[1]")),
         ];
         for (text, value) in cases {
-            let expected = Assignment { node: "lift_arbiter".into(), param: "votes".into(), value };
+            let expected = Assignment { node: Some("lift_arbiter".into()), param: "votes".into(), value };
             assert_eq!(format!("lift_arbiter.votes={text}").parse(), Ok(What::Assignment(expected)), "{text}");
         }
-        for text in ["votes=5", ".b=1", "a.=1", ".b", "a.", "=1", ""] {
+        let of_all = Assignment { node: None, param: "votes".into(), value: json!(5) };
+        assert_eq!("votes=5".parse(), Ok(What::Assignment(of_all)));
+        for text in [".b=1", "a.=1", ".b", "a.", "=1", ""] {
             text.parse::<What>().expect_err(text);
         }
     }
@@ -204,6 +252,6 @@ mod tests {
     #[test]
     fn without_a_value_a_parameter_or_a_node_is_shown() {
         assert_eq!("a.b".parse(), Ok(What::Param { node: "a".into(), param: "b".into() }));
-        assert_eq!("a".parse(), Ok(What::Node("a".into())));
+        assert_eq!("a".parse(), Ok(What::Name("a".into())));
     }
 }

@@ -28,8 +28,26 @@ fn the_samples_of_a_running_graph_are_printed_as_they_are() {
     for topic in ["/tactile", "/contacts", "/feature", "/prediction", "/decision", "/truth"] {
         assert!(lines.iter().any(|line| line["topic"] == topic), "{topic}");
     }
+    // A name that only one output has is enough, as is its node.
+    for name in ["decision", "/decision", "lift_arbiter"] {
+        let lines = json_lines(&echo(&["-n", "2", name]).stdout);
+        assert!(lines.len() == 2 && lines.iter().all(|line| line["topic"] == "/decision"), "{name}: {lines:?}");
+    }
     let wrong = run(&["echo", "--graph", &graph.name, "lift_arbiter/decisions"], 1);
-    assert!(text(&wrong.stderr).contains("lift_arbiter/decisions"), "{}", text(&wrong.stderr));
+    assert!(text(&wrong.stderr).contains("did you mean 'lift_arbiter/decision'?"), "{}", text(&wrong.stderr));
+    // A parameter is named as with run --set.
+    let set = |argument: &str, exit_code| run(&["set", "--graph", &graph.name, argument], exit_code);
+    assert!(text(&set("votes=4", 0).stdout).contains("lift_arbiter.votes: 3 → 4"));
+    let shown = set("votes", 0);
+    assert!(text(&shown.stdout).contains("lift_arbiter.votes") && !text(&shown.stdout).contains("model"));
+    for (argument, expected) in [
+        ("vote=4", "did you mean 'votes'?"),
+        ("lift_arbitr", "did you mean 'lift_arbiter'?"),
+        ("lift_arbitr.votes=4", "did you mean 'lift_arbiter'?"),
+    ] {
+        let refused = set(argument, 1);
+        assert!(text(&refused.stderr).contains(expected), "{argument}: {}", text(&refused.stderr));
+    }
     // A reader that goes ends it.
     let mut command = blindgrasp();
     command.args(["echo", "--graph", &graph.name]).stdout(Stdio::piped());

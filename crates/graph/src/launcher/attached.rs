@@ -13,6 +13,7 @@ use crate::dataflow::Node;
 use crate::launcher::Launcher;
 use crate::plan::{N_ATTACHED, Port};
 use crate::recorded_graph::describe_graph;
+use blindgrasp_operator::text::did_you_mean;
 
 /// A graph that ends waits this long until its attached readers have read all samples.
 const RETIRE_LIMIT: Duration = Duration::from_secs(2);
@@ -70,12 +71,21 @@ impl Launcher {
         let nodes = || self.members.iter().map(|member| &member.node);
         let name = |port: &Port| format!("{}/{}", port.0, port.1);
         let all: Vec<Port> = nodes().flat_map(Node::output_ports).map(|(port, _)| port).collect();
-        if let Some(unknown) = wanted.iter().find(|wanted| !all.iter().any(|port| name(port) == **wanted)) {
+        // NODE/PORT, the topic of a recording, with or without its '/', or a node with all its outputs.
+        let is_named = |port: &Port, wanted: &str| {
+            let wanted = wanted.trim_start_matches('/');
+            name(port) == wanted || self.plan.topic(port).trim_start_matches('/') == wanted || port.0 == wanted
+        };
+        if let Some(unknown) = wanted.iter().find(|wanted| !all.iter().any(|port| is_named(port, wanted))) {
             let known: Vec<String> = all.iter().map(name).collect();
-            return Err(format!("graph '{}' has no edge from '{unknown}'; it has: {}", self.name, known.join(", ")));
+            let alike = did_you_mean(unknown, known.iter().map(String::as_str));
+            let alike = alike.map(|alike| format!("{alike} ")).unwrap_or_default();
+            let known = known.join(", ");
+            return Err(format!("graph '{}' has no edge from '{unknown}'; {alike}it has: {known}", self.name));
         }
         let is_at_start = all.iter().all(|port| self.last_sent_at(port).is_none());
-        let edges = all.iter().filter(|port| wanted.is_empty() || wanted.contains(&name(port)));
+        let is_wanted = |port: &&Port| wanted.is_empty() || wanted.iter().any(|wanted| is_named(port, wanted));
+        let edges = all.iter().filter(is_wanted);
         let edges = edges.filter_map(|port| {
             Some(AttachedEdge {
                 port: name(port),

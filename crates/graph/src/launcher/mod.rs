@@ -51,6 +51,7 @@ use blindgrasp_operator::cursors::{CursorsError, SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::namespace::{self, NamespaceError};
+use blindgrasp_operator::text::did_you_mean;
 use blindgrasp_operator::wiring::{Clock, Command, LogEntry, LogLevel, Report};
 
 /// The status of a graph without trouble.
@@ -958,7 +959,8 @@ impl Launcher {
                 return format!("node '{id}' runs on machine '{machine}': give --machine {machine}");
             }
             let known: Vec<_> = self.members.iter().map(|member| member.node.id.as_str()).collect();
-            format!("graph '{}' has no node '{id}'; its nodes: {}", self.name, known.join(", "))
+            let alike = did_you_mean(id, known.iter().copied()).map(|alike| format!("{alike} ")).unwrap_or_default();
+            format!("graph '{}' has no node '{id}'; {alike}its nodes: {}", self.name, known.join(", "))
         })
     }
 
