@@ -9,18 +9,20 @@ use serde::Serialize;
 
 use super::simulate::report_in;
 use super::{Outcome, cases, hand_cells, percent, print_line};
+use blindgrasp_graph::client::{is_graph_name, running_graphs};
 use blindgrasp_graph::log::printable;
 use blindgrasp_learning::dataset::{REPORT_METADATA, hand_of, label_of, reported_truth};
 use blindgrasp_learning::evaluation::paper_label::PaperLabel;
 use blindgrasp_learning::evaluation::statistics::Interval;
 use blindgrasp_messages::{GraspTruth, Phase, TactileFrame};
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::text::did_you_mean;
 use blindgrasp_recording::{
     IndexedTopic, Problem, Problems, Record, RecordingIndex, RecordingReader, RepairReport, recordings_in, repair,
 };
 use blindgrasp_simulator::simulator::SimulationReport;
 use blindgrasp_stages::contacts::contacts_from_frame;
-use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::hand::{Hand, builtin_names};
 use blindgrasp_stages::label::Label;
 
 /// Recordings that together are larger than this are read only with --full.
@@ -144,6 +146,18 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         if cases::are_at(path) {
             return cases::print(path, arguments.json);
         }
+    }
+    if let [path] = arguments.recordings.as_slice()
+        && let Some(name) = path.to_str()
+        && is_graph_name(name)
+        && !path.exists()
+    {
+        if running_graphs().unwrap_or_default().iter().any(|graph| graph == name) {
+            bail!("'{name}' is a running graph: blindgrasp ps {name} describes it, blindgrasp view {name} shows it");
+        }
+        let hands = builtin_names();
+        let alike = did_you_mean(name, hands.iter().copied()).map(|alike| format!("{alike} ")).unwrap_or_default();
+        bail!("no file, folder or built-in hand is called '{name}'; {alike}built-in hands: {}", hands.join(", "));
     }
     if !arguments.joints.is_empty() {
         bail!("--joints is for a hand: name its pad layout (YAML)");

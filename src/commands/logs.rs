@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::elsewhere::MachineArgument;
 use super::{Outcome, completions, print_line};
-use blindgrasp_graph::client::{ClientError, is_graph_name, pick_graph, status};
+use blindgrasp_graph::client::{ClientError, is_graph_name, pick_graph, running_graphs, status};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
@@ -44,7 +44,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         return destination.run();
     }
     let folder = log_folder(arguments.graph.as_deref())?;
-    let (mut tail, lines) = LogTail::open(folder, arguments.operator.as_deref(), arguments.lines, u64::MAX)?;
+    let opened = LogTail::open(folder, arguments.operator.as_deref(), arguments.lines, u64::MAX);
+    if let (Err(_), Some(name)) = (&opened, &arguments.operator)
+        && running_graphs().unwrap_or_default().contains(name)
+    {
+        bail!("'{name}' is a running graph, expected one of its nodes: blindgrasp logs -g {name}");
+    }
+    let (mut tail, lines) = opened?;
     print(&lines, arguments.json)?;
     if !arguments.follow {
         return Ok(Outcome::Done);

@@ -278,8 +278,18 @@ fn stop_signals() -> Vec<i32> {
 fn number_in(text: &str, range: RangeInclusive<f64>) -> Result<f64, String> {
     match text.parse() {
         Ok(number) if range.contains(&number) => Ok(number),
-        _ => Err(format!("expected a number from {} to {}", range.start(), range.end())),
+        _ => {
+            let hint = share_hint(text, &range).map(|hint| format!("; {hint}")).unwrap_or_default();
+            Err(format!("expected a number from {} to {}{hint}", range.start(), range.end()))
+        }
     }
+}
+
+/// The share that a number of percent stands for, where shares are expected.
+fn share_hint(text: &str, range: &RangeInclusive<f64>) -> Option<String> {
+    let percent: f64 = text.trim_end_matches('%').trim().parse().ok()?;
+    let is_likely = *range.end() <= 1.0 && (text.ends_with('%') || percent > 1.0);
+    (is_likely && range.contains(&(percent / 100.0))).then(|| format!("{percent} % are {}", percent / 100.0))
 }
 
 /// A length of time in seconds, within `range`: a number of seconds, or with units, as 500ms, 1m 30s.

@@ -15,6 +15,7 @@ use super::object_list::list;
 use super::trials::physics;
 use super::{Outcome, check_new, number_in, percent, print_line};
 use blindgrasp_learning::dataset::REPORT_METADATA;
+use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::read_regular;
 use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
 use blindgrasp_objects::{objects_id, objects_named};
@@ -337,6 +338,9 @@ pub(super) fn report_in(reader: &RecordingReader, path: &Path) -> anyhow::Result
 fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {
     let mut options = match &arguments.options {
         Some(path) => {
+            if let Some(kind) = FileKind::at(path).filter(|kind| !matches!(kind, FileKind::Empty | FileKind::Json)) {
+                bail!("options {}: expected YAML as of --print-options, found {}", path.display(), kind.description());
+            }
             let text = read_regular(path).with_context(|| format!("options {}", path.display()))?;
             serde_saphyr::from_str(&text).with_context(|| format!("options {}", path.display()))?
         }

@@ -23,6 +23,7 @@ use blindgrasp_messages::Record;
 use blindgrasp_operator::cursors::COMPARE_BELL;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::text::is_name;
 use blindgrasp_operator::wiring::NamespaceWiring;
 
 /// The time of the handover itself and of the old operator's end, beyond the given limits.
@@ -125,6 +126,9 @@ struct Comparison {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if let Some(file) = arguments.nodes.iter().find(|node| !is_name(node)) {
+        bail!("'{file}' is no name of a node: a model is given by --set model=FILE, a program by --run FILE");
+    }
     let mut request = request(arguments)?;
     if let Some(destination) = arguments.machine.destination()? {
         return destination.run();

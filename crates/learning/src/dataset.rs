@@ -191,7 +191,7 @@ fn check_hand(path: &Path, reader: &RecordingReader, hand: &Hand) -> Result<(), 
         return Err(DatasetError::Unusable {
             path: path.into(),
             message: format!(
-                "it was made with the hand '{}' ({:016x}), not with '{}' ({:016x})",
+                "it was made with the hand '{}' ({:016x}), not with '{}' ({:016x}): leave --hand out, or name that hand",
                 info.hand,
                 info.hand_id,
                 hand.name,

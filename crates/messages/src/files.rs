@@ -25,7 +25,10 @@ pub fn partial_path(path: &Path) -> PathBuf {
 pub fn open_regular(path: &Path) -> std::io::Result<File> {
     let kind = match std::fs::metadata(path) {
         Ok(found) => found.file_type(),
-        Err(error) if error.kind() == ErrorKind::NotFound => return Err(with_neighbours(path, error)),
+        Err(error) if error.kind() == ErrorKind::NotFound => {
+            let text = neighbours(path).map_or(error.to_string(), |neighbours| format!("{error}; {neighbours}"));
+            return Err(std::io::Error::new(error.kind(), text));
+        }
         Err(error) => return Err(error),
     };
     if kind.is_file() {
@@ -34,7 +37,10 @@ pub fn open_regular(path: &Path) -> std::io::Result<File> {
         return Ok(file);
     }
     let found = if kind.is_dir() {
-        "a folder"
+        let names = names_in(path, |file| file.is_file());
+        let names = names.map(|names| format!("; it has {names}")).unwrap_or_default();
+        let text = format!("it is a folder, expected a regular file{names}");
+        return Err(std::io::Error::new(ErrorKind::InvalidInput, text));
     } else if kind.is_fifo() {
         "a pipe"
     } else if kind.is_socket() {
@@ -45,28 +51,30 @@ pub fn open_regular(path: &Path) -> std::io::Result<File> {
     Err(std::io::Error::new(ErrorKind::InvalidInput, format!("it is {found}, expected a regular file")))
 }
 
-/// The error of a file that is not there, with the files beside its place whose names end alike.
-fn with_neighbours(path: &Path, error: std::io::Error) -> std::io::Error {
-    let folder = match path.parent() {
+/// What a folder has in the place of a missing file: its files whose names end alike, to stand behind the error; `None` if it
+/// has none.
+pub fn neighbours(missing: &Path) -> Option<String> {
+    let folder = match missing.parent() {
         Some(folder) if folder != Path::new("") => folder,
         _ => Path::new("."),
     };
-    let Ok(entries) = std::fs::read_dir(folder) else { return error };
-    let is_alike = |file: &PathBuf| file.extension().is_some() && file.extension() == path.extension();
-    let mut names: Vec<String> = entries
-        .take(MAX_NEIGHBOURS)
-        .filter_map(|entry| Some(entry.ok()?.path()))
-        .filter(is_alike)
-        .filter_map(|file| Some(file.file_name()?.to_string_lossy().into_owned()))
-        .collect();
-    if names.is_empty() {
-        return error;
-    }
+    let extension = missing.extension()?;
+    Some(format!("its folder has {}", names_in(folder, |file| file.extension() == Some(extension))?))
+}
+
+/// Some names of files in a folder.
+fn names_in(folder: &Path, is_wanted: impl Fn(&Path) -> bool) -> Option<String> {
+    let files = std::fs::read_dir(folder).ok()?.take(MAX_NEIGHBOURS).filter_map(|entry| Some(entry.ok()?.path()));
+    let name = |file: PathBuf| Some(file.file_name()?.to_string_lossy().into_owned());
+    let mut names: Vec<String> = files.filter(|file| is_wanted(file)).filter_map(name).collect();
     names.sort_unstable();
     let n_more = names.len().saturating_sub(MAX_SHOWN_NEIGHBOURS);
-    let more = if n_more == 0 { String::new() } else { format!(" and {n_more} more") };
     names.truncate(MAX_SHOWN_NEIGHBOURS);
-    std::io::Error::new(error.kind(), format!("{error}; its folder has {}{more}", names.join(", ")))
+    match n_more {
+        _ if names.is_empty() => None,
+        0 => Some(names.join(", ")),
+        _ => Some(format!("{} and {n_more} more", names.join(", "))),
+    }
 }
 
 /// Refuses the text that a checkout without Git LFS has in the place of a large file.
@@ -117,8 +125,9 @@ mod tests {
         std::fs::write(&file, "text").expect("written");
         assert_eq!(read_regular(&file).expect("read"), "text");
         let _listener = std::os::unix::net::UnixListener::bind(&socket).expect("bound");
-        for (path, found) in [(folder.path(), "a folder"), (&socket, "a socket"), (Path::new("/dev/zero"), "a device")]
-        {
+        let of_folder = open_regular(folder.path()).expect_err("a folder").to_string();
+        assert_eq!(of_folder, "it is a folder, expected a regular file; it has file");
+        for (path, found) in [(socket.as_path(), "a socket"), (Path::new("/dev/zero"), "a device")] {
             let error = open_regular(path).expect_err(found).to_string();
             assert_eq!(error, format!("it is {found}, expected a regular file"));
         }

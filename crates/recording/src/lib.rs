@@ -84,7 +84,7 @@ pub enum RecordingError {
     #[error("recording {}: {message}", path.display())]
     Invalid { path: PathBuf, message: String },
     /// The file was cut off or is damaged.
-    #[error("recording {}: {message} (`blindgrasp info --repair` recovers what is whole in it)", path.display())]
+    #[error("recording {}: {message} (`blindgrasp info --repair` recovers its undamaged samples)", path.display())]
     Damaged { path: PathBuf, message: String },
     /// The disk is full; `reason` is the system's message.
     #[error("recording {}: {reason}: it ends here, complete in itself, with {n_samples} samples", path.display())]

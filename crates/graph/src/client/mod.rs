@@ -316,7 +316,11 @@ fn has_hung_up(error: &std::io::Error) -> bool {
 }
 
 fn listed(running: &[String]) -> String {
-    if running.is_empty() { "none is".into() } else { format!("running: {}", running.join(", ")) }
+    if running.is_empty() {
+        "none is; start one with: blindgrasp run".into()
+    } else {
+        format!("running: {}", running.join(", "))
+    }
 }
 
 fn shortened(text: &str) -> String {

@@ -9,6 +9,7 @@ use serde_json::{Map, Value};
 use crate::dataflow::diagnostic::{Diagnostics, did_you_mean_or_list, list, quote_path};
 use crate::dataflow::node::NodeEntry;
 use crate::dataflow::yaml::{Content, Entry};
+use blindgrasp_messages::files::neighbours;
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::param::{ParamDescription, ParamKind};
 use blindgrasp_operator::text::is_name;
@@ -273,7 +274,7 @@ fn settle(param: &ParamDescription, accepted: Value, of: &str, folder: &Path) ->
     let shown = quote_path(&path);
     let refuse = |problem: String| Refusal {
         message: format!("param {} of {of}: {shown} {problem}", quote(&param.name)),
-        help: None,
+        help: neighbours(&path),
     };
     if *must_exist {
         match path.try_exists() {
