@@ -455,7 +455,7 @@ fn print_summary(hand: &Hand, summary: &FileReport) -> anyhow::Result<()> {
     };
     let mut lines = summary.overview.lines();
     lines.extend([
-        ("grasps", format!("{}, {} with truth", summary.n_grasps, summary.n_with_truth)),
+        ("grasps", format!("{}, {} with a label", summary.n_grasps, summary.n_with_truth)),
         ("stable", share(summary.n_stable, summary.n_with_truth)),
         ("label", labels(&summary.labels)),
         ("force closure", share(summary.n_force_closure, summary.n_with_quality)),
@@ -484,7 +484,7 @@ fn print_summary(hand: &Hand, summary: &FileReport) -> anyhow::Result<()> {
         lines.push((
             "simulation",
             format!(
-                "{} candidates, {} stable by nature; {} without touch, {} over their quota, {} hull failures",
+                "{} candidates, {} stable before balancing; {} without touch, {} over their quota, {} hull failures",
                 report.n_candidates,
                 share(report.n_judged_stable, report.n_judged),
                 report.n_without_touch,
@@ -510,7 +510,7 @@ fn print_summary(hand: &Hand, summary: &FileReport) -> anyhow::Result<()> {
 
 fn labels(labels: &BTreeSet<Label>) -> String {
     let meanings: Vec<&str> = labels.iter().map(|label| label.meaning()).collect();
-    if meanings.is_empty() { "as the recordings have it: no simulation made them".into() } else { meanings.join("; ") }
+    if meanings.is_empty() { "as recorded; not from a simulation".into() } else { meanings.join("; ") }
 }
 
 /// So many classes are printed whose truth and paper's label disagree most.

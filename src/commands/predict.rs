@@ -128,7 +128,7 @@ fn print(json: bool, file: &Path, decided: &Decided, truth: Option<&GraspTruth>)
         );
     }
     let truth = truth.map_or(String::new(), |truth| {
-        format!("  truth: {} ({})", if truth.stable { "stable" } else { "unstable" }, truth.object)
+        format!("  label: {} ({})", if truth.stable { "stable" } else { "unstable" }, truth.object)
     });
     let line =
         format!("grasp {grasp_id:>5}  {}  p {probability_stable:.3}  {:<14}{truth}", action.shown(), reason.as_str());

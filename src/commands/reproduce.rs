@@ -202,7 +202,7 @@ fn steps(arguments: &Arguments) -> Vec<Step> {
         ),
         step(
             "paper.txt",
-            "train the paper's machine for lifts",
+            "train the paper's SVM for lifts",
             &["train", &data, "--recipe", "paper", "--seed", &seed, "--out", &at("paper.json")],
         ),
         lift("tables-2-to-4-paper.txt", "lift by the paper's method", "dataflow-paper.yaml", "lifts-paper.html"),

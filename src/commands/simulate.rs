@@ -281,7 +281,7 @@ impl Job<'_> {
                     let (n, n_all) = (before as usize + report.n_grasps, options.n_grasps);
                     let (n_tried, rate) = (report.n_candidates, 100.0 * report.natural_stable_rate());
                     print_diagnostic(&format!(
-                        "{n} of {n_all} grasps, {n_tried} candidates tried, {rate:.1} % stable by nature"
+                        "{n} of {n_all} grasps, {n_tried} candidates tried, {rate:.1} % stable before balancing"
                     ));
                 }
             },
@@ -491,7 +491,7 @@ fn print_report(json: bool, out: &Path, report: &SimulationReport) -> anyhow::Re
                 report.n_diverged
             ),
         ),
-        ("stable by nature", share(report.n_judged_stable, report.n_judged)),
+        ("natural share", format!("{} of the candidates are stable", share(report.n_judged_stable, report.n_judged))),
         (
             "unsensed",
             format!(

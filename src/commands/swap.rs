@@ -376,7 +376,7 @@ fn print_ended(ended: &Ended) -> anyhow::Result<()> {
 fn swapped_line(node: &SwappedNode) -> String {
     let after = node.last_seq.map_or("before the first sample".into(), |seq| format!("after sample {seq}"));
     format!(
-        "{}: process {} → {} {after}, nobody active for {:.1} ms",
+        "{}: process {} → {} {after}, no operator active for {:.1} ms",
         node.node,
         node.old_pid,
         node.new_pid,
@@ -543,7 +543,7 @@ mod tests {
             Ended::Swapped { nodes, .. } => assert_eq!(nodes, std::slice::from_ref(&node)),
             other => panic!("{other:?}"),
         }
-        assert_eq!(swapped_line(&node), "classifier: process 10 → 11 after sample 991, nobody active for 2.7 ms");
+        assert_eq!(swapped_line(&node), "classifier: process 10 → 11 after sample 991, no operator active for 2.7 ms");
         let error = |rolled_back| Reply::Error { message: "it crashed".into(), rolled_back };
         let back = ran("back", &arguments, Vec::new(), vec![progress(), error(true)]).expect_err("rolled back");
         assert_eq!(

@@ -192,7 +192,7 @@ pub(super) fn threshold_line(classifier: &Classifier) -> String {
 /// What a model of lifts says after probes and before it touches anything, and what to expect of trials, for people.
 pub(super) fn probe_lines(model: &Model) -> Vec<String> {
     let mut lines = Vec::new();
-    for (name, probe) in [("squeezed", &model.squeezed), ("test_lifted", &model.test_lifted)] {
+    for (name, probe) in [("squeezed", &model.squeezed), ("test-lifted", &model.test_lifted)] {
         lines.extend(probe.as_ref().map(|probe| {
             format!("{name}: calibration error {:.4}, {}", probe.cross_validated_ece, threshold_line(&probe.classifier))
         }));
@@ -208,7 +208,7 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
         lines.push(format!(
             "expected of trials decided when {} (ROC area {:.3}; a drop costs {} s): {} of the lifted objects kept, {:.2} \
              attempts a lift, {} given up, {:.1} s for each kept object",
-            policy.look,
+            policy.look.replace('_', "-"),
             policy.roc_area,
             policy.drop_secs,
             percent(Some(policy.kept)),

@@ -32,7 +32,7 @@ fn predictions_are_the_decisions_of_a_graph() {
     assert_eq!(predicted.iter().map(action_and_reason).collect::<Vec<_>>(), of_graph);
     assert_eq!(predicted[0]["truth"]["object"], "vase-20");
     let said = text(&run(&["predict", MODEL, RECORDING], 0).stdout).to_string();
-    assert!(said.starts_with("grasp     0  LIFT  p 0.762  stable          truth: stable (vase-20)\n"), "{said}");
+    assert!(said.starts_with("grasp     0  LIFT  p 0.762  stable          label: stable (vase-20)\n"), "{said}");
 }
 
 /// The lines of a bridge have numbers of its own.

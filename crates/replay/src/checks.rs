@@ -311,7 +311,7 @@ impl Decisions {
             let accuracy = (n_grasps > 0).then(|| n_right as f64 / n_grasps as f64);
             let percent = |share: f64| format!("{:.1} %", 100.0 * share);
             let text = format!(
-                "{} of {n_grasps} grasps with truth{}, at least {}",
+                "{} of {n_grasps} grasps with a label{}, at least {}",
                 accuracy.map_or("n/a".into(), percent),
                 if n_undecided > 0 { format!(", {n_undecided} undecided") } else { String::new() },
                 percent(least)
@@ -322,7 +322,7 @@ impl Decisions {
         if let Some(most) = expected.false_positives_at_most {
             let text = match n_decided {
                 0 => "the recording has labels (/truth) of no decided grasp: expected some".into(),
-                _ => format!("{n_false_positive} of {n_decided} grasps with truth, at most {most}"),
+                _ => format!("{n_false_positive} of {n_decided} grasps with a label, at most {most}"),
             };
             let has_passed = n_decided > 0 && n_false_positive <= most;
             checks.push(Check::new("false_positives_at_most", has_passed, text));

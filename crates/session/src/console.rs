@@ -121,7 +121,7 @@ impl RunSink for Console {
             let painted = |text: &str, colour| if self.is_coloured { paint(text, colour) } else { text.to_owned() };
             let truth = truth.map_or(String::new(), |truth| {
                 let text = format!(
-                    "truth: {} ({})",
+                    "label: {} ({})",
                     if truth.stable { "stable" } else { "unstable" },
                     printable(&truth.object)
                 );

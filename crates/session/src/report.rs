@@ -265,7 +265,7 @@ impl RunReport {
             },
             y: Axis { label: "probability (%)".into(), range: [0.0, 1.0], format: NumberFormat::Percent },
             series: vec![
-                series("right, or truth not known", COLOURS[4], &self.others, 2.0),
+                series("right, or without a label", COLOURS[4], &self.others, 2.0),
                 series("held, stable", COLOURS[1], &self.wrong_holds.points, 3.5),
                 series("lifted, unstable", COLOURS[5], &self.wrong_lifts.points, 4.5),
             ],
@@ -306,8 +306,8 @@ fn lead(summary: &RunSummary) -> String {
     let losses: Vec<String> = losses.collect();
     let loss = if losses.is_empty() { "No sample was lost.".into() } else { losses.join(" ") };
     let truth = match summary.with_truth {
-        0 => "The truth of no grasp is known.".into(),
-        n => format!("Of {n} grasps whose truth is known, {} were lifted and unstable.", summary.false_positives),
+        0 => "No grasp has a label.".into(),
+        n => format!("Of {n} grasps with a label, {} were lifted and unstable.", summary.false_positives),
     };
     let latency = summary.latency_nanos.as_ref().map_or(String::new(), |latency| {
         format!(" A decision took {} in the median and {} at 99 %.", time(latency.p50), time(latency.p99))

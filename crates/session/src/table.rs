@@ -26,7 +26,7 @@ fn figures(summary: &RunSummary) -> Vec<(&'static str, String)> {
         let (accuracy, majority) = (percent(summary.accuracy), percent(summary.majority_class));
         let judged = &summary.judged;
         figures.extend([
-            ("accuracy", format!("{accuracy} of {} with truth (majority class {majority})", summary.with_truth)),
+            ("accuracy", format!("{accuracy} of {} with a label (majority class {majority})", summary.with_truth)),
             (
                 "false positives",
                 format!("{} ({} of all grasps)", summary.false_positives, percent(summary.false_positive_share)),

@@ -36,7 +36,7 @@ pub(super) struct Arguments {
     /// Check the file and print the graph; start nothing
     ///
     /// Asks each program for its ports and parameters, and prints nodes and edges with every value filled in. The
-    /// programs of the file are run for that, with --describe: a foreign dataflow file is code. With --machine, the programs and files of other machines need not be here. With --json: {"graph": …}, with
+    /// programs of the file are run for that, with --describe: use only files that you trust. With --machine, the programs and files of other machines need not be here. With --json: {"graph": …}, with
     /// "crossing" edges where the file names machines, or {"errors": […]}.
     #[arg(long, conflicts_with_all = ["record", "detach", "stay", "metrics", "view", "report"])]
     check: bool,
@@ -86,7 +86,7 @@ pub(super) struct Arguments {
     rights: Rights,
     /// Write a report with pictures to this file (.html) at the end
     ///
-    /// Decisions in time, ages on arrival, losses, the log, and the first wrong decisions where the truth is known. Like a recording,
+    /// Decisions in time, ages on arrival, losses, the log, and the first wrong decisions where a label is known. Like a recording,
     /// it reads every edge.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["detach", "stay"])]
     report: Option<PathBuf>,

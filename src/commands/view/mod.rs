@@ -20,7 +20,7 @@ use super::{Outcome, secs_in};
 
 /// Show a graph or a recording in a browser; draw it, or a hand.
 ///
-/// The programs of a dataflow file are run with --describe: a foreign dataflow file is code.
+/// The programs of a dataflow file are run with --describe: use only files that you trust.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp view grasp_gate\n         \
                         blindgrasp view recordings/paper-recipe.mcap\n         \

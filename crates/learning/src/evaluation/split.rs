@@ -37,7 +37,7 @@ pub enum SplitError {
     )]
     TwoClasses { object: String, first: String, second: String },
     /// Training would have seen the grasps that it judges. This must never happen.
-    #[error("{what} '{group}' is in the folds {} and {}: it would be judged by a machine that has seen it", first + 1, second + 1)]
+    #[error("{what} '{group}' is in the folds {} and {}: it would be judged by a classifier that has seen it", first + 1, second + 1)]
     Leak { what: &'static str, group: String, first: usize, second: usize },
     /// Nothing can be learned from grasps that are all alike.
     #[error(

@@ -199,17 +199,23 @@ pub fn train_on(
             learned.push(None);
             continue;
         }
-        progress(&format!("learning to judge {} hands", phase.as_str()));
         let n_without = probes::n_without(phase, &examples);
-        if n_without > 0 && n_without < examples.len() {
+        if n_without == examples.len() {
+            // Recordings without this probe have nothing to learn from.
+            learned.push(None);
+            continue;
+        }
+        let probe_name = if phase == Phase::Squeezed { "squeeze" } else { "test lift" };
+        progress(&format!("learning the decision after the {probe_name}"));
+        if n_without > 0 {
             progress(&format!("not learned: {n_without} of {} grasps have no such frames", examples.len()));
         }
         let mut probe = probes::learn(hand, recipe, &fitted.features, phase, &examples, &folds, options.seed)?;
         if probe.is_none() && n_without == 0 && matches!(recipe.learner, Learner::Boosting(_)) {
-            progress(&format!("not learned: frames of {} hands say nothing of objects not seen", phase.as_str()));
+            progress(&format!("not learned: on new objects, frames after the {probe_name} do no better than a guess"));
         }
         if phase == Phase::TestLifted && matches!(learned[..], [None]) && probe.take().is_some() {
-            progress("not learned: a test lift follows a squeeze, whose frames say nothing");
+            progress("not learned: a test lift follows a squeeze, and the decision after that was not learned");
         }
         if let Some(learned) = &mut probe {
             learned.probe.classifier.threshold_probability = threshold_probability;
@@ -498,7 +504,7 @@ fn check_skill(calibration: &PlattCalibration, outcomes: &[bool], brier: f64) ->
         return Ok(());
     }
     Err(TrainingError::Data(format!(
-        "nothing was learned: about objects it has not seen, the machine says no more than the share of stable grasps does \
+        "nothing was learned: on objects it has not seen, the classifier does no better than the share of stable grasps \
          (Brier score {brier:.4}, a guess has {of_a_guess:.4}): expected readings that tell stable grasps from unstable ones, \
          of more objects; or try another recipe"
     )))

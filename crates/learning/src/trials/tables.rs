@@ -200,7 +200,7 @@ fn attempts(report: &TrialsReport) -> Table {
     let ways = report.ways();
     let way = ways.first();
     let rows = way.iter().flat_map(|(_, tallies)| tallies.things.iter().chain([&tallies.total])).map(row);
-    let title = way.map_or("Attempts".into(), |(name, _)| format!("Attempts by thing, {name}"));
+    let title = way.map_or("Attempts".into(), |(name, _)| format!("Attempts by object, {name}"));
     Table { title, head: head.map(String::from).into(), rows: rows.collect() }
 }
 
