@@ -7,7 +7,7 @@ use clap::{ArgGroup, Args, ValueEnum};
 
 use super::frame_lines::{FrameLines, read_frames};
 use super::hand_cells::joint;
-use super::{Outcome, check_new, number_in, percent, print_line};
+use super::{Outcome, check_new, completions, number_in, percent, print_line};
 use blindgrasp_learning::import::{AngleUnit, Day, ImportOptions, ImportReport, Joints, import_frames, import_table};
 use blindgrasp_stages::hand::{CellUnit, Hand};
 
@@ -35,7 +35,7 @@ pub(super) struct Arguments {
         "group", "class", "day", "day_column", "grasp_column", "delimiter", "frames", "grasp_id_start", "clip_negative", "skip_bad_rows"])]
     lines: bool,
     /// Pad layout (YAML) of the hand, or the name of a built-in one.
-    #[arg(long)]
+    #[arg(long, add = completions::hands())]
     hand: PathBuf,
     /// Columns of the cells, names or patterns with *, separated by commas; they fill the hand's pads in order.
     #[arg(long, required_unless_present = "lines", value_delimiter = ',', value_name = "PATTERNS")]

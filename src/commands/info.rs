@@ -8,7 +8,7 @@ use clap::Args;
 use serde::Serialize;
 
 use super::simulate::report_in;
-use super::{Outcome, cases, hand_cells, percent, print_line};
+use super::{Outcome, cases, completions, hand_cells, percent, print_line};
 use blindgrasp_graph::client::{is_graph_name, running_graphs};
 use blindgrasp_graph::log::printable;
 use blindgrasp_learning::dataset::{REPORT_METADATA, hand_of, label_of, reported_truth};
@@ -46,7 +46,7 @@ pub(super) struct Arguments {
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
-    #[arg(long)]
+    #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// Read all of it, however large, and sum up the grasps.
     #[arg(long)]

@@ -7,7 +7,7 @@ use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 
 use super::train::{probe_lines, threshold_line};
-use super::{Outcome, check_new, check_output, percent, print_line};
+use super::{Outcome, check_new, check_output, completions, percent, print_line};
 use blindgrasp_learning::dataset::{hand_of, label_line};
 use blindgrasp_learning::learners::libsvm_format::{parse_libsvm, write_libsvm};
 use blindgrasp_learning::training::adapt;
@@ -114,7 +114,7 @@ struct AdaptArguments {
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
-    #[arg(long)]
+    #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// Where to write the model.
     #[arg(short, long)]

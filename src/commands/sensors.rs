@@ -7,7 +7,7 @@ use clap::{Args, Subcommand};
 use indicatif::ProgressBar;
 use serde_json::json;
 
-use super::{Outcome, check_new, print_line};
+use super::{Outcome, check_new, completions, print_line};
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::sensors::{alarms, learn, read};
 use blindgrasp_recording::recordings_in;
@@ -37,7 +37,7 @@ struct LearnArguments {
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
-    #[arg(long)]
+    #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// Seed of the faults that are put in.
     #[arg(long, default_value_t = 0)]
@@ -60,7 +60,7 @@ struct CheckArguments {
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
-    #[arg(long)]
+    #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// Print JSON.
     #[arg(long)]

@@ -13,7 +13,7 @@ use serde::Serialize;
 
 use super::object_list::list;
 use super::trials::physics;
-use super::{Outcome, check_new, number_in, percent, print_line};
+use super::{Outcome, check_new, completions, number_in, percent, print_line};
 use blindgrasp_learning::dataset::REPORT_METADATA;
 use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::read_regular;
@@ -45,11 +45,11 @@ const PAUSE_NANOS: u64 = 100_000_000;
                   The same seed and options give the same bytes, with any number of threads and shards.")]
 pub(super) struct Arguments {
     /// Pad layout (YAML) of the hand, or the name of a built-in one.
-    #[arg(long, default_value = "barrett-bh8-280")]
+    #[arg(long, default_value = "barrett-bh8-280", add = completions::hands())]
     hand: PathBuf,
     /// Objects: train, held-out or all (builtin) of the built-in ones, names and classes separated by commas, or a folder
     /// of meshes. --list also takes paper, the objects of the paper's lift trials.
-    #[arg(long, default_value = "all")]
+    #[arg(long, default_value = "all", add = completions::objects())]
     objects: String,
     /// Number of grasps to record [default: 1000].
     #[arg(long)]
@@ -113,6 +113,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     };
     options.check()?;
     let is_file = out.extension().is_some_and(|extension| extension == "mcap");
+    let is_of_another_kind =
+        |extension: &str| ["csv", "json", "jsonl", "yaml", "html", "bag", "db3"].contains(&extension);
+    if out.extension().and_then(|extension| extension.to_str()).is_some_and(is_of_another_kind) && !out.is_dir() {
+        bail!(
+            "{}: expected a name that ends in .mcap, or that of a folder; blindgrasp export writes a recording as CSV or JSON",
+            out.display()
+        );
+    }
     if is_file && arguments.shard.is_some() {
         bail!("--shard needs a folder to share: --out {} names a file", out.display());
     }

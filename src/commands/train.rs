@@ -7,7 +7,7 @@ use clap::{Args, ValueEnum};
 
 use super::evaluate::print_label;
 use super::grid::{GridArguments, search};
-use super::{Outcome, check_new, number_in, percent, print_line};
+use super::{Outcome, check_new, completions, number_in, percent, print_line};
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::training::{Aim, TrainingOptions, train};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -32,7 +32,7 @@ pub(super) struct Arguments {
     #[arg(long)]
     pub(super) overwrite: bool,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
-    #[arg(long)]
+    #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// The features and the learner: boosted (the histogram, pads and joints, boosted trees), wrist (the same with gravity
     /// and the load on the wrist), blend (cells and joints, boosted trees and an SVM), paper (the histogram, an SVM), raw (cells
@@ -108,6 +108,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let first = recordings.first().context("expected a recording")?;
     let hand = hand_of(first, arguments.hand.as_deref())?;
     check_new(&arguments.out, &recordings, arguments.overwrite)?;
+    if arguments.out.extension().is_some_and(|extension| extension == "mcap") {
+        let out = arguments.out.display();
+        anyhow::bail!("{out}: expected a name that ends in .json, by which evaluate tells a model from a recording");
+    }
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let mut options = TrainingOptions {
         recipe: recipe(arguments)?,

@@ -121,9 +121,18 @@ impl fmt::Display for Difference {
             What::Field { path, expected, found, difference } => {
                 let shown = |value: &Option<String>| value.clone().unwrap_or_else(|| "nothing".into());
                 write!(f, "{path}: expected {}, found {}", shown(expected), shown(found))?;
-                difference.as_ref().map_or(Ok(()), |difference| write!(f, ", difference {difference}"))
+                difference.as_ref().map_or(Ok(()), |difference| write!(f, ", difference {}", shortened(difference)))
             }
         }
+    }
+}
+
+/// A difference of floats with as many digits as a person needs.
+fn shortened(difference: &str) -> String {
+    match difference.parse::<f64>() {
+        Ok(value) if difference.contains('e') && (1e-3..1e6).contains(&value.abs()) => format!("{value:.4}"),
+        Ok(value) if difference.contains('e') => format!("{value:.2e}"),
+        _ => difference.into(),
     }
 }
 

@@ -199,7 +199,10 @@ impl fmt::Display for Promise {
             100.0 * confidence,
             trials.n_objects,
         )?;
-        n_attempts.map_or(Ok(()), |n| write!(formatter, "; a trial has at most {n} attempts"))
+        n_attempts.map_or(Ok(()), |n| {
+            let attempts = if n == 1 { "attempt" } else { "attempts" };
+            write!(formatter, "; a trial has at most {n} {attempts}")
+        })
     }
 }
 

@@ -15,7 +15,7 @@ use self::setup::Setup;
 use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
 use super::model::write_at_once;
-use super::{Outcome, check_page, print_line, stop_requests};
+use super::{Outcome, check_page, completions, print_line, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_learning::trials::late_decisions::LateDecisions;
@@ -51,7 +51,7 @@ const MAX_STRIPS: usize = 18;
 pub(super) struct Arguments {
     /// Objects to lift, separated by commas: paper, one of its groups (paper/mug), objects, classes and splits of the
     /// catalogue, meshes. @MASSkg and @muFRICTION behind a name replace its mass and friction.
-    #[arg(long, default_value = "paper")]
+    #[arg(long, default_value = "paper", add = completions::objects())]
     objects: String,
     /// Number of trials; the objects take turns.
     #[arg(long, default_value_t = 110, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]

@@ -272,20 +272,20 @@ fn settle(param: &ParamDescription, accepted: Value, of: &str, folder: &Path) ->
     };
     let path = absolute(folder, path);
     let shown = quote_path(&path);
-    let refuse = |problem: String| Refusal {
+    let refuse = |problem: String, help| Refusal {
         message: format!("param {} of {of}: {shown} {problem}", quote(&param.name)),
-        help: neighbours(&path),
+        help,
     };
     if *must_exist {
         match path.try_exists() {
             Ok(true) => {}
-            Ok(false) => return Err(refuse("does not exist".to_owned())),
-            Err(error) => return Err(refuse(format!("cannot be reached: {error}"))),
+            Ok(false) => return Err(refuse("does not exist".to_owned(), neighbours(&path))),
+            Err(error) => return Err(refuse(format!("cannot be reached: {error}"), None)),
         }
     }
     match path.into_os_string().into_string() {
         Ok(path) => Ok(Value::from(path)),
-        Err(_) => Err(refuse("is not UTF-8".to_owned())),
+        Err(_) => Err(refuse("is not UTF-8".to_owned(), None)),
     }
 }
 

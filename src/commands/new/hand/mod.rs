@@ -267,10 +267,20 @@ fn with_base_advice(error: anyhow::Error, arguments: &Arguments) -> anyhow::Erro
     anyhow::anyhow!("{text}; if it is a whole robot, give the first link of the hand with --base LINK")
 }
 
+/// The farthest that the frame of a palm lies from that of its link.
+const MAX_PALM_OFFSET_M: f64 = 2.0;
+
 /// The pose of --palm-pose.
 fn palm_pose(arguments: &Arguments) -> anyhow::Result<Option<[f64; 6]>> {
     let pose = &arguments.palm_pose;
     match <[f64; 6]>::try_from(pose.as_slice()) {
+        Ok(pose) if pose[..3].iter().any(|length| length.abs() > MAX_PALM_OFFSET_M) => {
+            bail!("--palm-pose: x, y and z are {:?}: expected metres, each at most {MAX_PALM_OFFSET_M}", &pose[..3])
+        }
+        Ok(pose) if pose[3..].iter().any(|angle| angle.abs() > std::f64::consts::TAU) => bail!(
+            "--palm-pose: roll, pitch and yaw are {:?}: expected radians, each at most 6.2832; 90 degrees are 1.5708",
+            &pose[3..]
+        ),
         Ok(pose) if arguments.palm.is_some() => Ok(Some(pose)),
         Ok(_) => bail!("--palm-pose needs --palm: the link in which it is given"),
         Err(_) if pose.is_empty() => Ok(None),
