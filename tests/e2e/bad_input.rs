@@ -218,6 +218,41 @@ fn dataflows() {
 }
 
 #[test]
+fn a_file_of_another_kind_names_the_command_that_takes_it() {
+    let folder = Folder::new();
+    let table = folder.write("table.csv", "a,b\n1,2\n");
+    let (picture, out) = (folder.write("a.png", b"\x89PNG\r\n\x1a\n"), folder.at("out.json"));
+    check(&["train", &table, "--out", &out], 1, &["table.csv", "expected an MCAP file", "blindgrasp import"]);
+    check(&["train", &picture, "--out", &out], 1, &["a.png", "expected an MCAP file, found a picture"]);
+    check(&["train", MODEL, "--out", &out], 1, &[MODEL, "a model", "blindgrasp model show"]);
+    check(&["info", &table], 1, &["table.csv", "blindgrasp import"]);
+    check(&["info", MODEL], 1, &[MODEL, "blindgrasp model show"]);
+    check(&["info", "dataflow.yaml"], 1, &["dataflow.yaml", "blindgrasp run starts it"]);
+    check(&["replay", "dataflow.yaml"], 1, &["dataflow.yaml", "blindgrasp run starts it"]);
+    check(&["run", RECORDING], 1, &[RECORDING, "not a dataflow file", "blindgrasp view shows it"]);
+    check(&["run", MODEL], 1, &[MODEL, "not a dataflow file", "blindgrasp model show"]);
+    check(&["run", HAND], 1, &[HAND, "not a dataflow file", "blindgrasp info prints it"]);
+    check(&["predict", RECORDING, MODEL], 1, &["expected JSON made by blindgrasp train", "found a recording"]);
+    check(&["predict", MODEL, &table], 1, &["table.csv", "expected frames", "blindgrasp import"]);
+    check(&["model", "show", HAND], 1, &[HAND, "the pad layout of a hand"]);
+    let out = folder.at("out.mcap");
+    check(&["simulate", "--hand", RECORDING, "--out", &out], 1, &["not a pad layout", "found a recording"]);
+    check(&["simulate", "--out", &folder.at("out.csv")], 1, &["out.csv", ".mcap", "blindgrasp export"]);
+    check(&["new", "hand", &folder.at("mine"), "--urdf", &table], 1, &["not a URDF", "found a table"]);
+    // A file that is not there, and names that are nearly right.
+    check(&["info", "recordings/held-uot.mcap"], 1, &["No such file", "its folder has", "held-out.mcap"]);
+    check(&["info", "barett-bh8-280"], 1, &["did you mean 'barrett-bh8-280'?", "allegro"]);
+    // Values in another unit.
+    check(&["info", HAND, "--joints", "spread=45"], 1, &["45 rad", "45 degrees are 0.7854 rad"]);
+    check(&["info", HAND, "--joints", "spread=45deg"], 2, &["'45deg' is not a number", "without the unit"]);
+    check(&["train", RECORDING, "--max-drops", "5%", "--out", &out], 2, &["a number from", "5 % are 0.05"]);
+    check(&["simulate", "--grasps", "many", "--out", &out], 2, &["'many'", "a whole number"]);
+    // The text comes once.
+    let text = text(&run(&["simulate", "--objects", "teapott", "--out", &out], 1).stderr).to_owned();
+    assert_eq!(text.matches("did you mean 'teapot'?").count(), 1, "{text}");
+}
+
+#[test]
 fn usage() {
     check(&["fly"], 2, &["fly"]);
     check(&["run", "--fly"], 2, &["--fly"]);

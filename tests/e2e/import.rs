@@ -359,6 +359,31 @@ fn bad_rows_are_counted_beyond_those_shown() {
 }
 
 #[test]
+fn values_in_another_unit_are_told() {
+    let folder = Folder::new();
+    let table = |angle: &str, reading: &str| {
+        format!("object,held,l_1,l_2,r_1,q_1,q_2\ncup,yes,1,1,{reading},{angle},0\nbox,no,1,1,1,{angle},0\n")
+    };
+    let columns = ["--joint-columns", "q_*"];
+    folder.refuse(table("45", "1"), &columns, 1, &["line 2: column 'q_1'", "--joint-unit deg takes degrees"]);
+    folder.refuse(table("0.5", "\"1,5\""), &columns, 1, &["'1,5'", "the decimal point as a dot"]);
+    assert_eq!(folder.import(table("0.5", "2"), &columns)["warnings"], json!([]));
+    let warned = |table: String, more: &[&str], expected: &str| {
+        let report = folder.import(table, &[&columns[..], more].concat());
+        let warning = report["warnings"][0].as_str().expect("a warning");
+        assert!(warning.contains(expected), "{warning}");
+    };
+    warned(table("0.5", "1"), &["--joint-unit", "deg"], "leave out --joint-unit deg");
+    warned(table("0.5", "900"), &[], "give --newtons-per-unit");
+    // Both ways to give the posture are named.
+    folder.write("table.csv", TABLE);
+    let arguments: Vec<String> = folder.arguments(&[]).into_iter().filter(|word| word != "left=0.5").collect();
+    let without: Vec<&str> = arguments.iter().map(String::as_str).filter(|word| *word != "--joints").collect();
+    let refused = text(&run(&without, 2).stderr).to_string();
+    assert!(refused.contains("--joints <JOINTS>") && refused.contains("--joint-columns <PATTERNS>"), "{refused}");
+}
+
+#[test]
 fn existing_files_and_inputs_are_not_written_over() {
     let folder = Folder::new();
     let before = folder.write("before.mcap", "mine");

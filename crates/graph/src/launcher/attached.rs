@@ -79,9 +79,9 @@ impl Launcher {
         if let Some(unknown) = wanted.iter().find(|wanted| !all.iter().any(|port| is_named(port, wanted))) {
             let known: Vec<String> = all.iter().map(name).collect();
             let alike = did_you_mean(unknown, known.iter().map(String::as_str));
-            let alike = alike.map(|alike| format!("{alike} ")).unwrap_or_default();
+            let alike = alike.map(|alike| format!("; {alike}")).unwrap_or_default();
             let known = known.join(", ");
-            return Err(format!("graph '{}' has no edge from '{unknown}'; {alike}it has: {known}", self.name));
+            return Err(format!("graph '{}' has no edge from '{unknown}'; it has: {known}{alike}", self.name));
         }
         let is_at_start = all.iter().all(|port| self.last_sent_at(port).is_none());
         let is_wanted = |port: &&Port| wanted.is_empty() || wanted.iter().any(|wanted| is_named(port, wanted));

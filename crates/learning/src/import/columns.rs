@@ -165,8 +165,9 @@ fn help(header: &[String], wanted: &str) -> String {
     }
     // Numbered columns stand for the pattern that matches them all.
     let has_star = wanted.contains('*');
-    let likeness = |name: &String| {
-        if has_star { format!("{}*", name.trim_end_matches(|char: char| char.is_ascii_digit())) } else { name.clone() }
+    let likeness = |name: &String| match name.trim_end_matches(|char: char| char.is_ascii_digit()) {
+        stem if has_star && stem.len() < name.len() => format!("{stem}*"),
+        _ => name.clone(),
     };
     let distance = |name: &String| strsim::osa_distance(&wanted.to_lowercase(), &name.to_lowercase());
     let nearest = header.iter().filter(|name| !name.is_empty()).map(likeness).min_by_key(distance);
@@ -241,6 +242,7 @@ mod tests {
         let header = ["object", "slipped", "ff_biotac_1", "ff_biotac_2"].map(String::from);
         assert_eq!(help(&header, "sliped"), "did you mean 'slipped'?");
         assert_eq!(help(&header, "f_biotac_*"), "did you mean 'ff_biotac_*'?");
+        assert!(help(&["held", "c1", "c2"].map(String::from), "cell*").starts_with("the table has"));
         assert_eq!(help(&header, "pressure"), "the table has object, slipped, ff_biotac_1, ff_biotac_2");
         assert_eq!(help(&["a;b".into()], "a"), "line 1 has one column only, 'a;b': give --delimiter ';'");
     }
