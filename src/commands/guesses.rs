@@ -119,7 +119,7 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (
         &["daemon", "background", "systemd", "service", "services", "enable"],
         ROOT,
-        "use 'blindgrasp run --detach'; docs/operating.md has a systemd unit",
+        "use 'blindgrasp run --detach'; docs/machines.md has a unit of systemd",
     ),
     (
         &["deploy", "connect", "ssh", "remote", "machines", "machine", "cluster", "daemonize"],
@@ -199,6 +199,41 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (&["report"], ROOT, "use 'blindgrasp run --report FILE', or 'blindgrasp evaluate MODEL RECORDING --report FILE'"),
     (&["completion", "complete", "autocomplete"], ROOT, "use 'blindgrasp completions …'"),
     (&["log", "journal", "tail", "follow"], ROOT, "use 'blindgrasp logs -f'"),
+    (&["history"], ROOT, "use 'blindgrasp logs', or 'blindgrasp info RECORDING' for what was recorded"),
+    (&["reset"], ROOT, "use 'blindgrasp swap NODE', which starts an operator anew"),
+    (
+        &["tune", "optimize", "optimise", "gridsearch", "grid", "sweep", "hyperopt"],
+        ROOT,
+        "use 'blindgrasp train RECORDING --out MODEL --grid'",
+    ),
+    (
+        &["upload", "download", "push", "pull", "fetch", "sync"],
+        ROOT,
+        "nothing is kept elsewhere: recordings, models and projects are files",
+    ),
+    (
+        &["importance", "shap", "ablation"],
+        ROOT,
+        "use 'blindgrasp evaluate RECORDING --split object --recipe boosted,raw,joints', which compares features",
+    ),
+    (&["sensor"], ROOT, "use 'blindgrasp sensors check' or 'blindgrasp sensors learn'"),
+    (
+        &["cells", "pads", "taxels", "joints", "heatmap", "tf", "forces", "contacts"],
+        ROOT,
+        "use 'blindgrasp info HAND' for where they are, 'blindgrasp view RECORDING' or 'blindgrasp view GRAPH' for what they \
+         read",
+    ),
+    (
+        &["grasp", "grasps"],
+        ROOT,
+        "use 'blindgrasp info RECORDING', or 'blindgrasp view RECORDING --grasp 3 --out grasp.html'",
+    ),
+    (
+        &["gate", "decision", "decisions", "result", "results"],
+        ROOT,
+        "use 'blindgrasp echo decision' for a running graph",
+    ),
+    (&["trace", "strace"], ROOT, "set the environment variable RUST_LOG=debug, and use 'blindgrasp logs'"),
     (&["python"], ROOT, "use the Python package: docs/python.md"),
     (&["paper", "figures", "tables"], ROOT, "use 'blindgrasp reproduce --out FOLDER'"),
     (&["node", "component", "stage", "package", "pkg", "plugin"], &["new"], "use 'blindgrasp new operator NAME'"),
@@ -217,6 +252,9 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (&["test", "diagnose", "faults"], &["sensors"], "use 'blindgrasp sensors check'"),
     // Options.
     (&["--output", "--output-file", "--outfile", "--save", "--dest", "--to", "-o", "-O"], &["--out"], "use --out FILE"),
+    (&["--to", "--with", "--program", "--by", "--operator"], &["swap"], "use --run PROGRAM, or --set model=FILE"),
+    (OUTPUTS, &["new", "init"], "give the folder without an option: {usage}"),
+    (OUTPUTS, &["run", "trials"], "use --record FILE for a recording of all edges, --report FILE for a page"),
     (OUTPUTS, &["evaluate"], "use --report FILE for a page, --figures FOLDER for figures, --json for stdout"),
     (OUTPUTS, &["predict"], "the decisions go to stdout: add --json > FILE"),
     (OUTPUTS, &["test"], "use --junit FILE for a report, --keep FOLDER for the recordings of the replays"),
@@ -240,6 +278,7 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (&["--format", "--fmt", "--csv"], &["info", "predict", "evaluate", "ps", "model", "set"], "use --json"),
     (&["--csv"], &["export"], "use --format csv"),
     (&["--dry-run", "--validate", "--lint", "--no-run"], &["--check"], "use --check"),
+    (&["--dry-run"], &["swap"], "use --shadow TIME, which compares and swaps nothing"),
     (&["--dry-run"], &["--print-options"], "use --print-options, which prints the options and stops"),
     (&["--dry-run", "--validate"], &[], "use 'blindgrasp run --check', which checks a dataflow file"),
     (SPEED, &["--rate"], "use --rate 2x, or --rate max"),
@@ -250,6 +289,106 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     ),
     (&["--loop", "--repeat", "--forever"], &["--loop"], "use --loop"),
     (&["--loop", "--repeat", "--forever"], &["run"], "use --set recorded_source.repeat=forever"),
+    (
+        &["--recording", "--input", "--source", "--bag", "--data", "-i"],
+        &["run"],
+        "use --set recording=FILE, or 'blindgrasp replay RECORDING'",
+    ),
+    (&["--grasps", "--count", "-n", "--n", "--samples"], &["run"], "use 'blindgrasp replay RECORDING --grasps 0-9'"),
+    (&["--headless", "--no-view", "--no-gui", "--no-ui"], &["run"], "leave it out: nothing is shown without --view"),
+    (&["--once", "--no-loop"], &["run"], "leave it out: the graph ends with its source"),
+    (&["--watch", "--top"], &["run"], "use 'blindgrasp top', or --view"),
+    (&["--env", "-e"], &["run"], "set variables before the command, as in NAME=VALUE blindgrasp run"),
+    (&["--seed"], &["run", "replay"], "leave it out: nothing in it is random"),
+    (
+        &["--no-color", "--no-colour", "--color", "--colour"],
+        &[],
+        "set the environment variable NO_COLOR=1; there are no colours without a terminal",
+    ),
+    (&["--delay", "-d", "-i", "--refresh", "--period"], &["--interval"], "use --interval TIME"),
+    (&["--field", "--filter", "--grep", "--jq"], &["echo"], "filter the lines, as by jq"),
+    (&["--csv", "--format"], &["echo"], "use 'blindgrasp record', then 'blindgrasp export RECORDING --format csv'"),
+    (&["--rate", "--hz"], &["echo"], "use 'blindgrasp top'"),
+    (&["-f", "--follow", "--watch", "-w"], &["echo", "top"], "leave it out: it goes on until Ctrl-C"),
+    (&["-t", "--timestamps", "--time"], &["logs"], "leave it out: each line has its time"),
+    (&["--node"], &["logs", "swap"], "name the node without an option: {usage}"),
+    (&["--operator"], &["logs"], "name the node without an option: {usage}"),
+    (&["--compression", "--compress", "--zstd"], &["--rotate-size"], "leave it out: recordings are compressed"),
+    (&["--split", "--max-size", "--max-bag-size", "-b"], &["--rotate-size"], "use --rotate-size SIZE"),
+    (&["--max-bag-duration"], &["--rotate-every"], "use --rotate-every TIME"),
+    (&["--append"], &["--rotate-size"], "a recording is not continued: name another file"),
+    (&["-l"], &["--loop"], "use --loop"),
+    (&["--pause", "--start-paused", "--interactive"], &["--step"], "use --step"),
+    (&["--duration", "--time", "--for"], &["--to"], "use --from TIME and --to TIME"),
+    (&["--topic", "--topics"], &["replay"], "use --replace NODE: the recorded output of that node is played"),
+    (
+        &["--label-column", "--target", "--labels", "--y"],
+        &["train", "evaluate"],
+        "leave it out: labels are in the recordings; 'blindgrasp import --label COLUMN' puts them there",
+    ),
+    (&["--features"], &["--recipe"], "use --recipe NAME, which chooses features and learner"),
+    (
+        &["--kernel", "--C", "--degree"],
+        &["--recipe"],
+        "use --recipe paper, an SVM with an RBF kernel, and --c and --gamma",
+    ),
+    (
+        &["--metrics", "--metric", "--confusion-matrix", "--plot", "--roc", "--curve", "--figure"],
+        &["evaluate"],
+        "leave it out: all metrics are printed; --report FILE and --figures FOLDER have the curves",
+    ),
+    (&["--proba", "--probability", "--probabilities"], &["predict"], "leave it out: p is the probability of stable"),
+    (&["--grasp", "--grasps"], &["predict"], "leave it out: every grasp is printed; --json is for jq"),
+    (
+        &["--render", "--gui", "--headless", "--viz", "--display", "--view", "--show"],
+        &["simulate", "trials"],
+        "leave it out: nothing is shown while it runs; 'blindgrasp view RECORDING' shows simulated grasps, trials --report \
+         FILE draws trials",
+    ),
+    (&["--resume", "--continue"], &["simulate", "reproduce"], "leave it out: the same command goes on with its folder"),
+    (&["--format", "--csv"], &["simulate"], "use 'blindgrasp export RECORDING --format csv' afterwards"),
+    (&["--sep", "--separator", "-d"], &["--delimiter"], "use --delimiter CHARACTER, or tab"),
+    (&["--degrees", "--deg", "--radians", "--rad"], &["--joint-unit"], "use --joint-unit deg or rad"),
+    (&["--target", "--outcome", "--success", "--y"], &["--stable-value"], "use --label COLUMN and --stable-value TEXT"),
+    (&["--object", "--objects"], &["import"], "use --group COLUMN"),
+    (&["--scale", "--factor", "--gain"], &["--newtons-per-unit"], "use --newtons-per-unit N"),
+    (&["--skip-errors", "--ignore-errors", "--on-bad-lines"], &["--skip-bad-rows"], "use --skip-bad-rows"),
+    (
+        &["--columns", "--features", "--sensors", "--taxels", "--pads"],
+        &["import"],
+        "use --cells PATTERNS and --joint-columns PATTERNS",
+    ),
+    (&["--header", "--encoding", "--no-header"], &["import"], "the table needs a line of names first, and UTF-8"),
+    (&["--json", "--jsonl"], &["export"], "leave it out: JSON lines are written without --format"),
+    (&["--columns", "--fields", "--select"], &["export"], "use --topic NAME, and select columns afterwards"),
+    (&["--grasp", "--grasps"], &["export"], "use 'blindgrasp replay RECORDING --grasps 3,7-9 --record FILE' first"),
+    (&["--all", "--summary", "--stats", "--topics", "--contents", "-a"], &["info"], "leave it out: {usage}"),
+    (&["--model", "-m"], &["info"], "use 'blindgrasp model show FILE'"),
+    (
+        &["--host", "--address", "--bind", "--ip"],
+        &["view", "run"],
+        "the page is on 127.0.0.1 alone: ssh -L PORT:127.0.0.1:PORT leads to it from another machine",
+    ),
+    (&["--png", "--pdf", "--svg", "--html", "--image"], &["view"], "use --out FILE.svg or FILE.html"),
+    (&["--force", "-f"], &["swap"], "use --allow-mismatch, if a mismatch was refused"),
+    (&["-a"], &["stop"], "use --all"),
+    (&["--wait"], &["stop", "swap", "set"], "leave it out: it waits"),
+    (&["--repair", "--apply"], &["--fix"], "use --fix"),
+    (&["--force", "-f", "--overwrite"], &["init", "new"], "choose a new name: nothing is overwritten"),
+    (&["--template", "--type", "--list"], &["init"], "use --hand NAME for the project of another hand"),
+    (
+        &["--rust", "--lang", "--language", "-l"],
+        &["new"],
+        "use --python for Python; without it the operator is in Rust",
+    ),
+    (
+        &["--mjcf", "--xml", "--mujoco"],
+        &["new"],
+        "use 'python3 -m blindgrasp.mjcf hand.xml hand.urdf' first (docs/hand.md)",
+    ),
+    (&["--file", "-f", "--robot", "--model"], &["--urdf"], "use --urdf FILE"),
+    (&["--node"], &["set"], "write the node before the parameter: NODE.PARAM=VALUE"),
+    (&["--shell"], &["completions"], "give the shell without an option: {usage}"),
     (&["--model", "--weights", "--checkpoint", "-m"], &["--model"], "use --model FILE"),
     (
         &["--model", "--weights", "--checkpoint", "-m"],
@@ -269,6 +408,7 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (&["--object", "--obj", "--class", "--item", "--mesh"], &["--objects"], "use --objects NAMES"),
     (COUNTS, &["simulate", "reproduce"], "use --grasps N"),
     (COUNTS, &["trials"], "use --trials N"),
+    (&["--episodes", "--n-trials", "--num-trials", "--rollouts", "--grasps"], &["trials"], "use --trials N"),
     (COUNTS, &["replay"], "use --grasps IDS, as 0-9 for the first ten"),
     (COUNTS, &["echo"], "use --samples N (-n N)"),
     (&["--tail", "--last", "--count", "--n"], &["logs"], "use --lines N (-n N)"),
@@ -308,7 +448,7 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     ),
     (&["--cv", "--kfold", "-k", "--n-splits"], &["--folds"], "use --split object --folds 5"),
     (
-        &["--config", "--conf", "--file", "-f", "-c", "--dataflow", "--graph"],
+        &["--config", "--config-file", "--conf", "--file", "-f", "-c", "--dataflow", "--graph"],
         &["run"],
         "give the dataflow file without an option: {usage}",
     ),
@@ -382,7 +522,7 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (&["--host", "--remote", "--ip", "--on"], &["--machine"], "use --machine NAME"),
     (&["--restart", "--respawn"], &["run"], "write 'restart:' at a node of the dataflow file (docs/dataflow.md)"),
     (&["--engine", "--backend", "--simulator"], &["--physics"], "use --physics NAME"),
-    (&["--gate"], &["trials"], "use --lift-policy decision, always or both"),
+    (&["--gate", "--no-gate"], &["trials"], "use --lift-policy decision, always or both"),
     (&["--threshold-probability"], &["train"], "use --threshold PROBABILITY"),
     (
         &["--max-false-positive-rate", "--precision", "--recall"],
@@ -480,8 +620,16 @@ pub(super) fn with_hint(mut error: clap::Error, root: Command, words: &[OsString
     error
 }
 
+/// The hint for a word that stands where the name of a graph does, as `hands` in `list hands`.
+pub(super) fn hint_for_word(word: &str, root: Command) -> Option<String> {
+    let place = Place::of(root, &["blindgrasp".into(), word.into()]);
+    place.row(word).map(|hint| place.filled_in(hint, place.rest.len()))
+}
+
 /// The command that the words lead to.
 struct Place {
+    /// The names of all commands.
+    commands: Vec<String>,
     command: Command,
     /// Its name behind the program's, or the program's.
     name: String,
@@ -492,8 +640,10 @@ struct Place {
 impl Place {
     fn of(mut root: Command, words: &[String]) -> Place {
         root.build();
-        let mut place =
-            Place { name: root.get_name().into(), command: root, rest: words.iter().skip(1).cloned().collect() };
+        let visible = root.get_subcommands().filter(|command| !command.is_hide_set());
+        let commands = visible.map(|command| command.get_name().to_owned()).collect();
+        let rest = words.iter().skip(1).cloned().collect();
+        let mut place = Place { commands, name: root.get_name().into(), command: root, rest };
         // The first command's name is that of the place: `model show` is `model`.
         let mut n_commands = 0;
         while let Some(word) = place.rest.first()
@@ -517,8 +667,16 @@ impl Place {
         if let Some(hint) = next.and_then(|both| self.row(&both)).or_else(|| self.row(word)) {
             return Some(self.filled_in(hint, at + 1));
         }
+        if self.is_command(word) {
+            return Some(self.filled_in(&format!("use 'blindgrasp {word} …'"), at + 1));
+        }
         if self.name == "new" {
             return Some(format!("use 'blindgrasp init {word}' for a project of that name"));
+        }
+        if let Some((command, _)) = word.split_once(['-', '_'])
+            && self.is_command(command)
+        {
+            return Some(self.filled_in(&format!("use 'blindgrasp {command} …'"), at + 1));
         }
         if let Some(kind) = FileKind::at(Path::new(word)) {
             return Some(format!("the command is missing before {}: it is {}", quote(word), kind.description()));
@@ -547,9 +705,16 @@ impl Place {
         let known: Vec<&str> = self.options().collect();
         let alike = did_you_mean(argument.trim_start_matches('-'), known);
         alike.map(|alike| alike.replacen('\'', "'--", 1)).or_else(|| {
-            let can_set = self.options().any(|option| option == "set");
-            can_set.then(|| "use --set [NODE.]PARAM=VALUE for a parameter of an operator".into())
+            let has = |wanted: &str| self.options().any(|option| option == wanted);
+            if has("print-options") {
+                return Some("--print-options prints what a file of --options can change".into());
+            }
+            has("set").then(|| "a parameter of an operator is given by --set [NODE.]PARAM=VALUE".into())
         })
+    }
+
+    fn is_command(&self, word: &str) -> bool {
+        self.commands.iter().any(|command| command == word)
     }
 
     /// The hint of the first row for a guess at this place.
@@ -623,7 +788,7 @@ mod tests {
     }
 
     /// The lines that the first column says are typed by people who know another program.
-    const LINES: [(&str, &str); 92] = [
+    const LINES: [(&str, &str); 108] = [
         ("plot a.mcap", "tip: use 'blindgrasp view a.mcap'"),
         ("compare a.mcap b.mcap", "'blindgrasp test RECORDING'"),
         ("diff a.mcap b.mcap", "'blindgrasp test RECORDING'"),
@@ -716,6 +881,22 @@ mod tests {
         ("stop --force", "--grace"),
         ("set lift_arbiter.votes 4", "set lift_arbiter.votes=5"),
         ("test --verbose", "--keep"),
+        ("run --once", "ends with its source"),
+        ("run --recording a.mcap", "--set recording=FILE"),
+        ("run --fancy", "given by --set"),
+        ("simulate --noise 1", "--print-options"),
+        ("simulate --render", "blindgrasp view RECORDING"),
+        ("import t.csv --sep ;", "use --delimiter"),
+        ("import t.csv --degrees", "use --joint-unit deg"),
+        ("top --delay 1", "use --interval TIME"),
+        ("record -o x.mcap --split 1GB", "use --rotate-size"),
+        ("view a.mcap --host 0.0.0.0", "ssh -L"),
+        ("swap classifier --with x", "use --run PROGRAM"),
+        ("model predict m.json a.mcap", "'blindgrasp predict m.json a.mcap'"),
+        ("train-model a.mcap", "'blindgrasp train a.mcap'"),
+        ("tune", "--grid"),
+        ("completions --shell bash", "blindgrasp completions <SHELL>"),
+        ("init x --force", "choose a new name"),
     ];
 
     #[test]
