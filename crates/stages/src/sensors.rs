@@ -19,6 +19,7 @@ use crate::classifier::boosting::BoostedTrees;
 use crate::day::GraspPlace;
 use crate::hand::{Hand, Motion};
 use crate::model::ModelHand;
+use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::{read_regular, write_whole};
 use blindgrasp_messages::{Contact, Phase};
 
@@ -166,6 +167,9 @@ impl SensorCheck {
     /// A file that cannot be read, is no sensor check, is for another hand, or contradicts itself.
     pub fn load(path: &Path, hand: &Hand) -> Result<SensorCheck, SensorCheckError> {
         let invalid = |message: String| SensorCheckError { path: path.into(), message };
+        if let Some(kind) = FileKind::at(path).filter(|kind| !matches!(kind, FileKind::Sensors | FileKind::Json)) {
+            return Err(invalid(format!("expected a file of blindgrasp sensors learn, found {}", kind.description())));
+        }
         let text = read_regular(path).map_err(|error| invalid(error.to_string()))?;
         let check: SensorCheck = serde_json::from_str(&text)
             .map_err(|error| invalid(format!("expected a file of blindgrasp sensors learn ({error})")))?;

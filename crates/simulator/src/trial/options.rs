@@ -12,6 +12,7 @@ use crate::planner::PlannerOptions;
 use crate::protocol::{Approach, check_preshape_range};
 use crate::soft_finger::SoftFingerOptions;
 use crate::tactile_sensor::SensorOptions;
+use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::read_regular;
 
 /// All options of trials.
@@ -239,6 +240,9 @@ impl TrialOptions {
     /// A file that cannot be read, an unknown option, or a value that cannot be used; with the file's name.
     pub fn load(path: &Path) -> Result<TrialOptions, TrialError> {
         let refuse = |reason: String| TrialError::OptionsFile { path: path.into(), reason };
+        if let Some(kind) = FileKind::at(path).filter(|kind| !matches!(kind, FileKind::Empty | FileKind::Json)) {
+            return Err(refuse(format!("expected YAML as of --print-options, found {}", kind.description())));
+        }
         let text = read_regular(path).map_err(|error| refuse(error.to_string()))?;
         let options: TrialOptions = serde_saphyr::from_str(&text).map_err(|error| refuse(error.to_string()))?;
         options.check().map_err(|error| refuse(error.to_string()))?;

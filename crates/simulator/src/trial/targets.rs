@@ -196,7 +196,9 @@ fn others(name: &str) -> Result<(Vec<LiftTarget>, Vec<String>), TrialError> {
     let (objects, warnings) = objects_named(name).map_err(|error| match error {
         NamedError::Selection(SelectionError::Unknown { .. }) => TrialError::Target {
             name: name.into(),
-            reason: format!("{error}; or paper, paper/mug, ... for the paper's objects"),
+            reason: format!(
+                "{error}; or paper, paper/mug, ... for the paper's objects, each perhaps with @MASSkg and @muFRICTION"
+            ),
         },
         error => TrialError::Mesh { path: name.into(), reason: error.to_string() },
     })?;

@@ -253,10 +253,13 @@ impl Layout {
             return Err(format!("joints: '{missing}' moves in the URDF but is not listed"));
         }
         if let Some(unknown) = self.preshape_joints.iter().find(|name| !self.joints.contains(name)) {
-            return Err(format!("preshape_joints: '{unknown}' is not listed under 'joints'"));
+            return Err(format!(
+                "preshape_joints: '{unknown}' is not listed under 'joints' ({})",
+                self.joints.join(", ")
+            ));
         }
         if let Some(unknown) = self.open.keys().find(|name| !self.joints.contains(name)) {
-            return Err(format!("open: '{unknown}' is not listed under 'joints'"));
+            return Err(format!("open: '{unknown}' is not listed under 'joints' ({})", self.joints.join(", ")));
         }
         for coupling in &self.couplings {
             let idx = |name: &str| {
