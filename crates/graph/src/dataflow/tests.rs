@@ -624,7 +624,7 @@ operators:
 2:1: unknown key 'nmae'; did you mean 'name'?
 5:24: node 'contacts' has no output 'contact'; did you mean 'contacts'?
 7:23: there is no node 'sorce'; did you mean 'source'?
-8:20: param 'hand' of node 'contacts': 'hands/b.yaml' does not exist
+8:20: param 'hand' of node 'contacts': 'hands/b.yaml' does not exist; its folder has a.yaml
 8:34: duplicate key 'hand', first given in line 8
 9:5: unknown key 'rnu' in node 'contacts'; did you mean 'run'?
 10:21: unknown param 'recordin' of node 'source'; did you mean 'recording'?",
