@@ -667,11 +667,11 @@ impl Place {
         if let Some(hint) = next.and_then(|both| self.row(&both)).or_else(|| self.row(word)) {
             return Some(self.filled_in(hint, at + 1));
         }
-        if self.is_command(word) {
-            return Some(self.filled_in(&format!("use 'blindgrasp {word} …'"), at + 1));
-        }
         if self.name == "new" {
             return Some(format!("use 'blindgrasp init {word}' for a project of that name"));
+        }
+        if self.is_command(word) {
+            return Some(self.filled_in(&format!("use 'blindgrasp {word} …'"), at + 1));
         }
         if let Some((command, _)) = word.split_once(['-', '_'])
             && self.is_command(command)
@@ -837,7 +837,7 @@ mod tests {
         ("run --output x.mcap", "use --record FILE"),
         ("run --daemon", "use --detach"),
         ("run --param votes=4", "use --set"),
-        ("run --votes 4", "use --set"),
+        ("run --votes 4", "given by --set"),
         ("run --model m.json", "use --set model=FILE"),
         ("run --hand allegro", "use --set hand=FILE"),
         ("run --port 8080", "use --view"),
