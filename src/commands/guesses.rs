@@ -673,13 +673,14 @@ impl Place {
         if self.is_command(word) {
             return Some(self.filled_in(&format!("use 'blindgrasp {word} …'"), at + 1));
         }
+        if let Some(kind) = FileKind::at(Path::new(word)) {
+            return Some(format!("the command is missing before {}: it is {}", quote(word), kind.description()));
+        }
         if let Some((command, _)) = word.split_once(['-', '_'])
+            && !word.contains('.')
             && self.is_command(command)
         {
             return Some(self.filled_in(&format!("use 'blindgrasp {command} …'"), at + 1));
-        }
-        if let Some(kind) = FileKind::at(Path::new(word)) {
-            return Some(format!("the command is missing before {}: it is {}", quote(word), kind.description()));
         }
         let subcommands = || self.command.get_subcommands().filter(|command| !command.is_hide_set());
         let names: Vec<&str> =

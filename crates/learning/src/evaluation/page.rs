@@ -443,7 +443,7 @@ fn how_made(report: &Report) -> String {
         items.push((
             "split",
             format!(
-                "by {}, {} folds, seed {}{repeats}. Dictionary, scaling and machine of a recipe are learned from the other \
+                "by {}, {} folds, seed {}{repeats}. Dictionary, scaling and classifier of a recipe are learned from the other \
                  folds alone; the calibration, too, on decision values out of {} inner folds, split alike.",
                 split.by.word(),
                 split.n_folds,
