@@ -5,35 +5,46 @@
     for grasp in blindgrasp.Recording("run.mcap"):        # one grasp at a time
         settled = grasp.cells_newtons[grasp.phase == "settled"]
 
+    table = blindgrasp.Recording("run.mcap").to_frame()   # pandas, a row for each grasp
+
     predictions = blindgrasp.Model("model.json").predict("run.mcap")
 
     with blindgrasp.run("dataflow.yaml") as graph:        # starts the graph, and ends it
         for decision in graph:
             print(decision.grasp_id, decision.action)
 
+    decisions = blindgrasp.replay("run.mcap", "dataflow.yaml")     # the same in a test: the fixture `replay` of pytest
+
 Recordings are read here; all else is done by the program `blindgrasp` (`blindgrasp.program()`). Nothing here computes a
 feature or a probability, so that Python and a robot never disagree.
 """
 
-from ._graph import Run, echo, run
-from ._model import Model, Predictions
+from ._graph import ReplayedDecisions, Run, echo, replay, run
+from ._model import Model, PredictedGrasp, Predictions
 from ._program import ProgramError, ProgramNotFoundError, program
 from ._recording import Grasp, Recording, RecordingError, read
 from ._types import Decision, Label
+
+# The version of the program and of all else: Cargo.toml has it as well, and a test compares them.
+__version__ = "0.1.0"
 
 __all__ = [
     "Decision",
     "Grasp",
     "Label",
     "Model",
+    "PredictedGrasp",
     "Predictions",
     "ProgramError",
     "ProgramNotFoundError",
     "Recording",
     "RecordingError",
+    "ReplayedDecisions",
     "Run",
+    "__version__",
     "echo",
     "program",
     "read",
+    "replay",
     "run",
 ]

@@ -4,23 +4,49 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import tempfile
 from collections.abc import Iterable, Iterator
+from operator import index
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ._program import Process, answer_of
 from ._recording import Grasp, Recording
+from ._tables import check_pandas, label_columns, table_of
 from ._types import Label
 
+if TYPE_CHECKING:
+    import pandas
 
-@dataclasses.dataclass
+
+@dataclasses.dataclass(frozen=True)
+class PredictedGrasp:
+    """What a model predicts of one grasp: a row of `Predictions`, whose fields say what each is."""
+
+    file: str
+    grasp_id: int
+    probability_stable: float
+    action: str
+    reason: str
+    label: Label | None = None
+
+    @property
+    def is_lifted(self) -> bool:
+        """Whether the action is `lift`."""
+        return self.action == "lift"
+
+
+@dataclasses.dataclass(repr=False)
 class Predictions:
-    """What a model predicts of grasps: element i of each array is about the i-th grasp."""
+    """What a model predicts of grasps: element i of each array is about the i-th grasp.
+
+    `predictions[3]` is one grasp. A slice, a mask or a list of places gives the predictions of those grasps.
+    """
 
     file: NDArray[np.str_]
     """(n_grasps,): the file that the grasp is from; `-` for grasps that were given as arrays."""
@@ -38,6 +64,44 @@ class Predictions:
     def __len__(self) -> int:
         return len(self.grasp_id)
 
+    def __repr__(self) -> str:
+        n_lifted = int(self.is_lifted.sum())
+        said = f"{len(self)} grasps, {n_lifted} lifted, {len(self) - n_lifted} held"
+        if self.accuracy is not None:
+            said += f", accuracy {self.accuracy:.1%} of {self.is_labelled.sum()} labelled"
+        return f"Predictions({said})"
+
+    def __iter__(self) -> Iterator[PredictedGrasp]:
+        return (self[place] for place in range(len(self)))
+
+    @overload
+    def __getitem__(self, place: int) -> PredictedGrasp: ...
+
+    @overload
+    def __getitem__(self, place: slice | NDArray[Any] | list[int] | list[bool]) -> Predictions: ...
+
+    def __getitem__(self, place: Any) -> PredictedGrasp | Predictions:
+        # This raises IndexError as numpy does.
+        places = np.arange(len(self))[place]
+        if np.ndim(places) == 0:
+            idx = index(places)
+            return PredictedGrasp(
+                file=str(self.file[idx]),
+                grasp_id=int(self.grasp_id[idx]),
+                probability_stable=float(self.probability_stable[idx]),
+                action=str(self.action[idx]),
+                reason=str(self.reason[idx]),
+                label=self.labels[idx],
+            )
+        return Predictions(
+            file=self.file[places],
+            grasp_id=self.grasp_id[places],
+            probability_stable=self.probability_stable[places],
+            action=self.action[places],
+            reason=self.reason[places],
+            labels=[self.labels[idx] for idx in places],
+        )
+
     @property
     def is_labelled(self) -> NDArray[np.bool_]:
         """(n_grasps,): whether the grasp has a label."""
@@ -53,20 +117,53 @@ class Predictions:
         """(n_grasps,): whether the action is `lift`."""
         return np.equal(self.action, "lift")
 
+    @property
+    def accuracy(self) -> float | None:
+        """The share of right decisions among the labelled grasps; None if none is labelled."""
+        is_right = self.is_lifted == self.is_stable
+        return float(is_right[self.is_labelled].mean()) if self.is_labelled.any() else None
+
+    @property
+    def false_positives(self) -> int | None:
+        """The number of labelled grasps that are lifted and unstable; None if none is labelled."""
+        is_wrong = self.is_labelled & self.is_lifted & ~self.is_stable
+        return int(is_wrong.sum()) if self.is_labelled.any() else None
+
+    def to_frame(self) -> pandas.DataFrame:
+        """A table (pandas) with a row for each grasp.
+
+        Its columns are `file`, `grasp_id`, `probability_stable`, `action`, `reason`, and of the label `stable`,
+        `object`, `class`, `epsilon` and `volume`. Raises ModuleNotFoundError without pandas.
+        """
+        check_pandas()
+        names = ("file", "grasp_id", "probability_stable", "action", "reason")
+        columns = {name: getattr(self, name) for name in names}
+        return table_of(columns | label_columns(self.labels))
+
 
 Source = str | PathLike[str] | Recording | Grasp
 # Between two grasps that were given as arrays.
 PAUSE_NANOS = 1_000_000_000
+# Between two frames that were given without a time: 100 Hz, the rate of the simulated hand.
+PERIOD_NANOS = 10_000_000
+# So many settled frames decide a grasp (`votes` of the lift arbiter, docs/dataflow.md).
+N_VOTES = 3
+# The reasons of decisions that a probability made.
+DECIDED_BY_PROBABILITY = ("stable", "unstable", "unsure")
+# What a robot may sense beside joints and cells (docs/messages.md).
+SENSES = ("gravity_m_per_s2", "wrist_wrench", "joint_torques")
 
 
 class Model:
     """A model, as `blindgrasp model show` describes it.
 
-    Raises FileNotFoundError if there is no file, ProgramError if it is no model, and ProgramNotFoundError.
+    `hand` is the pad layout of its hand, if that is not built in. Raises FileNotFoundError if there is no file,
+    ProgramError if it is no model, and ProgramNotFoundError.
     """
 
-    def __init__(self, path: str | PathLike[str]) -> None:
+    def __init__(self, path: str | PathLike[str], hand: str | PathLike[str] | None = None) -> None:
         self.path = Path(fspath(path))
+        self._hand_words = [] if hand is None else ["--hand", fspath(hand)]
         if not self.path.is_file():
             raise FileNotFoundError(f"{self.path}: there is no such model file")
         info = answer_of(["model", "show", str(self.path.absolute()), "--json"])
@@ -88,16 +185,31 @@ class Model:
     def __repr__(self) -> str:
         return f"Model({str(self.path)!r}, hand={self.hand!r}, recipe={self.recipe!r})"
 
-    def predict(self, source: Source | Iterable[Source]) -> Predictions:
+    def predict(
+        self, source: Source | Iterable[Source] | pandas.DataFrame | ArrayLike, cells_newtons: ArrayLike | None = None
+    ) -> Predictions:
         """Decides grasps as a graph with this model would (`blindgrasp predict`).
 
         `source` is a recording (its path or a Recording), a Grasp, or several of one kind. A Grasp may be made by hand
         from arrays of your own. Recordings are read by the program, one grasp at a time. Grasps are decided as if each
         followed the one before it; a frame that is missing inside a grasp holds it, and so does another `hand_id`.
 
-        Raises ProgramError if a recording cannot be read or is of another hand.
+        `source` may also be a table of `Recording.to_frame`; or the joints, if `cells_newtons` is given: arrays
+        (n_grasps, n_joints) and (n_grasps, n_cells) of a settled frame, or (n_grasps, n_frames, n_joints) and
+        (n_grasps, n_frames, n_cells) of several. `grasp_id` is then the row. The last frame is repeated if there are
+        fewer than three, which is how many the arbiter asks for.
+
+        Raises ProgramError if a recording cannot be read or is of another hand, and ValueError if arrays or tables have
+        other numbers of joints or cells than the hand.
         """
-        sources = [source] if isinstance(source, (str, PathLike, Recording, Grasp)) else list(source)
+        if cells_newtons is not None:
+            return self._predict_settled(_settled_grasps({"joints": source, "cells_newtons": cells_newtons}))
+        if hasattr(source, "columns"):
+            return self._predict_settled(_settled_grasps(_arrays_of_table(source)))
+        if isinstance(source, np.ndarray):
+            raise TypeError("one array: expected two, the joints and the cells")
+        given: Any = [source] if isinstance(source, (str, PathLike, Recording, Grasp)) else source
+        sources = list(given)
         grasps = [source for source in sources if isinstance(source, Grasp)]
         others = [source for source in sources if not isinstance(source, Grasp)]
         paths = [source.path if isinstance(source, Recording) else Path(source) for source in others]
@@ -110,8 +222,77 @@ class Model:
         with tempfile.TemporaryFile() as frames:
             frames.writelines(_frame_lines(grasps))
             frames.seek(0)
-            with Process(["predict", "--json", str(self.path.absolute()), *files], stdin=frames) as process:
+            arguments = ["predict", "--json", *self._hand_words, str(self.path.absolute()), *files]
+            with Process(arguments, stdin=frames) as process:
                 return _predictions(list(process.lines()), [grasp.label for grasp in grasps] if grasps else None)
+
+    def _predict_settled(self, grasps: list[Grasp]) -> Predictions:
+        predictions = self.predict(grasps)
+        if grasps and (predictions.reason == "invalid").all():
+            n_joints, n_cells = grasps[0].joints.shape[1], grasps[0].cells_newtons.shape[1]
+            raise ValueError(
+                f"{n_joints} joints and {n_cells} cells: expected finite numbers, as many as the hand {self.hand} has"
+            )
+        return predictions
+
+    def predict_proba(
+        self, source: Source | Iterable[Source] | pandas.DataFrame | ArrayLike, cells_newtons: ArrayLike | None = None
+    ) -> NDArray[np.float64]:
+        """The probability that each grasp is unstable, and that it is stable: (n_grasps, 2), as in scikit-learn.
+
+        `source` and errors are those of `predict`. The second column is its `probability_stable`: the lowest among the
+        settled frames that decided. These are the first three frames, if they agree. A row is NaN if no probability
+        decided: no cell feels the object, the grasp is out of distribution, its frames do not agree, or frames are
+        missing or faulty. The reason is in `predict`. The arbiter holds such a grasp, so
+        `np.nan_to_num(model.predict_proba(source)[:, 1])` ranks it last.
+        """
+        predictions = self.predict(source, cells_newtons)
+        is_decided = np.isin(predictions.reason, DECIDED_BY_PROBABILITY)
+        stable = np.where(is_decided, predictions.probability_stable, np.nan)
+        return np.column_stack([1 - stable, stable])
+
+
+def _arrays_of_table(table: Any) -> dict[str, Any]:
+    """The joints, cells and senses of a table of `Recording.to_frame`, by their names in a Grasp."""
+    patterns = {"joints": r"joint_\d+", "cells_newtons": r"cell_.+"} | {sense: rf"{sense}_\d+" for sense in SENSES}
+    columns = {
+        name: [column for column in table.columns if re.fullmatch(pattern, str(column))]
+        for name, pattern in patterns.items()
+    }
+    if not columns["joints"] or not columns["cells_newtons"]:
+        raise ValueError("the table has no columns joint_0, … and cell_0, …: expected one of Recording.to_frame")
+    return {name: table[found].to_numpy(float) for name, found in columns.items() if found}
+
+
+def _settled_grasps(given: dict[str, Any]) -> list[Grasp]:
+    """Grasps of settled frames, from arrays (n_grasps, n_values) or (n_grasps, n_frames, n_values)."""
+    arrays = {name: np.asarray(array, float) for name, array in given.items()}
+    arrays = {name: array[:, np.newaxis] if array.ndim == 2 else array for name, array in arrays.items()}
+    shapes = {array.shape[:2] for array in arrays.values()}
+    if len(shapes) != 1 or any(array.ndim != 3 for array in arrays.values()):
+        found = ", ".join(f"{name} {np.shape(array)}" for name, array in given.items())
+        raise ValueError(
+            f"expected (n_grasps, n_values) or (n_grasps, n_frames, n_values), with as many grasps and frames in each "
+            f"array, found {found}"
+        )
+    ((n_grasps, n_frames),) = shapes
+    if n_frames == 0:
+        raise ValueError("the grasps have no frames: there is nothing to decide on")
+    frames = np.minimum(np.arange(max(n_frames, N_VOTES)), n_frames - 1)
+    numbers = np.arange(len(frames))
+    return [
+        Grasp(
+            grasp_id=place,
+            epoch=0,
+            seq=numbers.astype(np.uint64),
+            stamp_nanos=numbers * PERIOD_NANOS,
+            phase=np.full(len(frames), "settled"),
+            joints=arrays["joints"][place][frames],
+            cells_newtons=arrays["cells_newtons"][place][frames],
+            senses={name: array[place][frames] for name, array in arrays.items() if name in SENSES},
+        )
+        for place in range(n_grasps)
+    ]
 
 
 def _predictions(lines: list[dict[str, Any]], labels: list[Label | None] | None) -> Predictions:

@@ -65,10 +65,13 @@ def _is_executable(path: Path) -> bool:
 class Process:
     """A run of the program that prints a JSON object a line. As a context manager it ends the program.
 
-    The program has a process group of its own: Ctrl-C reaches it once, from here, and not also from the terminal.
+    Relative paths in its arguments begin at `folder`, or at the current folder. The program has a process group of its
+    own: Ctrl-C reaches it once, from here, and not also from the terminal.
     """
 
-    def __init__(self, arguments: list[str], stdin: IO[bytes] | None = None) -> None:
+    def __init__(
+        self, arguments: list[str], stdin: IO[bytes] | None = None, folder: str | os.PathLike[str] | None = None
+    ) -> None:
         self.command = [str(program()), *arguments]
         # A file takes any amount of text while nobody reads it.
         self._stderr = tempfile.TemporaryFile()
@@ -77,6 +80,7 @@ class Process:
             stdin=subprocess.DEVNULL if stdin is None else stdin,
             stdout=subprocess.PIPE,
             stderr=self._stderr,
+            cwd=folder,
             process_group=0,
         )
         self.pid = self._process.pid
@@ -135,8 +139,8 @@ class Process:
         return [json.loads(line) for line in unread if line.endswith(b"\n")]
 
 
-def answer_of(arguments: list[str]) -> dict[str, Any]:
-    """The one JSON object that a command prints, over one line or several.
+def answer_of(arguments: list[str]) -> Any:
+    """The one JSON value that a command prints, over one line or several.
 
     Raises ProgramError if the command fails.
     """
@@ -144,5 +148,4 @@ def answer_of(arguments: list[str]) -> dict[str, Any]:
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
     if done.returncode:
         raise ProgramError(command, done.returncode, done.stderr.decode(errors="replace"))
-    answer: dict[str, Any] = json.loads(done.stdout)
-    return answer
+    return json.loads(done.stdout)

@@ -12,9 +12,11 @@ import struct
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
+from operator import index
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, overload
 
 import mcap.exceptions
 import numpy as np
@@ -23,7 +25,11 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 from ._cdr import decoder
-from ._types import Decision, Label
+from ._tables import cell_names, check_pandas, label_columns, mean_of_rows, table_of
+from ._types import WHILE_LIFTING, Decision, Label
+
+if TYPE_CHECKING:
+    import pandas
 
 MAGIC = b"\x89MCAP0\r\n"
 # The footer: operation code, length, start of the summary, start of its offsets, checksum.
@@ -39,8 +45,6 @@ PHASES = (
     "lifting",
 )  # fmt: skip
 ACTIONS = {0: "hold", 1: "lift", 3: "squeeze", 4: "test_lift", 5: "tighten", 6: "set_down", 7: "go_on"}
-# Actions that are told while the arm lifts.
-WHILE_LIFTING = {"tighten", "set_down", "go_on"}
 REASONS = (
     "stable", "unstable", "no_agreement", "missing", "out_of_order", "stale", "no_contact", "invalid", "self_collision",
     "wrong_hand", "wrong_model", "out_of_distribution", "unsure", "link_down", "promising", "missing_reading",
@@ -92,8 +96,13 @@ class Grasp:
 
     def __repr__(self) -> str:
         (n_frames, n_cells), n_joints = self.cells_newtons.shape, self.joints.shape[1]
-        sizes = f"{n_frames} frames of {n_joints} joints and {n_cells} cells"
-        return f"Grasp({self.grasp_id}: {sizes}, label={self.label}, decision={self.decision})"
+        said = f"{n_frames} frames of {n_joints} joints and {n_cells} cells"
+        if self.label is not None:
+            said += f", label {'stable' if self.label.is_stable else 'unstable'}"
+            said += f" ({self.label.object_id})" if self.label.object_id else ""
+        if self.decision is not None:
+            said += f", decision {self.decision.action} ({self.decision.reason})"
+        return f"Grasp({self.grasp_id}: {said})"
 
     @property
     def decision(self) -> Decision | None:
@@ -103,7 +112,7 @@ class Grasp:
 
 
 class Recording:
-    """A recording: its metadata at once, and its grasps by iteration, as often as wanted.
+    """A recording: its metadata at once, and its grasps by iteration or by their places, as often as wanted.
 
     `topic` is the topic of the frames; labels are read from `/truth` and decisions from `/decision`. Raises
     FileNotFoundError if there is no file, and RecordingError if it is no recording, was cut off, or has no frames on
@@ -144,6 +153,7 @@ class Recording:
         """The hand's name."""
         self.hand_id: str = ours.get("hand_id", "")
         """The identity of the hand's layout, 16 hexadecimal digits."""
+        self._n_grasps: int | None = None
 
     def __repr__(self) -> str:
         return f"Recording({str(self.path)!r}, hand={self.hand!r}, n_frames={self.topics[self.topic]})"
@@ -154,20 +164,103 @@ class Recording:
         Raises RecordingError if the file is damaged, or if frames of a grasp lie on both sides of another grasp.
         """
         labels, decisions = self._labels_and_decisions()
+        for frames in self._frames_of_grasps():
+            yield self._grasp(frames, labels, decisions)
+
+    def __len__(self) -> int:
+        """The number of grasps.
+
+        The first call reads all frames, because no index of the file has the number. It is kept. `list(recording)` asks
+        for it as well; `blindgrasp.read` does not.
+        """
+        if self._n_grasps is None:
+            self._n_grasps = sum(1 for _ in self._frames_of_grasps())
+        return self._n_grasps
+
+    @overload
+    def __getitem__(self, place: int) -> Grasp: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> list[Grasp]: ...
+
+    def __getitem__(self, place: int | slice) -> Grasp | list[Grasp]:
+        """The grasp at a place, from 0, or -1 for the last one; a slice is a list.
+
+        A place is not a `grasp_id`. The file is read from its beginning to that place, each time: iterate to see all
+        grasps, or keep them with `blindgrasp.read`.
+        """
+        if isinstance(place, slice):
+            wanted = range(len(self))[place]
+            n_read = max(wanted, default=-1) + 1
+            found = {idx: grasp for idx, grasp in enumerate(islice(self, n_read)) if idx in wanted}
+            return [found[idx] for idx in wanted]
+        idx = index(place)
+        if idx < 0:
+            idx += len(self)
+        grasp = next(islice(self, idx, None), None) if idx >= 0 else None
+        if grasp is None:
+            raise IndexError(f"{self.path} has {len(self)} grasps: there is none at the place {place}")
+        return grasp
+
+    def to_frame(self, hand: str | PathLike[str] | None = None) -> pandas.DataFrame:
+        """A table (pandas) with a row for each grasp.
+
+        Its columns are `grasp_id` and `n_frames`; the mean over the settled frames of each joint (`joint_0`, …), cell
+        (`cell_0`, …) and other sense (`gravity_m_per_s2_0`, …); `stable`, `object`, `class`, `epsilon` and `volume` of
+        the label; `action`, `reason` and `probability_stable` of the decision. A reading that is NaN is in no mean.
+        What is not known of a grasp is missing in its row.
+
+        With `hand`, the name of a built-in hand or the path of a pad layout, the columns of cells have the name of the
+        pad, like `cell_palm_0`; the program tells it. Memory holds the table, and the frames of one grasp.
+
+        Raises ModuleNotFoundError without pandas, and ValueError if the hand has another number of cells.
+        """
+        check_pandas()
+        names = None if hand is None else cell_names(fspath(hand))
+        # Of each sense, the mean by the place of the grasp.
+        means: dict[str, dict[int, NDArray[np.float64]]] = defaultdict(dict)
+        ids, n_frames, labels, decisions = [], [], [], []
+        for place, grasp in enumerate(self):
+            for sense, rows in ({"joint": grasp.joints, "cell": grasp.cells_newtons} | grasp.senses).items():
+                means[sense][place] = mean_of_rows(rows[grasp.phase == "settled"])
+            ids.append(grasp.grasp_id)
+            n_frames.append(len(grasp.phase))
+            labels.append(grasp.label)
+            decisions.append(grasp.decision)
+        columns: dict[str, Any] = {"grasp_id": ids, "n_frames": n_frames}
+        for sense, found in means.items():
+            table = _table([found.get(place, np.empty(0)) for place in range(len(ids))])
+            numbers = [str(idx) for idx in range(table.shape[1])]
+            if sense == "cell" and names is not None and len(names) != len(numbers):
+                raise ValueError(
+                    f"{self.path} has {len(numbers)} cells and the hand {hand} has {len(names)}: "
+                    f"expected the pad layout of the hand {self.hand}"
+                )
+            of_sense = names if sense == "cell" and names is not None else numbers
+            columns |= {f"{sense}_{name}": table[:, idx] for idx, name in enumerate(of_sense)}
+        columns |= label_columns(labels)
+        columns["action"] = [decision and decision.action for decision in decisions]
+        columns["reason"] = [decision and decision.reason for decision in decisions]
+        columns["probability_stable"] = [decision.probability_stable if decision else np.nan for decision in decisions]
+        return table_of(columns)
+
+    def _frames_of_grasps(self) -> Iterator[list[Any]]:
+        """The frames of each grasp. The number of grasps is known at the end."""
         frames: list[Any] = []
-        key: Key | None = None
         seen: set[Key] = set()
         for _, frame in self._messages([self.topic]):
-            if _key(frame) != key:
+            key = _key(frame)
+            if not frames or key != _key(frames[0]):
                 if frames:
-                    yield self._grasp(frames, labels, decisions)
-                key, frames = _key(frame), []
+                    yield frames
+                frames = []
                 if key in seen:
                     raise RecordingError(f"{self.path}: frames of another grasp lie between those of grasp {key[1]}")
                 seen.add(key)
             frames.append(frame)
         if frames:
-            yield self._grasp(frames, labels, decisions)
+            yield frames
+        self._n_grasps = len(seen)
 
     def _messages(self, topics: Sequence[str]) -> Iterator[tuple[str, Any]]:
         """The topics and messages in the order of the file, which is the order in which they came."""
@@ -255,7 +348,8 @@ def read(path: str | PathLike[str]) -> list[Grasp]:
 
     Raises FileNotFoundError or RecordingError, as `Recording` does.
     """
-    return list(Recording(path))
+    # `list` would ask a Recording for its length, which reads the file once more.
+    return list(iter(Recording(path)))
 
 
 def _key(message: Any) -> Key:
@@ -279,7 +373,7 @@ def _decision(message: Any) -> Decision:
     )
 
 
-def _table(rows: Sequence[Sequence[float]]) -> NDArray[np.float64]:
+def _table(rows: Sequence[Sequence[float] | NDArray[np.float64]]) -> NDArray[np.float64]:
     """Rows of numbers as an array; a row that is shorter than the longest one ends with NaN."""
     table = np.full((len(rows), max(map(len, rows))), np.nan)
     for row, values in zip(table, rows):

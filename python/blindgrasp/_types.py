@@ -7,6 +7,9 @@ import math
 import time
 from typing import Any
 
+# Actions that are told while the arm lifts.
+WHILE_LIFTING = {"tighten", "set_down", "go_on"}
+
 
 @dataclasses.dataclass(frozen=True)
 class Label:

@@ -10,7 +10,9 @@ import json
 import math
 import os
 import re
+import shlex
 import subprocess
+import sys
 import tempfile
 import unittest
 from pathlib import Path
@@ -19,6 +21,7 @@ from xml.etree import ElementTree
 
 import blindgrasp
 import numpy as np
+import pandas as pd
 from blindgrasp import _recording
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -113,6 +116,84 @@ class Recordings(Folder):
         self.assertEqual([grasp.grasp_id for grasp in recording], list(range(12)))
         self.assertEqual(recording.topics["/tactile"], sum(len(grasp.seq) for grasp in recording))
 
+    def test_a_recording_has_a_length_and_places(self):
+        recording, grasps = blindgrasp.Recording(ORDINARY), blindgrasp.read(ORDINARY)
+        self.assertEqual([recording[place].grasp_id for place in (0, 3, -1, np.int64(-12))], [0, 3, 11, 0])
+        np.testing.assert_array_equal(recording[3].cells_newtons, grasps[3].cells_newtons)
+        self.assertEqual(len(recording), 12)
+        for part in (slice(2, 5), slice(-2, None), slice(9, 2, -3), slice(20, None), slice(None, None, 4)):
+            self.assertEqual([grasp.grasp_id for grasp in recording[part]], list(range(12))[part], part)
+        for place in (12, -13):
+            with self.assertRaisesRegex(IndexError, f"12 grasps: there is none at the place {place}"):
+                recording[place]
+        with self.assertRaises(TypeError):
+            recording["3"]
+        self.assertLess(len(repr(grasps[3])), 120)
+        self.assertEqual(
+            repr(grasps[3]),
+            "Grasp(3: 14 frames of 7 joints and 96 cells, label stable (bowl-02), decision lift (stable))",
+        )
+
+    def test_the_length_is_read_once_and_not_by_read(self):
+        recording = blindgrasp.Recording(ORDINARY)
+        with mock.patch.object(recording, "_frames_of_grasps", wraps=recording._frames_of_grasps) as reads:
+            self.assertEqual((len(list(recording)), len(recording)), (12, 12))
+            self.assertEqual(reads.call_count, 2)
+        with mock.patch.object(blindgrasp.Recording, "__len__", side_effect=AssertionError):
+            self.assertEqual(len(blindgrasp.read(ORDINARY)), 12)
+
+    def test_a_table_has_the_settled_means_the_label_and_the_decision_of_each_grasp(self):
+        grasps = blindgrasp.read(ORDINARY)
+        table = blindgrasp.Recording(ORDINARY).to_frame()
+        self.assertEqual(table["grasp_id"].tolist(), list(range(12)))
+        self.assertEqual(table["n_frames"].tolist(), [14] * 12)
+        for grasp, (_, row) in zip(grasps, table.iterrows(), strict=True):
+            settled = grasp.phase == "settled"
+            cells = row.filter(like="cell_").to_numpy(float)
+            np.testing.assert_allclose(cells, grasp.cells_newtons[settled].mean(axis=0), atol=1e-12)
+            np.testing.assert_allclose(row.filter(like="joint_").to_numpy(float), grasp.joints[settled].mean(axis=0))
+            label, decision = grasp.label, grasp.decision
+            found = (row["stable"], row["object"], row["class"], row["epsilon"], row["volume"])
+            self.assertEqual(found, (label.is_stable, label.object_id, label.object_class, label.epsilon, label.volume))
+            found = (row["action"], row["reason"], row["probability_stable"])
+            self.assertEqual(found, (decision.action, decision.reason, decision.probability_stable))
+        self.assertEqual(table["stable"].dtype, bool)
+        self.assertTrue(blindgrasp.Recording(HELD_OUT).to_frame()["action"].isna().all())
+        path = self.folder / "grasps.parquet"
+        table.to_parquet(path)
+        pd.testing.assert_frame_equal(pd.read_parquet(path), table)
+
+    def test_the_cells_of_a_table_have_the_names_of_the_pads(self):
+        recording = blindgrasp.Recording(ORDINARY)
+        numbered = recording.to_frame().filter(like="cell_")
+        self.assertEqual(numbered.columns.tolist(), [f"cell_{idx}" for idx in range(96)])
+        for hand in ("barrett-bh8-280", REPOSITORY / "hands/barrett-bh8-280.yaml"):
+            named = recording.to_frame(hand=hand).filter(like="cell_")
+            pads = ("palm", "finger_1", "finger_2", "finger_3")
+            self.assertEqual(named.columns.tolist(), [f"cell_{pad}_{idx}" for pad in pads for idx in range(24)])
+            np.testing.assert_array_equal(named.to_numpy(), numbered.to_numpy())
+        with self.assertRaisesRegex(ValueError, "96 cells and the hand parallel-gripper has"):
+            recording.to_frame(hand="parallel-gripper")
+        with self.assertRaisesRegex(ValueError, "is no hand"):
+            recording.to_frame(hand=ORDINARY)
+
+    def test_what_is_not_known_is_missing_in_a_table(self):
+        nan = math.nan
+        rows = np.array([[1.0, nan, nan], [3.0, 5.0, nan]])
+        np.testing.assert_array_equal(_recording.mean_of_rows(rows), [2.0, 5.0, nan])
+        np.testing.assert_array_equal(_recording.mean_of_rows(rows[:0]), [nan] * 3)
+        columns = pd.DataFrame(_recording.label_columns([blindgrasp.Label(True, object_id="mug-02"), None]))
+        self.assertEqual(columns["stable"].isna().tolist(), [False, True])
+        self.assertEqual(columns["object"].isna().tolist(), [False, True])
+        self.assertTrue(columns[["class", "epsilon"]].isna().all(axis=None))
+
+    def test_a_table_without_pandas_is_refused_in_words(self):
+        with mock.patch.dict(sys.modules, pandas=None):
+            with self.assertRaisesRegex(ModuleNotFoundError, "pip install pandas"):
+                blindgrasp.Recording(ORDINARY).to_frame()
+            with self.assertRaisesRegex(ModuleNotFoundError, "pip install pandas"):
+                blindgrasp.Model(MODEL).predict(ORDINARY).to_frame()
+
     def test_codes_are_those_of_the_messages(self):
         path = REPOSITORY / "operators/blindgrasp_messages.py"
         spec = importlib.util.spec_from_file_location("blindgrasp_messages", path)
@@ -198,6 +279,90 @@ class Models(Folder):
         with self.assertRaisesRegex(blindgrasp.ProgramError, "none.mcap"):
             model.predict(self.folder / "none.mcap")
         return of_path
+
+    def test_predictions_are_a_sequence_and_a_table(self):
+        found = blindgrasp.Model(MODEL).predict(HELD_OUT)
+        n_lifted = int(found.is_lifted.sum())
+        accuracy = np.mean(found.is_lifted == found.is_stable)
+        self.assertEqual(
+            repr(found),
+            f"Predictions(240 grasps, {n_lifted} lifted, {240 - n_lifted} held, "
+            f"accuracy {accuracy:.1%} of 240 labelled)",
+        )
+        self.assertAlmostEqual(found.accuracy, accuracy)
+        self.assertEqual(found.false_positives, np.sum(found.is_lifted & ~found.is_stable))
+        rows = list(found)
+        self.assertEqual(rows[-1], found[-1])
+        self.assertEqual([row.grasp_id for row in rows], found.grasp_id.tolist())
+        row = found[np.int64(3)]
+        self.assertEqual((row.grasp_id, row.label, row.is_lifted), (3, found.labels[3], found.is_lifted[3]))
+        for name in ("file", "probability_stable", "action", "reason"):
+            self.assertEqual(getattr(row, name), getattr(found, name)[3])
+        with self.assertRaises(IndexError):
+            found[240]
+        self.assertEqual(found[5:2:-1].grasp_id.tolist(), [5, 4, 3])
+        self.assertEqual(found[[7, 1]].labels, [found.labels[7], found.labels[1]])
+        wrong = found[found.is_lifted & ~found.is_stable]
+        self.assertEqual((len(wrong), wrong.accuracy), (found.false_positives, 0.0))
+        table = found.to_frame()
+        for name in ("file", "grasp_id", "probability_stable", "action", "reason"):
+            self.assertEqual(table[name].tolist(), getattr(found, name).tolist())
+        self.assertEqual(table["stable"].tolist(), found.is_stable.tolist())
+        self.assertEqual(table["object"].tolist(), [label.object_id for label in found.labels])
+        none = found[:0]
+        self.assertEqual((none.accuracy, none.false_positives, len(none.to_frame())), (None, None, 0))
+        self.assertEqual(repr(none), "Predictions(0 grasps, 0 lifted, 0 held)")
+
+    def test_probabilities_are_those_that_decided(self):
+        model = blindgrasp.Model(MODEL)
+        found, probabilities = model.predict(HELD_OUT), model.predict_proba(HELD_OUT)
+        self.assertEqual(probabilities.shape, (240, 2))
+        is_decided = np.isin(found.reason, ["stable", "unstable", "unsure"])
+        self.assertTrue(0 < is_decided.sum() < 240)
+        np.testing.assert_array_equal(probabilities[is_decided, 1], found.probability_stable[is_decided])
+        np.testing.assert_allclose(probabilities[is_decided].sum(axis=1), 1.0)
+        self.assertTrue(np.isnan(probabilities[~is_decided]).all())
+        np.testing.assert_array_equal(
+            probabilities[is_decided, 1] >= model.threshold_probability, found.is_lifted[is_decided]
+        )
+        np.testing.assert_array_equal(model.predict_proba(blindgrasp.read(HELD_OUT)), probabilities)
+        with_layout = blindgrasp.Model(MODEL, hand=REPOSITORY / "hands/barrett-bh8-280.yaml")
+        np.testing.assert_array_equal(with_layout.predict_proba(HELD_OUT), probabilities)
+
+    def test_arrays_and_tables_are_settled_frames(self):
+        model, grasps = blindgrasp.Model(MODEL), blindgrasp.read(HELD_OUT)[:20]
+        probabilities = model.predict_proba(grasps)
+        settled = [grasp.phase == "settled" for grasp in grasps]
+        joints = np.array([grasp.joints[rows] for grasp, rows in zip(grasps, settled)])
+        cells = np.array([grasp.cells_newtons[rows] for grasp, rows in zip(grasps, settled)])
+        self.assertEqual(cells.shape, (20, 6, 96))
+        np.testing.assert_array_equal(model.predict_proba(joints, cells), probabilities)
+        # A frame alone votes as often as is needed, and the lowest probability of three frames decides.
+        alone = np.array([model.predict_proba(joints[:, idx], cells[:, idx])[:, 1] for idx in range(3)])
+        is_one_sided = np.isin(model.predict(grasps).reason, ["stable", "unstable"])
+        np.testing.assert_array_equal(alone.min(axis=0)[is_one_sided], probabilities[is_one_sided, 1])
+        np.testing.assert_array_equal(model.predict_proba(joints[:, :1], cells[:, :1])[:, 1], alone[0])
+        table = blindgrasp.Recording(HELD_OUT).to_frame()[:20]
+        of_means = model.predict_proba(joints.mean(axis=1), cells.mean(axis=1))
+        np.testing.assert_allclose(model.predict_proba(table), of_means)
+        named = blindgrasp.Recording(HELD_OUT).to_frame(hand="barrett-bh8-280")[:20]
+        np.testing.assert_array_equal(model.predict_proba(named), model.predict_proba(table))
+        self.assertEqual(model.predict(table).grasp_id.tolist(), list(range(20)))
+        self.assertEqual(model.predict_proba(joints[:0], cells[:0]).shape, (0, 2))
+
+    def test_arrays_of_another_size_are_refused(self):
+        model, joints, cells = blindgrasp.Model(MODEL), np.zeros((4, 7)), np.ones((4, 96))
+        for given, words in (
+            ((joints, cells[:, :90]), "7 joints and 90 cells: expected finite numbers, as many as the hand barrett"),
+            ((joints, cells[:3]), r"in each array, found joints \(4, 7\), cells_newtons \(3, 96\)"),
+            ((joints[0], cells[0]), "as many grasps and frames in each array"),
+            ((joints[:, np.newaxis][:, :0], cells[:, np.newaxis][:, :0]), "nothing to decide on"),
+            ((pd.DataFrame({"stable": [True]}),), "no columns joint_0"),
+        ):
+            with self.assertRaisesRegex(ValueError, words):
+                model.predict_proba(*given)
+        with self.assertRaisesRegex(TypeError, "expected two, the joints and the cells"):
+            model.predict(joints)
 
     def test_the_program_predicts(self):
         found = self.check_predictions(blindgrasp.Model(MODEL))
@@ -292,6 +457,37 @@ class Graphs(Folder):
                 nodes = json.loads(shown.stdout)["graphs"][0]["nodes"]
                 os.kill(next(node["pid"] for node in nodes if node["node"] == "classifier"), 9)
                 list(graph)
+
+    def test_a_replay_gives_the_decision_of_each_grasp(self):
+        decisions = blindgrasp.replay(ORDINARY, DATAFLOW)
+        grasps = blindgrasp.read(ORDINARY)
+        self.assertEqual(list(decisions), [grasp.grasp_id for grasp in grasps])
+        for grasp in grasps:
+            found = decisions[grasp.grasp_id]
+            self.assertEqual((found.action, found.reason), (grasp.decision.action, grasp.decision.reason))
+            self.assertEqual(found.label, grasp.label)
+        is_lifted = np.array([decision.action == "lift" for decision in decisions.values()])
+        is_stable = np.array([grasp.label.is_stable for grasp in grasps])
+        self.assertAlmostEqual(decisions.accuracy, np.mean(is_lifted == is_stable))
+        self.assertEqual(decisions.false_positives, np.sum(is_lifted & ~is_stable))
+        self.assertRegex(repr(decisions), r"^ReplayedDecisions\(12 grasps, \d+ lifted, \d+ held, accuracy .*\)$")
+        self.assertEqual(decisions.summary["samples_lost"], 0)
+        self.assertNotIn(12, decisions)
+        strict = blindgrasp.replay(ORDINARY, DATAFLOW, set={"lift_arbiter.min_probability_stable": 1}, grasps=[1, 3])
+        self.assertEqual([(key, decision.action) for key, decision in strict.items()], [(1, "hold"), (3, "hold")])
+        with self.assertRaisesRegex(blindgrasp.ProgramError, "none.mcap"):
+            blindgrasp.replay(self.folder / "none.mcap", DATAFLOW)
+
+    def test_what_comes_while_the_arm_lifts_is_no_decision_about_the_lift(self):
+        line = {"grasp_id": 4, "reason": "stable", "probability_stable": 0.9, "seq": 0, "stamp_nanos": 0}
+        actions = ("test_lift", "lift", "set_down")
+        every = [blindgrasp.Decision.from_json(line | {"action": action}) for action in actions]
+        summary = {"accuracy": None, "false_positives": 0, "with_truth": 0}
+        decisions = blindgrasp.ReplayedDecisions(every, summary, "")
+        self.assertEqual((len(decisions), decisions[4].action, len(decisions.every)), (1, "lift", 3))
+        # Without labels, a test of false positives must not pass.
+        self.assertEqual((decisions.accuracy, decisions.false_positives), (None, None))
+        self.assertEqual(repr(decisions), "ReplayedDecisions(1 grasps, 1 lifted, 0 held)")
 
     def test_only_a_live_lift_may_be_acted_upon(self):
         live = {"grasp_id": 1, "action": "lift", "reason": "stable", "probability_stable": 0.9}
@@ -398,7 +594,55 @@ class Mjcf(Folder):
             urdf_of(path, self.folder / "hand.urdf")
 
 
+# A test as users write it. The last two of its tests fail.
+REPLAYING_TEST = """
+def test_it_lifts(replay):
+    decisions = replay("recordings/ordinary.mcap", "../dataflow.yaml", set={"model": "model.json"})
+    assert decisions[3].action == "lift" and decisions[3].label.is_stable
+    assert decisions.accuracy > 0.8
+
+def test_it_is_careful(replay):
+    decisions = replay("recordings/ordinary.mcap", "../dataflow.yaml", set={"min_probability_stable": 1})
+    assert decisions.false_positives == 0
+
+def test_it_always_lifts(replay):
+    decisions = replay("recordings/no-contact.mcap", "../dataflow.yaml")
+    assert decisions[0].action == "lift"
+
+def test_there_is_a_recording(replay):
+    replay("recordings/none.mcap", "../dataflow.yaml")
+"""
+
+
+class Pytest(Folder):
+    def test_the_fixture_replays_recordings_beside_the_test(self):
+        tests = self.folder / "tests"
+        tests.mkdir()
+        for name in ("models", "hands"):
+            (self.folder / name).symlink_to(REPOSITORY / name)
+        (tests / "recordings").symlink_to(REPOSITORY / "recordings")
+        (tests / "model.json").symlink_to(MODEL)
+        (self.folder / "dataflow.yaml").write_text(DATAFLOW.read_text())
+        (self.folder / "recordings").symlink_to(REPOSITORY / "recordings")
+        (tests / "test_grasps.py").write_text(REPLAYING_TEST)
+        plugins = ["-p", "blindgrasp.pytest_plugin", "-p", "no:cacheprovider"]
+        command = [sys.executable, "-m", "pytest", *plugins, str(tests)]
+        package = str(Path(blindgrasp.__file__).parents[1])
+        # The entry point of an installed package would load the fixture a second time.
+        environment = os.environ | {"PYTHONPATH": package, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+        environment["BLINDGRASP_PROGRAM"] = str(blindgrasp.program())
+        done = subprocess.run(command, cwd=self.folder, env=environment, capture_output=True, text=True)
+        self.assertEqual(done.returncode, 1, done.stdout + done.stderr)
+        self.assertIn("2 failed, 2 passed", done.stdout)
+        self.assertIn("AssertionError: assert 'hold' == 'lift'", done.stdout)
+        self.assertIn("recordings/none.mcap: No such file", done.stdout)
+
+
 class Program(Folder):
+    def test_the_version_is_that_of_the_program(self):
+        done = subprocess.run([blindgrasp.program(), "--version"], stdout=subprocess.PIPE, text=True, check=True)
+        self.assertEqual(f"blindgrasp {blindgrasp.__version__}", done.stdout.strip())
+
     def test_the_program_is_found_or_missed_in_words(self):
         there = str(blindgrasp.program())
         self.assertTrue(os.access(there, os.X_OK))
@@ -413,6 +657,32 @@ class Program(Folder):
                     blindgrasp.program()
                 (self.folder / "blindgrasp").symlink_to(there)
                 self.assertEqual(blindgrasp.program(), self.folder / "blindgrasp")
+
+
+class Pages(Folder):
+    def test_the_examples_of_the_page_run_as_they_stand(self):
+        for name in ("recordings", "models", "hands", "dataflow.yaml"):
+            (self.folder / name).symlink_to(REPOSITORY / name)
+        page = (REPOSITORY / "docs/python.md").read_text()
+        codes = re.findall("^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+        self.assertGreater(len(codes), 6)
+        commands = re.findall("^blindgrasp (?:export|import) (?:.*\\\\\n)*.*$", page, re.MULTILINE)
+        self.assertEqual(len(commands), 2)
+        names, printed = {"__name__": "__main__"}, io.StringIO()
+        with contextlib.chdir(self.folder), contextlib.redirect_stdout(printed):
+            for idx, code in enumerate(codes):
+                exec(compile(code.replace('"mine"', repr(unique_name())), f"python.md, block {idx}", "exec"), names)
+            for command in commands:
+                words = shlex.split(command.replace("\\\n", " "))[1:]
+                subprocess.run([blindgrasp.program(), *words], stdout=subprocess.DEVNULL, check=True)
+        self.assertIn("Predictions(240 grasps", printed.getvalue())
+        features = pd.read_csv(self.folder / "features.csv")
+        self.assertLessEqual({"stable", "object"}, set(features.columns))
+        # The table has become a recording again.
+        table, again = names["table"], blindgrasp.Recording(self.folder / "grasps.mcap").to_frame()
+        self.assertEqual(again["stable"].tolist(), table["stable"].tolist())
+        cells = [frame.filter(like="cell_").to_numpy() for frame in (table, again)]
+        np.testing.assert_allclose(cells[1], cells[0], atol=1e-12)
 
 
 class Notebook(Folder):

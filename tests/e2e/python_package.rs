@@ -43,6 +43,9 @@ fn a_wheel_with_the_program_installs_package_operator_modules_and_command() {
         text(&output.stdout).trim().to_string()
     };
     assert_eq!(run(python(), &["-c", asks]), utf8(&installed.join("blindgrasp/bin/blindgrasp")));
+    // pytest finds the fixture by the wheel's entry point.
+    let fixtures = run(python(), &["-m", "pytest", "--fixtures", "-p", "no:cacheprovider"]);
+    assert!(fixtures.contains("\nreplay -- "), "{fixtures}");
     let version = run(Path::new(PROGRAM), &["--version"]);
     assert_eq!(run(&installed.join("bin/blindgrasp"), &["--version"]), version);
 }

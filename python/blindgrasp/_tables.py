@@ -1,0 +1,69 @@
+"""Tables for pandas, which is needed by nothing else here."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ._program import answer_of
+from ._types import Label
+
+if TYPE_CHECKING:
+    import pandas
+
+
+def check_pandas() -> None:
+    """Raises ModuleNotFoundError if pandas is not installed."""
+    try:
+        importlib.import_module("pandas")
+    except ModuleNotFoundError as error:
+        if error.name != "pandas":
+            raise
+        missing = "to_frame needs pandas, which is not installed: pip install pandas"
+        raise ModuleNotFoundError(missing, name="pandas") from error
+
+
+def table_of(columns: dict[str, Any]) -> pandas.DataFrame:
+    """The columns as a table."""
+    import pandas
+
+    return pandas.DataFrame(columns)
+
+
+def label_columns(labels: Sequence[Label | None]) -> dict[str, Any]:
+    """The columns of labels, named as the tables of `blindgrasp export` name them."""
+    import pandas
+
+    known = [label or Label(False) for label in labels]
+    # A column of bool cannot say that a label is not known.
+    dtype = "boolean" if None in labels else "bool"
+    return {
+        "stable": pandas.array([label and label.is_stable for label in labels], dtype=dtype),
+        "object": [label.object_id or None for label in known],
+        "class": [label.object_class or None for label in known],
+        "epsilon": [label.epsilon for label in known],
+        "volume": [label.volume for label in known],
+    }
+
+
+def mean_of_rows(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The mean of each column without its NaN; NaN where there is no number."""
+    n_known = np.sum(~np.isnan(rows), axis=0)
+    means = np.full(rows.shape[1], np.nan)
+    np.divide(np.nansum(rows, axis=0), n_known, out=means, where=n_known > 0)
+    return means
+
+
+def cell_names(hand: str) -> list[str]:
+    """The pads and numbers of a hand's cells, like `palm_0`, as the program tells them.
+
+    Raises ProgramError if there is no such hand.
+    """
+    cells = answer_of(["info", hand, "--json"])
+    if not isinstance(cells, list):
+        raise ValueError(f"{hand} is no hand: expected the name of a built-in hand, or the path of a pad layout (YAML)")
+    return [f"{cell['pad']}_{cell['cell']}" for cell in cells]
