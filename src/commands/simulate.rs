@@ -376,7 +376,7 @@ fn stable_fraction(text: &str) -> Result<StableFraction, String> {
         "natural" => Ok(StableFraction(None)),
         _ => number_in(text, 0.0..=1.0)
             .map(|fraction| StableFraction(Some(fraction)))
-            .map_err(|expected| format!("{expected}, or natural")),
+            .map_err(|expected| expected.replacen("expected ", "expected natural, or ", 1)),
     }
 }
 

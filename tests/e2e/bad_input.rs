@@ -157,7 +157,11 @@ fn simulations() {
     let folder = Folder::new();
     let out = folder.at("out.mcap");
     check(&["simulate", "--objects", "bal", "--out", &out], 1, &["bal", "ball"]);
-    check(&["simulate", "--stable-fraction", "2", "--out", &out], 2, &["--stable-fraction", "0 to 1, or natural"]);
+    check(
+        &["simulate", "--stable-fraction", "2", "--out", &out],
+        2,
+        &["--stable-fraction", "expected natural, or a number from 0 to 1; 2 % are 0.02"],
+    );
     check(&["simulate", "--stable-fraction", "some", "--out", &out], 2, &["some", "natural"]);
     check(&["simulate", "--friction", "-1", "--out", &out], 2, &["--friction"]);
     check(&["simulate", "--out", "/nonexistent/out.mcap"], 1, &["/nonexistent", "no such folder"]);

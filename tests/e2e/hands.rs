@@ -391,5 +391,8 @@ fn a_hand_is_drawn_by_itself() {
     let error = text(&run(&["view", "allegro"], 2).stderr).to_owned();
     assert!(error.contains("--out is missing"), "{error}");
     let error = text(&run(&["view", "allegro", "--joints", "joint_1=9", "--out", utf8(&svg)], 1).stderr).to_owned();
-    assert!(error.contains("joint 'joint_1' is 9 rad, expected -0.196 to 1.61"), "{error}");
+    assert!(
+        error.contains("joint 'joint_1' is 9 rad, expected -0.1960 to 1.6100; 9 degrees are 0.1571 rad"),
+        "{error}"
+    );
 }

@@ -125,7 +125,7 @@ fn files_without_a_case_say_why() {
             assert!(stderr.contains(part), "expected '{part}' in\n{stderr}");
         }
     };
-    check("", &["no grasp case"]);
+    check("", &["expected grasp cases (JSON), found an empty file"]);
     check("[]", &["no grasp case"]);
     check("[\n{\"a\": NaN}]", &["line 2 column", "finite"]);
     check("[1, 2", &["line 1 column"]);

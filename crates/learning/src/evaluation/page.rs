@@ -465,7 +465,7 @@ fn how_made(report: &Report) -> String {
     items.push((
         "grasps",
         format!(
-            "{} with truth, of {} objects in {} classes; {} judged, {} held without a judgement",
+            "{} with a label, of {} objects in {} classes; {} judged, {} held without a judgement",
             count(data.n_grasps as f64),
             count(data.n_objects as f64),
             count(data.n_classes as f64),
