@@ -14,6 +14,8 @@ use blindgrasp_stages::steps;
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
+use crate::beginning::Beginning;
+
 #[derive(Deserialize)]
 struct Params {
     model: PathBuf,
@@ -39,6 +41,13 @@ pub(crate) fn describe() -> OperatorDescription {
             "Whether the outcomes of lifts (frames of the phases kept and dropped) correct the probabilities of the look that decided: \
              off keeps them and judges as the model does, on corrects after each one, frozen takes no more",
         )
+}
+
+/// The mistakes with which [`work`] would fail at once.
+pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+    let params: Params = parse_params(node.params)?;
+    Model::load(&params.model)?;
+    Ok(())
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {

@@ -48,28 +48,11 @@ pub(crate) fn with_connection_params(description: OperatorDescription) -> Operat
 }
 
 impl ConnectionParams {
-    /// The network, with a warning if others can reach it.
-    ///
-    /// # Errors
-    /// An endpoint is not valid, or the keys are of no use to it.
-    pub fn network(&self) -> Result<Network, RosError> {
-        let network = self.checked()?;
-        if network.keys.is_none() {
-            let mut endpoints = network.connect.iter().chain(&network.listen);
-            if let Some(endpoint) = endpoints.find(|endpoint| !is_on_loopback(endpoint)) {
-                print_diagnostic(&format!(
-                    "WARNING: {endpoint} without TLS: everybody who reaches it can read and send what passes there"
-                ));
-            }
-        }
-        Ok(network)
-    }
-
     /// The network.
     ///
     /// # Errors
     /// An endpoint is not valid, or the keys are of no use to it.
-    pub(crate) fn checked(&self) -> Result<Network, RosError> {
+    pub fn network(&self) -> Result<Network, RosError> {
         let keys = self.keys.as_deref().map(|folder| {
             let KeyFiles { authority, certificate, private_key } = key_files(folder, KEY_NAME);
             Keys { authority, certificate, private_key }
@@ -107,6 +90,19 @@ impl ConnectionParams {
     }
 }
 
+/// Warns if others can reach a network.
+pub fn warn_if_open(network: &Network) {
+    if network.keys.is_some() {
+        return;
+    }
+    let mut endpoints = network.connect.iter().chain(&network.listen);
+    if let Some(endpoint) = endpoints.find(|endpoint| !is_on_loopback(endpoint)) {
+        print_diagnostic(&format!(
+            "WARNING: {endpoint} without TLS: everybody who reaches it can read and send what passes there"
+        ));
+    }
+}
+
 /// Whether no other machine reaches an endpoint like `tcp/localhost:7447`.
 fn is_on_loopback(endpoint: &str) -> bool {
     let host = endpoint.split_once('/').and_then(|(_, address)| address.rsplit_once(':')).map_or("", |(host, _)| host);
@@ -121,7 +117,7 @@ mod tests {
     use super::*;
 
     fn params(yaml: &serde_json::Value) -> Result<Network, RosError> {
-        serde_json::from_value::<ConnectionParams>(yaml.clone()).expect("params").checked()
+        serde_json::from_value::<ConnectionParams>(yaml.clone()).expect("params").network()
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use blindgrasp_messages::{Contact, ContactSet, Fault, FrameParts, Phase, Recorded, TactileFrame, TactileFrameHead};
 use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::operator::Operator;
+use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
 use blindgrasp_stages::contacts::{ContactFinder, ContactSummary};
@@ -14,6 +14,8 @@ use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::sensors::{Described, SensorCheck, SensorFault, SensorMemory};
 use blindgrasp_stages::steps::{contact_set, find_contacts};
 use serde::Deserialize;
+
+use crate::beginning::Beginning;
 
 #[derive(Deserialize)]
 struct Params {
@@ -35,11 +37,9 @@ pub(crate) fn describe() -> OperatorDescription {
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
-    let params: Params = operator.params()?;
-    let (hand, mut identity) = hand_of(&params.hand)?;
+    let (hand, mut identity, check) = files_of(&operator.params()?)?;
     let mut watch = None;
-    if let Some(sensors) = &params.sensors {
-        let check = SensorCheck::load(sensors, &hand)?;
+    if let Some(check) = check {
         identity.insert("sensors".into(), format!("{:016x}", check.id()));
         let (memory, reported) = (SensorMemory::default(), Reported::default());
         watch = Some(Watch { operator: operator.clone(), check, memory, reported });
@@ -47,6 +47,18 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let max_contacts = hand.n_cells();
     let stage = FindContacts { hand, finder: ContactFinder::default(), watch };
     stage::run(operator, "tactile", "contacts", max_contacts, identity, stage)
+}
+
+/// The mistakes with which [`work`] would fail at once.
+pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+    files_of(&parse_params(node.params)?).map(drop)
+}
+
+/// The hand, its identity, and the sensor check.
+fn files_of(params: &Params) -> anyhow::Result<(Hand, BTreeMap<String, String>, Option<SensorCheck>)> {
+    let (hand, identity) = hand_of(&params.hand)?;
+    let check = params.sensors.as_ref().map(|sensors| SensorCheck::load(sensors, &hand)).transpose()?;
+    Ok((hand, identity, check))
 }
 
 pub(crate) fn hand_of(path: &Path) -> anyhow::Result<(Hand, BTreeMap<String, String>)> {

@@ -5,11 +5,13 @@ use std::path::PathBuf;
 use blindgrasp_messages::{ContactSet, Fault, GraspFeature, Phase, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operator::operator::Operator;
+use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage;
 use blindgrasp_stages::{Model, steps};
 use serde::Deserialize;
+
+use crate::beginning::Beginning;
 
 #[derive(Deserialize)]
 struct Params {
@@ -23,6 +25,13 @@ pub(crate) fn describe() -> OperatorDescription {
         .input("contacts", ContactSet::TYPE_NAME, "The contacts of each frame")
         .output("feature", GraspFeature::TYPE_NAME, "The feature of each frame")
         .param("model", ParamKind::Path { must_exist: true }, None, "The model file")
+}
+
+/// The mistakes with which [`work`] would fail at once.
+pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+    let params: Params = parse_params(node.params)?;
+    Model::load(&params.model)?;
+    Ok(())
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {

@@ -277,7 +277,7 @@ impl<'a> Check<'a> {
         let Ok(params) = serde_json::from_value::<ConnectionParams>(Value::Object(part.params.clone())) else {
             return;
         };
-        if let Err(error) = params.checked() {
+        if let Err(error) = params.network() {
             let help = "docs/ros2.md says what endpoints and keys a node can have".into();
             self.refuse(MisfitKind::Network, part, error.to_string(), help);
         } else if let Some(keys) = &params.keys

@@ -5,6 +5,7 @@
 
 #[cfg(test)]
 mod allocations;
+pub mod beginning;
 mod classifier;
 pub mod connection;
 mod contacts;
@@ -31,6 +32,8 @@ use blindgrasp_graph::operators::{LINK_OPERATOR, Operators};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 
+use crate::beginning::Beginning;
+
 /// The module for operators in Python, and the messages that it knows.
 pub const PYTHON_OPERATOR: &str = include_str!("blindgrasp_operator.py");
 pub const PYTHON_MESSAGES: &str = include_str!("blindgrasp_messages.py");
@@ -51,21 +54,27 @@ pub struct Shipped {
 pub struct Form {
     pub describe: fn() -> OperatorDescription,
     pub work: fn(&Operator) -> anyhow::Result<()>,
+    /// Finds the mistakes in params and files with which `work` would fail at once.
+    pub check: Check,
 }
+
+/// See [`Form::check`].
+pub type Check = fn(&Beginning<'_>) -> anyhow::Result<()>;
 
 /// All of them. A new one is its file and a line here.
 pub const SHIPPED: [Shipped; 11] = [
     recorded_source::SHIPPED,
-    Shipped::new("tactile_source", tactile_source::describe, tactile_source::work),
-    Shipped::new("simulated_hand", simulated_hand::describe, simulated_hand::work),
-    Shipped::new("senses", senses::describe, senses::work).sharing_process(),
-    Shipped::new("contacts", contacts::describe, contacts::work).sharing_process(),
-    Shipped::new("encoder", encoder::describe, encoder::work).sharing_process(),
-    Shipped::new("classifier", classifier::describe, classifier::work).sharing_process(),
-    Shipped::new("lift_arbiter", lift_arbiter::describe, lift_arbiter::work).sharing_process(),
-    Shipped::new("ros2", ros2::describe, ros2::work),
-    Shipped::new("zenoh", zenoh::describe, zenoh::work),
-    Shipped::new(LINK_OPERATOR, link::describe, link::work),
+    Shipped::new("tactile_source", tactile_source::describe, tactile_source::work, tactile_source::check),
+    Shipped::new("simulated_hand", simulated_hand::describe, simulated_hand::work, simulated_hand::check),
+    Shipped::new("senses", senses::describe, senses::work, senses::check).sharing_process(),
+    Shipped::new("contacts", contacts::describe, contacts::work, contacts::check).sharing_process(),
+    Shipped::new("encoder", encoder::describe, encoder::work, encoder::check).sharing_process(),
+    Shipped::new("classifier", classifier::describe, classifier::work, classifier::check).sharing_process(),
+    Shipped::new("lift_arbiter", lift_arbiter::describe, lift_arbiter::work, lift_arbiter::check).sharing_process(),
+    Shipped::new("ros2", ros2::describe, ros2::work, ros2::check),
+    Shipped::new("zenoh", zenoh::describe, zenoh::work, zenoh::check),
+    // The launcher adds it and gives it its params.
+    Shipped::new(LINK_OPERATOR, link::describe, link::work, |_| Ok(())),
 ];
 
 /// These operators as a dataflow file can name them. `program` must run each as `PROGRAM operator NAME`, as blindgrasp does.
@@ -80,8 +89,9 @@ impl Shipped {
         name: &'static str,
         describe: fn() -> OperatorDescription,
         work: fn(&Operator) -> anyhow::Result<()>,
+        check: Check,
     ) -> Shipped {
-        Shipped { name, form: Form { describe, work }, can_share_process: false, variants: &[] }
+        Shipped { name, form: Form { describe, work, check }, can_share_process: false, variants: &[] }
     }
 
     const fn sharing_process(self) -> Shipped {

@@ -13,6 +13,8 @@ use blindgrasp_stages::promise_monitor::{OUTCOME_COUNTS, PromiseMonitor};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use crate::beginning::Beginning;
+
 #[derive(Deserialize)]
 struct Params {
     votes: u32,
@@ -68,6 +70,12 @@ pub(crate) fn describe() -> OperatorDescription {
             "The promised share of the lifts that drop the object: if frames of the phases kept and dropped refute it, every grasp \
              is held until this is set to another value; 1 promises nothing",
         )
+}
+
+/// The mistakes with which [`work`] would fail at once.
+pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+    parse_params::<Params>(node.params)?;
+    Ok(())
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {

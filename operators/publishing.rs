@@ -19,9 +19,6 @@ const RETRY_NANOS: u64 = 1_000_000_000;
 
 /// Publishes the samples of all edges until the graph ends.
 pub(super) fn publish(operator: &Operator, outside: Outside, edges: Vec<Box<dyn Forward>>) -> anyhow::Result<()> {
-    if edges.is_empty() {
-        bail!("it has no input: connect one of decision, tactile, contacts, feature and prediction");
-    }
     let publishing = Publishing {
         operator,
         outside,
@@ -34,6 +31,24 @@ pub(super) fn publish(operator: &Operator, outside: Outside, edges: Vec<Box<dyn 
         reported: (0, 0),
     };
     source::run(operator, BTreeMap::new(), publishing)
+}
+
+/// Refuses a node without inputs, and inputs that hold up the graph while the network does not take their samples.
+pub(super) fn check_inputs<'a>(inputs: impl IntoIterator<Item = (&'a str, bool)>) -> anyhow::Result<()> {
+    let mut has_any = false;
+    for (port, is_lossless) in inputs {
+        if is_lossless {
+            bail!(
+                "input '{port}' is lossless, and the network must not hold up the graph: write \
+                 {port}: {{from: NODE/PORT, policy: latest, capacity: 256}}"
+            );
+        }
+        has_any = true;
+    }
+    if !has_any {
+        bail!("it has no input: connect one of decision, tactile, contacts, feature and prediction");
+    }
+    Ok(())
 }
 
 /// A topic that the samples of an edge make.
@@ -105,12 +120,6 @@ pub(super) fn edge<M: Message>(
     port: &str,
     topics: Vec<Topic<M>>,
 ) -> anyhow::Result<Option<Box<dyn Forward>>> {
-    if operator.is_lossless(port) {
-        bail!(
-            "input '{port}' is lossless, and the network must not hold up the graph: write \
-             {port}: {{from: NODE/PORT, policy: latest, capacity: 256}}"
-        );
-    }
     let subscriber = operator.optional_subscriber::<M>(port)?;
     Ok(subscriber.map(|subscriber| {
         let states = vec![TopicState::default(); topics.len()];

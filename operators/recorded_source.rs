@@ -24,6 +24,7 @@ use blindgrasp_replay::selection::Selection;
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
+use crate::beginning::Beginning;
 use crate::{Form, Shipped};
 
 /// Clocks jump, and robots are switched off overnight.
@@ -56,11 +57,11 @@ pub(crate) const SHIPPED: Shipped = Shipped {
         ("feature", form::<GraspFeature>()),
         ("prediction", form::<Prediction>()),
     ],
-    ..Shipped::new("recorded_source", describe::<TactileFrame>, work::<TactileFrame>)
+    ..Shipped::new("recorded_source", describe::<TactileFrame>, work::<TactileFrame>, check::<TactileFrame>)
 };
 
 const fn form<M: Played>() -> Form {
-    Form { describe: describe::<M>, work: work::<M> }
+    Form { describe: describe::<M>, work: work::<M>, check: check::<M> }
 }
 
 fn describe<M: Played>() -> OperatorDescription {
@@ -83,9 +84,18 @@ fn describe<M: Played>() -> OperatorDescription {
         .optional_param("topic", ParamKind::String {}, "Which topic to play, if several are of this type")
 }
 
+/// The mistakes with which [`work`] would fail at once.
+fn check<M: Played>(node: &Beginning<'_>) -> anyhow::Result<()> {
+    opened::<M>(&parse_params(node.params)?).map(drop)
+}
+
+fn opened<M: Played>(params: &Params) -> anyhow::Result<Player<M>> {
+    Ok(Player::open(params.program()?)?)
+}
+
 fn work<M: Played>(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
-    let player = Player::<M>::open(params.program()?)?;
+    let player = opened::<M>(&params)?;
     let identity = match player.hand_id() {
         0 => BTreeMap::new(),
         id => BTreeMap::from([("hand".into(), format!("{id:016x}"))]),

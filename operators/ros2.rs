@@ -8,7 +8,7 @@ use std::sync::Arc;
 use anyhow::{Context as _, bail};
 use blindgrasp_messages::{ContactSet, GraspFeature, LiftDecision, Prediction, Recorded, Stamped, TactileFrame};
 use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::operator::Operator;
+use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_recording::cdr;
 use blindgrasp_ros::definition::Definition;
@@ -17,8 +17,9 @@ use blindgrasp_ros::standard;
 use blindgrasp_stages::hand::Hand;
 use serde::Deserialize;
 
-use super::connection::{ConnectionParams, with_connection_params};
-use super::publishing::{Forward, Node, Outside, Topic, edge, publish};
+use super::beginning::Beginning;
+use super::connection::{ConnectionParams, warn_if_open, with_connection_params};
+use super::publishing::{Forward, Node, Outside, Topic, check_inputs, edge, publish};
 use super::ros2_decision::{Decision, LastDecision, decide_type, decision_type};
 use super::ros2_markers::{cell_points, hand_markers};
 
@@ -102,9 +103,10 @@ pub(crate) fn describe() -> OperatorDescription {
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
-    let (network, domain, namespace) = params.network.network()?;
+    let ((network, domain, namespace), hand) = network_and_hand(&params)?;
+    check_inputs(operator.inputs())?;
+    warn_if_open(&network);
     let convention = params.network.convention();
-    let hand = params.hand.as_deref().map(Hand::load).transpose()?;
     let mut edges: Vec<Box<dyn Forward>> = Vec::new();
     let last = Arc::new(LastDecision::default());
     edges.extend(edge::<LiftDecision>(operator, "decision", vec![decision_topic(&last)?])?);
@@ -169,6 +171,19 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         Ok(Node::Ros(node))
     });
     publish(operator, Outside { open, prefix, opened }, edges)
+}
+
+/// The mistakes with which [`work`] would fail at once.
+pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+    network_and_hand(&parse_params(node.params)?)?;
+    check_inputs(node.inputs.iter().copied())
+}
+
+type NetworkAndHand = ((Network, u32, String), Option<Hand>);
+
+fn network_and_hand(params: &Params) -> anyhow::Result<NetworkAndHand> {
+    let network = params.network.network()?;
+    Ok((network, params.hand.as_deref().map(Hand::load).transpose()?))
 }
 
 fn topic_of<M: Recorded>(name: &'static str) -> anyhow::Result<Topic<M>> {

@@ -4,10 +4,12 @@ use std::path::PathBuf;
 
 use blindgrasp_messages::{FrameParts, Recorded, Sense, Senses, TactileFrame, TactileFrameHead};
 use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::operator::Operator;
+use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage;
 use serde::Deserialize;
+
+use crate::beginning::Beginning;
 
 #[derive(Deserialize)]
 struct Params {
@@ -25,6 +27,12 @@ pub(crate) fn describe() -> OperatorDescription {
         .output("tactile", TactileFrame::TYPE_NAME, "The hand's readings, each with the senses nearest in time")
         .param("hand", ParamKind::Path { must_exist: true }, None, "The hand file")
         .answers_each()
+}
+
+/// The mistakes with which [`work`] would fail at once.
+pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+    let params: Params = parse_params(node.params)?;
+    crate::contacts::hand_of(&params.hand).map(drop)
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {

@@ -18,7 +18,7 @@ use blindgrasp_messages::{
 };
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::description::OperatorDescription;
-use blindgrasp_operator::operator::{Operator, TICK};
+use blindgrasp_operator::operator::{Operator, TICK, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::port::{Publisher, Sent, Subscriber, sample_id};
 use blindgrasp_operator::source::{self, Source, Step, send};
@@ -27,10 +27,13 @@ use blindgrasp_operator::wiring::InputCounts;
 use blindgrasp_simulator::trial::course::{Course, Finished};
 use blindgrasp_simulator::trial::robot::{Doing, Robot, RobotOptions, told_header};
 use blindgrasp_simulator::trial::targets::{check_approaches, targets_named};
-use blindgrasp_simulator::trial::{PhysicsEngine, TrialOptions};
+use blindgrasp_simulator::trial::{LiftTarget, PhysicsEngine, TrialOptions};
+use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 use serde::{Deserialize, Serialize};
+
+use crate::beginning::Beginning;
 
 const DEFAULT_HAND: &str = "barrett-bh8-280";
 /// The most attempts that are kept because they may be unread; that many fit into a node's state.
@@ -50,6 +53,14 @@ struct Params {
     options: Option<PathBuf>,
     physics: Option<PhysicsEngine>,
     model: Option<PathBuf>,
+}
+
+/// The files and objects of a run.
+struct Setup {
+    hand: Hand,
+    things: Vec<LiftTarget>,
+    trial_options: TrialOptions,
+    prior: Option<ApproachPrior>,
 }
 
 pub(crate) fn describe() -> OperatorDescription {
@@ -107,8 +118,13 @@ pub(crate) fn describe() -> OperatorDescription {
         )
 }
 
-pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
-    let params: Params = operator.params()?;
+/// The mistakes with which [`work`] would fail at once, but that no approach is free, which takes simulation to find.
+pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+    setup(&parse_params(node.params)?).map(drop)
+}
+
+/// The hand, the things, the options of trials and the approaches that a model prefers.
+fn setup(params: &Params) -> anyhow::Result<Setup> {
     let hand = Hand::load(params.hand.as_deref().unwrap_or(Path::new(DEFAULT_HAND)))?;
     let mut things = targets_named(&params.things)?;
     if things.is_empty() {
@@ -122,15 +138,21 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let mut trial_options =
         params.options.as_deref().map_or_else(|| Ok(TrialOptions::default()), TrialOptions::load)?;
     trial_options.physics.engine = params.physics.unwrap_or(trial_options.physics.engine);
+    let prior = match &params.model {
+        Some(path) => Model::load(path)?.approach,
+        None => None,
+    };
+    Ok(Setup { hand, things, trial_options, prior })
+}
+
+pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
+    let params: Params = operator.params()?;
+    let Setup { hand, things, trial_options, prior } = setup(&params)?;
     operator.reserve_state()?;
     // An instance that goes on has checked before.
     if operator.saved_state().is_none() {
         check_approaches(&hand, &things, &trial_options, params.seed, params.trials)?;
     }
-    let prior = match &params.model {
-        Some(path) => Model::load(path)?.approach,
-        None => None,
-    };
     let options = RobotOptions {
         n_trials: params.trials,
         seed: params.seed,

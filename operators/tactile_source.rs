@@ -36,6 +36,8 @@ use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, 
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
+use crate::beginning::Beginning;
+use crate::connection::warn_if_open;
 use crate::joint_map::hand_joints;
 use crate::ros2::{NetworkParams, definition_of, with_network_params};
 
@@ -223,19 +225,11 @@ pub(crate) fn describe() -> OperatorDescription {
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
-    let hand = Hand::load(&params.hand)?;
+    let Setup { hand, driver, zeros } = setup(&params, operator.has_sandbox())?;
     let (n_joints, n_cells) = (hand.joints.len(), hand.n_cells());
-    if n_joints > MAX_JOINTS || n_cells > MAX_CELLS {
-        bail!("hand {}: {n_joints} joints and {n_cells} cells, at most {MAX_JOINTS} and {MAX_CELLS}", hand.name);
+    if matches!(params.driver, DriverWord::Ros2 | DriverWord::Zenoh) {
+        warn_if_open(&params.network.connection.network()?);
     }
-    let driver = driver(&params, &hand, operator.has_sandbox())?;
-    let mut sensed = hand.clone();
-    if let DriverWord::Recording = params.driver {
-        // A recording holds forces, which rise.
-        sensed.pads.iter_mut().for_each(|pad| pad.falls_under_load = false);
-    }
-    let zeros =
-        CellZeros::new(&sensed, params.zero_when_open).map_err(|reason| anyhow!("hand {}: {reason}", hand.name))?;
     operator.reserve_state()?;
     let shape = Shape { n_joints, n_cells };
     let wall_offset_nanos = wall_nanos().saturating_sub(monotonic_nanos());
@@ -261,6 +255,35 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         source.driver.open(monotonic_nanos())?;
     }
     source::run(operator, BTreeMap::from([("hand".into(), format!("{:016x}", hand.id()))]), source)
+}
+
+/// The mistakes with which [`work`] would fail at once, but for devices and sockets, which it opens.
+pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+    setup(&parse_params(node.params)?, node.has_sandbox).map(drop)
+}
+
+/// The hand, its driver, which is not open yet, and the zeros of its cells.
+struct Setup {
+    hand: Hand,
+    driver: Box<dyn TactileDriver>,
+    zeros: CellZeros,
+}
+
+fn setup(params: &Params, has_sandbox: bool) -> anyhow::Result<Setup> {
+    let hand = Hand::load(&params.hand)?;
+    let (n_joints, n_cells) = (hand.joints.len(), hand.n_cells());
+    if n_joints > MAX_JOINTS || n_cells > MAX_CELLS {
+        bail!("hand {}: {n_joints} joints and {n_cells} cells, at most {MAX_JOINTS} and {MAX_CELLS}", hand.name);
+    }
+    let driver = driver(params, &hand, has_sandbox)?;
+    let mut sensed = hand.clone();
+    if let DriverWord::Recording = params.driver {
+        // A recording holds forces, which rise.
+        sensed.pads.iter_mut().for_each(|pad| pad.falls_under_load = false);
+    }
+    let zeros =
+        CellZeros::new(&sensed, params.zero_when_open).map_err(|reason| anyhow!("hand {}: {reason}", hand.name))?;
+    Ok(Setup { hand, driver, zeros })
 }
 
 /// The driver that the parameters ask for. A parameter that the driver does not use is a mistake.

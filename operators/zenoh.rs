@@ -6,13 +6,14 @@ use blindgrasp_messages::{
 };
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::operator::Operator;
+use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_ros::node::{Quality, Rights, topic_name};
+use blindgrasp_ros::node::{Network, Quality, Rights, topic_name};
 use serde::{Deserialize, Serialize};
 
-use super::connection::{ConnectionParams, with_connection_params};
-use super::publishing::{Encode, Forward, Node, Outside, Topic, edge, publish};
+use super::beginning::Beginning;
+use super::connection::{ConnectionParams, warn_if_open, with_connection_params};
+use super::publishing::{Encode, Forward, Node, Outside, Topic, check_inputs, edge, publish};
 
 pub(crate) fn describe() -> OperatorDescription {
     let mut description = OperatorDescription::new("zenoh", "Publishes samples as JSON on keys of Zenoh");
@@ -40,12 +41,9 @@ struct Params {
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
-    let params: Params = operator.params()?;
-    let network = params.connection.network()?;
-    let prefix = params.prefix.unwrap_or_else(|| "blindgrasp".into());
-    // The words of a prefix are those of a topic's name.
-    topic_name("/", &format!("/{prefix}"))
-        .with_context(|| format!("prefix '{prefix}': expected words of letters, digits and _, with / between them"))?;
+    let (network, prefix) = network_and_prefix(operator.params()?)?;
+    check_inputs(operator.inputs())?;
+    warn_if_open(&network);
     let mut edges: Vec<Box<dyn Forward>> = Vec::new();
     edges.extend(decision_edge(operator)?);
     edges.extend(json_edge::<TactileFrame>(operator, "tactile")?);
@@ -56,6 +54,21 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let rights = Rights { sends: vec![format!("{prefix}/**")], ..Rights::default() };
     let open = Box::new(move || Ok(Node::Json(network.open(&rights)?)));
     publish(operator, Outside { open, prefix, opened }, edges)
+}
+
+/// The mistakes with which [`work`] would fail at once.
+pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+    network_and_prefix(parse_params(node.params)?)?;
+    check_inputs(node.inputs.iter().copied())
+}
+
+fn network_and_prefix(params: Params) -> anyhow::Result<(Network, String)> {
+    let network = params.connection.network()?;
+    let prefix = params.prefix.unwrap_or_else(|| "blindgrasp".into());
+    // The words of a prefix are those of a topic's name.
+    topic_name("/", &format!("/{prefix}"))
+        .with_context(|| format!("prefix '{prefix}': expected words of letters, digits and _, with / between them"))?;
+    Ok((network, prefix))
 }
 
 /// A sample as it is published.

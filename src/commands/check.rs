@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde_json::json;
 
-use super::graph_file::{OnMisfit, fitting};
+use super::graph_file::{OnMisfit, able_to_begin};
 use super::text_table::TextTable;
 use super::{Outcome, print_line};
 use blindgrasp_graph::dataflow::{
@@ -21,7 +21,7 @@ pub(super) fn run(
     is_json: bool,
 ) -> anyhow::Result<Outcome> {
     let file = dataflow::load(file).map_err(anyhow::Error::from);
-    let checked = file.and_then(|file| fitting(&file, overrides, scope, on_misfit));
+    let checked = file.and_then(|file| able_to_begin(&file, overrides, scope, on_misfit));
     match &checked {
         Ok(graph) if is_json => print_line(&serde_json::to_string_pretty(&as_json(graph))?)?,
         Ok(graph) => print_graph(graph)?,

@@ -9,6 +9,7 @@ use blindgrasp_graph::dataflow::{self, DataflowError, DataflowFile, Diagnostic, 
 use blindgrasp_graph::describe::describe;
 use blindgrasp_graph::operators::{Operators, running_program};
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operators::beginning::{Unable, unable_to_begin};
 use blindgrasp_operators::fit::{Fit, Misfit, MisfitKind, Part, check_fit, parts_of, running_parts};
 use blindgrasp_operators::{SHIPPED, operators_of};
 
@@ -57,6 +58,29 @@ pub(super) fn fitting(
         return Ok(graph);
     }
     Err(DataflowError { diagnostics }.into())
+}
+
+/// As [`fitting`]; each operator of this program is asked as well whether it could begin.
+pub(super) fn able_to_begin(
+    file: &DataflowFile,
+    overrides: &[Override],
+    scope: Scope<'_>,
+    on_misfit: OnMisfit,
+) -> anyhow::Result<Graph> {
+    let graph = fitting(file, overrides, scope, on_misfit)?;
+    let here = match scope {
+        Scope::Everything => None,
+        Scope::Machine(here) => Some(here),
+    };
+    let diagnostics = unable_to_begin(&graph, here).into_iter().map(|Unable { node, reason }| Diagnostic {
+        file: file.path().into(),
+        at: file.position_of(&node),
+        setting: None,
+        message: format!("node '{node}': {reason}"),
+        help: None,
+    });
+    let diagnostics: Vec<Diagnostic> = diagnostics.collect();
+    if diagnostics.is_empty() { Ok(graph) } else { Err(DataflowError { diagnostics }.into()) }
 }
 
 fn diagnostic(file: &DataflowFile, misfit: Misfit) -> Diagnostic {

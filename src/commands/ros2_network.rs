@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use blindgrasp_operators::connection::ConnectionParams;
+use blindgrasp_operators::connection::{ConnectionParams, warn_if_open};
 use blindgrasp_ros::node::{MAX_DOMAIN, Network};
 use clap::Args;
 
@@ -35,6 +35,8 @@ impl Ros2Network {
     pub(super) fn network(&self) -> anyhow::Result<(Network, u32)> {
         let (connect, keys, from) = (self.connect.clone(), self.keys.clone(), self.from.clone());
         let connection = ConnectionParams { connect, listen: None, keys, from };
-        Ok((connection.network()?, self.domain.unwrap_or(0)))
+        let network = connection.network()?;
+        warn_if_open(&network);
+        Ok((network, self.domain.unwrap_or(0)))
     }
 }

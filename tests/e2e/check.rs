@@ -234,3 +234,30 @@ fn a_graph_that_could_never_lift_is_refused() {
     let warned = run(&[&["replay", "recordings/ordinary.mcap", "--name", &name], &probe[..]].concat(), 0);
     assert!(text(&warned.stderr).contains(expected), "{}", text(&warned.stderr));
 }
+
+/// `run` fails with these when the operator begins; a check finds them in the same words and starts nothing.
+#[test]
+fn files_that_an_operator_could_not_begin_with_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let text = std::fs::read_to_string(project().join("dataflow.yaml")).expect("readable");
+    let root = project().display().to_string();
+    let text = text.replace("hands/", &format!("{root}/hands/")).replace("models/", &format!("{root}/models/"));
+    let flow = folder.path().join("dataflow.yaml");
+    std::fs::write(&flow, text.replace("recordings/", &format!("{root}/recordings/"))).expect("written");
+    let broken = folder.path().join("broken");
+    std::fs::write(&broken, "no file of this kind").expect("written");
+    let broken = broken.to_str().expect("UTF-8");
+    let flow = flow.to_str().expect("UTF-8");
+    crate::common::run(&["run", "--check", flow], 0);
+    for (node, setting) in [
+        ("recorded_source", format!("recorded_source.recording={broken}")),
+        ("recorded_source", "recorded_source.repeat=1.5".to_owned()),
+        ("contacts", format!("contacts.hand={broken}")),
+        ("encoder", format!("encoder.model={broken}")),
+        ("classifier", format!("classifier.model={broken}")),
+    ] {
+        let output = crate::common::run(&["run", "--check", flow, "--set", &setting], 1);
+        let said = crate::common::text(&output.stderr);
+        assert!(said.contains(&format!("node '{node}': ")), "{setting}: {said}");
+    }
+}

@@ -307,9 +307,7 @@ fn a_joint_map_of_another_hand_and_a_domain_of_the_bridge_are_refused() {
         let params =
             format!("driver: ros2\n      cells_topic: /cells\n      joint_map: {}\n      {params}", map.display());
         let flow = live_dataflow(folder.path(), &params);
-        let refused = run(&["run", "--name", &unique_name(), flow.to_str().expect("UTF-8")], 1);
-        let said = crate::common::text(&refused.stderr);
-        assert!(said.contains(expected), "{expected}: {said}");
+        refused_at_once(&flow, expected);
     }
 }
 
@@ -330,9 +328,32 @@ fn a_lossless_input_or_a_wrong_endpoint_is_refused() {
     ] {
         let node = format!("\n  ros2:\n    inputs: {{decision: {input}}}\n    params: {params}\n");
         std::fs::write(&flow, format!("{text}{node}")).expect("written");
-        let output = run(&["run", flow.to_str().expect("UTF-8"), "--name", &unique_name()], 1);
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert!(said.contains(expected), "{expected}: {said}");
+        refused_at_once(&flow, expected);
+    }
+}
+
+/// `run` refuses a file, and so does `run --check`, which starts nothing.
+fn refused_at_once(flow: &Path, expected: &str) {
+    let (flow, name) = (flow.to_str().expect("UTF-8"), unique_name());
+    for arguments in [&["run", flow, "--name", &name][..], &["run", "--check", flow]] {
+        let said = crate::common::text(&run(arguments, 1).stderr);
+        assert!(said.contains(expected), "{arguments:?}: {expected}: {said}");
+    }
+}
+
+/// Nothing is a router: each node says so in one line, and no line of Zenoh's own comes beside it.
+#[test]
+fn without_a_router_one_line_a_node_says_how_to_start_it() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let port = free_port();
+    let graph = ros_graph(folder.path(), port, "");
+    let advice = format!(
+        "tcp/127.0.0.1:{port}: no router of Zenoh answers; start the router: ros2 run rmw_zenoh_cpp rmw_zenohd"
+    );
+    wait_until(|| graph.said().matches(&advice).count() == 2, || graph.said());
+    let said = graph.said();
+    for unwanted in [".rs:", "Unable to connect", "Connection refused"] {
+        assert!(!said.contains(unwanted), "{unwanted}: {said}");
     }
 }
 

@@ -1,6 +1,7 @@
 //! The commands that speak to a robot in ROS 2. The robot is a router and nodes in Python, by eclipse-zenoh, zenoh-ros2-sdk
 //! and rosbags.
 
+use std::io::{BufRead, BufReader};
 use std::process::{Child, Stdio};
 
 use crate::common::{Graph, blindgrasp, project, run, text, unique_name, wait_until};
@@ -65,6 +66,21 @@ impl Drop for Running {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
+}
+
+#[test]
+fn commands_say_how_to_start_the_router_that_does_not_answer() {
+    let connect = format!("tcp/127.0.0.1:{}", free_port());
+    let made = ["new", "hand", "mine", "--robot-description", "--base", "palm", "--connect", &connect];
+    let said = text(&run(&made, 1).stderr);
+    let advice = format!("{connect}: no router of Zenoh answers; start the router: ros2 run rmw_zenoh_cpp rmw_zenohd");
+    assert!(said.contains(&advice) && !said.contains(".rs:"), "{said}");
+    let mut command = blindgrasp();
+    command.args(["diagnostics", "none", "--connect", &connect]).stderr(Stdio::piped());
+    let mut running = Running(command.spawn().expect("started"));
+    let mut line = String::new();
+    BufReader::new(running.0.stderr.take().expect("stderr")).read_line(&mut line).expect("read");
+    assert!(line.contains(&advice), "{line}");
 }
 
 #[test]

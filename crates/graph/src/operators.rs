@@ -8,8 +8,7 @@ use crate::dataflow::Program;
 use crate::describe::program_on_path;
 use blindgrasp_operator::text::{did_you_mean, list};
 
-/// The operator that carries edges to other machines. The launcher adds it; a dataflow file cannot name it.
-pub const LINK_OPERATOR: &str = "link";
+pub use blindgrasp_operator::description::LINK_OPERATOR;
 
 /// The operator that has the ports of a program in another language. The launcher adds it to that program.
 pub const HOST_OPERATOR: &str = "host";

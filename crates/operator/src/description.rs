@@ -12,6 +12,9 @@ use crate::text::quote;
 /// The version of [`OperatorDescription`], and of the protocol behind it, that this module understands.
 pub const PROTOCOL: u32 = 3;
 
+/// The operator that carries edges to other machines. The launcher adds it; a dataflow file cannot name it.
+pub const LINK_OPERATOR: &str = "link";
+
 /// The answer of an operator to `--describe`.
 ///
 /// ```json

@@ -19,7 +19,7 @@ use rustix::process::{Pid, Signal, getpgrp, getppid, kill_process_group};
 use serde_json::{Map, Value};
 
 use crate::cursors::{STATE_BYTES, SampleId, SharedCursors};
-use crate::description::OperatorDescription;
+use crate::description::{LINK_OPERATOR, OperatorDescription};
 use crate::diagnostics::{print_diagnostic, with_lack_of_files};
 use crate::link_status::LinkStatus;
 use crate::partner::{PairedInput, Partner, PartnerInput};
@@ -268,9 +268,10 @@ impl Operator {
         self.0.wiring.inputs.contains_key(port).then(|| self.subscriber(port)).transpose()
     }
 
-    /// Whether an input is connected, and its writer waits for it.
-    pub fn is_lossless(&self, port: &str) -> bool {
-        self.0.wiring.inputs.get(port).is_some_and(|input| input.policy == EdgePolicy::Lossless)
+    /// The connected inputs, and whether their writers wait for them.
+    pub fn inputs(&self) -> impl Iterator<Item = (&str, bool)> {
+        let inputs = self.0.wiring.inputs.iter();
+        inputs.map(|(port, input)| (port.as_str(), input.policy == EdgePolicy::Lossless))
     }
 
     /// Opens a partner input of a stage, before [`stage::run`](crate::stage::run): while the stage answers a sample,
@@ -678,7 +679,8 @@ pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyho
     let leader = wirings.first().context("a process without operators")?.clone();
     let is_group = wirings.len() > 1;
     let voice = |node: &str| Voice(is_group.then(|| Arc::from(node)));
-    trace::install(|entry| Voice(SPEAKER.with_borrow(Option::clone)).report(&Report::Log(entry)));
+    let has_link = descriptions.iter().any(|description| description.operator == LINK_OPERATOR);
+    trace::install(has_link, |entry| Voice(SPEAKER.with_borrow(Option::clone)).report(&Report::Log(entry)));
     if leader.lock_memory {
         lock_memory()?;
     }

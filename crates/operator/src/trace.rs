@@ -24,19 +24,24 @@ const ACCESS_CONTROL: &str = "zenoh::net::routing::interceptor::access_control";
 /// Zenoh logs here why it cannot connect, but at `debug`, among other lines.
 const ORCHESTRATOR: &str = "zenoh::net::runtime::orchestrator";
 const CANNOT_CONNECT: &str = "Unable to connect";
+/// Zenoh logs this at `warn` and returns it as well, so that the program says it.
+const ANSWERED_BY_NONE: &str = "Unable to connect to any of";
+/// An attempt to connect to a port at which nothing listens.
+const REFUSED: &str = "Connection refused";
 /// A line of Zenoh is logged once in this time.
 const INTERVAL: Duration = Duration::from_secs(60);
 /// The most lines that are remembered.
 const MAX_LINES: usize = 256;
 
-/// Sends this process's events to `say`. An operator that has a subscriber of its own keeps it.
-pub(super) fn install(say: impl Fn(LogEntry) + Send + Sync + 'static) {
+/// Sends this process's events to `say`. An operator that has a subscriber of its own keeps it. `tells_refused` is for an operator
+/// that does not tell by itself that nothing listens at an endpoint of Zenoh.
+pub(super) fn install(tells_refused: bool, say: impl Fn(LogEntry) + Send + Sync + 'static) {
     let asked_for = std::env::var(FILTER_VARIABLE).ok();
     let filter = asked_for.as_deref().map(str::parse::<Targets>);
     let unreadable = filter.as_ref().and_then(|filter| filter.as_ref().err().map(ToString::to_string));
     let filter = filter.and_then(Result::ok);
     // A user who asks for certain levels gets every line of them.
-    let repeats = filter.is_none().then(Repeats::default);
+    let repeats = filter.is_none().then(|| Repeats { tells_refused, ..Repeats::default() });
     let usual = || {
         let levels =
             [(ZENOH, LevelFilter::WARN), (ACCESS_CONTROL, LevelFilter::INFO), (ORCHESTRATOR, LevelFilter::DEBUG)];
@@ -57,6 +62,9 @@ struct Sayer<F> {
 impl<S: Subscriber, F: Fn(LogEntry) + 'static> Layer<S> for Sayer<F> {
     fn on_event(&self, event: &Event<'_>, _context: Context<'_, S>) {
         let mut entry = entry(event);
+        if event.metadata().target().starts_with(ZENOH) {
+            entry.text = without_places(&entry.text);
+        }
         let is_held_back = self
             .repeats
             .as_ref()
@@ -74,6 +82,7 @@ impl<S: Subscriber, F: Fn(LogEntry) + 'static> Layer<S> for Sayer<F> {
 /// The lines of Zenoh that were logged lately. All other lines pass.
 #[derive(Default)]
 struct Repeats {
+    tells_refused: bool,
     logged: Mutex<BTreeMap<String, Instant>>,
 }
 
@@ -90,6 +99,12 @@ impl Repeats {
         if entry.level > Some(LogLevel::Info) && !entry.text.starts_with(CANNOT_CONNECT) {
             return true;
         }
+        if entry.text.starts_with(ANSWERED_BY_NONE) {
+            return true;
+        }
+        if !self.tells_refused && entry.text.starts_with(CANNOT_CONNECT) && entry.text.contains(REFUSED) {
+            return true;
+        }
         // Ports and times differ from one line to the next.
         let key: String = entry.text.chars().filter(|char| !char.is_ascii_digit()).collect();
         let mut logged = self.logged.lock().unwrap_or_else(PoisonError::into_inner);
@@ -102,6 +117,21 @@ impl Repeats {
         logged.insert(key, now);
         false
     }
+}
+
+/// A text of Zenoh without the places in its source code, such as ` at /home/me/.cargo/…/tcp.rs:105.`
+fn without_places(text: &str) -> String {
+    let (mut kept, mut rest) = (String::new(), text);
+    while let Some(at) = rest.find(" at /") {
+        let place = &rest[at + 1..];
+        let Some(line) = place.find(".rs:").map(|end| &place[end + 4..]) else {
+            break;
+        };
+        kept += &rest[..at];
+        let behind = line.trim_start_matches(|char: char| char.is_ascii_digit());
+        rest = behind.strip_prefix('.').unwrap_or(behind);
+    }
+    kept + rest
 }
 
 fn entry(event: &Event<'_>) -> LogEntry {
@@ -188,6 +218,37 @@ mod tests {
         let json = serde_json::to_value(&said[0]).expect("JSON");
         assert_eq!(json["level"], "warn");
         assert_eq!(json["fields"]["cell"], 7);
+    }
+
+    #[test]
+    fn lines_of_zenoh_name_no_places_in_its_source_code() {
+        let line = "Unable to connect to configured peer tcp/localhost:7447! Can not create a link: [127.0.0.1:7447: Connection \
+                    refused (os error 111) at /root/.cargo/registry/zenoh-link-commons-1.10.2/src/tcp.rs:105.] at \
+                    /root/.cargo/registry/zenoh-link-commons-1.10.2/src/tcp.rs:133. at /root/.cargo/unicast.rs:287.. Retry in 100ms.";
+        assert_eq!(
+            without_places(line),
+            "Unable to connect to configured peer tcp/localhost:7447! Can not create a link: [127.0.0.1:7447: Connection refused \
+             (os error 111)]. Retry in 100ms."
+        );
+        for plain in ["", "a file at /tmp/x is open", "at 5 Hz"] {
+            assert_eq!(without_places(plain), plain);
+        }
+    }
+
+    #[test]
+    fn that_nothing_listens_is_logged_where_the_program_does_not_say_it() {
+        let refused = "Unable to connect to configured peer tcp/localhost:7447! [127.0.0.1:7447: Connection refused]";
+        let forged = "Unable to connect to configured peer tls/robot:7447! invalid peer certificate";
+        let is_logged = |repeats: &Repeats, level: LogLevel, text: &str| {
+            let entry = LogEntry { level: Some(level), ..LogEntry::plain(text) };
+            !repeats.holds_back(ORCHESTRATOR, &entry, Instant::now())
+        };
+        let (node, link) = (Repeats::default(), Repeats { tells_refused: true, ..Repeats::default() });
+        assert!(!is_logged(&node, LogLevel::Debug, refused));
+        assert!(is_logged(&node, LogLevel::Debug, forged));
+        assert!(is_logged(&link, LogLevel::Debug, refused));
+        let returned = "Unable to connect to any of [Single(tcp/localhost:7447)]. Timeout!";
+        assert!(!is_logged(&node, LogLevel::Warn, returned) && !is_logged(&link, LogLevel::Warn, returned));
     }
 
     #[test]

@@ -33,6 +33,8 @@ const BLOCK_MICROS: u64 = 500_000;
 const LEASE_MILLIS: u64 = 2000;
 /// The time in which a router must answer.
 const OPEN_MILLIS: u64 = 1000;
+/// A client's session cannot be opened because no endpoint answers it; Zenoh says so in its message alone.
+const NO_ANSWER: &str = "Unable to connect to any of";
 /// The domains that ROS 2 has.
 pub const MAX_DOMAIN: u32 = 232;
 
@@ -64,6 +66,12 @@ pub enum RosError {
     Keys(String),
     #[error("{endpoints}: {message}")]
     Open { endpoints: String, message: String },
+    #[error(
+        "{endpoints}: no router of Zenoh answers{}; start the router: ros2 run rmw_zenoh_cpp rmw_zenohd, or for nodes of DDS \
+         zenoh-bridge-ros2dds",
+        if *.with_keys { ", or one end refuses the other's certificate" } else { "" }
+    )]
+    NoRouter { endpoints: String, with_keys: bool },
     #[error("'{0}' is no name of a topic: expected words of letters, digits and '_', joined by '/'")]
     Topic(String),
     #[error("Zenoh: {0}")]
@@ -152,8 +160,12 @@ impl Network {
         let refused = |error: zenoh::Error| {
             let message = error.to_string();
             // Zenoh appends the place in its source code.
-            let message = message.split(" at /").next().unwrap_or_default().into();
-            RosError::Open { endpoints: endpoints(), message }
+            let message = message.split(" at /").next().unwrap_or_default();
+            if message.contains(NO_ANSWER) {
+                RosError::NoRouter { endpoints: endpoints(), with_keys: self.keys.is_some() }
+            } else {
+                RosError::Open { endpoints: endpoints(), message: message.into() }
+            }
         };
         let config = Config::from_json5(&config.to_string()).map_err(refused)?;
         zenoh::open(config).wait().map_err(refused)
