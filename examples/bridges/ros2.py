@@ -25,6 +25,7 @@ A frame is made for each message of the first topic of cells, with the others th
 angles of the last 150 ms. Frames that lack something are not sent, and counted; the source sees the gap.
 """
 
+import importlib
 import math
 import sys
 import time
@@ -174,10 +175,15 @@ class Frames:
         )
 
 
+def message_class(name):
+    """The class of a message type such as `sensor_msgs/msg/JointState`."""
+    package, _, kind = name.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), kind)
+
+
 def bridge(table, address):
     import rclpy
     from rclpy.qos import qos_profile_sensor_data
-    from rosidl_runtime_py.utilities import get_message
 
     source = line_protocol.Source(address)
     rclpy.init()
@@ -196,7 +202,7 @@ def bridge(table, address):
             print(f"{frames.dropped} frames not sent: {frames.lacks()}", file=sys.stderr)
 
     def subscribe(entry, kind, callback):
-        node.create_subscription(get_message(entry.get("type", kind)), entry["topic"], callback, qos_profile_sensor_data)
+        node.create_subscription(message_class(entry.get("type", kind)), entry["topic"], callback, qos_profile_sensor_data)
 
     joints = {"topic": "/joint_states", **(table.get("joints") or {})}
     subscribe(joints, "sensor_msgs/msg/JointState", lambda message: frames.take_joints(message, now_nanos()))

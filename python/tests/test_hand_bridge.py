@@ -157,10 +157,9 @@ class Bridge(unittest.TestCase):
         rclpy = types.ModuleType("rclpy")
         rclpy.init, rclpy.try_shutdown = lambda: None, lambda: None
         rclpy.create_node, rclpy.spin = lambda name: node, spin
-        qos, utilities = types.ModuleType("rclpy.qos"), types.ModuleType("rosidl_runtime_py.utilities")
-        qos.qos_profile_sensor_data, utilities.get_message = None, lambda kind: kind
-        modules = {"rclpy": rclpy, "rclpy.qos": qos, "rosidl_runtime_py": types.ModuleType("rosidl_runtime_py")}
-        modules["rosidl_runtime_py.utilities"] = utilities
+        qos = types.ModuleType("rclpy.qos")
+        qos.qos_profile_sensor_data = None
+        modules = {"rclpy": rclpy, "rclpy.qos": qos}
         with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX) as source:
             path = f"{folder}/tactile.hand"
             source.bind(path)
@@ -175,7 +174,8 @@ class Bridge(unittest.TestCase):
 
             thread = threading.Thread(target=serve)
             thread.start()
-            with mock.patch.dict(sys.modules, modules), mock.patch("sys.stderr"):
+            classes = mock.patch.object(bridge, "message_class", lambda kind: kind)
+            with mock.patch.dict(sys.modules, modules), mock.patch("sys.stderr"), classes:
                 bridge.bridge(TABLE, f"unix:{path}")
             thread.join()
         self.assertEqual(lines[0]["cells_newtons"], [1.0, 2.5, 4.0, 3.0])

@@ -1,5 +1,6 @@
 //! `blindgrasp init`
 
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -22,16 +23,20 @@ pub(super) struct Arguments {
     /// Add the files of another built-in hand, and its bridge.
     #[arg(long, value_name = "NAME", value_parser = PossibleValuesParser::new(builtin_names()))]
     hand: Option<String>,
+    /// Add the nodes for a robot in ROS 2: the bridge, the gates of arm and gripper, and the package of messages.
+    #[arg(long)]
+    ros2: bool,
     /// Print JSON: {"folder", "files"}.
     #[arg(long)]
     json: bool,
 }
 
 /// The project's files: those that this repository's own default graph consists of.
-pub(super) const FILES: [File; 10] = [
+pub(super) const FILES: [File; 11] = [
     ("dataflow.yaml", include_bytes!("../../dataflow.yaml")),
     ("dataflow-live.yaml", include_bytes!("../../dataflow-live.yaml")),
     ("tactile_bridge.py", include_bytes!("../../examples/tactile_bridge.py")),
+    ("dataflow-ros2.yaml", include_bytes!("../../dataflow-ros2.yaml")),
     ("dataflow-machines.yaml", include_bytes!("../../dataflow-machines.yaml")),
     ("hands/barrett-bh8-280.yaml", include_bytes!("../../hands/barrett-bh8-280.yaml")),
     ("hands/barrett-bh8-280.urdf", include_bytes!("../../hands/barrett-bh8-280.urdf")),
@@ -68,6 +73,29 @@ const BRIDGES: [(&str, &[File]); 4] = [
 const LINES: File = ("bridges/line_protocol.py", include_bytes!("../../examples/bridges/line_protocol.py"));
 const ROS2: File = ("bridges/ros2.py", include_bytes!("../../examples/bridges/ros2.py"));
 
+/// The nodes of ROS 2. They and the bridge have the places in a project that the documents name.
+const ROS2_FILES: [File; 19] = [
+    ROS2,
+    LINES,
+    ("ros2_lift_gate.py", include_bytes!("../../examples/ros2_lift_gate.py")),
+    ("ros2_gripper_gate.py", include_bytes!("../../examples/ros2_gripper_gate.py")),
+    ("blindgrasp_msgs/CMakeLists.txt", include_bytes!("../../examples/blindgrasp_msgs/CMakeLists.txt")),
+    ("blindgrasp_msgs/package.xml", include_bytes!("../../examples/blindgrasp_msgs/package.xml")),
+    ("blindgrasp_msgs/msg/Contact.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Contact.msg")),
+    ("blindgrasp_msgs/msg/ContactSet.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/ContactSet.msg")),
+    ("blindgrasp_msgs/msg/Decision.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Decision.msg")),
+    ("blindgrasp_msgs/msg/GraspFeature.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/GraspFeature.msg")),
+    ("blindgrasp_msgs/msg/GraspScene.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/GraspScene.msg")),
+    ("blindgrasp_msgs/msg/GraspTruth.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/GraspTruth.msg")),
+    ("blindgrasp_msgs/msg/Header.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Header.msg")),
+    ("blindgrasp_msgs/msg/LiftDecision.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/LiftDecision.msg")),
+    ("blindgrasp_msgs/msg/LiftOutcome.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/LiftOutcome.msg")),
+    ("blindgrasp_msgs/msg/Prediction.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Prediction.msg")),
+    ("blindgrasp_msgs/msg/SceneContact.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/SceneContact.msg")),
+    ("blindgrasp_msgs/msg/TactileFrame.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/TactileFrame.msg")),
+    ("blindgrasp_msgs/srv/Decide.srv", include_bytes!("../../examples/blindgrasp_msgs/srv/Decide.srv")),
+];
+
 /// The files of a built-in hand and of its bridge.
 fn of_hand(name: &str) -> Vec<(String, &'static [u8])> {
     let layout_and_urdf = builtin_files(name).map(|(layout, urdf)| {
@@ -95,6 +123,7 @@ blindgrasp stop
 | `dataflow.yaml` | the graph: which operators run, what they read, their parameters |
 | `dataflow-live.yaml` | the graph for a hand that lifts, with its model: a bridge sends the frames; `blindgrasp trials` tries it in simulated physics |
 | `tactile_bridge.py` | a bridge to begin with: `blindgrasp export recordings/held-out.mcap --topic /tactile \\| ./tactile_bridge.py` |
+| `dataflow-ros2.yaml` | the graph for a hand of a robot in ROS 2; `init --ros2` adds the nodes that run there |
 | `dataflow-machines.yaml` | the same graph on two machines |
 | `hands/` | the Barrett hand BH8-280: kinematics (URDF) and pad layout; describe your own beside it. `init --hand NAME` adds another one, with its bridge in `bridges/` |
 | `models/` | models of that hand: by the paper's label for `dataflow.yaml`, and of lifts (`…-lifts.json`) for an arm |
@@ -111,7 +140,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let mut files: Vec<(String, &[u8])> = FILES.iter().map(|(name, content)| ((*name).to_owned(), *content)).collect();
     // The dataflow files name it, for editors.
     files.push((SCHEMA.into(), made_schema.as_bytes()));
-    for file in arguments.hand.iter().flat_map(|hand| of_hand(hand)) {
+    let of_ros2: &[File] = if arguments.ros2 { &ROS2_FILES } else { &[] };
+    let of_ros2 = of_ros2.iter().map(|(name, content)| ((*name).to_owned(), *content));
+    for file in arguments.hand.iter().flat_map(|hand| of_hand(hand)).chain(of_ros2) {
         if files.iter().all(|(name, _)| *name != file.0) {
             files.push(file);
         }
@@ -137,10 +168,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
+/// Writes a file, which can be run if it is a script.
 fn write_new(path: &Path, content: &[u8]) -> anyhow::Result<()> {
     let folder = path.parent().unwrap_or(Path::new("."));
     std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
-    let mut file =
-        std::fs::File::create_new(path).with_context(|| format!("cannot make the file {}", path.display()))?;
+    let mode = if content.starts_with(b"#!") { 0o777 } else { 0o666 };
+    let mut options = std::fs::OpenOptions::new();
+    options.write(true).create_new(true).mode(mode);
+    let mut file = options.open(path).with_context(|| format!("cannot make the file {}", path.display()))?;
     std::io::Write::write_all(&mut file, content).with_context(|| format!("cannot write {}", path.display()))
 }

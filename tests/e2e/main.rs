@@ -53,6 +53,7 @@ mod reproduce;
 mod ros2;
 mod ros2_access;
 mod ros2_commands;
+mod ros2_installed;
 mod run_report;
 mod sandbox;
 mod scaffold;

@@ -341,6 +341,34 @@ fn refused_at_once(flow: &Path, expected: &str) {
     }
 }
 
+/// The dataflow file of the page on ROS 2, with the topics and the model of the tests' robot.
+#[test]
+fn the_graph_for_ros_2_that_comes_with_the_project_decides() {
+    let port = free_port();
+    let mut peer = Peer::start(port, 200, N_GRASPS);
+    let connect = format!("connect=tcp/127.0.0.1:{port}");
+    let model = format!("model={}", project().join("models/barrett-bh8-280.json").display());
+    let settings = [
+        &connect,
+        &model,
+        "source.joints_topic=/robot/joint_states",
+        "source.cells_topic=/cells",
+        "source.phase_topic=/phase",
+        "source.tolerance_ms=20000",
+        "source.max_delay_ms=20000",
+        "lift_arbiter.max_age_ms=20000",
+        "lift_arbiter.max_gap_ms=1000",
+        "lift_arbiter.min_probability_stable=0",
+        "ros2.namespace=/",
+    ];
+    let arguments: Vec<&str> = settings.into_iter().flat_map(|setting| ["--set", setting]).collect();
+    let graph = Graph::launch(&unique_name(), &project().join("dataflow-ros2.yaml"), &arguments);
+    wait_until_joined(&graph);
+    peer.send();
+    assert_decisions(&mut peer, &undisturbed()[..N_GRASPS as usize]);
+    graph.stop();
+}
+
 /// Nothing is a router: each node says so in one line, and no line of Zenoh's own comes beside it.
 #[test]
 fn without_a_router_one_line_a_node_says_how_to_start_it() {

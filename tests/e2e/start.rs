@@ -28,6 +28,10 @@ fn a_new_project_runs_and_is_never_overwritten() {
     let checked = text(&checked.stdout);
     assert!(["robot", "brain", "contacts/contacts"].iter().all(|word| checked.contains(word)), "{checked}");
 
+    let out =
+        Command::new(project.join("tactile_bridge.py")).arg("--help").output().expect("a program that can be run");
+    assert_eq!(out.status.code(), Some(0), "{}", text(&out.stderr));
+
     std::fs::remove_file(project.join("hands/barrett-bh8-280.yaml")).expect("removed");
     std::fs::write(project.join("dataflow.yaml"), "mine").expect("written");
     let refused = text(&run(&["init", project.to_str().expect("UTF-8")], 1).stderr);

@@ -432,11 +432,16 @@ impl Request {
     /// # Errors
     /// The session is closed.
     pub fn answer(self, cdr: &[u8]) -> Result<(), RosError> {
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as i64;
-        let attachment = [&self.seq[..], &now.to_le_bytes(), &[self.client.len() as u8], &self.client].concat();
+        let attachment = attachment(&self.seq, &self.client);
         let key = self.query.key_expr().clone();
         self.query.reply(key, cdr).attachment(attachment).wait().map_err(of_zenoh)
     }
+}
+
+/// Beside a message: its number, the time, and the hash of its sender behind its length.
+fn attachment(seq: &[u8; 8], gid: &[u8; 16]) -> Vec<u8> {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as i64;
+    [&seq[..], &now.to_le_bytes(), &[gid.len() as u8], gid].concat()
 }
 
 /// Sends messages to a topic.
@@ -456,12 +461,7 @@ impl RosPublisher {
         if !self.attaches {
             return self.publisher.put(cdr).wait().map_err(of_zenoh);
         }
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as i64;
-        let mut attachment = Vec::with_capacity(33);
-        attachment.extend(self.next_seq.to_le_bytes());
-        attachment.extend(now.to_le_bytes());
-        attachment.push(self.gid.len() as u8);
-        attachment.extend(self.gid);
+        let attachment = attachment(&self.next_seq.to_le_bytes(), &self.gid);
         self.next_seq += 1;
         self.publisher.put(cdr).attachment(attachment).wait().map_err(of_zenoh)
     }
@@ -648,6 +648,58 @@ mod tests {
             assert_eq!(without_numbers(token), without_numbers(&captured.replace("HASH", STRING_HASH)));
         }
         assert!(tokens[0].ends_with("/:1:,10:,:,:,,"), "{}", tokens[0]);
+    }
+
+    /// A publisher as in Lyrical, after rmw_zenoh's pull request 930: its token has a further part behind the qualities, and it
+    /// sends the same message on keys below the topic's own to subscribers whose tokens have one.
+    #[test]
+    fn a_publisher_of_lyrical_is_heard_once() {
+        let message = MessageType { name: "sensor_msgs/msg/Image".into(), hash: format!("RIHS01_{}", "7f".repeat(32)) };
+        let port = std::net::TcpListener::bind("127.0.0.1:0").and_then(|it| it.local_addr()).expect("a port").port();
+        let endpoint = format!("tcp/127.0.0.1:{port}");
+        let listens = Network { listen: vec![endpoint.clone()], ..Network::default() };
+        let takes = Rights { takes: vec![Convention::RmwZenoh.key(0, "/touch")], ..Rights::default() };
+        let session = listens.open(&takes).expect("a session");
+        let mut hearer = RosNode::new(session, Convention::RmwZenoh, 0, "/", "hearer").expect("a node");
+        let (sender, heard) = std::sync::mpsc::channel();
+        let _subscriber = hearer
+            .subscriber("/touch", &message, Quality::Sensor, move |received| drop(sender.send(received)))
+            .expect("a subscriber");
+
+        let config = json!({"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": false}}});
+        let config = Config::from_json5(&config.to_string()).expect("a configuration");
+        let robot = zenoh::open(config).wait().expect("a session");
+        let dds = dds_name(&message).expect("a type");
+        let token =
+            format!("@ros2_lv/0/{}/0/1/MP/%/%/camera/%touch/{dds}/{}/2::,5:,:,:,,/cpu:", robot.zid(), message.hash);
+        let _token = robot.liveliness().declare_token(token.clone()).wait().expect("a token");
+        let gid = gid_of(&token);
+        let key = format!("0/touch/{dds}/{}", message.hash);
+        let send = |seq: i64| {
+            for key in [format!("{key}/_buf_cpu"), format!("{key}/_buf/00ff"), key.clone()] {
+                let beside = attachment(&seq.to_le_bytes(), &gid);
+                robot.put(key, [0, 1, 0, 0]).attachment(beside).wait().expect("sent");
+            }
+        };
+        // Until the subscription is known, messages go nowhere.
+        let (mut seq, mut first) = (0, None);
+        while first.is_none() && seq < 200 {
+            seq += 1;
+            send(seq);
+            first = heard.recv_timeout(std::time::Duration::from_millis(50)).ok();
+        }
+        let first = first.expect("a message");
+        assert_eq!((&first.message, first.sender), (&message, Some(gid)));
+        send(1000);
+        // Each number comes once, up to the last one.
+        let mut numbers = vec![first.seq];
+        while numbers.last() != Some(&Some(1000)) {
+            let next = heard.recv_timeout(std::time::Duration::from_secs(10)).expect("a message");
+            assert_eq!(next.message, message);
+            numbers.push(next.seq);
+        }
+        assert!(heard.recv_timeout(std::time::Duration::from_millis(100)).is_err());
+        assert!(numbers.is_sorted_by(|one, next| one < next), "{numbers:?}");
     }
 
     /// One node on loopback hears another one.
