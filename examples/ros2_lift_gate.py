@@ -10,6 +10,7 @@ import time
 
 import rclpy
 from blindgrasp_msgs.msg import Decision
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
@@ -47,6 +48,8 @@ def main():
     rclpy.init()
     try:
         rclpy.spin(LiftGate())
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
     finally:
         rclpy.try_shutdown()
 

@@ -183,6 +183,7 @@ def message_class(name):
 
 def bridge(table, address):
     import rclpy
+    from rclpy.executors import ExternalShutdownException
     from rclpy.qos import qos_profile_sensor_data
 
     source = line_protocol.Source(address)
@@ -213,6 +214,8 @@ def bridge(table, address):
         subscribe(entry, "std_msgs/msg/Float64MultiArray", take)
     try:
         rclpy.spin(node)
+    except ExternalShutdownException:
+        pass
     finally:
         rclpy.try_shutdown()
 

@@ -152,6 +152,7 @@ class Gate(unittest.TestCase):
         action, executors = types.ModuleType("rclpy.action"), types.ModuleType("rclpy.executors")
         action.ActionClient, action.ActionServer = Client, server
         executors.MultiThreadedExecutor = lambda num_threads: None
+        executors.ExternalShutdownException = InterruptedError
         action.GoalResponse = Message(ACCEPT="accept", REJECT="reject")
         action.CancelResponse = Message(ACCEPT="accept")
         control, actions = types.ModuleType("control_msgs"), types.ModuleType("control_msgs.action")

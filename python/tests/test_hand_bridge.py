@@ -157,9 +157,9 @@ class Bridge(unittest.TestCase):
         rclpy = types.ModuleType("rclpy")
         rclpy.init, rclpy.try_shutdown = lambda: None, lambda: None
         rclpy.create_node, rclpy.spin = lambda name: node, spin
-        qos = types.ModuleType("rclpy.qos")
-        qos.qos_profile_sensor_data = None
-        modules = {"rclpy": rclpy, "rclpy.qos": qos}
+        executors, qos = types.ModuleType("rclpy.executors"), types.ModuleType("rclpy.qos")
+        executors.ExternalShutdownException, qos.qos_profile_sensor_data = InterruptedError, None
+        modules = {"rclpy": rclpy, "rclpy.executors": executors, "rclpy.qos": qos}
         with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX) as source:
             path = f"{folder}/tactile.hand"
             source.bind(path)
