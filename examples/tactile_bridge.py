@@ -2,7 +2,7 @@
 """Feeds a running graph's tactile_source with frames: a bridge to copy and to put your hand's driver into.
 
     blindgrasp run dataflow-live.yaml
-    blindgrasp export recordings/held-out.mcap --topic /tactile | examples/tactile_bridge.py [--rate 1]
+    blindgrasp export recordings/held-out.mcap --topic /tactile | ./tactile_bridge.py [--rate 1]
 
 This one has no hand: it takes frames from the recording on its stdin, at --rate times the recorded speed. In yours,
 `frames` asks the hand. Standard library only.

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use crate::common::project;
+use crate::common::{project, run};
 
 /// What README may have at most.
 const README_LINES: usize = 120;
@@ -56,6 +56,57 @@ fn anchors_and_links_are_found_as_github_does() {
     let expected = ["what-set-does", "foxglove-rviz--more", "same", "same-1", "see-it"].map(str::to_owned);
     assert_eq!(anchors(text), BTreeSet::from(expected));
     assert_eq!(links(text), ["a.md", "b.md#c", "g.svg"]);
+}
+
+/// Commands of pages work in a project of `blindgrasp init`: the files that they name are there. Pages about hands have a hand of their
+/// own, and `--ros2` is that of the page on ROS 2.
+#[test]
+fn commands_name_files_that_a_project_has() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let project_of = |name: &str, option: &[&str]| {
+        let path = folder.path().join(name);
+        run(&[&["init", path.to_str().expect("UTF-8")], option].concat(), 0);
+        path
+    };
+    let usual = project_of("usual", &["--ros2"]);
+    let mut missing = Vec::new();
+    for page in markdown_of(&project().join("docs")) {
+        let name = page.file_stem().expect("a name").to_str().expect("UTF-8");
+        let is_hand = page.parent().is_some_and(|folder| folder.ends_with("hands"));
+        let root = if is_hand { project_of(name, &["--hand", name]) } else { usual.clone() };
+        for path in files_in_commands(&read(&page)) {
+            if !root.join(&path).is_file() {
+                missing.push(format!("{}: {path}", page.display()));
+            }
+        }
+    }
+    assert!(missing.is_empty(), "not in a project: {}", missing.join(", "));
+}
+
+/// The files of a project that the commands of a page name. Models are left out, because commands make them.
+fn files_in_commands(text: &str) -> Vec<String> {
+    let mut is_shell = false;
+    let mut files = Vec::new();
+    for line in text.lines() {
+        if let Some(language) = line.trim_start().strip_prefix("```") {
+            is_shell = language == "sh";
+            continue;
+        }
+        if !is_shell {
+            continue;
+        }
+        let command = line.split(" #").next().unwrap_or_default();
+        let is_separator = |letter: char| letter.is_whitespace() || "=|\"'()".contains(letter);
+        let words = command.split(is_separator).map(|word| word.trim_start_matches("./"));
+        let is_file = |word: &&str| {
+            let is_below = ["recordings/", "hands/", "bridges/"].iter().any(|folder| word.starts_with(folder));
+            let is_program =
+                ["tactile_bridge", "ros2_"].iter().any(|name| word.starts_with(name)) && word.ends_with(".py");
+            is_below || is_program || word.starts_with("dataflow")
+        };
+        files.extend(words.filter(is_file).map(str::to_owned));
+    }
+    files
 }
 
 /// README, ARCHITECTURE, CONTRIBUTING, all pages of docs, and the README of each folder that has one.

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
+use crate::common::python::python;
 use crate::common::{project, skipped, text};
 
 /// The tools of `scripts/release` that a machine with Rust may lack.
@@ -87,6 +88,99 @@ fn the_package_of_cargo_has_all_files_that_init_writes() {
             "Cargo.toml's include has no {name}"
         );
     }
+}
+
+/// A maintainer's command, in a clone: mistakes are listed before anything is made, and without --go nothing is tagged.
+#[test]
+fn a_version_is_published_only_if_it_is_the_same_everywhere() {
+    if let Some(tool) = TOOLS.iter().find(|tool| output(Command::new(tool).arg("--version")).is_none()) {
+        return skipped(&format!("{tool} is missing"));
+    }
+    if !project().join(".git").exists() {
+        return skipped("the source is no clone of git");
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let (clone, out) = (folder.path().join("clone"), folder.path().join("dist"));
+    succeed(Command::new("git").args(["clone", "--quiet", "--no-tags"]).arg(project()).arg(&clone));
+    let version = env!("CARGO_PKG_VERSION");
+    let changelog = clone.join("CHANGELOG.md");
+    let of_this_tree = |name: &str| assert!(std::fs::copy(project().join(name), clone.join(name)).is_ok(), "{name}");
+    ["CHANGELOG.md", "CITATION.cff", "scripts/publish", "scripts/release", "scripts/python-wheel"]
+        .into_iter()
+        .for_each(of_this_tree);
+    let written = std::fs::read_to_string(&changelog).expect("readable");
+    let dated = |date: &str| {
+        let begin = written.find("\n## ").expect("a heading") + 1;
+        let end = begin + written[begin..].find('\n').expect("more lines");
+        let dated = format!("{}## {version} ({date}){}", &written[..begin], &written[end..]);
+        std::fs::write(&changelog, dated).expect("written");
+    };
+    let commit = || {
+        let author = ["-c", "user.name=a", "-c", "user.email=a@example.org"];
+        let commit = ["commit", "--quiet", "--allow-empty", "--all", "--message", "a version"];
+        succeed(Command::new("git").args(author).args(commit).current_dir(&clone));
+    };
+    let publish = |is_right: bool| {
+        let mut command = Command::new(clone.join("scripts/publish"));
+        command.arg("--program").arg(env!("CARGO_BIN_EXE_blindgrasp")).arg("--out").arg(&out).arg("--fast");
+        command.env("PATH", path_with_python()).env_remove("CARGO_TARGET_DIR");
+        let output = output(&mut command).expect("started");
+        let said = format!("{}{}", text(&output.stdout), text(&output.stderr));
+        assert_eq!(output.status.success(), is_right, "{said}");
+        said
+    };
+    dated("unreleased");
+    let citation = std::fs::read_to_string(clone.join("CITATION.cff")).expect("readable");
+    let other = citation.replace(&format!("version: {version}"), "version: 9.9.9");
+    std::fs::write(clone.join("CITATION.cff"), other).expect("written");
+    let said = publish(false);
+    for mistake in ["CITATION.cff has version 9.9.9", "CHANGELOG.md begins with", "that are not committed"] {
+        assert!(said.contains(mistake), "{mistake}: {said}");
+    }
+    assert!(!out.exists(), "{said}");
+
+    dated("2026-11-27");
+    std::fs::write(clone.join("CITATION.cff"), citation).expect("written");
+    commit();
+    let said = publish(true);
+    let places = ["blindgrasp-messages", "blindgrasp-stages", "blindgrasp-operators"]
+        .map(|name| said.find(&format!("  {name}\n")));
+    assert!(places.is_sorted() && places[0].is_some(), "{said}");
+    let names = file_names(&out);
+    for end in [".deb", ".tar.gz", ".cdx.json", "_x86_64.whl"] {
+        one(&names, end);
+    }
+    let tags = succeed(Command::new("git").args(["tag", "--list"]).current_dir(&clone));
+    assert!(!tags.contains(&format!("v{version}")), "{tags}");
+
+    succeed(Command::new("git").args(["tag", &format!("v{version}")]).current_dir(&clone));
+    assert!(publish(false).contains("is there already"));
+}
+
+/// The workflow names scripts that are there, and both machines.
+#[test]
+fn the_workflow_of_a_release_runs_scripts_that_are_there() {
+    let workflow = std::fs::read_to_string(project().join(".github/workflows/release.yml")).expect("readable");
+    let workflow: serde_json::Value = serde_saphyr::from_str(&workflow).expect("YAML");
+    let build = &workflow["jobs"]["build"];
+    assert_eq!(build["strategy"]["matrix"]["runner"], serde_json::json!(["ubuntu-22.04", "ubuntu-22.04-arm"]));
+    assert_eq!(workflow["jobs"]["publish"]["needs"], "build");
+    let steps = build["steps"].as_array().expect("steps");
+    let commands = steps.iter().filter_map(|step| step["run"].as_str());
+    let scripts: Vec<&str> = commands.filter(|run| run.starts_with("scripts/")).collect();
+    assert!(scripts.len() >= 2, "{scripts:?}");
+    for script in scripts {
+        let path = project().join(script.split(' ').next().expect("a word"));
+        assert!(path.is_file(), "{} is not there", path.display());
+    }
+}
+
+/// The search path, with the Python of the tests first: it builds wheels without PyPI.
+fn path_with_python() -> std::ffi::OsString {
+    let python = python().parent().expect("a folder").to_path_buf();
+    let others = std::env::var_os("PATH").unwrap_or_default();
+    let paths = std::iter::once(python).chain(std::env::split_paths(&others));
+    std::env::join_paths(paths).expect("a search path")
 }
 
 /// Packs the program of this build.
