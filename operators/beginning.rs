@@ -1,5 +1,6 @@
-//! The mistakes that a node's operator finds when it begins, found before anything is started: files that cannot be read, params that
-//! do not go together, inputs that must not hold up the graph. An operator asks the same functions when it begins.
+//! The mistakes that a node's operator finds when it begins, found before anything is started: files that cannot be read,
+//! params that do not go together, inputs that must not hold up the graph. An operator asks the same functions when it
+//! begins.
 
 use blindgrasp_graph::dataflow::{EdgePolicy, Graph, Node};
 use blindgrasp_operator::wiring::Sandbox;
@@ -22,8 +23,8 @@ pub struct Unable {
     pub reason: String,
 }
 
-/// The nodes of a graph that could not begin on `here`, or on any machine. Nodes of other machines have their files there, and programs
-/// of somebody's own are not asked.
+/// The nodes of a graph that could not begin on `here`, or on any machine. Nodes of other machines have their files there,
+/// and programs of somebody's own are not asked.
 pub fn unable_to_begin(graph: &Graph, here: Option<&str>) -> Vec<Unable> {
     let mut unable = Vec::new();
     for node in &graph.nodes {

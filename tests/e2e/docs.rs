@@ -58,8 +58,8 @@ fn anchors_and_links_are_found_as_github_does() {
     assert_eq!(links(text), ["a.md", "b.md#c", "g.svg"]);
 }
 
-/// Commands of pages work in a project of `blindgrasp init`: the files that they name are there. Pages about hands have a hand of their
-/// own, and `--ros2` is that of the page on ROS 2.
+/// Commands of pages work in a project of `blindgrasp init`: the files that they name are there. Pages about hands have a
+/// hand of their own, and `--ros2` is that of the page on ROS 2.
 #[test]
 fn commands_name_files_that_a_project_has() {
     let folder = tempfile::tempdir().expect("a folder");

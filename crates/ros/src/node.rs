@@ -67,8 +67,8 @@ pub enum RosError {
     #[error("{endpoints}: {message}")]
     Open { endpoints: String, message: String },
     #[error(
-        "{endpoints}: no router of Zenoh answers{}; start the router: ros2 run rmw_zenoh_cpp rmw_zenohd, or for nodes of DDS \
-         zenoh-bridge-ros2dds",
+        "{endpoints}: no router of Zenoh answers{}; start the router: ros2 run rmw_zenoh_cpp rmw_zenohd, or for nodes \
+         of DDS zenoh-bridge-ros2dds",
         if *.with_keys { ", or one end refuses the other's certificate" } else { "" }
     )]
     NoRouter { endpoints: String, with_keys: bool },
@@ -650,8 +650,8 @@ mod tests {
         assert!(tokens[0].ends_with("/:1:,10:,:,:,,"), "{}", tokens[0]);
     }
 
-    /// A publisher as in Lyrical, after rmw_zenoh's pull request 930: its token has a further part behind the qualities, and it
-    /// sends the same message on keys below the topic's own to subscribers whose tokens have one.
+    /// A publisher as in Lyrical, after rmw_zenoh's pull request 930: its token has a further part behind the qualities, and
+    /// it sends the same message on keys below the topic's own to subscribers whose tokens have one.
     #[test]
     fn a_publisher_of_lyrical_is_heard_once() {
         let message = MessageType { name: "sensor_msgs/msg/Image".into(), hash: format!("RIHS01_{}", "7f".repeat(32)) };
@@ -666,7 +666,8 @@ mod tests {
             .subscriber("/touch", &message, Quality::Sensor, move |received| drop(sender.send(received)))
             .expect("a subscriber");
 
-        let config = json!({"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": false}}});
+        let scouting = json!({"multicast": {"enabled": false}});
+        let config = json!({"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": scouting});
         let config = Config::from_json5(&config.to_string()).expect("a configuration");
         let robot = zenoh::open(config).wait().expect("a session");
         let dds = dds_name(&message).expect("a type");
