@@ -242,14 +242,15 @@ pub(crate) fn definition_of(name: &str, file: Option<&Path>) -> anyhow::Result<D
 
 #[cfg(test)]
 mod tests {
-    use blindgrasp_messages::{GraspScene, GraspTruth, LiftOutcome};
+    use blindgrasp_messages::{GraspScene, LiftOutcome};
 
     use std::collections::BTreeMap;
 
     use super::super::ros2_decision::DECISION;
     use super::*;
 
-    /// The files of messages: `Header.msg` and so on.
+    /// The files of messages: `Header.msg` and so on. Labels are not among them: a field is called `class`, which no program in
+    /// C++ can have, and no topic carries them.
     fn message_files() -> BTreeMap<String, String> {
         let mut files = BTreeMap::from([("Decision".to_owned(), DECISION.to_owned())]);
         let mut add = |schema: &str, definition: String| {
@@ -265,7 +266,6 @@ mod tests {
         add(GraspFeature::SCHEMA, GraspFeature::definition());
         add(Prediction::SCHEMA, Prediction::definition());
         add(LiftDecision::SCHEMA, LiftDecision::definition());
-        add(GraspTruth::SCHEMA, GraspTruth::definition());
         add(LiftOutcome::SCHEMA, LiftOutcome::definition());
         add(GraspScene::SCHEMA, GraspScene::definition());
         files

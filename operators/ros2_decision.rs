@@ -183,6 +183,15 @@ mod tests {
 
     use super::*;
 
+    /// The hashes that the generators of ROS 2 Kilted give the package of messages.
+    #[test]
+    fn hashes_are_those_of_ros_2() {
+        let decide = decide_type().expect("a type").0.hash;
+        assert_eq!(decide, "RIHS01_3a3db401d17c9a9d5bf44c9dc831b8f557b00d92376b56e7cc7a0943bb8187ef");
+        let decision = decision_type().expect("a type").hash;
+        assert_eq!(decision, "RIHS01_ee09b7459ecfa1dff2e058e5677af62831667101a87eed055c5b2ecfb91b3bf7");
+    }
+
     #[test]
     fn a_call_gets_the_valid_decision_or_waits_for_the_next_or_gets_none() {
         let last = Arc::new(LastDecision::default());

@@ -74,7 +74,7 @@ const LINES: File = ("bridges/line_protocol.py", include_bytes!("../../examples/
 const ROS2: File = ("bridges/ros2.py", include_bytes!("../../examples/bridges/ros2.py"));
 
 /// The nodes of ROS 2. They and the bridge have the places in a project that the documents name.
-const ROS2_FILES: [File; 19] = [
+const ROS2_FILES: [File; 18] = [
     ROS2,
     LINES,
     ("ros2_lift_gate.py", include_bytes!("../../examples/ros2_lift_gate.py")),
@@ -86,7 +86,6 @@ const ROS2_FILES: [File; 19] = [
     ("blindgrasp_msgs/msg/Decision.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Decision.msg")),
     ("blindgrasp_msgs/msg/GraspFeature.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/GraspFeature.msg")),
     ("blindgrasp_msgs/msg/GraspScene.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/GraspScene.msg")),
-    ("blindgrasp_msgs/msg/GraspTruth.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/GraspTruth.msg")),
     ("blindgrasp_msgs/msg/Header.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Header.msg")),
     ("blindgrasp_msgs/msg/LiftDecision.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/LiftDecision.msg")),
     ("blindgrasp_msgs/msg/LiftOutcome.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/LiftOutcome.msg")),

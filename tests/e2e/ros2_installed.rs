@@ -1,7 +1,8 @@
-//! The bridge for ROS 2 with an installation of it: rclpy and Fast DDS of Kilted, as PyPI has them for x86-64.
+//! The programs for ROS 2 with an installation of it: rclpy, Fast DDS and the generators of messages of Kilted, as PyPI has
+//! them for x86-64.
 
 use std::io::{BufRead, BufReader, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
 use serde_json::{Value, json};
@@ -9,6 +10,9 @@ use serde_json::{Value, json};
 use crate::common::python::python;
 use crate::common::{Graph, project, skipped, undisturbed, unique_name, wait_until};
 use crate::tactile_source::{free_port, grasps, live_dataflow};
+use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};
+use blindgrasp_ros::definition::Definition;
+use blindgrasp_ros::standard;
 use blindgrasp_stages::hand::Hand;
 
 const N_GRASPS: u64 = 3;
@@ -21,17 +25,49 @@ cells:
 phase: {topic: /hand/phase, max_age_ms: 0}
 tolerance_ms: 1000
 ";
+/// Publishes the decisions of stdin: grasp, action, and the seconds for which it is valid.
+const ARBITER: &str = "
+import json, sys, time, rclpy
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from blindgrasp_msgs.msg import Decision
+rclpy.init()
+node = rclpy.create_node('arbiter')
+qos = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+decisions = node.create_publisher(Decision, '/blindgrasp/decision', qos)
+while not decisions.get_subscription_count():
+    time.sleep(0.05)
+for line in sys.stdin:
+    grasp_id, action, left_secs = json.loads(line)
+    decision = Decision(grasp_id=grasp_id, action=getattr(Decision, action), reason='stable', probability_stable=0.9)
+    nanos = time.time_ns() + left_secs * 1_000_000_000
+    decision.valid_until.sec, decision.valid_until.nanosec = divmod(nanos, 1_000_000_000)
+    decisions.publish(decision)
+";
 
+/// A program in Python.
 struct Node(Child);
 
 impl Node {
-    /// A program in Python, in a domain of ROS that other tests do not use, on this machine alone.
-    fn start(program: &Path, arguments: &[&str], domain: u32) -> Node {
+    /// It is in a domain of ROS that other tests do not use, on this machine alone.
+    fn start(arguments: &[&str], domain: u32, built: Option<&Path>) -> Node {
         let mut command = Command::new(python());
-        command.arg(program).args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped());
+        command.args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
         command.env("ROS_DOMAIN_ID", domain.to_string()).env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST");
         command.env("PYTHONDONTWRITEBYTECODE", "1");
+        if let Some(built) = built {
+            let prefixes = [built.to_path_buf(), environment()];
+            let libraries = prefixes.clone().map(|prefix| prefix.join("lib"));
+            command.env("AMENT_PREFIX_PATH", std::env::join_paths(&prefixes).expect("paths"));
+            command.env("LD_LIBRARY_PATH", std::env::join_paths(libraries).expect("paths"));
+            command.env("PYTHONPATH", packages_of(built));
+        }
         Node(command.spawn().expect("started"))
+    }
+
+    /// It ends as any program when it is asked to, without a traceback.
+    fn stop(mut self) {
+        crate::common::signal(self.0.id() as i32, rustix::process::Signal::TERM);
+        assert!(self.0.wait().expect("ended").success());
     }
 }
 
@@ -42,10 +78,33 @@ impl Drop for Node {
     }
 }
 
+/// The folder in which pip has installed ROS 2.
+fn environment() -> PathBuf {
+    python().parent().and_then(Path::parent).expect("an environment").to_path_buf()
+}
+
+/// The packages of Python below an installation.
+fn packages_of(installed: &Path) -> PathBuf {
+    let folders = std::fs::read_dir(installed.join("lib")).expect("a folder");
+    let paths = folders.map(|entry| entry.expect("an entry").path().join("site-packages"));
+    paths.into_iter().find(|path| path.is_dir()).expect("packages of Python")
+}
+
+/// Whether something in Python is true.
+fn holds(expression: &str) -> bool {
+    let script = format!("import os, sysconfig\nimport rclpy\nraise SystemExit(0 if {expression} else 1)");
+    let status = Command::new(python()).args(["-c", &script]).stderr(Stdio::null()).status();
+    status.is_ok_and(|status| status.success())
+}
+
+/// One of the first or of the second fifty domains. Ports of those above 101 may be taken for other connections.
+fn domain(fifty: u32) -> u32 {
+    1 + 50 * fifty + std::process::id() % 50
+}
+
 #[test]
 fn nodes_of_an_installation_of_ros_2_are_read_by_the_bridge() {
-    let has_ros = Command::new(python()).args(["-c", "import rclpy"]).stderr(Stdio::null()).status();
-    if !has_ros.is_ok_and(|status| status.success()) {
+    if !holds("True") {
         return skipped("PyPI has no ROS 2 for this machine");
     }
     let folder = tempfile::tempdir().expect("a folder");
@@ -55,12 +114,13 @@ fn nodes_of_an_installation_of_ros_2_are_read_by_the_bridge() {
     let params = format!("driver: listen\n      address: 127.0.0.1:{port}\n      max_delay_ms: 20000");
     let graph = Graph::launch(&unique_name(), &live_dataflow(folder.path(), &params), &PATIENT);
     wait_until(|| graph.said().contains("listening on"), || graph.said());
-    let domain = 1 + std::process::id() % 100;
     let address = format!("127.0.0.1:{port}");
-    let program = project().join("examples/bridges/ros2.py");
-    let mut bridge = Node::start(&program, &[table.to_str().expect("UTF-8"), "--address", &address], domain);
+    let program = project().join("examples/bridges/ros2.py").display().to_string();
+    let table = table.to_str().expect("UTF-8");
+    let bridge = Node::start(&[&program, table, "--address", &address], domain(0), None);
 
-    let mut driver = Node::start(&project().join("tests/ros2_driver.py"), &[], domain);
+    let driver = project().join("tests/ros2_driver.py").display().to_string();
+    let mut driver = Node::start(&[&driver], domain(0), None);
     let mut answers = BufReader::new(driver.0.stdout.take().expect("stdout"));
     let mut stdin = driver.0.stdin.take().expect("stdin");
     let mut say = |said: &Value, expected: &str| {
@@ -92,8 +152,87 @@ fn nodes_of_an_installation_of_ros_2_are_read_by_the_bridge() {
     for (line, (action, reason)) in decided.iter().zip(&undisturbed()[..N_GRASPS as usize]) {
         assert_eq!((&line["action"], &line["reason"]), (&json!(action), &json!(reason)), "{line}");
     }
-    // It ends as any program when it is asked to, without a traceback.
-    crate::common::signal(bridge.0.id() as i32, rustix::process::Signal::TERM);
-    assert!(bridge.0.wait().expect("ended").success());
+    bridge.stop();
     graph.stop();
+}
+
+/// The package of messages compiles, its types have the hashes that blindgrasp sends, and the example node lifts what it should.
+#[test]
+fn the_package_of_messages_compiles_and_the_gate_of_the_arm_reads_them() {
+    if !holds("os.path.exists(sysconfig.get_paths()['include'] + '/Python.h')") {
+        return skipped("PyPI has no ROS 2 for this machine, or the headers of Python are missing");
+    }
+    if !Command::new("c++").arg("--version").stdout(Stdio::null()).status().is_ok_and(|status| status.success()) {
+        return skipped("c++ is missing");
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let (build, built) = (folder.path().join("build"), folder.path().join("built"));
+    let prefix = environment();
+    let package = project().join("examples/blindgrasp_msgs");
+    let of_cmake = |arguments: &[String]| {
+        let mut command = Command::new(prefix.join("bin/cmake"));
+        let others = std::env::var_os("PATH").unwrap_or_default();
+        let paths = std::iter::once(prefix.join("bin")).chain(std::env::split_paths(&others));
+        command.args(arguments).env("PATH", std::env::join_paths(paths).expect("paths"));
+        let output = command.env("AMENT_PREFIX_PATH", &prefix).output().expect("started");
+        let said = crate::common::text(&output.stdout);
+        assert!(output.status.success(), "{said}\n{}", crate::common::text(&output.stderr));
+    };
+    of_cmake(&[
+        format!("-S{}", package.display()),
+        format!("-B{}", build.display()),
+        "-GNinja".into(),
+        format!("-DCMAKE_PREFIX_PATH={}", prefix.display()),
+        format!("-DCMAKE_INSTALL_PREFIX={}", built.display()),
+        format!("-DPython3_EXECUTABLE={}", python().display()),
+        "-DBUILD_TESTING=OFF".into(),
+    ]);
+    of_cmake(&["--build".into(), build.display().to_string(), "--target".into(), "install".into()]);
+
+    let decision = std::fs::read_to_string(project().join("operators/Decision.msg")).expect("readable");
+    let decision = standard::with_parts(&decision, &["builtin_interfaces/Time"]);
+    for (name, definition) in [
+        (TactileFrame::SCHEMA, TactileFrame::definition()),
+        (ContactSet::SCHEMA, ContactSet::definition()),
+        (GraspFeature::SCHEMA, GraspFeature::definition()),
+        (Prediction::SCHEMA, Prediction::definition()),
+        ("blindgrasp_msgs/msg/Decision", decision),
+    ] {
+        let ours = Definition::parse(name, &definition).expect("a definition").hash();
+        assert_eq!(hash_of(&built, name), ours, "{name}");
+    }
+
+    // The other test may run its nodes at the same time.
+    let domain = domain(1);
+    let gate = project().join("examples/ros2_lift_gate.py").display().to_string();
+    let mut gate = Node::start(&[&gate], domain, Some(&built));
+    let mut arbiter = Node::start(&["-c", ARBITER], domain, Some(&built));
+    let mut stdin = arbiter.0.stdin.take().expect("stdin");
+    let mut answers = BufReader::new(gate.0.stderr.take().expect("stderr"));
+    for (decision, expected) in [
+        (json!([1, "HOLD", 600]), "grasp 1: hold, stable"),
+        (json!([2, "LIFT", -1]), "grasp 2: LIFT is no longer valid, hold"),
+        (json!([3, "LIFT", 600]), "grasp 3: lift, probability 0.90"),
+        // A grasp is lifted once, so that the same decision again is not answered.
+        (json!([3, "LIFT", 600]), ""),
+        (json!([4, "TEST_LIFT", 600]), "grasp 4: hold, stable"),
+    ] {
+        writeln!(stdin, "{decision}").expect("written");
+        if !expected.is_empty() {
+            let mut said = String::new();
+            answers.read_line(&mut said).expect("read");
+            assert!(said.trim_end().ends_with(expected), "{expected}: {said}");
+        }
+    }
+    gate.stop();
+}
+
+/// The hash that the generators of ROS 2 gave a type.
+fn hash_of(built: &Path, name: &str) -> String {
+    let (package, rest) = name.split_once('/').expect("a package");
+    let text = std::fs::read_to_string(built.join(format!("share/{package}/{rest}.json"))).expect("readable");
+    let described: Value = serde_json::from_str(&text).expect("JSON");
+    let hashes = described["type_hashes"].as_array().expect("hashes");
+    let ours = hashes.iter().find(|hash| hash["type_name"] == name).expect("its hash");
+    ours["hash_string"].as_str().expect("a hash").to_owned()
 }
