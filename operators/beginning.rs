@@ -9,7 +9,7 @@ use serde_json::{Map, Value};
 use crate::SHIPPED;
 
 /// A node as its dataflow file has it.
-pub struct Beginning<'a> {
+pub struct FileNode<'a> {
     pub(crate) params: &'a Map<String, Value>,
     /// The connected inputs, and whether each is lossless.
     pub(crate) inputs: Vec<(&'a str, bool)>,
@@ -18,21 +18,21 @@ pub struct Beginning<'a> {
 
 /// A node that could not begin, and why.
 #[derive(Debug)]
-pub struct Unable {
+pub struct UnableNode {
     pub node: String,
     pub reason: String,
 }
 
 /// The nodes of a graph that could not begin on `here`, or on any machine. Nodes of other machines have their files there,
 /// and programs of somebody's own are not asked.
-pub fn unable_to_begin(graph: &Graph, here: Option<&str>) -> Vec<Unable> {
+pub fn unable_to_begin(graph: &Graph, here: Option<&str>) -> Vec<UnableNode> {
     let mut unable = Vec::new();
     for node in &graph.nodes {
         if here.is_some() && node.machine.is_some() && node.machine.as_deref() != here {
             continue;
         }
         if let Err(error) = check(node) {
-            unable.push(Unable { node: node.id.clone(), reason: format!("{error:#}") });
+            unable.push(UnableNode { node: node.id.clone(), reason: format!("{error:#}") });
         }
     }
     unable
@@ -49,5 +49,5 @@ fn check(node: &Node) -> anyhow::Result<()> {
     };
     let inputs = node.inputs.iter().map(|input| (input.port.as_str(), input.edge.policy == EdgePolicy::Lossless));
     let has_sandbox = node.sandbox != Sandbox::Off;
-    (form.check)(&Beginning { params: &node.params, inputs: inputs.collect(), has_sandbox })
+    (form.check)(&FileNode { params: &node.params, inputs: inputs.collect(), has_sandbox })
 }

@@ -15,7 +15,7 @@ use blindgrasp_stages::sensors::{Described, SensorCheck, SensorFault, SensorMemo
 use blindgrasp_stages::steps::{contact_set, find_contacts};
 use serde::Deserialize;
 
-use crate::beginning::Beginning;
+use crate::beginning::FileNode;
 
 #[derive(Deserialize)]
 struct Params {
@@ -50,7 +50,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
 }
 
 /// The mistakes with which [`work`] would fail at once.
-pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+pub(crate) fn check(node: &FileNode<'_>) -> anyhow::Result<()> {
     files_of(&parse_params(node.params)?).map(drop)
 }
 

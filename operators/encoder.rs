@@ -11,7 +11,7 @@ use blindgrasp_operator::stage;
 use blindgrasp_stages::{Model, steps};
 use serde::Deserialize;
 
-use crate::beginning::Beginning;
+use crate::beginning::FileNode;
 
 #[derive(Deserialize)]
 struct Params {
@@ -28,7 +28,7 @@ pub(crate) fn describe() -> OperatorDescription {
 }
 
 /// The mistakes with which [`work`] would fail at once.
-pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+pub(crate) fn check(node: &FileNode<'_>) -> anyhow::Result<()> {
     let params: Params = parse_params(node.params)?;
     Model::load(&params.model)?;
     Ok(())

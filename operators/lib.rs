@@ -32,7 +32,7 @@ use blindgrasp_graph::operators::{LINK_OPERATOR, Operators};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 
-use crate::beginning::Beginning;
+use crate::beginning::FileNode;
 
 /// The module for operators in Python, and the messages that it knows.
 pub const PYTHON_OPERATOR: &str = include_str!("blindgrasp_operator.py");
@@ -55,11 +55,11 @@ pub struct Form {
     pub describe: fn() -> OperatorDescription,
     pub work: fn(&Operator) -> anyhow::Result<()>,
     /// Finds the mistakes in params and files with which `work` would fail at once.
-    pub check: Check,
+    pub check: CheckNode,
 }
 
 /// See [`Form::check`].
-pub type Check = fn(&Beginning<'_>) -> anyhow::Result<()>;
+pub type CheckNode = fn(&FileNode<'_>) -> anyhow::Result<()>;
 
 /// All of them. A new one is its file and a line here.
 pub const SHIPPED: [Shipped; 11] = [
@@ -89,7 +89,7 @@ impl Shipped {
         name: &'static str,
         describe: fn() -> OperatorDescription,
         work: fn(&Operator) -> anyhow::Result<()>,
-        check: Check,
+        check: CheckNode,
     ) -> Shipped {
         Shipped { name, form: Form { describe, work, check }, can_share_process: false, variants: &[] }
     }

@@ -13,7 +13,7 @@ use blindgrasp_stages::promise_monitor::{OUTCOME_COUNTS, PromiseMonitor};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::beginning::Beginning;
+use crate::beginning::FileNode;
 
 #[derive(Deserialize)]
 struct Params {
@@ -73,7 +73,7 @@ pub(crate) fn describe() -> OperatorDescription {
 }
 
 /// The mistakes with which [`work`] would fail at once.
-pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+pub(crate) fn check(node: &FileNode<'_>) -> anyhow::Result<()> {
     parse_params::<Params>(node.params)?;
     Ok(())
 }

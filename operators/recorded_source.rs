@@ -24,7 +24,7 @@ use blindgrasp_replay::selection::Selection;
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
-use crate::beginning::Beginning;
+use crate::beginning::FileNode;
 use crate::{Form, Shipped};
 
 /// Clocks jump, and robots are switched off overnight.
@@ -85,7 +85,7 @@ fn describe<M: Played>() -> OperatorDescription {
 }
 
 /// The mistakes with which [`work`] would fail at once.
-fn check<M: Played>(node: &Beginning<'_>) -> anyhow::Result<()> {
+fn check<M: Played>(node: &FileNode<'_>) -> anyhow::Result<()> {
     opened::<M>(&parse_params(node.params)?).map(drop)
 }
 

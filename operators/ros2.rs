@@ -17,7 +17,7 @@ use blindgrasp_ros::standard;
 use blindgrasp_stages::hand::Hand;
 use serde::Deserialize;
 
-use super::beginning::Beginning;
+use super::beginning::FileNode;
 use super::connection::{ConnectionParams, warn_if_open, with_connection_params};
 use super::publishing::{Forward, Node, Outside, Topic, check_inputs, edge, publish};
 use super::ros2_decision::{Decision, LastDecision, decide_type, decision_type};
@@ -174,7 +174,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
 }
 
 /// The mistakes with which [`work`] would fail at once.
-pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+pub(crate) fn check(node: &FileNode<'_>) -> anyhow::Result<()> {
     network_and_hand(&parse_params(node.params)?)?;
     check_inputs(node.inputs.iter().copied())
 }

@@ -9,7 +9,7 @@ use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage;
 use serde::Deserialize;
 
-use crate::beginning::Beginning;
+use crate::beginning::FileNode;
 
 #[derive(Deserialize)]
 struct Params {
@@ -30,7 +30,7 @@ pub(crate) fn describe() -> OperatorDescription {
 }
 
 /// The mistakes with which [`work`] would fail at once.
-pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+pub(crate) fn check(node: &FileNode<'_>) -> anyhow::Result<()> {
     let params: Params = parse_params(node.params)?;
     crate::contacts::hand_of(&params.hand).map(drop)
 }

@@ -33,7 +33,7 @@ use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 use serde::{Deserialize, Serialize};
 
-use crate::beginning::Beginning;
+use crate::beginning::FileNode;
 
 const DEFAULT_HAND: &str = "barrett-bh8-280";
 /// The most attempts that are kept because they may be unread; that many fit into a node's state.
@@ -56,7 +56,7 @@ struct Params {
 }
 
 /// The files and objects of a run.
-struct Setup {
+struct TrialParts {
     hand: Hand,
     things: Vec<LiftTarget>,
     trial_options: TrialOptions,
@@ -119,12 +119,12 @@ pub(crate) fn describe() -> OperatorDescription {
 }
 
 /// The mistakes with which [`work`] would fail at once, but that no approach is free, which takes simulation to find.
-pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+pub(crate) fn check(node: &FileNode<'_>) -> anyhow::Result<()> {
     setup(&parse_params(node.params)?).map(drop)
 }
 
 /// The hand, the things, the options of trials and the approaches that a model prefers.
-fn setup(params: &Params) -> anyhow::Result<Setup> {
+fn setup(params: &Params) -> anyhow::Result<TrialParts> {
     let hand = Hand::load(params.hand.as_deref().unwrap_or(Path::new(DEFAULT_HAND)))?;
     let mut things = targets_named(&params.things)?;
     if things.is_empty() {
@@ -142,12 +142,12 @@ fn setup(params: &Params) -> anyhow::Result<Setup> {
         Some(path) => Model::load(path)?.approach,
         None => None,
     };
-    Ok(Setup { hand, things, trial_options, prior })
+    Ok(TrialParts { hand, things, trial_options, prior })
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
-    let Setup { hand, things, trial_options, prior } = setup(&params)?;
+    let TrialParts { hand, things, trial_options, prior } = setup(&params)?;
     operator.reserve_state()?;
     // An instance that goes on has checked before.
     if operator.saved_state().is_none() {

@@ -36,7 +36,7 @@ use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, 
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
-use crate::beginning::Beginning;
+use crate::beginning::FileNode;
 use crate::connection::warn_if_open;
 use crate::joint_map::hand_joints;
 use crate::ros2::{NetworkParams, definition_of, with_network_params};
@@ -225,7 +225,7 @@ pub(crate) fn describe() -> OperatorDescription {
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
-    let Setup { hand, driver, zeros } = setup(&params, operator.has_sandbox())?;
+    let SourceParts { hand, driver, zeros } = setup(&params, operator.has_sandbox())?;
     let (n_joints, n_cells) = (hand.joints.len(), hand.n_cells());
     if matches!(params.driver, DriverWord::Ros2 | DriverWord::Zenoh) {
         warn_if_open(&params.network.connection.network()?);
@@ -258,18 +258,18 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
 }
 
 /// The mistakes with which [`work`] would fail at once, but for devices and sockets, which it opens.
-pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+pub(crate) fn check(node: &FileNode<'_>) -> anyhow::Result<()> {
     setup(&parse_params(node.params)?, node.has_sandbox).map(drop)
 }
 
 /// The hand, its driver, which is not open yet, and the zeros of its cells.
-struct Setup {
+struct SourceParts {
     hand: Hand,
     driver: Box<dyn TactileDriver>,
     zeros: CellZeros,
 }
 
-fn setup(params: &Params, has_sandbox: bool) -> anyhow::Result<Setup> {
+fn setup(params: &Params, has_sandbox: bool) -> anyhow::Result<SourceParts> {
     let hand = Hand::load(&params.hand)?;
     let (n_joints, n_cells) = (hand.joints.len(), hand.n_cells());
     if n_joints > MAX_JOINTS || n_cells > MAX_CELLS {
@@ -283,7 +283,7 @@ fn setup(params: &Params, has_sandbox: bool) -> anyhow::Result<Setup> {
     }
     let zeros =
         CellZeros::new(&sensed, params.zero_when_open).map_err(|reason| anyhow!("hand {}: {reason}", hand.name))?;
-    Ok(Setup { hand, driver, zeros })
+    Ok(SourceParts { hand, driver, zeros })
 }
 
 /// The driver that the parameters ask for. A parameter that the driver does not use is a mistake.

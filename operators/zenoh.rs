@@ -11,7 +11,7 @@ use blindgrasp_operator::param::ParamKind;
 use blindgrasp_ros::node::{Network, Quality, Rights, topic_name};
 use serde::{Deserialize, Serialize};
 
-use super::beginning::Beginning;
+use super::beginning::FileNode;
 use super::connection::{ConnectionParams, warn_if_open, with_connection_params};
 use super::publishing::{Encode, Forward, Node, Outside, Topic, check_inputs, edge, publish};
 
@@ -57,7 +57,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
 }
 
 /// The mistakes with which [`work`] would fail at once.
-pub(crate) fn check(node: &Beginning<'_>) -> anyhow::Result<()> {
+pub(crate) fn check(node: &FileNode<'_>) -> anyhow::Result<()> {
     network_and_prefix(parse_params(node.params)?)?;
     check_inputs(node.inputs.iter().copied())
 }

@@ -9,7 +9,7 @@ use blindgrasp_graph::dataflow::{self, DataflowError, DataflowFile, Diagnostic, 
 use blindgrasp_graph::describe::describe;
 use blindgrasp_graph::operators::{Operators, running_program};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operators::beginning::{Unable, unable_to_begin};
+use blindgrasp_operators::beginning::{UnableNode, unable_to_begin};
 use blindgrasp_operators::fit::{Fit, Misfit, MisfitKind, Part, check_fit, parts_of, running_parts};
 use blindgrasp_operators::{SHIPPED, operators_of};
 
@@ -72,7 +72,7 @@ pub(super) fn able_to_begin(
         Scope::Everything => None,
         Scope::Machine(here) => Some(here),
     };
-    let diagnostics = unable_to_begin(&graph, here).into_iter().map(|Unable { node, reason }| Diagnostic {
+    let diagnostics = unable_to_begin(&graph, here).into_iter().map(|UnableNode { node, reason }| Diagnostic {
         file: file.path().into(),
         at: file.position_of(&node),
         setting: None,

@@ -44,6 +44,46 @@ for line in sys.stdin:
     decisions.publish(decision)
 ";
 
+/// The controller of a gripper, which reaches each goal.
+const CONTROLLER: &str = "
+import rclpy
+from rclpy.action import ActionServer
+from control_msgs.action import GripperCommand
+rclpy.init()
+node = rclpy.create_node('controller')
+def reach(goal):
+    goal.succeed()
+    return GripperCommand.Result(position=goal.request.command.position, reached_goal=True)
+server = ActionServer(node, GripperCommand, '/gripper/cmd', reach)
+rclpy.spin(node)
+";
+/// In place of a graph: the same decision about one grasp after the other.
+const DECISIONS: &str = "
+import itertools, json, sys, time
+for grasp_id in itertools.count():
+    time.sleep(0.2)
+    until = time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 600_000_000_000
+    print(json.dumps({'grasp_id': grasp_id, 'action': sys.argv[1], 'reason': 'stable', 'valid_until_nanos': until}), flush=True)
+";
+/// MoveIt's part: goals, one after the other, and how each ended.
+const GOALS: &str = "
+import rclpy
+from rclpy.action import ActionClient
+from control_msgs.action import GripperCommand
+rclpy.init()
+node = rclpy.create_node('moveit')
+client = ActionClient(node, GripperCommand, '/grasp_gate/gripper_cmd')
+client.wait_for_server()
+def result(future):
+    rclpy.spin_until_future_complete(node, future)
+    return future.result()
+for position in [0.08, 0.01]:
+    goal = GripperCommand.Goal()
+    goal.command.position = position
+    ended = result(result(client.send_goal_async(goal)).get_result_async())
+    print(position, ended.status, flush=True)
+";
+
 /// A program in Python.
 struct Node(Child);
 
@@ -97,9 +137,9 @@ fn holds(expression: &str) -> bool {
     status.is_ok_and(|status| status.success())
 }
 
-/// One of the first or of the second fifty domains. Ports of those above 101 may be taken for other connections.
-fn domain(fifty: u32) -> u32 {
-    1 + 50 * fifty + std::process::id() % 50
+/// A domain for the nth test of this process. Ports of domains above 101 may be taken for other connections.
+fn domain(n: u32) -> u32 {
+    1 + 30 * n + std::process::id() % 30
 }
 
 #[test]
@@ -159,35 +199,11 @@ fn nodes_of_an_installation_of_ros_2_are_read_by_the_bridge() {
 /// The package of messages compiles, its types have the hashes that blindgrasp sends, and the example node lifts what it should.
 #[test]
 fn the_package_of_messages_compiles_and_the_gate_of_the_arm_reads_them() {
-    if !holds("os.path.exists(sysconfig.get_paths()['include'] + '/Python.h')") {
-        return skipped("PyPI has no ROS 2 for this machine, or the headers of Python are missing");
-    }
-    if !Command::new("c++").arg("--version").stdout(Stdio::null()).status().is_ok_and(|status| status.success()) {
-        return skipped("c++ is missing");
+    if let Some(missing) = missing_for_packages() {
+        return skipped(missing);
     }
     let folder = tempfile::tempdir().expect("a folder");
-    let (build, built) = (folder.path().join("build"), folder.path().join("built"));
-    let prefix = environment();
-    let package = project().join("examples/blindgrasp_msgs");
-    let of_cmake = |arguments: &[String]| {
-        let mut command = Command::new(prefix.join("bin/cmake"));
-        let others = std::env::var_os("PATH").unwrap_or_default();
-        let paths = std::iter::once(prefix.join("bin")).chain(std::env::split_paths(&others));
-        command.args(arguments).env("PATH", std::env::join_paths(paths).expect("paths"));
-        let output = command.env("AMENT_PREFIX_PATH", &prefix).output().expect("started");
-        let said = crate::common::text(&output.stdout);
-        assert!(output.status.success(), "{said}\n{}", crate::common::text(&output.stderr));
-    };
-    of_cmake(&[
-        format!("-S{}", package.display()),
-        format!("-B{}", build.display()),
-        "-GNinja".into(),
-        format!("-DCMAKE_PREFIX_PATH={}", prefix.display()),
-        format!("-DCMAKE_INSTALL_PREFIX={}", built.display()),
-        format!("-DPython3_EXECUTABLE={}", python().display()),
-        "-DBUILD_TESTING=OFF".into(),
-    ]);
-    of_cmake(&["--build".into(), build.display().to_string(), "--target".into(), "install".into()]);
+    let built = compile(&project().join("examples/blindgrasp_msgs"), folder.path());
 
     let decision = std::fs::read_to_string(project().join("operators/Decision.msg")).expect("readable");
     let decision = standard::with_parts(&decision, &["builtin_interfaces/Time"]);
@@ -202,7 +218,7 @@ fn the_package_of_messages_compiles_and_the_gate_of_the_arm_reads_them() {
         assert_eq!(hash_of(&built, name), ours, "{name}");
     }
 
-    // The other test may run its nodes at the same time.
+    // Other tests may run their nodes at the same time.
     let domain = domain(1);
     let gate = project().join("examples/ros2_lift_gate.py").display().to_string();
     let mut gate = Node::start(&[&gate], domain, Some(&built));
@@ -225,6 +241,85 @@ fn the_package_of_messages_compiles_and_the_gate_of_the_arm_reads_them() {
         }
     }
     gate.stop();
+}
+
+/// MoveIt's goals reach the gripper's controller, and one that closes on an object succeeds only if a LIFT follows. The action is
+/// compiled from its definition, because PyPI has no `control_msgs`.
+#[test]
+fn the_gate_of_the_gripper_passes_goals_on_and_lets_only_a_lift_succeed() {
+    if let Some(missing) = missing_for_packages() {
+        return skipped(missing);
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let package = folder.path().join("control_msgs");
+    let example = project().join("examples/blindgrasp_msgs");
+    for folder in ["msg", "action"] {
+        std::fs::create_dir_all(package.join(folder)).expect("made");
+    }
+    for file in ["CMakeLists.txt", "package.xml"] {
+        let text = std::fs::read_to_string(example.join(file)).expect("readable");
+        let text = text.replace("blindgrasp_msgs", "control_msgs").replace("builtin_interfaces", "action_msgs");
+        std::fs::write(package.join(file), text.replace("srv/*.srv", "action/*.action")).expect("written");
+    }
+    std::fs::write(package.join("msg/GripperCommand.msg"), "float64 position\nfloat64 max_effort\n").expect("written");
+    let state = "float64 position\nfloat64 effort\nbool stalled\nbool reached_goal\n";
+    let action = format!("GripperCommand command\n---\n{state}---\n{state}");
+    std::fs::write(package.join("action/GripperCommand.action"), action).expect("written");
+    let built = compile(&package, folder.path());
+
+    let _controller = Node::start(&["-c", CONTROLLER], domain(2), Some(&built));
+    let gate = project().join("examples/ros2_gripper_gate.py").display().to_string();
+    let graph = folder.path().join("graph.py");
+    std::fs::write(&graph, DECISIONS).expect("written");
+    let (python, graph) = (python().display().to_string(), graph.display().to_string());
+    // A hand that opens needs no decision; 4 is a goal that succeeded, and 6 one that was aborted.
+    for (action, expected) in [("lift", ["0.08 4", "0.01 4"]), ("hold", ["0.08 4", "0.01 6"])] {
+        let of_gate = [&gate, "--controller", "/gripper/cmd", "--grasps-below", "0.03", "--wait", "50"];
+        let options = [&of_gate[..], &[&python, &graph, action]].concat();
+        let gate = Node::start(&options, domain(2), Some(&built));
+        let mut moveit = Node::start(&["-c", GOALS], domain(2), Some(&built));
+        let mut ends = BufReader::new(moveit.0.stdout.take().expect("stdout"));
+        for expected in expected {
+            let mut end = String::new();
+            ends.read_line(&mut end).expect("read");
+            assert_eq!(end.trim_end(), expected, "{action}");
+        }
+        gate.stop();
+    }
+}
+
+/// What is missing to compile a package of messages.
+fn missing_for_packages() -> Option<&'static str> {
+    if !holds("os.path.exists(sysconfig.get_paths()['include'] + '/Python.h')") {
+        return Some("PyPI has no ROS 2 for this machine, or the headers of Python are missing");
+    }
+    let compiler = Command::new("c++").arg("--version").stdout(Stdio::null()).status();
+    if compiler.is_ok_and(|status| status.success()) { None } else { Some("c++ is missing") }
+}
+
+/// Compiles a package as `colcon build` does, below `folder`; returns where it is installed.
+fn compile(package: &Path, folder: &Path) -> PathBuf {
+    let (build, built, prefix) = (folder.join("build"), folder.join("built"), environment());
+    let cmake = |arguments: &[String]| {
+        let mut command = Command::new(prefix.join("bin/cmake"));
+        let others = std::env::var_os("PATH").unwrap_or_default();
+        let paths = std::iter::once(prefix.join("bin")).chain(std::env::split_paths(&others));
+        command.args(arguments).env("PATH", std::env::join_paths(paths).expect("paths"));
+        let output = command.env("AMENT_PREFIX_PATH", &prefix).output().expect("started");
+        let said = crate::common::text(&output.stdout);
+        assert!(output.status.success(), "{said}\n{}", crate::common::text(&output.stderr));
+    };
+    cmake(&[
+        format!("-S{}", package.display()),
+        format!("-B{}", build.display()),
+        "-GNinja".into(),
+        format!("-DCMAKE_PREFIX_PATH={}", prefix.display()),
+        format!("-DCMAKE_INSTALL_PREFIX={}", built.display()),
+        format!("-DPython3_EXECUTABLE={}", python().display()),
+        "-DBUILD_TESTING=OFF".into(),
+    ]);
+    cmake(&["--build".into(), build.display().to_string(), "--target".into(), "install".into()]);
+    built
 }
 
 /// The hash that the generators of ROS 2 gave a type.
