@@ -86,6 +86,8 @@ def hand(params):
             return None
         head.header.hand_id = int(params["hand_id"], 16)
         place += 1
+        # A test that kills it must find it running.
+        time.sleep(params["period_ms"] / 1e3)
         return {port: (head, items)}
 
     def receive(port, head, _items):

@@ -109,7 +109,8 @@ fn a_python_source_with_feedback_is_killed_without_a_loss() {
         })
         .collect();
     let flow = dataflow_with(folder.path(), &replace);
-    let arguments = ["--set", "lift_arbiter.max_age_ms=600000", "--wait-limit", "60"];
+    let slowly = ["--set", "recorded_source.period_ms=3"];
+    let arguments = [&["--set", "lift_arbiter.max_age_ms=600000", "--wait-limit", "60"], &slowly[..]].concat();
     let graph = Graph::launch(&unique_name(), &flow, &arguments);
     for _ in 0..3 {
         graph.wait_for_decisions(A_FEW_GRASPS);
