@@ -6,7 +6,7 @@ import dataclasses
 import json
 import re
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from operator import index
 from os import PathLike, fspath
 from pathlib import Path
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ._program import Process, answer_of
 from ._recording import Grasp, Recording
-from ._tables import check_pandas, label_columns, table_of
+from ._tables import cell_names, check_pandas, label_columns, table_of
 from ._types import Label
 
 if TYPE_CHECKING:
@@ -205,7 +205,7 @@ class Model:
         if cells_newtons is not None:
             return self._predict_settled(_settled_grasps({"joints": source, "cells_newtons": cells_newtons}))
         if hasattr(source, "columns"):
-            return self._predict_settled(_settled_grasps(_arrays_of_table(source)))
+            return self._predict_settled(_settled_grasps(_arrays_of_table(source, self._cell_columns)))
         if isinstance(source, np.ndarray):
             raise TypeError("one array: expected two, the joints and the cells")
         given: Any = [source] if isinstance(source, (str, PathLike, Recording, Grasp)) else source
@@ -228,12 +228,19 @@ class Model:
 
     def _predict_settled(self, grasps: list[Grasp]) -> Predictions:
         predictions = self.predict(grasps)
-        if grasps and (predictions.reason == "invalid").all():
+        # A reading that is NaN holds its grasp; sizes that are wrong are so in all of them.
+        is_finite = [np.isfinite(grasp.joints).all() and np.isfinite(grasp.cells_newtons).all() for grasp in grasps]
+        if any(is_finite) and (predictions.reason == "invalid").all():
             n_joints, n_cells = grasps[0].joints.shape[1], grasps[0].cells_newtons.shape[1]
             raise ValueError(
                 f"{n_joints} joints and {n_cells} cells: expected finite numbers, as many as the hand {self.hand} has"
             )
         return predictions
+
+    def _cell_columns(self) -> list[str]:
+        """The columns of cells that are named by pads, in the hand's order."""
+        hand = self._hand_words[-1] if self._hand_words else self.hand
+        return [f"cell_{name}" for name in cell_names(hand)]
 
     def predict_proba(
         self, source: Source | Iterable[Source] | pandas.DataFrame | ArrayLike, cells_newtons: ArrayLike | None = None
@@ -252,8 +259,11 @@ class Model:
         return np.column_stack([1 - stable, stable])
 
 
-def _arrays_of_table(table: Any) -> dict[str, Any]:
-    """The joints, cells and senses of a table of `Recording.to_frame`, by their names in a Grasp."""
+def _arrays_of_table(table: Any, cell_columns: Callable[[], list[str]]) -> dict[str, Any]:
+    """The joints, cells and senses of a table of `Recording.to_frame`, by their names in a Grasp.
+
+    The order of the columns does not matter. `cell_columns` gives the names of cells that are named by pads, in order.
+    """
     patterns = {"joints": r"joint_\d+", "cells_newtons": r"cell_.+"} | {sense: rf"{sense}_\d+" for sense in SENSES}
     columns = {
         name: [column for column in table.columns if re.fullmatch(pattern, str(column))]
@@ -261,7 +271,20 @@ def _arrays_of_table(table: Any) -> dict[str, Any]:
     }
     if not columns["joints"] or not columns["cells_newtons"]:
         raise ValueError("the table has no columns joint_0, … and cell_0, …: expected one of Recording.to_frame")
+    for name, found in columns.items():
+        if all(re.fullmatch(r".*_\d+", column) for column in found) and (name != "cells_newtons" or _is_numbered(found)):
+            found.sort(key=lambda column: int(column.rpartition("_")[2]))
+        else:
+            expected = cell_columns()
+            if set(found) != set(expected):
+                odd = sorted(set(found) ^ set(expected))
+                raise ValueError(f"the table's cells are not those of the model's hand: {', '.join(odd[:5])}")
+            found[:] = expected
     return {name: table[found].to_numpy(float) for name, found in columns.items() if found}
+
+
+def _is_numbered(cells: list[str]) -> bool:
+    return all(re.fullmatch(r"cell_\d+", cell) for cell in cells)
 
 
 def _settled_grasps(given: dict[str, Any]) -> list[Grasp]:

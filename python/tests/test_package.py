@@ -177,6 +177,22 @@ class Recordings(Folder):
         with self.assertRaisesRegex(ValueError, "is no hand"):
             recording.to_frame(hand=ORDINARY)
 
+    def test_the_order_of_a_tables_columns_does_not_matter(self):
+        model = blindgrasp.Model(MODEL)
+        for hand in (None, "barrett-bh8-280"):
+            table = blindgrasp.Recording(HELD_OUT).to_frame(hand=hand).head(12)
+            shuffled = table[sorted(table.columns, reverse=True)]
+            expected = model.predict(table).probability_stable
+            self.assertTrue(np.array_equal(model.predict(shuffled).probability_stable, expected))
+        with self.assertRaisesRegex(ValueError, "not those of the model's hand"):
+            model.predict(table.rename(columns={"cell_palm_0": "cell_plam_0"}))
+
+    def test_a_row_that_is_not_finite_is_held(self):
+        table = blindgrasp.Recording(HELD_OUT).to_frame().head(2)
+        table.loc[0, "cell_0"] = np.nan
+        predictions = blindgrasp.Model(MODEL).predict(table.head(1))
+        self.assertEqual([predictions.action[0], predictions.reason[0]], ["hold", "invalid"])
+
     def test_what_is_not_known_is_missing_in_a_table(self):
         nan = math.nan
         rows = np.array([[1.0, nan, nan], [3.0, 5.0, nan]])

@@ -100,8 +100,8 @@ fn files_in_commands(text: &str) -> Vec<String> {
         let words = command.split(is_separator).map(|word| word.trim_start_matches("./"));
         let is_file = |word: &&str| {
             let is_below = ["recordings/", "hands/", "bridges/"].iter().any(|folder| word.starts_with(folder));
-            // Files of the flight recorder.
-            let is_made = word.starts_with("recordings/robot");
+            // Files that the commands before make.
+            let is_made = ["recordings/robot", "recordings/run."].iter().any(|made| word.starts_with(made));
             let is_program =
                 ["tactile_bridge", "ros2_"].iter().any(|name| word.starts_with(name)) && word.ends_with(".py");
             (is_below && !is_made) || is_program || word.starts_with("dataflow")

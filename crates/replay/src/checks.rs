@@ -234,6 +234,10 @@ impl Decisions {
         changed.filter(|changed| action(changed.before) != action(changed.after)).collect()
     }
 
+    pub fn is_empty(&self) -> bool {
+        self.decisions.is_empty()
+    }
+
     /// Counts the decisions, of which the labels say whether they are right.
     pub fn tally(&self) -> Tally {
         let mut tally = Tally::default();

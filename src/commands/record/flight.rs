@@ -23,6 +23,8 @@ const UNDER_WAY_NANOS: u64 = 500_000_000;
 const BEFORE_GRASP_NANOS: u64 = 1_000_000_000;
 /// The oldest samples go when more bytes than this are held: a hand of 1,000 cells at 1 kHz fills it in a minute.
 const MAX_BYTES: usize = 512 << 20;
+/// The memory that each sample takes beside its values, roughly.
+const ALLOCATION_BYTES: usize = 64;
 
 /// Why a file is written after a lift that dropped its object.
 const DROPPED: &str = "dropped";
@@ -64,6 +66,8 @@ pub(super) struct FlightRecorder {
     /// The fault that held the last grasp. The next grasps that it holds write no further files.
     last_fault: Option<Reason>,
     trigger: Option<Trigger>,
+    /// The next one, while the last samples of a file are under way.
+    later: Option<Trigger>,
 }
 
 /// The samples for a file.
@@ -111,6 +115,7 @@ impl FlightRecorder {
             dropped: None,
             last_fault: None,
             trigger: None,
+            later: None,
         })
     }
 
@@ -160,15 +165,24 @@ impl FlightRecorder {
     /// more than the time to keep.
     pub(super) fn ask(&mut self, why: &str, now_nanos: u64) {
         let (after_nanos, keep_nanos) = (self.after_nanos, self.keep_nanos);
-        let trigger = self.trigger.get_or_insert_with(|| Trigger {
-            why: Vec::new(),
-            since_nanos: now_nanos,
-            until_nanos: now_nanos,
-        });
+        let is_over = self.trigger.as_ref().is_some_and(|trigger| now_nanos > trigger.until_nanos);
+        let trigger = if is_over { &mut self.later } else { &mut self.trigger };
+        let trigger =
+            trigger.get_or_insert_with(|| Trigger { why: Vec::new(), since_nanos: now_nanos, until_nanos: now_nanos });
         trigger.until_nanos = (now_nanos + after_nanos).min(trigger.since_nanos + keep_nanos.max(after_nanos));
         if !trigger.why.iter().any(|known| known == why) {
             trigger.why.push(why.into());
         }
+    }
+
+    /// The graph has been stopped. A grasp that was open then is held as missing, which is no fault.
+    pub(super) fn graph_has_ended(&mut self) {
+        let last_nanos =
+            self.samples.iter().rfind(|kept| kept.edge_idx == self.leader_idx).map(|kept| kept.received_nanos);
+        let is_of_the_end = |trigger: &mut Trigger| {
+            trigger.why == [Reason::Missing.as_str()] && last_nanos.is_none_or(|last| trigger.since_nanos >= last)
+        };
+        self.trigger.take_if(is_of_the_end);
     }
 
     /// The samples for the file that was asked for, once they have come.
@@ -183,16 +197,22 @@ impl FlightRecorder {
     }
 
     fn excerpt(&mut self, until_nanos: u64) -> Option<Excerpt> {
-        let why = self.trigger.take()?.why;
-        let frames = || self.samples.iter().filter(|kept| kept.edge_idx == self.leader_idx);
-        let frames: Vec<&Kept> = frames()
-            .skip_while(|kept| !kept.begins_grasp)
+        let Trigger { why, since_nanos, .. } = self.trigger.take()?;
+        self.trigger = self.later.take();
+        let held = || self.samples.iter().filter(|kept| kept.edge_idx == self.leader_idx);
+        // From the first whole grasp on, unless that began after the moment that is to be kept.
+        let has_whole = held().any(|kept| kept.begins_grasp && kept.received_nanos <= since_nanos);
+        let frames: Vec<&Kept> = held()
+            .skip_while(|kept| has_whole && !kept.begins_grasp)
             .take_while(|kept| kept.received_nanos <= until_nanos)
             .collect();
-        let from_nanos = frames.first()?.received_nanos.saturating_sub(BEFORE_GRASP_NANOS);
+        let (Some(first), Some(last_kept)) = (frames.first(), frames.last()) else {
+            return Some(Excerpt { why, ..Excerpt::EMPTY });
+        };
+        let from_nanos = first.received_nanos.saturating_sub(BEFORE_GRASP_NANOS);
         let ids: HashSet<(u64, u64)> = frames.iter().map(|kept| id(&kept.record)).collect();
         let grasps: HashSet<u64> = frames.iter().map(|kept| kept.record.grasp_id()).collect();
-        let last_frame = frames.last()?.record.header();
+        let last_frame = last_kept.record.header();
         let belongs = |kept: &&Kept| {
             let header = kept.record.header();
             kept.received_nanos >= from_nanos
@@ -206,11 +226,18 @@ impl FlightRecorder {
         let samples = self.samples.iter().filter(belongs);
         let samples = samples.map(|kept| (self.edges[kept.edge_idx].topic.clone(), Arc::clone(&kept.record)));
         let last = (last_frame.epoch, last_frame.seq);
+        // Numbers that no frame has: the recorder was too slow, or the source had a gap.
+        let gap = |pair: &[&Kept]| {
+            let (before, after) = (pair[0].record.header(), pair[1].record.header());
+            let next = before.seq.saturating_add(1);
+            if before.epoch == after.epoch { after.seq.saturating_sub(next) } else { 0 }
+        };
+        let n_gaps: u64 = frames.windows(2).map(gap).sum();
         let (mut missing, mut is_whole) = (0, true);
         for edge_idx in (0..self.edges.len()).filter(|idx| self.edges[*idx].is_numbered) {
             let of_edge = self.samples.iter().filter(|kept| kept.edge_idx == edge_idx).map(|kept| id(&kept.record));
             let found: HashSet<(u64, u64)> = of_edge.filter(|id| ids.contains(id)).collect();
-            missing += (ids.len() - found.len()) as u64;
+            missing += (ids.len() - found.len()) as u64 + n_gaps;
             is_whole &= found.contains(&last);
         }
         Some(Excerpt {
@@ -221,7 +248,7 @@ impl FlightRecorder {
             n_frames: frames.len(),
             n_grasps: grasps.len(),
             missing,
-            secs: (frames.last()?.received_nanos - frames.first()?.received_nanos) as f64 / 1e9,
+            secs: (last_kept.received_nanos - first.received_nanos) as f64 / 1e9,
         })
     }
 
@@ -245,6 +272,21 @@ impl FlightRecorder {
 }
 
 impl Excerpt {
+    /// No frame has come yet.
+    const EMPTY: Excerpt = Excerpt {
+        why: Vec::new(),
+        samples: Vec::new(),
+        ending: Ending::Detached,
+        n_frames: 0,
+        n_grasps: 0,
+        missing: 0,
+        secs: 0.0,
+    };
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.n_frames == 0
+    }
+
     /// Writes `STEM-TIME-WHY.mcap` beside `out`.
     ///
     /// # Errors
@@ -302,11 +344,11 @@ fn id(record: &Record) -> (u64, u64) {
 fn n_bytes(record: &Record) -> usize {
     let of_lists = match record {
         Record::Tactile(sample) => 8 * (sample.message.joints.len() + sample.message.cells_newtons.len()),
-        Record::Contacts(sample) => 64 * sample.message.contacts.len(),
+        Record::Contacts(sample) => 64 * sample.message.contacts.len() + 8 * sample.message.joints.len(),
         Record::Feature(sample) => 8 * sample.message.values.len(),
         _ => 0,
     };
-    size_of::<Kept>() + of_lists
+    size_of::<Kept>() + size_of::<Record>() + ALLOCATION_BYTES + of_lists
 }
 
 fn path_for(out: &Path, why: &[String]) -> PathBuf {
@@ -343,6 +385,7 @@ mod tests {
             dropped: None,
             last_fault: None,
             trigger: None,
+            later: None,
         }
     }
 
@@ -443,10 +486,51 @@ mod tests {
     #[test]
     fn triggers_go_on_for_no_longer_than_the_time_to_keep() {
         let mut recorder = recorder(10, 3);
-        (0..100).for_each(|sec| recorder.ask("asked", sec * SEC));
+        (0..=10).for_each(|sec| recorder.ask("asked", sec * SEC));
         assert_eq!(
             recorder.trigger,
             Some(Trigger { why: vec!["asked".into()], since_nanos: 0, until_nanos: 10 * SEC })
         );
+        // The next one has a file of its own.
+        feed(&mut recorder, 0..12);
+        recorder.ask("stale", 10 * SEC + 1);
+        assert_eq!(recorder.excerpt_when_due(11 * SEC).expect("due").why, ["asked"]);
+        assert_eq!(recorder.excerpt_when_due(20 * SEC).expect("due").why, ["stale"]);
+        assert!(recorder.trigger.is_none());
+    }
+
+    #[test]
+    fn a_moment_before_the_first_whole_grasp_is_written_from_the_oldest_frame_on() {
+        let mut recorder = recorder(10, 0);
+        // It attached amid grasp 0.
+        feed(&mut recorder, 1..3);
+        recorder.ask("dropped", 2 * SEC);
+        feed(&mut recorder, 3..6);
+        let excerpt = recorder.excerpt_when_due(3 * SEC).expect("due");
+        assert_eq!(seqs(&excerpt, "/tactile"), [1, 2]);
+        let mut idle = super::tests::recorder(10, 0);
+        idle.ask("asked", SEC);
+        assert!(idle.excerpt_now().expect("told").is_empty());
+    }
+
+    #[test]
+    fn a_grasp_that_is_open_when_the_graph_is_stopped_is_no_fault() {
+        let mut recorder = recorder(10, 1);
+        feed(&mut recorder, 0..6);
+        decide(&mut recorder, 1, Reason::Missing, 6 * SEC);
+        recorder.graph_has_ended();
+        assert!(recorder.excerpt_now().is_none());
+        decide(&mut recorder, 2, Reason::Stale, 6 * SEC);
+        recorder.graph_has_ended();
+        assert!(recorder.excerpt_now().is_some());
+    }
+
+    #[test]
+    fn frames_that_were_missed_are_counted_on_every_edge() {
+        let mut recorder = recorder(10, 0);
+        feed(&mut recorder, 0..2);
+        feed(&mut recorder, 5..7);
+        recorder.ask("asked", 6 * SEC);
+        assert_eq!(recorder.excerpt_now().expect("asked").missing, 2 * 3);
     }
 }

@@ -1,12 +1,13 @@
 //! `record --keep` and `record --write-kept`: the commands of the flight recorder.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::flight::{Excerpt, FlightRecorder, SharedRecorder};
 use super::{Arguments, Outcome, POLL, attach, observed, print_line, stop_signal};
@@ -14,6 +15,7 @@ use blindgrasp_graph::client::observer::Observer;
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
 use blindgrasp_graph::control::{Attachment, Reply, Request};
 use blindgrasp_graph::recorded_graph::{Beginning, Ending, RecordedGraph};
+use blindgrasp_messages::{Recorded as _, TactileFrame};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_session::of_graph::of_graph;
@@ -51,6 +53,12 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
         .context("cannot listen for SIGUSR1")?;
     let mut connection = Connection::open(&pick_graph(arguments.graph.name())?)?;
     let Attachment { domain, edges, graph, .. } = attach(&mut connection, &[], out, true)?;
+    if n_sources_of_frames(&graph) > 1 {
+        bail!(
+            "graph '{}' has several sources of frames, and --keep is for one: use blindgrasp record without --keep",
+            connection.graph()
+        );
+    }
     let about = of_graph(&graph, Beginning::Attached)?;
     let recorder = FlightRecorder::new(&edges, kept, Duration::from_secs_f64(arguments.after));
     let Some(recorder) = recorder.map(SharedRecorder::new) else {
@@ -87,6 +95,9 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
     let finished = if ending == Ending::Detached { observer.leave() } else { observer.finish() };
     let graph = connection.graph().to_string();
     drop(connection);
+    if ending == Ending::Graph {
+        recorder.with(FlightRecorder::graph_has_ended);
+    }
     if ending == Ending::Broken {
         recorder.with(|recorder| recorder.ask(Ending::Broken.word(), monotonic_nanos()));
     }
@@ -101,6 +112,23 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
     Ok(Outcome::of(writer.has_loss))
 }
 
+/// The nodes that send frames and read none.
+fn n_sources_of_frames(graph: &Value) -> usize {
+    let list = |value: &Value| value.as_array().cloned().unwrap_or_default();
+    let nodes = list(&graph["nodes"]);
+    let ports_of_frames = |node: &Value| {
+        let ports = list(&node["outputs"]).into_iter().filter(|port| port["type"] == TactileFrame::TYPE_NAME);
+        ports.map(|port| format!("{}/{}", word(&node["id"]), word(&port["port"]))).collect::<Vec<_>>()
+    };
+    let frames: BTreeSet<String> = nodes.iter().flat_map(ports_of_frames).collect();
+    let reads_frames = |node: &Value| list(&node["inputs"]).iter().any(|input| frames.contains(word(&input["from"])));
+    nodes.iter().filter(|node| !ports_of_frames(node).is_empty() && !reads_frames(node)).count()
+}
+
+fn word(value: &Value) -> &str {
+    value.as_str().unwrap_or_default()
+}
+
 struct Writer<'a> {
     out: &'a Path,
     about: RecordedGraph,
@@ -111,6 +139,11 @@ struct Writer<'a> {
 impl Writer<'_> {
     fn write(&mut self, excerpt: Option<Excerpt>) -> anyhow::Result<()> {
         let Some(excerpt) = excerpt else { return Ok(()) };
+        if excerpt.is_empty() {
+            self.has_loss = true;
+            print_diagnostic("blindgrasp: nothing is written: no frame has come yet");
+            return Ok(());
+        }
         let written = match excerpt.write(self.out, &self.about) {
             Ok(written) => written,
             Err(error) => {

@@ -129,6 +129,21 @@ impl Runner<'_> {
         fitting(&file, overrides, dataflow::Scope::Everything, OnMisfit::Warn)
     }
 
+    /// As [`Runner::replay`]; lost samples are an error.
+    pub(super) fn replay_whole(
+        &self,
+        recording: &Path,
+        graph: &Graph,
+        overrides: &[Override],
+        found: &Path,
+    ) -> anyhow::Result<Fed> {
+        let (fed, summary) = self.replay(recording, graph, overrides, found)?;
+        if summary.samples_lost + summary.samples_dropped > 0 || summary.edges_unknown > 0 {
+            bail!("the replay lost samples, so its decisions say nothing: run the command again");
+        }
+        Ok(fed)
+    }
+
     /// Plays a recording as fast as the graph takes it, and records every edge to `found`.
     pub(super) fn replay(
         &self,

@@ -7,9 +7,10 @@ use anyhow::{Context, bail};
 use serde_json::json;
 
 use super::case::Runner;
-use super::{Outcome, project_recordings};
+use super::{Outcome, project_recordings, settings};
 use crate::commands::model::write_at_once;
 use crate::commands::print_line;
+use blindgrasp_recording::RecordingReader;
 use blindgrasp_replay::checks::{Decisions, describe_changes};
 use blindgrasp_replay::expectations::{Expectations, path_of};
 
@@ -39,7 +40,8 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
         let found = runner.scratch.path(recording);
         // The recording's own dataflow file is not known yet: all are replayed with the one of the command.
         let graph = runner.graph(&Expectations::default(), runner.overrides)?;
-        runner.replay(recording, &graph, runner.overrides, &found).with_context(|| recording.display().to_string())?;
+        let replayed = runner.replay_whole(recording, &graph, runner.overrides, &found);
+        replayed.with_context(|| recording.display().to_string())?;
         let decisions = Decisions::read(&found)?;
         let mut expected = decisions.to_expectations();
         expected.dataflow = other_dataflow(runner.dataflow, recording)?;
@@ -62,7 +64,10 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
                 print_line("  the graph does not meet this yet: `blindgrasp test` fails until it does")?;
             }
             if let Some(text) = describe_changes(&changed) {
-                print_line(&format!("  the replay decides otherwise than the robot did, {text}"))?;
+                print_line(&format!("  the replay decides otherwise than recorded, {text}"))?;
+            }
+            if let Some(note) = settings::differing(&RecordingReader::open(recording)?, &graph) {
+                print_line(&format!("  {note}"))?;
             }
         }
         written.push(json!({
@@ -78,12 +83,14 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
 
 /// The dataflow file relative to the recording's folder; `None` if it is the one that `test` takes by itself.
 fn other_dataflow(dataflow: &Path, recording: &Path) -> anyhow::Result<Option<PathBuf>> {
-    if dataflow.file_name().is_some_and(|name| name == "dataflow.yaml") {
+    let absolute = |path: &Path| path.canonicalize().with_context(|| path.display().to_string());
+    let (given, recording) = (dataflow, absolute(recording)?);
+    let dataflow = absolute(given)?;
+    let folder = recording.parent().unwrap_or(Path::new("/"));
+    let is_the_projects = folder.parent().is_some_and(|project| project.join("dataflow.yaml") == dataflow);
+    if given == Path::new("dataflow.yaml") || is_the_projects {
         return Ok(None);
     }
-    let absolute = |path: &Path| path.canonicalize().with_context(|| path.display().to_string());
-    let (dataflow, recording) = (absolute(dataflow)?, absolute(recording)?);
-    let folder = recording.parent().unwrap_or(Path::new("/"));
     let n_common = dataflow.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
     let up = folder.components().skip(n_common).map(|_component| "..");
     let down = dataflow.components().skip(n_common);

@@ -28,9 +28,9 @@ use blindgrasp_replay::expectations;
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                         blindgrasp test --junit report.xml\n  \
-                        blindgrasp test recordings/slip-prone.mcap --replace contacts --keep /tmp/found\n  \
+                        blindgrasp test run.mcap --replace contacts --keep /tmp/found\n  \
                         blindgrasp test run.mcap --update\n  \
-                        blindgrasp test --init recordings/robot-20261127T101500Z-dropped.mcap\n  \
+                        blindgrasp test --init recordings/robot-20261127T101500Z-dropped.mcap --dataflow dataflow-live.yaml\n  \
                         blindgrasp test --sweep lift_arbiter.votes=1,2,3,5\n  \
                         blindgrasp test --faults\n\n\
                         NAME.expect.yaml beside NAME.mcap says what else is expected. Exit code 1 when anything fails.")]

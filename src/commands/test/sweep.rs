@@ -11,6 +11,7 @@ use crate::commands::print_line;
 use crate::commands::text_table::{TextTable, percent};
 use blindgrasp_graph::dataflow::Override;
 use blindgrasp_replay::checks::{Decisions, Tally};
+use blindgrasp_replay::comparison::Coverage;
 use blindgrasp_replay::expectations::Expectations;
 
 /// A param and the values to try, in the order of the command line.
@@ -35,16 +36,21 @@ impl Sweep {
         let (mut table, mut rows) = (TextTable::new(titles, 1), Vec::new());
         for value in &self.values {
             let overrides: Vec<Override> = runner.overrides.iter().cloned().chain([value.clone()]).collect();
-            let (mut tally, mut n_changed) = (Tally::default(), 0);
+            // `None` if a recording has no decisions to compare with.
+            let (mut tally, mut n_changed) = (Tally::default(), Some(0));
             for recording in recordings {
                 let expected = Expectations::of(recording)?.unwrap_or_default();
                 let found = runner.scratch.path(recording);
                 let graph = runner.graph(&expected, &overrides)?;
-                let replayed = runner.replay(recording, &graph, &overrides, &found);
-                replayed.with_context(|| recording.display().to_string())?;
+                let replayed = runner.replay_whole(recording, &graph, &overrides, &found);
+                let fed = replayed.with_context(|| recording.display().to_string())?;
                 let decisions = Decisions::read(&found)?;
                 tally.add(decisions.tally());
-                n_changed += decisions.changed_since(&Decisions::read(recording)?).len();
+                let before = Decisions::read(recording)?;
+                let coverage = Coverage::of(recording, &fed.topic)?;
+                let changed = decisions.changed_since(&before);
+                let n = changed.iter().filter(|changed| coverage.covers_decision(changed.grasp_id)).count();
+                n_changed = n_changed.filter(|_so_far| !before.is_empty()).map(|so_far| so_far + n);
             }
             let n_labelled = tally.n_labelled;
             let accuracy = (n_labelled > 0).then(|| tally.n_right as f64 / n_labelled as f64);
@@ -54,7 +60,7 @@ impl Sweep {
                 tally.n_holds.to_string(),
                 percent(accuracy),
                 if n_labelled > 0 { tally.n_false_positive.to_string() } else { "n/a".into() },
-                n_changed.to_string(),
+                n_changed.map_or("n/a".into(), |n| n.to_string()),
             ]);
             rows.push(
                 json!({"value": value.text, "decisions": tally, "accuracy": accuracy, "n_actions_changed": n_changed}),

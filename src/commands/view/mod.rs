@@ -23,11 +23,11 @@ use super::{Outcome, secs_in};
 /// The programs of a dataflow file are run with --describe: use only files that you trust.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp view grasp_gate\n         \
-                        blindgrasp view recordings/paper-recipe.mcap\n         \
+                        blindgrasp view recordings/held-out.mcap\n         \
                         blindgrasp view dataflow.yaml --out graph.svg\n         \
                         blindgrasp view grasp_gate --format mermaid\n         \
                         blindgrasp view recordings/held-out.mcap --grasp 3 --out grasp.html\n         \
-                        blindgrasp view hands/allegro.yaml --out hand.html\n\n\
+                        blindgrasp view allegro --out hand.html\n\n\
                         In a graph, 'run' is the launching command: it reads the decisions, and the label where a source knows it.\n\
                         In a picture of a recording with /scene the object and all contacts are shown, in any other the active cells.")]
 pub(super) struct Arguments {
