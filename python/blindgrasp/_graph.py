@@ -45,10 +45,14 @@ class Run:
 
     def _wait_until_it_runs(self, process: Process) -> None:
         while (code := process.exit_code()) is None:
+            has_decided = process.has_printed()
             for graph in answer_of(["ps", "--json"])["graphs"]:
                 if graph["pid"] == process.pid and graph["state"] == "running":
                     self.name = graph["graph"]
                     return
+            # A short graph has ended between two looks, and waits until its decisions are read.
+            if has_decided:
+                return
             time.sleep(LOOK_PAUSE_SECS)
         process.check(code)
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
+import termios
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -102,6 +105,12 @@ class Process:
         for line in self._process.stdout:
             yield json.loads(line)
         self.check(self._process.wait())
+
+    def has_printed(self) -> bool:
+        """Whether output waits to be read."""
+        assert self._process.stdout is not None
+        n_bytes = fcntl.ioctl(self._process.stdout, termios.FIONREAD, bytes(4))
+        return int.from_bytes(n_bytes, sys.byteorder) > 0
 
     def exit_code(self) -> int | None:
         """Its exit code, None while it runs."""

@@ -387,6 +387,13 @@ class Models(Folder):
 
 
 class Graphs(Folder):
+    def test_a_graph_that_has_ended_before_it_is_seen_running_is_read(self):
+        # Its decisions fill the pipe, so it waits for a reader.
+        with mock.patch("blindgrasp._graph.answer_of", return_value={"graphs": []}):
+            with blindgrasp.run(DATAFLOW, set=FAST, name=unique_name()) as graph:
+                self.assertEqual(len(list(graph)), 240)
+        self.assertIsNone(graph.name)
+
     def test_a_graph_is_run_to_its_end_and_recorded(self):
         recorded = self.folder / "run.mcap"
         with blindgrasp.run(DATAFLOW, set=FAST, name=unique_name(), recording=recorded) as graph:
