@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Gates every pick of MoveIt 2 by configuration: a node that is the gripper's controller for MoveIt.
 
-    python3 examples/ros2_gripper_gate.py --controller /gripper_controller/gripper_cmd --grasps-below 0.03 \\
-        env PROBE=none PROMISED_DROPS=0.25 blindgrasp run dataflow-live.yaml --json
+    python3 ros2_gripper_gate.py --controller /gripper_controller/gripper_cmd --grasps-below 0.03 \\
+        blindgrasp run dataflow-ros2.yaml --json
 
 It serves the action `/grasp_gate/gripper_cmd` (control_msgs GripperCommand, or ParallelGripperCommand with --parallel), and
 passes each goal on to the real controller. A goal whose position is below --grasps-below (or above --grasps-above, for a
@@ -209,7 +209,7 @@ def main():
     options.add_argument("graph", nargs=argparse.REMAINDER, help="the command whose lines are the decisions")
     arguments = options.parse_args()
     if not arguments.graph:
-        options.error("expected the command of the graph, such as: env PROBE=none PROMISED_DROPS=0.25 blindgrasp run dataflow-live.yaml --json")
+        options.error("expected the command of the graph, such as: blindgrasp run dataflow-ros2.yaml --json")
     graph = subprocess.Popen(arguments.graph, stdout=subprocess.PIPE, text=True)
     try:
         serve(arguments, Decisions(graph.stdout))

@@ -23,7 +23,7 @@ pub struct UnableNode {
     pub reason: String,
 }
 
-/// The nodes of a graph that could not begin on `here`, or on any machine. Nodes of other machines have their files there,
+/// The nodes of a graph that could not begin on the machine `here`; without it, on any machine. Nodes of other machines have their files there,
 /// and programs of somebody's own are not asked.
 pub fn unable_to_begin(graph: &Graph, here: Option<&str>) -> Vec<UnableNode> {
     let mut unable = Vec::new();

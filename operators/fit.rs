@@ -250,7 +250,9 @@ impl<'a> Check<'a> {
                 path_of(classifier, "model").display(),
                 percent(best)
             ),
-            help: "expected probe: test_lift, if the arm can lift by 10 mm and wait".into(),
+            help: "expected probe: test_lift, if the arm can lift by 10 mm and wait; otherwise min_probability_stable: 0.75, and \
+                   promised_drops no less than that bound"
+                .into(),
         });
     }
 

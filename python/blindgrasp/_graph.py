@@ -182,7 +182,7 @@ def replay_in(
     set: Mapping[str, Any] | None = None,
     grasps: Iterable[int] | None = None,
 ) -> ReplayedDecisions:
-    """As `replay`, with relative paths from a folder; those in `set` as well."""
+    """As `replay`, but relative paths, also those in `set`, begin at `folder`."""
     name = f"replay-{os.getpid()}-{next(REPLAY_NUMBERS)}"
     arguments = ["replay", fspath(recording), "--dataflow", fspath(dataflow), "--rate", "max", "--name", name, "--json"]
     arguments += _set_words(set)

@@ -233,7 +233,8 @@ class Model:
         if any(is_finite) and (predictions.reason == "invalid").all():
             n_joints, n_cells = grasps[0].joints.shape[1], grasps[0].cells_newtons.shape[1]
             raise ValueError(
-                f"{n_joints} joints and {n_cells} cells: expected finite numbers, as many as the hand {self.hand} has"
+                f"all grasps are invalid ({n_joints} joints and {n_cells} cells): expected as many as the hand {self.hand} "
+                "has, no force below 0, and joints within their limits"
             )
         return predictions
 
@@ -274,6 +275,8 @@ def _arrays_of_table(table: Any, cell_columns: Callable[[], list[str]]) -> dict[
     for name, found in columns.items():
         if all(re.fullmatch(r".*_\d+", column) for column in found) and (name != "cells_newtons" or _is_numbered(found)):
             found.sort(key=lambda column: int(column.rpartition("_")[2]))
+            if any(int(column.rpartition("_")[2]) != place for place, column in enumerate(found)):
+                raise ValueError(f"the columns {found[0]}, … are not numbered from 0 without a gap")
         else:
             expected = cell_columns()
             if set(found) != set(expected):

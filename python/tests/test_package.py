@@ -184,6 +184,8 @@ class Recordings(Folder):
             shuffled = table[sorted(table.columns, reverse=True)]
             expected = model.predict(table).probability_stable
             self.assertTrue(np.array_equal(model.predict(shuffled).probability_stable, expected))
+        with self.assertRaisesRegex(ValueError, "not numbered from 0"):
+            model.predict(blindgrasp.Recording(HELD_OUT).to_frame().head(2).drop(columns="cell_3"))
         with self.assertRaisesRegex(ValueError, "not those of the model's hand"):
             model.predict(table.rename(columns={"cell_palm_0": "cell_plam_0"}))
 
@@ -369,7 +371,7 @@ class Models(Folder):
     def test_arrays_of_another_size_are_refused(self):
         model, joints, cells = blindgrasp.Model(MODEL), np.zeros((4, 7)), np.ones((4, 96))
         for given, words in (
-            ((joints, cells[:, :90]), "7 joints and 90 cells: expected finite numbers, as many as the hand barrett"),
+            ((joints, cells[:, :90]), r"7 joints and 90 cells\): expected as many as the hand barrett"),
             ((joints, cells[:3]), r"in each array, found joints \(4, 7\), cells_newtons \(3, 96\)"),
             ((joints[0], cells[0]), "as many grasps and frames in each array"),
             ((joints[:, np.newaxis][:, :0], cells[:, np.newaxis][:, :0]), "nothing to decide on"),
@@ -388,7 +390,7 @@ class Models(Folder):
 
 class Graphs(Folder):
     def test_a_graph_that_has_ended_before_it_is_seen_running_is_read(self):
-        # Its decisions fill the pipe, so it waits for a reader.
+        # It is never seen running; its decisions are read all the same.
         with mock.patch("blindgrasp._graph.answer_of", return_value={"graphs": []}):
             with blindgrasp.run(DATAFLOW, set=FAST, name=unique_name()) as graph:
                 self.assertEqual(len(list(graph)), 240)

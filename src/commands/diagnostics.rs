@@ -17,7 +17,7 @@ use super::ps::{node_state_word, state_word, warnings};
 use super::ros2_network::Ros2Network;
 use super::top::poller::Poller;
 use super::top::sample::{Look, Measured, MeasuredEdge, MeasuredNode, Window, measure};
-use super::{Outcome, secs_in};
+use super::{GraphArgument, Outcome, secs_in};
 
 /// Publish a graph's state to ROS 2, on /diagnostics
 ///
@@ -26,8 +26,8 @@ use super::{Outcome, secs_in};
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp diagnostics grasp_gate --connect tcp/localhost:7447")]
 pub(super) struct Arguments {
-    /// Graph, which need not run yet [default: the only one running]
-    graph: Option<String>,
+    #[command(flatten)]
+    graph: GraphArgument,
     #[command(flatten)]
     network: Ros2Network,
     /// Publish every so many seconds
@@ -66,8 +66,9 @@ struct Status {
 type Publishing = (RosNode, RosPublisher);
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let graph = match &arguments.graph {
-        Some(graph) => graph.clone(),
+    let graph = match arguments.graph.name() {
+        // It need not run yet.
+        Some(graph) => graph.to_owned(),
         None => pick_graph(None)?,
     };
     let (network, domain) = arguments.network.network()?;

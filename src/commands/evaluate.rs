@@ -33,7 +33,7 @@ const PREDICTIONS_FILE: &str = "predictions.csv";
 /// Compare decisions with labels, on recordings or by folds
 ///
 /// A model decides every grasp of the recordings as the graph would. Recipes (--split) are trained on a part of the
-/// grasps and judged on the rest, fold by fold, so that no machine judges a grasp that it was trained on. Predictions of any
+/// grasps and judged on the rest, fold by fold, so that no classifier judges a grasp that it was trained on. Predictions of any
 /// other model (--predictions) are judged by the same figures, alone or beside a model or recipes.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \

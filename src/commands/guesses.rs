@@ -260,9 +260,10 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (OUTPUTS, &["test"], "use --junit FILE for a report, --keep FOLDER for the recordings of the replays"),
     (OUTPUTS, &["--record"], "use --record FILE for a recording of all edges"),
     (OUTPUTS, &[], "the output goes to stdout: add > FILE"),
-    (&["--record-to", "--rec", "--bag"], &["--record"], "use --record FILE"),
+    (&["--record-to", "--rec"], &["--record"], "use --record FILE"),
     (&["--html", "--page"], &["--report"], "use --report FILE.html"),
     (&["--html", "--page", "--report"], &["test"], "use --junit FILE"),
+    (&["--silent", "-s"], &["--quiet"], "use --quiet"),
     (&["--quiet", "-q", "--silent", "-s"], &[], "add > /dev/null for results, 2> /dev/null for progress"),
     (VERBOSE, &["test"], "each check is printed already; --keep FOLDER keeps the recording of each replay"),
     (
@@ -274,8 +275,8 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (VERBOSE, &[], "set the environment variable RUST_LOG=debug"),
     (&["--json"], &["echo"], "leave it out: the lines are JSON"),
     (&["--json"], &["train"], "use 'blindgrasp model show MODEL --json' afterwards"),
-    (&["--format", "-f", "--fmt"], &["--format"], "use --format NAME"),
-    (&["--format", "--fmt", "--csv"], &["info", "predict", "evaluate", "ps", "model", "set"], "use --json"),
+    (&["-f", "--fmt"], &["--format"], "use --format NAME"),
+    (&["--format", "--fmt", "--csv"], &["info", "predict", "evaluate", "ps", "set"], "use --json"),
     (&["--csv"], &["export"], "use --format csv"),
     (&["--dry-run", "--validate", "--lint", "--no-run"], &["--check"], "use --check"),
     (&["--dry-run"], &["swap"], "use --shadow TIME, which compares and swaps nothing"),
@@ -287,7 +288,7 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
         &["run"],
         "use --set recorded_source.rate=2, or =max; 'blindgrasp replay RECORDING --rate 2x' plays another recording",
     ),
-    (&["--loop", "--repeat", "--forever"], &["--loop"], "use --loop"),
+    (&["--repeat", "--forever"], &["--loop"], "use --loop"),
     (&["--loop", "--repeat", "--forever"], &["run"], "use --set recorded_source.repeat=forever"),
     (
         &["--recording", "--input", "--source", "--bag", "--data", "-i"],
@@ -299,7 +300,8 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (&["--once", "--no-loop"], &["run"], "leave it out: the graph ends with its source"),
     (&["--watch", "--top"], &["run"], "use 'blindgrasp top', or --view"),
     (&["--env", "-e"], &["run"], "set variables before the command, as in NAME=VALUE blindgrasp run"),
-    (&["--seed"], &["run", "replay"], "leave it out: nothing in it is random"),
+    (&["--seed"], &["replay"], "leave it out: nothing in it is random"),
+    (&["--seed"], &["run"], "use --set seed=N for a simulated hand; nothing else is random"),
     (
         &["--no-color", "--no-colour", "--color", "--colour"],
         &[],
@@ -314,12 +316,12 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (&["--node"], &["logs", "swap"], "name the node without an option: {usage}"),
     (&["--operator"], &["logs"], "name the node without an option: {usage}"),
     (&["--compression", "--compress", "--zstd"], &["--rotate-size"], "leave it out: recordings are compressed"),
-    (&["--split", "--max-size", "--max-bag-size", "-b"], &["--rotate-size"], "use --rotate-size SIZE"),
+    (&["--split", "--max-size", "--max-bag-size"], &["--rotate-size"], "use --rotate-size SIZE"),
     (&["--max-bag-duration"], &["--rotate-every"], "use --rotate-every TIME"),
     (&["--append"], &["--rotate-size"], "a recording is not continued: name another file"),
     (&["-l"], &["--loop"], "use --loop"),
     (&["--pause", "--start-paused", "--interactive"], &["--step"], "use --step"),
-    (&["--duration", "--time", "--for"], &["--to"], "use --from TIME and --to TIME"),
+    (&["--duration", "--time", "--for"], &["replay"], "use --from TIME and --to TIME"),
     (&["--topic", "--topics"], &["replay"], "use --replace NODE: the recorded output of that node is played"),
     (
         &["--label-column", "--target", "--labels", "--y"],
@@ -329,7 +331,7 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (&["--features"], &["--recipe"], "use --recipe NAME, which chooses features and learner"),
     (
         &["--kernel", "--C", "--degree"],
-        &["--recipe"],
+        &["train"],
         "use --recipe paper, an SVM with an RBF kernel, and --c and --gamma",
     ),
     (
@@ -378,7 +380,7 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (&["--template", "--type", "--list"], &["init"], "use --hand NAME for the project of another hand"),
     (
         &["--rust", "--lang", "--language", "-l"],
-        &["new"],
+        &["--python"],
         "use --python for Python; without it the operator is in Rust",
     ),
     (
@@ -386,10 +388,10 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
         &["new"],
         "use 'python3 -m blindgrasp.mjcf hand.xml hand.urdf' first (docs/hand.md)",
     ),
-    (&["--file", "-f", "--robot", "--model"], &["--urdf"], "use --urdf FILE"),
+    (&["--file", "--robot", "--model"], &["--urdf"], "use --urdf FILE"),
     (&["--node"], &["set"], "write the node before the parameter: NODE.PARAM=VALUE"),
     (&["--shell"], &["completions"], "give the shell without an option: {usage}"),
-    (&["--model", "--weights", "--checkpoint", "-m"], &["--model"], "use --model FILE"),
+    (&["--weights", "--checkpoint", "-m"], &["--model"], "use --model FILE"),
     (
         &["--model", "--weights", "--checkpoint", "-m"],
         &["predict", "evaluate"],
@@ -426,7 +428,7 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
         &[],
         "all processors are used; the environment variable RAYON_NUM_THREADS=N makes it fewer",
     ),
-    (&["--gpu", "--cuda", "--device"], &[], "leave it out: nothing here needs a GPU"),
+    (&["--gpu", "--cuda"], &[], "leave it out: nothing here needs a GPU"),
     (
         &[
             "--epochs",
@@ -460,8 +462,13 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     ),
     (
         &["--threshold", "--cutoff", "--min-probability"],
-        &["predict", "evaluate"],
+        &["predict"],
         "the threshold is the model's: 'blindgrasp train --threshold PROBABILITY' sets it",
+    ),
+    (
+        &["--cutoff", "--min-probability"],
+        &["evaluate"],
+        "use --threshold PROBABILITY for --predictions; a model has its own",
     ),
     (
         &["--threshold", "--cutoff", "--min-probability"],
@@ -476,11 +483,7 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     ),
     (&["--graph", "-g", "--running"], &["view"], "give the graph's name without an option: {usage}"),
     (&["--config", "--conf", "--graph"], &["--dataflow"], "use --dataflow FILE"),
-    (
-        &["--port", "--ui", "--web", "--gui", "--browser", "--dashboard", "--open", "--page"],
-        &["--view"],
-        "use --view[=PORT]",
-    ),
+    (&["--port", "--ui", "--web", "--gui", "--browser", "--dashboard", "--open"], &["--view"], "use --view[=PORT]"),
     (
         &["--web", "--ui", "--gui", "--browser", "--page"],
         &["view"],
@@ -509,8 +512,8 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (&["--once"], &["view"], "use --out FILE, or --format mermaid"),
     (&["--watch", "-w", "--follow", "-f"], &["ps", "set"], "use 'blindgrasp top'"),
     (&["--name"], &["init"], "give the folder without an option: {usage}"),
-    (&["--start", "--begin", "--since"], &["--from"], "use --from TIME"),
-    (&["--end", "--stop", "--until"], &["--to"], "use --to TIME"),
+    (&["--start", "--begin", "--since"], &["replay"], "use --from TIME"),
+    (&["--end", "--stop", "--until"], &["replay"], "use --to TIME"),
     (
         &["--tolerance", "--atol", "--rtol", "--eps"],
         &["test"],
@@ -668,7 +671,8 @@ impl Place {
             return Some(self.filled_in(hint, at + 1));
         }
         if self.name == "new" {
-            return Some(format!("use 'blindgrasp init {word}' for a project of that name"));
+            let project = || format!("use 'blindgrasp init {word}' for a project of that name");
+            return did_you_mean(word, ["operator", "hand"]).or_else(|| Some(project()));
         }
         if self.is_command(word) {
             return Some(self.filled_in(&format!("use 'blindgrasp {word} …'"), at + 1));
@@ -750,7 +754,14 @@ fn value_hint(error: &clap::Error) -> Option<String> {
     let value = text_of(error, ContextKind::InvalidValue)?;
     let option = text_of(error, ContextKind::InvalidArg)?;
     let name = option.split(' ').next().unwrap_or_default();
-    let row = GUESSES.iter().find(|(guesses, places, _)| places.contains(&name) && guesses.contains(&value.as_str()));
+    // An option of the same name may take other values.
+    let is_possible = |hint: &str| match error.get(ContextKind::ValidValue) {
+        Some(ContextValue::Strings(valid)) => valid.iter().any(|valid| hint.starts_with(&format!("use {valid}"))),
+        _ => true,
+    };
+    let row = GUESSES.iter().find(|(guesses, places, hint)| {
+        places.contains(&name) && guesses.contains(&value.as_str()) && is_possible(hint)
+    });
     if let Some((_, _, hint)) = row {
         return Some((*hint).into());
     }
@@ -788,7 +799,7 @@ mod tests {
         with_hint(error, help::grouped(Cli::command()), &words).to_string()
     }
 
-    /// The lines that the first column says are typed by people who know another program.
+    /// Lines that people who know another program type, each with a part of its hint.
     const LINES: [(&str, &str); 108] = [
         ("plot a.mcap", "tip: use 'blindgrasp view a.mcap'"),
         ("compare a.mcap b.mcap", "'blindgrasp test RECORDING'"),

@@ -8,6 +8,7 @@ use std::path::Path;
 use anyhow::{Context, bail};
 use blindgrasp_messages::{GraspTruth, Phase, Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingInfo, RecordingReader, RecordingWriter};
+use blindgrasp_replay::faults::InjectedFault;
 use blindgrasp_stages::hand::Hand;
 
 /// Grasps in each recording.
@@ -157,8 +158,8 @@ fn drop_outs(mut grasps: Vec<Grasp>) -> anyhow::Result<Vec<Grasp>> {
     for (idx, grasp) in grasps.iter_mut().enumerate() {
         let settled = grasp.first_settled()?;
         match idx % 5 {
-            0 => drop(grasp.frames.remove(settled + 1)),
-            1 => grasp.frames[settled + 1].message.cells_newtons.fill(0.0),
+            0 => InjectedFault::LostFrame.apply(&mut grasp.frames, &[]),
+            1 => InjectedFault::SilentFrame.apply(&mut grasp.frames, &[]),
             2 => grasp.frames[settled].message.cells_newtons[17] = f64::NAN,
             3 => grasp.frames[settled - 2].message.cells_newtons.truncate(90),
             _ => {}
@@ -172,11 +173,8 @@ fn out_of_order(mut grasps: Vec<Grasp>) -> anyhow::Result<Vec<Grasp>> {
     for (idx, grasp) in grasps.iter_mut().enumerate() {
         let settled = grasp.first_settled()?;
         match idx % 4 {
-            0 => grasp.frames.swap(settled, settled + 1),
-            1 => {
-                let again = grasp.frames[settled].clone();
-                grasp.frames.insert(settled + 1, again);
-            }
+            0 => InjectedFault::LateFrame.apply(&mut grasp.frames, &[]),
+            1 => InjectedFault::DoubledFrame.apply(&mut grasp.frames, &[]),
             2 => grasp.frames[settled].header.stamp_nanos -= 50_000_000,
             _ => {}
         }

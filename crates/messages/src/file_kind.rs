@@ -94,7 +94,10 @@ impl FileKind {
                 "a bag of ROS or a database: write its readings to a table (CSV) for blindgrasp import"
             }
             FileKind::Picture => "a picture or a PDF",
-            FileKind::Archive => "a compressed file: unpack it first",
+            FileKind::Archive => {
+                "a compressed file (.xlsx, .npz and .pt are such files as well): unpack it, or write its readings to a table (CSV) for \
+                 blindgrasp import"
+            }
             FileKind::Array => "a file of arrays: write the readings to a table (CSV) for blindgrasp import",
             FileKind::Pickle => "a pickle of Python: docs/operators.md shows how such a model decides in a graph",
         }
@@ -136,6 +139,8 @@ fn of_json(text: &str) -> FileKind {
         FileKind::Sensors
     } else if text.contains("\"contacts\"") && text.contains("\"centre_of_mass_m\"") {
         FileKind::GraspCases
+    } else if text.contains("\"operators\"") || text.contains("operators:") {
+        FileKind::Dataflow
     } else if begin.starts_with('{') && ["\"topic\"", "\"cells\""].iter().any(|key| text.contains(key)) {
         FileKind::FrameLines
     } else {
@@ -169,6 +174,8 @@ mod tests {
             (b"{\"format\":\"blindgrasp-model/2\",", Some(FileKind::Model)),
             (b"{\n  \"format\": \"blindgrasp-sensors/1\",", Some(FileKind::Sensors)),
             (b"{\"topic\":\"/tactile\",", Some(FileKind::FrameLines)),
+            (b"{\"operators\":{\"a\":{\"params\":{\"topic\":\"/x\"}}}}", Some(FileKind::Dataflow)),
+            (b"{version: 1, operators: {}}", Some(FileKind::Dataflow)),
             (b"{\"a\": 1}", Some(FileKind::Json)),
             (b"<?xml version=\"1.0\"?>\n<robot name=\"x\">", Some(FileKind::Urdf)),
             (b"<html>", None),

@@ -223,8 +223,8 @@ mod tests {
     #[test]
     fn lines_of_zenoh_name_no_places_in_its_source_code() {
         let line = "Can not create a link: [127.0.0.1:7447: Connection refused (os error 111) at \
-                    /root/.cargo/registry/zenoh-link-commons-1.10.2/src/tcp.rs:105.] at \
-                    /root/.cargo/registry/zenoh-link-commons-1.10.2/src/tcp.rs:133. at /root/.cargo/unicast.rs:287.. Retry.";
+                    /cargo/registry/zenoh-link-commons-1.10.2/src/tcp.rs:105.] at \
+                    /cargo/registry/zenoh-link-commons-1.10.2/src/tcp.rs:133. at /cargo/unicast.rs:287.. Retry.";
         assert_eq!(
             without_places(line),
             "Can not create a link: [127.0.0.1:7447: Connection refused (os error 111)]. Retry."

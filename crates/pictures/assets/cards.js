@@ -18,7 +18,9 @@ const show = (idx) => {
   stage.show({ links, contacts: [], gravity: null }, cells.map(colourOf));
   blindgrasp.shown = grasp_id;
 };
+let chosen = 0;
 const choose = (idx) => {
+  chosen = idx;
   show(idx);
   cards.forEach((card) => card.setAttribute("aria-pressed", String(Number(card.dataset.grasp) === idx)));
   byId("chosen").textContent = `Grasp ${data.frames[idx].grasp_id}. A click on a card shows another one. Drag or arrow keys: turn. Double click: back.`;
@@ -31,4 +33,4 @@ for (const card of cards) {
   stage.drawTo(card.querySelector("canvas"));
   blindgrasp.drawn += 1;
 }
-choose(0);
+choose(chosen);

@@ -11,7 +11,7 @@ use blindgrasp_recording::{Record, RecordingError, RecordingReader, RecordingWri
 /// A fault that each grasp of a recording meets. Grasps that never settle stay as they are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Fault {
+pub enum InjectedFault {
     /// The second settled frame is lost.
     LostFrame,
     /// Every third frame is lost.
@@ -23,7 +23,7 @@ pub enum Fault {
     /// In the second settled frame, all cells read 0.
     SilentFrame,
     /// In the second settled frame, the most loaded cell reads NaN.
-    MissingReading,
+    NanReading,
     /// The cell that is most loaded when the hand settles reads 0 throughout.
     DeadCell,
     /// It reads throughout what it reads when the hand settles.
@@ -32,31 +32,31 @@ pub enum Fault {
     DeadPad,
 }
 
-impl Fault {
-    pub const ALL: [Fault; 9] = [
-        Fault::LostFrame,
-        Fault::DropOuts,
-        Fault::DoubledFrame,
-        Fault::LateFrame,
-        Fault::SilentFrame,
-        Fault::MissingReading,
-        Fault::DeadCell,
-        Fault::StuckCell,
-        Fault::DeadPad,
+impl InjectedFault {
+    pub const ALL: [InjectedFault; 9] = [
+        InjectedFault::LostFrame,
+        InjectedFault::DropOuts,
+        InjectedFault::DoubledFrame,
+        InjectedFault::LateFrame,
+        InjectedFault::SilentFrame,
+        InjectedFault::NanReading,
+        InjectedFault::DeadCell,
+        InjectedFault::StuckCell,
+        InjectedFault::DeadPad,
     ];
 
     /// What happens, for a person to read.
     pub fn describe(self) -> &'static str {
         match self {
-            Fault::LostFrame => "the second settled frame is lost",
-            Fault::DropOuts => "every third frame is lost",
-            Fault::DoubledFrame => "the first settled frame comes twice",
-            Fault::LateFrame => "the first settled frame comes after the second",
-            Fault::SilentFrame => "all cells read 0 in the second settled frame",
-            Fault::MissingReading => "a cell reads NaN in the second settled frame",
-            Fault::DeadCell => "the most loaded cell reads 0",
-            Fault::StuckCell => "the most loaded cell is stuck",
-            Fault::DeadPad => "the most loaded pad reads 0",
+            InjectedFault::LostFrame => "the second settled frame is lost",
+            InjectedFault::DropOuts => "every third frame is lost",
+            InjectedFault::DoubledFrame => "the first settled frame comes twice",
+            InjectedFault::LateFrame => "the first settled frame comes after the second",
+            InjectedFault::SilentFrame => "all cells read 0 in the second settled frame",
+            InjectedFault::NanReading => "a cell reads NaN in the second settled frame",
+            InjectedFault::DeadCell => "the most loaded cell reads 0",
+            InjectedFault::StuckCell => "the most loaded cell is stuck",
+            InjectedFault::DeadPad => "the most loaded pad reads 0",
         }
     }
 
@@ -73,17 +73,17 @@ impl Fault {
             }
         };
         match self {
-            Fault::DropOuts => {
+            InjectedFault::DropOuts => {
                 let mut place = 0;
                 frames.retain(|_frame| {
                     place += 1;
                     place % 3 != 0
                 });
             }
-            Fault::DoubledFrame => frames.insert(first + 1, frames[first].clone()),
-            Fault::DeadCell => frames.iter_mut().for_each(|frame| of_cell(frame, 0.0)),
-            Fault::StuckCell => frames.iter_mut().for_each(|frame| of_cell(frame, cells[cell])),
-            Fault::DeadPad => {
+            InjectedFault::DoubledFrame => frames.insert(first + 1, frames[first].clone()),
+            InjectedFault::DeadCell => frames.iter_mut().for_each(|frame| of_cell(frame, 0.0)),
+            InjectedFault::StuckCell => frames.iter_mut().for_each(|frame| of_cell(frame, cells[cell])),
+            InjectedFault::DeadPad => {
                 let mut loads: BTreeMap<usize, f64> = BTreeMap::new();
                 for (newtons, pad) in cells.iter().zip(pad_of_cell) {
                     *loads.entry(*pad).or_default() += newtons;
@@ -94,12 +94,15 @@ impl Fault {
                     readings.filter(|(_, pad)| Some(**pad) == most).for_each(|(reading, _)| *reading = 0.0);
                 }
             }
-            Fault::LostFrame | Fault::LateFrame | Fault::SilentFrame | Fault::MissingReading => {
+            InjectedFault::LostFrame
+            | InjectedFault::LateFrame
+            | InjectedFault::SilentFrame
+            | InjectedFault::NanReading => {
                 let Some(&second) = settled.get(1) else { return };
                 match self {
-                    Fault::LostFrame => drop(frames.remove(second)),
-                    Fault::LateFrame => frames.swap(first, second),
-                    Fault::SilentFrame => frames[second].message.cells_newtons.fill(0.0),
+                    InjectedFault::LostFrame => drop(frames.remove(second)),
+                    InjectedFault::LateFrame => frames.swap(first, second),
+                    InjectedFault::SilentFrame => frames[second].message.cells_newtons.fill(0.0),
                     _ => of_cell(&mut frames[second], f64::NAN),
                 }
             }
@@ -114,7 +117,7 @@ impl Fault {
 pub fn write_with_fault(
     recording: &Path,
     topic: &str,
-    fault: Fault,
+    fault: InjectedFault,
     pad_of_cell: &[usize],
     out: &Path,
 ) -> Result<(), RecordingError> {
@@ -158,7 +161,7 @@ mod tests {
     }
 
     /// The numbers of the frames, and the readings of the second settled one of them.
-    fn after(fault: Fault) -> (Vec<u64>, Vec<f64>) {
+    fn after(fault: InjectedFault) -> (Vec<u64>, Vec<f64>) {
         let mut frames = grasp();
         fault.apply(&mut frames, &[0, 0, 1, 1]);
         let settled = frames.iter().filter(|frame| frame.message.phase == Phase::Settled);
@@ -170,25 +173,25 @@ mod tests {
     fn each_fault_by_hand() {
         let (all, readings) = (vec![0, 1, 2, 3, 4, 5], vec![1.0, 3.0, 0.0, 3.5]);
         for (fault, seqs, expected) in [
-            (Fault::LostFrame, vec![0, 1, 2, 4, 5], readings.clone()),
-            (Fault::DropOuts, vec![0, 1, 3, 4], readings.clone()),
-            (Fault::DoubledFrame, vec![0, 1, 2, 2, 3, 4, 5], readings.clone()),
-            (Fault::LateFrame, vec![0, 1, 3, 2, 4, 5], readings.clone()),
-            (Fault::SilentFrame, all.clone(), vec![0.0; 4]),
-            (Fault::DeadCell, all.clone(), vec![1.0, 3.0, 0.0, 0.0]),
-            (Fault::StuckCell, all.clone(), readings.clone()),
+            (InjectedFault::LostFrame, vec![0, 1, 2, 4, 5], readings.clone()),
+            (InjectedFault::DropOuts, vec![0, 1, 3, 4], readings.clone()),
+            (InjectedFault::DoubledFrame, vec![0, 1, 2, 2, 3, 4, 5], readings.clone()),
+            (InjectedFault::LateFrame, vec![0, 1, 3, 2, 4, 5], readings.clone()),
+            (InjectedFault::SilentFrame, all.clone(), vec![0.0; 4]),
+            (InjectedFault::DeadCell, all.clone(), vec![1.0, 3.0, 0.0, 0.0]),
+            (InjectedFault::StuckCell, all.clone(), readings.clone()),
             // Its two cells have 4 N together, the other pad's have 3.5 N.
-            (Fault::DeadPad, all.clone(), vec![0.0, 0.0, 0.0, 3.5]),
+            (InjectedFault::DeadPad, all.clone(), vec![0.0, 0.0, 0.0, 3.5]),
         ] {
             assert_eq!(after(fault), (seqs, expected), "{fault:?}");
         }
-        let (seqs, missing) = after(Fault::MissingReading);
+        let (seqs, missing) = after(InjectedFault::NanReading);
         assert!(seqs == all && missing[3].is_nan() && missing[..3] == readings[..3]);
     }
 
     #[test]
     fn a_grasp_that_never_settles_stays_as_it_is() {
-        for fault in Fault::ALL {
+        for fault in InjectedFault::ALL {
             let mut frames: Vec<_> = grasp().into_iter().take(2).collect();
             fault.apply(&mut frames, &[0, 0, 1, 1]);
             assert_eq!(frames.len(), 2, "{fault:?}");

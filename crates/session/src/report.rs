@@ -103,9 +103,11 @@ impl RunReport {
     pub(super) fn sample(&mut self, record: &Record) {
         match record {
             Record::Tactile(sample) => {
-                let hand = self.hand.as_ref().map(|hand| (hand.id(), hand.n_cells()));
-                let is_shown = hand.is_some_and(|(id, n_cells)| {
-                    [0, id].contains(&sample.header.hand_id) && sample.message.cells_newtons.len() == n_cells
+                let is_shown = self.hand.as_ref().is_some_and(|hand| {
+                    let TactileFrame { joints, cells_newtons, .. } = &sample.message;
+                    let fits = joints.len() == hand.joints.len() && cells_newtons.len() == hand.n_cells();
+                    let is_finite = joints.iter().all(|joint| joint.is_finite());
+                    [0, hand.id()].contains(&sample.header.hand_id) && fits && is_finite
                 });
                 if is_shown {
                     let grasp = self.grasp((sample.header.epoch, sample.message.grasp_id));

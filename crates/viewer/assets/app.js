@@ -114,7 +114,7 @@ const recordedChart = () => {
     secs: frame.since_start_ms / 1000,
     probabilities: frame.probability === null ? [] : [frame.probability],
     shadow: frame.shadow === null ? [] : [frame.shadow],
-    forces: isShownHand(frame) ? touchOf(frame).map(({ sum }) => sum) : null,
+    forces: byId("quantity").value === "force" && isShownHand(frame) ? touchOf(frame).map(({ sum }) => sum) : null,
     decisions: idx === decided && grasps[at].action !== null ? [grasps[at]] : [],
   }));
   drawChart({ moments, from: 0, to, ticks, title: "seconds since the grasp began", cursor: moments[n]?.secs ?? null, scene: shown.scene, model: null, hasShadow });
@@ -165,17 +165,17 @@ const past = makeHistory({
   show: (moment, decision, isPaused) => {
     showDecision(decision);
     showFrame(moment.frame);
+    if (isPaused && moment.frame && !isShownHand(moment.frame)) tell("moment", "this frame lacks readings of the hand: an earlier one stays drawn");
     if (isPaused || !moment.frame) tell("waits", "");
     else showVotes(moment.votes, moment.frame);
-    if (moment.feature) {
-      [feature, words] = [moment.feature, moment.words];
-      showFeature();
-      showWords();
-    }
+    // No feature is kept of the frame that decided, and that of another moment would mislead.
+    [feature, words] = [moment.feature ?? null, moment.feature ? moment.words : null];
+    showFeature();
+    showWords();
   },
 });
 shown.past = past;
-const player = makePlayer({ surround: hand.surround, showFrame, showDecision, showShadow, chart });
+const player = makePlayer({ surround: hand.surround, isShownHand, showFrame, showDecision, showShadow, chart });
 shown.player = player;
 setInterval(() => {
   if (document.hidden || player.grasps.length) return;
@@ -224,7 +224,7 @@ setInterval(() => {
   const isLive = !player.grasps.length && past.at === null;
   const isSilent = graphAt === null || performance.now() - graphAt > SILENT_MS;
   const isFrameOld = frameAt === null || performance.now() - frameAt > SILENT_MS;
-  if (isLive && graphAt !== null && isSilent) say(`no news of the graph since ${age(graphAt)}`, true);
+  if (isLive && graphAt !== null && isSilent && !isOver()) say(`no news of the graph since ${age(graphAt)}`, true);
   document.body.classList.toggle("stale", isLive && isSilent);
   byId("stage").classList.toggle("old", isLive && isFrameOld);
   tell("decided", isLive && decidedAt !== null ? `decided ${age(decidedAt)} ago` : "");

@@ -14,7 +14,7 @@ const isProbe = (decision) => ["squeeze", "test_lift"].includes(decision.action)
 const makeHistory = ({ show, chart }) => {
   // `at` is the time of the page's clock in milliseconds of the moment that is shown, null at present.
   const state = { moments: [], decisions: [], at: null, decided: new Set(), push, label, pause, resume, clear, isDecided, end, choose, isOver: () => isOver };
-  let n_kept = 0, chosen = null, isOver = false, isListDue = true;
+  let n_kept = 0, chosen = null, isOver = false, isListDue = true, listed = [];
   const last = () => state.moments.at(-1);
 
   function drop() {
@@ -33,7 +33,11 @@ const makeHistory = ({ show, chart }) => {
       decide(decision);
       state.decisions.push(decision);
       isListDue = true;
-      if (state.decisions.length > MAX_DECISIONS) state.decisions.shift();
+      if (state.decisions.length > MAX_DECISIONS) {
+        const dropped = state.decisions.shift();
+        // Moments keep their decisions, but no frame that cannot be chosen any more. The list of a paused page stays.
+        if (state.at === null || !listed.includes(dropped)) delete dropped.frame;
+      }
     }
     if (state.at !== null && n_kept > MAX_KEPT_NUMBERS) return;
     // The hand stays as it was until its next frame.
@@ -114,7 +118,6 @@ const makeHistory = ({ show, chart }) => {
     slider.setAttribute("aria-valuetext", isPaused ? text : "live");
   }
   // The newest first. While the page is paused the rows stay where they are.
-  let listed = [];
   function list() {
     isListDue = false;
     if (state.at === null || isOver || !listed.length) listed = state.decisions.slice().reverse();
@@ -146,6 +149,6 @@ const makeHistory = ({ show, chart }) => {
     if (isListDue && (state.at === null || isOver)) list();
   };
   byId("pause").addEventListener("click", () => (state.at === null ? pause(Infinity) : resume()));
-  byId("moment-slider").addEventListener("input", () => pause(state.moments[Number(byId("moment-slider").value)].at));
+  byId("moment-slider").addEventListener("input", () => pause((state.moments[Number(byId("moment-slider").value)] ?? last())?.at ?? Infinity));
   return state;
 };

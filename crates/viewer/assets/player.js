@@ -2,8 +2,8 @@
 
 const COLOURS = { right: "--lift", "false-positive": "--hold", "false-negative": "--probe", other: "--soft" };
 
-// Its functions show parts of the page: `surround` an object, `showFrame`, `showDecision`, `showShadow`, and `chart`.
-const makePlayer = ({ surround, showFrame, showDecision, showShadow, chart }) => {
+// Its functions show parts of the page: `surround` an object, `isShownHand` says whether a frame fits the hand, `showFrame`, `showDecision`, `showShadow`, and `chart`.
+const makePlayer = ({ surround, isShownHand, showFrame, showDecision, showShadow, chart }) => {
   // `decided` is the number of the frame that decided: without a decision, of the last one of the settled hand; or null.
   const state = { grasps: [], at: -1, frames: [], n: 0, decided: null, isPlaying: false, verdict, go, start };
   let opening = 0, abort = null, run = 0, due = 0, wholeStep = 1;
@@ -22,10 +22,10 @@ const makePlayer = ({ surround, showFrame, showDecision, showShadow, chart }) =>
     byId("frame").value = n;
     const nth = wholeStep > 1 ? ` (every ${wholeStep}th is shown)` : "";
     const decided = n !== state.decided ? "" : grasp.action === null ? ", the last settled one" : ", which decided";
-    byId("when").textContent = frame.links
+    byId("when").textContent = isShownHand(frame)
       ? `grasp ${grasp.id}, ${frame.since_start_ms.toFixed(0)} ms, frame ${n + 1} of ${state.frames.length}${nth}${decided}`
-      : `grasp ${grasp.id}, frame ${n + 1}: its joints are not those of the hand`;
-    if (frame.links) showFrame(frame);
+      : `grasp ${grasp.id}, frame ${n + 1}${decided}: its joints or cells are not those of the hand, an earlier frame stays drawn`;
+    if (isShownHand(frame)) showFrame(frame);
     chart();
   };
   // Shows a grasp, at its first frame or at the one that decided; false if another one was asked for meanwhile, or there is no

@@ -44,8 +44,9 @@ const MAX_BROWSERS: usize = 64;
 const MAX_ORDER_BYTES: usize = 16 << 10;
 /// The event after which a browser's stream ends.
 const FINISHED: &str = "finished";
-/// The browsers have this time to read it.
+/// The browsers have this time to read the last event.
 const FINISH_LIMIT: Duration = Duration::from_secs(1);
+/// Between two looks whether they have, and for the last bytes on their way.
 const FINISH_PAUSE: Duration = Duration::from_millis(20);
 /// The address of orders.
 const ORDERS: &str = "/orders";

@@ -59,6 +59,8 @@ pub(super) struct FlightRecorder {
     after_nanos: u64,
     samples: VecDeque<Kept>,
     n_bytes: usize,
+    /// Samples younger than the time to keep have been forgotten, for lack of room.
+    is_full: bool,
     /// The grasp of the last frame, with its epoch.
     grasp: Option<(u64, u64)>,
     /// The grasp that was last reported as dropped, with its epoch.
@@ -96,13 +98,14 @@ pub(super) struct WrittenExcerpt {
 impl FlightRecorder {
     /// `None` if no edge bears frames.
     pub(super) fn new(edges: &[AttachedEdge], keep: Duration, after: Duration) -> Option<Self> {
-        let edges: Vec<KeptEdge> = edges
-            .iter()
-            .map(|edge| KeptEdge {
-                topic: edge.topic.clone(),
-                is_numbered: bears_source_number(&edge.input.service.type_name),
-            })
-            .collect();
+        let kept = |edge: &AttachedEdge| KeptEdge {
+            topic: edge.topic.clone(),
+            is_numbered: bears_source_number(&edge.input.service.type_name),
+        };
+        Self::of(edges.iter().map(kept).collect(), keep, after)
+    }
+
+    fn of(edges: Vec<KeptEdge>, keep: Duration, after: Duration) -> Option<Self> {
         Some(FlightRecorder {
             // The edges are in the graph's order, sources first.
             leader_idx: edges.iter().position(|edge| edge.is_numbered)?,
@@ -111,6 +114,7 @@ impl FlightRecorder {
             after_nanos: after.as_nanos() as u64,
             samples: VecDeque::new(),
             n_bytes: 0,
+            is_full: false,
             grasp: None,
             dropped: None,
             last_fault: None,
@@ -137,6 +141,7 @@ impl FlightRecorder {
             self.forget(received_nanos);
         }
         while self.n_bytes > MAX_BYTES {
+            self.is_full = true;
             self.forget_first();
         }
     }
@@ -189,6 +194,11 @@ impl FlightRecorder {
     pub(super) fn excerpt_when_due(&mut self, now_nanos: u64) -> Option<Excerpt> {
         let until_nanos = self.trigger.as_ref()?.until_nanos;
         if now_nanos < until_nanos + UNDER_WAY_NANOS { None } else { self.excerpt(until_nanos) }
+    }
+
+    /// Whether the time to keep does not fit into memory.
+    pub(super) fn is_full(&self) -> bool {
+        self.is_full
     }
 
     /// The samples for a file that was asked for and is not due yet.
@@ -369,24 +379,10 @@ mod tests {
 
     fn recorder(keep_secs: u64, after_secs: u64) -> FlightRecorder {
         let edge = |topic: &str, is_numbered| KeptEdge { topic: topic.into(), is_numbered };
-        FlightRecorder {
-            edges: vec![
-                edge("/tactile", true),
-                edge("/prediction", true),
-                edge("/decision", false),
-                edge("/outcome", false),
-            ],
-            leader_idx: 0,
-            keep_nanos: keep_secs * SEC,
-            after_nanos: after_secs * SEC,
-            samples: VecDeque::new(),
-            n_bytes: 0,
-            grasp: None,
-            dropped: None,
-            last_fault: None,
-            trigger: None,
-            later: None,
-        }
+        let edges =
+            vec![edge("/tactile", true), edge("/prediction", true), edge("/decision", false), edge("/outcome", false)];
+        let (keep, after) = (Duration::from_secs(keep_secs), Duration::from_secs(after_secs));
+        FlightRecorder::of(edges, keep, after).expect("an edge with frames")
     }
 
     fn header(seq: u64, nanos: u64) -> Header {

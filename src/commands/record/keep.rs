@@ -74,6 +74,7 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
     ));
     let end = arguments.for_secs.map(|secs| start + Duration::from_secs_f64(secs));
     let mut writer = Writer { out, about, is_json: arguments.json, has_loss: false };
+    let mut is_full = false;
     let ending = loop {
         if stop.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end) {
             break Ending::Detached;
@@ -81,7 +82,15 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
         if asked.swap(false, Ordering::Relaxed) {
             recorder.with(|recorder| recorder.ask(ASKED, monotonic_nanos()));
         }
-        writer.write(recorder.with(|recorder| recorder.excerpt_when_due(monotonic_nanos())))?;
+        if let Some(excerpt) = recorder.with(|recorder| recorder.excerpt_when_due(monotonic_nanos())) {
+            writer.write(excerpt)?;
+        }
+        if !is_full && recorder.with(|recorder| recorder.is_full()) {
+            is_full = true;
+            print_diagnostic(
+                "blindgrasp: --keep holds 512 MiB, which is less than that time: older samples are forgotten",
+            );
+        }
         match connection.receive_within(POLL) {
             Ok(None) if observer.has_failed() => break Ending::Broken,
             Ok(None) => {}
@@ -101,7 +110,9 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
     if ending == Ending::Broken {
         recorder.with(|recorder| recorder.ask(Ending::Broken.word(), monotonic_nanos()));
     }
-    writer.write(recorder.with(FlightRecorder::excerpt_now))?;
+    while let Some(excerpt) = recorder.with(FlightRecorder::excerpt_now) {
+        writer.write(excerpt)?;
+    }
     finished.context("cannot read the graph's edges any more")?;
     let how = match ending {
         Ending::Graph => "the graph has ended",
@@ -137,8 +148,7 @@ struct Writer<'a> {
 }
 
 impl Writer<'_> {
-    fn write(&mut self, excerpt: Option<Excerpt>) -> anyhow::Result<()> {
-        let Some(excerpt) = excerpt else { return Ok(()) };
+    fn write(&mut self, excerpt: Excerpt) -> anyhow::Result<()> {
         if excerpt.is_empty() {
             self.has_loss = true;
             print_diagnostic("blindgrasp: nothing is written: no frame has come yet");

@@ -14,7 +14,7 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_replay::checks::{ChangedDecision, Decisions};
 use blindgrasp_replay::expectations::Expectations;
-use blindgrasp_replay::faults::{Fault, write_with_fault};
+use blindgrasp_replay::faults::{InjectedFault, write_with_fault};
 use blindgrasp_stages::hand::Hand;
 
 pub(super) fn run(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) -> anyhow::Result<Outcome> {
@@ -38,7 +38,7 @@ pub(super) fn run(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) ->
         let pad_of_cell: Vec<usize> = hand.cells().map(|(pad_idx, _)| pad_idx).collect();
         let mut table = TextTable::new(["fault", "held -> lifted", "lifted -> held"], 1);
         let mut told = Vec::new();
-        for fault in Fault::ALL {
+        for fault in InjectedFault::ALL {
             let faulty = runner.scratch.path(Path::new(&format!(".{}-with-fault.mcap", std::process::id())));
             write_with_fault(recording, &fed.topic, fault, &pad_of_cell, &faulty).with_context(shown)?;
             // A doubled frame is dropped on the way, which counts as a loss.

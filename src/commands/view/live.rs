@@ -42,8 +42,8 @@ const RETRY: Duration = Duration::from_millis(500);
 const MAX_PROBABILITIES: usize = 200;
 /// Lines of the log that are shown.
 const MAX_LOG_LINES: usize = 100;
-/// Frames that wait for the decisions about them.
-const MAX_RECENT: usize = 128;
+/// Cells in all of the frames that wait for the decisions about them: 8 MiB.
+const MAX_RECENT_CELLS: usize = 1 << 20;
 /// Labels of grasps that wait for their decision.
 const MAX_TRUTHS: usize = 256;
 
@@ -379,7 +379,7 @@ impl Sink for Reader {
             Record::Tactile(sample) if is_shown(sample.header.hand_id) => {
                 let Header { epoch, stamp_nanos, .. } = sample.header;
                 let shown = ShownFrame { epoch, stamp_nanos, frame: Arc::new(sample.message) };
-                if latest.recent.len() >= MAX_RECENT {
+                if latest.recent.len() * shown.frame.cells_newtons.len().max(64) >= MAX_RECENT_CELLS {
                     latest.recent.pop_front();
                 }
                 latest.recent.push_back(shown.clone());

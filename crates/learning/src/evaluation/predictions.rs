@@ -125,8 +125,8 @@ impl OutsidePredictions {
     pub fn check_names(&self, others: &[String]) -> Result<(), PredictionsError> {
         match self.models.iter().find(|model| others.contains(&model.name)) {
             Some(model) => Err(self.refused(format!(
-                "a model is called '{}', as one of blindgrasp's: expected another name in the column model, or without that \
-                 column another name of the file",
+                "a model is called '{}', like one of blindgrasp's: expected another name in the column model or, without that \
+                 column, another file name",
                 model.name
             ))),
             None => Ok(()),
@@ -172,8 +172,8 @@ impl OutsideModel {
     }
 }
 
-/// The table of the judges' predictions: a row for each judge and each grasp for which it has a probability. It can be read
-/// as predictions of outside models.
+/// The table of the judges' predictions: a row for each judge and each grasp for which it has a probability. That of recipes
+/// can be read as predictions of outside models; that of a model lacks grasps for which it has no single probability.
 ///
 /// # Errors
 /// A row cannot be written.
@@ -344,7 +344,9 @@ impl PredictionColumns {
         let probability_stable = in_range.ok_or_else(|| {
             format!("column 'probability_stable': expected a number from 0 to 1, found {}", found(probability))
         })?;
-        let fold = self.fold.map(|idx| whole_number("fold", idx)).transpose()?;
+        // Predictions that belong to no fold have an empty column.
+        let fold = self.fold.filter(|idx| !record[*idx].is_empty());
+        let fold = fold.map(|idx| whole_number("fold", idx)).transpose()?;
         Ok((place, OutsidePrediction { probability_stable, fold, line }))
     }
 }
@@ -525,8 +527,8 @@ mod tests {
             ("grasp_id,probability_stable\n9,0.5\n".into(), "line 2: none of the 2 recordings has a grasp 9"),
             ("model,grasp_id,probability_stable\na/b,0,0.5\n".into(), "line 2: column 'model': expected a name"),
             (
-                "fold,grasp_id,probability_stable\n,0,0.5\n".into(),
-                "line 2: column 'fold': expected a whole number, found nothing",
+                "fold,grasp_id,probability_stable\nx,0,0.5\n".into(),
+                "line 2: column 'fold': expected a whole number, found 'x'",
             ),
         ] {
             let error = read_table(&table).expect_err(expected);
@@ -564,5 +566,9 @@ mod tests {
             assert_eq!(outside.models[0].probability(grasp), grasp.probability);
         }
         outside.check_folds(&examples.examples, &[0, 0, 0, 1]).expect("the same folds");
+        let without_folds = judge.decided.iter().map(|grasp| JudgedGrasp { fold: None, ..grasp.clone() }).collect();
+        let judge = JudgedRecipe::new("m", String::new(), 0.5, without_folds, Unit::Object, 1);
+        let table = predictions_csv(std::slice::from_ref(&judge), &recordings).expect("written");
+        assert_eq!(read_table(&table).expect("readable").models[0].name, "m");
     }
 }
