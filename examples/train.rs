@@ -5,14 +5,14 @@
 //! ```
 //!
 //! The grasps are a recording's here. Grasps of your own are the same: the frames of each grasp in order, and a
-//! `GraspTruth` that says whether it held and of which object it was. `blindgrasp_learning::training::train` takes
-//! recordings as they are.
+//! `GraspTruth` that says whether it held and of which object it was. `Examples::read` takes recordings as they
+//! are.
 
 use std::path::Path;
 
 use anyhow::Context;
 use blindgrasp_learning::dataset::{hand_of, read_grasps};
-use blindgrasp_learning::training::{Examples, TrainingOptions, train_on};
+use blindgrasp_learning::training::{Examples, TrainingOptions, train};
 
 fn main() -> anyhow::Result<()> {
     let mut args = std::env::args().skip(1);
@@ -26,7 +26,7 @@ fn main() -> anyhow::Result<()> {
     let examples = Examples::of_grasps(&hand, labelled)?;
     println!("{} grasps to learn from", examples.examples.len());
 
-    let model = train_on(&hand, &examples, &[], &TrainingOptions::default(), |step| println!("{step}"))?;
+    let model = train(&hand, &examples, &[], &TrainingOptions::default(), |step| println!("{step}"))?;
     println!("{:.1} % right about objects not seen", 100.0 * model.training.cross_validated_accuracy);
     model.save(Path::new(&out))?;
     Ok(())

@@ -8,8 +8,8 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{check_new, number_in, percent, print_line, train};
-use blindgrasp_learning::training::grid::{GridReport, Search, axes_around, with_values};
-use blindgrasp_learning::training::{Example, Examples, TrainingOptions, folds_by_object};
+use blindgrasp_learning::training::grid::{Axis, GridReport, Search, axes_around, with_values};
+use blindgrasp_learning::training::{Example, Examples, Recipe, TrainingOptions, folds_by_object};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::training_summary::GridSummary;
@@ -37,14 +37,13 @@ pub(super) struct GridArguments {
     grid_report: Option<PathBuf>,
 }
 
-/// Searches the grid if `--grid` is given, puts the best pair into the recipe, and returns the summary for the model.
-pub(super) fn search(
+/// The values to try, if `--grid` is given: checked before recordings are read.
+pub(super) fn axes(
     arguments: &GridArguments,
-    hand: &Hand,
     recordings: &[PathBuf],
     training: &train::Arguments,
-    options: &mut TrainingOptions,
-) -> anyhow::Result<Option<GridSummary>> {
+    recipe: &Recipe,
+) -> anyhow::Result<Option<[Axis; 2]>> {
     if !arguments.grid {
         return Ok(None);
     }
@@ -54,7 +53,7 @@ pub(super) fn search(
             bail!("{} is given for --out and for --grid-report: choose two files", path.display());
         }
     }
-    let mut axes = axes_around(&options.recipe);
+    let mut axes = axes_around(recipe);
     let given = [
         ("--grid-c", "c", &arguments.grid_c),
         ("--grid-gamma", "gamma", &arguments.grid_gamma),
@@ -63,17 +62,26 @@ pub(super) fn search(
     ];
     for (flag, name, values) in given.into_iter().filter(|(_, _, values)| !values.is_empty()) {
         let Some(axis) = axes.iter_mut().find(|axis| axis.name == name) else {
-            bail!("{flag}: the recipe {} has no {name}; name another with --recipe", options.recipe.name);
+            bail!("{flag}: the recipe {} has no {name}; name another with --recipe", recipe.name);
         };
         axis.values = values.clone();
         axis.values.sort_by(f64::total_cmp);
         axis.values.dedup();
     }
-    let read = Examples::read(hand, recordings, &options.relabelling(), |_, _| {})?;
+    Ok(Some(axes))
+}
+
+/// Searches the grid, puts the best pair into the recipe, and returns the summary for the model.
+pub(super) fn search(
+    arguments: &GridArguments,
+    axes: &[Axis; 2],
+    hand: &Hand,
+    read: &Examples,
+    options: &mut TrainingOptions,
+) -> anyhow::Result<GridSummary> {
     let examples: Vec<&Example> = read.examples.iter().collect();
     let folds = folds_by_object(&examples, options.n_folds)?;
-    let search =
-        Search { hand, recipe: &options.recipe, axes: &axes, examples: &examples, folds: &folds, seed: options.seed };
+    let search = Search { hand, recipe: &options.recipe, axes, examples: &examples, folds: &folds, seed: options.seed };
     let report = run(&search)?;
     if let Some(path) = &arguments.grid_report {
         let text = serde_json::to_string_pretty(&report)? + "\n";
@@ -98,9 +106,8 @@ pub(super) fn search(
             "the most accurate pair has the first or last {name} of the grid: a value beyond it may do better"
         ));
     }
-    let recipe = with_values(&options.recipe, report.best.values);
-    options.recipe = recipe;
-    Ok(Some(report.summary()))
+    options.recipe = with_values(&options.recipe, report.best.values);
+    Ok(report.summary())
 }
 
 fn run(search: &Search<'_>) -> anyhow::Result<GridReport> {

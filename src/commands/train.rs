@@ -6,10 +6,10 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 
 use super::evaluate::print_label;
-use super::grid::{GridArguments, search};
+use super::grid::{self, GridArguments};
 use super::{Outcome, check_new, completions, number_in, percent, print_line};
 use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::training::{Aim, TrainingOptions, train};
+use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, train};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::Classifier;
@@ -122,8 +122,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         seed: arguments.seed,
         ..TrainingOptions::default()
     };
-    let grid = search(&arguments.grid, &hand, &recordings, arguments, &mut options)?;
-    let mut model = train(&hand, &recordings, &options, |what| print_diagnostic(&format!("{what} …")))?;
+    options.check()?;
+    let axes = grid::axes(&arguments.grid, &recordings, arguments, &options.recipe)?;
+    let progress = |what: &str| print_diagnostic(&format!("{what} …"));
+    let examples = Examples::read(&hand, &recordings, &options.relabelling(), |n_read, n| {
+        progress(&format!("read recording {n_read} of {n}"));
+    })?;
+    let grid = axes.map(|axes| grid::search(&arguments.grid, &axes, &hand, &examples, &mut options)).transpose()?;
+    let mut model = train(&hand, &examples, &recordings, &options, progress)?;
     model.training.grid = grid;
     model.save(&arguments.out)?;
     let training = &model.training;

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use blindgrasp_learning::dataset::{hand_of, read_grasps};
-use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, adapt_on, train_on};
+use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, adapt_on, train};
 use blindgrasp_messages::{Action, GraspTruth, Header, Phase, Stamped, TactileFrame};
 use blindgrasp_stages::own_lifts::Adapt;
 use blindgrasp_stages::promise_monitor::drops_at_most;
@@ -66,7 +66,7 @@ fn main() -> anyhow::Result<()> {
             let examples = Examples::of_grasps(&hand, own)?;
             let training = TrainingOptions { aim: Some(Aim::DropSecs(300.0)), ..TrainingOptions::default() };
             let model = match which.as_str() {
-                "scratch" => train_on(&hand, &examples, &[], &training, |_| {})?,
+                "scratch" => train(&hand, &examples, &[], &training, |_| {})?,
                 _ if *number == 0 => model.clone(),
                 // So few grasps may have too few that can be judged: then the model stays.
                 _ => adapt_on(&hand, &model, &examples, &[]).unwrap_or(model.clone()),

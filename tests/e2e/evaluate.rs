@@ -366,7 +366,7 @@ fn predictions_that_do_not_fit_are_refused() {
         "line 2: column 'probability_stable': expected a number from 0",
     );
     let split = ["--split", "object", "--folds", "3", "--recipe", "boosted"];
-    refuse(&whole, &split, "a model is called 'boosted', as one of blindgrasp's");
+    refuse(&whole, &split, "a model is called 'boosted', like one of blindgrasp's");
     // With another seed, grasps are in other folds.
     let other = [&split[..], &["--seed", "2"]].concat();
     refuse(&whole.replace(",boosted,", ",mine,"), &other, "in predictions.csv, which --figures writes");

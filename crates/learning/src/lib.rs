@@ -12,7 +12,7 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
-//! [`training::train`] makes such a model of recordings, and [`training::train_on`] of grasps in memory.
+//! [`training::train`] makes such a model of the grasps of recordings, or of grasps in memory ([`training::Examples`]).
 //!
 //! * [`dataset`] - recordings as data sets. [`import`] - tables of tactile readings as recordings.
 //! * [`training`] - the model, by the [`learners`].

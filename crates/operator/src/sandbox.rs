@@ -48,7 +48,7 @@ const FIRST_X32_CALL: u32 = 0x4000_0000;
 /// its user; those that hide from this filter what they do; and those that make files which are neither regular nor folders.
 const DENIED_CALLS: [i64; 17] = [
     libc::SYS_fchmodat,
-    libc::SYS_fchmodat2,
+    SYS_FCHMODAT2,
     libc::SYS_fchown,
     libc::SYS_fchownat,
     libc::SYS_setxattr,
@@ -79,7 +79,8 @@ const DENIED_OLD_CALLS: [i64; 7] = [
 ];
 #[cfg(not(target_arch = "x86_64"))]
 const DENIED_OLD_CALLS: [i64; 0] = [];
-/// Calls of Linux 6.13 and 6.17, which have the same numbers on all machines.
+/// Calls of Linux 6.6, 6.13 and 6.17, which have the same numbers on all machines.
+const SYS_FCHMODAT2: i64 = 452;
 const SYS_SETXATTRAT: i64 = 463;
 const SYS_REMOVEXATTRAT: i64 = 466;
 const SYS_FILE_SETATTR: i64 = 469;

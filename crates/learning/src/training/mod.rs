@@ -91,6 +91,28 @@ impl TrainingOptions {
     pub fn relabelling(&self) -> Relabelling {
         Relabelling { frictions: self.frictions.clone(), by_wrench_space: self.by_wrench_space }
     }
+
+    /// Refuses options that no training takes, before recordings are read.
+    ///
+    /// # Errors
+    /// Too many words, a threshold that is no probability, or frictions for a learner without probabilities.
+    pub fn check(&self) -> Result<(), TrainingError> {
+        let recipe = &self.recipe;
+        if recipe.n_words > MAX_FEATURES {
+            return Err(TrainingError::Data(format!("{} words, expected at most {MAX_FEATURES}", recipe.n_words)));
+        }
+        let threshold = self.threshold_probability;
+        if !(threshold > 0.0 && threshold <= 1.0) {
+            return Err(TrainingError::Data(format!("the threshold is {threshold}, expected more than 0, at most 1")));
+        }
+        if !self.frictions.is_empty() && !matches!(recipe.learner, Learner::Boosting(_)) {
+            return Err(TrainingError::Data(format!(
+                "several frictions need a learner of probabilities, and the recipe {} has an SVM: use the recipe boosted",
+                recipe.name
+            )));
+        }
+        Ok(())
+    }
 }
 
 /// Why a model could not be trained.
@@ -126,36 +148,19 @@ pub struct Fitted {
     pub(crate) day_variances: Vec<f64>,
 }
 
-/// Trains a model on labelled recordings. `progress` gets a description of each step.
-///
-/// # Errors
-/// Recordings that cannot be used, of one class only, of fewer objects than folds, or with too few contacts.
-pub fn train(
-    hand: &Hand,
-    recordings: &[PathBuf],
-    options: &TrainingOptions,
-    mut progress: impl FnMut(&str),
-) -> Result<Model, TrainingError> {
-    check_options(options)?;
-    let read = Examples::read(hand, recordings, &options.relabelling(), |n_read, n| {
-        progress(&format!("read recording {n_read} of {n}"));
-    })?;
-    train_on(hand, &read, recordings, options, progress)
-}
-
 /// Trains a model on examples. `recordings` names the files that they are from; it is empty for examples out of memory
-/// ([`Examples::of_grasps`]), which have the labels that they came with.
+/// ([`Examples::of_grasps`]), which have the labels that they came with. `progress` gets a description of each step.
 ///
 /// # Errors
-/// As of [`train`].
-pub fn train_on(
+/// As of [`TrainingOptions::check`]; examples of one class only, of fewer objects than folds, or with too few contacts.
+pub fn train(
     hand: &Hand,
     read: &Examples,
     recordings: &[PathBuf],
     options: &TrainingOptions,
     mut progress: impl FnMut(&str),
 ) -> Result<Model, TrainingError> {
-    check_options(options)?;
+    options.check()?;
     let recipe = &options.recipe;
     check_examples(read, recordings, &options.frictions)?;
     let examples: Vec<&Example> = read.examples.iter().collect();
@@ -528,25 +533,6 @@ fn out_of_fold_probabilities(judged: &OutOfFold<'_>) -> Result<Vec<f64>, PlattEr
 /// The settled frames of the examples.
 fn readings<'a>(examples: &[&'a Example]) -> Vec<FeltReading<'a>> {
     examples.iter().map(|example| example.reading()).collect()
-}
-
-/// Refuses options that do not fit each other before any recording is read.
-fn check_options(options: &TrainingOptions) -> Result<(), TrainingError> {
-    let recipe = &options.recipe;
-    if recipe.n_words > MAX_FEATURES {
-        return Err(TrainingError::Data(format!("{} words, expected at most {MAX_FEATURES}", recipe.n_words)));
-    }
-    let threshold = options.threshold_probability;
-    if !(threshold > 0.0 && threshold <= 1.0) {
-        return Err(TrainingError::Data(format!("the threshold is {threshold}, expected more than 0, at most 1")));
-    }
-    if !options.frictions.is_empty() && !matches!(recipe.learner, Learner::Boosting(_)) {
-        return Err(TrainingError::Data(format!(
-            "several frictions need a learner of probabilities, and the recipe {} has an SVM: use the recipe boosted",
-            recipe.name
-        )));
-    }
-    Ok(())
 }
 
 /// Refuses examples without grasps or of one class only.
