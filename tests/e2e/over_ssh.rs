@@ -291,16 +291,19 @@ fn ctrl_c_ends_the_command_there() {
     let Some(sshd) = Sshd::start() else { return };
     let folder = tempfile::tempdir().expect("a folder");
     let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    // The arbiter says a line as it begins, and no more.
+    let log = || blindgrasp().args(["logs", "lift_arbiter", "--graph", &graph.name]).output().expect("started");
+    wait_until(|| log().status.success(), || text(&log().stderr));
     for with in [Signal::INT, Signal::KILL] {
-        // It never writes a line, and so would not notice that nobody reads.
+        // It writes no further line, and so would not notice that nobody reads.
         let mut command = sshd.blindgrasp();
-        command.args(["logs", "audit", "-f", "-n", "3", "--graph", &graph.name, "--machine", "brain"]);
+        command.args(["logs", "lift_arbiter", "-f", "-n", "3", "--graph", &graph.name, "--machine", "brain"]);
         let logs = Running::start(command);
-        let there = format!("blindgrasp logs audit -f -n 3 --graph {} --machine brain", graph.name);
+        let there = format!("blindgrasp logs lift_arbiter -f -n 3 --graph {} --machine brain", graph.name);
         // The one here and the one there; ssh has it as one word.
         wait_until(|| processes(&there).len() >= 2, || format!("{:?}", processes(&there)));
-        let code = logs.stop(with).0;
-        assert_eq!(code, (with == Signal::INT).then_some(130));
+        let (code, _, said) = logs.stop(with);
+        assert_eq!(code, (with == Signal::INT).then_some(130), "{said}");
         wait_until(|| processes(&there).is_empty(), || format!("{:?}", processes(&there)));
     }
     graph.stop();

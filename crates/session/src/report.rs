@@ -434,7 +434,7 @@ mod tests {
     #[test]
     fn each_decision_is_counted_once_whatever_the_order_of_grasps_and_epochs() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
-        let n_cells = hand.n_cells();
+        let (joints, n_cells) = (vec![0.0; hand.joints.len()], hand.n_cells());
         let mut report = RunReport::begin(Some(hand));
         let n_grasps = 3 * MAX_GRASPS as u64;
         for (epoch, grasp_id) in [9, 4].into_iter().flat_map(|epoch| (0..n_grasps).rev().map(move |id| (epoch, id))) {
@@ -442,6 +442,7 @@ mod tests {
             let frame = TactileFrame {
                 grasp_id,
                 phase: Phase::Settled,
+                joints: joints.clone(),
                 cells_newtons: vec![0.0; n_cells],
                 ..TactileFrame::default()
             };
