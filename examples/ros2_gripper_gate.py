@@ -128,7 +128,7 @@ def serve(arguments, decisions):
     import control_msgs.action
     import rclpy
     from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
-    from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+    from rclpy.executors import MultiThreadedExecutor
 
     # Humble has no ParallelGripperCommand.
     kind = getattr(control_msgs.action, "ParallelGripperCommand" if arguments.parallel else "GripperCommand")
@@ -192,8 +192,12 @@ def serve(arguments, decisions):
     try:
         # The answers of the controller come while a goal is executed.
         rclpy.spin(node, MultiThreadedExecutor(num_threads=4))
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
         pass
+    except Exception:
+        # A signal that ends ROS 2 makes rclpy.spin raise one of several errors.
+        if rclpy.ok():
+            raise
     finally:
         rclpy.try_shutdown()
 

@@ -12,7 +12,6 @@ import time
 
 import rclpy
 from blindgrasp_msgs.msg import Decision
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
@@ -50,8 +49,12 @@ def main():
     rclpy.init()
     try:
         rclpy.spin(LiftGate())
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
         pass
+    except Exception:
+        # A signal that ends ROS 2 makes rclpy.spin raise one of several errors.
+        if rclpy.ok():
+            raise
     finally:
         rclpy.try_shutdown()
 

@@ -183,7 +183,6 @@ def message_class(name):
 
 def bridge(table, address):
     import rclpy
-    from rclpy.executors import ExternalShutdownException
     from rclpy.qos import qos_profile_sensor_data
 
     source = line_protocol.Source(address)
@@ -214,8 +213,10 @@ def bridge(table, address):
         subscribe(entry, "std_msgs/msg/Float64MultiArray", take)
     try:
         rclpy.spin(node)
-    except ExternalShutdownException:
-        pass
+    except Exception:
+        # A signal that ends ROS 2 makes rclpy.spin raise one of several errors.
+        if rclpy.ok():
+            raise
     finally:
         rclpy.try_shutdown()
 

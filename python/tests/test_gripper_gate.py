@@ -147,12 +147,11 @@ class Gate(unittest.TestCase):
         lines = self.lines
         rclpy = types.ModuleType("rclpy")
         logger = Message(info=lambda text: None)
-        rclpy.init, rclpy.try_shutdown, rclpy.spin = lambda: None, lambda: None, spin
+        rclpy.init, rclpy.try_shutdown, rclpy.ok, rclpy.spin = lambda: None, lambda: None, lambda: True, spin
         rclpy.create_node = lambda name: Message(get_logger=lambda: logger)
         action, executors = types.ModuleType("rclpy.action"), types.ModuleType("rclpy.executors")
         action.ActionClient, action.ActionServer = Client, server
         executors.MultiThreadedExecutor = lambda num_threads: None
-        executors.ExternalShutdownException = InterruptedError
         action.GoalResponse = Message(ACCEPT="accept", REJECT="reject")
         action.CancelResponse = Message(ACCEPT="accept")
         control, actions = types.ModuleType("control_msgs"), types.ModuleType("control_msgs.action")

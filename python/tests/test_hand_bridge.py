@@ -155,11 +155,11 @@ class Bridge(unittest.TestCase):
             calls["/left"](left(t, 100, 250))
 
         rclpy = types.ModuleType("rclpy")
-        rclpy.init, rclpy.try_shutdown = lambda: None, lambda: None
+        rclpy.init, rclpy.try_shutdown, rclpy.ok = lambda: None, lambda: None, lambda: True
         rclpy.create_node, rclpy.spin = lambda name: node, spin
-        executors, qos = types.ModuleType("rclpy.executors"), types.ModuleType("rclpy.qos")
-        executors.ExternalShutdownException, qos.qos_profile_sensor_data = InterruptedError, None
-        modules = {"rclpy": rclpy, "rclpy.executors": executors, "rclpy.qos": qos}
+        qos = types.ModuleType("rclpy.qos")
+        qos.qos_profile_sensor_data = None
+        modules = {"rclpy": rclpy, "rclpy.qos": qos}
         with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX) as source:
             path = f"{folder}/tactile.hand"
             source.bind(path)
