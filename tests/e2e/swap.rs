@@ -263,7 +263,7 @@ fn assert_each_once(ended: &Ended) {
 #[test]
 fn a_replacement_that_answers_a_few_samples_and_dies_or_hangs_loses_none() {
     let folder = tempfile::tempdir().expect("a folder");
-    let flow = crate::common::dataflow_with(folder.path(), &[of_node("classifier", &["heartbeat_ms: 300"])]);
+    let flow = crate::common::dataflow_with(folder.path(), &[of_node("classifier", &["heartbeat_ms: 1500"])]);
     let graph = Graph::start(&flow, &FAST_FOREVER);
     let stubborn = utf8(&stubborn_classifier());
     for fault in ["die_after=50", "hang_after=50", "die_after=9", "hang_after=9", "die_after=200", "hang_after=200"] {

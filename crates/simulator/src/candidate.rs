@@ -409,6 +409,32 @@ mod tests {
         assert!(quality.is_stable(), "{quality:?}");
     }
 
+    /// One motor moves the knuckles, the inner knuckles and the fingers of both sides.
+    #[test]
+    fn a_gripper_with_linkages_pushes_an_object_only_until_both_tips_hold_it() {
+        let hand = Hand::load(Path::new("robotiq-2f85-tsf85")).expect("built in");
+        let options = SimulatorOptions::default();
+        let mechanism = Mechanism::new(&hand);
+        let ball = Object::new("ball".into(), "ball".into(), SharedShape::ball(0.02), 300.0, false);
+        let mut middles_m = Vec::new();
+        for aside_m in [-0.012, -0.004, 0.0, 0.004, 0.012] {
+            let start = Start {
+                open_joints_rad: hand.open_joints_rad(),
+                palm_from_object_rotation: UnitQuaternion::identity(),
+                lateral_offset_m: [aside_m, 0.0],
+                back_off_m: 0.02,
+            };
+            let (exploration, contacts) = grasp(&mechanism, &ball, &start, &options).expect("a hand").expect("touches");
+            let mut names: Vec<&str> =
+                contacts.iter().map(|contact| hand.links[contact.point.link_idx].name.as_str()).collect();
+            names.sort_unstable();
+            names.dedup();
+            assert_eq!(names, ["robotiq_85_left_finger_tip_link", "robotiq_85_right_finger_tip_link"], "{aside_m}: {contacts:?}");
+            middles_m.push(exploration.palm_from_object.translation.x);
+        }
+        assert!(middles_m.iter().all(|x| x.abs() < 5e-4), "{middles_m:?}");
+    }
+
     /// An object of other corners, which keep their triangles.
     fn with_corners(object: &Object, faces_inwards: bool, place: impl Fn(Point3<f64>) -> Point3<f64>) -> Object {
         let mut mesh = object.to_mesh();

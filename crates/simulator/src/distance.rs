@@ -3,13 +3,15 @@
 //! Links are convex cores with rounded edges. Objects are convex, or many convex parts (the triangles of a mesh, the
 //! pieces of a compound) under parry's tree of bounding boxes; the tree is searched nearest part first.
 
+use std::cell::Cell;
+
 use nalgebra::{Isometry3, Matrix3, Point3, Vector3};
 use parry3d_f64::bounding_volume::BoundingVolume;
 use parry3d_f64::math::{Pose, Vector};
 use parry3d_f64::partitioning::{BvhLeafCost, BvhNode};
 use parry3d_f64::query;
 use parry3d_f64::query::details::contact_support_map_support_map;
-use parry3d_f64::shape::{CompositeShape, Shape, Triangle};
+use parry3d_f64::shape::{CompositeShape, ConvexPolyhedron, Shape, SupportMap, Triangle};
 
 use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::{LinkShape, pose_from_isometry};
@@ -23,6 +25,8 @@ pub struct PlacedShape<'a> {
     /// The core's box in its own frame.
     box_centre: Vector,
     box_half: Vector,
+    /// Where the core is a hull of a mesh: the planes of its faces, in its own frame.
+    faces: Vec<Plane>,
     /// The bounding sphere in the link's frame, edges included.
     pub(super) centre_in_link: Point3<f64>,
     pub(super) radius_m: f64,
@@ -45,6 +49,67 @@ impl BvhLeafCost for ClosestPoints {
     }
 }
 
+/// A plane with a shape behind it: the shape is at least as far as the plane from all that is before it.
+#[derive(Clone, Copy)]
+struct Plane {
+    normal: Vector,
+    /// Along the normal.
+    offset_m: f64,
+}
+
+impl Plane {
+    fn distance_m(&self, point: Vector) -> f64 {
+        self.normal.dot(point) - self.offset_m
+    }
+
+    fn triangle_bound_m(&self, triangle: &Triangle) -> f64 {
+        self.distance_m(triangle.a).min(self.distance_m(triangle.b)).min(self.distance_m(triangle.c))
+    }
+
+    fn node_bound_m(&self, node: &BvhNode) -> f64 {
+        let half = (node.maxs() - node.mins()) * 0.5;
+        self.distance_m(node.center()) - self.normal.abs().dot(half)
+    }
+}
+
+/// The planes of a hull's faces. Faces that are nearly parallel are one, whose plane is put at the outermost corner.
+fn faces(hull: &ConvexPolyhedron) -> Vec<Plane> {
+    let plane = |normal: Vector| Plane { normal, offset_m: normal.dot(hull.local_support_point(normal)) };
+    hull.faces().iter().map(|face| plane(face.normal)).collect()
+}
+
+/// The points that are in a shape or near it.
+pub(super) struct Within<'a> {
+    shape: &'a PlacedShape<'a>,
+    pose: Pose,
+    reach_m: f64,
+    /// The faces of a hull that are near those points: they are behind all others.
+    faces: Vec<Plane>,
+}
+
+impl Within<'_> {
+    pub(super) fn contains(&self, point: Vector) -> bool {
+        let exact = || self.shape.distance_to_point_m(&self.pose, point) <= self.reach_m;
+        if self.shape.faces.is_empty() {
+            return exact();
+        }
+        // The distance to a hull takes GJK, and the faces tell most points.
+        let in_shape = self.pose.inverse_transform_point(point);
+        let mut distance_m = f64::NEG_INFINITY;
+        let mut on_face = in_shape;
+        for face in &self.faces {
+            let of_face_m = face.distance_m(in_shape);
+            if of_face_m > distance_m {
+                (distance_m, on_face) = (of_face_m, in_shape - face.normal * of_face_m);
+            }
+        }
+        if distance_m <= 0.0 || distance_m > self.reach_m {
+            return distance_m <= 0.0;
+        }
+        self.faces.iter().all(|face| face.distance_m(on_face) <= 1e-9) || exact()
+    }
+}
+
 /// Distances that nothing depends on are measured up to here.
 const FAR_M: f64 = 10.0;
 
@@ -59,6 +124,7 @@ impl<'a> PlacedShape<'a> {
             edge_radius_m: shape.edge_radius_m,
             box_centre: around.center(),
             box_half: around.half_extents(),
+            faces: shape.core.as_convex_polyhedron().map(faces).unwrap_or_default(),
             centre_in_link: shape.link_from_shape * Point3::new(sphere.center.x, sphere.center.y, sphere.center.z),
             radius_m: sphere.radius + shape.edge_radius_m,
         }
@@ -89,17 +155,30 @@ impl<'a> PlacedShape<'a> {
             return (closest.distance_m <= within_m).then_some(closest);
         };
         let shape_from_object = palm_from_shape.inv_mul(palm_from_object);
+        // Where the surface curves away from the shape, the plane at the nearest part so far leaves out all others.
+        let plane: Cell<Option<Plane>> = Cell::new(None);
         let of_part = |part_idx: u32, best_m: f64| {
             with_part(composite, part_idx, palm_from_object, |palm_from_part, part| {
                 if let Some(triangle) = part.as_triangle()
-                    && self.triangle_bound_m(triangle, &shape_from_object) >= best_m
+                    && (plane.get().is_some_and(|plane| plane.triangle_bound_m(triangle) >= best_m)
+                        || self.triangle_bound_m(triangle, &shape_from_object) >= best_m)
                 {
                     return None;
                 }
-                self.closest_to_convex(palm_from_shape, palm_from_part, part, best_m)
+                let closest = self.closest_to_convex(palm_from_shape, palm_from_part, part, best_m)?;
+                if closest.distance_m < best_m {
+                    plane.set(self.plane(palm_from_shape, palm_from_object, closest.direction));
+                }
+                Some(closest)
             })
         };
-        let at_least_m = |node: &BvhNode, _: f64| self.node_bound_m(node, &shape_from_object);
+        let at_least_m = |node: &BvhNode, best_m: f64| {
+            let bound_m = self.node_bound_m(node, &shape_from_object);
+            if bound_m >= best_m {
+                return bound_m;
+            }
+            plane.get().map_or(bound_m, |plane| bound_m.max(plane.node_bound_m(node)))
+        };
         let (part_idx, closest) = composite.bvh().find_best(within_m, at_least_m, of_part)?;
         // The distance is exact, the points that GJK names need not be: on a face, many are as near.
         let on_part = with_part(composite, part_idx, palm_from_object, |palm_from_part, part| {
@@ -130,11 +209,19 @@ impl<'a> PlacedShape<'a> {
         (from_centre.abs() - self.box_half).max(Vector::ZERO).length() - half.length() - self.edge_radius_m
     }
 
+    /// The plane that touches the shape in a direction (palm frame), in the object's frame.
+    fn plane(&self, palm_from_shape: &Pose, palm_from_object: &Pose, direction: Vector) -> Option<Plane> {
+        let outermost = self.core.as_support_map()?.support_point(palm_from_shape, direction);
+        let in_palm_m = direction.dot(outermost) + self.edge_radius_m;
+        let offset_m = in_palm_m - direction.dot(palm_from_object.translation);
+        Some(Plane { normal: palm_from_object.rotation.inverse() * direction, offset_m })
+    }
+
     /// A bound below the distance to a triangle: the largest of those along the axes of the core's box together, and
     /// along the triangle's normal.
     fn triangle_bound_m(&self, triangle: &Triangle, shape_from_object: &Pose) -> f64 {
-        let [a, b, c] = [triangle.a, triangle.b, triangle.c]
-            .map(|corner| shape_from_object.transform_point(corner) - self.box_centre);
+        let from_centre = |corner: Vector| shape_from_object.transform_point(corner) - self.box_centre;
+        let (a, b, c) = (from_centre(triangle.a), from_centre(triangle.b), from_centre(triangle.c));
         let (low, high) = (a.min(b).min(c), a.max(b).max(c));
         let along_axes_m = (low - self.box_half).max(-high - self.box_half).max(Vector::ZERO).length();
         let normal = (b - a).cross(c - a);
@@ -254,6 +341,14 @@ impl<'a> PlacedShape<'a> {
     /// Distance of a point of the palm frame to the shape; 0 inside.
     pub(super) fn distance_to_point_m(&self, palm_from_shape: &Pose, point: Vector) -> f64 {
         (self.core.distance_to_point(palm_from_shape, point, true) - self.edge_radius_m).max(0.0)
+    }
+
+    /// Tells which points are in the shape or at most `reach_m` from it, among those within a radius of `centre`. All are in the
+    /// frame in which `pose` places the shape.
+    pub(super) fn within(&self, pose: Pose, reach_m: f64, centre: Vector, radius_m: f64) -> Within<'_> {
+        let centre = pose.inverse_transform_point(centre);
+        let is_near = |face: &&Plane| face.distance_m(centre) > -radius_m - reach_m;
+        Within { shape: self, pose, reach_m, faces: self.faces.iter().filter(is_near).copied().collect() }
     }
 
     /// Curvature of the shape's surface where its outward normal is `normal`, both in the shape's frame: a symmetric
@@ -396,6 +491,64 @@ mod tests {
             assert!((between - to_mesh.direction * to_mesh.distance_m).length() < 1e-9);
         }
         assert!(n_apart > 250, "{n_apart}");
+    }
+
+    /// Every triangle by itself gives the same distance as the search that leaves most of them out, where nothing overlaps.
+    #[test]
+    fn no_triangle_that_is_left_out_is_nearer() {
+        let (points, triangles) = parry3d_f64::shape::Ball::new(0.03).to_trimesh(12, 24);
+        let hollow = |point: &Vector| if point.y > 0.015 { Vector::new(point.x, 0.03 - point.y, point.z) } else { *point };
+        let points: Vec<Vector> = points.iter().map(hollow).collect();
+        let object = Object {
+            shape: SharedShape::trimesh(points, triangles).expect("a mesh"),
+            ..Object::new("b".into(), "b".into(), SharedShape::ball(0.03), 400.0, false)
+        };
+        let mesh = object.shape.as_trimesh().expect("a mesh");
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(5);
+        let mut n_apart = 0;
+        for edge_radius_m in [0.0, 0.002] {
+            let shape = link_shape(edge_radius_m);
+            let shape = PlacedShape::new(0, &shape);
+            for _ in 0..200 {
+                let [shape_pose, object_pose] = [random_pose(&mut rng, 0.05), random_pose(&mut rng, 0.02)]
+                    .map(|pose| pose_from_isometry(&pose));
+                let found = shape.closest_to_object(&shape_pose, &object_pose, &object, 1.0).expect("within 1 m");
+                let of_triangle = |triangle: Triangle| {
+                    let closest = shape.closest_to_convex(&shape_pose, &object_pose, &triangle, 1.0);
+                    closest.expect("within 1 m").distance_m
+                };
+                let least_m = mesh.triangles().map(of_triangle).fold(f64::INFINITY, f64::min);
+                assert_eq!(found.distance_m > 0.0, least_m > 0.0, "{found:?} {least_m}");
+                assert!(least_m < 0.0 || (found.distance_m - least_m).abs() < 1e-9, "{found:?} {least_m}");
+                n_apart += u32::from(least_m > 0.0);
+            }
+        }
+        assert!(n_apart > 200, "{n_apart}");
+    }
+
+    #[test]
+    fn the_faces_of_a_hull_tell_which_points_are_within_reach() {
+        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(3);
+        let mut number = || 2.0 * rng.random::<f64>() - 1.0;
+        let corners: Vec<Vector> = (0..60).map(|_| 0.02 * Vector::new(number(), number(), number())).collect();
+        let core = SharedShape::convex_hull(&corners).expect("a hull");
+        let shape = LinkShape { link_from_shape: Isometry3::identity(), core, edge_radius_m: 0.0 };
+        let shape = PlacedShape::new(0, &shape);
+        let pose = pose_from_isometry(&random_pose(&mut rand_chacha::ChaCha8Rng::seed_from_u64(4), 0.1));
+        let (mut n_within, mut n_off_the_faces) = (0, 0);
+        for _ in 0..200 {
+            let centre = pose.transform_point(0.02 * Vector::new(number(), number(), number()));
+            let within = shape.within(pose, 0.0005, centre, 0.005);
+            for _ in 0..50 {
+                let aside = 0.005 * Vector::new(number(), number(), number()).normalize_or_zero();
+                let point = centre + aside * number();
+                let distance_m = shape.distance_to_point_m(&pose, point);
+                assert_eq!(within.contains(point), distance_m <= 0.0005, "{distance_m}");
+                n_within += usize::from(distance_m <= 0.0005);
+                n_off_the_faces += usize::from(distance_m > 0.0 && distance_m <= 0.0005);
+            }
+        }
+        assert!((1000..9000).contains(&n_within) && n_off_the_faces > 100, "{n_within} {n_off_the_faces}");
     }
 
     #[test]

@@ -195,8 +195,9 @@ impl Mechanism<'_> {
         Ok(Some(Exploration { palm_from_object, open_joints_rad: start.open_joints_rad.clone(), joints, end }))
     }
 
-    /// The way by which fingers of one motor push the object: in the direction of a finger that touches it, by half the
-    /// distance to the nearest finger that does not. `None` where no finger touches, or all do, or the motor is at its limit.
+    /// The way by which fingers of one motor push the object, until a finger that comes from the other side holds it: in the
+    /// mean direction of the fingers that touch it, by half the distance to the nearest one that moves against them. `None`
+    /// where no finger touches, where those that do would push against each other, or where the motor is at its limit.
     fn push(
         &self,
         object: &Object,
@@ -211,25 +212,31 @@ impl Mechanism<'_> {
             if fingers.len() < 2 || joints[closing_idx].end >= self.joints[closing_idx].end {
                 continue;
             }
-            let closest = fingers.iter().map(|links| {
+            // Of each finger: its distance, and the direction in which its nearest point moves.
+            let closest = fingers.iter().filter_map(|links| {
                 let shapes = self.shapes.iter().filter(|shape| links.contains(&shape.link_idx));
-                shapes
+                let (link_idx, closest) = shapes
                     .filter_map(|shape| {
                         let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
                         let closest = shape.closest_to_object(&pose, &object_pose, object, FARTHEST_PUSH_M)?;
                         Some((shape.link_idx, closest))
                     })
-                    .min_by(|(_, a), (_, b)| a.distance_m.total_cmp(&b.distance_m))
+                    .min_by(|(_, a), (_, b)| a.distance_m.total_cmp(&b.distance_m))?;
+                let velocity = self.velocity(link_idx, closest.point_on_first, &palm_from_links, &self.joints, 0.0);
+                let direction = Vector3::new(velocity.x, velocity.y, velocity.z).try_normalize(1e-12)?;
+                Some((closest.distance_m, direction))
             });
-            let touches = |closest: &ClosestPoints| closest.distance_m <= options.touch_tolerance_m;
-            let (touching, apart): (Vec<_>, Vec<_>) = closest.flatten().partition(|(_, closest)| touches(closest));
-            let nearest = apart.iter().map(|(_, closest)| closest.distance_m).fold(f64::INFINITY, f64::min);
-            if let Some((link_idx, closest)) = touching.first()
-                && nearest.is_finite()
-            {
-                let velocity = self.velocity(*link_idx, closest.point_on_first, &palm_from_links, &self.joints, 0.0);
-                let direction = Vector3::new(velocity.x, velocity.y, velocity.z).try_normalize(1e-12);
-                return Ok(direction.map(|direction| direction * (nearest / 2.0)));
+            let (touching, apart): (Vec<_>, Vec<_>) =
+                closest.partition(|(distance_m, _)| *distance_m <= options.touch_tolerance_m);
+            let mean = touching.iter().map(|(_, direction)| direction).sum::<Vector3<f64>>();
+            let Some(mean) = mean.try_normalize(1e-9) else { continue };
+            if touching.iter().any(|(_, direction)| direction.dot(&mean) <= 0.0) {
+                continue;
+            }
+            let against = apart.iter().filter(|(_, direction)| direction.dot(&mean) < 0.0);
+            let nearest_m = against.map(|(distance_m, _)| *distance_m).fold(f64::INFINITY, f64::min);
+            if nearest_m.is_finite() {
+                return Ok(Some(mean * (nearest_m / 2.0)));
             }
         }
         Ok(None)

@@ -265,11 +265,14 @@ pub fn patch_load(
         .filter(|shape| {
             shape.link_idx == link_idx && (shape.centre_in_link - centre).norm() <= shape.radius_m + a.max(b) + reach_m
         })
-        .map(|shape| (shape, pose_from_isometry(&shape.link_from_shape)))
+        .map(|shape| {
+            let around = Vector::new(centre.x, centre.y, centre.z);
+            shape.within(pose_from_isometry(&shape.link_from_shape), reach_m, around, a.max(b))
+        })
         .collect();
     let is_on_link = |point: &Point3<f64>| {
         let point = Vector::new(point.x, point.y, point.z);
-        shapes.iter().any(|(shape, link_from_shape)| shape.distance_to_point_m(link_from_shape, point) <= reach_m)
+        shapes.iter().any(|shape| shape.contains(point))
     };
     let at = |[x, y]: [f64; 2]| centre + first * (a * x) + second * (b * y);
     // Links are unions of few convex shapes: where the rim is on the link, the rest is.
