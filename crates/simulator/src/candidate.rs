@@ -429,7 +429,11 @@ mod tests {
                 contacts.iter().map(|contact| hand.links[contact.point.link_idx].name.as_str()).collect();
             names.sort_unstable();
             names.dedup();
-            assert_eq!(names, ["robotiq_85_left_finger_tip_link", "robotiq_85_right_finger_tip_link"], "{aside_m}: {contacts:?}");
+            assert_eq!(
+                names,
+                ["robotiq_85_left_finger_tip_link", "robotiq_85_right_finger_tip_link"],
+                "{aside_m}: {contacts:?}"
+            );
             middles_m.push(exploration.palm_from_object.translation.x);
         }
         assert!(middles_m.iter().all(|x| x.abs() < 5e-4), "{middles_m:?}");

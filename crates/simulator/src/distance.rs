@@ -497,7 +497,8 @@ mod tests {
     #[test]
     fn no_triangle_that_is_left_out_is_nearer() {
         let (points, triangles) = parry3d_f64::shape::Ball::new(0.03).to_trimesh(12, 24);
-        let hollow = |point: &Vector| if point.y > 0.015 { Vector::new(point.x, 0.03 - point.y, point.z) } else { *point };
+        let hollow =
+            |point: &Vector| if point.y > 0.015 { Vector::new(point.x, 0.03 - point.y, point.z) } else { *point };
         let points: Vec<Vector> = points.iter().map(hollow).collect();
         let object = Object {
             shape: SharedShape::trimesh(points, triangles).expect("a mesh"),
@@ -510,8 +511,8 @@ mod tests {
             let shape = link_shape(edge_radius_m);
             let shape = PlacedShape::new(0, &shape);
             for _ in 0..200 {
-                let [shape_pose, object_pose] = [random_pose(&mut rng, 0.05), random_pose(&mut rng, 0.02)]
-                    .map(|pose| pose_from_isometry(&pose));
+                let [shape_pose, object_pose] =
+                    [random_pose(&mut rng, 0.05), random_pose(&mut rng, 0.02)].map(|pose| pose_from_isometry(&pose));
                 let found = shape.closest_to_object(&shape_pose, &object_pose, &object, 1.0).expect("within 1 m");
                 let of_triangle = |triangle: Triangle| {
                     let closest = shape.closest_to_convex(&shape_pose, &object_pose, &triangle, 1.0);

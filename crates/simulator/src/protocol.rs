@@ -1,8 +1,8 @@
 //! Blind exploration: the palm comes to the object from anywhere, then the fingers close with break-away.
 //!
 //! Nothing is pushed away: the object stays where it is, unless one motor moves several fingers (a gripper's jaws, by a
-//! URDF's mimic joints). Such fingers push the object, without turning it, until another finger touches it, so that a gripper
-//! centres the object.
+//! URDF's mimic joints). Such fingers push the object, without turning it, until one that comes from the other side touches it,
+//! so that a gripper centres the object.
 //!
 //! The hand is taken from its description, not assumed to be a Barrett hand: preshape joints without an open value are drawn;
 //! the other joints close from their open values towards their closed limits, all leaders at the same speed and followers at
