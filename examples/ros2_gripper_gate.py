@@ -4,7 +4,8 @@
     python3 ros2_gripper_gate.py --controller /gripper_controller/gripper_cmd --grasps-below 0.03 \\
         blindgrasp run dataflow-ros2.yaml --json
 
-It serves the action `/grasp_gate/gripper_cmd` (control_msgs GripperCommand, or ParallelGripperCommand with --parallel), and
+It serves the action `/grasp_gate/gripper_cmd` (control_msgs GripperCommand, or ParallelGripperCommand with --parallel;
+`--name left_gate` serves `/left_gate/gripper_cmd`), and
 passes each goal on to the real controller. A goal whose position is below --grasps-below (or above --grasps-above, for a
 gripper whose value grows as it closes) closes on an object: it succeeds only if the controller has closed the hand and a
 fresh LIFT of blindgrasp follows; everything else aborts it. MoveIt
@@ -16,6 +17,9 @@ The rest of the command line starts the graph, whose lines of JSON are the decis
 rclpy and control_msgs, in any RMW. The gate makes no test lift: use a model and an arbiter that decide when the hand is
 settled, and read what they promise (`blindgrasp model show`). MoveIt gives a gripper 1.1 times the planned duration and
 0.5 s: set `allowed_goal_duration_margin` of the controller to the seconds that --wait allows.
+
+A LIFT is valid for `max_age_ms` of the arbiter (200), and follows some 0.3 s after the fingers stand. The controllers of
+ros2_controllers say so only after `stall_timeout`, which is 1 s: set it to 0.2.
 """
 
 import argparse
@@ -88,8 +92,11 @@ class Decisions:
                 if final:
                     _, came, decision = max(final, key=lambda found: found[:2])
                     if decision["action"] == LIFT:
-                        is_valid = now_nanos() < decision.get("valid_until_nanos", 0)
-                        return is_valid, decision.get("reason", "") if is_valid else "no longer valid"
+                        over_ms = (now_nanos() - decision.get("valid_until_nanos", 0)) / 1e6
+                        if over_ms < 0:
+                            return True, decision.get("reason", "")
+                        hint = "; a controller that says late that the hand stands needs a shorter stall_timeout" if came < closed else ""
+                        return False, f"LIFT was valid until {over_ms:.0f} ms ago{hint}"
                     why = decision.get("reason", "")
                     if came >= closed:
                         return False, why
@@ -133,15 +140,18 @@ def serve(arguments, decisions):
     # Humble has no ParallelGripperCommand.
     kind = getattr(control_msgs.action, "ParallelGripperCommand" if arguments.parallel else "GripperCommand")
     rclpy.init()
-    node = rclpy.create_node("grasp_gate")
+    node = rclpy.create_node(arguments.name)
     controller = ActionClient(node, kind, arguments.controller)
     gate = Gate(decisions, grasps(arguments), arguments.wait)
     busy = threading.Lock()
 
     def wait_for(future, meanwhile=lambda: None):
+        """What the controller answers; `None` if it has gone, or a signal ends the gate."""
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
         while not done.wait(0.05):
+            if not rclpy.ok() or not controller.server_is_ready():
+                return None
             meanwhile()
         return future.result()
 
@@ -161,14 +171,18 @@ def serve(arguments, decisions):
             if not controller.wait_for_server(timeout_sec=arguments.wait):
                 return False, False
             accepted = wait_for(controller.send_goal_async(handle.request))
-            if not accepted.accepted:
+            if accepted is None or not accepted.accepted:
                 return False, False
+            has_cancelled = []
 
             def pass_cancel_on():
-                if handle.is_cancel_requested:
+                if handle.is_cancel_requested and not has_cancelled:
+                    has_cancelled.append(True)
                     accepted.cancel_goal_async()
 
             answer = wait_for(accepted.get_result_async(), pass_cancel_on)
+            if answer is None:
+                return False, False
             answers.append(answer.result)
             return answer.status == SUCCEEDED, answer.result.stalled
 
@@ -177,14 +191,15 @@ def serve(arguments, decisions):
             succeeds, why, end = False, "cancelled", handle.canceled
         else:
             end = handle.succeed if succeeds else handle.abort
-        node.get_logger().info(f"goal {position:g}: {'succeeded' if succeeds else 'not succeeded'}, {why}")
-        end()
+        if rclpy.ok():
+            node.get_logger().info(f"goal {position:g}: {'succeeded' if succeeds else 'not succeeded'}, {why}")
+            end()
         return answers[0] if answers else kind.Result()
 
     ActionServer(
         node,
         kind,
-        "/grasp_gate/gripper_cmd",
+        "~/gripper_cmd",
         execute,
         goal_callback=take,
         cancel_callback=lambda _: CancelResponse.ACCEPT,
@@ -210,8 +225,11 @@ def main():
     closing.add_argument("--grasps-above", type=float, help="positions above this close on an object")
     options.add_argument("--wait", type=float, default=3.0, help="seconds for a decision after the hand has closed")
     options.add_argument("--parallel", action="store_true", help="ParallelGripperCommand instead of GripperCommand")
+    options.add_argument("--name", default="grasp_gate", help="of the node: each gripper has a gate of its own")
     options.add_argument("graph", nargs=argparse.REMAINDER, help="the command whose lines are the decisions")
-    arguments = options.parse_args()
+    # rclpy reads what follows --ros-args.
+    own = sys.argv[1 : sys.argv.index("--ros-args")] if "--ros-args" in sys.argv else sys.argv[1:]
+    arguments = options.parse_args(own)
     if not arguments.graph:
         options.error("expected the command of the graph, such as: blindgrasp run dataflow-ros2.yaml --json")
     graph = subprocess.Popen(arguments.graph, stdout=subprocess.PIPE, text=True)

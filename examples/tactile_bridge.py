@@ -53,7 +53,7 @@ def main():
     connection = connect(arguments.address)
     answers = connection.makefile()
     # The first line says which hand the source expects, and where the bridge before left off.
-    hand = json.loads(answers.readline())
+    hand = json.loads(answers.readline() or '{"refused": "gone", "why": "the source has gone; start the bridge again"}')
     if "refused" in hand:
         sys.exit(hand["why"])
     print(f"connected: {hand['hand']}, {hand['n_joints']} joints, {hand['n_cells']} cells", file=sys.stderr)

@@ -238,6 +238,16 @@ impl<'a> Check<'a> {
             return;
         }
         let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+        let promised = arbiter.params.get("promised_drops").and_then(Value::as_f64);
+        let otherwise = match own {
+            None => {
+                format!("; otherwise another model, because no promised_drops is backed by this one with probe: {name}")
+            }
+            Some(own) if promised.is_none_or(|promised| promised < own) => {
+                format!("; otherwise promised_drops of at least {:.2}", (100.0 * own).ceil() / 100.0)
+            }
+            Some(_) => String::new(),
+        };
         let own = own
             .map_or("has no bound on drops".into(), |own| format!("lets at most {} of the lifts drop", percent(own)));
         self.fit.warnings.push(Misfit {
@@ -250,9 +260,7 @@ impl<'a> Check<'a> {
                 path_of(classifier, "model").display(),
                 percent(best)
             ),
-            help: "expected probe: test_lift, if the arm can lift by 10 mm and wait; otherwise min_probability_stable: 0.75, and \
-                   promised_drops no less than that bound"
-                .into(),
+            help: format!("expected probe: test_lift, if the arm can lift by 10 mm and wait{otherwise}"),
         });
     }
 

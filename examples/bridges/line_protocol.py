@@ -43,23 +43,53 @@ class Source:
     """A connection to tactile_source. `hand` is its first line: the hand that it expects."""
 
     def __init__(self, address, n_joints=None, n_cells=None):
-        self.connection = connect(address)
-        answers = self.connection.makefile()
-        self.hand = json.loads(answers.readline() or '{"refused": "gone", "why": "the source has gone"}')
-        if "refused" in self.hand:
-            sys.exit(self.hand["why"])
+        self.address = address
+        self.hand = self.open()
         found = self.hand["n_joints"], self.hand["n_cells"]
         if n_cells is not None and found != (n_joints, n_cells):
             sys.exit(
                 f"the graph is for the hand {self.hand['hand']} with {found[0]} joints and {found[1]} cells, this bridge for one with "
                 f"{n_joints} and {n_cells}: give the graph --set hand=HAND.yaml"
             )
-        print(f"connected: {self.hand['hand']}, {self.hand['n_joints']} joints, {self.hand['n_cells']} cells", file=sys.stderr)
+
+    def open(self):
+        """Connects, as often as it takes; returns the source's first line."""
+        while True:
+            self.connection = connect(self.address)
+            answers = self.connection.makefile()
+            try:
+                hand = json.loads(answers.readline() or "null")
+            except (OSError, ValueError):
+                hand = None
+            if hand is not None:
+                break
+            # A source that is just ending.
+            time.sleep(0.1)
+        if "refused" in hand:
+            sys.exit(hand["why"])
+        print(f"connected: {hand['hand']}, {hand['n_joints']} joints, {hand['n_cells']} cells", file=sys.stderr)
         # Every further line names the fault of a frame.
-        threading.Thread(target=lambda: [print(line, end="", file=sys.stderr) for line in answers], daemon=True).start()
+        threading.Thread(target=self.tell, args=(answers,), daemon=True).start()
+        return hand
+
+    @staticmethod
+    def tell(answers):
+        try:
+            for line in answers:
+                print(line, end="", file=sys.stderr)
+        except OSError:
+            pass  # The connection has gone.
 
     def send(self, frame):
-        self.connection.sendall(json.dumps(frame).encode() + b"\n")
+        """Sends a frame. If the source has gone, the frame is lost, and the bridge waits for another source of the same hand."""
+        try:
+            self.connection.sendall(json.dumps(frame).encode() + b"\n")
+        except (BrokenPipeError, ConnectionResetError):
+            print("the source has gone; connecting again", file=sys.stderr)
+            self.connection.close()
+            hand, before = self.open(), self.hand
+            if any(hand.get(key) != before.get(key) for key in ("hand", "joints", "n_cells")):
+                sys.exit(f"the graph is now for the hand {hand['hand']}; start the bridge again")
 
     def send_all(self, frames):
         """Sends frames. A sentence in place of a frame is printed, once in a row."""
@@ -136,10 +166,8 @@ class StatusPhase:
 
 
 def run(work):
-    """Runs a bridge's `work` until the source goes or somebody ends it."""
+    """Runs a bridge's `work` until somebody ends it."""
     try:
         work()
-    except (BrokenPipeError, ConnectionResetError):
-        sys.exit("the source has gone; start the bridge again")
     except KeyboardInterrupt:
         pass

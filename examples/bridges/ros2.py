@@ -16,13 +16,15 @@ Dex3-1, of uSkin sensors and of Robotiq's TSF-85:
 A joint's value is `scale` times the topic's, plus `offset`; without an entry it is the value of the same name. A topic of
 another `type` than sensor_msgs/msg/JointState has its values in a `field`, in the order of `names`. Cells are `scale` times the
 field's numbers, plus `offset`; `order` picks them, and a picked number that is `missing`, or none, makes no frame. A phase is
-one word for one value; of several values (a list of states, one a finger) the hand is settled if all are. It counts for
-`max_age_ms` (1000; 0 for a topic that speaks on change alone). Without `phase` it is inferred from the fingers' motion:
+one word for one value, any that docs/hardware.md names: a robot that makes a test lift or reports how lifts end needs this
+topic. Of several values (a list of states, one a finger) the hand is settled if all are. It counts for `max_age_ms` (1000; 0 for a
+topic that speaks on change alone, with `latched: true` if its publisher is transient local). Without `phase` it is inferred from the
+fingers' motion, and is `open`, `closing` or `settled`:
 `closes` in the map is then the change of a joint's value while the hand closes by a radian: 1 if it is not given, -1 where the
 value falls, 0.1 or -0.1 for a slide in metres, 0 for a joint that does not close.
 
-A frame is made for each message of the first topic of cells, with the others that are within `tolerance_ms` of it (20) and
-angles of the last 150 ms. Frames that lack something are not sent, and counted; the source sees the gap.
+A frame is made for each message of the first topic of cells, with the others that are within `tolerance_ms` of it (20), before
+it or after it, and angles of the last 150 ms. Frames that lack something are not sent, and counted; the source sees the gap.
 """
 
 import importlib
@@ -32,7 +34,7 @@ import time
 
 import line_protocol
 
-WORDS = ("open", "closing", "settled", "ended")
+WORDS = ("open", "closing", "settled", "squeezing", "squeezed", "test_lifting", "test_lifted", "lifting", "ended", "kept", "dropped")
 # Angles older than this are missed: joint_states often comes at 10 to 30 Hz.
 JOINTS_NANOS = 150_000_000
 
@@ -85,6 +87,8 @@ class Frames:
         self.cells = [None] * len(table["cells"])
         # The cells of each topic that its last message lacked.
         self.missing = [[]] * len(table["cells"])
+        # The time of a frame for which other topics are still to come.
+        self.waits_stamp = None
         self.phase, self.phase_nanos = None, 0
         self.phase_age_nanos = float((table.get("phase") or {}).get("max_age_ms", 1000.0)) * 1e6
         self.seq = 0
@@ -116,7 +120,7 @@ class Frames:
         self.phase, self.phase_nanos = named[0] if len(set(named)) == 1 else "closing", now_nanos
 
     def take_cells(self, idx, message, now_nanos):
-        """The frame that the message completes: that of the table's first topic of cells, with the others near it."""
+        """The frame that the message completes."""
         entry = self.table["cells"][idx]
         found = numbers(at(message, entry.get("field", "data")))
         if len(found) <= max(entry.get("order", [-1])):
@@ -127,7 +131,15 @@ class Frames:
         stamp = stamp_of(message, now_nanos)
         self.missing[idx] = missing
         self.cells[idx] = None if missing else ([scale * number + offset for number in found], stamp)
-        return self.frame(stamp, now_nanos) if idx == 0 else None
+        if idx == 0:
+            if self.waits_stamp is not None:
+                self.drop()
+            self.waits_stamp = stamp
+        return None if self.waits_stamp is None else self.frame(now_nanos)
+
+    def drop(self):
+        # The number of a frame is used up also if it is not sent: the source sees the gap and holds the grasp.
+        self.waits_stamp, self.seq, self.dropped = None, self.seq + 1, self.dropped + 1
 
     def joints(self, stamp):
         """The hand's joints, if each was heard of lately."""
@@ -140,21 +152,22 @@ class Frames:
             values.append(float(entry.get("scale", 1.0)) * value + float(entry.get("offset", 0.0)))
         return values
 
-    def frame(self, stamp, now_nanos):
+    def frame(self, now_nanos):
+        """The frame of the table's first topic of cells, once the others near it have come."""
+        stamp = self.waits_stamp
         joints = self.joints(stamp)
         is_phase_old = "phase" in self.table and 0 < self.phase_age_nanos < now_nanos - self.phase_nanos
-        # Its number is used up also if it is not sent: the source sees the gap and holds the grasp.
-        seq, self.seq = self.seq, self.seq + 1
-        missing = [entry["topic"] for entry, cells in zip(self.table["cells"], self.cells) if cells is None]
-        is_near = all(cells is not None and abs(cells[1] - stamp) <= self.tolerance_nanos for cells in self.cells)
-        if missing or not is_near or joints is None or self.phase is None or is_phase_old:
-            self.dropped += 1
+        if self.cells[0] is None or joints is None or self.phase is None or is_phase_old:
+            self.drop()
             return None
+        if not all(cells is not None and abs(cells[1] - stamp) <= self.tolerance_nanos for cells in self.cells):
+            return None
+        self.waits_stamp, self.seq = None, self.seq + 1
         return {
             "joints": joints,
             "cells_newtons": [number for values, _ in self.cells for number in values],
             "phase": self.phase,
-            "seq": seq,
+            "seq": self.seq - 1,
             "stamp_nanos": stamp,
         }
 
@@ -168,7 +181,9 @@ class Frames:
         ]
         found = [f"no angle of {', '.join(joints)}"] if joints else []
         found += [f"no message on {', '.join(cells)}"] if cells else []
-        found += ["no phase: without a topic of its own, the fingers must open once first"] if self.phase is None else []
+        topic = (self.table.get("phase") or {}).get("topic")
+        why = f"no message on {topic}" if topic else "without a topic of its own, the fingers must open once first"
+        found += [f"no phase: {why}"] if self.phase is None else []
         return "; ".join(found) or (
             f"cells more than {self.tolerance_nanos / 1e6:g} ms apart (tolerance_ms), angles older than "
             f"{JOINTS_NANOS / 1e6:g} ms, or an old phase (max_age_ms)"
@@ -183,13 +198,13 @@ def message_class(name):
 
 def bridge(table, address):
     import rclpy
-    from rclpy.qos import qos_profile_sensor_data
+    from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 
     source = line_protocol.Source(address)
     rclpy.init()
     node = rclpy.create_node("blindgrasp_hand_bridge")
     frames = Frames(table, source.hand)
-    told = [time.monotonic()]
+    told = [time.monotonic(), 0]
 
     def now_nanos():
         return node.get_clock().now().nanoseconds
@@ -197,12 +212,15 @@ def bridge(table, address):
     def send(frame):
         if frame is not None:
             source.send(frame)
-        elif time.monotonic() - told[0] > 2.0:
-            told[0] = time.monotonic()
+        elif frames.dropped > told[1] and time.monotonic() - told[0] > 2.0:
+            told[:] = time.monotonic(), frames.dropped
             print(f"{frames.dropped} frames not sent: {frames.lacks()}", file=sys.stderr)
 
     def subscribe(entry, kind, callback):
-        node.create_subscription(message_class(entry.get("type", kind)), entry["topic"], callback, qos_profile_sensor_data)
+        qos = qos_profile_sensor_data
+        if entry.get("latched"):
+            qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        node.create_subscription(message_class(entry.get("type", kind)), entry["topic"], callback, qos)
 
     joints = {"topic": "/joint_states", **(table.get("joints") or {})}
     subscribe(joints, "sensor_msgs/msg/JointState", lambda message: frames.take_joints(message, now_nanos()))
@@ -224,7 +242,9 @@ def bridge(table, address):
 def main():
     options = line_protocol.options(__doc__)
     options.add_argument("table", help="the topics (YAML)")
-    arguments = options.parse_args()
+    # rclpy reads what follows --ros-args.
+    own = sys.argv[1 : sys.argv.index("--ros-args")] if "--ros-args" in sys.argv else sys.argv[1:]
+    arguments = options.parse_args(own)
     import yaml
 
     with open(arguments.table, encoding="utf-8") as file:

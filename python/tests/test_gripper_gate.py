@@ -56,7 +56,9 @@ class Gate(unittest.TestCase):
     def test_only_a_fresh_lift_succeeds(self):
         self.assertEqual(self.close("lift", reason="stable"), (True, "stable"))
         self.assertEqual(self.close("hold", reason="unstable"), (False, "unstable"))
-        self.assertEqual(self.close("lift", valid_for_s=-1), (False, "no longer valid"))
+        succeeds, why = self.close("lift", valid_for_s=-1)
+        self.assertEqual((succeeds, why[:22]), (False, "LIFT was valid until 1"))
+        self.assertNotIn("stall_timeout", why)
         self.assertEqual(self.close("test_lift", "hold"), (False, "told"))
         # A hand that closed again: the hold of the later grasp counts.
         self.assertEqual(self.close("lift", "hold"), (False, "told"))
@@ -70,6 +72,16 @@ class Gate(unittest.TestCase):
             return True, False
 
         self.assertEqual(self.gate.run(0.0, move), (True, "stable"))
+
+    def test_a_lift_that_ended_before_the_controller_did_says_why(self):
+        def move():
+            self.lines.say("lift", valid_for_s=0.02)
+            time.sleep(0.1)
+            return False, True
+
+        succeeds, why = self.gate.run(0.0, move)
+        self.assertFalse(succeeds)
+        self.assertIn("needs a shorter stall_timeout", why)
 
     def test_a_decision_of_an_earlier_grasp_does_not_count(self):
         self.lines.say("lift")
@@ -111,6 +123,9 @@ class Gate(unittest.TestCase):
                 served["controller"] = name
 
             def wait_for_server(self, timeout_sec):
+                return True
+
+            def server_is_ready(self):
                 return True
 
             def send_goal_async(self, goal):
@@ -158,11 +173,11 @@ class Gate(unittest.TestCase):
         actions.GripperCommand, control.action = Message(Result=Message), actions
         modules = {"rclpy": rclpy, "rclpy.action": action, "rclpy.executors": executors}
         modules.update({"control_msgs": control, "control_msgs.action": actions})
-        arguments = Message(parallel=False, controller="/gripper/cmd", grasps_below=0.03, grasps_above=None, wait=20.0)
+        arguments = Message(parallel=False, controller="/gripper/cmd", grasps_below=0.03, grasps_above=None, wait=20.0, name="grasp_gate")
         with mock.patch.dict(sys.modules, modules):
             example.serve(arguments, self.decisions)
         self.assertEqual(served["ends"], [True, False, True])
-        self.assertEqual((served["name"], served["controller"]), ("/grasp_gate/gripper_cmd", "/gripper/cmd"))
+        self.assertEqual((served["name"], served["controller"]), ("~/gripper_cmd", "/gripper/cmd"))
 
 
 if __name__ == "__main__":

@@ -71,6 +71,22 @@ class Frames(unittest.TestCase):
         self.assertEqual(self.frames.dropped, 2)
         self.assertIn("tolerance_ms", self.frames.lacks())
 
+    def test_the_second_topic_may_come_after_the_first(self):
+        self.frames.take_phase(Message(states=[2, 2]), self.t)
+        self.frames.take_joints(joints(self.t), self.t)
+        for step in range(3):
+            # 30 Hz: the right pad of the frame before is more than the tolerance away.
+            at = self.t + step * 33 * MILLI
+            self.assertIsNone(self.frames.take_cells(0, left(at, 100, 250), at))
+            frame = self.frames.take_cells(1, Message(header=header(at), data=[3.0 + step, 4.0]), at + MILLI)
+            self.assertEqual((frame["seq"], frame["stamp_nanos"], frame["cells_newtons"][3]), (step, at, 3.0 + step))
+        # The right pad is missed: the next frame shows the gap.
+        self.assertIsNone(self.frames.take_cells(0, left(at + 33 * MILLI, 1, 2), at + 33 * MILLI))
+        at += 66 * MILLI
+        self.assertIsNone(self.frames.take_cells(0, left(at, 1, 2), at))
+        frame = self.frames.take_cells(1, Message(data=[3.0, 4.0]), at)
+        self.assertEqual((frame["seq"], self.frames.dropped), (4, 1))
+
     def test_a_dead_driver_beside_a_live_arm_is_noticed(self):
         self.frames.take_joints(joints(self.t), self.t)
         later = self.t + 200 * MILLI
@@ -89,6 +105,11 @@ class Frames(unittest.TestCase):
             self.assertEqual(self.send(self.t, states=states)["phase"], phase)
         with self.assertRaisesRegex(ValueError, "stands for none of open, closing"):
             self.send(self.t, states=(7, 7))
+        phase = {"topic": "/phase"}
+        frames = bridge.Frames({**TABLE, "phase": phase}, HAND)
+        self.assertIn("no phase: no message on /phase", frames.lacks())
+        frames.take_phase(Message(data="test_lifted"), self.t)
+        self.assertEqual(frames.phase, "test_lifted")
 
     def test_the_phase_is_inferred_from_the_motion(self):
         # The jaw slides by 10 mm/s, and its value falls: 0.1 rad/s of a hand that closes.
@@ -130,6 +151,42 @@ class Frames(unittest.TestCase):
             bridge.Frames({"cells": [], "joints": {"map": {"thumb": {}}}}, HAND)
 
 
+class Reconnects(unittest.TestCase):
+    def test_a_bridge_connects_again_when_the_source_is_another(self):
+        with tempfile.TemporaryDirectory() as folder, mock.patch("sys.stderr"):
+            path = f"{folder}/tactile.hand"
+            source = socket.socket(socket.AF_UNIX)
+            source.bind(path)
+            source.listen()
+            greeted = []
+
+            def greet(hand):
+                connection, _ = source.accept()
+                connection.sendall(json.dumps(hand).encode() + b"\n")
+                greeted.append(connection)
+
+            def sends(hand):
+                thread = threading.Thread(target=greet, args=(hand,))
+                thread.start()
+                # The first frame after the end may still be taken by the kernel.
+                for seq in range(3):
+                    found.send({"seq": seq})
+                thread.join()
+
+            thread = threading.Thread(target=greet, args=(HAND,))
+            thread.start()
+            found = bridge.line_protocol.Source(f"unix:{path}")
+            thread.join()
+            greeted.pop().close()
+            sends(HAND)
+            with greeted.pop() as connection, connection.makefile() as lines:
+                self.assertIn("seq", json.loads(lines.readline()))
+            with self.assertRaisesRegex(SystemExit, "is now for the hand other"):
+                sends({**HAND, "hand": "other"})
+            found.connection.close()
+            source.close()
+
+
 class Node:
     """A stand-in for a node of rclpy: it keeps its subscriptions."""
 
@@ -158,7 +215,7 @@ class Bridge(unittest.TestCase):
         rclpy.init, rclpy.try_shutdown, rclpy.ok = lambda: None, lambda: None, lambda: True
         rclpy.create_node, rclpy.spin = lambda name: node, spin
         qos = types.ModuleType("rclpy.qos")
-        qos.qos_profile_sensor_data = None
+        qos.qos_profile_sensor_data = qos.DurabilityPolicy = qos.QoSProfile = None
         modules = {"rclpy": rclpy, "rclpy.qos": qos}
         with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX) as source:
             path = f"{folder}/tactile.hand"

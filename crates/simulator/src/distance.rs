@@ -25,7 +25,7 @@ pub struct PlacedShape<'a> {
     /// The core's box in its own frame.
     box_centre: Vector,
     box_half: Vector,
-    /// Where the core is a hull of a mesh: the planes of its faces, in its own frame.
+    /// Where the core is a hull of a mesh, without rounded edges: the planes of its faces, in its own frame.
     faces: Vec<Plane>,
     /// The bounding sphere in the link's frame, edges included.
     pub(super) centre_in_link: Point3<f64>,
@@ -124,7 +124,11 @@ impl<'a> PlacedShape<'a> {
             edge_radius_m: shape.edge_radius_m,
             box_centre: around.center(),
             box_half: around.half_extents(),
-            faces: shape.core.as_convex_polyhedron().map(faces).unwrap_or_default(),
+            faces: shape
+                .core
+                .as_convex_polyhedron()
+                .filter(|_hull| shape.edge_radius_m == 0.0)
+                .map_or(Vec::new(), faces),
             centre_in_link: shape.link_from_shape * Point3::new(sphere.center.x, sphere.center.y, sphere.center.z),
             radius_m: sphere.radius + shape.edge_radius_m,
         }

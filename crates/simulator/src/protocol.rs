@@ -197,7 +197,8 @@ impl Mechanism<'_> {
 
     /// The way by which fingers of one motor push the object, until a finger that comes from the other side holds it: in the
     /// mean direction of the fingers that touch it, by half the distance to the nearest one that moves against them. `None`
-    /// where no finger touches, where those that do would push against each other, or where the motor is at its limit.
+    /// where no finger touches, where those that do would push against each other, where no other is near, or where the motor is
+    /// at its limit.
     fn push(
         &self,
         object: &Object,

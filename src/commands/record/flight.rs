@@ -140,8 +140,9 @@ impl FlightRecorder {
         if begins_grasp {
             self.forget(received_nanos);
         }
+        let limit_nanos = self.limit_nanos(received_nanos);
         while self.n_bytes > MAX_BYTES {
-            self.is_full = true;
+            self.is_full |= self.samples.front().is_some_and(|kept| kept.received_nanos >= limit_nanos);
             self.forget_first();
         }
     }
@@ -188,6 +189,10 @@ impl FlightRecorder {
             trigger.why == [Reason::Missing.as_str()] && last_nanos.is_none_or(|last| trigger.since_nanos >= last)
         };
         self.trigger.take_if(is_of_the_end);
+        self.later.take_if(is_of_the_end);
+        if self.trigger.is_none() {
+            self.trigger = self.later.take();
+        }
     }
 
     /// The samples for the file that was asked for, once they have come.
@@ -262,10 +267,15 @@ impl FlightRecorder {
         })
     }
 
-    /// Forgets all before the last grasp that began before the time to keep, which ends now or when a file was asked for.
-    fn forget(&mut self, now_nanos: u64) {
+    /// When the time to keep begins, which ends now or when a file was asked for.
+    fn limit_nanos(&self, now_nanos: u64) -> u64 {
         let until_nanos = self.trigger.as_ref().map_or(now_nanos, |trigger| trigger.since_nanos);
-        let limit_nanos = until_nanos.saturating_sub(self.keep_nanos);
+        until_nanos.saturating_sub(self.keep_nanos)
+    }
+
+    /// Forgets all before the last grasp that began before the time to keep.
+    fn forget(&mut self, now_nanos: u64) {
+        let limit_nanos = self.limit_nanos(now_nanos);
         let begins = self.samples.iter().filter(|kept| kept.begins_grasp).map(|kept| kept.received_nanos);
         let Some(begins_nanos) = begins.take_while(|nanos| *nanos <= limit_nanos).last() else { return };
         let is_old = |kept: &Kept| kept.received_nanos + BEFORE_GRASP_NANOS < begins_nanos;
@@ -519,6 +529,31 @@ mod tests {
         decide(&mut recorder, 2, Reason::Stale, 6 * SEC);
         recorder.graph_has_ended();
         assert!(recorder.excerpt_now().is_some());
+        // A file is under way.
+        recorder.ask("asked", 6 * SEC);
+        decide(&mut recorder, 3, Reason::Missing, 8 * SEC);
+        recorder.graph_has_ended();
+        assert_eq!(recorder.excerpt_now().expect("asked").why, ["asked"]);
+        assert!(recorder.excerpt_now().is_none());
+        // Somebody asks for a file after the end.
+        decide(&mut recorder, 4, Reason::Stale, 9 * SEC);
+        recorder.trigger = None;
+        decide(&mut recorder, 5, Reason::Missing, 9 * SEC);
+        recorder.ask("asked", 20 * SEC);
+        recorder.graph_has_ended();
+        assert_eq!(recorder.excerpt_now().expect("asked").why, ["asked"]);
+    }
+
+    #[test]
+    fn a_long_grasp_does_not_make_the_time_to_keep_too_long() {
+        let mut recorder = recorder(10, 0);
+        let n_cells = MAX_BYTES / 8 / 40;
+        for sec in 0..60 {
+            let message = TactileFrame { cells_newtons: vec![0.0; n_cells], ..TactileFrame::default() };
+            recorder.take("/tactile", Stamped { header: header(sec, sec * SEC), message }.into(), sec * SEC);
+        }
+        assert!(recorder.samples.len() < 41, "the oldest samples are forgotten");
+        assert!(!recorder.is_full(), "they were older than 10 s");
     }
 
     #[test]

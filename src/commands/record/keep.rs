@@ -103,9 +103,16 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
     };
     let finished = if ending == Ending::Detached { observer.leave() } else { observer.finish() };
     let graph = connection.graph().to_string();
+    // Somebody may have asked since the last look.
+    while let Ok(Some(Reply::Keep)) = connection.receive_within(Duration::ZERO) {
+        asked.store(true, Ordering::Relaxed);
+    }
     drop(connection);
     if ending == Ending::Graph {
         recorder.with(FlightRecorder::graph_has_ended);
+    }
+    if asked.load(Ordering::Relaxed) {
+        recorder.with(|recorder| recorder.ask(ASKED, monotonic_nanos()));
     }
     if ending == Ending::Broken {
         recorder.with(|recorder| recorder.ask(Ending::Broken.word(), monotonic_nanos()));

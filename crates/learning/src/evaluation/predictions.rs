@@ -96,19 +96,23 @@ impl OutsidePredictions {
         Ok(OutsidePredictions { path: path.into(), models, threshold_probability, n_unused })
     }
 
-    /// Refuses a fold of the table that is not the fold of the grasp. A table without folds passes.
+    /// Refuses a fold of the table that is not the fold of the grasp, and a missing one of a model that has folds. A model without
+    /// folds passes.
     ///
     /// * `folds` - the fold of each example, from 0.
     ///
     /// # Errors
     /// The line, and both folds.
     pub fn check_folds(&self, examples: &[Example], folds: &[usize]) -> Result<(), PredictionsError> {
-        for (example, fold) in examples.iter().zip(folds) {
-            let expected = *fold as u64 + 1;
-            for prediction in self.models.iter().filter_map(|model| model.predictions.get(&key_of(example))) {
-                if let Some(fold) = prediction.fold.filter(|fold| *fold != expected) {
+        for model in &self.models {
+            let has_folds = model.predictions.values().any(|prediction| prediction.fold.is_some());
+            for (example, fold) in examples.iter().zip(folds).filter(|_judged| has_folds) {
+                let Some(prediction) = model.predictions.get(&key_of(example)) else { continue };
+                let expected = *fold as u64 + 1;
+                if prediction.fold != Some(expected) {
+                    let given = prediction.fold.map_or("no fold".into(), |fold| format!("fold {fold}"));
                     return Err(self.refused(format!(
-                        "line {}: fold {fold}, but grasp {} is in fold {expected} of this evaluation: train on the folds in \
+                        "line {}: {given}, but grasp {} is in fold {expected} of this evaluation: train on the folds in \
                          predictions.csv, which --figures writes with the same --split, --folds and --seed",
                         prediction.line, example.grasp_id
                     )));
@@ -344,7 +348,7 @@ impl PredictionColumns {
         let probability_stable = in_range.ok_or_else(|| {
             format!("column 'probability_stable': expected a number from 0 to 1, found {}", found(probability))
         })?;
-        // Predictions that belong to no fold have an empty column.
+        // Predictions of a model that belong to no fold have an empty column.
         let fold = self.fold.filter(|idx| !record[*idx].is_empty());
         let fold = fold.map(|idx| whole_number("fold", idx)).transpose()?;
         Ok((place, OutsidePrediction { probability_stable, fold, line }))
@@ -486,6 +490,12 @@ mod tests {
         outside.check_folds(&examples.examples, &[0, 0, 0, 1]).expect("the same folds");
         let error = outside.check_folds(&examples.examples, &[0, 1, 0, 1]).expect_err("another fold").to_string();
         assert!(error.contains("line 3: fold 1, but grasp 1 is in fold 2"), "{error}");
+        let partly = read_table(format!("{header}{}", rows("svm").replace(",1,1,0.5", ",1,,0.5"))).expect("readable");
+        let error = partly.check_folds(&examples.examples, &[0, 0, 0, 1]).expect_err("a fold is missing").to_string();
+        assert!(error.contains("line 3: no fold, but grasp 1 is in fold 1"), "{error}");
+        let without =
+            read_table(format!("{header}{}", rows("svm").replace(",1,0.5", ",,0.5").replace(",2,0.5", ",,0.5")));
+        without.expect("readable").check_folds(&examples.examples, &[0, 1, 0, 1]).expect("no folds");
         outside.check_names(&["boosted".into()]).expect("other names");
         let error = outside.check_names(&["boosted".into(), "forest".into()]).expect_err("a twin").to_string();
         assert!(error.contains("'forest'"), "{error}");
