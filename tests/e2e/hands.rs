@@ -86,10 +86,11 @@ fn hands_that_people_own_are_simulated_trained_and_run() {
 fn a_hand_of_sixteen_joints_is_simulated_trained_and_run_by_one_command() {
     let folder = tempfile::tempdir().expect("a folder");
     let options = folder.path().join("options.yaml");
-    std::fs::write(&options, "planner: {n_approaches: 1}\nthresholds: {epsilon: 0.02, volume: 0.01}\n")
+    // One approach takes less time, and lower thresholds leave enough stable grasps to learn from.
+    std::fs::write(&options, "planner: {n_approaches: 1}\nthresholds: {epsilon: 0.005, volume: 0.001}\n")
         .expect("written");
     let said = try_hand("hands/allegro.yaml", folder.path(), &["--options", utf8(&options)]);
-    for expected in ["stable: epsilon > 0.02 and volume > 0.01", "grasps           83 (", "samples lost     0"] {
+    for expected in ["stable: epsilon > 0.005 and volume > 0.001", "grasps           83 (", "samples lost     0"] {
         assert!(said.contains(expected), "'{expected}' in\n{said}");
     }
     // A lift in physics.
