@@ -63,8 +63,8 @@ class Source:
                 hand = None
             if hand is not None:
                 break
-            # A source that is just ending.
-            time.sleep(0.1)
+            print(f"{self.address}: closed before the source's first line; trying again", file=sys.stderr)
+            time.sleep(1)
         if "refused" in hand:
             sys.exit(hand["why"])
         print(f"connected: {hand['hand']}, {hand['n_joints']} joints, {hand['n_cells']} cells", file=sys.stderr)
