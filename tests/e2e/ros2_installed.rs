@@ -44,14 +44,17 @@ for line in sys.stdin:
     decisions.publish(decision)
 ";
 
-/// The controller of a gripper, which reaches each goal.
+/// The controller of a gripper, which reaches each goal but 0.02.
 const CONTROLLER: &str = "
-import rclpy
+import time, rclpy
 from rclpy.action import ActionServer
 from control_msgs.action import GripperCommand
 rclpy.init()
 node = rclpy.create_node('controller')
 def reach(goal):
+    if goal.request.command.position == 0.02:
+        print('closing', flush=True)
+        time.sleep(3600)
     goal.succeed()
     return GripperCommand.Result(position=goal.request.command.position, reached_goal=True)
 server = ActionServer(node, GripperCommand, '/gripper/cmd', reach)
@@ -67,7 +70,7 @@ for grasp_id in itertools.count():
 ";
 /// MoveIt's part: goals, one after the other, and how each ended.
 const GOALS: &str = "
-import rclpy
+import sys, rclpy
 from rclpy.action import ActionClient
 from control_msgs.action import GripperCommand
 rclpy.init()
@@ -77,7 +80,7 @@ client.wait_for_server()
 def result(future):
     rclpy.spin_until_future_complete(node, future)
     return future.result()
-for position in [0.08, 0.01]:
+for position in map(float, sys.argv[1:]):
     goal = GripperCommand.Goal()
     goal.command.position = position
     ended = result(result(client.send_goal_async(goal)).get_result_async())
@@ -267,17 +270,19 @@ fn the_gate_of_the_gripper_passes_goals_on_and_lets_only_a_lift_succeed() {
     std::fs::write(package.join("action/GripperCommand.action"), action).expect("written");
     let built = compile(&package, folder.path());
 
-    let _controller = Node::start(&["-c", CONTROLLER], domain(2), Some(&built));
+    let mut controller = Node::start(&["-c", CONTROLLER], domain(2), Some(&built));
     let gate = project().join("examples/ros2_gripper_gate.py").display().to_string();
     let graph = folder.path().join("graph.py");
     std::fs::write(&graph, DECISIONS).expect("written");
     let (python, graph) = (python().display().to_string(), graph.display().to_string());
+    let start_gate = |action: &str| {
+        let of_gate = [&gate, "--controller", "/gripper/cmd", "--grasps-below", "0.03", "--wait", "50"];
+        Node::start(&[&of_gate[..], &[&python, &graph, action]].concat(), domain(2), Some(&built))
+    };
     // A hand that opens needs no decision; 4 is a goal that succeeded, and 6 one that was aborted.
     for (action, expected) in [("lift", ["0.08 4", "0.01 4"]), ("hold", ["0.08 4", "0.01 6"])] {
-        let of_gate = [&gate, "--controller", "/gripper/cmd", "--grasps-below", "0.03", "--wait", "50"];
-        let options = [&of_gate[..], &[&python, &graph, action]].concat();
-        let gate = Node::start(&options, domain(2), Some(&built));
-        let mut moveit = Node::start(&["-c", GOALS], domain(2), Some(&built));
+        let gate = start_gate(action);
+        let mut moveit = Node::start(&["-c", GOALS, "0.08", "0.01"], domain(2), Some(&built));
         let mut ends = BufReader::new(moveit.0.stdout.take().expect("stdout"));
         for expected in expected {
             let mut end = String::new();
@@ -286,6 +291,13 @@ fn the_gate_of_the_gripper_passes_goals_on_and_lets_only_a_lift_succeed() {
         }
         gate.stop();
     }
+    // It also ends while the controller moves the hand.
+    let gate = start_gate("lift");
+    let _moveit = Node::start(&["-c", GOALS, "0.02"], domain(2), Some(&built));
+    let mut said = String::new();
+    BufReader::new(controller.0.stdout.take().expect("stdout")).read_line(&mut said).expect("read");
+    assert_eq!(said.trim_end(), "closing");
+    gate.stop();
 }
 
 /// What is missing to compile a package of messages.
