@@ -6,7 +6,7 @@ use blindgrasp_graph::dataflow::{EdgePolicy, Graph, Node};
 use blindgrasp_operator::wiring::Sandbox;
 use serde_json::{Map, Value};
 
-use crate::SHIPPED;
+use crate::form_of;
 
 /// A node as its dataflow file has it.
 pub struct FileNode<'a> {
@@ -39,12 +39,7 @@ pub fn unable_to_begin(graph: &Graph, here: Option<&str>) -> Vec<UnableNode> {
 }
 
 fn check(node: &Node) -> anyhow::Result<()> {
-    let [word, name, arguments @ ..] = node.args.as_slice() else {
-        return Ok(());
-    };
-    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-    let shipped = SHIPPED.iter().find(|shipped| word == "operator" && shipped.name == name);
-    let Some(form) = shipped.and_then(|shipped| shipped.with_arguments(&arguments)) else {
+    let Some(form) = form_of(&node.args) else {
         return Ok(());
     };
     let inputs = node.inputs.iter().map(|input| (input.port.as_str(), input.edge.policy == EdgePolicy::Lossless));

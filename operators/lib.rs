@@ -77,6 +77,16 @@ pub const SHIPPED: [Shipped; 11] = [
     Shipped::new(LINK_OPERATOR, link::describe, link::work, |_| Ok(())),
 ];
 
+/// The operator that blindgrasp runs with these arguments, `operator NAME [VARIANT]`; `None` for those of another program.
+pub fn form_of(args: &[String]) -> Option<Form> {
+    let [word, name, arguments @ ..] = args else {
+        return None;
+    };
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let shipped = SHIPPED.iter().find(|shipped| word == "operator" && shipped.name == name)?;
+    shipped.with_arguments(&arguments)
+}
+
 /// These operators as a dataflow file can name them. `program` must run each as `PROGRAM operator NAME`, as blindgrasp does.
 pub fn operators_of(program: &Path) -> Operators {
     let in_files = || SHIPPED.iter().filter(|shipped| shipped.name != LINK_OPERATOR);

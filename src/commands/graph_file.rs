@@ -1,17 +1,20 @@
 //! Dataflow files with the operators of this program, checked.
 
+use std::path::Path;
+
 use anyhow::{Context, bail};
 use serde_json::Value;
 
 use blindgrasp_graph::client::status;
 use blindgrasp_graph::control::SwapRequest;
 use blindgrasp_graph::dataflow::{self, DataflowError, DataflowFile, Diagnostic, Graph, Override, Scope};
-use blindgrasp_graph::describe::describe;
+use blindgrasp_graph::describe;
 use blindgrasp_graph::operators::{Operators, running_program};
+use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operators::beginning::{UnableNode, unable_to_begin};
 use blindgrasp_operators::fit::{Fit, Misfit, MisfitKind, Part, check_fit, parts_of, running_parts};
-use blindgrasp_operators::{SHIPPED, operators_of};
+use blindgrasp_operators::{SHIPPED, form_of, operators_of};
 
 /// What becomes of a graph with which nothing can be lifted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -23,6 +26,20 @@ pub(super) enum OnMisfit {
 /// The operators that come with this program.
 pub(super) fn shipped() -> anyhow::Result<Operators> {
     Ok(operators_of(&running_program().context("the path of this program is unknown")?))
+}
+
+/// Ports and parameters of an operator. An operator of this program is described without starting a process.
+///
+/// # Errors
+/// As [`describe::describe`].
+pub(super) fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, String> {
+    // The path of a running program that was replaced on the disk is another one, so that the new program is asked.
+    if std::env::current_exe().is_ok_and(|running| running == program)
+        && let Some(form) = form_of(args)
+    {
+        return Ok((form.describe)());
+    }
+    describe::describe(program, args)
 }
 
 /// The graph of a file, which need not be able to lift.

@@ -8,12 +8,11 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use super::elsewhere::MachineArgument;
-use super::graph_file::warn_of_misfit;
+use super::graph_file::{describe, warn_of_misfit};
 use super::text_table::TextTable;
 use super::{Outcome, completions, print_line};
 use blindgrasp_graph::client::{Connection, pick_graph, status};
 use blindgrasp_graph::control::{NodeStatus, Reply, Request};
-use blindgrasp_graph::describe::describe;
 use blindgrasp_operator::text::did_you_mean;
 
 /// The operator checks the value, and applies it between two samples.

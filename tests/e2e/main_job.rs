@@ -317,7 +317,7 @@ fn a_foreign_operator_that_floods_its_output_can_be_stopped() {
     script(
         folder.path(),
         "flood.sh",
-        "if [ \"$1\" = --describe ]; then echo '{\"protocol\":3,\"operator\":\"flood\",\"version\":\"1\"}'; exit; fi\n\
+        "if [ \"$1\" = --describe ]; then echo '{\"protocol\":4,\"operator\":\"flood\",\"version\":\"1\"}'; exit; fi\n\
          echo '@blindgrasp {\"report\":\"ready\"}'\nexec yes flood",
     );
     let flow = folder.path().join("flow.yaml");

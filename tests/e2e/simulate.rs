@@ -98,7 +98,7 @@ fn info_adds_up_and_agrees_with_the_simulations_report() {
 }
 
 #[test]
-fn a_file_is_interrupted_whole_and_leaves_nothing() {
+fn a_file_is_interrupted_whole_and_leaves_nothing_else() {
     let folder = tempfile::tempdir().expect("a folder");
     let out = folder.path().join("big.mcap");
     let child = blindgrasp()
@@ -115,8 +115,14 @@ fn a_file_is_interrupted_whole_and_leaves_nothing() {
         .expect("signalled");
     let output = child.wait_with_output().expect("ended");
     assert_eq!(output.status.code(), Some(1));
-    assert!(text(&output.stderr).contains("interrupted: nothing is recorded"), "{}", text(&output.stderr));
-    assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), 0);
+    // The signal may come after the first grasps.
+    let said = text(&output.stderr);
+    let is_empty = said.contains("interrupted: nothing is recorded");
+    assert!(is_empty || said.contains("interrupted: the first "), "{said}");
+    assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), usize::from(!is_empty));
+    if !is_empty {
+        run(&["info", out.to_str().expect("UTF-8")], 0);
+    }
 }
 
 #[test]

@@ -15,7 +15,7 @@ use blindgrasp_messages::{Header, Message};
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
-use blindgrasp_operator::port::{Subscriber, sample_id};
+use blindgrasp_operator::port::{Subscriber, UntypedSubscriber, sample_id};
 use blindgrasp_operator::wiring::InputCounts;
 
 /// Maximum number of samples of a channel that are on their way to a peer that is up.
@@ -194,19 +194,19 @@ impl<M: Message> Reader for Subscriber<M> {
     }
 
     fn counts(&self) -> InputCounts {
-        Subscriber::counts(self)
+        UntypedSubscriber::counts(self)
     }
 
     fn commit_late(&mut self, key: SampleId, counts: &InputCounts) {
-        Subscriber::commit_late(self, key, counts);
+        UntypedSubscriber::commit_late(self, key, counts);
     }
 
     fn written(&self) -> Option<SampleId> {
-        Subscriber::written(self)
+        UntypedSubscriber::written(self)
     }
 
     fn connect(&mut self) -> anyhow::Result<()> {
-        Subscriber::connect(self)?;
+        UntypedSubscriber::connect(self)?;
         Ok(())
     }
 }

@@ -101,7 +101,7 @@ pub enum Reply {
         from_seq: Option<u64>,
     },
     /// To [`Request::Attach`]: slots are reserved. Writers wait for the reader once it has begun, see
-    /// [`Subscriber::begin_here`](blindgrasp_operator::port::Subscriber::begin_here).
+    /// [`Subscriber::begin_here`](blindgrasp_operator::port::UntypedSubscriber::begin_here).
     Attached(Attachment),
     /// To an attached client: the graph ends, and all its samples have been sent. It waits a little until the client
     /// has read them and closes the connection.

@@ -16,9 +16,9 @@
 //! # Ok::<(), blindgrasp_messages::MessageError>(())
 //! ```
 //!
-//! A declaration gives a message all its shapes. In shared memory a message is a fixed-size `…Head` (`repr(C)`,
-//! iceoryx2's user header, beginning with [`Header`]) and a slice of [`Message::Item`]s (the payload), so that the
-//! memory taken is that of the hand in use and not that of the largest one. Elsewhere it is an owned struct: recordings
+//! A declaration gives a message all its shapes. In shared memory a message is a fixed-size `…Head` (`repr(C)` without
+//! padding, beginning with [`Header`]) and behind it a slice of [`Message::Item`]s, so that the memory taken is that of
+//! the hand in use and not that of the largest one. Elsewhere it is an owned struct: recordings
 //! (CDR with a ROS 2 definition), the bridge between machines (bincode) and JSON serialise it with serde.
 //! `operators/blindgrasp_messages.py` is generated from the same declarations.
 //!

@@ -348,7 +348,7 @@ impl<M: Message> PartnerInput<M> {
 
 impl<M: Message> PairedInput for PartnerInput<M> {
     fn connect(&mut self) -> Result<(), PortError> {
-        self.onlooker.as_mut().map_or(Ok(false), Subscriber::connect)?;
+        self.onlooker.as_mut().map_or(Ok(false), |onlooker| onlooker.connect())?;
         self.subscriber.connect().map(|_| ())
     }
 

@@ -606,7 +606,7 @@ impl<S: Stage> Instance<S> {
             let arrival_nanos = arrival_nanos(&self.operator, S::In::header(head));
             self.stage.answer(head, sample.payload(), arrival_nanos, &mut self.answers);
             for (head, items) in self.answers.iter() {
-                shadow.publisher.send(head, items)?;
+                shadow.publisher.send(&head, items)?;
             }
             shadow.n_samples += 1;
             if shadow.n_samples == N_WARM {

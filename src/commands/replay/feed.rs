@@ -6,9 +6,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use serde_json::{Map, Value, json};
 
-use super::super::graph_file::shipped;
+use super::super::graph_file::{describe, shipped};
 use blindgrasp_graph::dataflow::{Graph, Node, Override, Program, accept_param_value};
-use blindgrasp_graph::describe::describe;
 use blindgrasp_graph::plan::Port;
 use blindgrasp_graph::run::observed_topics;
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, TactileFrame};

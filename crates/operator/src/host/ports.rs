@@ -10,6 +10,7 @@ use crate::cursors::SampleId;
 use crate::operator::{Operator, OperatorError};
 use crate::outbox::Keyed;
 use crate::partner::Partner;
+use crate::port::bytes::{head_bytes, head_of, item_bytes, items_of};
 use crate::port::{PortError, PortSample, Publisher, Sent, ShadowPublisher, Subscriber, sample_id};
 use crate::wiring::{Clock, InputCounts, OnLate};
 
@@ -62,7 +63,7 @@ impl<M: Message> Input<M> {
     fn begin_anew(&mut self) {
         for sample in self.back.drain(..) {
             if let (Some(head), Some(items)) = (head_of::<M>(&sample.head), items_of::<M>(&sample.items)) {
-                self.subscriber.put_back(PortSample::of_copy(head, items));
+                self.subscriber.put_back(PortSample::of_copy(&head, &items));
             }
         }
     }
@@ -242,7 +243,7 @@ impl<M: Message> OutputPort for Output<M> {
 
     fn send_beside(&self, answer: &RawAnswer) -> Result<(), PortError> {
         if let (Some(shadow), Some((head, items))) = (&self.shadow, Self::parts(answer)) {
-            shadow.send(head, &items)?;
+            shadow.send(&head, &items)?;
         }
         Ok(())
     }
@@ -405,52 +406,5 @@ impl WithMessage for OpenOutput<'_> {
             None => Some(operator.growing_shadow::<M>(port)?),
         };
         Ok(Box::new(Output { publisher, shadow }))
-    }
-}
-
-fn head_bytes<M: Message>(head: &M::Head) -> &[u8] {
-    // SAFETY: heads have no padding (a test of crates/messages), so that each of their bytes is initialised.
-    unsafe { std::slice::from_raw_parts(std::ptr::from_ref(head).cast(), size_of::<M::Head>()) }
-}
-
-fn item_bytes<M: Message>(items: &[M::Item]) -> &[u8] {
-    // SAFETY: as for heads.
-    unsafe { std::slice::from_raw_parts(items.as_ptr().cast(), size_of_val(items)) }
-}
-
-/// A head of these bytes; `None` if it has another length.
-fn head_of<M: Message>(bytes: &[u8]) -> Option<M::Head> {
-    // SAFETY: the length is that of a head, and no bytes are invalid as a head, because enums travel as integers.
-    (bytes.len() == size_of::<M::Head>()).then(|| unsafe { std::ptr::read_unaligned(bytes.as_ptr().cast()) })
-}
-
-/// The items of these bytes; `None` if they are no whole number of items.
-fn items_of<M: Message>(bytes: &[u8]) -> Option<Vec<M::Item>> {
-    if !bytes.len().is_multiple_of(size_of::<M::Item>()) {
-        return None;
-    }
-    let mut items = vec![M::Item::default(); bytes.len() / size_of::<M::Item>()];
-    // SAFETY: the memory is as long as the bytes, and no bytes are invalid as items.
-    unsafe { std::ptr::copy_nonoverlapping(bytes.as_ptr(), items.as_mut_ptr().cast(), bytes.len()) };
-    Some(items)
-}
-
-#[cfg(test)]
-mod tests {
-    use blindgrasp_messages::{Phase, TactileFrame};
-
-    use super::*;
-
-    #[test]
-    fn heads_and_items_are_read_back_from_their_bytes_and_other_lengths_are_refused() {
-        let frame = TactileFrame { phase: Phase::Settled, cells_newtons: vec![0.25, 3.0], ..TactileFrame::default() };
-        let (head, items) = frame.to_parts(Header { seq: 7, ..Header::default() });
-        let bytes = head_bytes::<TactileFrame>(&head);
-        let read = head_of::<TactileFrame>(bytes).expect("a head");
-        let items = items_of::<TactileFrame>(item_bytes::<TactileFrame>(&items)).expect("items");
-        assert_eq!(read.header, head.header);
-        assert_eq!(TactileFrame::from_parts(&read, &items).expect("a frame"), frame);
-        assert!(head_of::<TactileFrame>(&bytes[1..]).is_none());
-        assert!(items_of::<TactileFrame>(&[0; 15]).is_none());
     }
 }

@@ -1,5 +1,9 @@
 //! Publisher and subscriber of one message type over iceoryx2.
 //!
+//! iceoryx2 carries the bytes of samples, and their [`Header`] beside them: ports of all messages are the same code, which is compiled
+//! once ([`UntypedPublisher`], [`UntypedSubscriber`]). [`Publisher`] and [`Subscriber`] give the bytes their type; the name of the
+//! type is compared when a port opens.
+//!
 //! A port is a publish-subscribe service and an event service of one name, with safe overflow: iceoryx2 itself never
 //! blocks, and a reader that is behind keeps its newest samples. Credit makes an edge lossless: the publisher reads on
 //! the [cursors](crate::cursors) how far each reader of a lossless edge has come, and waits, for a bounded time, before it
@@ -10,25 +14,27 @@
 //! A trap of iceoryx2 0.10: a subscriber that exists but has not looked for its publishers yet gets samples up to its
 //! buffer's size, and later ones are dropped without an error. Within the credit that cannot happen.
 
+pub(crate) mod bytes;
 mod publisher;
+mod sample;
 mod service;
 mod subscriber;
 
-use iceoryx2::prelude::ipc;
-use iceoryx2::sample::Sample;
-
 use crate::cursors::SampleId;
-use blindgrasp_messages::{Header, Message};
+use blindgrasp_messages::Header;
 
 pub(crate) use publisher::{LONGEST_TRY, LOOK_PAUSE, RETRY_PAUSE};
-pub use publisher::{Publisher, Sent, ShadowPublisher};
-pub use subscriber::Subscriber;
+pub use publisher::{Publisher, Sent, ShadowPublisher, UntypedPublisher};
+pub use sample::{PortSample, UntypedSample};
+pub use subscriber::{Subscriber, UntypedSubscriber};
 
 /// Why a port does not work. The sources are errors of iceoryx2.
 #[derive(Debug, thiserror::Error)]
 pub enum PortError {
     #[error("port {service} carries {found}, expected {expected}")]
     WrongType { service: String, found: String, expected: &'static str },
+    #[error("port {service} received {n_bytes} bytes, which are no {expected}: its writer is of another version")]
+    WrongLength { service: String, n_bytes: u64, expected: &'static str },
     #[error("port {service} cannot be opened")]
     Open { service: String, source: BoxedError },
     #[error("port {service} cannot be connected")]
@@ -50,42 +56,6 @@ pub enum PortError {
 
 /// An error of iceoryx2.
 pub type BoxedError = Box<dyn std::error::Error + Send + Sync>;
-
-/// A sample that was received.
-pub struct PortSample<M: Message>(Place<M>);
-
-enum Place<M: Message> {
-    /// In shared memory, borrowed from its publisher.
-    Lent(Sample<ipc::Service, [M::Item], M::Head>),
-    Copied(M::Head, Vec<M::Item>),
-}
-
-impl<M: Message> PortSample<M> {
-    pub fn user_header(&self) -> &M::Head {
-        match &self.0 {
-            Place::Lent(sample) => sample.user_header(),
-            Place::Copied(head, _) => head,
-        }
-    }
-
-    pub fn payload(&self) -> &[M::Item] {
-        match &self.0 {
-            Place::Lent(sample) => sample.payload(),
-            Place::Copied(_, items) => items,
-        }
-    }
-
-    /// A sample that was received before, from a copy.
-    pub(crate) fn of_copy(head: M::Head, items: Vec<M::Item>) -> Self {
-        PortSample(Place::Copied(head, items))
-    }
-
-    /// The sample in memory of this process, so that its publisher gets its own back. For each sample that a publisher must
-    /// be able to lend at a time, iceoryx2 reserves 3.6 KB in each of its subscribers.
-    fn copied(self) -> Self {
-        PortSample(Place::Copied(*self.user_header(), self.payload().to_vec()))
-    }
-}
 
 /// The sample that a header belongs to.
 pub fn sample_id(header: &Header) -> SampleId {

@@ -1,5 +1,7 @@
 //! The sending end of an edge.
 
+use std::marker::PhantomData;
+use std::ops::{Deref, DerefMut};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -8,6 +10,7 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, ipc};
 use iceoryx2::service::port_factory::PortFactory;
 
+use super::bytes::{Envelope, Parts, Word, n_bytes, n_words};
 use super::service::{self, Connections, PubSub};
 use super::{PortError, sample_id};
 use crate::credit::{Credit, Reader};
@@ -37,10 +40,10 @@ pub enum Sent {
 }
 
 /// A publisher that does not wait for readers.
-struct Sender<M: Message> {
+struct Sender {
     service: String,
-    pub_sub: PubSub<M>,
-    publisher: iceoryx2::port::publisher::Publisher<ipc::Service, [M::Item], M::Head>,
+    pub_sub: PubSub,
+    publisher: iceoryx2::port::publisher::Publisher<ipc::Service, [Word], Envelope>,
     cursors: Arc<SharedCursors>,
     /// The slots of the bells that wake its readers.
     bells: Vec<usize>,
@@ -48,22 +51,43 @@ struct Sender<M: Message> {
     connections: Connections,
 }
 
-impl<M: Message> Sender<M> {
+/// A message's name, and the memory for its samples.
+struct Room {
+    type_name: &'static str,
+    n_words: usize,
+    strategy: AllocationStrategy,
+}
+
+impl Room {
+    fn of<M: Message>(max_items: usize) -> Room {
+        Room {
+            type_name: M::TYPE_NAME,
+            n_words: n_words(n_bytes::<M>(max_items)),
+            strategy: AllocationStrategy::Static,
+        }
+    }
+
+    /// A larger message takes more memory.
+    fn growing<M: Message>() -> Room {
+        Room { strategy: AllocationStrategy::PowerOfTwo, ..Room::of::<M>(N_FIRST_ITEMS) }
+    }
+}
+
+impl Sender {
     fn open(
         node: &Node<ipc::Service>,
         cursors: &Arc<SharedCursors>,
         bells: &[usize],
         wiring: &ServiceWiring,
-        max_items: usize,
-        strategy: AllocationStrategy,
+        room: &Room,
     ) -> Result<Self, PortError> {
-        let pub_sub = service::pub_sub::<M>(node, wiring)?;
+        let pub_sub = service::pub_sub(node, wiring, room.type_name)?;
         let connections = Connections::default();
         let publisher = pub_sub
             .publisher_builder()
             .set_degradation_handler(connections.handler())
-            .initial_max_slice_len(max_items.max(1))
-            .allocation_strategy(strategy)
+            .initial_max_slice_len(room.n_words)
+            .allocation_strategy(room.strategy)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
             .map_err(|error| service::open_failed(wiring, error))?;
@@ -71,11 +95,13 @@ impl<M: Message> Sender<M> {
         Ok(Sender { service, pub_sub, publisher, cursors, bells, n_subscribers: 0, connections })
     }
 
-    fn send(&self, head: M::Head, items: &[M::Item]) -> Result<(), PortError> {
-        let failed = |source| PortError::Send { service: self.service.clone(), seq: M::header(&head).seq, source };
-        let mut sample = self.publisher.loan_slice_uninit(items.len()).map_err(|error| failed(error.into()))?;
-        *sample.user_header_mut() = head;
-        sample.write_from_slice(items).send().map_err(|error| failed(error.into()))?;
+    fn send(&self, parts: &Parts<'_>) -> Result<(), PortError> {
+        let failed = |source| PortError::Send { service: self.service.clone(), seq: parts.header.seq, source };
+        let mut sample = self.publisher.loan_slice_uninit(parts.n_words()).map_err(|error| failed(error.into()))?;
+        *sample.user_header_mut() = parts.envelope();
+        parts.write(sample.payload_mut());
+        // SAFETY: all words were written.
+        unsafe { sample.assume_init() }.send().map_err(|error| failed(error.into()))?;
         self.ring();
         Ok(())
     }
@@ -104,15 +130,22 @@ impl<M: Message> Sender<M> {
 
 /// The sending end of an edge.
 pub struct Publisher<M: Message> {
-    sender: Sender<M>,
-    cursors: Arc<SharedCursors>,
-    slot: usize,
-    credit: Credit,
-    wait_limit: Duration,
-    /// The slots of the readers in this process, which cannot go on while this publisher waits.
-    own_readers: Vec<usize>,
-    /// See [`Credit::has_sent_all`].
-    has_sent_all: Arc<AtomicBool>,
+    port: UntypedPublisher,
+    message: PhantomData<M>,
+}
+
+impl<M: Message> Deref for Publisher<M> {
+    type Target = UntypedPublisher;
+
+    fn deref(&self) -> &UntypedPublisher {
+        &self.port
+    }
+}
+
+impl<M: Message> DerefMut for Publisher<M> {
+    fn deref_mut(&mut self) -> &mut UntypedPublisher {
+        &mut self.port
+    }
 }
 
 impl<M: Message> Publisher<M> {
@@ -126,7 +159,8 @@ impl<M: Message> Publisher<M> {
         wiring: &OutputWiring,
         max_items: usize,
     ) -> Result<Self, PortError> {
-        Self::open_with(node, cursors, wiring, max_items, AllocationStrategy::Static)
+        let port = UntypedPublisher::open(node, cursors, wiring, &Room::of::<M>(max_items))?;
+        Ok(Publisher { port, message: PhantomData })
     }
 
     /// As [`Publisher::open`], for messages whose largest number of items is unknown: a larger message takes more memory.
@@ -138,18 +172,67 @@ impl<M: Message> Publisher<M> {
         cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
     ) -> Result<Self, PortError> {
-        Self::open_with(node, cursors, wiring, N_FIRST_ITEMS, AllocationStrategy::PowerOfTwo)
+        let port = UntypedPublisher::open(node, cursors, wiring, &Room::growing::<M>())?;
+        Ok(Publisher { port, message: PhantomData })
     }
 
-    fn open_with(
+    /// Sends a message, written straight into shared memory, once every lossless reader has room for it. While it waits it
+    /// calls `should_yield` now and then, and gives up when that returns true.
+    ///
+    /// # Errors
+    /// A reader had no room for longer than the limit, or an error of iceoryx2.
+    pub fn send(
+        &mut self,
+        head: M::Head,
+        items: &[M::Item],
+        should_yield: &mut dyn FnMut() -> bool,
+    ) -> Result<Sent, PortError> {
+        self.send_checked(head, items, should_yield, |_| true)
+    }
+
+    /// As [`Publisher::send`]; `check` may change the head at the last moment, when the readers have room. If it returns
+    /// false, nothing is sent ([`Sent::GaveWay`]).
+    ///
+    /// # Errors
+    /// As [`Publisher::send`].
+    pub(crate) fn send_checked(
+        &mut self,
+        mut head: M::Head,
+        items: &[M::Item],
+        should_yield: &mut dyn FnMut() -> bool,
+        check: impl FnOnce(&mut M::Head) -> bool,
+    ) -> Result<Sent, PortError> {
+        let key = sample_id(M::header(&head));
+        if self.port.wait_for_room(key, should_yield)? == Sent::GaveWay || !check(&mut head) {
+            return Ok(Sent::GaveWay);
+        }
+        self.port.send_now(key, &Parts::of::<M>(&head, items))?;
+        Ok(Sent::Yes)
+    }
+}
+
+/// The sending end of an edge, whatever its message.
+pub struct UntypedPublisher {
+    sender: Sender,
+    cursors: Arc<SharedCursors>,
+    slot: usize,
+    credit: Credit,
+    wait_limit: Duration,
+    /// The slots of the readers in this process, which cannot go on while this publisher waits.
+    own_readers: Vec<usize>,
+    /// See [`Credit::has_sent_all`].
+    has_sent_all: Arc<AtomicBool>,
+}
+
+impl UntypedPublisher {
+    fn open(
         node: &Node<ipc::Service>,
         cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
-        max_items: usize,
-        strategy: AllocationStrategy,
+        room: &Room,
     ) -> Result<Self, PortError> {
-        Ok(Publisher {
-            sender: Sender::open(node, cursors, &wiring.bells, &wiring.service, max_items, strategy)?,
+        Ok(UntypedPublisher {
+            sender: Sender::open(node, cursors, &wiring.bells, &wiring.service, room)?,
             cursors: Arc::clone(cursors),
             slot: wiring.slot,
             credit: Credit::new(&wiring.consumers, wiring.service.history),
@@ -183,7 +266,7 @@ impl<M: Message> Publisher<M> {
         known
     }
 
-    /// As [`Publisher::begin`], without taking over.
+    /// As [`UntypedPublisher::begin`], without taking over.
     pub(crate) fn known(&self, is_handed_over: bool) -> Option<SampleId> {
         self.credit.known(is_handed_over, &*self.cursors, self.written())
     }
@@ -219,48 +302,17 @@ impl<M: Message> Publisher<M> {
         self.slot().n_sent()
     }
 
-    /// Sends a message, written straight into shared memory, once every lossless reader has room for it. While it waits it
-    /// calls `should_yield` now and then, and gives up when that returns true.
-    ///
-    /// # Errors
-    /// A reader had no room for longer than the limit, or an error of iceoryx2.
-    pub fn send(
-        &mut self,
-        head: M::Head,
-        items: &[M::Item],
-        should_yield: &mut dyn FnMut() -> bool,
-    ) -> Result<Sent, PortError> {
-        self.send_checked(head, items, should_yield, |_| true)
-    }
-
-    /// As [`Publisher::send`]; `check` may change the head at the last moment, when the readers have room. If it returns
-    /// false, nothing is sent ([`Sent::GaveWay`]).
-    ///
-    /// # Errors
-    /// As [`Publisher::send`].
-    pub(crate) fn send_checked(
-        &mut self,
-        mut head: M::Head,
-        items: &[M::Item],
-        should_yield: &mut dyn FnMut() -> bool,
-        check: impl FnOnce(&mut M::Head) -> bool,
-    ) -> Result<Sent, PortError> {
-        let key = sample_id(M::header(&head));
-        if !self.has_room(key) && self.wait_for_room(key, should_yield)? == Sent::GaveWay {
-            return Ok(Sent::GaveWay);
-        }
-        if !check(&mut head) {
-            return Ok(Sent::GaveWay);
-        }
+    /// Counts a sample and sends it. The readers have room for it.
+    fn send_now(&mut self, key: SampleId, parts: &Parts<'_>) -> Result<(), PortError> {
         // It is counted first: a publisher that is killed in between sends it again, and it is counted once. The other way
         // round, a reader could answer a sample that is not counted.
         self.slot().commit(key);
-        self.sender.send(head, items)?;
+        self.sender.send(parts)?;
         self.credit.has_sent(key);
         if !self.has_sent_all.load(Ordering::Relaxed) {
             self.has_sent_all.store(self.credit.has_sent_all(self.written()), Ordering::Relaxed);
         }
-        Ok(Sent::Yes)
+        Ok(())
     }
 
     /// Gives readers that have come back the samples that they missed. Call it when there is nothing to send.
@@ -332,6 +384,9 @@ impl<M: Message> Publisher<M> {
     }
 
     fn wait_for_room(&mut self, key: SampleId, should_yield: &mut dyn FnMut() -> bool) -> Result<Sent, PortError> {
+        if self.has_room(key) {
+            return Ok(Sent::Yes);
+        }
         self.wait(key, should_yield, |publisher, waited| {
             if publisher.has_room(key) {
                 return Wait::Over;
@@ -433,7 +488,8 @@ fn gives_up(reader: &Reader, waited: Duration, cursors: &SharedCursors) -> bool 
 
 /// The output of a standby, for comparison. It waits for no reader.
 pub struct ShadowPublisher<M: Message> {
-    sender: Sender<M>,
+    sender: Sender,
+    message: PhantomData<M>,
 }
 
 impl<M: Message> ShadowPublisher<M> {
@@ -447,9 +503,7 @@ impl<M: Message> ShadowPublisher<M> {
         wiring: &OutputWiring,
         max_items: usize,
     ) -> Result<Self, PortError> {
-        let sender =
-            Sender::open(node, cursors, &[COMPARE_BELL], &wiring.shadow, max_items, AllocationStrategy::Static)?;
-        Ok(ShadowPublisher { sender })
+        Self::open_with(node, cursors, wiring, &Room::of::<M>(max_items))
     }
 
     /// As [`ShadowPublisher::open`], for messages whose largest number of items is unknown.
@@ -461,16 +515,24 @@ impl<M: Message> ShadowPublisher<M> {
         cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
     ) -> Result<Self, PortError> {
-        let strategy = AllocationStrategy::PowerOfTwo;
-        let sender = Sender::open(node, cursors, &[COMPARE_BELL], &wiring.shadow, N_FIRST_ITEMS, strategy)?;
-        Ok(ShadowPublisher { sender })
+        Self::open_with(node, cursors, wiring, &Room::growing::<M>())
+    }
+
+    fn open_with(
+        node: &Node<ipc::Service>,
+        cursors: &Arc<SharedCursors>,
+        wiring: &OutputWiring,
+        room: &Room,
+    ) -> Result<Self, PortError> {
+        let sender = Sender::open(node, cursors, &[COMPARE_BELL], &wiring.shadow, room)?;
+        Ok(ShadowPublisher { sender, message: PhantomData })
     }
 
     /// Sends a message to the readers that are there.
     ///
     /// # Errors
     /// An error of iceoryx2.
-    pub fn send(&self, head: M::Head, items: &[M::Item]) -> Result<(), PortError> {
-        self.sender.send(head, items)
+    pub fn send(&self, head: &M::Head, items: &[M::Item]) -> Result<(), PortError> {
+        self.sender.send(&Parts::of::<M>(head, items))
     }
 }

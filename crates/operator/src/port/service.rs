@@ -8,27 +8,31 @@ use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
 use iceoryx2::prelude::{Node, ServiceName, ipc};
 use iceoryx2::service::port_factory::publish_subscribe;
 
+use super::bytes::{Envelope, Word};
 use super::{BoxedError, PortError};
 use crate::wiring::ServiceWiring;
-use blindgrasp_messages::Message;
 
 /// Opening a service is tried so often, with this pause between tries.
 const N_OPENINGS: u32 = 20;
 const OPENING_PAUSE: Duration = Duration::from_millis(10);
 
-pub(super) type PubSub<M> = publish_subscribe::PortFactory<ipc::Service, [<M as Message>::Item], <M as Message>::Head>;
+pub(super) type PubSub = publish_subscribe::PortFactory<ipc::Service, [Word], Envelope>;
 
 /// The first process to come creates the service, and the others must ask for the same: the wiring decides for all.
-pub(super) fn pub_sub<M: Message>(node: &Node<ipc::Service>, wiring: &ServiceWiring) -> Result<PubSub<M>, PortError> {
-    if wiring.type_name != M::TYPE_NAME {
+pub(super) fn pub_sub(
+    node: &Node<ipc::Service>,
+    wiring: &ServiceWiring,
+    type_name: &'static str,
+) -> Result<PubSub, PortError> {
+    if wiring.type_name != type_name {
         let (service, found) = (wiring.name.clone(), wiring.type_name.clone());
-        return Err(PortError::WrongType { service, found, expected: M::TYPE_NAME });
+        return Err(PortError::WrongType { service, found, expected: type_name });
     }
     let name = service_name(wiring)?;
     let open = || {
         node.service_builder(&name)
-            .publish_subscribe::<[M::Item]>()
-            .user_header::<M::Head>()
+            .publish_subscribe::<[Word]>()
+            .user_header::<Envelope>()
             .enable_safe_overflow(true)
             .subscriber_max_buffer_size(wiring.max_capacity)
             .subscriber_max_borrowed_samples(wiring.max_borrowed)

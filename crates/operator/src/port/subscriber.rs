@@ -1,6 +1,8 @@
 //! The receiving end of an edge.
 
 use std::collections::VecDeque;
+use std::marker::PhantomData;
+use std::ops::{Deref, DerefMut};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -10,8 +12,9 @@ use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
 use iceoryx2::prelude::{Node, ipc};
 use iceoryx2::service::port_factory::PortFactory;
 
+use super::bytes::{Envelope, Word};
 use super::service::{self, Connections, PubSub};
-use super::{Place, PortError, PortSample, sample_id};
+use super::{PortError, PortSample, UntypedSample, sample_id};
 use crate::cursors::{SampleId, SharedCursors};
 use crate::monotonic_nanos;
 use crate::sequencer::{Placing, Sequencer};
@@ -19,35 +22,34 @@ use crate::wiring::{EdgePolicy, InputCounts, InputWiring, OnLate};
 use crate::written::Written;
 use blindgrasp_messages::{Header, Message};
 
-type Port<M> = iceoryx2::port::subscriber::Subscriber<ipc::Service, [<M as Message>::Item], <M as Message>::Head>;
+type Port = iceoryx2::port::subscriber::Subscriber<ipc::Service, [Word], Envelope>;
 
-fn open_port<M: Message>(
-    pub_sub: &PubSub<M>,
+fn open_port(
+    pub_sub: &PubSub,
     buffer_size: usize,
     handler: impl Fn(DegradationCause, &DegradationInfo) -> DegradationAction + Send + 'static,
-) -> Result<Port<M>, SubscriberCreateError> {
+) -> Result<Port, SubscriberCreateError> {
     pub_sub.subscriber_builder().buffer_size(buffer_size).set_degradation_handler(handler).create()
 }
 
 /// The receiving end of an edge.
 pub struct Subscriber<M: Message> {
-    service: String,
-    pub_sub: PubSub<M>,
-    subscriber: Port<M>,
-    connections: Connections,
-    /// The number of samples that the queue takes.
-    buffer_size: usize,
-    cursors: Option<(Arc<SharedCursors>, usize)>,
-    writer_slot: usize,
-    deadline_nanos: Option<u64>,
-    on_late: OnLate,
-    /// The age of the last sample, if it came too late.
-    late_nanos: Option<u64>,
-    /// Whether samples wait for those before them. On an edge that may drop samples, they don't.
-    may_hold: bool,
-    /// Samples that were taken and not answered, the first one first.
-    put_back: VecDeque<(SampleId, PortSample<M>)>,
-    sequencer: Sequencer<PortSample<M>>,
+    port: UntypedSubscriber,
+    message: PhantomData<M>,
+}
+
+impl<M: Message> Deref for Subscriber<M> {
+    type Target = UntypedSubscriber;
+
+    fn deref(&self) -> &UntypedSubscriber {
+        &self.port
+    }
+}
+
+impl<M: Message> DerefMut for Subscriber<M> {
+    fn deref_mut(&mut self) -> &mut UntypedSubscriber {
+        &mut self.port
+    }
 }
 
 impl<M: Message> Subscriber<M> {
@@ -60,17 +62,75 @@ impl<M: Message> Subscriber<M> {
         cursors: Option<&Arc<SharedCursors>>,
         wiring: &InputWiring,
     ) -> Result<Self, PortError> {
-        let pub_sub = service::pub_sub::<M>(node, &wiring.service)?;
+        let port = UntypedSubscriber::open(node, cursors, wiring, M::TYPE_NAME)?;
+        Ok(Subscriber { port, message: PhantomData })
+    }
+
+    /// The next sample in order, if one is there.
+    ///
+    /// # Errors
+    /// An error of iceoryx2, or a sample that is not of this message.
+    pub fn receive(&mut self) -> Result<Option<PortSample<M>>, PortError> {
+        let Some(sample) = self.port.receive()? else {
+            return Ok(None);
+        };
+        let n_bytes = sample.bytes().len() as u64;
+        PortSample::of_untyped(sample).map(Some).ok_or_else(|| self.port.wrong_length(n_bytes))
+    }
+
+    /// Keeps a sample that was not answered, in case that this reader goes on.
+    pub fn put_back(&mut self, sample: PortSample<M>) {
+        let sample = sample.into_untyped();
+        self.port.put_back.push_back((sample.key(), sample));
+    }
+
+    /// A sample that was kept without an answer.
+    pub(crate) fn take_back(&mut self) -> Option<PortSample<M>> {
+        self.port.put_back.pop_front().and_then(|(_, sample)| PortSample::of_untyped(sample))
+    }
+}
+
+/// The receiving end of an edge, whatever its message.
+pub struct UntypedSubscriber {
+    service: String,
+    type_name: &'static str,
+    pub_sub: PubSub,
+    subscriber: Port,
+    connections: Connections,
+    /// The number of samples that the queue takes.
+    buffer_size: usize,
+    cursors: Option<(Arc<SharedCursors>, usize)>,
+    writer_slot: usize,
+    deadline_nanos: Option<u64>,
+    on_late: OnLate,
+    /// The age of the last sample, if it came too late.
+    late_nanos: Option<u64>,
+    /// Whether samples wait for those before them. On an edge that may drop samples, they don't.
+    may_hold: bool,
+    /// Samples that were taken and not answered, the first one first.
+    put_back: VecDeque<(SampleId, UntypedSample)>,
+    sequencer: Sequencer<UntypedSample>,
+}
+
+impl UntypedSubscriber {
+    fn open(
+        node: &Node<ipc::Service>,
+        cursors: Option<&Arc<SharedCursors>>,
+        wiring: &InputWiring,
+        type_name: &'static str,
+    ) -> Result<Self, PortError> {
+        let pub_sub = service::pub_sub(node, &wiring.service, type_name)?;
         // A reader that comes back finds all that its writer keeps; the cursors limit how much may be unanswered.
         let buffer_size = match wiring.policy {
             EdgePolicy::Lossless => wiring.service.max_capacity,
             EdgePolicy::Latest => wiring.capacity.min(wiring.service.max_capacity),
         };
         let connections = Connections::default();
-        let subscriber = open_port::<M>(&pub_sub, buffer_size, connections.handler())
+        let subscriber = open_port(&pub_sub, buffer_size, connections.handler())
             .map_err(|error| service::open_failed(&wiring.service, error))?;
-        let mut subscriber = Subscriber {
+        let mut subscriber = UntypedSubscriber {
             service: wiring.service.name.clone(),
+            type_name,
             pub_sub,
             subscriber,
             connections,
@@ -88,7 +148,11 @@ impl<M: Message> Subscriber<M> {
         Ok(subscriber)
     }
 
-    fn begin_with(&mut self, sequencer: Sequencer<PortSample<M>>) {
+    fn wrong_length(&self, n_bytes: u64) -> PortError {
+        PortError::WrongLength { service: self.service.clone(), n_bytes, expected: self.type_name }
+    }
+
+    fn begin_with(&mut self, sequencer: Sequencer<UntypedSample>) {
         let now = Instant::now();
         let written = self.writer();
         let sequencer = sequencer.beginning_at(now, written.map(|written| written.last));
@@ -110,7 +174,7 @@ impl<M: Message> Subscriber<M> {
         let (subscriber, sequencer) = (&mut self.subscriber, &mut self.sequencer);
         let mended = self.connections.mend(|| {
             // A new port connects to all publishers, and gets what they keep.
-            let Ok(port) = open_port::<M>(pub_sub, buffer_size, handler) else { return false };
+            let Ok(port) = open_port(pub_sub, buffer_size, handler) else { return false };
             *subscriber = port;
             sequencer.has_reconnected();
             subscriber.update_connections().is_ok()
@@ -200,10 +264,7 @@ impl<M: Message> Subscriber<M> {
     }
 
     /// The next sample in order, if one is there.
-    ///
-    /// # Errors
-    /// An error of iceoryx2.
-    pub fn receive(&mut self) -> Result<Option<PortSample<M>>, PortError> {
+    fn receive(&mut self) -> Result<Option<UntypedSample>, PortError> {
         if let Some(sample) = self.sequencer.next_in_order() {
             return Ok(Some(self.delivered(sample)));
         }
@@ -217,21 +278,22 @@ impl<M: Message> Subscriber<M> {
                     if self.sequencer.n_held() > 0 { self.sequencer.next_overdue(Instant::now()) } else { None };
                 return Ok(overdue.map(|sample| self.delivered(sample)));
             };
-            let key = sample_id(M::header(sample.user_header()));
             let publisher = sample.header().publisher_id().value();
             let may_reorder = || self.pub_sub.dynamic_config().number_of_publishers() > 1;
-            let sample = PortSample(Place::Lent(sample));
+            let n_bytes = sample.user_header().n_bytes;
+            let sample = UntypedSample::lent(sample).ok_or_else(|| self.wrong_length(n_bytes))?;
+            let key = sample.key();
             let written = self.cursors.as_ref().and_then(|(cursors, _)| cursors.output(self.writer_slot).written());
             match self.sequencer.push(sample, key, publisher, written.as_ref(), may_reorder, Instant::now) {
                 Placing::Deliver(sample) => return Ok(Some(self.delivered(sample))),
-                Placing::Hold => self.sequencer.keep_as(key, PortSample::copied),
+                Placing::Hold => self.sequencer.keep_as(key, UntypedSample::copied),
                 Placing::Drop => {}
             }
         }
     }
 
-    fn delivered(&mut self, sample: PortSample<M>) -> PortSample<M> {
-        let origin_nanos = M::header(sample.user_header()).origin_nanos;
+    fn delivered(&mut self, sample: UntypedSample) -> UntypedSample {
+        let origin_nanos = sample.header().origin_nanos;
         // A reader without a slot counts nothing, and a sample without a time has no age.
         if let Some((cursors, slot)) = self.cursors.as_ref()
             && origin_nanos != 0
@@ -273,23 +335,13 @@ impl<M: Message> Subscriber<M> {
         last
     }
 
-    /// Keeps a sample that was not answered, in case that this reader goes on.
-    pub fn put_back(&mut self, sample: PortSample<M>) {
-        self.put_back.push_back((sample_id(M::header(sample.user_header())), sample));
-    }
-
-    /// A sample that was kept without an answer.
-    pub(crate) fn take_back(&mut self) -> Option<PortSample<M>> {
-        self.put_back.pop_front().map(|(_, sample)| sample)
-    }
-
     /// Marks all samples up to this one as answered: its writer may overwrite them, and an instance that takes over goes on
     /// after them.
     pub fn commit(&self, header: &Header) {
         self.commit_with(header, &self.sequencer.counts());
     }
 
-    /// As [`Subscriber::commit`], with the counts of the time at which it received this sample.
+    /// As [`UntypedSubscriber::commit`], with the counts of the time at which it received this sample.
     pub(crate) fn commit_with(&self, header: &Header, counts: &InputCounts) {
         if let Some((cursors, slot)) = &self.cursors {
             let key = sample_id(header);
@@ -300,7 +352,7 @@ impl<M: Message> Subscriber<M> {
         }
     }
 
-    /// As [`Subscriber::commit`], for a reader that answers long after it has received; with the counts of the time at which
+    /// As [`UntypedSubscriber::commit`], for a reader that answers long after it has received; with the counts of the time at which
     /// it received this sample.
     pub fn commit_late(&self, key: SampleId, counts: &InputCounts) {
         if let Some((cursors, slot)) = &self.cursors {

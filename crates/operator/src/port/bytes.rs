@@ -1,0 +1,132 @@
+//! The bytes of a sample in shared memory: its head, and behind it its items.
+
+use std::mem::MaybeUninit;
+
+use blindgrasp_messages::{Header, Message};
+use iceoryx2::prelude::ZeroCopySend;
+
+/// The unit in which iceoryx2 lends memory: heads and items need no greater alignment. (Of single bytes that are aligned,
+/// iceoryx2 0.10 takes eight times as much memory.)
+pub(super) type Word = u64;
+
+/// iceoryx2's user header.
+#[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
+#[repr(C)]
+pub(crate) struct Envelope {
+    pub(super) header: Header,
+    /// The sample's length: the last word may have bytes behind it.
+    pub(super) n_bytes: u64,
+}
+
+/// The length of a head, behind which the items begin.
+pub(super) const fn head_len<M: Message>() -> usize {
+    const { assert!(align_of::<M::Head>() == align_of::<Word>() && align_of::<M::Item>() <= align_of::<Word>()) };
+    size_of::<M::Head>()
+}
+
+/// The length of a sample with so many items.
+pub(super) const fn n_bytes<M: Message>(n_items: usize) -> usize {
+    head_len::<M>() + n_items * size_of::<M::Item>()
+}
+
+/// The words that so many bytes take.
+pub(super) const fn n_words(n_bytes: usize) -> usize {
+    n_bytes.div_ceil(size_of::<Word>())
+}
+
+/// The bytes of a sample that is to be sent.
+pub(super) struct Parts<'a> {
+    pub(super) header: &'a Header,
+    head: &'a [u8],
+    items: &'a [u8],
+}
+
+impl<'a> Parts<'a> {
+    pub(super) fn of<M: Message>(head: &'a M::Head, items: &'a [M::Item]) -> Parts<'a> {
+        Parts { header: M::header(head), head: head_bytes::<M>(head), items: item_bytes::<M>(items) }
+    }
+
+    fn n_bytes(&self) -> usize {
+        self.head.len() + self.items.len()
+    }
+
+    pub(super) fn n_words(&self) -> usize {
+        n_words(self.n_bytes())
+    }
+
+    pub(super) fn envelope(&self) -> Envelope {
+        Envelope { header: *self.header, n_bytes: self.n_bytes() as u64 }
+    }
+
+    /// Writes all of the first [`Parts::n_words`] words.
+    pub(super) fn write(&self, words: &mut [MaybeUninit<Word>]) {
+        let words = &mut words[..self.n_words()];
+        // Behind the items.
+        words.last_mut().map(|word| word.write(0));
+        let begin: *mut u8 = words.as_mut_ptr().cast();
+        // SAFETY: the words are as long as both parts.
+        unsafe {
+            std::ptr::copy_nonoverlapping(self.head.as_ptr(), begin, self.head.len());
+            std::ptr::copy_nonoverlapping(self.items.as_ptr(), begin.add(self.head.len()), self.items.len());
+        }
+    }
+}
+
+/// Whether a sample of this message can have this length.
+pub(super) const fn is_length_of<M: Message>(n_bytes: usize) -> bool {
+    n_bytes >= head_len::<M>() && (n_bytes - head_len::<M>()).is_multiple_of(size_of::<M::Item>())
+}
+
+pub(crate) fn head_bytes<M: Message>(head: &M::Head) -> &[u8] {
+    // SAFETY: heads have no padding (a test of crates/messages), so that each of their bytes is initialised.
+    unsafe { std::slice::from_raw_parts(std::ptr::from_ref(head).cast(), size_of::<M::Head>()) }
+}
+
+pub(crate) fn item_bytes<M: Message>(items: &[M::Item]) -> &[u8] {
+    // SAFETY: as for heads.
+    unsafe { std::slice::from_raw_parts(items.as_ptr().cast(), size_of_val(items)) }
+}
+
+/// A head of these bytes; `None` if it has another length.
+pub(crate) fn head_of<M: Message>(bytes: &[u8]) -> Option<M::Head> {
+    // SAFETY: the length is that of a head, and no bytes are invalid as a head, because enums travel as integers.
+    (bytes.len() == size_of::<M::Head>()).then(|| unsafe { std::ptr::read_unaligned(bytes.as_ptr().cast()) })
+}
+
+/// The items of these bytes; `None` if they are no whole number of items.
+pub(crate) fn items_of<M: Message>(bytes: &[u8]) -> Option<Vec<M::Item>> {
+    if !bytes.len().is_multiple_of(size_of::<M::Item>()) {
+        return None;
+    }
+    let mut items = vec![M::Item::default(); bytes.len() / size_of::<M::Item>()];
+    // SAFETY: the memory is as long as the bytes, and no bytes are invalid as items.
+    unsafe { std::ptr::copy_nonoverlapping(bytes.as_ptr(), items.as_mut_ptr().cast(), bytes.len()) };
+    Some(items)
+}
+
+#[cfg(test)]
+mod tests {
+    use blindgrasp_messages::{Header, Phase, TactileFrame};
+
+    use super::*;
+
+    #[test]
+    fn heads_and_items_are_read_back_from_their_bytes_and_other_lengths_are_refused() {
+        let frame = TactileFrame { phase: Phase::Settled, cells_newtons: vec![0.25, 3.0], ..TactileFrame::default() };
+        let (head, items) = frame.to_parts(Header { seq: 7, ..Header::default() });
+        let bytes = head_bytes::<TactileFrame>(&head);
+        let read = head_of::<TactileFrame>(bytes).expect("a head");
+        let items = items_of::<TactileFrame>(item_bytes::<TactileFrame>(&items)).expect("items");
+        assert_eq!(read.header, head.header);
+        assert_eq!(TactileFrame::from_parts(&read, &items).expect("a frame"), frame);
+        assert!(head_of::<TactileFrame>(&bytes[1..]).is_none());
+        assert!(items_of::<TactileFrame>(&[0; 15]).is_none());
+    }
+
+    #[test]
+    fn a_sample_has_a_head_and_a_whole_number_of_items() {
+        let least = n_bytes::<TactileFrame>(0);
+        assert!(is_length_of::<TactileFrame>(least) && is_length_of::<TactileFrame>(n_bytes::<TactileFrame>(3)));
+        assert!(!is_length_of::<TactileFrame>(least - 1) && !is_length_of::<TactileFrame>(least + 1));
+    }
+}
