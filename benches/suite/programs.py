@@ -1,5 +1,6 @@
 """The project's programs: how they are built and asked, and what processes take."""
 
+import contextlib
 import functools
 import json
 import os
@@ -104,8 +105,11 @@ def descendants(parent):
 
 def cpu_nanos(pids):
     """The processor time of all threads that live, to the nanosecond."""
-    tasks = [task for pid in pids for task in Path(f"/proc/{pid}/task").glob("*/schedstat")]
-    return sum(int(task.read_text().split()[0]) for task in tasks)
+    nanos = 0
+    for task in (task for pid in pids for task in Path(f"/proc/{pid}/task").glob("*/schedstat")):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            nanos += int(task.read_text().split()[0])
+    return nanos
 
 
 def pss_mib(pids):

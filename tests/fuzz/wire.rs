@@ -118,6 +118,7 @@ fn frame(rng: &mut ChaCha8Rng, message: &[u8]) -> Vec<u8> {
                 exports,
                 is_ready: true,
                 is_cut_off: false,
+                lacks_request: false,
                 run: 0,
             })
         }

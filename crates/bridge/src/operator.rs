@@ -393,8 +393,10 @@ impl<'a> Link<'a> {
             Body::Hello(_) => {}
             Body::Ping { sent_nanos } => {
                 connection.peer.echo_nanos = connection.peer.echo_nanos.max(sent_nanos);
-                let pong = Body::Pong { sent_nanos, received_nanos: now_nanos, answered_nanos: monotonic_nanos() };
-                self.say(idx, KeyKind::Link, pong)?;
+                if connection.peer.answers_ping(now_nanos) {
+                    let pong = Body::Pong { sent_nanos, received_nanos: now_nanos, answered_nanos: monotonic_nanos() };
+                    self.say(idx, KeyKind::Link, pong)?;
+                }
             }
             Body::Pong { sent_nanos, received_nanos, answered_nanos } => {
                 if !connection.peer.clock.add(sent_nanos, received_nanos, answered_nanos, now_nanos) {
@@ -404,6 +406,9 @@ impl<'a> Link<'a> {
             Body::Resume { channel, run, after } => {
                 if let Some(uplink) = connection.uplinks.get_mut(usize::from(channel)) {
                     uplink.outgoing.on_resume(run, after.map(SampleId::from));
+                }
+                if connection.uplinks.iter().all(|uplink| uplink.outgoing.has_request()) {
+                    connection.peer.on_requests();
                 }
             }
             Body::Sample(frame) => self.on_sample(idx, &frame, now_nanos)?,

@@ -288,6 +288,11 @@ impl Outgoing {
         }
     }
 
+    /// Whether the receiver has requested samples since it was cut off.
+    pub fn has_request(&self) -> bool {
+        self.run.is_some()
+    }
+
     /// The next sample that is due; call this until it returns `None`.
     pub fn next(&mut self, now_nanos: u64) -> Option<Next<'_>> {
         let end_position = self.end_position();

@@ -14,8 +14,12 @@ use blindgrasp_operator::link_status::PeerState;
 const HELLO_PAUSE_NANOS: u64 = 250_000_000;
 /// Interval of hellos to a peer that is up.
 const HELLO_PAUSE_UP_NANOS: u64 = 1_000_000_000;
-/// Interval of pings. They measure the peer's clock and tell the peer that this link is alive.
-const PING_PAUSE_NANOS: u64 = 25_000_000;
+/// So many pings are sent within a deadline. They tell the peer that this link is alive.
+const N_PINGS_PER_DEADLINE: u64 = 6;
+/// A peer that is new answers so many pings, for a good estimate of its clock.
+const N_FIRST_PONGS: u64 = 64;
+/// Interval of its answers from then on, which follow the drift of its clock.
+const PONG_PAUSE_NANOS: u64 = 250_000_000;
 /// A peer proves with each hello that its certificate is still valid. Its keys count for this long without a hello, and
 /// for the peer's deadline on top.
 const PROOF_NANOS: u64 = 10 * HELLO_PAUSE_UP_NANOS;
@@ -76,6 +80,10 @@ pub struct Peer {
     past: VecDeque<u64>,
     last_hello_nanos: Option<u64>,
     last_ping_nanos: Option<u64>,
+    /// It came up again after it was cut off here alone: it does not know that its requests for samples no longer count.
+    lacks_request: bool,
+    n_pongs: u64,
+    last_pong_nanos: u64,
 }
 
 /// A change of a peer's state.
@@ -143,6 +151,9 @@ impl Peer {
             past: VecDeque::new(),
             last_hello_nanos: None,
             last_ping_nanos: None,
+            lacks_request: false,
+            n_pongs: 0,
+            last_pong_nanos: 0,
         }
     }
 
@@ -169,10 +180,24 @@ impl Peer {
         if is_due(self.last_hello_nanos, self.hello_pause_nanos(own.is_eager_until_nanos, now_nanos)) {
             bodies.push(self.hello(own, now_nanos));
         }
-        if self.instance.is_some() && is_due(self.last_ping_nanos, PING_PAUSE_NANOS) {
+        if self.instance.is_some() && is_due(self.last_ping_nanos, self.ping_pause_nanos()) {
             self.last_ping_nanos = Some(now_nanos);
             bodies.push(Body::Ping { sent_nanos: now_nanos });
         }
+    }
+
+    fn ping_pause_nanos(&self) -> u64 {
+        self.deadline_nanos / N_PINGS_PER_DEADLINE
+    }
+
+    /// Whether a ping of the peer is answered. A ping alone shows that it is alive, and so few answers measure the clock.
+    pub fn answers_ping(&mut self, now_nanos: u64) -> bool {
+        let is_due = self.n_pongs < N_FIRST_PONGS || now_nanos.saturating_sub(self.last_pong_nanos) >= PONG_PAUSE_NANOS;
+        if is_due {
+            self.n_pongs += 1;
+            self.last_pong_nanos = now_nanos;
+        }
+        is_due
     }
 
     /// When the next frame is due or the peer's deadline passes.
@@ -180,7 +205,7 @@ impl Peer {
         // If the peer is up, this may be too early; then nothing is sent.
         let hello = self.last_hello_nanos.map_or(0, |last| last + self.hello_pause_nanos(0, last));
         let ping = match self.instance {
-            Some(_) => self.last_ping_nanos.map_or(0, |last| last + PING_PAUSE_NANOS),
+            Some(_) => self.last_ping_nanos.map_or(0, |last| last + self.ping_pause_nanos()),
             None => u64::MAX,
         };
         let deadline = match (self.state, self.last_heard_nanos) {
@@ -216,6 +241,7 @@ impl Peer {
             fingerprint: own.fingerprint,
             run: own.run,
             is_cut_off: self.state != PeerState::Up,
+            lacks_request: self.lacks_request,
             exports: exports.collect(),
             is_ready: own.is_ready,
         })
@@ -239,8 +265,20 @@ impl Peer {
         self.last_heard_nanos = Some(now_nanos);
         Ok((self.state == PeerState::Down).then(|| {
             self.come_up();
+            self.ask_for_requests();
             Change::Found
         }))
+    }
+
+    /// Has the next hello, which is due at once, ask for a request. Hellos repeat it until [`Peer::on_requests`].
+    fn ask_for_requests(&mut self) {
+        self.lacks_request = !self.exports.is_empty();
+        self.last_hello_nanos = None;
+    }
+
+    /// It has requested the samples of each channel.
+    pub fn on_requests(&mut self) {
+        self.lacks_request = false;
     }
 
     /// Takes a hello; the second value is whether it must be answered.
@@ -307,9 +345,15 @@ impl Peer {
         self.reason = None;
         let is_anew = self.run.replace(hello.run).is_some_and(|before| before != hello.run);
         match self.state {
-            PeerState::Up if !is_anew => Ok((hello.is_cut_off.then_some(Change::Asked), hello.is_cut_off)),
-            _ => {
+            PeerState::Up if !is_anew => {
+                let is_asked = hello.is_cut_off || hello.lacks_request;
+                Ok((is_asked.then_some(Change::Asked), hello.is_cut_off))
+            }
+            before => {
                 self.come_up();
+                if before == PeerState::Down && !is_anew && !hello.is_cut_off {
+                    self.ask_for_requests();
+                }
                 Ok((Some(if is_anew { Change::FoundAnew } else { Change::Found }), true))
             }
         }
@@ -379,6 +423,7 @@ impl Peer {
         self.heard = [counter, 0];
         self.echo_nanos = 0;
         self.clock = ClockOffset::default();
+        self.n_pongs = 0;
         if self.state == PeerState::Up {
             self.state = PeerState::Down;
         }

@@ -26,7 +26,7 @@ use blindgrasp_messages::read_list;
 use blindgrasp_operator::cursors::SampleId;
 
 /// The version of the protocol. It changes with the frames.
-pub const PROTOCOL: u8 = 3;
+pub const PROTOCOL: u8 = 4;
 /// The first bytes of a frame.
 pub const MAGIC: [u8; 2] = *b"bg";
 /// Maximum size of a frame in bytes; longer input is rejected. The largest message, with 16,384 contacts of up to 66 bytes,
@@ -262,6 +262,8 @@ pub struct Hello {
     pub run: u64,
     /// Whether the sender had lost the receiver and waits for [`Body::Resume`].
     pub is_cut_off: bool,
+    /// The receiver was cut off here and may not know it: its requests for samples no longer count.
+    pub lacks_request: bool,
     /// The channels from the sender to the receiver.
     #[serde(deserialize_with = "channels")]
     pub exports: Vec<ExportedChannel>,

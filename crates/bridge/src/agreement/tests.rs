@@ -13,6 +13,7 @@ fn hello(agreement: &Agreement, candidate: Option<PublicKey>) -> Hello {
         fingerprint: 0,
         run: 0,
         is_cut_off: false,
+        lacks_request: false,
         exports: Vec::new(),
         is_ready: false,
     }

@@ -97,6 +97,61 @@ fn frames_of_strangers_and_replays_are_rejected() {
     assert_eq!(brain.peer.on_frame(KeyKind::Data, 1, 1, 2 * MILLIS), Err(Rejection::Replayed));
 }
 
+/// On a busy machine one link can miss a deadline that the other one does not miss.
+#[test]
+fn a_peer_that_was_cut_off_on_one_side_only_is_asked_for_its_requests_until_they_come() {
+    for is_found_by_hello in [false, true] {
+        let [mut robot, mut brain] = pair();
+        greet(&mut robot, &mut brain, 0);
+        let late_nanos = 2 * DEADLINE_NANOS;
+        assert_eq!(robot.peer.check_deadline(late_nanos), Some(Change::CutOff));
+        let found = if is_found_by_hello {
+            let hello = brain.hello(late_nanos);
+            robot.hear(&hello, late_nanos).expect("taken").0
+        } else {
+            robot.ping(&mut brain, late_nanos).expect("taken")
+        };
+        assert_eq!(found, Some(Change::Found));
+        // A hello that is lost is repeated.
+        for _ in 0..2 {
+            let hello = robot.hello(late_nanos);
+            assert!(!hello.2.is_cut_off);
+            assert_eq!(brain.hear(&hello, late_nanos), Ok((Some(Change::Asked), false)));
+        }
+        robot.peer.on_requests();
+        let hello = robot.hello(late_nanos);
+        assert_eq!(brain.hear(&hello, late_nanos), Ok((None, false)));
+    }
+}
+
+/// Brain sends nothing to robot, and needs no request.
+#[test]
+fn a_peer_without_channels_from_here_is_not_asked() {
+    let [mut robot, mut brain] = pair();
+    greet(&mut robot, &mut brain, 0);
+    brain.peer.check_deadline(2 * DEADLINE_NANOS);
+    assert_eq!(brain.ping(&mut robot, 2 * DEADLINE_NANOS), Ok(Some(Change::Found)));
+    assert!(!brain.hello(2 * DEADLINE_NANOS).2.lacks_request);
+}
+
+#[test]
+fn after_the_first_pings_few_are_answered_until_a_new_instance_comes() {
+    let [mut robot, mut brain] = pair();
+    greet(&mut robot, &mut brain, 0);
+    let pause_nanos = brain.peer.ping_pause_nanos();
+    let answered_within = |brain: &mut Side, begin: u64, n_pings: u64| {
+        (0..n_pings).filter(|&n| brain.peer.answers_ping(begin + n * pause_nanos)).count() as u64
+    };
+    assert_eq!(answered_within(&mut brain, 0, N_FIRST_PONGS), N_FIRST_PONGS);
+    let n_pings = 10 * PONG_PAUSE_NANOS / pause_nanos;
+    let n_answered = answered_within(&mut brain, N_FIRST_PONGS * pause_nanos, n_pings);
+    assert!((5..=10).contains(&n_answered), "{n_answered}");
+    let mut again =
+        Side { own: Own { run: 1, ..own("robot", 5) }, peer: pair().into_iter().next().expect("robot").peer };
+    greet(&mut again, &mut brain, MILLIS);
+    assert_eq!(answered_within(&mut brain, 0, 3), 3);
+}
+
 #[test]
 fn a_new_instance_takes_over_and_frames_of_the_old_one_are_rejected() {
     let [mut robot, mut brain] = pair();

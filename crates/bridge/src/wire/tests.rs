@@ -18,6 +18,7 @@ fn bodies(message: &[u8]) -> Vec<Body<'_>> {
         fingerprint: u64::MAX,
         run: 5,
         is_cut_off: true,
+        lacks_request: true,
         exports: vec![channel; 3],
         is_ready: true,
     };
@@ -140,6 +141,7 @@ fn names_are_short_and_printable_and_lists_are_not_endless() {
             fingerprint: 1,
             run: 2,
             is_cut_off: false,
+            lacks_request: false,
             exports: vec![channel; n_exports],
             is_ready: true,
         });
