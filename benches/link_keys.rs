@@ -84,6 +84,7 @@ fn hello() -> Hello {
         fingerprint: 1,
         run: 1,
         is_cut_off: false,
+        lacks_request: false,
         exports: Vec::new(),
         is_ready: true,
     }
