@@ -20,7 +20,7 @@ const N_REPEATS: usize = 5;
 fn main() -> anyhow::Result<()> {
     let [sender, receiver] = pair()?;
     for n_bytes in [64, 1000, 2000] {
-        let plain = [b"bg\x03\0".as_slice(), &vec![7; n_bytes]].concat();
+        let plain = [b"bg\x04\0".as_slice(), &vec![7; n_bytes]].concat();
         let mut frame = Vec::with_capacity(2 * plain.len());
         let encrypt = nanos(10_000, || {
             frame.clear();

@@ -20,7 +20,7 @@ use blindgrasp_operator::wiring::Clock;
 use blindgrasp_replay::player::{Player, Playing, Program};
 use blindgrasp_replay::selection::Selection;
 
-use crate::{Form, SHIPPED, operators_of};
+use crate::{form_of, operators_of};
 
 thread_local! {
     static N_ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
@@ -46,12 +46,8 @@ unsafe impl GlobalAlloc for Counting {
     }
 }
 
-fn of_args(args: &[String]) -> Form {
-    SHIPPED.iter().find(|shipped| args.last().is_some_and(|name| name == shipped.name)).expect("shipped").form
-}
-
 fn describe(_program: &Path, args: &[String]) -> Result<OperatorDescription, String> {
-    Ok((of_args(args).describe)())
+    Ok((form_of(args).expect("shipped").describe)())
 }
 
 /// iceoryx2 0.10 itself allocates so often for a sample that is sent: 48 bytes that count who holds it.
@@ -79,7 +75,7 @@ fn no_stage_allocates_for_a_sample_once_it_is_warm() {
     let plan = Plan::new(&graph, namespace.name(), namespace.wiring(), &BTreeSet::from([port.clone()]), options);
     let _cursors = plan.create_cursors().expect("cursors");
     let wiring = |idx: usize| plan.wiring(&graph.nodes[idx], 0, false).expect("planned");
-    let of_node = |idx: usize| of_args(&graph.nodes[idx].args);
+    let of_node = |idx: usize| form_of(&graph.nodes[idx].args).expect("shipped");
 
     let node = namespace::join(namespace.wiring(), "reader").expect("joined");
     let cursors = Arc::new(SharedCursors::open(Path::new(&namespace.wiring().cursors)).expect("cursors"));
@@ -118,7 +114,7 @@ fn no_stage_allocates_for_a_sample_once_it_is_warm() {
             *n_that_allocated += u64::from(has_allocated && warm.is_some());
         }
         while let Some(sample) = decisions.receive().expect("received") {
-            decisions.commit(&sample.user_header().header);
+            decisions.commit(&sample.head().header);
             n_decisions += 1;
         }
         if n_frames == 1000 {

@@ -77,14 +77,18 @@ pub const SHIPPED: [Shipped; 11] = [
     Shipped::new(LINK_OPERATOR, link::describe, link::work, |_| Ok(())),
 ];
 
+/// The operator of this name with these arguments, if there is one.
+pub fn form_named(name: &str, arguments: &[&str]) -> Option<Form> {
+    SHIPPED.iter().find(|shipped| shipped.name == name)?.with_arguments(arguments)
+}
+
 /// The operator that blindgrasp runs with these arguments, `operator NAME [VARIANT]`; `None` for those of another program.
 pub fn form_of(args: &[String]) -> Option<Form> {
-    let [word, name, arguments @ ..] = args else {
-        return None;
-    };
-    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-    let shipped = SHIPPED.iter().find(|shipped| word == "operator" && shipped.name == name)?;
-    shipped.with_arguments(&arguments)
+    let args: Vec<&str> = args.iter().map(String::as_str).collect();
+    match args.as_slice() {
+        ["operator", name, arguments @ ..] => form_named(name, arguments),
+        _ => None,
+    }
 }
 
 /// These operators as a dataflow file can name them. `program` must run each as `PROGRAM operator NAME`, as blindgrasp does.

@@ -157,8 +157,8 @@ impl<M: Message> Forward for Edge<M> {
         let Some(sample) = self.subscriber.receive()? else {
             return Ok(Forwarded::NoSample);
         };
-        let header = *M::header(sample.user_header());
-        let message = M::from_parts(sample.user_header(), sample.payload());
+        let header = *M::header(sample.head());
+        let message = M::from_parts(sample.head(), sample.items());
         self.subscriber.commit(&header);
         let message = match message {
             Ok(message) => message,

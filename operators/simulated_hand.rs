@@ -368,8 +368,8 @@ impl Inbox {
     fn receive(&mut self) -> anyhow::Result<bool> {
         let before = self.last;
         while let Some(sample) = self.subscriber.receive()? {
-            let head = sample.user_header();
-            let decision = LiftDecision::from_parts(head, sample.payload()).unwrap_or_else(|error| {
+            let head = sample.head();
+            let decision = LiftDecision::from_parts(head, sample.items()).unwrap_or_else(|error| {
                 tracing::warn!(seq = head.header.seq, "a decision cannot be read, so its grasp is held: {error}");
                 LiftDecision { grasp_id: head.grasp_id, ..LiftDecision::default() }
             });

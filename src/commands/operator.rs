@@ -7,7 +7,7 @@ use blindgrasp_graph::operators::HOST_OPERATOR;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::host;
 use blindgrasp_operator::operator::{self, GroupMember, name_process};
-use blindgrasp_operators::{Form, SHIPPED};
+use blindgrasp_operators::{SHIPPED, form_named};
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 
@@ -52,7 +52,7 @@ pub(crate) fn run(arguments: &Arguments) -> ExitCode {
     }
     let given: Vec<&str> =
         arguments.arguments.iter().map(String::as_str).filter(|text| *text != "--describe").collect();
-    let Some(form) = form(name, &given) else {
+    let Some(form) = form_named(name, &given) else {
         let variants = SHIPPED.iter().filter(|shipped| shipped.name == name).flat_map(|shipped| shipped.variants);
         let known: Vec<&str> = variants.map(|(argument, _)| *argument).collect();
         let known =
@@ -69,12 +69,8 @@ pub(crate) fn run(arguments: &Arguments) -> ExitCode {
 fn member(args: &[String]) -> Option<GroupMember> {
     let (name, arguments) = args.split_first()?;
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-    let form = form(name, &arguments)?;
+    let form = form_named(name, &arguments)?;
     Some(((form.describe)(), form.work))
-}
-
-fn form(name: &str, arguments: &[&str]) -> Option<Form> {
-    SHIPPED.iter().find(|shipped| shipped.name == name)?.with_arguments(arguments)
 }
 
 fn names() -> PossibleValuesParser {

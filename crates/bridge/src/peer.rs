@@ -14,7 +14,7 @@ use blindgrasp_operator::link_status::PeerState;
 const HELLO_PAUSE_NANOS: u64 = 250_000_000;
 /// Interval of hellos to a peer that is up.
 const HELLO_PAUSE_UP_NANOS: u64 = 1_000_000_000;
-/// So many pings are sent within a deadline. They tell the peer that this link is alive.
+/// So many pings are sent within a deadline, or more. They tell the peer that this link is alive.
 const N_PINGS_PER_DEADLINE: u64 = 6;
 /// A peer that is new answers so many pings, for a good estimate of its clock.
 const N_FIRST_PONGS: u64 = 64;
@@ -187,7 +187,7 @@ impl Peer {
     }
 
     fn ping_pause_nanos(&self) -> u64 {
-        self.deadline_nanos / N_PINGS_PER_DEADLINE
+        (self.deadline_nanos / N_PINGS_PER_DEADLINE).min(PONG_PAUSE_NANOS)
     }
 
     /// Whether a ping of the peer is answered. A ping alone shows that it is alive, and so few answers measure the clock.
@@ -349,9 +349,10 @@ impl Peer {
                 let is_asked = hello.is_cut_off || hello.lacks_request;
                 Ok((is_asked.then_some(Change::Asked), hello.is_cut_off))
             }
-            before => {
+            _ => {
                 self.come_up();
-                if before == PeerState::Down && !is_anew && !hello.is_cut_off {
+                // It may not know that it was cut off or refused here. A new instance requests samples by itself.
+                if is_in_use && !is_anew && !hello.is_cut_off {
                     self.ask_for_requests();
                 }
                 Ok((Some(if is_anew { Change::FoundAnew } else { Change::Found }), true))
@@ -424,6 +425,9 @@ impl Peer {
         self.echo_nanos = 0;
         self.clock = ClockOffset::default();
         self.n_pongs = 0;
+        // Without a ping at once, its first samples would have no age.
+        self.last_ping_nanos = None;
+        self.lacks_request = false;
         if self.state == PeerState::Up {
             self.state = PeerState::Down;
         }

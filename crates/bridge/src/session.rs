@@ -13,8 +13,8 @@ use blindgrasp_operator::control_socket;
 
 /// Maximum length of Zenoh's sending queue in batches: the largest value that Zenoh allows.
 const QUEUE_BATCHES: usize = 16;
-/// A message that waits longer for the connection is dropped and requested again. This is well below the interval of
-/// pings.
+/// A message that waits longer for the connection is dropped and requested again. This is below the shortest
+/// deadline.
 const DROP_MICROS: i64 = 15_000;
 /// Zenoh closes a connection after this silence. The link itself notices silence sooner: see
 /// [`LinkConfig::deadline_millis`].

@@ -183,10 +183,10 @@ impl<M: Message> Reader for Subscriber<M> {
         let Some(received) = self.receive()? else {
             return Ok(None);
         };
-        let head = received.user_header();
+        let head = received.head();
         let header = *M::header(head);
         let mut message = Vec::new();
-        if let Err(error) = sample::encode::<M>(head, received.payload(), &mut message) {
+        if let Err(error) = sample::encode::<M>(head, received.items(), &mut message) {
             tracing::warn!(port, seq = header.seq, "a sample cannot be sent: {error}");
             message = sample::encode_unreadable(sample_id(&header)).to_vec();
         }

@@ -241,6 +241,15 @@ fn the_python_file_is_up_to_date() {
     );
 }
 
+/// Ports read the header of any message there.
+#[test]
+fn each_head_begins_with_the_header() {
+    for MessageLayout { name, head, .. } in layouts() {
+        let first = &head.fields[0];
+        assert_eq!((first.name, first.offset, first.type_name.as_str()), ("header", 0, "Header"), "{name}");
+    }
+}
+
 #[test]
 fn no_struct_has_padding() {
     for Struct { name, n_bytes, fields, .. } in structs() {

@@ -384,10 +384,10 @@ impl<M: Message> PairedInput for PartnerInput<M> {
                 }
                 return Ok(());
             };
-            let head = *sample.user_header();
+            let head = *sample.head();
             let mut items = self.spare.pop().unwrap_or_default();
             items.clear();
-            items.extend_from_slice(sample.payload());
+            items.extend_from_slice(sample.items());
             drop(sample);
             if is_active {
                 self.retained.receive(sample_id(M::header(&head)), self.subscriber.counts(), monotonic_nanos());

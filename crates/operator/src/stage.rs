@@ -382,7 +382,7 @@ impl<S: Stage> Instance<S> {
         {
             self.operator.beat();
             self.answers.clear();
-            let head = sample.user_header();
+            let head = sample.head();
             let header = *S::In::header(head);
             if self.operator.skips(sample_id(&header)) {
                 self.skip(&header)?;
@@ -398,7 +398,7 @@ impl<S: Stage> Instance<S> {
                 self.judge_lateness(S::In::header_mut(&mut head));
             }
             self.operator.works_on(Some(sample_id(&header)));
-            self.stage.answer(&head, sample.payload(), arrival_nanos, &mut self.answers);
+            self.stage.answer(&head, sample.items(), arrival_nanos, &mut self.answers);
             self.operator.works_on(None);
             let sent = if self.has_state { self.keep(Some(sample))? } else { self.send(sample)? };
             if sent == Sent::GaveWay {
@@ -463,7 +463,7 @@ impl<S: Stage> Instance<S> {
 
     /// Answers a sample without saving anything.
     fn send(&mut self, sample: PortSample<S::In>) -> anyhow::Result<Sent> {
-        let header = *S::In::header(sample.user_header());
+        let header = *S::In::header(sample.head());
         if self.send_answers(Some(&header))? == Sent::GaveWay {
             // Another instance finds the sample in its own queue; this one finds it here if it is active again, or still is.
             self.subscriber.put_back(sample);
@@ -500,7 +500,7 @@ impl<S: Stage> Instance<S> {
     /// Takes the answers of a stage with state to a sample, or to none. They are saved with its state before they are sent: a
     /// kill at any moment neither loses an answer nor makes another one under the same number.
     fn keep(&mut self, sample: Option<PortSample<S::In>>) -> anyhow::Result<Sent> {
-        let answered = sample.as_ref().map(|sample| *S::In::header(sample.user_header()));
+        let answered = sample.as_ref().map(|sample| *S::In::header(sample.head()));
         self.name_makers(answered.as_ref());
         self.last = answered.as_ref().map(sample_id).or(self.last);
         for (head, items) in self.answers.iter() {
@@ -522,7 +522,7 @@ impl<S: Stage> Instance<S> {
             return Ok(Sent::GaveWay);
         }
         if let Some(sample) = self.pending.take().and_then(|pending| pending.sample) {
-            self.subscriber.commit(S::In::header(sample.user_header()));
+            self.subscriber.commit(S::In::header(sample.head()));
         }
         Ok(Sent::Yes)
     }
@@ -598,13 +598,13 @@ impl<S: Stage> Instance<S> {
                 return self.look_on_again();
             }
             self.answers.clear();
-            let head = sample.user_header();
+            let head = sample.head();
             if !self.partners.choose(S::In::header(head), false, false)? {
                 shadow.subscriber.put_back(sample);
                 return Ok(());
             }
             let arrival_nanos = arrival_nanos(&self.operator, S::In::header(head));
-            self.stage.answer(head, sample.payload(), arrival_nanos, &mut self.answers);
+            self.stage.answer(head, sample.items(), arrival_nanos, &mut self.answers);
             for (head, items) in self.answers.iter() {
                 shadow.publisher.send(&head, items)?;
             }

@@ -1,6 +1,6 @@
 use super::*;
 
-const PLAIN: &[u8] = b"bg\x03\0a frame";
+const PLAIN: &[u8] = b"bg\x04\0a frame";
 
 fn hello(agreement: &Agreement, candidate: Option<PublicKey>) -> Hello {
     let (key, heard_key) = agreement.for_hello(candidate);

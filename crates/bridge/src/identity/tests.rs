@@ -10,7 +10,7 @@ use crate::certificates::key_files;
 use crate::config::Endpoints;
 use crate::keys::{KeyRequest, make, renew_authority, revoke};
 
-const FRAME: &[u8] = b"bg\x03\0a hello";
+const FRAME: &[u8] = b"bg\x04\0a hello";
 
 fn now() -> OffsetDateTime {
     OffsetDateTime::from_unix_timestamp(1_790_000_000).expect("a time")
@@ -76,7 +76,7 @@ fn a_machine_proves_its_name_to_one_machine_for_one_frame() {
     assert!(refused.contains("'laptop'") && refused.contains("expected that of 'robot'"), "{refused}");
     for refused in [
         laptop.verify("robot", &proof, FRAME, now()),
-        brain.verify("robot", &proof, b"bg\x03\0a hellp", now()),
+        brain.verify("robot", &proof, b"bg\x04\0a hellp", now()),
         brain.verify(
             "robot",
             &Proof { signature: vec![7; 64].into(), ..robot.sign("brain", FRAME, now()).expect("signed") },

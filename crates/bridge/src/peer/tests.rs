@@ -124,6 +124,34 @@ fn a_peer_that_was_cut_off_on_one_side_only_is_asked_for_its_requests_until_they
     }
 }
 
+/// A machine that was refused, because another one spoke in its name, may not know that either.
+#[test]
+fn a_peer_that_was_refused_for_another_one_is_asked_for_its_requests() {
+    let [mut robot, mut brain] = pair();
+    greet(&mut robot, &mut brain, 0);
+    robot.peer.check_deadline(2 * DEADLINE_NANOS);
+    let (_, _, hello) = brain.hello(2 * DEADLINE_NANOS);
+    let other = (77, 1, Hello { heard: None, fingerprint: 8, ..hello });
+    assert!(matches!(robot.hear(&other, 2 * DEADLINE_NANOS), Err(Rejection::Refused(_))));
+    robot.peer.state = PeerState::Refused;
+    let hello = brain.hello(2 * DEADLINE_NANOS);
+    assert_eq!(robot.hear(&hello, 2 * DEADLINE_NANOS).expect("taken").0, Some(Change::Found));
+    assert!(robot.hello(2 * DEADLINE_NANOS).2.lacks_request);
+}
+
+/// A link that was started again requests samples by itself: a second request would send the first samples twice.
+#[test]
+fn a_new_instance_is_not_asked() {
+    let [mut robot, mut brain] = pair();
+    greet(&mut robot, &mut brain, 0);
+    let channels = brain.peer.imports.clone();
+    let peer = Peer::new("robot".into(), vec![], channels, DEADLINE_NANOS, None);
+    let mut again = Side { own: Own { run: 2, ..own("brain", 7) }, peer };
+    greet(&mut again, &mut robot, MILLIS);
+    assert_eq!(robot.peer.state, PeerState::Up);
+    assert!(!robot.hello(MILLIS).2.lacks_request);
+}
+
 /// Brain sends nothing to robot, and needs no request.
 #[test]
 fn a_peer_without_channels_from_here_is_not_asked() {

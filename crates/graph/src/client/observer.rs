@@ -438,8 +438,8 @@ impl<M: Message> AnySubscriber for Typed<M> {
         let Some(sample) = self.subscriber.receive()? else {
             return Ok(None);
         };
-        let head = sample.user_header();
-        let message = M::from_parts(head, sample.payload());
+        let head = sample.head();
+        let message = M::from_parts(head, sample.items());
         if message.is_err() {
             self.n_unreadable += 1;
         }

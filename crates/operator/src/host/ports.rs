@@ -81,7 +81,7 @@ impl<M: Message> InputPort for Input<M> {
         let Some(sample) = self.subscriber.receive()? else {
             return Ok(None);
         };
-        let mut head = *sample.user_header();
+        let mut head = *sample.head();
         let late = self.subscriber.lateness();
         if self.may_expire && late.is_some_and(|(on_late, _)| on_late != OnLate::Count) {
             // The least that says so: see `Header::valid_until_nanos`.
@@ -90,7 +90,7 @@ impl<M: Message> InputPort for Input<M> {
         Ok(Some(RawSample {
             header: *M::header(&head),
             head: head_bytes::<M>(&head).to_vec(),
-            items: item_bytes::<M>(sample.payload()).to_vec(),
+            items: item_bytes::<M>(sample.items()).to_vec(),
             counts: self.subscriber.counts(),
             late,
         }))

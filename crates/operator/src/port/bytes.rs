@@ -2,20 +2,46 @@
 
 use std::mem::MaybeUninit;
 
-use blindgrasp_messages::{Header, Message};
+use blindgrasp_messages::Message;
 use iceoryx2::prelude::ZeroCopySend;
 
 /// The unit in which iceoryx2 lends memory: heads and items need no greater alignment. (Of single bytes that are aligned,
 /// iceoryx2 0.10 takes eight times as much memory.)
 pub(super) type Word = u64;
 
-/// iceoryx2's user header.
-#[derive(Debug, Clone, Copy, Default, ZeroCopySend)]
+/// iceoryx2's user header: the lengths of head and items. The last word may have bytes behind them.
+#[derive(Debug, Clone, Copy, Default, PartialEq, ZeroCopySend)]
 #[repr(C)]
+#[type_name("blindgrasp/Envelope/1")]
 pub(crate) struct Envelope {
-    pub(super) header: Header,
-    /// The sample's length: the last word may have bytes behind it.
-    pub(super) n_bytes: u64,
+    pub(super) n_head_bytes: u32,
+    pub(super) n_item_bytes: u32,
+}
+
+/// The bytes that a message's head and each of its items take.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Layout {
+    pub(super) type_name: &'static str,
+    n_head_bytes: usize,
+    n_bytes_per_item: usize,
+}
+
+impl Layout {
+    pub(super) const fn of<M: Message>() -> Layout {
+        Layout { type_name: M::TYPE_NAME, n_head_bytes: head_len::<M>(), n_bytes_per_item: size_of::<M::Item>() }
+    }
+
+    /// The words that a sample with so many items takes.
+    pub(super) const fn n_words(&self, n_items: usize) -> usize {
+        n_words(self.n_head_bytes + n_items * self.n_bytes_per_item)
+    }
+
+    /// The length of a sample with this envelope in so many words; `None` if it is no sample of this message.
+    pub(super) fn n_bytes(&self, envelope: Envelope, n_words: usize) -> Option<usize> {
+        let [head, items] = [envelope.n_head_bytes, envelope.n_item_bytes].map(|n_bytes| n_bytes as usize);
+        let is_whole = head == self.n_head_bytes && items.is_multiple_of(self.n_bytes_per_item);
+        (is_whole && head + items <= n_words * size_of::<Word>()).then_some(head + items)
+    }
 }
 
 /// The length of a head, behind which the items begin.
@@ -24,29 +50,23 @@ pub(super) const fn head_len<M: Message>() -> usize {
     size_of::<M::Head>()
 }
 
-/// The length of a sample with so many items.
-pub(super) const fn n_bytes<M: Message>(n_items: usize) -> usize {
-    head_len::<M>() + n_items * size_of::<M::Item>()
-}
-
 /// The words that so many bytes take.
-pub(super) const fn n_words(n_bytes: usize) -> usize {
+const fn n_words(n_bytes: usize) -> usize {
     n_bytes.div_ceil(size_of::<Word>())
 }
 
 /// The bytes of a sample that is to be sent.
 pub(super) struct Parts<'a> {
-    pub(super) header: &'a Header,
     head: &'a [u8],
     items: &'a [u8],
 }
 
 impl<'a> Parts<'a> {
     pub(super) fn of<M: Message>(head: &'a M::Head, items: &'a [M::Item]) -> Parts<'a> {
-        Parts { header: M::header(head), head: head_bytes::<M>(head), items: item_bytes::<M>(items) }
+        Parts { head: head_bytes::<M>(head), items: item_bytes::<M>(items) }
     }
 
-    fn n_bytes(&self) -> usize {
+    pub(super) fn n_bytes(&self) -> usize {
         self.head.len() + self.items.len()
     }
 
@@ -55,14 +75,16 @@ impl<'a> Parts<'a> {
     }
 
     pub(super) fn envelope(&self) -> Envelope {
-        Envelope { header: *self.header, n_bytes: self.n_bytes() as u64 }
+        Envelope { n_head_bytes: self.head.len() as u32, n_item_bytes: self.items.len() as u32 }
     }
 
     /// Writes all of the first [`Parts::n_words`] words.
     pub(super) fn write(&self, words: &mut [MaybeUninit<Word>]) {
         let words = &mut words[..self.n_words()];
         // Behind the items.
-        words.last_mut().map(|word| word.write(0));
+        if let Some(last) = words.last_mut() {
+            last.write(0);
+        }
         let begin: *mut u8 = words.as_mut_ptr().cast();
         // SAFETY: the words are as long as both parts.
         unsafe {
@@ -70,11 +92,6 @@ impl<'a> Parts<'a> {
             std::ptr::copy_nonoverlapping(self.items.as_ptr(), begin.add(self.head.len()), self.items.len());
         }
     }
-}
-
-/// Whether a sample of this message can have this length.
-pub(super) const fn is_length_of<M: Message>(n_bytes: usize) -> bool {
-    n_bytes >= head_len::<M>() && (n_bytes - head_len::<M>()).is_multiple_of(size_of::<M::Item>())
 }
 
 pub(crate) fn head_bytes<M: Message>(head: &M::Head) -> &[u8] {
@@ -124,9 +141,15 @@ mod tests {
     }
 
     #[test]
-    fn a_sample_has_a_head_and_a_whole_number_of_items() {
-        let least = n_bytes::<TactileFrame>(0);
-        assert!(is_length_of::<TactileFrame>(least) && is_length_of::<TactileFrame>(n_bytes::<TactileFrame>(3)));
-        assert!(!is_length_of::<TactileFrame>(least - 1) && !is_length_of::<TactileFrame>(least + 1));
+    fn a_sample_of_other_lengths_is_refused() {
+        let layout = Layout::of::<TactileFrame>();
+        let head = size_of::<<TactileFrame as Message>::Head>() as u32;
+        let n_words = layout.n_words(3);
+        let n_bytes = |n_head_bytes, n_item_bytes| layout.n_bytes(Envelope { n_head_bytes, n_item_bytes }, n_words);
+        assert_eq!(n_bytes(head, 24), Some(head as usize + 24));
+        assert_eq!(n_bytes(head, 0), Some(head as usize));
+        for (head, items) in [(head + 8, 16), (head - 8, 24), (head, 23), (head, 32), (u32::MAX, u32::MAX)] {
+            assert_eq!(n_bytes(head, items), None, "{head} {items}");
+        }
     }
 }

@@ -1,10 +1,10 @@
 //! Publisher and subscriber of one message type over iceoryx2.
 //!
-//! iceoryx2 carries the bytes of samples, and their [`Header`] beside them: ports of all messages are the same code, which is compiled
+//! iceoryx2 carries the bytes of samples, and their lengths beside them: ports of all messages are the same code, which is compiled
 //! once ([`UntypedPublisher`], [`UntypedSubscriber`]). [`Publisher`] and [`Subscriber`] give the bytes their type; the name of the
-//! type is compared when a port opens.
+//! type is compared when a port opens, and the lengths when a sample comes.
 //!
-//! A port is a publish-subscribe service and an event service of one name, with safe overflow: iceoryx2 itself never
+//! A port is a publish-subscribe service, with safe overflow, whose readers are woken by bells in the cursors: iceoryx2 itself never
 //! blocks, and a reader that is behind keeps its newest samples. Credit makes an edge lossless: the publisher reads on
 //! the [cursors](crate::cursors) how far each reader of a lossless edge has come, and waits, for a bounded time, before it
 //! overtakes a reader by more than its capacity. Its history reaches back as far, so a reader that comes back after a
@@ -25,7 +25,8 @@ use blindgrasp_messages::Header;
 
 pub(crate) use publisher::{LONGEST_TRY, LOOK_PAUSE, RETRY_PAUSE};
 pub use publisher::{Publisher, Sent, ShadowPublisher, UntypedPublisher};
-pub use sample::{PortSample, UntypedSample};
+pub use sample::PortSample;
+use sample::UntypedSample;
 pub use subscriber::{Subscriber, UntypedSubscriber};
 
 /// Why a port does not work. The sources are errors of iceoryx2.
@@ -33,8 +34,8 @@ pub use subscriber::{Subscriber, UntypedSubscriber};
 pub enum PortError {
     #[error("port {service} carries {found}, expected {expected}")]
     WrongType { service: String, found: String, expected: &'static str },
-    #[error("port {service} received {n_bytes} bytes, which are no {expected}: its writer is of another version")]
-    WrongLength { service: String, n_bytes: u64, expected: &'static str },
+    #[error("port {service}: a sample has not the lengths of {expected}: its writer was built with another version")]
+    WrongLength { service: String, expected: &'static str },
     #[error("port {service} cannot be opened")]
     Open { service: String, source: BoxedError },
     #[error("port {service} cannot be connected")]

@@ -10,7 +10,7 @@ use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, ipc};
 use iceoryx2::service::port_factory::PortFactory;
 
-use super::bytes::{Envelope, Parts, Word, n_bytes, n_words};
+use super::bytes::{Envelope, Layout, Parts, Word};
 use super::service::{self, Connections, PubSub};
 use super::{PortError, sample_id};
 use crate::credit::{Credit, Reader};
@@ -51,20 +51,16 @@ struct Sender {
     connections: Connections,
 }
 
-/// A message's name, and the memory for its samples.
+/// The memory for the samples of a message.
 struct Room {
-    type_name: &'static str,
-    n_words: usize,
+    layout: Layout,
+    n_items: usize,
     strategy: AllocationStrategy,
 }
 
 impl Room {
     fn of<M: Message>(max_items: usize) -> Room {
-        Room {
-            type_name: M::TYPE_NAME,
-            n_words: n_words(n_bytes::<M>(max_items)),
-            strategy: AllocationStrategy::Static,
-        }
+        Room { layout: Layout::of::<M>(), n_items: max_items, strategy: AllocationStrategy::Static }
     }
 
     /// A larger message takes more memory.
@@ -81,12 +77,12 @@ impl Sender {
         wiring: &ServiceWiring,
         room: &Room,
     ) -> Result<Self, PortError> {
-        let pub_sub = service::pub_sub(node, wiring, room.type_name)?;
+        let pub_sub = service::pub_sub(node, wiring, room.layout.type_name)?;
         let connections = Connections::default();
         let publisher = pub_sub
             .publisher_builder()
             .set_degradation_handler(connections.handler())
-            .initial_max_slice_len(room.n_words)
+            .initial_max_slice_len(room.layout.n_words(room.n_items))
             .allocation_strategy(room.strategy)
             .backpressure_strategy(BackpressureStrategy::DiscardData)
             .create()
@@ -95,8 +91,8 @@ impl Sender {
         Ok(Sender { service, pub_sub, publisher, cursors, bells, n_subscribers: 0, connections })
     }
 
-    fn send(&self, parts: &Parts<'_>) -> Result<(), PortError> {
-        let failed = |source| PortError::Send { service: self.service.clone(), seq: parts.header.seq, source };
+    fn send(&self, seq: u64, parts: &Parts<'_>) -> Result<(), PortError> {
+        let failed = |source| PortError::Send { service: self.service.clone(), seq, source };
         let mut sample = self.publisher.loan_slice_uninit(parts.n_words()).map_err(|error| failed(error.into()))?;
         *sample.user_header_mut() = parts.envelope();
         parts.write(sample.payload_mut());
@@ -307,7 +303,7 @@ impl UntypedPublisher {
         // It is counted first: a publisher that is killed in between sends it again, and it is counted once. The other way
         // round, a reader could answer a sample that is not counted.
         self.slot().commit(key);
-        self.sender.send(parts)?;
+        self.sender.send(key.seq, parts)?;
         self.credit.has_sent(key);
         if !self.has_sent_all.load(Ordering::Relaxed) {
             self.has_sent_all.store(self.credit.has_sent_all(self.written()), Ordering::Relaxed);
@@ -533,6 +529,6 @@ impl<M: Message> ShadowPublisher<M> {
     /// # Errors
     /// An error of iceoryx2.
     pub fn send(&self, head: &M::Head, items: &[M::Item]) -> Result<(), PortError> {
-        self.sender.send(&Parts::of::<M>(head, items))
+        self.sender.send(M::header(head).seq, &Parts::of::<M>(head, items))
     }
 }

@@ -3,70 +3,81 @@
 use std::marker::PhantomData;
 
 use blindgrasp_messages::{Header, Message};
-use iceoryx2::prelude::ipc;
+use iceoryx2::prelude::{ZeroCopySend, ipc};
 use iceoryx2::sample::Sample;
 
-use super::bytes::{Envelope, Parts, Word, head_len, is_length_of};
+use super::bytes::{Envelope, Layout, Parts, Word, head_len};
 use super::sample_id;
 use crate::cursors::SampleId;
 
 /// The bytes of a sample, whatever its message.
-pub struct UntypedSample(Place);
+pub(crate) struct UntypedSample {
+    place: Place,
+    /// Checked once: a writer could change what its envelope says.
+    n_bytes: usize,
+}
 
 enum Place {
     /// In shared memory, borrowed from its publisher.
     Lent(Sample<ipc::Service, [Word], Envelope>),
-    Copied(Envelope, Vec<Word>),
+    Copied(Vec<Word>),
 }
 
 impl UntypedSample {
-    /// `None` if its envelope says that it is longer than it is.
-    pub(super) fn lent(sample: Sample<ipc::Service, [Word], Envelope>) -> Option<Self> {
-        let is_whole = sample.user_header().n_bytes <= size_of_val(sample.payload()) as u64;
-        is_whole.then_some(UntypedSample(Place::Lent(sample)))
+    /// `None` if it is no sample of this message.
+    pub(super) fn lent(sample: Sample<ipc::Service, [Word], Envelope>, layout: &Layout) -> Option<Self> {
+        let n_bytes = layout.n_bytes(*sample.user_header(), sample.payload().len())?;
+        Some(UntypedSample { place: Place::Lent(sample), n_bytes })
     }
 
-    fn parts(&self) -> (&Envelope, &[Word]) {
-        match &self.0 {
-            Place::Lent(sample) => (sample.user_header(), sample.payload()),
-            Place::Copied(envelope, words) => (envelope, words),
+    fn words(&self) -> &[Word] {
+        match &self.place {
+            Place::Lent(sample) => sample.payload(),
+            Place::Copied(words) => words,
         }
     }
 
+    /// Head and items.
+    fn bytes(&self) -> &[u8] {
+        let words = self.words();
+        let n_bytes = self.n_bytes.min(size_of_val(words));
+        // SAFETY: the words have at least so many bytes.
+        unsafe { std::slice::from_raw_parts(words.as_ptr().cast(), n_bytes) }
+    }
+
+    /// The header, with which each head begins.
     pub(super) fn header(&self) -> &Header {
-        &self.parts().0.header
+        self.beginning()
+    }
+
+    /// What the bytes begin with: a header, or a head of the message.
+    fn beginning<T: ZeroCopySend>(&self) -> &T {
+        const { assert!(align_of::<T>() <= align_of::<Word>()) };
+        let bytes = &self.bytes()[..size_of::<T>()];
+        // SAFETY: the bytes are as many, and begin with a word. None are invalid, because enums travel as integers.
+        unsafe { &*bytes.as_ptr().cast() }
     }
 
     pub(super) fn key(&self) -> SampleId {
         sample_id(self.header())
     }
 
-    /// Head and items.
-    pub(super) fn bytes(&self) -> &[u8] {
-        let (envelope, words) = self.parts();
-        // SAFETY: the words have at least so many bytes, see `UntypedSample::lent`.
-        unsafe { std::slice::from_raw_parts(words.as_ptr().cast(), envelope.n_bytes as usize) }
-    }
-
     /// The sample in memory of this process, so that its publisher gets its own back. For each sample that a publisher must
     /// be able to lend at a time, iceoryx2 reserves 3.6 KB in each of its subscribers.
     pub(super) fn copied(self) -> Self {
-        let (envelope, words) = self.parts();
-        UntypedSample(Place::Copied(*envelope, words.to_vec()))
+        UntypedSample { place: Place::Copied(self.words().to_vec()), n_bytes: self.n_bytes }
     }
 }
 
 /// A sample that was received.
 pub struct PortSample<M: Message> {
-    /// Its length is one of this message's.
     sample: UntypedSample,
     message: PhantomData<M>,
 }
 
 impl<M: Message> PortSample<M> {
-    /// `None` if no sample of this message has this length.
-    pub(super) fn of_untyped(sample: UntypedSample) -> Option<Self> {
-        is_length_of::<M>(sample.bytes().len()).then_some(PortSample { sample, message: PhantomData })
+    pub(super) fn of_untyped(sample: UntypedSample) -> Self {
+        PortSample { sample, message: PhantomData }
     }
 
     /// A sample that was received before, from a copy.
@@ -76,22 +87,20 @@ impl<M: Message> PortSample<M> {
         parts.write(words.spare_capacity_mut());
         // SAFETY: so many words were written.
         unsafe { words.set_len(parts.n_words()) };
-        PortSample { sample: UntypedSample(Place::Copied(parts.envelope(), words)), message: PhantomData }
+        PortSample::of_untyped(UntypedSample { place: Place::Copied(words), n_bytes: parts.n_bytes() })
     }
 
     pub(super) fn into_untyped(self) -> UntypedSample {
         self.sample
     }
 
-    pub fn user_header(&self) -> &M::Head {
-        // SAFETY: the length was checked and the bytes begin with a word. No bytes are invalid as a head,
-        // because enums travel as integers.
-        unsafe { &*self.sample.bytes().as_ptr().cast() }
+    pub fn head(&self) -> &M::Head {
+        self.sample.beginning()
     }
 
-    pub fn payload(&self) -> &[M::Item] {
+    pub fn items(&self) -> &[M::Item] {
         let items = &self.sample.bytes()[head_len::<M>()..];
-        // SAFETY: as for the head; the items begin at a multiple of their alignment.
+        // SAFETY: the items begin at a multiple of their alignment, and no bytes are invalid as items.
         unsafe { std::slice::from_raw_parts(items.as_ptr().cast(), items.len() / size_of::<M::Item>()) }
     }
 }
@@ -107,15 +116,8 @@ mod tests {
         let frame = TactileFrame { phase: Phase::Settled, cells_newtons: vec![0.25, 3.0], ..TactileFrame::default() };
         let (head, items) = frame.to_parts(Header { seq: 7, ..Header::default() });
         let sample = PortSample::<TactileFrame>::of_copy(&head, &items);
-        let sample =
-            PortSample::<TactileFrame>::of_untyped(sample.into_untyped().copied()).expect("a length of a frame");
-        assert_eq!(TactileFrame::from_parts(sample.user_header(), sample.payload()).expect("a frame"), frame);
+        let sample = PortSample::<TactileFrame>::of_untyped(sample.into_untyped().copied());
+        assert_eq!(TactileFrame::from_parts(sample.head(), sample.items()).expect("a frame"), frame);
         assert_eq!(sample.sample.key(), SampleId { epoch: 0, seq: 7 });
-    }
-
-    #[test]
-    fn a_sample_of_another_length_is_refused() {
-        let sample = UntypedSample(Place::Copied(Envelope { n_bytes: 3, ..Envelope::default() }, vec![0]));
-        assert!(PortSample::<TactileFrame>::of_untyped(sample).is_none());
     }
 }

@@ -12,7 +12,7 @@ use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
 use iceoryx2::prelude::{Node, ipc};
 use iceoryx2::service::port_factory::PortFactory;
 
-use super::bytes::{Envelope, Word};
+use super::bytes::{Envelope, Layout, Word};
 use super::service::{self, Connections, PubSub};
 use super::{PortError, PortSample, UntypedSample, sample_id};
 use crate::cursors::{SampleId, SharedCursors};
@@ -62,7 +62,7 @@ impl<M: Message> Subscriber<M> {
         cursors: Option<&Arc<SharedCursors>>,
         wiring: &InputWiring,
     ) -> Result<Self, PortError> {
-        let port = UntypedSubscriber::open(node, cursors, wiring, M::TYPE_NAME)?;
+        let port = UntypedSubscriber::open(node, cursors, wiring, Layout::of::<M>())?;
         Ok(Subscriber { port, message: PhantomData })
     }
 
@@ -71,29 +71,24 @@ impl<M: Message> Subscriber<M> {
     /// # Errors
     /// An error of iceoryx2, or a sample that is not of this message.
     pub fn receive(&mut self) -> Result<Option<PortSample<M>>, PortError> {
-        let Some(sample) = self.port.receive()? else {
-            return Ok(None);
-        };
-        let n_bytes = sample.bytes().len() as u64;
-        PortSample::of_untyped(sample).map(Some).ok_or_else(|| self.port.wrong_length(n_bytes))
+        Ok(self.port.receive()?.map(PortSample::of_untyped))
     }
 
     /// Keeps a sample that was not answered, in case that this reader goes on.
     pub fn put_back(&mut self, sample: PortSample<M>) {
-        let sample = sample.into_untyped();
-        self.port.put_back.push_back((sample.key(), sample));
+        self.port.put_back.push_back(sample.into_untyped());
     }
 
     /// A sample that was kept without an answer.
     pub(crate) fn take_back(&mut self) -> Option<PortSample<M>> {
-        self.port.put_back.pop_front().and_then(|(_, sample)| PortSample::of_untyped(sample))
+        self.port.put_back.pop_front().map(PortSample::of_untyped)
     }
 }
 
 /// The receiving end of an edge, whatever its message.
 pub struct UntypedSubscriber {
     service: String,
-    type_name: &'static str,
+    layout: Layout,
     pub_sub: PubSub,
     subscriber: Port,
     connections: Connections,
@@ -108,7 +103,7 @@ pub struct UntypedSubscriber {
     /// Whether samples wait for those before them. On an edge that may drop samples, they don't.
     may_hold: bool,
     /// Samples that were taken and not answered, the first one first.
-    put_back: VecDeque<(SampleId, UntypedSample)>,
+    put_back: VecDeque<UntypedSample>,
     sequencer: Sequencer<UntypedSample>,
 }
 
@@ -117,9 +112,9 @@ impl UntypedSubscriber {
         node: &Node<ipc::Service>,
         cursors: Option<&Arc<SharedCursors>>,
         wiring: &InputWiring,
-        type_name: &'static str,
+        layout: Layout,
     ) -> Result<Self, PortError> {
-        let pub_sub = service::pub_sub(node, &wiring.service, type_name)?;
+        let pub_sub = service::pub_sub(node, &wiring.service, layout.type_name)?;
         // A reader that comes back finds all that its writer keeps; the cursors limit how much may be unanswered.
         let buffer_size = match wiring.policy {
             EdgePolicy::Lossless => wiring.service.max_capacity,
@@ -130,7 +125,7 @@ impl UntypedSubscriber {
             .map_err(|error| service::open_failed(&wiring.service, error))?;
         let mut subscriber = UntypedSubscriber {
             service: wiring.service.name.clone(),
-            type_name,
+            layout,
             pub_sub,
             subscriber,
             connections,
@@ -148,10 +143,6 @@ impl UntypedSubscriber {
         Ok(subscriber)
     }
 
-    fn wrong_length(&self, n_bytes: u64) -> PortError {
-        PortError::WrongLength { service: self.service.clone(), n_bytes, expected: self.type_name }
-    }
-
     fn begin_with(&mut self, sequencer: Sequencer<UntypedSample>) {
         let now = Instant::now();
         let written = self.writer();
@@ -159,7 +150,7 @@ impl UntypedSubscriber {
         let sequencer = if self.may_hold { sequencer } else { sequencer.without_waiting() };
         let before = std::mem::replace(&mut self.sequencer, sequencer);
         // Samples that this reader has received and not answered exist nowhere else any more.
-        let put_back = std::mem::take(&mut self.put_back).into_iter().map(|(key, sample)| (key, sample.copied()));
+        let put_back = std::mem::take(&mut self.put_back).into_iter().map(|sample| (sample.key(), sample.copied()));
         self.sequencer.hold_again(before, put_back, written.as_ref(), now);
     }
 
@@ -280,8 +271,10 @@ impl UntypedSubscriber {
             };
             let publisher = sample.header().publisher_id().value();
             let may_reorder = || self.pub_sub.dynamic_config().number_of_publishers() > 1;
-            let n_bytes = sample.user_header().n_bytes;
-            let sample = UntypedSample::lent(sample).ok_or_else(|| self.wrong_length(n_bytes))?;
+            let sample = UntypedSample::lent(sample, &self.layout).ok_or_else(|| PortError::WrongLength {
+                service: self.service.clone(),
+                expected: self.layout.type_name,
+            })?;
             let key = sample.key();
             let written = self.cursors.as_ref().and_then(|(cursors, _)| cursors.output(self.writer_slot).written());
             match self.sequencer.push(sample, key, publisher, written.as_ref(), may_reorder, Instant::now) {
