@@ -197,14 +197,16 @@ const FINE: i64 = 1 << 20;
 
 /// Adds the crossings of one triangle, given by its corners in even whole numbers and its heights, to the columns.
 fn push_crossings(flat: &[[i64; 2]; 3], heights_m: [f64; 3], columns: &mut [Vec<Crossing>]) {
-    // Twice the area of the triangle a, b, p. A point on the line counts as moved by (ε, ε²), for every triangle alike.
+    // Twice the area of the triangle a, b, p.
     let side = |a: [i64; 2], b: [i64; 2], p: [i64; 2]| (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]);
-    let is_left = |a: [i64; 2], b: [i64; 2], side: i64| (side, a[1] - b[1], b[0] - a[0]) > (0, 0, 0);
     let [a, b, c] = *flat;
     let area = side(a, b, c);
     if area == 0 {
         return;
     }
+    let edges = [[b, c], [c, a], [a, b]];
+    // A point on the line counts as moved by (ε, ε²), for every triangle alike: so it is left of some edges that it lies on.
+    let left_if_on = edges.map(|[a, b]| i64::from((a[1] - b[1], b[0] - a[0]) > (0, 0)));
     let spacing = 2 * FINE / N_COLUMNS;
     // Rays stand at odd numbers, corners at even ones.
     let ray = |idx: i64| idx * spacing + spacing / 2 + 1;
@@ -215,20 +217,22 @@ fn push_crossings(flat: &[[i64; 2]; 3], heights_m: [f64; 3], columns: &mut [Vec<
         let last = (high - spacing / 2 - 1).div_euclid(spacing).min(N_COLUMNS - 1);
         first..=last
     };
+    // From one ray to the next across.
+    let steps = edges.map(|[a, b]| (a[1] - b[1]) * spacing);
     for along_idx in range(1) {
+        let first = [ray(*range(0).start()), ray(along_idx)];
+        let mut sides = edges.map(|[a, b]| side(a, b, first));
         for across_idx in range(0) {
-            let point = [ray(across_idx), ray(along_idx)];
-            let sides = [side(b, c, point), side(c, a, point), side(a, b, point)];
-            let lefts = [is_left(b, c, sides[0]), is_left(c, a, sides[1]), is_left(a, b, sides[2])];
-            if lefts != [area > 0; 3] {
-                continue;
+            let is_left = |idx: usize| sides[idx] + left_if_on[idx] > 0;
+            if [is_left(0), is_left(1), is_left(2)] == [area > 0; 3] {
+                let weighted: f64 = sides.iter().zip(heights_m).map(|(side, height_m)| *side as f64 * height_m).sum();
+                columns[(along_idx * N_COLUMNS + across_idx) as usize].push(Crossing {
+                    height_m: weighted / area as f64,
+                    // A triangle seen counter-clockwise from above is a way out.
+                    step: if area > 0 { -1 } else { 1 },
+                });
             }
-            let weighted: f64 = sides.iter().zip(heights_m).map(|(side, height_m)| *side as f64 * height_m).sum();
-            columns[(along_idx * N_COLUMNS + across_idx) as usize].push(Crossing {
-                height_m: weighted / area as f64,
-                // A triangle seen counter-clockwise from above is a way out.
-                step: if area > 0 { -1 } else { 1 },
-            });
+            sides = [sides[0] + steps[0], sides[1] + steps[1], sides[2] + steps[2]];
         }
     }
 }

@@ -235,6 +235,19 @@ impl<'a> PlacedShape<'a> {
         along_axes_m.max(along_normal_m) - self.edge_radius_m
     }
 
+    /// A bound above [`PlacedShape::stop_z`]: that of the bounding spheres.
+    pub(super) fn spheres_stop_z(
+        &self,
+        palm_from_link: &Isometry3<f64>,
+        palm_from_object: &Isometry3<f64>,
+        object: &Object,
+        distance_m: f64,
+    ) -> f64 {
+        let com = palm_from_object * object.centre_of_mass_m;
+        let reach_m = self.radius_m + object.max_radius_m + distance_m;
+        spheres_stop_z(palm_from_link * self.centre_in_link, reach_m, Vector::new(com.x, com.y, com.z))
+    }
+
     /// How far the object, placed at `palm_from_object`, must be raised along the palm's +z to keep the distance from this
     /// shape when it comes down from above; `at_least_z` if that is more, as where it passes by.
     pub(super) fn stop_z(
@@ -245,23 +258,21 @@ impl<'a> PlacedShape<'a> {
         distance_m: f64,
         at_least_z: f64,
     ) -> f64 {
-        let palm_from_shape = pose_from_isometry(&(palm_from_link * self.link_from_shape));
-        let at_zero = pose_from_isometry(palm_from_object);
-        let centre = palm_from_link * self.centre_in_link;
-        // Two spheres touch at this z at the latest.
-        let at_most = |centre_at_zero: Vector, radius_m: f64| {
-            let reach_m = self.radius_m + radius_m + distance_m;
-            let aside_m = (centre_at_zero.x - centre.x).hypot(centre_at_zero.y - centre.y);
-            let up_m = (reach_m * reach_m - aside_m * aside_m).sqrt();
-            if aside_m < reach_m { centre.z + up_m - centre_at_zero.z } else { f64::NEG_INFINITY }
-        };
-        let com = palm_from_object * object.centre_of_mass_m;
-        let first_z = at_most(Vector::new(com.x, com.y, com.z), object.max_radius_m);
+        let first_z = self.spheres_stop_z(palm_from_link, palm_from_object, object, distance_m);
         if first_z <= at_least_z {
             return at_least_z;
         }
+        let palm_from_shape = pose_from_isometry(&(palm_from_link * self.link_from_shape));
+        let at_zero = pose_from_isometry(palm_from_object);
+        let of_convex = |palm_from_part: &Pose, part: &dyn Shape, first_z: f64, at_least_z: f64| {
+            self.convex_stop_z(&palm_from_shape, palm_from_part, part, distance_m, first_z, at_least_z)
+        };
         let Some(composite) = object.shape.as_composite_shape() else {
-            return self.convex_stop_z(&palm_from_shape, &at_zero, &*object.shape, first_z, distance_m).max(at_least_z);
+            return of_convex(&at_zero, &*object.shape, first_z, at_least_z).max(at_least_z);
+        };
+        let centre = palm_from_link * self.centre_in_link;
+        let at_most = |centre_at_zero: Vector, radius_m: f64| {
+            spheres_stop_z(centre, self.radius_m + radius_m + distance_m, centre_at_zero)
         };
         // And so do two boxes along the palm's axes.
         let around = self.core.compute_aabb(&palm_from_shape).loosened(self.edge_radius_m + distance_m);
@@ -285,25 +296,29 @@ impl<'a> PlacedShape<'a> {
                 if -first_z >= best_cost {
                     return None;
                 }
-                Some(-self.convex_stop_z(&palm_from_shape, palm_from_part, part, first_z, distance_m))
+                Some(-of_convex(palm_from_part, part, first_z, -best_cost))
             })
         };
         composite.bvh().find_best(-at_least_z, node_cost, leaf_cost).map_or(at_least_z, |(_, cost)| -cost)
     }
 
-    /// [`PlacedShape::stop_z`] for one convex part, coming down from `first_z`. The plane between two convex bodies bounds
-    /// how far the part can come down, and a plane that it moves away from says that it never arrives. Newton-like, so
-    /// a few steps do.
+    /// [`PlacedShape::stop_z`] for one convex part, coming down from `first_z`; anything up to `at_least_z` if it is no more
+    /// than that. The plane between two convex bodies bounds how far the part can come down, and a plane that it moves away
+    /// from says that it never arrives. Newton-like, so a few steps do.
     fn convex_stop_z(
         &self,
         palm_from_shape: &Pose,
         at_zero: &Pose,
         part: &dyn Shape,
-        first_z: f64,
         distance_m: f64,
+        first_z: f64,
+        at_least_z: f64,
     ) -> f64 {
         let mut z = first_z;
         for _ in 0..100 {
+            if z <= at_least_z {
+                return f64::NEG_INFINITY;
+            }
             let mut palm_from_part = *at_zero;
             palm_from_part.translation.z += z;
             let Some(closest) = self.closest_to_convex(palm_from_shape, &palm_from_part, part, FAR_M) else {
@@ -388,6 +403,14 @@ impl<'a> PlacedShape<'a> {
             Matrix3::zeros()
         }
     }
+}
+
+/// How far a point must be raised along z from where it is to be as far as `reach_m` from `centre` when it comes down from
+/// above; minus infinity where it passes by.
+fn spheres_stop_z(centre: Point3<f64>, reach_m: f64, at_zero: Vector) -> f64 {
+    let aside_m = (at_zero.x - centre.x).hypot(at_zero.y - centre.y);
+    let up_m = (reach_m * reach_m - aside_m * aside_m).sqrt();
+    if aside_m < reach_m { centre.z + up_m - at_zero.z } else { f64::NEG_INFINITY }
 }
 
 /// The closest points of two convex bodies, each a pose, a core and a radius around it. `None` if they are farther than

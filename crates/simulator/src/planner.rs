@@ -6,7 +6,7 @@
 //! closes the hand on each, and keeps the one of least energy. It sees the object's shape only, not the grasp's quality.
 
 use nalgebra::{Isometry3, Point3, Unit, UnitQuaternion, UnitVector3, Vector3};
-use parry3d_f64::math::Vector;
+use parry3d_f64::math::{Rotation, Vector};
 use parry3d_f64::query::Ray;
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
@@ -58,9 +58,10 @@ pub fn plan_start(
     options: &PlannerOptions,
     rng: &mut impl rand::Rng,
 ) -> Result<Option<Start>, JointError> {
+    let approaches = Approaches::new(mechanism.hand, object, protocol, options);
     let mut best: Option<(f64, Start)> = None;
     for _ in 0..options.n_approaches {
-        let start = draw_approach(mechanism.hand, object, protocol, options, rng);
+        let start = approaches.draw(rng);
         let Some(exploration) = mechanism.explore(object, &start, protocol)? else { continue };
         let energy = energy(mechanism.hand, object, &exploration, options)?;
         if best.as_ref().is_none_or(|(least, _)| energy < *least) {
@@ -70,37 +71,53 @@ pub fn plan_start(
     Ok(best.map(|(_, start)| start))
 }
 
-/// A start whose palm faces a point of the surface along its normal, or the centre along a principal axis; roll and
-/// preshape are drawn as in a blind one.
-pub(crate) fn draw_approach(
-    hand: &Hand,
-    object: &Object,
-    protocol: &ProtocolOptions,
-    options: &PlannerOptions,
-    rng: &mut impl rand::Rng,
-) -> Start {
-    let blind = draw_start(hand, protocol, rng);
-    let along_normal = rng.random::<f64>() < options.normal_fraction;
-    // A random direction from the centre of mass; where a ray comes in from there, it meets the surface.
-    let from_centre = blind.palm_from_object_rotation.inverse() * Vector3::z_axis();
-    let (target, outward) = if along_normal {
-        surface_point(object, &from_centre)
-    } else {
-        let axes = object.shape.mass_properties(1.0).principal_inertia_local_frame;
-        let axis = [Vector::X, Vector::Y, Vector::Z][rng.random_range(0..3)];
-        let axis = axes * axis * if rng.random::<f64>() < 0.5 { 1.0 } else { -1.0 };
-        (object.centre_of_mass_m, Unit::new_normalize(Vector3::new(axis.x, axis.y, axis.z)))
-    };
-    // The palm looks along its +z against the outward direction: outward becomes -z.
-    let turn = UnitQuaternion::rotation_between(&outward, &-Vector3::z_axis())
-        .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
-    let roll = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::TAU * rng.random::<f64>());
-    let palm_from_object_rotation = roll * turn;
-    // The target lies on the palm's axis.
-    let aside = palm_from_object_rotation * (object.centre_of_mass_m - target);
-    let stands_off = rng.random::<f64>() < 0.5;
-    let back_off_m = if stands_off { options.stand_off_m * rng.random::<f64>() } else { 0.0 };
-    Start { palm_from_object_rotation, lateral_offset_m: [aside.x, aside.y], back_off_m, ..blind }
+/// The approaches to an object from which a planner draws.
+pub(crate) struct Approaches<'a> {
+    hand: &'a Hand,
+    object: &'a Object,
+    protocol: &'a ProtocolOptions,
+    options: &'a PlannerOptions,
+    /// In the object's frame.
+    principal_axes: Rotation,
+}
+
+impl<'a> Approaches<'a> {
+    pub(crate) fn new(
+        hand: &'a Hand,
+        object: &'a Object,
+        protocol: &'a ProtocolOptions,
+        options: &'a PlannerOptions,
+    ) -> Self {
+        let principal_axes = object.shape.mass_properties(1.0).principal_inertia_local_frame;
+        Approaches { hand, object, protocol, options, principal_axes }
+    }
+
+    /// A start whose palm faces a point of the surface along its normal, or the centre along a principal axis; roll and
+    /// preshape are drawn as in a blind one.
+    pub(crate) fn draw(&self, rng: &mut impl rand::Rng) -> Start {
+        let object = self.object;
+        let blind = draw_start(self.hand, self.protocol, rng);
+        let along_normal = rng.random::<f64>() < self.options.normal_fraction;
+        // A random direction from the centre of mass; where a ray comes in from there, it meets the surface.
+        let from_centre = blind.palm_from_object_rotation.inverse() * Vector3::z_axis();
+        let (target, outward) = if along_normal {
+            surface_point(object, &from_centre)
+        } else {
+            let axis = [Vector::X, Vector::Y, Vector::Z][rng.random_range(0..3)];
+            let axis = self.principal_axes * axis * if rng.random::<f64>() < 0.5 { 1.0 } else { -1.0 };
+            (object.centre_of_mass_m, Unit::new_normalize(Vector3::new(axis.x, axis.y, axis.z)))
+        };
+        // The palm looks along its +z against the outward direction: outward becomes -z.
+        let turn = UnitQuaternion::rotation_between(&outward, &-Vector3::z_axis())
+            .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
+        let roll = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::TAU * rng.random::<f64>());
+        let palm_from_object_rotation = roll * turn;
+        // The target lies on the palm's axis.
+        let aside = palm_from_object_rotation * (object.centre_of_mass_m - target);
+        let stands_off = rng.random::<f64>() < 0.5;
+        let back_off_m = if stands_off { self.options.stand_off_m * rng.random::<f64>() } else { 0.0 };
+        Start { palm_from_object_rotation, lateral_offset_m: [aside.x, aside.y], back_off_m, ..blind }
+    }
 }
 
 /// The outermost point of the surface in a direction from the centre of mass, and its outward normal.

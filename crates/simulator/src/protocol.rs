@@ -18,7 +18,7 @@ use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
-use super::distance::ClosestPoints;
+use super::distance::{ClosestPoints, PlacedShape};
 use super::mechanism::{ClosestLinks, ClosingJoint, Mechanism};
 use super::option_check::{OptionError, not_negative, positive, require, share};
 use blindgrasp_objects::Object;
@@ -180,19 +180,33 @@ impl Mechanism<'_> {
             return Ok(None);
         };
         palm_from_object.translation.vector.z += start.back_off_m;
-        let mut joints = self.close(object, &palm_from_object, &start.open_joints_rad, options)?;
+        self.close_from(object, palm_from_object, start.open_joints_rad.clone(), options).map(Some)
+    }
+
+    /// Closes the open hand around an object, which fingers of one motor may push.
+    ///
+    /// # Errors
+    /// Joints of another hand.
+    pub(crate) fn close_from(
+        &self,
+        object: &Object,
+        mut palm_from_object: Isometry3<f64>,
+        open_joints_rad: Vec<f64>,
+        options: &ProtocolOptions,
+    ) -> Result<Exploration, JointError> {
+        let mut joints = self.close(object, &palm_from_object, &open_joints_rad, options)?;
         for _ in 0..MOST_PUSHES {
-            let posture = posture(&start.open_joints_rad, &joints, f64::INFINITY);
+            let posture = posture(&open_joints_rad, &joints, f64::INFINITY);
             let Some(push) = self.push(object, &palm_from_object, &posture, &joints, options)? else { break };
             let pushed = Translation3::from(push) * palm_from_object;
-            if !self.is_apart(object, &pushed, &start.open_joints_rad)? {
+            if !self.is_apart(object, &pushed, &open_joints_rad)? {
                 break;
             }
             palm_from_object = pushed;
-            joints = self.close(object, &palm_from_object, &start.open_joints_rad, options)?;
+            joints = self.close(object, &palm_from_object, &open_joints_rad, options)?;
         }
         let end = joints.iter().map(|joint| joint.end).fold(0.0, f64::max);
-        Ok(Some(Exploration { palm_from_object, open_joints_rad: start.open_joints_rad.clone(), joints, end }))
+        Ok(Exploration { palm_from_object, open_joints_rad, joints, end })
     }
 
     /// The way by which fingers of one motor push the object, until a finger that comes from the other side holds it: in the
@@ -272,8 +286,16 @@ impl Mechanism<'_> {
             let centre = Vector3::new(x, y, z) - rotation * object.centre_of_mass_m.coords;
             Isometry3::from_parts(centre.into(), rotation)
         };
-        let stop_z = self.shapes.iter().fold(f64::NEG_INFINITY, |z, shape| {
-            shape.stop_z(&palm_from_links[shape.link_idx], &at(0.0), object, stop_m(options), z)
+        let at_zero = at(0.0);
+        let bound_of = |shape: &PlacedShape<'_>| {
+            shape.spheres_stop_z(&palm_from_links[shape.link_idx], &at_zero, object, stop_m(options))
+        };
+        // The shapes that may touch first come first, and spare most of the others the search.
+        let mut shapes: Vec<(f64, &PlacedShape<'_>)> =
+            self.shapes.iter().map(|shape| (bound_of(shape), shape)).collect();
+        shapes.sort_by(|(a, _), (b, _)| b.total_cmp(a));
+        let stop_z = shapes.iter().fold(f64::NEG_INFINITY, |z, (_, shape)| {
+            shape.stop_z(&palm_from_links[shape.link_idx], &at_zero, object, stop_m(options), z)
         });
         Ok(stop_z.is_finite().then(|| at(stop_z)))
     }

@@ -9,7 +9,7 @@ use super::rest;
 use super::world::{stand_shape, world_from_stand};
 use super::{LiftTarget, PhysicsOptions, Start, TrialError, TrialOptions};
 use crate::mechanism::Mechanism;
-use crate::planner::{draw_approach, energy};
+use crate::planner::{Approaches, energy};
 use crate::protocol::{self, Approach, ProtocolOptions};
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::{Hand, pose_from_isometry};
@@ -95,11 +95,11 @@ fn plan(
     let refuse = |reason: String| TrialError::Hand { hand: mechanism.hand.name.clone(), reason };
     let (protocol, planner) = (&options.protocol, &options.planner);
     let world_from_target = world_from_standing(target, yaw_rad);
+    let approaches = Approaches::new(mechanism.hand, &target.object, range, planner);
     let mut best: Option<(f64, Start)> = None;
     let mut n_found = 0;
     for _ in 0..MOST_DRAWS.max(8 * planner.n_approaches) {
-        let drawn = draw_approach(mechanism.hand, &target.object, range, planner, rng);
-        let drawn = protocol::Start { back_off_m: 0.0, ..drawn };
+        let drawn = approaches.draw(rng);
         let world_from_palm = world_from_target.rotation * drawn.palm_from_object_rotation.inverse();
         if -(world_from_palm * Vector3::z()).z < protocol.least_descent_rad.sin() {
             continue;
@@ -114,8 +114,9 @@ fn plan(
         if stand_distance_m(mechanism, &start, &touch.palm_from_world, &options.physics)? < protocol.stand_clearance_m {
             continue;
         }
-        let explored = mechanism.explore(&target.object, &drawn, range).map_err(|error| refuse(error.to_string()))?;
-        let Some(exploration) = explored else { continue };
+        let explored =
+            mechanism.close_from(&target.object, touch.palm_from_target, start.open_joints_rad.clone(), range);
+        let exploration = explored.map_err(|error| refuse(error.to_string()))?;
         let energy = energy(mechanism.hand, &target.object, &exploration, planner);
         let energy = energy.map_err(|error| refuse(error.to_string()))?;
         if best.as_ref().is_none_or(|(least, _)| energy < *least) {
@@ -174,6 +175,7 @@ pub fn sensor_seed(seed: u64, trial: u64, attempt: u32) -> u64 {
 
 /// Where everything is when the open hand first touches.
 pub(super) struct FirstTouch {
+    palm_from_target: Isometry3<f64>,
     pub(super) palm_from_world: Isometry3<f64>,
     pub(super) world_from_target: Isometry3<f64>,
 }
@@ -200,6 +202,7 @@ pub(super) fn first_touch(
         .approach(&target.object, &from, &ProtocolOptions::default())
         .map_err(|error| refuse(error.to_string()))?;
     Ok(palm_from_target.map(|palm_from_target| FirstTouch {
+        palm_from_target,
         palm_from_world: palm_from_target * world_from_target.inverse(),
         world_from_target,
     }))
