@@ -208,7 +208,8 @@ impl HandBody {
             let (body_a, body_b) = (link_bodies[a], link_bodies[b]);
             body_a == body_b || body_above(a) == body_b || body_above(b) == body_a
         };
-        let groups = link_groups(mechanism, &palm_from_links, are_joined).ok_or_else(|| {
+        let is_on_palm = |idx: usize| link_bodies[idx].is_none();
+        let groups = link_groups(mechanism, &palm_from_links, are_joined, is_on_palm).ok_or_else(|| {
             let n = MAX_LINKS_APART - 1;
             refuse(format!(
                 "more than {n} links overlap others in the open hand, which no joint joins: give another open hand (--open of \
@@ -367,17 +368,21 @@ impl HandBody {
 }
 
 /// For each link its collision group, and those of the links that it may touch: all but those that it overlaps in the open
-/// hand, which are built into each other. Of joined links the engine itself disables the contacts. Links that may touch all
-/// others share a group. `None` if there are too few groups.
+/// hand, which are built into each other, and the palm those that a joint joins to it. The engine itself disables the contacts
+/// of other joined links. Links that may touch all others share a group. `None` if there are too few groups.
 fn link_groups(
     mechanism: &Mechanism<'_>,
     palm_from_links: &[Isometry3<f64>],
     are_joined: impl Fn(usize, usize) -> bool,
+    is_on_palm: impl Fn(usize) -> bool,
 ) -> Option<Vec<(Group, Group)>> {
     let links = &mechanism.hand.links;
     let overlaps = |a: usize, b: usize| {
         let closest = || mechanism.closest_of_links(a, b, palm_from_links);
-        !are_joined(a, b) && closest().is_some_and(|closest| closest.points.distance_m <= 0.0)
+        match are_joined(a, b) {
+            true => is_on_palm(a) != is_on_palm(b),
+            false => closest().is_some_and(|closest| closest.points.distance_m <= 0.0),
+        }
     };
     let overlapped: Vec<Vec<usize>> =
         (0..links.len()).map(|idx| (0..links.len()).filter(|other| overlaps(idx, *other)).collect()).collect();
