@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::played::played;
 use blindgrasp_messages::{Header, Recorded};
 use blindgrasp_recording::export::{Value, ValueError, leaves};
-use blindgrasp_recording::{Record, RecordingError, RecordingReader};
+use blindgrasp_recording::{ChosenSamples, Reach, Record, RecordingError, RecordingReader};
 
 /// A sample counts as re-ordered if it is at most so many samples away in the other recording.
 const WINDOW: usize = 512;
@@ -220,8 +220,7 @@ pub fn compare_edge(
 
 /// The next samples of an edge in one of the recordings.
 struct Side {
-    reader: RecordingReader,
-    topic: String,
+    samples: ChosenSamples,
     window: VecDeque<Sample>,
     /// The first sample of an edge with numbers of its own, such as labels.
     first_own: Option<Header>,
@@ -245,18 +244,16 @@ struct Sides<'a> {
 }
 
 impl Side {
+    /// [`Coverage::of`] has read the whole file, and checked it.
     fn open(path: &Path, topic: &str) -> Result<Side, RecordingError> {
-        Ok(Side { reader: RecordingReader::open(path)?, topic: topic.into(), window: VecDeque::new(), first_own: None })
+        let topic = topic.to_owned();
+        let samples = ChosenSamples::open(path, Box::new(move |found, _| found == topic), Reach::ByIndex)?;
+        Ok(Side { samples, window: VecDeque::new(), first_own: None })
     }
 
     fn read(&mut self) -> Result<Option<Record>, RecordingError> {
-        for record in self.reader.by_ref() {
-            let (topic, record) = record?;
-            if topic == self.topic {
-                return Ok(Some(record));
-            }
-        }
-        Ok(None)
+        let sample = self.samples.advance()?;
+        sample.map(|sample| self.samples.decode(&sample)).transpose()
     }
 
     /// The number of a sample of an edge with numbers of its own, counted from its first sample.

@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
+use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::json;
 
@@ -94,10 +95,11 @@ impl Runner<'_> {
             );
         }
         let coverage = Coverage::of(&recording, &fed.topic)?;
-        for edge in &edges {
+        let compared = edges.par_iter().map(|edge| {
             self.check_stop()?;
-            case.checks.push(Check::of_edge(compare_edge(&recording, &found, edge, &coverage)?, is_update));
-        }
+            Ok(Check::of_edge(compare_edge(&recording, &found, edge, &coverage)?, is_update))
+        });
+        case.checks.extend(compared.collect::<anyhow::Result<Vec<_>>>()?);
         let decisions = Decisions::read(&found)?;
         if let Some(of_decisions) = decisions_edge(&recording, &mut case.checks)? {
             let mut changed = decisions.changed_since(&Decisions::read(&recording)?);
