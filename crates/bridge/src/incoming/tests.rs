@@ -1,5 +1,6 @@
-//! Both ends of a channel over a network that loses, delays, repeats and reorders frames, and goes away and comes back.
-//! Both ends are killed and restarted meanwhile.
+//! Both ends of a channel over a network that loses, delays, repeats and reorders frames, and goes away and comes back, in
+//! one direction or in both. Both ends are killed and restarted meanwhile. The ends find and lose each other by what their
+//! links say ([`Peer`](crate::peer::Peer)).
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -7,11 +8,14 @@ use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
+use crate::config::KeyKind;
 use crate::outgoing::{KeptSample, Outgoing, OutgoingOptions};
+use crate::peer::Change;
+use crate::peer::tests::{Side, pair};
+use crate::wire::Body;
+use blindgrasp_operator::link_status::PeerState;
 
 const MILLI: u64 = 1_000_000;
-/// An end notices after this silence that the other end is gone.
-const DEADLINE_MILLIS: u64 = 200;
 
 fn key(epoch: u64, seq: u64) -> SampleId {
     SampleId { epoch, seq }
@@ -19,8 +23,14 @@ fn key(epoch: u64, seq: u64) -> SampleId {
 
 #[derive(Debug, Clone)]
 enum Frame {
+    /// Of the links, with its number: a hello or a ping.
+    Link(u64, Body<'static>),
     Resume(u32, Option<SampleId>),
-    Sample { run: u32, index: u64, key: SampleId },
+    Sample {
+        run: u32,
+        index: u64,
+        key: SampleId,
+    },
     Ack(Progress),
     End(u32),
     Ended,
@@ -51,15 +61,24 @@ struct Setting {
 }
 
 /// The process of one end of the channel.
-#[derive(Debug, Clone, Copy)]
 struct EndProcess {
-    instance: u64,
+    link: Side,
     is_alive: bool,
     back_at_millis: u64,
-    /// The instance of the other end, if that is up for this end.
-    peer: Option<u64>,
-    /// The last time when it could hear the other end.
-    heard_millis: u64,
+}
+
+impl EndProcess {
+    /// A process of the sender or of the receiver.
+    fn new(end: usize, instance: u64) -> Self {
+        let [sender, receiver] = pair();
+        let mut link = if end == SENDER { sender } else { receiver };
+        link.own.instance = instance;
+        EndProcess { link, is_alive: true, back_at_millis: 0 }
+    }
+
+    fn is_up(&self) -> bool {
+        self.is_alive && self.link.peer.state == PeerState::Up
+    }
 }
 
 struct World {
@@ -78,7 +97,12 @@ struct World {
     spool: (Vec<KeptSample>, u64),
     receiver: Incoming,
     ends: [EndProcess; 2],
-    is_cut_until_millis: u64,
+    /// Until when nothing of the sender and of the receiver passes.
+    are_cut_until_millis: [u64; 2],
+    /// Number of times that one end was cut off, and the other was not.
+    n_one_sided: u32,
+    /// Numbers the frames of channels as they arrive: the links' own order is not what is tested here.
+    n_arrived: u64,
     /// The frames from the sender and from the receiver: time of arrival, instance of the sender, frame.
     wires: [VecDeque<(u64, u64, Frame)>; 2],
     /// The samples that each process of the receiver has delivered.
@@ -108,7 +132,6 @@ const RECEIVER: usize = 1;
 
 impl World {
     fn new(setting: Setting, seed: u64) -> Self {
-        let place = |instance| EndProcess { instance, is_alive: true, back_at_millis: 0, peer: None, heard_millis: 0 };
         World {
             setting,
             rng: ChaCha8Rng::seed_from_u64(seed),
@@ -120,8 +143,10 @@ impl World {
             committed: None,
             spool: Default::default(),
             receiver: Incoming::new(setting.options.policy, seed, None),
-            ends: [place(1000 * seed), place(1000 * seed + 500)],
-            is_cut_until_millis: 0,
+            ends: [EndProcess::new(SENDER, 1000 * seed + 1), EndProcess::new(RECEIVER, 1000 * seed + 501)],
+            are_cut_until_millis: [0; 2],
+            n_one_sided: 0,
+            n_arrived: 0,
             wires: Default::default(),
             lives: vec![Vec::new()],
             answered: None,
@@ -144,14 +169,14 @@ impl World {
 
     fn send(&mut self, from: usize, frame: Frame) {
         let faults = self.setting.faults;
-        let is_cut = self.now_millis < self.is_cut_until_millis;
+        let is_cut = self.now_millis < self.are_cut_until_millis[from];
         let n_copies = if self.happens(faults.repeat) { 2 } else { 1 };
         for _ in 0..n_copies {
             if is_cut || self.happens(faults.loss) {
                 continue;
             }
             let at_millis = self.now_millis + self.rng.random_range(1..=1 + faults.longest_delay_millis);
-            self.wires[from].push_back((at_millis, self.ends[from].instance, frame.clone()));
+            self.wires[from].push_back((at_millis, self.ends[from].link.own.instance, frame.clone()));
         }
     }
 
@@ -182,7 +207,9 @@ impl World {
     fn break_things(&mut self) {
         let faults = self.setting.faults;
         if self.happens(faults.cut) {
-            self.is_cut_until_millis = self.now_millis + self.rng.random_range(1..=600);
+            let until_millis = self.now_millis + self.rng.random_range(1..=600);
+            let cut: &[usize] = [&[SENDER, RECEIVER][..], &[SENDER], &[RECEIVER]][self.rng.random_range(0..3)];
+            cut.iter().for_each(|from| self.are_cut_until_millis[*from] = until_millis);
         }
         for (end, probability) in [(SENDER, faults.kill_sender), (RECEIVER, faults.kill_receiver)] {
             // A loss before the receiver has any sample is not counted, because another receiver may have had the
@@ -191,8 +218,7 @@ impl World {
             if self.ends[end].is_alive && !is_enough && self.happens(probability) {
                 self.n_kills += 1;
                 let place = &mut self.ends[end];
-                (place.is_alive, place.peer) = (false, None);
-                place.instance += 1;
+                place.is_alive = false;
                 place.back_at_millis = self.now_millis + self.rng.random_range(5..=100);
             }
         }
@@ -202,7 +228,7 @@ impl World {
     fn mend_things(&mut self) {
         let now_millis = self.now_millis;
         if !self.ends[SENDER].is_alive && now_millis >= self.ends[SENDER].back_at_millis {
-            self.ends[SENDER].is_alive = true;
+            self.ends[SENDER] = EndProcess::new(SENDER, self.ends[SENDER].link.own.instance + 1);
             let begun_after = self.committed;
             self.sender = Outgoing::new(self.setting.options, begun_after);
             self.sender.restore(std::mem::take(&mut self.spool.0), self.spool.1);
@@ -210,35 +236,47 @@ impl World {
             self.n_taken = self.place_of(begun_after);
         }
         if !self.ends[RECEIVER].is_alive && now_millis >= self.ends[RECEIVER].back_at_millis {
-            self.ends[RECEIVER].is_alive = true;
+            let instance = self.ends[RECEIVER].link.own.instance + 1;
+            self.ends[RECEIVER] = EndProcess::new(RECEIVER, instance);
             self.n_lost += self.receiver.status("").n_lost;
-            self.receiver = Incoming::new(self.setting.options.policy, self.ends[RECEIVER].instance, self.answered);
+            self.receiver = Incoming::new(self.setting.options.policy, instance, self.answered);
             self.lives.push(Vec::new());
             self.n_unanswered = 0;
         }
-        let can_hear = now_millis >= self.is_cut_until_millis && self.ends.iter().all(|end| end.is_alive);
+    }
+
+    /// The links say what is due, and notice silence.
+    fn run_links(&mut self) {
+        let now_nanos = self.now_nanos();
         for end in [SENDER, RECEIVER] {
-            let other = self.ends[1 - end].instance;
-            let place = &mut self.ends[end];
-            if can_hear {
-                place.heard_millis = now_millis;
-            }
-            let is_up = can_hear || now_millis - place.heard_millis < DEADLINE_MILLIS;
-            let known = if is_up { place.peer } else { None };
-            let peer = if can_hear { Some(other) } else { known };
-            let before = std::mem::replace(&mut place.peer, peer);
-            if before == peer || !place.is_alive {
+            if !self.ends[end].is_alive {
                 continue;
             }
-            if end == SENDER {
-                self.sender.cut_off();
-            } else {
-                self.receiver.cut_off();
-                if peer.is_some() {
-                    self.receiver.reconnected();
-                }
-            }
+            let Side { own, peer } = &mut self.ends[end].link;
+            let change = peer.check_deadline(now_nanos);
+            let mut bodies = Vec::new();
+            peer.due(own, now_nanos, &mut bodies);
+            self.apply(end, change);
+            bodies.into_iter().for_each(|body| self.say(end, body));
         }
+    }
+
+    fn say(&mut self, from: usize, body: Body<'static>) {
+        let number = self.ends[from].link.peer.next_counter(KeyKind::Link);
+        self.send(from, Frame::Link(number, body));
+    }
+
+    /// As the link's operator does.
+    fn apply(&mut self, end: usize, change: Option<Change>) {
+        match (end, change) {
+            (_, None) | (SENDER, Some(Change::Asked)) => return,
+            (SENDER, Some(_)) => self.sender.cut_off(),
+            (_, Some(Change::CutOff)) => self.receiver.cut_off(),
+            (_, Some(Change::Found | Change::Asked)) => self.receiver.reconnected(),
+            (_, Some(Change::FoundAnew)) => panic!("it is one run"),
+        }
+        let is_one_sided = change == Some(Change::CutOff) && self.ends[1 - end].is_up();
+        self.n_one_sided += u32::from(is_one_sided);
     }
 
     fn write(&mut self) {
@@ -273,7 +311,7 @@ impl World {
             self.written.push(next);
             self.places.insert(next, self.written.len());
         }
-        let is_cut_off = self.ends[SENDER].peer.is_none() && self.ends[SENDER].is_alive;
+        let is_cut_off = self.ends[SENDER].is_alive && !self.ends[SENDER].is_up();
         self.blocked_cut_off_millis = if is_blocked && is_cut_off { self.blocked_cut_off_millis + 1 } else { 0 };
         self.longest_blocked_cut_off_millis = self.longest_blocked_cut_off_millis.max(self.blocked_cut_off_millis);
     }
@@ -283,7 +321,7 @@ impl World {
             return;
         }
         let now_nanos = self.now_nanos();
-        let is_up = self.ends[SENDER].peer.is_some();
+        let is_up = self.ends[SENDER].is_up();
         while self.n_taken < self.written.len() && self.sender.wants_more(is_up, now_nanos) {
             let next = self.written[self.n_taken];
             self.sender.push(next, next.seq.to_le_bytes().to_vec(), 1, now_nanos);
@@ -333,13 +371,37 @@ impl World {
                 VecDeque::into(due)
             };
             for (_, instance, frame) in arrived {
-                let to = self.ends[1 - from];
-                // The link drops frames of another instance before they get here.
-                if !to.is_alive || to.peer != Some(instance) {
+                let to = 1 - from;
+                if !self.ends[to].is_alive {
                     continue;
                 }
+                self.n_arrived += 1;
+                let Side { own, peer } = &mut self.ends[to].link;
+                let taken = match &frame {
+                    Frame::Link(number, Body::Hello(hello)) => peer.on_hello(own, instance, *number, hello, now_nanos),
+                    Frame::Link(number, _) => {
+                        peer.on_frame(KeyKind::Link, instance, *number, now_nanos).map(|change| (change, false))
+                    }
+                    _ => {
+                        peer.on_frame(KeyKind::Data, instance, self.n_arrived, now_nanos).map(|change| (change, false))
+                    }
+                };
+                // A frame of another instance, or an old one.
+                let Ok((change, is_to_answer)) = taken else { continue };
+                self.apply(to, change);
                 match frame {
-                    Frame::Resume(run, after) => self.sender.on_resume(run, after),
+                    Frame::Link(..) if is_to_answer => {
+                        let Side { own, peer } = &mut self.ends[to].link;
+                        let hello = peer.hello(own, now_nanos);
+                        self.say(to, hello);
+                    }
+                    Frame::Link(..) => {}
+                    Frame::Resume(run, after) => {
+                        self.sender.on_resume(run, after);
+                        if self.sender.has_request() {
+                            self.ends[SENDER].link.peer.on_requests();
+                        }
+                    }
                     Frame::Ack(progress) => {
                         let Progress { run, n_received, answered } = progress;
                         self.sender.on_ack(run, n_received, answered, now_nanos);
@@ -364,6 +426,7 @@ impl World {
     fn tick(&mut self) {
         self.break_things();
         self.mend_things();
+        self.run_links();
         self.write();
         self.run_sender();
         self.run_receiver();
@@ -446,13 +509,16 @@ fn setting(options: OutgoingOptions, faults: Faults) -> Setting {
 
 #[test]
 fn over_a_bad_network_nothing_is_lost_or_comes_twice() {
+    let mut n_one_sided = 0;
     for world in worlds(setting(LOSSLESS, BAD_NETWORK)) {
         assert_eq!((world.n_missing(), world.n_lost), (0, 0));
         let n_delivered: usize = world.lives.iter().map(Vec::len).sum();
         assert_eq!(n_delivered, world.written.len());
         // A machine that is away does not block the writer: a new epoch waits for 50 ms, twice.
         assert!(world.longest_blocked_cut_off_millis < 110, "{}", world.longest_blocked_cut_off_millis);
+        n_one_sided += world.n_one_sided;
     }
+    assert!(n_one_sided > 20, "{n_one_sided}");
 }
 
 #[test]

@@ -7,17 +7,17 @@ const MILLIS: u64 = 1_000_000;
 const DEADLINE_NANOS: u64 = 150 * MILLIS;
 
 /// A machine with one peer.
-struct Side {
-    own: Own,
-    peer: Peer,
+pub(crate) struct Side {
+    pub(crate) own: Own,
+    pub(crate) peer: Peer,
 }
 
-fn own(machine: &str, instance: u64) -> Own {
+pub(crate) fn own(machine: &str, instance: u64) -> Own {
     Own { instance, machine: machine.into(), fingerprint: 9, run: instance, is_ready: true, is_eager_until_nanos: 0 }
 }
 
 /// A link from robot to brain, with contacts as the only channel.
-fn pair() -> [Side; 2] {
+pub(crate) fn pair() -> [Side; 2] {
     let channel = Channel {
         port: "contacts/contacts".into(),
         type_name: ContactSet::TYPE_NAME.into(),
