@@ -1,8 +1,9 @@
 //! Wakes a process when a sample, a command or a signal has come.
 //!
 //! Each instance has a bell among the [cursors](crate::cursors): two words in shared memory. A writer rings the bells of its
-//! readers after each sample. A reader that is awake costs it one load or one exchange, a reader that sleeps one futex call.
-//! The reader clears its bell before it looks at its queues, so a ring that comes after the look ends the next wait at once.
+//! readers after each sample, or after a few where more wait for the writer itself (`stage.rs`). A reader that is awake costs
+//! it one load or one exchange, a reader that sleeps one futex call. The reader clears its bell before it looks at its queues,
+//! so a ring that comes after the look ends the next wait at once.
 //!
 //! A process that is killed at any moment leaves the bell in a state that costs a writer one futex call at most.
 

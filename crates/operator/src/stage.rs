@@ -21,6 +21,10 @@ use blindgrasp_messages::{Header, Message};
 
 /// A stage that gave way to another one of its group tries again after this time.
 pub(crate) const ROOM_PAUSE: Duration = Duration::from_millis(1);
+/// A stage for which samples wait may send so many answers before it wakes its readers, which saves most of the wake-ups …
+const MOST_UNRUNG: u32 = 8;
+/// … if an answer takes it no longer than this.
+const QUICK_NANOS: u64 = 20_000;
 /// A standby reports that it is warm after so many samples.
 pub(crate) const N_WARM: u64 = 8;
 
@@ -372,6 +376,12 @@ impl<S: Stage> Instance<S> {
 
     /// Answers the samples that are there, and tells the stage of silence or the end of the stream.
     fn work(&mut self, stop: bool) -> anyhow::Result<Sent> {
+        let sent = self.answer_samples(stop);
+        self.publisher.may_leave_unrung(0);
+        sent
+    }
+
+    fn answer_samples(&mut self, stop: bool) -> anyhow::Result<Sent> {
         if self.settle()? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
@@ -400,6 +410,8 @@ impl<S: Stage> Instance<S> {
             self.operator.works_on(Some(sample_id(&header)));
             self.stage.answer(&head, sample.items(), arrival_nanos, &mut self.answers);
             self.operator.works_on(None);
+            let most_unrung = if self.subscriber.has_more() && self.was_quick() { MOST_UNRUNG } else { 0 };
+            self.publisher.may_leave_unrung(most_unrung);
             let sent = if self.has_state { self.keep(Some(sample))? } else { self.send(sample)? };
             if sent == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
@@ -424,6 +436,12 @@ impl<S: Stage> Instance<S> {
             return self.keep(None);
         }
         self.send_answers(None)
+    }
+
+    /// Whether it has answered the last sample so fast that the next answer will not keep readers waiting for this one.
+    fn was_quick(&self) -> bool {
+        let received_nanos = self.subscriber.received_nanos();
+        received_nanos.is_some_and(|since| crate::monotonic_nanos().saturating_sub(since) < QUICK_NANOS)
     }
 
     /// The last sample that an instance after this one will not answer again.

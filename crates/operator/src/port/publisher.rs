@@ -1,5 +1,6 @@
 //! The sending end of an edge.
 
+use std::cell::Cell;
 use std::marker::PhantomData;
 use std::ops::{Deref, DerefMut};
 use std::sync::Arc;
@@ -49,6 +50,8 @@ struct Sender {
     bells: Vec<usize>,
     n_subscribers: usize,
     connections: Connections,
+    /// Number of samples that its readers were not woken for.
+    n_unrung: Cell<u32>,
 }
 
 /// The memory for the samples of a message.
@@ -88,7 +91,16 @@ impl Sender {
             .create()
             .map_err(|error| service::open_failed(wiring, error))?;
         let (service, cursors, bells) = (wiring.name.clone(), Arc::clone(cursors), bells.to_vec());
-        Ok(Sender { service, pub_sub, publisher, cursors, bells, n_subscribers: 0, connections })
+        Ok(Sender {
+            service,
+            pub_sub,
+            publisher,
+            cursors,
+            bells,
+            n_subscribers: 0,
+            connections,
+            n_unrung: Cell::new(0),
+        })
     }
 
     fn send(&self, seq: u64, parts: &Parts<'_>) -> Result<(), PortError> {
@@ -98,11 +110,12 @@ impl Sender {
         parts.write(sample.payload_mut());
         // SAFETY: all words were written.
         unsafe { sample.assume_init() }.send().map_err(|error| failed(error.into()))?;
-        self.ring();
+        self.n_unrung.set(self.n_unrung.get() + 1);
         Ok(())
     }
 
     fn ring(&self) {
+        self.n_unrung.set(0);
         self.bells.iter().for_each(|slot| self.cursors.bell(*slot).ring());
     }
 
@@ -218,6 +231,8 @@ pub struct UntypedPublisher {
     own_readers: Vec<usize>,
     /// See [`Credit::has_sent_all`].
     has_sent_all: Arc<AtomicBool>,
+    /// Number of samples that may wait until their readers are woken.
+    most_unrung: u32,
 }
 
 impl UntypedPublisher {
@@ -235,7 +250,20 @@ impl UntypedPublisher {
             wait_limit: Duration::from_millis(wiring.wait_limit_millis),
             own_readers: Vec::new(),
             has_sent_all: Arc::new(AtomicBool::new(true)),
+            most_unrung: 0,
         })
+    }
+
+    /// Leaves up to so many samples without waking their readers, until this is called again with fewer.
+    pub(crate) fn may_leave_unrung(&mut self, most: u32) {
+        self.most_unrung = most;
+        self.ring_for_more_than(most);
+    }
+
+    fn ring_for_more_than(&self, most: u32) {
+        if self.sender.n_unrung.get() > most {
+            self.sender.ring();
+        }
     }
 
     fn slot(&self) -> &OutputSlot {
@@ -304,6 +332,7 @@ impl UntypedPublisher {
         // round, a reader could answer a sample that is not counted.
         self.slot().commit(key);
         self.sender.send(key.seq, parts)?;
+        self.ring_for_more_than(self.most_unrung);
         self.credit.has_sent(key);
         if !self.has_sent_all.load(Ordering::Relaxed) {
             self.has_sent_all.store(self.credit.has_sent_all(self.written()), Ordering::Relaxed);
@@ -426,6 +455,7 @@ impl UntypedPublisher {
         should_yield: &mut dyn FnMut() -> bool,
         mut look: impl FnMut(&mut Self, Duration) -> Wait,
     ) -> Result<Sent, PortError> {
+        self.ring_for_more_than(0);
         let start = Instant::now();
         let mut last_look = start;
         let (mut last_try, mut waited) = (start, Duration::ZERO);
@@ -529,6 +559,8 @@ impl<M: Message> ShadowPublisher<M> {
     /// # Errors
     /// An error of iceoryx2.
     pub fn send(&self, head: &M::Head, items: &[M::Item]) -> Result<(), PortError> {
-        self.sender.send(M::header(head).seq, &Parts::of::<M>(head, items))
+        self.sender.send(M::header(head).seq, &Parts::of::<M>(head, items))?;
+        self.sender.ring();
+        Ok(())
     }
 }

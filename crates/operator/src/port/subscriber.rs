@@ -100,6 +100,8 @@ pub struct UntypedSubscriber {
     on_late: OnLate,
     /// The age of the last sample, if it came too late.
     late_nanos: Option<u64>,
+    /// See [`UntypedSubscriber::received_nanos`].
+    received_nanos: Option<u64>,
     /// Whether samples wait for those before them. On an edge that may drop samples, they don't.
     may_hold: bool,
     /// Samples that were taken and not answered, the first one first.
@@ -135,6 +137,7 @@ impl UntypedSubscriber {
             deadline_nanos: wiring.deadline_nanos,
             on_late: wiring.on_late,
             late_nanos: None,
+            received_nanos: None,
             may_hold: wiring.policy == EdgePolicy::Lossless,
             put_back: VecDeque::new(),
             sequencer: Sequencer::onlooker(),
@@ -254,6 +257,16 @@ impl UntypedSubscriber {
         self.cursors.as_ref().and_then(|(cursors, slot)| cursors.input(*slot).key())
     }
 
+    /// When it delivered the last sample (CLOCK_BOOTTIME), if it knows the age of its samples.
+    pub(crate) fn received_nanos(&self) -> Option<u64> {
+        self.received_nanos
+    }
+
+    /// Whether samples wait that were not received.
+    pub(crate) fn has_more(&self) -> bool {
+        self.subscriber.has_samples().unwrap_or(false)
+    }
+
     /// The next sample in order, if one is there.
     fn receive(&mut self) -> Result<Option<UntypedSample>, PortError> {
         if let Some(sample) = self.sequencer.next_in_order() {
@@ -291,7 +304,9 @@ impl UntypedSubscriber {
         if let Some((cursors, slot)) = self.cursors.as_ref()
             && origin_nanos != 0
         {
-            let age_nanos = monotonic_nanos().saturating_sub(origin_nanos);
+            let now_nanos = monotonic_nanos();
+            self.received_nanos = Some(now_nanos);
+            let age_nanos = now_nanos.saturating_sub(origin_nanos);
             cursors.ages(*slot).count(age_nanos);
             self.late_nanos = self.deadline_nanos.filter(|limit| age_nanos > *limit).map(|_| age_nanos);
             if self.late_nanos.is_some() {

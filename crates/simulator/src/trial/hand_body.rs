@@ -379,10 +379,10 @@ fn link_groups(
     let links = &mechanism.hand.links;
     let overlaps = |a: usize, b: usize| {
         let closest = || mechanism.closest_of_links(a, b, palm_from_links);
-        match are_joined(a, b) {
-            true => is_on_palm(a) != is_on_palm(b),
-            false => closest().is_some_and(|closest| closest.points.distance_m <= 0.0),
+        if are_joined(a, b) {
+            return is_on_palm(a) != is_on_palm(b);
         }
+        closest().is_some_and(|closest| closest.points.distance_m <= 0.0)
     };
     let overlapped: Vec<Vec<usize>> =
         (0..links.len()).map(|idx| (0..links.len()).filter(|other| overlaps(idx, *other)).collect()).collect();
