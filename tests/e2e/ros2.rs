@@ -488,7 +488,8 @@ time.sleep(60)
     let expected = &undisturbed()[..N_GRASPS as usize - 1];
     let mut found = Vec::new();
     let mut n_predictions = 0;
-    while found.len() < expected.len() {
+    // On a busy machine decisions may come before predictions that are older.
+    while found.len() < expected.len() || n_predictions <= found.len() {
         let line = peer.line();
         assert_eq!(line["encoding"], "application/json", "{line}");
         assert!(line["sent"].as_f64().is_some_and(|secs| secs.abs() < 20.0), "{line}");
@@ -506,7 +507,6 @@ time.sleep(60)
         found.push((word("action"), word("reason")));
     }
     assert_eq!(found, expected);
-    assert!(n_predictions > found.len(), "{n_predictions}");
     drop(stdin);
     graph.stop();
     let flow = std::fs::read_to_string(&flow).expect("readable").replace("robot/hand}", "/robot}");

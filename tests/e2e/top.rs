@@ -3,6 +3,7 @@
 use std::fs::File;
 use std::io::{Read, Write};
 use std::os::fd::OwnedFd;
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::os::unix::process::CommandExt;
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
@@ -92,7 +93,9 @@ fn start(mut command: Command, arguments: &[&str], rows: u16, columns: u16) -> (
     grantpt(&terminal).expect("granted");
     unlockpt(&terminal).expect("unlocked");
     let path = ptsname(&terminal, Vec::new()).expect("named").into_string().expect("UTF-8");
-    let line = File::options().read(true).write(true).open(path).expect("opened");
+    // It is the terminal of `top`, and not that of the tests.
+    let no_terminal = OpenptFlags::NOCTTY.bits() as i32;
+    let line = File::options().read(true).write(true).custom_flags(no_terminal).open(path).expect("opened");
     tcsetwinsize(&line, size(rows, columns)).expect("sized");
     let before = tcgetattr(&line).expect("settings");
     let stdio = || Stdio::from(line.try_clone().expect("cloned"));

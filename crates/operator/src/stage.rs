@@ -21,9 +21,10 @@ use blindgrasp_messages::{Header, Message};
 
 /// A stage that gave way to another one of its group tries again after this time.
 pub(crate) const ROOM_PAUSE: Duration = Duration::from_millis(1);
-/// A stage for which samples wait may send so many answers before it wakes its readers, which saves most of the wake-ups …
+/// A stage that answers each sample may answer so many before it wakes its readers, while more samples wait for it. That saves
+/// most of the wake-ups …
 const MOST_UNRUNG: u32 = 8;
-/// … if an answer takes it no longer than this.
+/// … if the last answer took it no longer than this.
 const QUICK_NANOS: u64 = 20_000;
 /// A standby reports that it is warm after so many samples.
 pub(crate) const N_WARM: u64 = 8;
@@ -203,6 +204,10 @@ struct Instance<S: Stage> {
     shadow: Option<Shadow<S>>,
     last_look: Instant,
     is_drained: bool,
+    /// Whether it has answered the last sample with a message.
+    had_answer: bool,
+    /// Number of samples that it has answered since it has woken its readers.
+    n_unrung: u32,
 }
 
 /// Answers in the outbox that are to be saved, sent and committed.
@@ -253,6 +258,8 @@ pub fn run<S: Stage + 'static>(
         shadow: None,
         last_look: Instant::now(),
         is_drained: false,
+        had_answer: false,
+        n_unrung: 0,
     };
     if has_state {
         operator.reserve_state()?;
@@ -377,7 +384,9 @@ impl<S: Stage> Instance<S> {
     /// Answers the samples that are there, and tells the stage of silence or the end of the stream.
     fn work(&mut self, stop: bool) -> anyhow::Result<Sent> {
         let sent = self.answer_samples(stop);
-        self.publisher.may_leave_unrung(0);
+        self.n_unrung = 0;
+        self.publisher.delay_bells(false);
+        self.publisher.ring_if_due();
         sent
     }
 
@@ -410,8 +419,7 @@ impl<S: Stage> Instance<S> {
             self.operator.works_on(Some(sample_id(&header)));
             self.stage.answer(&head, sample.items(), arrival_nanos, &mut self.answers);
             self.operator.works_on(None);
-            let most_unrung = if self.subscriber.has_more() && self.was_quick() { MOST_UNRUNG } else { 0 };
-            self.publisher.may_leave_unrung(most_unrung);
+            self.delay_or_ring();
             let sent = if self.has_state { self.keep(Some(sample))? } else { self.send(sample)? };
             if sent == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
@@ -438,10 +446,22 @@ impl<S: Stage> Instance<S> {
         self.send_answers(None)
     }
 
-    /// Whether it has answered the last sample so fast that the next answer will not keep readers waiting for this one.
-    fn was_quick(&self) -> bool {
-        let received_nanos = self.subscriber.received_nanos();
-        received_nanos.is_some_and(|since| crate::monotonic_nanos().saturating_sub(since) < QUICK_NANOS)
+    /// Decides whether readers are woken for the answer. An answer that is not one of many, such as a decision, wakes them at
+    /// once.
+    fn delay_or_ring(&mut self) {
+        let has_answer = !self.answers.heads.is_empty();
+        let is_one_of_many = std::mem::replace(&mut self.had_answer, has_answer) && has_answer;
+        let is_quick = |since: u64| crate::monotonic_nanos().saturating_sub(since) < QUICK_NANOS;
+        let delays = is_one_of_many
+            && self.n_unrung < MOST_UNRUNG
+            && self.subscriber.has_more()
+            && self.subscriber.received_nanos().is_some_and(is_quick);
+        self.n_unrung = if delays { self.n_unrung + 1 } else { 0 };
+        self.publisher.delay_bells(delays);
+        // An answer wakes them once it is sent.
+        if !has_answer {
+            self.publisher.ring_if_due();
+        }
     }
 
     /// The last sample that an instance after this one will not answer again.

@@ -212,7 +212,7 @@ pub struct OutputWiring {
     pub slot: usize,
     /// The readers that the writer waits for.
     pub consumers: Vec<ConsumerWiring>,
-    /// The slots whose bells the writer rings after each sample.
+    /// The slots of the bells by which the writer wakes its readers.
     #[serde(default)]
     pub bells: Vec<usize>,
     /// The writer fails after it has waited for so long.

@@ -244,10 +244,9 @@ struct Sides<'a> {
 }
 
 impl Side {
-    /// [`Coverage::of`] has read the whole file, and checked it.
     fn open(path: &Path, topic: &str) -> Result<Side, RecordingError> {
         let topic = topic.to_owned();
-        let samples = ChosenSamples::open(path, Box::new(move |found, _| found == topic), Reach::ByIndex)?;
+        let samples = ChosenSamples::open(path, Box::new(move |found, _| found == topic), Reach::Whole)?;
         Ok(Side { samples, window: VecDeque::new(), first_own: None })
     }
 

@@ -95,11 +95,14 @@ impl Runner<'_> {
             );
         }
         let coverage = Coverage::of(&recording, &fed.topic)?;
-        let compared = edges.par_iter().map(|edge| {
+        let compare = |edge: &ComparedEdge| {
             self.check_stop()?;
             Ok(Check::of_edge(compare_edge(&recording, &found, edge, &coverage)?, is_update))
-        });
-        case.checks.extend(compared.collect::<anyhow::Result<Vec<_>>>()?);
+        };
+        let compared: Vec<anyhow::Result<Check>> = edges.par_iter().map(compare).collect();
+        for check in compared {
+            case.checks.push(check?);
+        }
         let decisions = Decisions::read(&found)?;
         if let Some(of_decisions) = decisions_edge(&recording, &mut case.checks)? {
             let mut changed = decisions.changed_since(&Decisions::read(&recording)?);

@@ -10,8 +10,8 @@ use rand_chacha::ChaCha8Rng;
 use super::*;
 use crate::config::KeyKind;
 use crate::outgoing::{KeptSample, Outgoing, OutgoingOptions};
-use crate::peer::Change;
 use crate::peer::tests::{Side, pair};
+use crate::peer::{Change, Rejection};
 use crate::wire::Body;
 use blindgrasp_operator::link_status::PeerState;
 
@@ -99,7 +99,7 @@ struct World {
     ends: [EndProcess; 2],
     /// Until when nothing of the sender and of the receiver passes.
     are_cut_until_millis: [u64; 2],
-    /// Number of times that one end was cut off, and the other was not.
+    /// Number of times that one end lost the other one, which still heard it.
     n_one_sided: u32,
     /// Numbers the frames of channels as they arrive: the links' own order is not what is tested here.
     n_arrived: u64,
@@ -224,7 +224,7 @@ impl World {
         }
     }
 
-    /// Restarts processes, and lets the ends find or lose each other.
+    /// Restarts processes.
     fn mend_things(&mut self) {
         let now_millis = self.now_millis;
         if !self.ends[SENDER].is_alive && now_millis >= self.ends[SENDER].back_at_millis {
@@ -275,7 +275,8 @@ impl World {
             (_, Some(Change::Found | Change::Asked)) => self.receiver.reconnected(),
             (_, Some(Change::FoundAnew)) => panic!("it is one run"),
         }
-        let is_one_sided = change == Some(Change::CutOff) && self.ends[1 - end].is_up();
+        let is_heard = self.now_millis >= self.are_cut_until_millis[end] && self.ends[1 - end].is_up();
+        let is_one_sided = change == Some(Change::CutOff) && is_heard;
         self.n_one_sided += u32::from(is_one_sided);
     }
 
@@ -386,8 +387,12 @@ impl World {
                         peer.on_frame(KeyKind::Data, instance, self.n_arrived, now_nanos).map(|change| (change, false))
                     }
                 };
-                // A frame of another instance, or an old one.
-                let Ok((change, is_to_answer)) = taken else { continue };
+                let (change, is_to_answer) = match taken {
+                    Ok(taken) => taken,
+                    Err(Rejection::Refused(reason)) => panic!("{reason}"),
+                    // A frame of another instance, or an old one.
+                    Err(_) => continue,
+                };
                 self.apply(to, change);
                 match frame {
                     Frame::Link(..) if is_to_answer => {

@@ -50,8 +50,8 @@ struct Sender {
     bells: Vec<usize>,
     n_subscribers: usize,
     connections: Connections,
-    /// Number of samples that its readers were not woken for.
-    n_unrung: Cell<u32>,
+    /// Whether its readers were not woken for a sample.
+    is_unrung: Cell<bool>,
 }
 
 /// The memory for the samples of a message.
@@ -99,7 +99,7 @@ impl Sender {
             bells,
             n_subscribers: 0,
             connections,
-            n_unrung: Cell::new(0),
+            is_unrung: Cell::new(false),
         })
     }
 
@@ -110,12 +110,12 @@ impl Sender {
         parts.write(sample.payload_mut());
         // SAFETY: all words were written.
         unsafe { sample.assume_init() }.send().map_err(|error| failed(error.into()))?;
-        self.n_unrung.set(self.n_unrung.get() + 1);
+        self.is_unrung.set(true);
         Ok(())
     }
 
     fn ring(&self) {
-        self.n_unrung.set(0);
+        self.is_unrung.set(false);
         self.bells.iter().for_each(|slot| self.cursors.bell(*slot).ring());
     }
 
@@ -231,8 +231,8 @@ pub struct UntypedPublisher {
     own_readers: Vec<usize>,
     /// See [`Credit::has_sent_all`].
     has_sent_all: Arc<AtomicBool>,
-    /// Number of samples that may wait until their readers are woken.
-    most_unrung: u32,
+    /// See [`UntypedPublisher::delay_bells`].
+    delays_bells: bool,
 }
 
 impl UntypedPublisher {
@@ -250,18 +250,18 @@ impl UntypedPublisher {
             wait_limit: Duration::from_millis(wiring.wait_limit_millis),
             own_readers: Vec::new(),
             has_sent_all: Arc::new(AtomicBool::new(true)),
-            most_unrung: 0,
+            delays_bells: false,
         })
     }
 
-    /// Leaves up to so many samples without waking their readers, until this is called again with fewer.
-    pub(crate) fn may_leave_unrung(&mut self, most: u32) {
-        self.most_unrung = most;
-        self.ring_for_more_than(most);
+    /// Whether it sends the next samples without waking their readers: see [`UntypedPublisher::ring_if_due`].
+    pub(crate) fn delay_bells(&mut self, delays: bool) {
+        self.delays_bells = delays;
     }
 
-    fn ring_for_more_than(&self, most: u32) {
-        if self.sender.n_unrung.get() > most {
+    /// Wakes the readers of samples that were sent without.
+    pub(crate) fn ring_if_due(&self) {
+        if self.sender.is_unrung.get() {
             self.sender.ring();
         }
     }
@@ -332,7 +332,9 @@ impl UntypedPublisher {
         // round, a reader could answer a sample that is not counted.
         self.slot().commit(key);
         self.sender.send(key.seq, parts)?;
-        self.ring_for_more_than(self.most_unrung);
+        if !self.delays_bells {
+            self.sender.ring();
+        }
         self.credit.has_sent(key);
         if !self.has_sent_all.load(Ordering::Relaxed) {
             self.has_sent_all.store(self.credit.has_sent_all(self.written()), Ordering::Relaxed);
@@ -455,7 +457,7 @@ impl UntypedPublisher {
         should_yield: &mut dyn FnMut() -> bool,
         mut look: impl FnMut(&mut Self, Duration) -> Wait,
     ) -> Result<Sent, PortError> {
-        self.ring_for_more_than(0);
+        self.ring_if_due();
         let start = Instant::now();
         let mut last_look = start;
         let (mut last_try, mut waited) = (start, Duration::ZERO);

@@ -368,8 +368,9 @@ impl HandBody {
 }
 
 /// For each link its collision group, and those of the links that it may touch: all but those that it overlaps in the open
-/// hand, which are built into each other, and the palm those that a joint joins to it. The engine itself disables the contacts
-/// of other joined links. Links that may touch all others share a group. `None` if there are too few groups.
+/// hand, which are built into each other, and those on the palm that a joint joins to it. The engine itself disables the contacts
+/// of other joined links. A contact takes two links that may touch each other, so one of them is enough to rule it out. Links
+/// that are left out by the same links share a group. `None` if there are too few groups.
 fn link_groups(
     mechanism: &Mechanism<'_>,
     palm_from_links: &[Isometry3<f64>],
@@ -377,29 +378,35 @@ fn link_groups(
     is_on_palm: impl Fn(usize) -> bool,
 ) -> Option<Vec<(Group, Group)>> {
     let links = &mechanism.hand.links;
-    let overlaps = |a: usize, b: usize| {
+    let leaves_out = |a: usize, b: usize| {
         let closest = || mechanism.closest_of_links(a, b, palm_from_links);
         if are_joined(a, b) {
-            return is_on_palm(a) != is_on_palm(b);
+            return !is_on_palm(a) && is_on_palm(b);
         }
         closest().is_some_and(|closest| closest.points.distance_m <= 0.0)
     };
-    let overlapped: Vec<Vec<usize>> =
-        (0..links.len()).map(|idx| (0..links.len()).filter(|other| overlaps(idx, *other)).collect()).collect();
-    let mut n_used = 1;
-    let own: Vec<Group> = (0..links.len())
-        .map(|idx| match () {
-            () if links[idx].shapes.is_empty() => Group::NONE,
-            () if overlapped[idx].is_empty() => Group::GROUP_1,
-            () => {
-                n_used += 1;
-                Group::from_bits_truncate(1_u32.checked_shl(n_used - 1).unwrap_or(0))
-            }
-        })
-        .collect();
+    let with_shapes: Vec<usize> = (0..links.len()).filter(|idx| !links[*idx].shapes.is_empty()).collect();
+    let left_out_by =
+        |idx: usize| with_shapes.iter().copied().filter(|other| leaves_out(*other, idx)).collect::<Vec<_>>();
+    let left_out_by: Vec<Vec<usize>> = (0..links.len()).map(left_out_by).collect();
+    // The first group is that of the links which nothing leaves out.
+    let by_none = Vec::new();
+    let mut kinds: Vec<&Vec<usize>> = vec![&by_none];
+    kinds.extend(with_shapes.iter().map(|idx| &left_out_by[*idx]).filter(|by| !by.is_empty()));
+    kinds[1..].sort();
+    kinds.dedup();
+    let group_of_kind = |kind: usize| Group::from_bits_truncate(1_u32.checked_shl(kind as u32).unwrap_or(0));
+    let own = |idx: usize| {
+        let kind = kinds.iter().position(|kind| **kind == left_out_by[idx]);
+        kind.filter(|_kind| !links[idx].shapes.is_empty()).map_or(Group::NONE, group_of_kind)
+    };
+    let own: Vec<Group> = (0..links.len()).map(own).collect();
     let all = own.iter().fold(Group::NONE, |all, group| all | *group);
-    let touched = |idx: usize| overlapped[idx].iter().fold(all, |rest, other| rest & !own[*other]);
-    (n_used <= MAX_LINKS_APART).then(|| (0..own.len()).map(|idx| (own[idx], touched(idx))).collect())
+    let touched = |idx: usize| {
+        let left_out = (0..links.len()).filter(|other| left_out_by[*other].contains(&idx));
+        left_out.fold(all, |rest, other| rest & !own[other])
+    };
+    (kinds.len() <= MAX_LINKS_APART as usize).then(|| (0..own.len()).map(|idx| (own[idx], touched(idx))).collect())
 }
 
 /// The motor's torque or force for each newton at the fingertips that a joint with several links moves: the sum of the
