@@ -142,6 +142,10 @@ impl Downlink {
         self.is_closed = true;
     }
 
+    pub(super) fn is_closed_and_empty(&self) -> bool {
+        self.is_closed && self.writer.n_waiting() == 0
+    }
+
     /// The last sample that all readers here have answered.
     pub(super) fn answered(&self) -> Option<SampleId> {
         let published = self.writer.published();

@@ -538,6 +538,7 @@ impl<'a> Link<'a> {
         self.log_stall(idx);
         self.tell_readers(idx, now_nanos);
         self.tend_downlinks(idx, now_nanos)?;
+        self.end_closed_ports(idx);
         Ok(is_busy)
     }
 
@@ -594,6 +595,16 @@ impl<'a> Link<'a> {
             }
         }
         Ok(is_busy)
+    }
+
+    /// Says of ports that take no more samples that they have ended, once their readers can get all that was taken.
+    fn end_closed_ports(&mut self, idx: usize) {
+        let closed = self.connections[idx].downlinks.iter().filter(|downlink| downlink.is_closed_and_empty());
+        let n_before = self.ended_ports.len();
+        self.ended_ports.extend(closed.map(|downlink| downlink.channel.port.clone()));
+        if self.ended_ports.len() > n_before {
+            self.operator.ended(self.ended_ports.iter().cloned().collect());
+        }
     }
 
     fn tend_downlinks(&mut self, idx: usize, now_nanos: u64) -> anyhow::Result<()> {

@@ -101,7 +101,7 @@ struct World {
     are_cut_until_millis: [u64; 2],
     /// Number of times that one end lost the other one, which still heard it.
     n_one_sided: u32,
-    /// Numbers the frames of channels as they arrive: the links' own order is not what is tested here.
+    /// Numbers the frames of channels as they arrive: the order that links demand of each other's frames has tests of its own.
     n_arrived: u64,
     /// The frames from the sender and from the receiver: time of arrival, instance of the sender, frame.
     wires: [VecDeque<(u64, u64, Frame)>; 2],
@@ -245,7 +245,7 @@ impl World {
         }
     }
 
-    /// The links say what is due, and notice silence.
+    /// The links send the hellos and pings that are due, and notice silence.
     fn run_links(&mut self) {
         let now_nanos = self.now_nanos();
         for end in [SENDER, RECEIVER] {

@@ -1,6 +1,7 @@
 //! The launcher's knowledge of the other machines of its graph.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::time::Instant;
 
 use crate::dataflow::{LocalView, Node};
 use blindgrasp_operator::link_status::{LinkStatus, PeerState};
@@ -24,6 +25,8 @@ pub(super) struct LinkBook {
     pub(super) ended_nodes: Vec<String>,
     /// The graph ends on request, even if sources on other machines go on.
     pub(super) was_stopped: bool,
+    /// Until when the link is awaited to say that it takes no more samples of those sources.
+    pub(super) takes_more_until: Option<Instant>,
 }
 
 impl LinkBook {
@@ -80,9 +83,11 @@ impl LinkBook {
         };
         node.inputs.iter().any(|input| {
             let port = format!("{}/{}", input.from_node, input.from_port);
-            // A graph that is stopped does not wait for the sources of other machines to end.
-            let is_awaited =
-                |(import, is_driven): &(String, bool)| *import == port && !(*is_driven && self.was_stopped);
+            // A graph that is stopped does not wait for the sources of other machines to end, but for its own link.
+            let is_link_awaited = self.takes_more_until.is_some_and(|until| Instant::now() < until);
+            let is_awaited = |(import, is_driven): &(String, bool)| {
+                *import == port && (!(*is_driven && self.was_stopped) || is_link_awaited)
+            };
             local.imports.iter().any(is_awaited) && !self.ended_imports.contains(&port) && self.may_come(&port)
         })
     }

@@ -62,6 +62,8 @@ const POLL: Duration = Duration::from_millis(50);
 const LOG_DRAIN_LIMIT: Duration = Duration::from_millis(500);
 /// The launcher listens this long at a stretch before it does anything else.
 const LISTEN: Duration = Duration::from_millis(50);
+/// A link says within this time that it takes no more samples, unless it hangs or was killed.
+const LINK_WAIT: Duration = Duration::from_secs(1);
 /// This many lines of all operators may wait for the launcher.
 const MAX_PENDING_EVENTS: usize = 1024;
 /// This many lines wait for the reader of stderr.
@@ -618,6 +620,7 @@ impl Launcher {
         let link = if self.link.was_stopped && !ports.is_empty() { self.link_idx() } else { None };
         if let Some(process) = link.and_then(|link| self.members[link].active.as_mut()) {
             process.tell(&Command::TakeNoMore { ports });
+            self.link.takes_more_until = Some(Instant::now() + LINK_WAIT);
         }
     }
 
