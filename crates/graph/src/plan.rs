@@ -337,8 +337,9 @@ impl Plan {
         own.chain(attached).collect()
     }
 
-    /// The slots whose bells a port's writer rings: those of all instances of its readers' processes, and of commands that read it. The bell
-    /// of an instance that is not there stays rung, and costs nothing.
+    /// The slots whose bells a port's writer rings: those of commands that read it, then those of all instances of its readers'
+    /// processes. A bell may let its reader run at once, before the next one is rung, and the launching command is done sooner
+    /// than a node that publishes to a network. The bell of an instance that is not there stays rung, and costs nothing.
     fn bells(&self, port: &Port) -> Vec<usize> {
         let readers = self.edges.iter().filter(|edge| edge.from == *port).filter_map(|edge| edge.to.as_ref());
         let nodes: BTreeSet<&String> = readers.filter_map(|(node, _)| self.leaders.get(node)).collect();
@@ -346,7 +347,7 @@ impl Plan {
         let is_run_waiting = self.observer_slots.contains_key(port)
             && self.services.get(port).is_some_and(|service| is_needed(&service.type_name));
         let commands = is_run_waiting.then_some(RUN_BELL).into_iter().chain([COMPARE_BELL]);
-        instances.flat_map(|first| *first..first + N_INSTANCES).chain(commands).collect()
+        commands.chain(instances.flat_map(|first| *first..first + N_INSTANCES)).collect()
     }
 
     /// The slots of a port's lossless readers and of those behind them.

@@ -21,6 +21,7 @@ mod service;
 mod slow_nodes;
 mod supervision;
 mod swap;
+mod wake_policy;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::os::unix::net::UnixListener;
@@ -34,7 +35,7 @@ use serde_json::Value;
 
 use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
 use crate::dataflow::pins::PinError;
-use crate::dataflow::{Graph, Node, Program};
+use crate::dataflow::{Graph, Node, ProcessOptions, Program};
 use crate::launcher::clients::Clients;
 use crate::launcher::link_book::LinkBook;
 use crate::launcher::log_writer::{Log, LogWriter};
@@ -44,6 +45,7 @@ use crate::launcher::server::Ask;
 use crate::launcher::service::Service;
 use crate::launcher::slow_nodes::SlowNodes;
 use crate::launcher::swap::Swap;
+use crate::launcher::wake_policy::WakePolicy;
 use crate::log::AUDIT;
 use crate::log::{LogFolder, LogFormat, log_tail};
 use crate::plan::{Plan, Port};
@@ -52,7 +54,7 @@ use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::namespace::{self, NamespaceError};
 use blindgrasp_operator::text::did_you_mean;
-use blindgrasp_operator::wiring::{Clock, Command, LogEntry, LogLevel, Report};
+use blindgrasp_operator::wiring::{Clock, Command, LogEntry, LogLevel, Report, WaitMode};
 
 /// The status of a graph without trouble.
 const RUNNING: &str = "running";
@@ -195,6 +197,7 @@ pub struct Launcher {
     has_ended: bool,
     started: Instant,
     slow_nodes: SlowNodes,
+    wake_policy: WakePolicy,
     /// When heartbeats were looked at last ([`monotonic_nanos`]).
     last_look_nanos: u64,
 }
@@ -302,6 +305,7 @@ impl Launcher {
             has_ended: false,
             started: now,
             slow_nodes: SlowNodes::new(),
+            wake_policy: WakePolicy::new(),
             last_look_nanos: monotonic_nanos(),
         };
         for node in &graph.nodes {
@@ -712,7 +716,21 @@ impl Launcher {
                 self.say(&line);
             }
         }
+        if self.wake_policy.is_due() {
+            self.give_wake_policy();
+        }
         Ok(())
+    }
+
+    /// Gives a policy to the processes for which the dataflow file names none.
+    fn give_wake_policy(&mut self) {
+        // A node that polls never gives way: the others must interrupt it.
+        let polls = self.members.iter().any(|member| member.node.process.wait == WaitMode::Poll);
+        let is_open = |options: &ProcessOptions| options.scheduling.is_none() && options.nice.is_none();
+        let open = self.members.iter().filter(|member| is_open(&member.node.process));
+        let running = open.filter_map(|member| member.active.as_ref().filter(|process| process.is_running()));
+        let pids: Vec<u32> = running.map(Process::pid).collect();
+        self.wake_policy.look(&pids, !polls);
     }
 
     /// Lets old instances go whose samples are answered, and kills those that do not end.
