@@ -337,17 +337,25 @@ impl Plan {
         own.chain(attached).collect()
     }
 
-    /// The slots whose bells a port's writer rings: those of commands that read it, then those of all instances of its readers'
-    /// processes. A bell may let its reader run at once, before the next one is rung, and the launching command is done sooner
-    /// than a node that publishes to a network. The bell of an instance that is not there stays rung, and costs nothing.
+    /// The slots whose bells a port's writer rings: those of all instances of its readers' processes, and of commands that read
+    /// it. A bell may let its reader run at once, before the next one is rung: lossless readers come first, then the launching
+    /// command, which is done sooner than the nodes behind it that publish to a network. The bell of an instance that is not
+    /// there stays rung, and costs nothing.
     fn bells(&self, port: &Port) -> Vec<usize> {
-        let readers = self.edges.iter().filter(|edge| edge.from == *port).filter_map(|edge| edge.to.as_ref());
-        let nodes: BTreeSet<&String> = readers.filter_map(|(node, _)| self.leaders.get(node)).collect();
-        let instances = nodes.into_iter().filter_map(|node| self.instance_slots.get(node));
+        let slots_of = |nodes: &BTreeSet<&String>| -> Vec<usize> {
+            let firsts = nodes.iter().filter_map(|node| self.instance_slots.get(*node));
+            firsts.flat_map(|first| *first..first + N_INSTANCES).collect()
+        };
+        let readers = |policy: EdgePolicy| {
+            let edges = self.edges.iter().filter(move |edge| edge.from == *port && edge.options.policy == policy);
+            edges.filter_map(|edge| self.leaders.get(&edge.to.as_ref()?.0))
+        };
+        let lossless: BTreeSet<&String> = readers(EdgePolicy::Lossless).collect();
+        let latest: BTreeSet<&String> = readers(EdgePolicy::Latest).filter(|node| !lossless.contains(node)).collect();
         let is_run_waiting = self.observer_slots.contains_key(port)
             && self.services.get(port).is_some_and(|service| is_needed(&service.type_name));
-        let commands = is_run_waiting.then_some(RUN_BELL).into_iter().chain([COMPARE_BELL]);
-        commands.chain(instances.flat_map(|first| *first..first + N_INSTANCES)).collect()
+        let run = if is_run_waiting { vec![RUN_BELL] } else { Vec::new() };
+        [slots_of(&lossless), run, slots_of(&latest), vec![COMPARE_BELL]].concat()
     }
 
     /// The slots of a port's lossless readers and of those behind them.

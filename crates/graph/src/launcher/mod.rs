@@ -23,7 +23,7 @@ mod supervision;
 mod swap;
 mod wake_policy;
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::os::unix::net::UnixListener;
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
@@ -724,12 +724,15 @@ impl Launcher {
 
     /// Gives a policy to the processes for which the dataflow file names none.
     fn give_wake_policy(&mut self) {
-        // A node that polls never gives way: the others must interrupt it.
-        let polls = self.members.iter().any(|member| member.node.process.wait == WaitMode::Poll);
-        let is_open = |options: &ProcessOptions| options.scheduling.is_none() && options.nice.is_none();
+        // A node that polls does not give way: the others must interrupt it.
+        let polls = self.members.iter().any(|member| member.node.process.wait != WaitMode::Event);
+        let is_open = |options: &ProcessOptions| {
+            options.scheduling.is_none() && options.nice.is_none() && options.cpus.is_empty()
+        };
         let open = self.members.iter().filter(|member| is_open(&member.node.process));
-        let running = open.filter_map(|member| member.active.as_ref().filter(|process| process.is_running()));
-        let pids: Vec<u32> = running.map(Process::pid).collect();
+        let processes = open.flat_map(|member| member.active.iter().chain(&member.standby));
+        let ready = processes.filter(|process| process.is_ready() && process.is_running());
+        let pids: BTreeSet<u32> = ready.map(Process::pid).collect();
         self.wake_policy.look(&pids, !polls);
     }
 

@@ -3,10 +3,10 @@
 //!
 //! A stage that wakes the next one has microseconds of work left. If the woken stage interrupts it, the kernel moves the
 //! interrupted one to another core, and soon each hop wakes a sleeping core: 27 µs instead of 5 on a virtual machine of
-//! two cores. So operators wait, as long as other programs leave most of the processor time unused. Where these fill the
-//! cores, an operator that waits would wait for milliseconds, so it interrupts them.
+//! two cores. So operators wait, as long as that costs nothing. Where other programs fill the cores, or the operators
+//! themselves compute for long, an operator that waits would wait for milliseconds, so it interrupts them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use rustix::param::clock_ticks_per_second;
@@ -16,37 +16,64 @@ use rustix::thread::{CpuSet, sched_getaffinity};
 const PERIOD: Duration = Duration::from_millis(250);
 /// Operators wait while other programs take less than this share of the processor time.
 const LARGEST_SHARE: f64 = 0.25;
+/// They also wait only while a woken operator runs sooner than this, on average.
+const LONGEST_WAIT_SECS: f64 = 1e-3;
+/// After a look at which they must not wait, they do not for so long.
+const PAUSE: Duration = Duration::from_secs(2);
+
+/// What a process' main thread has used since it began.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+struct Thread {
+    running_secs: f64,
+    /// The time for which it could have run, and another one did.
+    waiting_secs: f64,
+    n_runs: u64,
+}
 
 /// The use of the cores that this process may run on, since they were started.
 struct Usage {
     at: Instant,
     n_cpus: usize,
     idle_secs: f64,
-    /// The processor time of the operators' main threads, by process.
-    own_secs: BTreeMap<u32, f64>,
+    threads: BTreeMap<u32, Thread>,
 }
 
 impl Usage {
     /// `None` where the kernel does not tell.
-    fn now(pids: &[u32]) -> Option<Usage> {
+    fn now(pids: &BTreeSet<u32>) -> Option<Usage> {
         let cpus = sched_getaffinity(None).ok()?;
         let stat = std::fs::read_to_string("/proc/stat").ok()?;
         let idle_ticks: Vec<u64> = stat.lines().filter_map(|line| idle_ticks(line, &cpus)).collect();
-        let own_secs = pids.iter().filter_map(|pid| Some((*pid, processor_secs(*pid)?))).collect();
+        let thread = |pid: &u32| {
+            let text = std::fs::read_to_string(format!("/proc/{pid}/schedstat")).ok()?;
+            Some((*pid, thread_of(&text)?))
+        };
         Some(Usage {
             at: Instant::now(),
             n_cpus: idle_ticks.len(),
             idle_secs: idle_ticks.iter().sum::<u64>() as f64 / clock_ticks_per_second() as f64,
-            own_secs,
+            threads: pids.iter().filter_map(thread).collect(),
         })
     }
 
-    /// The share of the processor time that other programs have taken since an earlier look.
-    fn share_of_others(&self, before: &Usage) -> f64 {
-        let whole = self.at.duration_since(before.at).as_secs_f64() * self.n_cpus as f64;
-        let since = |(pid, secs): (&u32, &f64)| secs - before.own_secs.get(pid).unwrap_or(&0.0);
-        let own: f64 = self.own_secs.iter().map(since).sum();
-        (whole - (self.idle_secs - before.idle_secs) - own) / whole
+    /// Whether woken operators may wait, by the time since an earlier look.
+    fn allows_waiting(&self, before: &Usage) -> bool {
+        let secs = self.at.duration_since(before.at).as_secs_f64();
+        let whole = secs * self.n_cpus as f64;
+        let (mut own, mut waiting, mut n_runs) = (0.0, 0.0, 0);
+        for (pid, thread) in &self.threads {
+            // The time of a process that was not known before may be older.
+            let Some(earlier) = before.threads.get(pid) else {
+                own += thread.running_secs.min(secs);
+                continue;
+            };
+            own += thread.running_secs - earlier.running_secs;
+            waiting += thread.waiting_secs - earlier.waiting_secs;
+            n_runs += thread.n_runs.saturating_sub(earlier.n_runs);
+        }
+        let share_of_others = (whole - (self.idle_secs - before.idle_secs) - own) / whole;
+        // A core that comes or goes, or one that a container cannot see, makes no sense of the sums.
+        self.n_cpus == before.n_cpus && share_of_others < LARGEST_SHARE && waiting <= LONGEST_WAIT_SECS * n_runs as f64
     }
 }
 
@@ -58,45 +85,70 @@ fn idle_ticks(line: &str, cpus: &CpuSet) -> Option<u64> {
     (cpu < CpuSet::MAX_CPU && cpus.is_set(cpu)).then_some(ticks.get(3)? + ticks.get(4)?)
 }
 
-/// The processor time of a process' main thread.
-fn processor_secs(pid: u32) -> Option<f64> {
-    let text = std::fs::read_to_string(format!("/proc/{pid}/schedstat")).ok()?;
-    Some(text.split(' ').next()?.parse::<u64>().ok()? as f64 / 1e9)
+/// By the text of a `schedstat`: nanoseconds of running and of waiting, and the number of runs.
+fn thread_of(text: &str) -> Option<Thread> {
+    let numbers: Vec<u64> = text.split_whitespace().map_while(|word| word.parse().ok()).collect();
+    let [running_nanos, waiting_nanos, n_runs] = numbers.get(..3)?.try_into().ok()?;
+    Some(Thread { running_secs: running_nanos as f64 / 1e9, waiting_secs: waiting_nanos as f64 / 1e9, n_runs })
 }
 
 /// The last look.
 pub(super) struct WakePolicy {
     before: Option<Usage>,
+    last_look: Instant,
+    /// The last look at which operators must not wait.
+    refused: Option<Instant>,
+    waits: bool,
 }
 
 impl WakePolicy {
     pub(super) fn new() -> WakePolicy {
-        WakePolicy { before: Usage::now(&[]) }
+        WakePolicy { before: Usage::now(&BTreeSet::new()), last_look: Instant::now(), refused: None, waits: false }
     }
 
     pub(super) fn is_due(&self) -> bool {
-        self.before.as_ref().is_none_or(|before| before.at.elapsed() >= PERIOD)
+        self.last_look.elapsed() >= PERIOD
     }
 
     /// Gives these processes their policy, which lets them wait only if `may_wait`.
-    pub(super) fn look(&mut self, pids: &[u32], may_wait: bool) {
+    pub(super) fn look(&mut self, pids: &BTreeSet<u32>, may_wait: bool) {
+        self.last_look = Instant::now();
         let now = Usage::now(pids);
-        if let (Some(now), Some(before)) = (&now, &self.before) {
-            let waits = may_wait && now.share_of_others(before) < LARGEST_SHARE;
-            pids.iter().for_each(|pid| set_policy(*pid, waits));
-        }
+        let is_allowed =
+            may_wait && now.as_ref().zip(self.before.as_ref()).is_some_and(|(now, before)| now.allows_waiting(before));
         self.before = now;
+        if !is_allowed {
+            self.refused = Some(self.last_look);
+        }
+        let waited = self.waits;
+        self.waits = self.refused.is_none_or(|refused| refused.elapsed() >= PAUSE);
+        if self.waits {
+            pids.iter().for_each(|pid| set_policy(*pid, true));
+        } else if waited {
+            pids.iter().flat_map(|pid| threads_of(*pid)).for_each(|thread| set_policy(thread, false));
+        }
     }
 }
 
-/// Threads that the process starts later, such as those of a network, have the normal policy.
-fn set_policy(pid: u32, waits: bool) {
+/// The threads of a process. Those that began while it waited do so as well.
+fn threads_of(pid: u32) -> Vec<u32> {
+    let entries = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
+    entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok()).collect()
+}
+
+/// A policy or a negative `nice` that others have chosen (the operator itself, or the service in which `run` is) stays.
+fn set_policy(thread: u32, waits: bool) {
+    let thread = thread as libc::pid_t;
     let policy = if waits { libc::SCHED_BATCH } else { libc::SCHED_OTHER };
     // SAFETY: the struct is valid for any bits, and the kernel reads it during the call alone.
     unsafe {
-        let param: libc::sched_param = std::mem::zeroed();
-        // A process that has just ended, or a kernel that refuses, keeps the policy that it has.
-        libc::sched_setscheduler(pid as libc::pid_t, policy | libc::SCHED_RESET_ON_FORK, &raw const param);
+        let before = libc::sched_getscheduler(thread);
+        let is_ours = [libc::SCHED_OTHER, libc::SCHED_BATCH].contains(&before);
+        if is_ours && before != policy && libc::getpriority(libc::PRIO_PROCESS, thread as libc::id_t) >= 0 {
+            let param: libc::sched_param = std::mem::zeroed();
+            // A thread that has just ended, or a kernel that refuses, keeps the policy that it has.
+            libc::sched_setscheduler(thread, policy, &raw const param);
+        }
     }
 }
 
@@ -104,19 +156,34 @@ fn set_policy(pid: u32, waits: bool) {
 mod tests {
     use super::*;
 
-    fn usage(at: Instant, idle_secs: f64, own_secs: &[(u32, f64)]) -> Usage {
-        Usage { at, n_cpus: 2, idle_secs, own_secs: own_secs.iter().copied().collect() }
+    fn thread(running_secs: f64, waiting_secs: f64, n_runs: u64) -> Thread {
+        Thread { running_secs, waiting_secs, n_runs }
+    }
+
+    fn usage(at: Instant, idle_secs: f64, threads: &[(u32, Thread)]) -> Usage {
+        Usage { at, n_cpus: 2, idle_secs, threads: threads.iter().copied().collect() }
     }
 
     #[test]
-    fn the_time_of_others_is_neither_idle_nor_our_own() {
+    fn operators_wait_while_others_take_little_time_and_none_waits_for_long() {
         let start = Instant::now();
         let later = start + Duration::from_secs(1);
-        let before = usage(start, 100.0, &[(7, 5.0), (8, 9.0)]);
-        // Of two seconds, half of one was idle; a process has ended and another one begun.
-        let after = usage(later, 100.5, &[(7, 5.75), (9, 0.25)]);
-        assert!((after.share_of_others(&before) - 0.25).abs() < 1e-9);
-        assert!(usage(later, 102.0, &[(7, 5.0)]).share_of_others(&before).abs() < 1e-9);
+        let before = usage(start, 100.0, &[(7, thread(5.0, 1.0, 1000)), (8, thread(9.0, 0.0, 10))]);
+        let allows =
+            |idle_secs: f64, threads: &[(u32, Thread)]| usage(later, idle_secs, threads).allows_waiting(&before);
+        // All of two seconds is idle, or our own: a process has ended, and another one began long ago.
+        assert!(allows(102.0, &[(7, thread(5.0, 1.0, 1000))]));
+        assert!(allows(100.5, &[(7, thread(5.5, 1.0, 1001)), (9, thread(50.0, 0.0, 1))]));
+        // Others have taken a fifth, or two fifths.
+        assert!(allows(101.1, &[(7, thread(5.5, 1.0, 1000))]));
+        assert!(!allows(100.7, &[(7, thread(5.5, 1.0, 1000))]));
+        // It waited for 0.9 ms or 1.1 ms before each run.
+        assert!(allows(101.5, &[(7, thread(5.5, 1.09, 1100))]));
+        assert!(!allows(101.5, &[(7, thread(5.5, 1.11, 1100))]));
+        let other_cores = Usage { n_cpus: 3, ..usage(later, 102.0, &[]) };
+        assert!(!other_cores.allows_waiting(&before));
+        let none = || Usage { n_cpus: 0, ..usage(start, 0.0, &[]) };
+        assert!(!none().allows_waiting(&none()));
     }
 
     #[test]
@@ -127,6 +194,8 @@ mod tests {
         for other in ["cpu0 10 0 20 300 4 0 1 0 0 0", "cpu  10 0 20 300 4 0 1 0 0 0", "intr 1 2", "cpu1 10 0"] {
             assert_eq!(idle_ticks(other, &cpus), None, "{other}");
         }
+        assert_eq!(thread_of("1500000000 250000000 12\n"), Some(thread(1.5, 0.25, 12)));
+        assert_eq!(thread_of("1500000000 250000000"), None);
     }
 
     #[test]
@@ -134,16 +203,19 @@ mod tests {
         let mut child = std::process::Command::new("sleep").arg("600").spawn().expect("sleep");
         let pid = child.id();
         // SAFETY: the call has no preconditions.
-        let policy = || unsafe { libc::sched_getscheduler(pid as libc::pid_t) } & !libc::SCHED_RESET_ON_FORK;
-        let found = [true, false, true].map(|waits| {
-            set_policy(pid, waits);
+        let policy = || unsafe { libc::sched_getscheduler(pid as libc::pid_t) };
+        let found = [policy(), libc::SCHED_BATCH, libc::SCHED_OTHER].map(|wanted| {
+            set_policy(pid, wanted == libc::SCHED_BATCH);
             policy()
         });
-        let usage = Usage::now(&[pid, u32::MAX]);
+        // SAFETY: as above.
+        let nice = unsafe { libc::getpriority(libc::PRIO_PROCESS, pid) };
+        let threads = threads_of(pid);
         child.kill().and_then(|()| child.wait()).expect("killed");
-        assert_eq!(found, [libc::SCHED_BATCH, libc::SCHED_OTHER, libc::SCHED_BATCH]);
-        let usage = usage.expect("a look");
-        assert!(usage.n_cpus > 0 && usage.idle_secs > 0.0, "{} cores", usage.n_cpus);
-        assert_eq!(usage.own_secs.keys().copied().collect::<Vec<_>>(), [pid]);
+        // A policy under which the tests themselves run is left alone.
+        if found[0] == libc::SCHED_OTHER && nice >= 0 {
+            assert_eq!(found, [libc::SCHED_OTHER, libc::SCHED_BATCH, libc::SCHED_OTHER]);
+        }
+        assert_eq!(threads, [pid]);
     }
 }
