@@ -27,6 +27,7 @@ from .options import REQUIRED
 SUBJECTS = (
     "runtime",
     "rate_max",
+    "peers",
     "side_by_side",
     "gaps",
     "soak",

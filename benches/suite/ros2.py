@@ -42,7 +42,7 @@ REFUSALS = ("malformed", "oversized", "cut_off", "late", "out_of_order")
 
 
 def measure(options):
-    peer = build_peer()
+    peer = programs.build_peer("hiroz")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         robot = [write_frames(folder / "frames.jsonl"), str(options.rate), str(options.secs)]
@@ -58,14 +58,6 @@ def measure(options):
     costs = {side: runs[side] for side in COSTS}
     ratios = figures.ratios(loops, "bare") | figures.ratios(costs, "cost, alone")
     return {"medians": figures.medians(runs), "ratios": ratios, "rounds": runs}
-
-
-def build_peer():
-    manifest = programs.PROJECT / "benches" / "hiroz" / "Cargo.toml"
-    target = programs.PROJECT / "target" / "hiroz"
-    command = ["cargo", "build", "--release", "--quiet", "--manifest-path", manifest, "--target-dir", target]
-    subprocess.run(command, check=True, stdout=sys.stderr)
-    return target / "release" / "hiroz-peer"
 
 
 def write_frames(path):

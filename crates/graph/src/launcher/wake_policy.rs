@@ -120,17 +120,15 @@ impl WakePolicy {
         if !is_allowed {
             self.refused = Some(self.last_look);
         }
-        let waited = self.waits;
-        self.waits = self.refused.is_none_or(|refused| refused.elapsed() >= PAUSE);
-        if self.waits {
-            pids.iter().for_each(|pid| set_policy(*pid, true));
-        } else if waited {
-            pids.iter().flat_map(|pid| threads_of(*pid)).for_each(|thread| set_policy(thread, false));
+        let waits = self.refused.is_none_or(|refused| refused.elapsed() >= PAUSE);
+        // Threads that begin while their process waits do so as well, and a process begins without.
+        if waits || self.waits {
+            pids.iter().flat_map(|pid| threads_of(*pid)).for_each(|thread| set_policy(thread, waits));
         }
+        self.waits = waits;
     }
 }
 
-/// The threads of a process. Those that began while it waited do so as well.
 fn threads_of(pid: u32) -> Vec<u32> {
     let entries = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
     entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok()).collect()
