@@ -3,8 +3,8 @@
 "copper" is one process of Copper (benches/copper) with five tasks, which call the stages' functions in turn; its log and
 a monitor are on. Its time begins when its source has the frame and ends when its arbiter has decided, all in one thread;
 those of graph and group are taken from process to process. "dora" is a chain of six nodes (benches/dora) that passes
-samples of the same sizes along and computes nothing, with dora's default queues, and "dora, reliable" with those that drop
-nothing. At rate max, graph and group are recorded, as Copper logs all that its tasks send. dora takes some ten minutes to
+samples of the same sizes along and computes nothing, with dora's default policy for full queues (of 1,000 samples), and
+"dora, reliable" with its policy `backpressure`. At rate max, graph and group are recorded, as Copper logs all that its tasks send. dora takes some ten minutes to
 build the first time, Copper three.
 """
 

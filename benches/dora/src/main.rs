@@ -44,7 +44,7 @@ const N_FEATURES: usize = 70;
 const N_GRASP_FRAMES: u64 = 14;
 /// The distance to the next grasp's frames, in frames.
 const N_PAUSE_FRAMES: u64 = 10;
-/// Samples that an input keeps: so many that none is dropped. With `backpressure`, dora keeps ten times as many.
+/// Samples that an input keeps. With `backpressure`, dora keeps ten times as many.
 const QUEUE_SIZE: usize = 1000;
 /// The last samples have this long to arrive before the source ends and its output closes.
 const SETTLE: Duration = Duration::from_millis(500);

@@ -339,8 +339,8 @@ impl Plan {
 
     /// The slots whose bells a port's writer rings: those of all instances of its readers' processes, and of commands that read
     /// it. A bell may let its reader run at once, before the next one is rung: lossless readers come first, then the launching
-    /// command, which is done sooner than the nodes behind it that publish to a network. The bell of an instance that is not
-    /// there stays rung, and costs nothing.
+    /// command, then readers with `latest`, such as those that publish to a network and take longer. The bell of an instance
+    /// that is not there stays rung, and costs nothing.
     fn bells(&self, port: &Port) -> Vec<usize> {
         let slots_of = |nodes: &BTreeSet<&String>| -> Vec<usize> {
             let firsts = nodes.iter().filter_map(|node| self.instance_slots.get(*node));

@@ -2,8 +2,8 @@
 //! (`SCHED_BATCH`).
 //!
 //! A stage that wakes the next one has microseconds of work left. If the woken stage interrupts it, the kernel moves the
-//! interrupted one to another core, and soon each hop wakes a sleeping core: 27 µs instead of 5 on a virtual machine of
-//! two cores. So operators wait, as long as that costs nothing. Where other programs fill the cores, or the operators
+//! interrupted one to another core, and soon every third hop wakes a sleeping core: 27 µs instead of 5 on a virtual machine
+//! of two cores. So operators wait, as long as that costs little. Where other programs fill the cores, or the operators
 //! themselves compute for long, an operator that waits would wait for milliseconds, so it interrupts them.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -16,12 +16,14 @@ use rustix::thread::{CpuSet, sched_getaffinity};
 const PERIOD: Duration = Duration::from_millis(250);
 /// Operators wait while other programs take less than this share of the processor time.
 const LARGEST_SHARE: f64 = 0.25;
-/// They also wait only while a woken operator runs sooner than this, on average.
+/// They also wait only while none of their threads waits for a core longer than this, on average.
 const LONGEST_WAIT_SECS: f64 = 1e-3;
+/// A thread that runs less often between two looks has no average.
+const LEAST_RUNS: u64 = 10;
 /// After a look at which they must not wait, they do not for so long.
 const PAUSE: Duration = Duration::from_secs(2);
 
-/// What a process' main thread has used since it began.
+/// The times of a thread since it began.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 struct Thread {
     running_secs: f64,
@@ -35,24 +37,25 @@ struct Usage {
     at: Instant,
     n_cpus: usize,
     idle_secs: f64,
+    /// Those of the graph, by their numbers.
     threads: BTreeMap<u32, Thread>,
 }
 
 impl Usage {
     /// `None` where the kernel does not tell.
-    fn now(pids: &BTreeSet<u32>) -> Option<Usage> {
+    fn now(threads: impl Iterator<Item = u32>) -> Option<Usage> {
         let cpus = sched_getaffinity(None).ok()?;
         let stat = std::fs::read_to_string("/proc/stat").ok()?;
         let idle_ticks: Vec<u64> = stat.lines().filter_map(|line| idle_ticks(line, &cpus)).collect();
-        let thread = |pid: &u32| {
-            let text = std::fs::read_to_string(format!("/proc/{pid}/schedstat")).ok()?;
-            Some((*pid, thread_of(&text)?))
+        let thread = |number: u32| {
+            let text = std::fs::read_to_string(format!("/proc/{number}/schedstat")).ok()?;
+            Some((number, thread_of(&text)?))
         };
         Some(Usage {
             at: Instant::now(),
             n_cpus: idle_ticks.len(),
             idle_secs: idle_ticks.iter().sum::<u64>() as f64 / clock_ticks_per_second() as f64,
-            threads: pids.iter().filter_map(thread).collect(),
+            threads: threads.filter_map(thread).collect(),
         })
     }
 
@@ -60,20 +63,22 @@ impl Usage {
     fn allows_waiting(&self, before: &Usage) -> bool {
         let secs = self.at.duration_since(before.at).as_secs_f64();
         let whole = secs * self.n_cpus as f64;
-        let (mut own, mut waiting, mut n_runs) = (0.0, 0.0, 0);
-        for (pid, thread) in &self.threads {
-            // The time of a process that was not known before may be older.
-            let Some(earlier) = before.threads.get(pid) else {
-                own += thread.running_secs.min(secs);
-                continue;
-            };
-            own += thread.running_secs - earlier.running_secs;
-            waiting += thread.waiting_secs - earlier.waiting_secs;
-            n_runs += thread.n_runs.saturating_sub(earlier.n_runs);
+        let (mut own, mut waits_for_long) = (0.0, false);
+        for (number, thread) in &self.threads {
+            match before.threads.get(number) {
+                Some(earlier) => {
+                    own += thread.running_secs - earlier.running_secs;
+                    let n_runs = thread.n_runs.saturating_sub(earlier.n_runs);
+                    let longest = LONGEST_WAIT_SECS * n_runs as f64;
+                    waits_for_long |= n_runs >= LEAST_RUNS && thread.waiting_secs - earlier.waiting_secs > longest;
+                }
+                // The time of a thread that was not known before may be older.
+                None => own += thread.running_secs.min(secs),
+            }
         }
-        let share_of_others = (whole - (self.idle_secs - before.idle_secs) - own) / whole;
+        let share_of_others = (whole - (self.idle_secs - before.idle_secs) - own.min(whole)) / whole;
         // A core that comes or goes, or one that a container cannot see, makes no sense of the sums.
-        self.n_cpus == before.n_cpus && share_of_others < LARGEST_SHARE && waiting <= LONGEST_WAIT_SECS * n_runs as f64
+        self.n_cpus == before.n_cpus && share_of_others < LARGEST_SHARE && !waits_for_long
     }
 }
 
@@ -98,22 +103,28 @@ pub(super) struct WakePolicy {
     last_look: Instant,
     /// The last look at which operators must not wait.
     refused: Option<Instant>,
-    waits: bool,
+    /// Operators begin with the normal policy.
+    is_open: bool,
 }
 
 impl WakePolicy {
     pub(super) fn new() -> WakePolicy {
-        WakePolicy { before: Usage::now(&BTreeSet::new()), last_look: Instant::now(), refused: None, waits: false }
+        let before = Usage::now(threads_of(std::process::id()).into_iter());
+        // SAFETY: the call has no preconditions.
+        let is_open = unsafe { libc::sched_getscheduler(0) } == libc::SCHED_OTHER;
+        WakePolicy { before, last_look: Instant::now(), refused: None, is_open }
     }
 
     pub(super) fn is_due(&self) -> bool {
-        self.last_look.elapsed() >= PERIOD
+        self.is_open && self.last_look.elapsed() >= PERIOD
     }
 
     /// Gives these processes their policy, which lets them wait only if `may_wait`.
     pub(super) fn look(&mut self, pids: &BTreeSet<u32>, may_wait: bool) {
         self.last_look = Instant::now();
-        let now = Usage::now(pids);
+        let threads: Vec<u32> = pids.iter().flat_map(|pid| threads_of(*pid)).collect();
+        // The launcher reads and records samples, and keeps its policy: it may be a part of a user's program.
+        let now = Usage::now(threads.iter().copied().chain(threads_of(std::process::id())));
         let is_allowed =
             may_wait && now.as_ref().zip(self.before.as_ref()).is_some_and(|(now, before)| now.allows_waiting(before));
         self.before = now;
@@ -121,11 +132,7 @@ impl WakePolicy {
             self.refused = Some(self.last_look);
         }
         let waits = self.refused.is_none_or(|refused| refused.elapsed() >= PAUSE);
-        // Threads that begin while their process waits do so as well, and a process begins without.
-        if waits || self.waits {
-            pids.iter().flat_map(|pid| threads_of(*pid)).for_each(|thread| set_policy(thread, waits));
-        }
-        self.waits = waits;
+        threads.into_iter().for_each(|thread| set_policy(thread, waits));
     }
 }
 
@@ -134,18 +141,19 @@ fn threads_of(pid: u32) -> Vec<u32> {
     entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok()).collect()
 }
 
-/// A policy or a negative `nice` that others have chosen (the operator itself, or the service in which `run` is) stays.
+/// A policy that the operator has chosen itself stays, unless it is one of the two. So does a negative `nice`: it asks for more
+/// than to wait.
 fn set_policy(thread: u32, waits: bool) {
     let thread = thread as libc::pid_t;
-    let policy = if waits { libc::SCHED_BATCH } else { libc::SCHED_OTHER };
+    let (from, to) =
+        if waits { (libc::SCHED_OTHER, libc::SCHED_BATCH) } else { (libc::SCHED_BATCH, libc::SCHED_OTHER) };
     // SAFETY: the struct is valid for any bits, and the kernel reads it during the call alone.
     unsafe {
-        let before = libc::sched_getscheduler(thread);
-        let is_ours = [libc::SCHED_OTHER, libc::SCHED_BATCH].contains(&before);
-        if is_ours && before != policy && libc::getpriority(libc::PRIO_PROCESS, thread as libc::id_t) >= 0 {
+        let is_from = libc::sched_getscheduler(thread) == from;
+        if is_from && (!waits || libc::getpriority(libc::PRIO_PROCESS, thread as libc::id_t) >= 0) {
             let param: libc::sched_param = std::mem::zeroed();
             // A thread that has just ended, or a kernel that refuses, keeps the policy that it has.
-            libc::sched_setscheduler(thread, policy, &raw const param);
+            libc::sched_setscheduler(thread, to, &raw const param);
         }
     }
 }
@@ -175,9 +183,10 @@ mod tests {
         // Others have taken a fifth, or two fifths.
         assert!(allows(101.1, &[(7, thread(5.5, 1.0, 1000))]));
         assert!(!allows(100.7, &[(7, thread(5.5, 1.0, 1000))]));
-        // It waited for 0.9 ms or 1.1 ms before each run.
-        assert!(allows(101.5, &[(7, thread(5.5, 1.09, 1100))]));
+        // It waited for 0.9 ms or 1.1 ms before each run. What a thread does that runs once is no average.
+        assert!(allows(101.5, &[(7, thread(5.5, 1.09, 1100)), (8, thread(9.0, 0.2, 11))]));
         assert!(!allows(101.5, &[(7, thread(5.5, 1.11, 1100))]));
+        assert!(!allows(101.5, &[(7, thread(5.5, 1.0, 1100)), (8, thread(9.0, 0.2, 30))]));
         let other_cores = Usage { n_cpus: 3, ..usage(later, 102.0, &[]) };
         assert!(!other_cores.allows_waiting(&before));
         let none = || Usage { n_cpus: 0, ..usage(start, 0.0, &[]) };
