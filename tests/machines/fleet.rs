@@ -22,13 +22,16 @@ fn a_graph_through_a_router_decides_as_on_one_machine_and_survives_the_router() 
         "scouting": {"multicast": {"enabled": false}, "gossip": {"enabled": false}}}"#;
     std::fs::write(folder.path().join("zenohd.json5"), config).expect("written");
     let start_router = || Attacker::start(gateway, folder.path(), &["router", "zenohd.json5"]);
-    let machines = format!(
-        "machines:\n  robot: {{}}\n  brain: {{}}\nlink: {{router: tcp/{}:7447, insecure: true}}\n",
-        gateway.address
-    );
-    let flow = split(folder.path(), &machines, &[]);
+    let machines = |more: &str| {
+        format!(
+            "machines:\n  robot: {{}}\n  brain: {{}}\nlink: {{router: tcp/{}:7447, insecure: true{more}}}\n",
+            gateway.address
+        )
+    };
+    // A busy machine must not end as a cut link.
+    let flow = split(folder.path(), &machines(", deadline_ms: 20000"), &[patient()]);
     let strict_folder = tempfile::tempdir().expect("a folder");
-    let strict_flow = split(strict_folder.path(), &machines, &[strict()]);
+    let strict_flow = split(strict_folder.path(), &machines(""), &[strict()]);
 
     // The machines first.
     let brain_part = part(brain, &flow, "brain", &[]);
