@@ -4,8 +4,9 @@
 a monitor are on. Its time begins when its source has the frame and ends when its arbiter has decided, all in one thread;
 those of graph and group are taken from process to process. "dora" is a chain of six nodes (benches/dora) that passes
 samples of the same sizes along and computes nothing, with dora's default policy for full queues (of 1,000 samples), and
-"dora, reliable" with its policy `backpressure`. At rate max, graph and group are recorded, as Copper logs all that its tasks send. dora takes some ten minutes to
-build the first time, Copper three.
+"dora, reliable" with its policy `backpressure`. dora's nodes look for each other by multicast on the machine's networks. At
+rate max, graph and group are recorded, as Copper logs all that its tasks send. The first build of dora takes some ten
+minutes, that of Copper three.
 """
 
 import json

@@ -4,7 +4,7 @@
 //! `copper-peer RECORDING MODEL RATE_HZ SECS` sends the frames of a simulated recording over and over in its rhythm: those
 //! of a grasp at RATE_HZ, then a pause of ten frames' time; at the rate inf, it waits for nothing. It prints JSON.
 //! `latency_nanos` is the time from the source's stamp to the decision, over the frames that bring one, without the first
-//! 50. `frame_nanos` is the time of the whole loop a frame. `log_bytes` is what is used of Copper's log.
+//! 50. `frame_nanos` is the time of the whole loop a frame. `log_bytes` is the used part of Copper's log.
 //!
 //! The log is a temporary file with all payloads, keyframes and the lines of the monitor, cu-logmon 1.3.0: one a second.
 //! Copper has one thread. It sleeps between the iterations, as with Copper's own `rate_target_hz`, which knows no pauses.

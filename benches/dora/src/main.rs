@@ -65,7 +65,7 @@ fn main() -> eyre::Result<()> {
     }
 }
 
-/// Runs the dataflow to its end and prints what was measured.
+/// Runs the dataflow to its end and prints the measured times.
 fn run(rate_hz: f64, secs: f64, policy: &str) -> eyre::Result<()> {
     ensure!((10.0..=1e6).contains(&rate_hz), "expected RATE_HZ from 10 to 1000000, found {rate_hz}");
     ensure!(secs > 0.0 && secs <= 1e5, "expected SECS above 0, at most 100000, found {secs}");

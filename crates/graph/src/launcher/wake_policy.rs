@@ -24,7 +24,7 @@ const LEAST_RUNS: u64 = 10;
 const PAUSE: Duration = Duration::from_secs(2);
 
 /// The times of a thread since it began.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 struct Thread {
     running_secs: f64,
     /// The time for which it could have run, and another one did.
@@ -37,7 +37,7 @@ struct Usage {
     at: Instant,
     n_cpus: usize,
     idle_secs: f64,
-    /// Those of the graph, by their numbers.
+    /// The threads of operators and of the launcher, by their numbers.
     threads: BTreeMap<u32, Thread>,
 }
 
@@ -128,11 +128,16 @@ impl WakePolicy {
         let is_allowed =
             may_wait && now.as_ref().zip(self.before.as_ref()).is_some_and(|(now, before)| now.allows_waiting(before));
         self.before = now;
-        if !is_allowed {
-            self.refused = Some(self.last_look);
-        }
-        let waits = self.refused.is_none_or(|refused| refused.elapsed() >= PAUSE);
+        let waits = self.waits(is_allowed, self.last_look);
         threads.into_iter().for_each(|thread| set_policy(thread, waits));
+    }
+
+    /// Whether operators wait after a look at which that was allowed, or not.
+    fn waits(&mut self, is_allowed: bool, now: Instant) -> bool {
+        if !is_allowed {
+            self.refused = Some(now);
+        }
+        self.refused.is_none_or(|refused| now.duration_since(refused) >= PAUSE)
     }
 }
 
@@ -191,6 +196,16 @@ mod tests {
         assert!(!other_cores.allows_waiting(&before));
         let none = || Usage { n_cpus: 0, ..usage(start, 0.0, &[]) };
         assert!(!none().allows_waiting(&none()));
+    }
+
+    #[test]
+    fn operators_interrupt_for_two_seconds_after_a_refusal() {
+        let mut policy = WakePolicy::new();
+        let start = Instant::now();
+        let mut waits = |is_allowed, millis| policy.waits(is_allowed, start + Duration::from_millis(millis));
+        assert!(waits(true, 0));
+        assert!(!waits(false, 250) && !waits(true, 500) && !waits(false, 750) && !waits(true, 2500));
+        assert!(waits(true, 2750));
     }
 
     #[test]
