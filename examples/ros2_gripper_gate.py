@@ -135,6 +135,7 @@ def serve(arguments, decisions):
     import control_msgs.action
     import rclpy
     from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
+    from rclpy.clock import Clock
     from rclpy.executors import MultiThreadedExecutor
 
     # Humble has no ParallelGripperCommand.
@@ -204,6 +205,8 @@ def serve(arguments, decisions):
         goal_callback=take,
         cancel_callback=lambda _: CancelResponse.ACCEPT,
     )
+    # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
+    node.create_timer(1.0, lambda: None, clock=Clock())
     try:
         # The answers of the controller come while a goal is executed.
         rclpy.spin(node, MultiThreadedExecutor(num_threads=4))

@@ -12,6 +12,7 @@ import time
 
 import rclpy
 from blindgrasp_msgs.msg import Decision
+from rclpy.clock import Clock
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
@@ -48,7 +49,10 @@ class LiftGate(Node):
 def main():
     rclpy.init()
     try:
-        rclpy.spin(LiftGate())
+        gate = LiftGate()
+        # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
+        gate.create_timer(1.0, lambda: None, clock=Clock())
+        rclpy.spin(gate)
     except KeyboardInterrupt:
         pass
     except Exception:

@@ -198,6 +198,7 @@ def message_class(name):
 
 def bridge(table, address):
     import rclpy
+    from rclpy.clock import Clock
     from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 
     source = line_protocol.Source(address)
@@ -229,6 +230,8 @@ def bridge(table, address):
     for idx, entry in enumerate(table["cells"]):
         take = lambda message, idx=idx: send(frames.take_cells(idx, message, now_nanos()))
         subscribe(entry, "std_msgs/msg/Float64MultiArray", take)
+    # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
+    node.create_timer(1.0, lambda: None, clock=Clock())
     try:
         rclpy.spin(node)
     except Exception:

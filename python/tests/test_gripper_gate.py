@@ -163,15 +163,17 @@ class Gate(unittest.TestCase):
         rclpy = types.ModuleType("rclpy")
         logger = Message(info=lambda text: None)
         rclpy.init, rclpy.try_shutdown, rclpy.ok, rclpy.spin = lambda: None, lambda: None, lambda: True, spin
-        rclpy.create_node = lambda name: Message(get_logger=lambda: logger)
+        rclpy.create_node = lambda name: Message(get_logger=lambda: logger, create_timer=lambda *_, clock: None)
         action, executors = types.ModuleType("rclpy.action"), types.ModuleType("rclpy.executors")
         action.ActionClient, action.ActionServer = Client, server
         executors.MultiThreadedExecutor = lambda num_threads: None
+        clock = types.ModuleType("rclpy.clock")
+        clock.Clock = Message
         action.GoalResponse = Message(ACCEPT="accept", REJECT="reject")
         action.CancelResponse = Message(ACCEPT="accept")
         control, actions = types.ModuleType("control_msgs"), types.ModuleType("control_msgs.action")
         actions.GripperCommand, control.action = Message(Result=Message), actions
-        modules = {"rclpy": rclpy, "rclpy.action": action, "rclpy.executors": executors}
+        modules = {"rclpy": rclpy, "rclpy.action": action, "rclpy.executors": executors, "rclpy.clock": clock}
         modules.update({"control_msgs": control, "control_msgs.action": actions})
         arguments = Message(parallel=False, controller="/gripper/cmd", grasps_below=0.03, grasps_above=None, wait=20.0, name="grasp_gate")
         with mock.patch.dict(sys.modules, modules):

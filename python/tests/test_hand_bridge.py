@@ -196,6 +196,9 @@ class Node:
     def create_subscription(self, kind, topic, callback, qos):
         self.subscriptions[topic] = (kind, callback)
 
+    def create_timer(self, period_s, callback, clock):
+        pass
+
     def get_clock(self):
         return Message(now=lambda: Message(nanoseconds=5 * 10**9))
 
@@ -216,7 +219,9 @@ class Bridge(unittest.TestCase):
         rclpy.create_node, rclpy.spin = lambda name: node, spin
         qos = types.ModuleType("rclpy.qos")
         qos.qos_profile_sensor_data = qos.DurabilityPolicy = qos.QoSProfile = None
-        modules = {"rclpy": rclpy, "rclpy.qos": qos}
+        clock = types.ModuleType("rclpy.clock")
+        clock.Clock = Message
+        modules = {"rclpy": rclpy, "rclpy.qos": qos, "rclpy.clock": clock}
         with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX) as source:
             path = f"{folder}/tactile.hand"
             source.bind(path)
