@@ -3,6 +3,7 @@
 mod commands;
 
 use std::process::ExitCode;
+use std::sync::Arc;
 
 use blindgrasp_graph::dataflow::DataflowError;
 use blindgrasp_graph::launcher::ZENOH_THREADS;
@@ -14,6 +15,8 @@ fn main() -> ExitCode {
         // SAFETY: no other thread has begun yet, which could read the environment meanwhile.
         unsafe { std::env::set_var(name, value) };
     }
+    // A file beyond the limit of sizes (ulimit -f) is an error of the write, as a full disk is, and kills no graph.
+    let _ = signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::default());
     let cli = commands::Cli::read();
     if let Some(code) = cli.run_operator() {
         return code;

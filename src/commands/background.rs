@@ -54,7 +54,7 @@ pub(super) fn detach(name: &str, json: bool) -> anyhow::Result<Outcome> {
     }
     let (pid, logs) = (child.id(), folder.path().display());
     print_line(&if json {
-        json!({ "graph": name, "pid": pid, "log_folder": folder.path() }).to_string()
+        json!({ "graph": name, "pid": pid, "log_folder": folder.path().display().to_string() }).to_string()
     } else {
         format!(
             "graph '{name}' runs in the background (process {pid}); its logs are in {logs}\n\

@@ -339,12 +339,12 @@ fn print_scores(Evaluated { evaluation, trained, .. }: &Evaluated) -> anyhow::Re
     Ok(())
 }
 
-/// Prints how well each look of a model with probes judges.
+/// Prints how well each stage of a model with probes judges.
 fn print_looks(looks: &[Look]) -> anyhow::Result<()> {
     if looks.is_empty() {
         return Ok(());
     }
-    print_line("look          grasps    stable  ROC area  calibration error  lifted by the thresholds, stable ones")?;
+    print_line("stage         grasps    stable  ROC area  calibration error  lifted by the thresholds, stable ones")?;
     for look in looks {
         let share = |n: usize, of: usize| percent((of > 0).then(|| n as f64 / of as f64));
         print_line(&format!(
@@ -360,7 +360,7 @@ fn print_looks(looks: &[Look]) -> anyhow::Result<()> {
             share(look.n_kept, look.n_lifted),
         ))?;
     }
-    print_line("looks: of the grasps that some cell feels, each by one frame")?;
+    print_line("stages: of the grasps that some cell feels, each by one frame")?;
     Ok(())
 }
 
@@ -402,19 +402,19 @@ fn print_judges(report: &Report) -> anyhow::Result<()> {
     }
     for pair in &report.repeated_comparisons {
         print_line(&format!(
-            "{} against {}, {} repeats: {} fewer errors in the mean ({:.1}..{:.1})",
+            "{} against {}, {} repeats: {} fewer errors in the mean (least {}, greatest {})",
             pair.first,
             pair.second,
             pair.relative_error_reduction.len(),
             percent(Some(pair.mean)),
-            100.0 * pair.least,
-            100.0 * pair.greatest,
+            percent(Some(pair.least)),
+            percent(Some(pair.greatest)),
         ))?;
     }
     let data = &report.data;
     print_line(&format!(
         "judged: {} grasps of {} objects; held without a judgement: {}, {} of them stable",
-        data.n_judged, data.n_objects, data.n_held_unjudged, data.n_held_unjudged_stable
+        data.n_judged, data.n_judged_objects, data.n_held_unjudged, data.n_held_unjudged_stable
     ))?;
     for (reason, n) in &data.n_excluded {
         print_line(&format!("left out: {n} with {reason}"))?;

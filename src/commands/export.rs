@@ -11,7 +11,7 @@ use serde_json::json;
 
 use super::{Outcome, check_new, data_on_stdout, print_line};
 use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::training::write_feature_table;
+use blindgrasp_learning::training::{FeatureTableError, write_feature_table};
 use blindgrasp_messages::files::partial_path;
 use blindgrasp_recording::export::{CsvTable, ExportError, row, table_shapes};
 use blindgrasp_recording::{Record, RecordingReader, recordings_in};
@@ -79,7 +79,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::Result<Outcome> {
     let recordings = recordings_in(&arguments.recordings)?;
     let first = recordings.first().context("expected a recording")?;
-    check_new(out, &[&recordings[..], &[model.to_path_buf()]].concat(), arguments.overwrite)?;
+    let file = NewFile::create(out, &[&recordings[..], &[model.to_path_buf()]].concat(), arguments.overwrite)?;
     let (path, model) = (model, Model::load(model)?);
     let hand = hand_of(first, arguments.hand.as_deref())?;
     if hand.id() != model.hand.id {
@@ -93,9 +93,12 @@ fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::R
             hand.id()
         );
     }
-    let file = File::create(out).with_context(|| format!("cannot write {}", out.display()))?;
-    let written = write_feature_table(&hand, &model, &recordings, BufWriter::new(file))
-        .with_context(|| format!("cannot write {}", out.display()))?;
+    let written = write_feature_table(&hand, &model, &recordings, BufWriter::new(&file.file));
+    let written = written.map_err(|error| match error {
+        FeatureTableError::Examples(of_recordings) => anyhow::Error::from(of_recordings),
+        error => anyhow::Error::from(error).context(format!("cannot write {}", out.display())),
+    })?;
+    file.finish()?;
     print_line(&format!("{}: {} grasps, {} values each", out.display(), written.n_rows, model.features.len()))?;
     for (reason, n) in &written.n_excluded {
         print_line(&format!("left out: {n} with {reason}"))?;
@@ -107,7 +110,7 @@ fn export_lines(arguments: &Arguments, recording: &Path) -> anyhow::Result<Outco
     match &arguments.out {
         None => write_lines(recording, &arguments.topic, data_on_stdout())?,
         Some(path) => {
-            let file = NewFile::create(path, recording, arguments.overwrite)?;
+            let file = NewFile::create(path, &[recording.into()], arguments.overwrite)?;
             write_lines(recording, &arguments.topic, &file.file).with_context(|| path.display().to_string())?;
             file.finish()?;
         }
@@ -154,7 +157,7 @@ fn export_tables(arguments: &Arguments, recording: &Path) -> anyhow::Result<Outc
     };
     let mut files = Vec::new();
     for (topic, path) in paths_of_topics(out, shapes.keys())? {
-        let file = NewFile::create(&path, recording, arguments.overwrite)?;
+        let file = NewFile::create(&path, &[recording.into()], arguments.overwrite)?;
         let to = file.file.try_clone().with_context(|| path.display().to_string())?;
         let to: Box<dyn Write> = Box::new(BufWriter::new(to));
         let table = CsvTable::new(to, &shapes[&topic]).with_context(|| path.display().to_string())?;
@@ -230,10 +233,10 @@ struct NewFile {
 }
 
 impl NewFile {
-    fn create(path: &Path, input: &Path, overwrite: bool) -> anyhow::Result<NewFile> {
+    fn create(path: &Path, inputs: &[PathBuf], overwrite: bool) -> anyhow::Result<NewFile> {
         let partial = partial_path(path);
-        check_new(path, &[input.into()], overwrite)?;
-        check_new(&partial, &[input.into()], true)?;
+        check_new(path, inputs, overwrite)?;
+        check_new(&partial, inputs, true)?;
         if path.exists() && !path.is_file() {
             anyhow::bail!("{}: expected a file that can be replaced; leave --out away for a pipe", path.display());
         }

@@ -21,12 +21,14 @@ const PERIOD_NANOS: u64 = 10_000_000;
 pub(super) struct FrameLines {
     pub(super) frames: Vec<Stamped<TactileFrame>>,
     pub(super) truths: BTreeMap<u64, GraspTruth>,
+    /// Of the labels that have a line of their own.
+    pub(super) headers_of_truths: BTreeMap<u64, Header>,
 }
 
 /// A line: a frame, with the outcome of its lift if it says it and names the object; a label; or a sample of another topic.
 enum Line {
     Frame(Stamped<TactileFrame>, Option<GraspTruth>),
-    Truth(GraspTruth),
+    Truth(Stamped<GraspTruth>),
     Other,
 }
 
@@ -44,19 +46,24 @@ pub(super) fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines
         _ => Box::new(BufReader::new(std::fs::File::open(file).with_context(|| file.display().to_string())?)),
     };
     let mut frames: Vec<Stamped<TactileFrame>> = Vec::new();
-    let mut truths = BTreeMap::new();
+    let (mut truths, mut headers_of_truths) = (BTreeMap::new(), BTreeMap::new());
     // Of lines of a bridge: whether they have numbers.
     let mut has_seq = None;
     let mut zeros = CellZeros::new(hand, false);
     for (line_idx, line) in input.lines().enumerate() {
         let line = line.with_context(|| file.display().to_string())?;
+        // Some programs write a byte order mark before the first line.
+        let line = if line_idx == 0 { line.trim_start_matches('\u{feff}') } else { &line };
         if line.trim().is_empty() {
             continue;
         }
         let place = || format!("{}, line {}", file.display(), line_idx + 1);
-        let (frame, truth) = match read_line(&line, &frames, hand, &mut zeros).with_context(place)? {
+        let (frame, truth) = match read_line(line, &frames, hand, &mut zeros).with_context(place)? {
             Line::Frame(frame, truth) => (Some(frame), truth),
-            Line::Truth(truth) => (None, Some(truth)),
+            Line::Truth(truth) => {
+                headers_of_truths.entry(truth.message.grasp_id).or_insert(truth.header);
+                (None, Some(truth.message))
+            }
             Line::Other => (None, None),
         };
         let has_seq_here = line.contains("\"seq\"");
@@ -79,7 +86,7 @@ pub(super) fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines
     if frames.is_empty() {
         bail!("{}: expected lines with tactile frames, found none", file.display());
     }
-    Ok(FrameLines { frames, truths })
+    Ok(FrameLines { frames, truths, headers_of_truths })
 }
 
 fn read_line(
@@ -94,23 +101,24 @@ fn read_line(
     }
     let line: ExportedLine = serde_json::from_value(value)
         .context("not a line of 'blindgrasp export': expected topic, seq, stamp_nanos and data")?;
-    if line.topic == GraspTruth::TOPIC {
-        let truth: TruthLine = serde_json::from_value(line.data)
-            .context("not a label: expected grasp_id, epsilon, volume, stable, object and class")?;
-        let unknown = |number: Option<f64>| number.unwrap_or(f64::NAN);
-        let TruthLine { grasp_id, epsilon, volume, stable, object, class } = truth;
-        let (epsilon, volume) = (unknown(epsilon), unknown(volume));
-        return Ok(Line::Truth(GraspTruth { grasp_id, epsilon, volume, stable, object, class }));
-    }
-    if line.topic != TactileFrame::TOPIC {
-        return Ok(Line::Other);
-    }
     let hand_id = match &line.hand_id {
         Some(id) => u64::from_str_radix(id, 16).context("hand_id: expected 16 hexadecimal digits")?,
         None => hand.id(),
     };
     let header =
         Header { hand_id, seq: line.seq, stamp_nanos: line.stamp_nanos, epoch: line.epoch, ..Header::default() };
+    if line.topic == GraspTruth::TOPIC {
+        let truth: TruthLine = serde_json::from_value(line.data)
+            .context("not a label: expected grasp_id, epsilon, volume, stable, object and class")?;
+        let unknown = |number: Option<f64>| number.unwrap_or(f64::NAN);
+        let TruthLine { grasp_id, epsilon, volume, stable, object, class } = truth;
+        let (epsilon, volume) = (unknown(epsilon), unknown(volume));
+        let message = GraspTruth { grasp_id, epsilon, volume, stable, object, class };
+        return Ok(Line::Truth(Stamped { header, message }));
+    }
+    if line.topic != TactileFrame::TOPIC {
+        return Ok(Line::Other);
+    }
     let frame: FrameLine = serde_json::from_value(line.data)
         .context("not a tactile frame: expected grasp_id, phase, joints and cells_newtons")?;
     let message = TactileFrame {

@@ -165,9 +165,9 @@ fn import_lines(arguments: &Arguments, hand: &Hand) -> anyhow::Result<Outcome> {
     // Stdin has no name.
     let inputs: &[PathBuf] = if arguments.table.is_file() { std::slice::from_ref(&arguments.table) } else { &[] };
     check_new(&arguments.out, inputs, arguments.overwrite)?;
-    let FrameLines { frames, truths } = read_frames(&arguments.table, hand)?;
+    let FrameLines { frames, truths, headers_of_truths } = read_frames(&arguments.table, hand)?;
     let name = arguments.table.file_name().unwrap_or(arguments.table.as_os_str()).to_string_lossy();
-    let report = import_frames(&name, hand, &frames, &truths, &arguments.out)?;
+    let report = import_frames(&name, hand, &frames, (&truths, &headers_of_truths), &arguments.out)?;
     if arguments.json {
         print_line(&serde_json::to_string_pretty(&report)?)?;
         return Ok(Outcome::Done);
@@ -284,7 +284,10 @@ fn print_report(
         lines.push(("warning", warning.clone()));
     }
     if !report.skipped.is_empty() {
-        lines.push(("left out", format!("{} rows", report.skipped.len())));
+        let ImportReport { n_grasps_left_out, n_rows_left_out, skipped, .. } = report;
+        let n_bad = skipped.len();
+        let left_out = format!("{n_grasps_left_out} grasps with {n_rows_left_out} rows, for {n_bad} bad rows");
+        lines.push(("left out", left_out));
     }
     for row in report.skipped.iter().take(MAX_SHOWN_ROWS) {
         lines.push(("", format!("line {}: {}", row.line, row.problem)));

@@ -71,9 +71,10 @@ struct Overview {
     n_recordings: usize,
     /// Whether the recordings were read whole.
     is_full: bool,
-    n_samples: BTreeMap<String, u64>,
-    /// The sum over all recordings, by their stamps.
-    duration_secs: f64,
+    /// `None` if an index does not say.
+    n_samples: BTreeMap<String, Option<u64>>,
+    /// The sum over all recordings, by their stamps; `None` if an index does not say and the recordings were not read.
+    duration_secs: Option<f64>,
     n_file_bytes: u64,
     n_chunks: u64,
     n_compressed_bytes: u64,
@@ -98,6 +99,8 @@ struct FileReport {
     n_settled: usize,
     n_without_contact: usize,
     n_self_collisions: usize,
+    /// Frames of other hands than the one that sums up.
+    n_frames_of_other_hands: u64,
     /// Quantiles at 5, 25, 50, 75 and 95 % over the grasps with force closure.
     epsilon_quantiles: Option<[f64; 5]>,
     volume_quantiles: Option<[f64; 5]>,
@@ -116,7 +119,7 @@ struct FileReport {
 /// A problem in a recording.
 #[derive(Debug, Serialize)]
 struct FoundProblem {
-    recording: PathBuf,
+    recording: String,
     #[serde(flatten)]
     problem: Problem,
     message: String,
@@ -243,8 +246,10 @@ fn print_repair(report: &RepairReport) -> anyhow::Result<()> {
         let unverified = counts(&report.n_unverified);
         lines.push(("unverified", format!("{unverified}: recovered, but no checksum tells whether they are damaged")));
     }
-    if !report.has_end {
-        lines.push(("end", "missing: what came after the last chunk, if anything did, is not in the file".into()));
+    if !report.has_data_end {
+        lines.push(("end", "missing: samples after the last chunk may be lost".into()));
+    } else if !report.has_end {
+        lines.push(("end", "missing: all samples lie before it".into()));
     }
     if !report.has_info {
         lines.push(("hand", "unknown: what the recording said of itself is lost; name the hand with --hand".into()));
@@ -254,9 +259,11 @@ fn print_repair(report: &RepairReport) -> anyhow::Result<()> {
 
 impl Overview {
     fn of(indexes: Vec<RecordingIndex>) -> Self {
-        let mut overview = Overview { n_recordings: indexes.len(), ..Overview::default() };
+        let mut overview = Overview { n_recordings: indexes.len(), duration_secs: Some(0.0), ..Overview::default() };
+        let added = |sum: Option<u64>, more: Option<u64>| sum.zip(more).map(|(sum, more)| sum.saturating_add(more));
         for (idx, index) in indexes.into_iter().enumerate() {
-            overview.duration_secs += index.duration_nanos() as f64 / 1e9;
+            let secs = index.duration_nanos().map(|nanos| nanos as f64 / 1e9);
+            overview.duration_secs = overview.duration_secs.zip(secs).map(|(sum, more)| sum + more);
             overview.n_file_bytes += index.n_file_bytes;
             overview.n_chunks += index.n_chunks;
             overview.n_compressed_bytes = overview.n_compressed_bytes.saturating_add(index.n_compressed_bytes);
@@ -269,13 +276,11 @@ impl Overview {
             }
             for (name, topic) in index.topics {
                 if topic.is_ours {
-                    *overview.n_samples.entry(name.clone()).or_default() += topic.n_messages.unwrap_or(0);
+                    let n_samples = overview.n_samples.entry(name.clone()).or_insert(Some(0));
+                    *n_samples = added(*n_samples, topic.n_messages);
                 }
                 match overview.topics.get_mut(&name) {
-                    Some(known) => {
-                        known.n_messages =
-                            known.n_messages.zip(topic.n_messages).map(|(sum, more)| sum.saturating_add(more));
-                    }
+                    Some(known) => known.n_messages = added(known.n_messages, topic.n_messages),
                     None => {
                         overview.topics.insert(name, topic);
                     }
@@ -286,13 +291,15 @@ impl Overview {
     }
 
     fn lines(&self) -> Vec<(&str, String)> {
-        let samples: Vec<_> = self.n_samples.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
+        let unknown = || "unknown".to_string();
+        let number = |n: &Option<u64>| n.map_or_else(unknown, |n| n.to_string());
+        let samples: Vec<_> = self.n_samples.iter().map(|(topic, n)| format!("{topic} {}", number(n))).collect();
         let mebibytes = |n_bytes: u64| n_bytes as f64 / f64::from(1 << 20);
         let mut lines = vec![
             ("recordings", self.n_recordings.to_string()),
             ("hand", self.hand.clone()),
             ("samples", samples.join(", ")),
-            ("duration", format!("{:.1} s", self.duration_secs)),
+            ("duration", self.duration_secs.map_or_else(unknown, |secs| format!("{secs:.1} s"))),
             (
                 "size",
                 format!(
@@ -321,8 +328,10 @@ impl Overview {
 }
 
 fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow::Result<FileReport> {
-    let overview = Overview { hand: hand.name.clone(), is_full: true, n_samples: BTreeMap::new(), ..overview };
+    let overview = Overview { hand: hand.name.clone(), is_full: true, ..overview };
     let mut summary = FileReport { overview, ..FileReport::default() };
+    let mut n_samples: BTreeMap<String, u64> = BTreeMap::new();
+    let mut read_secs = 0.0;
     for pad in &hand.pads {
         summary.pads.insert(pad.name.clone(), PadSummary::default());
     }
@@ -343,12 +352,19 @@ fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow:
         let mut labelled = BTreeSet::new();
         let mut seen = BTreeSet::new();
         let mut problems = Problems::default();
+        let mut stamps_nanos: Option<(u64, u64)> = None;
         for record in reader {
             let (topic, record) = record?;
             problems.add(&topic, &record);
-            *summary.overview.n_samples.entry(topic).or_default() += 1;
+            let stamp_nanos = record.header().stamp_nanos;
+            let (begin, end) = stamps_nanos.unwrap_or((stamp_nanos, stamp_nanos));
+            stamps_nanos = Some((begin.min(stamp_nanos), end.max(stamp_nanos)));
+            *n_samples.entry(topic).or_default() += 1;
             match record {
                 Record::Tactile(frame) => {
+                    // 0 stands for an unknown hand.
+                    let is_of_other = ![0, hand.id()].contains(&frame.header.hand_id);
+                    summary.n_frames_of_other_hands += u64::from(is_of_other);
                     if last.as_ref().is_some_and(|last| last.grasp_id != frame.message.grasp_id) {
                         summary.count_contacts(hand, last.take());
                     }
@@ -369,15 +385,18 @@ fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow:
             }
         }
         summary.count_contacts(hand, last);
+        read_secs += stamps_nanos.map_or(0.0, |(first, last)| (last - first) as f64 / 1e9);
         for (grasp_id, is_kept) in reported.into_iter().filter(|(grasp_id, _)| !labelled.contains(grasp_id)) {
             summary.count_truth(&reported_truth(path, grasp_id, is_kept), &mut qualities);
         }
         summary.problems.extend(problems.found().into_iter().map(|problem| FoundProblem {
-            recording: path.clone(),
+            recording: path.display().to_string(),
             message: problem.to_string(),
             problem,
         }));
     }
+    summary.overview.n_samples = n_samples.into_iter().map(|(topic, n)| (topic, Some(n))).collect();
+    summary.overview.duration_secs.get_or_insert(read_secs);
     summary.simulation = reports;
     let paper_label = PaperLabel::of(&truths);
     let is_other = summary.labels.contains(&Label::Lift) || paper_label.all.n_different() > 0;
@@ -494,7 +513,11 @@ fn print_summary(hand: &Hand, summary: &FileReport) -> anyhow::Result<()> {
         ));
     }
     for found in &summary.problems {
-        lines.push(("problem", format!("{}: {}", found.recording.display(), found.message)));
+        lines.push(("problem", format!("{}: {}", found.recording, found.message)));
+    }
+    if summary.n_frames_of_other_hands > 0 {
+        let n_frames = summary.n_frames_of_other_hands;
+        lines.push(("problem", format!("{n_frames} frames are of other hands than {}", hand.name)));
     }
     print_lines(lines)?;
     if !summary.classes.is_empty() {

@@ -155,7 +155,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         write_new(&folder.join(name), content)?;
     }
     print_line(&if arguments.json {
-        json!({ "folder": folder, "files": names }).to_string()
+        json!({ "folder": folder.display().to_string(), "files": names }).to_string()
     } else {
         format!(
             "{}: {}\n\nblindgrasp run {}",

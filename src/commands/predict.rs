@@ -9,7 +9,7 @@ use serde_json::json;
 use super::frame_lines::read_frames;
 use super::{Outcome, print_line};
 use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::evaluation::{Decided, decide, decide_frames};
+use blindgrasp_learning::evaluation::{Decided, decide, decide_frames, has_probability};
 use blindgrasp_messages::{GraspTruth, LiftDecision};
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::{ArbiterOptions, Hand, Judge, Model, Probe};
@@ -130,8 +130,8 @@ fn print(json: bool, file: &Path, decided: &Decided, truth: Option<&GraspTruth>)
     let truth = truth.map_or(String::new(), |truth| {
         format!("  label: {} ({})", if truth.stable { "stable" } else { "unstable" }, truth.object)
     });
-    let line =
-        format!("grasp {grasp_id:>5}  {}  p {probability_stable:.3}  {:<14}{truth}", action.shown(), reason.as_str());
+    let probability = if has_probability(*reason) { format!("{probability_stable:.3}") } else { "-".into() };
+    let line = format!("grasp {grasp_id:>5}  {}  p {probability:>5}  {:<14}{truth}", action.shown(), reason.as_str());
     print_line(line.trim_end())?;
     decided.violations.iter().try_for_each(|violation| print_line(&format!("             {violation}")))
 }

@@ -286,7 +286,8 @@ impl Job<'_> {
                 // Without a terminal there is no bar.
                 if bar.is_hidden() && told_at.elapsed() >= TELL_EVERY {
                     told_at = Instant::now();
-                    let (n, n_all) = (before as usize + report.n_grasps, options.n_grasps);
+                    // Of this shard, if it is one.
+                    let (n, n_all) = (before as usize + report.n_grasps, bar.length().unwrap_or(0));
                     let (n_tried, rate) = (report.n_candidates, 100.0 * report.natural_stable_rate());
                     print_diagnostic(&format!(
                         "{n} of {n_all} grasps, {n_tried} candidates tried, {rate:.1} % stable before balancing"

@@ -560,7 +560,6 @@ mod tests {
             root_path: String::new(),
             prefix: String::new(),
             cursors: String::new(),
-            lock: String::new(),
             lock_file: String::new(),
         };
         let shadowing = || vec![Reply::Shadowing { domain: domain.clone(), outputs: Vec::new() }];

@@ -9,10 +9,12 @@ use super::evaluate::print_label;
 use super::grid::{self, GridArguments};
 use super::{Outcome, check_new, completions, number_in, percent, print_line};
 use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, train};
+use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, TrainingSummary, train};
+use blindgrasp_messages::Fault;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::Classifier;
+use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 
@@ -93,12 +95,12 @@ struct ThresholdArguments {
     threshold_probability: f64,
     /// Choose the thresholds by the price of a drop: those that take the least time for each kept object, if a drop costs so
     /// many seconds and the hand grasps again until it lifts, judged by folds of objects. Recordings with probes get a
-    /// threshold for each probe. 120 is cautious, and what the models of lifts were trained with; 0 is for objects that may
-    /// fall.
+    /// threshold for each probe. 120 is cautious, the models of lifts that come with blindgrasp were trained with 300, and 0 is
+    /// for objects that may fall.
     #[arg(long, value_name = "SECONDS", conflicts_with = "threshold_probability", value_parser = |text: &str| number_in(text, 0.0..=1e6))]
     drop_secs: Option<f64>,
     /// Choose the thresholds by a bound on drops: at most this share of the lifts drops, with 95 % confidence, for new objects
-    /// like those recorded. A look whose strictest threshold cannot promise this never lifts.
+    /// like those recorded. A stage whose strictest threshold cannot promise this never lifts.
     #[arg(long, value_name = "SHARE", conflicts_with_all = ["drop_secs", "threshold_probability"], value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
     max_drops: Option<f64>,
 }
@@ -214,10 +216,15 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
     );
     // A promise holds for the world that the lifts were made in.
     let world = if model.training.labels.is_empty() { "as recorded" } else { "in simulation" };
+    let (kept, each_kept) = if is_of_the_papers_label(&model.training) {
+        ("stable by the paper's label", "each stable one")
+    } else {
+        ("kept", "each kept object")
+    };
     for policy in &model.training.policies {
         lines.push(format!(
-            "expected of trials decided when {} (ROC area {:.3}; a drop costs {} s): {} of the lifted objects kept, {:.2} \
-             attempts a lift, {} given up, {:.1} s for each kept object",
+            "expected of trials decided when {} (ROC area {:.3}; a drop costs {} s): {} of the lifted objects {kept}, {:.2} \
+             attempts with contact a lift, {} given up, {:.1} s for {each_kept}",
             policy.look.replace('_', "-"),
             policy.roc_area,
             policy.drop_secs,
@@ -228,7 +235,22 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
         ));
         lines.extend(policy.promise.map(|promise| format!("promised for new objects {world}: {promise}")));
     }
+    let n_unfelt = model.training.n_excluded.get(Fault::NoContact.as_str()).copied().unwrap_or(0);
+    if !model.training.policies.is_empty() && n_unfelt > 0 {
+        lines.push(format!(
+            "attempts without contact, and their time, are not counted: no cell feels {n_unfelt} of the {} grasps, and a robot \
+             holds such a grasp and tries again",
+            n_unfelt + model.training.n_grasps
+        ));
+    }
     lines
+}
+
+/// Whether a grasp was learned to be stable by epsilon and volume. A model names no label if its recordings are simulated with this
+/// one, or if they are a robot's.
+fn is_of_the_papers_label(training: &TrainingSummary) -> bool {
+    let is_simulated = training.made_by.iter().any(|made_by| made_by.starts_with("simulation of "));
+    training.labels.contains_key(&Label::WrenchSpace) || (training.labels.is_empty() && is_simulated)
 }
 
 /// The named recipe with the values of the command line.

@@ -189,6 +189,28 @@ fn a_model_gets_the_same_report() {
     assert!(text(&refused.stderr).contains("is an input"), "{}", text(&refused.stderr));
 }
 
+#[test]
+fn a_model_of_lifts_is_shown_at_each_stage() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let page = folder.path().join("report.html");
+    let model = "models/barrett-bh8-280-lifts.json";
+    let report = json(&["evaluate", model, RECORDING, "--json", "--report", utf8(&page)]);
+    let cells = cells(&std::fs::read_to_string(page).expect("the report"));
+    let row = cells.iter().position(|cell| cell == "settled").expect("the stage of a recording without probes");
+    let look = &report["looks"][0];
+    assert_eq!(cells[row + 1], look["n_grasps"].to_string());
+    assert!(cells[row + 5].starts_with(&format!("{} (", look["n_lifted"])), "{}", cells[row + 5]);
+}
+
+#[test]
+fn judged_grasps_have_their_own_objects_and_repeats_have_a_least_and_a_greatest_value() {
+    let arguments = [&SPLIT[..SPLIT.len() - 1], &["--repeats", "2"]].concat();
+    let printed = text(&run(&arguments, 0).stdout);
+    // 240 grasps of 151 objects have a label.
+    assert!(printed.contains("judged: 203 grasps of 132 objects; held without a judgement: 37,"), "{printed}");
+    assert!(printed.contains("fewer errors in the mean (least ") && printed.contains(" %, greatest "), "{printed}");
+}
+
 /// The rows of a table, each by the names of its columns.
 fn rows(path: &Path) -> Vec<BTreeMap<String, String>> {
     let mut table = csv::Reader::from_path(path).expect("a table");

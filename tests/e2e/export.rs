@@ -132,6 +132,11 @@ fn a_damaged_recording_leaves_what_was_there() {
         refused(&[&arguments[..], &["--overwrite"]].concat(), &["damaged.mcap"]);
         assert_eq!(std::fs::read_to_string(&out).expect("there"), "of yesterday");
     }
+    let (damaged, out) = (at("damaged.mcap"), at("t"));
+    let output = run(&["export", RECORDING, &damaged, "--features", MODEL, "--out", &out, "--overwrite"], 1);
+    let errors = text(&output.stderr);
+    assert!(errors.contains("damaged.mcap") && !errors.contains("cannot write"), "{errors}");
+    assert_eq!(std::fs::read_to_string(&out).expect("there"), "of yesterday");
     assert_eq!(names_in(folder.path()), ["damaged.mcap", "t"]);
 }
 

@@ -162,6 +162,7 @@ fn the_model_is_trained_with_the_best_pair_and_keeps_the_table() {
 
     let report = &json_lines(std::fs::read_to_string(&json).expect("there").replace('\n', " ").as_bytes())[0];
     assert_eq!(report["axes"][0]["values"], serde_json::json!([1.0, 10.0]));
+    assert_eq!(report["cells"].as_array().map(Vec::len), Some(6));
     let best: Vec<f64> = serde_json::from_value(report["best"]["values"].clone()).expect("a pair");
     let Learner::Svm(params) = &model.training.recipe.learner else { panic!("an SVM") };
     assert_eq!([params.c, params.gamma], best[..]);

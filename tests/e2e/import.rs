@@ -232,11 +232,32 @@ fn rows_may_be_the_frames_of_grasps() {
             SERIES.replacen("box", &format!("{nameless}box"), 1) + "cap,no,0,0,0,c,settled\ncap,yes,0,0,0,d,settled\n";
         let report = folder.import(table, &[&flags[..], &["--skip-bad-rows"]].concat());
         assert_eq!((&report["n_grasps"], &report["groups"]["cap"]["n_grasps"]), (&json!(2), &json!(2)), "{report}");
+        assert_eq!((&report["n_grasps_left_out"], &report["n_rows_left_out"]), (&json!(2), &json!(6)), "{report}");
     }
     let more = format!("{}cap,yes,0,0,0,c,settled\n", changed("cup,yes,0.5,1.25,2,a", "cup,yes,0.5,x,2,a"));
     let report = folder.import(more, &[&flags[..], &["--skip-bad-rows"]].concat());
     assert_eq!((&report["n_grasps"], &report["n_frames"]), (&json!(2), &json!(2)));
     assert_eq!(report["skipped"].as_array().map(Vec::len), Some(1), "{report}");
+    assert_eq!((&report["n_grasps_left_out"], &report["n_rows_left_out"]), (&json!(1), &json!(4)), "{report}");
+}
+
+#[test]
+fn labels_of_exported_lines_keep_stamp_and_epoch() {
+    let folder = Folder::new();
+    let topics = ["--topic", "/tactile", "--topic", "/truth"];
+    let exported = text(&run(&[&["export", "recordings/ordinary.mcap"], &topics[..]].concat(), 0).stdout);
+    let lines = exported.replace("\"epoch\":0,", "\"epoch\":3,");
+    // Labels later than their frames, and a byte order mark.
+    let later = |line: &str| {
+        let is_label = line.contains("\"/truth\"");
+        if is_label { line.replace("\"stamp_nanos\":", "\"stamp_nanos\":7") } else { line.to_string() }
+    };
+    let lines: String = lines.lines().map(|line| later(line) + "\n").collect();
+    let file = folder.write("lines.jsonl", format!("\u{feff}{lines}"));
+    run(&["import", "--lines", &file, "--hand", HAND, "--out", &folder.at("out.mcap")], 0);
+    let mut expected = json_lines(lines.as_bytes());
+    expected.retain(|line| line["topic"] == "/truth");
+    assert_eq!(folder.exported("/truth"), expected);
 }
 
 #[test]
@@ -341,7 +362,7 @@ fn each_bad_row_is_named() {
     assert_eq!(folder.exported("/truth").len(), 2);
     let arguments = folder.arguments(&["--skip-bad-rows"]);
     let printed = text(&run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), 0).stdout);
-    assert!(printed.contains("11 rows") && printed.contains(&expected[3]), "{printed}");
+    assert!(printed.contains("11 grasps with 11 rows, for 11 bad rows") && printed.contains(&expected[3]), "{printed}");
 }
 
 #[test]
@@ -375,6 +396,7 @@ fn values_in_another_unit_are_told() {
     };
     warned(table("0.5", "1"), &["--joint-unit", "deg"], "leave out --joint-unit deg");
     warned(table("0.5", "900"), &[], "give --newtons-per-unit");
+    warned(table("0.5", "1").replacen("l_1,l_2", "l_10,l_9", 1), &[], "'l_9' lies behind 'l_10'");
     // Both ways to give the posture are named.
     folder.write("table.csv", TABLE);
     let arguments: Vec<String> = folder.arguments(&[]).into_iter().filter(|word| word != "left=0.5").collect();

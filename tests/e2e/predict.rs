@@ -33,6 +33,10 @@ fn predictions_are_the_decisions_of_a_graph() {
     assert_eq!(predicted[0]["truth"]["object"], "vase-20");
     let said = text(&run(&["predict", MODEL, RECORDING], 0).stdout).to_string();
     assert!(said.starts_with("grasp     0  LIFT  p 0.762  stable          label: stable (vase-20)\n"), "{said}");
+    // No probability decided that nothing is felt. JSON has a number, as the messages have.
+    assert!(said.contains("  HOLD  p     -  no_contact ") && !said.contains("p 0.000"), "{said}");
+    let unfelt = predicted.iter().find(|line| line["reason"] == "no_contact").expect("an empty hand");
+    assert_eq!(unfelt["probability_stable"], 0.0);
 }
 
 /// The lines of a bridge have numbers of its own.

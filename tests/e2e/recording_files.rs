@@ -1,6 +1,8 @@
 //! Recordings as files: live recording, splitting, full disks, killed recorders, repair, versions, selection.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::OsStr;
+use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -144,8 +146,8 @@ fn a_live_recording_is_read_as_it_was_written() {
     assert_eq!(index.topics["/joint_states"].n_messages, Some(2000));
     assert_eq!(index.topics["/contact_points"].schema, "sensor_msgs/msg/PointCloud2");
     assert!(index.topics["/tactile"].is_ours && !index.topics["/joint_states"].is_ours);
-    assert_eq!(index.n_messages, samples.len() as u64 + 4000);
-    assert_eq!((index.first_stamp_nanos, index.duration_nanos()), (Some(1_000_000_000), 1_999_000_000));
+    assert_eq!(index.n_messages, Some(samples.len() as u64 + 4000));
+    assert_eq!((index.first_stamp_nanos, index.duration_nanos()), (Some(1_000_000_000), Some(1_999_000_000)));
     assert!(index.n_chunks > 3 && index.n_compressed_bytes < index.n_uncompressed_bytes, "{index:?}");
 
     // An existing file is overwritten only when that was asked for.
@@ -192,7 +194,8 @@ fn a_recorder_that_is_killed_leaves_all_whole_chunks_and_repair_recovers_them() 
     let before = std::fs::read(&path).expect("read");
     let report = repair(&path).expect("repaired");
     assert_eq!(std::fs::read(&path).expect("read"), before, "the original was touched");
-    assert!(report.has_info && !report.has_loss() && !report.has_end, "{report:?}");
+    assert!(report.has_info && report.has_loss() && !report.has_data_end, "{report:?}");
+    assert!(!report.has_partial_chunk && report.n_lost.is_empty() && report.n_unverified.is_empty(), "{report:?}");
     assert_eq!(report.n_recovered["/tactile"], n_linear as u64);
     assert!(n_linear > 1000, "{n_linear}");
     let output = report.output.expect("written");
@@ -638,6 +641,32 @@ fn info_names_oddities_and_foreign_topics() {
 }
 
 #[test]
+fn info_counts_what_the_index_does_not_say_and_tells_of_other_hands() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (whole, path) = (folder.path().join("whole.mcap"), folder.path().join("plain.mcap"));
+    let mut samples = run_of(30);
+    let Record::Tactile(mut of_other_hand) = frame(30, 3) else { panic!("expected a frame") };
+    of_other_hand.header.hand_id = 5;
+    samples.push(("/tactile", Record::Tactile(of_other_hand)));
+    written_file(&whole, &samples);
+    let bytes = std::fs::read(&whole).expect("read");
+    let file = std::io::BufWriter::new(std::fs::File::create(&path).expect("created"));
+    let mut writer = mcap::WriteOptions::new().emit_statistics(false).create(file).expect("begun");
+    for message in mcap::MessageStream::new(&bytes).expect("MCAP") {
+        writer.write(&message.expect("read")).expect("written");
+    }
+    writer.finish().expect("finished");
+    let arguments = [path.to_str().expect("UTF-8"), "--hand", "barrett-bh8-280"];
+    let (code, stdout, stderr) = info_command(&[&arguments[..], &["--json"]].concat());
+    assert_eq!(code, 0, "{stderr}");
+    let found: serde_json::Value = serde_json::from_str(&stdout).expect("JSON");
+    assert_eq!((&found["n_samples"]["/tactile"], &found["duration_secs"]), (&31.into(), &0.03.into()));
+    assert_eq!(found["topics"]["/tactile"]["n_messages"], serde_json::Value::Null);
+    let (_, stdout, _) = info_command(&arguments);
+    assert!(stdout.contains("1 frames are of other hands than barrett-bh8-280"), "{stdout}");
+}
+
+#[test]
 fn info_repairs_and_says_with_its_exit_code_whether_something_is_lost() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("cut.mcap");
@@ -645,6 +674,13 @@ fn info_repairs_and_says_with_its_exit_code_whether_something_is_lost() {
     live_file(&path, &run_of(3000));
     let (code, stdout, _) = info_command(&[text, "--repair"]);
     assert!(code == 0 && stdout.contains("nothing to repair"), "{code}: {stdout}");
+    // A name that is not UTF-8.
+    let other = folder.path().join(OsStr::from_bytes(b"other\xff.mcap"));
+    std::fs::copy(&path, &other).expect("copied");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_blindgrasp"));
+    let output = command.args(["info", "--repair", "--json"]).arg(&other).output().expect("run");
+    let found: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(found["repairs"][0]["input"], other.to_string_lossy().into_owned());
     let offsets = chunk_offsets(&path);
     let bytes = std::fs::read(&path).expect("read");
     std::fs::write(&path, &bytes[..offsets[2] as usize + 200_000]).expect("written");
@@ -653,7 +689,18 @@ fn info_repairs_and_says_with_its_exit_code_whether_something_is_lost() {
     assert_eq!((code, &found["repairs"][0]["has_partial_chunk"]), (3, &true.into()), "{stdout}");
     let (code, stdout, stderr) = info_command(&[repaired_path(&path).to_str().expect("UTF-8")]);
     assert!(code == 0 && stdout.contains("repair            of: cut.mcap"), "{stdout}{stderr}");
+    // Cut off behind a chunk, or within the index behind all samples.
+    for (n_bytes, code, says) in [
+        (offsets[2] as usize, 3, "end               missing: samples after the last chunk may be lost"),
+        (bytes.len() - 100, 0, "end               missing: all samples lie before it"),
+    ] {
+        std::fs::write(&path, &bytes[..n_bytes]).expect("written");
+        std::fs::remove_file(repaired_path(&path)).expect("removed");
+        let (found, stdout, _) = info_command(&[text, "--repair"]);
+        assert!(found == code && stdout.contains(says), "{found}: {stdout}");
+    }
     // No checksum covers the recovered part of a chunk that is cut off.
+    std::fs::write(&path, &bytes[..offsets[2] as usize + 200_000]).expect("written");
     std::fs::remove_file(repaired_path(&path)).expect("removed");
     let (_, stdout, _) = info_command(&[text, "--repair"]);
     assert!(stdout.contains("unverified        /contact") && stdout.contains("no checksum tells"), "{stdout}");

@@ -1,8 +1,10 @@
 //! The project's recordings through the real processes: every edge is as recorded, and every expectation is met.
 
+use std::ffi::OsStr;
+use std::os::unix::ffi::OsStrExt;
 use std::path::Path;
 
-use crate::common::{MODEL, blindgrasp, project, run, skipped, text, unique_name};
+use crate::common::{MODEL, blindgrasp, json_lines, project, run, skipped, text, unique_name};
 use serde_json::{Value, json};
 
 #[test]
@@ -75,6 +77,21 @@ fn a_failure_says_which_actions_have_changed() {
     let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     let found = &report["recordings"][0]["changed_actions"];
     assert_eq!((&found[0]["grasp_id"], found.as_array().map(Vec::len)), (&json!(207), Some(1)), "{found}");
+}
+
+#[test]
+fn names_that_are_not_utf8_are_text_in_json() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join(OsStr::from_bytes(b"run\xff.mcap"));
+    let missing = blindgrasp().args(["test", "--json"]).arg(&path).output().expect("started");
+    let report: Value = serde_json::from_slice(&missing.stdout).expect("JSON");
+    let shown = json!(path.to_string_lossy());
+    assert_eq!((&report["recordings"][0]["recording"], &report["n_failed"]), (&shown, &json!(1)));
+    let rate = ["--set", "recorded_source.rate=max", "--name", &unique_name(), "--json", "--record"];
+    let output = blindgrasp().args(["run", "dataflow.yaml"]).args(rate).arg(&path).output().expect("started");
+    let lines = json_lines(&output.stdout);
+    let summary = &lines.last().expect("a summary")["summary"];
+    assert_eq!(summary["recorded_files"], json!([shown]), "{}", text(&output.stderr));
 }
 
 #[test]

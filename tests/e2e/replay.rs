@@ -152,6 +152,28 @@ fn the_same_bytes_come_out_at_any_rate_on_any_number_of_cores() {
     }
 }
 
+/// More repeated frames than the queues have places.
+#[test]
+fn repeated_frames_are_lost_at_no_rate() {
+    let own = own();
+    own.edit(|records| {
+        records.retain(|(topic, _)| ["/tactile", "/truth"].contains(&topic.as_str()));
+        let times = |topic: &str| if topic == "/tactile" { 4 } else { 1 };
+        *records = records.iter().flat_map(|record| vec![record.clone(); times(&record.0)]).collect();
+    });
+    let sent = topics(&own.recording)["/tactile"].clone();
+    assert!(sent.len() > 2 * 256, "{}", sent.len());
+    let found = own.path("found.mcap");
+    let replayed = ["max", "50x"].map(|rate| {
+        let output = own.replay(&["--rate", rate, "--record", &found, "--overwrite"]);
+        let summary = json_lines(&output.stdout).pop().expect("a summary")["summary"].clone();
+        assert_eq!((&summary["samples_lost"], &summary["undecided"]), (&0.into(), &0.into()), "{rate}: {summary}");
+        topics(&found)
+    });
+    assert_eq!(replayed[0], replayed[1]);
+    assert_eq!(replayed[0]["/tactile"], sent);
+}
+
 #[test]
 fn a_part_of_a_recording_is_decided_as_in_the_whole() {
     let own = own();

@@ -60,12 +60,11 @@ fn the_doctor_finds_what_a_dead_graph_left_and_removes_only_that() {
         std::fs::write(root.join("node.details"), b"").expect("written");
         [segment, root]
     };
-    let address = <std::os::unix::net::SocketAddr as std::os::linux::net::SocketAddrExt>::from_abstract_name(format!(
-        "blindgrasp-domain/{alive}.42424242"
-    ));
-    let lock = std::os::unix::net::UnixListener::bind_addr(&address.expect("short")).expect("free");
     let (left, held) = (paths_of(&dead), paths_of(&alive));
-    // The same, of a launcher in another network namespace: only the lock on its file tells.
+    // A launcher whose shared memory is that of another container: only the lock on its folder tells.
+    let lock = std::fs::File::open(&held[1]).expect("opened");
+    lock.lock().expect("locked");
+    // A launcher with another folder for temporary files: only the lock on its file tells.
     let far = format!("{}-far", unique_name());
     let far_paths = paths_of(&far);
     let lock_file = format!("/dev/shm/blindgrasp_{far}.42424242.lock");

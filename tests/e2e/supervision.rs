@@ -571,7 +571,7 @@ fn a_graph_in_the_background_can_be_watched_set_and_stopped() {
     }
     assert_eq!(json(&["ps", &name, "--json"])["graphs"][0]["nodes"][4]["params"]["votes"], 4);
 
-    let said = run(&["logs", "run", "--graph", &name], 0);
+    let said = run(&["logs", "run", "--graph", &name, "--lines", "100000"], 0);
     assert!(text(&said.stdout).contains("lift_arbiter.votes: 5 -> 4"), "{}", text(&said.stdout));
     let stopped = json(&["stop", &name, "--json"]);
     assert_eq!(stopped, serde_json::json!({ "ended": [&*name], "failed": [] }));

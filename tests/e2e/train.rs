@@ -179,7 +179,8 @@ fn a_promise_about_drops_holds_for_new_objects_or_nothing_is_lifted() {
     for (flags, most) in [(["--drop-secs", "120"], 1.0), (["--max-drops", "0.25"], 0.25)] {
         let trained = train(&flags, 0);
         let promised = "promised for new objects as recorded: at most";
-        assert!(text(&trained.stdout).contains(promised), "{}", text(&trained.stdout));
+        let printed = text(&trained.stdout);
+        assert!(printed.contains(promised) && printed.contains(" of the lifted objects kept, "), "{printed}");
         let shown = run(&["model", "show", &model], 0);
         assert!(text(&shown.stdout).contains(promised), "{}", text(&shown.stdout));
         let shown: Value = serde_json::from_slice(&run(&["model", "show", &model, "--json"], 0).stdout).expect("JSON");
@@ -204,6 +205,25 @@ fn a_promise_about_drops_holds_for_new_objects_or_nothing_is_lifted() {
     let wrench_space = run(&["train", RECORDING, "--max-drops", "0.1", "--out", &at("never.json")], 1);
     let stderr = text(&wrench_space.stderr);
     assert!(stderr.contains("a share of drops can be promised for lifts alone"), "{stderr}");
+}
+
+#[test]
+fn what_to_expect_names_the_label_and_the_grasps_without_contact() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let model = folder.path().join("model.json");
+    let model = model.to_str().expect("UTF-8");
+    let trained = text(&run(&["train", RECORDING, "--drop-secs", "120", "--out", model], 0).stdout);
+    let expected = [
+        " of the lifted objects stable by the paper's label, ",
+        " attempts with contact a lift, ",
+        "no cell feels 37 of the 240 grasps",
+    ];
+    for said in [trained, text(&run(&["model", "show", model], 0).stdout)] {
+        assert!(expected.iter().all(|part| said.contains(part)) && !said.contains("kept"), "{said}");
+    }
+    let help = text(&run(&["train", "--help"], 0).stdout);
+    let help = help.split_whitespace().collect::<Vec<_>>().join(" ");
+    assert!(help.contains("trained with 300") && help.contains("A stage whose strictest threshold"), "{help}");
 }
 
 /// Grasps of a pincer with a squeeze: the settled hand feels the force of every second grasp, and the squeezed hand that of each.

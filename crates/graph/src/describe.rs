@@ -48,7 +48,8 @@ pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, 
         })?;
     let (sender, answer) = channel();
     if let Some(stdout) = child.stdout.take() {
-        std::thread::spawn(move || {
+        // Without a thread no answer comes.
+        let _ = std::thread::Builder::new().spawn(move || {
             let mut text = String::new();
             let read = stdout.take(MAX_BYTES).read_to_string(&mut text);
             let _ = sender.send(read.map(|_| text));
@@ -56,7 +57,7 @@ pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, 
     }
     let (sender, stderr_tail) = channel();
     if let Some(mut stderr) = child.stderr.take() {
-        std::thread::spawn(move || {
+        let _ = std::thread::Builder::new().spawn(move || {
             let mut said = Vec::new();
             let mut bytes = [0; 4096];
             while let Ok(n @ 1..) = stderr.read(&mut bytes) {

@@ -50,8 +50,9 @@ fn missing(what: &str, found: impl Into<String>) -> Problem {
     Problem::new(None, what, found)
 }
 
-/// Reads the triangles and polygons of a COLLADA file's scene: in metres by its `<unit>`, and with +z up where its `<up_axis>`
-/// names another axis. Without a scene, each geometry stands where it was made.
+/// Reads the triangles and polygons of a COLLADA file's scene, in metres by its `<unit>`. Its `<up_axis>` says nothing: loaders of
+/// ROS (RViz, geometric_shapes) ignore it, and packages have the same part as STL and as COLLADA with +y up in the same axes. Without a
+/// scene, each geometry stands where it was made.
 ///
 /// # Errors
 /// A damaged file, or one without such geometries.
@@ -215,7 +216,7 @@ impl<'a> Dae<'a> {
         self.ids.get(id).copied().ok_or_else(|| missing("the id of an element of the file", quoted(url)))
     }
 
-    /// To metres, and to +z up.
+    /// To metres.
     fn root_transform(&self) -> Result<Matrix4<f64>, Problem> {
         let asset = self.root.child("asset");
         let unit = asset.and_then(|asset| asset.child("unit")).map_or("", |unit| unit.attribute("meter"));
@@ -223,14 +224,7 @@ impl<'a> Dae<'a> {
         if !(metres.is_finite() && metres > 0.0) {
             return Err(missing("<unit meter> of more than 0", quoted(unit)));
         }
-        let up = asset.and_then(|asset| asset.child("up_axis")).map_or("", |up| up.text.trim());
-        let quarter = std::f64::consts::FRAC_PI_2;
-        let upright = match up {
-            "Y_UP" => Rotation3::from_axis_angle(&Vector3::x_axis(), quarter),
-            "X_UP" => Rotation3::from_axis_angle(&Vector3::y_axis(), -quarter),
-            _ => Rotation3::identity(),
-        };
-        Ok(upright.to_homogeneous() * Matrix4::new_scaling(metres))
+        Ok(Matrix4::new_scaling(metres))
     }
 
     fn place(&mut self, geometry: &Element, scene_from_mesh: &Matrix4<f64>) -> Result<(), Problem> {

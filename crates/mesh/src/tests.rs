@@ -162,9 +162,7 @@ fn a_scene_places_its_meshes() {
     for (from, to, expected) in [
         ("", "", [[0.0, 1.0], [0.0, 2.0], [0.0, 3.0]]),
         ("meter='1'", "name='millimeter' meter='0.001'", [[0.0, 0.001], [0.0, 0.002], [0.0, 0.003]]),
-        // +y of the file is up, so its +z looks to the front.
-        ("Z_UP", "Y_UP", [[0.0, 1.0], [-3.0, 0.0], [0.0, 2.0]]),
-        ("Z_UP", "X_UP", [[-3.0, 0.0], [0.0, 2.0], [0.0, 1.0]]),
+        ("Z_UP", "Y_UP", [[0.0, 1.0], [0.0, 2.0], [0.0, 3.0]]),
         (
             instance,
             "<translate>1 0 0</translate><rotate>0 0 1 90</rotate><scale>2 1 1</scale><node>\

@@ -11,6 +11,8 @@ use crate::written::Written;
 pub(crate) trait Places {
     /// The last sample that a reader has answered.
     fn answered(&self, slot: usize) -> Option<SampleId>;
+    /// How many samples it has answered whose number was not above those before.
+    fn n_repeated(&self, slot: usize) -> u64;
     /// Whether no process will read on.
     fn is_given_up(&self, slot: usize) -> bool;
 }
@@ -18,6 +20,10 @@ pub(crate) trait Places {
 impl Places for SharedCursors {
     fn answered(&self, slot: usize) -> Option<SampleId> {
         self.input(slot).key()
+    }
+
+    fn n_repeated(&self, slot: usize) -> u64 {
+        self.input(slot).counts().n_repeated
     }
 
     fn is_given_up(&self, slot: usize) -> bool {
@@ -33,6 +39,7 @@ pub(crate) struct Credit {
     begun_after: Option<Option<SampleId>>,
     /// The first sample of this publisher in the current epoch.
     own_first: Option<SampleId>,
+    /// Its last sample, without those whose number was not above the ones before: a recording may have such.
     own_last: Option<SampleId>,
 }
 
@@ -41,8 +48,11 @@ pub(crate) struct Credit {
 pub(crate) struct Reader {
     pub(crate) slot: usize,
     limit: Limit,
-    /// The last sample that it had answered at the last look.
+    /// The last sample that it had answered at the last look, and its count of repeated samples.
     key: Option<SampleId>,
+    n_repeated: u64,
+    /// How many repeated samples of this very publisher it had not answered then. They take places in its queue, too.
+    n_repeats: u64,
     /// If it is an attached reader, the slots of all its readers, and how long the publisher waits for it.
     pub(crate) attached_slots: Vec<usize>,
     pub(crate) attached_limit_millis: u64,
@@ -62,7 +72,9 @@ enum Limit {
 
 /// The sample that is to be sent, for [`Reader::has_room`].
 struct Next {
+    /// Of a repeated sample, the number behind the last one that was sent.
     key: SampleId,
+    is_repeat: bool,
     written: Option<Written>,
     /// The number of the first sample of this publisher in the epoch.
     own_first: u64,
@@ -76,6 +88,8 @@ impl Reader {
             slot: wiring.slot,
             limit: Limit::Queue(wiring.capacity as u64),
             key: None,
+            n_repeated: 0,
+            n_repeats: 0,
             attached_slots: wiring.attached_slots.clone(),
             attached_limit_millis: wiring.attached_limit_millis,
             behind: wiring.behind.iter().map(|behind| Reader::further_on(behind, history)).collect(),
@@ -87,6 +101,8 @@ impl Reader {
             slot: wiring.slot,
             limit: Limit::History(history as u64),
             key: None,
+            n_repeated: 0,
+            n_repeats: 0,
             attached_slots: Vec::new(),
             attached_limit_millis: 0,
             behind: wiring.behind.iter().map(|behind| Reader::further_on(behind, history)).collect(),
@@ -94,8 +110,11 @@ impl Reader {
     }
 
     fn has_room(&mut self, places: &impl Places, next: &Next) -> bool {
-        if !(self.key.is_some() && self.is_near(next)) {
+        if next.is_repeat || !(self.key.is_some() && self.is_near(next)) {
             self.key = places.answered(self.slot);
+            let n_repeated = places.n_repeated(self.slot);
+            self.n_repeats = self.n_repeats.saturating_sub(n_repeated.saturating_sub(self.n_repeated));
+            self.n_repeated = n_repeated;
             if !self.is_near(next) {
                 return places.is_given_up(self.slot);
             }
@@ -107,9 +126,11 @@ impl Reader {
         let Some(written) = &next.written else {
             return true;
         };
+        let (Limit::Queue(limit) | Limit::History(limit)) = self.limit;
+        let limit = limit.saturating_sub(self.n_repeats);
         // A reader that has answered all samples has room for one more, however far the numbers jump.
         if self.key == Some(written.last) {
-            return true;
+            return limit > 0;
         }
         // A new epoch begins when every reader has answered the one before.
         if next.key.epoch != written.last.epoch {
@@ -118,9 +139,9 @@ impl Reader {
         // It had answered the epoch before, or it has just come.
         let is_within_epoch = self.key.filter(|key| written.is_current(*key));
         let first_unanswered = is_within_epoch.map_or(written.first_seq, |key| key.seq + 1);
-        let (first_unanswered, limit) = match self.limit {
-            Limit::History(limit) if next.is_repeatable => (first_unanswered, limit),
-            Limit::Queue(limit) | Limit::History(limit) => (first_unanswered.max(next.own_first), limit),
+        let first_unanswered = match self.limit {
+            Limit::History(_) if next.is_repeatable => first_unanswered,
+            Limit::Queue(_) | Limit::History(_) => first_unanswered.max(next.own_first),
         };
         next.key.seq.saturating_sub(first_unanswered) < limit
     }
@@ -138,6 +159,11 @@ impl Reader {
             }
         }
         Some(least)
+    }
+
+    fn has_been_sent_a_repeat(&mut self) {
+        self.n_repeats += 1;
+        self.behind.iter_mut().for_each(Reader::has_been_sent_a_repeat);
     }
 
     pub(crate) fn is_among(&self, slots: &[usize]) -> bool {
@@ -160,7 +186,10 @@ impl Credit {
         key: SampleId,
     ) -> Option<&Reader> {
         let own_first = self.own_first.filter(|first| first.epoch == key.epoch).map_or(key.seq, |first| first.seq);
-        let next = Next { key, written, own_first, is_repeatable: self.begun_after.is_some() };
+        let is_repeat = self.is_repeat(key);
+        let last = self.own_last.filter(|_| is_repeat);
+        let key = last.map_or(key, |last| SampleId { seq: last.seq + 1, ..last });
+        let next = Next { key, is_repeat, written, own_first, is_repeatable: self.begun_after.is_some() };
         self.readers.iter_mut().find_map(|reader| (!reader.has_room(places, &next)).then_some(&*reader))
     }
 
@@ -178,8 +207,16 @@ impl Credit {
 
     /// Notes a sample that this publisher sends.
     pub(crate) fn has_sent(&mut self, key: SampleId) {
+        if self.is_repeat(key) {
+            return self.readers.iter_mut().for_each(Reader::has_been_sent_a_repeat);
+        }
         self.own_first = self.own_first.filter(|first| first.epoch == key.epoch).or(Some(key));
         self.own_last = Some(key);
+    }
+
+    /// Whether a number is not above the last one of this publisher.
+    fn is_repeat(&self, key: SampleId) -> bool {
+        self.own_last.is_some_and(|last| last.epoch == key.epoch && key.seq <= last.seq)
     }
 
     /// The last sample that need not be sent again by an instance that takes over with this publisher: if another one has
@@ -272,5 +309,62 @@ impl Credit {
             (Some(Some(place)), Some(written)) => !written.is_past(place, key),
         };
         self.readers.iter().filter(lacks).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The last sample that the only reader has answered, and its count of repeated samples.
+    struct Place(Option<SampleId>, u64);
+
+    impl Places for Place {
+        fn answered(&self, _: usize) -> Option<SampleId> {
+            self.0
+        }
+
+        fn n_repeated(&self, _: usize) -> u64 {
+            self.1
+        }
+
+        fn is_given_up(&self, _: usize) -> bool {
+            false
+        }
+    }
+
+    #[test]
+    fn repeated_samples_take_places_in_the_queue_until_they_are_answered() {
+        let id = |seq| SampleId { epoch: 7, seq };
+        let reader = ConsumerWiring {
+            slot: 0,
+            capacity: 4,
+            attached_slots: vec![],
+            attached_limit_millis: 0,
+            behind: vec![],
+        };
+        let mut credit = Credit::new(&[reader], 4);
+        let mut written = None;
+        // So many can be sent until the reader has no room.
+        let mut send = |numbers: &[u64], place: &Place| {
+            let sent = numbers.iter().take_while(|seq| {
+                let key = id(**seq);
+                let has_room = credit.first_without_room(place, written, key).is_none();
+                if has_room {
+                    written = Written::with(written, key).or(written);
+                    credit.has_sent(key);
+                }
+                has_room
+            });
+            sent.count()
+        };
+        // The reader has counted repeated samples of an earlier writer.
+        assert_eq!(send(&[0, 1, 1, 0, 2, 2], &Place(None, 10)), 4);
+        // It has answered 0 and 1 and one of the two repeated ones; then all but the repeated ones.
+        assert_eq!(send(&[2, 3, 3, 4], &Place(Some(id(1)), 11)), 3);
+        assert_eq!(send(&[3, 3, 3, 3], &Place(Some(id(3)), 11)), 2);
+        assert_eq!(send(&[3, 4, 4, 4, 4], &Place(Some(id(3)), 13)), 2);
+        // It has answered all.
+        assert_eq!(send(&[5, 6, 7, 8, 9], &Place(Some(id(4)), 16)), 4);
     }
 }

@@ -8,10 +8,9 @@ use std::collections::BTreeSet;
 use std::fs::{DirBuilder, File};
 use std::hash::{BuildHasher, RandomState};
 use std::io::Write;
-use std::os::linux::net::SocketAddrExt;
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
-use std::os::unix::net::{SocketAddr, UnixListener};
+use std::os::unix::net::UnixListener;
 use std::path::PathBuf;
 
 use iceoryx2::prelude::{CallbackProgression, NodeState};
@@ -174,12 +173,10 @@ impl Namespace {
     }
 }
 
-/// The sign that a launcher lives. It has two parts, because containers may share one and not the other: a lock on a file in
-/// the folder of shared memory, and an abstract socket, which belongs to the network namespace. The kernel frees both when
-/// the process ends, however it ends.
+/// The sign that a launcher lives: locks (flock) on a file in the folder of shared memory and on the graph's folder, because
+/// containers may share one and not the other. The kernel frees both when the process ends, however it ends.
 struct Lock {
-    _socket: UnixListener,
-    _file: Option<File>,
+    _held: Vec<File>,
 }
 
 /// The id in the names of a graph's files: the beginning of the graph's name, for people, and random letters, which
@@ -214,40 +211,45 @@ impl Id {
         let prefix = format!("{FILE_PREFIX}{}.", self.0);
         // The prefix lets it be removed with the other files.
         let cursors = format!("{SHARED_MEMORY_FOLDER}/{prefix}cursors");
-        NamespaceWiring { root_path, cursors, prefix, lock: self.lock_name(), lock_file: self.lock_file() }
+        NamespaceWiring { root_path, cursors, prefix, lock_file: self.lock_file() }
     }
 
-    /// The lock, for a launcher. No other process gets it while the launcher lives.
+    /// The lock, for a launcher that has made the graph's folder. No other process gets it while the launcher lives.
     fn reserve(&self) -> std::io::Result<Lock> {
-        let path = self.lock_file();
-        let file = std::fs::OpenOptions::new().append(true).create_new(true).mode(0o600).open(&path)?;
-        rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive)?;
-        // Between the two, another launcher may have taken the file for a dead graph's and removed it.
-        if file.metadata()?.ino() != std::fs::metadata(&path)?.ino() {
-            return Err(std::io::ErrorKind::AlreadyExists.into());
+        let NamespaceWiring { root_path, lock_file, .. } = self.wiring();
+        std::fs::OpenOptions::new().append(true).create_new(true).mode(0o600).open(&lock_file)?;
+        let mut held = Vec::new();
+        for path in [root_path, lock_file] {
+            let file = File::open(&path)?;
+            rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive)?;
+            // Another launcher may have taken it for a dead graph's before and removed it.
+            if file.metadata()?.ino() != std::fs::metadata(&path)?.ino() {
+                return Err(std::io::ErrorKind::AlreadyExists.into());
+            }
+            held.push(file);
         }
-        Ok(Lock { _socket: bind(&self.lock_name())?, _file: Some(file) })
+        Ok(Lock { _held: held })
     }
 
     /// The lock, if no launcher holds it. Its holder may remove the files with the id.
     fn lock(&self) -> std::io::Result<Lock> {
-        let file = match File::open(self.lock_file()) {
-            Ok(file) => Some(file),
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => None,
-            Err(error) => return Err(error),
-        };
-        if let Some(file) = &file {
-            rustix::fs::flock(file, FlockOperation::NonBlockingLockExclusive)?;
+        let NamespaceWiring { root_path, lock_file, .. } = self.wiring();
+        let mut held = Vec::new();
+        for path in [root_path, lock_file] {
+            match File::open(path) {
+                Ok(file) => {
+                    rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive)?;
+                    held.push(file);
+                }
+                Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
+                Err(error) => return Err(error),
+            }
         }
-        Ok(Lock { _socket: bind(&self.lock_name())?, _file: file })
+        Ok(Lock { _held: held })
     }
 
     fn lock_file(&self) -> String {
         format!("{SHARED_MEMORY_FOLDER}/{FILE_PREFIX}{}.lock", self.0)
-    }
-
-    fn lock_name(&self) -> String {
-        format!("blindgrasp-domain/{}", self.0)
     }
 
     /// The files and folders with this id.
@@ -334,11 +336,6 @@ fn entries() -> Vec<(Id, PathBuf)> {
     let of_graphs = all.filter_map(|entry| Some((Id::of(entry.file_name().to_str()?)?, entry)));
     let own = of_graphs.filter(|(_, entry)| entry.metadata().is_ok_and(|metadata| metadata.uid() == uid));
     own.map(|(id, entry)| (id, entry.path())).collect()
-}
-
-/// Takes a name in the abstract namespace of sockets.
-fn bind(name: &str) -> std::io::Result<UnixListener> {
-    UnixListener::bind_addr(&SocketAddr::from_abstract_name(name)?)
 }
 
 /// Frees the resources that dead processes of a graph still hold in iceoryx2.

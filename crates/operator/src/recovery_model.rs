@@ -115,6 +115,11 @@ impl Places for Answered {
         self.0[slot]
     }
 
+    /// No source of these worlds repeats a number.
+    fn n_repeated(&self, _: usize) -> u64 {
+        0
+    }
+
     fn is_given_up(&self, _: usize) -> bool {
         false
     }

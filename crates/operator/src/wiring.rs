@@ -171,10 +171,8 @@ pub struct NamespaceWiring {
     pub prefix: String,
     /// The [cursors](crate::cursors)'s file.
     pub cursors: String,
-    /// The abstract unix socket that is the launcher's while it lives. An operator that can take it and the lock on
-    /// `lock_file` is the last, or among the last: it removes the root path, and what bears the prefix in shared memory.
-    pub lock: String,
-    /// A file on which the launcher holds a lock (flock) while it lives.
+    /// A file on which the launcher holds a lock (flock) while it lives, as on the root path. An operator that can take both
+    /// is the last, or among the last: it removes the root path, and what bears the prefix in shared memory.
     pub lock_file: String,
 }
 

@@ -15,9 +15,9 @@ pub struct RecordingIndex {
     pub metadata: BTreeMap<String, BTreeMap<String, String>>,
     /// All topics, ours and others.
     pub topics: BTreeMap<String, IndexedTopic>,
-    /// Messages of all topics, the standard messages for viewers among them.
-    pub n_messages: u64,
-    /// Stamp of the first message, nanoseconds; `None` without messages.
+    /// Messages of all topics, the standard messages for viewers among them; `None` if the file does not say.
+    pub n_messages: Option<u64>,
+    /// Stamp of the first message, nanoseconds; `None` without messages, or if the file does not say.
     pub first_stamp_nanos: Option<u64>,
     /// Stamp of the last message, nanoseconds.
     pub last_stamp_nanos: Option<u64>,
@@ -64,7 +64,7 @@ impl RecordingIndex {
         let sum = |sizes: &mut dyn Iterator<Item = u64>| sizes.fold(0, u64::saturating_add);
         Ok(RecordingIndex {
             topics,
-            n_messages: statistics.map_or(0, |statistics| statistics.message_count),
+            n_messages: statistics.map(|statistics| statistics.message_count),
             first_stamp_nanos: stamps.map(|statistics| statistics.message_start_time),
             last_stamp_nanos: stamps.map(|statistics| statistics.message_end_time),
             n_chunks: summary.chunks.len() as u64,
@@ -76,8 +76,10 @@ impl RecordingIndex {
         })
     }
 
-    /// How long it lasts, by its stamps, in nanoseconds; 0 without messages.
-    pub fn duration_nanos(&self) -> u64 {
-        self.first_stamp_nanos.zip(self.last_stamp_nanos).map_or(0, |(first, last)| last.saturating_sub(first))
+    /// How long it lasts, by its stamps, in nanoseconds: 0 without messages, `None` if the file does not say.
+    pub fn duration_nanos(&self) -> Option<u64> {
+        self.n_messages?;
+        let stamps = self.first_stamp_nanos.zip(self.last_stamp_nanos);
+        Some(stamps.map_or(0, |(first, last)| last.saturating_sub(first)))
     }
 }

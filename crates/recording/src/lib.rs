@@ -224,6 +224,45 @@ mod tests {
     }
 
     #[test]
+    fn a_link_stays_and_the_file_that_it_leads_to_is_replaced() {
+        use std::os::unix::fs::{PermissionsExt, symlink};
+
+        let folder = tempfile::tempdir().expect("a folder");
+        let (file, link) = (folder.path().join("key"), folder.path().join("run.mcap"));
+        std::fs::write(&file, "of yesterday").expect("written");
+        std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o640)).expect("set");
+        symlink("key", &link).expect("linked");
+        write_all(&link);
+        assert!(link.is_symlink());
+        assert_eq!(RecordingReader::open(&file).expect("opened").count(), records().len());
+        assert_eq!(std::fs::metadata(&file).expect("there").permissions().mode() & 0o777, 0o640);
+        assert_eq!(std::fs::read_dir(folder.path()).expect("listed").count(), 2);
+    }
+
+    #[test]
+    fn without_statistics_counts_are_unknown_and_without_an_index_the_metadata_are_found() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (whole, path) = (folder.path().join("whole.mcap"), folder.path().join("plain.mcap"));
+        write_all(&whole);
+        let bytes = std::fs::read(&whole).expect("read");
+        let file = std::io::BufWriter::new(std::fs::File::create(&path).expect("created"));
+        let options = writer::write_options().emit_statistics(false).emit_metadata_indexes(false);
+        let mut plain = options.create(file).expect("begun");
+        for message in mcap::MessageStream::new(&bytes).expect("MCAP") {
+            plain.write(&message.expect("read")).expect("written");
+        }
+        let metadata = writer::info_metadata(&info());
+        plain.write_metadata(&mcap::records::Metadata { name: METADATA_NAME.into(), metadata }).expect("written");
+        plain.finish().expect("finished");
+        let index = RecordingIndex::open(&path).expect("opened");
+        assert_eq!((&index.info, index.n_messages, index.duration_nanos()), (&info(), None, None));
+        assert_eq!(index.topics["/truth"].n_messages, None);
+        let reader = RecordingReader::open(&path).expect("opened");
+        assert_eq!(reader.info(), &info());
+        assert_eq!(reader.flatten().count(), records().len());
+    }
+
+    #[test]
     fn a_recording_cut_off_or_damaged_anywhere_is_an_error_that_names_the_file() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("whole.mcap");

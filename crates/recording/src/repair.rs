@@ -13,7 +13,7 @@ use blindgrasp_messages::files::partial_path;
 use mcap::Writer;
 use mcap::records::{MessageHeader, Metadata, Record as McapRecord, op};
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use super::channels::Channels;
 use super::reader::{RecordingReader, message_parts};
@@ -28,6 +28,8 @@ const REPAIR_METADATA_NAME: &str = "repair";
 const CHUNK_FIXED_BYTES: usize = 8 + 8 + 8 + 4 + 4;
 /// The bytes that follow in each chunk of ours, by which a chunk is found in a damaged file.
 const ZSTD_NAME: &[u8] = b"\x04\0\0\0zstd";
+/// Bytes of the record that ends the data: its checksum.
+const DATA_END_CONTENT_BYTES: u64 = 4;
 /// Bytes of the file that are searched at a time.
 const WINDOW_BYTES: usize = 1 << 20;
 /// The longest record beside chunks: metadata. A damaged length would otherwise hide the records behind it.
@@ -37,8 +39,10 @@ const MAX_METADATA_BYTES: u64 = 16 << 20;
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct RepairReport {
     /// The recording, which stays as it is.
+    #[serde(serialize_with = "path_as_text")]
     pub input: PathBuf,
     /// The repaired recording; `None` if the input is whole.
+    #[serde(serialize_with = "path_as_text")]
     pub output: Option<PathBuf>,
     /// Whether the recording's own metadata (the hand, what made it) was found; otherwise the hand is `unknown`.
     pub has_info: bool,
@@ -61,12 +65,15 @@ pub struct RepairReport {
     pub n_skipped_bytes: u64,
     /// Whether the file's end is there.
     pub has_end: bool,
+    /// Whether the end of the samples is there, which lies before the index. Without it, nobody knows how many came after.
+    pub has_data_end: bool,
 }
 
 impl RepairReport {
-    /// Whether anything is known to be lost.
+    /// Whether samples are lost, or may be: after the last chunk of a file whose end is missing.
     pub fn has_loss(&self) -> bool {
-        self.n_damaged_chunks > 0
+        !self.has_data_end
+            || self.n_damaged_chunks > 0
             || self.has_partial_chunk
             || self.n_skipped_bytes > 0
             || self.n_of_unknown_topics > 0
@@ -205,13 +212,17 @@ impl Repair {
         while let Some((opcode, n_bytes)) = self.record_at(at)? {
             let end = at.saturating_add(PREFIX_BYTES).saturating_add(n_bytes);
             if opcode == op::CHUNK {
+                self.report.has_data_end = false;
                 let (next, is_whole) = self.chunk(at)?;
                 last_chunk_is_damaged = !is_whole;
                 at = next;
                 continue;
             }
             // Indexes and the summary contain no samples.
-            self.is_past_data |= opcode == op::DATA_END;
+            if opcode == op::DATA_END {
+                self.is_past_data = true;
+                self.report.has_data_end = n_bytes == DATA_END_CONTENT_BYTES;
+            }
             if end > self.n_file_bytes && (self.is_past_data || opcode == op::MESSAGE_INDEX) {
                 return Ok(());
             }
@@ -497,7 +508,13 @@ impl Read for FileSlice<'_> {
 
 /// The report of a recording that needs no repair; `None` if it needs one.
 fn report_of_whole(path: &Path) -> Option<RepairReport> {
-    let mut report = RepairReport { input: path.into(), has_info: true, has_end: true, ..RepairReport::default() };
+    let mut report = RepairReport {
+        input: path.into(),
+        has_info: true,
+        has_end: true,
+        has_data_end: true,
+        ..RepairReport::default()
+    };
     for record in RecordingReader::open(path).ok()? {
         *report.n_recovered.entry(record.ok()?.0).or_default() += 1;
     }
@@ -512,6 +529,12 @@ pub(super) fn unknown_info() -> RecordingInfo {
         made_by: "unknown".into(),
         version: env!("CARGO_PKG_VERSION").into(),
     }
+}
+
+/// Serializes a path as it is shown: JSON has no place for bytes that are not UTF-8.
+fn path_as_text<'a, S: Serializer>(path: impl Into<Option<&'a PathBuf>>, serializer: S) -> Result<S::Ok, S::Error> {
+    let path: Option<&PathBuf> = path.into();
+    path.map(|path| path.to_string_lossy()).serialize(serializer)
 }
 
 fn repair_metadata(path: &Path, report: &RepairReport) -> BTreeMap<String, String> {

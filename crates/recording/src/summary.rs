@@ -12,7 +12,7 @@ use mcap::sans_io::{LinearReader, LinearReaderOptions};
 
 use super::channels::Channels;
 use super::repair::unknown_info;
-use super::source::{Growth, MAX_RECORD_BYTES, longest_record, parse_record, read_records};
+use super::source::{Growth, MAX_RECORD_BYTES, PREFIX_BYTES, longest_record, parse_record, read_records};
 use super::{METADATA_NAME, RecordingError, RecordingInfo};
 
 /// Bytes of the footer: opcode and length, its 20 bytes, and MCAP's mark behind it.
@@ -53,13 +53,18 @@ pub(super) fn open(path: &Path) -> Result<(File, FileSummary), RecordingError> {
     let damaged = |message: String| RecordingError::Damaged { path: path.into(), message };
     let mut file = open_mcap(path)?;
     let n_file_bytes = file.metadata().map_err(io)?.len();
-    let raw = raw_summary(&mut file, n_file_bytes).map_err(|error| {
+    let mut raw = raw_summary(&mut file, n_file_bytes).map_err(|error| {
         if is_being_written(&file) {
             invalid("it is still being recorded: it can be read when its recorder has ended".into())
         } else {
             damaged(format!("it was cut off or is damaged: expected MCAP's summary at its end ({error})"))
         }
     })?;
+    let is_ours = raw.channels.iter().any(|known| known.ours.is_some());
+    if is_ours && raw.metadata.iter().all(|index| index.name != METADATA_NAME) {
+        let found = metadata_in_data(&mut file, n_file_bytes);
+        raw.metadata_in_data = found.map_err(|message| damaged(format!("its metadata: {message}")))?;
+    }
     let mut info = None;
     let mut metadata = BTreeMap::new();
     for index in &raw.metadata {
@@ -83,7 +88,7 @@ pub(super) fn open(path: &Path) -> Result<(File, FileSummary), RecordingError> {
     // Other MCAP tools copy samples without metadata. The samples still say which hand they are of.
     let info = match info {
         Some(info) => info,
-        None if raw.channels.iter().any(|known| known.ours.is_some()) => unknown_info(),
+        None if is_ours => unknown_info(),
         None => {
             let message = format!(
                 "it has no '{METADATA_NAME}' metadata and no topic of blindgrasp: expected a recording made by blindgrasp"
@@ -130,7 +135,7 @@ pub(super) struct RawSummary {
     pub(super) statistics: Option<Statistics>,
     pub(super) chunks: Vec<ChunkIndex>,
     metadata: Vec<MetadataIndex>,
-    /// By name: of a file without an index.
+    /// By name: of a file whose index does not name them.
     metadata_in_data: BTreeMap<String, BTreeMap<String, String>>,
 }
 
@@ -259,6 +264,38 @@ fn check_chunks(chunks: &mut [ChunkIndex], data_end: u64) -> Result<(), String> 
         }
     }
     Ok(())
+}
+
+/// The metadata between the chunks, by name. Chunks are passed over: they have none.
+fn metadata_in_data(file: &mut File, n_file_bytes: u64) -> Result<BTreeMap<String, BTreeMap<String, String>>, String> {
+    let text = |error: std::io::Error| error.to_string();
+    let mut input = std::io::BufReader::new(file);
+    input.seek(SeekFrom::Start(mcap::MAGIC.len() as u64)).map_err(text)?;
+    let mut all = BTreeMap::new();
+    loop {
+        let mut prefix = [0; PREFIX_BYTES as usize];
+        input.read_exact(&mut prefix).map_err(text)?;
+        let [opcode, n_bytes @ ..] = prefix;
+        let n_bytes = u64::from_le_bytes(n_bytes);
+        if opcode == op::DATA_END || opcode == op::FOOTER {
+            return Ok(all);
+        }
+        if n_bytes > n_file_bytes {
+            return Err(format!("a record of {n_bytes} bytes: more than there are"));
+        }
+        if opcode != op::METADATA {
+            input.seek_relative(n_bytes as i64).map_err(text)?;
+            continue;
+        }
+        if n_bytes > MAX_RECORD_BYTES as u64 {
+            return Err(format!("{n_bytes} bytes: expected at most {MAX_RECORD_BYTES}"));
+        }
+        let mut data = vec![0; n_bytes as usize];
+        input.read_exact(&mut data).map_err(text)?;
+        if let McapRecord::Metadata(found) = parse_record(op::METADATA, &data)? {
+            all.insert(found.name, found.metadata);
+        }
+    }
 }
 
 fn read_metadata(

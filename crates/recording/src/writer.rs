@@ -35,11 +35,13 @@ struct WrittenChannel {
 }
 
 impl RecordingWriter {
-    /// Begins a recording that will replace a file of that name.
+    /// Begins a recording that will replace a file of that name, or the file that a link of that name leads to.
     ///
     /// # Errors
     /// The file cannot be written.
     pub fn create(path: &Path, info: &RecordingInfo) -> Result<Self, RecordingError> {
+        let target = if path.is_symlink() { path.canonicalize().ok() } else { None };
+        let path = target.as_deref().unwrap_or(path);
         let file = lock_partial(path)?;
         write_options()
             .create(BufWriter::new(file))
@@ -152,13 +154,16 @@ pub(super) fn lock_partial(path: &Path) -> Result<File, RecordingError> {
     }
 }
 
-/// Completes a file that [`lock_partial`] began, and gives it its name.
+/// Completes a file that [`lock_partial`] began, and gives it its name, with the permissions of the file that it replaces.
 pub(super) fn complete(mut writer: Writer<BufWriter<File>>, path: &Path) -> Result<(), RecordingError> {
+    let io = |source| RecordingError::Io { path: path.into(), source };
     writer.finish().map_err(|error| write_error(path, error))?;
-    let file = writer.into_inner().into_inner().map_err(std::io::IntoInnerError::into_error);
+    let file = writer.into_inner().into_inner().map_err(|error| io(error.into_error()))?;
+    if let Ok(replaced) = std::fs::metadata(path) {
+        file.set_permissions(replaced.permissions()).map_err(io)?;
+    }
     // The file is on the disk before it takes the name that says that it is complete, and locked until then.
-    file.and_then(|file| file.sync_all().and_then(|()| std::fs::rename(partial_path(path), path)))
-        .map_err(|source| RecordingError::Io { path: path.into(), source })
+    file.sync_all().and_then(|()| std::fs::rename(partial_path(path), path)).map_err(io)
 }
 
 /// Locks a file against other processes that write the recording `path`.

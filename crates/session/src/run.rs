@@ -53,7 +53,7 @@ pub struct SessionSummary {
     pub run: run::RunSummary,
     #[serde(rename = "recorded")]
     recorded_samples: Option<BTreeMap<String, u64>>,
-    recorded_files: Vec<PathBuf>,
+    recorded_files: Vec<String>,
     /// Why the recording ended before the graph.
     pub recording_error: Option<String>,
     /// Samples that were received and are not in the recording.
@@ -117,7 +117,7 @@ impl Session {
         let summary = SessionSummary {
             run: summary,
             recorded_samples: is_recorded.then_some(recorded.samples),
-            recorded_files: recorded.files,
+            recorded_files: recorded.files.iter().map(|file| file.display().to_string()).collect(),
             recording_error: recorded.error,
             samples_not_recorded: recorded.n_not_recorded,
         };
@@ -171,8 +171,7 @@ impl SessionSummary {
             && !self.recorded_files.is_empty()
         {
             let topics: Vec<_> = samples.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
-            let files: Vec<_> = self.recorded_files.iter().map(|file| file.display().to_string()).collect();
-            print_diagnostic(&format!("recorded to {}: {}", files.join(", "), topics.join(", ")));
+            print_diagnostic(&format!("recorded to {}: {}", self.recorded_files.join(", "), topics.join(", ")));
         }
     }
 }

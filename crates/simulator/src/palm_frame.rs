@@ -30,6 +30,8 @@ const LEAST_GAIN: f64 = 0.05;
 const ALIKE: f64 = 0.87;
 /// A step must make the score better by this much.
 const LEAST_STEP: f64 = 0.005;
+/// A joint that goes as far to one side of 0 as to the other, in this part, spreads fingers: it stays at 0.
+const LEAST_SYMMETRY: f64 = 0.8;
 /// Frames that are moved, of those in each direction.
 const N_MOVED: usize = 2;
 
@@ -259,18 +261,19 @@ pub fn odd_joints(hand: &Hand) -> Result<OddJoints, JointError> {
     Ok(OddJoints { sideways, opposed })
 }
 
-/// The value of a joint that is set before the grasp with which the hand closes best on a ball: 0 of a joint that goes to both
-/// sides of it.
+/// The value of a joint that is set before the grasp with which the hand closes best on a ball: 0 of a joint that goes about as
+/// far to both sides of it.
 ///
 /// # Errors
 /// The hand's joints do not fit together.
 pub fn best_value(hand: &Hand, joint_idx: usize) -> Result<f64, JointError> {
     const N_VALUES: usize = 5;
     let joint = &hand.joints[joint_idx];
-    if joint.lower < 0.0 && joint.upper > 0.0 {
+    let (less, more) = (joint.upper.min(-joint.lower), joint.upper.max(-joint.lower));
+    if less > 0.0 && less > LEAST_SYMMETRY * more {
         return Ok(joint.open());
     }
-    let mut best = (0.0, joint.open());
+    let mut best = (Trial::of(hand, Isometry3::identity())?.score, joint.open());
     for idx in 0..N_VALUES {
         let part = idx as f64 / (N_VALUES - 1) as f64;
         let value = joint.lower + part * (joint.upper - joint.lower);

@@ -49,7 +49,7 @@ pub(super) fn run(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) ->
             n_lifted_now += lifted.len();
             table.row([fault.describe().into(), lifted.len().to_string(), held.len().to_string()]);
             told.extend(lifted.into_iter().map(|changed: &ChangedDecision| format!("{}: {changed}", fault.describe())));
-            all.push(json!({"recording": recording, "fault": fault, "changed_actions": changed}));
+            all.push(json!({"recording": shown(), "fault": fault, "changed_actions": changed}));
         }
         if !is_json {
             print_line(&format!("{}: {} lifts without a fault", shown(), whole.tally().n_lifts))?;

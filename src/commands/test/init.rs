@@ -71,7 +71,8 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
             }
         }
         written.push(json!({
-            "recording": recording, "expectations": path, "dropped": remarks.keys().collect::<Vec<_>>(),
+            "recording": recording.display().to_string(), "expectations": path.display().to_string(),
+            "dropped": remarks.keys().collect::<Vec<_>>(),
             "is_met": !fails, "changed_actions": changed,
         }));
     }

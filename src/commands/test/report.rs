@@ -34,8 +34,8 @@ pub(super) fn print_summary(cases: &[Case], is_json: bool) -> anyhow::Result<()>
             .iter()
             .map(|case| {
                 json!({
-                    "recording": case.recording, "has_passed": case.has_passed(), "checks": case.checks,
-                    "changed_actions": case.changed, "notes": case.notes, "secs": case.secs
+                    "recording": case.recording.display().to_string(), "has_passed": case.has_passed(),
+                    "checks": case.checks, "changed_actions": case.changed, "notes": case.notes, "secs": case.secs
                 })
             })
             .collect();

@@ -30,6 +30,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use rustix::io::Errno;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use serde_json::Value;
 
@@ -135,6 +136,15 @@ pub enum LaunchError {
     /// Without its socket no command could stop the graph.
     #[error("commands cannot reach the graph: its socket cannot be used")]
     Control(#[source] std::io::Error),
+}
+
+impl LaunchError {
+    /// Whether the machine lacks descriptors, processes or memory, which may pass.
+    fn is_shortage(&self) -> bool {
+        let LaunchError::Spawn { source, .. } = self else { return false };
+        let errno = source.raw_os_error().map(Errno::from_raw_os_error);
+        errno.is_some_and(|errno| [Errno::AGAIN, Errno::MFILE, Errno::NFILE, Errno::NOMEM].contains(&errno))
+    }
 }
 
 /// How a graph ended.

@@ -214,7 +214,12 @@ impl Process {
             .collect();
         for stream in streams.into_iter().flatten() {
             let (events, hearers) = (events.clone(), hearers.clone());
-            std::thread::spawn(move || forward_lines(stream, &hearers, &events));
+            let forwarding = move || forward_lines(stream, &hearers, &events);
+            if let Err(error) = std::thread::Builder::new().spawn(forwarding) {
+                let _ = child.kill();
+                let _ = child.wait();
+                return Err(error);
+            }
         }
         let stdin = child.stdin.take();
         if let Some(stdin) = &stdin {

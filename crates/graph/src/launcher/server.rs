@@ -70,7 +70,7 @@ pub(super) fn serve(
     let pins = Arc::new(pins);
     let accepting = listener.try_clone()?;
     let events = events.clone();
-    let thread = std::thread::spawn(move || {
+    let thread = std::thread::Builder::new().spawn(move || {
         let (next_client, n_clients) = (AtomicU64::new(0), Arc::new(AtomicUsize::new(0)));
         for stream in accepting.incoming() {
             let stream = match stream {
@@ -91,23 +91,31 @@ pub(super) fn serve(
                 n_clients.fetch_sub(1, Ordering::Relaxed);
                 // It is told within the room of the socket: nothing waits for it.
                 let _ = stream.set_nonblocking(true);
-                let _ = refuse(&stream);
+                let _ = refuse(&stream, too_many());
                 continue;
             }
             let is_late = n_before >= MAX_CLIENTS;
             let (client, events, n_clients) =
                 (next_client.fetch_add(1, Ordering::Relaxed), events.clone(), Arc::clone(&n_clients));
             let pins = Arc::clone(&pins);
-            std::thread::spawn(move || {
+            let (other_end, place) = (stream.try_clone(), Arc::clone(&n_clients));
+            let attending = move || {
                 if is_late {
                     attend_late(stream, client, &pins, &events, trail);
                 } else {
                     attend(BufReader::new(stream), client, &pins, &events, trail);
                 }
                 n_clients.fetch_sub(1, Ordering::Relaxed);
-            });
+            };
+            if let Err(error) = std::thread::Builder::new().spawn(attending) {
+                place.fetch_sub(1, Ordering::Relaxed);
+                if let Ok(stream) = other_end {
+                    let _ = stream.set_nonblocking(true);
+                    let _ = refuse(&stream, no_thread(&error));
+                }
+            }
         }
-    });
+    })?;
     Ok(Server { listener: listener.try_clone()?, thread: Some(thread) })
 }
 
@@ -118,9 +126,16 @@ fn own_user(stream: &UnixStream) -> Option<String> {
     (peer.uid == rustix::process::getuid().as_raw()).then(|| format!("uid {} pid {pid}", peer.uid))
 }
 
-/// Tells a client that there is no place for it.
-fn refuse(mut stream: &UnixStream) -> std::io::Result<()> {
-    let message = format!("too many commands at work ({MAX_CLIENTS}): end some of them; stop still works");
+fn too_many() -> String {
+    format!("too many commands at work ({MAX_CLIENTS}): end some of them; stop still works")
+}
+
+fn no_thread(error: &std::io::Error) -> String {
+    format!("the graph cannot make a thread for the command ({error}): try again, or raise the limit of processes")
+}
+
+/// Tells a client why it is not attended to.
+fn refuse(mut stream: &UnixStream, message: String) -> std::io::Result<()> {
     let reply = Reply::Error { message, rolled_back: false };
     stream.write_all(format!("{}\n", serde_json::to_string(&reply)?).as_bytes())
 }
@@ -145,7 +160,7 @@ fn attend_late(
         attend(reader, client, pins, events, trail);
     } else {
         // A client that does not read has gone, or goes on alone.
-        let _ = refuse(reader.get_ref());
+        let _ = refuse(reader.get_ref(), too_many());
     }
 }
 
@@ -161,10 +176,14 @@ fn attend(
     };
     let (reply, replies) = sync_channel(MAX_PENDING_REPLIES);
     let trail = Arc::new(Mutex::new(trail));
-    std::thread::spawn({
+    let writing = {
         let trail = Arc::clone(&trail);
         move || write_replies(writer, &replies, &trail)
-    });
+    };
+    if let Err(error) = std::thread::Builder::new().spawn(writing) {
+        let _ = refuse(reader.get_ref(), no_thread(&error));
+        return;
+    }
     let mut line = Vec::new();
     loop {
         line.clear();

@@ -186,7 +186,7 @@ impl Launcher {
         if is_for_want_of_room {
             // Neither the node nor the sample is to blame.
             member.active = None;
-            self.wait_for_room(idx, &ending);
+            self.wait_for_room(idx, &ending, &format!("there is room in {SHARED_MEMORY_FOLDER}"));
             return Ok(());
         }
         // A failure that comes twice at the start for the same reason, such as a file that cannot be read, comes again.
@@ -254,18 +254,16 @@ impl Launcher {
         self.say(&format!("blindgrasp: node '{id}' {ending}; it is started again"));
     }
 
-    /// Plans the restart of a node without a process for when shared memory has room. It does not count among its restarts.
-    fn wait_for_room(&mut self, idx: usize, ending: &str) {
+    /// Plans the restart of a node without a process for when the machine has room for it, `when`. It does not count among its
+    /// restarts.
+    fn wait_for_room(&mut self, idx: usize, ending: &str, when: &str) {
         let now = Instant::now();
         let member = &mut self.members[idx];
         member.state = NodeState::Restarting;
         member.died.get_or_insert(now);
         member.restart_at = Some(now + ROOM_PAUSE);
         if !std::mem::replace(&mut member.waits_for_room, true) {
-            let line = format!(
-                "blindgrasp: node '{}' {ending}; it is started again when there is room in {SHARED_MEMORY_FOLDER}",
-                member.node.id
-            );
+            let line = format!("blindgrasp: node '{}' {ending}; it is started again when {when}", member.node.id);
             self.say(&line);
         }
         // The memory of the dead process is free then.
@@ -279,6 +277,11 @@ impl Launcher {
             let again = Instant::now() + ROOM_PAUSE;
             return idxs.into_iter().for_each(|idx| self.members[idx].restart_at = Some(again));
         }
+        let failure = self.spawn_active(idx).err().map(|error| (error.is_shortage(), anyhow::Error::from(error)));
+        if let Some((true, error)) = &failure {
+            let (ending, when) = (format!("is missing ({error:#})"), "the machine can start processes again");
+            return idxs.into_iter().for_each(|idx| self.wait_for_room(idx, &ending, when));
+        }
         // A source fails because a node behind it waits for room.
         let is_counted = !self.members.iter().any(|member| member.waits_for_room);
         for idx in &idxs {
@@ -289,8 +292,8 @@ impl Launcher {
             }
             member.n_restarts += 1;
         }
-        if let Err(error) = self.spawn_active(idx) {
-            let message = format!("{:#}", anyhow::Error::from(error));
+        if let Some((_, error)) = failure {
+            let message = format!("{error:#}");
             return idxs.into_iter().for_each(|idx| self.start_again(idx, &message, &[]));
         }
         for idx in idxs {
@@ -313,7 +316,8 @@ impl Launcher {
     /// Frees the iceoryx2 resources of dead processes, on a thread because it takes milliseconds.
     pub(super) fn reap(&self) {
         let domain = self.plan.domain().clone();
-        std::thread::spawn(move || namespace::clean_dead_nodes(&domain));
+        // Without a thread, they are freed the next time.
+        let _ = std::thread::Builder::new().spawn(move || namespace::clean_dead_nodes(&domain));
     }
 
     /// Tells the writers of a node's inputs that it reads no more.

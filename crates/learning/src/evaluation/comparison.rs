@@ -1,10 +1,12 @@
 //! The comparison of two judges of the same grasps.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use serde::Serialize;
 
-use super::decisions::{JudgedGrasp, Unit, by_object, with_probability};
+use super::decisions::{JudgedGrasp, Unit, with_probability};
 use super::measures::{CurvePoint, at_recall, curve};
-use super::statistics::{Estimate, bootstrap, mcnemar_exact};
+use super::statistics::{Estimate, bootstrap, mcnemar_exact, resample};
 
 /// Two judges, paired over the grasps that both judged.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -34,7 +36,8 @@ pub struct EqualRecall {
     /// The first judge at the highest threshold that gives this recall.
     pub first: CurvePoint,
     pub second: CurvePoint,
-    /// 1 - false positives of the first / false positives of the second, at these thresholds.
+    /// 1 - false positives of the first / false positives of the second, at these thresholds. For the interval, each resample
+    /// has its own recall and thresholds.
     pub relative_reduction: Option<Estimate>,
 }
 
@@ -83,14 +86,71 @@ fn equal_recall(pairs: &[(&JudgedGrasp, &JudgedGrasp)], unit: Unit, seed: u64) -
     }
     let second = at_recall(&curve_of(second_grasps), n_lifted as f64 / n_stable as f64)?;
     let first = at_recall(&curve_of(pairs.iter().map(|(first, _)| *first).collect()), second.recall)?;
-    let dropped = |grasp: &JudgedGrasp, threshold: f64| {
-        f64::from(u8::from(!grasp.stable && grasp.probability.is_some_and(|probability| probability >= threshold)))
-    };
-    let of_pair = |(a, b): (&JudgedGrasp, &JudgedGrasp)| [dropped(a, first.threshold), dropped(b, second.threshold)];
-    let [interval] = bootstrap(&clusters(pairs, unit, of_pair), seed, |[first, second]| [1.0 - first / second]);
+    let (places, n_units) = places(pairs, unit);
+    let ranked = [0, 1].map(|side| ranked(pairs, &places, side));
+    let lifted_by_second = clusters(pairs, unit, |(_, second)| {
+        [second.stable && second.lifted, second.stable].map(|counts| f64::from(u8::from(counts)))
+    });
+    let [interval] = resample(n_units, seed, |drawn| {
+        let mut n_drawn = vec![0.0; n_units];
+        drawn.iter().for_each(|place| n_drawn[*place] += 1.0);
+        let sum = |idx: usize| drawn.iter().map(|place| lifted_by_second[*place][idx]).sum::<f64>();
+        [reduction(&ranked, &n_drawn, sum(0) / sum(1)).unwrap_or(f64::NAN)]
+    });
     let relative_reduction = (second.n_false_positive > 0)
         .then(|| Estimate { value: 1.0 - first.n_false_positive as f64 / second.n_false_positive as f64, interval });
     Some(EqualRecall { recall: second.recall, first, second, relative_reduction })
+}
+
+/// A grasp as one judge ranks it.
+struct Ranked {
+    probability: f64,
+    stable: bool,
+    /// The place of its unit.
+    place: usize,
+}
+
+/// The grasps to which a judge gave a probability, from the highest one to the lowest. `side` is 0 for the first judge, 1 for the
+/// second.
+fn ranked(pairs: &[(&JudgedGrasp, &JudgedGrasp)], places: &[usize], side: usize) -> Vec<Ranked> {
+    let ranked = |(pair, place): (&(&JudgedGrasp, &JudgedGrasp), &usize)| {
+        let grasp = [pair.0, pair.1][side];
+        Some(Ranked { probability: grasp.probability?, stable: grasp.stable, place: *place })
+    };
+    let mut all: Vec<Ranked> = pairs.iter().zip(places).filter_map(ranked).collect();
+    all.sort_by(|a, b| b.probability.total_cmp(&a.probability));
+    all
+}
+
+/// 1 - false positives of the first / false positives of the second, at the recall that the second has at its threshold, if each
+/// unit is there `n_drawn` times.
+fn reduction([first, second]: &[Vec<Ranked>; 2], n_drawn: &[f64], recall: f64) -> Option<f64> {
+    let (recall, of_second) = false_positives(second, n_drawn, recall)?;
+    let (_, of_first) = false_positives(first, n_drawn, recall)?;
+    Some(1.0 - of_first / of_second)
+}
+
+/// The recall and the false positives of the highest threshold with this recall, as [`at_recall`] finds it, if each unit is there
+/// `n_drawn` times. `None` without stable or without unstable grasps.
+fn false_positives(ranked: &[Ranked], n_drawn: &[f64], recall: f64) -> Option<(f64, f64)> {
+    let n_of = |stable: bool| -> f64 {
+        ranked.iter().filter(|grasp| grasp.stable == stable).map(|grasp| n_drawn[grasp.place]).sum()
+    };
+    let n_stable = n_of(true);
+    if n_stable == 0.0 || n_of(false) == 0.0 {
+        return None;
+    }
+    let (mut n_true_positive, mut n_false_positive) = (0.0, 0.0);
+    for equal in ranked.chunk_by(|a, b| a.probability == b.probability) {
+        for grasp in equal {
+            let count = if grasp.stable { &mut n_true_positive } else { &mut n_false_positive };
+            *count += n_drawn[grasp.place];
+        }
+        if n_true_positive / n_stable >= recall - 1e-12 {
+            return Some((n_true_positive / n_stable, n_false_positive));
+        }
+    }
+    None
 }
 
 /// Values of pairs, summed by the unit that a bootstrap draws.
@@ -99,18 +159,22 @@ fn clusters<'a, const K: usize>(
     unit: Unit,
     of_pair: impl Fn((&'a JudgedGrasp, &'a JudgedGrasp)) -> [f64; K],
 ) -> Vec<[f64; K]> {
+    let (places, n_units) = places(pairs, unit);
+    let mut sums = vec![[0.0; K]; n_units];
+    for (pair, place) in pairs.iter().zip(places) {
+        sums[place].iter_mut().zip(of_pair(*pair)).for_each(|(sum, value)| *sum += value);
+    }
+    sums
+}
+
+/// The place of each pair's unit among the units that a bootstrap draws, and their number.
+fn places(pairs: &[(&JudgedGrasp, &JudgedGrasp)], unit: Unit) -> (Vec<usize>, usize) {
     match unit {
-        Unit::Grasp => pairs.iter().copied().map(of_pair).collect(),
+        Unit::Grasp => ((0..pairs.len()).collect(), pairs.len()),
         Unit::Object => {
-            let firsts: Vec<&JudgedGrasp> = pairs.iter().map(|(first, _)| *first).collect();
-            let place_of: std::collections::BTreeMap<&str, usize> =
-                by_object(&firsts).into_keys().enumerate().map(|(place, object)| (object, place)).collect();
-            let mut sums = vec![[0.0; K]; place_of.len()];
-            for pair in pairs {
-                let sum = &mut sums[place_of[pair.0.object.as_str()]];
-                sum.iter_mut().zip(of_pair(*pair)).for_each(|(sum, value)| *sum += value);
-            }
-            sums
+            let objects: BTreeSet<&str> = pairs.iter().map(|(first, _)| first.object.as_str()).collect();
+            let place_of: BTreeMap<&str, usize> = objects.into_iter().zip(0..).collect();
+            (pairs.iter().map(|(first, _)| place_of[first.object.as_str()]).collect(), place_of.len())
         }
     }
 }
@@ -146,6 +210,25 @@ mod tests {
         let same = compare([("1", &first), ("1", &first)], Unit::Grasp, 1);
         assert_eq!((same.mcnemar_p, same.accuracy_difference.expect("some").value), (1.0, 0.0));
         assert_eq!(same.relative_error_reduction.expect("some").value, 0.0);
+    }
+
+    #[test]
+    fn thresholds_of_equal_recall_are_chosen_again_in_each_resample() {
+        // Each is sure of the stable grasps of five objects. So the first needs no false positive for the recall of the second, or
+        // all of them, as the objects fall.
+        let judge = |is_sure: fn(usize) -> bool, unstable: f64| {
+            let of_object = |object: usize| {
+                let stable = if is_sure(object) { 0.9 } else { 0.1 };
+                decided(&object.to_string(), "x", &[(true, Some(stable)), (false, Some(unstable))])
+            };
+            (0..10).flat_map(of_object).collect::<Vec<_>>()
+        };
+        let (first, second) = (judge(|object| object < 5, 0.3), judge(|object| object >= 5, 0.95));
+        let equal = compare([("1", &first), ("2", &second)], Unit::Object, 1).at_equal_recall.expect("some");
+        assert_eq!((equal.recall, equal.first.n_false_positive, equal.second.n_false_positive), (0.5, 0, 10));
+        let Estimate { value, interval } = equal.relative_reduction.expect("some");
+        let interval = interval.expect("ten objects");
+        assert_eq!((value, interval.low, interval.high), (1.0, 0.0, 1.0));
     }
 
     #[test]

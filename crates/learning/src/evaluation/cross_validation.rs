@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
 use super::EvaluationError;
-use super::split::{Split, check_disjoint, shuffle, split_into_folds};
+use super::split::{Split, SplitError, check_disjoint, shuffle, split_into_folds};
 use crate::learners::platt::fit_platt;
 use crate::training::{Example, Fitted, TrainingError, cross_validate, fit};
 use blindgrasp_stages::dictionary::Dictionary;
@@ -209,8 +209,19 @@ fn inner_folds(split: Split, training: &[&Example], seed: u64) -> Result<Vec<usi
         Split::Class if n_classes > 1 => (Split::Class, n_classes),
         Split::Class | Split::Object => (Split::Object, n_objects(training)),
     };
-    split_into_folds(split, training, N_INNER_FOLDS.min(n_groups), seed)
-        .map_err(|error| TrainingError::Data(format!("the calibration: {error}")))
+    split_into_folds(split, training, N_INNER_FOLDS.min(n_groups), seed).map_err(|error| {
+        // Nobody can ask for other inner folds.
+        TrainingError::Data(match error {
+            SplitError::TooFewFolds(_) | SplitError::OneLabel { .. } => format!(
+                "the calibration is fitted on the {} of the other folds, split once more: expected {} there, and more if a \
+                 part holds them all; give recordings of more {}",
+                split.counted(n_groups),
+                split.needed(),
+                split.words()
+            ),
+            other => format!("the calibration: {other}"),
+        })
+    })
 }
 
 /// The indices of a fold, and of all others.
@@ -291,6 +302,19 @@ mod tests {
         }
         let sizes: Vec<usize> = nested(Split::Grasp, &all, &training, 3).iter().map(|(_, part)| part.len()).collect();
         assert_eq!(sizes, [4, 7, 14, 25]);
+    }
+
+    #[test]
+    fn too_few_objects_for_the_calibration_say_how_many_are_needed() {
+        for (names, counted) in [(&[("a", "x", 6)][..], "1 object"), (&[("a", "x", 6), ("b", "x", 1)][..], "2 objects")]
+        {
+            let all = examples(names);
+            let error =
+                inner_folds(Split::Object, &all.iter().collect::<Vec<_>>(), 1).expect_err("refused").to_string();
+            let expected = format!("the calibration is fitted on the {counted} of the other folds");
+            assert!(error.starts_with(&expected) && error.contains("at least 2 objects"), "{error}");
+            assert!(error.ends_with("give recordings of more objects"), "{error}");
+        }
     }
 
     #[test]

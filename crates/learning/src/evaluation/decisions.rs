@@ -33,7 +33,7 @@ pub struct JudgedGrasp {
 pub enum Unit {
     /// Grasps, independent of each other: Wilson's intervals, and a bootstrap over grasps where shares are compared.
     Grasp,
-    /// Objects with all their grasps: a bootstrap over objects.
+    /// Objects with all their grasps: a bootstrap over objects; for shares of 0 and 1 Wilson's intervals over objects.
     Object,
 }
 
@@ -148,17 +148,25 @@ pub fn measure(grasps: &[&JudgedGrasp], unit: Unit, seed: u64) -> Measures {
             wilson_interval(part, whole)
         }),
         Unit::Object => {
-            let clusters: Vec<[f64; 10]> = by_object(grasps)
-                .into_values()
-                .map(|of_object| {
-                    let counts = Counts::of(of_object.iter().map(|grasp| (grasp.lifted, grasp.stable)));
-                    std::array::from_fn(|idx| {
-                        let (part, whole) = counts.part_of_whole(SHARES[idx / 2]);
-                        if idx % 2 == 0 { part as f64 } else { whole as f64 }
-                    })
+            let of_object = |grasps: Vec<&JudgedGrasp>| -> [f64; 10] {
+                let counts = Counts::of(grasps.iter().map(|grasp| (grasp.lifted, grasp.stable)));
+                std::array::from_fn(|idx| {
+                    let (part, whole) = counts.part_of_whole(SHARES[idx / 2]);
+                    if idx % 2 == 0 { part as f64 } else { whole as f64 }
                 })
-                .collect();
-            bootstrap(&clusters, seed, |sums| std::array::from_fn(|idx| sums[2 * idx] / sums[2 * idx + 1]))
+            };
+            let clusters: Vec<[f64; 10]> = by_object(grasps).into_values().map(of_object).collect();
+            let drawn: [Option<Interval>; 5] =
+                bootstrap(&clusters, seed, |sums| std::array::from_fn(|idx| sums[2 * idx] / sums[2 * idx + 1]));
+            std::array::from_fn(|idx| {
+                let (part, whole) = counts.part_of_whole(SHARES[idx]);
+                if part > 0 && part < whole {
+                    return drawn[idx];
+                }
+                // Every resample has this share. Wilson's interval takes each object as one sample, which is wide enough.
+                let n_objects = clusters.iter().filter(|cluster| cluster[2 * idx + 1] > 0.0).count();
+                wilson_interval(if part == 0 { 0 } else { n_objects }, n_objects)
+            })
         }
     };
     let estimate = |idx: usize| counts.share(SHARES[idx]).map(|value| Estimate { value, interval: intervals[idx] });
@@ -178,7 +186,7 @@ pub fn measure(grasps: &[&JudgedGrasp], unit: Unit, seed: u64) -> Measures {
 }
 
 /// Grasps by their objects.
-pub(super) fn by_object<'a>(grasps: &[&'a JudgedGrasp]) -> BTreeMap<&'a str, Vec<&'a JudgedGrasp>> {
+fn by_object<'a>(grasps: &[&'a JudgedGrasp]) -> BTreeMap<&'a str, Vec<&'a JudgedGrasp>> {
     let mut objects: BTreeMap<&str, Vec<&JudgedGrasp>> = BTreeMap::new();
     for grasp in grasps {
         objects.entry(&grasp.object).or_default().push(grasp);
@@ -243,5 +251,19 @@ pub(super) mod tests {
         let by_object = measure(&grasps.iter().collect::<Vec<_>>(), Unit::Object, 1).accuracy.expect("some");
         let interval = by_object.interval.expect("two objects");
         assert!(by_object.value == 0.5 && interval.low == 0.5 && interval.high == 0.5, "each is half right");
+    }
+
+    #[test]
+    fn a_share_of_all_or_none_has_wilsons_interval_over_the_objects_that_have_it() {
+        let mut grasps: Vec<JudgedGrasp> =
+            (0..20).flat_map(|object| decided(&object.to_string(), "x", &[(true, Some(0.9)); 3])).collect();
+        grasps.extend(decided("unstable", "x", &[(false, Some(0.1)); 5]));
+        let found = measure(&grasps.iter().collect::<Vec<_>>(), Unit::Object, 1);
+        let interval = |estimate: Option<Estimate>| estimate.and_then(|estimate| estimate.interval);
+        assert_eq!(interval(found.accuracy), wilson_interval(21, 21));
+        assert_eq!(interval(found.recall), wilson_interval(20, 20));
+        assert_eq!(interval(found.false_positive_share), wilson_interval(0, 21));
+        assert_eq!(interval(found.false_positive_rate), wilson_interval(0, 1));
+        assert_eq!(measure(&[], Unit::Object, 1).accuracy, None);
     }
 }

@@ -163,9 +163,12 @@ impl From<LiftDecision> for Decided {
     }
 }
 
+/// Whether a probability made the decision. Without agreement of the votes, no single one did.
+pub fn has_probability(reason: Reason) -> bool {
+    is_judged(reason) && reason != Reason::NoAgreement
+}
+
 fn decided_grasp(recording_idx: usize, decision: &LiftDecision, truth: GraspTruth) -> JudgedGrasp {
-    // Without agreement of the votes, no single probability decided.
-    let has_probability = is_judged(decision.reason) && decision.reason != Reason::NoAgreement;
     JudgedGrasp {
         recording_idx,
         grasp_id: truth.grasp_id,
@@ -175,7 +178,7 @@ fn decided_grasp(recording_idx: usize, decision: &LiftDecision, truth: GraspTrut
         stable: truth.stable,
         lifted: decision.action == Action::Lift,
         judged: is_judged(decision.reason),
-        probability: has_probability.then_some(decision.probability_stable),
+        probability: has_probability(decision.reason).then_some(decision.probability_stable),
     }
 }
 

@@ -4,6 +4,7 @@ use std::fmt::Write;
 
 use super::comparison::Comparison;
 use super::decisions::{JudgedRecipe, Measures};
+use super::looks::Look;
 use super::measures::at_recall;
 use super::report::{LearningPoint, Report, TableRow};
 use super::split::Split;
@@ -30,6 +31,9 @@ pub fn report_page(hand: &Hand, report: &Report) -> Result<String, PictureError>
     let mut page = ReportPage::begin(&title(report), &summary(report));
     page.section(&format!("Table I: learning performance{}", world(report)), &table_1(report));
     page.section("Decisions", &measures_table(report));
+    if !report.looks.is_empty() {
+        page.section("By stage", &stages_table(&report.looks));
+    }
     if !report.comparisons.is_empty() {
         page.section("Compared with each other", &comparisons(report));
     }
@@ -315,6 +319,37 @@ fn measures_table(report: &Report) -> String {
         if report.data.n_held_unjudged > 0 { "All: with the grasps held without a judgement. " } else { "" },
         majority.map_or("none".into(), percent),
         escape(&report.made.intervals)
+    );
+    text
+}
+
+fn stages_table(looks: &[Look]) -> String {
+    let share = |n: usize, of: usize| if of > 0 { percent(n as f64 / of as f64) } else { "–".into() };
+    let row = |look: &Look| {
+        let cells = vec![
+            escape(&look.look.replace('_', "-")),
+            count(look.n_grasps as f64),
+            share(look.n_stable, look.n_grasps),
+            decimals(look.roc_area),
+            decimals(Some(look.ece)),
+            format!("{} ({})", count(look.n_lifted as f64), share(look.n_lifted, look.n_grasps)),
+            format!("{} ({})", count(look.n_kept as f64), share(look.n_kept, look.n_lifted)),
+        ];
+        (false, cells)
+    };
+    let head = [
+        ("stage", false),
+        ("grasps", true),
+        ("stable", true),
+        ("ROC area", true),
+        ("calibration<br>error", true),
+        ("lifted by<br>the thresholds", true),
+        ("stable ones<br>of these", true),
+    ];
+    let mut text = report_table(&head, &looks.iter().map(row).collect::<Vec<_>>());
+    text.push_str(
+        "<p class=\"caption\">Of the grasps that some cell feels, each by one frame. Votes and the limits of the training data \
+         are not considered: the graph lifts fewer.</p>\n",
     );
     text
 }

@@ -84,6 +84,8 @@ pub struct Data {
     pub n_stable: usize,
     /// Grasps that a classifier judged.
     pub n_judged: usize,
+    /// The objects of these.
+    pub n_judged_objects: usize,
     /// Grasps that were held without a judgement, such as grasps without contact.
     pub n_held_unjudged: usize,
     pub n_held_unjudged_stable: usize,
@@ -400,7 +402,7 @@ fn made(
         ),
         Unit::Object => format!(
             "95 %: percentiles of {N_RESAMPLES} bootstrap resamples of whole objects, because grasps of one object go \
-             right or wrong together"
+             right or wrong together; of shares of 0 and 100 % Wilson's, each object counting once"
         ),
     };
     Made {
@@ -423,11 +425,13 @@ fn made(
 
 fn data(decided: &[JudgedGrasp], n_excluded: BTreeMap<String, usize>) -> Data {
     let distinct = |of: fn(&JudgedGrasp) -> &String| decided.iter().map(of).collect::<BTreeSet<_>>().len();
+    let judged = decided.iter().filter(|grasp| grasp.judged);
     let count = |wanted: fn(&JudgedGrasp) -> bool| decided.iter().filter(|grasp| wanted(grasp)).count();
     Data {
         n_grasps: decided.len(),
         n_stable: count(|grasp| grasp.stable),
         n_judged: count(|grasp| grasp.judged),
+        n_judged_objects: judged.map(|grasp| &grasp.object).collect::<BTreeSet<_>>().len(),
         n_held_unjudged: count(|grasp| !grasp.judged),
         n_held_unjudged_stable: count(|grasp| !grasp.judged && grasp.stable),
         // Grasps without contact are in the figures over all grasps.

@@ -23,13 +23,15 @@ pub enum Split {
 #[derive(Debug, thiserror::Error)]
 pub enum SplitError {
     /// Fewer than two folds.
-    #[error("{0} folds: expected at least 2, one to judge and one to train on")]
+    #[error("expected at least 2 folds, one to judge and one to train on, found {0}")]
     TooFewFolds(usize),
     /// A fold would be empty.
     #[error(
-        "{n_groups} {what} for {n_folds} folds: expected one for each; ask for fewer folds, or give more recordings"
+        "{} for {n_folds} folds: expected one for each; ask for fewer folds (2 at least), or give recordings of more {}",
+        split.counted(*n_groups),
+        split.words()
     )]
-    TooFewGroups { what: &'static str, n_groups: usize, n_folds: usize },
+    TooFewGroups { split: Split, n_groups: usize, n_folds: usize },
     /// An object of two classes cannot be left out with either.
     #[error(
         "object '{object}' is of class '{first}' in one grasp and of '{second}' in another: name the objects apart, or \
@@ -41,12 +43,14 @@ pub enum SplitError {
     Leak { what: &'static str, group: String, first: usize, second: usize },
     /// Nothing can be learned from grasps that are all alike.
     #[error(
-        "without fold {} of {n_folds}, all {n_grasps} grasps are {}: expected stable and unstable ones to train on; ask \
-         for fewer folds, or give more recordings",
+        "without fold {} of {n_folds}, only {} grasps are left to train on ({n_grasps}): expected {}; ask for more folds, or \
+         give recordings of more {}",
         fold + 1,
-        if *stable { "stable" } else { "unstable" }
+        if *stable { "stable" } else { "unstable" },
+        split.needed(),
+        split.words()
     )]
-    OneLabel { fold: usize, n_folds: usize, n_grasps: usize, stable: bool },
+    OneLabel { split: Split, fold: usize, n_folds: usize, n_grasps: usize, stable: bool },
 }
 
 impl Split {
@@ -55,6 +59,29 @@ impl Split {
             Split::Grasp => "grasp",
             Split::Object => "object",
             Split::Class => "class",
+        }
+    }
+
+    /// The word for several.
+    pub fn words(self) -> &'static str {
+        match self {
+            Split::Grasp => "grasps",
+            Split::Object => "objects",
+            Split::Class => "classes",
+        }
+    }
+
+    /// So many, for people.
+    pub fn counted(self, n: usize) -> String {
+        format!("{n} {}", if n == 1 { self.word() } else { self.words() })
+    }
+
+    /// The fewest of which both labels can be left without any fold, for people.
+    pub fn needed(self) -> &'static str {
+        match self {
+            Split::Grasp => "at least 2 stable and 2 unstable grasps",
+            Split::Object => "stable grasps of at least 2 objects and unstable ones of at least 2",
+            Split::Class => "stable grasps of at least 2 classes and unstable ones of at least 2",
         }
     }
 
@@ -97,7 +124,7 @@ pub fn split_into_folds(
         let Some(first) = labels.next() else { continue };
         if labels.all(|stable| stable == first) {
             let n_grasps = folds.iter().filter(|of| **of != fold).count();
-            return Err(SplitError::OneLabel { fold, n_folds, n_grasps, stable: first });
+            return Err(SplitError::OneLabel { split, fold, n_folds, n_grasps, stable: first });
         }
     }
     Ok(folds)
@@ -146,7 +173,7 @@ fn check_classes(examples: &[&Example]) -> Result<(), SplitError> {
 /// Deals stable and then unstable grasps to the folds in turn, each in a random order.
 fn stratified_folds(examples: &[&Example], n_folds: usize, random: &mut ChaCha8Rng) -> Result<Vec<usize>, SplitError> {
     if examples.len() < n_folds {
-        return Err(SplitError::TooFewGroups { what: "grasps", n_groups: examples.len(), n_folds });
+        return Err(SplitError::TooFewGroups { split: Split::Grasp, n_groups: examples.len(), n_folds });
     }
     let (mut stable, mut unstable): (Vec<usize>, Vec<usize>) =
         (0..examples.len()).partition(|idx| examples[*idx].stable);
@@ -171,8 +198,7 @@ fn grouped_folds(
         *n_grasps.entry(group).or_default() += 1;
     }
     if n_grasps.len() < n_folds {
-        let what = if split == Split::Class { "classes" } else { "objects" };
-        return Err(SplitError::TooFewGroups { what, n_groups: n_grasps.len(), n_folds });
+        return Err(SplitError::TooFewGroups { split, n_groups: n_grasps.len(), n_folds });
     }
     let mut groups: Vec<(&str, usize)> = n_grasps.into_iter().collect();
     shuffle(&mut groups, random);
@@ -259,12 +285,15 @@ pub(super) mod tests {
             split_into_folds(split, &all.iter().collect::<Vec<_>>(), n_folds, 1).expect_err("refused").to_string()
         };
         assert!(refused(&NAMES, Split::Object, 7).starts_with("6 objects for 7 folds"));
+        assert!(refused(&NAMES[..1], Split::Object, 3).starts_with("1 object for 3 folds"));
         assert!(refused(&NAMES, Split::Class, 4).starts_with("3 classes for 4 folds"));
-        assert!(refused(&NAMES, Split::Grasp, 1).starts_with("1 folds"));
+        assert!(refused(&NAMES, Split::Grasp, 1).starts_with("expected at least 2 folds"));
         assert!(refused(&NAMES, Split::Grasp, 100).starts_with("75 grasps for 100 folds"));
         let two = [("a", "x", 3), ("a", "y", 3), ("b", "y", 3)];
         assert!(refused(&two, Split::Grasp, 2).contains("'a' is of class 'x'"));
         // Object b has one grasp, a stable one.
-        assert!(refused(&[("a", "x", 9), ("b", "x", 1)], Split::Object, 2).contains("are stable"));
+        let error = refused(&[("a", "x", 9), ("b", "x", 1)], Split::Object, 2);
+        let expected = "only stable grasps are left to train on (1): expected stable grasps of at least 2 objects";
+        assert!(error.contains(expected) && error.contains("ask for more folds"), "{error}");
     }
 }

@@ -2,6 +2,7 @@
 //!
 //! There are two kinds of 95 % interval: Wilson's for a share of independent samples, and the percentiles of a bootstrap
 //! over whole clusters. Clusters are for claims about objects never seen: grasps of one object go right or wrong together.
+//! No resample differs from a share of 0 or 1, so such a share has Wilson's interval over clusters.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -48,18 +49,30 @@ pub fn bootstrap<const K: usize, const N: usize>(
     seed: u64,
     statistics: impl Fn(&[f64; K]) -> [f64; N],
 ) -> [Option<Interval>; N] {
-    if clusters.len() < 2 {
+    resample(clusters.len(), seed, |drawn| {
+        let mut sums = [0.0; K];
+        for cluster_idx in drawn {
+            sums.iter_mut().zip(&clusters[*cluster_idx]).for_each(|(sum, value)| *sum += value);
+        }
+        statistics(&sums)
+    })
+}
+
+/// As [`bootstrap`], for statistics that are not of sums: they get the indices of the drawn clusters.
+pub fn resample<const N: usize>(
+    n_clusters: usize,
+    seed: u64,
+    statistics: impl Fn(&[usize]) -> [f64; N],
+) -> [Option<Interval>; N] {
+    if n_clusters < 2 {
         return [None; N];
     }
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut found: [Vec<f64>; N] = std::array::from_fn(|_| Vec::with_capacity(N_RESAMPLES));
+    let mut drawn = vec![0; n_clusters];
     for _ in 0..N_RESAMPLES {
-        let mut sums = [0.0; K];
-        for _ in 0..clusters.len() {
-            let drawn = &clusters[random.random_range(0..clusters.len())];
-            sums.iter_mut().zip(drawn).for_each(|(sum, value)| *sum += value);
-        }
-        for (values, value) in found.iter_mut().zip(statistics(&sums)) {
+        drawn.fill_with(|| random.random_range(0..n_clusters));
+        for (values, value) in found.iter_mut().zip(statistics(&drawn)) {
             if value.is_finite() {
                 values.push(value);
             }

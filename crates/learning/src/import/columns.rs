@@ -21,6 +21,7 @@ pub(super) struct Columns {
     pub(super) day: Option<usize>,
     pub(super) grasp: Option<usize>,
     pub(super) phase: Option<usize>,
+    pub(super) warnings: Vec<String>,
 }
 
 impl Columns {
@@ -38,6 +39,7 @@ impl Columns {
         let class = optional(&options.class, "--class")?;
         let by_pattern = matches(header, &options.cells, "--cells")?;
         check_cells(hand, &options.cells, &by_pattern)?;
+        let warnings = out_of_order(header, &by_pattern);
         let cells = by_pattern.concat();
         let joints = match &options.joints {
             Joints::Fixed(_) => Vec::new(),
@@ -62,7 +64,7 @@ impl Columns {
             }
         }
         check_names(header, &uses.iter().map(|(idx, _)| *idx).collect::<Vec<_>>())?;
-        Ok(Columns { cells, joints, label, group, class, day, grasp, phase })
+        Ok(Columns { cells, joints, label, group, class, day, grasp, phase, warnings })
     }
 }
 
@@ -102,6 +104,26 @@ fn matches(header: &[String], patterns: &[String], flag: &str) -> Result<Vec<Vec
         }
     };
     patterns.iter().map(of).collect()
+}
+
+/// Warns of a pattern of cells whose columns are numbered and do not lie in the order of their numbers.
+fn out_of_order(header: &[String], by_pattern: &[Vec<usize>]) -> Vec<String> {
+    let numbered = |idx: usize| {
+        let stem = header[idx].trim_end_matches(|char: char| char.is_ascii_digit());
+        Some((stem, header[idx][stem.len()..].parse::<u64>().ok()?))
+    };
+    let falls = |pair: &&[usize]| match (numbered(pair[0]), numbered(pair[1])) {
+        (Some((stem, number)), Some((next_stem, next))) => stem == next_stem && number > next,
+        _ => false,
+    };
+    let warning = |pair: &[usize]| {
+        let [before, name] = [pair[0], pair[1]].map(|idx| shortened(&header[idx]));
+        format!(
+            "column '{name}' lies behind '{before}', and cells follow the table's order: if the numbers are those of the \
+             cells, sort the columns by number"
+        )
+    };
+    by_pattern.iter().filter_map(|found| found.windows(2).find(falls).map(warning)).collect()
 }
 
 /// Whether a name is like a pattern, in which `*` stands for any text.
@@ -235,6 +257,13 @@ mod tests {
         let header = ["c10", "x", "c2", "", "c1"].map(String::from);
         assert_eq!(matches(&header, &["c*".into(), "x".into()], "--cells"), Ok(vec![vec![0, 2, 4], vec![1]]));
         assert_eq!(matches(&header, &["*".into()], "--cells"), Ok(vec![vec![0, 1, 2, 4]]));
+    }
+
+    #[test]
+    fn numbers_that_do_not_ascend_are_told() {
+        let header = ["a_1", "a_10", "a_2", "b_3", "c_1", "x", "y"].map(String::from);
+        let warnings = out_of_order(&header, &[vec![0, 1, 2, 3], vec![3, 4], vec![5, 6]]);
+        assert!(warnings.len() == 1 && warnings[0].starts_with("column 'a_2' lies behind 'a_10'"), "{warnings:?}");
     }
 
     #[test]

@@ -25,8 +25,8 @@ pub struct FramesReport {
     pub senses: Vec<String>,
 }
 
-/// Writes frames and the labels of their grasps to a recording at `out`. `name` says where they are from. After an error there
-/// is no recording.
+/// Writes frames and the labels of their grasps to a recording at `out`. A label has its own header if it is
+/// given, else stamp and epoch of its grasp's first frame. `name` says where they are from. After an error there is no recording.
 ///
 /// # Errors
 /// A frame that does not fit the hand, frames of a grasp on both sides of another one, or a recording that cannot be written.
@@ -34,7 +34,7 @@ pub fn import_frames(
     name: &str,
     hand: &Hand,
     frames: &[Stamped<TactileFrame>],
-    truths: &BTreeMap<u64, GraspTruth>,
+    (truths, headers_of_truths): (&BTreeMap<u64, GraspTruth>, &BTreeMap<u64, Header>),
     out: &Path,
 ) -> Result<FramesReport, ImportError> {
     let refused = |message: String| ImportError::Table { path: name.into(), message };
@@ -48,7 +48,8 @@ pub fn import_frames(
     let mut recording = RecordingWriter::create(out, &info)?;
     let mut outcomes = BTreeMap::new();
     let mut senses: Option<BTreeSet<&'static str>> = None;
-    let (mut last, mut seen) = (None, BTreeSet::new());
+    // The header of each grasp's first frame.
+    let (mut last, mut seen) = (None, BTreeMap::new());
     for frame in frames {
         let TactileFrame { grasp_id, phase, joints, cells_newtons, .. } = &frame.message;
         let place = format!("grasp {grasp_id}, frame {} ({})", frame.header.seq, phase.as_str());
@@ -62,7 +63,7 @@ pub fn import_frames(
         if frame.header.hand_id != hand.id() {
             return Err(refused(format!("{place}: it is of another hand than {}", hand.name)));
         }
-        if last.replace(grasp_id) != Some(grasp_id) && !seen.insert(grasp_id) {
+        if last.replace(grasp_id) != Some(grasp_id) && seen.insert(grasp_id, frame.header).is_some() {
             return Err(refused(format!(
                 "{place}: frames of another grasp come before it; expected each grasp's together"
             )));
@@ -81,9 +82,13 @@ pub fn import_frames(
         senses = Some(senses.map_or(has.clone(), |known| &known & &has));
         recording.write(TactileFrame::TOPIC, frame)?;
     }
-    for (seq, (grasp_id, truth)) in truths.iter().filter(|(grasp_id, _)| seen.contains(grasp_id)).enumerate() {
+    let labelled = truths.iter().filter_map(|(grasp_id, truth)| Some((seen.get(grasp_id)?, grasp_id, truth)));
+    for (seq, (first, grasp_id, truth)) in labelled.enumerate() {
         outcomes.insert(grasp_id, truth.stable);
-        let header = Header { seq: seq as u64, hand_id: hand.id(), ..Header::default() };
+        let header = match headers_of_truths.get(grasp_id) {
+            Some(own) => Header { hand_id: hand.id(), ..*own },
+            None => Header { seq: seq as u64, ..*first },
+        };
         recording.write(GraspTruth::TOPIC, &Stamped { header, message: truth.clone() })?;
     }
     recording.finish()?;

@@ -10,8 +10,8 @@ use blindgrasp_messages::Phase;
 #[derive(Default)]
 pub(super) struct Grasps {
     by_name: bool,
-    /// The grasp whose rows are being read, with its name; `None` in the place of one with a bad row.
-    open: Option<(String, Option<TableGrasp>)>,
+    /// The grasp whose rows are being read.
+    open: Option<OpenGrasp>,
     /// The names of earlier grasps.
     closed: BTreeSet<String>,
     /// Whether the row before has no name that can be read: it may be the first one of the next grasp.
@@ -19,6 +19,16 @@ pub(super) struct Grasps {
     /// The first line of each value of the label.
     pub(super) first_lines: BTreeMap<String, u64>,
     pub(super) bad_rows: Vec<BadRow>,
+    pub(super) n_grasps_left_out: usize,
+    /// The rows of these grasps, and rows that name none.
+    pub(super) n_rows_left_out: usize,
+}
+
+struct OpenGrasp {
+    name: String,
+    /// `None` in the place of one with a bad row.
+    grasp: Option<TableGrasp>,
+    n_rows: usize,
 }
 
 impl Grasps {
@@ -42,11 +52,15 @@ impl Grasps {
         }
         let row = row.map_err(|bad| self.bad_rows.push(bad)).ok();
         if !self.by_name {
+            if row.is_none() {
+                self.leave_out(1);
+            }
             return Ok(row);
         }
         let is_after_nameless = std::mem::replace(&mut self.is_after_nameless, name.is_none());
         match (&mut self.open, name) {
-            (Some((open, grasp)), name) if name.as_ref().is_none_or(|name| name == open) => {
+            (Some(OpenGrasp { name: open, grasp, n_rows }), name) if name.as_ref().is_none_or(|name| name == open) => {
+                *n_rows += 1;
                 let so_far = grasp.take();
                 *grasp = match so_far.zip(row).map(|(so_far, next)| so_far.followed_by(next)) {
                     Some(Err(problem)) => {
@@ -57,14 +71,17 @@ impl Grasps {
                 };
                 Ok(None)
             }
-            (_, None) => Ok(None),
+            (_, None) => {
+                self.n_rows_left_out += 1;
+                Ok(None)
+            }
             (_, Some(name)) => {
                 let complete = self.close();
                 if self.closed.contains(&name) {
                     let expected = "expected the rows of a grasp one after another; sort the table";
                     return Err(format!("line {line}: grasp '{}' again: {expected}", shortened(&name)));
                 }
-                self.open = Some((name, if is_after_nameless { None } else { row }));
+                self.open = Some(OpenGrasp { name, grasp: if is_after_nameless { None } else { row }, n_rows: 1 });
                 Ok(complete)
             }
         }
@@ -72,7 +89,7 @@ impl Grasps {
 
     /// The open grasp, if it is complete.
     pub(super) fn close(&mut self) -> Option<TableGrasp> {
-        let (name, grasp) = self.open.take()?;
+        let OpenGrasp { name, grasp, n_rows } = self.open.take()?;
         let grasp = grasp.filter(|grasp| {
             let has_settled = grasp.readings.iter().any(|reading| reading.phase == Phase::Settled);
             if !has_settled {
@@ -82,7 +99,15 @@ impl Grasps {
             has_settled
         });
         self.closed.insert(name);
+        if grasp.is_none() {
+            self.leave_out(n_rows);
+        }
         grasp
+    }
+
+    fn leave_out(&mut self, n_rows: usize) {
+        self.n_grasps_left_out += 1;
+        self.n_rows_left_out += n_rows;
     }
 }
 

@@ -129,7 +129,11 @@ pub struct ImportReport {
     /// The columns of the joints in the hand's order; empty for a fixed posture.
     pub joint_columns: Vec<String>,
     pub skipped: Vec<BadRow>,
-    /// Units that are probably others than the options say.
+    /// Grasps that have a bad row, or lie beside one that names no grasp.
+    pub n_grasps_left_out: usize,
+    /// The rows of these grasps, good and bad, and rows that name no grasp.
+    pub n_rows_left_out: usize,
+    /// Units, or an order of columns, that are probably others than the options say.
     pub warnings: Vec<String>,
 }
 
@@ -238,6 +242,9 @@ pub fn import_table(
         return Err(refused("there is no row below the header: expected one for each grasp or frame".into()));
     }
     report.warnings = extremes.warnings(hand, options);
+    report.warnings.extend(columns.warnings);
+    report.n_grasps_left_out = grasps.n_grasps_left_out;
+    report.n_rows_left_out = grasps.n_rows_left_out;
     let bad_rows = grasps.bad_rows;
     if !bad_rows.is_empty() && (!options.skip_bad_rows || report.n_grasps == 0) {
         return Err(ImportError::Rows { path: table.into(), n_rows: report.n_rows, rows: bad_rows });

@@ -26,6 +26,7 @@ pub(crate) use probes::composed;
 use crate::dataset::DatasetError;
 use crate::evaluation::measures::{area_under_roc, curve};
 use crate::evaluation::reliability::{N_RELIABILITY_BINS, reliability};
+use crate::evaluation::split::Split;
 use crate::learners::booster::train_boosted;
 use crate::learners::decision_values;
 use crate::learners::k_means::{DictionaryError, KMeansParams, learn_dictionary};
@@ -52,7 +53,7 @@ pub struct TrainingOptions {
     pub n_folds: usize,
     /// A grasp counts as stable from this probability on, and as unstable below 1 minus it; between them it is unsure.
     pub threshold_probability: f64,
-    /// What the thresholds of all looks are chosen for, in place of that probability.
+    /// What the thresholds of all stages are chosen for, in place of that probability.
     pub aim: Option<Aim>,
     /// Friction coefficients, equally probable, for which the grasps are labelled again from their scenes. The target
     /// is then the probability that a grasp is stable. Empty: the recordings' own labels.
@@ -330,6 +331,7 @@ impl Aim {
 const NEVER: f64 = 1.0;
 
 /// Chooses the thresholds of all looks, each for hands that can do this probe and no other. A look without a policy never lifts.
+/// Attempts are grasps with contact: those that no cell feels are attempts of a robot as well, and are not counted.
 /// `promises` says whether the labels are outcomes of lifts, for which a promise can be made.
 fn choose_policies(
     classifier: &mut Classifier,
@@ -572,11 +574,16 @@ fn check_examples(read: &Examples, recordings: &[PathBuf], frictions: &[f64]) ->
 /// Fewer than two folds, or fewer objects than folds.
 pub fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usize>, TrainingError> {
     let objects: BTreeSet<&str> = examples.iter().map(|example| example.object.as_str()).collect();
-    if n_folds < 2 || objects.len() < n_folds {
+    let n_needed = n_folds.max(2);
+    if objects.len() < n_needed {
         return Err(TrainingError::Data(format!(
-            "{} objects for {n_folds} folds: expected at least 2 folds and an object for each",
-            objects.len()
+            "grasps with contact of {}: expected at least {n_needed} objects, one for each fold of the cross-validation, with stable \
+             and unstable grasps of several; record more objects, or say which grasps are of which object",
+            Split::Object.counted(objects.len())
         )));
+    }
+    if n_folds < 2 {
+        return Err(TrainingError::Data(format!("expected at least 2 folds, found {n_folds}")));
     }
     let fold_of: BTreeMap<&str, usize> =
         objects.iter().enumerate().map(|(idx, object)| (*object, idx % n_folds)).collect();
@@ -717,5 +724,18 @@ mod tests {
             let error = check(a, brier).expect_err("no skill").to_string();
             assert!(error.contains("nothing was learned") && error.contains("0.1875"), "{error}");
         }
+    }
+
+    #[test]
+    fn too_few_objects_say_how_many_are_needed() {
+        let example = |object: &str| Example { object: object.into(), ..Example::default() };
+        let examples = [example("a"), example("b")];
+        let folds = |n: usize, n_folds| folds_by_object(&examples[..n].iter().collect::<Vec<_>>(), n_folds);
+        let refused = |n: usize, n_folds| folds(n, n_folds).expect_err("too few").to_string();
+        assert!(refused(1, 5).starts_with("grasps with contact of 1 object: expected at least 5 objects"));
+        assert!(refused(2, 5).starts_with("grasps with contact of 2 objects: expected at least 5 objects"));
+        assert!(refused(1, 1).contains("expected at least 2 objects"));
+        assert!(refused(2, 1).contains("expected at least 2 folds"));
+        assert_eq!(folds(2, 2).expect("folds"), [0, 1]);
     }
 }

@@ -351,20 +351,17 @@ impl UntypedSubscriber {
 
     /// As [`UntypedSubscriber::commit`], with the counts of the time at which it received this sample.
     pub(crate) fn commit_with(&self, header: &Header, counts: &InputCounts) {
-        if let Some((cursors, slot)) = &self.cursors {
-            let key = sample_id(header);
-            let slot = cursors.input(*slot);
-            // A sample that goes back in order is answered, but does not move the cursor.
-            let is_ahead = self.is_after(key, slot.key());
-            slot.commit(is_ahead.then_some(key), counts);
-        }
+        self.commit_late(sample_id(header), counts);
     }
 
     /// As [`UntypedSubscriber::commit`], for a reader that answers long after it has received; with the counts of the time at which
     /// it received this sample.
     pub fn commit_late(&self, key: SampleId, counts: &InputCounts) {
         if let Some((cursors, slot)) = &self.cursors {
-            cursors.input(*slot).commit(Some(key), counts);
+            let slot = cursors.input(*slot);
+            // A sample that goes back in order is answered, but does not move the cursor.
+            let is_ahead = self.is_after(key, slot.key());
+            slot.commit(is_ahead.then_some(key), counts);
         }
     }
 

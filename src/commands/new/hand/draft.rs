@@ -8,7 +8,7 @@ use blindgrasp_simulator::mechanism::Mechanism;
 use blindgrasp_simulator::pad_grid::pad_grid;
 use blindgrasp_simulator::palm_frame::{best_value, idle_pads, odd_joints, palm_fit, self_pressing};
 use blindgrasp_stages::hand::{BareHand, Hand, Joint, Motion, PALM_FRAME, Pad};
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Point3};
 
 use super::{Arguments, NewPad};
 
@@ -225,9 +225,17 @@ impl Draft {
         Ok(Fitted { draft, score: fit.score, told })
     }
 
-    /// Says which pads come to no object, and whether the hand closes on itself.
+    /// Says which pads come to no object or lie inside another link, and whether the hand closes on itself.
     pub(super) fn warn(&self, pads: &[NewPad]) -> anyhow::Result<()> {
         let hand = self.with_pads(pads);
+        for (pad, n_inside, link) in buried_pads(&hand)? {
+            print_diagnostic(&format!(
+                "{n_inside} of the {} cells of pad '{}' lie inside the collision shapes of link '{link}' while the hand is open, \
+                 where they feel nothing: a link that only keeps a robot's distance does not belong into the URDF",
+                pad.cells.len(),
+                pad.name
+            ));
+        }
         let moving = hand.with_moving_pads();
         let fit = idle_pads(&moving)?;
         if !fit.is_empty() {
@@ -293,6 +301,22 @@ impl Draft {
         }
         hand
     }
+}
+
+/// Pads of which more than half of the cells lie inside the shapes of another link while the hand is open, with their number.
+fn buried_pads(hand: &Hand) -> anyhow::Result<Vec<(&Pad, usize, &str)>> {
+    let palm_from_links = hand.palm_from_links(&hand.open_joints_rad())?;
+    let mut buried = Vec::new();
+    for pad in &hand.pads {
+        let others = (0..hand.links.len()).filter(|idx| *idx != pad.link_idx);
+        buried.extend(others.filter_map(|idx| {
+            let is_inside = |point: Point3<f64>| hand.distance_to_link_m(&point, idx, &palm_from_links) == 0.0;
+            let points = pad.cells.iter().map(|cell| palm_from_links[pad.link_idx] * cell.position_in_link_m);
+            let n_inside = points.filter(|point| is_inside(*point)).count();
+            (2 * n_inside > pad.cells.len()).then_some((pad, n_inside, hand.links[idx].name.as_str()))
+        }));
+    }
+    Ok(buried)
 }
 
 /// A joint that moves all pads as one, where they lie on several links that move against each other, and the link that it moves.

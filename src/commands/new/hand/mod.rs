@@ -179,8 +179,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let shown = in_shell(&layout_path.display().to_string());
     print_line(&format!(
         "\n{}: {} pads, {} cells; picture: {name}.svg\nnext:\n  blindgrasp view {shown} --out hand.html      turn it, close it\n  \
-         blindgrasp simulate --hand {shown} --protocol planned --grasps 1000 --out grasps.mcap\n  \
-         blindgrasp train grasps.mcap --hand {shown} --out model.json",
+         blindgrasp simulate --hand {shown} --label lift --protocol planned --stable-fraction natural --objects train \
+         --grasps 600 --out lifts.mcap\n  \
+         blindgrasp train lifts.mcap --hand {shown} --drop-secs 120 --out model.json",
         layout_path.display(),
         hand.pads.len(),
         hand.n_cells()
@@ -453,7 +454,7 @@ fn numbers(values: &[f64], per_unit: f64) -> String {
 }
 
 fn grid(text: &str) -> Result<(String, [usize; 2]), String> {
-    let parsed = text.split_once('=').and_then(|(link, size)| {
+    let parsed = text.rsplit_once('=').and_then(|(link, size)| {
         let (rows, columns) = size.split_once('x')?;
         Some((link.to_owned(), [rows.parse().ok()?, columns.parse().ok()?]))
     });
