@@ -13,7 +13,8 @@ executes no step after a controller that does not succeed, so the arm stays. Nam
 
     grasp_gate: {type: GripperCommand, action_ns: gripper_cmd, joints: [finger_joint], default: true}
 
-The rest of the command line starts the graph, whose lines of JSON are the decisions; the graph ends with the node. It needs
+The rest of the command line starts the graph, whose lines of JSON are the decisions. The graph ends with the node, however that
+ends (setpriv of util-linux), and the node with the graph: it rejects goals then, and its exit code is 1. It needs
 rclpy and control_msgs, in any RMW. The gate makes no test lift: use a model and an arbiter that decide when the hand is
 settled, and read what they promise (`blindgrasp model show`). MoveIt gives a gripper 1.1 times the planned duration and
 0.5 s: set `allowed_goal_duration_margin` of the controller to the seconds that --wait allows.
@@ -25,12 +26,15 @@ ros2_controllers say so only after `stall_timeout`, which is 1 s: set it to 0.2.
 import argparse
 import collections
 import json
+import math
 import subprocess
 import sys
 import threading
 import time
 
 LIFT = "lift"
+# Seconds between two looks whether a goal was cancelled, or a signal came.
+LOOK_S = 0.05
 # action_msgs/msg/GoalStatus
 SUCCEEDED = 4
 # Decisions after which another one follows.
@@ -74,7 +78,7 @@ class Decisions:
             self.newest = max([self.newest, *ids])
             self.waiting.clear()
 
-    def may_lift(self, wait_s, now_nanos=boottime_nanos):
+    def may_lift(self, wait_s, is_cancelled, now_nanos=boottime_nanos):
         """Whether the final decision of the newest grasp is a LIFT that is still valid, and the reason.
 
         A hold that came while the hand still closed may be of the grasp before: it counts if nothing follows it.
@@ -101,9 +105,11 @@ class Decisions:
                     if came >= closed:
                         return False, why
                 left = deadline - time.monotonic()
+                if is_cancelled():
+                    return False, "cancelled"
                 if self.has_ended or left <= 0:
                     return False, "the graph has ended" if self.has_ended else why
-                self.condition.wait(left)
+                self.condition.wait(min(left, LOOK_S))
 
 
 class Gate:
@@ -112,7 +118,7 @@ class Gate:
     def __init__(self, decisions, is_grasp, wait_s):
         self.decisions, self.is_grasp, self.wait_s = decisions, is_grasp, wait_s
 
-    def run(self, position, move):
+    def run(self, position, move, is_cancelled=lambda: False):
         """Moves the hand by `move`, which tells whether the controller succeeded, or stalled. Whether the goal succeeds, and why."""
         self.decisions.begin()
         has_succeeded, has_stalled = move()
@@ -121,7 +127,7 @@ class Gate:
         # A hand that an object stops has closed on it, though it has not reached its goal.
         if not (has_succeeded or has_stalled):
             return False, "the controller did not succeed"
-        return self.decisions.may_lift(self.wait_s)
+        return self.decisions.may_lift(self.wait_s, is_cancelled)
 
 
 def grasps(arguments):
@@ -131,11 +137,16 @@ def grasps(arguments):
     return lambda position: position > arguments.grasps_above
 
 
+def positions_of(command, is_parallel):
+    """The positions of a goal: ParallelGripperCommand has a list, which may be empty."""
+    return list(command.position) if is_parallel else [command.position]
+
+
 def serve(arguments, decisions):
+    """Serves goals until a signal comes, or the graph has ended; whether it was the graph."""
     import control_msgs.action
     import rclpy
     from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
-    from rclpy.clock import Clock
     from rclpy.executors import MultiThreadedExecutor
 
     # Humble has no ParallelGripperCommand.
@@ -150,22 +161,31 @@ def serve(arguments, decisions):
         """What the controller answers; `None` if it has gone, or a signal ends the gate."""
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
-        while not done.wait(0.05):
+        while not done.wait(LOOK_S):
             if not rclpy.ok() or not controller.server_is_ready():
                 return None
             meanwhile()
         return future.result()
 
-    def take(_):
-        return GoalResponse.REJECT if busy.locked() else GoalResponse.ACCEPT
+    def take(goal):
+        positions = positions_of(goal.command, arguments.parallel)
+        if decisions.has_ended:
+            why = "the graph has ended"
+        elif busy.locked():
+            why = "another goal is executed"
+        elif not positions or not all(map(math.isfinite, positions)):
+            why = f"the positions {positions}, expected finite ones"
+        else:
+            return GoalResponse.ACCEPT
+        node.get_logger().warning(f"goal rejected: {why}")
+        return GoalResponse.REJECT
 
     def execute(handle):
         with busy:
             return execute_alone(handle)
 
     def execute_alone(handle):
-        command = handle.request.command
-        position = command.position[0] if arguments.parallel else command.position
+        position = positions_of(handle.request.command, arguments.parallel)[0]
         answers = []
 
         def move():
@@ -187,7 +207,7 @@ def serve(arguments, decisions):
             answers.append(answer.result)
             return answer.status == SUCCEEDED, answer.result.stalled
 
-        succeeds, why = gate.run(position, move)
+        succeeds, why = gate.run(position, move, lambda: handle.is_cancel_requested or not rclpy.ok())
         if handle.is_cancel_requested:
             succeeds, why, end = False, "cancelled", handle.canceled
         else:
@@ -205,17 +225,24 @@ def serve(arguments, decisions):
         goal_callback=take,
         cancel_callback=lambda _: CancelResponse.ACCEPT,
     )
-    # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
-    node.create_timer(1.0, lambda: None, clock=Clock())
+    # The answers of the controller come while a goal is executed.
+    executor = MultiThreadedExecutor(num_threads=4)
+    executor.add_node(node)
     try:
-        # The answers of the controller come while a goal is executed.
-        rclpy.spin(node, MultiThreadedExecutor(num_threads=4))
+        while rclpy.ok() and (busy.locked() or not decisions.has_ended):
+            executor.spin_once(timeout_sec=1.0)
+        # The answers of the last goals still go out.
+        until = time.monotonic() + 0.5
+        while rclpy.ok() and time.monotonic() < until:
+            executor.spin_once(timeout_sec=0.1)
+        return rclpy.ok()
     except KeyboardInterrupt:
-        pass
+        return False
     except Exception:
-        # A signal that ends ROS 2 makes rclpy.spin raise one of several errors.
+        # A signal that ends ROS 2 makes rclpy raise one of several errors.
         if rclpy.ok():
             raise
+        return False
     finally:
         rclpy.try_shutdown()
 
@@ -235,12 +262,15 @@ def main():
     arguments = options.parse_args(own)
     if not arguments.graph:
         options.error("expected the command of the graph, such as: blindgrasp run dataflow-ros2.yaml --json")
-    graph = subprocess.Popen(arguments.graph, stdout=subprocess.PIPE, text=True)
+    # The graph gets SIGTERM if this process is killed.
+    graph = subprocess.Popen(["setpriv", "--pdeathsig", "TERM", *arguments.graph], stdout=subprocess.PIPE, text=True)
     try:
-        serve(arguments, Decisions(graph.stdout))
+        has_graph_ended = serve(arguments, Decisions(graph.stdout))
     finally:
         graph.terminate()
-        graph.wait()
+        code = graph.wait()
+    if has_graph_ended:
+        sys.exit(f"the graph has ended with the exit code {code}: read what it said, and start the gate again")
 
 
 if __name__ == "__main__":

@@ -12,9 +12,13 @@ import argparse
 import json
 import os
 import socket
+import stat
 import sys
 import threading
 import time
+
+# The folders of tactile_source's socket, in the program's order.
+SOCKET_FOLDERS = ("/run/bgrasp", f"/tmp/blindgrasp-{os.getuid()}", f"/run/user/{os.getuid()}/blindgrasp")
 
 
 def frames(rate):
@@ -28,25 +32,44 @@ def frames(rate):
         yield record["data"]
 
 
-def connect(address):
-    while True:
+def own_sockets():
+    """The addresses at which tactile_source may listen without a param: in those of its folders that are this user's alone."""
+    for folder in SOCKET_FOLDERS:
         try:
-            if address.startswith("unix:"):
-                connection = socket.socket(socket.AF_UNIX)
-                connection.connect(address.removeprefix("unix:"))
-                return connection
-            host, _, port = address.rpartition(":")
-            connection = socket.create_connection((host, int(port)))
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            return connection
-        except OSError as error:
-            print(f"{address}: {error}; trying again", file=sys.stderr)
-            time.sleep(1)
+            found = os.lstat(folder)
+        except OSError:
+            continue
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077:
+            yield f"unix:{folder}/tactile.hand"
+
+
+def connect_to(address):
+    if address.startswith("unix:"):
+        connection = socket.socket(socket.AF_UNIX)
+        connection.connect(address.removeprefix("unix:"))
+        return connection
+    host, _, port = address.rpartition(":")
+    connection = socket.create_connection((host, int(port)))
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return connection
+
+
+def connect(address):
+    """Connects, as often as it takes, to the address; without one, to the first socket of this user that answers."""
+    while True:
+        why = f"no folder of this user: {', '.join(SOCKET_FOLDERS)}"
+        for found in [address] if address else own_sockets():
+            try:
+                return connect_to(found)
+            except OSError as error:
+                why = f"{found}: {error}"
+        print(f"{why}; trying again", file=sys.stderr)
+        time.sleep(1)
 
 
 def main():
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--address", default=f"unix:/tmp/blindgrasp-{os.getuid()}/tactile.hand", help="or HOST:PORT")
+    options.add_argument("--address", help="unix:PATH or HOST:PORT; without it, the source's socket in a folder of this user")
     options.add_argument("--rate", type=float, default=1.0, help="times the recorded speed")
     arguments = options.parse_args()
 

@@ -3,18 +3,21 @@
 import argparse
 import json
 import os
+import signal
 import socket
+import stat
 import sys
 import threading
 import time
+
+# The folders of tactile_source's socket, in the program's order (crates/operator/src/control_socket.rs).
+SOCKET_FOLDERS = ("/run/bgrasp", f"/tmp/blindgrasp-{os.getuid()}", f"/run/user/{os.getuid()}/blindgrasp")
 
 
 def options(description):
     """The options that all bridges have."""
     found = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    found.add_argument(
-        "--address", default=f"unix:/tmp/blindgrasp-{os.getuid()}/tactile.hand", help="of tactile_source; or HOST:PORT"
-    )
+    found.add_argument("--address", help="of tactile_source, unix:PATH or HOST:PORT; without it, its socket in a folder of this user")
     return found
 
 
@@ -23,28 +26,50 @@ def now_nanos():
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
-def connect(address):
-    while True:
+def own_sockets():
+    """The addresses at which tactile_source may listen without a param: in those of its folders that are this user's alone."""
+    for folder in SOCKET_FOLDERS:
         try:
-            if address.startswith("unix:"):
-                connection = socket.socket(socket.AF_UNIX)
-                connection.connect(address.removeprefix("unix:"))
-                return connection
-            host, _, port = address.rpartition(":")
-            connection = socket.create_connection((host, int(port)))
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            return connection
-        except OSError as error:
-            print(f"{address}: {error}; trying again", file=sys.stderr)
-            time.sleep(1)
+            found = os.lstat(folder)
+        except OSError:
+            continue
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077:
+            yield f"unix:{folder}/tactile.hand"
+
+
+def connect_to(address):
+    if address.startswith("unix:"):
+        connection = socket.socket(socket.AF_UNIX)
+        connection.connect(address.removeprefix("unix:"))
+        return connection
+    host, _, port = address.rpartition(":")
+    connection = socket.create_connection((host, int(port)))
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return connection
+
+
+def connect(address):
+    """Connects, as often as it takes, to the address; without one, to the first socket of this user that answers."""
+    while True:
+        why = f"no folder of this user: {', '.join(SOCKET_FOLDERS)}"
+        for found in [address] if address else own_sockets():
+            try:
+                return connect_to(found)
+            except OSError as error:
+                why = f"{found}: {error}"
+        print(f"{why}; trying again", file=sys.stderr)
+        time.sleep(1)
 
 
 class Source:
-    """A connection to tactile_source. `hand` is its first line: the hand that it expects."""
+    """A connection to tactile_source. `hand` is its first line: the hand that it expects. If the source goes, a thread connects
+    again, so that whoever sends never waits for a source: readings that wait would look fresh to the next one."""
 
     def __init__(self, address, n_joints=None, n_cells=None):
         self.address = address
-        self.hand = self.open()
+        self.connection, self.hand = self.open()
+        # Why the bridge must end.
+        self.fault = None
         found = self.hand["n_joints"], self.hand["n_cells"]
         if n_cells is not None and found != (n_joints, n_cells):
             sys.exit(
@@ -53,24 +78,33 @@ class Source:
             )
 
     def open(self):
-        """Connects, as often as it takes; returns the source's first line."""
+        """Connects, as often as it takes; returns the connection and the source's first line."""
         while True:
-            self.connection = connect(self.address)
-            answers = self.connection.makefile()
+            connection = connect(self.address)
+            answers = connection.makefile()
             try:
                 hand = json.loads(answers.readline() or "null")
             except (OSError, ValueError):
                 hand = None
             if hand is not None:
                 break
-            print(f"{self.address}: closed before the source's first line; trying again", file=sys.stderr)
+            print("the source has closed before its first line; trying again", file=sys.stderr)
             time.sleep(1)
         if "refused" in hand:
             sys.exit(hand["why"])
         print(f"connected: {hand['hand']}, {hand['n_joints']} joints, {hand['n_cells']} cells", file=sys.stderr)
         # Every further line names the fault of a frame.
         threading.Thread(target=self.tell, args=(answers,), daemon=True).start()
-        return hand
+        return connection, hand
+
+    def open_again(self):
+        try:
+            connection, hand = self.open()
+            if any(hand.get(key) != self.hand.get(key) for key in ("hand", "joints", "n_cells")):
+                sys.exit(f"the graph is now for the hand {hand['hand']}; start the bridge again")
+            self.connection = connection
+        except SystemExit as error:
+            self.fault = error.code
 
     @staticmethod
     def tell(answers):
@@ -81,15 +115,20 @@ class Source:
             pass  # The connection has gone.
 
     def send(self, frame):
-        """Sends a frame. If the source has gone, the frame is lost, and the bridge waits for another source of the same hand."""
+        """Sends a frame; returns whether there was a connection. A frame is lost if the source has gone."""
+        if self.fault is not None:
+            sys.exit(self.fault)
+        if self.connection is None:
+            return False
         try:
             self.connection.sendall(json.dumps(frame).encode() + b"\n")
-        except (BrokenPipeError, ConnectionResetError):
+            return True
+        except OSError:
             print("the source has gone; connecting again", file=sys.stderr)
             self.connection.close()
-            hand, before = self.open(), self.hand
-            if any(hand.get(key) != before.get(key) for key in ("hand", "joints", "n_cells")):
-                sys.exit(f"the graph is now for the hand {hand['hand']}; start the bridge again")
+            self.connection = None
+            threading.Thread(target=self.open_again, daemon=True).start()
+            return False
 
     def send_all(self, frames):
         """Sends frames. A sentence in place of a frame is printed, once in a row."""
@@ -166,7 +205,8 @@ class StatusPhase:
 
 
 def run(work):
-    """Runs a bridge's `work` until somebody ends it."""
+    """Runs a bridge's `work` until somebody ends it, by SIGINT or SIGTERM."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         work()
     except KeyboardInterrupt:

@@ -25,18 +25,94 @@ value falls, 0.1 or -0.1 for a slide in metres, 0 for a joint that does not clos
 
 A frame is made for each message of the first topic of cells, with the others that are within `tolerance_ms` of it (20), before
 it or after it, and angles of the last 150 ms. Frames that lack something are not sent, and counted; the source sees the gap.
+So are those whose message waited longer than 150 ms for the bridge, or that come while several nodes publish a topic of cells,
+of the phase, or of joints in a `field`. Joint states may come from several nodes, but each joint from one: rclpy tells who sent
+it from Kilted on; before, two nodes that send the same joint go unnoticed. A message without a header has the time at which it
+was received, or where the middleware does not tell that (CycloneDDS), the one at which it was sent.
 """
 
+import collections
 import importlib
 import math
+import re
 import sys
 import time
 
 import line_protocol
 
 WORDS = ("open", "closing", "settled", "squeezing", "squeezed", "test_lifting", "test_lifted", "lifting", "ended", "kept", "dropped")
-# Angles older than this are missed: joint_states often comes at 10 to 30 Hz.
-JOINTS_NANOS = 150_000_000
+# Angles older than this are missed: joint_states often comes at 10 to 30 Hz. Messages that waited for longer make no frame.
+OLD_NANOS = 150_000_000
+# Two nodes send a joint if one does so within this time after the other: joint states are rarely slower than 1 Hz.
+TWO_NODES_NANOS = 2_000_000_000
+
+
+def is_number(value):
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def is_text(value):
+    return isinstance(value, str) and value != ""
+
+
+def are_all(value, holds):
+    """Whether it is a list that is not empty, and all that is in it holds."""
+    return isinstance(value, list) and value != [] and all(map(holds, value))
+
+
+def is_type(value):
+    return isinstance(value, str) and re.fullmatch(r"\w+/\w+/\w+", value)
+
+
+# The keys of the table's parts: what is expected there, and whether a value is that.
+NUMBER, TEXT = ("a number", is_number), ("a text", is_text)
+FLAG = ("true or false", lambda value: isinstance(value, bool))
+MAPPING = ("a mapping", lambda value: isinstance(value, dict))
+TYPE = ("a type such as std_msgs/msg/Float64MultiArray", is_type)
+NAMES = ("a list of names", lambda value: are_all(value, is_text))
+PLACES = ("a list of places, from 0 on", lambda value: are_all(value, lambda place: type(place) is int and place >= 0))
+ENTRIES = ("a list of topics", lambda value: are_all(value, lambda entry: isinstance(entry, dict)))
+WORD_OF = (f"a mapping to {', '.join(WORDS)}", lambda value: isinstance(value, dict) and all(word in WORDS for word in value.values()))
+TOPIC = {"topic": TEXT, "type": TYPE, "field": TEXT, "latched": FLAG}
+JOINTS = {**TOPIC, "names": NAMES, "map": MAPPING}
+JOINT = {"from": TEXT, "scale": NUMBER, "offset": NUMBER, "closes": NUMBER}
+CELLS = {**TOPIC, "scale": NUMBER, "offset": NUMBER, "order": PLACES, "missing": NUMBER}
+PHASE = {**TOPIC, "words": WORD_OF, "max_age_ms": NUMBER}
+TIMES = {"tolerance_ms": NUMBER, "moving_rad_per_s": NUMBER, "still_ms": NUMBER}
+TABLE = {"joints": MAPPING, "cells": ENTRIES, "phase": MAPPING, **TIMES}
+
+
+def check(where, entry, expected, required=()):
+    """Refuses a part of the table.
+
+    # Errors
+    ValueError: a key or a value that is not expected, or a required key that is missing."""
+    if not isinstance(entry, dict):
+        raise ValueError(f"{where}: {entry!r}, expected a mapping with {', '.join(expected)}: correct it, see --help")
+    for key in required:
+        if key not in entry:
+            raise ValueError(f"{where}: `{key}` is missing: write it, see --help")
+    for key, value in entry.items():
+        if key not in expected:
+            raise ValueError(f"{where}: unknown key `{key}`, expected {', '.join(expected)}: correct or remove it")
+        what, holds = expected[key]
+        if not holds(value):
+            raise ValueError(f"{where}: {key}: {value!r}, expected {what}: correct it, see --help")
+
+
+def check_table(table):
+    """Refuses a table, as `check` does."""
+    check("the table", table, TABLE, ["cells"])
+    joints = table.get("joints", {})
+    check("joints", joints, JOINTS)
+    if ("field" in joints) != ("names" in joints):
+        raise ValueError("joints: only one of `field` and `names`: write the field of the values, and their names in its order")
+    for name, entry in joints.get("map", {}).items():
+        check(f"joints: map: {name}", entry, JOINT)
+    for idx, entry in enumerate(table["cells"]):
+        check(f"cells[{idx}]", entry, CELLS, ["topic"])
+    if "phase" in table:
+        check("phase", table["phase"], PHASE, ["topic"])
 
 
 def part(value, name):
@@ -46,194 +122,267 @@ def part(value, name):
 
 def at(value, path):
     """The values at a path such as `taxels.force.z`: a list where a part of the path is a list."""
-    for name in path.split("."):
-        value = part(value, name)
+    try:
+        for name in path.split("."):
+            value = part(value, name)
+    except AttributeError as error:
+        raise ValueError(f"field: {path}: {error}: write it as `ros2 interface show` has it") from None
     return value
 
 
 def numbers(value):
     """All numbers in lists of lists, in order."""
-    if hasattr(value, "__len__") and not isinstance(value, str):
+    if isinstance(value, str):
+        raise ValueError(f"field: it is the text {value!r}, expected numbers: name another one")
+    if hasattr(value, "__len__"):
         return [number for item in value for number in numbers(item)]
     return [float(value)]
 
 
-def stamp_of(message, now_nanos):
-    """The time in the header, if the message has one that is set."""
+def stamp_of(message, came_nanos):
+    """The time in the header, if the message has one that is set; otherwise the time at which the message came."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     nanos = stamp.sec * 1_000_000_000 + stamp.nanosec if stamp is not None else 0
-    return nanos or now_nanos
+    return nanos or came_nanos
 
 
 class Frames:
-    """Joins the messages of the table's topics to frames."""
+    """Joins the messages of the table's topics to frames. `came_nanos` is the time at which a message was received."""
 
     def __init__(self, table, hand):
+        check_table(table)
         self.table, self.hand = table, hand
-        self.map = (table.get("joints") or {}).get("map") or {}
+        self.map = table.get("joints", {}).get("map") or {}
         unknown = set(self.map) - set(hand["joints"])
         if unknown:
-            raise ValueError(f"joints: map: the hand has no joint {', '.join(sorted(unknown))}")
-        if "field" in (table.get("joints") or {}) and "names" not in table["joints"]:
-            raise ValueError("joints: the field has no names of joints: give `names`, in its order")
-        if any("topic" not in entry for entry in table["cells"]):
-            raise ValueError("cells: an entry has no topic")
+            raise ValueError(f"joints: map: the hand has no joint {', '.join(sorted(unknown))}, but {', '.join(hand['joints'])}")
+        self.sources = {self.map.get(name, {}).get("from", name) for name in hand["joints"]}
+        names = table.get("joints", {}).get("names", self.sources)
+        if not self.sources <= set(names):
+            raise ValueError(f"joints: names: {', '.join(sorted(self.sources - set(names)))} is missing: name it, or write `map`")
         self.tolerance_nanos = float(table.get("tolerance_ms", 20.0)) * 1e6
         self.motion = line_protocol.MotionPhase(table.get("moving_rad_per_s", 0.05), table.get("still_ms", 200.0))
-        self.closing = [float((self.map.get(name) or {}).get("closes", 1)) for name in hand["joints"]]
-        self.sources = {(self.map.get(name) or {}).get("from", name) for name in hand["joints"]}
+        self.closing = [float(self.map.get(name, {}).get("closes", 1)) for name in hand["joints"]]
         # The last value of each joint of the hand, by the topic's name, and its time.
         self.values = {}
+        # Who sent each of them last and when, and the joint that two nodes sent, and when.
+        self.senders, self.sent_twice = {}, None
         self.cells = [None] * len(table["cells"])
         # The cells of each topic that its last message lacked.
         self.missing = [[]] * len(table["cells"])
         # The time of a frame for which other topics are still to come.
         self.waits_stamp = None
         self.phase, self.phase_nanos = None, 0
-        self.phase_age_nanos = float((table.get("phase") or {}).get("max_age_ms", 1000.0)) * 1e6
+        self.phase_age_nanos = float(table.get("phase", {}).get("max_age_ms", 1000.0)) * 1e6
         self.seq = 0
-        self.dropped = 0
+        # The frames that were not sent, by the cause.
+        self.dropped = collections.Counter()
 
-    def take_joints(self, message, now_nanos):
-        stamp = stamp_of(message, now_nanos)
-        entry = self.table.get("joints") or {}
+    def take_joints(self, message, came_nanos, sender=None):
+        stamp = stamp_of(message, came_nanos)
+        entry = self.table.get("joints", {})
         if "field" in entry:
             names, values = entry["names"], numbers(at(message, entry["field"]))
+            if len(names) != len(values):
+                raise ValueError(f"names: {len(names)} names, but `field` has {len(values)} values: name each of them, in order")
         else:
             names, values = message.name, message.position
         ours = {name: (value, stamp) for name, value in zip(names, values) if name in self.sources}
         self.values.update(ours)
+        for name in ours:
+            other, other_nanos = self.senders.get(name, (sender, 0))
+            if other != sender and came_nanos - other_nanos < TWO_NODES_NANOS:
+                self.sent_twice = (name, came_nanos)
+            self.senders[name] = (sender, came_nanos)
         joints = self.joints(stamp)
         if ours and joints is not None and "phase" not in self.table:
             fingers = [value / rate for value, rate in zip(joints, self.closing) if rate]
-            self.phase, self.phase_nanos = self.motion.of(stamp, fingers), now_nanos
+            self.phase, self.phase_nanos = self.motion.of(stamp, fingers), came_nanos
 
-    def take_phase(self, message, now_nanos):
+    def take_phase(self, message, came_nanos):
         """One word for one value; of a list, the hand is settled if all fingers are, and open if all are."""
         entry = self.table["phase"]
         found = at(message, entry.get("field", "data"))
         words = entry.get("words")
         states = found if isinstance(found, (list, tuple)) or hasattr(found, "tolist") else [found]
         named = [str(state) if words is None else words.get(state, words.get(str(state))) for state in states]
-        if any(word not in WORDS for word in named):
-            raise ValueError(f"phase: {found!r} stands for none of {', '.join(WORDS)}: name it in `words`")
-        self.phase, self.phase_nanos = named[0] if len(set(named)) == 1 else "closing", now_nanos
+        if not named or any(word not in WORDS for word in named):
+            raise ValueError(f"{found!r} stands for none of {', '.join(WORDS)}: name it in `words`")
+        self.phase, self.phase_nanos = named[0] if len(set(named)) == 1 else "closing", came_nanos
 
-    def take_cells(self, idx, message, now_nanos):
+    def take_cells(self, idx, message, came_nanos):
         """The frame that the message completes."""
         entry = self.table["cells"][idx]
         found = numbers(at(message, entry.get("field", "data")))
         if len(found) <= max(entry.get("order", [-1])):
-            raise ValueError(f"cells: {entry['topic']} has {len(found)} numbers, and `order` names the place {max(entry['order'])}")
+            raise ValueError(f"order: the place {max(entry['order'])}, but `field` has {len(found)} numbers: correct it")
         found = [found[place] for place in entry["order"]] if "order" in entry else found
         missing = [place for place, number in enumerate(found) if number == entry.get("missing") or not math.isfinite(number)]
         scale, offset = float(entry.get("scale", 1.0)), float(entry.get("offset", 0.0))
-        stamp = stamp_of(message, now_nanos)
-        self.missing[idx] = missing
-        self.cells[idx] = None if missing else ([scale * number + offset for number in found], stamp)
+        stamp = stamp_of(message, came_nanos)
         if idx == 0:
             if self.waits_stamp is not None:
-                self.drop()
+                self.drop(self.lacking_cells(self.waits_stamp))
             self.waits_stamp = stamp
-        return None if self.waits_stamp is None else self.frame(now_nanos)
+        self.missing[idx] = missing
+        self.cells[idx] = None if missing else ([scale * number + offset for number in found], stamp)
+        return None if self.waits_stamp is None else self.frame(came_nanos)
 
-    def drop(self):
+    def drop(self, why):
         # The number of a frame is used up also if it is not sent: the source sees the gap and holds the grasp.
-        self.waits_stamp, self.seq, self.dropped = None, self.seq + 1, self.dropped + 1
+        self.waits_stamp, self.seq = None, self.seq + 1
+        self.dropped[why] += 1
+
+    def joint(self, name, stamp):
+        """The value of a joint of the hand, `None` if it was not heard of lately."""
+        entry = self.map.get(name, {})
+        value, at_nanos = self.values.get(entry.get("from", name), (None, 0))
+        if value is None or abs(at_nanos - stamp) > OLD_NANOS:
+            return None
+        return float(entry.get("scale", 1.0)) * value + float(entry.get("offset", 0.0))
 
     def joints(self, stamp):
         """The hand's joints, if each was heard of lately."""
-        values = []
-        for name in self.hand["joints"]:
-            entry = self.map.get(name) or {}
-            value, at_nanos = self.values.get(entry.get("from", name), (None, 0))
-            if value is None or abs(at_nanos - stamp) > JOINTS_NANOS:
-                return None
-            values.append(float(entry.get("scale", 1.0)) * value + float(entry.get("offset", 0.0)))
-        return values
+        values = [self.joint(name, stamp) for name in self.hand["joints"]]
+        return None if None in values else values
 
-    def frame(self, now_nanos):
+    def frame(self, came_nanos):
         """The frame of the table's first topic of cells, once the others near it have come."""
         stamp = self.waits_stamp
-        joints = self.joints(stamp)
-        is_phase_old = "phase" in self.table and 0 < self.phase_age_nanos < now_nanos - self.phase_nanos
-        if self.cells[0] is None or joints is None or self.phase is None or is_phase_old:
-            self.drop()
-            return None
-        if not all(cells is not None and abs(cells[1] - stamp) <= self.tolerance_nanos for cells in self.cells):
+        why = self.lacking(stamp, came_nanos)
+        if why:
+            self.drop(why)
+        if why or self.lacking_cells(stamp):
             return None
         self.waits_stamp, self.seq = None, self.seq + 1
         return {
-            "joints": joints,
+            "joints": self.joints(stamp),
             "cells_newtons": [number for values, _ in self.cells for number in values],
             "phase": self.phase,
             "seq": self.seq - 1,
             "stamp_nanos": stamp,
         }
 
-    def lacks(self):
-        """The parts that a frame lacks, for a person."""
-        joints = [name for name in self.hand["joints"] if (self.map.get(name) or {}).get("from", name) not in self.values]
-        cells = [
-            entry["topic"] + "".join(f" with cell {place}" for place in places[:1])
-            for entry, cells, places in zip(self.table["cells"], self.cells, self.missing)
-            if cells is None
-        ]
-        found = [f"no angle of {', '.join(joints)}"] if joints else []
-        found += [f"no message on {', '.join(cells)}"] if cells else []
-        topic = (self.table.get("phase") or {}).get("topic")
-        why = f"no message on {topic}" if topic else "without a topic of its own, the fingers must open once first"
-        found += [f"no phase: {why}"] if self.phase is None else []
-        return "; ".join(found) or (
-            f"cells more than {self.tolerance_nanos / 1e6:g} ms apart (tolerance_ms), angles older than "
-            f"{JOINTS_NANOS / 1e6:g} ms, or an old phase (max_age_ms)"
-        )
+    def lacking(self, stamp, came_nanos):
+        """Why no frame of this time can be made, for a person; nothing if only cells may be missing that are still to come."""
+        joints = [name for name in self.hand["joints"] if self.joint(name, stamp) is None]
+        phase = self.table.get("phase")
+        if joints:
+            return f"no angle of {', '.join(joints)} within {OLD_NANOS / 1e6:g} ms"
+        if self.sent_twice and came_nanos - self.sent_twice[1] < TWO_NODES_NANOS:
+            return f"two nodes send the joint {self.sent_twice[0]}: stop one"
+        if self.cells[0] is None:
+            return self.lacking_cells(stamp)
+        if self.phase is None:
+            return f"no phase: {'no message on ' + phase['topic'] if phase else 'without a topic of its own, the fingers must open once first'}"
+        if phase and 0 < self.phase_age_nanos < came_nanos - self.phase_nanos:
+            return f"a phase on {phase['topic']} older than {self.phase_age_nanos / 1e6:g} ms (max_age_ms)"
+        return None
+
+    def lacking_cells(self, stamp):
+        """The topics of cells that a frame of this time lacks, for a person; nothing if it lacks none."""
+        found = []
+        for entry, cells, missing in zip(self.table["cells"], self.cells, self.missing):
+            if cells is None:
+                found.append(f"no message on {entry['topic']}" + "".join(f" with cell {place}" for place in missing[:1]))
+            elif abs(cells[1] - stamp) > self.tolerance_nanos:
+                found.append(f"cells on {entry['topic']} more than {self.tolerance_nanos / 1e6:g} ms apart (tolerance_ms)")
+        return ", ".join(found)
 
 
-def message_class(name):
-    """The class of a message type such as `sensor_msgs/msg/JointState`."""
-    package, _, kind = name.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), kind)
+def message_class(where, name, field):
+    """The class of a message type such as `sensor_msgs/msg/JointState`.
+
+    # Errors
+    ValueError: the type is not there, or has no such field."""
+    package, folder, kind = name.split("/")
+    try:
+        found = getattr(importlib.import_module(f"{package}.{folder}"), kind)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"{where}: type: no {name} ({error}): source the workspace that has the package, or correct the type") from None
+    try:
+        at(found(), field)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+    return found
 
 
 def bridge(table, address):
     import rclpy
     from rclpy.clock import Clock
+    from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+    from rclpy.subscription import Subscription
 
+    check_table(table)
     source = line_protocol.Source(address)
+    frames = Frames(table, source.hand)
     rclpy.init()
     node = rclpy.create_node("blindgrasp_hand_bridge")
-    frames = Frames(table, source.hand)
-    told = [time.monotonic(), 0]
+    executor = SingleThreadedExecutor()
+    is_humble = not hasattr(Subscription, "CallbackType")
+    if is_humble:
+        # The executor of Humble takes a message with its times, and passes on the message alone.
+        executor._take_subscription = lambda subscription: subscription.handle.take_message(subscription.msg_type, False)
+    # The topics that only one node may publish.
+    own_topics = set()
+    told = [time.monotonic()]
 
-    def now_nanos():
-        return node.get_clock().now().nanoseconds
+    def subscribe(where, entry, kind, field, take, is_own):
+        def taken(message, info):
+            waited_nanos = max(0, time.time_ns() - (info["received_timestamp"] or info["source_timestamp"]))
+            try:
+                # The node's clock may be that of a simulation.
+                take(message, node.get_clock().now().nanoseconds - waited_nanos, waited_nanos, info.get("publisher_gid"))
+            except ValueError as error:
+                raise ValueError(f"{where}: {error}") from None
 
-    def send(frame):
-        if frame is not None:
-            source.send(frame)
-        elif frames.dropped > told[1] and time.monotonic() - told[0] > 2.0:
-            told[:] = time.monotonic(), frames.dropped
-            print(f"{frames.dropped} frames not sent: {frames.lacks()}", file=sys.stderr)
-
-    def subscribe(entry, kind, callback):
         qos = qos_profile_sensor_data
         if entry.get("latched"):
             qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        node.create_subscription(message_class(entry.get("type", kind)), entry["topic"], callback, qos)
+        kind = message_class(where, entry.get("type", kind), field)
+        subscription = node.create_subscription(kind, entry["topic"], (lambda both: taken(*both)) if is_humble else taken, qos)
+        if is_own:
+            own_topics.add(subscription.topic_name)
 
-    joints = {"topic": "/joint_states", **(table.get("joints") or {})}
-    subscribe(joints, "sensor_msgs/msg/JointState", lambda message: frames.take_joints(message, now_nanos()))
+    def take_joints(message, came_nanos, _, sender):
+        frames.take_joints(message, came_nanos, sender)
+
+    def take_phase(message, came_nanos, *_):
+        frames.take_phase(message, came_nanos)
+
+    def take_cells(idx, message, came_nanos, waited_nanos):
+        shared = [topic for topic in sorted(own_topics) if node.count_publishers(topic) > 1]
+        why = None
+        if shared:
+            why = f"several nodes publish {', '.join(shared)}: stop all but one; DDS forgets a killed one after up to 20 s"
+            # Nobody knows whose phase it is.
+            frames.phase = None
+        elif waited_nanos > OLD_NANOS:
+            why = f"a message on {table['cells'][idx]['topic']} waited longer than {OLD_NANOS / 1e6:g} ms for the bridge"
+        if why is None:
+            frame = frames.take_cells(idx, message, came_nanos)
+            if frame is not None and not source.send(frame):
+                frames.dropped["no connection to the source"] += 1
+        elif idx == 0:
+            frames.drop(why)
+        if frames.dropped and time.monotonic() - told[0] > 2.0:
+            told[0] = time.monotonic()
+            causes = "; ".join(f"{n}: {why}" for why, n in frames.dropped.most_common())
+            print(f"{frames.dropped.total()} frames not sent: {causes}", file=sys.stderr)
+            frames.dropped.clear()
+
+    joints = {"topic": "/joint_states", **table.get("joints", {})}
+    subscribe("joints", joints, "sensor_msgs/msg/JointState", joints.get("field", "position"), take_joints, "field" in joints)
     if "phase" in table:
-        subscribe(table["phase"], "std_msgs/msg/String", lambda message: frames.take_phase(message, now_nanos()))
+        subscribe("phase", table["phase"], "std_msgs/msg/String", table["phase"].get("field", "data"), take_phase, True)
     for idx, entry in enumerate(table["cells"]):
-        take = lambda message, idx=idx: send(frames.take_cells(idx, message, now_nanos()))
-        subscribe(entry, "std_msgs/msg/Float64MultiArray", take)
+        take = lambda message, came_nanos, waited_nanos, _, idx=idx: take_cells(idx, message, came_nanos, waited_nanos)
+        subscribe(f"cells[{idx}]", entry, "std_msgs/msg/Float64MultiArray", entry.get("field", "data"), take, True)
     # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
     node.create_timer(1.0, lambda: None, clock=Clock())
     try:
-        rclpy.spin(node)
+        rclpy.spin(node, executor)
     except Exception:
         # A signal that ends ROS 2 makes rclpy.spin raise one of several errors.
         if rclpy.ok():
@@ -252,8 +401,6 @@ def main():
 
     with open(arguments.table, encoding="utf-8") as file:
         table = yaml.safe_load(file)
-    if not isinstance(table, dict) or not table.get("cells"):
-        sys.exit(f"{arguments.table}: expected topics under `cells`; see --help")
     try:
         bridge(table, arguments.address)
     except ValueError as error:

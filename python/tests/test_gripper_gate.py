@@ -2,8 +2,11 @@
 
 import importlib.util
 import json
+import math
 import queue
+import subprocess
 import sys
+import tempfile
 import threading
 import time
 import types
@@ -105,6 +108,48 @@ class Gate(unittest.TestCase):
         self.lines.queue.put(None)
         self.assertEqual(self.close(), (False, "the graph has ended"))
 
+    def test_a_cancel_ends_the_wait_for_a_decision(self):
+        self.gate.wait_s = 3600
+        cancelled = iter([False, True])
+        found = self.gate.run(0.0, lambda: (True, False), lambda: next(cancelled))
+        self.assertEqual(found, (False, "cancelled"))
+
+    def test_a_graph_ends_with_the_gate_that_started_it(self):
+        with tempfile.TemporaryDirectory() as folder:
+            gone = f"{folder}/gone"
+            graph = f"""import signal, sys
+signal.signal(signal.SIGTERM, lambda *_: (open({gone!r}, "w").close(), sys.exit()))
+print('{{"action": "hold"}}', flush=True)
+signal.pause()"""
+            serve = """import time, ros2_gripper_gate as gate
+def serve(_, decisions):
+    while not decisions.waiting:
+        time.sleep(0.01)
+    print(flush=True)
+    time.sleep(3600)
+gate.serve = serve
+gate.main()"""
+            command = [sys.executable, "-c", serve, "--controller", "/c", "--grasps-below", "0", sys.executable, "-c", graph]
+            gate = subprocess.Popen(command, cwd=EXAMPLE.parent, stdout=subprocess.PIPE)
+            gate.stdout.readline()
+            gate.kill()
+            gate.wait()
+            while not Path(gone).exists():
+                time.sleep(0.01)
+            gate.stdout.close()
+
+    def test_the_gate_ends_with_its_graph(self):
+        arguments = ["gate", "--controller", "/c", "--grasps-below", "0", sys.executable, "-c", "raise SystemExit(7)"]
+        with mock.patch.object(sys, "argv", arguments), mock.patch.object(example, "serve", lambda _, decisions: self.wait_for_end(decisions)):
+            with self.assertRaisesRegex(SystemExit, "the graph has ended with the exit code 7: "):
+                example.main()
+
+    @staticmethod
+    def wait_for_end(decisions):
+        while not decisions.has_ended:
+            time.sleep(0.001)
+        return True
+
     def test_the_server_ends_goals_as_the_gate_says(self):
         served = {}
 
@@ -133,10 +178,20 @@ class Gate(unittest.TestCase):
                 return Future(Message(accepted=True, get_result_async=lambda: Future(answer)))
 
         def server(node, kind, name, execute, goal_callback, cancel_callback):
-            served["name"], served["execute"] = name, execute
-            self.assertEqual((goal_callback(None), cancel_callback(None)), ("accept", "accept"))
+            served["name"], served["execute"], served["take"] = name, execute, goal_callback
+            self.assertEqual(cancel_callback(None), "accept")
 
-        def spin(node, executor):
+        def take(position):
+            return served["take"](Message(command=Message(position=position)))
+
+        def spin(timeout_sec):
+            if served.get("ends"):
+                # The graph has ended.
+                lines.queue.put(None)
+                self.wait_for_end(self.decisions)
+                self.assertEqual(take(0.08), "reject")
+                return
+            self.assertEqual([take(0.0), take(math.nan), take(math.inf)], ["accept", "reject", "reject"])
             for action, position in [("lift", 0.0), ("hold", 0.0), (None, 0.08)]:
                 ends = []
                 command = Message(position=position)
@@ -161,25 +216,58 @@ class Gate(unittest.TestCase):
 
         lines = self.lines
         rclpy = types.ModuleType("rclpy")
-        logger = Message(info=lambda text: None)
-        rclpy.init, rclpy.try_shutdown, rclpy.ok, rclpy.spin = lambda: None, lambda: None, lambda: True, spin
-        rclpy.create_node = lambda name: Message(get_logger=lambda: logger, create_timer=lambda *_, clock: None)
+        logger = Message(info=lambda text: None, warning=lambda text: None)
+        rclpy.init, rclpy.try_shutdown, rclpy.ok = lambda: None, lambda: None, lambda: True
+        rclpy.create_node = lambda name: Message(get_logger=lambda: logger)
         action, executors = types.ModuleType("rclpy.action"), types.ModuleType("rclpy.executors")
         action.ActionClient, action.ActionServer = Client, server
-        executors.MultiThreadedExecutor = lambda num_threads: None
-        clock = types.ModuleType("rclpy.clock")
-        clock.Clock = Message
+        executors.MultiThreadedExecutor = lambda num_threads: Message(add_node=lambda node: None, spin_once=spin)
         action.GoalResponse = Message(ACCEPT="accept", REJECT="reject")
         action.CancelResponse = Message(ACCEPT="accept")
         control, actions = types.ModuleType("control_msgs"), types.ModuleType("control_msgs.action")
         actions.GripperCommand, control.action = Message(Result=Message), actions
-        modules = {"rclpy": rclpy, "rclpy.action": action, "rclpy.executors": executors, "rclpy.clock": clock}
+        modules = {"rclpy": rclpy, "rclpy.action": action, "rclpy.executors": executors}
         modules.update({"control_msgs": control, "control_msgs.action": actions})
         arguments = Message(parallel=False, controller="/gripper/cmd", grasps_below=0.03, grasps_above=None, wait=20.0, name="grasp_gate")
         with mock.patch.dict(sys.modules, modules):
-            example.serve(arguments, self.decisions)
+            self.assertTrue(example.serve(arguments, self.decisions))
         self.assertEqual(served["ends"], [True, False, True])
         self.assertEqual((served["name"], served["controller"]), ("~/gripper_cmd", "/gripper/cmd"))
+
+    def test_a_goal_of_the_parallel_gripper_may_have_no_position(self):
+        self.assertEqual(example.positions_of(Message(position=[]), True), [])
+        self.assertEqual(example.positions_of(Message(position=[0.1, 0.2]), True), [0.1, 0.2])
+        self.assertEqual(example.positions_of(Message(position=0.1), False), [0.1])
+
+
+class LiftGate(unittest.TestCase):
+    """ros2_lift_gate.py, with stand-ins for rclpy and the messages."""
+
+    def test_a_grasp_is_lifted_once_in_a_run_of_the_graph(self):
+        modules = {name: mock.MagicMock() for name in ("rclpy", "rclpy.clock", "rclpy.qos", "rclpy.node", "rclpy.time")}
+        modules.update({name: mock.MagicMock() for name in ("blindgrasp_msgs", "blindgrasp_msgs.msg")})
+        modules["rclpy.node"].Node = object
+        modules["rclpy.time"].Time.from_msg = lambda nanos: Message(nanoseconds=nanos)
+        kind = Message(HOLD=0, LIFT=1, TIGHTEN=5, SET_DOWN=6, GO_ON=7)
+        modules["blindgrasp_msgs.msg"].Decision = kind
+        spec = importlib.util.spec_from_file_location("ros2_lift_gate", EXAMPLE.with_name("ros2_lift_gate.py"))
+        gate = importlib.util.module_from_spec(spec)
+        with mock.patch.dict(sys.modules, modules):
+            spec.loader.exec_module(gate)
+        node, logger, lifted = gate.LiftGate.__new__(gate.LiftGate), mock.Mock(), []
+        node.lifted_grasp, node.lifted_until_nanos = None, 0
+        node.get_logger, node.lift = lambda: logger, lambda decision: lifted.append(decision.grasp_id)
+        until = time.time_ns() + 10**10
+        decision = lambda action, after_s=0: Message(grasp_id=0, action=action, valid_until=until + int(after_s * 1e9), reason="stable")
+        node.on_decision(decision(kind.LIFT))
+        node.on_decision(decision(kind.LIFT))
+        self.assertEqual(lifted, [0])
+        logger.warning.assert_called_once_with("grasp 0: LIFT came before, ignored")
+        # The graph is started again, and counts from 0.
+        node.on_decision(decision(kind.LIFT, after_s=3))
+        self.assertEqual(lifted, [0, 0])
+        node.on_decision(decision(kind.TIGHTEN))
+        self.assertIn("ignored", logger.info.call_args[0][0])
 
 
 if __name__ == "__main__":

@@ -1,12 +1,18 @@
-"""Tests of examples/bridges/ros2.py with stand-ins for rclpy and for the source that it feeds."""
+"""Tests of examples/bridges/ros2.py and line_protocol.py with stand-ins for rclpy and for the source that they feed."""
 
+import contextlib
 import importlib.util
+import io
 import json
 import math
+import os
+import signal
 import socket
+import subprocess
 import sys
 import tempfile
 import threading
+import time
 import types
 import unittest
 from pathlib import Path
@@ -55,7 +61,7 @@ class Frames(unittest.TestCase):
 
     def test_topics_become_a_frame(self):
         self.assertIsNone(self.send(self.t))
-        self.assertEqual(self.frames.lacks(), "no angle of jaw, wrist")
+        self.assertEqual(dict(self.frames.dropped), {"no angle of jaw, wrist within 150 ms": 1})
         self.frames.take_joints(joints(self.t), self.t)
         frame = self.send(self.t)
         self.assertAlmostEqual(frame.pop("joints")[0], 0.03)
@@ -68,8 +74,9 @@ class Frames(unittest.TestCase):
         self.assertIsNotNone(self.send(self.t + 100 * MILLI))
         self.assertIsNone(self.send(self.t + 100 * MILLI, right_at=self.t + 79 * MILLI))
         self.assertIsNone(self.send(self.t + 151 * MILLI))
-        self.assertEqual(self.frames.dropped, 2)
-        self.assertIn("tolerance_ms", self.frames.lacks())
+        # Each cause has a count.
+        expected = {"cells on /right more than 20 ms apart (tolerance_ms)": 1, "no angle of jaw, wrist within 150 ms": 1}
+        self.assertEqual(dict(self.frames.dropped), expected)
 
     def test_the_second_topic_may_come_after_the_first(self):
         self.frames.take_phase(Message(states=[2, 2]), self.t)
@@ -85,7 +92,7 @@ class Frames(unittest.TestCase):
         at += 66 * MILLI
         self.assertIsNone(self.frames.take_cells(0, left(at, 1, 2), at))
         frame = self.frames.take_cells(1, Message(data=[3.0, 4.0]), at)
-        self.assertEqual((frame["seq"], self.frames.dropped), (4, 1))
+        self.assertEqual((frame["seq"], self.frames.dropped.total()), (4, 1))
 
     def test_a_dead_driver_beside_a_live_arm_is_noticed(self):
         self.frames.take_joints(joints(self.t), self.t)
@@ -98,6 +105,7 @@ class Frames(unittest.TestCase):
         at = later + 100 * MILLI
         self.frames.take_cells(1, Message(data=[3.0, 4.0]), at)
         self.assertIsNone(self.frames.take_cells(0, left(at, 100, 250), at + 2000 * MILLI))
+        self.assertIn("a phase on /status older than 1000 ms (max_age_ms)", self.frames.dropped)
 
     def test_a_hand_is_settled_if_all_its_fingers_are(self):
         self.frames.take_joints(joints(self.t), self.t)
@@ -107,7 +115,9 @@ class Frames(unittest.TestCase):
             self.send(self.t, states=(7, 7))
         phase = {"topic": "/phase"}
         frames = bridge.Frames({**TABLE, "phase": phase}, HAND)
-        self.assertIn("no phase: no message on /phase", frames.lacks())
+        frames.take_joints(joints(self.t), self.t)
+        frames.take_cells(0, left(self.t, 1, 2), self.t)
+        self.assertIn("no phase: no message on /phase", frames.dropped)
         frames.take_phase(Message(data="test_lifted"), self.t)
         self.assertEqual(frames.phase, "test_lifted")
 
@@ -131,7 +141,7 @@ class Frames(unittest.TestCase):
         frames.phase = "settled"
         for number in (30000, math.nan):
             self.assertIsNone(frames.take_cells(0, Message(data=[number, 7.0, 8.0]), self.t))
-            self.assertEqual(frames.lacks(), "no message on /left with cell 1")
+        self.assertEqual(dict(frames.dropped), {"no message on /left with cell 1": 2})
         # A number that is not picked may be anything.
         frame = frames.take_cells(0, Message(data=[6.0, math.nan, 8.0]), self.t)
         self.assertEqual((frame["cells_newtons"], frame["seq"]), ([3.0, 2.0], 2))
@@ -145,10 +155,57 @@ class Frames(unittest.TestCase):
         frames = bridge.Frames(table, HAND)
         frames.take_joints(Message(header=header(self.t), motors=[Message(q=0.5), Message(q=0.25)]), self.t)
         self.assertEqual(frames.joints(self.t), [0.25, 0.5])
+        with self.assertRaisesRegex(ValueError, "names: 2 names, but `field` has 3 values"):
+            frames.take_joints(Message(motors=[Message(q=0.5)] * 3), self.t)
 
-    def test_an_unknown_joint_is_told(self):
-        with self.assertRaisesRegex(ValueError, "the hand has no joint thumb"):
-            bridge.Frames({"cells": [], "joints": {"map": {"thumb": {}}}}, HAND)
+    def test_a_joint_that_two_nodes_send_makes_no_frame(self):
+        self.frames.take_joints(joints(self.t), self.t, sender="driver")
+        self.frames.take_joints(Message(name=["elbow"], position=[1.0]), self.t, sender="arm")
+        self.assertIsNotNone(self.send(self.t))
+        self.frames.take_joints(joints(self.t), self.t, sender="simulation")
+        self.assertIsNone(self.send(self.t))
+        self.assertEqual(dict(self.frames.dropped), {"two nodes send the joint wrist: stop one": 1})
+        # One of them has ended.
+        later = self.t + 2000 * MILLI
+        self.frames.take_joints(joints(later), later, sender="simulation")
+        self.assertIsNotNone(self.send(later))
+
+    def test_mistakes_in_the_table_are_told(self):
+        cells = {"topic": "/left"}
+        for table, expected in [
+            ([], "the table: [], expected a mapping with joints, cells"),
+            ({}, "the table: `cells` is missing"),
+            ({"cells": cells}, "the table: cells: {'topic': '/left'}, expected a list of topics"),
+            ({"cells": [cells], "tolerence_ms": 1}, "the table: unknown key `tolerence_ms`, expected joints, cells, phase, tolerance_ms"),
+            ({"cells": [cells, {**cells, "scael": 0.01}]}, "cells[1]: unknown key `scael`, expected topic, type, field"),
+            ({"cells": [{"type": "my_msgs/msg/Touch"}]}, "cells[0]: `topic` is missing"),
+            ({"cells": [{**cells, "type": "my_msgs/Touch"}]}, "cells[0]: type: 'my_msgs/Touch', expected a type such as"),
+            ({"cells": [{**cells, "order": []}]}, "cells[0]: order: [], expected a list of places, from 0 on"),
+            ({"cells": [{**cells, "order": [0, -1]}]}, "cells[0]: order: [0, -1], expected a list of places"),
+            ({"cells": [{**cells, "scale": "1e-3"}]}, "cells[0]: scale: '1e-3', expected a number"),
+            ({"cells": [cells], "joints": {"field": "data"}}, "joints: only one of `field` and `names`"),
+            ({"cells": [cells], "joints": {"field": "data", "names": ["jaw"]}}, "joints: names: wrist is missing"),
+            ({"cells": [cells], "joints": {"map": {"jaw": {"form": "x"}}}}, "joints: map: jaw: unknown key `form`"),
+            ({"cells": [cells], "joints": {"map": {"thumb": {}}}}, "joints: map: the hand has no joint thumb, but jaw, wrist"),
+            ({"cells": [cells], "phase": {"topic": "/p", "words": {0: "opened"}}}, "phase: words: {0: 'opened'}, expected a mapping to open"),
+        ]:
+            with self.subTest(expected), self.assertRaises(ValueError) as raised:
+                bridge.Frames(table, HAND)
+            self.assertEqual(str(raised.exception)[: len(expected)], expected)
+
+    def test_types_and_fields_that_are_not_there_are_told(self):
+        module = types.ModuleType("my_msgs.msg")
+        module.Touch = lambda: Message(taxels=[], name="", force=Message(z=0.0))
+        with mock.patch.dict(sys.modules, {"my_msgs": types.ModuleType("my_msgs"), "my_msgs.msg": module}):
+            self.assertIs(bridge.message_class("cells[0]", "my_msgs/msg/Touch", "taxels.z"), module.Touch)
+            with self.assertRaisesRegex(ValueError, r"cells\[0\]: field: force.y: .*no attribute 'y'.*ros2 interface show"):
+                bridge.message_class("cells[0]", "my_msgs/msg/Touch", "force.y")
+            with self.assertRaisesRegex(ValueError, r"phase: type: no my_msgs/msg/Status .*source the workspace"):
+                bridge.message_class("phase", "my_msgs/msg/Status", "data")
+        with self.assertRaisesRegex(ValueError, r"cells\[1\]: type: no other_msgs/msg/Touch .*source the workspace"):
+            bridge.message_class("cells[1]", "other_msgs/msg/Touch", "data")
+        with self.assertRaisesRegex(ValueError, "it is the text '12', expected numbers"):
+            bridge.numbers("12")
 
 
 class Reconnects(unittest.TestCase):
@@ -166,12 +223,13 @@ class Reconnects(unittest.TestCase):
                 greeted.append(connection)
 
             def sends(hand):
-                thread = threading.Thread(target=greet, args=(hand,))
-                thread.start()
-                # The first frame after the end may still be taken by the kernel.
-                for seq in range(3):
-                    found.send({"seq": seq})
-                thread.join()
+                # While nobody answers, frames are lost, and the bridge does not wait.
+                while found.send({"seq": 0}):
+                    pass
+                self.assertFalse(found.send({"seq": 1}))
+                greet(hand)
+                while not found.send({"seq": 2}):
+                    time.sleep(0.01)
 
             thread = threading.Thread(target=greet, args=(HAND,))
             thread.start()
@@ -180,21 +238,50 @@ class Reconnects(unittest.TestCase):
             greeted.pop().close()
             sends(HAND)
             with greeted.pop() as connection, connection.makefile() as lines:
-                self.assertIn("seq", json.loads(lines.readline()))
+                self.assertEqual(json.loads(lines.readline()), {"seq": 2})
             with self.assertRaisesRegex(SystemExit, "is now for the hand other"):
                 sends({**HAND, "hand": "other"})
-            found.connection.close()
             source.close()
+
+    def test_a_socket_is_sought_in_the_folders_of_this_user(self):
+        with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX) as source, mock.patch("sys.stderr"):
+            folders = [f"{folder}/{name}" for name in ("absent", "open", "empty", "own")]
+            for path in folders[1:]:
+                os.mkdir(path, 0o700)
+            os.chmod(folders[1], 0o755)
+            source.bind(f"{folders[3]}/tactile.hand")
+            source.listen()
+            tactile_bridge = importlib.util.spec_from_file_location("tactile_bridge", BRIDGES.parent / "tactile_bridge.py")
+            copied = importlib.util.module_from_spec(tactile_bridge)
+            tactile_bridge.loader.exec_module(copied)
+            self.assertEqual(copied.SOCKET_FOLDERS, bridge.line_protocol.SOCKET_FOLDERS)
+            for module in (bridge.line_protocol, copied):
+                with mock.patch.object(module, "SOCKET_FOLDERS", folders):
+                    self.assertEqual([path.split("/")[-2] for path in module.own_sockets()], ["empty", "own"])
+                    with module.connect(None) as connection:
+                        self.assertEqual(connection.getpeername(), f"{folders[3]}/tactile.hand")
+
+    def test_signals_end_a_bridge_that_waits_for_a_source(self):
+        work = "import line_protocol; line_protocol.run(lambda: line_protocol.Source('unix:/nowhere'))"
+        for number in (signal.SIGINT, signal.SIGTERM):
+            waits = subprocess.Popen([sys.executable, "-c", work], cwd=BRIDGES, stderr=subprocess.PIPE, text=True)
+            self.assertIn("trying again", waits.stderr.readline())
+            waits.send_signal(number)
+            self.assertEqual((waits.communicate(timeout=60)[1].count("Traceback"), waits.returncode), (0, 0))
 
 
 class Node:
-    """A stand-in for a node of rclpy: it keeps its subscriptions."""
+    """A stand-in for a node of rclpy: it keeps its subscriptions. A second node publishes the topics of `shared`."""
 
     def __init__(self):
-        self.subscriptions = {}
+        self.subscriptions, self.shared = {}, []
 
     def create_subscription(self, kind, topic, callback, qos):
         self.subscriptions[topic] = (kind, callback)
+        return Message(topic_name=topic)
+
+    def count_publishers(self, topic):
+        return 2 if topic in self.shared else 1
 
     def create_timer(self, period_s, callback, clock):
         pass
@@ -204,47 +291,123 @@ class Node:
 
 
 class Bridge(unittest.TestCase):
-    def test_it_sends_lines_to_the_source(self):
-        node, t = Node(), 5 * 10**9
+    """The bridge with a source that reads the lines of one connection; `info` is what rclpy says of a message beside it."""
 
-        def spin(_):
-            calls = {topic: callback for topic, (_, callback) in node.subscriptions.items()}
-            calls["/joint_states"](joints(t))
-            calls["/status"](Message(states=[2]))
-            calls["/right"](Message(data=[3.0, 4.0]))
-            calls["/left"](left(t, 100, 250))
-
+    def run_bridge(self, spin, distribution="kilted"):
+        """The lines that the source has got when `spin` is over, and what the bridge said."""
+        self.node = Node()
+        executor = Message(add_node=None)
         rclpy = types.ModuleType("rclpy")
         rclpy.init, rclpy.try_shutdown, rclpy.ok = lambda: None, lambda: None, lambda: True
-        rclpy.create_node, rclpy.spin = lambda name: node, spin
-        qos = types.ModuleType("rclpy.qos")
+        rclpy.create_node, rclpy.spin = lambda name: self.node, lambda node, executor: spin(executor)
+        qos, clock = types.ModuleType("rclpy.qos"), types.ModuleType("rclpy.clock")
         qos.qos_profile_sensor_data = qos.DurabilityPolicy = qos.QoSProfile = None
-        clock = types.ModuleType("rclpy.clock")
         clock.Clock = Message
-        modules = {"rclpy": rclpy, "rclpy.qos": qos, "rclpy.clock": clock}
+        executors, subscription = types.ModuleType("rclpy.executors"), types.ModuleType("rclpy.subscription")
+        executors.SingleThreadedExecutor = lambda: executor
+        subscription.Subscription = Message() if distribution == "humble" else Message(CallbackType=None)
+        modules = {module.__name__: module for module in (rclpy, qos, clock, executors, subscription)}
+        lines = []
         with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX) as source:
-            path = f"{folder}/tactile.hand"
-            source.bind(path)
+            source.bind(f"{folder}/tactile.hand")
             source.listen()
-            lines = []
 
             def serve():
                 connection, _ = source.accept()
                 connection.sendall(json.dumps(HAND).encode() + b"\n")
                 with connection, connection.makefile() as sent:
-                    lines.append(json.loads(sent.readline()))
+                    lines.extend(json.loads(line) for line in sent)
 
             thread = threading.Thread(target=serve)
             thread.start()
-            classes = mock.patch.object(bridge, "message_class", lambda kind: kind)
-            with mock.patch.dict(sys.modules, modules), mock.patch("sys.stderr"), classes:
-                bridge.bridge(TABLE, f"unix:{path}")
+            with mock.patch("sys.stderr"):
+                self.source = bridge.line_protocol.Source(f"unix:{folder}/tactile.hand")
+            classes = mock.patch.object(bridge, "message_class", lambda where, kind, field: kind)
+            kept = mock.patch.object(bridge.line_protocol, "Source", lambda address: self.source)
+            said = io.StringIO()
+            with mock.patch.dict(sys.modules, modules), contextlib.redirect_stderr(said), classes, kept:
+                bridge.bridge(TABLE, None)
+            self.source.connection.shutdown(socket.SHUT_RDWR)
+            self.source.connection.close()
             thread.join()
-        self.assertEqual(lines[0]["cells_newtons"], [1.0, 2.5, 4.0, 3.0])
-        self.assertEqual((lines[0]["phase"], lines[0]["seq"]), ("settled", 0))
-        kinds = {topic: kind for topic, (kind, _) in node.subscriptions.items()}
+        return lines, said.getvalue()
+
+    def send(self, waited_ms=0, has_header=False, came="received_timestamp"):
+        """A message on each topic. It waited so long for the bridge."""
+        t = self.node.get_clock().now().nanoseconds
+        info = {"received_timestamp": 0, "source_timestamp": 1, came: time.time_ns() - waited_ms * MILLI}
+        calls = {topic: callback for topic, (_, callback) in self.node.subscriptions.items()}
+        cells = left(t, 100, 250)
+        if not has_header:
+            del cells.header
+        calls["/joint_states"](joints(t), info)
+        calls["/status"](Message(states=[2]), info)
+        calls["/right"](Message(data=[3.0, 4.0]), info)
+        calls["/left"](cells, info)
+
+    def test_it_sends_lines_to_the_source(self):
+        [line], _ = self.run_bridge(lambda _: self.send(has_header=True))
+        self.assertEqual(line["cells_newtons"], [1.0, 2.5, 4.0, 3.0])
+        self.assertEqual((line["phase"], line["seq"], line["stamp_nanos"]), ("settled", 0, 5 * 10**9))
+        kinds = {topic: kind for topic, (kind, _) in self.node.subscriptions.items()}
         self.assertEqual(kinds["/right"], "std_msgs/msg/Float64MultiArray")
         self.assertEqual(kinds["/joint_states"], "sensor_msgs/msg/JointState")
+
+    def test_a_message_without_a_header_has_the_time_at_which_it_came(self):
+        for came in ("received_timestamp", "source_timestamp"):
+            [line], _ = self.run_bridge(lambda _, came=came: self.send(waited_ms=100, came=came))
+            waited_ms = (5 * 10**9 - line["stamp_nanos"]) / MILLI
+            # The node's clock stands still, that of the messages does not.
+            self.assertTrue(100 <= waited_ms < 150, waited_ms)
+
+    def test_messages_that_waited_are_not_sent(self):
+        def spin(_):
+            self.send(waited_ms=8000)
+            self.send(waited_ms=8000, has_header=True)
+            with mock.patch("time.monotonic", lambda: 1e9):
+                self.send()
+
+        [line], said = self.run_bridge(spin)
+        self.assertEqual(line["seq"], 2)
+        self.assertIn("2 frames not sent: 2: a message on /left waited longer than 150 ms for the bridge", said)
+
+    def test_topics_of_two_nodes_are_not_mixed(self):
+        def spin(_):
+            for topic in ("/left", "/right", "/status"):
+                self.node.shared = [topic]
+                self.send()
+            # Joint states usually come from several nodes.
+            self.node.shared = ["/joint_states"]
+            with mock.patch("time.monotonic", lambda: 1e9):
+                self.send()
+
+        [line], said = self.run_bridge(spin)
+        self.assertEqual(line["seq"], 3)
+        self.assertIn("3 frames not sent: 1: several nodes publish /left", said)
+        self.assertIn("several nodes publish /status", said)
+
+    def test_in_humble_the_executor_hands_over_the_times(self):
+        def spin(executor):
+            t, info = 5 * 10**9, {"received_timestamp": time.time_ns(), "source_timestamp": 1}
+            sent = {"/joint_states": joints(t), "/status": Message(states=[2]), "/right": Message(data=[3.0, 4.0]), "/left": left(t, 1, 2)}
+            for topic, message in sent.items():
+                handle = Message(take_message=lambda kind, is_raw, message=message: (message, info))
+                taken = executor._take_subscription(Message(handle=handle, msg_type=None))
+                # The executor calls back with what it took.
+                self.node.subscriptions[topic][1](taken)
+
+        [line], _ = self.run_bridge(spin, "humble")
+        self.assertEqual(line["stamp_nanos"], 5 * 10**9)
+
+    def test_frames_without_a_source_are_counted(self):
+        def spin(_):
+            self.send()
+            with mock.patch.object(self.source, "send", lambda _: False), mock.patch("time.monotonic", lambda: 1e9):
+                self.send()
+
+        lines, said = self.run_bridge(spin)
+        self.assertEqual(len(lines), 1)
+        self.assertIn("1 frames not sent: 1: no connection to the source", said)
 
 
 if __name__ == "__main__":

@@ -81,7 +81,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     write_at_once(&summary, &summary_text(folder, &table_1)?)?;
     if arguments.json {
         let results: Vec<&str> = steps.iter().map(|step| step.result).collect();
-        print_line(&json!({ "folder": folder.display().to_string(), "results": results, "table_1": table_1 }).to_string())?;
+        print_line(
+            &json!({ "folder": folder.display().to_string(), "results": results, "table_1": table_1 }).to_string(),
+        )?;
     } else {
         print_line(&std::fs::read_to_string(&summary)?)?;
         print_line(&format!("{}: tables, figures and reports", folder.display()))?;

@@ -336,13 +336,8 @@ mod tests {
     #[test]
     fn repeated_samples_take_places_in_the_queue_until_they_are_answered() {
         let id = |seq| SampleId { epoch: 7, seq };
-        let reader = ConsumerWiring {
-            slot: 0,
-            capacity: 4,
-            attached_slots: vec![],
-            attached_limit_millis: 0,
-            behind: vec![],
-        };
+        let reader =
+            ConsumerWiring { slot: 0, capacity: 4, attached_slots: vec![], attached_limit_millis: 0, behind: vec![] };
         let mut credit = Credit::new(&[reader], 4);
         let mut written = None;
         // So many can be sent until the reader has no room.
