@@ -185,6 +185,11 @@ gate.main()"""
             return served["take"](Message(command=Message(position=position)))
 
         def spin(timeout_sec):
+            if served.get("ends") and "is_idle" not in served:
+                # Without goals the gate waits for more.
+                served["is_idle"] = True
+                time.sleep(0.6)
+                return
             if served.get("ends"):
                 # The graph has ended.
                 lines.queue.put(None)
@@ -192,6 +197,9 @@ gate.main()"""
                 self.assertEqual(take(0.08), "reject")
                 return
             self.assertEqual([take(0.0), take(math.nan), take(math.inf)], ["accept", "reject", "reject"])
+            arguments.parallel = True
+            self.assertEqual([take([0.0]), take([]), take([0.0, math.nan])], ["accept", "reject", "reject"])
+            arguments.parallel = False
             for action, position in [("lift", 0.0), ("hold", 0.0), (None, 0.08)]:
                 ends = []
                 command = Message(position=position)
@@ -232,6 +240,7 @@ gate.main()"""
         with mock.patch.dict(sys.modules, modules):
             self.assertTrue(example.serve(arguments, self.decisions))
         self.assertEqual(served["ends"], [True, False, True])
+        self.assertTrue(self.decisions.has_ended)
         self.assertEqual((served["name"], served["controller"]), ("~/gripper_cmd", "/gripper/cmd"))
 
     def test_a_goal_of_the_parallel_gripper_may_have_no_position(self):

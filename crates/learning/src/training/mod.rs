@@ -510,10 +510,18 @@ fn check_skill(calibration: &PlattCalibration, outcomes: &[bool], brier: f64) ->
     if calibration.a < 0.0 && brier < of_a_guess {
         return Ok(());
     }
+    let why = if brier < of_a_guess {
+        "grasps that the classifier prefers are stable no more often than others".into()
+    } else {
+        format!(
+            "the classifier does no better than the share of stable grasps (Brier score {brier:.4}, a guess has {of_a_guess:.4})"
+        )
+    };
     Err(TrainingError::Data(format!(
-        "nothing was learned: on objects it has not seen, the classifier does no better than the share of stable grasps \
-         (Brier score {brier:.4}, a guess has {of_a_guess:.4}): expected readings that tell stable grasps from unstable ones, \
-         of more objects; or try another recipe"
+        "nothing was learned: on objects it has not seen, {why}; it learned from {} outcomes of grasps with contact, {:.0} % of them stable: expected \
+         more grasps of more objects, or readings that tell stable grasps from unstable ones; or try another recipe",
+        outcomes.len(),
+        100.0 * share
     )))
 }
 
@@ -722,7 +730,11 @@ mod tests {
         assert!(check(-1.0, 0.18).is_ok());
         for (a, brier) in [(-1.0, 3.0 / 16.0), (-1.0, 0.2), (0.0, 0.1), (0.5, 0.1)] {
             let error = check(a, brier).expect_err("no skill").to_string();
-            assert!(error.contains("nothing was learned") && error.contains("0.1875"), "{error}");
+            assert!(
+                error.contains("nothing was learned") && error.contains("4 outcomes of grasps with contact, 75 %"),
+                "{error}"
+            );
+            assert_eq!(error.contains("0.1875"), brier >= 0.1875, "{error}");
         }
     }
 
