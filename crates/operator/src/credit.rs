@@ -187,7 +187,7 @@ impl Credit {
     ) -> Option<&Reader> {
         let own_first = self.own_first.filter(|first| first.epoch == key.epoch).map_or(key.seq, |first| first.seq);
         let is_repeat = self.is_repeat(key);
-        let last = self.own_last.filter(|_| is_repeat);
+        let last = if is_repeat { self.own_last } else { None };
         let key = last.map_or(key, |last| SampleId { seq: last.seq + 1, ..last });
         let next = Next { key, is_repeat, written, own_first, is_repeatable: self.begun_after.is_some() };
         self.readers.iter_mut().find_map(|reader| (!reader.has_room(places, &next)).then_some(&*reader))
