@@ -264,7 +264,10 @@ class Reconnects(unittest.TestCase):
     def test_signals_end_a_bridge_that_waits_for_a_source(self):
         work = "import line_protocol; line_protocol.run(lambda: line_protocol.Source('unix:/nowhere'))"
         for number in (signal.SIGINT, signal.SIGTERM):
-            waits = subprocess.Popen([sys.executable, "-c", work], cwd=BRIDGES, stderr=subprocess.PIPE, text=True)
+            # A shell ignores SIGINT for what it runs in the background, these tests for example.
+            heard = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
+            command = [sys.executable, "-c", work]
+            waits = subprocess.Popen(command, cwd=BRIDGES, stderr=subprocess.PIPE, text=True, preexec_fn=heard)
             self.assertIn("trying again", waits.stderr.readline())
             waits.send_signal(number)
             self.assertEqual((waits.communicate(timeout=60)[1].count("Traceback"), waits.returncode), (0, 0))

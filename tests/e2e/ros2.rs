@@ -567,7 +567,7 @@ class Decision:
     def __init__(self, grasp_id, action, left_secs):
         self.grasp_id, self.action, self.reason, self.probability_stable = grasp_id, action, 'stable', 0.9
         self.valid_until = time.time_ns() + int(left_secs * 1e9)
-for name in ['rclpy', 'rclpy.executors', 'rclpy.node', 'rclpy.qos', 'rclpy.time', 'blindgrasp_msgs',
+for name in ['rclpy', 'rclpy.clock', 'rclpy.executors', 'rclpy.node', 'rclpy.qos', 'rclpy.time', 'blindgrasp_msgs',
              'blindgrasp_msgs.msg']:
     sys.modules[name] = MagicMock()
 sys.modules['rclpy.node'].Node = Node

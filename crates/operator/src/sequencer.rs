@@ -206,11 +206,13 @@ impl<T> Sequencer<T> {
         let n_before = self.n_before(place);
         // A publisher sends in order and skips no number that it or another publisher has. So a gap within its own samples is
         // a gap of the stream; only before its first sample may be samples of the publisher that it took over from.
+        // A reader that takes what comes begins with the first sample of all publishers, whichever queue is read first.
+        let may_begin_elsewhere = self.takes_what_comes && self.last.is_none();
         let may_come = || {
-            let may_be_elsewhere = n_before > 0 && is_first_of_publisher;
+            let may_be_elsewhere = (n_before > 0 || may_begin_elsewhere) && is_first_of_publisher;
             !self.held.is_empty() || (may_be_elsewhere && (self.publishers.len() > 1 || has_other_publishers()))
         };
-        if self.may_hold && self.is_early(place) && may_come() {
+        if self.may_hold && (self.is_early(place) || may_begin_elsewhere) && may_come() {
             self.held.insert(place, (sample, now()));
             return Placing::Hold;
         }
@@ -588,6 +590,32 @@ mod tests {
         }
         assert_eq!(delivered, [key(2, 1), key(9, 4), key(9, 5)]);
         assert_eq!(sequencer.counts(), InputCounts { n_received: 3, ..InputCounts::default() });
+    }
+
+    #[test]
+    fn a_reader_that_takes_what_comes_begins_with_the_first_sample_of_all_publishers() {
+        let id = |seq| SampleId { epoch: EPOCH, seq };
+        let counts = InputCounts { n_received: 6, ..InputCounts::default() };
+        for (n_publishers, arrivals, expected) in [
+            (2, &[(8, 2), (9, 2), (4, 1), (5, 1), (6, 1), (7, 1)][..], [4, 5, 6, 7, 8, 9].as_slice()),
+            (2, &[(4, 1), (8, 2), (5, 1), (6, 1), (7, 1)], &[4, 5, 6, 7, 8]),
+            (2, &[(8, 2), (9, 2)], &[8, 9]),
+            (1, &[(8, 2), (9, 2)], &[8, 9]),
+        ] {
+            let mut sequencer = Sequencer::resume(None, Some(id(5)), counts).taking_what_comes();
+            let mut delivered = Vec::new();
+            for (seq, publisher) in arrivals {
+                match sequencer.push(*seq, id(*seq), *publisher, None, || n_publishers > 1, Instant::now) {
+                    Placing::Deliver(seq) => delivered.push(seq),
+                    Placing::Hold => {}
+                    Placing::Drop => panic!("{seq} of {arrivals:?}"),
+                }
+            }
+            delivered.extend(std::iter::from_fn(|| sequencer.next_in_order()));
+            assert_eq!(delivered, expected, "{arrivals:?}");
+            let n_new = expected.iter().filter(|seq| **seq > 5).count() as u64;
+            assert_eq!((sequencer.counts().n_received, sequencer.counts().n_missing), (6 + n_new, 0), "{arrivals:?}");
+        }
     }
 
     #[test]
