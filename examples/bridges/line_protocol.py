@@ -63,7 +63,7 @@ def connect(address):
 
 class Source:
     """A connection to tactile_source. `hand` is its first line: the hand that it expects. If the source goes, a thread connects
-    again, so that whoever sends never waits for a source: readings that wait would look fresh to the next one."""
+    again, and frames are lost meanwhile: readings that waited for the next source would look fresh to it."""
 
     def __init__(self, address, n_joints=None, n_cells=None):
         self.address = address

@@ -64,7 +64,7 @@ def is_type(value):
     return isinstance(value, str) and re.fullmatch(r"\w+/\w+/\w+", value)
 
 
-# The keys of the table's parts: what is expected there, and whether a value is that.
+# The keys of the table's parts, each with the words for its value and a check of the value.
 NUMBER, TEXT = ("a number", is_number), ("a text", is_text)
 FLAG = ("true or false", lambda value: isinstance(value, bool))
 MAPPING = ("a mapping", lambda value: isinstance(value, dict))

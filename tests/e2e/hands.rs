@@ -177,6 +177,14 @@ fn a_hand_is_made_from_xacro_with_meshes_and_grids() {
     let urdf = std::fs::read_to_string(made.join("mine.urdf")).expect("a URDF");
     assert!(urdf.contains("filename=\"meshes/jaw.obj\"") && !urdf.contains("package://"), "{urdf}");
     assert!(made.join("meshes/jaw.obj").is_file() && made.join("mine.svg").is_file());
+    // Around a hand that a robot keeps away from things, no cell feels any.
+    let guard = "<link name=\"guard\"><collision><geometry><sphere radius=\"0.3\"/></geometry></collision></link>\
+                 <joint name=\"guard_joint\" type=\"fixed\"><parent link=\"base\"/><child link=\"guard\"/></joint></robot>";
+    std::fs::write(made.join("guarded.urdf"), urdf.replace("</robot>", guard)).expect("written");
+    let guarded = ["new", "hand", "guarded", "--urdf", "mine/guarded.urdf", "--open", "jaw=0.04"];
+    let (_, stderr) = run_in(folder.path(), &[&guarded[..], &grids[..]].concat(), 0);
+    let told = "12 of the 12 cells of pad 'left_jaw' lie inside the collision shapes of link 'guard'";
+    assert!(stderr.contains(told), "{stderr}");
     // The cells lie on the inner faces of the meshes' hulls and look at each other.
     let (cells, stderr) = run_in(folder.path(), &["info", "mine/mine.yaml", "--joints", "jaw=0.02", "--json"], 0);
     assert!(stderr.is_empty(), "{stderr}");

@@ -285,6 +285,30 @@ fn a_recording_in_parts_is_whole() {
 
 /// The recording lies on a file system of 3 MB that only this test's processes see. Only root can make one.
 #[test]
+fn a_limit_of_file_sizes_ends_the_recording_and_not_the_graph() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max")]);
+    let out = folder.path().join("limited.mcap");
+    let name = crate::common::unique_name();
+    // Larger than the graph's files in shared memory.
+    let output = Command::new("prlimit")
+        .args(["--fsize=40000000", env!("CARGO_BIN_EXE_blindgrasp"), "run", "--json", "--name", &name, "--record"])
+        .arg(&out)
+        .args(["--set", "recorded_source.repeat=100"])
+        .arg(&flow)
+        .current_dir(crate::common::project())
+        .env("XDG_STATE_HOME", Path::new(env!("CARGO_TARGET_TMPDIR")).join("state"))
+        .output()
+        .expect("prlimit is there");
+    let lines = crate::common::json_lines(&output.stdout);
+    let summary = &lines.last().expect("a summary")["summary"];
+    assert_eq!(output.status.code(), Some(3), "{summary} {}", text(&output.stderr));
+    assert_eq!((&summary["samples_lost"], &summary["undecided"]), (&0.into(), &0.into()), "{summary}");
+    assert!(summary["recording_error"].as_str().expect("an error").contains("limited.mcap"), "{summary}");
+    crate::common::assert_nothing_left(&name);
+}
+
+#[test]
 fn a_full_disk_ends_the_recording_and_not_the_graph() {
     let folder = tempfile::tempdir().expect("a folder");
     let small = folder.path().join("small");

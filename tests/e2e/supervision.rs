@@ -9,7 +9,7 @@ use crate::common::{
     json_lines, left_overs, of_node, operator, run, script, signal, skipped, stubborn_classifier, text, unique_name,
     wait_until,
 };
-use rustix::process::Signal;
+use rustix::process::{Resource, Signal, getrlimit, prlimit};
 use serde_json::Value;
 
 /// A graph that decides this many grasps goes on well.
@@ -20,6 +20,29 @@ fn patient_dataflow(folder: &Path, heartbeat_ms: u32) -> std::path::PathBuf {
     let heartbeat = format!("heartbeat_ms: {heartbeat_ms}");
     let lines = ["restart: {policy: on-failure, limit: 1000, within_s: 60, backoff_ms: 1}", &heartbeat];
     dataflow_with(folder, &NODES.map(|node| of_node(node, &lines)))
+}
+
+/// The launcher has no descriptor left for a moment.
+#[test]
+fn an_operator_that_cannot_be_started_for_a_while_comes_back_and_no_restart_is_counted() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    let pid = rustix::process::Pid::from_raw(graph.pid());
+    let classifier = graph.pid_of("classifier");
+    let limit = |current| {
+        let limit = rustix::process::Rlimit { current: Some(current), ..getrlimit(Resource::Nofile) };
+        prlimit(pid, Resource::Nofile, limit).expect("set").current
+    };
+    let before = limit(4).expect("a limit");
+    signal(classifier, Signal::KILL);
+    wait_until(|| graph.said().contains("when the machine can start processes again"), || graph.said());
+    // More tries than restarts are allowed within a second.
+    std::thread::sleep(Duration::from_millis(1200));
+    limit(before);
+    wait_until(|| graph.said().contains("node 'classifier' is back"), || graph.said());
+    assert_eq!(graph.node("classifier")["n_restarts"], 1, "{}", graph.node("classifier"));
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    graph.stop().assert_undisturbed("a launcher without descriptors");
 }
 
 #[test]

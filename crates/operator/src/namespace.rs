@@ -219,11 +219,15 @@ impl Id {
         let NamespaceWiring { root_path, lock_file, .. } = self.wiring();
         std::fs::OpenOptions::new().append(true).create_new(true).mode(0o600).open(&lock_file)?;
         let mut held = Vec::new();
-        for path in [root_path, lock_file] {
-            let file = File::open(&path)?;
-            rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive)?;
+        for path in [&root_path, &lock_file] {
+            let file = File::open(path)?;
+            match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
+                // Some file systems (NFS) lock no folder. Then nobody else can lock it either, and so remove it.
+                Err(error) if error != Errno::WOULDBLOCK && path == &root_path => continue,
+                locked => locked?,
+            }
             // Another launcher may have taken it for a dead graph's before and removed it.
-            if file.metadata()?.ino() != std::fs::metadata(&path)?.ino() {
+            if file.metadata()?.ino() != std::fs::metadata(path)?.ino() {
                 return Err(std::io::ErrorKind::AlreadyExists.into());
             }
             held.push(file);

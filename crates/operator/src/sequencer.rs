@@ -206,7 +206,7 @@ impl<T> Sequencer<T> {
         let n_before = self.n_before(place);
         // A publisher sends in order and skips no number that it or another publisher has. So a gap within its own samples is
         // a gap of the stream; only before its first sample may be samples of the publisher that it took over from.
-        // A reader that takes what comes begins with the first sample of all publishers, whichever queue is read first.
+        // A reader that takes what comes begins with the first sample of all publishers. Their queues are read in any order.
         let may_begin_elsewhere = self.takes_what_comes && self.last.is_none();
         let may_come = || {
             let may_be_elsewhere = (n_before > 0 || may_begin_elsewhere) && is_first_of_publisher;

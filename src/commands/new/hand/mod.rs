@@ -462,3 +462,14 @@ fn grid(text: &str) -> Result<(String, [usize; 2]), String> {
         .filter(|(_, [rows, columns])| (1..=256).contains(rows) && (1..=256).contains(columns))
         .ok_or_else(|| "expected LINK=ROWSxCOLUMNS, as in left_finger=4x3, of 1 to 256 each".into())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_name_of_a_link_may_have_an_equals_sign() {
+        assert_eq!(grid("finger=3=4x2"), Ok(("finger=3".into(), [4, 2])));
+        assert!(grid("finger").is_err() && grid("finger=4").is_err() && grid("finger=0x2").is_err());
+    }
+}
