@@ -9,6 +9,7 @@ This one has no hand: it takes frames from the recording on its stdin, at --rate
 """
 
 import argparse
+import glob
 import json
 import os
 import socket
@@ -18,7 +19,7 @@ import threading
 import time
 
 # The folders of tactile_source's socket, in the program's order.
-SOCKET_FOLDERS = ("/run/bgrasp", f"/tmp/blindgrasp-{os.getuid()}", f"/run/user/{os.getuid()}/blindgrasp")
+SOCKET_FOLDERS = ("/run/bgrasp", f"/tmp/blindgrasp-{os.getuid()}", f"/dev/shm/blindgrasp-{os.getuid()}.*")
 
 
 def frames(rate):
@@ -34,7 +35,7 @@ def frames(rate):
 
 def own_sockets():
     """The addresses at which tactile_source may listen without a param: in those of its folders that are this user's alone."""
-    for folder in SOCKET_FOLDERS:
+    for folder in (path for pattern in SOCKET_FOLDERS for path in sorted(glob.glob(pattern))):
         try:
             found = os.lstat(folder)
         except OSError:

@@ -78,7 +78,7 @@ fn no_stage_allocates_for_a_sample_once_it_is_warm() {
     let of_node = |idx: usize| form_of(&graph.nodes[idx].args).expect("shipped");
 
     let node = namespace::join(namespace.wiring(), "reader").expect("joined");
-    let cursors = Arc::new(SharedCursors::open(Path::new(&namespace.wiring().cursors)).expect("cursors"));
+    let cursors = Arc::new(SharedCursors::open(&namespace.wiring().cursors()).expect("cursors"));
     let input = plan.observer_input(&port).expect("observed");
     let mut decisions = Subscriber::<LiftDecision>::open(&node, Some(&cursors), &input).expect("opened");
     decisions.take_over(None);

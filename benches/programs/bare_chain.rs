@@ -19,11 +19,12 @@ use blindgrasp_messages::{
 };
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::namespace::{self, Namespace};
+use blindgrasp_operator::private_service::PrivateService;
 use blindgrasp_operator::wiring::NamespaceWiring;
 use clap::Parser;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::port::{listener::Listener, notifier::Notifier, publisher, subscriber};
-use iceoryx2::prelude::{Node, PortFactory as _, ServiceName, ipc};
+use iceoryx2::prelude::{Node, PortFactory as _, ServiceName};
 use iceoryx2::service::port_factory::publish_subscribe;
 use rustix::process::{Signal, set_parent_process_death_signal};
 use rustix::time::{ClockId, clock_gettime};
@@ -221,7 +222,7 @@ fn be_process(process: u64, domain: &NamespaceWiring, arguments: &Arguments, n_g
     }
 }
 
-fn source(node: &Node<ipc::Service>, rate: f64, n_frames: u64) -> anyhow::Result<()> {
+fn source(node: &Node<PrivateService>, rate: f64, n_frames: u64) -> anyhow::Result<()> {
     let frames = Sender::<TactileFrame>::open(node, N_JOINTS + N_CELLS)?;
     ready(|| Ok(frames.is_connected()))?;
     std::io::stdin().lock().read_line(&mut String::new())?;
@@ -239,7 +240,7 @@ fn source(node: &Node<ipc::Service>, rate: f64, n_frames: u64) -> anyhow::Result
 }
 
 fn stage<In: Message, Out: Message>(
-    node: &Node<ipc::Service>,
+    node: &Node<PrivateService>,
     n_frames: u64,
     items: &[Out::Item],
     head: impl Fn(Header) -> Out::Head,
@@ -258,7 +259,7 @@ fn stage<In: Message, Out: Message>(
     report(json!({}))
 }
 
-fn sink(node: &Node<ipc::Service>, n_frames: u64) -> anyhow::Result<()> {
+fn sink(node: &Node<PrivateService>, n_frames: u64) -> anyhow::Result<()> {
     let predictions = Receiver::<Prediction>::open(node)?;
     let decisions = Sender::<LiftDecision>::open(node, 0)?;
     ready(|| Ok(predictions.connect()? && decisions.is_connected()))?;
@@ -280,16 +281,16 @@ fn sink(node: &Node<ipc::Service>, n_frames: u64) -> anyhow::Result<()> {
     report(json!({"latency_nanos": latencies.json(), "lost": n_lost, "first_nanos": first_nanos}))
 }
 
-type PubSub<M> = publish_subscribe::PortFactory<ipc::Service, [<M as Message>::Item], <M as Message>::Head>;
+type PubSub<M> = publish_subscribe::PortFactory<PrivateService, [<M as Message>::Item], <M as Message>::Head>;
 
 struct Sender<M: Message> {
     pub_sub: PubSub<M>,
-    publisher: publisher::Publisher<ipc::Service, [M::Item], M::Head>,
-    notifier: Notifier<ipc::Service>,
+    publisher: publisher::Publisher<PrivateService, [M::Item], M::Head>,
+    notifier: Notifier<PrivateService>,
 }
 
 impl<M: Message> Sender<M> {
-    fn open(node: &Node<ipc::Service>, max_items: usize) -> anyhow::Result<Self> {
+    fn open(node: &Node<PrivateService>, max_items: usize) -> anyhow::Result<Self> {
         let pub_sub = pub_sub::<M>(node)?;
         let publisher =
             pub_sub.publisher_builder().initial_max_slice_len(max_items.max(1)).create().map_err(refused)?;
@@ -313,12 +314,12 @@ impl<M: Message> Sender<M> {
 
 struct Receiver<M: Message> {
     pub_sub: PubSub<M>,
-    subscriber: subscriber::Subscriber<ipc::Service, [M::Item], M::Head>,
-    listener: Listener<ipc::Service>,
+    subscriber: subscriber::Subscriber<PrivateService, [M::Item], M::Head>,
+    listener: Listener<PrivateService>,
 }
 
 impl<M: Message> Receiver<M> {
-    fn open(node: &Node<ipc::Service>) -> anyhow::Result<Self> {
+    fn open(node: &Node<PrivateService>) -> anyhow::Result<Self> {
         let events = node.service_builder(&service_name::<M>()?).event().open_or_create().map_err(refused)?;
         let listener = events.listener_builder().create().map_err(refused)?;
         let pub_sub = pub_sub::<M>(node)?;
@@ -335,7 +336,7 @@ impl<M: Message> Receiver<M> {
 }
 
 /// Lossless: a publisher waits for a full subscriber.
-fn pub_sub<M: Message>(node: &Node<ipc::Service>) -> anyhow::Result<PubSub<M>> {
+fn pub_sub<M: Message>(node: &Node<PrivateService>) -> anyhow::Result<PubSub<M>> {
     node.service_builder(&service_name::<M>()?)
         .publish_subscribe::<[M::Item]>()
         .user_header::<M::Head>()

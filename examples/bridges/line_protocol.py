@@ -1,6 +1,7 @@
 """The parts that the bridges of this folder share: the connection to a running tactile_source, and the phase of a grasp."""
 
 import argparse
+import glob
 import json
 import os
 import signal
@@ -11,7 +12,7 @@ import threading
 import time
 
 # The folders of tactile_source's socket, in the program's order (crates/operator/src/control_socket.rs).
-SOCKET_FOLDERS = ("/run/bgrasp", f"/tmp/blindgrasp-{os.getuid()}", f"/run/user/{os.getuid()}/blindgrasp")
+SOCKET_FOLDERS = ("/run/bgrasp", f"/tmp/blindgrasp-{os.getuid()}", f"/dev/shm/blindgrasp-{os.getuid()}.*")
 
 
 def options(description):
@@ -28,7 +29,7 @@ def now_nanos():
 
 def own_sockets():
     """The addresses at which tactile_source may listen without a param: in those of its folders that are this user's alone."""
-    for folder in SOCKET_FOLDERS:
+    for folder in (path for pattern in SOCKET_FOLDERS for path in sorted(glob.glob(pattern))):
         try:
             found = os.lstat(folder)
         except OSError:

@@ -256,7 +256,7 @@ class Reconnects(unittest.TestCase):
             tactile_bridge.loader.exec_module(copied)
             self.assertEqual(copied.SOCKET_FOLDERS, bridge.line_protocol.SOCKET_FOLDERS)
             for module in (bridge.line_protocol, copied):
-                with mock.patch.object(module, "SOCKET_FOLDERS", folders):
+                with mock.patch.object(module, "SOCKET_FOLDERS", [*folders[:3], f"{folder}/o?n"]):
                     self.assertEqual([path.split("/")[-2] for path in module.own_sockets()], ["empty", "own"])
                     with module.connect(None) as connection:
                         self.assertEqual(connection.getpeername(), f"{folders[3]}/tactile.hand")

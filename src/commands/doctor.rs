@@ -34,9 +34,9 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let mut removed = Vec::new();
     if arguments.fix {
-        let paths = left_over().into_iter().flat_map(|(_, paths)| paths);
+        removed.extend(left_over().into_iter().map(|(_, path)| path));
         let failed = sweep();
-        removed.extend(paths.filter(|path| !failed.iter().any(|(left, _)| left == path)));
+        removed.retain(|path| !failed.iter().any(|(left, _)| left == path));
         for (path, error) in failed {
             print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display()));
         }

@@ -182,7 +182,7 @@ fn record_from(
     let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
     let about = of_graph(&graph, beginning)?;
     let recorder = Recorder::create(out, about, &arguments.recording.options())?;
-    let cursors = SharedCursors::open(std::path::Path::new(&domain.cursors))?;
+    let cursors = SharedCursors::open(&domain.cursors())?;
     let observed = observed(&edges);
     let failed = Arc::new(AtomicBool::new(false));
     let span = Span::new(cursors, edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));

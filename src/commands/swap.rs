@@ -556,12 +556,7 @@ mod tests {
 
     #[test]
     fn a_comparison_of_nothing_is_abandoned() {
-        let domain = NamespaceWiring {
-            root_path: String::new(),
-            prefix: String::new(),
-            cursors: String::new(),
-            lock_file: String::new(),
-        };
+        let domain = NamespaceWiring { folder: "/nowhere".into() };
         let shadowing = || vec![Reply::Shadowing { domain: domain.clone(), outputs: Vec::new() }];
         let abandoned = || vec![(Request::Abandon, vec![Reply::Abandoned])];
         let only = parsed(&["a", "--shadow", "0.1"]).expect("accepted");

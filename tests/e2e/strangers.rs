@@ -1,6 +1,6 @@
 //! Other users of the machine, and files and programs of strangers: they reach no graph, no terminal and no other file.
 
-use std::os::unix::fs::MetadataExt;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -9,8 +9,8 @@ use blindgrasp_recording::{Record, RecordingInfo, RecordingReader, RecordingWrit
 use rustix::process::{Signal, getuid};
 
 use crate::common::{
-    FAST_FOREVER, Graph, HAND, MODEL, RECORDING, blindgrasp, classifier_runs, dataflow, dataflow_with, operator,
-    project, run, script, skipped, text, unique_name, wait_until,
+    FAST_FOREVER, Graph, HAND, MODEL, NODES, RECORDING, blindgrasp, classifier_runs, dataflow, dataflow_with, operator,
+    project, run, script, skipped, swap, text, unique_name, wait_until,
 };
 
 const A_FEW_GRASPS: usize = 20;
@@ -21,10 +21,10 @@ fn utf8(path: &Path) -> &str {
     path.to_str().expect("UTF-8")
 }
 
-/// The files of a graph: its shared memory, and its folder with all that is in it.
+/// The files of a graph: its folder with all that is in it.
 fn files_of(name: &str) -> Vec<PathBuf> {
     let mut found = Vec::new();
-    let mut folders = vec![PathBuf::from("/dev/shm"), std::env::temp_dir()];
+    let mut folders = vec![PathBuf::from("/dev/shm")];
     while let Some(folder) = folders.pop() {
         for path in std::fs::read_dir(folder).expect("readable").flatten().map(|entry| entry.path()) {
             let is_of_graph = utf8(&path).contains("blindgrasp") && utf8(&path).contains(name);
@@ -70,6 +70,64 @@ fn another_user_cannot_touch_a_running_graph() {
     run(&["record", &graph.name, "--for", "0.2", "--out", utf8(&recording)], 0);
     graph.wait_for_decisions(A_FEW_GRASPS);
     graph.stop().assert_undisturbed("beside another user");
+}
+
+/// What another user tries while a graph starts, and an operator of it is started again and swapped: to see names of its files,
+/// and to put a pipe, a link and a large sparse file where the graph could open them.
+const PLANTER: &str = "
+while [ -e \"$1\" ]; do
+    for graph in /dev/shm/blindgrasp_$2*; do
+        ls \"$graph\"/* 2> /dev/null && echo 'it sees names'
+        for place in \"$graph/ports/x\" \"$graph/x\"; do
+            mkfifo \"$place.pipe\" 2> /dev/null && echo 'it made a pipe'
+            ln -s /etc/passwd \"$place.link\" 2> /dev/null && echo 'it made a link'
+            truncate -s 1T \"$place.data\" 2> /dev/null && echo 'it made a file'
+        done
+        mv \"$graph\" \"$graph.mine\" 2> /dev/null && echo 'it moved the folder'
+    done
+    mkfifo \"/dev/shm/blindgrasp_$2.pipe\" 2> /dev/null
+    truncate -s 1T \"/dev/shm/blindgrasp_$2.data\" 2> /dev/null
+done
+rm -f /dev/shm/blindgrasp_$2.pipe /dev/shm/blindgrasp_$2.data
+echo tried";
+
+#[test]
+fn another_user_cannot_plant_files_where_a_graph_opens_its_own() {
+    if !getuid().is_root() {
+        return skipped("acting as another user (needs root)");
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    std::fs::set_permissions(folder.path(), PermissionsExt::from_mode(0o755)).expect("readable");
+    let goes_on = folder.path().join("goes-on");
+    std::fs::write(&goes_on, "").expect("written");
+    let name = unique_name();
+    let begin = &name[..name.len().min(11)];
+    let mut planter = Command::new("setpriv");
+    planter.args(["--reuid=65534", "--regid=65534", "--clear-groups", "sh", "-c", PLANTER, "sh"]);
+    let planter = planter.arg(&goes_on).arg(begin).stdout(Stdio::piped()).spawn().expect("started");
+    let pipe = PathBuf::from(format!("/dev/shm/blindgrasp_{begin}.pipe"));
+    wait_until(|| pipe.exists(), || "the other user makes a pipe".into());
+
+    let graph = Graph::launch(&name, &dataflow(folder.path(), &[]), &FAST_FOREVER);
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    graph.kill("classifier");
+    let model = format!("model={MODEL}");
+    swap(&graph, &["classifier", "--run", "classifier", "--set", &model, "--probation", "0.1"], 0);
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    // Each process has mapped files of this user's folder alone.
+    let pids = NODES.map(|node| graph.pid_of(node));
+    for pid in pids.into_iter().chain([graph.pid()]) {
+        let maps = std::fs::read_to_string(format!("/proc/{pid}/maps")).expect("there");
+        let shared: Vec<&str> = maps.lines().filter_map(|line| Some(line.split_once("/dev/shm/")?.1)).collect();
+        assert!(!shared.is_empty(), "{maps}");
+        let is_own = |path: &&&str| path.starts_with(&format!("blindgrasp_{begin}.")) && path.contains('/');
+        let foreign: Vec<&&str> = shared.iter().filter(|path| !is_own(path)).collect();
+        assert!(foreign.is_empty(), "{foreign:?}");
+    }
+    std::fs::remove_file(&goes_on).expect("removed");
+    let tried = planter.wait_with_output().expect("ended");
+    assert_eq!(text(&tried.stdout), "tried\n");
+    graph.stop().assert_undisturbed("beside another user's files");
 }
 
 /// The project's recording by a stranger: its objects, its maker and the name of its hand are what they like.

@@ -1,12 +1,14 @@
 //! The samples that a link has committed and still keeps for another machine, in a file of the graph's folder: a link that is
-//! killed and started again finds them there. The file ends with the graph.
+//! killed and started again finds them there. The file ends with the graph. A link follows no link of the file system: it has
+//! no sandbox, and could be led anywhere.
 
 use std::fs::{File, OpenOptions};
-use std::io::{Result, Write};
+use std::io::{ErrorKind, Read, Result, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use blindgrasp_operator::cursors::SampleId;
+use rustix::fs::OFlags;
 
 use super::outgoing::KeptSample;
 
@@ -38,12 +40,12 @@ impl Spool {
     /// # Errors
     /// The file cannot be read or written.
     pub(super) fn open(path: &Path) -> Result<(Spool, Saved)> {
-        let saved = read(&std::fs::read(path).or_else(|error| match error.kind() {
-            std::io::ErrorKind::NotFound => Ok(Vec::new()),
-            _ => Err(error),
-        })?);
-        let file = OpenOptions::new().append(true).create(true).mode(0o600).open(path)?;
-        let n_bytes = file.metadata()?.len();
+        let no_follow = OFlags::NOFOLLOW.bits() as i32;
+        let mut options = OpenOptions::new();
+        let mut file = options.read(true).append(true).create(true).mode(0o600).custom_flags(no_follow).open(path)?;
+        let mut bytes = Vec::new();
+        file.read_to_end(&mut bytes)?;
+        let (saved, n_bytes) = (read(&bytes), bytes.len() as u64);
         let mut spool = Spool { path: path.into(), file, n_bytes, most_bytes: 0, n_lost: saved.n_lost };
         // The end of the file may be half of a record.
         spool.replace(saved.samples.iter().map(KeptSample::as_parts), saved.n_lost)?;
@@ -93,11 +95,15 @@ impl Spool {
         push_lost(&mut bytes, n_lost);
         samples.for_each(|(key, origin_nanos, message)| push_sample(&mut bytes, key, origin_nanos, message));
         let partial = self.path.with_extension("partial");
-        let mut options = OpenOptions::new();
-        let mut file = options.write(true).create(true).truncate(true).mode(0o600).open(&partial)?;
+        // A link that was killed may have left one.
+        match std::fs::remove_file(&partial) {
+            Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
+            _ => {}
+        }
+        let mut file = OpenOptions::new().append(true).create_new(true).mode(0o600).open(&partial)?;
         file.write_all(&bytes)?;
         std::fs::rename(&partial, &self.path)?;
-        self.file = OpenOptions::new().append(true).open(&self.path)?;
+        self.file = file;
         (self.n_bytes, self.n_lost) = (bytes.len() as u64, n_lost);
         self.most_bytes = 2 * self.n_bytes + SLACK_BYTES;
         Ok(())
@@ -179,6 +185,22 @@ mod tests {
         // It goes on behind them.
         spool.save(sample(5).as_parts()).expect("saved");
         assert_eq!(Spool::open(&path).expect("opened").1.samples, (0..6).map(sample).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn no_other_file_is_read_or_written_under_a_planted_name() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (keys, path) = (folder.path().join("authorized_keys"), folder.path().join("spool"));
+        std::fs::write(&keys, "mine").expect("written");
+        std::os::unix::fs::symlink(&keys, path.with_extension("partial")).expect("planted");
+        let (mut spool, _) = Spool::open(&path).expect("opened");
+        spool.save(sample(1).as_parts()).expect("saved");
+        std::os::unix::fs::symlink(&keys, path.with_extension("partial")).expect("planted");
+        spool.replace([sample(2).as_parts()].into_iter(), 0).expect("written");
+        std::fs::remove_file(&path).expect("removed");
+        std::os::unix::fs::symlink(&keys, &path).expect("planted");
+        assert!(Spool::open(&path).is_err());
+        assert_eq!(std::fs::read(&keys).expect("there"), b"mine");
     }
 
     #[test]

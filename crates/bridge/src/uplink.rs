@@ -67,7 +67,7 @@ impl Uplink {
         let last = subscriber.last();
         subscriber.take_over(last);
         let deadlines_nanos = config.deadline_millis.saturating_mul(1_000_000 * N_DEADLINES_STALLED);
-        let path = operator.folder().join(format!("spool_{}", channel.input_port().replace('/', "_")));
+        let path = operator.link_folder().join(format!("spool_{}", channel.input_port().replace('/', "_")));
         let (mut spool, saved) = Spool::open(&path).with_context(|| path.display().to_string())?;
         let options = OutgoingOptions {
             policy: channel.policy,

@@ -169,8 +169,7 @@ impl Plan {
     /// # Errors
     /// See [`SharedCursors::create`].
     pub fn create_cursors(&self) -> Result<SharedCursors, CursorsError> {
-        let cursors =
-            SharedCursors::create(std::path::Path::new(&self.domain.cursors), self.n_slots, self.state_regions.len())?;
+        let cursors = SharedCursors::create(&self.domain.cursors(), self.n_slots, self.state_regions.len())?;
         // No writer waits for a reader that is not there.
         self.attached_slots.values().flatten().for_each(|slot| cursors.input(*slot).give_up(true));
         Ok(cursors)

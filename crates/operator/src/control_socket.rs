@@ -1,9 +1,9 @@
 //! The sockets at which running graphs take commands: one file for each graph, in a folder of this user alone.
 //!
 //! The folder is `/run/bgrasp` if that belongs to this user, as it does in a service of systemd, otherwise
-//! `/tmp/blindgrasp-UID`. If another user has taken that name, it is `/run/user/UID/blindgrasp`, which no other user can take.
-//! That one is the last choice, because it goes when the user logs out, and a graph may go on. A command looks for graphs in
-//! all of them. Environment variables such as `TMPDIR` are not asked: a command and a graph may have different ones.
+//! `/tmp/blindgrasp-UID`. If another user has taken that name, it is `/dev/shm/blindgrasp-UID.LETTERS`, whose letters are drawn
+//! when it is made. A command looks for graphs in all of them. Environment variables such as `TMPDIR` are not asked: a command
+//! and a graph may have different ones.
 //!
 //! Files, unlike abstract sockets, are not shared with a container that has its own files and the network of its host.
 
@@ -14,6 +14,7 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::os::unix::net::UnixListener;
 use std::path::{Path, PathBuf};
 
+use crate::namespace::{SHARED_MEMORY_FOLDER, random_letters};
 use rustix::fs::{FlockOperation, flock};
 use rustix::io::Errno;
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
@@ -219,13 +220,28 @@ struct Candidate {
 }
 
 /// The folders that may have sockets of this user, the first choice first.
-fn candidates() -> [Candidate; 3] {
-    let uid = own_uid();
-    [
+fn candidates() -> Vec<Candidate> {
+    let name = format!("blindgrasp-{}", own_uid());
+    let mut candidates = vec![
         Candidate { path: SERVICE_FOLDER.into(), is_made: false },
-        Candidate { path: format!("/tmp/blindgrasp-{uid}").into(), is_made: true },
-        Candidate { path: format!("/run/user/{uid}/blindgrasp").into(), is_made: true },
-    ]
+        Candidate { path: Path::new("/tmp").join(&name), is_made: true },
+    ];
+    candidates.extend(drawn(Path::new(SHARED_MEMORY_FOLDER), &name));
+    candidates
+}
+
+/// The folders with drawn letters that are there, and one that could be made.
+fn drawn(parent: &Path, name: &str) -> Vec<Candidate> {
+    let beginning = format!("{name}.");
+    let mut paths = Vec::new();
+    for entry in std::fs::read_dir(parent).into_iter().flatten().flatten() {
+        if entry.file_name().to_string_lossy().starts_with(&beginning) && check(&entry.path(), own_uid()).is_ok() {
+            paths.push(entry.path());
+        }
+    }
+    paths.sort();
+    paths.push(parent.join(beginning + &random_letters()));
+    paths.into_iter().map(|path| Candidate { path, is_made: true }).collect()
 }
 
 /// The first candidate that is a user's, made if it is missing. The error is that of the first one that could not be made.
@@ -300,14 +316,14 @@ mod tests {
     fn a_folder_that_another_user_has_taken_first_is_passed_over() {
         let parent = tempfile::tempdir().expect("a folder");
         let at = |name: &str| parent.path().join(name);
-        let candidates = [("service", false), ("tmp", true), ("run", true)]
+        let candidates = [("service", false), ("tmp", true), ("shared", true)]
             .map(|(name, is_made)| Candidate { path: at(name), is_made });
         let uid = own_uid();
         assert_eq!(choose(&candidates, uid).expect("made"), at("tmp"));
         // A link stands for a folder of another user: neither belongs to this one.
         std::fs::remove_dir(at("tmp")).expect("removed");
         std::os::unix::fs::symlink("/tmp", at("tmp")).expect("a link");
-        assert_eq!(choose(&candidates, uid).expect("made"), at("run"));
+        assert_eq!(choose(&candidates, uid).expect("made"), at("shared"));
         assert_eq!(choose(&candidates[..2], uid + 1).expect_err("taken").kind(), ErrorKind::PermissionDenied);
         let error = choose(&candidates[..2], uid).expect_err("taken").to_string();
         assert!(error.contains("tmp must be a folder of this user") && error.contains("administrator"), "{error}");
@@ -316,6 +332,15 @@ mod tests {
         assert!(choose(&candidates[..2], uid).expect_err("open").to_string().contains("chmod 0700"));
         DirBuilder::new().mode(0o700).create(at("service")).expect("made");
         assert_eq!(choose(&candidates, uid).expect("a service's"), at("service"));
+    }
+
+    #[test]
+    fn a_folder_with_drawn_letters_is_found_again_unless_another_has_made_it() {
+        let parent = tempfile::tempdir().expect("a folder");
+        std::os::unix::fs::symlink("/tmp", parent.path().join("blindgrasp-7.planted1")).expect("a link");
+        let made = choose(&drawn(parent.path(), "blindgrasp-7"), own_uid()).expect("made");
+        assert_eq!(choose(&drawn(parent.path(), "blindgrasp-7"), own_uid()).expect("found"), made);
+        assert_ne!(choose(&drawn(parent.path(), "blindgrasp-77"), own_uid()).expect("made"), made);
     }
 
     #[test]

@@ -38,7 +38,8 @@
 //! * [`cursors`] - how far each of a graph's processes has come. [`ages`] - how old samples are when a reader gets them.
 //! * [`host`] - gives the samples of an operator to a program in any language, over two pipes.
 //! * [`wiring`] - what the launcher tells an operator and what the operator tells the launcher.
-//! * [`namespace`] - a running graph's own corner of shared memory, and how it is left clean.
+//! * [`namespace`] - a running graph's own folder in shared memory, and how it is left clean. [`private_service`] - iceoryx2 in
+//!   that folder.
 //! * [`sandbox`] - what an operator process gives up once it is ready.
 //! * [`link_status`] - what a machine knows of the other machines of its graph.
 //! * [`diagnostics`] - lines for people. [`text`] - names and quotes.
@@ -60,6 +61,7 @@ pub mod param;
 pub mod partner;
 pub mod peer;
 pub mod port;
+pub mod private_service;
 #[cfg(test)]
 mod recovery_model;
 pub mod sandbox;

@@ -1,29 +1,26 @@
-//! A running graph's own namespace in shared memory.
+//! A running graph's own folder in shared memory.
 //!
-//! Each running graph has a name that no other graph of the same user has at the time, and an iceoryx2 root path and prefix
-//! of its own: graphs don't see each other, and all files with the prefix are removed when the graph ends, or after it was
-//! killed.
+//! All files of a graph lie in one folder that only its user can enter: another user can neither make a file under a name that
+//! a process of the graph opens, nor see its names. The folder is locked while the launcher lives, and goes with the graph, or
+//! after it was killed.
 
-use std::collections::BTreeSet;
-use std::fs::{DirBuilder, File};
+use std::fs::{DirBuilder, File, Permissions};
 use std::hash::{BuildHasher, RandomState};
-use std::io::Write;
-use std::os::unix::ffi::OsStrExt;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::io::Error;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::os::unix::net::UnixListener;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use iceoryx2::prelude::{CallbackProgression, NodeState};
-use iceoryx2::prelude::{
-    Config, FileName, LogLevel, Node, NodeBuilder, NodeName, SemanticString, SignalHandlingMode, ipc,
-};
+use iceoryx2::prelude::{Config, FileName, LogLevel, Node, NodeBuilder, NodeName, SemanticString, SignalHandlingMode};
 
-use rustix::fs::{FallocateFlags, FlockOperation};
+use rustix::fs::{FallocateFlags, FlockOperation, OFlags};
 use rustix::io::Errno;
 
 use crate::control_socket::{self, ControlSocket};
 use crate::diagnostics::print_diagnostic;
 use crate::port::BoxedError;
+use crate::private_service::PrivateService;
 use crate::text::is_name;
 use crate::wiring::NamespaceWiring;
 
@@ -36,41 +33,23 @@ pub const LEAST_FREE_BYTES: u64 = 16 << 20;
 /// A process that dies of full shared memory (SIGBUS) is started again when so much of it is free.
 const LEAST_FREE_FOR_RESTART_BYTES: u64 = 4 << 20;
 
-/// The names of folders of graphs, in the folder for temporary files, begin with this; their id follows.
-const FOLDER_PREFIX: &str = "blindgrasp-";
+/// The names of the folders of graphs begin with this; the beginning of the graph's name, for people, and random letters follow.
+const FOLDER_PREFIX: &str = "blindgrasp_";
 /// The unit in which the kernel counts the blocks of a file.
 const BLOCK_BYTES: u64 = 512;
-/// The names of all files that iceoryx2 makes begin with this; the id follows.
-const FILE_PREFIX: &str = "blindgrasp_";
-/// The names of files have so much of the graph's name.
-const MAX_ID_NAME_BYTES: usize = 11;
-/// The random letters in an id: so many that no other user can take all names first (36^8 is about 3 · 10^12).
-const ID_LETTERS: &[u8; 36] = b"abcdefghijklmnopqrstuvwxyz0123456789";
-const N_ID_LETTERS: usize = 8;
-/// So many ids are tried, in case that one is taken.
-const N_ID_TRIES: u32 = 8;
-/// The longest path of a file in iceoryx2 0.10.
-const MAX_PATH_BYTES: usize = 255;
-/// iceoryx2 0.10 adds to the prefix of a connection the digits of a hash, two numbers of up to 33 digits, and an ending.
-const MAX_NAME_BYTES: usize = 40 + 1 + 33 + 1 + 33 + ".connection".len();
-/// The longest path of a folder in which the folders of graphs may be: behind it come the folder, and in that a file.
-const MAX_FOLDER_BYTES: usize = MAX_PATH_BYTES
-    - (1 + FOLDER_PREFIX.len() + MAX_ID_BYTES)
-    - (1 + FILE_PREFIX.len() + MAX_ID_BYTES + 1)
-    - MAX_NAME_BYTES;
-const MAX_ID_BYTES: usize = MAX_ID_NAME_BYTES + 1 + N_ID_LETTERS;
-/// The file in which iceoryx2 0.10 counts the processes of a graph. iceoryx2 lets all users of the machine write to it, so the
-/// launcher makes it before the first process joins. The name has the hash of a type.
-const COUNTER_NAME: &str = "9204dd183d1c4d8e1ff592a30766ffa6765aa8b5_node.0_10_0.global_mgmt";
-/// The version of iceoryx2 (0.10.0, 16 bits a part), and the count, which is 0, with its padding.
-const COUNTER: [u64; 2] = [10 << 16, 0];
-
-/// The folder in which the folders of graphs are: the one for temporary files (`TMPDIR`), or `/tmp` where the path of that one is
-/// too long for the files below it.
-pub fn graphs_folder() -> PathBuf {
-    let folder = std::env::temp_dir();
-    if folder.as_os_str().len() <= MAX_FOLDER_BYTES { folder } else { "/tmp".into() }
-}
+/// The names of all files that iceoryx2 makes begin with this.
+const FILE_PREFIX: &str = "x";
+/// The names of folders have so much of the graph's name. iceoryx2 has room for about 60 characters before the name of a socket.
+const MAX_NAME_BYTES: usize = 11;
+/// The random letters in a name: so many that no other user can take all names first (36^8 is about 3 · 10^12).
+const LETTERS: &[u8; 36] = b"abcdefghijklmnopqrstuvwxyz0123456789";
+const N_LETTERS: usize = 8;
+/// So many names are tried, in case that one is taken.
+const N_TRIES: u32 = 8;
+/// A folder in which any user may remove and rename the files of others has this bit not set.
+const STICKY_BIT: u32 = 0o1000;
+/// Rights of users other than the owner.
+const OTHERS: u32 = 0o077;
 
 /// Why a graph has no namespace, or a process cannot join it.
 #[derive(Debug, thiserror::Error)]
@@ -82,7 +61,7 @@ pub enum NamespaceError {
     )]
     NameTaken { name: String },
     #[error("cannot reserve the graph's name '{name}'")]
-    Lock { name: String, source: std::io::Error },
+    Lock { name: String, source: Error },
     #[error(
         "only {free_mib:.1} MiB of shared memory are free in {SHARED_MEMORY_FOLDER}, and a graph needs {needed_mib} or more: \
          remove old files there, or make it larger (mount -o remount,size=…; docker run --shm-size=…)"
@@ -93,69 +72,53 @@ pub enum NamespaceError {
          there, stop other graphs, or make it larger (mount -o remount,size=…; docker run --shm-size=…)"
     )]
     NoRoom { missing_mib: f64 },
+    #[error("the graph's folder cannot be made in {SHARED_MEMORY_FOLDER}: let this user write there")]
+    Folder { source: Error },
     #[error(
-        "the graph's folder cannot be made in the folder for temporary files, {}: set TMPDIR to a folder that this user may \
-         write to",
-        folder.display()
+        "every user may rename the files of others in {SHARED_MEMORY_FOLDER}: expected a folder with the sticky bit \
+         (chmod 1777 {SHARED_MEMORY_FOLDER})"
     )]
-    Folder { folder: PathBuf, source: std::io::Error },
-    #[error("cannot join the graph's shared memory at {root_path}")]
-    Join { root_path: String, source: BoxedError },
+    Unprotected,
+    #[error("{} must be a folder of this user with mode 0700, as the launcher made it", folder.display())]
+    Foreign { folder: PathBuf },
+    #[error("cannot join the graph's shared memory at {}", folder.display())]
+    Join { folder: PathBuf, source: BoxedError },
 }
 
-/// A graph's name, which this process holds until it is dropped, and the shared memory that belongs to it.
+/// A graph's name, which this process holds until it is dropped, and the folder of its memory.
 ///
-/// Dropping it removes all files with its prefix: by then the graph's processes must have ended.
+/// Dropping it removes the folder: by then the graph's processes must have ended.
 pub struct Namespace {
     name: String,
     wiring: NamespaceWiring,
     socket: ControlSocket,
-    /// The lock of the id.
-    _lock: Lock,
+    /// The kernel frees the lock when the process ends, however it ends.
+    _lock: File,
 }
 
 impl Namespace {
     /// Reserves `name`, and removes files that ended graphs have left.
     ///
     /// # Errors
-    /// A graph of that name is running, the name has forbidden characters, shared memory is full, or the folder for temporary
-    /// files cannot be written to.
+    /// A graph of that name is running, the name has forbidden characters, or shared memory is full or cannot be written to.
     pub fn reserve(name: &str) -> Result<Namespace, NamespaceError> {
         if !is_name(name) {
             return Err(NamespaceError::Name { name: name.into() });
         }
         sweep();
-        let failed = |source: std::io::Error| match source.kind() {
+        let failed = |source: Error| match source.kind() {
             std::io::ErrorKind::AddrInUse => NamespaceError::NameTaken { name: name.into() },
             _ => NamespaceError::Lock { name: name.into(), source },
         };
         let socket = ControlSocket::bind(name).map_err(failed)?;
-        let (wiring, lock) = Self::reserve_files(name)?;
+        let (wiring, lock) = make_folder(name)?;
         let domain = Namespace { name: name.into(), wiring, socket, _lock: lock };
         check_room()?;
-        make_counter(&domain.wiring).map_err(|source| NamespaceError::Lock { name: name.into(), source })?;
+        // The first process to join makes the file in which iceoryx2 counts them, and gives it rights for others, which a
+        // sandbox could not.
+        drop(join(&domain.wiring, "launcher")?);
+        close_to_others(&domain.wiring.ports()).map_err(|source| NamespaceError::Lock { name: name.into(), source })?;
         Ok(domain)
-    }
-
-    /// A folder and a lock that no other graph has. The folder is new and of this user alone: files that another user has put
-    /// where a graph opens its services could lead it anywhere.
-    fn reserve_files(name: &str) -> Result<(NamespaceWiring, Lock), NamespaceError> {
-        for attempt in 1.. {
-            let id = Id::new(name);
-            let wiring = id.wiring();
-            let folder = graphs_folder();
-            match DirBuilder::new().mode(0o700).create(&wiring.root_path) {
-                Ok(()) => {}
-                Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists && attempt < N_ID_TRIES => continue,
-                Err(source) => return Err(NamespaceError::Folder { folder, source }),
-            }
-            match id.reserve() {
-                Ok(lock) => return Ok((wiring, lock)),
-                Err(source) if attempt == N_ID_TRIES => return Err(NamespaceError::Lock { name: name.into(), source }),
-                Err(_) => drop(std::fs::remove_dir(&wiring.root_path)),
-            }
-        }
-        unreachable!("the last attempt returns")
     }
 
     pub fn name(&self) -> &str {
@@ -173,121 +136,91 @@ impl Namespace {
     }
 }
 
-/// The sign that a launcher lives: locks (flock) on a file in the folder of shared memory and on the graph's folder, because
-/// containers may share one and not the other. The kernel frees both when the process ends, however it ends.
-struct Lock {
-    _held: Vec<File>,
-}
-
-/// The id in the names of a graph's files: the beginning of the graph's name, for people, and random letters, which
-/// distinguish it from all others and cannot be foreseen.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-struct Id(String);
-
-impl Id {
-    fn new(graph: &str) -> Id {
-        // A name is ASCII.
-        let mut random = RandomState::new().hash_one(std::process::id());
-        let letters = std::iter::repeat_with(|| {
-            let letter = ID_LETTERS[(random % ID_LETTERS.len() as u64) as usize];
-            random /= ID_LETTERS.len() as u64;
-            char::from(letter)
-        });
-        let letters: String = letters.take(N_ID_LETTERS).collect();
-        Id(format!("{}.{letters}", &graph[..graph.len().min(MAX_ID_NAME_BYTES)]))
-    }
-
-    /// The id in the name of a file or folder.
-    fn of(entry: &str) -> Option<Id> {
-        let rest = entry.strip_prefix(FOLDER_PREFIX).or_else(|| entry.strip_prefix(FILE_PREFIX))?;
-        let mut parts = rest.split('.');
-        let (name, letters) = (parts.next()?, parts.next()?);
-        let is_id = letters.len() == N_ID_LETTERS && letters.bytes().all(|letter| ID_LETTERS.contains(&letter));
-        (is_name(name) && is_id).then(|| Id(format!("{name}.{letters}")))
-    }
-
-    fn wiring(&self) -> NamespaceWiring {
-        let root_path = graphs_folder().join(format!("{FOLDER_PREFIX}{}", self.0)).to_string_lossy().into_owned();
-        let prefix = format!("{FILE_PREFIX}{}.", self.0);
-        // The prefix lets it be removed with the other files.
-        let cursors = format!("{SHARED_MEMORY_FOLDER}/{prefix}cursors");
-        NamespaceWiring { root_path, cursors, prefix, lock_file: self.lock_file() }
-    }
-
-    /// The lock, for a launcher that has made the graph's folder. No other process gets it while the launcher lives.
-    fn reserve(&self) -> std::io::Result<Lock> {
-        let NamespaceWiring { root_path, lock_file, .. } = self.wiring();
-        std::fs::OpenOptions::new().append(true).create_new(true).mode(0o600).open(&lock_file)?;
-        let mut held = Vec::new();
-        for path in [&root_path, &lock_file] {
-            let file = File::open(path)?;
-            match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
-                // Some file systems (NFS) lock no folder. Then nobody else can lock it either, and so remove it.
-                Err(error) if error != Errno::WOULDBLOCK && path == &root_path => continue,
-                locked => locked?,
-            }
-            // Another launcher may have taken it for a dead graph's before and removed it.
-            if file.metadata()?.ino() != std::fs::metadata(path)?.ino() {
-                return Err(std::io::ErrorKind::AlreadyExists.into());
-            }
-            held.push(file);
-        }
-        Ok(Lock { _held: held })
-    }
-
-    /// The lock, if no launcher holds it. Its holder may remove the files with the id.
-    fn lock(&self) -> std::io::Result<Lock> {
-        let NamespaceWiring { root_path, lock_file, .. } = self.wiring();
-        let mut held = Vec::new();
-        for path in [root_path, lock_file] {
-            match File::open(path) {
-                Ok(file) => {
-                    rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive)?;
-                    held.push(file);
-                }
-                Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
-                Err(error) => return Err(error),
-            }
-        }
-        Ok(Lock { _held: held })
-    }
-
-    fn lock_file(&self) -> String {
-        format!("{SHARED_MEMORY_FOLDER}/{FILE_PREFIX}{}.lock", self.0)
-    }
-
-    /// The files and folders with this id.
-    fn remains(&self) -> Vec<PathBuf> {
-        let bears = |(id, path): (Id, PathBuf)| (id == *self).then_some(path);
-        entries().into_iter().filter_map(bears).collect()
-    }
-
-    /// Removes the files and folders with the id, whose lock the caller holds. No living process uses them, so the clean-up of
-    /// iceoryx2, which tells the dead from the living, isn't needed. Returns the files that could not be removed.
-    fn clear(&self) -> Vec<(PathBuf, std::io::Error)> {
-        let removed = self.remains().into_iter().filter_map(|path| {
-            let outcome = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
-            // Its owner was ending and may have removed it.
-            let error = outcome.err().filter(|error| error.kind() != std::io::ErrorKind::NotFound)?;
-            Some((path, error))
-        });
-        removed.collect()
-    }
-}
-
 impl Drop for Namespace {
     fn drop(&mut self) {
-        clear_or_say(&self.wiring);
+        remove_or_say(&self.wiring.folder);
     }
 }
 
-/// Removes the files of a graph whose launcher has died. Its operators call this as they end, so that the last one leaves no
+/// A new folder that no other graph has, with its lock.
+fn make_folder(name: &str) -> Result<(NamespaceWiring, File), NamespaceError> {
+    let shared = std::fs::metadata(SHARED_MEMORY_FOLDER).map_err(|source| NamespaceError::Folder { source })?;
+    if shared.mode() & 0o022 != 0 && shared.mode() & STICKY_BIT == 0 {
+        return Err(NamespaceError::Unprotected);
+    }
+    for attempt in 1.. {
+        let wiring = NamespaceWiring { folder: Path::new(SHARED_MEMORY_FOLDER).join(folder_name(name)) };
+        match make_locked(&wiring) {
+            Ok(lock) => return Ok((wiring, lock)),
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists && attempt < N_TRIES => {}
+            Err(source) => return Err(NamespaceError::Folder { source }),
+        }
+    }
+    unreachable!("the last attempt returns")
+}
+
+fn make_locked(wiring: &NamespaceWiring) -> std::io::Result<File> {
+    let mut private = DirBuilder::new();
+    private.mode(0o700).create(&wiring.folder)?;
+    // Another launcher may have taken it for a dead graph's before it was locked, and removes it.
+    let Ok(folder) = lock(&wiring.folder) else {
+        return Err(std::io::ErrorKind::AlreadyExists.into());
+    };
+    for inner in [wiring.ports(), wiring.link()] {
+        private.create(inner).map_err(|_| std::io::ErrorKind::AlreadyExists)?;
+    }
+    Ok(folder)
+}
+
+/// Takes the rights of other users from the files of a folder.
+fn close_to_others(folder: &Path) -> std::io::Result<()> {
+    for entry in std::fs::read_dir(folder)? {
+        let entry = entry?;
+        if entry.file_type()?.is_file() {
+            std::fs::set_permissions(entry.path(), Permissions::from_mode(0o600))?;
+        }
+    }
+    Ok(())
+}
+
+fn folder_name(graph: &str) -> String {
+    // A name is ASCII.
+    format!("{FOLDER_PREFIX}{}.{}", &graph[..graph.len().min(MAX_NAME_BYTES)], random_letters())
+}
+
+/// The end of a name that nobody can foresee.
+pub(crate) fn random_letters() -> String {
+    let mut random = RandomState::new().hash_one(std::process::id());
+    let mut letters = String::new();
+    for _ in 0..N_LETTERS {
+        letters.push(char::from(LETTERS[(random % LETTERS.len() as u64) as usize]));
+        random /= LETTERS.len() as u64;
+    }
+    letters
+}
+
+/// The part of a folder's name behind the prefix, if it is the name of a graph's folder.
+fn id_of(entry: &str) -> Option<&str> {
+    let id = entry.strip_prefix(FOLDER_PREFIX)?;
+    let (name, letters) = id.split_once('.')?;
+    let is_id = letters.len() == N_LETTERS && letters.bytes().all(|letter| LETTERS.contains(&letter));
+    (is_name(name) && is_id).then_some(id)
+}
+
+/// The lock of a folder, if no launcher holds it. Its holder may remove the folder. A link to a folder is not followed.
+fn lock(path: &Path) -> std::io::Result<File> {
+    let flags = (OFlags::DIRECTORY | OFlags::NOFOLLOW).bits() as i32;
+    let folder = std::fs::OpenOptions::new().read(true).custom_flags(flags).open(path)?;
+    rustix::fs::flock(&folder, FlockOperation::NonBlockingLockExclusive)?;
+    Ok(folder)
+}
+
+/// Removes the folder of a graph whose launcher has died. Its operators call this as they end, so that the last one leaves no
 /// file behind.
 pub fn clear_orphaned(domain: &NamespaceWiring) {
     // Taking the lock shows that the launcher is gone.
-    if let Some(lock) = id_of(domain).and_then(|id| id.lock().ok()) {
-        clear_or_say(domain);
-        drop(lock);
+    if let Ok(_lock) = lock(&domain.folder) {
+        remove_or_say(&domain.folder);
         // An operator in a sandbox cannot: then the next graph that starts does.
         control_socket::remove_dead();
     }
@@ -295,51 +228,66 @@ pub fn clear_orphaned(domain: &NamespaceWiring) {
 
 /// The files and folders that ended graphs have left, by id or name. There are seldom any: the next graph that starts removes them, and
 /// so does [`sweep`].
-pub fn left_over() -> Vec<(String, Vec<PathBuf>)> {
-    // Taking the lock shows that no process holds it.
-    let dead = ids().into_iter().filter(|id| id.lock().is_ok());
-    let mut left: Vec<(String, Vec<PathBuf>)> = dead.map(|id| (id.0.clone(), id.remains())).collect();
-    left.extend(control_socket::dead().into_iter().map(|(name, socket)| (name, vec![socket])));
+pub fn left_over() -> Vec<(String, PathBuf)> {
+    let mut left = Vec::new();
+    for (id, folder) in folders() {
+        // Taking the lock shows that no process holds it.
+        if lock(&folder).is_ok() {
+            left.push((id, folder));
+        }
+    }
+    left.extend(control_socket::dead());
     left
 }
 
-/// Removes the files of graphs that were killed before their operators could do so. Returns the files that could not be
+/// Removes the files of graphs that were killed before their operators could do so. Returns the folders that could not be
 /// removed.
-pub fn sweep() -> Vec<(PathBuf, std::io::Error)> {
+pub fn sweep() -> Vec<(PathBuf, Error)> {
     control_socket::remove_dead();
     let mut failed = Vec::new();
-    for id in ids() {
-        if let Ok(lock) = id.lock() {
-            failed.extend(id.clear());
-            drop(lock);
+    for (_, folder) in folders() {
+        if let Ok(_lock) = lock(&folder)
+            && let Err(error) = remove(&folder)
+        {
+            failed.push((folder, error));
         }
     }
     failed
 }
 
-fn id_of(domain: &NamespaceWiring) -> Option<Id> {
-    Id::of(&domain.prefix)
-}
-
-fn clear_or_say(domain: &NamespaceWiring) {
-    for (path, error) in id_of(domain).map(|id| id.clear()).unwrap_or_default() {
-        print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", path.display()));
+/// Removes a folder whose lock the caller holds, with all that is in it; links are not followed. No living process uses it, so
+/// the clean-up of iceoryx2, which tells the dead from the living, isn't needed.
+fn remove(folder: &Path) -> std::io::Result<()> {
+    match std::fs::remove_dir_all(folder) {
+        // Its owner was ending and may have removed it.
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(()),
+        outcome => outcome,
     }
 }
 
-/// The ids of all files and folders of graphs.
-fn ids() -> BTreeSet<Id> {
-    entries().into_iter().map(|(id, _)| id).collect()
+fn remove_or_say(folder: &Path) {
+    if let Err(error) = remove(folder) {
+        print_diagnostic(&format!("blindgrasp: cannot remove {}: {error}", folder.display()));
+    }
 }
 
-/// This user's files and folders of graphs.
-fn entries() -> Vec<(Id, PathBuf)> {
-    let uid = rustix::process::getuid().as_raw();
-    let folders = [PathBuf::from(SHARED_MEMORY_FOLDER), graphs_folder()];
-    let all = folders.iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flat_map(Iterator::flatten);
-    let of_graphs = all.filter_map(|entry| Some((Id::of(entry.file_name().to_str()?)?, entry)));
-    let own = of_graphs.filter(|(_, entry)| entry.metadata().is_ok_and(|metadata| metadata.uid() == uid));
-    own.map(|(id, entry)| (id, entry.path())).collect()
+/// This user's folders of graphs, with their ids.
+fn folders() -> Vec<(String, PathBuf)> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(SHARED_MEMORY_FOLDER).into_iter().flatten().flatten() {
+        let name = entry.file_name();
+        if let Some(id) = name.to_str().and_then(id_of)
+            && entry.metadata().is_ok_and(|metadata| metadata.is_dir() && metadata.uid() == own_uid())
+        {
+            found.push((id.to_string(), entry.path()));
+        }
+    }
+    found.sort();
+    found
+}
+
+fn own_uid() -> u32 {
+    rustix::process::getuid().as_raw()
 }
 
 /// Frees the resources that dead processes of a graph still hold in iceoryx2.
@@ -347,7 +295,7 @@ pub fn clean_dead_nodes(domain: &NamespaceWiring) {
     let Ok(config) = config(domain) else {
         return;
     };
-    let _ = Node::<ipc::Service>::list(&config, |state| {
+    let _ = Node::<PrivateService>::list(&config, |state| {
         if let NodeState::Dead(view) = state {
             let _ = view.try_remove_stale_resources();
         }
@@ -358,41 +306,38 @@ pub fn clean_dead_nodes(domain: &NamespaceWiring) {
 /// Joins a graph's shared memory under a name for this process.
 ///
 /// # Errors
-/// An error of iceoryx2.
-pub fn join(domain: &NamespaceWiring, node: &str) -> Result<Node<ipc::Service>, NamespaceError> {
-    let refused = |source: BoxedError| NamespaceError::Join { root_path: domain.root_path.clone(), source };
+/// The graph's folder belongs to another user or is open to others; an error of iceoryx2.
+pub fn join(domain: &NamespaceWiring, node: &str) -> Result<Node<PrivateService>, NamespaceError> {
+    let refused = |source: BoxedError| NamespaceError::Join { folder: domain.folder.clone(), source };
+    let metadata = std::fs::symlink_metadata(&domain.folder).map_err(|error| refused(error.into()))?;
+    if !metadata.is_dir() || metadata.uid() != own_uid() || metadata.mode() & OTHERS != 0 {
+        return Err(NamespaceError::Foreign { folder: domain.folder.clone() });
+    }
     let config = config(domain)?;
     let name = NodeName::new(node).map_err(|error| refused(error.into()))?;
     NodeBuilder::new()
         .name(&name)
         .config(&config)
         .signal_handling_mode(SignalHandlingMode::Disabled)
-        .create::<ipc::Service>()
+        .create::<PrivateService>()
         .map_err(|error| refused(error.into()))
 }
 
 fn config(domain: &NamespaceWiring) -> Result<Config, NamespaceError> {
-    let refused = |source: BoxedError| NamespaceError::Join { root_path: domain.root_path.clone(), source };
+    let refused = |source: BoxedError| NamespaceError::Join { folder: domain.folder.clone(), source };
     // Errors are returned; logging them as well would only repeat them.
     iceoryx2::prelude::set_log_level(LogLevel::Fatal);
     // The global configuration would read ./config/iceoryx2.toml from the current folder.
     let mut config = Config::default();
     config.global.prefix =
-        FileName::new(domain.prefix.as_bytes()).map_err(|error| refused(format!("{error:?}").into()))?;
-    let root_path = iceoryx2::prelude::Path::new(domain.root_path.as_bytes());
+        FileName::new(FILE_PREFIX.as_bytes()).map_err(|error| refused(format!("{error:?}").into()))?;
+    let root_path = iceoryx2::prelude::Path::new(domain.ports().as_os_str().as_encoded_bytes());
     config.global.set_root_path(&root_path.map_err(|error| refused(format!("{error:?}").into()))?);
     // The launcher alone finds dead processes and frees their memory: looking for them costs milliseconds.
     config.global.node.cleanup_dead_nodes_on_creation = false;
     config.global.node.cleanup_dead_nodes_on_destruction = false;
     config.global.service.cleanup_dead_nodes_on_open = false;
     Ok(config)
-}
-
-/// Makes the file of [`COUNTER_NAME`] for this user alone.
-fn make_counter(wiring: &NamespaceWiring) -> std::io::Result<()> {
-    let path = format!("{SHARED_MEMORY_FOLDER}/{}{COUNTER_NAME}", wiring.prefix);
-    let mut file = std::fs::OpenOptions::new().write(true).create_new(true).mode(0o600).open(path)?;
-    COUNTER.iter().try_for_each(|word| file.write_all(&word.to_ne_bytes()))
 }
 
 /// Takes the memory of a graph's files. The kernel gives memory to a file in shared memory when it is written to for the first
@@ -402,17 +347,19 @@ fn make_counter(wiring: &NamespaceWiring) -> std::io::Result<()> {
 /// Shared memory has too little room. The part that was taken stays taken.
 pub fn take_room(wiring: &NamespaceWiring) -> Result<(), NamespaceError> {
     let mut n_missing_bytes = 0;
-    for entry in std::fs::read_dir(SHARED_MEMORY_FOLDER).into_iter().flatten().flatten() {
-        if !entry.file_name().as_bytes().starts_with(wiring.prefix.as_bytes()) {
-            continue;
-        }
+    // Links are not followed and pipes are not waited for: an operator may have put any file here.
+    let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
+    for entry in std::fs::read_dir(wiring.ports()).into_iter().flatten().flatten() {
         // A file may go meanwhile, with its process, and some are read-only: these are written already.
-        let Ok(file) = std::fs::OpenOptions::new().write(true).open(entry.path()) else {
+        let Ok(file) = std::fs::OpenOptions::new().write(true).custom_flags(flags).open(entry.path()) else {
             continue;
         };
         let Ok(metadata) = file.metadata() else {
             continue;
         };
+        if !metadata.is_file() || metadata.uid() != own_uid() {
+            continue;
+        }
         let n_bytes_to_take = metadata.len().saturating_sub(metadata.blocks() * BLOCK_BYTES);
         if n_bytes_to_take > 0
             && rustix::fs::fallocate(&file, FallocateFlags::empty(), 0, metadata.len()) == Err(Errno::NOSPC)
@@ -453,65 +400,67 @@ fn check_room() -> Result<(), NamespaceError> {
 mod tests {
     use super::*;
 
+    fn reserved(name: &str) -> Namespace {
+        Namespace::reserve(&format!("{name}-{}", std::process::id())).expect("reserved")
+    }
+
     #[test]
-    fn an_id_is_read_back_from_what_bears_it() {
-        let id = Id::new("a_graph-with_the_longest_name_32");
-        let NamespaceWiring { root_path, prefix, cursors, .. } = id.wiring();
-        for entry in [root_path.as_str(), cursors.as_str(), &format!("{prefix}3f.data")] {
-            let name = entry.rsplit('/').next().expect("a name");
-            assert_eq!(Id::of(name), Some(id.clone()), "{entry}");
-        }
-        assert_eq!(id_of(&id.wiring()), Some(id));
-        // The folder of logs, and files of other programs.
-        for entry in ["blindgrasp-state-0", "blindgrasp-", "blindgrasp_a.b.data", "iox2_a.12.data", "blindgrasp_../x.1"]
+    fn the_folder_of_a_graph_is_known_by_its_name() {
+        let id = "a_graph-wit.01234abc";
+        assert_eq!(id_of(&format!("blindgrasp_{id}")), Some(id));
+        let made = folder_name("a_graph-with_the_longest_name_32");
+        assert!(id_of(&made).is_some_and(|id| id.starts_with("a_graph-wit.")), "{made}");
+        for entry in
+            ["blindgrasp-state-0", "blindgrasp_", "blindgrasp_a.b", "iox2_a.12345678", "blindgrasp_../.12345678"]
         {
-            assert_eq!(Id::of(entry), None, "{entry}");
+            assert_eq!(id_of(entry), None, "{entry}");
         }
     }
 
-    /// The names, modes and contents of a graph's files in shared memory.
-    fn files_of(wiring: &NamespaceWiring) -> Vec<(String, u32, Vec<u8>)> {
-        let entries = std::fs::read_dir(SHARED_MEMORY_FOLDER).expect("readable").flatten();
-        let of_graph = entries.filter_map(|entry| {
-            let name = entry.file_name().to_str()?.strip_prefix(&wiring.prefix)?.to_string();
-            Some((name, entry.metadata().ok()?.mode() & 0o7777, std::fs::read(entry.path()).ok()?))
-        });
-        of_graph.collect()
-    }
-
     #[test]
-    fn the_counter_of_processes_is_the_one_that_iceoryx2_would_make_but_for_its_mode() {
-        let name = format!("counter-{}", std::process::id());
-        let domain = Namespace::reserve(&name).expect("reserved");
-        let counter = |files: Vec<(String, u32, Vec<u8>)>| files.into_iter().find(|(name, ..)| name == COUNTER_NAME);
-        let (_, own_mode, own) = counter(files_of(domain.wiring())).expect("made");
-        // Without it, iceoryx2 makes its own.
-        let path = format!("{SHARED_MEMORY_FOLDER}/{}{COUNTER_NAME}", domain.wiring().prefix);
-        std::fs::remove_file(path).expect("removed");
-        drop(join(domain.wiring(), "first").expect("joined"));
-        let (_, mode, mut made) = counter(files_of(domain.wiring())).expect("iceoryx2 has made it under this name");
-        assert_eq!((own_mode, mode), (0o600, 0o666));
-        // The first process is counted, and iceoryx2 leaves the padding as it is.
-        made[8..12].fill(0);
-        assert_eq!(own, made);
-    }
-
-    #[test]
-    fn no_file_of_a_graph_is_open_to_other_users() {
-        let domain = Namespace::reserve(&format!("modes-{}", std::process::id())).expect("reserved");
-        let nodes = ["one", "two"].map(|name| join(domain.wiring(), name).expect("joined"));
-        for (name, mode, _) in files_of(domain.wiring()) {
-            assert_eq!(mode & 0o077, 0, "{name}: {mode:o}");
+    fn no_file_of_a_graph_can_be_reached_by_other_users() {
+        let namespace = reserved("modes");
+        let _nodes = ["one", "two"].map(|name| join(namespace.wiring(), name).expect("joined"));
+        let folder = &namespace.wiring().folder;
+        assert_eq!(std::fs::metadata(folder).expect("made").mode() & 0o7777, 0o700);
+        // Nothing of it lies anywhere else.
+        let id = folder.file_name().and_then(|name| name.to_str()).and_then(id_of).expect("an id");
+        for place in [PathBuf::from(SHARED_MEMORY_FOLDER), std::env::temp_dir()] {
+            for entry in std::fs::read_dir(place).expect("readable").flatten() {
+                let is_of_graph = entry.file_name().to_string_lossy().contains(id);
+                assert!(!is_of_graph || entry.path() == *folder, "{}", entry.path().display());
+            }
         }
-        drop(nodes);
+        std::fs::set_permissions(folder, Permissions::from_mode(0o755)).expect("opened");
+        let refused = join(namespace.wiring(), "three").expect_err("open to others");
+        assert!(matches!(refused, NamespaceError::Foreign { .. }), "{refused}");
     }
 
     #[test]
-    fn a_folder_for_temporary_files_with_a_long_path_has_room_for_a_graph() {
-        let id = Id::new("a_graph-with_the_longest_name_32");
-        let NamespaceWiring { prefix, .. } = id.wiring();
-        let n_left = MAX_PATH_BYTES - MAX_NAME_BYTES - prefix.len() - FOLDER_PREFIX.len() - id.0.len() - 2;
-        assert!(n_left >= 64, "{n_left}");
+    fn a_folder_that_another_user_has_made_is_no_graphs() {
+        let namespace = reserved("planted");
+        let elsewhere = tempfile::tempdir().expect("a folder");
+        let link = elsewhere.path().join("link");
+        std::os::unix::fs::symlink(&namespace.wiring().folder, &link).expect("linked");
+        let refused = join(&NamespaceWiring { folder: link.clone() }, "one").expect_err("a link");
+        assert!(matches!(refused, NamespaceError::Foreign { .. }), "{refused}");
+        assert!(lock(&link).is_err());
+    }
+
+    #[test]
+    fn room_is_taken_in_regular_files_alone_and_without_waiting() {
+        let namespace = reserved("room");
+        let at = |name: &str| namespace.wiring().ports().join(name);
+        // To open a pipe for writing waits for a reader, and a link leads to any file.
+        rustix::fs::mkfifoat(rustix::fs::CWD, at("pipe"), rustix::fs::Mode::RWXU).expect("a pipe");
+        let outside = tempfile::NamedTempFile::new().expect("a file");
+        outside.as_file().set_len(1 << 16).expect("sparse");
+        std::os::unix::fs::symlink(outside.path(), at("link")).expect("linked");
+        let own = File::create(at("own")).expect("made");
+        own.set_len(1 << 16).expect("sparse");
+        take_room(namespace.wiring()).expect("room");
+        assert_eq!(own.metadata().expect("there").blocks() * BLOCK_BYTES, 1 << 16);
+        assert_eq!(outside.as_file().metadata().expect("there").blocks(), 0);
     }
 
     #[test]
@@ -521,10 +470,10 @@ mod tests {
         let again = Namespace::reserve(&name).err().expect("taken");
         assert!(matches!(again, NamespaceError::NameTaken { .. }), "{again}");
         let node = join(domain.wiring(), "reader").expect("joined");
-        let root_path = PathBuf::from(&domain.wiring().root_path);
-        assert!(root_path.exists() && left_over().iter().all(|(_, paths)| !paths.contains(&root_path)));
+        let folder = domain.wiring().folder.clone();
+        assert!(folder.exists() && left_over().iter().all(|(_, path)| *path != folder));
         drop(node);
         drop(domain);
-        assert!(!root_path.exists());
+        assert!(!folder.exists());
     }
 }

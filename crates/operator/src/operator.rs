@@ -14,7 +14,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use iceoryx2::prelude::{Node, ipc};
+use iceoryx2::prelude::Node;
 use rustix::process::{Pid, Signal, getpgrp, getppid, kill_process_group};
 use serde_json::{Map, Value};
 
@@ -24,6 +24,7 @@ use crate::diagnostics::{print_diagnostic, with_lack_of_files};
 use crate::link_status::LinkStatus;
 use crate::partner::{PairedInput, Partner, PartnerInput};
 use crate::port::{PortError, Publisher, ShadowPublisher, Subscriber};
+use crate::private_service::PrivateService;
 use crate::sandbox::Sandbox;
 use crate::waiter::{PollFd, Waiter, Waker};
 use crate::wiring::{
@@ -45,7 +46,7 @@ pub struct Operator(Rc<Member>);
 /// An operator of a process, which may have several.
 struct Member {
     wiring: Wiring,
-    node: Node<ipc::Service>,
+    node: Node<PrivateService>,
     cursors: Arc<SharedCursors>,
     inbox: Arc<Inbox>,
     stop: Arc<AtomicBool>,
@@ -185,9 +186,9 @@ impl Operator {
         parse_params(&self.0.wiring.params)
     }
 
-    /// The graph's folder, private to its user. It is removed with all its files when the graph has ended.
-    pub fn folder(&self) -> &std::path::Path {
-        std::path::Path::new(&self.0.wiring.domain.root_path)
+    /// A folder of the graph in which no process with a sandbox can make a file. It is removed when the graph has ended.
+    pub fn link_folder(&self) -> std::path::PathBuf {
+        self.0.wiring.domain.link()
     }
 
     /// The clock of its stages.
@@ -684,7 +685,7 @@ pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyho
     if leader.lock_memory {
         lock_memory()?;
     }
-    let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&leader.domain.cursors))?);
+    let cursors = Arc::new(SharedCursors::open(&leader.domain.cursors())?);
     let waiter = Rc::new(Waiter::of_slot(&cursors, leader.bell_slot, leader.wait).context("cannot make an event")?);
     let inboxes: Vec<Arc<Inbox>> = wirings.iter().map(|_| Arc::default()).collect();
     let stop = Arc::new(AtomicBool::new(false));

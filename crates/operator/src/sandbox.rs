@@ -1,35 +1,35 @@
 //! The sandbox of an operator process, which restricts itself with Landlock and a filter of system calls (seccomp).
 //!
-//! A process with a sandbox restricts itself twice. Before it begins, it gives up running programs, the network, writing files,
-//! changing the rights, owner and times of files, signals to other processes, and all sockets, because one leads to the launcher,
-//! through which it could have programs run. When it is ready and has read its files, it gives up reading any others. It keeps
-//! the graph's shared memory and folder, the files that its params name, and the network if its description says that it uses
-//! it.
+//! A process with a sandbox restricts itself twice. Before it begins, it gives up running programs, starting processes, the
+//! network, writing files, signals to other processes, and all sockets, because one leads to the launcher, through which it
+//! could have programs run. When it is ready and has read its files, it gives up reading any others. It keeps the graph's
+//! memory, the files that its params name, and the network if its description says that it uses it.
 //!
-//! Landlock decides by the place of a file. It has no rights for sockets other than TCP, for programs in memory or for the mode
-//! and owner of files, so the filter denies these (`DENIED_CALLS`). The filter names what is denied, not what is allowed:
-//! another version of a library, with other system calls, does not end an operator.
+//! Landlock decides by the place of a file. It grants no process the making of links and pipes, so a process without a sandbox,
+//! such as the launcher, meets none under a name that an operator could make. The filter of system calls names those that are
+//! allowed (`calls`): another process, namespace, keyring, memory of System V or right of a file is out of reach,
+//! and so is a call that a newer kernel brings. A file that it makes is its user's alone, because it gives up changing the
+//! umask.
 //!
 //! Both restrict threads and those that they start. Threads that an operator starts before it is ready can read files for as
 //! long as they live; the thread that listens to the launcher gives it up with its first command.
 
-use std::collections::BTreeMap;
+mod calls;
+
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use landlock::{
     ABI, Access, AccessFs, AccessNet, BitFlags, RestrictionStatus, Ruleset, RulesetAttr, RulesetCreated,
     RulesetCreatedAttr, RulesetError, RulesetStatus, Scope, make_bitflags, path_beneath_rules,
 };
-use seccompiler::SeccompCmpArgLen::Dword;
-use seccompiler::{
-    BpfProgram, SeccompAction, SeccompCmpOp, SeccompCondition, SeccompFilter, SeccompRule, apply_filter,
-    apply_filter_all_threads, sock_filter,
-};
+use rustix::fs::Mode;
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit, umask};
+use seccompiler::{apply_filter, apply_filter_all_threads};
 use serde_json::{Map, Value};
 
 use crate::description::OperatorDescription;
 use crate::namespace::SHARED_MEMORY_FOLDER;
-use crate::namespace::graphs_folder;
 use crate::param::ParamKind;
 use crate::wiring::{Enforcement, NamespaceWiring};
 
@@ -42,61 +42,19 @@ const NAME_SERVICE_FOLDERS: [&str; 5] = ["/etc", "/usr", "/lib", "/lib64", "/run
 const NULL_DEVICE: &str = "/dev/null";
 /// A device that is plugged in again is another file in this folder.
 const DEVICE_FOLDER: &str = "/dev";
-/// System calls from this number on belong to the x32 ABI of x86-64, which has each call under another number.
-const FIRST_X32_CALL: u32 = 0x4000_0000;
-/// System calls that no operator needs. Those with which it would give others rights on a file of its user, or take them from
-/// its user; those that hide from this filter what they do; and those that make files which are neither regular nor folders.
-const DENIED_CALLS: [i64; 17] = [
-    libc::SYS_fchmodat,
-    SYS_FCHMODAT2,
-    libc::SYS_fchown,
-    libc::SYS_fchownat,
-    libc::SYS_setxattr,
-    libc::SYS_lsetxattr,
-    libc::SYS_fsetxattr,
-    SYS_SETXATTRAT,
-    libc::SYS_removexattr,
-    libc::SYS_lremovexattr,
-    libc::SYS_fremovexattr,
-    SYS_REMOVEXATTRAT,
-    SYS_FILE_SETATTR,
-    libc::SYS_utimensat,
-    libc::SYS_mknodat,
-    // Its mode lies behind a pointer, which a filter cannot follow.
-    libc::SYS_openat2,
-    libc::SYS_io_uring_setup,
-];
-/// The older forms of these calls, which newer machines do not have.
-#[cfg(target_arch = "x86_64")]
-const DENIED_OLD_CALLS: [i64; 7] = [
-    libc::SYS_chmod,
-    libc::SYS_chown,
-    libc::SYS_lchown,
-    libc::SYS_utime,
-    libc::SYS_utimes,
-    libc::SYS_futimesat,
-    libc::SYS_mknod,
-];
-#[cfg(not(target_arch = "x86_64"))]
-const DENIED_OLD_CALLS: [i64; 0] = [];
-/// Calls of Linux 6.6, 6.13 and 6.17, which have the same numbers on all machines.
-const SYS_FCHMODAT2: i64 = 452;
-const SYS_SETXATTRAT: i64 = 463;
-const SYS_REMOVEXATTRAT: i64 = 466;
-const SYS_FILE_SETATTR: i64 = 469;
-const PROGRAM_CALLS: [i64; 2] = [libc::SYS_execve, libc::SYS_execveat];
+/// The rights on a folder in which it may make files. Links and pipes are left out: a process without a sandbox would follow
+/// them.
+const WRITE: BitFlags<AccessFs> = make_bitflags!(AccessFs::{
+    WriteFile | Truncate | IoctlDev | MakeReg | MakeDir | RemoveFile | RemoveDir
+});
+/// The last process of a graph removes what is in the graph's folder.
+const REMOVE: BitFlags<AccessFs> = make_bitflags!(AccessFs::{RemoveFile | RemoveDir});
+/// The rights of others on a file, none of which a file that an operator makes has.
+const OTHERS: libc::mode_t = 0o077;
 /// The families of sockets that an operator of the network needs: TCP, UDP, and the kernel's list of interfaces.
 const NETWORK_FAMILIES: [i32; 3] = [libc::AF_INET, libc::AF_INET6, libc::AF_NETLINK];
-/// Types of pairs of sockets of which one end can be connected to another process's socket.
-const DATAGRAM_TYPES: [i32; 2] = [libc::SOCK_DGRAM, libc::SOCK_RAW];
-/// The type of a socket in an argument that has flags as well.
-const SOCKET_TYPE_MASK: u64 = 0xf;
-/// A file with such a mode could be run with its user's rights by others (set-user-ID, set-group-ID).
-const SET_ID_BITS: [libc::mode_t; 2] = [libc::S_ISUID, libc::S_ISGID];
-/// Bits of a mode that an open file must not get: those above, and rights of other users. iceoryx2 lets the group read its
-/// folders, which lie in a folder of the user alone.
-const FOREIGN_BITS: [libc::mode_t; 6] =
-    [libc::S_ISUID, libc::S_ISGID, libc::S_IWGRP, libc::S_IROTH, libc::S_IWOTH, libc::S_IXOTH];
+/// The programs of other languages may start so many threads and processes beyond those that their user has.
+const N_TASKS_OF_PROGRAM: u64 = 1024;
 
 /// Why a sandbox cannot be entered.
 #[derive(Debug, thiserror::Error)]
@@ -116,8 +74,10 @@ pub enum SandboxError {
 pub(crate) struct Sandbox {
     /// Files and folders that it may read.
     readable: Vec<PathBuf>,
-    /// Folders that it may read and write.
+    /// Folders that it may read and write, and files.
     writable: Vec<PathBuf>,
+    /// The graph's folder, if it can be the last process of a graph.
+    graph: Option<PathBuf>,
     uses_network: bool,
     /// It entered the scope of its signals and sockets before, with its program.
     is_host: bool,
@@ -132,19 +92,21 @@ pub(crate) fn enter_scope() -> Result<Enforcement, SandboxError> {
 impl Sandbox {
     /// The rights of the program of a host, which knows nothing of shared memory.
     pub(crate) fn of_program(description: &OperatorDescription, params: &Map<String, Value>) -> Self {
-        Sandbox::new_in(std::iter::once((description, params)), vec![NULL_DEVICE.into()])
+        Sandbox::new_in(std::iter::once((description, params)), vec![NULL_DEVICE.into()], None)
     }
 
     /// Gives up writing files, the network, signals and sockets, for a program that is about to begin. It may read files and run
     /// programs, which have its rights.
     pub(crate) fn enter_program(&self) -> Result<Enforcement, SandboxError> {
-        apply_filter(&calls_without(&[], self.families())?)?;
+        umask(Mode::from_raw_mode(OTHERS));
+        limit_tasks();
+        apply_filter(&calls::filter(calls::Role::Program, self.families())?)?;
         let rights = AccessFs::from_all(NEWEST) & !READ & !AccessFs::Execute;
         let mut ruleset = Ruleset::default().handle_access(rights)?.scope(Scope::from_all(NEWEST))?;
         if !self.uses_network {
             ruleset = ruleset.handle_access(AccessNet::from_all(NEWEST))?;
         }
-        enforce(ruleset.create()?.add_rules(path_beneath_rules(&self.writable, rights))?)
+        enforce(ruleset.create()?.add_rules(path_beneath_rules(&self.writable, WRITE))?)
     }
 
     /// The rights that the operators of a process need, each with its params: params of paths that must exist are read, others
@@ -153,12 +115,13 @@ impl Sandbox {
         operators: impl Iterator<Item = (&'a OperatorDescription, &'a Map<String, Value>)>,
         domain: &NamespaceWiring,
     ) -> Self {
-        Sandbox::new_in(operators, vec![PathBuf::from(SHARED_MEMORY_FOLDER), PathBuf::from(&domain.root_path)])
+        Sandbox::new_in(operators, vec![domain.ports(), domain.cursors()], Some(domain.folder.clone()))
     }
 
     fn new_in<'a>(
         operators: impl Iterator<Item = (&'a OperatorDescription, &'a Map<String, Value>)>,
         mut writable: Vec<PathBuf>,
+        graph: Option<PathBuf>,
     ) -> Self {
         let (mut uses_network, mut is_host) = (false, false);
         let mut readable: Vec<PathBuf> = Vec::new();
@@ -182,23 +145,25 @@ impl Sandbox {
         if uses_network {
             readable.extend(NAME_SERVICE_FOLDERS.map(PathBuf::from));
         }
-        Sandbox { readable, writable, uses_network, is_host }
+        Sandbox { readable, writable, graph, uses_network, is_host }
     }
 
     /// Gives up all but reading files, for this thread and those that it will start.
     pub(crate) fn enter(&self) -> Result<Enforcement, SandboxError> {
-        apply_filter(&calls_without(&PROGRAM_CALLS, self.families())?)?;
-        let rights = AccessFs::from_all(NEWEST) & !READ;
-        let mut ruleset = Ruleset::default().handle_access(rights)?;
+        umask(Mode::from_raw_mode(OTHERS));
+        let role = if self.is_host { calls::Role::Host } else { calls::Role::Operator };
+        apply_filter(&calls::filter(role, self.families())?)?;
+        let mut ruleset = Ruleset::default().handle_access(AccessFs::from_all(NEWEST) & !READ)?;
         if !self.is_host {
             ruleset = ruleset.scope(Scope::from_all(NEWEST))?;
         }
         if !self.uses_network {
             ruleset = ruleset.handle_access(AccessNet::from_all(NEWEST))?;
         }
-        let ruleset = ruleset.create()?.add_rules(path_beneath_rules(&self.writable, rights & !AccessFs::Execute))?;
-        // The last process of a graph removes its folder, which is in this one.
-        enforce(ruleset.add_rules(path_beneath_rules([graphs_folder()], AccessFs::RemoveDir))?)
+        let ruleset = ruleset.create()?.add_rules(path_beneath_rules(&self.writable, WRITE))?;
+        let ruleset = ruleset.add_rules(path_beneath_rules(&self.graph, REMOVE))?;
+        // The graph's folder is in this one.
+        enforce(ruleset.add_rules(path_beneath_rules([SHARED_MEMORY_FOLDER], AccessFs::RemoveDir))?)
     }
 
     /// The families of the sockets that it may make.
@@ -210,7 +175,7 @@ impl Sandbox {
     pub(crate) fn close(&self) -> Result<Enforcement, SandboxError> {
         let kept = self.readable.iter().chain(&self.writable);
         let ruleset = Ruleset::default().handle_access(READ)?.create()?.add_rules(path_beneath_rules(kept, READ))?;
-        enforce(ruleset.add_rules(path_beneath_rules([graphs_folder()], AccessFs::ReadDir))?)
+        enforce(ruleset.add_rules(path_beneath_rules(&self.graph, AccessFs::ReadDir))?)
     }
 }
 
@@ -232,78 +197,34 @@ pub(crate) fn or_none(step: Result<Enforcement, SandboxError>) -> Enforcement {
     })
 }
 
-/// Gives up running programs and changing the rights of files, for all threads of a process that needs sockets of all families
-/// and so has no sandbox.
+/// Gives up running programs, starting processes and changing the rights of files, for all threads of a process that needs
+/// files and sockets of all families and so has no sandbox.
 ///
 /// # Errors
 /// The kernel does not take the filter.
 pub fn deny_programs() -> Result<(), SandboxError> {
     let families = [&NETWORK_FAMILIES[..], &[libc::AF_UNIX]].concat();
-    Ok(apply_filter_all_threads(&calls_without(&PROGRAM_CALLS, &families)?)?)
+    Ok(apply_filter_all_threads(&calls::filter(calls::Role::Operator, &families)?)?)
 }
 
-/// A filter that denies `DENIED_CALLS`, `denied` and all sockets but those of some families.
-fn calls_without(denied: &[i64], families: &[i32]) -> Result<BpfProgram, SandboxError> {
-    let masked =
-        |argument, mask: u64, value: u64| SeccompCondition::new(argument, Dword, SeccompCmpOp::MaskedEq(mask), value);
-    let whole = [&DENIED_CALLS[..], &DENIED_OLD_CALLS, denied].concat();
-    // A call without rules is denied whatever its arguments are.
-    let mut rules: BTreeMap<i64, Vec<SeccompRule>> = whole.into_iter().map(|call| (call, Vec::new())).collect();
+/// Lets this process and those that it starts have no more than [`N_TASKS_OF_PROGRAM`] threads and processes beyond those
+/// that their user has. The kernel does not hold the superuser to it.
+fn limit_tasks() {
+    let n_tasks = N_TASKS_OF_PROGRAM + n_tasks_of_user();
+    let Rlimit { current, maximum } = getrlimit(Resource::Nproc);
+    let [current, maximum] = [current, maximum].map(|limit| Some(limit.unwrap_or(n_tasks).min(n_tasks)));
+    let _ = setrlimit(Resource::Nproc, Rlimit { current, maximum });
+}
 
-    let is_another = |family: &i32| SeccompCondition::new(0, Dword, SeccompCmpOp::Ne, *family as u64);
-    let other_families: Vec<SeccompCondition> = families.iter().map(is_another).collect::<Result<_, _>>()?;
-    rules.insert(
-        libc::SYS_socket,
-        if families.is_empty() { Vec::new() } else { vec![SeccompRule::new(other_families)?] },
-    );
-
-    let mut pairs = Vec::new();
-    for kind in DATAGRAM_TYPES {
-        pairs.push(SeccompRule::new(vec![masked(1, SOCKET_TYPE_MASK, kind as u64)?])?);
-    }
-    rules.insert(libc::SYS_socketpair, pairs);
-
-    let mut modes = Vec::new();
-    for bit in FOREIGN_BITS.map(u64::from) {
-        modes.push(SeccompRule::new(vec![masked(1, bit, bit)?])?);
-    }
-    rules.insert(libc::SYS_fchmod, modes);
-
-    // Each call that makes a file, with the positions of its flags and of its mode.
-    #[cfg(target_arch = "x86_64")]
-    let making = [(libc::SYS_openat, Some(2), 3), (libc::SYS_open, Some(1), 2), (libc::SYS_creat, None, 1)];
-    #[cfg(not(target_arch = "x86_64"))]
-    let making = [(libc::SYS_openat, Some(2), 3)];
-    for (call, flags, mode) in making {
-        let mut rules_of_call = Vec::new();
-        for bit in SET_ID_BITS.map(u64::from) {
-            let has_bit = masked(mode, bit, bit)?;
-            let Some(flags) = flags else {
-                rules_of_call.push(SeccompRule::new(vec![has_bit])?);
-                continue;
-            };
-            // Without these flags, the argument of the mode is what happened to be in the register.
-            for makes in [libc::O_CREAT, libc::O_TMPFILE & !libc::O_DIRECTORY].map(|flag| flag as u64) {
-                rules_of_call.push(SeccompRule::new(vec![masked(flags, makes, makes)?, has_bit.clone()])?);
-            }
+fn n_tasks_of_user() -> u64 {
+    let uid = rustix::process::getuid().as_raw();
+    let mut n_tasks = 0;
+    for process in std::fs::read_dir("/proc").into_iter().flatten().flatten() {
+        if process.metadata().is_ok_and(|metadata| metadata.uid() == uid) {
+            n_tasks += std::fs::read_dir(process.path().join("task")).map_or(0, Iterator::count) as u64;
         }
-        rules.insert(call, rules_of_call);
     }
-
-    let denial = SeccompAction::Errno(libc::EACCES as u32);
-    let filter = SeccompFilter::new(rules, SeccompAction::Allow, denial.clone(), std::env::consts::ARCH.try_into()?)?;
-    let filter: BpfProgram = filter.try_into()?;
-    Ok(without_x32(denial.into(), filter))
-}
-
-/// A filter that denies all calls of the x32 ABI, and passes the others on.
-fn without_x32(denial: u32, filter: BpfProgram) -> BpfProgram {
-    let statement = |code: u32, k: u32, jf: u8| sock_filter { code: code as u16, jt: 0, jf, k };
-    // The number of the call is the first field of `seccomp_data`.
-    let number = statement(libc::BPF_LD | libc::BPF_W | libc::BPF_ABS, 0, 0);
-    let is_x32 = statement(libc::BPF_JMP | libc::BPF_JGE | libc::BPF_K, FIRST_X32_CALL, 1);
-    let deny = statement(libc::BPF_RET | libc::BPF_K, denial, 0);
-    [vec![number, is_x32, deny], filter].concat()
+    n_tasks
 }
 
 fn enforce(ruleset: RulesetCreated) -> Result<Enforcement, SandboxError> {
@@ -321,7 +242,7 @@ mod tests {
     use std::io::{ErrorKind, Write};
     use std::net::{TcpListener, TcpStream, UdpSocket};
     use std::os::fd::AsRawFd;
-    use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+    use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt, PermissionsExt};
     use std::os::unix::net::{UnixDatagram, UnixListener, UnixStream};
 
     use rustix::fs::{CWD, FileType, Mode};
@@ -345,8 +266,8 @@ mod tests {
             assert_eq!(sandbox.enter().expect("entered"), Enforcement::Full);
             assert_eq!(sandbox.close().expect("closed"), Enforcement::Full);
             // It can still do its work.
-            std::fs::write(format!("{}/own", domain.root_path), "own").expect("written to the graph's folder");
-            std::fs::read_dir(std::env::temp_dir()).expect("the folder of graphs");
+            std::fs::write(domain.ports().join("own"), "own").expect("written to the graph's folder");
+            std::fs::read_dir(&domain.folder).expect("the graph's folder");
             check();
         });
         restricted.join().expect("no panic");
@@ -377,7 +298,7 @@ mod tests {
         assert_denied(
             rustix::fs::mknodat(CWD, path.with_extension("fifo"), FileType::Fifo, Mode::RWXU, 0).map_err(Into::into),
         );
-        let program = rustix::fs::memfd_create("program", rustix::fs::MemfdFlags::empty()).expect("memory");
+        let program = File::open("/proc/self/exe").unwrap_or(open);
         // SAFETY: the call reads its arguments, which live on; if it were allowed, the test would end.
         let executed = unsafe {
             libc::syscall(
@@ -401,9 +322,78 @@ mod tests {
         #[cfg(target_arch = "x86_64")]
         {
             // SAFETY: the call has no pointers.
-            assert_denied(outcome_of(unsafe { libc::syscall(i64::from(FIRST_X32_CALL) + libc::SYS_getpid) }));
+            assert_denied(outcome_of(unsafe { libc::syscall(i64::from(calls::FIRST_X32_CALL) + libc::SYS_getpid) }));
         }
     }
+
+    /// Calls on other processes, and those that make names which a process without a sandbox would follow. Calls that no role
+    /// needs are tried by their numbers.
+    fn assert_others_are_out_of_reach(path: &Path, uses_network: bool) {
+        let parent = rustix::process::getppid().expect("a parent").as_raw_nonzero().get();
+        let limit = libc::rlimit { rlim_cur: 0, rlim_max: 0 };
+        // SAFETY: the calls read and write their arguments, which live on.
+        unsafe {
+            assert_denied(outcome_of(
+                libc::prlimit(parent, libc::RLIMIT_CPU, &raw const limit, std::ptr::null_mut()).into(),
+            ));
+            assert_denied(outcome_of(libc::syscall(libc::SYS_sched_setaffinity, parent, 0, 0)));
+            assert_denied(outcome_of(libc::syscall(libc::SYS_kill, parent, 0)));
+            assert_denied(outcome_of(libc::syscall(libc::SYS_tgkill, parent, parent, 0)));
+            assert_denied(outcome_of(libc::syscall(
+                libc::SYS_clone,
+                libc::CLONE_NEWUSER | libc::CLONE_THREAD,
+                0,
+                0,
+                0,
+                0,
+            )));
+            assert_denied(outcome_of(libc::syscall(libc::SYS_clone, libc::SIGCHLD, 0, 0, 0, 0)));
+            assert_denied(outcome_of(libc::fcntl(0, libc::F_SETOWN, parent).into()));
+            assert_denied(outcome_of(libc::syscall(libc::SYS_ioctl, 0, libc::TIOCSTI, 0)));
+            assert_denied(outcome_of(libc::syscall(libc::SYS_prctl, libc::PR_SET_DUMPABLE, 1)));
+            let allowed = calls::allowed(calls::Role::Operator, uses_network);
+            for call in 0..N_CALLS {
+                if allowed.contains(&call) || BY_ARGUMENTS.contains(&call) || UPROBE_CALLS.contains(&call) {
+                    continue;
+                }
+                let error = outcome_of(libc::syscall(call, 0, 0, 0, 0, 0, 0)).expect_err("denied").raw_os_error();
+                let expected = if call == libc::SYS_clone3 { libc::ENOSYS } else { libc::EACCES };
+                assert_eq!(error, Some(expected), "call {call}");
+            }
+        }
+        assert_denied(std::os::unix::fs::symlink("/etc/passwd", path.with_extension("link")));
+        assert_denied(std::fs::hard_link(path, path.with_extension("hard")));
+        // Others have no rights on its files and folders, whatever it asks for.
+        let made = path.with_extension("made");
+        drop(std::fs::OpenOptions::new().write(true).create_new(true).mode(0o666).open(&made).expect("its own file"));
+        assert_eq!(std::fs::metadata(&made).expect("made").permissions().mode() & 0o077, 0);
+        let folder = path.with_extension("folder");
+        std::fs::DirBuilder::new().mode(0o777).create(&folder).expect("its own folder");
+        assert_eq!(std::fs::metadata(&folder).expect("made").permissions().mode() & 0o077, 0);
+    }
+
+    /// The numbers of system calls of this and the next versions of Linux.
+    const N_CALLS: i64 = 480;
+    /// `uretprobe` and `uprobe` of x86-64, which the kernel makes for itself and which filters do not see.
+    const UPROBE_CALLS: [i64; 2] = [335, 336];
+    /// Calls that are allowed with some arguments.
+    const BY_ARGUMENTS: [i64; 15] = [
+        libc::SYS_socket,
+        libc::SYS_socketpair,
+        libc::SYS_fchmod,
+        libc::SYS_ioctl,
+        libc::SYS_fcntl,
+        libc::SYS_openat,
+        libc::SYS_open,
+        libc::SYS_creat,
+        libc::SYS_clone,
+        libc::SYS_prctl,
+        libc::SYS_prlimit64,
+        libc::SYS_sched_setaffinity,
+        libc::SYS_kill,
+        libc::SYS_tgkill,
+        libc::SYS_exit,
+    ];
 
     fn assert_denied<T>(outcome: std::io::Result<T>) {
         assert_eq!(outcome.err().map(|error| error.kind()), Some(ErrorKind::PermissionDenied));
@@ -422,6 +412,7 @@ mod tests {
             .param("out", ParamKind::Path { must_exist: false }, None, "");
         let params = json!({"model": at("model"), "out": at("out/log")});
         let port = TcpListener::bind("127.0.0.1:0").expect("a port");
+        let address = port.local_addr().expect("an address");
         let launcher = at("launcher.sock");
         let _launcher = UnixListener::bind(&launcher).expect("bound");
         let path = folder.path().to_path_buf();
@@ -433,7 +424,7 @@ mod tests {
             assert_denied(std::fs::write(path.join("new"), "new"));
             assert_denied(std::fs::remove_file(path.join("other")));
             assert_denied(std::process::Command::new("/bin/true").status());
-            assert_denied(TcpStream::connect(port.local_addr().expect("an address")));
+            assert_denied(TcpStream::connect(address));
             assert_denied(TcpListener::bind("127.0.0.1:0"));
             assert_denied(UdpSocket::bind("127.0.0.1:0"));
             assert_denied(UnixStream::connect(&launcher));
@@ -442,6 +433,7 @@ mod tests {
             let netlink = unsafe { libc::syscall(libc::SYS_socket, libc::AF_NETLINK, libc::SOCK_RAW, 0) };
             assert_denied(outcome_of(netlink));
             assert_nothing_is_given_away(&path.join("out/own"));
+            assert_others_are_out_of_reach(&path.join("out/own"), false);
             let parent = rustix::process::getppid().expect("a parent");
             assert!(rustix::process::test_kill_process(parent).is_err());
         });
@@ -468,6 +460,7 @@ mod tests {
             let netlink = unsafe { libc::syscall(libc::SYS_socket, libc::AF_NETLINK, libc::SOCK_RAW, 0) };
             outcome_of(netlink).expect("the list of interfaces");
             assert_nothing_is_given_away(&path);
+            assert_others_are_out_of_reach(&path, true);
         });
         drop(folder);
     }

@@ -15,6 +15,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
@@ -164,16 +165,29 @@ pub enum Clock {
     Recording,
 }
 
-/// Where a graph's shared memory is: iceoryx2's `global.root-path` and `global.prefix`, and the cursors.
+/// Where a graph's memory is.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct NamespaceWiring {
-    pub root_path: String,
-    pub prefix: String,
+    /// A folder of shared memory that belongs to the graph's user alone. The launcher holds a lock (flock) on it while it lives.
+    /// An operator that can take the lock is the last, or among the last: it removes the folder.
+    pub folder: PathBuf,
+}
+
+impl NamespaceWiring {
+    /// The folder of iceoryx2's files (its `global.root-path`), in which all operators write.
+    pub fn ports(&self) -> PathBuf {
+        self.folder.join("ports")
+    }
+
     /// The [cursors](crate::cursors)'s file.
-    pub cursors: String,
-    /// A file on which the launcher holds a lock (flock) while it lives, as on the root path. An operator that can take both
-    /// is the last, or among the last: it removes the root path, and what bears the prefix in shared memory.
-    pub lock_file: String,
+    pub fn cursors(&self) -> PathBuf {
+        self.folder.join("cursors")
+    }
+
+    /// The folder of a link. No sandbox can make a file in it, so a process without a sandbox may trust its names.
+    pub fn link(&self) -> PathBuf {
+        self.folder.join("link")
+    }
 }
 
 /// An input port.

@@ -12,7 +12,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, anyhow};
-use iceoryx2::prelude::{Node, ipc};
+use iceoryx2::prelude::Node;
 
 use blindgrasp_messages::Record;
 use blindgrasp_messages::{
@@ -22,6 +22,7 @@ use blindgrasp_messages::{
 use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::{print_diagnostic, with_lack_of_files};
 use blindgrasp_operator::port::{PortError, Subscriber};
+use blindgrasp_operator::private_service::PrivateService;
 use blindgrasp_operator::waiter::{Waiter, Waker};
 use blindgrasp_operator::wiring::{InputCounts, InputWiring, NamespaceWiring, WaitMode};
 use blindgrasp_operator::{monotonic_nanos, namespace};
@@ -141,7 +142,7 @@ impl<S: Sink> Observer<S> {
         let request = Arc::new(AtomicU8::new(GO_ON));
         let failed = Arc::new(AtomicBool::new(false));
         let connected = Arc::new(AtomicBool::new(false));
-        let cursors = Arc::new(SharedCursors::open(std::path::Path::new(&domain.cursors))?);
+        let cursors = Arc::new(SharedCursors::open(&domain.cursors())?);
         let waiter = match bell {
             Some(slot) => Waiter::of_slot(&cursors, slot, WaitMode::Event),
             None => Waiter::of_process(),
@@ -477,7 +478,7 @@ impl<M: Message> AnySubscriber for Typed<M> {
 }
 
 /// Opens a subscriber to an edge.
-struct Opener<'a>(&'a Node<ipc::Service>, &'a Arc<SharedCursors>, &'a ObservedEdge);
+struct Opener<'a>(&'a Node<PrivateService>, &'a Arc<SharedCursors>, &'a ObservedEdge);
 
 impl WithMessage for Opener<'_> {
     type Output = Result<Box<dyn AnySubscriber>, PortError>;

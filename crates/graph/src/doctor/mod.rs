@@ -17,7 +17,6 @@ use crate::log::LogFolder;
 use crate::operators::Operators;
 use blindgrasp_operator::diagnostics::ENOUGH_FILES;
 use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::namespace::graphs_folder;
 use blindgrasp_operator::namespace::{LEAST_FREE_BYTES, SHARED_MEMORY_FOLDER, left_over};
 use blindgrasp_operator::sandbox::supported;
 use blindgrasp_operator::wiring::Enforcement;
@@ -144,11 +143,7 @@ fn folders() -> Vec<Finding> {
     let logs = logs.path().parent().unwrap_or(Path::new("/")).to_path_buf();
     // The folder for logs is made with the first log.
     let logs = logs.ancestors().find(|folder| folder.is_dir()).unwrap_or(Path::new("/")).to_path_buf();
-    let places = [
-        ("permissions: shared memory", SHARED_MEMORY_FOLDER.into()),
-        ("permissions: temporary files", graphs_folder()),
-        ("permissions: logs", logs),
-    ];
+    let places = [("permissions: shared memory", SHARED_MEMORY_FOLDER.into()), ("permissions: logs", logs)];
     let writable = |(check, folder): (&str, std::path::PathBuf)| {
         let probe = folder.join(format!(".blindgrasp-doctor-{}", std::process::id()));
         let mut options = std::fs::OpenOptions::new();
@@ -159,7 +154,7 @@ fn folders() -> Vec<Finding> {
             Err(error) => Finding::failure(
                 check,
                 format!("{}: {error}", folder.display()),
-                "let this user write there, or set TMPDIR or XDG_STATE_HOME to where it may",
+                "let this user write there; for logs, set XDG_STATE_HOME to a folder where it may",
             ),
         }
     };
@@ -172,8 +167,7 @@ fn leftovers() -> Finding {
     if left.is_empty() {
         return Finding::ok(check, "none");
     }
-    let names: Vec<String> =
-        left.iter().map(|(name, paths)| format!("{name} ({} files and folders)", paths.len())).collect();
+    let names: Vec<&str> = left.iter().map(|(name, _)| name.as_str()).collect();
     Finding::warning(
         check,
         names.join(", "),
@@ -367,6 +361,6 @@ mod tests {
             assert!(checks.contains(&check), "{checks:?}");
         }
         let probe = format!(".blindgrasp-doctor-{}", std::process::id());
-        assert!(!Path::new(SHARED_MEMORY_FOLDER).join(&probe).exists() && !std::env::temp_dir().join(&probe).exists());
+        assert!(!Path::new(SHARED_MEMORY_FOLDER).join(&probe).exists());
     }
 }

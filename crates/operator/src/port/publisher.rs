@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use iceoryx2::port::update_connections::UpdateConnections;
-use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node, ipc};
+use iceoryx2::prelude::{AllocationStrategy, BackpressureStrategy, Node};
 use iceoryx2::service::port_factory::PortFactory;
 
 use super::bytes::{Envelope, Layout, Parts, Word};
@@ -16,6 +16,7 @@ use super::service::{self, Connections, PubSub};
 use super::{PortError, sample_id};
 use crate::credit::{Credit, Reader};
 use crate::cursors::{COMPARE_BELL, OutputSlot, SampleId, SharedCursors};
+use crate::private_service::PrivateService;
 use crate::wiring::{OutputWiring, ServiceWiring};
 use crate::written::Written;
 use blindgrasp_messages::{Header, Message};
@@ -44,7 +45,7 @@ pub enum Sent {
 struct Sender {
     service: String,
     pub_sub: PubSub,
-    publisher: iceoryx2::port::publisher::Publisher<ipc::Service, [Word], Envelope>,
+    publisher: iceoryx2::port::publisher::Publisher<PrivateService, [Word], Envelope>,
     cursors: Arc<SharedCursors>,
     /// The slots of the bells that wake its readers.
     bells: Vec<usize>,
@@ -74,7 +75,7 @@ impl Room {
 
 impl Sender {
     fn open(
-        node: &Node<ipc::Service>,
+        node: &Node<PrivateService>,
         cursors: &Arc<SharedCursors>,
         bells: &[usize],
         wiring: &ServiceWiring,
@@ -163,7 +164,7 @@ impl<M: Message> Publisher<M> {
     /// # Errors
     /// An error of iceoryx2.
     pub fn open(
-        node: &Node<ipc::Service>,
+        node: &Node<PrivateService>,
         cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
         max_items: usize,
@@ -177,7 +178,7 @@ impl<M: Message> Publisher<M> {
     /// # Errors
     /// An error of iceoryx2.
     pub fn open_growing(
-        node: &Node<ipc::Service>,
+        node: &Node<PrivateService>,
         cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
     ) -> Result<Self, PortError> {
@@ -237,7 +238,7 @@ pub struct UntypedPublisher {
 
 impl UntypedPublisher {
     fn open(
-        node: &Node<ipc::Service>,
+        node: &Node<PrivateService>,
         cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
         room: &Room,
@@ -526,7 +527,7 @@ impl<M: Message> ShadowPublisher<M> {
     /// # Errors
     /// An error of iceoryx2.
     pub fn open(
-        node: &Node<ipc::Service>,
+        node: &Node<PrivateService>,
         cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
         max_items: usize,
@@ -539,7 +540,7 @@ impl<M: Message> ShadowPublisher<M> {
     /// # Errors
     /// An error of iceoryx2.
     pub(crate) fn open_growing(
-        node: &Node<ipc::Service>,
+        node: &Node<PrivateService>,
         cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
     ) -> Result<Self, PortError> {
@@ -547,7 +548,7 @@ impl<M: Message> ShadowPublisher<M> {
     }
 
     fn open_with(
-        node: &Node<ipc::Service>,
+        node: &Node<PrivateService>,
         cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
         room: &Room,

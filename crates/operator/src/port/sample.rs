@@ -3,12 +3,13 @@
 use std::marker::PhantomData;
 
 use blindgrasp_messages::{Header, Message};
-use iceoryx2::prelude::{ZeroCopySend, ipc};
+use iceoryx2::prelude::ZeroCopySend;
 use iceoryx2::sample::Sample;
 
 use super::bytes::{Envelope, Layout, Parts, Word, head_len};
 use super::sample_id;
 use crate::cursors::SampleId;
+use crate::private_service::PrivateService;
 
 /// The bytes of a sample, whatever its message.
 pub(crate) struct UntypedSample {
@@ -19,13 +20,13 @@ pub(crate) struct UntypedSample {
 
 enum Place {
     /// In shared memory, borrowed from its publisher.
-    Lent(Sample<ipc::Service, [Word], Envelope>),
+    Lent(Sample<PrivateService, [Word], Envelope>),
     Copied(Vec<Word>),
 }
 
 impl UntypedSample {
     /// `None` if it is no sample of this message.
-    pub(super) fn lent(sample: Sample<ipc::Service, [Word], Envelope>, layout: &Layout) -> Option<Self> {
+    pub(super) fn lent(sample: Sample<PrivateService, [Word], Envelope>, layout: &Layout) -> Option<Self> {
         let n_bytes = layout.n_bytes(*sample.user_header(), sample.payload().len())?;
         Some(UntypedSample { place: Place::Lent(sample), n_bytes })
     }

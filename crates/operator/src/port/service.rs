@@ -5,22 +5,23 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
-use iceoryx2::prelude::{Node, ServiceName, ipc};
+use iceoryx2::prelude::{Node, ServiceName};
 use iceoryx2::service::port_factory::publish_subscribe;
 
 use super::bytes::{Envelope, Word};
 use super::{BoxedError, PortError};
+use crate::private_service::PrivateService;
 use crate::wiring::ServiceWiring;
 
 /// Opening a service is tried so often, with this pause between tries.
 const N_OPENINGS: u32 = 20;
 const OPENING_PAUSE: Duration = Duration::from_millis(10);
 
-pub(super) type PubSub = publish_subscribe::PortFactory<ipc::Service, [Word], Envelope>;
+pub(super) type PubSub = publish_subscribe::PortFactory<PrivateService, [Word], Envelope>;
 
 /// The first process to come creates the service, and the others must ask for the same: the wiring decides for all.
 pub(super) fn pub_sub(
-    node: &Node<ipc::Service>,
+    node: &Node<PrivateService>,
     wiring: &ServiceWiring,
     type_name: &'static str,
 ) -> Result<PubSub, PortError> {

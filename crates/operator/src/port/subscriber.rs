@@ -9,7 +9,7 @@ use std::time::Instant;
 use iceoryx2::port::subscriber::SubscriberCreateError;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::port::{DegradationAction, DegradationCause, DegradationInfo};
-use iceoryx2::prelude::{Node, ipc};
+use iceoryx2::prelude::Node;
 use iceoryx2::service::port_factory::PortFactory;
 
 use super::bytes::{Envelope, Layout, Word};
@@ -17,12 +17,13 @@ use super::service::{self, Connections, PubSub};
 use super::{PortError, PortSample, UntypedSample, sample_id};
 use crate::cursors::{SampleId, SharedCursors};
 use crate::monotonic_nanos;
+use crate::private_service::PrivateService;
 use crate::sequencer::{Placing, Sequencer};
 use crate::wiring::{EdgePolicy, InputCounts, InputWiring, OnLate};
 use crate::written::Written;
 use blindgrasp_messages::{Header, Message};
 
-type Port = iceoryx2::port::subscriber::Subscriber<ipc::Service, [Word], Envelope>;
+type Port = iceoryx2::port::subscriber::Subscriber<PrivateService, [Word], Envelope>;
 
 fn open_port(
     pub_sub: &PubSub,
@@ -58,7 +59,7 @@ impl<M: Message> Subscriber<M> {
     /// # Errors
     /// An error of iceoryx2.
     pub fn open(
-        node: &Node<ipc::Service>,
+        node: &Node<PrivateService>,
         cursors: Option<&Arc<SharedCursors>>,
         wiring: &InputWiring,
     ) -> Result<Self, PortError> {
@@ -111,7 +112,7 @@ pub struct UntypedSubscriber {
 
 impl UntypedSubscriber {
     fn open(
-        node: &Node<ipc::Service>,
+        node: &Node<PrivateService>,
         cursors: Option<&Arc<SharedCursors>>,
         wiring: &InputWiring,
         layout: Layout,
