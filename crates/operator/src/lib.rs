@@ -62,6 +62,7 @@ pub mod peer;
 pub mod port;
 #[cfg(test)]
 mod recovery_model;
+mod reports;
 pub mod sandbox;
 pub mod sequencer;
 pub mod source;
