@@ -32,7 +32,7 @@ from typing import Any, Callable, Sequence
 
 from blindgrasp_messages import Fault, Message
 
-PROTOCOL = 4
+PROTOCOL = 5
 PIPES_VARIABLE = "BLINDGRASP_HOST"
 
 # Kinds of messages from the host, and to it: crates/operator/src/host/protocol.rs.

@@ -177,6 +177,9 @@ pub(crate) const FAST_FOREVER: [&str; 6] = [
 /// This much of a graph's stderr is kept.
 const MAX_SAID_BYTES: usize = 1 << 20;
 
+/// In a shell script: the file to which an operator writes its reports.
+pub(crate) const REPORTS: &str = "/proc/self/fd/$BLINDGRASP_REPORTS";
+
 /// Writes a shell script into a folder and makes it executable.
 pub(crate) fn script(folder: &Path, name: &str, body: &str) -> PathBuf {
     let path = folder.join(name);

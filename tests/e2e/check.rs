@@ -118,7 +118,7 @@ fn arguments_come_before_describe() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_owned();
     let param = r#"{"name": "a", "kind": "string", "default": "'$1,$2'"}"#;
-    let description = format!(r#"{{"protocol": 4, "operator": "own", "version": "1", "params": [{param}]}}"#);
+    let description = format!(r#"{{"protocol": 5, "operator": "own", "version": "1", "params": [{param}]}}"#);
     let script = format!("[ \"$#,$3\" = 3,--describe ] && echo '{description}'\n");
     std::fs::write(at("own.sh"), script).expect("written");
     let path = at("dataflow.yaml");

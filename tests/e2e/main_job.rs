@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use crate::common::{
-    Graph, HAND, MODEL, NODES, RECORDING, assert_nothing_left, classifier_runs, dataflow, json_lines, paper_model, run,
-    script, signal, stubborn_classifier, text, unique_name,
+    Graph, HAND, MODEL, NODES, RECORDING, REPORTS, assert_nothing_left, classifier_runs, dataflow, json_lines,
+    paper_model, run, script, signal, stubborn_classifier, text, unique_name,
 };
 use rustix::process::Signal;
 use serde_json::Value;
@@ -317,8 +317,10 @@ fn a_foreign_operator_that_floods_its_output_can_be_stopped() {
     script(
         folder.path(),
         "flood.sh",
-        "if [ \"$1\" = --describe ]; then echo '{\"protocol\":4,\"operator\":\"flood\",\"version\":\"1\"}'; exit; fi\n\
-         echo '@blindgrasp {\"report\":\"ready\"}'\nexec yes flood",
+        &format!(
+            "if [ \"$1\" = --describe ]; then echo '{{\"protocol\":5,\"operator\":\"flood\",\"version\":\"1\"}}'; exit; fi\n\
+             echo '{{\"report\":\"ready\"}}' >{REPORTS}\nexec yes flood"
+        ),
     );
     let flow = folder.path().join("flow.yaml");
     std::fs::write(&flow, "version: 1\nname: flood\noperators:\n  flood: {run: ./flood.sh}\n").expect("written");

@@ -3,7 +3,7 @@
 use std::io::{Read, Write};
 use std::net::TcpStream;
 
-use crate::common::{FAST_FOREVER, Graph, dataflow, json_lines, run, text, wait_until};
+use crate::common::{FAST_FOREVER, Graph, REPORTS, dataflow, json_lines, run, text, wait_until};
 
 fn ask(address: &str, request: &str) -> (String, String) {
     let mut stream = TcpStream::connect(address).expect("connected");
@@ -105,8 +105,8 @@ fn logs_can_be_written_as_json_with_levels_and_fields() {
         &format!(
             "case \"$*\" in *--describe*) exec {operator} --describe;; esac\n\
              echo 'plain words'\n\
-             echo '@blindgrasp {{\"report\":\"log\",\"level\":\"warn\",\"message\":\"cell 7 drifts\",\
-             \"fields\":{{\"cell\":7}}}}'\n\
+             echo '{{\"report\":\"log\",\"level\":\"warn\",\"message\":\"cell 7 drifts\",\
+             \"fields\":{{\"cell\":7}}}}' >{REPORTS}\n\
              exec {operator}",
             operator = crate::common::operator("classifier")
         ),
@@ -118,21 +118,26 @@ fn logs_can_be_written_as_json_with_levels_and_fields() {
         let arguments: Vec<&str> = FAST_FOREVER.into_iter().chain(["--log-format", format]).collect();
         let graph = Graph::start(&path, &arguments);
         let logs = graph.status()["log_folder"].as_str().expect("a path").to_string();
+        let said = || {
+            let lines = json_lines(&run(&["logs", "classifier", "--graph", &graph.name, "--json"], 0).stdout);
+            let mut said: Vec<String> =
+                lines.iter().map(|line| format!("{} {}", line["level"], line["text"])).collect();
+            said.retain(|line| !line.contains("=="));
+            said.sort();
+            said
+        };
+        let entry = if format == "json" { "cell 7 drifts" } else { "cell 7 drifts cell=7" };
+        // Printed lines and reports come over two pipes, in any order.
+        let expected = [format!("\"warn\" \"{entry}\""), "null \"plain words\"".to_owned()];
+        wait_until(|| said() == expected, || format!("{:?}", said()));
         let content = std::fs::read_to_string(format!("{logs}/classifier.log")).expect("a log");
-        let lines = json_lines(&run(&["logs", "classifier", "--graph", &graph.name, "--json"], 0).stdout);
-        let said: Vec<(&str, Option<&str>)> = lines
-            .iter()
-            .map(|line| (line["text"].as_str().expect("text"), line["level"].as_str()))
-            .filter(|(text, _)| !text.starts_with("=="))
-            .collect();
         if format == "json" {
-            assert_eq!(said, [("plain words", None), ("cell 7 drifts", Some("warn"))]);
             let whole: Vec<serde_json::Value> = json_lines(content.as_bytes());
             assert!(whole.iter().all(|line| line["time"].is_string() && line["operator"] == "classifier"), "{content}");
-            assert_eq!(whole.last().expect("a line")["fields"]["cell"], 7);
+            assert!(whole.iter().any(|line| line["fields"]["cell"] == 7), "{content}");
         } else {
-            assert_eq!(said, [("plain words", None), ("cell 7 drifts cell=7", Some("warn"))]);
-            assert!(content.trim_end().ends_with(" [classifier] WARN cell 7 drifts cell=7"), "{content}");
+            let is_entry = |line: &str| line.ends_with(" [classifier] WARN cell 7 drifts cell=7");
+            assert!(content.lines().any(is_entry), "{content}");
         }
         let ended = graph.stop();
         assert!(ended.stderr.contains("[classifier] WARN cell 7 drifts cell=7"), "{}", ended.stderr);

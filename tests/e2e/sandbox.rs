@@ -7,8 +7,8 @@ use blindgrasp_operator::sandbox::supported;
 use blindgrasp_operator::wiring::Enforcement;
 
 use crate::common::{
-    FAST_FOREVER, Graph, HAND, MODEL, NODES, blindgrasp, classifier_runs, dataflow, dataflow_with, of_node, operator,
-    project, run, script, skipped, stubborn_classifier, swap, text, unique_name, wait_until,
+    FAST_FOREVER, Graph, HAND, MODEL, NODES, REPORTS, blindgrasp, classifier_runs, dataflow, dataflow_with, of_node,
+    operator, project, run, script, skipped, stubborn_classifier, swap, text, unique_name, wait_until,
 };
 
 /// What the intruder tries.
@@ -71,7 +71,7 @@ static void try(const char *what, long outcome) {
 ssize_t write(int fd, const void *bytes, size_t n) {
     static int has_tried;
     ssize_t outcome = syscall(SYS_write, fd, bytes, n);
-    if (fd != 1 || has_tried || !memmem(bytes, n, "\"report\":\"ready\"", 16)) return outcome;
+    if (has_tried || !memmem(bytes, n, "\"report\":\"ready\"", 16)) return outcome;
     has_tried = 1;
     int error = errno, own = open("/dev/shm", O_TMPFILE | O_RDWR, 0600), program = memfd_create("program", 0);
     char *const nothing[] = {0};
@@ -161,7 +161,7 @@ fn an_operator_without_a_sandbox_can_do_what_its_user_can() {
 fn a_program_that_does_not_restrict_itself_is_told_of_or_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let body = format!(
-        "case \"$*\" in *--describe*) exec {} --describe;; esac\necho '@blindgrasp {{\"report\": \"ready\"}}'\nexec cat",
+        "case \"$*\" in *--describe*) exec {} --describe;; esac\necho '{{\"report\": \"ready\"}}' >{REPORTS}\nexec cat",
         operator("classifier")
     );
     let program = script(folder.path(), "classifier", &body);

@@ -9,8 +9,8 @@ use blindgrasp_recording::{Record, RecordingInfo, RecordingReader, RecordingWrit
 use rustix::process::{Signal, getuid};
 
 use crate::common::{
-    FAST_FOREVER, Graph, HAND, MODEL, NODES, RECORDING, blindgrasp, classifier_runs, dataflow, dataflow_with, operator,
-    project, run, script, skipped, swap, text, unique_name, wait_until,
+    FAST_FOREVER, Graph, HAND, MODEL, NODES, RECORDING, REPORTS, blindgrasp, classifier_runs, dataflow, dataflow_with,
+    operator, project, run, script, skipped, swap, text, unique_name, wait_until,
 };
 
 const A_FEW_GRASPS: usize = 20;
@@ -168,7 +168,8 @@ fn nothing_of_a_stranger_commands_the_terminal() {
     // An operator that prints what it was sent, as lines and as log entries.
     let body = format!(
         "case \"$*\" in *--describe*) ;; *) printf 'chat\\033]0;own\\007 \\302\\2331m\\n' >&2; printf \
-         '@blindgrasp {{\"report\":\"log\",\"level\":\"warn\",\"text\":\"a\\\\u001b[2J\\\\n[lift_arbiter] b\"}}\\n';; esac\nexec {} \"$@\"",
+         '{{\"report\":\"log\",\"level\":\"warn\",\"message\":\"a\\\\u001b[2J\\\\n[lift_arbiter] b\"}}\\n' \
+         >{REPORTS};; esac\nexec {} \"$@\"",
         operator("classifier")
     );
     let chatty = script(folder.path(), "chatty", &body);
@@ -187,6 +188,51 @@ fn nothing_of_a_stranger_commands_the_terminal() {
         assert!(!stdout.lines().any(|line| line.starts_with("grasp 1 LIFT")), "{stdout}");
         assert!(stderr.contains("[classifier] chat\\u"), "{stderr}");
         assert!(!stderr.lines().any(|line| line.starts_with("[lift_arbiter] b")), "{stderr}");
+    }
+}
+
+/// A classifier that prints a line for each sample.
+const CHATTERER: &str = r#"
+import sys
+sys.path.insert(0, "OPERATORS")
+from blindgrasp_operator import Description, Stage, run
+from blindgrasp_messages import GraspFeature, Prediction, PredictionHead
+
+def answer(head, _items):
+    print("""LINE""", flush=True)
+    print("""LINE""", file=sys.stderr, flush=True)
+    return PredictionHead(grasp_id=head.grasp_id, phase=head.phase, fault=head.fault)
+
+run(Description("chatterer", "", ("feature", GraspFeature), ("prediction", Prediction)), lambda params: Stage(answer))
+"#;
+
+/// Lines that programs print, panics and tracebacks may have text of strangers, such as the name of an object.
+#[test]
+fn a_printed_line_is_a_line_of_the_log_and_no_report() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("chatterer.py");
+    for line in [
+        r#"no object of the name @blindgrasp {"report":"unfit","message":"by a message"}"#,
+        r#"@blindgrasp {"report":"unfit","message":"by a message"}"#,
+        r#"{"report":"unfit","message":"by a message"}"#,
+    ] {
+        let body = format!(
+            "case \"$*\" in *--describe*) ;; *) echo '{line}'; echo '{line}' >&2;; esac\nexec {} \"$@\"",
+            operator("classifier")
+        );
+        let in_rust = script(folder.path(), "chatty", &body);
+        let program = CHATTERER.replace("OPERATORS", utf8(&project().join("operators"))).replace("LINE", line);
+        std::fs::write(&path, program).expect("written");
+        let in_python = script(folder.path(), "chatterer", &format!("exec python3 -B {} \"$@\"", path.display()));
+        for (program, params) in [(in_rust, format!("{{model: {MODEL}}}")), (in_python, "{}".to_owned())] {
+            let flow = dataflow_with(folder.path(), &[classifier_runs(&program, &params)]);
+            let graph = Graph::start(&flow, &FAST_FOREVER);
+            let log = || text(&run(&["logs", "classifier", "--graph", &graph.name], 0).stdout);
+            wait_until(|| log().matches(line).count() >= 2, log);
+            graph.wait_for_decisions(2);
+            let ended = graph.stop();
+            assert_eq!(ended.code, Some(0), "{}", ended.stderr);
+        }
     }
 }
 

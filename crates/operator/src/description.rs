@@ -10,7 +10,7 @@ use crate::text::is_name;
 use crate::text::quote;
 
 /// The version of [`OperatorDescription`], and of the protocol behind it, that this module understands.
-pub const PROTOCOL: u32 = 4;
+pub const PROTOCOL: u32 = 5;
 
 /// The operator that carries edges to other machines. The launcher adds it; a dataflow file cannot name it.
 pub const LINK_OPERATOR: &str = "link";
@@ -19,7 +19,7 @@ pub const LINK_OPERATOR: &str = "link";
 ///
 /// ```json
 /// {
-///   "protocol": 4, "operator": "contacts", "version": "0.1.0", "summary": "Contacts from tactile cells",
+///   "protocol": 5, "operator": "contacts", "version": "0.1.0", "summary": "Contacts from tactile cells",
 ///   "inputs": [{"name": "tactile", "type": "blindgrasp/TactileFrame/5"}],
 ///   "outputs": [{"name": "contacts", "type": "blindgrasp/ContactSet/2"}],
 ///   "params": [{"name": "hand", "kind": "path"},

@@ -64,6 +64,7 @@ pub mod port;
 pub mod private_service;
 #[cfg(test)]
 mod recovery_model;
+mod reports;
 pub mod sandbox;
 pub mod sequencer;
 pub mod source;

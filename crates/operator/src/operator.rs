@@ -28,10 +28,10 @@ use crate::private_service::PrivateService;
 use crate::sandbox::Sandbox;
 use crate::waiter::{PollFd, Waiter, Waker};
 use crate::wiring::{
-    Addressed, Clock, Command, EdgePolicy, Enforcement, GroupMemberWiring, GroupWiring, LogEntry, REPORT_PREFIX,
-    Report, WIRING_VARIABLE, Wiring,
+    Addressed, Clock, Command, EdgePolicy, Enforcement, GroupMemberWiring, GroupWiring, LogEntry, Report,
+    WIRING_VARIABLE, Wiring,
 };
-use crate::{host, identity, monotonic_nanos, namespace, sandbox, trace, wiring};
+use crate::{host, identity, monotonic_nanos, namespace, reports, sandbox, trace, wiring};
 use blindgrasp_messages::Message;
 
 /// The longest time that an operator waits before it gives a sign of life.
@@ -165,6 +165,7 @@ pub(crate) fn run_described(
     description: &OperatorDescription,
     work: impl FnOnce(&Operator) -> anyhow::Result<()>,
 ) -> ExitCode {
+    reports::take();
     match join_and_work(description, work) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(&error),
@@ -599,6 +600,7 @@ pub type GroupMember = (OperatorDescription, fn(&Operator) -> anyhow::Result<()>
 /// The `main` of a process with several operators, which answer samples in turn. `member` finds an operator by the arguments
 /// of its program.
 pub fn run_group(member: impl Fn(&[String]) -> Option<GroupMember>) -> ExitCode {
+    reports::take();
     match join_and_work_together(member) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(&error),
@@ -811,12 +813,10 @@ impl Voice {
         }
     }
 
-    /// Writes a report in one go, so that lines of two threads don't mix. A launcher that is gone hears nothing.
     fn report(&self, report: &Report) {
         let addressed = Addressed { member: self.0.as_deref().map(str::to_owned), message: report };
         if let Ok(json) = serde_json::to_string(&addressed) {
-            let mut stdout = std::io::stdout().lock();
-            let _ = stdout.write_all(format!("{REPORT_PREFIX}{json}\n").as_bytes()).and_then(|()| stdout.flush());
+            reports::write(&json);
         }
     }
 }

@@ -2,9 +2,9 @@
 //!
 //! * `PROGRAM --describe` answers with an [`OperatorDescription`] as JSON.
 //! * The launcher starts `PROGRAM` with a [`Wiring`] as JSON in the environment variable [`WIRING_VARIABLE`].
-//! * The operator reports on stdout, one line each, beginning with [`REPORT_PREFIX`]: see [`Report`]. Any other line on
-//!   stdout or stderr is a log line. A report of at most 4096 bytes that is written in one go is heard even if a child of
-//!   the operator writes to the same pipe.
+//! * The operator writes [`Report`]s, one line of JSON each, to a pipe of their own. The environment variable
+//!   [`REPORTS_VARIABLE`] holds the number of its descriptor. The operator sees to it that its children don't inherit it.
+//! * All lines on stdout and stderr are log lines.
 //! * The launcher writes [`Command`]s to its stdin, one line of JSON each. The end of stdin asks it to exit.
 //! * SIGTERM asks it to answer the samples that still lie in its inputs, report `drained`, and keep its ports open until
 //!   its stdin ends. An operator that exits at SIGTERM at once is accepted too.
@@ -25,8 +25,8 @@ use crate::link_status::LinkStatus;
 
 /// The environment variable that holds the [`Wiring`].
 pub const WIRING_VARIABLE: &str = "BLINDGRASP_WIRING";
-/// A line on an operator's stdout that is meant for the launcher begins with this.
-pub const REPORT_PREFIX: &str = "@blindgrasp ";
+/// The environment variable that holds the number of the descriptor for [`Report`]s.
+pub const REPORTS_VARIABLE: &str = "BLINDGRASP_REPORTS";
 
 /// All that an operator must know of the graph that it runs in.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -315,7 +315,7 @@ pub enum Command {
     },
 }
 
-/// A line from an operator to the launcher, after [`REPORT_PREFIX`].
+/// A line from an operator to the launcher.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "report")]
 pub enum Report {
@@ -362,7 +362,7 @@ pub enum Report {
         #[serde(default)]
         in_all: bool,
     },
-    /// A line for the log, with a level and fields. A line without [`REPORT_PREFIX`] is a log line without them.
+    /// A line for the log, with a level and fields. A line on stdout or stderr is a log line without them.
     Log(LogEntry),
     /// Of a link: all other machines of the graph are there and ready.
     Connected,

@@ -32,7 +32,7 @@ operators:
 ";
 
 const SOURCE: &str = r#"{
-    "protocol": 4, "operator": "source", "version": "0.1.0", "summary": "Replays",
+    "protocol": 5, "operator": "source", "version": "0.1.0", "summary": "Replays",
     "outputs": [{"name": "tactile", "type": "t/Tactile/1"}, {"name": "joints", "type": "t/Joints/1"}],
     "params": [
         {"name": "recording", "kind": "path", "summary": "What to replay"},
@@ -46,14 +46,14 @@ const SOURCE: &str = r#"{
 }"#;
 
 const CONTACTS: &str = r#"{
-    "protocol": 4, "operator": "contacts", "version": "0.1.0",
+    "protocol": 5, "operator": "contacts", "version": "0.1.0",
     "inputs": [{"name": "tactile", "type": "t/Tactile/1"}],
     "outputs": [{"name": "contacts", "type": "t/Contacts/1"}],
     "params": [{"name": "hand", "kind": "path"}]
 }"#;
 
 const ARBITER: &str = r#"{
-    "protocol": 4, "operator": "arbiter", "version": "0.1.0",
+    "protocol": 5, "operator": "arbiter", "version": "0.1.0",
     "inputs": [
         {"name": "contacts", "type": "t/Contacts/1"},
         {"name": "veto", "type": "t/Tactile/1", "optional": true}
@@ -61,18 +61,18 @@ const ARBITER: &str = r#"{
 }"#;
 
 const OWN: &str = r#"{
-    "protocol": 4, "operator": "own", "version": "9", "outputs": [{"name": "tactile", "type": "t/Tactile/1"}]
+    "protocol": 5, "operator": "own", "version": "9", "outputs": [{"name": "tactile", "type": "t/Tactile/1"}]
 }"#;
 
 /// Reads the same type as it writes, so that it can be chained and looped.
 const FILTER: &str = r#"{
-    "protocol": 4, "operator": "filter", "version": "9",
+    "protocol": 5, "operator": "filter", "version": "9",
     "inputs": [{"name": "in", "type": "t/Tactile/1"}], "outputs": [{"name": "out", "type": "t/Tactile/1"}]
 }"#;
 
 /// A source that is told what became of its samples.
 const TOLD: &str = r#"{
-    "protocol": 4, "operator": "told", "version": "9",
+    "protocol": 5, "operator": "told", "version": "9",
     "inputs": [{"name": "back", "type": "t/Tactile/1", "feedback": true}],
     "outputs": [{"name": "tactile", "type": "t/Tactile/1"}]
 }"#;
@@ -140,9 +140,9 @@ fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, Stri
         Some("filter") => FILTER,
         Some("broken") => return Err("exit status 3\nno such device\n".to_owned()),
         Some("nonsense") => "Usage: nonsense",
-        Some("newer") => r#"{"protocol": 5, "operator": {"id": "newer"}}"#,
+        Some("newer") => r#"{"protocol": 6, "operator": {"id": "newer"}}"#,
         _ => {
-            r#"{"protocol": 4, "operator": "crooked", "version": "1", "outputs": [
+            r#"{"protocol": 5, "operator": "crooked", "version": "1", "outputs": [
             {"name": "a", "type": "t"}, {"name": "a", "type": "t"}]}"#
         }
     };
@@ -416,7 +416,7 @@ fn programs() {
     );
     check_nodes_err(
         "  newer: {}\n",
-        "4:3: program '/bin/newer' cannot be used: speaks protocol 5, but this blindgrasp speaks protocol 4",
+        "4:3: program '/bin/newer' cannot be used: speaks protocol 6, but this blindgrasp speaks protocol 5",
     );
     check_nodes_err(
         "  crooked: {}\n",
@@ -634,9 +634,9 @@ operators:
 #[test]
 fn descriptions_are_strict() {
     for (json, expected) in [
-        (r#"{"protocol": 4, "operator": "a", "version": "1", "input": []}"#, "unknown field `input`"),
+        (r#"{"protocol": 5, "operator": "a", "version": "1", "input": []}"#, "unknown field `input`"),
         (r#"{"operator": "a", "version": "1"}"#, "missing field `protocol`"),
-        (r#"{"protocol": 4, "version": "1"}"#, "missing field `operator`"),
+        (r#"{"protocol": 5, "version": "1"}"#, "missing field `operator`"),
     ] {
         let error = OperatorDescription::from_json(json).expect_err(json).to_string();
         assert!(error.contains(expected), "{error}");
@@ -667,7 +667,7 @@ fn descriptions_are_strict() {
             "param 'a' has a default and is optional; one of them is enough",
         ),
     ] {
-        let json = format!(r#"{{"protocol": 4, "operator": "a", "version": "1", {part}}}"#);
+        let json = format!(r#"{{"protocol": 5, "operator": "a", "version": "1", {part}}}"#);
         let error = OperatorDescription::from_json(&json).expect_err(part).to_string();
         assert!(error.contains(expected), "{part}: {error}");
     }

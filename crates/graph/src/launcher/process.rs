@@ -2,7 +2,8 @@
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, VecDeque};
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{BufRead, BufReader, PipeReader, Read, Write};
+use std::os::fd::{AsRawFd, BorrowedFd};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::process::{Child, ChildStdin, Command as Program, ExitStatus, Stdio};
 use std::rc::Rc;
@@ -10,6 +11,7 @@ use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use rustix::io::{FdFlags, fcntl_setfd};
 use rustix::process::{
     Pid, Resource, Rlimit, Signal, WaitId, WaitIdOptions, kill_process, kill_process_group,
     set_parent_process_death_signal, setrlimit, waitid,
@@ -24,7 +26,7 @@ use crate::log::printable;
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::namespace;
 use blindgrasp_operator::wiring::{
-    Addressed, Command, Enforcement, GroupMemberWiring, GroupWiring, LogEntry, REPORT_PREFIX, Report, Sandbox,
+    Addressed, Command, Enforcement, GroupMemberWiring, GroupWiring, LogEntry, REPORTS_VARIABLE, Report, Sandbox,
     WIRING_VARIABLE, Wiring,
 };
 
@@ -35,7 +37,7 @@ pub const ZENOH_THREADS: (&str, &str) = ("ZENOH_RUNTIME", "(tx: (worker_threads:
 /// The arguments of the program that runs the operators of a group.
 const GROUP_ARGS: [&str; 2] = ["operator", "group"];
 
-/// A longer line is split.
+/// A longer line of text is split, and of a longer report the rest is dropped.
 const MAX_LINE_BYTES: u64 = 64 << 10;
 /// The last log lines of an operator explain its failure.
 const N_KEPT_LINES: usize = 20;
@@ -48,7 +50,7 @@ const MAX_UNWRITTEN: usize = 4 << 20;
 #[derive(Debug)]
 pub(super) enum ProcessOutput {
     Report(Report),
-    /// It has closed stdout or stderr, and is ending, most likely.
+    /// It has closed the pipe for its reports, and is ending, most likely.
     Closed,
 }
 
@@ -171,12 +173,17 @@ impl Process {
                 serde_json::to_string(&GroupWiring { members: starts.iter().map(member).collect() })?
             }
         };
+        // Text for the log has a pipe, and reports have another: no text is ever a report.
+        let (lines, its_lines) = std::io::pipe()?;
+        let (reports, its_reports) = std::io::pipe()?;
+        let reports_number = its_reports.as_raw_fd();
         command
             .env(WIRING_VARIABLE, wiring)
+            .env(REPORTS_VARIABLE, reports_number.to_string())
             .env_remove(service::SOCKET_VARIABLE)
             .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
+            .stdout(its_lines.try_clone()?)
+            .stderr(its_lines)
             .process_group(0);
         if starts.iter().any(|start| start.node.is_link() || start.node.description.uses_network) {
             command.env(ZENOH_THREADS.0, ZENOH_THREADS.1);
@@ -199,27 +206,23 @@ impl Process {
             // iceoryx2 0.10 opens its sockets and files without O_CLOEXEC: the operators must not inherit the launcher's.
             // SAFETY: it marks descriptors, and nothing of this process uses them between here and exec.
             unsafe { libc::syscall(libc::SYS_close_range, 3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC) };
+            // SAFETY: the descriptor is open until the program begins.
+            fcntl_setfd(unsafe { BorrowedFd::borrow_raw(reports_number) }, FdFlags::empty())?;
             Ok(())
         };
         // SAFETY: between fork and exec the closure makes system calls alone; it neither allocates nor takes a lock.
         unsafe { command.pre_exec(before_exec) };
         let mut child = command.spawn().map_err(|error| explain(error, &node.process))?;
-        let streams: [Option<Box<dyn Read + Send>>; 2] = [
-            child.stdout.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
-            child.stderr.take().map(|stream| Box::new(stream) as Box<dyn Read + Send>),
-        ];
+        // The ends of the pipes that are the process's alone: the others see its end.
+        drop((command, its_reports));
         let hearers: Vec<Hearer> = starts
             .iter()
             .map(|start| Hearer { id: start.id, sink: start.sink.clone(), lines: Lines::default() })
             .collect();
-        for stream in streams.into_iter().flatten() {
-            let (events, hearers) = (events.clone(), hearers.clone());
-            let forwarding = move || forward_lines(stream, &hearers, &events);
-            if let Err(error) = std::thread::Builder::new().spawn(forwarding) {
-                let _ = child.kill();
-                let _ = child.wait();
-                return Err(error);
-            }
+        if let Err(error) = hear(lines, reports, &hearers, events) {
+            let _ = child.kill();
+            let _ = child.wait();
+            return Err(error);
         }
         let stdin = child.stdin.take();
         if let Some(stdin) = &stdin {
@@ -550,27 +553,38 @@ fn lacking(sandbox: Enforcement) -> &'static str {
     }
 }
 
-/// Reports go to the launcher, lines to the log: those about a node to its own, and the others to the first node's.
-fn forward_lines(stream: impl Read, hearers: &[Hearer], events: &SyncSender<Event>) {
+/// Hears a process until its end, on a thread for its lines and one for its reports.
+fn hear(lines: PipeReader, reports: PipeReader, hearers: &[Hearer], events: &SyncSender<Event>) -> std::io::Result<()> {
+    let first = hearers[0].clone();
+    std::thread::Builder::new().spawn(move || forward_lines(lines, &first))?;
+    let (hearers, events) = (hearers.to_vec(), events.clone());
+    std::thread::Builder::new().spawn(move || forward_reports(reports, &hearers, &events))?;
+    Ok(())
+}
+
+/// What a process prints goes to the log of its first node.
+fn forward_lines(stream: impl Read, first: &Hearer) {
     let mut stream = BufReader::new(stream);
     let mut bytes = Vec::new();
+    while read_line(&mut stream, &mut bytes) {
+        first.take(LogEntry::plain(String::from_utf8_lossy(&bytes).trim_end()));
+    }
+}
+
+/// Reports go to the launcher, and log entries to the log of the node that they are about.
+fn forward_reports(stream: impl Read, hearers: &[Hearer], events: &SyncSender<Event>) {
     let first = &hearers[0];
-    loop {
-        bytes.clear();
-        match (&mut stream).take(MAX_LINE_BYTES).read_until(b'\n', &mut bytes) {
-            Ok(0) | Err(_) => break,
-            Ok(_) => {}
+    let mut stream = BufReader::new(stream);
+    let mut bytes = Vec::new();
+    let mut is_whole = true;
+    while read_line(&mut stream, &mut bytes) {
+        let is_rest = !is_whole;
+        is_whole = bytes.ends_with(b"\n");
+        if is_rest {
+            continue;
         }
-        let line = String::from_utf8_lossy(&bytes).trim_end().to_string();
-        // A text stands before a report if another writer to the same pipe, such as a child of the operator, had written
-        // a part of its line.
-        let (text, report) =
-            line.split_once(REPORT_PREFIX).map_or((&line[..], None), |(text, json)| (text, Some(json)));
-        match report.map(serde_json::from_str::<Addressed<Report>>) {
-            Some(Ok(Addressed { member, message })) => {
-                if !text.is_empty() {
-                    first.take(LogEntry::plain(text));
-                }
+        match serde_json::from_slice::<Addressed<Report>>(&bytes) {
+            Ok(Addressed { member, message }) => {
                 let named = |hearer: &&Hearer| member.as_ref().is_some_and(|member| *member == hearer.sink.node);
                 let hearer = hearers.iter().find(named).unwrap_or(first);
                 match message {
@@ -582,13 +596,19 @@ fn forward_lines(stream: impl Read, hearers: &[Hearer], events: &SyncSender<Even
                     }
                 }
             }
-            Some(Err(error)) if text.is_empty() => {
-                first.take(LogEntry::plain(format!("not a report of this version ({error}): {line}")));
+            Err(error) => {
+                let line = String::from_utf8_lossy(&bytes);
+                first.take(LogEntry::plain(format!("not a report of this version ({error}): {}", line.trim_end())));
             }
-            _ => first.take(LogEntry::plain(line)),
         }
     }
     let _ = events.send(Event::Output(first.id, ProcessOutput::Closed));
+}
+
+/// Reads a line, or the first part of a long one; false at the end.
+fn read_line(stream: &mut impl BufRead, bytes: &mut Vec<u8>) -> bool {
+    bytes.clear();
+    stream.take(MAX_LINE_BYTES).read_until(b'\n', bytes).is_ok_and(|n_read| n_read > 0)
 }
 
 /// A node whose process speaks.
@@ -628,16 +648,39 @@ impl LineSink {
 mod tests {
     use super::*;
 
-    #[test]
-    fn a_report_behind_a_part_of_a_line_is_heard() {
-        let (events, heard) = std::sync::mpsc::sync_channel(10);
+    fn hearer() -> Hearer {
         let sink = LineSink { node: "contacts".into(), log: None, printer: None };
-        let hearer = Hearer { id: 7, sink, lines: Lines::default() };
-        let output = format!(
-            "fl{prefix}{{\"report\": \"drained\"}}\nood\nit printed '{prefix}'\n{prefix}?\n",
-            prefix = REPORT_PREFIX
+        Hearer { id: 7, sink, lines: Lines::default() }
+    }
+
+    fn logged(hearer: &Hearer) -> Vec<String> {
+        hearer.lines.lock().expect("lines").iter().cloned().collect()
+    }
+
+    /// What a program prints may be text of strangers, such as the name of an object.
+    #[test]
+    fn a_printed_line_is_no_report() {
+        let lines = [
+            "{\"report\":\"unfit\",\"message\":\"by a message\"}",
+            "@blindgrasp {\"report\":\"unfit\",\"message\":\"by a message\"}",
+            "no object of the name @blindgrasp {\"report\":\"ready\",\"sandbox\":\"full\"}",
+        ];
+        let hearer = hearer();
+        forward_lines(lines.join("\n").as_bytes(), &hearer);
+        assert_eq!(logged(&hearer), lines);
+    }
+
+    #[test]
+    fn reports_are_heard_and_the_rest_of_a_long_line_is_not() {
+        let (events, heard) = std::sync::mpsc::sync_channel(10);
+        let hearer = hearer();
+        let n_until_report = MAX_LINE_BYTES as usize - "{\"report\":\"drained\"}".len();
+        let said = format!(
+            "?\n{{\"report\":\"drained\"}}\n{}{{\"report\":\"drained\"}}{{\"report\":\"finished\"}}\n\
+             {{\"report\":\"log\",\"message\":\"a line\"}}\n",
+            "x".repeat(n_until_report)
         );
-        forward_lines(output.as_bytes(), std::slice::from_ref(&hearer), &events);
+        forward_reports(said.as_bytes(), std::slice::from_ref(&hearer), &events);
         let heard: Vec<Event> = heard.try_iter().collect();
         assert!(
             matches!(
@@ -647,8 +690,8 @@ mod tests {
             "{}",
             heard.len()
         );
-        let lines = hearer.lines.lock().expect("lines");
-        assert_eq!(lines.iter().take(3).collect::<Vec<_>>(), ["fl", "ood", "it printed '@blindgrasp '"]);
-        assert!(lines.len() == 4 && lines[3].starts_with("not a report of this version"), "{lines:?}");
+        let lines = logged(&hearer);
+        assert!(lines.len() == 3 && lines[2] == "a line", "{lines:?}");
+        assert!(lines[..2].iter().all(|line| line.starts_with("not a report of this version")), "{lines:?}");
     }
 }

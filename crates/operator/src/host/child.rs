@@ -2,7 +2,7 @@
 
 use std::ffi::{OsStr, OsString};
 use std::io::{PipeReader, PipeWriter, Read, Write};
-use std::os::fd::{AsFd, AsRawFd, OwnedFd};
+use std::os::fd::{AsRawFd, OwnedFd};
 use std::os::unix::process::CommandExt;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -13,7 +13,7 @@ use rustix::io::FdFlags;
 use rustix::process::{Signal, getpid, getppid, set_parent_process_death_signal};
 
 use super::protocol::{Ask, FRAME_BYTES, MAX_BODY_BYTES, PIPES_VARIABLE, Say, Work, number, read_work, write_work};
-use crate::wiring::{LogEntry, WIRING_VARIABLE};
+use crate::wiring::{LogEntry, REPORTS_VARIABLE, WIRING_VARIABLE};
 
 /// A program whose pipes are closed gets so long to end.
 const END_LIMIT: Duration = Duration::from_secs(1);
@@ -81,16 +81,13 @@ impl Program {
         let its_own: [OwnedFd; 2] = [to_read.into(), from_write.into()];
         let host = getpid();
         let numbers: Vec<String> = its_own.iter().map(|fd| fd.as_raw_fd().to_string()).collect();
-        // What it prints is for the log, and no report to the launcher.
-        let log: OwnedFd = std::io::stderr().as_fd().try_clone_to_owned().context("cannot copy stderr")?;
         let mut command = Command::new(program);
         command
             .args(arguments)
             .env(PIPES_VARIABLE, numbers.join(","))
             .env_remove(WIRING_VARIABLE)
-            .stdin(Stdio::null())
-            .stdout(log)
-            .stderr(Stdio::inherit());
+            .env_remove(REPORTS_VARIABLE)
+            .stdin(Stdio::null());
         let inherited: Vec<i32> = its_own.iter().map(AsRawFd::as_raw_fd).collect();
         let before_exec = move || {
             set_parent_process_death_signal(Some(Signal::KILL))?;

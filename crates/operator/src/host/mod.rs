@@ -24,7 +24,7 @@ use crate::description::OperatorDescription;
 use crate::operator::{self, Operator, name_process};
 use crate::sandbox::Sandbox;
 use crate::wiring::{self, Enforcement, LogEntry, WIRING_VARIABLE, Wiring};
-use crate::{monotonic_nanos, sandbox};
+use crate::{monotonic_nanos, reports, sandbox};
 use child::{Answer, Asides, Program, ProgramError};
 use protocol::{Ask, HAS_STATE, Ready, Start, VERSION, Work};
 
@@ -45,6 +45,7 @@ pub fn run(program: &OsStr, arguments: &[OsString]) -> ExitCode {
         return ExitCode::from(2);
     }
     let _ = PROGRAM.set(program.into());
+    reports::take();
     match started(program, arguments) {
         Ok((description, child)) => {
             operator::run_described(&description, |operator| work(operator, &description, child))
