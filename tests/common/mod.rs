@@ -31,9 +31,10 @@ pub(crate) const ON_TWO_MACHINES: [(&str, &str); 6] = [
 /// The `blindgrasp` of this build, in the project's folder.
 pub(crate) fn blindgrasp() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_blindgrasp"));
-    // Logs of the tests' graphs stay out of the user's state folder.
-    let state = Path::new(env!("CARGO_TARGET_TMPDIR")).join("state");
-    command.current_dir(project()).stdin(Stdio::null()).env("XDG_STATE_HOME", state);
+    // Nothing comes from the user's folders, and nothing goes there: logs of graphs, and convex parts for MuJoCo.
+    let own = Path::new(env!("CARGO_TARGET_TMPDIR"));
+    command.env("XDG_STATE_HOME", own.join("state")).env("XDG_CACHE_HOME", own.join("cache"));
+    command.current_dir(project()).stdin(Stdio::null());
     command
 }
 

@@ -7,6 +7,7 @@ mod bad_input;
 mod benchsuite;
 mod check;
 mod days;
+mod dependencies;
 mod docs;
 mod echo;
 mod evaluate;

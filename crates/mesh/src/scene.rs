@@ -4,6 +4,7 @@ use std::collections::HashMap;
 
 use nalgebra::{Matrix4, Point3, Rotation3, Unit, Vector3};
 use quick_xml::Reader;
+use quick_xml::escape::unescape;
 use quick_xml::events::{BytesStart, Event};
 use serde_json::Value;
 
@@ -104,11 +105,10 @@ struct Element {
 
 impl Element {
     fn begun(start: &BytesStart<'_>) -> Element {
-        let name = String::from_utf8_lossy(start.local_name().as_ref()).into_owned();
-        let mut element = Element { name, ..Element::default() };
+        let mut element = Element { name: start.local_name().as_ref().to_owned(), ..Element::default() };
         for attribute in start.attributes().with_checks(false).flatten() {
-            let value = attribute.unescape_value().unwrap_or_default().into_owned();
-            element.attributes.insert(String::from_utf8_lossy(attribute.key.as_ref()).into_owned(), value);
+            let value = unescape(&attribute.value).unwrap_or_default().into_owned();
+            element.attributes.insert(attribute.key.as_ref().to_owned(), value);
         }
         element
     }
@@ -159,7 +159,6 @@ impl Element {
                 Ok(Event::Empty(start)) => Some(Element::begun(&start)),
                 Ok(Event::End(_)) => open.pop(),
                 Ok(Event::Text(text)) => {
-                    let text = String::from_utf8_lossy(&text);
                     open.iter_mut().last().into_iter().for_each(|element| element.text.push_str(&text));
                     None
                 }

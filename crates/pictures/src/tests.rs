@@ -55,13 +55,12 @@ fn classes_of(svg: &str) -> Vec<String> {
                 let (Event::Start(element) | Event::Empty(element)) = event else { continue };
                 for attribute in element.attributes() {
                     let attribute = attribute.expect("an attribute");
-                    if attribute.key.as_ref() == b"class" {
-                        classes.push(String::from_utf8(attribute.value.into_owned()).expect("UTF-8"));
+                    if attribute.key.as_ref() == "class" {
+                        classes.push(attribute.value.into_owned());
                     }
                 }
             }
             Event::End(_) => depth -= 1,
-            Event::Text(text) => drop(text.decode().expect("UTF-8")),
             Event::Eof => break,
             _ => {}
         }

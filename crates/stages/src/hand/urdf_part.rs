@@ -99,7 +99,7 @@ fn edited(
         let event = reader.read_event().map_err(|error| format!("not a URDF, or cut off: {error}"))?;
         let span = (from, reader.buffer_position() as usize);
         if let Event::Start(start) | Event::Empty(start) = &event {
-            path.push(String::from_utf8_lossy(start.name().as_ref()).into_owned());
+            path.push(start.name().as_ref().to_owned());
         }
         if let Some(((from, to), by)) = edit(&event, &path, span)? {
             written += &text[copied..from];

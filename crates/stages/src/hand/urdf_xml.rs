@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
 use quick_xml::Reader;
+use quick_xml::escape::unescape;
 use quick_xml::events::{BytesStart, Event};
 
 use super::isometry;
@@ -113,7 +114,7 @@ struct UrdfReading {
 
 impl UrdfReading {
     fn enter(&mut self, element: &BytesStart<'_>) -> Result<(), String> {
-        let name = String::from_utf8_lossy(element.name().as_ref()).into_owned();
+        let name = element.name().as_ref().to_owned();
         if self.path.is_empty() && (name != "robot" || self.robot.is_some()) {
             return Err(format!("not a URDF: expected XML with one <robot>, found <{name}>"));
         }
@@ -258,11 +259,11 @@ pub(super) struct Attributes(BTreeMap<String, String>);
 impl Attributes {
     pub(super) fn of(element: &BytesStart<'_>) -> Result<Attributes, String> {
         let mut by_name = BTreeMap::new();
-        // The reader's own check for duplicates compares every attribute with every other.
+        // The reader's own check for duplicates names their places, not the attribute.
         for attribute in element.attributes().with_checks(false) {
             let attribute = attribute.map_err(|error| error.to_string())?;
-            let name = String::from_utf8_lossy(attribute.key.as_ref()).into_owned();
-            let value = attribute.unescape_value().map_err(|error| format!("attribute '{name}': {error}"))?;
+            let name = attribute.key.as_ref().to_owned();
+            let value = unescape(&attribute.value).map_err(|error| format!("attribute '{name}': {error}"))?;
             if by_name.insert(name.clone(), value.into_owned()).is_some() {
                 return Err(format!("two attributes are called '{name}'"));
             }

@@ -1,0 +1,105 @@
+//! The work of others that the project uses: crates with known faults, and the actions of workflows.
+
+use std::collections::BTreeMap;
+
+use serde_json::Value;
+
+use crate::common::project;
+
+#[test]
+fn a_version_has_a_fault_from_the_first_to_before_the_mended_one() {
+    let advisories = "# of some day\nA one 0.0.0-0..0.11.6 0.12.0..0.12.1\nB two 1.0.0..\nC three 0.0.0-0..9.0.0\n";
+    for (name, version, expected) in [
+        ("one", "0.10.0", vec!["A"]),
+        ("one", "0.11.6", vec![]),
+        ("one", "0.12.0", vec!["A"]),
+        ("one", "0.12.1+spec-1.1.0", vec![]),
+        ("two", "0.9.9", vec![]),
+        ("two", "1.0.0", vec!["B"]),
+        ("four", "1.0.0", vec![]),
+    ] {
+        let lock = format!("version = 4\n\n[[package]]\nname = \"{name}\"\nversion = \"{version}\"\n");
+        let found: Vec<&str> = faults(advisories, &lock).into_keys().collect();
+        assert_eq!(found, expected, "{name} {version}");
+    }
+}
+
+#[test]
+fn each_known_fault_of_a_crate_is_answered_and_no_other() {
+    let (advisories, lock, deny) = (read("tests/advisories.txt"), read("Cargo.lock"), read("deny.toml"));
+    let faults = faults(&advisories, &lock);
+    let answers: Vec<&str> = deny.split("{ id = \"").skip(1).filter_map(|rest| rest.split('"').next()).collect();
+    for (id, crate_name) in &faults {
+        assert!(
+            answers.contains(id),
+            "{id} is a fault of {crate_name}: use another version, or answer it in deny.toml"
+        );
+    }
+    for id in answers {
+        assert!(faults.contains_key(id), "deny.toml answers {id}, which no crate of Cargo.lock has: delete the answer");
+    }
+}
+
+/// The advisories on crates that a Cargo.lock names, each with such a crate and its version.
+fn faults<'a>(advisories: &'a str, lock: &str) -> BTreeMap<&'a str, String> {
+    let mut found = BTreeMap::new();
+    for package in lock.split("[[package]]").skip(1) {
+        let mut values = package.split('"').skip(1).step_by(2);
+        let (Some(name), Some(version)) = (values.next(), values.next()) else { panic!("a package: {package}") };
+        for line in advisories.lines().filter(|line| !line.starts_with('#')) {
+            let mut words = line.split(' ');
+            let (Some(id), Some(of)) = (words.next(), words.next()) else { panic!("an advisory: {line}") };
+            if of == name && words.any(|range| is_within(version, range)) {
+                found.insert(id, format!("{name} {version}"));
+            }
+        }
+    }
+    found
+}
+
+/// A range is FIRST..AFTER, without AFTER if no version is mended.
+fn is_within(version: &str, range: &str) -> bool {
+    let (first, after) = range.split_once("..").expect("a range");
+    numbers(first) <= numbers(version) && (after.is_empty() || numbers(version) < numbers(after))
+}
+
+/// The three numbers of a version. A pre-release counts as its release.
+fn numbers(version: &str) -> Vec<u64> {
+    let end = version.find(['-', '+']).unwrap_or(version.len());
+    version[..end].split('.').map(|number| number.parse().expect("a number")).collect()
+}
+
+/// A tag of an action can be moved to other content, and a checkout's credentials can be read by all later steps.
+#[test]
+fn workflows_run_actions_of_one_content_and_keep_no_credentials() {
+    for folder in [".github/workflows", "docs/ci"] {
+        for entry in std::fs::read_dir(project().join(folder)).expect("readable") {
+            let path = entry.expect("readable").path();
+            let text = std::fs::read_to_string(&path).expect("readable");
+            let workflow: Value = serde_saphyr::from_str(&text).expect("YAML");
+            // Those of GitLab have no actions.
+            for (_, job) in workflow["jobs"].as_object().into_iter().flatten() {
+                for step in job["steps"].as_array().expect("steps") {
+                    assert_step_is_pinned(step, &path.display().to_string());
+                }
+            }
+        }
+    }
+}
+
+fn assert_step_is_pinned(step: &Value, file: &str) {
+    if let Some(script) = step["run"].as_str().filter(|run| run.starts_with("scripts/")) {
+        let path = project().join(script.split(' ').next().expect("a word"));
+        assert!(path.is_file(), "{file}: {} is not there", path.display());
+    }
+    let Some((action, commit)) = step["uses"].as_str().and_then(|action| action.split_once('@')) else { return };
+    let is_commit = commit.len() == 40 && commit.bytes().all(|byte| byte.is_ascii_hexdigit());
+    assert!(is_commit, "{file}: {action} is used by '{commit}', expected a commit");
+    if action == "actions/checkout" {
+        assert_eq!(step["with"]["persist-credentials"], false, "{file}: {step}");
+    }
+}
+
+fn read(name: &str) -> String {
+    std::fs::read_to_string(project().join(name)).expect("readable")
+}
