@@ -3,10 +3,11 @@
 //! The inputs must be `latest`: the network never holds up the graph.
 
 use std::collections::BTreeMap;
+use std::hash::{BuildHasher, RandomState};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::bail;
-use blindgrasp_messages::{Message, Stamped};
+use blindgrasp_messages::{Header, Message, Stamped};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
@@ -23,6 +24,7 @@ pub(super) fn publish(operator: &Operator, outside: Outside, edges: Vec<Box<dyn 
         operator,
         outside,
         edges,
+        epochs: RandomState::new(),
         node: None,
         retry_nanos: 0,
         said: None,
@@ -73,8 +75,8 @@ pub(super) trait Forward {
     fn open(&mut self, node: &mut Node, namespace: &str) -> Result<(), RosError>;
     fn close(&mut self);
     fn connect(&mut self) -> anyhow::Result<()>;
-    /// Publishes the next sample, if there is a session.
-    fn forward(&mut self, data: &mut Vec<u8>) -> anyhow::Result<Forwarded>;
+    /// Publishes the next sample, if there is a session, with a hash of its epoch.
+    fn forward(&mut self, epochs: &RandomState, data: &mut Vec<u8>) -> anyhow::Result<Forwarded>;
 }
 
 /// The outcome of an attempt to publish a sample.
@@ -153,7 +155,7 @@ impl<M: Message> Forward for Edge<M> {
         Ok(())
     }
 
-    fn forward(&mut self, data: &mut Vec<u8>) -> anyhow::Result<Forwarded> {
+    fn forward(&mut self, epochs: &RandomState, data: &mut Vec<u8>) -> anyhow::Result<Forwarded> {
         let Some(sample) = self.subscriber.receive()? else {
             return Ok(Forwarded::NoSample);
         };
@@ -170,7 +172,9 @@ impl<M: Message> Forward for Edge<M> {
         if self.publishers.is_empty() {
             return Ok(Forwarded::Unpublished);
         }
-        let stamped = Stamped { header, message };
+        // Others can read the topics, and a user of this machine who forges samples needs the epoch.
+        let told = Header { epoch: epochs.hash_one(header.epoch), ..header };
+        let stamped = Stamped { header: told, message };
         let mut outcome = Forwarded::Published;
         for ((topic, publisher), state) in self.topics.iter().zip(&mut self.publishers).zip(&mut self.states) {
             let is_soon = |sent: u64| header.stamp_nanos.wrapping_sub(sent) < topic.interval_nanos;
@@ -209,6 +213,8 @@ struct Publishing<'a> {
     operator: &'a Operator,
     outside: Outside,
     edges: Vec<Box<dyn Forward>>,
+    /// The key of the hashes that stand for the graph's epochs.
+    epochs: RandomState,
     node: Option<Node>,
     retry_nanos: u64,
     said: Option<String>,
@@ -232,7 +238,7 @@ impl Publishing<'_> {
         let mut data = Vec::new();
         let mut has_any = false;
         for edge in &mut self.edges {
-            match edge.forward(&mut data)? {
+            match edge.forward(&self.epochs, &mut data)? {
                 Forwarded::NoSample => continue,
                 Forwarded::Published => self.n_published += 1,
                 Forwarded::Unpublished => self.n_unpublished += 1,

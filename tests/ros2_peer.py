@@ -49,6 +49,7 @@ def main() -> None:
     node(ROS2Subscriber, "/hand_markers", "visualization_msgs/msg/MarkerArray", callback=lambda said: markers.append(said.markers))
     clouds = []
     node(ROS2Subscriber, "/cell_points", "sensor_msgs/msg/PointCloud2", callback=clouds.append)
+    last_frame = router.declare_subscriber("0/tactile/**", zenoh.handlers.RingChannel(1))
     joints = node(ROS2Publisher, "/robot/joint_states", "sensor_msgs/msg/JointState")
     cells = node(ROS2Publisher, "/cells", "std_msgs/msg/Float64MultiArray")
     phases = node(ROS2Publisher, "/phase", "std_msgs/msg/String")
@@ -103,7 +104,8 @@ def main() -> None:
     print(json.dumps({"tokens": tokens}), flush=True)
     hand = markers[-1]
     felt = any(colour.r > 0.4 for picture in markers for colour in picture[-1].colors)
-    print(json.dumps({"pictures": len(markers), "shapes": len(hand) - 1, "cells": len(hand[-1].points),
+    print(json.dumps({"frame": list(bytes(last_frame.recv().payload)),
+                      "pictures": len(markers), "shapes": len(hand) - 1, "cells": len(hand[-1].points),
                       "points": [clouds[-1].width, [field.name for field in clouds[-1].fields]],
                       "size": [hand[0].scale.x, hand[0].scale.y, hand[0].scale.z], "felt": felt}), flush=True)
 

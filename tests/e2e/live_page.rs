@@ -587,8 +587,11 @@ fn foxglove_reads_the_samples_of_a_graph() {
         assert_eq!(schema("/prediction").as_deref(), Some("blindgrasp_msgs/msg/Prediction"), "{found}");
         assert_eq!(schema("/decision").as_deref(), Some("blindgrasp_msgs/msg/LiftDecision"));
         let tactile = &found["/tactile"]["fields"];
+        let epoch = tactile["header"]["epoch"].as_u64().expect("a number");
+        assert_eq!(found["/prediction"]["fields"]["header"]["epoch"], epoch, "one source");
         let is_recorded = RecordingReader::open(&project().join(RECORDING)).expect("a recording").any(|record| {
             let Record::Tactile(sample) = record.expect("a record").1 else { return false };
+            assert_ne!(sample.header.epoch, epoch, "the epoch of the graph");
             sample.message.joints == numbers(&tactile["joints"])
                 && sample.message.cells_newtons == numbers(&tactile["cells_newtons"])
         });

@@ -7,6 +7,7 @@ use std::io::{BufRead, BufReader, Write};
 use std::net::TcpListener;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use crate::common::python::python;
 use crate::common::{Graph, RECORDING, project, run, undisturbed, unique_name, wait_until};
@@ -130,6 +131,7 @@ fn a_robot_in_ros_2_gets_the_decisions_of_its_recording() {
     let folder = tempfile::tempdir().expect("a folder");
     let port = free_port();
     let mut peer = Peer::start(port, 200, N_GRASPS);
+    let started_nanos = unix_nanos();
     let graph = ros_graph(folder.path(), port, "phase_topic: /phase");
     wait_until_joined(&graph);
     peer.send();
@@ -151,6 +153,12 @@ fn a_robot_in_ros_2_gets_the_decisions_of_its_recording() {
     }
     let hand = Hand::load(&project().join("hands/barrett-bh8-280.yaml")).expect("a hand");
     let picture = peer.line();
+    let bytes: Vec<u8> = serde_json::from_value(picture["frame"].clone()).expect("bytes");
+    let epoch = cdr::decode::<TactileFrame>(&bytes).expect("a frame").header.epoch;
+    assert!(
+        !(started_nanos..unix_nanos()).contains(&epoch),
+        "the epoch of a live graph is the time of its start: {epoch}"
+    );
     let n_shapes: usize = hand.links.iter().map(|link| link.shapes.len()).sum();
     assert_eq!((&picture["shapes"], &picture["cells"]), (&n_shapes.into(), &hand.n_cells().into()), "{picture}");
     assert_eq!(picture["points"], json!([hand.n_cells(), ["x", "y", "z", "force"]]), "{picture}");
@@ -172,6 +180,10 @@ fn a_robot_in_ros_2_gets_the_decisions_of_its_recording() {
     expected[0] = ("hold".into(), "out_of_order".into());
     assert_decisions(&mut peer, &expected);
     graph.stop();
+}
+
+fn unix_nanos() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).expect("a clock").as_nanos() as u64
 }
 
 /// Reads decisions at the robot.

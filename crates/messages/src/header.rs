@@ -15,7 +15,8 @@ declared! { shared
         /// In a replay, this is the recorded time.
         #[ros = "When the source took it, nanoseconds of the source's clock."]
         pub stamp_nanos: u64,
-        /// Changes when the source starts anew.
+        /// Changes when the source starts anew. The page, Foxglove and topics of ROS 2 have a keyed hash of it,
+        /// because another user who forges samples needs it.
         #[ros = "Generation of the source."]
         pub epoch: u64,
         /// `Hand::id`.

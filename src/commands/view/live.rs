@@ -1,6 +1,7 @@
 //! The page of a running graph: the hand, the touch, the decisions and the graph itself, as they change.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::hash::{BuildHasher, RandomState};
 use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -13,6 +14,7 @@ use blindgrasp_graph::control::{Attachment, Reply, Request};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_messages::{
     Action, ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Record, Sense, TactileFrame,
+    with_sample,
 };
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, link_poses};
@@ -128,7 +130,8 @@ fn watch(
     let edges = edges.into_iter().filter(|edge| can_observe(&edge.input.service.type_name));
     let edges = edges.map(|edge| ObservedEdge { topic: edge.topic, input: edge.input, is_prompt: false }).collect();
     let latest = Arc::new(Mutex::new(Latest::default()));
-    let reader = Reader { latest: Arc::clone(&latest), hand_id: hand.as_ref().map(Hand::id), streams, shadow };
+    let hand_id = hand.as_ref().map(Hand::id);
+    let reader = Reader { latest: Arc::clone(&latest), hand_id, streams, shadow, epochs: RandomState::new() };
     let observer = Observer::start_attached(&domain, edges, reader).context("cannot read the graph's edges")?;
     viewer.forget("ended");
     viewer.keep("graph", &first);
@@ -262,10 +265,10 @@ fn hand_of(graph: &Value) -> Option<Hand> {
     }
 }
 
-/// A grasp: the source's epoch, and its number.
+/// A grasp: the hash of the source's epoch, and its number.
 type GraspKey = (u64, u64);
 
-/// A frame with its epoch and stamp.
+/// A frame with the hash of its epoch, and its stamp.
 #[derive(Clone)]
 struct ShownFrame {
     epoch: u64,
@@ -353,10 +356,14 @@ struct Reader {
     hand_id: Option<u64>,
     streams: Option<Streams>,
     shadow: Option<Judge>,
+    /// The key of the hashes that stand for the graph's epochs.
+    epochs: RandomState,
 }
 
 impl Sink for Reader {
-    fn take(&mut self, topic: &str, record: Record, _received_nanos: u64) -> anyhow::Result<()> {
+    fn take(&mut self, topic: &str, mut record: Record, _received_nanos: u64) -> anyhow::Result<()> {
+        // Every user of this machine can read the page, and a user who forges samples needs the epoch.
+        with_sample!(&mut record, sample => sample.header.epoch = self.epochs.hash_one(sample.header.epoch));
         // A graph may have several hands: the page shows one. 0 stands for an unknown hand.
         let shown = self.hand_id;
         let is_shown = |hand_id: u64| hand_id == 0 || shown.is_none_or(|shown| shown == hand_id);
@@ -497,4 +504,46 @@ fn graph_event(now: &Look, before: Option<&Look>) -> anyhow::Result<String> {
     let params = now.status.nodes.iter().map(|node| (&node.node, &node.params));
     event["params"] = json!(params.collect::<BTreeMap<_, _>>());
     Ok(event.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use blindgrasp_messages::{GraspTruth, Stamped};
+
+    use super::*;
+
+    const EPOCH: u64 = 1_795_879_623_871_224_034;
+
+    #[test]
+    fn the_page_tells_no_epoch_and_labels_find_their_decision() {
+        let layout = Path::new(env!("CARGO_MANIFEST_DIR")).join("hands/barrett-bh8-280.yaml");
+        let hand = Hand::load(&layout).expect("a hand");
+        let latest = Arc::new(Mutex::new(Latest::default()));
+        let shared = Arc::clone(&latest);
+        let mut reader =
+            Reader { latest: shared, hand_id: None, streams: None, shadow: None, epochs: RandomState::new() };
+        let header = Header { epoch: EPOCH, stamp_nanos: 7, ..Header::default() };
+        let frame = TactileFrame { grasp_id: 5, joints: vec![0.0; hand.joints.len()], ..TactileFrame::default() };
+        let decision = LiftDecision { grasp_id: 5, action: Action::Lift, ..LiftDecision::default() };
+        let truth = GraspTruth { grasp_id: 5, stable: true, ..GraspTruth::default() };
+        let records: [Record; 3] = [
+            Stamped { header, message: frame }.into(),
+            Stamped { header, message: decision }.into(),
+            Stamped { header, message: truth }.into(),
+        ];
+        for record in records {
+            reader.take("/topic", record, 0).expect("taken");
+        }
+        let latest = std::mem::take(&mut *latest.lock().expect("a lock"));
+        let event = frame_event(Some(&hand), &ShownModel::default(), latest).expect("an event");
+        assert!(!event.contains(&EPOCH.to_string()), "{event}");
+        let event: Value = serde_json::from_str(&event).expect("JSON");
+        let epoch = &event["epoch"];
+        let decided = &event["decisions"][0];
+        assert!(epoch.is_string(), "{event}");
+        assert_eq!(&decided["epoch"], epoch);
+        assert_eq!(decided["truth"], true);
+        assert_eq!(decided["frame"]["grasp_id"], "5", "the frame of the decision is known by its epoch");
+        assert_eq!(event["labels"], json!([[epoch, "5", true]]));
+    }
 }

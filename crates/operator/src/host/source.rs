@@ -260,10 +260,9 @@ impl HostedSource {
                 // An end before the sample after which it was to go on: it is not the same stream.
                 if let Some((output, known)) = self.outputs.iter().find_map(|output| Some((output, output.known?))) {
                     anyhow::bail!(
-                        "it ended without sample {} of epoch {} of the output {}, which readers have: expected that after \
-                         `resume`, `next` gives that sample or one before it, and then the same samples again",
+                        "it ended without sample {} of the output {}, which readers have: expected that after `resume`, \
+                         `next` gives that sample or one before it, and then the same samples again",
                         known.seq,
-                        known.epoch,
                         output.name
                     );
                 }
