@@ -13,6 +13,7 @@ use std::os::fd::OwnedFd;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::os::unix::net::UnixListener;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use crate::namespace::{SHARED_MEMORY_FOLDER, random_letters};
 use rustix::fs::{FlockOperation, flock};
@@ -21,6 +22,9 @@ use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
 
 /// The end of a socket's name.
 const SUFFIX: &str = ".sock";
+/// The lock of a folder, which is held for less than a millisecond, is tried so often.
+const N_LOCK_TRIES: u32 = 300;
+const LOCK_PAUSE: Duration = Duration::from_millis(10);
 /// The folder of the graphs of a service (`RuntimeDirectory=` in its unit).
 const SERVICE_FOLDER: &str = "/run/bgrasp";
 
@@ -187,11 +191,18 @@ fn remove_if_there(path: &Path) -> Result<()> {
     }
 }
 
-/// No other process binds or frees a name in a folder until the file is dropped.
+/// No other process binds or frees a name in a folder until the file is dropped. A process that keeps the lock, stopped or
+/// harmful, is not waited for without end.
 fn lock(folder: &Path) -> Result<File> {
     let file = File::open(folder)?;
-    flock(&file, FlockOperation::LockExclusive)?;
-    Ok(file)
+    for _ in 0..N_LOCK_TRIES {
+        match flock(&file, FlockOperation::NonBlockingLockExclusive) {
+            Err(Errno::WOULDBLOCK) => std::thread::sleep(LOCK_PAUSE),
+            outcome => return outcome.map(|()| file).map_err(Error::from),
+        }
+    }
+    let message = format!("{} is locked by another process: find it with 'lslocks', and end it", folder.display());
+    Err(Error::new(ErrorKind::TimedOut, message))
 }
 
 /// The folder of this user's sockets. It is made if it is missing.
@@ -332,6 +343,16 @@ mod tests {
         assert!(choose(&candidates[..2], uid).expect_err("open").to_string().contains("chmod 0700"));
         DirBuilder::new().mode(0o700).create(at("service")).expect("made");
         assert_eq!(choose(&candidates, uid).expect("a service's"), at("service"));
+    }
+
+    #[test]
+    fn a_process_that_keeps_the_lock_of_the_folder_is_not_waited_for_without_end() {
+        let parent = tempfile::tempdir().expect("a folder");
+        let held = lock(parent.path()).expect("free");
+        let error = lock(parent.path()).expect_err("held");
+        assert!(error.kind() == ErrorKind::TimedOut && error.to_string().contains("lslocks"), "{error}");
+        drop(held);
+        lock(parent.path()).expect("free again");
     }
 
     #[test]

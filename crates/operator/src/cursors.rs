@@ -16,7 +16,7 @@
 //! then [`SLOT_BYTES`] a slot, then the state regions. Every number is 64 bits, aligned.
 
 use std::fs::{File, OpenOptions};
-use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU64, Ordering, fence};
@@ -210,9 +210,12 @@ impl SharedCursors {
     pub fn open(path: &Path) -> Result<SharedCursors, CursorsError> {
         let failed = |source: std::io::Error| CursorsError::Io { path: path.display().to_string(), source };
         let alien = || CursorsError::Alien { path: path.display().to_string() };
-        let file = OpenOptions::new().read(true).write(true).open(path).map_err(failed)?;
-        let n_bytes = file.metadata().map_err(failed)?.len() as usize;
-        if n_bytes < HEADER_BYTES {
+        let no_follow = rustix::fs::OFlags::NOFOLLOW.bits() as i32;
+        let file = OpenOptions::new().read(true).write(true).custom_flags(no_follow).open(path).map_err(failed)?;
+        let metadata = file.metadata().map_err(failed)?;
+        let n_bytes = metadata.len() as usize;
+        let is_own = metadata.is_file() && metadata.uid() == rustix::process::getuid().as_raw();
+        if !is_own || n_bytes < HEADER_BYTES {
             return Err(alien());
         }
         let header = Self::map(file.try_clone().map_err(failed)?, 0, 0).map_err(failed)?;

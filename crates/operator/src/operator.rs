@@ -687,6 +687,12 @@ pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyho
     if leader.lock_memory {
         lock_memory()?;
     }
+    // Before the first thread: those that it starts are restricted as well.
+    let sandbox = (leader.sandbox != wiring::Sandbox::Off).then(|| {
+        let operators = descriptions.iter().zip(wirings.iter().map(|wiring| &wiring.params));
+        Arc::new(Sandbox::new(operators, &leader.domain))
+    });
+    let entered = sandbox.as_ref().map_or(Enforcement::None, |sandbox| sandbox::or_none(sandbox.enter()));
     let cursors = Arc::new(SharedCursors::open(&leader.domain.cursors())?);
     let waiter = Rc::new(Waiter::of_slot(&cursors, leader.bell_slot, leader.wait).context("cannot make an event")?);
     let inboxes: Vec<Arc<Inbox>> = wirings.iter().map(|_| Arc::default()).collect();
@@ -699,12 +705,6 @@ pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyho
         unsafe { signal_hook::low_level::register(signal, move || waker.wake()) }
             .context("cannot listen for signals")?;
     }
-    // Before the first thread: those that it starts are restricted as well.
-    let sandbox = (leader.sandbox != wiring::Sandbox::Off).then(|| {
-        let operators = descriptions.iter().zip(wirings.iter().map(|wiring| &wiring.params));
-        Arc::new(Sandbox::new(operators, &leader.domain))
-    });
-    let entered = sandbox.as_ref().map_or(Enforcement::None, |sandbox| sandbox::or_none(sandbox.enter()));
     let input_slots = wirings.iter().flat_map(|wiring| wiring.inputs.values()).filter_map(|input| input.slot).collect();
     let group = is_group.then(|| Rc::new(Group { inboxes: inboxes.clone(), input_slots, tasks: RefCell::default() }));
     let mut operators = Vec::with_capacity(wirings.len());

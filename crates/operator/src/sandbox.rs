@@ -76,8 +76,8 @@ pub(crate) struct Sandbox {
     readable: Vec<PathBuf>,
     /// Folders that it may read and write, and files.
     writable: Vec<PathBuf>,
-    /// The graph's folder, if it can be the last process of a graph.
-    graph: Option<PathBuf>,
+    /// Its graph, if it uses the graph's memory.
+    graph: Option<NamespaceWiring>,
     uses_network: bool,
     /// It entered the scope of its signals and sockets before, with its program.
     is_host: bool,
@@ -115,13 +115,13 @@ impl Sandbox {
         operators: impl Iterator<Item = (&'a OperatorDescription, &'a Map<String, Value>)>,
         domain: &NamespaceWiring,
     ) -> Self {
-        Sandbox::new_in(operators, vec![domain.ports(), domain.cursors()], Some(domain.folder.clone()))
+        Sandbox::new_in(operators, vec![domain.ports()], Some(domain.clone()))
     }
 
     fn new_in<'a>(
         operators: impl Iterator<Item = (&'a OperatorDescription, &'a Map<String, Value>)>,
         mut writable: Vec<PathBuf>,
-        graph: Option<PathBuf>,
+        graph: Option<NamespaceWiring>,
     ) -> Self {
         let (mut uses_network, mut is_host) = (false, false);
         let mut readable: Vec<PathBuf> = Vec::new();
@@ -161,7 +161,11 @@ impl Sandbox {
             ruleset = ruleset.handle_access(AccessNet::from_all(NEWEST))?;
         }
         let ruleset = ruleset.create()?.add_rules(path_beneath_rules(&self.writable, WRITE))?;
-        let ruleset = ruleset.add_rules(path_beneath_rules(&self.graph, REMOVE))?;
+        let folder = self.graph.as_ref().map(|graph| &graph.folder);
+        let cursors = self.graph.as_ref().map(NamespaceWiring::cursors);
+        let ruleset = ruleset.add_rules(path_beneath_rules(folder, REMOVE))?;
+        // Without the right to truncate it: its other users would die.
+        let ruleset = ruleset.add_rules(path_beneath_rules(cursors, AccessFs::WriteFile))?;
         // The graph's folder is in this one.
         enforce(ruleset.add_rules(path_beneath_rules([SHARED_MEMORY_FOLDER], AccessFs::RemoveDir))?)
     }
@@ -175,7 +179,9 @@ impl Sandbox {
     pub(crate) fn close(&self) -> Result<Enforcement, SandboxError> {
         let kept = self.readable.iter().chain(&self.writable);
         let ruleset = Ruleset::default().handle_access(READ)?.create()?.add_rules(path_beneath_rules(kept, READ))?;
-        enforce(ruleset.add_rules(path_beneath_rules(&self.graph, AccessFs::ReadDir))?)
+        enforce(
+            ruleset.add_rules(path_beneath_rules(self.graph.as_ref().map(|graph| &graph.folder), AccessFs::ReadDir))?,
+        )
     }
 }
 
