@@ -24,7 +24,7 @@ fn main() -> anyhow::Result<()> {
     for record in RecordingReader::open(Path::new(&recording))? {
         let (_topic, record) = record?;
         let Record::Tactile(frame) = record else { continue };
-        if let Some(decision) = judge.frame(frame.header.stamp_nanos, &frame.message) {
+        for decision in judge.frame(frame.header.stamp_nanos, &frame.message) {
             let (action, reason) = (decision.action.as_str(), decision.reason.as_str());
             println!("grasp {}: {action} ({reason}), p {:.3}", decision.grasp_id, decision.probability_stable);
         }

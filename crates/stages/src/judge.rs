@@ -87,13 +87,13 @@ impl Judge {
         &self.model
     }
 
-    /// Takes the next frame, and returns the decision if it comes with this frame: also a probe before it, or what the arm
-    /// should do while it lifts. `stamp_nanos` is the time of the
+    /// Takes the next frame, and returns the decisions that come with it, in order ([`Judged::decisions`]): also a probe
+    /// before a decision, or what the arm should do while it lifts. `stamp_nanos` is the time of the
     /// reading by the source's clock: frames of one time are one reading and have one vote, and a grasp whose frames
     /// come more than 100 ms apart (see [`ArbiterOptions`]) is held.
-    pub fn frame(&mut self, stamp_nanos: u64, frame: &TactileFrame) -> Option<LiftDecision> {
+    pub fn frame(&mut self, stamp_nanos: u64, frame: &TactileFrame) -> Vec<LiftDecision> {
         let header = Header { seq: self.next_seq, stamp_nanos, hand_id: self.hand_id, ..Header::default() };
-        self.judge(header, frame).decisions.pop()
+        self.judge(header, frame).decisions
     }
 
     /// As [`Judge::frame`], for a sample that bears its source's number and time. A number that is missing is a doubt,
@@ -185,8 +185,8 @@ mod tests {
     #[test]
     fn frames_are_numbered_without_gaps_and_a_gap_of_samples_is_a_doubt() {
         let mut judge = judge();
-        assert_eq!(judge.frame(0, &frame(Phase::Closing)), None);
-        let decision = judge.frame(10_000_000, &frame(Phase::Settled)).expect("decided");
+        assert_eq!(judge.frame(0, &frame(Phase::Closing)), []);
+        let decision = judge.frame(10_000_000, &frame(Phase::Settled)).pop().expect("decided");
         assert_eq!((decision.action, decision.reason), (Action::Hold, Reason::NoContact));
         assert_eq!(judge.end(), None);
 
@@ -199,9 +199,24 @@ mod tests {
     }
 
     #[test]
+    fn a_frame_that_ends_a_grasp_and_decides_the_next_one_has_both_decisions() {
+        let mut judge = judge();
+        let mut felt = frame(Phase::Settled);
+        // One cell, as in training: all cells would be out of distribution, which holds at once.
+        felt.cells_newtons[0] = 1.0;
+        assert_eq!(judge.frame(0, &felt), []);
+        assert_eq!(judge.frame(10_000_000, &felt), []);
+        let next = TactileFrame { grasp_id: 2, ..frame(Phase::Settled) };
+        let decisions = judge.frame(20_000_000, &next);
+        let said: Vec<_> =
+            decisions.iter().map(|decision| (decision.grasp_id, decision.action, decision.reason)).collect();
+        assert_eq!(said, [(1, Action::Hold, Reason::NoAgreement), (2, Action::Hold, Reason::NoContact)]);
+    }
+
+    #[test]
     fn a_grasp_without_a_decision_is_held_in_the_end() {
         let mut judge = judge();
-        assert_eq!(judge.frame(0, &frame(Phase::Closing)), None);
+        assert_eq!(judge.frame(0, &frame(Phase::Closing)), []);
         let decision = judge.end().expect("held");
         assert_eq!((decision.grasp_id, decision.action, decision.reason), (1, Action::Hold, Reason::Missing));
     }

@@ -17,8 +17,9 @@
 //! };
 //!
 //! let mut judge = Judge::new(hand, model)?;
-//! let decision = judge.frame(0, &closed_on_nothing).expect("decided at once: no cell feels anything");
-//! assert_eq!((decision.action, decision.reason), (Action::Hold, Reason::NoContact));
+//! let decisions = judge.frame(0, &closed_on_nothing);
+//! assert_eq!(decisions.len(), 1, "decided at once: no cell feels anything");
+//! assert_eq!((decisions[0].action, decisions[0].reason), (Action::Hold, Reason::NoContact));
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 //!
