@@ -23,7 +23,7 @@ use blindgrasp_operator::wiring::NamespaceWiring;
 use clap::Parser;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::port::{listener::Listener, notifier::Notifier, publisher, subscriber};
-use iceoryx2::prelude::{Node, PortFactory as _, ServiceName, ipc};
+use iceoryx2::prelude::{Node, PortFactory as _, ServiceName, ZeroCopySend, ipc};
 use iceoryx2::service::port_factory::publish_subscribe;
 use rustix::process::{Signal, set_parent_process_death_signal};
 use rustix::time::{ClockId, clock_gettime};
@@ -238,7 +238,11 @@ fn source(node: &Node<ipc::Service>, rate: f64, n_frames: u64) -> anyhow::Result
     report(json!({}))
 }
 
-fn stage<In: Message, Out: Message>(
+/// A message whose parts iceoryx2 carries as they are.
+trait Sendable: Message<Head: ZeroCopySend, Item: ZeroCopySend> {}
+impl<M: Message<Head: ZeroCopySend, Item: ZeroCopySend>> Sendable for M {}
+
+fn stage<In: Sendable, Out: Sendable>(
     node: &Node<ipc::Service>,
     n_frames: u64,
     items: &[Out::Item],
@@ -282,13 +286,13 @@ fn sink(node: &Node<ipc::Service>, n_frames: u64) -> anyhow::Result<()> {
 
 type PubSub<M> = publish_subscribe::PortFactory<ipc::Service, [<M as Message>::Item], <M as Message>::Head>;
 
-struct Sender<M: Message> {
+struct Sender<M: Sendable> {
     pub_sub: PubSub<M>,
     publisher: publisher::Publisher<ipc::Service, [M::Item], M::Head>,
     notifier: Notifier<ipc::Service>,
 }
 
-impl<M: Message> Sender<M> {
+impl<M: Sendable> Sender<M> {
     fn open(node: &Node<ipc::Service>, max_items: usize) -> anyhow::Result<Self> {
         let pub_sub = pub_sub::<M>(node)?;
         let publisher =
@@ -311,13 +315,13 @@ impl<M: Message> Sender<M> {
     }
 }
 
-struct Receiver<M: Message> {
+struct Receiver<M: Sendable> {
     pub_sub: PubSub<M>,
     subscriber: subscriber::Subscriber<ipc::Service, [M::Item], M::Head>,
     listener: Listener<ipc::Service>,
 }
 
-impl<M: Message> Receiver<M> {
+impl<M: Sendable> Receiver<M> {
     fn open(node: &Node<ipc::Service>) -> anyhow::Result<Self> {
         let events = node.service_builder(&service_name::<M>()?).event().open_or_create().map_err(refused)?;
         let listener = events.listener_builder().create().map_err(refused)?;
@@ -335,7 +339,7 @@ impl<M: Message> Receiver<M> {
 }
 
 /// Lossless: a publisher waits for a full subscriber.
-fn pub_sub<M: Message>(node: &Node<ipc::Service>) -> anyhow::Result<PubSub<M>> {
+fn pub_sub<M: Sendable>(node: &Node<ipc::Service>) -> anyhow::Result<PubSub<M>> {
     node.service_builder(&service_name::<M>()?)
         .publish_subscribe::<[M::Item]>()
         .user_header::<M::Head>()
