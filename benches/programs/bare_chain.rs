@@ -24,7 +24,7 @@ use blindgrasp_operator::wiring::NamespaceWiring;
 use clap::Parser;
 use iceoryx2::port::update_connections::UpdateConnections;
 use iceoryx2::port::{listener::Listener, notifier::Notifier, publisher, subscriber};
-use iceoryx2::prelude::{Node, PortFactory as _, ServiceName};
+use iceoryx2::prelude::{Node, PortFactory as _, ServiceName, ZeroCopySend};
 use iceoryx2::service::port_factory::publish_subscribe;
 use rustix::process::{Signal, set_parent_process_death_signal};
 use rustix::time::{ClockId, clock_gettime};
@@ -239,7 +239,11 @@ fn source(node: &Node<PrivateService>, rate: f64, n_frames: u64) -> anyhow::Resu
     report(json!({}))
 }
 
-fn stage<In: Message, Out: Message>(
+/// A message whose parts iceoryx2 carries as they are.
+trait Sendable: Message<Head: ZeroCopySend, Item: ZeroCopySend> {}
+impl<M: Message<Head: ZeroCopySend, Item: ZeroCopySend>> Sendable for M {}
+
+fn stage<In: Sendable, Out: Sendable>(
     node: &Node<PrivateService>,
     n_frames: u64,
     items: &[Out::Item],
@@ -283,13 +287,13 @@ fn sink(node: &Node<PrivateService>, n_frames: u64) -> anyhow::Result<()> {
 
 type PubSub<M> = publish_subscribe::PortFactory<PrivateService, [<M as Message>::Item], <M as Message>::Head>;
 
-struct Sender<M: Message> {
+struct Sender<M: Sendable> {
     pub_sub: PubSub<M>,
     publisher: publisher::Publisher<PrivateService, [M::Item], M::Head>,
     notifier: Notifier<PrivateService>,
 }
 
-impl<M: Message> Sender<M> {
+impl<M: Sendable> Sender<M> {
     fn open(node: &Node<PrivateService>, max_items: usize) -> anyhow::Result<Self> {
         let pub_sub = pub_sub::<M>(node)?;
         let publisher =
@@ -312,13 +316,13 @@ impl<M: Message> Sender<M> {
     }
 }
 
-struct Receiver<M: Message> {
+struct Receiver<M: Sendable> {
     pub_sub: PubSub<M>,
     subscriber: subscriber::Subscriber<PrivateService, [M::Item], M::Head>,
     listener: Listener<PrivateService>,
 }
 
-impl<M: Message> Receiver<M> {
+impl<M: Sendable> Receiver<M> {
     fn open(node: &Node<PrivateService>) -> anyhow::Result<Self> {
         let events = node.service_builder(&service_name::<M>()?).event().open_or_create().map_err(refused)?;
         let listener = events.listener_builder().create().map_err(refused)?;
@@ -336,7 +340,7 @@ impl<M: Message> Receiver<M> {
 }
 
 /// Lossless: a publisher waits for a full subscriber.
-fn pub_sub<M: Message>(node: &Node<PrivateService>) -> anyhow::Result<PubSub<M>> {
+fn pub_sub<M: Sendable>(node: &Node<PrivateService>) -> anyhow::Result<PubSub<M>> {
     node.service_builder(&service_name::<M>()?)
         .publish_subscribe::<[M::Item]>()
         .user_header::<M::Head>()

@@ -6,7 +6,6 @@ use crate::declare::{Raw as _, at_most};
 use crate::senses::MAX_SENSE_VALUES;
 use crate::{
     Fault, Header, MAX_CELLS, MAX_JOINTS, MAX_PADS, Message, MessageError, OwnedSenses, Phase, Recorded as _, Senses,
-    ZeroCopySend,
 };
 
 declared! { shared

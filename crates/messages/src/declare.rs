@@ -117,7 +117,7 @@ macro_rules! shared {
         #[doc = $doc]
         #[repr(C)]
         #[derive(Debug, Clone, Copy, Default)]
-        #[cfg_attr(feature = "ipc", derive(ZeroCopySend))]
+        #[cfg_attr(feature = "ipc", derive(ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout))]
         $(#[$($meta)*])*
         pub struct $name { $($(#[$($field_meta)*])* pub $field: $type,)+ }
 
@@ -147,7 +147,7 @@ macro_rules! declared {
             #[doc = $doc]
             #[repr(C)]
             #[derive(Debug, Clone, Copy, Default)]
-            #[cfg_attr(feature = "ipc", derive(ZeroCopySend))]
+            #[cfg_attr(feature = "ipc", derive(ZeroCopySend, FromBytes, IntoBytes, Immutable, KnownLayout))]
             $(#[$($meta)*])*
             pub struct $name { $($(#[$($field_meta)*])* pub $field: $type,)+ }
         }
@@ -251,6 +251,10 @@ macro_rules! message {
     (@head #[doc = $doc:literal] $head:ident $head_name:literal {
         $($field:ident: $raw:ty $(= $fixed:literal)? $(=> $list:ident)?,)+
     }) => {
+        // The derived code of `shared!` and `declared!` knows the traits by these names.
+        #[cfg(feature = "ipc")]
+        use crate::shared_memory::{FromBytes, Immutable, IntoBytes, KnownLayout, ZeroCopySend};
+
         shared! {
             #[doc = $doc]
             #[cfg_attr(feature = "ipc", type_name($head_name))]

@@ -1,6 +1,6 @@
 //! What the encoder sends.
 
-use crate::{Fault, MAX_FEATURES, MAX_PADS, Phase, ZeroCopySend};
+use crate::{Fault, MAX_FEATURES, MAX_PADS, Phase};
 
 message! {
     /// A frame's feature: the blocks of the model's recipe, the paper's histogram over the dictionary (Eq. 2-4) among

@@ -1,6 +1,6 @@
 //! What is known to be true of a grasp.
 
-use crate::{MAX_NAME_BYTES, ZeroCopySend};
+use crate::MAX_NAME_BYTES;
 
 message! {
     /// The label of a simulated or labelled grasp. The header's sequence counts labels.

@@ -2,7 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Recorded, ZeroCopySend};
+use crate::Recorded;
+#[cfg(feature = "ipc")]
+use crate::shared_memory::{FromBytes, Immutable, IntoBytes, KnownLayout, ZeroCopySend};
 
 declared! { shared
     /// On each sample: which one it is and where it comes from.

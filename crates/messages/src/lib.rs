@@ -23,12 +23,9 @@
 //! `operators/blindgrasp_messages.py` is generated from the same declarations.
 //!
 //! A message in shared memory may come from a process of a stranger. Therefore no bit pattern of a head is invalid as
-//! such: enums travel as integer codes, and [`Message::from_parts`] checks the codes and every length.
+//! such ([`PlainBytes`]): enums travel as integer codes, and [`Message::from_parts`] checks the codes and every length.
 //!
 //! A new message type is a file with its `message!`, which this file names as a module, and a line in the list below.
-
-// Files of messages import the condition on shared memory, which only the feature makes use of.
-#![cfg_attr(not(feature = "ipc"), allow(unused_imports))]
 
 #[macro_use]
 mod declare;
@@ -51,7 +48,7 @@ mod ros;
 pub mod score;
 mod serialized;
 mod tactile_frame;
-#[cfg(test)]
+#[cfg(all(test, feature = "ipc"))]
 mod tests;
 
 pub use coded::{Action, Codes, Fault, Phase, Reason, coded_enums};
@@ -67,9 +64,10 @@ pub use ros::{first_difference, signature};
 pub use senses::{OwnedSenses, Sense, Senses};
 pub use serialized::{hex_id, read_list};
 pub use tactile_frame::{FrameParts, FramePartsMut, TactileFrame, TactileFrameHead};
+#[cfg(feature = "ipc")]
+pub use zerocopy;
 
 use serde::{Deserialize, Serialize};
-use shared_memory::ZeroCopySend;
 
 /// The most joints that a message carries.
 pub const MAX_JOINTS: usize = 32;
@@ -104,24 +102,66 @@ pub trait Recorded: Serialize + for<'de> Deserialize<'de> + Clone + std::fmt::De
     fn check(&self) -> Result<(), MessageError>;
 }
 
-/// The condition on what lies in shared memory: iceoryx2's with the feature `ipc`, none without.
-#[allow(unreachable_pub, reason = "it bounds the associated types of a public trait")]
+/// What a struct in shared memory implements.
+#[cfg(feature = "ipc")]
 mod shared_memory {
-    #[cfg(feature = "ipc")]
-    pub use iceoryx2::prelude::ZeroCopySend;
-
-    #[cfg(not(feature = "ipc"))]
-    pub trait ZeroCopySend {}
-    #[cfg(not(feature = "ipc"))]
-    impl<T> ZeroCopySend for T {}
+    /// Programs may send it with iceoryx2 alone.
+    pub(crate) use iceoryx2::prelude::ZeroCopySend;
+    /// See [`PlainBytes`](crate::PlainBytes).
+    pub(crate) use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 }
+
+/// The condition on what lies in shared memory: all bytes of its length are a value, and a value is nothing but its
+/// bytes. (Without the feature `ipc`, there is no condition, because nothing reads the bytes.)
+///
+/// A head has it by `derive`; no other dependency is needed:
+///
+/// ```
+/// use blindgrasp_messages::zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+/// use blindgrasp_messages::{Header, PlainBytes};
+///
+/// #[derive(FromBytes, IntoBytes, Immutable, KnownLayout)]
+/// #[zerocopy(crate = "blindgrasp_messages::zerocopy")]
+/// #[repr(C)]
+/// struct SlipHead {
+///     header: Header,
+///     slips: [u8; 8],
+/// }
+///
+/// fn may_be_shared<T: PlainBytes>() {}
+/// may_be_shared::<SlipHead>();
+/// ```
+///
+/// Bytes from another process may be anything, and no `bool` is 7. The compiler refuses such a head, one that has an
+/// enum or a reference, and one with padding:
+///
+/// ```compile_fail,E0277
+/// # use blindgrasp_messages::zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+/// # use blindgrasp_messages::Header;
+/// #[derive(FromBytes, IntoBytes, Immutable, KnownLayout)]
+/// #[zerocopy(crate = "blindgrasp_messages::zerocopy")]
+/// #[repr(C)]
+/// struct SlipHead {
+///     header: Header,
+///     slips: [bool; 8],
+/// }
+/// ```
+#[cfg(feature = "ipc")]
+pub trait PlainBytes: zerocopy::FromBytes + zerocopy::IntoBytes + zerocopy::Immutable + zerocopy::KnownLayout {}
+#[cfg(feature = "ipc")]
+impl<T: zerocopy::FromBytes + zerocopy::IntoBytes + zerocopy::Immutable + zerocopy::KnownLayout> PlainBytes for T {}
+
+#[cfg(not(feature = "ipc"))]
+pub trait PlainBytes {}
+#[cfg(not(feature = "ipc"))]
+impl<T> PlainBytes for T {}
 
 /// A message that can travel along an edge.
 pub trait Message: Recorded {
-    /// The fixed-size part in shared memory.
-    type Head: ZeroCopySend + Copy + Default + std::fmt::Debug;
+    /// The fixed-size part in shared memory, which begins with the header.
+    type Head: PlainBytes + Copy + Default + std::fmt::Debug;
     /// An element of the variable part in shared memory.
-    type Item: ZeroCopySend + Copy + Default + std::fmt::Debug;
+    type Item: PlainBytes + Copy + Default + std::fmt::Debug;
 
     /// The header in a head.
     fn header(head: &Self::Head) -> &Header;

@@ -1,6 +1,6 @@
 //! What the arbiter sends.
 
-use crate::{Action, Reason, ZeroCopySend};
+use crate::{Action, Reason};
 
 message! {
     /// The arbiter's decision, one per grasp. The header's sequence counts decisions.

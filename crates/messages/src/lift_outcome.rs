@@ -1,6 +1,6 @@
 //! What became of a grasp.
 
-use crate::{MAX_NAME_BYTES, ZeroCopySend};
+use crate::MAX_NAME_BYTES;
 
 message! {
     /// What became of a grasp that a hand tried: whether the hand lifted, and whether the object was kept. The header's

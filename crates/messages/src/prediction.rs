@@ -1,6 +1,6 @@
 //! What the classifier sends.
 
-use crate::{Fault, Phase, ZeroCopySend};
+use crate::{Fault, Phase};
 
 message! {
     /// The classifier's verdict on a frame.

@@ -1,10 +1,7 @@
 //! What the tactile source sends.
 
 use crate::declare::at_most;
-use crate::{
-    Header, MAX_CELLS, MAX_JOINTS, Message, MessageError, OwnedSenses, Phase, Recorded as _, Sense, Senses,
-    ZeroCopySend,
-};
+use crate::{Header, MAX_CELLS, MAX_JOINTS, Message, MessageError, OwnedSenses, Phase, Recorded as _, Sense, Senses};
 
 message! {
     /// One reading of all joints and cells.

@@ -4,17 +4,11 @@
 
 use serde_json::{Map, Value, json};
 
+use crate::shared_memory::IntoBytes as _;
 use crate::*;
 
 fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-/// The bytes of a value in shared memory.
-fn raw<T: Copy>(value: &T) -> &[u8] {
-    // SAFETY: heads and items are `repr(C)`, made of integers and floats without padding: their sizes are in the
-    // golden bytes, and `layout` has the offsets.
-    unsafe { std::slice::from_raw_parts(std::ptr::from_ref(value).cast::<u8>(), size_of::<T>()) }
 }
 
 fn recorded<M: Recorded>(message: &M) -> Map<String, Value> {
@@ -44,8 +38,8 @@ fn sent<M: Message + PartialEq>(message: &M) -> Map<String, Value> {
     assert_eq!(M::from_parts(&head, &items).as_ref(), Ok(message));
     assert_eq!(M::header(&head), &header);
     let mut shapes = recorded(message);
-    shapes.insert("head".into(), hex(raw(&head)).into());
-    shapes.insert("items".into(), items.iter().map(|item| hex(raw(item))).collect::<String>().into());
+    shapes.insert("head".into(), hex(head.as_bytes()).into());
+    shapes.insert("items".into(), hex(items.as_bytes()).into());
     shapes
 }
 

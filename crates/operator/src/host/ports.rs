@@ -4,13 +4,14 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
+use blindgrasp_messages::zerocopy::IntoBytes as _;
 use blindgrasp_messages::{Header, MESSAGE_TYPES, Message, WithMessage, with_message};
 
 use crate::cursors::SampleId;
 use crate::operator::{Operator, OperatorError};
 use crate::outbox::Keyed;
 use crate::partner::Partner;
-use crate::port::bytes::{head_bytes, head_of, item_bytes, items_of};
+use crate::port::bytes::{head_of, items_of};
 use crate::port::{PortError, PortSample, Publisher, Sent, ShadowPublisher, Subscriber, sample_id};
 use crate::wiring::{Clock, InputCounts, OnLate};
 
@@ -89,8 +90,8 @@ impl<M: Message> InputPort for Input<M> {
         }
         Ok(Some(RawSample {
             header: *M::header(&head),
-            head: head_bytes::<M>(&head).to_vec(),
-            items: item_bytes::<M>(sample.items()).to_vec(),
+            head: head.as_bytes().to_vec(),
+            items: sample.items().as_bytes().to_vec(),
             counts: self.subscriber.counts(),
             late,
         }))
@@ -151,7 +152,7 @@ pub(super) trait PartnerPort {
 impl<M: Message> PartnerPort for Partner<M> {
     fn sample(&self) -> Option<(Vec<u8>, Vec<u8>)> {
         let sample = Partner::sample(self)?;
-        Some((head_bytes::<M>(&sample.head).to_vec(), item_bytes::<M>(&sample.items).to_vec()))
+        Some((sample.head.as_bytes().to_vec(), sample.items.as_bytes().to_vec()))
     }
 }
 
@@ -230,7 +231,7 @@ impl<M: Message> OutputPort for Output<M> {
         self.publisher.send_checked(head, &items, should_yield, |head| {
             let Some(check) = check else { return true };
             let header = *M::header(head);
-            let mut bytes = head_bytes::<M>(head).to_vec();
+            let mut bytes = head.as_bytes().to_vec();
             if !check(&header, &mut bytes, &answer.items) {
                 return false;
             }
@@ -297,7 +298,7 @@ impl<M: Message> OutputPort for Output<M> {
             return head.to_vec();
         };
         *M::header_mut(&mut head) = header;
-        head_bytes::<M>(&head).to_vec()
+        head.as_bytes().to_vec()
     }
 
     fn n_items(&self, head: &[u8], items: &[u8]) -> Option<usize> {

@@ -4,7 +4,6 @@
 //! sample: nothing is saved, and after a restart it answers again what readers may lack. Any other is saved after each sample,
 //! with its answers and the places of all its inputs, before the answers are sent.
 
-use std::hash::{DefaultHasher, Hash, Hasher};
 use std::time::{Duration, Instant};
 
 use blindgrasp_messages::Header;
@@ -16,6 +15,7 @@ use super::store::{Input, Output, Store, look_for_readers};
 use super::{listen, log};
 use crate::cursors::SampleId;
 use crate::description::OperatorDescription;
+use crate::identity::stable_hash;
 use crate::monotonic_nanos;
 use crate::operator::{Operator, TICK, Task, Turn, run_in_turn};
 use crate::partner::Partners;
@@ -480,9 +480,7 @@ impl HostedStage {
         if self.inputs.len() == 1 {
             return key;
         }
-        let mut hasher = DefaultHasher::new();
-        self.inputs[idx].name.hash(&mut hasher);
-        SampleId { epoch: key.epoch ^ hasher.finish(), seq: key.seq }
+        SampleId { epoch: key.epoch ^ stable_hash(&[&self.inputs[idx].name]), seq: key.seq }
     }
 
     fn judge_lateness(&mut self, sample: &RawSample) {

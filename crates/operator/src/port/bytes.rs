@@ -1,8 +1,7 @@
 //! The bytes of a sample in shared memory: its head, and behind it its items.
 
-use std::mem::MaybeUninit;
-
 use blindgrasp_messages::Message;
+use blindgrasp_messages::zerocopy::{FromBytes as _, IntoBytes as _};
 use iceoryx2::prelude::ZeroCopySend;
 
 /// The unit in which iceoryx2 lends memory: heads and items need no greater alignment. (Of single bytes that are aligned,
@@ -63,7 +62,7 @@ pub(super) struct Parts<'a> {
 
 impl<'a> Parts<'a> {
     pub(super) fn of<M: Message>(head: &'a M::Head, items: &'a [M::Item]) -> Parts<'a> {
-        Parts { head: head_bytes::<M>(head), items: item_bytes::<M>(items) }
+        Parts { head: head.as_bytes(), items: items.as_bytes() }
     }
 
     pub(super) fn n_bytes(&self) -> usize {
@@ -78,36 +77,17 @@ impl<'a> Parts<'a> {
         Envelope { n_head_bytes: self.head.len() as u32, n_item_bytes: self.items.len() as u32 }
     }
 
-    /// Writes all of the first [`Parts::n_words`] words.
-    pub(super) fn write(&self, words: &mut [MaybeUninit<Word>]) {
-        let words = &mut words[..self.n_words()];
-        // Behind the items.
-        if let Some(last) = words.last_mut() {
-            last.write(0);
-        }
-        let begin: *mut u8 = words.as_mut_ptr().cast();
-        // SAFETY: the words are as long as both parts.
-        unsafe {
-            std::ptr::copy_nonoverlapping(self.head.as_ptr(), begin, self.head.len());
-            std::ptr::copy_nonoverlapping(self.items.as_ptr(), begin.add(self.head.len()), self.items.len());
-        }
+    /// Writes the first [`Parts::n_bytes`] bytes of as many words as [`Parts::n_words`].
+    pub(super) fn write(&self, words: &mut [Word]) {
+        let (head, rest) = words.as_mut_bytes().split_at_mut(self.head.len());
+        head.copy_from_slice(self.head);
+        rest[..self.items.len()].copy_from_slice(self.items);
     }
-}
-
-pub(crate) fn head_bytes<M: Message>(head: &M::Head) -> &[u8] {
-    // SAFETY: heads have no padding (a test of crates/messages), so that each of their bytes is initialised.
-    unsafe { std::slice::from_raw_parts(std::ptr::from_ref(head).cast(), size_of::<M::Head>()) }
-}
-
-pub(crate) fn item_bytes<M: Message>(items: &[M::Item]) -> &[u8] {
-    // SAFETY: as for heads.
-    unsafe { std::slice::from_raw_parts(items.as_ptr().cast(), size_of_val(items)) }
 }
 
 /// A head of these bytes; `None` if it has another length.
 pub(crate) fn head_of<M: Message>(bytes: &[u8]) -> Option<M::Head> {
-    // SAFETY: the length is that of a head, and no bytes are invalid as a head, because enums travel as integers.
-    (bytes.len() == size_of::<M::Head>()).then(|| unsafe { std::ptr::read_unaligned(bytes.as_ptr().cast()) })
+    M::Head::read_from_bytes(bytes).ok()
 }
 
 /// The items of these bytes; `None` if they are no whole number of items.
@@ -116,8 +96,7 @@ pub(crate) fn items_of<M: Message>(bytes: &[u8]) -> Option<Vec<M::Item>> {
         return None;
     }
     let mut items = vec![M::Item::default(); bytes.len() / size_of::<M::Item>()];
-    // SAFETY: the memory is as long as the bytes, and no bytes are invalid as items.
-    unsafe { std::ptr::copy_nonoverlapping(bytes.as_ptr(), items.as_mut_ptr().cast(), bytes.len()) };
+    items.as_mut_bytes().copy_from_slice(bytes);
     Some(items)
 }
 
@@ -131,9 +110,9 @@ mod tests {
     fn heads_and_items_are_read_back_from_their_bytes_and_other_lengths_are_refused() {
         let frame = TactileFrame { phase: Phase::Settled, cells_newtons: vec![0.25, 3.0], ..TactileFrame::default() };
         let (head, items) = frame.to_parts(Header { seq: 7, ..Header::default() });
-        let bytes = head_bytes::<TactileFrame>(&head);
+        let bytes = head.as_bytes();
         let read = head_of::<TactileFrame>(bytes).expect("a head");
-        let items = items_of::<TactileFrame>(item_bytes::<TactileFrame>(&items)).expect("items");
+        let items = items_of::<TactileFrame>(items.as_bytes()).expect("items");
         assert_eq!(read.header, head.header);
         assert_eq!(TactileFrame::from_parts(&read, &items).expect("a frame"), frame);
         assert!(head_of::<TactileFrame>(&bytes[1..]).is_none());

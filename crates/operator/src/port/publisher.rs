@@ -106,11 +106,10 @@ impl Sender {
 
     fn send(&self, seq: u64, parts: &Parts<'_>) -> Result<(), PortError> {
         let failed = |source| PortError::Send { service: self.service.clone(), seq, source };
-        let mut sample = self.publisher.loan_slice_uninit(parts.n_words()).map_err(|error| failed(error.into()))?;
+        let mut sample = self.publisher.loan_slice(parts.n_words()).map_err(|error| failed(error.into()))?;
         *sample.user_header_mut() = parts.envelope();
         parts.write(sample.payload_mut());
-        // SAFETY: all words were written.
-        unsafe { sample.assume_init() }.send().map_err(|error| failed(error.into()))?;
+        sample.send().map_err(|error| failed(error.into()))?;
         self.is_unrung.set(true);
         Ok(())
     }

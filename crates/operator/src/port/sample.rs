@@ -2,8 +2,8 @@
 
 use std::marker::PhantomData;
 
-use blindgrasp_messages::{Header, Message};
-use iceoryx2::prelude::ZeroCopySend;
+use blindgrasp_messages::zerocopy::{FromBytes as _, IntoBytes as _};
+use blindgrasp_messages::{Header, Message, PlainBytes};
 use iceoryx2::sample::Sample;
 
 use super::bytes::{Envelope, Layout, Parts, Word, head_len};
@@ -40,10 +40,7 @@ impl UntypedSample {
 
     /// Head and items.
     fn bytes(&self) -> &[u8] {
-        let words = self.words();
-        let n_bytes = self.n_bytes.min(size_of_val(words));
-        // SAFETY: the words have at least so many bytes.
-        unsafe { std::slice::from_raw_parts(words.as_ptr().cast(), n_bytes) }
+        &self.words().as_bytes()[..self.n_bytes]
     }
 
     /// The header, with which each head begins.
@@ -52,11 +49,10 @@ impl UntypedSample {
     }
 
     /// What the bytes begin with: a header, or a head of the message.
-    fn beginning<T: ZeroCopySend>(&self) -> &T {
+    fn beginning<T: PlainBytes>(&self) -> &T {
         const { assert!(align_of::<T>() <= align_of::<Word>()) };
-        let bytes = &self.bytes()[..size_of::<T>()];
-        // SAFETY: the bytes are as many, and begin with a word. None are invalid, because enums travel as integers.
-        unsafe { &*bytes.as_ptr().cast() }
+        let (beginning, _) = T::ref_from_prefix(self.bytes()).expect("the length was checked when the sample came");
+        beginning
     }
 
     pub(super) fn key(&self) -> SampleId {
@@ -84,10 +80,8 @@ impl<M: Message> PortSample<M> {
     /// A sample that was received before, from a copy.
     pub(crate) fn of_copy(head: &M::Head, items: &[M::Item]) -> Self {
         let parts = Parts::of::<M>(head, items);
-        let mut words = Vec::with_capacity(parts.n_words());
-        parts.write(words.spare_capacity_mut());
-        // SAFETY: so many words were written.
-        unsafe { words.set_len(parts.n_words()) };
+        let mut words = vec![0; parts.n_words()];
+        parts.write(&mut words);
         PortSample::of_untyped(UntypedSample { place: Place::Copied(words), n_bytes: parts.n_bytes() })
     }
 
@@ -101,8 +95,7 @@ impl<M: Message> PortSample<M> {
 
     pub fn items(&self) -> &[M::Item] {
         let items = &self.sample.bytes()[head_len::<M>()..];
-        // SAFETY: the items begin at a multiple of their alignment, and no bytes are invalid as items.
-        unsafe { std::slice::from_raw_parts(items.as_ptr().cast(), items.len() / size_of::<M::Item>()) }
+        <[M::Item]>::ref_from_bytes(items).expect("the length was checked when the sample came")
     }
 }
 
