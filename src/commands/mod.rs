@@ -59,7 +59,7 @@ use anyhow::Context;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use blindgrasp_operator::text::{HarmlessWriter, harmless};
-use blindgrasp_session::output::{check_new, check_output, check_page, write_out};
+use blindgrasp_session::output::{check_new, check_output, check_page, write_out, write_report};
 use blindgrasp_session::text_table::{self, percent};
 
 /// Decides from touch and joint angles whether a grasp will hold before the lift.

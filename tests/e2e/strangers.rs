@@ -68,6 +68,11 @@ fn another_user_cannot_touch_a_running_graph() {
     graph.kill("classifier");
     let recording = folder.path().join("some.mcap");
     run(&["record", &graph.name, "--for", "0.2", "--out", utf8(&recording)], 0);
+    let table = folder.path().join("lines.jsonl");
+    run(&["export", utf8(&recording), "--out", utf8(&table)], 0);
+    for file in [&recording, &table] {
+        assert_eq!(std::fs::metadata(file).expect("there").mode() & 0o777, 0o600, "{}", file.display());
+    }
     graph.wait_for_decisions(A_FEW_GRASPS);
     graph.stop().assert_undisturbed("beside another user");
 }
