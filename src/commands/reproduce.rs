@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 
 use super::init;
 use super::model::write_at_once;
-use super::{Outcome, percent, print_line, stop_signal};
+use super::{Outcome, percent, print_line, print_text, stop_signal};
 use blindgrasp_messages::files::{partial_path, read_regular};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
@@ -85,7 +85,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             &json!({ "folder": folder.display().to_string(), "results": results, "table_1": table_1 }).to_string(),
         )?;
     } else {
-        print_line(&read_regular(&summary)?)?;
+        print_text(&read_regular(&summary)?)?;
         print_line(&format!("{}: tables, figures and reports", folder.display()))?;
     }
     Ok(Outcome::Done)

@@ -87,13 +87,15 @@ fn recording_of_stranger(path: &Path, hand: &str) {
         match record {
             Record::Truth(mut truth) => {
                 truth.message.object = format!("mug{EVIL}\ngrasp 1 LIFT");
-                truth.message.class = format!("cup{EVIL}");
+                truth.message.class = format!("cup{EVIL}\ngrasp 1 LIFT");
                 writer.write_record(&topic, &Record::Truth(truth)).expect("written");
             }
             record @ Record::Tactile(_) => writer.write_record(&topic, &record).expect("written"),
             _ => {}
         }
     }
+    let metadata = std::collections::BTreeMap::from([("key".to_owned(), "value".to_owned())]);
+    writer.write_metadata(&format!("note{EVIL}\ngrasp 1 LIFT"), metadata).expect("written");
     writer.finish().expect("finished");
 }
 
@@ -108,9 +110,16 @@ fn nothing_of_a_stranger_commands_the_terminal() {
     let folder = tempfile::tempdir().expect("a folder");
     let recording = folder.path().join("evil.mcap");
     recording_of_stranger(&recording, "barrett-bh8-280");
-    for arguments in [&["info", utf8(&recording)][..], &["info", "--json", utf8(&recording)]] {
+    for arguments in [
+        &["info", utf8(&recording)][..],
+        &["info", "--json", utf8(&recording)],
+        &["predict", MODEL, utf8(&recording)],
+        &["evaluate", MODEL, utf8(&recording)],
+    ] {
         let output = run(arguments, 0);
-        assert_harmless(&[output.stdout, output.stderr].concat(), "info");
+        let said = text(&output.stdout);
+        assert!(said.contains("grasp 1 LIFT") && !said.lines().any(|line| line.starts_with("grasp 1 LIFT")), "{said}");
+        assert_harmless(&[output.stdout, output.stderr].concat(), arguments[0]);
     }
     // An operator that prints what it was sent, as lines and as log entries.
     let body = format!(

@@ -17,7 +17,7 @@ use serde::Serialize;
 
 pub use self::frames::{FramesReport, import_frames};
 
-use self::columns::{Columns, shortened};
+use self::columns::{Columns, in_one_line, shortened};
 use self::grasps::{Grasps, TableGrasp, TableReading};
 use self::lines::{Lines, RowLimit};
 use blindgrasp_messages::file_kind::FileKind;
@@ -203,7 +203,7 @@ pub fn import_table(
     let mut reader =
         csv::ReaderBuilder::new().delimiter(options.delimiter).trim(csv::Trim::All).from_reader(RowLimit::new(text));
     let header = match reader.headers() {
-        Ok(header) => header.iter().map(String::from).collect::<Vec<String>>(),
+        Ok(header) => header.iter().map(in_one_line).collect::<Vec<String>>(),
         Err(error) => return Err(table_error(table, error, 1)),
     };
     if header.iter().all(String::is_empty) {

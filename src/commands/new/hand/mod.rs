@@ -22,7 +22,7 @@ use serde::Deserialize;
 
 use super::super::hand_cells::joint;
 use super::super::ros2_network::Ros2Network;
-use super::super::{Outcome, print_line};
+use super::super::{Outcome, print_line, print_text};
 use super::{check_free, in_shell};
 use draft::Draft;
 
@@ -159,7 +159,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         bail!("joint '{}' moves the palm: give the first link of the hand with --base", joint.name);
     }
     if arguments.cells.is_none() && arguments.grids.is_empty() {
-        print_line(
+        print_text(
             "\nnothing is made yet: give a table of the cells with --cells, or pads with --grid LINK=ROWSxCOLUMNS",
         )?;
         return Ok(Outcome::Done);
@@ -178,7 +178,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let hand = written?;
     let layout_path = folder.join(format!("{name}.yaml"));
     let shown = in_shell(&layout_path.display().to_string());
-    print_line(&format!(
+    print_text(&format!(
         "\n{}: {} pads, {} cells; picture: {name}.svg\nnext:\n  blindgrasp view {shown} --out hand.html      turn it, close it\n  \
          blindgrasp simulate --hand {shown} --label lift --protocol planned --stable-fraction natural --objects train \
          --grasps 600 --out lifts.mcap\n  \
@@ -299,7 +299,7 @@ fn print_parts(hand: &Hand) -> anyhow::Result<()> {
         let (lower, upper, open) = (joint.lower, joint.upper, joint.open());
         print_line(&format!("{:<16} {kind:<9} {lower:>8.4}  {upper:>8.4}  {open:>8.4}   {closed}", joint.name))?;
     }
-    print_line("\nlink             collision shapes")?;
+    print_text("\nlink             collision shapes")?;
     for link in &hand.links {
         print_line(&format!("{:<16} {}", link.name, link.shapes.len()))?;
     }
@@ -363,7 +363,7 @@ fn read_table(path: &Path, threshold_newtons: f64) -> anyhow::Result<Vec<NewPad>
     }
     if !is_sized {
         pads.iter_mut().for_each(size_by_neighbours);
-        print_line(
+        print_text(
             "\nno width and height in the table: a cell is 0.8 times as wide and high as the nearest one is away",
         )?;
     }
