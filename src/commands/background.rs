@@ -9,7 +9,7 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use serde_json::json;
 
-use super::{Outcome, print_line};
+use super::{Outcome, print_text};
 use blindgrasp_graph::client;
 use blindgrasp_graph::control::GraphState;
 use blindgrasp_graph::log::{LogFile, LogFolder, LogFormat, LogReader};
@@ -53,7 +53,7 @@ pub(super) fn detach(name: &str, json: bool) -> anyhow::Result<Outcome> {
         std::thread::sleep(POLL);
     }
     let (pid, logs) = (child.id(), folder.path().display());
-    print_line(&if json {
+    print_text(&if json {
         json!({ "graph": name, "pid": pid, "log_folder": folder.path().display().to_string() }).to_string()
     } else {
         format!(

@@ -6,7 +6,7 @@ use serde_json::json;
 
 use super::graph_file::{OnMisfit, able_to_begin};
 use super::text_table::TextTable;
-use super::{Outcome, print_line};
+use super::{Outcome, print_line, print_text};
 use blindgrasp_graph::dataflow::{
     self, DataflowError, Edge, Graph, Input, Machine, Machines, Node, Override, Restart, RestartPolicy, Scope,
 };
@@ -23,12 +23,12 @@ pub(super) fn run(
     let file = dataflow::load(file).map_err(anyhow::Error::from);
     let checked = file.and_then(|file| able_to_begin(&file, overrides, scope, on_misfit));
     match &checked {
-        Ok(graph) if is_json => print_line(&serde_json::to_string_pretty(&as_json(graph))?)?,
+        Ok(graph) if is_json => print_text(&serde_json::to_string_pretty(&as_json(graph))?)?,
         Ok(graph) => print_graph(graph)?,
         Err(error) => {
             // The mistakes go to stderr as well.
             if is_json && let Some(error) = error.downcast_ref::<DataflowError>() {
-                print_line(&serde_json::to_string_pretty(&errors(error))?)?;
+                print_text(&serde_json::to_string_pretty(&errors(error))?)?;
             }
         }
     }
@@ -75,7 +75,7 @@ fn print_graph(graph: &Graph) -> std::io::Result<()> {
         let n_crossing = graph.edges().filter(|edge| graph.crossing(edge).is_some()).count();
         format!(", {} machines, {n_crossing} edges between them", machines.machines.len())
     });
-    print_line(&format!("graph '{}': {n_nodes} nodes, {n_edges} edges{on_machines}\n", graph.name))?;
+    print_text(&format!("graph '{}': {n_nodes} nodes, {n_edges} edges{on_machines}\n", graph.name))?;
     if let Some(machines) = machines {
         print_machines(machines)?;
     }
@@ -126,7 +126,7 @@ fn print_machines(machines: &Machines) -> std::io::Result<()> {
     if link.insecure {
         said.push("INSECURE: no TLS needed beyond this computer".into());
     }
-    print_line(&format!("link: {}\n", said.join(", ")))
+    print_text(&format!("link: {}\n", said.join(", ")))
 }
 
 fn restart(restart: &Restart) -> String {

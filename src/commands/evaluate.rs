@@ -7,7 +7,7 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::model::write_at_once;
-use super::{Outcome, check_output, check_page, number_in, percent, print_line};
+use super::{Outcome, check_output, check_page, number_in, percent, print_line, print_text, write_report};
 use blindgrasp_learning::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::looks::{Look, looks};
@@ -257,7 +257,7 @@ impl Job<'_> {
     /// Writes and prints the report as the options say.
     fn deliver(&self, report: &Report) -> anyhow::Result<Outcome> {
         if let Some(path) = &self.arguments.report {
-            write_at_once(path, &report_page(self.hand, report)?)?;
+            write_report(path, &report_page(self.hand, report)?)?;
             if !self.arguments.json {
                 print_line(&format!("report: {}", path.display()))?;
             }
@@ -270,7 +270,7 @@ impl Job<'_> {
             write_at_once(&folder.join(PREDICTIONS_FILE), &predictions_csv(&report.judges, self.recordings)?)?;
         }
         if self.arguments.json {
-            print_line(&serde_json::to_string_pretty(report)?)?;
+            print_text(&serde_json::to_string_pretty(report)?)?;
         }
         Ok(Outcome::Done)
     }

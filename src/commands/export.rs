@@ -12,7 +12,7 @@ use serde_json::json;
 use super::{Outcome, check_new, data_on_stdout, print_line};
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::training::{FeatureTableError, write_feature_table};
-use blindgrasp_messages::files::partial_path;
+use blindgrasp_messages::files::{keep_mode, partial_path, private_file};
 use blindgrasp_recording::export::{CsvTable, ExportError, row, table_shapes};
 use blindgrasp_recording::{Record, RecordingReader, recordings_in};
 use blindgrasp_stages::model::Model;
@@ -240,12 +240,15 @@ impl NewFile {
         if path.exists() && !path.is_file() {
             anyhow::bail!("{}: expected a file that can be replaced; leave --out away for a pipe", path.display());
         }
-        let file = File::create(&partial).with_context(|| partial.display().to_string())?;
+        let file =
+            private_file().create(true).truncate(true).open(&partial).with_context(|| partial.display().to_string())?;
         Ok(NewFile { path: path.into(), file, is_finished: false })
     }
 
     fn finish(mut self) -> anyhow::Result<()> {
-        std::fs::rename(partial_path(&self.path), &self.path).with_context(|| self.path.display().to_string())?;
+        keep_mode(&self.file, &self.path)
+            .and_then(|()| std::fs::rename(partial_path(&self.path), &self.path))
+            .with_context(|| self.path.display().to_string())?;
         self.is_finished = true;
         Ok(())
     }

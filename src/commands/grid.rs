@@ -3,11 +3,11 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-use anyhow::{Context, bail};
+use anyhow::bail;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{check_new, number_in, percent, print_line, train};
+use super::{check_new, number_in, percent, print_line, train, write_report};
 use blindgrasp_learning::training::grid::{Axis, GridReport, Search, axes_around, with_values};
 use blindgrasp_learning::training::{Example, Examples, Recipe, TrainingOptions, folds_by_object};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -85,7 +85,7 @@ pub(super) fn search(
     let report = run(&search)?;
     if let Some(path) = &arguments.grid_report {
         let text = serde_json::to_string_pretty(&report)? + "\n";
-        std::fs::write(path, text).with_context(|| format!("cannot write {}", path.display()))?;
+        write_report(path, &text)?;
     }
     for point in &report.points {
         print_line(&format!(

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::{Outcome, print_line};
+use super::{Outcome, print_line, print_text};
 use blindgrasp_stages::hand::Hand;
 
 #[derive(Serialize)]
@@ -38,7 +38,7 @@ pub(super) fn print(hand: &Path, joints: &[(String, f64)], json: bool) -> anyhow
         })
         .collect();
     if json {
-        print_line(&serde_json::to_string_pretty(&rows)?)?;
+        print_text(&serde_json::to_string_pretty(&rows)?)?;
         return Ok(Outcome::Done);
     }
     print_line("pad        cell    x m       y m       z m       normal (palm frame)")?;

@@ -7,7 +7,7 @@ use clap::{ArgGroup, Args, ValueEnum};
 
 use super::frame_lines::{FrameLines, read_frames};
 use super::hand_cells::joint;
-use super::{Outcome, check_new, completions, number_in, percent, print_line};
+use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text};
 use blindgrasp_learning::import::{AngleUnit, Day, ImportOptions, ImportReport, Joints, import_frames, import_table};
 use blindgrasp_stages::hand::{CellUnit, Hand};
 
@@ -154,7 +154,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     };
     let report = import_table(&arguments.table, &hand, &options, &arguments.out)?;
     if arguments.json {
-        print_line(&serde_json::to_string_pretty(&report)?)?;
+        print_text(&serde_json::to_string_pretty(&report)?)?;
     } else {
         print_report(arguments, &hand, &options, &report)?;
     }
@@ -169,7 +169,7 @@ fn import_lines(arguments: &Arguments, hand: &Hand) -> anyhow::Result<Outcome> {
     let name = arguments.table.file_name().unwrap_or(arguments.table.as_os_str()).to_string_lossy();
     let report = import_frames(&name, hand, &frames, (&truths, &headers_of_truths), &arguments.out)?;
     if arguments.json {
-        print_line(&serde_json::to_string_pretty(&report)?)?;
+        print_text(&serde_json::to_string_pretty(&report)?)?;
         return Ok(Outcome::Done);
     }
     for (what, value) in [

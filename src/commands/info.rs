@@ -8,9 +8,8 @@ use clap::Args;
 use serde::Serialize;
 
 use super::simulate::report_in;
-use super::{Outcome, cases, completions, hand_cells, percent, print_line};
+use super::{Outcome, cases, completions, hand_cells, percent, print_line, print_text};
 use blindgrasp_graph::client::{is_graph_name, running_graphs};
-use blindgrasp_graph::log::printable;
 use blindgrasp_learning::dataset::{REPORT_METADATA, hand_of, label_of, reported_truth};
 use blindgrasp_learning::evaluation::paper_label::PaperLabel;
 use blindgrasp_learning::evaluation::statistics::Interval;
@@ -176,7 +175,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let overview = Overview::of(indexes);
     if overview.n_file_bytes > MAX_READ_BYTES && !arguments.full {
         if arguments.json {
-            print_line(&serde_json::to_string_pretty(&overview)?)?;
+            print_text(&serde_json::to_string_pretty(&overview)?)?;
         } else {
             print_lines(overview.lines())?;
         }
@@ -188,7 +187,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let summary = summarise(&hand, &recordings, overview)?;
     if arguments.json {
-        print_line(&serde_json::to_string_pretty(&summary)?)?;
+        print_text(&serde_json::to_string_pretty(&summary)?)?;
     } else {
         print_summary(&hand, &summary)?;
     }
@@ -205,7 +204,7 @@ fn repair_all(recordings: &[PathBuf], json: bool) -> anyhow::Result<Outcome> {
         reports.push(report);
     }
     if json {
-        print_line(&serde_json::to_string_pretty(&serde_json::json!({ "repairs": reports }))?)?;
+        print_text(&serde_json::to_string_pretty(&serde_json::json!({ "repairs": reports }))?)?;
     }
     // Exit code 0 promises that nothing is lost.
     let has_loss = reports.iter().any(|report| report.has_loss() || !report.n_unverified.is_empty());
@@ -521,7 +520,7 @@ fn print_summary(hand: &Hand, summary: &FileReport) -> anyhow::Result<()> {
     }
     print_lines(lines)?;
     if !summary.classes.is_empty() {
-        print_line("\nclass              grasps    stable  by nature")?;
+        print_text("\nclass              grasps    stable  by nature")?;
     }
     for (class, group) in &summary.classes {
         let natural = percent(group.natural_stable_rate);
@@ -542,7 +541,7 @@ const N_CLASSES: usize = 5;
 /// The paper's label beside another truth.
 fn print_paper_label(found: &PaperLabel) -> anyhow::Result<()> {
     let all = &found.all;
-    print_line("\nthe paper's label (epsilon > 0.07 and volume > 0.1) beside the truth, in grasps")?;
+    print_text("\nthe paper's label (epsilon > 0.07 and volume > 0.1) beside the truth, in grasps")?;
     print_line("                    truth stable  truth unstable")?;
     for (row, stable, unstable) in [
         ("label stable", all.n_stable_by_both, all.n_stable_by_paper_only),
@@ -563,8 +562,7 @@ fn print_paper_label(found: &PaperLabel) -> anyhow::Result<()> {
     ))?;
     for (class, agreement) in found.by_disagreement().into_iter().take(N_CLASSES) {
         print_line(&format!(
-            "  {:<16} differs in {} of {}: {} stable by the label only, {} by the truth only",
-            printable(class),
+            "  {class:<16} differs in {} of {}: {} stable by the label only, {} by the truth only",
             agreement.n_different(),
             agreement.n(),
             agreement.n_stable_by_paper_only,
@@ -579,7 +577,7 @@ fn print_paper_label(found: &PaperLabel) -> anyhow::Result<()> {
 
 fn print_lines(lines: Vec<(&str, String)>) -> anyhow::Result<()> {
     for (what, value) in lines {
-        print_line(&format!("{what:<17} {}", printable(&value)))?;
+        print_line(&format!("{what:<17} {value}"))?;
     }
     Ok(())
 }

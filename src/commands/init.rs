@@ -10,7 +10,7 @@ use clap::builder::PossibleValuesParser;
 use serde_json::json;
 
 use super::schema::schema;
-use super::{Outcome, print_line};
+use super::{Outcome, print_text};
 
 /// Write a new project that runs at once
 ///
@@ -154,7 +154,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     for (name, content) in &files {
         write_new(&folder.join(name), content)?;
     }
-    print_line(&if arguments.json {
+    print_text(&if arguments.json {
         json!({ "folder": folder.display().to_string(), "files": names }).to_string()
     } else {
         format!(

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::{Args, CommandFactory};
 
-use super::{Cli, Outcome, help, print_line};
+use super::{Cli, Outcome, help, print_line, print_text};
 
 /// Write the manual pages of all commands
 #[derive(Debug, Args)]
@@ -26,7 +26,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             clap_mangen::generate_to(Cli::command(), folder).with_context(|| folder.display().to_string())?;
             print_line(&folder.display().to_string())?;
         }
-        None => print_line(reference().trim_end())?,
+        None => print_text(reference().trim_end())?,
     }
     Ok(Outcome::Done)
 }

@@ -59,7 +59,7 @@ use anyhow::Context;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use blindgrasp_operator::text::{HarmlessWriter, harmless};
-use blindgrasp_session::output::{check_new, check_output, check_page, write_out};
+use blindgrasp_session::output::{check_new, check_output, check_page, write_out, write_report};
 use blindgrasp_session::text_table::{self, percent};
 
 /// Decides from touch and joint angles whether a grasp will hold before the lift.
@@ -228,10 +228,16 @@ pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
     })
 }
 
-/// Writes a line of results to stdout at once, harmless to a terminal (unlike `println!`, without a panic when nobody reads it).
+/// As [`print_text`], for one line: a line break in it, as in a name of a stranger's, is escaped, or the rest would pass for a
+/// line of ours.
 fn print_line(line: &str) -> std::io::Result<()> {
+    print_text(&line.replace('\n', "\\n"))
+}
+
+/// Writes lines of results to stdout at once, harmless to a terminal (unlike `println!`, without a panic when nobody reads it).
+fn print_text(lines: &str) -> std::io::Result<()> {
     let mut stdout = std::io::stdout().lock();
-    stdout.write_all(harmless(line).as_bytes())?;
+    stdout.write_all(harmless(lines).as_bytes())?;
     stdout.write_all(b"\n")?;
     stdout.flush()
 }

@@ -7,7 +7,7 @@ use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 
 use super::train::{probe_lines, threshold_line};
-use super::{Outcome, check_new, check_output, completions, percent, print_line};
+use super::{Outcome, check_new, check_output, completions, percent, print_line, print_text};
 use blindgrasp_learning::dataset::{hand_of, label_line};
 use blindgrasp_learning::learners::libsvm_format::{parse_libsvm, write_libsvm};
 use blindgrasp_learning::training::adapt;
@@ -230,7 +230,7 @@ fn adapt_model(arguments: &AdaptArguments) -> anyhow::Result<Outcome> {
     let model = adapt(&hand, &Model::load(&arguments.model)?, &recordings)?;
     model.save(&arguments.out)?;
     let lines: Vec<String> = recalibration_line(&model).into_iter().chain(own_lifts_lines(&model)).collect();
-    print_line(&format!("{}: {}", arguments.out.display(), lines.join("\n")))?;
+    print_text(&format!("{}: {}", arguments.out.display(), lines.join("\n")))?;
     Ok(Outcome::Done)
 }
 
@@ -308,7 +308,7 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
             "training": training_json,
             "checksum": model.checksum,
         });
-        print_line(&serde_json::to_string_pretty(&shown)?)?;
+        print_text(&serde_json::to_string_pretty(&shown)?)?;
         return Ok(Outcome::Done);
     }
     for (what, value) in [

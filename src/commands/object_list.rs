@@ -6,7 +6,7 @@ use std::path::Path;
 use anyhow::{Context, bail};
 use serde::Serialize;
 
-use super::{Outcome, print_line};
+use super::{Outcome, print_line, print_text};
 use blindgrasp_mesh::write_off;
 use blindgrasp_objects::{Object, objects_named};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -34,7 +34,7 @@ pub(super) fn list(objects: &str, folder: Option<&Path>, as_json: bool) -> anyho
     }
     let rows: Vec<Row<'_>> = objects.iter().map(row).collect();
     match folder {
-        _ if as_json => print_line(&serde_json::to_string_pretty(&rows)?)?,
+        _ if as_json => print_text(&serde_json::to_string_pretty(&rows)?)?,
         Some(folder) => {
             print_line(&format!("{} objects and catalogue.csv written to {}", rows.len(), folder.display()))?
         }

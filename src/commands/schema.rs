@@ -5,7 +5,7 @@ use blindgrasp_graph::operators::LINK_OPERATOR;
 use blindgrasp_operators::SHIPPED;
 use clap::Args;
 
-use super::{Outcome, print_line};
+use super::{Outcome, print_text};
 
 /// Print a JSON Schema of the dataflow file, for editors
 #[derive(Debug, Args)]
@@ -15,7 +15,7 @@ use super::{Outcome, print_line};
 pub(super) struct Arguments {}
 
 pub(super) fn run(_: &Arguments) -> anyhow::Result<Outcome> {
-    print_line(schema().trim_end())?;
+    print_text(schema().trim_end())?;
     Ok(Outcome::Done)
 }
 

@@ -7,7 +7,7 @@ use clap::{Args, Subcommand};
 use indicatif::ProgressBar;
 use serde_json::json;
 
-use super::{Outcome, check_new, completions, print_line};
+use super::{Outcome, check_new, completions, print_line, print_text};
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::sensors::{alarms, learn, read};
 use blindgrasp_recording::recordings_in;
@@ -110,7 +110,7 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<Outcome> {
             .iter()
             .map(|(grasp_id, fault)| json!({"grasp_id": grasp_id, "fault": fault.kind(), "part": fault.part(&hand)}))
             .collect();
-        print_line(&serde_json::to_string_pretty(&json!({"n_grasps": grasps.len(), "faults": faults}))?)?;
+        print_text(&serde_json::to_string_pretty(&json!({"n_grasps": grasps.len(), "faults": faults}))?)?;
     } else {
         print_line(&format!("{} grasps", grasps.len()))?;
         // A fault that goes on is said once.

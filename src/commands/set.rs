@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use super::elsewhere::MachineArgument;
 use super::graph_file::{describe, warn_of_misfit};
 use super::text_table::TextTable;
-use super::{Outcome, completions, print_line};
+use super::{Outcome, completions, print_line, print_text};
 use blindgrasp_graph::client::{Connection, pick_graph, status};
 use blindgrasp_graph::control::{NodeStatus, Reply, Request};
 use blindgrasp_operator::text::did_you_mean;
@@ -115,7 +115,7 @@ fn get(arguments: &Arguments, node: &str, param: &str) -> anyhow::Result<Outcome
         let known: Vec<&str> = nodes.iter().flat_map(|node| node.params.keys().map(String::as_str)).collect();
         bail!("node '{node}' has no parameter '{param}' with a value; its parameters: {}", known.join(", "));
     };
-    print_line(&if arguments.json { value.to_string() } else { shown(value) })?;
+    print_text(&if arguments.json { value.to_string() } else { shown(value) })?;
     Ok(Outcome::Done)
 }
 

@@ -13,7 +13,7 @@ use serde::Serialize;
 
 use super::object_list::list;
 use super::trials::physics;
-use super::{Outcome, check_new, completions, number_in, percent, print_line};
+use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text};
 use blindgrasp_learning::dataset::REPORT_METADATA;
 use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::read_regular;
@@ -107,7 +107,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let out = match &arguments.out {
         Some(out) if !arguments.print_options => out,
         _ => {
-            print_line(serde_saphyr::to_string(&AllOptions::of(&options))?.trim_end())?;
+            print_text(serde_saphyr::to_string(&AllOptions::of(&options))?.trim_end())?;
             return Ok(Outcome::Done);
         }
     };
@@ -475,7 +475,7 @@ impl GraspWriter {
 
 fn print_report(json: bool, out: &Path, report: &SimulationReport) -> anyhow::Result<()> {
     if json {
-        print_line(&serde_json::to_string_pretty(report)?)?;
+        print_text(&serde_json::to_string_pretty(report)?)?;
         return Ok(());
     }
     let Thresholds { epsilon, volume } = report.thresholds;

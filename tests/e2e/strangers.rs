@@ -68,6 +68,11 @@ fn another_user_cannot_touch_a_running_graph() {
     graph.kill("classifier");
     let recording = folder.path().join("some.mcap");
     run(&["record", &graph.name, "--for", "0.2", "--out", utf8(&recording)], 0);
+    let table = folder.path().join("lines.jsonl");
+    run(&["export", utf8(&recording), "--out", utf8(&table)], 0);
+    for file in [&recording, &table] {
+        assert_eq!(std::fs::metadata(file).expect("there").mode() & 0o777, 0o600, "{}", file.display());
+    }
     graph.wait_for_decisions(A_FEW_GRASPS);
     graph.stop().assert_undisturbed("beside another user");
 }
@@ -140,13 +145,15 @@ fn recording_of_stranger(path: &Path, hand: &str) {
         match record {
             Record::Truth(mut truth) => {
                 truth.message.object = format!("mug{EVIL}\ngrasp 1 LIFT");
-                truth.message.class = format!("cup{EVIL}");
+                truth.message.class = format!("cup{EVIL}\ngrasp 1 LIFT");
                 writer.write_record(&topic, &Record::Truth(truth)).expect("written");
             }
             record @ Record::Tactile(_) => writer.write_record(&topic, &record).expect("written"),
             _ => {}
         }
     }
+    let metadata = std::collections::BTreeMap::from([("key".to_owned(), "value".to_owned())]);
+    writer.write_metadata(&format!("note{EVIL}\ngrasp 1 LIFT"), metadata).expect("written");
     writer.finish().expect("finished");
 }
 
@@ -161,9 +168,16 @@ fn nothing_of_a_stranger_commands_the_terminal() {
     let folder = tempfile::tempdir().expect("a folder");
     let recording = folder.path().join("evil.mcap");
     recording_of_stranger(&recording, "barrett-bh8-280");
-    for arguments in [&["info", utf8(&recording)][..], &["info", "--json", utf8(&recording)]] {
+    for arguments in [
+        &["info", utf8(&recording)][..],
+        &["info", "--json", utf8(&recording)],
+        &["predict", MODEL, utf8(&recording)],
+        &["evaluate", MODEL, utf8(&recording)],
+    ] {
         let output = run(arguments, 0);
-        assert_harmless(&[output.stdout, output.stderr].concat(), "info");
+        let said = text(&output.stdout);
+        assert!(said.contains("grasp 1 LIFT") && !said.lines().any(|line| line.starts_with("grasp 1 LIFT")), "{said}");
+        assert_harmless(&[output.stdout, output.stderr].concat(), arguments[0]);
     }
     // An operator that prints what it was sent, as lines and as log entries.
     let body = format!(
@@ -254,7 +268,8 @@ fn what_is_no_regular_file_is_refused_at_once() {
     let pipe = folder.path().join("pipe.json");
     rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, rustix::fs::Mode::from_raw_mode(0o600), 0)
         .expect("made");
-    let pipe = utf8(&pipe);
+    let (pipe, out) = (utf8(&pipe), folder.path().join("out.mcap"));
+    let out = utf8(&out);
     for path in [pipe, "/dev/zero", "/dev/null"] {
         for arguments in [
             &["info", path][..],
@@ -264,6 +279,8 @@ fn what_is_no_regular_file_is_refused_at_once() {
             &["model", "show", path],
             &["info", RECORDING, "--hand", path],
             &["evaluate", path, RECORDING],
+            &["predict", MODEL, path],
+            &["import", "--lines", path, "--hand", HAND, "--out", out],
         ] {
             let output = blindgrasp().args(arguments).output().expect("started");
             let said = text(&output.stderr);

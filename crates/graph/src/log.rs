@@ -5,15 +5,16 @@
 
 use std::ffi::OsString;
 use std::fmt;
-use std::fs::{DirBuilder, File, OpenOptions};
+use std::fs::{DirBuilder, File};
 use std::io::{Read, Seek, SeekFrom, Write};
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use blindgrasp_messages::files::private_file;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::{LogEntry, LogLevel};
 
@@ -217,7 +218,7 @@ impl LogFile {
 
     fn open_newest(&self) -> std::io::Result<(File, u64)> {
         let path = self.folder.file(&self.name, 0);
-        let file = OpenOptions::new().append(true).create(true).mode(0o600).open(path)?;
+        let file = private_file().append(true).create(true).open(path)?;
         let n_bytes = file.metadata()?.len();
         Ok((file, n_bytes))
     }
@@ -649,7 +650,7 @@ mod tests {
         assert_eq!(texts(&reader.read().expect("readable")), expected);
         // A line that is not finished yet comes once it is.
         let mut reader = LogReader::new(&folder, "a");
-        let mut file = OpenOptions::new().append(true).open(folder.file("a", 0)).expect("opened");
+        let mut file = File::options().append(true).open(folder.file("a", 0)).expect("opened");
         file.write_all(b"half").expect("written");
         assert_eq!(texts(&reader.read_newest(1, u64::MAX).expect("readable")), ["49"]);
         file.write_all(b" and half\n").expect("written");
@@ -666,7 +667,7 @@ mod tests {
         let line = "2026-11-21T23:18:49.123Z [a] whole\n";
         std::fs::write(&path, &line[..20]).expect("written");
         assert_eq!(reader.read().expect("readable"), []);
-        let mut file = OpenOptions::new().append(true).open(&path).expect("opened");
+        let mut file = File::options().append(true).open(&path).expect("opened");
         file.write_all(&line.as_bytes()[20..]).expect("written");
         let found = reader.read().expect("readable");
         let expected = LogLine {

@@ -1,14 +1,17 @@
 //! Files that are complete or not there, and files that can be read to their end.
 
-use std::fs::File;
+use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Read, Seek, Write};
-use std::os::unix::fs::FileTypeExt;
+use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 /// The search for files beside a missing one ends after so many.
 const MAX_NEIGHBOURS: usize = 10_000;
 /// Most names of files that an error shows.
 const MAX_SHOWN_NEIGHBOURS: usize = 5;
+
+/// The size limit of a text that is read whole: that of a model.
+const MAX_TEXT_BYTES: u64 = 128 << 20;
 
 /// Where a file is written until it is complete: beside its place, so that a rename puts it there at once.
 pub fn partial_path(path: &Path) -> PathBuf {
@@ -92,21 +95,73 @@ fn refuse_git_lfs_pointer(file: &mut File) -> std::io::Result<()> {
 /// Reads a text by [`open_regular`].
 ///
 /// # Errors
-/// The file cannot be opened or read, is no regular file, or is not UTF-8.
+/// The file cannot be opened or read, is no regular file, has more than 128 MiB, or is not UTF-8.
 pub fn read_regular(path: &Path) -> std::io::Result<String> {
-    let mut text = String::new();
-    open_regular(path)?.read_to_string(&mut text)?;
-    Ok(text)
+    let bytes = read_regular_bytes(path)?;
+    String::from_utf8(bytes).map_err(|_| std::io::Error::new(ErrorKind::InvalidData, "it is no text in UTF-8"))
 }
 
-/// Writes a file whole or not at all: under [`partial_path`], onto the disk, and then into its place.
+/// As [`read_regular`], for a text in any encoding.
+///
+/// # Errors
+/// As [`read_regular`].
+pub fn read_regular_bytes(path: &Path) -> std::io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    open_regular(path)?.take(MAX_TEXT_BYTES + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > MAX_TEXT_BYTES {
+        let text = format!("it has more than {} MiB, expected a smaller file", MAX_TEXT_BYTES >> 20);
+        return Err(std::io::Error::new(ErrorKind::InvalidData, text));
+    }
+    Ok(bytes)
+}
+
+/// How a file that holds a user's data is opened to be written: one that is made has mode 0600, whatever the umask says, and
+/// one that is there keeps its mode.
+pub fn private_file() -> OpenOptions {
+    let mut options = File::options();
+    options.write(true).mode(0o600);
+    options
+}
+
+/// Gives a file that will replace another one the mode of that one.
+///
+/// # Errors
+/// The mode cannot be set.
+pub fn keep_mode(file: &File, replaced: &Path) -> std::io::Result<()> {
+    match std::fs::metadata(replaced) {
+        Ok(replaced) => file.set_permissions(replaced.permissions()),
+        Err(_) => Ok(()),
+    }
+}
+
+/// Writes a file whole or not at all: under [`partial_path`], onto the disk, and then into its place. A new file has the mode
+/// of the umask, for it is made to be shared.
 ///
 /// # Errors
 /// The file cannot be written; nothing is left of it, and what was in its place still is.
 pub fn write_whole(path: &Path, content: impl AsRef<[u8]>) -> std::io::Result<()> {
+    write_opened(File::options().write(true), path, content.as_ref())
+}
+
+/// As [`write_whole`], for a user's data: see [`private_file`].
+///
+/// # Errors
+/// As [`write_whole`].
+pub fn write_private(path: &Path, content: impl AsRef<[u8]>) -> std::io::Result<()> {
+    write_opened(&mut private_file(), path, content.as_ref())
+}
+
+fn write_opened(options: &mut OpenOptions, path: &Path, content: &[u8]) -> std::io::Result<()> {
     let partial = partial_path(path);
-    let written = File::create(&partial)
-        .and_then(|mut file| file.write_all(content.as_ref()).and_then(|()| file.sync_all()))
+    let written = options
+        .create(true)
+        .truncate(true)
+        .open(&partial)
+        .and_then(|mut file| {
+            keep_mode(&file, path)?;
+            file.write_all(content)?;
+            file.sync_all()
+        })
         .and_then(|()| std::fs::rename(&partial, path));
     if written.is_err() {
         let _ = std::fs::remove_file(&partial);
@@ -116,7 +171,25 @@ pub fn write_whole(path: &Path, content: impl AsRef<[u8]>) -> std::io::Result<()
 
 #[cfg(test)]
 mod tests {
+    use std::fs::Permissions;
+    use std::os::unix::fs::PermissionsExt;
+
     use super::*;
+
+    #[test]
+    fn no_other_user_reads_private_files_until_their_owner_says_so() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let at = |name: &str| folder.path().join(name);
+        let mode = |name: &str| std::fs::metadata(at(name)).expect("there").permissions().mode() & 0o777;
+        File::create(at("of the umask")).expect("made");
+        write_whole(&at("shared"), "a model").expect("written");
+        write_private(&at("private"), "a report").expect("written");
+        private_file().create_new(true).open(at("new")).expect("made");
+        assert_eq!((mode("shared"), mode("private"), mode("new")), (mode("of the umask"), 0o600, 0o600));
+        std::fs::set_permissions(at("private"), Permissions::from_mode(0o640)).expect("shared");
+        write_private(&at("private"), "the next report").expect("written");
+        assert_eq!(mode("private"), 0o640);
+    }
 
     #[test]
     fn only_regular_files_are_read() {
@@ -131,6 +204,9 @@ mod tests {
             let error = open_regular(path).expect_err(found).to_string();
             assert_eq!(error, format!("it is {found}, expected a regular file"));
         }
+        File::create(&file).and_then(|file| file.set_len(1 << 40)).expect("a file of 1 TiB that takes no room");
+        let error = read_regular(&file).expect_err("a long file").to_string();
+        assert_eq!(error, "it has more than 128 MiB, expected a smaller file");
         let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 9\n";
         std::fs::write(&file, pointer).expect("written");
         let error = open_regular(&file).expect_err("a pointer").to_string();

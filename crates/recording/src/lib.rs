@@ -43,7 +43,7 @@ use serde::{Deserialize, Serialize};
 pub use blindgrasp_messages::Record;
 pub use chosen::{Choice, ChosenSamples, RawSample, Reach};
 pub use index::{IndexedTopic, RecordingIndex};
-pub use live::{LiveOptions, LiveRecorder, LiveSummary};
+pub use live::{LiveOptions, LiveRecorder, LiveSummary, is_part_name};
 pub use parts::{Manifest, part_path, recordings_in};
 pub use problems::{Oddity, Problem, Problems};
 pub use reader::RecordingReader;
@@ -237,6 +237,10 @@ mod tests {
         assert_eq!(RecordingReader::open(&file).expect("opened").count(), records().len());
         assert_eq!(std::fs::metadata(&file).expect("there").permissions().mode() & 0o777, 0o640);
         assert_eq!(std::fs::read_dir(folder.path()).expect("listed").count(), 2);
+        // A new one is for its owner alone, also where the umask would open it.
+        let new = folder.path().join("new.mcap");
+        write_all(&new);
+        assert_eq!(std::fs::metadata(&new).expect("there").permissions().mode() & 0o777, 0o600);
     }
 
     #[test]

@@ -304,12 +304,10 @@ impl LiveRecorder {
     fn clear_old_parts(&self) -> Result<(), RecordingError> {
         let folder = self.path.parent().filter(|folder| *folder != Path::new("")).unwrap_or(Path::new("."));
         let io = |source| RecordingError::Io { path: folder.into(), source };
-        let prefix = format!("{}-", stem(&self.path));
         for entry in std::fs::read_dir(folder).map_err(io)? {
             let path = entry.map_err(io)?.path();
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            let number = name.strip_prefix(&prefix).and_then(|rest| rest.strip_suffix(".mcap"));
-            if number.is_some_and(|number| number.len() == 5 && number.bytes().all(|byte| byte.is_ascii_digit())) {
+            if is_part_name(&self.path, &name) {
                 let locked = open_locked(&path, self.options.overwrite)?;
                 std::fs::remove_file(&path).map_err(io)?;
                 drop(locked);
@@ -431,6 +429,13 @@ fn reason(error: RecordingError) -> String {
         RecordingError::Invalid { message, .. } | RecordingError::Damaged { message, .. } => message,
         error @ RecordingError::Full { .. } => error.to_string(),
     }
+}
+
+/// Whether the file `name` beside a recording would be one of its parts.
+pub fn is_part_name(recording: &Path, name: &str) -> bool {
+    let behind_stem = name.strip_prefix(&format!("{}-", stem(recording)));
+    let number = behind_stem.and_then(|rest| rest.strip_suffix(".mcap"));
+    number.is_some_and(|number| number.len() == 5 && number.bytes().all(|byte| byte.is_ascii_digit()))
 }
 
 fn stem(path: &Path) -> String {

@@ -6,6 +6,7 @@ use std::io::{BufWriter, Seek};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use blindgrasp_messages::files::private_file;
 use blindgrasp_messages::{Recorded, Stamped};
 use mcap::Writer;
 use mcap::records::{MessageHeader, Metadata};
@@ -323,9 +324,9 @@ fn fallocate(file: &File, offset: u64, n_bytes: u64) -> Result<(), Errno> {
 pub(super) fn open_locked(path: &Path, overwrite: bool) -> Result<File, RecordingError> {
     let io = |source| RecordingError::Io { path: path.into(), source };
     let found = if overwrite {
-        File::options().read(true).write(true).create(true).truncate(false).open(path)
+        private_file().read(true).create(true).truncate(false).open(path)
     } else {
-        File::options().read(true).write(true).create_new(true).open(path)
+        private_file().read(true).create_new(true).open(path)
     };
     let file = match found {
         Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {

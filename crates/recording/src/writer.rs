@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, WriteOptions, Writer};
 
-use blindgrasp_messages::files::partial_path;
+use blindgrasp_messages::files::{keep_mode, partial_path, private_file};
 use blindgrasp_messages::{Record, Recorded, Stamped, with_sample};
 
 use super::source::with_cause;
@@ -135,13 +135,13 @@ impl Drop for RecordingWriter {
     }
 }
 
-/// The file that a recording grows in, empty and locked against other processes that write the same recording. The rest
+/// The private file that a recording grows in, empty and locked against other processes that write the same recording. The rest
 /// of a killed process is written over.
 pub(super) fn lock_partial(path: &Path) -> Result<File, RecordingError> {
     let io = |source| RecordingError::Io { path: path.into(), source };
     let partial = partial_path(path);
     loop {
-        let file = File::options().write(true).create(true).truncate(false).open(&partial).map_err(io)?;
+        let file = private_file().create(true).truncate(false).open(&partial).map_err(io)?;
         lock(&file, path)?;
         // The process that held the lock may have given this very file its final name: then it must not be emptied.
         let is_still_there = std::fs::metadata(&partial).is_ok_and(|found| {
@@ -159,9 +159,7 @@ pub(super) fn complete(mut writer: Writer<BufWriter<File>>, path: &Path) -> Resu
     let io = |source| RecordingError::Io { path: path.into(), source };
     writer.finish().map_err(|error| write_error(path, error))?;
     let file = writer.into_inner().into_inner().map_err(|error| io(error.into_error()))?;
-    if let Ok(replaced) = std::fs::metadata(path) {
-        file.set_permissions(replaced.permissions()).map_err(io)?;
-    }
+    keep_mode(&file, path).map_err(io)?;
     // The file is on the disk before it takes the name that says that it is complete, and locked until then.
     file.sync_all().and_then(|()| std::fs::rename(partial_path(path), path)).map_err(io)
 }

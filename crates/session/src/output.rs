@@ -3,7 +3,7 @@
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use blindgrasp_messages::files::write_whole;
+use blindgrasp_messages::files::{write_private, write_whole};
 
 /// As [`check_output`], for a file that another one takes the place of once it is complete. It also refuses to replace a
 /// file, unless the user has asked for that, and anything else that bears the name.
@@ -73,9 +73,26 @@ fn check_writable(out: &Path) -> anyhow::Result<()> {
 /// # Errors
 /// It cannot be written; nothing is left of it.
 pub fn write_out(path: &Path, text: &str) -> anyhow::Result<()> {
-    let is_special = std::fs::symlink_metadata(path).is_ok_and(|found| !found.is_file());
-    let written = if is_special { std::fs::write(path, text) } else { write_whole(path, text) };
-    written.map_err(|error| anyhow::anyhow!("cannot write {}: {error}", path.display()))
+    let written = if is_special(path) { std::fs::write(path, text) } else { write_whole(path, text) };
+    written.map_err(|error| cannot_write(path, &error))
+}
+
+/// As [`write_out`], for a report of a user's data, which no other user may read.
+///
+/// # Errors
+/// As [`write_out`].
+pub fn write_report(path: &Path, text: &str) -> anyhow::Result<()> {
+    let written = if is_special(path) { std::fs::write(path, text) } else { write_private(path, text) };
+    written.map_err(|error| cannot_write(path, &error))
+}
+
+/// Whether it is a link, a pipe or a device.
+fn is_special(path: &Path) -> bool {
+    std::fs::symlink_metadata(path).is_ok_and(|found| !found.is_file())
+}
+
+fn cannot_write(path: &Path, error: &std::io::Error) -> anyhow::Error {
+    anyhow::anyhow!("cannot write {}: {error}", path.display())
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
 use std::time::Instant;
 
+use anyhow::Context;
 use blindgrasp_graph::log::AUDIT;
 use blindgrasp_graph::log::{LogFolder, LogTail};
 use blindgrasp_graph::run::{RunSummary, SeenDecision};
@@ -15,6 +16,8 @@ use blindgrasp_pictures::chart::{
 };
 use blindgrasp_pictures::{GraspCards, ObjectSurface, PictureError, RecordedGrasp, ReportPage, escape, report_table};
 use blindgrasp_stages::hand::Hand;
+
+use crate::output::write_report;
 
 /// Decisions in the chart, but for wrong ones; of more, every nth is drawn.
 const MAX_DRAWN: usize = 2000;
@@ -199,8 +202,7 @@ impl RunReport {
         for (_, grasp) in std::mem::take(&mut self.grasps) {
             self.add_without_truth(&grasp);
         }
-        std::fs::write(path, self.page(summary))
-            .map_err(|error| anyhow::anyhow!("cannot write {} (--report): {error}", path.display()))
+        write_report(path, &self.page(summary)).context("--report")
     }
 
     fn page(&self, summary: &RunSummary) -> String {

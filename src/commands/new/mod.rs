@@ -8,7 +8,7 @@ use anyhow::Context;
 use blindgrasp_operators::{PYTHON_MESSAGES, PYTHON_OPERATOR};
 use clap::{Args, Subcommand};
 
-use super::{Outcome, print_line};
+use super::{Outcome, print_line, print_text};
 
 /// Make a folder with an operator or a hand of your own
 ///
@@ -151,14 +151,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 
     let (language, shown) = (if arguments.python { "Python" } else { "Rust" }, folder.display());
     print_line(&format!("{shown}: the operator '{name}' in {language}: {} in, {} out", kind.from, kind.to))?;
-    print_line(&format!("next:\n  cd {}", in_shell(&shown.to_string())))?;
-    print_line(if arguments.python {
+    print_text(&format!("next:\n  cd {}", in_shell(&shown.to_string())))?;
+    print_text(if arguments.python {
         "  python3 -m venv .venv && .venv/bin/pip install -r requirements.txt\n  .venv/bin/python -m unittest"
     } else {
         "  cargo build --release\n  cargo test"
     })?;
-    print_line(&format!("  {}", try_it.replace('\n', "\n  ")))?;
-    print_line(&format!("in a dataflow file:\n{snippet}"))?;
+    print_text(&format!("  {}", try_it.replace('\n', "\n  ")))?;
+    print_text(&format!("in a dataflow file:\n{snippet}"))?;
     if !arguments.python && arguments.blindgrasp.is_none() {
         print_line(
             "note: no registry has blindgrasp-operator yet; make it with --blindgrasp FOLDER to build on a source tree",

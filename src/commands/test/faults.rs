@@ -7,8 +7,8 @@ use serde_json::json;
 
 use super::Outcome;
 use super::case::Runner;
-use crate::commands::print_line;
 use crate::commands::text_table::TextTable;
+use crate::commands::{print_line, print_text};
 use blindgrasp_graph::dataflow::Graph;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::RecordingReader;
@@ -59,7 +59,7 @@ pub(super) fn run(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) ->
         }
     }
     if is_json {
-        print_line(&serde_json::to_string_pretty(
+        print_text(&serde_json::to_string_pretty(
             &json!({"faults": all, "n_lifted_only_with_a_fault": n_lifted_now}),
         )?)?;
     }

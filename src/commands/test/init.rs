@@ -9,7 +9,7 @@ use serde_json::json;
 use super::case::Runner;
 use super::{Outcome, project_recordings, settings};
 use crate::commands::model::write_at_once;
-use crate::commands::print_line;
+use crate::commands::{print_line, print_text};
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_replay::checks::{Decisions, describe_changes};
 use blindgrasp_replay::expectations::{Expectations, path_of};
@@ -77,7 +77,7 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
         }));
     }
     if is_json {
-        print_line(&serde_json::to_string_pretty(&json!({ "recordings": written }))?)?;
+        print_text(&serde_json::to_string_pretty(&json!({ "recordings": written }))?)?;
     }
     Ok(Outcome::Done)
 }

@@ -11,7 +11,7 @@ use serde_json::json;
 use super::case::Case;
 use super::scratch::file_name;
 use crate::commands::model::write_at_once;
-use crate::commands::print_line;
+use crate::commands::{print_line, print_text};
 use blindgrasp_replay::checks::Check;
 
 pub(super) fn print_case(case: &Case) -> anyhow::Result<()> {
@@ -40,7 +40,7 @@ pub(super) fn print_summary(cases: &[Case], is_json: bool) -> anyhow::Result<()>
             })
             .collect();
         let line = json!({"recordings": cases, "n_passed": n_passed, "n_failed": n_failed});
-        return Ok(print_line(&serde_json::to_string_pretty(&line)?)?);
+        return Ok(print_text(&serde_json::to_string_pretty(&line)?)?);
     }
     print_line("")?;
     print_line(&format!(

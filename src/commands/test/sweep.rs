@@ -7,8 +7,8 @@ use serde_json::json;
 
 use super::Outcome;
 use super::case::Runner;
-use crate::commands::print_line;
 use crate::commands::text_table::{TextTable, percent};
+use crate::commands::{print_line, print_text};
 use blindgrasp_graph::dataflow::Override;
 use blindgrasp_replay::checks::{Decisions, Tally};
 use blindgrasp_replay::comparison::Coverage;
@@ -67,7 +67,7 @@ impl Sweep {
             );
         }
         if is_json {
-            print_line(&serde_json::to_string_pretty(&json!({"param": self.param, "values": rows}))?)?;
+            print_text(&serde_json::to_string_pretty(&json!({"param": self.param, "values": rows}))?)?;
         } else {
             table.lines().iter().try_for_each(|line| print_line(line))?;
         }

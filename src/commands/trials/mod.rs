@@ -14,8 +14,7 @@ use rayon::prelude::*;
 use self::setup::Setup;
 use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
-use super::model::write_at_once;
-use super::{Outcome, check_page, completions, print_line, stop_requests};
+use super::{Outcome, check_page, completions, print_line, print_text, stop_requests, write_report};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_learning::trials::late_decisions::LateDecisions;
@@ -126,7 +125,7 @@ struct Way {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if arguments.print_options {
-        print_line(TrialOptions::DEFAULTS.trim_end())?;
+        print_text(TrialOptions::DEFAULTS.trim_end())?;
         return Ok(Outcome::Done);
     }
     check_arguments(arguments)?;
@@ -164,7 +163,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     report.count();
     if let Some(path) = &arguments.report {
         let strips = strips(&setup, &targets, &report, &n_stops);
-        write_at_once(path, &trials_page(&report, &strips))?;
+        write_report(path, &trials_page(&report, &strips))?;
     }
     print_report(arguments, &report)?;
     let late = report.late.and_then(|late| late.advice());
@@ -289,7 +288,7 @@ fn strips(setup: &Setup, targets: &[LiftTarget], report: &TrialsReport, n_stops:
 
 fn print_report(arguments: &Arguments, report: &TrialsReport) -> anyhow::Result<()> {
     if arguments.json {
-        print_line(&serde_json::to_string_pretty(report)?)?;
+        print_text(&serde_json::to_string_pretty(report)?)?;
         return Ok(());
     }
     for (idx, table) in tables(report).iter().filter(|table| !table.rows.is_empty()).map(Table::to_text).enumerate() {
@@ -301,16 +300,16 @@ fn print_report(arguments: &Arguments, report: &TrialsReport) -> anyhow::Result<
     let unfinished = [&report.with_gate, &report.without_gate].into_iter().flatten();
     let n_unfinished: usize = unfinished.map(|tallies| tallies.n_unfinished).sum();
     if report.end != "finished" {
-        print_line(&format!(
+        print_text(&format!(
             "\nThe run was {} before all was done; {n_unfinished} trials without an end are not counted.",
             report.end
         ))?;
     }
     if let Some(left_out) = report.left_out() {
-        print_line(&format!("\n{left_out}."))?;
+        print_text(&format!("\n{left_out}."))?;
     }
     if let Some(path) = &arguments.report {
-        print_line(&format!("\nreport: {}", path.display()))?;
+        print_text(&format!("\nreport: {}", path.display()))?;
     }
     Ok(())
 }

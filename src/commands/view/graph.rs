@@ -13,7 +13,7 @@ use super::super::promises::shown_counts;
 use super::super::top::poller::Poller;
 use super::super::top::sample::{Measured, MeasuredEdge, MeasuredNode, RUN, Window, measure};
 use super::super::top::screen::{short_rate, short_time};
-use super::super::{Outcome, check_output, print_line, ps, write_out};
+use super::super::{Outcome, check_output, print_text, ps, write_out};
 use super::{Format, GraphArguments};
 use blindgrasp_graph::client::pick_graph;
 use blindgrasp_graph::control::NodeState;
@@ -103,7 +103,7 @@ fn draw(
     };
     match out {
         Some(out) => write_out(out, &format!("{}\n", text.trim_end()))?,
-        None => print_line(text.trim_end())?,
+        None => print_text(text.trim_end())?,
     }
     Ok(Outcome::Done)
 }

@@ -210,15 +210,26 @@ fn listed(names: &[String]) -> String {
 /// The beginning of a name or value for an error: they may have any length.
 pub(crate) fn shortened(text: &str) -> String {
     const MAX_CHARS: usize = 60;
-    match text.char_indices().nth(MAX_CHARS) {
+    let shown = match text.char_indices().nth(MAX_CHARS) {
         None => text.into(),
         Some((end, _)) => format!("{}…", &text[..end]),
-    }
+    };
+    in_one_line(&shown)
+}
+
+/// A text of a table with blanks in the place of line breaks and other control characters, which would fake lines in messages.
+pub(super) fn in_one_line(text: &str) -> String {
+    text.replace(char::is_control, " ")
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_text_fakes_no_line_of_a_message() {
+        assert_eq!(shortened("no\n  line 2: good\r"), "no   line 2: good ");
+    }
 
     #[test]
     fn a_star_stands_for_any_text() {

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
+use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{RecordedGrasp, grasp_svg};
 use blindgrasp_ros::cdr::{self, Value};
@@ -21,7 +22,7 @@ use serde::Deserialize;
 
 use super::super::hand_cells::joint;
 use super::super::ros2_network::Ros2Network;
-use super::super::{Outcome, print_line};
+use super::super::{Outcome, print_line, print_text};
 use super::{check_free, in_shell};
 use draft::Draft;
 
@@ -158,7 +159,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         bail!("joint '{}' moves the palm: give the first link of the hand with --base", joint.name);
     }
     if arguments.cells.is_none() && arguments.grids.is_empty() {
-        print_line(
+        print_text(
             "\nnothing is made yet: give a table of the cells with --cells, or pads with --grid LINK=ROWSxCOLUMNS",
         )?;
         return Ok(Outcome::Done);
@@ -177,7 +178,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let hand = written?;
     let layout_path = folder.join(format!("{name}.yaml"));
     let shown = in_shell(&layout_path.display().to_string());
-    print_line(&format!(
+    print_text(&format!(
         "\n{}: {} pads, {} cells; picture: {name}.svg\nnext:\n  blindgrasp view {shown} --out hand.html      turn it, close it\n  \
          blindgrasp simulate --hand {shown} --label lift --protocol planned --stable-fraction natural --objects train \
          --grasps 600 --out lifts.mcap\n  \
@@ -298,7 +299,7 @@ fn print_parts(hand: &Hand) -> anyhow::Result<()> {
         let (lower, upper, open) = (joint.lower, joint.upper, joint.open());
         print_line(&format!("{:<16} {kind:<9} {lower:>8.4}  {upper:>8.4}  {open:>8.4}   {closed}", joint.name))?;
     }
-    print_line("\nlink             collision shapes")?;
+    print_text("\nlink             collision shapes")?;
     for link in &hand.links {
         print_line(&format!("{:<16} {}", link.name, link.shapes.len()))?;
     }
@@ -316,11 +317,8 @@ const CELL_COLUMNS: [&str; 7] = ["link", "x", "y", "z", "nx", "ny", "nz"];
 
 /// Cells of the table, pad by pad.
 fn read_table(path: &Path, threshold_newtons: f64) -> anyhow::Result<Vec<NewPad>> {
-    let mut reader = csv::ReaderBuilder::new()
-        .trim(csv::Trim::All)
-        .comment(Some(b'#'))
-        .from_path(path)
-        .with_context(|| format!("cannot read {}", path.display()))?;
+    let text = read_regular(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).comment(Some(b'#')).from_reader(text.as_bytes());
     let header = reader.headers().with_context(|| path.display().to_string())?;
     if let Some(missing) = CELL_COLUMNS.iter().find(|column| !header.iter().any(|found| found == **column)) {
         bail!(
@@ -365,7 +363,7 @@ fn read_table(path: &Path, threshold_newtons: f64) -> anyhow::Result<Vec<NewPad>
     }
     if !is_sized {
         pads.iter_mut().for_each(size_by_neighbours);
-        print_line(
+        print_text(
             "\nno width and height in the table: a cell is 0.8 times as wide and high as the nearest one is away",
         )?;
     }
