@@ -153,9 +153,10 @@ pub fn write_private(path: &Path, content: impl AsRef<[u8]>) -> std::io::Result<
 
 fn write_opened(options: &mut OpenOptions, path: &Path, content: &[u8]) -> std::io::Result<()> {
     let partial = partial_path(path);
+    // A killed process may have left one, and another user a link to any file.
+    let _ = std::fs::remove_file(&partial);
     let written = options
-        .create(true)
-        .truncate(true)
+        .create_new(true)
         .open(&partial)
         .and_then(|mut file| {
             keep_mode(&file, path)?;
@@ -189,6 +190,17 @@ mod tests {
         std::fs::set_permissions(at("private"), Permissions::from_mode(0o640)).expect("shared");
         write_private(&at("private"), "the next report").expect("written");
         assert_eq!(mode("private"), 0o640);
+    }
+
+    #[test]
+    fn a_planted_link_is_replaced_and_not_followed() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (mine, path) = (folder.path().join("mine"), folder.path().join("report"));
+        std::fs::write(&mine, "mine").expect("written");
+        std::os::unix::fs::symlink(&mine, partial_path(&path)).expect("planted");
+        write_whole(&path, "a report").expect("written");
+        assert_eq!(std::fs::read(&path).expect("there"), b"a report");
+        assert_eq!(std::fs::read(&mine).expect("there"), b"mine");
     }
 
     #[test]

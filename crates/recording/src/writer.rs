@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::BufWriter;
-use std::os::unix::fs::MetadataExt;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 use mcap::records::{MessageHeader, Metadata};
@@ -140,8 +140,10 @@ impl Drop for RecordingWriter {
 pub(super) fn lock_partial(path: &Path) -> Result<File, RecordingError> {
     let io = |source| RecordingError::Io { path: path.into(), source };
     let partial = partial_path(path);
+    // Another user could have planted a link to any file, or a pipe.
+    let flags = (rustix::fs::OFlags::NOFOLLOW | rustix::fs::OFlags::NONBLOCK).bits() as i32;
     loop {
-        let file = private_file().create(true).truncate(false).open(&partial).map_err(io)?;
+        let file = private_file().create(true).truncate(false).custom_flags(flags).open(&partial).map_err(io)?;
         lock(&file, path)?;
         // The process that held the lock may have given this very file its final name: then it must not be emptied.
         let is_still_there = std::fs::metadata(&partial).is_ok_and(|found| {
