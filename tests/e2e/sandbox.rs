@@ -77,9 +77,11 @@ static void try(const char *what, long outcome) {
 static char place[400];
 
 static const char *in(const char *name) {
-    static char path[500];
-    snprintf(path, sizeof path, "%s/%s", place, name);
-    return path;
+    static char paths[2][500];
+    static int turn;
+    turn = !turn;
+    snprintf(paths[turn], sizeof paths[turn], "%s/%s", place, name);
+    return paths[turn];
 }
 
 static int make(const char *name) {

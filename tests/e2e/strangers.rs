@@ -81,7 +81,8 @@ fn another_user_cannot_touch_a_running_graph() {
 /// and to put a pipe, a link and a large sparse file where the graph could open them.
 const PLANTER: &str = "
 while [ -e \"$1\" ]; do
-    for graph in /dev/shm/blindgrasp_$2*; do
+    for graph in /dev/shm/blindgrasp_$2.*; do
+        [ -d \"$graph\" ] || continue
         ls \"$graph\"/* 2> /dev/null && echo 'it sees names'
         for place in \"$graph/ports/x\" \"$graph/x\"; do
             mkfifo \"$place.pipe\" 2> /dev/null && echo 'it made a pipe'
