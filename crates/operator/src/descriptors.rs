@@ -68,7 +68,7 @@ impl DescriptorWatch {
 
 #[cfg(test)]
 mod tests {
-    use landlock::{ABI, Access, AccessFs, Ruleset, RulesetAttr, RulesetStatus};
+    use landlock::{ABI, AccessFs, Ruleset, RulesetAttr, RulesetStatus};
 
     use super::*;
 
