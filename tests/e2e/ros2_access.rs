@@ -1,6 +1,7 @@
 //! Who takes part in the sessions of `tactile_source`, `ros2` and `zenoh`: real Zenoh sessions over loopback.
 
 use std::path::Path;
+use std::process::{Command, Stdio};
 
 use blindgrasp_bridge::certificates::key_files;
 use blindgrasp_bridge::config::KeyFiles;
@@ -10,7 +11,7 @@ use serde_json::{Value, json};
 use time::OffsetDateTime;
 use zenoh::{Session, Wait};
 
-use crate::common::{run, text};
+use crate::common::{Graph, example, project, run, text, unique_name};
 use crate::link_security::{Heard, free_endpoint, keys, put, says, stranger, tls_of, wait_until};
 use crate::tactile_source::live_dataflow;
 
@@ -166,6 +167,38 @@ fn what_a_node_connects_to_must_bear_a_name_that_takes_part() {
         }
         assert!(!heard.has("frame") && !router_hears.has("decision"));
     }
+}
+
+/// Connections without a certificate that take all descriptors of a source keep its bridge out for no longer than they last and
+/// the source needs to notice it. Its sandbox denies it to read /proc.
+#[test]
+fn a_flood_of_connections_does_not_keep_the_hands_bridge_out_for_good() {
+    const N_DESCRIPTORS: usize = 400;
+    let (folder, keys, endpoint) = (tempfile::tempdir().expect("a folder"), folder_of_keys(), free_endpoint("tls"));
+    let params = format!(
+        "driver: zenoh\n      key: {FRAMES}\n      listen: {endpoint}\n      keys: {}\n      from: arm\n    sandbox: on",
+        keys.path().display()
+    );
+    let flow = live_dataflow(folder.path(), &params);
+    let mut limited = Command::new("prlimit");
+    limited.args([&format!("--nofile={N_DESCRIPTORS}:{N_DESCRIPTORS}"), env!("CARGO_BIN_EXE_blindgrasp")]);
+    limited.current_dir(project()).env("XDG_STATE_HOME", folder.path()).stdin(Stdio::null());
+    let graph = Graph::launch_on(limited, &unique_name(), &flow, &[]);
+    wait_until("the source listens", || graph.said().contains("receives key"));
+    let descriptors = format!("/proc/{}/fd", graph.pid_of("tactile_source"));
+    let n_open = || std::fs::read_dir(&descriptors).map_or(0, |entries| entries.count());
+    let address = endpoint.trim_start_matches("tls/");
+    let mut flood = Command::new(example("link_attacker"));
+    let flood = flood.args(["half-open", address, "1000", "3"]).stdout(Stdio::null());
+    let mut flood = flood.spawn().expect("started");
+    wait_until("no descriptor is left", || n_open() + 5 >= N_DESCRIPTORS);
+    flood.wait().expect("ended");
+    let arm = stranger(&endpoint, tls_of(keys.path(), "arm"));
+    wait_until("the source hears the arm", || {
+        put(&arm, FRAMES, "no JSON");
+        graph.node("tactile_source")["counts"]["malformed"].as_u64() > Some(0)
+    });
+    graph.stop();
 }
 
 /// Keys that no endpoint uses are no protection: the file is refused before anything starts.

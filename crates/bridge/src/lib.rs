@@ -24,7 +24,6 @@ pub mod agreement;
 pub mod certificates;
 pub mod clock;
 pub mod config;
-mod descriptors;
 mod downlink;
 mod envelope;
 

@@ -8,12 +8,11 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, anyhow, bail};
+use anyhow::{Context, anyhow};
 use time::OffsetDateTime;
 
 use super::clock::{Origins, Passage, origin_of_answer, origin_on_arrival};
 use super::config::{KeyKind, LinkConfig};
-use super::descriptors::{self, DescriptorWatch};
 use super::downlink::{Accepted, Downlink};
 use super::identity::Identity;
 use super::peer::{Change, Own, Rejection};
@@ -70,8 +69,6 @@ struct Link<'a> {
     frame: Vec<u8>,
     last_status: Instant,
     last_look: Instant,
-    descriptors: DescriptorWatch,
-    last_count: Instant,
     started: Instant,
     started_nanos: u64,
     has_said_waiting: bool,
@@ -127,8 +124,6 @@ impl<'a> Link<'a> {
             frame: Vec::new(),
             last_status: now,
             last_look: now,
-            descriptors: DescriptorWatch::default(),
-            last_count: now,
             started: now,
             started_nanos: monotonic_nanos(),
             has_said_waiting: false,
@@ -161,33 +156,16 @@ impl<'a> Link<'a> {
             }
             if self.last_look.elapsed() >= LOOK_PAUSE {
                 self.last_look = Instant::now();
+                self.operator.look_at_descriptors()?;
                 for connection in &mut self.connections {
                     connection.uplinks.iter_mut().try_for_each(Uplink::connect)?;
                 }
                 self.look_for_readers()?;
             }
-            self.look_at_descriptors()?;
             if !is_busy {
                 self.wait(stop);
             }
         }
-    }
-
-    /// # Errors
-    /// This process has had no descriptors left for some time: the next one begins without the connections that hold them.
-    fn look_at_descriptors(&mut self) -> anyhow::Result<()> {
-        if self.last_count.elapsed() < descriptors::LOOK_PAUSE {
-            return Ok(());
-        }
-        self.last_count = Instant::now();
-        let limit = descriptors::limit();
-        if self.descriptors.is_out(descriptors::n_open(), limit, self.started.elapsed()) {
-            bail!(
-                "nearly all {limit} descriptors have been in use for some seconds, perhaps by connections of strangers: machines \
-                 could not come in any more; limit the connections per address in the firewall (docs/security.md)"
-            );
-        }
-        Ok(())
     }
 
     fn look_for_readers(&mut self) -> anyhow::Result<()> {

@@ -50,6 +50,7 @@ pub mod control_socket;
 mod credit;
 pub mod cursors;
 pub mod description;
+mod descriptors;
 pub mod diagnostics;
 pub mod host;
 mod identity;

@@ -20,6 +20,7 @@ use serde_json::{Map, Value};
 
 use crate::cursors::{STATE_BYTES, SampleId, SharedCursors};
 use crate::description::{LINK_OPERATOR, OperatorDescription};
+use crate::descriptors::DescriptorWatch;
 use crate::diagnostics::{print_diagnostic, with_lack_of_files};
 use crate::link_status::LinkStatus;
 use crate::partner::{PairedInput, Partner, PartnerInput};
@@ -55,6 +56,8 @@ struct Member {
     identity: (u64, Cell<u64>),
     /// The restriction of the process so far, and the rights that it gives up when it is ready.
     sandbox: (Enforcement, Option<Arc<Sandbox>>),
+    /// Of an operator that uses the network.
+    descriptors: Option<RefCell<DescriptorWatch>>,
     voice: Voice,
     /// The partner inputs, and the counts of its own that it has reported.
     partners: RefCell<Vec<Rc<RefCell<dyn PairedInput>>>>,
@@ -376,6 +379,18 @@ impl Operator {
     /// Gives a sign of life.
     pub fn beat(&self) {
         self.0.cursors.instance(self.0.wiring.instance_slot).beat(monotonic_nanos());
+    }
+
+    /// Looks, if the operator uses the network, whether strangers' connections hold the descriptors of this process. Call it
+    /// often.
+    ///
+    /// # Errors
+    /// Nearly none has been left for some time. The process must end, because only that frees them.
+    pub fn look_at_descriptors(&self) -> anyhow::Result<()> {
+        match &self.0.descriptors {
+            Some(watch) => watch.borrow_mut().look(Instant::now()),
+            None => Ok(()),
+        }
     }
 
     /// Names the sample that a stage works on, for the launcher if the process dies of it.
@@ -710,6 +725,11 @@ pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyho
     let mut operators = Vec::with_capacity(wirings.len());
     for ((wiring, description), inbox) in wirings.into_iter().zip(descriptions).zip(inboxes) {
         let program = identity::of_program(description, &wiring.params);
+        let descriptors = if description.uses_network || description.operator == LINK_OPERATOR {
+            Some(RefCell::new(DescriptorWatch::open().context("/proc/self/fd cannot be read")?))
+        } else {
+            None
+        };
         operators.push(Operator(Rc::new(Member {
             node: namespace::join(&wiring.domain, &wiring.node)?,
             cursors: Arc::clone(&cursors),
@@ -718,6 +738,7 @@ pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyho
             waiter: Rc::clone(&waiter),
             identity: (program, Cell::new(identity::with_params(program, &wiring.params))),
             sandbox: (entered, sandbox.clone()),
+            descriptors,
             voice: voice(&wiring.node),
             partners: RefCell::default(),
             counts: RefCell::default(),

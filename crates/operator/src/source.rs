@@ -130,6 +130,7 @@ pub fn run(operator: &Operator, identity: BTreeMap<String, String>, mut source: 
         let step = if takes_steps && is_placed { source.step()? } else { Step::Wait(None) };
         if last_look.elapsed() >= TICK {
             last_look = Instant::now();
+            operator.look_at_descriptors()?;
             source.look()?;
         }
         let until = match step {

@@ -313,6 +313,7 @@ impl<S: Stage> Task for Instance<S> {
         // core.
         if self.last_look.elapsed() >= TICK {
             self.last_look = Instant::now();
+            self.operator.look_at_descriptors()?;
             self.publisher.look_for_readers()?;
             self.subscriber.connect()?;
             self.partners.connect()?;
