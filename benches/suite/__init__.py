@@ -11,5 +11,5 @@ and where it needs them:
     EXAMPLES         the programs of examples/ to build
     PACKAGES         the packages of PyPI, by the name to import
     verdict(result)  why the result is bad, or None: the exit code is then 1
-    PAGE             its options for the page of benchmarks, with page(result): rows of figure, peer and ratio
+    PAGE             its options for benches/benchmarks.md, with page(result): rows of figure, peer and ratio
 """

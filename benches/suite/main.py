@@ -4,7 +4,7 @@
     scripts/benchsuite runtime --secs 20 --rounds 5
     scripts/benchsuite runtime svm --quick          # the smallest sizes: whether it works, no figures
     scripts/benchsuite svm --help                   # a subject's options
-    scripts/benchsuite --page                       # measures the page of benchmarks, and compares it with the last one
+    scripts/benchsuite --page                       # measures benches/benchmarks.md, and compares it with the last one
     scripts/benchsuite --page runtime --dry-run     # compares one subject, and leaves the page as it is
 
 The sides of a comparison run in turn, round by round, so that whatever else the machine does hits all alike; figures are

@@ -1,4 +1,4 @@
-"""The table of the page of benchmarks: figures that this run measured, beside those of the run before."""
+"""The table of benches/benchmarks.md: figures that this run measured, beside those of the run before."""
 
 import datetime
 import os
@@ -7,7 +7,7 @@ import sys
 
 from . import figures, programs
 
-PAGE = programs.PROJECT / "docs" / "benchmarks.md"
+PAGE = programs.PROJECT / "benches" / "benchmarks.md"
 HEAD = "| figure | peer | ratio | before | measured |\n|---|---|---|---|---|\n"
 # A figure that has grown by more than a third is slower.
 SLOWER = 4 / 3

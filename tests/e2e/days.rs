@@ -232,7 +232,7 @@ fn a_model_leaves_out_the_grasps_that_it_was_trained_on() {
     assert!(table.contains("\ntrained objects ") && table.contains("\nnew objects "), "{table}");
 }
 
-/// What README says of real grasps on another day.
+/// What docs/results.md says of real grasps on another day.
 #[test]
 fn a_real_hand_on_another_day_is_judged_or_held() {
     let Some(data) = reference("biotac-sp") else { return };
