@@ -91,14 +91,14 @@ impl Recipe {
 impl Default for Recipe {
     /// The paper's histogram, the load of each pad as a whole and the joint angles, and boosted trees. The trees grow
     /// more slowly and with a higher penalty than by default, because the histogram nearly doubles the columns that a
-    /// split may choose from by chance (docs/learning.md).
+    /// split may choose from by chance.
     fn default() -> Self {
         Recipe {
             name: "boosted".into(),
             blocks: vec![Block::Histogram, Block::Pads, Block::Joints, Block::Breakaways],
             scaled: false,
             day_baseline: false,
-            // By cross-validation over folds of training objects: 64 words were 0.4 points worse (docs/learning.md).
+            // By cross-validation over folds of training objects: 64 words were 0.4 points worse.
             n_words: 8,
             sigma_m: 0.03645,
             learner: Learner::Boosting(BoostingParams {
