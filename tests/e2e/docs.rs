@@ -117,7 +117,9 @@ fn files_in_commands(text: &str) -> Vec<String> {
 fn pages() -> Vec<PathBuf> {
     let root = project();
     let mut pages: Vec<PathBuf> =
-        ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "benches/benchmarks.md"].map(|name| root.join(name)).into();
+        ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "benches/archive.md", "benches/benchmarks.md"]
+            .map(|name| root.join(name))
+            .into();
     pages.extend(markdown_of(&root.join("docs")));
     let of_folders = ["hands", "recordings", "examples", "packaging"].map(|folder| root.join(folder).join("README.md"));
     pages.extend(of_folders.into_iter().filter(|page| page.exists()));
