@@ -76,21 +76,16 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Init(init::Arguments),
-    #[command(aliases = ["up", "start", "launch"])]
     Run(run::Arguments),
     Record(record::Arguments),
-    #[command(alias = "play")]
     Replay(replay::Arguments),
     Test(test::Arguments),
-    #[command(aliases = ["status", "list"])]
     Ps(ps::Arguments),
     Top(top::Arguments),
     Echo(echo::Arguments),
-    #[command(alias = "down")]
     Stop(stop::Arguments),
     Logs(logs::Arguments),
     Set(set::Arguments),
-    #[command(alias = "restart")]
     Swap(swap::Arguments),
     Simulate(simulate::Arguments),
     Import(import::Arguments),
@@ -105,7 +100,6 @@ enum Command {
     Export(export::Arguments),
     New(new::Arguments),
     Keys(keys::Arguments),
-    #[command(alias = "graph")]
     View(view::Arguments),
     Doctor(doctor::Arguments),
     Diagnostics(diagnostics::Arguments),
@@ -167,7 +161,7 @@ impl Cli {
         let words: Vec<OsString> = std::env::args_os().collect();
         let matches = help::grouped(Cli::command()).try_get_matches_from(&words);
         let parsed = matches.and_then(|matches| Cli::from_arg_matches(&matches));
-        parsed.unwrap_or_else(|error| guesses::with_hint(error, help::grouped(Cli::command()), &words).exit())
+        parsed.unwrap_or_else(|error| guesses::with_hint(error, Cli::command(), &words).exit())
     }
 
     /// Runs the operator that this process is to be. An operator reports its end to the launcher, not to a person.

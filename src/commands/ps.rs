@@ -3,16 +3,14 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use anyhow::bail;
-use clap::{Args, CommandFactory};
+use clap::Args;
 use serde::Serialize;
 
 use super::elsewhere::MachineArgument;
-use super::guesses::hint_for_word;
 use super::promises::RobotPromise;
 use super::text_table::TextTable;
 use super::top::screen::short_time;
-use super::{Cli, Outcome, completions, print_line};
+use super::{Outcome, completions, print_line};
 use blindgrasp_graph::client::usage::{ProcessUsage, usage};
 use blindgrasp_graph::client::{pick_graph, running_graphs, status};
 use blindgrasp_graph::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus};
@@ -68,7 +66,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     let listing = match arguments.graph.as_ref().or(arguments.named.as_ref()) {
         Some(graph) => {
-            let status = status(&picked(graph)?)?;
+            let status = status(&pick_graph(Some(graph))?)?;
             Listing { graphs: vec![completed(status)], not_answering: Vec::new() }
         }
         None => listing()?,
@@ -90,18 +88,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         print_diagnostic(&silent.message);
     }
     Ok(Outcome::Done)
-}
-
-/// The running graph of that name; `list hands` is a guess, of which the error tells what does it.
-fn picked(name: &str) -> anyhow::Result<String> {
-    let error = match pick_graph(Some(name)) {
-        Ok(graph) => return Ok(graph),
-        Err(error) => error,
-    };
-    match hint_for_word(name, Cli::command()) {
-        Some(hint) => bail!("{error}; {hint}"),
-        None => Err(error.into()),
-    }
 }
 
 fn listing() -> anyhow::Result<Listing> {
