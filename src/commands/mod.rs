@@ -109,23 +109,6 @@ enum Command {
     Operator(operator::Arguments),
 }
 
-/// The running graph that a command is about, by its place or by its option, as other commands have it.
-#[derive(Debug, clap::Args)]
-struct GraphArgument {
-    /// Graph [default: the only one running]
-    #[arg(add = completions::graphs())]
-    graph: Option<String>,
-    /// The same, as other commands have it
-    #[arg(short = 'g', long = "graph", value_name = "GRAPH", conflicts_with = "graph", add = completions::graphs())]
-    named: Option<String>,
-}
-
-impl GraphArgument {
-    fn name(&self) -> Option<&str> {
-        self.graph.as_deref().or(self.named.as_deref())
-    }
-}
-
 /// How a command ended that did not fail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Outcome {

@@ -27,9 +27,6 @@ pub(super) struct Arguments {
     /// Show only this graph
     #[arg(add = completions::graphs())]
     graph: Option<String>,
-    /// The same, as other commands have it
-    #[arg(short = 'g', long = "graph", value_name = "GRAPH", conflicts_with = "graph", add = completions::graphs())]
-    named: Option<String>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -64,7 +61,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(destination) = arguments.machine.destination()? {
         return destination.run();
     }
-    let listing = match arguments.graph.as_ref().or(arguments.named.as_ref()) {
+    let listing = match &arguments.graph {
         Some(graph) => {
             let status = status(&pick_graph(Some(graph))?)?;
             Listing { graphs: vec![completed(status)], not_answering: Vec::new() }

@@ -25,7 +25,7 @@ const ASKED: &str = "asked";
 
 /// `record --write-kept`
 pub(super) fn ask(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let mut connection = Connection::open(&pick_graph(arguments.graph.name())?)?;
+    let mut connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
     let n_flight_recorders = match connection.ask(&Request::Keep, ANSWER_LIMIT)? {
         Reply::Asked { n_flight_recorders } => n_flight_recorders,
         other => return Err(connection.unexpected(&other).into()),
@@ -51,7 +51,7 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
     let asked = Arc::new(AtomicBool::new(false));
     signal_hook::flag::register(signal_hook::consts::SIGUSR1, Arc::clone(&asked))
         .context("cannot listen for SIGUSR1")?;
-    let mut connection = Connection::open(&pick_graph(arguments.graph.name())?)?;
+    let mut connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
     let Attachment { domain, edges, graph, .. } = attach(&mut connection, &[], out, true)?;
     if n_sources_of_frames(&graph) > 1 {
         bail!(
