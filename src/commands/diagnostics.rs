@@ -3,6 +3,9 @@
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::Context as _;
+use blindgrasp_graph::client::activity::{Look, Measured, MeasuredEdge, MeasuredNode, Window, measure};
+use blindgrasp_graph::client::poller::Poller;
+use blindgrasp_graph::client::words::{node_state_word, state_word, warnings};
 use blindgrasp_graph::client::{ClientError, pick_graph};
 use blindgrasp_graph::control::{EdgeStatus, GraphState, NodeState, NodeStatus};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -13,10 +16,7 @@ use blindgrasp_ros::standard;
 use clap::Args;
 use serde::Serialize;
 
-use super::ps::{node_state_word, state_word, warnings};
 use super::ros2_network::Ros2Network;
-use super::top::poller::Poller;
-use super::top::sample::{Look, Measured, MeasuredEdge, MeasuredNode, Window, measure};
 use super::{Outcome, completions, secs_in};
 
 /// Publish a graph's state to ROS 2, on /diagnostics

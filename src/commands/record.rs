@@ -22,13 +22,10 @@ use blindgrasp_operator::cursors::SharedCursors;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_session::of_graph::of_graph;
 use blindgrasp_session::recorder::{Recorded, Recorder};
+use blindgrasp_session::span::{EdgeSpan, Span, SpanOfEdge};
 
-use self::span::{EdgeSpan, Span, SpanOfEdge};
-
-mod flight;
 mod keep;
 mod over_ssh;
-mod span;
 
 /// The command checks this often whether it was interrupted or its time is over.
 const POLL: Duration = Duration::from_millis(50);

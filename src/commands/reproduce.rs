@@ -11,8 +11,7 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use super::init;
-use super::model::write_at_once;
-use super::{Outcome, percent, print_line, stop_signal};
+use super::{Outcome, percent, print_line, stop_signal, write_out};
 use blindgrasp_messages::files::partial_path;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
@@ -78,7 +77,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     let table_1 = table_1(folder)?;
     let summary = folder.join("README.md");
-    write_at_once(&summary, &summary_text(folder, &table_1)?)?;
+    write_out(&summary, &summary_text(folder, &table_1)?)?;
     if arguments.json {
         let results: Vec<&str> = steps.iter().map(|step| step.result).collect();
         print_line(
@@ -109,7 +108,7 @@ fn claim(folder: &Path, arguments: &Arguments) -> anyhow::Result<()> {
         ),
         Err(_) => match std::fs::read_dir(folder)?.next() {
             Some(_) => bail!("{} holds other files: expected a new folder", folder.display()),
-            None => write_at_once(&path, &format!("{mine}\n")),
+            None => write_out(&path, &format!("{mine}\n")),
         },
     }
 }

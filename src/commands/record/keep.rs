@@ -9,7 +9,6 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use serde_json::{Value, json};
 
-use super::flight::{Excerpt, FlightRecorder, SharedRecorder};
 use super::{Arguments, Outcome, POLL, attach, observed, print_line, stop_signal};
 use blindgrasp_graph::client::observer::Observer;
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
@@ -18,6 +17,7 @@ use blindgrasp_graph::recorded_graph::{Beginning, Ending, RecordedGraph};
 use blindgrasp_messages::{Recorded as _, TactileFrame};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_session::flight::{Excerpt, FlightRecorder, SharedRecorder};
 use blindgrasp_session::of_graph::of_graph;
 
 /// The reason in the names of files that somebody asked for.

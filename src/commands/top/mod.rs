@@ -1,7 +1,5 @@
 //! `blindgrasp top`
 
-pub(super) mod poller;
-pub(super) mod sample;
 pub(super) mod screen;
 mod table;
 mod view;
@@ -16,11 +14,11 @@ use clap::Args;
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event};
 
-use self::poller::Poller;
-use self::sample::{Look, Window, measure};
 use self::view::{Condition, Then, View};
 use super::elsewhere::MachineArgument;
 use super::{Outcome, completions, print_line, secs_in};
+use blindgrasp_graph::client::activity::{Look, Window, measure};
+use blindgrasp_graph::client::poller::Poller;
 use blindgrasp_graph::client::{ClientError, pick_graph, running_graphs};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 

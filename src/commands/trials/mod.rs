@@ -14,8 +14,7 @@ use rayon::prelude::*;
 use self::setup::Setup;
 use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
-use super::model::write_at_once;
-use super::{Outcome, check_page, completions, print_line, stop_requests};
+use super::{Outcome, check_page, completions, print_line, stop_requests, write_out};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_learning::trials::late_decisions::LateDecisions;
@@ -164,7 +163,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     report.count();
     if let Some(path) = &arguments.report {
         let strips = strips(&setup, &targets, &report, &n_stops);
-        write_at_once(path, &trials_page(&report, &strips))?;
+        write_out(path, &trials_page(&report, &strips))?;
     }
     print_report(arguments, &report)?;
     let late = report.late.and_then(|late| late.advice());
