@@ -1,17 +1,17 @@
 //! `blindgrasp model`
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Context;
 use clap::{Args, Subcommand, ValueEnum};
 use serde_json::json;
 
 use super::train::{probe_lines, threshold_line};
-use super::{Outcome, check_new, check_output, completions, percent, print_line, print_text};
+use super::{Outcome, check_new, check_output, completions, percent, print_line, print_text, write_out};
 use blindgrasp_learning::dataset::{hand_of, label_line};
 use blindgrasp_learning::learners::libsvm_format::{parse_libsvm, write_libsvm};
 use blindgrasp_learning::training::adapt;
-use blindgrasp_messages::files::{read_regular, write_whole};
+use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::boosting::BoostedTrees;
@@ -164,18 +164,9 @@ fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
             training.recipe.name
         );
     };
-    write_at_once(&arguments.out, &write_libsvm(svm, Some(&classifier.calibration)))?;
+    write_out(&arguments.out, &write_libsvm(svm, Some(&classifier.calibration)))?;
     print_line(&format!("{}: {} support vectors", arguments.out.display(), svm.n_support_vectors()))?;
     Ok(Outcome::Done)
-}
-
-/// Writes a file whole or not at all.
-pub(super) fn write_at_once(path: &Path, text: &str) -> anyhow::Result<()> {
-    // A pipe, a terminal or a device is written to, not replaced.
-    if std::fs::metadata(path).is_ok_and(|found| !found.is_file()) {
-        return std::fs::write(path, text).with_context(|| format!("{}", path.display()));
-    }
-    write_whole(path, text).with_context(|| format!("{}", path.display()))
 }
 
 fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
