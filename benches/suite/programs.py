@@ -70,10 +70,10 @@ def use_packages(names):
     if Path(sys.prefix) != folder:
         if not python.exists():
             venv.create(folder, with_pip=True)
-        can_import = [python, "-c", f"import {', '.join(names)}"]
+        can_import = [python, "-P", "-c", f"import {', '.join(names)}"]
         if subprocess.run(can_import, stderr=subprocess.DEVNULL).returncode != 0:
             print(f"installing {', '.join(names.values())} into {folder}", file=sys.stderr)
-            subprocess.run([python, "-m", "pip", "install", "--quiet", *names.values()], check=True, stdout=sys.stderr)
+            subprocess.run([python, "-P", "-m", "pip", "install", "--quiet", *names.values()], check=True, stdout=sys.stderr)
         os.execv(python, [str(python), *sys.argv])
 
 

@@ -1,6 +1,6 @@
 """Table (CSV) of a LeRobot dataset, for blindgrasp import: one grasp an episode.
 
-    python3 -m blindgrasp.lerobot DATASET table.csv --cells observation.tactile.left,observation.tactile.right \\
+    python3 -P -m blindgrasp.lerobot DATASET table.csv --cells observation.tactile.left,observation.tactile.right \\
         --joints 'observation.state/gripper*' --label next.success --at -2 --hand parallel-gripper
 
 It needs the package pyarrow (pip install pyarrow). DATASET is a folder on this machine, of format v2.0, v2.1 or v3.0.
@@ -334,7 +334,7 @@ def _read(path: Path, names: list[str] | None):
 
 def main() -> int:
     parser = argparse.ArgumentParser(
-        prog="python3 -m blindgrasp.lerobot", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python3 -P -m blindgrasp.lerobot", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
     add("dataset", type=Path, metavar="DATASET", help="folder of the dataset, with meta and data")

@@ -1,4 +1,4 @@
-"""URDF of a hand that is described as a MuJoCo model (MJCF): ``python3 -m blindgrasp.mjcf hand.xml hand.urdf``.
+"""URDF of a hand that is described as a MuJoCo model (MJCF): ``python3 -P -m blindgrasp.mjcf hand.xml hand.urdf``.
 
 It needs the package ``mujoco`` (``pip install 'blindgrasp[mujoco]'``), which reads the file. ``blindgrasp new hand`` then
 makes a hand of the URDF.
@@ -278,7 +278,7 @@ def _text(numbers) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python3 -m blindgrasp.mjcf", description="URDF of a hand from a MuJoCo model (MJCF)")
+    parser = argparse.ArgumentParser(prog="python3 -P -m blindgrasp.mjcf", description="URDF of a hand from a MuJoCo model (MJCF)")
     parser.add_argument("model", type=Path, help="the model (XML)")
     parser.add_argument("urdf", type=Path, help="where to write the URDF; meshes go to the folder meshes beside it")
     arguments = parser.parse_args()

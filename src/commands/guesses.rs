@@ -386,7 +386,7 @@ const GUESSES: &[(&[&str], &[&str], &str)] = &[
     (
         &["--mjcf", "--xml", "--mujoco"],
         &["new"],
-        "use 'python3 -m blindgrasp.mjcf hand.xml hand.urdf' first (docs/hand.md)",
+        "use 'python3 -P -m blindgrasp.mjcf hand.xml hand.urdf' first (docs/hand.md)",
     ),
     (&["--file", "--robot", "--model"], &["--urdf"], "use --urdf FILE"),
     (&["--node"], &["set"], "write the node before the parameter: NODE.PARAM=VALUE"),

@@ -1,5 +1,7 @@
 //! MuJoCo in the robot's place: lifts that the project's own physics have no part in.
 
+use std::process::Command;
+
 use serde_json::Value;
 
 use crate::common::python::python;
@@ -50,6 +52,35 @@ fn a_seed_gives_the_same_lifts_with_mujoco_and_others_without() {
     let first = simulate("mujoco", &out("first.mcap"));
     assert!(first == simulate("mujoco", &out("second.mcap")));
     assert!(first != simulate("rapier", &out("rapier.mcap")));
+}
+
+#[test]
+fn files_of_the_current_folder_are_no_modules() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let modules = ["coacd", "hashlib", "json", "math", "mujoco", "numpy", "pathlib", "sitecustomize"];
+    for module in modules {
+        let runs = "open(__file__ + '.ran', 'w').close()\n";
+        std::fs::write(folder.path().join(format!("{module}.py")), runs).expect("written");
+    }
+    let ran = || -> Vec<&str> {
+        let marks = |module: &&str| folder.path().join(format!("{module}.py.ran")).exists();
+        modules.into_iter().filter(marks).collect()
+    };
+    let mut lured = Command::new(python());
+    lured.args(["-c", "import hashlib"]).current_dir(folder.path()).env("PYTHONPATH", ":/nowhere");
+    lured.env("PYTHONDONTWRITEBYTECODE", "1").output().expect("started");
+    assert!(ran().contains(&"hashlib") && ran().contains(&"sitecustomize"), "Python itself takes them: {:?}", ran());
+    for module in ran() {
+        std::fs::remove_file(folder.path().join(format!("{module}.py.ran"))).expect("removed");
+    }
+    let out = folder.path().join("lifts.mcap");
+    let arguments =
+        "simulate --label lift --physics mujoco --objects box --grasps 1 --seed 5 --stable-fraction natural --out";
+    let mut command = blindgrasp();
+    command.args(arguments.split(' ')).arg(&out).current_dir(folder.path());
+    let output = command.env("BLINDGRASP_PYTHON", python()).env("PYTHONPATH", ":/nowhere").output().expect("started");
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+    assert_eq!(ran(), [""; 0]);
 }
 
 #[test]

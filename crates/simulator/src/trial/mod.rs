@@ -32,6 +32,7 @@ use crate::OptionError;
 use blindgrasp_objects::Object;
 
 pub use attempt::{Attempt, ProbeMove, Reaction};
+pub use mujoco::python_path;
 pub(crate) use options::check_planner;
 pub use options::{MujocoOptions, PhysicsEngine, PhysicsOptions, TrialOptions, TrialProtocol};
 pub use start::{choose_start, draw_start, sensor_seed};

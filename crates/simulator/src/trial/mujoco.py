@@ -10,12 +10,17 @@ palm. Answers to touches: [[shape, other, point, normal out of other, newtons], 
 number, the target is -1, the stand and the ground are -2.
 """
 
-import hashlib
-import json
-import math
-import os
-import pathlib
 import sys
+
+# This module is built in. `python3 -c` looks for others in the current folder first, where a stranger's hashlib.py may be,
+# and Python has -P since 3.11 only.
+sys.path = [place for place in sys.path if place]
+
+import hashlib  # noqa: E402
+import json  # noqa: E402
+import math  # noqa: E402
+import os  # noqa: E402
+import pathlib  # noqa: E402
 
 answers = os.fdopen(os.dup(1), "w")
 os.dup2(2, 1)  # Libraries that print must not print answers.

@@ -8,6 +8,7 @@
 
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader, Write as _};
+use std::path::PathBuf;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::sync::{Mutex, PoisonError};
 
@@ -59,6 +60,7 @@ impl Process {
         let python = std::env::var(PYTHON).unwrap_or_else(|_| DEFAULT_PYTHON.into());
         let started = Command::new(&python)
             .args(["-c", SCRIPT])
+            .env("PYTHONPATH", std::env::join_paths(python_path()).unwrap_or_default())
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::null())
@@ -91,6 +93,12 @@ impl Process {
             None => Ok(answer),
         }
     }
+}
+
+/// The entries of PYTHONPATH, without empty ones: these mean the current folder, whose files must not decide what runs.
+pub fn python_path() -> Vec<PathBuf> {
+    let places = std::env::var_os("PYTHONPATH").unwrap_or_default();
+    std::env::split_paths(&places).filter(|place| !place.as_os_str().is_empty()).collect()
 }
 
 /// The bodies after a step.

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use anyhow::{Context, bail};
+use blindgrasp_simulator::trial::python_path;
 use blindgrasp_stages::hand::{decode_urdf, find_package};
 
 /// A stand-in for the module of ROS 2 by which xacro finds packages. Packages are sought by [`find_package`], also where ROS is
@@ -74,9 +75,7 @@ fn run(
     stand_in: &Path,
     packages: &BTreeMap<String, PathBuf>,
 ) -> anyhow::Result<Output> {
-    let own = std::env::var_os("PYTHONPATH").unwrap_or_default();
-    let own = std::env::split_paths(&own).filter(|place| !place.as_os_str().is_empty());
-    let places = std::env::join_paths([stand_in.to_path_buf()].into_iter().chain(own))?;
+    let places = std::env::join_paths([vec![stand_in.to_path_buf()], python_path()].concat())?;
     let output = Command::new("xacro")
         .arg(path)
         .args(arguments)
