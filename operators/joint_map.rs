@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context as _, bail};
+use blindgrasp_messages::files::read_regular;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_tactile::ros2::JointTopic;
 use serde::Deserialize;
@@ -30,7 +31,7 @@ impl Default for MappedJoint {
 pub(crate) fn hand_joints(hand: &Hand, prefix: &str, map: Option<&Path>) -> anyhow::Result<Vec<JointTopic>> {
     let mut mapped: BTreeMap<String, MappedJoint> = match map {
         Some(path) => {
-            let text = std::fs::read_to_string(path).with_context(|| format!("joint_map {}", path.display()))?;
+            let text = read_regular(path).with_context(|| format!("joint_map {}", path.display()))?;
             serde_saphyr::from_str(&text).with_context(|| {
                 format!("joint_map {}: expected {{JOINT: {{from: NAME, scale: 1, offset: 0}}}}", path.display())
             })?

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context as _, bail};
+use blindgrasp_messages::files::read_regular;
 use blindgrasp_messages::{ContactSet, GraspFeature, LiftDecision, Prediction, Recorded, Stamped, TactileFrame};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
@@ -228,7 +229,7 @@ fn decision_topic(last: &Arc<LastDecision>) -> anyhow::Result<Topic<LiftDecision
 /// The type is unknown, or the file has no definition of it.
 pub(crate) fn definition_of(name: &str, file: Option<&Path>) -> anyhow::Result<Definition> {
     if let Some(path) = file {
-        let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+        let text = read_regular(path).with_context(|| path.display().to_string())?;
         return Definition::parse(name, &text).with_context(|| path.display().to_string());
     }
     standard::definition(name).with_context(|| {

@@ -42,6 +42,12 @@ __all__ = ["main"]
 
 # The import takes names of up to 64 bytes.
 MAX_NAME_BYTES = 64
+# The elements of a feature: a dataset that names more would take all memory.
+MAX_ELEMENTS = 1_000_000
+# The size limit of the texts of a dataset, as of a table in the import.
+MAX_TEXT_BYTES = 1 << 30
+# The fields of data_path; a width of any size would take all memory.
+PLACE = r"\{(episode_index|episode_chunk|chunk_index|file_index)(:0?\d{1,2}d)?\}"
 # LeRobot's tolerance of timestamps.
 TOLERANCE_S = 1e-4
 
@@ -72,11 +78,15 @@ class _Dataset:
     def __init__(self, root: Path, fields_file: Path | None):
         self.info_path = root / "meta/info.json"
         with _expecting(self.info_path, "a LeRobot dataset's JSON with codebase_version, data_path, features"):
-            info = json.loads(self.info_path.read_text(encoding="utf-8"))
+            info = json.loads(_text(self.info_path))
             version, data_path, chunk = str(info["codebase_version"]), info["data_path"], int(info.get("chunks_size", 1000))
+            if re.search(r"[{}]", re.sub(PLACE, "", data_path)):
+                raise _Refused(f"{self.info_path}: expected fields like {{file_index:03d}} in data_path, found {data_path!r}")
             # Images and videos are no cells.
             features = {name: spec for name, spec in info["features"].items() if spec["dtype"] not in ("image", "video")}
             self.sizes = {name: math.prod(map(int, spec["shape"])) for name, spec in features.items()}
+            if max(self.sizes.values(), default=0) > MAX_ELEMENTS:
+                raise _Refused(f"{self.info_path}: expected features of at most {MAX_ELEMENTS} elements, found {self.sizes}")
             self.names = {name: _names(spec.get("names"), self.sizes[name]) for name, spec in features.items()}
         if not version.startswith(("v2.", "v3.")):
             raise _Refused(f"{self.info_path}: expected format v2.0, v2.1 or v3.0, found {version}: convert it with LeRobot")
@@ -98,7 +108,7 @@ class _Dataset:
                 self.files[root / path].append(episode)
         if fields_file:
             with _expecting(fields_file, "CSV in UTF-8 with a column episode_index that has episodes of the dataset"):
-                for row in csv.DictReader(io.StringIO(fields_file.read_text(encoding="utf-8-sig"))):
+                for row in csv.DictReader(io.StringIO(_text(fields_file, "utf-8-sig"))):
                     self.fields[int(row["episode_index"])].update((name, text) for name, text in row.items() if name)
         self.known = {name for fields in self.fields.values() for name in fields}
 
@@ -302,12 +312,21 @@ def _short(name: str) -> str:
     return name if len(whole) <= MAX_NAME_BYTES else f"{begin}~{zlib.crc32(whole):08x}"
 
 
+def _text(path: Path, encoding: str = "utf-8") -> str:
+    """The text of a file. A pipe or a device may have no end."""
+    if path.exists() and not path.is_file():
+        raise OSError("no regular file")
+    if path.stat().st_size > MAX_TEXT_BYTES:
+        raise OSError(f"more than {MAX_TEXT_BYTES >> 30} GiB")
+    return path.read_text(encoding=encoding)
+
+
 def _rows(path: Path) -> list[dict]:
     """The rows of a file of the folder meta."""
     if path.suffix == ".parquet":
         return _read(path, None).to_pylist()
     rows = []
-    for nth, line in enumerate(path.read_text(encoding="utf-8").split("\n"), 1):
+    for nth, line in enumerate(_text(path).split("\n"), 1):
         if line.strip():
             with _expecting(f"{path}, line {nth}", "JSON"):
                 rows.append(json.loads(line))

@@ -277,7 +277,12 @@ class LeRobot(unittest.TestCase):
             (info, "[]", "info.json: expected a LeRobot dataset's JSON"),
             (info, '{"codebase_version": "v2.1"}', "info.json: expected .*; found: no 'data_path'"),
             (info, other(codebase_version="v1.6"), "expected format v2.0, v2.1 or v3.0, found v1.6"),
-            (info, other(data_path="data/{x}.parquet"), "path of episode 0 by data_path .*found: no 'x'"),
+            (info, other(data_path="data/{x}.parquet"), "expected fields like .* in data_path, found 'data/{x}.parquet'"),
+            # Each would take 2 GB for a name.
+            (info, other(data_path="{episode_index:>2000000000}"), "expected fields like .* in data_path"),
+            (info, other(data_path="{episode_index:{episode_index}}"), "expected fields like .* in data_path"),
+            (info, other(data_path="{episode_index.real}"), "expected fields like .* in data_path"),
+            (info, other(features={"state": {"dtype": "float32", "shape": [1 << 31]}}), "at most 1000000 elements"),
             (info, other(features={"state": {"dtype": "float32"}}), "found: no 'shape'"),
             (episodes, episodes.read_text() + "{\n", "episodes.jsonl, line 13: expected JSON"),
             (episodes, '{"tasks": []}\n', "episodes.jsonl: expected a whole number episode_index .*found: no 'episode_index'"),
@@ -297,6 +302,12 @@ class LeRobot(unittest.TestCase):
                     path.write_bytes(content if isinstance(content, bytes) else content.encode())
                 self.refused(words, root, "--at", "1")
                 path.write_bytes(whole)
+        whole = info.read_bytes()
+        info.unlink()
+        info.symlink_to("/dev/zero")
+        self.refused("info.json: expected a LeRobot dataset's JSON .*found: no regular file", root, "--at", "1")
+        info.unlink()
+        info.write_bytes(whole)
         self.write_parquet(data, {name: values for name, values in episode_frames(3).items() if name != "next.success"})
         self.refused("episode_000003.parquet: expected a column 'next.success'; found columns: ", root, "--at", "1")
         self.write_parquet(data, episode_frames(4))

@@ -1,7 +1,7 @@
 //! Frames as lines of JSON: those of a bridge, or of `blindgrasp export`.
 
 use std::collections::BTreeMap;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Read, Take};
 use std::path::Path;
 
 use anyhow::{Context, bail};
@@ -9,6 +9,7 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use blindgrasp_messages::file_kind::FileKind;
+use blindgrasp_messages::files::open_regular;
 use blindgrasp_messages::{GraspTruth, Header, OwnedSenses, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_stages::Hand;
 use blindgrasp_tactile::cell_zeros::{AllowedReadings, CellZeros};
@@ -16,6 +17,10 @@ use blindgrasp_tactile::line_protocol;
 
 /// The time between two frames that have no stamp.
 const PERIOD_NANOS: u64 = 10_000_000;
+/// The size limit of the lines, which are all read before the first grasp is decided: that of a table.
+const MAX_BYTES: u64 = 1 << 30;
+/// The size limit of a line: thousands of cells.
+const MAX_LINE_BYTES: u64 = 4 << 20;
 
 /// The frames of lines, and the labels of their grasps by number.
 pub(super) struct FrameLines {
@@ -35,7 +40,8 @@ enum Line {
 /// Reads a file of lines, or stdin if it is `-`. Empty lines, and samples of other topics, are left out.
 ///
 /// # Errors
-/// A line that is no frame, or no frame at all. The text names the line.
+/// A file that is no regular one or has more than 1 GiB, a line of more than 4 MiB or that is no frame, or no frame at all. The
+/// text names the line.
 pub(super) fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines> {
     let is_other = |kind: &FileKind| !matches!(kind, FileKind::FrameLines | FileKind::Json | FileKind::Empty);
     if let Some(kind) = FileKind::at(file).filter(is_other) {
@@ -43,21 +49,23 @@ pub(super) fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines
     }
     let input: Box<dyn BufRead> = match file.to_str() {
         Some("-") => Box::new(std::io::stdin().lock()),
-        _ => Box::new(BufReader::new(std::fs::File::open(file).with_context(|| file.display().to_string())?)),
+        _ => Box::new(BufReader::new(open_regular(file).with_context(|| file.display().to_string())?)),
     };
+    let mut input = input.take(MAX_BYTES + 1);
     let mut frames: Vec<Stamped<TactileFrame>> = Vec::new();
     let (mut truths, mut headers_of_truths) = (BTreeMap::new(), BTreeMap::new());
     // Of lines of a bridge: whether they have numbers.
     let mut has_seq = None;
     let mut zeros = CellZeros::new(hand, false);
-    for (line_idx, line) in input.lines().enumerate() {
-        let line = line.with_context(|| file.display().to_string())?;
+    for line_number in 1_u64.. {
+        let place = || format!("{}, line {line_number}", file.display());
+        let Some(line) = next_line(&mut input).with_context(place)? else { break };
         // Some programs write a byte order mark before the first line.
-        let line = if line_idx == 0 { line.trim_start_matches('\u{feff}') } else { &line };
-        if line.trim().is_empty() {
+        let line = if line_number == 1 { line.trim_start_matches('\u{feff}') } else { &line };
+        let line = line.trim();
+        if line.is_empty() {
             continue;
         }
-        let place = || format!("{}, line {}", file.display(), line_idx + 1);
         let (frame, truth) = match read_line(line, &frames, hand, &mut zeros).with_context(place)? {
             Line::Frame(frame, truth) => (Some(frame), truth),
             Line::Truth(truth) => {
@@ -87,6 +95,22 @@ pub(super) fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines
         bail!("{}: expected lines with tactile frames, found none", file.display());
     }
     Ok(FrameLines { frames, truths, headers_of_truths })
+}
+
+/// The next line; `None` at the end.
+fn next_line(input: &mut Take<Box<dyn BufRead>>) -> anyhow::Result<Option<String>> {
+    let mut line = Vec::new();
+    input.by_ref().take(MAX_LINE_BYTES + 1).read_until(b'\n', &mut line)?;
+    if line.len() as u64 > MAX_LINE_BYTES {
+        bail!("more than {} MiB: expected a line with a frame", MAX_LINE_BYTES >> 20);
+    }
+    if input.limit() == 0 {
+        bail!("more than {} GiB so far: divide the lines, and give them part by part", MAX_BYTES >> 30);
+    }
+    if line.is_empty() {
+        return Ok(None);
+    }
+    Ok(Some(String::from_utf8(line).context("expected UTF-8")?))
 }
 
 fn read_line(

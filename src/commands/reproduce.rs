@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 use super::init;
 use super::model::write_at_once;
 use super::{Outcome, percent, print_line, stop_signal};
-use blindgrasp_messages::files::partial_path;
+use blindgrasp_messages::files::{partial_path, read_regular};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
 /// The paper trains on 24,640 grasps and tests on 12,320: three folds.
@@ -85,7 +85,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             &json!({ "folder": folder.display().to_string(), "results": results, "table_1": table_1 }).to_string(),
         )?;
     } else {
-        print_line(&std::fs::read_to_string(&summary)?)?;
+        print_line(&read_regular(&summary)?)?;
         print_line(&format!("{}: tables, figures and reports", folder.display()))?;
     }
     Ok(Outcome::Done)
@@ -100,7 +100,7 @@ fn claim(folder: &Path, arguments: &Arguments) -> anyhow::Result<()> {
         "seed": arguments.seed,
         "version": env!("CARGO_PKG_VERSION"),
     });
-    match std::fs::read_to_string(&path) {
+    match read_regular(&path) {
         Ok(text) if serde_json::from_str::<Value>(&text).ok().as_ref() == Some(&mine) => Ok(()),
         Ok(text) => bail!(
             "{} was begun with other options ({}): expected the same ones, or another folder",
@@ -248,7 +248,7 @@ fn table_1(folder: &Path) -> anyhow::Result<Vec<Value>> {
     let mut rows = Vec::new();
     for split in ["grasp", "object", "class"] {
         let path = folder.join(format!("by-{split}.json"));
-        let text = std::fs::read_to_string(&path).with_context(|| format!("{}", path.display()))?;
+        let text = read_regular(&path).with_context(|| format!("{}", path.display()))?;
         let report: Value = serde_json::from_str(&text).with_context(|| format!("{}", path.display()))?;
         for judge in report["judges"].as_array().into_iter().flatten() {
             let (judged, all) = (&judge["judged"], &judge["all"]);
@@ -310,7 +310,7 @@ fn summary_text(folder: &Path, table_1: &[Value]) -> anyhow::Result<String> {
         ("with a test lift, by a model of lifts", "tables-2-to-4-ours.txt"),
     ] {
         let path = folder.join(name);
-        let table = std::fs::read_to_string(&path).with_context(|| format!("{}", path.display()))?;
+        let table = read_regular(&path).with_context(|| format!("{}", path.display()))?;
         text += &format!("\n## Tables II to IV, {title}\n\n```text\n{}\n```\n", table.trim());
     }
     Ok(text)

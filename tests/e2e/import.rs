@@ -293,6 +293,10 @@ fn files_that_are_no_tables_are_refused() {
     folder.refuse("\u{feff}\r\n", &[], 1, &["table.csv", "empty"]);
     folder.refuse("object,kind,held,l_1,l_2,r_1\n", &[], 1, &["table.csv", "no row"]);
     folder.refuse(b"\xff\xfeo\0b\0\n\0", &[], 1, &["table.csv", "UTF-8"]);
+    // A quote that is not closed makes the rest of the table one field.
+    let rest = "x,".repeat(3 << 20);
+    folder.refuse(format!("{TABLE}\"{rest}"), &[], 1, &["table.csv: line 4: a row of more than 4 MiB"]);
+    folder.refuse(format!("object,\"{rest}"), &[], 1, &["table.csv: line 1: a row of more than 4 MiB"]);
     std::fs::remove_file(folder.at("table.csv")).expect("there");
     let arguments = folder.arguments(&[]);
     let absent = run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), 1);

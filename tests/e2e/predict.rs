@@ -97,6 +97,8 @@ fn input_that_is_no_frame_is_named() {
     refused("", "expected lines with tactile frames, found none");
     refused("{", "-, line 1: not a line of JSON");
     refused("{}\n", "-, line 1: not a frame: missing field `joints`");
+    // It has no end yet, and would be read to it.
+    refused(&"x".repeat((4 << 20) + 1), "-, line 1: more than 4 MiB: expected a line with a frame");
     let frame = r#""data": {"grasp_id": 0, "phase": "settled", "joints": [], "cells_newtons": []}"#;
     let with = |seq: &str| format!("{{\"topic\": \"/tactile\", \"stamp_nanos\": 0, {seq}{frame}}}\n");
     for seq in ["", "\"seq\": 1.5, ", "\"seq\": \"1\", ", "\"seq\": -1, ", "\"seq\": 1, \"hand_id\": 170, "] {

@@ -254,7 +254,8 @@ fn what_is_no_regular_file_is_refused_at_once() {
     let pipe = folder.path().join("pipe.json");
     rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, rustix::fs::Mode::from_raw_mode(0o600), 0)
         .expect("made");
-    let pipe = utf8(&pipe);
+    let (pipe, out) = (utf8(&pipe), folder.path().join("out.mcap"));
+    let out = utf8(&out);
     for path in [pipe, "/dev/zero", "/dev/null"] {
         for arguments in [
             &["info", path][..],
@@ -264,6 +265,8 @@ fn what_is_no_regular_file_is_refused_at_once() {
             &["model", "show", path],
             &["info", RECORDING, "--hand", path],
             &["evaluate", path, RECORDING],
+            &["predict", MODEL, path],
+            &["import", "--lines", path, "--hand", HAND, "--out", out],
         ] {
             let output = blindgrasp().args(arguments).output().expect("started");
             let said = text(&output.stderr);

@@ -3,6 +3,7 @@
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
+use blindgrasp_messages::files::{read_regular, read_regular_bytes};
 use rcgen::KeyPair;
 use serde::Serialize;
 use time::{Duration, OffsetDateTime};
@@ -152,7 +153,7 @@ pub fn check(
             files.authority.display()
         )));
     }
-    let private_key = std::fs::read_to_string(&files.private_key)
+    let private_key = read_regular(&files.private_key)
         .map_err(|source| CertificateError::Unreadable { file: files.private_key.clone(), source })?;
     // TLS checks keys of kinds that rcgen does not know.
     if let Ok(pair) = KeyPair::from_pem(&private_key)
@@ -236,7 +237,7 @@ fn fits(certificate: &X509Certificate<'_>, pair: &KeyPair) -> bool {
 
 fn pems(file: &Path) -> Result<Vec<Pem>, CertificateError> {
     let bytes =
-        std::fs::read(file).map_err(|source| CertificateError::Unreadable { file: file.to_path_buf(), source })?;
+        read_regular_bytes(file).map_err(|source| CertificateError::Unreadable { file: file.to_path_buf(), source })?;
     let malformed = |message: &str| CertificateError::Malformed { file: file.to_path_buf(), message: message.into() };
     let all: Result<Vec<Pem>, _> = Pem::iter_from_buffer(&bytes).collect();
     let all = all.map_err(|_| malformed("not a PEM file, expected -----BEGIN CERTIFICATE----- in it"))?;

@@ -7,6 +7,7 @@ use std::io::{ErrorKind, Write};
 use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
+use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::text::is_name;
 use rcgen::{
     BasicConstraints, CertificateParams, CertificateRevocationListParams, DnType, ExtendedKeyUsagePurpose, IsCa,
@@ -355,7 +356,7 @@ fn entries(folder: &Path) -> Result<Vec<PathBuf>, KeysError> {
 }
 
 fn read_text(file: &Path) -> Result<String, KeysError> {
-    std::fs::read_to_string(file).map_err(in_file(file))
+    read_regular(file).map_err(in_file(file))
 }
 
 fn make_folder(folder: &Path) -> Result<(), KeysError> {

@@ -10,6 +10,9 @@ const MAX_NEIGHBOURS: usize = 10_000;
 /// Most names of files that an error shows.
 const MAX_SHOWN_NEIGHBOURS: usize = 5;
 
+/// The size limit of a text that is read whole: that of a model.
+const MAX_TEXT_BYTES: u64 = 128 << 20;
+
 /// Where a file is written until it is complete: beside its place, so that a rename puts it there at once.
 pub fn partial_path(path: &Path) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
@@ -92,11 +95,24 @@ fn refuse_git_lfs_pointer(file: &mut File) -> std::io::Result<()> {
 /// Reads a text by [`open_regular`].
 ///
 /// # Errors
-/// The file cannot be opened or read, is no regular file, or is not UTF-8.
+/// The file cannot be opened or read, is no regular file, has more than 128 MiB, or is not UTF-8.
 pub fn read_regular(path: &Path) -> std::io::Result<String> {
-    let mut text = String::new();
-    open_regular(path)?.read_to_string(&mut text)?;
-    Ok(text)
+    let bytes = read_regular_bytes(path)?;
+    String::from_utf8(bytes).map_err(|_| std::io::Error::new(ErrorKind::InvalidData, "it is no text in UTF-8"))
+}
+
+/// As [`read_regular`], for a text in any encoding.
+///
+/// # Errors
+/// As [`read_regular`].
+pub fn read_regular_bytes(path: &Path) -> std::io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    open_regular(path)?.take(MAX_TEXT_BYTES + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > MAX_TEXT_BYTES {
+        let text = format!("it has more than {} MiB, expected a smaller file", MAX_TEXT_BYTES >> 20);
+        return Err(std::io::Error::new(ErrorKind::InvalidData, text));
+    }
+    Ok(bytes)
 }
 
 /// Writes a file whole or not at all: under [`partial_path`], onto the disk, and then into its place.
@@ -131,6 +147,9 @@ mod tests {
             let error = open_regular(path).expect_err(found).to_string();
             assert_eq!(error, format!("it is {found}, expected a regular file"));
         }
+        File::create(&file).and_then(|file| file.set_len(1 << 40)).expect("a file of 1 TiB that takes no room");
+        let error = read_regular(&file).expect_err("a long file").to_string();
+        assert_eq!(error, "it has more than 128 MiB, expected a smaller file");
         let pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 9\n";
         std::fs::write(&file, pointer).expect("written");
         let error = open_regular(&file).expect_err("a pointer").to_string();

@@ -5,13 +5,14 @@
 //! who may write to the file from the graph.
 
 use std::collections::{BTreeMap, HashMap};
-use std::fs::{File, Metadata};
+use std::fs::Metadata;
 use std::io::Read;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use blindgrasp_messages::files::open_regular;
 use serde::Serialize;
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
@@ -94,11 +95,8 @@ type Stamp = (u64, u64, u64, i64, i64, i64, i64);
 /// each time that it restarts a node.
 fn digest(path: &Path) -> std::io::Result<String> {
     static KNOWN: Mutex<Option<HashMap<PathBuf, (Stamp, String)>>> = Mutex::new(None);
-    let mut file = File::open(path)?;
+    let mut file = open_regular(path)?;
     let metadata = file.metadata()?;
-    if !metadata.is_file() {
-        return Err(std::io::Error::other("it is not a file"));
-    }
     let stamp = stamp(&metadata);
     let known = || KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
     let found = known().as_ref().and_then(|known| known.get(path).cloned());

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use super::decisions::{JudgedGrasp, JudgedRecipe};
 use crate::import::columns::shortened;
-use crate::import::lines::Lines;
+use crate::import::lines::{Lines, RowLimit};
 use crate::import::{BYTE_ORDER_MARK, bad_row, found};
 use crate::training::{Example, Examples};
 use blindgrasp_messages::MAX_NAME_BYTES;
@@ -230,14 +230,16 @@ fn read_bytes(path: &Path) -> Result<Vec<u8>, PredictionsError> {
 
 /// Errors do not name the file.
 fn read_models(text: &[u8], default_name: &str, grasps: &KnownGrasps<'_>) -> Result<Vec<OutsideModel>, String> {
-    let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(text);
+    let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(RowLimit::new(text));
     let header = reader.headers().map_err(|error| format!("line 1: expected the names of columns, found {error}"))?;
     let columns = PredictionColumns::find(header)?;
     let mut lines = Lines::new(text);
     let mut models: Vec<OutsideModel> = Vec::new();
-    for record in reader.records() {
-        let place = record.as_ref().map_or_else(csv::Error::position, csv::StringRecord::position);
-        let line = lines.line_of(place.map_or(0, csv::Position::byte));
+    let mut records = reader.records();
+    loop {
+        records.reader_mut().get_mut().begin_row();
+        let line = lines.line_of(records.reader().position().byte());
+        let Some(record) = records.next() else { break };
         let at_line = |problem: String| format!("line {line}: {problem}");
         let record = record
             .map_err(|error| at_line(bad_row(&error, line).map_or_else(|| error.to_string(), |row| row.problem)))?;

@@ -1,7 +1,42 @@
-//! The line of a text on which each row begins, as editors count lines.
+//! The line of a text on which each row begins, as editors count lines, and a limit of a row's size.
 //!
 //! The line numbers of the crate csv are those of the end of the row before: one line early after CRLF, more after blank
 //! lines.
+
+use std::io::{Error, ErrorKind, Read};
+
+/// The size limit of a row: a header of tens of thousands of cells. A quote that is not closed makes the rest of a table one row.
+const MAX_ROW_BYTES: usize = 4 << 20;
+
+/// A text for the crate csv, which would put a row of any size into memory, several times.
+pub(crate) struct RowLimit<'a> {
+    text: &'a [u8],
+    n_row_bytes: usize,
+}
+
+impl<'a> RowLimit<'a> {
+    pub(crate) fn new(text: &'a [u8]) -> Self {
+        RowLimit { text, n_row_bytes: 0 }
+    }
+
+    /// Says that the next row begins.
+    pub(crate) fn begin_row(&mut self) {
+        self.n_row_bytes = 0;
+    }
+}
+
+impl Read for RowLimit<'_> {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        if self.n_row_bytes > MAX_ROW_BYTES {
+            let found =
+                format!("a row of more than {} MiB: expected that quotes in it are closed", MAX_ROW_BYTES >> 20);
+            return Err(Error::new(ErrorKind::InvalidData, found));
+        }
+        let n_read = self.text.read(buffer)?;
+        self.n_row_bytes += n_read;
+        Ok(n_read)
+    }
+}
 
 /// Counts lines on the way through a text.
 #[derive(Debug)]
@@ -32,6 +67,21 @@ impl<'a> Lines<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_quote_that_is_not_closed_takes_no_more_than_a_row_may() {
+        let text = [b"a,b\n1,2\n\"", &b"x,\n".repeat(3 << 20)[..]].concat();
+        let mut unlimited = csv::Reader::from_reader(&text[..]);
+        let rest = unlimited.records().nth(1).expect("a row").expect_err("the rest of the table is one field");
+        assert!(rest.to_string().contains("found record with 1 field"), "{rest}");
+        let mut limited = csv::Reader::from_reader(RowLimit::new(&text));
+        let mut records = limited.records();
+        records.next().expect("a row").expect("whole");
+        records.reader_mut().get_mut().begin_row();
+        let error = records.next().expect("a row").expect_err("no end of the row");
+        assert_eq!(error.to_string(), "a row of more than 4 MiB: expected that quotes in it are closed");
+        assert!(limited.get_ref().text.len() > text.len() - MAX_ROW_BYTES - (1 << 20), "the rest is not read");
+    }
 
     #[test]
     fn lines_are_an_editors() {

@@ -19,7 +19,7 @@ pub use self::frames::{FramesReport, import_frames};
 
 use self::columns::{Columns, shortened};
 use self::grasps::{Grasps, TableGrasp, TableReading};
-use self::lines::Lines;
+use self::lines::{Lines, RowLimit};
 use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::open_regular;
 use blindgrasp_messages::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Recorded, Stamped, TactileFrame};
@@ -38,6 +38,8 @@ const PAUSE_NANOS: u64 = 100_000_000;
 const MAX_BYTES: u64 = 1 << 30;
 /// No cell of a known sensor for hands reads so much.
 const UNLIKELY_NEWTONS: f64 = 200.0;
+/// A table with more bad rows is refused without reading on, because they are kept until the end.
+const MAX_BAD_ROWS: usize = 1_000_000;
 /// The most bad rows that an error shows.
 const MAX_SHOWN_ROWS: usize = 20;
 /// The most values of the label that an error shows.
@@ -198,10 +200,11 @@ pub fn import_table(
         return Err(refused(format!("expected a table (CSV), found {}", kind.description())));
     }
     let text = bytes.strip_prefix(BYTE_ORDER_MARK).unwrap_or(&bytes);
-    let mut reader = csv::ReaderBuilder::new().delimiter(options.delimiter).trim(csv::Trim::All).from_reader(text);
+    let mut reader =
+        csv::ReaderBuilder::new().delimiter(options.delimiter).trim(csv::Trim::All).from_reader(RowLimit::new(text));
     let header = match reader.headers() {
         Ok(header) => header.iter().map(String::from).collect::<Vec<String>>(),
-        Err(error) => return Err(table_error(table, error)),
+        Err(error) => return Err(table_error(table, error, 1)),
     };
     if header.iter().all(String::is_empty) {
         return Err(refused(
@@ -215,22 +218,27 @@ pub fn import_table(
     let mut lines = Lines::new(text);
     let mut grasps = Grasps::new(columns.grasp.is_some());
     let mut extremes = Extremes::default();
-    for record in reader.records() {
+    let mut records = reader.records();
+    loop {
+        records.reader_mut().get_mut().begin_row();
+        let line = lines.line_of(records.reader().position().byte());
+        let Some(record) = records.next() else { break };
         report.n_rows += 1;
-        let place = record.as_ref().map_or_else(csv::Error::position, csv::StringRecord::position);
-        let line = lines.line_of(place.map_or(0, csv::Position::byte));
         let row = match record {
             Ok(record) => {
                 let name = columns.grasp.map(|idx| record[idx].to_string()).filter(|name| !name.is_empty());
                 report.n_below_zero += usize::from(row_reader.is_below_zero(&record));
                 (name, row_reader.read(&record, line).map_err(|problem| BadRow { line, problem }))
             }
-            Err(error) => (None, Err(bad_row(&error, line).ok_or_else(|| table_error(table, error))?)),
+            Err(error) => (None, Err(bad_row(&error, line).ok_or_else(|| table_error(table, error, line))?)),
         };
         if let Some(grasp) = grasps.add(row, line).map_err(refused)? {
             extremes.add(hand, &grasp);
             report.count(&grasp);
             writer.write(grasp)?;
+        }
+        if grasps.bad_rows.len() > MAX_BAD_ROWS {
+            return Err(ImportError::Rows { path: table.into(), n_rows: report.n_rows, rows: grasps.bad_rows });
         }
     }
     if let Some(grasp) = grasps.close() {
@@ -564,15 +572,13 @@ pub(crate) fn bad_row(error: &csv::Error, line: u64) -> Option<BadRow> {
     Some(BadRow { line, problem })
 }
 
-fn table_error(table: &Path, error: csv::Error) -> ImportError {
-    let message = error.to_string();
-    match error.into_kind() {
-        csv::ErrorKind::Io(source) => ImportError::Read { path: table.into(), source },
-        csv::ErrorKind::Utf8 { .. } => {
-            ImportError::Table { path: table.into(), message: "line 1: expected a table (CSV) in UTF-8".into() }
-        }
-        _ => ImportError::Table { path: table.into(), message },
-    }
+/// Why the row that begins on a line cannot be read.
+fn table_error(table: &Path, error: csv::Error, line: u64) -> ImportError {
+    let message = match error.kind() {
+        csv::ErrorKind::Utf8 { .. } => "line 1: expected a table (CSV) in UTF-8".into(),
+        _ => format!("line {line}: {error}"),
+    };
+    ImportError::Table { path: table.into(), message }
 }
 
 /// The rows of an error, line by line.

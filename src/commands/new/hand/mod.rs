@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
+use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{RecordedGrasp, grasp_svg};
 use blindgrasp_ros::cdr::{self, Value};
@@ -316,11 +317,8 @@ const CELL_COLUMNS: [&str; 7] = ["link", "x", "y", "z", "nx", "ny", "nz"];
 
 /// Cells of the table, pad by pad.
 fn read_table(path: &Path, threshold_newtons: f64) -> anyhow::Result<Vec<NewPad>> {
-    let mut reader = csv::ReaderBuilder::new()
-        .trim(csv::Trim::All)
-        .comment(Some(b'#'))
-        .from_path(path)
-        .with_context(|| format!("cannot read {}", path.display()))?;
+    let text = read_regular(path).with_context(|| format!("cannot read {}", path.display()))?;
+    let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).comment(Some(b'#')).from_reader(text.as_bytes());
     let header = reader.headers().with_context(|| path.display().to_string())?;
     if let Some(missing) = CELL_COLUMNS.iter().find(|column| !header.iter().any(|found| found == **column)) {
         bail!(
