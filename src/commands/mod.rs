@@ -13,7 +13,6 @@ mod evaluate;
 mod export;
 mod frame_lines;
 mod graph_file;
-mod grid;
 mod guesses;
 mod hand_cells;
 mod help;

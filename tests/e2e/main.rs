@@ -16,7 +16,6 @@ mod export;
 mod first_day;
 mod flight_recorder;
 mod graph;
-mod grid;
 mod hands;
 mod hosted;
 mod import;
