@@ -20,7 +20,6 @@ mod hands;
 mod hosted;
 mod import;
 mod launcher;
-mod libsvm;
 mod link_identity;
 mod link_security;
 mod live_page;
