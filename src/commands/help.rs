@@ -6,7 +6,7 @@ use clap::Command;
 const GROUPS: [(&str, &[&str]); 4] = [
     ("Run", &["run", "ps", "top", "echo", "stop", "set", "swap", "logs", "doctor", "diagnostics"]),
     ("Record", &["record", "replay", "test", "export", "info", "view"]),
-    ("Learn", &["simulate", "import", "train", "evaluate", "predict", "trials", "reproduce", "model", "sensors"]),
+    ("Learn", &["simulate", "import", "train", "evaluate", "predict", "trials", "model", "sensors"]),
     ("Describe", &["init", "new", "keys", "schema", "completions"]),
 ];
 const TEMPLATE: &str = "{about-with-newline}\n{usage-heading} {usage}\n\n{before-help}Options:\n{options}{after-help}";

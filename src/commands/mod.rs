@@ -32,7 +32,6 @@ mod ps;
 mod record;
 mod recording_arguments;
 mod replay;
-mod reproduce;
 mod ros2_network;
 mod run;
 mod schema;
@@ -97,7 +96,6 @@ enum Command {
     Evaluate(evaluate::Arguments),
     Predict(predict::Arguments),
     Trials(trials::Arguments),
-    Reproduce(reproduce::Arguments),
     Model(model::Arguments),
     Sensors(sensors::Arguments),
     Info(info::Arguments),
@@ -202,7 +200,6 @@ pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
         Command::Evaluate(arguments) => evaluate::run(&arguments),
         Command::Predict(arguments) => predict::run(&arguments),
         Command::Trials(arguments) => trials::run(&arguments),
-        Command::Reproduce(arguments) => reproduce::run(&arguments),
         Command::Model(arguments) => model::run(&arguments),
         Command::Sensors(arguments) => sensors::run(&arguments),
         Command::Info(arguments) => info::run(&arguments),
