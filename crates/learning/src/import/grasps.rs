@@ -13,6 +13,8 @@ pub(super) struct Grasps {
     open: Option<OpenGrasp>,
     /// The names of earlier grasps.
     closed: BTreeSet<String>,
+    /// Whether the row before is a bad one: it may be of the next grasp.
+    is_after_bad: bool,
     /// The first line of each value of the label.
     pub(super) first_lines: BTreeMap<String, u64>,
     pub(super) bad_rows: Vec<BadRow>,
@@ -43,6 +45,7 @@ impl Grasps {
                 return Ok(None);
             }
         };
+        let is_after_bad = std::mem::take(&mut self.is_after_bad);
         self.first_lines.entry(row.label.clone()).or_insert(line);
         let Some(name) = name else { return Ok(Some(row)) };
         if let Some(open) = &mut self.open
@@ -58,12 +61,13 @@ impl Grasps {
             let expected = "expected the rows of a grasp one after another; sort the table";
             return Err(format!("line {line}: grasp '{}' again: {expected}", shortened(&name)));
         }
-        self.open = Some(OpenGrasp { name, grasp: row, has_bad_row: false });
+        self.open = Some(OpenGrasp { name, grasp: row, has_bad_row: is_after_bad });
         Ok(complete)
     }
 
     fn add_bad(&mut self, bad: BadRow) {
         self.bad_rows.push(bad);
+        self.is_after_bad = true;
         if let Some(open) = &mut self.open {
             open.has_bad_row = true;
         }
