@@ -13,7 +13,6 @@ mod evaluate;
 mod export;
 mod frame_lines;
 mod graph_file;
-mod grid;
 mod guesses;
 mod hand_cells;
 mod help;
@@ -33,7 +32,6 @@ mod ps;
 mod record;
 mod recording_arguments;
 mod replay;
-mod reproduce;
 mod ros2_network;
 mod run;
 mod schema;
@@ -105,7 +103,7 @@ commands! {
         Diagnostics diagnostics;
     "Record": Record record, Replay replay, Test test, Export export, Info info, View view;
     "Learn": Simulate simulate, Import import, Train train, Evaluate evaluate, Predict predict, Trials trials,
-        Reproduce reproduce, Model model, Sensors sensors;
+        Model model, Sensors sensors;
     "Describe": Init init, New new, Keys keys, Schema schema, Completions completions;
 }
 

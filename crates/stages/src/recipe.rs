@@ -48,7 +48,7 @@ impl Recipe {
     /// The names of the recipes that come with the program, the default one first.
     pub const NAMES: [&str; 7] = ["boosted", "wrist", "blend", "paper", "raw", "posture", "joints"];
 
-    /// A recipe by its name. The parameters are the choice of `train --grid` on 12,000 simulated grasps of the built-in
+    /// A recipe by its name. The parameters are the choice of a grid search on 12,000 simulated grasps of the built-in
     /// training objects (docs/learning.md); held-out objects were not used. Those of `blend` were not searched.
     pub fn named(name: &str) -> Option<Recipe> {
         if name == "boosted" {
