@@ -125,8 +125,6 @@ fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-}
-
 fn adapt_model(arguments: &AdaptArguments) -> anyhow::Result<Outcome> {
     let recordings = recordings_in(&arguments.recordings)?;
     let first = recordings.first().context("expected a recording")?;
