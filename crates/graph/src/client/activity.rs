@@ -200,7 +200,7 @@ pub fn measure(now: &Look, window: Window) -> Measured {
 
 /// The edge over which the launching command reads decisions: among its edges from nodes with inputs (a source's truth
 /// has none), the port `decision`, or otherwise the last in the graph's order.
-pub fn decision_edge(edges: &[EdgeStatus]) -> Option<&EdgeStatus> {
+fn decision_edge(edges: &[EdgeStatus]) -> Option<&EdgeStatus> {
     let node_of = |port: &'_ str| port.split_once('/').map_or(port.to_string(), |(node, _)| node.to_string());
     let is_made = |edge: &&EdgeStatus| {
         let writer = node_of(&edge.from);
