@@ -90,7 +90,7 @@ pub struct SwapRequest {
 #[serde(rename_all = "snake_case", tag = "reply")]
 pub enum Reply {
     /// To [`Request::Status`].
-    Status(GraphStatus),
+    Status(Box<GraphStatus>),
     /// To [`Request::Stop`].
     Stopping,
     /// To [`Request::Set`].

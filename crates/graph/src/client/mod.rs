@@ -136,7 +136,7 @@ pub fn is_graph_name(text: &str) -> bool {
 pub fn status(graph: &str) -> Result<GraphStatus, ClientError> {
     let mut connection = Connection::open(graph)?;
     match connection.ask(&Request::Status, ANSWER_LIMIT)? {
-        Reply::Status(status) => Ok(status),
+        Reply::Status(status) => Ok(*status),
         other => Err(connection.unexpected(&other)),
     }
 }
@@ -346,7 +346,7 @@ mod tests {
     fn a_graph_is_found_asked_and_seen_to_end() {
         let graph = unique("found");
         let answers = vec![
-            (Request::Status, vec![Reply::Status(made_status(&graph))]),
+            (Request::Status, vec![Reply::Status(Box::new(made_status(&graph)))]),
             (Request::Stop, vec![Reply::Stopping, Reply::Progress { message: "draining".into() }]),
         ];
         let server = serve(&graph, answers);
@@ -354,7 +354,7 @@ mod tests {
         assert_eq!(pick_graph(Some(&graph)).expect("running"), graph);
         let mut connection = Connection::open(&graph).expect("connected");
         let found = connection.ask(&Request::Status, ANSWER_LIMIT).expect("answered");
-        assert_eq!(found, Reply::Status(made_status(&graph)));
+        assert_eq!(found, Reply::Status(Box::new(made_status(&graph))));
         assert_eq!(connection.ask(&Request::Stop, ANSWER_LIMIT).expect("answered"), Reply::Stopping);
         connection.wait_until_ended().expect("ended");
         assert!(!running_graphs().expect("listed").contains(&graph));
@@ -414,13 +414,13 @@ mod tests {
         let socket = listen(&graph);
         let mut connection = Connection::open(&graph).expect("connected");
         let (mut stream, _) = socket.listener().accept().expect("a client");
-        let line = serde_json::to_string(&Reply::Status(made_status(&graph))).expect("JSON");
+        let line = serde_json::to_string(&Reply::Status(Box::new(made_status(&graph)))).expect("JSON");
         let (first, second) = line.split_at(line.len() / 2);
         stream.write_all(first.as_bytes()).expect("sent");
         assert_eq!(connection.receive_within(Duration::from_millis(20)).expect("connected"), None);
         writeln!(stream, "{second}\n{{\"reply\":\"stopping\"}}").expect("sent");
         let whole = connection.receive(ANSWER_LIMIT, &|| false).expect("a reply");
-        assert_eq!(whole, Reply::Status(made_status(&graph)));
+        assert_eq!(whole, Reply::Status(Box::new(made_status(&graph))));
     }
 
     #[test]

@@ -61,7 +61,7 @@ impl Poller {
 
     fn look_of(&self, reply: Reply) -> Result<Look, ClientError> {
         match reply {
-            Reply::Status(status) => Ok(Look::new(status)),
+            Reply::Status(status) => Ok(Look::new(*status)),
             other => Err(self.connection.unexpected(&other)),
         }
     }

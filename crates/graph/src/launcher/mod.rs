@@ -790,7 +790,7 @@ impl Launcher {
     fn on_ask(&mut self, ask: Box<Ask>) {
         match ask.request {
             Request::Status => {
-                let _ = ask.reply.try_send(Reply::Status(self.status()));
+                let _ = ask.reply.try_send(Reply::Status(Box::new(self.status())));
             }
             Request::Stop => {
                 let _ = ask.reply.try_send(Reply::Stopping);
