@@ -161,7 +161,10 @@ impl FlightRecorder {
                 let fault = (sample.message.action == Action::Hold && reason.is_fault()).then_some(reason);
                 let is_new = fault != self.last_fault;
                 self.last_fault = fault;
-                fault.filter(|_reason| is_new).map(Reason::as_str)
+                if !is_new {
+                    return None;
+                }
+                fault.map(Reason::as_str)
             }
             _ => None,
         }
