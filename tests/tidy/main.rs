@@ -2,6 +2,7 @@
 //! program of the product.
 
 mod benchsuite;
+mod dead_files;
 mod dependencies;
 mod docs;
 mod plain_statements;
