@@ -2,17 +2,17 @@
 //!
 //! `cargo bench --bench svm -- features RECORDING MODEL N OUT` writes the features of N grasps, by the model's
 //! dictionary, as LIBSVM's problem file; `-- train PROBLEM C GAMMA TOLERANCE OUT` trains on one and writes LIBSVM's
-//! model file; `-- predict LIBSVM_MODEL PROBLEM` times single decision values. Results are lines of JSON on stdout.
+//! model file, and beside it the machine as blindgrasp's JSON; `-- predict JSON PROBLEM` times single decision values. Results are lines of JSON on stdout.
 
 use std::fmt::Write;
 use std::path::Path;
 use std::time::Instant;
 
 use blindgrasp_learning::dataset::{hand_of, read_grasps};
-use blindgrasp_learning::learners::libsvm_format::{parse_libsvm, write_libsvm};
+use blindgrasp_learning::learners::libsvm_format::write_libsvm;
 use blindgrasp_learning::learners::svm::train_svm;
 use blindgrasp_messages::Phase;
-use blindgrasp_stages::classifier::svm::{PreparedSvm, SvmParams};
+use blindgrasp_stages::classifier::svm::{PreparedSvm, RbfSvm, SvmParams};
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::encoder::FeltReading;
 use blindgrasp_stages::model::Model;
@@ -104,6 +104,7 @@ fn time_training(problem: &str, params: &SvmParams, out: &str) -> Result<(), Fai
     let (svm, report) = train_svm(&problem.features, problem.n_features, &problem.labels, params)?;
     let secs = start.elapsed().as_secs_f64();
     std::fs::write(out, write_libsvm(&svm, None))?;
+    std::fs::write(Path::new(out).with_extension("json"), serde_json::to_string(&svm)?)?;
     println!(
         "{}",
         json!({
@@ -120,7 +121,7 @@ fn time_training(problem: &str, params: &SvmParams, out: &str) -> Result<(), Fai
 
 fn time_prediction(model: &str, problem: &str) -> Result<(), Failure> {
     let problem = read_problem(problem)?;
-    let (svm, _) = parse_libsvm(&std::fs::read_to_string(model)?, problem.n_features)?;
+    let svm: RbfSvm = serde_json::from_str(&std::fs::read_to_string(model)?)?;
     let svm = PreparedSvm::try_from(svm)?;
     let samples: Vec<&[f64]> = problem.features.chunks_exact(problem.n_features).take(N_TIMED).collect();
     // Once to warm up, then what counts.

@@ -10,7 +10,7 @@
     run(DESCRIPTION, start)
 
 A process of blindgrasp has the operator's ports and gives it the samples over two pipes, so that it can be killed, stopped,
-restarted and swapped without a sample being lost, repeated or re-ordered (docs/operators-other-languages.md). Needs nothing
+restarted and swapped without a sample being lost, repeated or re-ordered (docs/operators.md). Needs nothing
 but Python; items are numpy arrays if numpy is there. If there is a folder `.venv` beside the program and no environment is
 active, the program runs in it.
 """

@@ -1,4 +1,4 @@
-"""How models judge real grasps of another day: the tables of docs/real-data.md.
+"""How models judge real grasps of another day: the tables of docs/results.md.
 
 `tables` is a folder with the tables of the BioTac SP Stability Set v2 (bts3v2_palm_down.csv, …) and
 other-day-palm_side.csv, whose columns are the same and whose grasps are of other objects and another day.

@@ -1,4 +1,4 @@
-"""How well a real fingertip tells a resting contact from a sliding one: the table of docs/real-data.md.
+"""How well a real fingertip tells a resting contact from a sliding one: the table of docs/results.md.
 
 `sequences` is the folder csvs of the public set BioTacSP-DoS: a folder for each kind of contact (t: it rests; n, e, s,
 w, cw, aw: it slides), with a table of 24 electrodes at 100 Hz for each sequence of 3 s, named after the object and a

@@ -2,7 +2,7 @@
 
 Both run in turn; times are medians of the rounds, of training and prediction alone, without reading files. LIBSVM has
 one thread and, by default, as much cache as ours, 1000 MB (its own default is 100); ours has all cores for training and
-one for a prediction. Both predict with LIBSVM's model. The first run simulates the grasps.
+one for a prediction. Both predict with our model. The first run simulates the grasps.
 """
 
 import statistics
@@ -30,13 +30,13 @@ def measure(options):
 def of_case(problem, case, options):
     c, gamma = case.split(":")
     c, gamma = float(c), libsvm.gamma_scale(problem) if gamma == "scale" else float(gamma)
-    theirs = libsvm.FOLDER / "libsvm.model"
+    machine = libsvm.FOLDER / "ours.model"
     trained = (problem, c, gamma, options.tolerance)
     sides = {
-        "train, ours": lambda: libsvm.ours("train", *trained, libsvm.FOLDER / "ours.model"),
-        "train, LIBSVM": lambda: libsvm.run("train", *trained, options.cache_mb, theirs),
-        "predict, ours": lambda: libsvm.ours("predict", theirs, problem),
-        "predict, LIBSVM": lambda: libsvm.run("predict", theirs, problem, 200),
+        "train, ours": lambda: libsvm.ours("train", *trained, machine),
+        "train, LIBSVM": lambda: libsvm.run("train", *trained, options.cache_mb, libsvm.FOLDER / "libsvm.model"),
+        "predict, ours": lambda: libsvm.ours("predict", machine.with_suffix(".json"), problem),
+        "predict, LIBSVM": lambda: libsvm.run("predict", machine, problem, 200),
     }
     runs = figures.in_turn(options.rounds, sides)
     values = [runs[f"predict, {side}"][0]["decision_values"] for side in ("ours", "LIBSVM")]

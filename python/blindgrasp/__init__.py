@@ -7,6 +7,8 @@
 
     table = blindgrasp.Recording("run.mcap").to_frame()   # pandas, a row for each grasp
 
+    blindgrasp.from_table(table, "again.mcap", hand="barrett-bh8-280")    # a table of readings as a recording
+
     predictions = blindgrasp.Model("model.json").predict("run.mcap")
 
     with blindgrasp.run("dataflow.yaml") as graph:        # starts the graph, and ends it
@@ -20,6 +22,7 @@ feature or a probability, so that Python and a robot never disagree.
 """
 
 from ._graph import ReplayedDecisions, Run, echo, replay, run
+from ._import import from_table
 from ._model import Model, PredictedGrasp, Predictions
 from ._program import ProgramError, ProgramNotFoundError, program
 from ._recording import Grasp, Recording, RecordingError, read
@@ -43,6 +46,7 @@ __all__ = [
     "Run",
     "__version__",
     "echo",
+    "from_table",
     "program",
     "read",
     "replay",

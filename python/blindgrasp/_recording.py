@@ -136,7 +136,7 @@ class Recording:
         if summary is None or summary.statistics is None:
             raise self._damaged("it has no summary")
         self.metadata: dict[str, dict[str, str]] = found
-        """The metadata by name, as the table of docs/recording.md has it."""
+        """The metadata by name, as the table of docs/messages.md has it."""
         self.topics: dict[str, int] = {channel.topic: 0 for channel in summary.channels.values()}
         """The number of samples of each topic."""
         for idx, channel in summary.channels.items():

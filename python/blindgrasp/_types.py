@@ -49,7 +49,7 @@ class Decision:
     """`lift`, `hold`, `squeeze` or `test_lift`; while the arm lifts, `tighten`, `set_down` or `go_on`. Only `lift` allows
     a lift."""
     reason: str
-    """Why, like `stable` or `out_of_order`: the table of `docs/messages.md`."""
+    """Why, like `stable` or `out_of_order`: the reasons of `docs/messages.md`."""
     probability_stable: float
     """The lowest probability among the predictions that decided, from 0 to 1; 0 if none did."""
     seq: int

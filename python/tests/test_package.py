@@ -663,6 +663,61 @@ class Pytest(Folder):
         self.assertIn("recordings/none.mcap: No such file", done.stdout)
 
 
+class Tables(Folder):
+    """Tables for the gripper of two jaws with 12 cells each, and one joint."""
+
+    def columns(self):
+        cells = {f"c{idx}": [idx / 8, 0.0, 0.5] for idx in range(24)}
+        return {"jaw": [0.01, 0.02, 0.03], "thing": ["mug", "can, big", "Bücher"], "held": [True, False, True], **cells}
+
+    def from_table(self, table, **more):
+        words = {"cells": "c*", "joint_columns": ["jaw"], "label": "held", "group": "thing", "hand": "parallel-gripper"}
+        return blindgrasp.from_table(table, self.folder / "out.mcap", **(words | more))
+
+    def test_a_table_of_each_form_is_the_same_recording(self):
+        columns = self.columns()
+        rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        arrays = {name: np.array(values) for name, values in columns.items()}
+        for table in (columns, arrays, rows, iter(rows), pd.DataFrame(columns)):
+            grasps = list(self.from_table(table, overwrite=True))
+            self.assertEqual([grasp.label.object_id for grasp in grasps], columns["thing"])
+            self.assertEqual([grasp.label.is_stable for grasp in grasps], columns["held"])
+            for idx, grasp in enumerate(grasps):
+                self.assertEqual(grasp.joints.tolist(), [[columns["jaw"][idx]]] * 3)
+                self.assertEqual(grasp.cells_newtons[0].tolist(), [values[idx] for name, values in columns.items() if name[0] == "c"])
+
+    def test_rows_may_be_frames_and_the_posture_one_for_all(self):
+        table = pd.DataFrame(self.columns()).assign(nth=[7, 7, 8], what=["closing", "settled", "settled"])
+        table["thing"], table["held"] = ["a", "a", "b"], [0, 0, 1]
+        more = {"grasp_column": "nth", "phase_column": "what", "stable_value": 1, "grasp_id_start": 40, "day": "2026-11-28"}
+        first, second = self.from_table(table, joints={"jaw": 0.015}, **more)
+        self.assertEqual((first.grasp_id, first.phase.tolist(), first.label.is_stable), (40, ["closing", "settled"], False))
+        self.assertEqual((second.grasp_id, second.joints.tolist(), second.label.is_stable), (41, [[0.015]], True))
+
+    def test_what_is_missing_is_no_name_and_no_number(self):
+        for missing in (None, math.nan, np.float32("nan"), pd.NA, pd.NaT):
+            for name, problem in (("thing", "expected a name, found nothing"), ("c3", "expected a number .*, found nothing")):
+                columns = self.columns()
+                columns[name][1] = missing
+                for table in (columns, pd.DataFrame(columns)):
+                    with self.assertRaisesRegex(blindgrasp.ProgramError, f"line 3: column '{name}': {problem}"):
+                        self.from_table(table)
+        self.assertEqual(list(self.folder.iterdir()), [])
+
+    def test_what_is_no_table_is_refused_and_what_is_odd_is_told(self):
+        with self.assertRaisesRegex(TypeError, "found rows that are int"):
+            self.from_table([1, 2])
+        with self.assertRaisesRegex(ValueError, "equally long; found lengths .*'jaw': 1"):
+            self.from_table(self.columns() | {"jaw": [0.01]})
+        with self.assertRaisesRegex(blindgrasp.ProgramError, "table.csv: the table is empty|there is no row"):
+            self.from_table([])
+        self.from_table(self.columns())
+        with self.assertRaisesRegex(blindgrasp.ProgramError, "--overwrite"):
+            self.from_table(self.columns())
+        with self.assertWarnsRegex(UserWarning, "the largest reading of a cell is 900 N"):
+            self.from_table(self.columns() | {"c0": [900, 1, 2]}, overwrite=True)
+
+
 class Program(Folder):
     def test_the_version_is_that_of_the_program(self):
         done = subprocess.run([blindgrasp.program(), "--version"], stdout=subprocess.PIPE, text=True, check=True)
@@ -691,21 +746,23 @@ class Pages(Folder):
         page = (REPOSITORY / "docs/python.md").read_text()
         codes = re.findall("^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
         self.assertGreater(len(codes), 6)
-        commands = re.findall("^blindgrasp (?:export|import) (?:.*\\\\\n)*.*$", page, re.MULTILINE)
-        self.assertEqual(len(commands), 2)
+        commands = re.findall("^blindgrasp export .*$", page, re.MULTILINE)
+        self.assertEqual(len(commands), 1)
         names, printed = {"__name__": "__main__"}, io.StringIO()
         with contextlib.chdir(self.folder), contextlib.redirect_stdout(printed):
             for idx, code in enumerate(codes):
                 exec(compile(code.replace('"mine"', repr(unique_name())), f"python.md, block {idx}", "exec"), names)
             for command in commands:
-                words = shlex.split(command.replace("\\\n", " "))[1:]
+                words = shlex.split(command)[1:]
                 subprocess.run([blindgrasp.program(), *words], stdout=subprocess.DEVNULL, check=True)
         self.assertIn("Predictions(240 grasps", printed.getvalue())
+        self.assertIn("2 2100.5 Label(", printed.getvalue())
         features = pd.read_csv(self.folder / "features.csv")
         self.assertLessEqual({"stable", "object"}, set(features.columns))
         # The table has become a recording again.
         table, again = names["table"], blindgrasp.Recording(self.folder / "grasps.mcap").to_frame()
         self.assertEqual(again["stable"].tolist(), table["stable"].tolist())
+        self.assertEqual(again["class"].tolist(), table["class"].tolist())
         cells = [frame.filter(like="cell_").to_numpy() for frame in (table, again)]
         np.testing.assert_allclose(cells[1], cells[0], atol=1e-12)
 

@@ -3,6 +3,9 @@
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::Context as _;
+use blindgrasp_graph::client::activity::{Look, Measured, MeasuredEdge, MeasuredNode, Window, measure};
+use blindgrasp_graph::client::poller::Poller;
+use blindgrasp_graph::client::words::{node_state_word, state_word, warnings};
 use blindgrasp_graph::client::{ClientError, pick_graph};
 use blindgrasp_graph::control::{EdgeStatus, GraphState, NodeState, NodeStatus};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -13,11 +16,8 @@ use blindgrasp_ros::standard;
 use clap::Args;
 use serde::Serialize;
 
-use super::ps::{node_state_word, state_word, warnings};
 use super::ros2_network::Ros2Network;
-use super::top::poller::Poller;
-use super::top::sample::{Look, Measured, MeasuredEdge, MeasuredNode, Window, measure};
-use super::{GraphArgument, Outcome, secs_in};
+use super::{Outcome, completions, secs_in};
 
 /// Publish a graph's state to ROS 2, on /diagnostics
 ///
@@ -26,8 +26,9 @@ use super::{GraphArgument, Outcome, secs_in};
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp diagnostics grasp_gate --connect tcp/localhost:7447")]
 pub(super) struct Arguments {
-    #[command(flatten)]
-    graph: GraphArgument,
+    /// Graph [default: the only one running]
+    #[arg(add = completions::graphs())]
+    graph: Option<String>,
     #[command(flatten)]
     network: Ros2Network,
     /// Publish every so many seconds
@@ -66,7 +67,7 @@ struct Status {
 type Publishing = (RosNode, RosPublisher);
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let graph = match arguments.graph.name() {
+    let graph = match arguments.graph.as_deref() {
         // It need not run yet.
         Some(graph) => graph.to_owned(),
         None => pick_graph(None)?,

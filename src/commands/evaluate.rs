@@ -6,8 +6,7 @@ use anyhow::{Context, bail};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::model::write_at_once;
-use super::{Outcome, check_output, check_page, number_in, percent, print_line, print_text, write_report};
+use super::{Outcome, check_output, check_page, number_in, percent, print_line, print_text, write_out, write_report};
 use blindgrasp_learning::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::looks::{Look, looks};
@@ -265,9 +264,9 @@ impl Job<'_> {
         if let Some(folder) = &self.arguments.figures {
             std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
             for (name, text) in tables(report)?.into_iter().chain(figures(self.hand, report)?) {
-                write_at_once(&folder.join(name), &text)?;
+                write_out(&folder.join(name), &text)?;
             }
-            write_at_once(&folder.join(PREDICTIONS_FILE), &predictions_csv(&report.judges, self.recordings)?)?;
+            write_out(&folder.join(PREDICTIONS_FILE), &predictions_csv(&report.judges, self.recordings)?)?;
         }
         if self.arguments.json {
             print_text(&serde_json::to_string_pretty(report)?)?;

@@ -2,13 +2,8 @@
 
 use clap::Command;
 
-/// The commands of each group, in the order of the help.
-const GROUPS: [(&str, &[&str]); 4] = [
-    ("Run", &["run", "ps", "top", "echo", "stop", "set", "swap", "logs", "doctor", "diagnostics"]),
-    ("Record", &["record", "replay", "test", "export", "info", "view"]),
-    ("Learn", &["simulate", "import", "train", "evaluate", "predict", "trials", "reproduce", "model", "sensors"]),
-    ("Describe", &["init", "new", "keys", "schema", "completions"]),
-];
+use super::GROUPS;
+
 const TEMPLATE: &str = "{about-with-newline}\n{usage-heading} {usage}\n\n{before-help}Options:\n{options}{after-help}";
 
 /// The command with its subcommands listed in groups.
@@ -16,7 +11,7 @@ pub(super) fn grouped(command: Command) -> Command {
     let mut list = String::new();
     for (group, names) in GROUPS {
         list += &format!("{group}:\n");
-        for name in names {
+        for name in *names {
             let about = command.find_subcommand(name).and_then(Command::get_about);
             let about = about.map(ToString::to_string).unwrap_or_default();
             list += &format!("  {name:<12} {}\n", about.trim_end_matches('.'));
@@ -36,15 +31,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_command_is_in_one_group_and_fits_a_line() {
+    fn each_command_fits_a_line() {
         let command = Cli::command();
-        let listed: Vec<&str> = GROUPS.iter().flat_map(|(_, names)| names.iter().copied()).collect();
-        let mut visible: Vec<&str> =
-            command.get_subcommands().filter(|known| !known.is_hide_set()).map(Command::get_name).collect();
-        let mut sorted = listed.clone();
-        sorted.sort_unstable();
-        visible.sort_unstable();
-        assert_eq!(sorted, visible);
         let help = grouped(command).render_help().to_string();
         assert!(help.lines().all(|line| line.chars().count() <= 80), "{help}");
         assert!(help.contains("Learn:\n  simulate"), "{help}");

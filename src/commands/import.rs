@@ -2,17 +2,13 @@
 
 use std::path::PathBuf;
 
-use anyhow::bail;
-use clap::{ArgGroup, Args, ValueEnum};
+use clap::{ArgGroup, Args};
 
 use super::frame_lines::{FrameLines, read_frames};
 use super::hand_cells::joint;
-use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text};
-use blindgrasp_learning::import::{AngleUnit, Day, ImportOptions, ImportReport, Joints, import_frames, import_table};
-use blindgrasp_stages::hand::{CellUnit, Hand};
-
-/// The most left-out rows that are printed.
-const MAX_SHOWN_ROWS: usize = 20;
+use super::{Outcome, check_new, completions, percent, print_line, print_text};
+use blindgrasp_learning::import::{Day, ImportOptions, ImportReport, Joints, import_frames, import_table};
+use blindgrasp_stages::hand::Hand;
 
 /// Turn a table (CSV) or lines of frames into a recording
 ///
@@ -27,12 +23,13 @@ const MAX_SHOWN_ROWS: usize = 20;
                   A row that is a grasp is one reading: its frames are alike, so the arbiter's votes always agree."
 )]
 pub(super) struct Arguments {
-    /// The table: CSV with a header, UTF-8. With --lines, the lines (- for stdin).
+    /// The table: CSV with a header, in UTF-8, with commas, in the units of the hand's cells and in radians; blindgrasp.from_table
+    /// in Python takes others. With --lines, the lines (- for stdin).
     table: PathBuf,
     /// The file has frames as lines of JSON, of a bridge (docs/hardware.md) or of blindgrasp export: phases, senses and outcomes
     /// of lifts are read as they are. Every line needs its grasp_id.
-    #[arg(long, conflicts_with_all = ["cells", "unit", "newtons_per_unit", "joints", "joint_columns", "label", "stable_value",
-        "group", "class", "day", "day_column", "grasp_column", "delimiter", "frames", "grasp_id_start", "clip_negative", "skip_bad_rows"])]
+    #[arg(long, conflicts_with_all = ["cells", "joints", "joint_columns", "label", "stable_value", "group", "class", "day", "day_column",
+        "grasp_column", "frames", "grasp_id_start"])]
     lines: bool,
     /// Pad layout (YAML) of the hand, or the name of a built-in one.
     #[arg(long, add = completions::hands())]
@@ -40,21 +37,12 @@ pub(super) struct Arguments {
     /// Columns of the cells, names or patterns with *, separated by commas; they fill the hand's pads in order.
     #[arg(long, required_unless_present = "lines", value_delimiter = ',', value_name = "PATTERNS")]
     cells: Vec<String>,
-    /// The unit of the cells' columns [default: the unit of the hand's cells].
-    #[arg(long, value_enum)]
-    unit: Option<Unit>,
-    /// Newtons per unit of the cells' columns, for a hand whose cells are in newtons and a table that is not.
-    #[arg(long, conflicts_with = "unit", value_parser = |text: &str| number_in(text, 1e-12..=1e12))]
-    newtons_per_unit: Option<f64>,
     /// The posture of all grasps, NAME=VALUE,…; joints not given are 0, or follow their coupling.
     #[arg(long, value_delimiter = ',', value_parser = joint, conflicts_with = "joint_columns")]
     joints: Vec<(String, f64)>,
     /// Columns of the joint angles, names or patterns with *, separated by commas, in the hand's order of joints.
     #[arg(long, value_delimiter = ',', value_name = "PATTERNS")]
     joint_columns: Vec<String>,
-    /// The unit of the joint angles' columns [default: rad].
-    #[arg(long, value_enum, requires = "joint_columns", conflicts_with = "joints")]
-    joint_unit: Option<JointUnit>,
     /// Column of the label: how the grasp ended, one of two values.
     #[arg(long, value_name = "COLUMN", required_unless_present = "lines", default_value = "")]
     label: String,
@@ -85,21 +73,12 @@ pub(super) struct Arguments {
     /// Column of the frame's phase (open, closing, settled, squeezing …) [default: all frames are settled].
     #[arg(long, value_name = "COLUMN", requires = "grasp_column")]
     phase_column: Option<String>,
-    /// The separator of the fields: one character, or tab.
-    #[arg(long, default_value = ",", value_parser = delimiter)]
-    delimiter: u8,
     /// Settled frames for each grasp, all with the same reading; the arbiter asks for 3 by default.
     #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
     frames: u32,
     /// Number of the first grasp, so that the grasps of several tables can be told apart.
     #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=1 << 52))]
     grasp_id_start: u64,
-    /// Take readings below zero, of tared or signed sensors, for 0; otherwise only those within a cell's noise threshold.
-    #[arg(long)]
-    clip_negative: bool,
-    /// Leave out rows that cannot be used, and list them, instead of refusing the table.
-    #[arg(long)]
-    skip_bad_rows: bool,
     /// Where to write the recording (MCAP).
     #[arg(short, long)]
     out: PathBuf,
@@ -109,20 +88,6 @@ pub(super) struct Arguments {
     /// Print the report as JSON.
     #[arg(long)]
     json: bool,
-}
-
-/// [`CellUnit`] on the command line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Unit {
-    Newtons,
-    Counts,
-}
-
-/// [`AngleUnit`] on the command line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum JointUnit {
-    Rad,
-    Deg,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
@@ -145,12 +110,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         },
         grasp: arguments.grasp_column.clone(),
         phase: arguments.phase_column.clone(),
-        delimiter: arguments.delimiter,
-        scale: scale(arguments, &hand)?,
         n_frames: arguments.frames,
         first_grasp_id: arguments.grasp_id_start,
-        clip_negative: arguments.clip_negative,
-        skip_bad_rows: arguments.skip_bad_rows,
     };
     let report = import_table(&arguments.table, &hand, &options, &arguments.out)?;
     if arguments.json {
@@ -189,44 +150,7 @@ fn joints(arguments: &Arguments, hand: &Hand) -> anyhow::Result<Joints> {
         let given = arguments.joints.iter().map(|(name, value)| (name.as_str(), *value));
         return Ok(Joints::Fixed(hand.posture(given)?));
     }
-    let unit = match arguments.joint_unit {
-        None | Some(JointUnit::Rad) => AngleUnit::Rad,
-        Some(JointUnit::Deg) => AngleUnit::Deg,
-    };
-    Ok(Joints::Columns {
-        patterns: arguments.joint_columns.iter().map(|pattern| pattern.trim().into()).collect(),
-        unit,
-    })
-}
-
-/// The factor from readings to the unit of the hand's cells.
-fn scale(arguments: &Arguments, hand: &Hand) -> anyhow::Result<f64> {
-    let unit = arguments.unit.map_or(hand.cell_unit, |unit| match unit {
-        Unit::Newtons => CellUnit::Newtons,
-        Unit::Counts => CellUnit::Counts,
-    });
-    match (hand.cell_unit, arguments.newtons_per_unit) {
-        (CellUnit::Newtons, Some(newtons_per_unit)) => Ok(newtons_per_unit),
-        (CellUnit::Counts, Some(_)) => {
-            bail!("--newtons-per-unit: the cells of {} read counts: leave it out", hand.name)
-        }
-        (expected, None) if unit == expected => Ok(1.0),
-        (CellUnit::Newtons, None) => {
-            bail!("--unit counts: the cells of {} are in newtons: give --newtons-per-unit instead", hand.name)
-        }
-        (CellUnit::Counts, None) => bail!(
-            "--unit newtons: the cells of {} read counts: expected a table of counts, or a hand whose layout says newtons",
-            hand.name
-        ),
-    }
-}
-
-fn delimiter(text: &str) -> Result<u8, String> {
-    match text.as_bytes() {
-        _ if text == "tab" => Ok(b'\t'),
-        [byte] if !matches!(byte, b'"' | b'\n' | b'\r') && byte.is_ascii() => Ok(*byte),
-        _ => Err("expected one ASCII character, or tab".into()),
-    }
+    Ok(Joints::Columns(arguments.joint_columns.iter().map(|pattern| pattern.trim().into()).collect()))
 }
 
 fn print_report(
@@ -266,7 +190,7 @@ fn print_report(
         Joints::Fixed(joints) => {
             hand.joints.iter().zip(joints).map(|(joint, value)| format!("{} {value}", joint.name)).collect()
         }
-        Joints::Columns { .. } => hand
+        Joints::Columns(_) => hand
             .joints
             .iter()
             .zip(&report.joint_columns)
@@ -275,25 +199,13 @@ fn print_report(
     };
     lines.push(match &options.joints {
         Joints::Fixed(_) => ("posture, rad", joints.join(", ")),
-        Joints::Columns { .. } => ("joints", joints.join(", ")),
+        Joints::Columns(_) => ("joints", joints.join(", ")),
     });
     if report.n_below_zero > 0 {
         lines.push(("below zero", format!("{} rows have readings below zero, which count as 0", report.n_below_zero)));
     }
     for warning in &report.warnings {
         lines.push(("warning", warning.clone()));
-    }
-    if !report.skipped.is_empty() {
-        let ImportReport { n_grasps_left_out, n_rows_left_out, skipped, .. } = report;
-        let n_bad = skipped.len();
-        let left_out = format!("{n_grasps_left_out} grasps with {n_rows_left_out} rows, for {n_bad} bad rows");
-        lines.push(("left out", left_out));
-    }
-    for row in report.skipped.iter().take(MAX_SHOWN_ROWS) {
-        lines.push(("", format!("line {}: {}", row.line, row.problem)));
-    }
-    if report.skipped.len() > MAX_SHOWN_ROWS {
-        lines.push(("", format!("and {} more (--json lists all)", report.skipped.len() - MAX_SHOWN_ROWS)));
     }
     for (what, value) in lines {
         print_line(&format!("{what:<17} {value}"))?;

@@ -5,22 +5,16 @@ use std::path::PathBuf;
 
 use anyhow::{Context, bail};
 use clap::Args;
-use serde::Serialize;
 
-use super::simulate::report_in;
 use super::{Outcome, cases, completions, hand_cells, percent, print_line, print_text};
 use blindgrasp_graph::client::{is_graph_name, running_graphs};
-use blindgrasp_learning::dataset::{REPORT_METADATA, hand_of, label_of, reported_truth};
+use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::evaluation::paper_label::PaperLabel;
 use blindgrasp_learning::evaluation::statistics::Interval;
-use blindgrasp_messages::{GraspTruth, Phase, TactileFrame};
+use blindgrasp_learning::summary::{Overview, RecordingsSummary};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::text::did_you_mean;
-use blindgrasp_recording::{
-    IndexedTopic, Problem, Problems, Record, RecordingIndex, RecordingReader, RepairReport, recordings_in, repair,
-};
-use blindgrasp_simulator::simulator::SimulationReport;
-use blindgrasp_stages::contacts::contacts_from_frame;
+use blindgrasp_recording::{RecordingIndex, RepairReport, recordings_in, repair};
 use blindgrasp_stages::hand::{Hand, builtin_names};
 use blindgrasp_stages::label::Label;
 
@@ -62,84 +56,6 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-/// The contents of the recordings' indexes.
-#[derive(Debug, Default, Serialize)]
-struct Overview {
-    hand: String,
-    made_by: BTreeSet<String>,
-    n_recordings: usize,
-    /// Whether the recordings were read whole.
-    is_full: bool,
-    /// `None` if an index does not say.
-    n_samples: BTreeMap<String, Option<u64>>,
-    /// The sum over all recordings, by their stamps; `None` if an index does not say and the recordings were not read.
-    duration_secs: Option<f64>,
-    n_file_bytes: u64,
-    n_chunks: u64,
-    n_compressed_bytes: u64,
-    n_uncompressed_bytes: u64,
-    /// All topics, also those of other types than blindgrasp's.
-    topics: BTreeMap<String, IndexedTopic>,
-    /// The first recording's metadata by name, without the simulation's report.
-    metadata: BTreeMap<String, BTreeMap<String, String>>,
-}
-
-/// The summary of recordings.
-#[derive(Debug, Default, Serialize)]
-struct FileReport {
-    #[serde(flatten)]
-    overview: Overview,
-    n_grasps: usize,
-    n_with_truth: usize,
-    n_stable: usize,
-    /// Grasps whose epsilon is known.
-    n_with_quality: usize,
-    n_force_closure: usize,
-    n_settled: usize,
-    n_without_contact: usize,
-    n_self_collisions: usize,
-    /// Frames of other hands than the one that sums up.
-    n_frames_of_other_hands: u64,
-    /// Quantiles at 5, 25, 50, 75 and 95 % over the grasps with force closure.
-    epsilon_quantiles: Option<[f64; 5]>,
-    volume_quantiles: Option<[f64; 5]>,
-    pads: BTreeMap<String, PadSummary>,
-    classes: BTreeMap<String, Group>,
-    objects: BTreeMap<String, Group>,
-    /// The simulation's report, if a simulation made all recordings.
-    simulation: Option<SimulationReport>,
-    /// The definitions of stable in the simulated recordings.
-    labels: BTreeSet<Label>,
-    /// The paper's label compared with the recorded labels, if those are others.
-    paper_label: Option<PaperLabel>,
-    problems: Vec<FoundProblem>,
-}
-
-/// A problem in a recording.
-#[derive(Debug, Serialize)]
-struct FoundProblem {
-    recording: String,
-    #[serde(flatten)]
-    problem: Problem,
-    message: String,
-}
-
-#[derive(Debug, Default, Serialize)]
-struct PadSummary {
-    /// Grasps in which the pad has a contact.
-    n_grasps: usize,
-    /// Active cells in these grasps.
-    n_contacts: usize,
-}
-
-#[derive(Debug, Default, Serialize)]
-struct Group {
-    n_grasps: usize,
-    n_stable: usize,
-    /// The stable share of the simulation's candidates, before balancing.
-    natural_stable_rate: Option<f64>,
-}
-
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let [path] = arguments.recordings.as_slice() {
         if hand_cells::is_hand(path) {
@@ -177,7 +93,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         if arguments.json {
             print_text(&serde_json::to_string_pretty(&overview)?)?;
         } else {
-            print_lines(overview.lines())?;
+            print_lines(overview_lines(&overview))?;
         }
         print_diagnostic("these are the contents of the index; --full reads the recordings and sums up the grasps too");
         return Ok(Outcome::Done);
@@ -185,7 +101,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let first = recordings.first().context("expected a recording")?;
     let hand = hand_of(first, arguments.hand.as_deref())?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
-    let summary = summarise(&hand, &recordings, overview)?;
+    let summary = RecordingsSummary::read(&hand, &recordings, overview)?;
     if arguments.json {
         print_text(&serde_json::to_string_pretty(&summary)?)?;
     } else {
@@ -256,222 +172,48 @@ fn print_repair(report: &RepairReport) -> anyhow::Result<()> {
     print_lines(lines)
 }
 
-impl Overview {
-    fn of(indexes: Vec<RecordingIndex>) -> Self {
-        let mut overview = Overview { n_recordings: indexes.len(), duration_secs: Some(0.0), ..Overview::default() };
-        let added = |sum: Option<u64>, more: Option<u64>| sum.zip(more).map(|(sum, more)| sum.saturating_add(more));
-        for (idx, index) in indexes.into_iter().enumerate() {
-            let secs = index.duration_nanos().map(|nanos| nanos as f64 / 1e9);
-            overview.duration_secs = overview.duration_secs.zip(secs).map(|(sum, more)| sum + more);
-            overview.n_file_bytes += index.n_file_bytes;
-            overview.n_chunks += index.n_chunks;
-            overview.n_compressed_bytes = overview.n_compressed_bytes.saturating_add(index.n_compressed_bytes);
-            overview.n_uncompressed_bytes = overview.n_uncompressed_bytes.saturating_add(index.n_uncompressed_bytes);
-            overview.made_by.insert(index.info.made_by);
-            if idx == 0 {
-                overview.hand = index.info.hand;
-                overview.metadata = index.metadata;
-                overview.metadata.remove(REPORT_METADATA);
-            }
-            for (name, topic) in index.topics {
-                if topic.is_ours {
-                    let n_samples = overview.n_samples.entry(name.clone()).or_insert(Some(0));
-                    *n_samples = added(*n_samples, topic.n_messages);
-                }
-                match overview.topics.get_mut(&name) {
-                    Some(known) => known.n_messages = added(known.n_messages, topic.n_messages),
-                    None => {
-                        overview.topics.insert(name, topic);
-                    }
-                }
-            }
-        }
-        overview
-    }
-
-    fn lines(&self) -> Vec<(&str, String)> {
-        let unknown = || "unknown".to_string();
-        let number = |n: &Option<u64>| n.map_or_else(unknown, |n| n.to_string());
-        let samples: Vec<_> = self.n_samples.iter().map(|(topic, n)| format!("{topic} {}", number(n))).collect();
-        let mebibytes = |n_bytes: u64| n_bytes as f64 / f64::from(1 << 20);
-        let mut lines = vec![
-            ("recordings", self.n_recordings.to_string()),
-            ("hand", self.hand.clone()),
-            ("samples", samples.join(", ")),
-            ("duration", self.duration_secs.map_or_else(unknown, |secs| format!("{secs:.1} s"))),
-            (
-                "size",
-                format!(
-                    "{:.1} MiB in {} chunks, {:.1} MiB before compression",
-                    mebibytes(self.n_file_bytes),
-                    self.n_chunks,
-                    mebibytes(self.n_uncompressed_bytes)
-                ),
+fn overview_lines(overview: &Overview) -> Vec<(&str, String)> {
+    let unknown = || "unknown".to_string();
+    let number = |n: &Option<u64>| n.map_or_else(unknown, |n| n.to_string());
+    let samples: Vec<_> = overview.n_samples.iter().map(|(topic, n)| format!("{topic} {}", number(n))).collect();
+    let mebibytes = |n_bytes: u64| n_bytes as f64 / f64::from(1 << 20);
+    let mut lines = vec![
+        ("recordings", overview.n_recordings.to_string()),
+        ("hand", overview.hand.clone()),
+        ("samples", samples.join(", ")),
+        ("duration", overview.duration_secs.map_or_else(unknown, |secs| format!("{secs:.1} s"))),
+        (
+            "size",
+            format!(
+                "{:.1} MiB in {} chunks, {:.1} MiB before compression",
+                mebibytes(overview.n_file_bytes),
+                overview.n_chunks,
+                mebibytes(overview.n_uncompressed_bytes)
             ),
-        ];
-        for (name, topic) in self.topics.iter().filter(|(_, topic)| !topic.is_ours) {
-            let n_messages = topic.n_messages.map_or("?".into(), |n| n.to_string());
-            lines.push(("not ours", format!("{name} {n_messages} ({})", topic.schema)));
-        }
-        for (name, metadata) in &self.metadata {
-            for (key, value) in metadata {
-                let value = match value.split_once('\n') {
-                    Some((first, rest)) => format!("{first} … ({} more lines)", rest.lines().count()),
-                    None => value.clone(),
-                };
-                lines.push((name, format!("{key}: {value}")));
-            }
-        }
-        lines
+        ),
+    ];
+    for (name, topic) in overview.topics.iter().filter(|(_, topic)| !topic.is_ours) {
+        let n_messages = topic.n_messages.map_or("?".into(), |n| n.to_string());
+        lines.push(("not ours", format!("{name} {n_messages} ({})", topic.schema)));
     }
+    for (name, metadata) in &overview.metadata {
+        for (key, value) in metadata {
+            let value = match value.split_once('\n') {
+                Some((first, rest)) => format!("{first} … ({} more lines)", rest.lines().count()),
+                None => value.clone(),
+            };
+            lines.push((name, format!("{key}: {value}")));
+        }
+    }
+    lines
 }
 
-fn summarise(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> anyhow::Result<FileReport> {
-    let overview = Overview { hand: hand.name.clone(), is_full: true, ..overview };
-    let mut summary = FileReport { overview, ..FileReport::default() };
-    let mut n_samples: BTreeMap<String, u64> = BTreeMap::new();
-    let mut read_secs = 0.0;
-    for pad in &hand.pads {
-        summary.pads.insert(pad.name.clone(), PadSummary::default());
-    }
-    let mut qualities: Vec<(f64, f64)> = Vec::new();
-    let mut truths: Vec<GraspTruth> = Vec::new();
-    let mut reports: Option<SimulationReport> = Some(SimulationReport::default());
-    for path in recordings {
-        let reader = RecordingReader::open(path)?;
-        let report = report_in(&reader, path)?;
-        summary.labels.extend(label_of(path, &reader)?);
-        match (report, &mut reports) {
-            (Some(report), Some(reports)) => reports.add(&report),
-            _ => reports = None,
-        }
-        let mut last: Option<TactileFrame> = None;
-        // The outcomes of lifts that frames report, for grasps without a label.
-        let mut reported = BTreeMap::new();
-        let mut labelled = BTreeSet::new();
-        let mut seen = BTreeSet::new();
-        let mut problems = Problems::default();
-        let mut stamps_nanos: Option<(u64, u64)> = None;
-        for record in reader {
-            let (topic, record) = record?;
-            problems.add(&topic, &record);
-            let stamp_nanos = record.header().stamp_nanos;
-            let (begin, end) = stamps_nanos.unwrap_or((stamp_nanos, stamp_nanos));
-            stamps_nanos = Some((begin.min(stamp_nanos), end.max(stamp_nanos)));
-            *n_samples.entry(topic).or_default() += 1;
-            match record {
-                Record::Tactile(frame) => {
-                    // 0 stands for an unknown hand.
-                    let is_of_other = ![0, hand.id()].contains(&frame.header.hand_id);
-                    summary.n_frames_of_other_hands += u64::from(is_of_other);
-                    if last.as_ref().is_some_and(|last| last.grasp_id != frame.message.grasp_id) {
-                        summary.count_contacts(hand, last.take());
-                    }
-                    summary.n_grasps += usize::from(seen.insert(frame.message.grasp_id));
-                    if matches!(frame.message.phase, Phase::Kept | Phase::Dropped) {
-                        reported.entry(frame.message.grasp_id).or_insert(frame.message.phase == Phase::Kept);
-                    }
-                    if frame.message.phase == Phase::Settled || last.is_none() {
-                        last = Some(frame.message);
-                    }
-                }
-                Record::Truth(truth) => {
-                    labelled.insert(truth.message.grasp_id);
-                    summary.count_truth(&truth.message, &mut qualities);
-                    truths.push(truth.message);
-                }
-                _ => {}
-            }
-        }
-        summary.count_contacts(hand, last);
-        read_secs += stamps_nanos.map_or(0.0, |(first, last)| (last - first) as f64 / 1e9);
-        for (grasp_id, is_kept) in reported.into_iter().filter(|(grasp_id, _)| !labelled.contains(grasp_id)) {
-            summary.count_truth(&reported_truth(path, grasp_id, is_kept), &mut qualities);
-        }
-        summary.problems.extend(problems.found().into_iter().map(|problem| FoundProblem {
-            recording: path.display().to_string(),
-            message: problem.to_string(),
-            problem,
-        }));
-    }
-    summary.overview.n_samples = n_samples.into_iter().map(|(topic, n)| (topic, Some(n))).collect();
-    summary.overview.duration_secs.get_or_insert(read_secs);
-    summary.simulation = reports;
-    let paper_label = PaperLabel::of(&truths);
-    let is_other = summary.labels.contains(&Label::Lift) || paper_label.all.n_different() > 0;
-    summary.paper_label = is_other.then_some(paper_label);
-    summary.add_natural_rates();
-    summary.n_force_closure = qualities.len();
-    summary.epsilon_quantiles = quantiles(qualities.iter().map(|(epsilon, _)| *epsilon).collect());
-    summary.volume_quantiles = quantiles(qualities.iter().map(|(_, volume)| *volume).collect());
-    Ok(summary)
-}
-
-impl FileReport {
-    fn count_truth(&mut self, truth: &GraspTruth, qualities: &mut Vec<(f64, f64)>) {
-        self.n_with_truth += 1;
-        self.n_stable += usize::from(truth.stable);
-        self.n_with_quality += usize::from(!truth.epsilon.is_nan());
-        if truth.epsilon > 0.0 {
-            qualities.push((truth.epsilon, truth.volume));
-        }
-        for group in [
-            self.classes.entry(truth.class.clone()).or_default(),
-            self.objects.entry(truth.object.clone()).or_default(),
-        ] {
-            group.n_grasps += 1;
-            group.n_stable += usize::from(truth.stable);
-        }
-    }
-
-    fn count_contacts(&mut self, hand: &Hand, frame: Option<TactileFrame>) {
-        let Some(frame) = frame.filter(|frame| frame.phase == Phase::Settled) else { return };
-        let mut contacts = Vec::new();
-        let found = contacts_from_frame(hand, 0, &frame.joints, &frame.cells_newtons, &mut contacts);
-        self.n_settled += 1;
-        self.n_self_collisions += usize::from(found.self_collision);
-        self.n_without_contact += usize::from(contacts.is_empty());
-        for (pad_idx, pad) in hand.pads.iter().enumerate() {
-            let n_contacts = contacts.iter().filter(|contact| contact.pad as usize == pad_idx).count();
-            if let Some(pad) = self.pads.get_mut(&pad.name) {
-                pad.n_grasps += usize::from(n_contacts > 0);
-                pad.n_contacts += n_contacts;
-            }
-        }
-    }
-
-    fn add_natural_rates(&mut self) {
-        let Some(report) = &self.simulation else { return };
-        let rate = |n_stable: usize, n: usize| (n > 0).then(|| n_stable as f64 / n as f64);
-        let mut of_classes: BTreeMap<&str, (usize, usize)> = BTreeMap::new();
-        for (name, object) in &report.objects {
-            if let Some(group) = self.objects.get_mut(name) {
-                group.natural_stable_rate = rate(object.n_judged_stable, object.n_judged);
-            }
-            let sums = of_classes.entry(&object.class).or_default();
-            sums.0 += object.n_judged_stable;
-            sums.1 += object.n_judged;
-        }
-        for (class, (n_stable, n)) in of_classes {
-            if let Some(group) = self.classes.get_mut(class) {
-                group.natural_stable_rate = rate(n_stable, n);
-            }
-        }
-    }
-}
-
-fn quantiles(mut values: Vec<f64>) -> Option<[f64; 5]> {
-    values.sort_by(f64::total_cmp);
-    let last = values.len().checked_sub(1)?;
-    Some([0.05, 0.25, 0.5, 0.75, 0.95].map(|part| values[(part * last as f64).round() as usize]))
-}
-
-fn print_summary(hand: &Hand, summary: &FileReport) -> anyhow::Result<()> {
+fn print_summary(hand: &Hand, summary: &RecordingsSummary) -> anyhow::Result<()> {
     let share = |part: usize, whole: usize| percent((whole > 0).then(|| part as f64 / whole as f64));
     let quantiles = |quantiles: Option<[f64; 5]>| {
         quantiles.map_or("n/a".into(), |values| values.map(|value| format!("{value:.3}")).join("  "))
     };
-    let mut lines = summary.overview.lines();
+    let mut lines = overview_lines(&summary.overview);
     lines.extend([
         ("grasps", format!("{}, {} with a label", summary.n_grasps, summary.n_with_truth)),
         ("stable", share(summary.n_stable, summary.n_with_truth)),

@@ -32,7 +32,7 @@ pub(super) struct Arguments {
 }
 
 /// The project's files: those that this repository's own default graph consists of.
-pub(super) const FILES: [File; 11] = [
+const FILES: [File; 11] = [
     ("dataflow.yaml", include_bytes!("../../dataflow.yaml")),
     ("dataflow-live.yaml", include_bytes!("../../dataflow-live.yaml")),
     ("tactile_bridge.py", include_bytes!("../../examples/tactile_bridge.py")),

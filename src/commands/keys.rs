@@ -6,8 +6,7 @@ use clap::Args;
 use serde_json::{Value, json};
 use time::OffsetDateTime;
 
-use super::model::write_at_once;
-use super::{Outcome, print_line};
+use super::{Outcome, print_line, write_out};
 use blindgrasp_bridge::access;
 use blindgrasp_bridge::certificates::{AUTHORITY_FILE, CertificateSummary, ROUTER_COMMON_NAME};
 use blindgrasp_bridge::config::KeyFiles;
@@ -182,7 +181,7 @@ fn write_router_config(folder: &Path) -> anyhow::Result<PathBuf> {
         "access_control": access::for_router(machines),
     });
     let file = folder.join(format!("{ROUTER_FILES}.json5"));
-    write_at_once(&file, &format!("{}\n", serde_json::to_string_pretty(&config)?))?;
+    write_out(&file, &format!("{}\n", serde_json::to_string_pretty(&config)?))?;
     Ok(file)
 }
 

@@ -13,7 +13,6 @@ mod evaluate;
 mod export;
 mod frame_lines;
 mod graph_file;
-mod grid;
 mod guesses;
 mod hand_cells;
 mod help;
@@ -33,7 +32,6 @@ mod ps;
 mod record;
 mod recording_arguments;
 mod replay;
-mod reproduce;
 mod ros2_network;
 mod run;
 mod schema;
@@ -73,63 +71,40 @@ pub(crate) struct Cli {
     command: Command,
 }
 
-#[derive(Debug, Subcommand)]
-enum Command {
-    Init(init::Arguments),
-    #[command(aliases = ["up", "start", "launch"])]
-    Run(run::Arguments),
-    Record(record::Arguments),
-    #[command(alias = "play")]
-    Replay(replay::Arguments),
-    Test(test::Arguments),
-    #[command(aliases = ["status", "list"])]
-    Ps(ps::Arguments),
-    Top(top::Arguments),
-    Echo(echo::Arguments),
-    #[command(alias = "down")]
-    Stop(stop::Arguments),
-    Logs(logs::Arguments),
-    Set(set::Arguments),
-    #[command(alias = "restart")]
-    Swap(swap::Arguments),
-    Simulate(simulate::Arguments),
-    Import(import::Arguments),
-    Train(train::Arguments),
-    Evaluate(evaluate::Arguments),
-    Predict(predict::Arguments),
-    Trials(trials::Arguments),
-    Reproduce(reproduce::Arguments),
-    Model(model::Arguments),
-    Sensors(sensors::Arguments),
-    Info(info::Arguments),
-    Export(export::Arguments),
-    New(new::Arguments),
-    Keys(keys::Arguments),
-    #[command(alias = "graph")]
-    View(view::Arguments),
-    Doctor(doctor::Arguments),
-    Diagnostics(diagnostics::Arguments),
-    Completions(completions::Arguments),
-    Schema(schema::Arguments),
-    Man(man::Arguments),
-    Operator(operator::Arguments),
+/// The table of the commands: a module with `Arguments` and `run` each, in the groups and the order of the help.
+macro_rules! commands {
+    ($($group:literal: $($name:ident $module:ident),*;)*) => {
+        #[derive(Debug, Subcommand)]
+        enum Command {
+            $($($name($module::Arguments),)*)*
+            Man(man::Arguments),
+            Operator(operator::Arguments),
+        }
+
+        const GROUPS: &[(&str, &[&str])] = &[$(($group, &[$(stringify!($module)),*])),*];
+
+        /// Carries out a command.
+        ///
+        /// # Errors
+        /// What failed, for a person to read.
+        pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
+            match cli.command {
+                $($(Command::$name(arguments) => $module::run(&arguments),)*)*
+                Command::Man(arguments) => man::run(&arguments),
+                // `main` has run it.
+                Command::Operator(_) => Ok(Outcome::Done),
+            }
+        }
+    };
 }
 
-/// The running graph that a command is about, by its place or by its option, as other commands have it.
-#[derive(Debug, clap::Args)]
-struct GraphArgument {
-    /// Graph [default: the only one running]
-    #[arg(add = completions::graphs())]
-    graph: Option<String>,
-    /// The same, as other commands have it
-    #[arg(short = 'g', long = "graph", value_name = "GRAPH", conflicts_with = "graph", add = completions::graphs())]
-    named: Option<String>,
-}
-
-impl GraphArgument {
-    fn name(&self) -> Option<&str> {
-        self.graph.as_deref().or(self.named.as_deref())
-    }
+commands! {
+    "Run": Run run, Ps ps, Top top, Echo echo, Stop stop, Set set, Swap swap, Logs logs, Doctor doctor,
+        Diagnostics diagnostics;
+    "Record": Record record, Replay replay, Test test, Export export, Info info, View view;
+    "Learn": Simulate simulate, Import import, Train train, Evaluate evaluate, Predict predict, Trials trials,
+        Model model, Sensors sensors;
+    "Describe": Init init, New new, Keys keys, Schema schema, Completions completions;
 }
 
 /// How a command ended that did not fail.
@@ -167,7 +142,7 @@ impl Cli {
         let words: Vec<OsString> = std::env::args_os().collect();
         let matches = help::grouped(Cli::command()).try_get_matches_from(&words);
         let parsed = matches.and_then(|matches| Cli::from_arg_matches(&matches));
-        parsed.unwrap_or_else(|error| guesses::with_hint(error, help::grouped(Cli::command()), &words).exit())
+        parsed.unwrap_or_else(|error| guesses::with_hint(error, Cli::command(), &words).exit())
     }
 
     /// Runs the operator that this process is to be. An operator reports its end to the launcher, not to a person.
@@ -176,48 +151,6 @@ impl Cli {
             Command::Operator(arguments) => Some(operator::run(arguments)),
             _ => None,
         }
-    }
-}
-
-/// Carries out a command.
-///
-/// # Errors
-/// What failed, for a person to read.
-pub(crate) fn run(cli: Cli) -> anyhow::Result<Outcome> {
-    match cli.command {
-        Command::Init(arguments) => init::run(&arguments),
-        Command::Run(arguments) => run::run(&arguments),
-        Command::Record(arguments) => record::run(&arguments),
-        Command::Replay(arguments) => replay::run(&arguments),
-        Command::Test(arguments) => test::run(&arguments),
-        Command::Ps(arguments) => ps::run(&arguments),
-        Command::Top(arguments) => top::run(&arguments),
-        Command::Echo(arguments) => echo::run(&arguments),
-        Command::Stop(arguments) => stop::run(&arguments),
-        Command::Logs(arguments) => logs::run(&arguments),
-        Command::Set(arguments) => set::run(&arguments),
-        Command::Swap(arguments) => swap::run(&arguments),
-        Command::Simulate(arguments) => simulate::run(&arguments),
-        Command::Import(arguments) => import::run(&arguments),
-        Command::Train(arguments) => train::run(&arguments),
-        Command::Evaluate(arguments) => evaluate::run(&arguments),
-        Command::Predict(arguments) => predict::run(&arguments),
-        Command::Trials(arguments) => trials::run(&arguments),
-        Command::Reproduce(arguments) => reproduce::run(&arguments),
-        Command::Model(arguments) => model::run(&arguments),
-        Command::Sensors(arguments) => sensors::run(&arguments),
-        Command::Info(arguments) => info::run(&arguments),
-        Command::Export(arguments) => export::run(&arguments),
-        Command::New(arguments) => new::run(&arguments),
-        Command::Keys(arguments) => keys::run(&arguments),
-        Command::View(arguments) => view::run(&arguments),
-        Command::Diagnostics(arguments) => diagnostics::run(&arguments),
-        Command::Doctor(arguments) => doctor::run(&arguments),
-        Command::Completions(arguments) => completions::run(&arguments),
-        Command::Schema(arguments) => schema::run(&arguments),
-        Command::Man(arguments) => man::run(&arguments),
-        // `main` has run it.
-        Command::Operator(_) => Ok(Outcome::Done),
     }
 }
 

@@ -1,18 +1,16 @@
 //! `blindgrasp model`
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Context;
-use clap::{Args, Subcommand, ValueEnum};
+use clap::{Args, Subcommand};
 use serde_json::json;
 
 use super::train::{probe_lines, threshold_line};
-use super::{Outcome, check_new, check_output, completions, percent, print_line, print_text};
+use super::{Outcome, check_new, check_output, completions, percent, print_line, print_text, write_out};
 use blindgrasp_learning::dataset::{hand_of, label_line};
-use blindgrasp_learning::learners::libsvm_format::{parse_libsvm, write_libsvm};
+use blindgrasp_learning::learners::libsvm_format::write_libsvm;
 use blindgrasp_learning::training::adapt;
-use blindgrasp_messages::files::{read_regular, write_whole};
-use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::boosting::BoostedTrees;
 use blindgrasp_stages::classifier::svm::RbfSvm;
@@ -22,10 +20,9 @@ use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::own_lifts::Correction;
 use blindgrasp_stages::probe::ProbeModel;
-use blindgrasp_stages::recipe::Learner;
 use blindgrasp_stages::training_summary::OwnLiftsSummary;
 
-/// Describe, adapt or exchange a model, or rate approaches
+/// Describe, adapt or export a model, or rate approaches
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(subcommand)]
@@ -36,59 +33,20 @@ pub(super) struct Arguments {
 enum Command {
     Show(ShowArguments),
     Export(ExportArguments),
-    Import(ImportArguments),
     Adapt(AdaptArguments),
     Approaches(super::approaches::Arguments),
 }
 
-/// Files of other programs.
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum Format {
-    /// LIBSVM's model file (svm-train, svm-predict).
-    Libsvm,
-}
-
-/// Write a model's SVM and calibration for another program.
+/// Write a model's SVM and calibration for LIBSVM (svm-predict).
 ///
 /// Labels are 1 (stable) and -1. Decision values and probabilities are the same there; dictionary, hand and threshold
 /// have no place in the file.
 #[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp model export paper.json --format libsvm --out svm.model")]
+#[command(after_help = "Example: blindgrasp model export paper.json --out svm.model")]
 struct ExportArguments {
     /// The model.
     model: PathBuf,
-    /// What to write.
-    #[arg(long, value_enum, default_value = "libsvm")]
-    format: Format,
     /// Where to write it.
-    #[arg(short, long)]
-    out: PathBuf,
-    /// Replace a file of this name
-    #[arg(long)]
-    overwrite: bool,
-}
-
-/// Make a model of another program's SVM.
-///
-/// Dictionary, hand, sigma and threshold come from an existing model: the one whose features the SVM was trained on.
-/// Labels must be 1 (stable) and -1 or 0. The calibration is the file's (probA and probB, as svm-train -b 1 writes
-/// them). What the model says of its training, c and figures included, stays that of the existing model, with a note.
-#[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp model import svm.model --format libsvm --like paper.json --out new.json")]
-struct ImportArguments {
-    /// The file to read.
-    file: PathBuf,
-    /// The format of the file.
-    #[arg(long, value_enum, default_value = "libsvm")]
-    format: Format,
-    /// The model that all but the SVM comes from.
-    #[arg(long)]
-    like: PathBuf,
-    /// Take the existing model's calibration when the file has none. Right only if the SVM is a copy of that model's:
-    /// another SVM's decision values mean other probabilities.
-    #[arg(long)]
-    keep_calibration: bool,
-    /// Where to write the model.
     #[arg(short, long)]
     out: PathBuf,
     /// Replace a file of this name
@@ -139,7 +97,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     match &arguments.command {
         Command::Show(arguments) => show(arguments),
         Command::Export(arguments) => export(arguments),
-        Command::Import(arguments) => import(arguments),
         Command::Adapt(arguments) => adapt_model(arguments),
         Command::Approaches(arguments) => super::approaches::run(arguments),
     }
@@ -154,7 +111,6 @@ fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
         check_output(&arguments.out, inputs)?
     }
     let Model { classifier, training, .. } = Model::load(&arguments.model)?;
-    let Format::Libsvm = arguments.format;
     let Predictor::Svm(svm) = &classifier.predictor else {
         anyhow::bail!(
             "{} has no SVM but {} (recipe {}): LIBSVM can take models of the recipes with an SVM (blindgrasp train \
@@ -164,60 +120,8 @@ fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
             training.recipe.name
         );
     };
-    write_at_once(&arguments.out, &write_libsvm(svm, Some(&classifier.calibration)))?;
+    write_out(&arguments.out, &write_libsvm(svm, Some(&classifier.calibration)))?;
     print_line(&format!("{}: {} support vectors", arguments.out.display(), svm.n_support_vectors()))?;
-    Ok(Outcome::Done)
-}
-
-/// Writes a file whole or not at all.
-pub(super) fn write_at_once(path: &Path, text: &str) -> anyhow::Result<()> {
-    // A pipe, a terminal or a device is written to, not replaced.
-    if std::fs::metadata(path).is_ok_and(|found| !found.is_file()) {
-        return std::fs::write(path, text).with_context(|| format!("{}", path.display()));
-    }
-    write_whole(path, text).with_context(|| format!("{}", path.display()))
-}
-
-fn import(arguments: &ImportArguments) -> anyhow::Result<Outcome> {
-    let ImportArguments { file, like, out, .. } = arguments;
-    check_new(out, &[file.clone(), like.clone()], arguments.overwrite)?;
-    let mut model = Model::load(like)?;
-    let Format::Libsvm = arguments.format;
-    let text = read_regular(file).with_context(|| format!("{}", file.display()))?;
-    let n_features = model.features.len();
-    let (svm, calibration) = parse_libsvm(&text, n_features).with_context(|| format!("{}", file.display()))?;
-    match calibration {
-        Some(calibration) if calibration.a >= 0.0 => anyhow::bail!(
-            "{}: its probA says that label 1 does not become more likely as the decision value grows: expected 1 to be stable",
-            file.display()
-        ),
-        Some(calibration) => model.classifier.calibration = calibration,
-        None if arguments.keep_calibration => print_diagnostic(&format!(
-            "blindgrasp: {} has no probA and probB: probabilities are by the calibration of {}, which was not made \
-             for this SVM",
-            file.display(),
-            like.display()
-        )),
-        None => anyhow::bail!(
-            "{} has no probA and probB, so nothing says what its decision values mean: write it with svm-train -b 1, \
-             or take the calibration of {} with --keep-calibration",
-            file.display(),
-            like.display()
-        ),
-    }
-    let Learner::Svm(params) = &mut model.training.recipe.learner else {
-        anyhow::bail!("{} has no SVM: expected a model whose recipe has one", like.display());
-    };
-    params.gamma = svm.gamma;
-    model.training.made_by.push(format!(
-        "SVM imported from {}; c, tolerance, iterations and cross-validated figures are those of the model before",
-        file.file_name().unwrap_or(file.as_os_str()).to_string_lossy()
-    ));
-    // They were for the SVM before.
-    model.training.withdraw_promises();
-    model.classifier.predictor = Predictor::Svm(svm.try_into()?);
-    model.save(out)?;
-    print_line(&format!("{}: {}", out.display(), model.classifier.predictor.summary()))?;
     Ok(Outcome::Done)
 }
 

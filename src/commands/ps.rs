@@ -3,19 +3,19 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use anyhow::bail;
-use clap::{Args, CommandFactory};
+use clap::Args;
 use serde::Serialize;
 
 use super::elsewhere::MachineArgument;
-use super::guesses::hint_for_word;
 use super::promises::RobotPromise;
 use super::text_table::TextTable;
-use super::top::screen::short_time;
-use super::{Cli, Outcome, completions, print_line};
+use super::{Outcome, completions, print_line};
 use blindgrasp_graph::client::usage::{ProcessUsage, usage};
+use blindgrasp_graph::client::words::{
+    clock_offset, node_state_word, peer_state_word, short_time, state_word, warnings,
+};
 use blindgrasp_graph::client::{pick_graph, running_graphs, status};
-use blindgrasp_graph::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus};
+use blindgrasp_graph::control::{EdgeStatus, GraphStatus, NodeStatus};
 use blindgrasp_graph::log::printable;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::link_status::{LinkStatus, PeerState, PeerStatus};
@@ -29,9 +29,6 @@ pub(super) struct Arguments {
     /// Show only this graph
     #[arg(add = completions::graphs())]
     graph: Option<String>,
-    /// The same, as other commands have it
-    #[arg(short = 'g', long = "graph", value_name = "GRAPH", conflicts_with = "graph", add = completions::graphs())]
-    named: Option<String>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -66,9 +63,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(destination) = arguments.machine.destination()? {
         return destination.run();
     }
-    let listing = match arguments.graph.as_ref().or(arguments.named.as_ref()) {
+    let listing = match &arguments.graph {
         Some(graph) => {
-            let status = status(&picked(graph)?)?;
+            let status = status(&pick_graph(Some(graph))?)?;
             Listing { graphs: vec![completed(status)], not_answering: Vec::new() }
         }
         None => listing()?,
@@ -90,18 +87,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         print_diagnostic(&silent.message);
     }
     Ok(Outcome::Done)
-}
-
-/// The running graph of that name; `list hands` is a guess, of which the error tells what does it.
-fn picked(name: &str) -> anyhow::Result<String> {
-    let error = match pick_graph(Some(name)) {
-        Ok(graph) => return Ok(graph),
-        Err(error) => error,
-    };
-    match hint_for_word(name, Cli::command()) {
-        Some(hint) => bail!("{error}; {hint}"),
-        None => Err(error.into()),
-    }
 }
 
 fn listing() -> anyhow::Result<Listing> {
@@ -225,23 +210,6 @@ fn link_tables(link: &LinkStatus) -> Vec<String> {
     lines
 }
 
-/// Another machine's clock minus this machine's.
-pub(super) fn clock_offset(peer: &PeerStatus) -> String {
-    let Some(offset) = peer.offset_nanos else { return "-".into() };
-    let uncertainty = peer.uncertainty_nanos.map_or(String::new(), |nanos| format!(" ±{}", short_time(nanos)));
-    format!("{}{}{uncertainty}", if offset < 0 { '-' } else { '+' }, short_time(offset.unsigned_abs()))
-}
-
-pub(super) fn peer_state_word(state: PeerState) -> &'static str {
-    match state {
-        PeerState::Waiting => "waiting",
-        PeerState::Up => "up",
-        PeerState::Down => "CUT OFF",
-        PeerState::Left => "left",
-        PeerState::Refused => "REFUSED",
-    }
-}
-
 fn mebibytes(bytes: u64) -> String {
     format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20))
 }
@@ -251,63 +219,9 @@ fn age(edge: &EdgeStatus, share: f64) -> String {
     edge.ages.quantile_nanos(share).map_or("-".into(), short_time)
 }
 
-/// The troubles of a graph, in words.
-pub(super) fn warnings(status: &GraphStatus) -> Vec<String> {
-    let mut warnings: Vec<String> = status.message.iter().cloned().collect();
-    if status.state == GraphState::Degraded {
-        let failed: Vec<&str> =
-            status.nodes.iter().filter(|node| node.state == NodeState::Failed).map(|node| node.node.as_str()).collect();
-        let which = if failed.is_empty() { "an operator".into() } else { failed.join(", ") };
-        warnings.push(format!("grasps are not decided without {which}: swap it (blindgrasp swap) or stop the graph"));
-    }
-    let lost = |edge: &&EdgeStatus| edge.policy == EdgePolicy::Lossless && edge.dropped > 0;
-    warnings.extend(status.edges.iter().filter(lost).map(|edge| {
-        format!("{} samples were lost between {} and {}, whose edge is lossless", edge.dropped, edge.from, edge.to)
-    }));
-    warnings.extend(status.link.iter().flat_map(|link| &link.peers).filter_map(trouble));
-    warnings
-}
-
-/// The reason why another machine takes no part.
-fn trouble(peer: &PeerStatus) -> Option<String> {
-    let machine = &peer.machine;
-    let reason = peer.reason.as_ref().map_or(String::new(), |reason| format!(": {reason}"));
-    match peer.state {
-        PeerState::Up => None,
-        PeerState::Waiting => Some(format!("machine '{machine}' has not been found yet{reason}")),
-        PeerState::Left => Some(format!("machine '{machine}' has left the graph: it was stopped there{reason}")),
-        PeerState::Refused => Some(format!("machine '{machine}' and this one do not fit{reason}")),
-        PeerState::Down => {
-            let silent = peer.silent_millis.map_or(String::new(), |millis| {
-                format!(": it has said nothing for {}", short_time(millis.saturating_mul(1_000_000)))
-            });
-            Some(format!("machine '{machine}' is cut off{silent}{reason}"))
-        }
-    }
-}
-
 fn pids(node: &NodeStatus) -> String {
     let active = node.pid.map_or("-".into(), |pid| pid.to_string());
     node.standby_pid.map_or(active.clone(), |standby| format!("{active} (standby {standby})"))
-}
-
-pub(super) fn state_word(state: GraphState) -> &'static str {
-    match state {
-        GraphState::Starting => "starting",
-        GraphState::Running => "running",
-        GraphState::Degraded => "DEGRADED",
-        GraphState::Stopping => "stopping",
-    }
-}
-
-pub(super) fn node_state_word(state: NodeState) -> &'static str {
-    match state {
-        NodeState::Starting => "starting",
-        NodeState::Running => "running",
-        NodeState::Restarting => "restarting",
-        NodeState::Done => "done",
-        NodeState::Failed => "FAILED",
-    }
 }
 
 fn policy_word(policy: EdgePolicy) -> &'static str {
@@ -391,19 +305,6 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_that_takes_no_part_says_why() {
-        let of = |state, silent_millis| {
-            let peer = PeerStatus { machine: "brain".into(), state, silent_millis, ..PeerStatus::default() };
-            trouble(&peer).unwrap_or_default()
-        };
-        assert_eq!(of(PeerState::Up, Some(5)), "");
-        assert_eq!(of(PeerState::Down, Some(1300)), "machine 'brain' is cut off: it has said nothing for 1.3s");
-        assert_eq!(of(PeerState::Waiting, None), "machine 'brain' has not been found yet");
-        assert!(of(PeerState::Left, None).contains("stopped there"));
-        assert_eq!(clock_offset(&PeerStatus::default()), "-");
-    }
-
-    #[test]
     fn a_degraded_graph_says_so_and_its_tables_stand_straight() {
         let mut graph = made();
         graph.status.nodes[0].pid = Some(4243);
@@ -428,17 +329,6 @@ graph 'gate'  DEGRADED, up 1h 2m 5s, pid 4242, /robot/dataflow.yaml
         let n_chars = |line: &String| line.chars().count();
         assert!(n_chars(&found[3]) == n_chars(&found[4]) && n_chars(&found[4]) == n_chars(&found[5]));
         assert_eq!(n_chars(&found[6]), n_chars(&found[7]));
-    }
-
-    #[test]
-    fn a_loss_on_a_lossless_edge_is_said_in_words() {
-        let mut graph = made();
-        graph.status.state = GraphState::Running;
-        graph.status.message = None;
-        assert_eq!(warnings(&graph.status), Vec::<String>::new());
-        graph.status.edges[0].policy = EdgePolicy::Lossless;
-        let expected = "10 samples were lost between contacts/contacts and classifier/contacts, whose edge is lossless";
-        assert_eq!(warnings(&graph.status), [expected]);
     }
 
     #[test]

@@ -13,7 +13,7 @@ use serde_json::json;
 use super::elsewhere::{MachineArgument, is_over_ssh};
 use super::recording_arguments::RecordingArguments;
 use super::text_table::TextTable;
-use super::{GraphArgument, Outcome, check_output, print_line, secs_in, stop_signal};
+use super::{Outcome, check_output, completions, print_line, secs_in, stop_signal};
 use blindgrasp_graph::client::observer::{ObservedEdge, Observer, can_observe};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
 use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request};
@@ -22,13 +22,10 @@ use blindgrasp_operator::cursors::SharedCursors;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_session::of_graph::of_graph;
 use blindgrasp_session::recorder::{Recorded, Recorder};
+use blindgrasp_session::span::{EdgeSpan, Span, SpanOfEdge};
 
-use self::span::{EdgeSpan, Span, SpanOfEdge};
-
-mod flight;
 mod keep;
 mod over_ssh;
-mod span;
 
 /// The command checks this often whether it was interrupted or its time is over.
 const POLL: Duration = Duration::from_millis(50);
@@ -46,8 +43,9 @@ const POLL: Duration = Duration::from_millis(50);
                         blindgrasp record grasp_gate --keep 30s --out recordings/robot.mcap\n\n\
                         Exit code 3 if samples are missing, or if the disk was full.")]
 pub(super) struct Arguments {
-    #[command(flatten)]
-    graph: GraphArgument,
+    /// Graph [default: the only one running]
+    #[arg(add = completions::graphs())]
+    graph: Option<String>,
     /// File to write; with --keep, each file has the time and the reason behind its name
     #[arg(short, long, value_name = "FILE", required_unless_present = "write_kept")]
     out: Option<PathBuf>,
@@ -127,7 +125,7 @@ impl Arguments {
 /// Records a graph of this machine to `out`.
 fn record(arguments: &Arguments, out: &Path) -> anyhow::Result<RecordSummary> {
     let stop = stop_signal()?;
-    let connection = Connection::open(&pick_graph(arguments.graph.name())?)?;
+    let connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
     record_from(arguments, out, connection, &|| stop.load(Ordering::Relaxed))
 }
 

@@ -5,7 +5,7 @@ use clap::Args;
 use serde_json::json;
 
 use super::elsewhere::MachineArgument;
-use super::{GraphArgument, Outcome, print_line};
+use super::{Outcome, completions, print_line};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_starting_graph, running_graphs};
 use blindgrasp_graph::control::{Reply, Request};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -16,10 +16,11 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
                         Samples in flight are decided first. Ctrl-C ends the wait only; the graph still stops.\n\
                         Of a graph on several machines, the part here is stopped, and with --machine another one.")]
 pub(super) struct Arguments {
-    #[command(flatten)]
-    graph: GraphArgument,
+    /// Graph [default: the only one running]
+    #[arg(add = completions::graphs())]
+    graph: Option<String>,
     /// Stop all graphs of this user
-    #[arg(long, conflicts_with_all = ["graph", "named"])]
+    #[arg(long, conflicts_with = "graph")]
     all: bool,
     /// Print JSON
     #[arg(long)]
@@ -32,7 +33,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(destination) = arguments.machine.destination()? {
         return destination.run();
     }
-    let graphs = if arguments.all { running_graphs()? } else { vec![pick_starting_graph(arguments.graph.name())?] };
+    let graphs = if arguments.all { running_graphs()? } else { vec![pick_starting_graph(arguments.graph.as_deref())?] };
     if graphs.is_empty() {
         print_diagnostic("no graph is running");
     }

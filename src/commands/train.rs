@@ -6,7 +6,6 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 
 use super::evaluate::print_label;
-use super::grid::{self, GridArguments};
 use super::{Outcome, check_new, completions, number_in, percent, print_line};
 use blindgrasp_learning::dataset::hand_of;
 use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, TrainingSummary, train};
@@ -22,17 +21,17 @@ use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                   blindgrasp train train.mcap --out mine.json\n  \
-                  blindgrasp train train.mcap --recipe paper --grid --grid-report grid.json --out mine.json")]
+                  blindgrasp train train.mcap --recipe paper --out mine.json")]
 pub(super) struct Arguments {
     /// Recordings (MCAP), simulated or a robot's own, or folders of them.
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
     /// Where to write the model (JSON).
     #[arg(short, long)]
-    pub(super) out: PathBuf,
+    out: PathBuf,
     /// Replace files of these names
     #[arg(long)]
-    pub(super) overwrite: bool,
+    overwrite: bool,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
@@ -44,7 +43,7 @@ pub(super) struct Arguments {
     /// Judge each value relative to the grasps of its recording day before it, for sensors that drift from day to day. The
     /// model holds the first 30 grasps of a day. It needs recordings of several days: those of import --day, or one
     /// recording for each day.
-    #[arg(long, conflicts_with = "grid")]
+    #[arg(long)]
     day_baseline: bool,
     /// Words of the contact dictionary.
     #[arg(long, value_parser = clap::value_parser!(u32).range(1..=2048))]
@@ -74,8 +73,6 @@ pub(super) struct Arguments {
     /// The seed of K-means and boosting.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
-    #[command(flatten)]
-    grid: GridArguments,
 }
 
 /// The definition of stable.
@@ -115,7 +112,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         anyhow::bail!("{out}: expected a name that ends in .json, by which evaluate tells a model from a recording");
     }
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
-    let mut options = TrainingOptions {
+    let options = TrainingOptions {
         recipe: recipe(arguments)?,
         threshold_probability: arguments.thresholds.threshold_probability,
         aim: arguments.thresholds.aim(),
@@ -125,14 +122,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         ..TrainingOptions::default()
     };
     options.check()?;
-    let axes = grid::axes(&arguments.grid, &recordings, arguments, &options.recipe)?;
     let progress = |what: &str| print_diagnostic(&format!("{what} …"));
     let examples = Examples::read(&hand, &recordings, &options.relabelling(), |n_read, n| {
         progress(&format!("read recording {n_read} of {n}"));
     })?;
-    let grid = axes.map(|axes| grid::search(&arguments.grid, &axes, &hand, &examples, &mut options)).transpose()?;
-    let mut model = train(&hand, &examples, &recordings, &options, progress)?;
-    model.training.grid = grid;
+    let model = train(&hand, &examples, &recordings, &options, progress)?;
     model.save(&arguments.out)?;
     let training = &model.training;
     print_line(&format!(

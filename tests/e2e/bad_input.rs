@@ -260,8 +260,12 @@ fn a_file_of_another_kind_names_the_command_that_takes_it() {
 fn usage() {
     check(&["fly"], 2, &["fly"]);
     check(&["run", "--fly"], 2, &["--fly"]);
-    check(&["run", "--speed", "2"], 2, &["tip: use --set recorded_source.rate=2", "Usage: blindgrasp run [OPTIONS]"]);
-    check(&["list", "hands"], 1, &["no graph 'hands'", "blindgrasp info NAME", "allegro"]);
+    check(
+        &["run", "--speed", "2"],
+        2,
+        &["tip: a parameter of an operator is given by --set", "Usage: blindgrasp run [OPTIONS]"],
+    );
+    check(&["topic", "list"], 2, &["tip: use 'blindgrasp ps'"]);
     check(&[], 2, &["Usage"]);
     for operator in ["recorded_source", "contacts", "encoder", "classifier", "lift_arbiter"] {
         check(&["operator", operator], 2, &["--describe"]);

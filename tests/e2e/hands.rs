@@ -46,7 +46,7 @@ fn a_gripper_is_simulated_trained_and_run_by_one_command() {
     assert!(said.contains("HOLD), 0 undecided") && !said.contains("(0 LIFT") && !said.contains(", 0 HOLD"), "{said}");
 }
 
-/// As in the pages of docs/hands, with fewer lifts, and with one of them to the end.
+/// As in docs/hands.md, with fewer lifts, and with one of them to the end.
 #[test]
 fn hands_that_people_own_are_simulated_trained_and_run() {
     for (hand, n_lifts) in

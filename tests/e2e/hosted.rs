@@ -361,7 +361,7 @@ fn the_operator_in_cpp_of_the_docs_compiles_and_runs() {
     }
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
-    let page = std::fs::read_to_string(project().join("docs/operators-other-languages.md")).expect("readable");
+    let page = std::fs::read_to_string(project().join("docs/operators.md")).expect("readable");
     let (_, code) = page.split_once("```cpp\n").expect("code in C++");
     let (code, _) = code.split_once("```").expect("its end");
     let (source, program) = (folder.join("judge.cpp"), folder.join("judge"));

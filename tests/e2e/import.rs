@@ -125,7 +125,6 @@ fn a_table_becomes_a_recording() {
     assert_eq!(report["groups"]["cup"], json!({"n_grasps": 1, "n_stable": 1}));
     assert_eq!(report["pads"][0], json!({"pad": "left", "columns": ["l_1", "l_2"]}));
     assert_eq!(report["pads"][1], json!({"pad": "right", "columns": ["r_1"]}));
-    assert_eq!(report["skipped"], json!([]));
     let frames = folder.exported("/tactile");
     let data = |grasp_id: u64, cells: [f64; 3]| {
         json!({"grasp_id": grasp_id, "phase": "settled", "joints": [0.5, 0.0], "cells_newtons": cells,
@@ -155,24 +154,22 @@ fn a_spreadsheets_table_reads_the_same() {
     let folder = Folder::new();
     folder.import(TABLE, &[]);
     let plain = (folder.exported("/tactile"), folder.exported("/truth"));
-    let table = "\u{feff}object;kind;held;l_1;l_2;r_1\r\n\"cup\";mug;yes; 0.5 ;1.25;2\r\n\r\nbox;;no;0;0.1;3e-2";
-    folder.import(table, &["--delimiter", ";"]);
-    assert_eq!((folder.exported("/tactile"), folder.exported("/truth")), plain);
-    folder.import(TABLE.replace(',', "\t"), &["--delimiter", "tab"]);
+    let table = "\u{feff}object,kind,held,l_1,l_2,r_1\r\n\"cup\",mug,yes, 0.5 ,1.25,2\r\n\r\nbox,,no,0,0.1,3e-2";
+    folder.import(table, &[]);
     assert_eq!((folder.exported("/tactile"), folder.exported("/truth")), plain);
 }
 
 #[test]
-fn columns_may_hold_angles_classes_and_another_unit() {
+fn columns_may_hold_angles_and_classes() {
     let folder = Folder::new();
-    let table = "object,kind,held,l_1,l_2,r_1,q_left,q_right\ncup,mug,1,100,0,50,45,0\nbox,crate,0,1,2,3,0,57\n";
-    let more = ["--joint-columns", "q_*", "--joint-unit", "deg", "--class", "kind", "--newtons-per-unit", "0.01"];
+    let table = "object,kind,held,l_1,l_2,r_1,q_left,q_right\ncup,mug,1,1,0,0.5,0.75,0\nbox,crate,0,1,2,3,0,1\n";
+    let more = ["--joint-columns", "q_*", "--class", "kind"];
     let report = folder.import(table, &[&more[..], &["--stable-value", "1"]].concat());
     assert_eq!(report["joint_columns"], json!(["q_left", "q_right"]));
     let frames = folder.exported("/tactile");
     assert_eq!(frames[0]["data"]["cells_newtons"], json!([1.0, 0.0, 0.5]));
-    assert_eq!(frames[0]["data"]["joints"], json!([std::f64::consts::FRAC_PI_4, 0.0]));
-    assert_eq!(frames[3]["data"]["joints"][1], json!(57_f64.to_radians()));
+    assert_eq!(frames[0]["data"]["joints"], json!([0.75, 0.0]));
+    assert_eq!(frames[3]["data"]["joints"][1], json!(1.0));
     assert_eq!(folder.exported("/truth")[1]["data"]["class"], "crate");
 }
 
@@ -220,25 +217,11 @@ fn rows_may_be_the_frames_of_grasps() {
         folder.refuse(&table, &flags, 1, &[expected]);
     }
     folder.refuse(SERIES, &["--phase-column", "phase"], 2, &["--grasp-column"]);
-    folder.refuse(
-        format!("{SERIES}cup,yes,0,0,0,a,settled\n"),
-        &[&flags[..], &["--skip-bad-rows"]].concat(),
-        1,
-        &["'a' again"],
-    );
-    // A grasp with a bad row is left out as a whole, and both grasps beside a row without a name.
-    for nameless in ["box,no,0,0.1,1,,settled\n", "box,no,0\n"] {
-        let table =
-            SERIES.replacen("box", &format!("{nameless}box"), 1) + "cap,no,0,0,0,c,settled\ncap,yes,0,0,0,d,settled\n";
-        let report = folder.import(table, &[&flags[..], &["--skip-bad-rows"]].concat());
-        assert_eq!((&report["n_grasps"], &report["groups"]["cap"]["n_grasps"]), (&json!(2), &json!(2)), "{report}");
-        assert_eq!((&report["n_grasps_left_out"], &report["n_rows_left_out"]), (&json!(2), &json!(6)), "{report}");
-    }
-    let more = format!("{}cap,yes,0,0,0,c,settled\n", changed("cup,yes,0.5,1.25,2,a", "cup,yes,0.5,x,2,a"));
-    let report = folder.import(more, &[&flags[..], &["--skip-bad-rows"]].concat());
-    assert_eq!((&report["n_grasps"], &report["n_frames"]), (&json!(2), &json!(2)));
-    assert_eq!(report["skipped"].as_array().map(Vec::len), Some(1), "{report}");
-    assert_eq!((&report["n_grasps_left_out"], &report["n_rows_left_out"]), (&json!(1), &json!(4)), "{report}");
+    // A settled frame in a bad row is not missed as well.
+    folder.write("table.csv", changed("box,no,0,0.1,1,b", "box,no,0,x,1,b") + "box,no,0,0.1,1,b,lifting\n");
+    let arguments = folder.arguments(&flags);
+    let stderr = text(&run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), 1).stderr);
+    assert!(stderr.contains("1 of 6 rows cannot be used") && !stderr.contains("no settled frame"), "{stderr}");
 }
 
 #[test]
@@ -276,12 +259,11 @@ fn columns_that_do_not_fit_are_refused() {
     folder.refuse(TABLE, &["--class", "Kind"], 1, &["--class", "did you mean 'kind'?"]);
     folder.refuse(TABLE.replace("l_2", "l_1"), &[], 1, &["line 1", "columns 4 and 5", "'l_1'"]);
     folder.refuse(TABLE, &["--joint-columns", "l_1"], 1, &["1 columns for the 2 joints", "left, right"]);
-    folder.refuse(TABLE, &["--joint-columns", "l_1,r_1", "--joint-unit", "grad"], 2, &["grad", "rad, deg"]);
-    folder.refuse(TABLE, &["--joint-unit", "deg"], 2, &["--joint-unit", "--joints"]);
     folder.refuse(TABLE, &["--joints", "middle=1"], 1, &["middle", "left, right"]);
     folder.refuse(TABLE, &["--joints", "left=45"], 1, &["left", "45 rad"]);
-    folder.refuse(TABLE.replace(',', ";"), &[], 1, &["one column only", "--delimiter ';'"]);
-    folder.refuse(TABLE, &["--delimiter", "::"], 2, &["one ASCII character, or tab"]);
+    for separator in [";", "\t"] {
+        folder.refuse(TABLE.replace(',', separator), &[], 1, &["line 1 has no comma", "blindgrasp.from_table"]);
+    }
     folder.refuse(TABLE, &["--frames", "0"], 2, &["--frames"]);
     folder.refuse(TABLE, &["--hand", "pincers"], 1, &["pincers"]);
 }
@@ -292,7 +274,14 @@ fn files_that_are_no_tables_are_refused() {
     folder.refuse("", &[], 1, &["table.csv", "empty"]);
     folder.refuse("\u{feff}\r\n", &[], 1, &["table.csv", "empty"]);
     folder.refuse("object,kind,held,l_1,l_2,r_1\n", &[], 1, &["table.csv", "no row"]);
-    folder.refuse(b"\xff\xfeo\0b\0\n\0", &[], 1, &["table.csv", "UTF-8"]);
+    for (bytes, found) in [
+        (&b"\xff\xfeo\0b\0\n\0"[..], "UTF-8"),
+        (b"PK\x03\x04", "a compressed file"),
+        (b"PAR1", "a file of arrays"),
+        (b"MATLAB 5.0 MAT-file\0\x01\xff", "UTF-8"),
+    ] {
+        folder.refuse(bytes, &[], 1, &["table.csv", found, "blindgrasp.from_table"]);
+    }
     // A quote that is not closed makes the rest of the table one field.
     let rest = "x,".repeat(3 << 20);
     folder.refuse(format!("{TABLE}\"{rest}"), &[], 1, &["table.csv: line 4: a row of more than 4 MiB"]);
@@ -330,7 +319,7 @@ fn each_bad_row_is_named() {
         ("cup,,yes,0.5,1e300,2", "column 'l_2': expected a number from 0 to 1000000, found '1e300'"),
         (
             "cup,,yes,-0.5,1.25,2",
-            "column 'l_1': expected a number from 0 to 1000000, found '-0.5' (--clip-negative takes readings below zero for 0)",
+            "column 'l_1': expected a number from 0 to 1000000, found '-0.5'; take readings below zero for 0: read it with pandas",
         ),
         (",,yes,0.5,1.25,2", "column 'object': expected a name, found nothing"),
         ("cup,,,0.5,1.25,2", "column 'held': expected a label, found nothing"),
@@ -344,29 +333,12 @@ fn each_bad_row_is_named() {
         expected.push(format!("line {}: {problem}", 5 + 2 * idx));
     }
     let named: Vec<&str> = expected.iter().map(String::as_str).collect();
-    let summary = ["table.csv: 11 of 13 rows cannot be used", "--skip-bad-rows"];
+    let summary = ["table.csv: 11 of 13 rows cannot be used", "leave them out with pandas"];
     folder.refuse(&table, &[], 1, &[&named[..], &summary].concat());
 
-    // Noise around a tared zero is no bad row, and a larger reading is 0 where the user says so.
-    let below = TABLE.replacen("0.5", "-0.001", 1);
-    let report = folder.import(&below, &[]);
-    assert_eq!((&report["n_below_zero"], &report["skipped"]), (&json!(1), &json!([])));
-    let report = folder.import(TABLE.replacen("0.5", "-50", 1), &["--clip-negative"]);
+    // Noise around a tared zero is no bad row.
+    let report = folder.import(TABLE.replacen("0.5", "-0.001", 1), &[]);
     assert_eq!((&report["n_below_zero"], &report["n_grasps"]), (&json!(1), &json!(2)));
-
-    let report = folder.import(&table, &["--skip-bad-rows"]);
-    assert_eq!((&report["n_rows"], &report["n_grasps"]), (&json!(13), &json!(2)));
-    let skipped = report["skipped"].as_array().expect("a list");
-    let found: Vec<String> = skipped
-        .iter()
-        .map(|row| format!("line {}: {}", row["line"], row["problem"].as_str().expect("a text")))
-        .collect();
-    assert_eq!(found.len(), expected.len());
-    assert!(found.iter().zip(&expected).all(|(found, expected)| found.starts_with(expected)), "{found:?}");
-    assert_eq!(folder.exported("/truth").len(), 2);
-    let arguments = folder.arguments(&["--skip-bad-rows"]);
-    let printed = text(&run(&arguments.iter().map(String::as_str).collect::<Vec<_>>(), 0).stdout);
-    assert!(printed.contains("11 grasps with 11 rows, for 11 bad rows") && printed.contains(&expected[3]), "{printed}");
 }
 
 #[test]
@@ -375,8 +347,6 @@ fn bad_rows_are_counted_beyond_those_shown() {
     let bad: String = (0..25).map(|_| "cup,,yes,0.5,1.25,x\n").collect();
     let shown = ["25 of 27 rows", "line 4: ", "line 23: ", "and 5 more"];
     folder.refuse(format!("{TABLE}{bad}"), &[], 1, &shown);
-    // Nothing is left to record.
-    folder.refuse(format!("object,kind,held,l_1,l_2,r_1\n{bad}"), &["--skip-bad-rows"], 1, &["25 of 25 rows"]);
     let latin = [TABLE.as_bytes(), b"b\xfccher,,no,1,1,1\n"].concat();
     folder.refuse(latin, &[], 1, &["line 4: field 1: expected UTF-8"]);
     let joints = "object,held,l_1,l_2,r_1,q_1,q_2\ncup,yes,1,1,1,0.5,90\nbox,no,1,1,1,0.5,0.5\n";
@@ -390,17 +360,16 @@ fn values_in_another_unit_are_told() {
         format!("object,held,l_1,l_2,r_1,q_1,q_2\ncup,yes,1,1,{reading},{angle},0\nbox,no,1,1,1,{angle},0\n")
     };
     let columns = ["--joint-columns", "q_*"];
-    folder.refuse(table("45", "1"), &columns, 1, &["line 2: column 'q_1'", "--joint-unit deg takes degrees"]);
-    folder.refuse(table("0.5", "\"1,5\""), &columns, 1, &["'1,5'", "the decimal point as a dot"]);
+    folder.refuse(table("45", "1"), &columns, 1, &["line 2: column 'q_1'", "convert degrees to radians"]);
+    folder.refuse(table("0.5", "\"1,5\""), &columns, 1, &["'1,5'", "the decimal point is a dot", "from_table"]);
     assert_eq!(folder.import(table("0.5", "2"), &columns)["warnings"], json!([]));
-    let warned = |table: String, more: &[&str], expected: &str| {
-        let report = folder.import(table, &[&columns[..], more].concat());
+    let warned = |table: String, expected: &str| {
+        let report = folder.import(table, &columns);
         let warning = report["warnings"][0].as_str().expect("a warning");
         assert!(warning.contains(expected), "{warning}");
     };
-    warned(table("0.5", "1"), &["--joint-unit", "deg"], "leave out --joint-unit deg");
-    warned(table("0.5", "900"), &[], "give --newtons-per-unit");
-    warned(table("0.5", "1").replacen("l_1,l_2", "l_10,l_9", 1), &[], "'l_9' lies behind 'l_10'");
+    warned(table("0.5", "900"), "convert it to newtons");
+    warned(table("0.5", "1").replacen("l_1,l_2", "l_10,l_9", 1), "'l_9' lies behind 'l_10'");
     // Both ways to give the posture are named.
     folder.write("table.csv", TABLE);
     let arguments: Vec<String> = folder.arguments(&[]).into_iter().filter(|word| word != "left=0.5").collect();
@@ -422,13 +391,9 @@ fn existing_files_and_inputs_are_not_written_over() {
 #[test]
 fn units_are_those_of_the_hand() {
     let folder = Folder::new();
-    folder.refuse(TABLE, &["--unit", "counts"], 1, &["pincer", "newtons", "--newtons-per-unit"]);
-    folder.refuse(TABLE, &["--unit", "newtons", "--newtons-per-unit", "2"], 2, &["--newtons-per-unit"]);
     let in_counts = LAYOUT.replace("pads:", "cell_unit: counts\npads:");
     folder.write("pincer.yaml", in_counts);
-    folder.refuse(TABLE, &["--unit", "newtons"], 1, &["pincer", "counts"]);
-    folder.refuse(TABLE, &["--newtons-per-unit", "2"], 1, &["pincer", "counts"]);
-    assert_eq!(folder.import(TABLE, &["--unit", "counts"])["cell_unit"], "counts");
+    assert_eq!(folder.import(TABLE, &[])["cell_unit"], "counts");
     std::fs::remove_file(folder.at("out.mcap")).expect("there");
     folder.write("pincer.yaml", LAYOUT.replace("pads:", "cell_unit: grams\npads:"));
     folder.refuse(TABLE, &[], 1, &["pincer.yaml", "grams", "counts"]);

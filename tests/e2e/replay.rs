@@ -2,14 +2,11 @@
 //! the recorded edges.
 
 use std::collections::BTreeMap;
-use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use crate::common::{
-    MODEL, assert_nothing_left, blindgrasp, dataflow, json_lines, project, run, shared_folder, text, unique_name,
-};
+use crate::common::{MODEL, assert_nothing_left, dataflow, json_lines, project, run, shared_folder, text, unique_name};
 use blindgrasp_messages::{Header, Prediction, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingInfo, RecordingReader, RecordingWriter};
 use blindgrasp_stages::model::Model;
@@ -214,44 +211,6 @@ fn recorded_contacts_are_judged_as_the_frames_they_came_from() {
 }
 
 #[test]
-fn a_script_steps_through_a_recording() {
-    let own = own();
-    let step = |input: &str| {
-        let name = unique_name();
-        let mut child = blindgrasp()
-            .args(["replay", &own.recording, "--dataflow", &own.flow, "--name", &name, "--step", "--json"])
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .expect("started");
-        child.stdin.take().expect("piped").write_all(input.as_bytes()).expect("written");
-        let output = child.wait_with_output().expect("waited");
-        assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
-        assert_nothing_left(&name);
-        json_lines(&output.stdout)
-    };
-    let of = |lines: &[Value], topic: &str| lines.iter().filter(|line| line["topic"] == topic).count();
-    let expected = topics(&own.recording);
-
-    let lines = step("\n\n\nq\n");
-    for topic in ["/tactile", "/contacts", "/feature", "/prediction"] {
-        assert_eq!(of(&lines, topic), 3, "{topic}");
-    }
-    // To the end of the first grasp, which is decided then, and one frame on.
-    let lines = step("g\n\n");
-    let frames = lines.iter().filter(|line| line["topic"] == "/tactile");
-    let grasp_ids: Vec<u64> = frames.map(|line| line["message"]["grasp_id"].as_u64().expect("an id")).collect();
-    let (last, first) = grasp_ids.split_last().expect("frames");
-    assert!(first.len() > 3 && first.iter().all(|grasp_id| grasp_id != last), "{grasp_ids:?}");
-    assert!(lines.iter().any(|line| line["grasp_id"] == grasp_ids[0] && line.get("action").is_some()));
-    // On to the end.
-    let lines = step("\nc\n");
-    assert_eq!(of(&lines, "/prediction"), expected["/prediction"].len());
-    assert_eq!(lines.last().expect("a summary")["summary"]["end"], "finished");
-}
-
-#[test]
 fn selections_that_do_not_fit_are_refused_before_the_start() {
     let own = own();
     let refused = |arguments: &[&str], expected: &str| {
@@ -302,9 +261,9 @@ fn a_large_recording_begins_at_once() {
         (bits >> 11) as f64 / (1_u64 << 53) as f64
     };
     for seq in 0..9_000 {
-        let header = Header { seq, stamp_nanos: seq, hand_id: info.hand_id, ..Header::default() };
+        let header = Header { seq, stamp_nanos: seq * 20_000_000, hand_id: info.hand_id, ..Header::default() };
         let cells_newtons = (0..1_024).map(|_| number()).collect();
-        let message = TactileFrame { cells_newtons, ..TactileFrame::default() };
+        let message = TactileFrame { grasp_id: seq / 100, cells_newtons, ..TactileFrame::default() };
         writer.write("/tactile", &Stamped { header, message }).expect("written");
     }
     writer.finish().expect("finished");
@@ -314,19 +273,10 @@ fn a_large_recording_begins_at_once() {
     let at = bytes.len() / 10 * 9;
     bytes[at] ^= 1;
     std::fs::write(&big, bytes).expect("written");
-    let name = unique_name();
-    let mut child = blindgrasp()
-        .args(["replay", &big, "--dataflow", &own.flow, "--name", &name, "--step", "--json"])
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .expect("started");
-    child.stdin.take().expect("piped").write_all(b"\n\nq\n").expect("written");
-    let output = child.wait_with_output().expect("waited");
-    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
-    let lines = json_lines(&output.stdout);
-    assert_eq!(lines.iter().filter(|line| line["topic"] == "/contacts").count(), 2);
+    let found = own.path("found.mcap");
+    let (name, part) = (unique_name(), ["--to", "4", "--rate", "max", "--record", &found]);
+    run(&[&["replay", &big, "--dataflow", &own.flow, "--name", &name], &part[..]].concat(), 0);
+    assert_eq!(topics(&found)["/contacts"].len(), 200);
     let output = run(&["test", &big, "--dataflow", &own.flow, "--json"], 1);
     let report = report(&output);
     assert!(check_text(&report, "error").contains("cut off or damaged after"), "{report}");

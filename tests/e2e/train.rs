@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::Output;
 
-use crate::common::{MODEL, RECORDING, blindgrasp, run, text};
+use crate::common::{MODEL, RECORDING, blindgrasp, paper_model, run, text};
 use crate::import::pincer;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -263,4 +263,18 @@ fn a_look_that_cannot_keep_the_promise_never_lifts() {
     let judged = run(&["evaluate", &model, &new, "--hand", &hand, "--json"], 0);
     let score = &serde_json::from_slice::<Value>(&judged.stdout).expect("JSON")["score"];
     assert_eq!((&score["n_lift"], &score["n_grasps"]), (&json!(0), &json!(2000)), "{score}");
+}
+
+#[test]
+fn an_svm_is_written_for_libsvm_and_trees_are_not() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("svm.model");
+    let out = out.to_str().expect("UTF-8");
+    let said = text(&run(&["model", "export", paper_model().to_str().expect("UTF-8"), "--out", out], 0).stdout);
+    let file = std::fs::read_to_string(out).expect("written");
+    let (header, vectors) = file.split_once("SV\n").expect("support vectors");
+    assert!(header.starts_with("svm_type c_svc\nkernel_type rbf\n") && header.contains("\nprobA -"), "{header}");
+    assert!(said.contains(&format!(": {} support vectors", vectors.lines().count())), "{said}");
+    let refused = text(&run(&["model", "export", MODEL, "--overwrite", "--out", out], 1).stderr);
+    assert!(refused.contains("has no SVM") && refused.contains("--recipe paper"), "{refused}");
 }

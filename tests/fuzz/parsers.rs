@@ -5,7 +5,6 @@ use std::path::Path;
 
 use blindgrasp_graph::control::Request;
 use blindgrasp_graph::dataflow;
-use blindgrasp_learning::learners::libsvm_format::parse_libsvm;
 use blindgrasp_mesh::read::read_mesh;
 use blindgrasp_mesh::{Mesh, write_off};
 use blindgrasp_simulator::case_file::parse_cases;
@@ -158,10 +157,6 @@ fn models() {
     // The checksum refuses most damage.
     let original = text(&project("recordings/paper-recipe.json"));
     check(300, original.as_bytes(), |bytes| Model::parse(&text(bytes)).is_ok());
-    let svm =
-        b"svm_type c_svc\nkernel_type rbf\ngamma 0.5\nnr_class 2\ntotal_sv 2\nrho 0.1\nlabel 1 -1\nnr_sv 1 1\nSV\n\
-                1 1:0.5 2:1\n-1 1:0.25 3:2\n";
-    check(20_000, svm, |bytes| parse_libsvm(&text(bytes), 3).is_ok());
 }
 
 #[test]

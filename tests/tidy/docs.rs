@@ -53,7 +53,9 @@ fn anchors_and_links_are_found_as_github_does() {
 fn pages() -> Vec<PathBuf> {
     let root = project();
     let mut pages: Vec<PathBuf> =
-        ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "benches/benchmarks.md"].map(|name| root.join(name)).into();
+        ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "benches/archive.md", "benches/benchmarks.md"]
+            .map(|name| root.join(name))
+            .into();
     pages.extend(files_below(&root.join("docs"), "md"));
     let of_folders = ["hands", "recordings", "examples", "packaging"].map(|folder| root.join(folder).join("README.md"));
     pages.extend(of_folders.into_iter().filter(|page| page.exists()));

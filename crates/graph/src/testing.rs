@@ -2,10 +2,14 @@
 
 use std::io::{BufRead, BufReader, Write};
 use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
 
 use blindgrasp_messages::{Action, Reason};
 use blindgrasp_operator::control_socket::ControlSocket;
+use blindgrasp_operator::wiring::EdgePolicy;
 
+use crate::client::activity::{Look, RUN};
+use crate::client::usage::ProcessUsage;
 use crate::control::{
     DecidedGrasp, DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request,
 };
@@ -92,4 +96,46 @@ pub fn made_status(graph: &str) -> GraphStatus {
         link: None,
         ssh_hosts: std::collections::BTreeMap::new(),
     }
+}
+
+/// Two looks at a graph, two seconds apart.
+pub fn made_looks() -> (Look, Look) {
+    let at = Instant::now();
+    let mut status = made_status("gate");
+    status.nodes[0].pid = Some(4243);
+    let used = |cpu_secs| ProcessUsage { cpu_secs, resident_bytes: 3 << 20 };
+    let before = Look {
+        status: status.clone(),
+        usage: [(4243, used(1.0)), (4242, used(5.0))].into(),
+        at,
+        load_average: Some(0.5),
+    };
+    status.uptime_secs += 2.0;
+    let edge = &mut status.edges[0];
+    (edge.sent, edge.received, edge.missing, edge.late) = (3000, 2988, 13, 8);
+    edge.ages = serde_json::from_str("[[102400,900],[204800,1980],[1024000,108]]").expect("ages");
+    status.edges.push(EdgeStatus {
+        from: "classifier/prediction".into(),
+        to: RUN.into(),
+        policy: EdgePolicy::Lossless,
+        dropped: 0,
+        missing: 0,
+        ..status.edges[0].clone()
+    });
+    status.decisions.n_hold += 1;
+    let held = DecidedGrasp {
+        action: Action::Hold,
+        reason: Reason::Unstable,
+        grasp_id: 100,
+        decided_nanos: 7,
+        ..status.decisions.latest[0].clone()
+    };
+    status.decisions.latest.push_back(held);
+    let now = Look {
+        status,
+        usage: [(4243, used(1.5)), (4242, used(5.02))].into(),
+        at: at + Duration::from_secs(2),
+        load_average: Some(0.75),
+    };
+    (before, now)
 }

@@ -7,6 +7,7 @@ use serde::Deserialize;
 
 use blindgrasp_messages::{GraspTruth, Phase, Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingError, RecordingReader};
+use blindgrasp_simulator::simulator::SimulationReport;
 use blindgrasp_stages::OtherHand;
 use blindgrasp_stages::hand::{Hand, HandError};
 use blindgrasp_stages::label::Label;
@@ -84,6 +85,22 @@ pub fn label_of(path: &Path, reader: &RecordingReader) -> Result<Option<Label>, 
     match serde_json::from_str::<Report>(report) {
         Ok(report) => Ok(Some(report.label)),
         Err(error) => Err(unknown(&format!("the report of its simulation has {error}"))),
+    }
+}
+
+/// The report of the simulation that made a recording; `None` if it was not a simulation.
+///
+/// # Errors
+/// The report is of another version, or damaged.
+pub fn report_in(path: &Path, reader: &RecordingReader) -> Result<Option<SimulationReport>, DatasetError> {
+    let Some(report) = reader.metadata(REPORT_METADATA).and_then(|metadata| metadata.get("report")) else {
+        return Ok(None);
+    };
+    match serde_json::from_str(report) {
+        Ok(report) => Ok(Some(report)),
+        Err(error) => {
+            Err(DatasetError::Unusable { path: path.into(), message: format!("its simulation's report: {error}") })
+        }
     }
 }
 

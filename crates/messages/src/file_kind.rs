@@ -95,10 +95,12 @@ impl FileKind {
             }
             FileKind::Picture => "a picture or a PDF",
             FileKind::Archive => {
-                "a compressed file (.xlsx, .npz and .pt are such files as well): unpack it, or write its readings to a table (CSV) for \
-                 blindgrasp import"
+                "a compressed file (.xlsx, .npz and .pt are such files as well): unpack it, or read it in Python and give the table to \
+                 blindgrasp.from_table (docs/python.md)"
             }
-            FileKind::Array => "a file of arrays: write the readings to a table (CSV) for blindgrasp import",
+            FileKind::Array => {
+                "a file of arrays: read it in Python and give the table to blindgrasp.from_table (docs/python.md)"
+            }
             FileKind::Pickle => "a pickle of Python: docs/operators.md shows how such a model decides in a graph",
         }
     }

@@ -7,6 +7,8 @@ use std::path::{Path, PathBuf};
 
 /// The search for files beside a missing one ends after so many.
 const MAX_NEIGHBOURS: usize = 10_000;
+/// The flag of Linux by which the opening of a pipe does not wait for its other end.
+const O_NONBLOCK: i32 = 0o4000;
 /// Most names of files that an error shows.
 const MAX_SHOWN_NEIGHBOURS: usize = 5;
 
@@ -35,7 +37,11 @@ pub fn open_regular(path: &Path) -> std::io::Result<File> {
         Err(error) => return Err(error),
     };
     if kind.is_file() {
-        let mut file = File::open(path)?;
+        // Another process may have put a pipe in its place since.
+        let mut file = File::options().read(true).custom_flags(O_NONBLOCK).open(path)?;
+        if !file.metadata()?.is_file() {
+            return Err(std::io::Error::new(ErrorKind::InvalidInput, "it has changed, expected a regular file"));
+        }
         refuse_git_lfs_pointer(&mut file)?;
         return Ok(file);
     }

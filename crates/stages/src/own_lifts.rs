@@ -7,7 +7,7 @@
 //! * Its threshold is chosen again for the price of a drop that the model was trained for ([`threshold`]): where too many lifts
 //!   drop, only surer grasps are lifted, if that is worth the attempts.
 //!
-//! Trees that learn from the same outcomes were tried and were worse with up to 600 of them (docs/archive.md).
+//! Trees that learn from the same outcomes were tried and were worse with up to 600 of them (benches/archive.md).
 //!
 //! Pure: no clock, no input or output. [`OwnLifts`] is the state; the classifier of a graph and `blindgrasp model adapt` learn
 //! with the same functions.
@@ -56,7 +56,7 @@ pub struct Prior {
 }
 
 /// The prior for one robot. It was chosen by the log loss on lifts of training objects and on one robot in MuJoCo
-/// (docs/archive.md).
+/// (benches/archive.md).
 pub const OF_A_ROBOT: Prior = Prior { slope_deviation: 0.1, offset_deviation: 0.5 };
 
 /// The prior for a robot of whose grasps many are unlike those of the training: the model's probabilities say little of them.

@@ -228,7 +228,7 @@ fn lifting_verdict(part: f64) -> Verdict {
 }
 
 /// A hand that feels less than this part of the load should tighten, and below the other set the object down: chosen on 2,500 lifts of
-/// training objects in rapier and MuJoCo (docs/archive.md).
+/// training objects in rapier and MuJoCo (benches/archive.md).
 const TIGHTEN_BELOW: f64 = 0.85;
 const SET_DOWN_BELOW: f64 = 0.5;
 

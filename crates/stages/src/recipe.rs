@@ -48,7 +48,7 @@ impl Recipe {
     /// The names of the recipes that come with the program, the default one first.
     pub const NAMES: [&str; 7] = ["boosted", "wrist", "blend", "paper", "raw", "posture", "joints"];
 
-    /// A recipe by its name. The parameters are the choice of `train --grid` on 12,000 simulated grasps of the built-in
+    /// A recipe by its name. The parameters are the choice of a grid search on 12,000 simulated grasps of the built-in
     /// training objects (docs/learning.md); held-out objects were not used. Those of `blend` were not searched.
     pub fn named(name: &str) -> Option<Recipe> {
         if name == "boosted" {
@@ -91,14 +91,14 @@ impl Recipe {
 impl Default for Recipe {
     /// The paper's histogram, the load of each pad as a whole and the joint angles, and boosted trees. The trees grow
     /// more slowly and with a higher penalty than by default, because the histogram nearly doubles the columns that a
-    /// split may choose from by chance (docs/learning.md).
+    /// split may choose from by chance.
     fn default() -> Self {
         Recipe {
             name: "boosted".into(),
             blocks: vec![Block::Histogram, Block::Pads, Block::Joints, Block::Breakaways],
             scaled: false,
             day_baseline: false,
-            // By cross-validation over folds of training objects: 64 words were 0.4 points worse (docs/learning.md).
+            // By cross-validation over folds of training objects: 64 words were 0.4 points worse.
             n_words: 8,
             sigma_m: 0.03645,
             learner: Learner::Boosting(BoostingParams {

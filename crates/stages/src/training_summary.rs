@@ -56,9 +56,6 @@ pub struct TrainingSummary {
     pub seed: u64,
     /// The version of the program that trained.
     pub version: String,
-    /// The grid search that chose two values of the recipe, if there was one.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub grid: Option<GridSummary>,
     /// The grasps that the model has learned from, so that an evaluation can leave them out. Models of earlier versions do
     /// not have it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -204,24 +201,4 @@ impl fmt::Display for Promise {
             write!(formatter, "; a trial has at most {n} {attempts}")
         })
     }
-}
-
-/// The result of the grid search that a model keeps.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct GridSummary {
-    pub axes: [String; 2],
-    pub cells: Vec<CellSummary>,
-}
-
-/// The score of a pair of values.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct CellSummary {
-    /// The values, in the order of the axes.
-    pub values: [f64; 2],
-    /// Share of all examples that are called rightly at decision value 0.
-    pub accuracy: f64,
-    /// Unstable examples called stable, as a share of all examples.
-    pub false_positive_share: f64,
 }

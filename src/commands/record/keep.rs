@@ -9,7 +9,6 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use serde_json::{Value, json};
 
-use super::flight::{Excerpt, FlightRecorder, SharedRecorder};
 use super::{Arguments, Outcome, POLL, attach, observed, print_line, stop_signal};
 use blindgrasp_graph::client::observer::Observer;
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
@@ -18,6 +17,7 @@ use blindgrasp_graph::recorded_graph::{Beginning, Ending, RecordedGraph};
 use blindgrasp_messages::{Recorded as _, TactileFrame};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_session::flight::{Excerpt, FlightRecorder, SharedRecorder};
 use blindgrasp_session::of_graph::of_graph;
 
 /// The reason in the names of files that somebody asked for.
@@ -25,7 +25,7 @@ const ASKED: &str = "asked";
 
 /// `record --write-kept`
 pub(super) fn ask(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let mut connection = Connection::open(&pick_graph(arguments.graph.name())?)?;
+    let mut connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
     let n_flight_recorders = match connection.ask(&Request::Keep, ANSWER_LIMIT)? {
         Reply::Asked { n_flight_recorders } => n_flight_recorders,
         other => return Err(connection.unexpected(&other).into()),
@@ -51,7 +51,7 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
     let asked = Arc::new(AtomicBool::new(false));
     signal_hook::flag::register(signal_hook::consts::SIGUSR1, Arc::clone(&asked))
         .context("cannot listen for SIGUSR1")?;
-    let mut connection = Connection::open(&pick_graph(arguments.graph.name())?)?;
+    let mut connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
     let Attachment { domain, edges, graph, .. } = attach(&mut connection, &[], out, true)?;
     if n_sources_of_frames(&graph) > 1 {
         bail!(

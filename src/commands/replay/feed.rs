@@ -33,7 +33,6 @@ pub(in crate::commands) struct Feed<'a> {
     /// The player's param: a number, or `max`.
     pub(in crate::commands) rate: Value,
     pub(in crate::commands) repeat: Value,
-    pub(in crate::commands) steps: Value,
 }
 
 /// A graph that is fed by a recording.
@@ -93,7 +92,7 @@ impl Feed<'_> {
             ("recording", Some(json!(recording.to_str().context("the recording's path is not UTF-8")?))),
             ("rate", Some(self.rate.clone())),
             ("repeat", Some(self.repeat.clone())),
-            ("steps", Some(self.steps.clone())),
+            ("steps", Some(json!("unlimited"))),
             ("from_s", secs(from_nanos)),
             ("to_s", secs(to_nanos)),
             ("grasps", grasps.as_ref().map(|grasps| json!(grasps.to_string()))),

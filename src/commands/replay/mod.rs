@@ -1,7 +1,6 @@
 //! `blindgrasp replay`
 
 mod feed;
-mod step;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -26,7 +25,7 @@ use blindgrasp_session::run::Session;
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                         blindgrasp replay recordings/held-out.mcap --rate max\n  \
-                        blindgrasp replay run.mcap --grasps 3,7-9 --step\n  \
+                        blindgrasp replay run.mcap --grasps 3,7-9\n  \
                         blindgrasp replay run.mcap --replace contacts --set classifier.model=new.json --record new.mcap\n\n\
                         The same recording and graph give the same bytes on every edge, at any rate: stages use the \
                         recording's clock.")]
@@ -52,11 +51,8 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "IDS")]
     grasps: Option<GraspIds>,
     /// Repeat the recording until Ctrl-C; numbers, times and grasps continue.
-    #[arg(long = "loop", conflicts_with = "step")]
+    #[arg(long = "loop")]
     is_loop: bool,
-    /// Play frame by frame and print every edge: Enter for the next frame, g to the end of the grasp, c to go on, q to stop.
-    #[arg(long)]
-    step: bool,
     /// The node that the recording replaces; only the nodes behind it run. Default: the source.
     #[arg(long, value_name = "NODE")]
     replace: Option<String>,
@@ -68,7 +64,7 @@ pub(super) struct Arguments {
     /// Give a param another value than the file does; a path is relative to the current folder. Can be repeated.
     #[arg(long = "set", value_name = "[NODE.]PARAM=VALUE", value_parser = Override::parse)]
     overrides: Vec<Override>,
-    /// Print JSON: one line per decision, and a last one with "summary"; with --step, one line per sample as well.
+    /// Print JSON: one line per decision, and a last one with "summary".
     #[arg(long)]
     json: bool,
 }
@@ -92,22 +88,15 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         selection: &selection,
         rate: arguments.rate.clone(),
         repeat: if arguments.is_loop { json!("forever") } else { json!(1.0) },
-        steps: if arguments.step { json!(0.0) } else { json!("unlimited") },
     };
     let fed = feed.into_graph(&graph, &arguments.overrides)?;
     let n_stops = stop_requests()?;
-    let tap = if arguments.step {
-        Some(step::start(&arguments.recording, &selection, &fed, name, arguments.json, &n_stops)?)
-    } else {
-        None
-    };
     let session = Session {
         launch: LaunchOptions { startup_limit: Duration::from_secs(60), ..LaunchOptions::default() },
         clock: Clock::Recording,
         record: arguments.record.clone(),
         record_options: arguments.recording_options.options(),
         json: arguments.json,
-        tap,
         ..Session::default()
     };
     Ok(Outcome::of(session.run(&fed.graph, name, &n_stops)?.is_lossy))

@@ -164,7 +164,6 @@ impl Runner<'_> {
             selection: &Selection::default(),
             rate: json!("max"),
             repeat: json!(1.0),
-            steps: json!("unlimited"),
         };
         let fed = feed.into_graph(graph, overrides)?;
         let name = format!("test-{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));

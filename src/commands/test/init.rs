@@ -8,8 +8,7 @@ use serde_json::json;
 
 use super::case::Runner;
 use super::{Outcome, project_recordings, settings};
-use crate::commands::model::write_at_once;
-use crate::commands::{print_line, print_text};
+use crate::commands::{print_line, print_text, write_out};
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_replay::checks::{Decisions, describe_changes};
 use blindgrasp_replay::expectations::{Expectations, path_of};
@@ -48,7 +47,7 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
         let remarks: BTreeMap<u64, String> =
             decisions.dropped().map(|grasp_id| (grasp_id, "its lift dropped the object".into())).collect();
         let path = path_of(recording);
-        write_at_once(&path, &(HEAD.to_string() + &expected.to_yaml(&remarks)))?;
+        write_out(&path, &(HEAD.to_string() + &expected.to_yaml(&remarks)))?;
         let changed = decisions.changed_since(&Decisions::read(recording)?);
         let fails = decisions.check(&expected).iter().any(|check| !check.has_passed);
         if !is_json {

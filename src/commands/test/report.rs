@@ -10,8 +10,7 @@ use serde_json::json;
 
 use super::case::Case;
 use super::scratch::file_name;
-use crate::commands::model::write_at_once;
-use crate::commands::{print_line, print_text};
+use crate::commands::{print_line, print_text, write_out};
 use blindgrasp_replay::checks::Check;
 
 pub(super) fn print_case(case: &Case) -> anyhow::Result<()> {
@@ -82,7 +81,7 @@ pub(super) fn write_junit(path: &Path, cases: &[Case]) -> anyhow::Result<()> {
         .write_inner_content(|writer| cases.iter().try_for_each(|case| write_suite(writer, case)))
         .context("the JUnit report cannot be made")?;
     xml.push(b'\n');
-    write_at_once(path, &String::from_utf8(xml)?)
+    write_out(path, &String::from_utf8(xml)?)
 }
 
 fn write_suite<W: Write>(writer: &mut Writer<W>, case: &Case) -> std::io::Result<()> {

@@ -1,7 +1,5 @@
 //! `blindgrasp top`
 
-pub(super) mod poller;
-pub(super) mod sample;
 pub(super) mod screen;
 mod table;
 mod view;
@@ -16,11 +14,11 @@ use clap::Args;
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event};
 
-use self::poller::Poller;
-use self::sample::{Look, Window, measure};
 use self::view::{Condition, Then, View};
 use super::elsewhere::MachineArgument;
-use super::{GraphArgument, Outcome, print_line, secs_in};
+use super::{Outcome, completions, print_line, secs_in};
+use blindgrasp_graph::client::activity::{Look, Window, measure};
+use blindgrasp_graph::client::poller::Poller;
 use blindgrasp_graph::client::{ClientError, pick_graph, running_graphs};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 
@@ -30,8 +28,9 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
                         Keys: ? shows them, q quits. For scripts: --json, or blindgrasp ps.\n\
                         Exit code 1 if no graph runs, or it does not answer.")]
 pub(super) struct Arguments {
-    #[command(flatten)]
-    graph: GraphArgument,
+    /// Graph [default: the only one running]
+    #[arg(add = completions::graphs())]
+    graph: Option<String>,
     /// Update every so many seconds
     #[arg(long, value_name = "TIME", default_value = "1", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
     interval: f64,
@@ -61,7 +60,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(destination) = arguments.machine.destination()? {
         return if arguments.json { destination.run() } else { destination.run_on_terminal() };
     }
-    let graph = pick_graph(arguments.graph.name())?;
+    let graph = pick_graph(arguments.graph.as_deref())?;
     let (poller, first) = Poller::connect(&graph)?;
     let interval = Duration::from_secs_f64(arguments.interval);
     if arguments.json {

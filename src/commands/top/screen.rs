@@ -8,11 +8,13 @@ use ratatui::style::{Color, Modifier, Style};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Clear, Paragraph, RenderDirection, Sparkline};
 
-use super::sample::{Measured, MeasuredEdge, MeasuredNode, Quantiles, RUN};
 use super::table::{Cell, Column, table};
 use super::view::{Condition, Table, View};
 use crate::commands::promises::shown_counts;
-use crate::commands::ps;
+use blindgrasp_graph::client::activity::{Measured, MeasuredEdge, MeasuredNode, Quantiles, RUN};
+use blindgrasp_graph::client::words::{
+    clock_offset, node_state_word, peer_state_word, short_rate, short_time, state_word, warnings,
+};
 use blindgrasp_graph::control::{DecidedGrasp, GraphState, NodeState};
 use blindgrasp_graph::log::printable;
 use blindgrasp_messages::Action;
@@ -120,8 +122,8 @@ fn header(view: &View, measured: &Measured) -> Vec<Line<'static>> {
     let state = match (&view.condition, measured.state) {
         (Condition::Ended { .. }, _) => Span::styled("ended", LOUD),
         (Condition::Silent { .. }, _) => Span::styled("NOT ANSWERING", LOUD),
-        (_, state @ GraphState::Degraded) => Span::styled(ps::state_word(state), LOUD),
-        (_, state) => Span::styled(ps::state_word(state), STRONG),
+        (_, state @ GraphState::Degraded) => Span::styled(state_word(state), LOUD),
+        (_, state) => Span::styled(state_word(state), STRONG),
     };
     let cpu = measured.cpu_percent.map_or("-".into(), |percent| format!("{percent:.1} %"));
     let load = measured.load_average.map_or("-".into(), |load| format!("{load:.2}"));
@@ -150,7 +152,7 @@ fn header(view: &View, measured: &Measured) -> Vec<Line<'static>> {
             LOUD,
         ),
         (_, Some(notice)) => Line::styled(printable(notice), STRONG),
-        _ => match ps::warnings(&view.now.status).into_iter().next() {
+        _ => match warnings(&view.now.status).into_iter().next() {
             Some(warning) => Line::styled(printable(&warning), LOUD),
             None => Line::styled(printable(&view.now.status.file.display().to_string()), QUIET),
         },
@@ -166,9 +168,9 @@ fn link_line(link: &LinkStatus) -> Line<'static> {
     for peer in &link.peers {
         let style = if peer.state == PeerState::Up { Style::new() } else { LOUD };
         spans.push(format!("  {} ", printable(&peer.machine)).into());
-        spans.push(Span::styled(ps::peer_state_word(peer.state), style));
+        spans.push(Span::styled(peer_state_word(peer.state), style));
         if let (PeerState::Up, Some(round_trip)) = (peer.state, peer.round_trip_nanos) {
-            spans.push(format!(" clock {} round trip {}", ps::clock_offset(peer), short_time(round_trip)).into());
+            spans.push(format!(" clock {} round trip {}", clock_offset(peer), short_time(round_trip)).into());
         }
     }
     Line::from(spans)
@@ -203,7 +205,7 @@ fn node_row(node: &MeasuredNode) -> Vec<Cell> {
     let counts = shown_counts(&node.counts);
     vec![
         Cell::new(printable(&node.node)),
-        Cell::styled(ps::node_state_word(node.state), state_style),
+        Cell::styled(node_state_word(node.state), state_style),
         // A standby is there for a moment only: a second number would make the column jump.
         Cell::new(if node.standby_pid.is_some() { format!("{pid}+") } else { pid }),
         Cell::new(node.cpu_percent.map_or("-".into(), |percent| format!("{percent:.1}"))),
@@ -418,33 +420,11 @@ fn loud_if(is_loud: bool) -> Style {
     if is_loud { LOUD } else { Style::new() }
 }
 
-/// A duration in at most six letters.
-pub(in crate::commands) fn short_time(nanos: u64) -> String {
-    let micros = nanos as f64 / 1e3;
-    match micros {
-        0.0..9.95 => format!("{micros:.1}µs"),
-        9.95..999.5 => format!("{micros:.0}µs"),
-        999.5..9_950.0 => format!("{:.1}ms", micros / 1e3),
-        9_950.0..999_500.0 => format!("{:.0}ms", micros / 1e3),
-        999_500.0..9_950_000.0 => format!("{:.1}s", micros / 1e6),
-        9_950_000.0..1e9 => format!("{:.0}s", micros / 1e6),
-        _ => format!("{:.0}min", micros / 6e7),
-    }
-}
-
 fn short_count(count: u64) -> String {
     match count {
         0..100_000 => count.to_string(),
         100_000..10_000_000 => format!("{}k", count / 1000),
         _ => format!("{}M", count / 1_000_000),
-    }
-}
-
-pub(in crate::commands) fn short_rate(rate_hz: f64) -> String {
-    match rate_hz {
-        0.0 => "0".into(),
-        0.0..99.95 => format!("{rate_hz:.1}"),
-        _ => format!("{rate_hz:.0}"),
     }
 }
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
-use super::sample::{Look, Measured, Window, measure};
+use blindgrasp_graph::client::activity::{Look, Measured, Window, measure};
 
 /// Between two looks, for `+` and `-`.
 const INTERVALS_SECS: [f64; 9] = [0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 60.0];
@@ -198,8 +198,8 @@ impl View {
 
 #[cfg(test)]
 mod tests {
-    use super::super::sample::tests::made_looks;
     use super::*;
+    use blindgrasp_graph::testing::made_looks;
 
     fn view() -> View {
         let (before, now) = made_looks();

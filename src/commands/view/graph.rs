@@ -10,12 +10,12 @@ use anyhow::Context;
 use serde::Serialize;
 
 use super::super::promises::shown_counts;
-use super::super::top::poller::Poller;
-use super::super::top::sample::{Measured, MeasuredEdge, MeasuredNode, RUN, Window, measure};
-use super::super::top::screen::{short_rate, short_time};
-use super::super::{Outcome, check_output, print_text, ps, write_out};
+use super::super::{Outcome, check_output, print_text, write_out};
 use super::{Format, GraphArguments};
+use blindgrasp_graph::client::activity::{Measured, MeasuredEdge, MeasuredNode, RUN, Window, measure};
 use blindgrasp_graph::client::pick_graph;
+use blindgrasp_graph::client::poller::Poller;
+use blindgrasp_graph::client::words::{node_state_word, short_rate, short_time};
 use blindgrasp_graph::control::NodeState;
 use blindgrasp_graph::dataflow::{self, EdgeOptions, Graph, Machines, Override, Restart, RestartPolicy, Scope};
 use blindgrasp_graph::log::printable;
@@ -291,7 +291,7 @@ fn drawn_node(node: &PictureNode, group: Option<usize>) -> DrawnNode {
     }
     let mut warnings = Vec::new();
     if let Some(running) = &node.running {
-        let word = ps::node_state_word(running.state).to_string();
+        let word = node_state_word(running.state).to_string();
         match running.state {
             NodeState::Failed | NodeState::Restarting => warnings.push(word),
             _ => notes.push(word),

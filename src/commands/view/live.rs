@@ -8,7 +8,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
+use blindgrasp_graph::client::activity::{Look, Window, measure};
 use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_observe};
+use blindgrasp_graph::client::poller::Poller;
+use blindgrasp_graph::client::words::warnings;
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection};
 use blindgrasp_graph::control::{Attachment, Reply, Request};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
@@ -23,9 +26,6 @@ use blindgrasp_viewer::{Abilities, Viewer};
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::super::ps::warnings;
-use super::super::top::poller::Poller;
-use super::super::top::sample::{Look, Window, measure};
 use super::super::{Outcome, print_line, stop_signal};
 use super::Rights;
 use super::control::control_of;

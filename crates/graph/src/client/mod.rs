@@ -1,9 +1,12 @@
 //! The clients' end of [`control`](crate::control): finds running graphs and sends requests to them.
 
+pub mod activity;
 pub mod metrics;
 pub mod observer;
+pub mod poller;
 pub mod shadow_comparison;
 pub mod usage;
+pub mod words;
 
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
@@ -35,7 +38,7 @@ pub enum ClientError {
     NoneRunning,
     #[error("no graph '{graph}' is running; {}", listed(running))]
     NotRunning { graph: String, running: Vec<String> },
-    #[error("several graphs are running: {}; name one, as with -g {}", running.join(", "), running[0])]
+    #[error("several graphs are running: {}; name one of them", running.join(", "))]
     SeveralRunning { running: Vec<String> },
     #[error("graph '{graph}' is run by another user ({uid})")]
     OtherUser { graph: String, uid: u32 },

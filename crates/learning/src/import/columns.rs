@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use super::{Day, ImportOptions, Joints};
+use super::{BY_PANDAS, Day, ImportOptions, Joints};
 use blindgrasp_stages::hand::Hand;
 
 /// How many names an error lists.
@@ -43,7 +43,7 @@ impl Columns {
         let cells = by_pattern.concat();
         let joints = match &options.joints {
             Joints::Fixed(_) => Vec::new(),
-            Joints::Columns { patterns, .. } => {
+            Joints::Columns(patterns) => {
                 let joints = matches(header, patterns, "--joint-columns")?.concat();
                 check_joints(hand, header, &joints)?;
                 joints
@@ -180,10 +180,9 @@ fn check_joints(hand: &Hand, header: &[String], joints: &[usize]) -> Result<(), 
 /// A hint for a name or pattern that no column matches.
 fn help(header: &[String], wanted: &str) -> String {
     if let [only] = header
-        && let Some(delimiter) = [',', ';', '\t'].into_iter().find(|delimiter| only.contains(*delimiter))
+        && only.contains([';', '\t'])
     {
-        let delimiter = if delimiter == '\t' { "tab".into() } else { format!("'{delimiter}'") };
-        return format!("line 1 has one column only, '{}': give --delimiter {delimiter}", shortened(only));
+        return format!("line 1 has no comma, only '{}': {BY_PANDAS}", shortened(only));
     }
     // Numbered columns stand for the pattern that matches them all.
     let has_star = wanted.contains('*');
@@ -284,6 +283,6 @@ mod tests {
         assert_eq!(help(&header, "f_biotac_*"), "did you mean 'ff_biotac_*'?");
         assert!(help(&["held", "c1", "c2"].map(String::from), "cell*").starts_with("the table has"));
         assert_eq!(help(&header, "pressure"), "the table has object, slipped, ff_biotac_1, ff_biotac_2");
-        assert_eq!(help(&["a;b".into()], "a"), "line 1 has one column only, 'a;b': give --delimiter ';'");
+        assert_eq!(help(&["a;b".into()], "a"), format!("line 1 has no comma, only 'a;b': {BY_PANDAS}"));
     }
 }

@@ -9,105 +9,81 @@ use blindgrasp_messages::Phase;
 /// Puts the rows of a grasp together.
 #[derive(Default)]
 pub(super) struct Grasps {
-    by_name: bool,
     /// The grasp whose rows are being read.
     open: Option<OpenGrasp>,
     /// The names of earlier grasps.
     closed: BTreeSet<String>,
-    /// Whether the row before has no name that can be read: it may be the first one of the next grasp.
-    is_after_nameless: bool,
+    /// Whether the row before is a bad one: it may be of the next grasp.
+    is_after_bad: bool,
     /// The first line of each value of the label.
     pub(super) first_lines: BTreeMap<String, u64>,
     pub(super) bad_rows: Vec<BadRow>,
-    pub(super) n_grasps_left_out: usize,
-    /// The rows of these grasps, and rows that name none.
-    pub(super) n_rows_left_out: usize,
 }
 
 struct OpenGrasp {
     name: String,
-    /// `None` in the place of one with a bad row.
-    grasp: Option<TableGrasp>,
-    n_rows: usize,
+    grasp: TableGrasp,
+    has_bad_row: bool,
 }
 
 impl Grasps {
-    /// `by_name`: whether rows name their grasp. Otherwise each row is one.
-    pub(super) fn new(by_name: bool) -> Self {
-        Grasps { by_name, ..Grasps::default() }
-    }
-
-    /// Adds a row with the name of its grasp, and returns the grasp that is complete. A row without a name that can be read may be
-    /// of the grasp before it or after it, so neither is complete.
+    /// Adds a row, with the name of its grasp if rows have one, and returns the grasp that is complete. A row without a name is a
+    /// grasp.
     ///
     /// # Errors
     /// A grasp whose rows do not follow each other.
     pub(super) fn add(
         &mut self,
-        (name, row): (Option<String>, Result<TableGrasp, BadRow>),
+        name: Option<String>,
+        row: Result<TableGrasp, BadRow>,
         line: u64,
     ) -> Result<Option<TableGrasp>, String> {
-        if let Ok(grasp) = &row {
-            self.first_lines.entry(grasp.label.clone()).or_insert(line);
+        let row = match row {
+            Ok(row) => row,
+            Err(bad) => {
+                self.add_bad(bad);
+                return Ok(None);
+            }
+        };
+        let is_after_bad = std::mem::take(&mut self.is_after_bad);
+        self.first_lines.entry(row.label.clone()).or_insert(line);
+        let Some(name) = name else { return Ok(Some(row)) };
+        if let Some(open) = &mut self.open
+            && open.name == name
+        {
+            if let Err(problem) = open.grasp.add(row) {
+                self.add_bad(BadRow { line, problem });
+            }
+            return Ok(None);
         }
-        let row = row.map_err(|bad| self.bad_rows.push(bad)).ok();
-        if !self.by_name {
-            if row.is_none() {
-                self.leave_out(1);
-            }
-            return Ok(row);
+        let complete = self.close();
+        if self.closed.contains(&name) {
+            let expected = "expected the rows of a grasp one after another; sort the table";
+            return Err(format!("line {line}: grasp '{}' again: {expected}", shortened(&name)));
         }
-        let is_after_nameless = std::mem::replace(&mut self.is_after_nameless, name.is_none());
-        match (&mut self.open, name) {
-            (Some(OpenGrasp { name: open, grasp, n_rows }), name) if name.as_ref().is_none_or(|name| name == open) => {
-                *n_rows += 1;
-                let so_far = grasp.take();
-                *grasp = match so_far.zip(row).map(|(so_far, next)| so_far.followed_by(next)) {
-                    Some(Err(problem)) => {
-                        self.bad_rows.push(BadRow { line, problem });
-                        None
-                    }
-                    joined => joined.and_then(Result::ok),
-                };
-                Ok(None)
-            }
-            (_, None) => {
-                self.n_rows_left_out += 1;
-                Ok(None)
-            }
-            (_, Some(name)) => {
-                let complete = self.close();
-                if self.closed.contains(&name) {
-                    let expected = "expected the rows of a grasp one after another; sort the table";
-                    return Err(format!("line {line}: grasp '{}' again: {expected}", shortened(&name)));
-                }
-                self.open = Some(OpenGrasp { name, grasp: if is_after_nameless { None } else { row }, n_rows: 1 });
-                Ok(complete)
-            }
+        self.open = Some(OpenGrasp { name, grasp: row, has_bad_row: is_after_bad });
+        Ok(complete)
+    }
+
+    fn add_bad(&mut self, bad: BadRow) {
+        self.bad_rows.push(bad);
+        self.is_after_bad = true;
+        if let Some(open) = &mut self.open {
+            open.has_bad_row = true;
         }
     }
 
-    /// The open grasp, if it is complete.
+    /// The open grasp.
     pub(super) fn close(&mut self) -> Option<TableGrasp> {
-        let OpenGrasp { name, grasp, n_rows } = self.open.take()?;
-        let grasp = grasp.filter(|grasp| {
-            let has_settled = grasp.readings.iter().any(|reading| reading.phase == Phase::Settled);
-            if !has_settled {
-                let problem = format!("grasp '{}' has no settled frame", shortened(&name));
-                self.bad_rows.push(BadRow { line: grasp.line, problem });
-            }
-            has_settled
-        });
-        self.closed.insert(name);
-        if grasp.is_none() {
-            self.leave_out(n_rows);
+        let OpenGrasp { name, grasp, has_bad_row } = self.open.take()?;
+        let has_settled = grasp.readings.iter().any(|reading| reading.phase == Phase::Settled);
+        // The settled frame may be in the bad row.
+        if !has_settled && !has_bad_row {
+            let problem = format!("grasp '{}' has no settled frame", shortened(&name));
+            self.bad_rows.push(BadRow { line: grasp.line, problem });
         }
-        grasp
-    }
-
-    fn leave_out(&mut self, n_rows: usize) {
-        self.n_grasps_left_out += 1;
-        self.n_rows_left_out += n_rows;
+        self.closed.insert(name);
+        Some(grasp)
     }
 }
 
@@ -133,28 +109,27 @@ pub(super) struct TableReading {
 }
 
 impl TableGrasp {
-    /// The grasp with the frames of its next row; an error if they do not fit together.
-    fn followed_by(mut self, next: TableGrasp) -> Result<TableGrasp, String> {
+    /// Adds the frame of the grasp's next row; an error if it does not fit.
+    fn add(&mut self, next: TableGrasp) -> Result<(), String> {
         let first = self.line;
         let day = |grasp: &TableGrasp| grasp.day.as_ref().map(|(name, _)| name.clone()).unwrap_or_default();
         for (what, ours, theirs) in [
             ("label", &self.label, &next.label),
             ("object", &self.object, &next.object),
             ("class", &self.class, &next.class),
-            ("day", &day(&self), &day(&next)),
+            ("day", &day(self), &day(&next)),
         ] {
             if ours != theirs {
                 let (ours, theirs) = (shortened(ours), shortened(theirs));
                 return Err(format!("{what} '{theirs}', but '{ours}' in line {first} of the same grasp"));
             }
         }
-        let phase = |grasp: &TableGrasp| grasp.readings.last().map(|reading| reading.phase);
-        if let (Some(before), Some(after)) = (phase(&self), phase(&next))
-            && after.is_before(before)
+        if let (Some(before), Some(after)) = (self.readings.last(), next.readings.last())
+            && after.phase.is_before(before.phase)
         {
-            return Err(format!("phase '{}' after '{}'", after.as_str(), before.as_str()));
+            return Err(format!("phase '{}' after '{}'", after.phase.as_str(), before.phase.as_str()));
         }
         self.readings.extend(next.readings);
-        Ok(self)
+        Ok(())
     }
 }

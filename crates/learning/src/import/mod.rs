@@ -26,7 +26,7 @@ use blindgrasp_messages::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Recorded, S
 use blindgrasp_recording::{RecordingError, RecordingInfo, RecordingWriter};
 use blindgrasp_stages::contacts::{LIMIT_TOLERANCE_RAD, MAX_CELL_NEWTONS};
 use blindgrasp_stages::day::day_number;
-use blindgrasp_stages::hand::{CellUnit, Hand, JointKind};
+use blindgrasp_stages::hand::{CellUnit, Hand};
 
 /// The first bytes of UTF-8 files by spreadsheets.
 pub(crate) const BYTE_ORDER_MARK: &[u8] = "\u{feff}".as_bytes();
@@ -38,6 +38,8 @@ const PAUSE_NANOS: u64 = 100_000_000;
 const MAX_BYTES: u64 = 1 << 30;
 /// No cell of a known sensor for hands reads so much.
 const UNLIKELY_NEWTONS: f64 = 200.0;
+/// What to do with a table that is not as the import reads it.
+pub(crate) const BY_PANDAS: &str = "read it with pandas and give it to blindgrasp.from_table (docs/python.md)";
 /// A table with more bad rows is refused without reading on, because they are kept until the end.
 const MAX_BAD_ROWS: usize = 1_000_000;
 /// The most bad rows that an error shows.
@@ -65,16 +67,9 @@ pub struct ImportOptions {
     pub grasp: Option<String>,
     /// The column of a frame's phase, if each row is a frame; without it, all frames are settled.
     pub phase: Option<String>,
-    pub delimiter: u8,
-    /// The factor from readings to the unit of the hand's cells.
-    pub scale: f64,
     /// The frames of a grasp that is one row.
     pub n_frames: u32,
     pub first_grasp_id: u64,
-    /// Takes readings below zero, of tared or signed sensors, for 0; otherwise only those within a cell's noise threshold.
-    pub clip_negative: bool,
-    /// Leaves out rows that cannot be used, instead of refusing the table.
-    pub skip_bad_rows: bool,
 }
 
 /// The source of the joint angles.
@@ -83,8 +78,8 @@ pub struct ImportOptions {
 pub enum Joints {
     /// One posture for all grasps, radians in the hand's order.
     Fixed(Vec<f64>),
-    /// Columns of the table, in the hand's order of joints.
-    Columns { patterns: Vec<String>, unit: AngleUnit },
+    /// Patterns of columns of the table, in the hand's order of joints; radians, or metres of joints that slide.
+    Columns(Vec<String>),
 }
 
 /// The source of the recording day, whose grasps have one baseline.
@@ -97,15 +92,6 @@ pub enum Day {
     Fixed(String),
     /// A column of names or dates.
     Column(String),
-}
-
-/// The unit of a table's angles.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum AngleUnit {
-    #[default]
-    Rad,
-    Deg,
 }
 
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
@@ -130,12 +116,7 @@ pub struct ImportReport {
     pub days: BTreeMap<String, DayReport>,
     /// The columns of the joints in the hand's order; empty for a fixed posture.
     pub joint_columns: Vec<String>,
-    pub skipped: Vec<BadRow>,
-    /// Grasps that have a bad row, or lie beside one that names no grasp.
-    pub n_grasps_left_out: usize,
-    /// The rows of these grasps, good and bad, and rows that name no grasp.
-    pub n_rows_left_out: usize,
-    /// Units, or an order of columns, that are probably others than the options say.
+    /// A unit of readings, or an order of columns, that is probably another than the hand's.
     pub warnings: Vec<String>,
 }
 
@@ -159,7 +140,7 @@ pub struct PadReport {
 }
 
 /// A row that cannot be used.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BadRow {
     /// Its first line in the file, from 1.
     pub line: u64,
@@ -174,7 +155,7 @@ pub enum ImportError {
     #[error("{}: {message}", path.display())]
     Table { path: PathBuf, message: String },
     #[error(
-        "{}: {} of {n_rows} rows cannot be used (mend them, or leave them out with --skip-bad-rows):{}",
+        "{}: {} of {n_rows} rows cannot be used; mend them, or leave them out with pandas and blindgrasp.from_table:{}",
         path.display(), rows.len(), listed(rows)
     )]
     Rows { path: PathBuf, n_rows: usize, rows: Vec<BadRow> },
@@ -182,11 +163,11 @@ pub enum ImportError {
     Recording(#[from] RecordingError),
 }
 
-/// Writes the grasps of a table (CSV with a header) to a recording at `out`. After an error there is no recording.
+/// Writes the grasps of a table (CSV with a header, UTF-8, comma and dot) to a recording at `out`. After an error there is no
+/// recording.
 ///
 /// # Errors
-/// The table cannot be read, or does not fit hand and options; rows cannot be used, unless they are to be left out; the
-/// recording cannot be written.
+/// The table cannot be read, or does not fit hand and options; rows cannot be used; the recording cannot be written.
 pub fn import_table(
     table: &Path,
     hand: &Hand,
@@ -200,8 +181,7 @@ pub fn import_table(
         return Err(refused(format!("expected a table (CSV), found {}", kind.description())));
     }
     let text = bytes.strip_prefix(BYTE_ORDER_MARK).unwrap_or(&bytes);
-    let mut reader =
-        csv::ReaderBuilder::new().delimiter(options.delimiter).trim(csv::Trim::All).from_reader(RowLimit::new(text));
+    let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(RowLimit::new(text));
     let header = match reader.headers() {
         Ok(header) => header.iter().map(in_one_line).collect::<Vec<String>>(),
         Err(error) => return Err(table_error(table, error, 1)),
@@ -216,24 +196,27 @@ pub fn import_table(
     let mut report = row_reader.empty_report();
     let mut writer = GraspWriter::create(table, hand, options, out)?;
     let mut lines = Lines::new(text);
-    let mut grasps = Grasps::new(columns.grasp.is_some());
-    let mut extremes = Extremes::default();
+    let mut grasps = Grasps::default();
+    let mut largest_reading = 0.0_f64;
     let mut records = reader.records();
     loop {
         records.reader_mut().get_mut().begin_row();
         let line = lines.line_of(records.reader().position().byte());
         let Some(record) = records.next() else { break };
         report.n_rows += 1;
+        let mut name = None;
         let row = match record {
             Ok(record) => {
-                let name = columns.grasp.map(|idx| record[idx].to_string()).filter(|name| !name.is_empty());
+                name = columns.grasp.map(|idx| record[idx].to_string());
                 report.n_below_zero += usize::from(row_reader.is_below_zero(&record));
-                (name, row_reader.read(&record, line).map_err(|problem| BadRow { line, problem }))
+                row_reader.read(&record, line).map_err(|problem| BadRow { line, problem })
             }
-            Err(error) => (None, Err(bad_row(&error, line).ok_or_else(|| table_error(table, error, line))?)),
+            Err(error) => Err(bad_row(&error, line).ok_or_else(|| table_error(table, error, line))?),
         };
-        if let Some(grasp) = grasps.add(row, line).map_err(refused)? {
-            extremes.add(hand, &grasp);
+        if let Ok(grasp) = &row {
+            largest_reading = grasp.readings[0].cells.iter().copied().fold(largest_reading, f64::max);
+        }
+        if let Some(grasp) = grasps.add(name, row, line).map_err(refused)? {
             report.count(&grasp);
             writer.write(grasp)?;
         }
@@ -242,23 +225,22 @@ pub fn import_table(
         }
     }
     if let Some(grasp) = grasps.close() {
-        extremes.add(hand, &grasp);
         report.count(&grasp);
         writer.write(grasp)?;
     }
     if report.n_rows == 0 {
         return Err(refused("there is no row below the header: expected one for each grasp or frame".into()));
     }
-    report.warnings = extremes.warnings(hand, options);
-    report.warnings.extend(columns.warnings);
-    report.n_grasps_left_out = grasps.n_grasps_left_out;
-    report.n_rows_left_out = grasps.n_rows_left_out;
-    let bad_rows = grasps.bad_rows;
-    if !bad_rows.is_empty() && (!options.skip_bad_rows || report.n_grasps == 0) {
-        return Err(ImportError::Rows { path: table.into(), n_rows: report.n_rows, rows: bad_rows });
+    if !grasps.bad_rows.is_empty() {
+        return Err(ImportError::Rows { path: table.into(), n_rows: report.n_rows, rows: grasps.bad_rows });
     }
     check_label(&report.label_values, &grasps.first_lines, options).map_err(refused)?;
-    report.skipped = bad_rows;
+    if hand.cell_unit == CellUnit::Newtons && largest_reading > UNLIKELY_NEWTONS {
+        report.warnings.push(format!(
+            "the largest reading of a cell is {largest_reading:.0} N: if the table is in another unit, convert it to newtons"
+        ));
+    }
+    report.warnings.extend(columns.warnings);
     report.n_frames = writer.header.seq;
     writer.recording.finish()?;
     Ok(report)
@@ -298,8 +280,8 @@ impl RowReader<'_> {
         let cells = cells.map(|(idx, threshold)| self.reading(record, *idx, threshold)).collect::<Result<_, _>>()?;
         let joints = match &options.joints {
             Joints::Fixed(joints) => joints.clone(),
-            Joints::Columns { unit, .. } => (0..self.columns.joints.len())
-                .map(|joint_idx| self.joint_value(record, joint_idx, *unit))
+            Joints::Columns(_) => (0..self.columns.joints.len())
+                .map(|joint_idx| self.joint_value(record, joint_idx))
                 .collect::<Result<_, _>>()?,
         };
         let day = match (&options.day, self.columns.day) {
@@ -336,23 +318,19 @@ impl RowReader<'_> {
     }
 
     fn reading(&self, record: &csv::StringRecord, idx: usize, threshold: f64) -> Result<f64, String> {
-        let least = if self.options.clip_negative { -MAX_CELL_NEWTONS } else { -threshold };
-        // The stages take larger readings for those of a broken sensor.
-        let reading = record[idx].parse().ok().map(|reading: f64| reading * self.options.scale);
-        let usable = reading.filter(|reading| (least..=MAX_CELL_NEWTONS).contains(reading)).ok_or_else(|| {
-            let most = MAX_CELL_NEWTONS / self.options.scale;
-            let (column, found) = (&self.header[idx], found(&record[idx]));
-            let is_below = reading.is_some_and(|reading| reading < least && !self.options.clip_negative);
-            let advice = if is_below {
-                " (--clip-negative takes readings below zero for 0)"
-            } else if record[idx].contains(',') && record[idx].replace(',', ".").parse::<f64>().is_ok() {
-                " (write the decimal point as a dot)"
-            } else {
-                ""
-            };
-            format!("column '{column}': expected a number from 0 to {most}, found {found}{advice}")
-        })?;
-        Ok(usable.max(0.0))
+        let reading: Option<f64> = record[idx].parse().ok();
+        // Sensors that are tared read a little below zero. The stages take larger readings for those of a broken sensor.
+        if let Some(usable) = reading.filter(|reading| (-threshold..=MAX_CELL_NEWTONS).contains(reading)) {
+            return Ok(usable.max(0.0));
+        }
+        let (column, found) = (&self.header[idx], found(&record[idx]));
+        let mut advice = String::new();
+        if reading.is_some_and(|reading| reading < 0.0) {
+            advice = format!("; take readings below zero for 0: {BY_PANDAS}");
+        } else if record[idx].replace(',', ".").parse::<f64>().is_ok() && reading.is_none() {
+            advice = format!("; the decimal point is a dot: {BY_PANDAS}");
+        }
+        Err(format!("column '{column}': expected a number from 0 to {MAX_CELL_NEWTONS}, found {found}{advice}"))
     }
 
     /// Whether a row has a reading below zero, which counts as 0 if the row can be used.
@@ -363,27 +341,27 @@ impl RowReader<'_> {
             .any(|idx| record.get(*idx).and_then(|cell| cell.parse().ok()).is_some_and(|cell: f64| cell < 0.0))
     }
 
-    fn joint_value(&self, record: &csv::StringRecord, joint_idx: usize, unit: AngleUnit) -> Result<f64, String> {
+    fn joint_value(&self, record: &csv::StringRecord, joint_idx: usize) -> Result<f64, String> {
         let idx = self.columns.joints[joint_idx];
         let joint = &self.hand.joints[joint_idx];
-        // A slide's value is a length in metres, whatever the unit of angles.
-        let (of_unit, unit) = match (joint.kind, unit) {
-            (JointKind::Revolute, AngleUnit::Deg) => (1.0_f64.to_radians(), "degrees"),
-            (kind, _) => (1.0, kind.unit()),
-        };
-        let value = record[idx].parse().ok().map(|number: f64| number * of_unit);
-        value.filter(|value| joint.allows(*value, LIMIT_TOLERANCE_RAD)).ok_or_else(|| {
-            let tolerance = LIMIT_TOLERANCE_RAD * joint.kind.per_radian();
-            let [least, most] = [joint.lower - tolerance, joint.upper + tolerance].map(|limit| limit / of_unit);
-            let is_degrees = value.is_some_and(|value| joint.degrees_hint(value).is_some());
-            let advice = if is_degrees { " (--joint-unit deg takes degrees)" } else { "" };
-            format!(
-                "column '{}': expected {least:.3} to {most:.3} {unit} for the joint {}, found {}{advice}",
-                self.header[idx],
-                joint.name,
-                found(&record[idx])
-            )
-        })
+        let value: Option<f64> = record[idx].parse().ok();
+        if let Some(usable) = value.filter(|value| joint.allows(*value, LIMIT_TOLERANCE_RAD)) {
+            return Ok(usable);
+        }
+        let tolerance = LIMIT_TOLERANCE_RAD * joint.kind.per_radian();
+        let mut advice = String::new();
+        if value.is_some_and(|value| joint.degrees_hint(value).is_some()) {
+            advice = format!("; convert degrees to radians: {BY_PANDAS}");
+        }
+        Err(format!(
+            "column '{}': expected {:.3} to {:.3} {} for the joint {}, found {}{advice}",
+            self.header[idx],
+            joint.lower - tolerance,
+            joint.upper + tolerance,
+            joint.kind.unit(),
+            joint.name,
+            found(&record[idx])
+        ))
     }
 
     fn empty_report(&self) -> ImportReport {
@@ -400,44 +378,6 @@ impl RowReader<'_> {
             joint_columns: names(&self.columns.joints),
             ..ImportReport::default()
         }
-    }
-}
-
-/// The largest values of a table, which show a wrong unit.
-#[derive(Debug, Default)]
-struct Extremes {
-    reading_newtons: f64,
-    angle_rad: f64,
-}
-
-impl Extremes {
-    fn add(&mut self, hand: &Hand, grasp: &TableGrasp) {
-        for reading in &grasp.readings {
-            self.reading_newtons = reading.cells.iter().fold(self.reading_newtons, |most, cell| most.max(*cell));
-            for (joint, value) in hand.joints.iter().zip(&reading.joints) {
-                if joint.kind == JointKind::Revolute {
-                    self.angle_rad = self.angle_rad.max(value.abs());
-                }
-            }
-        }
-    }
-
-    fn warnings(&self, hand: &Hand, options: &ImportOptions) -> Vec<String> {
-        let mut warnings = Vec::new();
-        if hand.cell_unit == CellUnit::Newtons && self.reading_newtons > UNLIKELY_NEWTONS {
-            warnings.push(format!(
-                "the largest reading of a cell is {:.0} N: if the table is in another unit, give --newtons-per-unit",
-                self.reading_newtons
-            ));
-        }
-        let is_deg = matches!(options.joints, Joints::Columns { unit: AngleUnit::Deg, .. });
-        let degrees = self.angle_rad.to_degrees();
-        if is_deg && degrees > 0.0 && degrees <= std::f64::consts::PI {
-            warnings.push(format!(
-                "the largest joint angle is {degrees:.2} degrees: if the table is in radians, leave out --joint-unit deg"
-            ));
-        }
-        warnings
     }
 }
 
@@ -575,7 +515,7 @@ pub(crate) fn bad_row(error: &csv::Error, line: u64) -> Option<BadRow> {
 /// Why the row that begins on a line cannot be read.
 fn table_error(table: &Path, error: csv::Error, line: u64) -> ImportError {
     let message = match error.kind() {
-        csv::ErrorKind::Utf8 { .. } => "line 1: expected a table (CSV) in UTF-8".into(),
+        csv::ErrorKind::Utf8 { .. } => format!("line 1: expected a table (CSV) in UTF-8; for another one: {BY_PANDAS}"),
         _ => format!("line {line}: {error}"),
     };
     ImportError::Table { path: table.into(), message }

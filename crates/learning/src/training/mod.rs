@@ -10,7 +10,6 @@ mod day;
 mod examples;
 mod feature_table;
 mod friction;
-pub mod grid;
 mod probes;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -264,7 +263,6 @@ pub fn train(
         cross_validated_ece: validated.ece,
         seed: options.seed,
         version: env!("CARGO_PKG_VERSION").into(),
-        grid: None,
         trained_on: Some(read.trained_on()),
         own_lifts: None,
     };

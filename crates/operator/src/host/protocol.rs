@@ -1,4 +1,4 @@
-//! The messages between a host and its program: docs/operators-other-languages.md describes them for programs.
+//! The messages between a host and its program: docs/operators.md describes them for programs.
 //!
 //! A message is the length of its body and its kind, 32 bits each, and the body. Bodies of messages that come once for a
 //! sample have a fixed form, `Work`; all others are JSON. Numbers have the order of bytes of the machine.

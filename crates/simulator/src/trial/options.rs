@@ -64,7 +64,7 @@ pub struct TrialProtocol {
     pub n_settled: usize,
     /// Time in which the hand tightens to its full force before the arm lifts. 0.3 s.
     pub grip_secs: f64,
-    /// Height of the test lift. 10 mm: with 5 mm, a model of 1,500 lifts told kept from dropped objects less well (docs/archive.md).
+    /// Height of the test lift. 10 mm: with 5 mm, a model of 1,500 lifts told kept from dropped objects less well (benches/archive.md).
     pub test_lift_m: f64,
     /// Duration of the test lift, and of setting down. 0.25 s.
     pub test_lift_secs: f64,

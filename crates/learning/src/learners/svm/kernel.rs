@@ -209,11 +209,6 @@ impl Kernel {
         self.panels.iter().flat_map(|panel| panel.sums.iter().copied()).take(self.slot_of_sample.len())
     }
 
-    /// Multiplies the sum of every sample, as if all weights so far had been multiplied.
-    pub(super) fn scale_sums(&mut self, factor: f64) {
-        self.panels.iter_mut().flat_map(|panel| &mut panel.sums).for_each(|sum| *sum *= factor);
-    }
-
     /// Up to `n` slots for new rows: new ones while there is room, then those not asked for for longest, but none of
     /// the present request.
     fn free_slots(&mut self, n: usize) -> Vec<usize> {

@@ -11,8 +11,6 @@
 mod kernel;
 mod solver;
 
-use std::ops::ControlFlow;
-
 use blindgrasp_stages::classifier::svm::{RbfSvm, SvmError, SvmParams, check_finite};
 use kernel::Kernel;
 use solver::solve;
@@ -66,40 +64,6 @@ pub fn train_svm(
     train_within(features, n_features, labels, params, MAX_ITERATIONS)
 }
 
-/// Trains a machine for each penalty of `cs`, which takes the place of `params.c`, in rising order, and hands each to
-/// `each` with its index; stops when that breaks off.
-///
-/// The kernel's rows are computed once for all of them, and each training begins where the last one ended, with every α
-/// grown as the penalty did. So it ends elsewhere within `tolerance` than [`train_svm`] does. On 8,000 histograms in
-/// five folds, c = 1, 10, 100 at gamma = 0.1 and 0.3 took 1.36 instead of 1.71 million steps; with α as they were left
-/// rather than grown, it would be 1.74 million.
-///
-/// # Errors
-/// As of [`train_svm`], and penalties that do not rise or leap beyond the range of an f64.
-pub fn train_svm_path(
-    features: &[f64],
-    n_features: usize,
-    labels: &[bool],
-    params: &SvmParams,
-    cs: &[f64],
-    mut each: impl FnMut(usize, RbfSvm, SvmReport) -> ControlFlow<()>,
-) -> Result<(), SvmError> {
-    for (c, next) in cs.iter().zip(&cs[1.min(cs.len())..]) {
-        if next <= c || !(next / c).is_finite() {
-            return Err(SvmError::Parameter { name: "c", value: *next });
-        }
-    }
-    let Some(&first) = cs.first() else { return Ok(()) };
-    let mut trainer = Trainer::new(features, n_features, labels, &SvmParams { c: first, ..params.clone() })?;
-    for (idx, c) in cs.iter().enumerate() {
-        let (svm, report) = trainer.train(*c, MAX_ITERATIONS)?;
-        if each(idx, svm, report).is_break() {
-            break;
-        }
-    }
-    Ok(())
-}
-
 /// Iterations after which training gives up, LIBSVM's cap for as many samples.
 const MAX_ITERATIONS: usize = 10_000_000;
 
@@ -110,91 +74,42 @@ fn train_within(
     params: &SvmParams,
     max_iterations: usize,
 ) -> Result<(RbfSvm, SvmReport), SvmError> {
-    Trainer::new(features, n_features, labels, params)?.train(params.c, max_iterations)
-}
-
-/// What trainings share that differ in their penalty only.
-struct Trainer<'a> {
-    features: &'a [f64],
-    n_features: usize,
-    labels: &'a [bool],
-    params: SvmParams,
-    kernel: Kernel,
-    /// The last solution; all 0 before the first.
-    beta: Vec<f64>,
-}
-
-impl<'a> Trainer<'a> {
-    fn new(features: &'a [f64], n_features: usize, labels: &'a [bool], params: &SvmParams) -> Result<Self, SvmError> {
-        for (name, value) in [
-            ("c", params.c),
-            ("gamma", params.gamma),
-            ("tolerance", params.tolerance),
-            ("weight_positive", params.weight_positive),
-            ("weight_negative", params.weight_negative),
-        ] {
-            check_positive(name, value)?;
+    for (name, value) in [
+        ("c", params.c),
+        ("gamma", params.gamma),
+        ("tolerance", params.tolerance),
+        ("weight_positive", params.weight_positive),
+        ("weight_negative", params.weight_negative),
+    ] {
+        if !value.is_finite() || value <= 0.0 {
+            return Err(SvmError::Parameter { name, value });
         }
-        if n_features == 0 || labels.len().checked_mul(n_features) != Some(features.len()) {
-            return Err(SvmError::Shape { n_values: features.len(), n_labels: labels.len(), n_features });
-        }
-        check_finite(features, n_features)?;
-        let n_positive = labels.iter().filter(|&&positive| positive).count();
-        let n_negative = labels.len() - n_positive;
-        if n_positive == 0 || n_negative == 0 {
-            return Err(SvmError::OneClass { n_positive, n_negative });
-        }
-        let kernel = Kernel::new(features, n_features, params.gamma, params.cache_bytes);
-        if !kernel.is_finite() {
-            return Err(SvmError::Model { problem: "the features are so large that their squares overflow".into() });
-        }
-        Ok(Self { features, n_features, labels, params: params.clone(), kernel, beta: vec![0.0; labels.len()] })
     }
-
-    /// Trains with a penalty that is not below the last one.
-    fn train(&mut self, c: f64, max_iterations: usize) -> Result<(RbfSvm, SvmReport), SvmError> {
-        check_positive("c", c)?;
-        self.grow_to(c);
-        let beta = std::mem::take(&mut self.beta);
-        let solution = solve(&mut self.kernel, self.labels, &self.params, max_iterations, beta);
-        self.beta = solution.beta;
-        let support = || (0..self.labels.len()).filter(|&sample_idx| self.beta[sample_idx] != 0.0);
-        let model = RbfSvm {
-            gamma: self.params.gamma,
-            rho: solution.rho,
-            n_features: self.n_features,
-            dual_coefficients: support().map(|sample_idx| self.beta[sample_idx]).collect(),
-            support_vectors: support()
-                .flat_map(|sample_idx| &self.features[sample_idx * self.n_features..][..self.n_features])
-                .copied()
-                .collect(),
-        };
-        // Parameters near the limits of f64 can overflow on the way, and a tolerance above 2 leaves no
-        // support vector.
-        model.validate()?;
-        Ok((model, solution.report))
+    if n_features == 0 || labels.len().checked_mul(n_features) != Some(features.len()) {
+        return Err(SvmError::Shape { n_values: features.len(), n_labels: labels.len(), n_features });
     }
-
-    /// Multiplies every β with the growth of the penalty to `c`: it stays within its bounds, all still add up to 0, and
-    /// one at a bound stays there.
-    fn grow_to(&mut self, c: f64) {
-        let growth = c / self.params.c;
-        for (beta, &positive) in self.beta.iter_mut().zip(self.labels) {
-            let weight = if positive { self.params.weight_positive } else { -self.params.weight_negative };
-            let is_at_bound = *beta == self.params.c * weight;
-            *beta = if is_at_bound { c * weight } else { *beta * growth };
+    check_finite(features, n_features)?;
+    let n_positive = labels.iter().filter(|&&positive| positive).count();
+    let n_negative = labels.len() - n_positive;
+    if n_positive == 0 || n_negative == 0 {
+        return Err(SvmError::OneClass { n_positive, n_negative });
+    }
+    let mut kernel = Kernel::new(features, n_features, params.gamma, params.cache_bytes);
+    if !kernel.is_finite() {
+        return Err(SvmError::Model { problem: "the features are so large that their squares overflow".into() });
+    }
+    let solution = solve(&mut kernel, labels, params, max_iterations);
+    let (mut dual_coefficients, mut support_vectors) = (Vec::new(), Vec::new());
+    for (sample, beta) in features.chunks_exact(n_features).zip(solution.beta) {
+        if beta != 0.0 {
+            dual_coefficients.push(beta);
+            support_vectors.extend(sample);
         }
-        self.kernel.scale_sums(growth);
-        self.params.c = c;
     }
-}
-
-fn check_positive(name: &'static str, value: f64) -> Result<(), SvmError> {
-    if is_positive(value) { Ok(()) } else { Err(SvmError::Parameter { name, value }) }
-}
-
-fn is_positive(value: f64) -> bool {
-    value.is_finite() && value > 0.0
+    let model = RbfSvm { gamma: params.gamma, rho: solution.rho, n_features, dual_coefficients, support_vectors };
+    // Parameters near the limits of f64 can overflow on the way, and a tolerance above 2 leaves no support vector.
+    model.validate()?;
+    Ok((model, solution.report))
 }
 
 #[cfg(test)]
@@ -338,49 +253,6 @@ mod tests {
         for n_rows in [0, 1, 2, 3, 50, 600] {
             assert_eq!(train(n_rows * 1504 * size_of::<f32>()), reference);
         }
-    }
-
-    #[test]
-    fn along_a_path_each_machine_is_as_if_trained_alone() {
-        let (features, labels) = random_problem(1500, 5);
-        let cs = [0.01, 0.3, 1.0, 40.0];
-        let weighted = SvmParams { weight_positive: 3.0, weight_negative: 0.5, ..params(7.0, 0.5, 1e-5) };
-        let mut n_trained = 0;
-        train_svm_path(&features, 5, &labels, &weighted, &cs, |idx, along, report| {
-            let alone = SvmParams { c: cs[idx], ..weighted.clone() };
-            let (alone, alone_report) = train_svm(&features, 5, &labels, &alone).unwrap();
-            assert!(report.converged);
-            assert!((report.objective / alone_report.objective - 1.0).abs() < 1e-6, "{report:?} {alone_report:?}");
-            assert!(along.dual_coefficients.iter().sum::<f64>().abs() < 1e-9 * cs[idx] * 1500.0);
-            let bounds = (-0.5 * cs[idx], 3.0 * cs[idx]);
-            assert!(along.dual_coefficients.iter().all(|beta| (bounds.0..=bounds.1).contains(beta)));
-            let [along, alone] = [along, alone].map(|model| decision_values(&model, &features));
-            assert!(largest_difference(&along, &alone) < 1e-3, "{}", largest_difference(&along, &alone));
-            // The first begins from nothing, as alone.
-            assert_eq!(idx == 0, report == alone_report);
-            n_trained += 1;
-            ControlFlow::Continue(())
-        })
-        .unwrap();
-        assert_eq!(n_trained, cs.len());
-    }
-
-    #[test]
-    fn a_path_rises_and_ends_where_it_is_told() {
-        let (features, labels) = random_problem(50, 2);
-        let walk = |cs: &[f64]| {
-            let mut walked = Vec::new();
-            let outcome = train_svm_path(&features, 2, &labels, &params(1.0, 0.5, 1e-3), cs, |idx, _, _| {
-                walked.push(cs[idx]);
-                if idx == 1 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
-            });
-            (walked, outcome)
-        };
-        assert_eq!(walk(&[0.5, 1.0, 2.0]), (vec![0.5, 1.0], Ok(())));
-        assert_eq!(walk(&[]), (vec![], Ok(())));
-        assert_eq!(walk(&[1.0, 1.0]), (vec![], Err(SvmError::Parameter { name: "c", value: 1.0 })));
-        assert_eq!(walk(&[-1.0, 1.0]), (vec![], Err(SvmError::Parameter { name: "c", value: -1.0 })));
-        assert_eq!(walk(&[1e-300, 1e300]), (vec![], Err(SvmError::Parameter { name: "c", value: 1e300 })));
     }
 
     #[test]

@@ -34,21 +34,16 @@ struct Problem {
     upper: Vec<f64>,
 }
 
-/// Solves the problem from `beta` on, which lies within the bounds and adds up to 0; `kernel` holds its sums.
-pub(super) fn solve(
-    kernel: &mut Kernel,
-    labels: &[bool],
-    params: &SvmParams,
-    max_iterations: usize,
-    mut beta: Vec<f64>,
-) -> Solution {
+/// Solves the problem from β = 0 on; `kernel` is new.
+pub(super) fn solve(kernel: &mut Kernel, labels: &[bool], params: &SvmParams, max_iterations: usize) -> Solution {
+    let mut beta = vec![0.0; labels.len()];
     let y: Vec<f64> = labels.iter().map(|&positive| if positive { 1.0 } else { -1.0 }).collect();
     let problem = Problem {
         lower: y.iter().map(|y| y.min(0.0) * params.c * params.weight_negative).collect(),
         upper: y.iter().map(|y| y.max(0.0) * params.c * params.weight_positive).collect(),
         y,
     };
-    let mut gradient: Vec<f64> = kernel.sums().zip(&problem.y).map(|(sum, y)| sum - y).collect();
+    let mut gradient: Vec<f64> = problem.y.iter().map(|y| -y).collect();
     let instruction_set = InstructionSet::detect();
     let mut working_set = Vec::new();
     let (mut n_iterations, mut converged) = (0, false);

@@ -2,12 +2,12 @@
 
 use std::time::{Duration, Instant};
 
-use super::sample::Look;
-use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection};
-use blindgrasp_graph::control::{Reply, Request};
+use super::activity::Look;
+use super::{ANSWER_LIMIT, ClientError, Connection};
+use crate::control::{Reply, Request};
 
 /// A connection, and whether an answer is due.
-pub(in crate::commands) struct Poller {
+pub struct Poller {
     connection: Connection,
     asked: Option<Instant>,
 }
@@ -17,7 +17,7 @@ impl Poller {
     ///
     /// # Errors
     /// The graph does not run or does not answer.
-    pub(in crate::commands) fn connect(graph: &str) -> Result<(Poller, Look), ClientError> {
+    pub fn connect(graph: &str) -> Result<(Poller, Look), ClientError> {
         let mut poller = Poller { connection: Connection::open(graph)?, asked: None };
         let first = poller.look()?;
         Ok((poller, first))
@@ -27,7 +27,7 @@ impl Poller {
     ///
     /// # Errors
     /// The graph has ended or does not answer.
-    pub(in crate::commands) fn look(&mut self) -> Result<Look, ClientError> {
+    pub fn look(&mut self) -> Result<Look, ClientError> {
         let reply = self.connection.ask(&Request::Status, ANSWER_LIMIT)?;
         self.look_of(reply)
     }
@@ -36,7 +36,7 @@ impl Poller {
     ///
     /// # Errors
     /// The graph has ended.
-    pub(in crate::commands) fn ask(&mut self) -> Result<(), ClientError> {
+    pub fn ask(&mut self) -> Result<(), ClientError> {
         if self.asked.is_none() {
             self.connection.send(&Request::Status)?;
             self.asked = Some(Instant::now());
@@ -45,7 +45,7 @@ impl Poller {
     }
 
     /// For how long an answer has been due.
-    pub(in crate::commands) fn waited(&self) -> Option<Duration> {
+    pub fn waited(&self) -> Option<Duration> {
         self.asked.map(|asked| asked.elapsed())
     }
 
@@ -53,7 +53,7 @@ impl Poller {
     ///
     /// # Errors
     /// The graph has ended, or what came is no answer.
-    pub(in crate::commands) fn answer_within(&mut self, limit: Duration) -> Result<Option<Look>, ClientError> {
+    pub fn answer_within(&mut self, limit: Duration) -> Result<Option<Look>, ClientError> {
         let Some(reply) = self.connection.receive_within(limit)? else { return Ok(None) };
         self.asked = None;
         self.look_of(reply).map(Some)

@@ -5,110 +5,110 @@ use std::time::Instant;
 
 use serde::Serialize;
 
-use blindgrasp_graph::client::usage::{ProcessUsage, usage};
-use blindgrasp_graph::control::{DecidedGrasp, EdgeStatus, GraphState, GraphStatus, NodeState};
+use super::usage::{ProcessUsage, usage};
+use crate::control::{DecidedGrasp, EdgeStatus, GraphState, GraphStatus, NodeState};
 use blindgrasp_operator::ages::Ages;
 use blindgrasp_operator::link_status::LinkStatus;
 use blindgrasp_operator::wiring::EdgePolicy;
 
 /// A graph at a moment.
 #[derive(Debug, Clone)]
-pub(in crate::commands) struct Look {
-    pub(in crate::commands) status: GraphStatus,
+pub struct Look {
+    pub status: GraphStatus,
     /// The use of its processes, including the launcher's, by process.
-    pub(in crate::commands) usage: BTreeMap<u32, ProcessUsage>,
-    pub(in crate::commands) at: Instant,
-    pub(in crate::commands) load_average: Option<f64>,
+    pub usage: BTreeMap<u32, ProcessUsage>,
+    pub at: Instant,
+    pub load_average: Option<f64>,
 }
 
 /// The intervals of rates, ages and counts; `None` is the graph's start.
 #[derive(Debug, Clone, Copy)]
-pub(in crate::commands) struct Window<'a> {
+pub struct Window<'a> {
     /// The look before this one; processor time is always taken since then.
-    pub(in crate::commands) previous: &'a Look,
-    pub(in crate::commands) rates_since: Option<&'a Look>,
-    pub(in crate::commands) counts_since: Option<&'a Look>,
+    pub previous: &'a Look,
+    pub rates_since: Option<&'a Look>,
+    pub counts_since: Option<&'a Look>,
 }
 
 /// The activity of a graph, a line of JSON.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(in crate::commands) struct Measured {
-    pub(in crate::commands) graph: String,
-    pub(in crate::commands) state: GraphState,
-    pub(in crate::commands) message: Option<String>,
-    pub(in crate::commands) pid: u32,
-    pub(in crate::commands) uptime_secs: f64,
-    pub(in crate::commands) interval_secs: f64,
-    pub(in crate::commands) load_average: Option<f64>,
+pub struct Measured {
+    pub graph: String,
+    pub state: GraphState,
+    pub message: Option<String>,
+    pub pid: u32,
+    pub uptime_secs: f64,
+    pub interval_secs: f64,
+    pub load_average: Option<f64>,
     /// The share of one processor used by all processes, including the launcher.
-    pub(in crate::commands) cpu_percent: Option<f64>,
-    pub(in crate::commands) launcher_cpu_percent: Option<f64>,
-    pub(in crate::commands) nodes: Vec<MeasuredNode>,
-    pub(in crate::commands) edges: Vec<MeasuredEdge>,
+    pub cpu_percent: Option<f64>,
+    pub launcher_cpu_percent: Option<f64>,
+    pub nodes: Vec<MeasuredNode>,
+    pub edges: Vec<MeasuredEdge>,
     /// The latency from the source to the launching command; `None` without decisions.
-    pub(in crate::commands) decision_latency_nanos: Option<Quantiles>,
-    pub(in crate::commands) decisions: MeasuredDecisions,
+    pub decision_latency_nanos: Option<Quantiles>,
+    pub decisions: MeasuredDecisions,
     /// The other machines of a graph on several.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(in crate::commands) link: Option<LinkStatus>,
+    pub link: Option<LinkStatus>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(in crate::commands) struct MeasuredNode {
-    pub(in crate::commands) node: String,
-    pub(in crate::commands) state: NodeState,
-    pub(in crate::commands) pid: Option<u32>,
-    pub(in crate::commands) standby_pid: Option<u32>,
+pub struct MeasuredNode {
+    pub node: String,
+    pub state: NodeState,
+    pub pid: Option<u32>,
+    pub standby_pid: Option<u32>,
     /// The share of one processor; `None` for a new process.
-    pub(in crate::commands) cpu_percent: Option<f64>,
-    pub(in crate::commands) resident_bytes: Option<u64>,
-    pub(in crate::commands) n_restarts: u32,
-    pub(in crate::commands) n_swaps: u32,
-    pub(in crate::commands) heartbeat_age_millis: Option<u64>,
-    pub(in crate::commands) counts: BTreeMap<String, u64>,
+    pub cpu_percent: Option<f64>,
+    pub resident_bytes: Option<u64>,
+    pub n_restarts: u32,
+    pub n_swaps: u32,
+    pub heartbeat_age_millis: Option<u64>,
+    pub counts: BTreeMap<String, u64>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(in crate::commands) struct MeasuredEdge {
-    pub(in crate::commands) from: String,
-    pub(in crate::commands) to: String,
-    pub(in crate::commands) policy: EdgePolicy,
-    pub(in crate::commands) capacity: usize,
+pub struct MeasuredEdge {
+    pub from: String,
+    pub to: String,
+    pub policy: EdgePolicy,
+    pub capacity: usize,
     /// Samples received, per second.
-    pub(in crate::commands) rate_hz: f64,
+    pub rate_hz: f64,
     /// The age on arrival, since the source published; `None` without samples that have a time.
-    pub(in crate::commands) age_nanos: Option<Quantiles>,
+    pub age_nanos: Option<Quantiles>,
     /// Samples that wait for the reader or are being answered.
-    pub(in crate::commands) n_queued: u64,
-    pub(in crate::commands) sent: u64,
-    pub(in crate::commands) received: u64,
-    pub(in crate::commands) dropped: u64,
-    pub(in crate::commands) missing: u64,
-    pub(in crate::commands) late: u64,
-    pub(in crate::commands) repeated: u64,
-    pub(in crate::commands) reordered: u64,
-    pub(in crate::commands) blocked_nanos: u64,
+    pub n_queued: u64,
+    pub sent: u64,
+    pub received: u64,
+    pub dropped: u64,
+    pub missing: u64,
+    pub late: u64,
+    pub repeated: u64,
+    pub reordered: u64,
+    pub blocked_nanos: u64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-pub(in crate::commands) struct Quantiles {
-    pub(in crate::commands) p50: u64,
-    pub(in crate::commands) p90: u64,
-    pub(in crate::commands) p99: u64,
+pub struct Quantiles {
+    pub p50: u64,
+    pub p90: u64,
+    pub p99: u64,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(in crate::commands) struct MeasuredDecisions {
-    pub(in crate::commands) n_lift: u64,
-    pub(in crate::commands) n_hold: u64,
-    pub(in crate::commands) n_false_positives: u64,
-    pub(in crate::commands) rate_hz: f64,
+pub struct MeasuredDecisions {
+    pub n_lift: u64,
+    pub n_hold: u64,
+    pub n_false_positives: u64,
+    pub rate_hz: f64,
     /// The decisions since the look before; at most as many as the graph keeps.
-    pub(in crate::commands) new: Vec<DecidedGrasp>,
+    pub new: Vec<DecidedGrasp>,
 }
 
 impl Look {
-    pub(in crate::commands) fn new(status: GraphStatus) -> Look {
+    pub fn new(status: GraphStatus) -> Look {
         let nodes = status.nodes.iter().flat_map(|node| [node.pid, node.standby_pid]).flatten();
         let pids = nodes.chain([status.pid]);
         let usage = pids.filter_map(|pid| Some((pid, usage(pid)?))).collect();
@@ -120,7 +120,8 @@ impl Look {
     }
 }
 
-pub(in crate::commands) fn measure(now: &Look, window: Window) -> Measured {
+/// The activity of a graph up to a look at it.
+pub fn measure(now: &Look, window: Window) -> Measured {
     let status = &now.status;
     let interval_secs = secs_since(status, window.rates_since);
     let cpu_secs = now.at.saturating_duration_since(window.previous.at).as_secs_f64();
@@ -199,7 +200,7 @@ pub(in crate::commands) fn measure(now: &Look, window: Window) -> Measured {
 
 /// The edge over which the launching command reads decisions: among its edges from nodes with inputs (a source's truth
 /// has none), the port `decision`, or otherwise the last in the graph's order.
-pub(in crate::commands) fn decision_edge(edges: &[EdgeStatus]) -> Option<&EdgeStatus> {
+fn decision_edge(edges: &[EdgeStatus]) -> Option<&EdgeStatus> {
     let node_of = |port: &'_ str| port.split_once('/').map_or(port.to_string(), |(node, _)| node.to_string());
     let is_made = |edge: &&EdgeStatus| {
         let writer = node_of(&edge.from);
@@ -210,7 +211,7 @@ pub(in crate::commands) fn decision_edge(edges: &[EdgeStatus]) -> Option<&EdgeSt
 }
 
 /// The launching command, as the end of an edge.
-pub(in crate::commands) const RUN: &str = "run";
+pub const RUN: &str = "run";
 
 /// The samples of an edge that wait for their reader or are being answered: sent, and neither received nor lost.
 fn n_queued(edge: &EdgeStatus, edges: &[EdgeStatus]) -> u64 {
@@ -254,54 +255,9 @@ fn load_average() -> Option<f64> {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
-    use std::time::Duration;
-
+mod tests {
     use super::*;
-    use blindgrasp_graph::testing::made_status;
-    use blindgrasp_messages::{Action, Reason};
-
-    /// Two seconds apart.
-    pub(in crate::commands::top) fn made_looks() -> (Look, Look) {
-        let at = Instant::now();
-        let mut status = made_status("gate");
-        status.nodes[0].pid = Some(4243);
-        let used = |cpu_secs| ProcessUsage { cpu_secs, resident_bytes: 3 << 20 };
-        let before = Look {
-            status: status.clone(),
-            usage: [(4243, used(1.0)), (4242, used(5.0))].into(),
-            at,
-            load_average: Some(0.5),
-        };
-        status.uptime_secs += 2.0;
-        let edge = &mut status.edges[0];
-        (edge.sent, edge.received, edge.missing, edge.late) = (3000, 2988, 13, 8);
-        edge.ages = serde_json::from_str("[[102400,900],[204800,1980],[1024000,108]]").expect("ages");
-        status.edges.push(EdgeStatus {
-            from: "classifier/prediction".into(),
-            to: RUN.into(),
-            policy: EdgePolicy::Lossless,
-            dropped: 0,
-            missing: 0,
-            ..edge_of(&status)
-        });
-        status.decisions.n_hold += 1;
-        let held = DecidedGrasp {
-            action: Action::Hold,
-            reason: Reason::Unstable,
-            grasp_id: 100,
-            decided_nanos: 7,
-            ..status.decisions.latest[0].clone()
-        };
-        status.decisions.latest.push_back(held);
-        let now = Look {
-            status,
-            usage: [(4243, used(1.5)), (4242, used(5.02))].into(),
-            at: at + Duration::from_secs(2),
-            load_average: Some(0.75),
-        };
-        (before, now)
-    }
+    use crate::testing::{made_looks, made_status};
 
     fn edge_of(status: &GraphStatus) -> EdgeStatus {
         status.edges[0].clone()

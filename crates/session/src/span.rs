@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use serde::Serialize;
 
+use crate::recorder::{Recorded, Recorder};
 use blindgrasp_graph::client::observer::{Sink, bears_source_number};
 use blindgrasp_graph::control::AttachedEdge;
 use blindgrasp_graph::recorded_graph::Ending;
@@ -18,22 +19,21 @@ use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::port::sample_id;
 use blindgrasp_recording::Record;
-use blindgrasp_session::recorder::{Recorded, Recorder};
 
 /// The first gaps of an edge are printed one by one.
 const N_GAPS_TOLD: u64 = 5;
 
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub(super) struct SpanOfEdge {
-    pub(super) topic: String,
-    pub(super) samples: u64,
-    pub(super) first: Option<u64>,
-    pub(super) last: Option<u64>,
+pub struct SpanOfEdge {
+    pub topic: String,
+    pub samples: u64,
+    pub first: Option<u64>,
+    pub last: Option<u64>,
     /// Missing numbers between the first and the last.
-    pub(super) missing: u64,
+    pub missing: u64,
 }
 
-pub(super) struct EdgeSpan {
+pub struct EdgeSpan {
     topic: String,
     /// Whether it has the source's numbers.
     is_numbered: bool,
@@ -57,7 +57,7 @@ pub(super) struct EdgeSpan {
 }
 
 /// The part of the stream that is recorded.
-pub(super) struct Span {
+pub struct Span {
     /// The progress of the graph.
     cursors: SharedCursors,
     edges: Vec<EdgeSpan>,
@@ -76,7 +76,7 @@ pub(super) struct Span {
 }
 
 impl EdgeSpan {
-    pub(super) fn of(edge: &AttachedEdge) -> Self {
+    pub fn of(edge: &AttachedEdge) -> Self {
         let type_name = &edge.input.service.type_name;
         EdgeSpan {
             topic: edge.topic.clone(),
@@ -152,12 +152,7 @@ impl EdgeSpan {
 }
 
 impl Span {
-    pub(super) fn new(
-        cursors: SharedCursors,
-        edges: Vec<EdgeSpan>,
-        recorder: Recorder,
-        failed: Arc<AtomicBool>,
-    ) -> Self {
+    pub fn new(cursors: SharedCursors, edges: Vec<EdgeSpan>, recorder: Recorder, failed: Arc<AtomicBool>) -> Self {
         Span {
             cursors,
             edges,
@@ -171,7 +166,7 @@ impl Span {
         }
     }
 
-    pub(super) fn finish(mut self, ending: Ending) -> (Vec<SpanOfEdge>, Recorded) {
+    pub fn finish(mut self, ending: Ending) -> (Vec<SpanOfEdge>, Recorded) {
         let end = self.end.map(|(end, _)| end);
         for edge in self.edges.iter_mut().filter(|edge| edge.is_numbered) {
             // The samples that it has not reached in time.

@@ -51,7 +51,7 @@ struct Kept {
 }
 
 /// The last seconds of a graph. Times are of CLOCK_BOOTTIME.
-pub(super) struct FlightRecorder {
+pub struct FlightRecorder {
     edges: Vec<KeptEdge>,
     /// The edge with the source's frames.
     leader_idx: usize,
@@ -73,7 +73,7 @@ pub(super) struct FlightRecorder {
 }
 
 /// The samples for a file.
-pub(super) struct Excerpt {
+pub struct Excerpt {
     why: Vec<String>,
     samples: Vec<(String, Arc<Record>)>,
     ending: Ending,
@@ -85,19 +85,19 @@ pub(super) struct Excerpt {
 
 /// A file that was written.
 #[derive(Debug, Serialize)]
-pub(super) struct WrittenExcerpt {
-    pub(super) file: PathBuf,
-    pub(super) why: Vec<String>,
-    pub(super) frames: usize,
-    pub(super) grasps: usize,
-    pub(super) secs: f64,
+pub struct WrittenExcerpt {
+    pub file: PathBuf,
+    pub why: Vec<String>,
+    pub frames: usize,
+    pub grasps: usize,
+    pub secs: f64,
     /// Samples that edges lack of the frames in the file.
-    pub(super) missing: u64,
+    pub missing: u64,
 }
 
 impl FlightRecorder {
     /// `None` if no edge bears frames.
-    pub(super) fn new(edges: &[AttachedEdge], keep: Duration, after: Duration) -> Option<Self> {
+    pub fn new(edges: &[AttachedEdge], keep: Duration, after: Duration) -> Option<Self> {
         let kept = |edge: &AttachedEdge| KeptEdge {
             topic: edge.topic.clone(),
             is_numbered: bears_source_number(&edge.input.service.type_name),
@@ -161,10 +161,7 @@ impl FlightRecorder {
                 let fault = (sample.message.action == Action::Hold && reason.is_fault()).then_some(reason);
                 let is_new = fault != self.last_fault;
                 self.last_fault = fault;
-                if !is_new {
-                    return None;
-                }
-                fault.map(Reason::as_str)
+                if is_new { fault.map(Reason::as_str) } else { None }
             }
             _ => None,
         }
@@ -172,7 +169,7 @@ impl FlightRecorder {
 
     /// Asks for a file. What happens before it is complete goes into the same file, and what happens meanwhile prolongs it, by no
     /// more than the time to keep.
-    pub(super) fn ask(&mut self, why: &str, now_nanos: u64) {
+    pub fn ask(&mut self, why: &str, now_nanos: u64) {
         let (after_nanos, keep_nanos) = (self.after_nanos, self.keep_nanos);
         let is_over = self.trigger.as_ref().is_some_and(|trigger| now_nanos > trigger.until_nanos);
         let trigger = if is_over { &mut self.later } else { &mut self.trigger };
@@ -185,7 +182,7 @@ impl FlightRecorder {
     }
 
     /// The graph has been stopped. A grasp that was open then is held as missing, which is no fault.
-    pub(super) fn graph_has_ended(&mut self) {
+    pub fn graph_has_ended(&mut self) {
         let last_nanos =
             self.samples.iter().rfind(|kept| kept.edge_idx == self.leader_idx).map(|kept| kept.received_nanos);
         let is_of_the_end = |trigger: &mut Trigger| {
@@ -199,18 +196,18 @@ impl FlightRecorder {
     }
 
     /// The samples for the file that was asked for, once they have come.
-    pub(super) fn excerpt_when_due(&mut self, now_nanos: u64) -> Option<Excerpt> {
+    pub fn excerpt_when_due(&mut self, now_nanos: u64) -> Option<Excerpt> {
         let until_nanos = self.trigger.as_ref()?.until_nanos;
         if now_nanos < until_nanos + UNDER_WAY_NANOS { None } else { self.excerpt(until_nanos) }
     }
 
     /// Whether the time to keep does not fit into memory.
-    pub(super) fn is_full(&self) -> bool {
+    pub fn is_full(&self) -> bool {
         self.is_full
     }
 
     /// The samples for a file that was asked for and is not due yet.
-    pub(super) fn excerpt_now(&mut self) -> Option<Excerpt> {
+    pub fn excerpt_now(&mut self) -> Option<Excerpt> {
         self.excerpt(u64::MAX)
     }
 
@@ -306,7 +303,7 @@ impl Excerpt {
         secs: 0.0,
     };
 
-    pub(super) fn is_empty(&self) -> bool {
+    pub fn is_empty(&self) -> bool {
         self.n_frames == 0
     }
 
@@ -314,7 +311,7 @@ impl Excerpt {
     ///
     /// # Errors
     /// The file cannot be written.
-    pub(super) fn write(self, out: &Path, graph: &RecordedGraph) -> Result<WrittenExcerpt, RecordingError> {
+    pub fn write(self, out: &Path, graph: &RecordedGraph) -> Result<WrittenExcerpt, RecordingError> {
         let file = path_for(out, &self.why);
         let info = RecordingInfo {
             hand: graph.hand.clone(),
@@ -340,14 +337,14 @@ impl Excerpt {
 
 /// The flight recorder as the observer's sink: the command looks at it beside.
 #[derive(Clone)]
-pub(super) struct SharedRecorder(Arc<Mutex<FlightRecorder>>);
+pub struct SharedRecorder(Arc<Mutex<FlightRecorder>>);
 
 impl SharedRecorder {
-    pub(super) fn new(recorder: FlightRecorder) -> Self {
+    pub fn new(recorder: FlightRecorder) -> Self {
         SharedRecorder(Arc::new(Mutex::new(recorder)))
     }
 
-    pub(super) fn with<T>(&self, act: impl FnOnce(&mut FlightRecorder) -> T) -> T {
+    pub fn with<T>(&self, act: impl FnOnce(&mut FlightRecorder) -> T) -> T {
         act(&mut self.0.lock().unwrap_or_else(PoisonError::into_inner))
     }
 }
