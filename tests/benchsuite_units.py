@@ -1,4 +1,4 @@
-"""Tests of what the subjects of scripts/benchsuite share. Run by tests/e2e/benchsuite.rs:
+"""Tests of what the subjects of scripts/benchsuite share. Run by tests/tidy/benchsuite.rs:
 
     python3 tests/benchsuite_units.py
 """

@@ -2,6 +2,7 @@
 #![allow(dead_code, reason = "each test program uses a part of it")]
 
 pub(crate) mod python;
+mod times;
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -38,13 +39,16 @@ pub(crate) fn blindgrasp() -> Command {
     command
 }
 
+/// Nearly every test calls this or [`unique_name`] early: its time begins there.
 pub(crate) fn project() -> &'static Path {
+    times::note();
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
 /// A graph name, and with it an iceoryx2 domain, that no other test has.
 pub(crate) fn unique_name() -> String {
     static COUNT: AtomicU32 = AtomicU32::new(0);
+    times::note();
     // No name is a part of another one, as [`left_overs`] looks for files whose name contains it.
     format!("t{}-{}x", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed))
 }

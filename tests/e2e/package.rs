@@ -157,15 +157,6 @@ fn a_version_is_published_only_if_it_is_the_same_everywhere() {
     assert!(publish(false).contains("is there already"));
 }
 
-#[test]
-fn the_workflow_of_a_release_builds_on_both_machines_before_it_publishes() {
-    let workflow = std::fs::read_to_string(project().join(".github/workflows/release.yml")).expect("readable");
-    let workflow: serde_json::Value = serde_saphyr::from_str(&workflow).expect("YAML");
-    let build = &workflow["jobs"]["build"];
-    assert_eq!(build["strategy"]["matrix"]["runner"], serde_json::json!(["ubuntu-22.04", "ubuntu-22.04-arm"]));
-    assert_eq!(workflow["jobs"]["publish"]["needs"], "build");
-}
-
 /// The search path, with the Python of the tests first: it builds wheels without PyPI.
 fn path_with_python() -> std::ffi::OsString {
     let python = python().parent().expect("a folder").to_path_buf();

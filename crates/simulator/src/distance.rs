@@ -117,6 +117,10 @@ impl<'a> PlacedShape<'a> {
     pub(super) fn new(link_idx: usize, shape: &'a LinkShape) -> Self {
         let sphere = shape.core.compute_local_bounding_sphere();
         let around = shape.core.compute_local_aabb();
+        let faces = match shape.core.as_convex_polyhedron() {
+            Some(hull) if shape.edge_radius_m == 0.0 => faces(hull),
+            _ => Vec::new(),
+        };
         PlacedShape {
             link_idx,
             link_from_shape: shape.link_from_shape,
@@ -124,11 +128,7 @@ impl<'a> PlacedShape<'a> {
             edge_radius_m: shape.edge_radius_m,
             box_centre: around.center(),
             box_half: around.half_extents(),
-            faces: shape
-                .core
-                .as_convex_polyhedron()
-                .filter(|_hull| shape.edge_radius_m == 0.0)
-                .map_or(Vec::new(), faces),
+            faces,
             centre_in_link: shape.link_from_shape * Point3::new(sphere.center.x, sphere.center.y, sphere.center.z),
             radius_m: sphere.radius + shape.edge_radius_m,
         }

@@ -92,7 +92,10 @@ fn other_dataflow(dataflow: &Path, recording: &Path) -> anyhow::Result<Option<Pa
         return Ok(None);
     }
     let n_common = dataflow.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
-    let up = folder.components().skip(n_common).map(|_component| "..");
-    let down = dataflow.components().skip(n_common);
-    Ok(Some(up.map(PathBuf::from).chain(down.map(|component| PathBuf::from(component.as_os_str()))).collect()))
+    let mut relative = PathBuf::new();
+    for _ in folder.components().skip(n_common) {
+        relative.push("..");
+    }
+    relative.extend(dataflow.components().skip(n_common));
+    Ok(Some(relative))
 }

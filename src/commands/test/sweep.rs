@@ -50,7 +50,7 @@ impl Sweep {
                 let coverage = Coverage::of(recording, &fed.topic)?;
                 let changed = decisions.changed_since(&before);
                 let n = changed.iter().filter(|changed| coverage.covers_decision(changed.grasp_id)).count();
-                n_changed = n_changed.filter(|_so_far| !before.is_empty()).map(|so_far| so_far + n);
+                n_changed = if before.is_empty() { None } else { n_changed.map(|so_far| so_far + n) };
             }
             let n_labelled = tally.n_labelled;
             let accuracy = (n_labelled > 0).then(|| tally.n_right as f64 / n_labelled as f64);

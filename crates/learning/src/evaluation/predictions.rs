@@ -106,7 +106,10 @@ impl OutsidePredictions {
     pub fn check_folds(&self, examples: &[Example], folds: &[usize]) -> Result<(), PredictionsError> {
         for model in &self.models {
             let has_folds = model.predictions.values().any(|prediction| prediction.fold.is_some());
-            for (example, fold) in examples.iter().zip(folds).filter(|_judged| has_folds) {
+            if !has_folds {
+                continue;
+            }
+            for (example, fold) in examples.iter().zip(folds) {
                 let Some(prediction) = model.predictions.get(&key_of(example)) else { continue };
                 let expected = *fold as u64 + 1;
                 if prediction.fold != Some(expected) {

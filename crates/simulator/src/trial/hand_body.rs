@@ -397,8 +397,11 @@ fn link_groups(
     kinds.dedup();
     let group_of_kind = |kind: usize| Group::from_bits_truncate(1_u32.checked_shl(kind as u32).unwrap_or(0));
     let own = |idx: usize| {
+        if links[idx].shapes.is_empty() {
+            return Group::NONE;
+        }
         let kind = kinds.iter().position(|kind| **kind == left_out_by[idx]);
-        kind.filter(|_kind| !links[idx].shapes.is_empty()).map_or(Group::NONE, group_of_kind)
+        kind.map_or(Group::NONE, group_of_kind)
     };
     let own: Vec<Group> = (0..links.len()).map(own).collect();
     let all = own.iter().fold(Group::NONE, |all, group| all | *group);

@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use serde_json::Value;
+use serde_json::{Value, json};
 
-use crate::common::project;
+use crate::{project, read};
 
 #[test]
 fn a_version_has_a_fault_from_the_first_to_before_the_mended_one() {
@@ -26,7 +26,8 @@ fn a_version_has_a_fault_from_the_first_to_before_the_mended_one() {
 
 #[test]
 fn each_known_fault_of_a_crate_is_answered_and_no_other() {
-    let (advisories, lock, deny) = (read("tests/advisories.txt"), read("Cargo.lock"), read("deny.toml"));
+    let [advisories, lock, deny] =
+        ["tests/advisories.txt", "Cargo.lock", "deny.toml"].map(|name| read(&project().join(name)));
     let faults = faults(&advisories, &lock);
     let answers: Vec<&str> = deny.split("{ id = \"").skip(1).filter_map(|rest| rest.split('"').next()).collect();
     for (id, crate_name) in &faults {
@@ -75,8 +76,7 @@ fn workflows_run_actions_of_one_content_and_keep_no_credentials() {
     for folder in [".github/workflows", "docs/ci"] {
         for entry in std::fs::read_dir(project().join(folder)).expect("readable") {
             let path = entry.expect("readable").path();
-            let text = std::fs::read_to_string(&path).expect("readable");
-            let workflow: Value = serde_saphyr::from_str(&text).expect("YAML");
+            let workflow: Value = serde_saphyr::from_str(&read(&path)).expect("YAML");
             // Those of GitLab have no actions.
             for (_, job) in workflow["jobs"].as_object().into_iter().flatten() {
                 for step in job["steps"].as_array().expect("steps") {
@@ -85,6 +85,15 @@ fn workflows_run_actions_of_one_content_and_keep_no_credentials() {
             }
         }
     }
+}
+
+#[test]
+fn the_workflow_of_a_release_builds_on_both_machines_before_it_publishes() {
+    let workflow = read(&project().join(".github/workflows/release.yml"));
+    let workflow: Value = serde_saphyr::from_str(&workflow).expect("YAML");
+    let build = &workflow["jobs"]["build"];
+    assert_eq!(build["strategy"]["matrix"]["runner"], json!(["ubuntu-22.04", "ubuntu-22.04-arm"]));
+    assert_eq!(workflow["jobs"]["publish"]["needs"], "build");
 }
 
 fn assert_step_is_pinned(step: &Value, file: &str) {
@@ -98,8 +107,4 @@ fn assert_step_is_pinned(step: &Value, file: &str) {
     if action == "actions/checkout" {
         assert_eq!(step["with"]["persist-credentials"], false, "{file}: {step}");
     }
-}
-
-fn read(name: &str) -> String {
-    std::fs::read_to_string(project().join(name)).expect("readable")
 }
