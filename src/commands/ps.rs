@@ -18,7 +18,7 @@ use blindgrasp_graph::client::{pick_graph, running_graphs, status};
 use blindgrasp_graph::control::{EdgeStatus, GraphStatus, NodeStatus};
 use blindgrasp_graph::log::printable;
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operator::link_status::{LinkStatus, PeerState, PeerStatus};
+use blindgrasp_operator::link_status::LinkStatus;
 use blindgrasp_operator::wiring::EdgePolicy;
 
 /// Show running graphs with their operators and edges
@@ -237,6 +237,8 @@ fn indented(table: &TextTable) -> impl Iterator<Item = String> {
 
 #[cfg(test)]
 mod tests {
+    use blindgrasp_operator::link_status::{PeerState, PeerStatus};
+
     use super::*;
     use blindgrasp_graph::testing::made_status;
     use blindgrasp_operator::link_status::ChannelStatus;
