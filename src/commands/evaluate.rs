@@ -11,7 +11,7 @@ use super::{Outcome, check_output, check_page, number_in, percent, print_line, p
 use blindgrasp_learning::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::looks::{Look, looks};
-use blindgrasp_learning::evaluation::page::{figures, report_page, tables};
+use blindgrasp_learning::evaluation::page::{FIGURE_1_FILE, figure_1, report_page, tables};
 use blindgrasp_learning::evaluation::predictions::{OutsidePredictions, predictions_csv};
 use blindgrasp_learning::evaluation::report::{
     Origin, Report, THRESHOLD_PROBABILITY, report_on_model, report_on_predictions, report_on_recipes,
@@ -264,8 +264,11 @@ impl Job<'_> {
         }
         if let Some(folder) = &self.arguments.figures {
             std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
-            for (name, text) in tables(report)?.into_iter().chain(figures(self.hand, report)?) {
+            for (name, text) in tables(report)? {
                 write_at_once(&folder.join(name), &text)?;
+            }
+            if let Some(picture) = figure_1(self.hand, report)? {
+                write_at_once(&folder.join(FIGURE_1_FILE), &picture)?;
             }
             write_at_once(&folder.join(PREDICTIONS_FILE), &predictions_csv(&report.judges, self.recordings)?)?;
         }
