@@ -45,14 +45,19 @@ const figure = (picture, text = "") => {
 const pairs = (pictures) => main.append(make("div", { class: "pairs" }, pictures.map((picture) => figure(picture))));
 
 // --- numbers as people write them
+// Of an exact tie the even digit, as the numbers on the console have it.
+const fixed = (value, n_digits) => {
+  const exact = value.toFixed(n_digits + 25), cut = exact.slice(0, -25).replace(/\.$/, "");
+  return /^50*$/.test(exact.slice(-25)) && "02468".includes(cut.at(-1)) ? cut : value.toFixed(n_digits);
+};
 const minus = (text) => text.replace("-", "−");
 const thousands = (n) => String(n).replace(/\B(?=(\d{3})+$)/g, ",");
-const count = (n) => thousands(n.toFixed(0));
-const number = (share) => minus((100 * share).toFixed(1));
+const count = (n) => thousands(fixed(n, 0));
+const number = (share) => minus(fixed(100 * share, 1));
 const percent = (share) => `${number(share)} %`;
 const part = (n, of) => (of > 0 ? percent(n / of) : "–");
-const decimals = (value) => value?.toFixed(3) ?? "–";
-const pValue = (p) => (p >= 0.001 ? p.toFixed(3) : minus(p.toExponential(1)));
+const decimals = (value) => (value == null ? "–" : fixed(value, 3));
+const pValue = (p) => (p >= 0.001 ? fixed(p, 3) : minus(p.toExponential(1)));
 const small = (text) => make("span", { class: "interval" }, text);
 // A share with its interval.
 const estimate = (found) => {
@@ -179,7 +184,7 @@ const howMade = (report) => {
 };
 
 // --- the curves of an evaluation
-const withNumber = (name, what, value) => (value == null ? name : `${name}, ${what} ${value.toFixed(3)}`);
+const withNumber = (name, what, value) => (value == null ? name : `${name}, ${what} ${fixed(value, 3)}`);
 const curves = (title, x, y, series) => lineChart({ title, ...HALF, x: percentAxis(x), y: percentAxis(y), series }).svg;
 const threshold = (x, y) => (x && y ? [[x.value, y.value, 5.5]] : []);
 const roc = (judges) => curves("Receiver operating characteristic (mark: the threshold)", "unstable grasps that are lifted (%)", "stable grasps that are lifted (%)",
