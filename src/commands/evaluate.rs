@@ -80,8 +80,8 @@ pub(super) struct Arguments {
     /// Write a report with tables and pictures (HTML).
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
-    /// Write to this folder: roc.svg, pr.svg and reliability.svg with their points (CSV), the probability and fold of each grasp
-    /// (predictions.csv), Table I (CSV), Figure 1 and Figure 2 of each recipe or model (SVG).
+    /// Write to this folder: the points of the curves (roc.csv, pr.csv, reliability.csv), the probability and fold of each grasp
+    /// (predictions.csv), Table I and Figure 2 (CSV), and Figure 1 (SVG). The page of --report saves its charts as SVG.
     #[arg(long, value_name = "FOLDER")]
     figures: Option<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
