@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use crate::common::python::{python, shell, utf8};
 use crate::common::{MODEL, RECORDING, project, report_data, run, skipped, text};
@@ -206,9 +206,9 @@ fn judged_grasps_have_their_own_objects_and_repeats_have_a_least_and_a_greatest_
     assert!(printed.contains("fewer errors in the mean (least ") && printed.contains(" %, greatest "), "{printed}");
 }
 
-/// The charts of a page can be saved as pictures, with the colours of the page in them.
+/// The functions of the page's script, in a browser: numbers, axes, charts, and charts as files.
 #[test]
-fn a_chart_is_saved_as_svg() {
+fn a_page_writes_numbers_and_draws_charts_as_people_do() {
     if !Path::new("/usr/bin/chromedriver").exists() {
         return skipped("no chromium-driver: scripts/test installs it on Debian");
     }
@@ -216,6 +216,48 @@ fn a_chart_is_saved_as_svg() {
     let page = folder.path().join("report.html");
     run(&["evaluate", MODEL, RECORDING, "--report", utf8(&page)], 0);
     let mut browser = Browser::open(&format!("file://{}", page.display()));
+    let texts = [
+        ("[0, 999, 24640, 1e6].map(blindgrasp.count)", json!(["0", "999", "24,640", "1,000,000"])),
+        // An exact tie goes to the even digit, as on the console.
+        ("[0.8125, 0.0625, 0.1875, -0.25].map(blindgrasp.percent)", json!(["81.2 %", "6.2 %", "18.8 %", "−25.0 %"])),
+        ("[blindgrasp.decimals(0.95), blindgrasp.decimals(null)]", json!(["0.950", "–"])),
+        ("[0.25, 1.234e-9].map(blindgrasp.pValue)", json!(["0.250", "1.2e−9"])),
+        (
+            "[{ value: 0.883, interval: { low: 0.8764, high: 0.89 } }, { value: 0.01, interval: { low: -0.01, high: 0.02 } }, \
+             { value: 0.5, interval: null }, null].map(blindgrasp.estimate)",
+            json!(["88.3 % (87.6–89.0)", "1.0 % (−1.0 to 2.0)", "50.0 %", "–"]),
+        ),
+        // A seed is no number of JavaScript, and a text stays as it is.
+        (
+            r#"Object.values(blindgrasp.read('{"a": 18446744073709551615, "b": "x:1234567890123456789,", "c": 0.1250000000000000}'))"#,
+            json!(["18446744073709551615", "x:1234567890123456789,", 0.125]),
+        ),
+        ("blindgrasp.percentAxis('', 0.25).ticks.map(([, text]) => text)", json!(["0", "5", "10", "15", "20", "25"])),
+        ("blindgrasp.axis('', 0, 16000).ticks.map(([, text]) => text)", json!(["0", "5,000", "10,000", "15,000"])),
+        ("blindgrasp.axis('', -1, 1).ticks.map(([, text]) => text)", json!(["−1", "−0.5", "0", "0.5", "1"])),
+        ("[0.21, 0].map(blindgrasp.roundUp)", json!([0.25, 1])),
+        ("[[62.4, 61.9, 70], [3], []].map(blindgrasp.rangeAround)", json!([[61, 70], [3, 4], [0, 1]])),
+    ];
+    for (expression, expected) in texts {
+        assert_eq!(browser.ask(expression), expected, "{expression}");
+    }
+    // The axes span 48 to 244 downwards and 68 to 268 to the right; 5 is moved to the edge.
+    let line = browser.ask(
+        "blindgrasp.lineChart({ title: 'T < 1', width: 292, height: 300, x: blindgrasp.axis('a & b', 0, 2), \
+         y: blindgrasp.percentAxis('y'), series: [{ colour: '--series-0', points: [[0, 0], [2, 5]], marks: [[1, 0.5, 3]], \
+         intervals: [[1, 0.25, 0.75]] }] }).svg.outerHTML",
+    );
+    for expected in ["M68 244L268 48", "M165 146a3 3", "M164 195h8m-4 0V97", "T &lt; 1", "a &amp; b"] {
+        assert!(line.as_str().is_some_and(|svg| svg.contains(expected)), "{expected}: {line}");
+    }
+    let bars = browser.ask(
+        "(window.bars = blindgrasp.barChart({ title: 'Errors', width: 250, height: 300, y: blindgrasp.percentAxis('y'), \
+         groups: ['<b>a</b>', 'a name that does not fit'], series: ['errors', 'false positives'].map((name) => \
+         ({ name, colour: '--series-1', heights: [0.5, 0.25] })) }), [bars.querySelectorAll('rect').length, \
+         bars.querySelectorAll('b').length, bars.outerHTML.includes('rotate(-45'), bars.textContent.includes('<b>a</b>')])",
+    );
+    assert_eq!(bars, json!([7, 0, true, true]), "the card, two in the legend, two in each of two groups");
+    // A saved chart has the colours of the page in it.
     for (idx, axes) in [
         ["unstable grasps that are lifted (%)", "stable grasps that are lifted (%)"],
         ["recall: stable grasps that are lifted (%)", "precision: lifted grasps that are stable (%)"],
