@@ -10,7 +10,7 @@ use super::{Outcome, check_output, check_page, number_in, percent, print_line, p
 use blindgrasp_learning::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::looks::{Look, looks};
-use blindgrasp_learning::evaluation::page::{figures, report_page, tables};
+use blindgrasp_learning::evaluation::page::{FIGURE_1_FILE, figure_1, report_page, tables};
 use blindgrasp_learning::evaluation::predictions::{OutsidePredictions, predictions_csv};
 use blindgrasp_learning::evaluation::report::{
     Origin, Report, THRESHOLD_PROBABILITY, report_on_model, report_on_predictions, report_on_recipes,
@@ -79,8 +79,8 @@ pub(super) struct Arguments {
     /// Write a report with tables and pictures (HTML).
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
-    /// Write to this folder: roc.svg, pr.svg and reliability.svg with their points (CSV), the probability and fold of each grasp
-    /// (predictions.csv), Table I (CSV), Figure 1 and Figure 2 of each recipe or model (SVG).
+    /// Write to this folder: the points of the curves (roc.csv, pr.csv, reliability.csv), the probability and fold of each grasp
+    /// (predictions.csv), Table I and Figure 2 (CSV), and Figure 1 (SVG). The page of --report saves its charts as SVG.
     #[arg(long, value_name = "FOLDER")]
     figures: Option<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
@@ -263,8 +263,11 @@ impl Job<'_> {
         }
         if let Some(folder) = &self.arguments.figures {
             std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
-            for (name, text) in tables(report)?.into_iter().chain(figures(self.hand, report)?) {
+            for (name, text) in tables(report)? {
                 write_out(&folder.join(name), &text)?;
+            }
+            if let Some(picture) = figure_1(self.hand, report)? {
+                write_out(&folder.join(FIGURE_1_FILE), &picture)?;
             }
             write_out(&folder.join(PREDICTIONS_FILE), &predictions_csv(&report.judges, self.recordings)?)?;
         }

@@ -153,6 +153,12 @@ pub(crate) fn wait_until(mut is_so: impl FnMut() -> bool, describe: impl Fn() ->
     }
 }
 
+/// The data of a report (`--report`), which its page holds as JSON.
+pub(crate) fn report_data(page: &str) -> serde_json::Value {
+    let data = page.split_once("<script type=\"application/json\" id=\"report\">").expect("data").1;
+    serde_json::from_str(data.split_once("</script>").expect("its end").0).expect("JSON")
+}
+
 /// Says that the calling test is skipped, on the real stderr. `scripts/test` counts these lines.
 #[track_caller]
 pub(crate) fn skipped(reason: &str) {

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 
 use crate::common::python::python;
-use crate::common::{Graph, RECORDING, blindgrasp, project, run, skipped, swap, unique_name, wait_until};
+use crate::common::{Graph, RECORDING, blindgrasp, project, report_data, run, skipped, swap, unique_name, wait_until};
 use blindgrasp_messages::Action;
 use blindgrasp_recording::{Record, RecordingReader};
 use blindgrasp_stages::hand::Hand;
@@ -50,7 +50,7 @@ impl Drop for Running {
     }
 }
 
-struct Browser(Running);
+pub(crate) struct Browser(Running);
 
 impl Drop for Browser {
     /// Without input the program ends the browser. If it were killed, the browser would go on.
@@ -61,7 +61,7 @@ impl Drop for Browser {
 }
 
 impl Browser {
-    fn open(address: &str) -> Browser {
+    pub(crate) fn open(address: &str) -> Browser {
         let mut command = Command::new(python());
         command.arg(project().join("tests/browser.py")).arg(address).env("PYTHONDONTWRITEBYTECODE", "1");
         let mut browser = Running::start(&mut command);
@@ -70,7 +70,7 @@ impl Browser {
     }
 
     /// The value of an expression, or the answer to another word.
-    fn ask(&mut self, line: &str) -> Value {
+    pub(crate) fn ask(&mut self, line: &str) -> Value {
         use std::io::Write;
         writeln!(self.0.child.stdin.as_mut().expect("stdin"), "{line}").expect("written");
         let answer = self.0.line();
@@ -217,6 +217,9 @@ fn a_browser_shows_a_graph_as_it_runs() {
         browser.ask(&format!("picture {path}"));
     }
 
+    // The chart has a mark at each probability and at each decision, and its legend.
+    browser.wait_until("document.querySelectorAll('#chart path[fill=\"var(--mark)\"]').length === 1");
+    browser.wait_until("/lift|hold/.test(document.getElementById('chart').textContent)");
     // The legends of chart and 3-D view.
     assert!(browser.text("chart-key").contains("threshold") && browser.text("chart-key").contains("model beside"));
     browser.choose("quantity", "force");
@@ -541,9 +544,25 @@ fn the_report_of_a_run_draws_the_wrong_decisions() {
     let flow = project().join("dataflow.yaml");
     let flow = flow.to_str().expect("UTF-8");
     run(&["run", flow, "--name", &unique_name(), "--set", "recorded_source.rate=max", "--report", page], 0);
+    let data = report_data(&std::fs::read_to_string(page).expect("a page"));
+    let summary = &data["data"]["summary"];
     let mut browser = Browser::open(&format!("file://{page}"));
     let n_cards = browser.ask("document.querySelectorAll('.card').length").as_u64().expect("a number");
     assert!(n_cards > 2);
+    let shown = browser.ask("document.querySelector('main').innerText");
+    let shown = shown.as_str().expect("a text");
+    assert!(shown.contains(&format!("finished: {} grasps, ", summary["grasps"])), "{shown}");
+    for wrong in ["wrong_lifts", "wrong_holds"] {
+        let n = data["data"][wrong]["n"].as_u64().expect("a number");
+        assert!(shown.contains(&format!("{n} in all; the first {} are shown.", n.min(6))), "{shown}");
+    }
+    for (reason, n) in summary["reasons"].as_object().expect("reasons") {
+        assert!(shown.contains(&format!("{reason}\t{n}")), "{reason}: {shown}");
+    }
+    for edge in summary["edges"].as_array().expect("edges") {
+        let (from, to) = (edge["from"].as_str().expect("a port"), edge["to"].as_str().expect("a port"));
+        assert!(shown.contains(&format!("{from}\t{to}\t{}\t{}", edge["sent"], edge["received"])), "{from}: {shown}");
+    }
     // Its scripts begin after the page is loaded.
     browser.wait_until(&format!("window.blindgrasp?.drawn === {n_cards} && blindgrasp.shown !== null"));
     // Every card has a picture.

@@ -1,6 +1,8 @@
 //! `run --report`: the page of a run says the same as its summary.
 
-use crate::common::{Graph, json_lines, project, run, swap, unique_name};
+use serde_json::Value;
+
+use crate::common::{Graph, json_lines, project, report_data, run, swap, unique_name};
 
 #[test]
 fn the_report_of_a_run_shows_its_decisions_edges_and_mistakes() {
@@ -14,23 +16,28 @@ fn the_report_of_a_run_shows_its_decisions_edges_and_mistakes() {
     let lines = json_lines(&ended.stdout);
     let summary = &lines.last().expect("a summary")["summary"];
     let html = std::fs::read_to_string(&page).expect("a page");
-    let (n_grasps, n_wrong_lifts) = (&summary["grasps"], summary["false_positives"].as_u64().expect("a number"));
-    assert!(html.contains(&format!("finished: {n_grasps} grasps, ")), "{}", &html[..2000]);
-    assert!(html.contains(&format!("<p>{n_wrong_lifts} in all; the first {} are shown.", n_wrong_lifts.min(6))));
-    for (reason, n) in summary["reasons"].as_object().expect("reasons") {
-        assert!(html.contains(&format!("<td>{reason}</td><td class=\"number\">{n}</td>")), "{reason}");
+    let page = report_data(&html);
+    let (data, cards) = (&page["data"], page["cards"]["frames"].as_array().expect("cards"));
+    for (name, value) in data["summary"].as_object().expect("a summary") {
+        assert_eq!(*value, summary[name], "{name}");
     }
-    for edge in summary["edges"].as_array().expect("edges") {
-        let (from, to) = (edge["from"].as_str().expect("a port"), edge["to"].as_str().expect("a port"));
-        let row = format!("<td>{from}</td><td>{to}</td><td class=\"number\">{}</td>", edge["sent"]);
-        assert!(html.contains(&row), "{row}");
+    let n_wrong_lifts = summary["false_positives"].as_u64().expect("a number");
+    let is_wrong_hold = |line: &&Value| line["action"] == "hold" && line["truth"]["stable"] == true;
+    let n_wrong_holds = lines.iter().filter(is_wrong_hold).count() as u64;
+    for (wrong, n) in [("wrong_lifts", n_wrong_lifts), ("wrong_holds", n_wrong_holds)] {
+        let wrong = &data[wrong];
+        assert_eq!((&wrong["n"], &wrong["shown"]), (&n.into(), &n.min(6).into()));
+        assert_eq!(wrong["points"].as_array().map(Vec::len), Some(n as usize));
     }
-    let n_wrong_holds = lines.iter().filter(|line| line["action"] == "hold" && line["truth"]["stable"] == true).count();
-    assert!(html.contains(&format!("<p>{n_wrong_holds} in all; the first {} are shown.", n_wrong_holds.min(6))));
+    let n_others = data["others"].as_array().expect("points").len() as u64;
+    assert_eq!(Value::from(n_others + n_wrong_lifts + n_wrong_holds), summary["grasps"]);
     // A card of each grasp, which the page draws by itself.
-    let n_cards = html.matches("data-grasp=\"").count() as u64;
-    assert_eq!(n_cards, n_wrong_lifts.min(6) + n_wrong_holds.min(6) as u64);
-    assert!(html.contains("known to be unstable; object ") && html.contains("palm: "), "the label and the pads");
+    assert_eq!(cards.len() as u64, n_wrong_lifts.min(6) + n_wrong_holds.min(6));
+    let told = cards[0]["lines"].to_string();
+    assert!(
+        told.contains("known to be unstable; object ") && told.contains("palm: "),
+        "the label and the pads: {told}"
+    );
     let names = ["http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink", "http://www.w3.org/1999/xhtml"];
     let addresses = names.iter().fold(html.clone(), |html, name| html.replace(name, ""));
     for loads in ["http:", "https:", "src=", "@import", "url("] {

@@ -1,9 +1,11 @@
 //! `blindgrasp trials`: the graph runs with its gate and without, and the outcome of each attempt is counted.
 
 use std::collections::BTreeSet;
+use std::path::Path;
 use std::process::Stdio;
 
 use crate::common::{assert_nothing_left, blindgrasp, project, run, signal, text, unique_name};
+use crate::live_page::Browser;
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -57,6 +59,19 @@ fn the_same_trials_with_the_gate_and_without_are_counted_and_reported() {
     let html = std::fs::read_to_string(page).expect("a page");
     assert!(html.contains("Table II") && html.contains("data:image/png;base64,"), "{} bytes", html.len());
     assert!(html.len() < 2_000_000, "{} bytes", html.len());
+    if Path::new("/usr/bin/chromedriver").exists() {
+        let mut browser = Browser::open(&format!("file://{page}"));
+        let shown = browser.ask("document.querySelector('main').textContent");
+        let shown = shown.as_str().expect("a text");
+        assert!(
+            shown.contains("Table II: lifts that kept the object") && shown.contains("How this was made"),
+            "{shown}"
+        );
+        let images = "[...document.querySelectorAll('.strip img')].map((image) => image.naturalWidth)";
+        let widths = browser.ask(images).as_array().expect("images").clone();
+        assert!(widths.len() > 1 && widths.iter().all(|width| *width == 220), "{widths:?}");
+        assert_eq!(browser.ask("errors"), Value::Array(vec![]));
+    }
 
     let again = made();
     assert_eq!((&again["records_with_gate"], &again["records_without_gate"]), (with, without));

@@ -9,7 +9,8 @@ use super::colour::{Rgb, force_colour, lightness};
 use super::grasp::{ContactKind, Placed, RecordedGrasp};
 use super::grasp_picture::{VIEW, draw, page_title, style};
 use super::pads::draw_pads;
-use super::scene::{HandScene, N_COLOURS, ObjectScene, STAGE_JS, THREE_JS, link_poses, point, rounded};
+use super::report::{json_for_page, stage_modules};
+use super::scene::{HandScene, N_COLOURS, ObjectScene, link_poses, point, rounded};
 use super::svg::{Svg, escape};
 use super::view::{Surfaces, choose_cameras};
 use blindgrasp_stages::hand::Hand;
@@ -66,8 +67,7 @@ pub fn grasp_html(hand: &Hand, grasp: &RecordedGrasp) -> Result<String, PictureE
     let mut drawn_pads = Svg::default();
     let height = draw_pads(&mut drawn_pads, &placed, [14.0, 14.0], 272.0, 400.0)?;
     let pads = drawn_pads.finish(300.0, height + 28.0, "Cells of the frame chosen", style());
-    let data = serde_json::to_string(&data(&placed, cameras[0].azimuth_rad())?)
-        .map_err(|source| PictureError::Data { source })?;
+    let data = json_for_page(&data(&placed, cameras[0].azimuth_rad())?)?;
     let title = escape(&page_title(&placed));
     Ok(format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
@@ -81,13 +81,11 @@ pub fn grasp_html(hand: &Hand, grasp: &RecordedGrasp) -> Result<String, PictureE
          <input id=\"frame\" type=\"range\" min=\"0\" step=\"1\" aria-label=\"frame\"><output id=\"when\"></output></div>\n\
          <p class=\"hint\">Drag or arrow keys: turn. Wheel, + and −: zoom. Double click: back.{}</p>\n\
          </section>\n{}</main>\n<script type=\"application/json\" id=\"grasp\">{}</script>\n\
-         <script type=\"text/plain\" id=\"three.js\">{THREE_JS}</script>\n\
-         <script type=\"text/plain\" id=\"stage.js\">{STAGE_JS}</script>\n\
-         <script type=\"module\">\n{SCRIPT}</script>\n</body>\n</html>\n",
+         {}<script type=\"module\">\n{SCRIPT}</script>\n</body>\n</html>\n",
         if placed.object_in_palm.is_some() { " The object is shown where the grasp ends." } else { "" },
         contact_table(&placed),
-        // A name in the data must not end the script.
-        data.replace('<', "\\u003c"),
+        data,
+        stage_modules(),
     ))
 }
 

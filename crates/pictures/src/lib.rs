@@ -22,9 +22,8 @@
 //! * [`posed_scene_images`] - a hand and a thing on a post, moment by moment, by one camera.
 //! * [`dictionary_svg`] - a contact dictionary over the hand.
 //! * [`graph_mermaid`], [`graph_dot`] - a graph of processes.
-//! * [`chart`] - lines, points and bars over axes.
-//! * [`ReportPage`] - a page of text, tables and pictures.
-//! * [`GraspCards`] - grasps that such a page draws by itself.
+//! * [`report_html`] - a report as a page that draws its data by itself, with charts by [`CHART_JS`].
+//! * [`GraspCards`] - grasps that such a page draws.
 //!
 //! Surfaces are rendered here, by a small z-buffered rasteriser (no graphics card, no fonts), and embedded as PNG; what
 //! must be sharp or read (arrows, numbers, text) lies over them as vectors. The same input gives the same
@@ -34,7 +33,6 @@
 //! only geometry that a hand's description here has.
 
 mod animation;
-pub mod chart;
 mod colour;
 mod dictionary_picture;
 mod geometry;
@@ -63,9 +61,8 @@ pub use grasp_cards::GraspCards;
 pub use grasp_picture::grasp_svg;
 pub use html::grasp_html;
 pub use posed_scene::{PosedScene, posed_scene_images};
-pub use report::{ReportPage, report_table};
+pub use report::{CHART_JS, ReportKind, report_html};
 pub use scene::{HandScene, ObjectScene, STAGE_JS, THREE_JS, link_poses};
-pub use svg::escape;
 
 use blindgrasp_stages::hand::JointError;
 

@@ -1,74 +1,77 @@
-//! A report as a page: one HTML file that asks the network for nothing. It runs no script but those that it is given.
+//! A report as a page: one HTML file that holds its data as JSON and the script that draws them. It asks the network for nothing.
 
-use std::fmt::Write;
+use serde::Serialize;
 
-use super::escape;
+use super::scene::{STAGE_JS, THREE_JS};
+use super::{GraspCards, PictureError};
 
+/// Charts of reports and of the page of a graph, as a module.
+pub const CHART_JS: &str = include_str!("../assets/chart.js");
+const REPORT_JS: &str = include_str!("../assets/report.js");
 const STYLE: &str = include_str!("../assets/report.css");
 
-/// A page under way. Texts that are given to it are HTML, but for titles.
-pub struct ReportPage {
-    text: String,
+/// The reports that the page's script draws.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ReportKind {
+    Evaluation,
+    Run,
+    Trials,
 }
 
-impl ReportPage {
-    /// Begins a page with its title and a sentence or two for a reader who reads no further.
-    pub fn begin(title: &str, lead: &str) -> ReportPage {
-        let title = escape(title);
-        let text = format!(
-            "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
-             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>{title}</title>\n\
-             <style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n<h1>{title}</h1>\n<p class=\"lead\">{lead}</p>\n"
-        );
-        ReportPage { text }
-    }
-
-    pub fn section(&mut self, title: &str, body: &str) {
-        // Writing to a string cannot fail.
-        let _ = writeln!(self.text, "<section>\n<h2>{}</h2>\n{body}</section>", escape(title));
-    }
-
-    pub fn figure(&mut self, picture: &str, caption: &str) {
-        let caption = match caption {
-            "" => String::new(),
-            caption => format!("<figcaption class=\"caption\">{caption}</figcaption>"),
-        };
-        // On a small screen it is scrolled, also by keys.
-        self.raw(&format!("<figure tabindex=\"0\">\n{picture}{caption}</figure>\n"));
-    }
-
-    /// Pictures side by side.
-    pub fn pairs(&mut self, pictures: impl Iterator<Item = String>) {
-        self.raw("<div class=\"pairs\">\n");
-        pictures.for_each(|picture| self.figure(&picture, ""));
-        self.raw("</div>\n");
-    }
-
-    pub fn raw(&mut self, html: &str) {
-        self.text.push_str(html);
-    }
-
-    pub fn finish(mut self) -> String {
-        self.raw("</main>\n</body>\n</html>\n");
-        self.text
-    }
+#[derive(Serialize)]
+struct Page<'a, T> {
+    kind: ReportKind,
+    data: &'a T,
+    cards: Option<&'a GraspCards>,
 }
 
-/// A table: the heads with whether their column has numbers, and the rows, of which some are marked.
-pub fn report_table(head: &[(&str, bool)], rows: &[(bool, Vec<String>)]) -> String {
-    let class = |number: bool| if number { " class=\"number\"" } else { "" };
-    let mut text = String::from("<div class=\"scroll\" tabindex=\"0\"><table>\n<thead><tr>");
-    for (name, number) in head {
-        let _ = write!(text, "<th{}>{name}</th>", class(*number));
-    }
-    text.push_str("</tr></thead>\n<tbody>\n");
-    for (own, cells) in rows {
-        text.push_str(if *own { "<tr class=\"own\">" } else { "<tr>" });
-        for (cell, (_, number)) in cells.iter().zip(head) {
-            let _ = write!(text, "<td{}>{cell}</td>", class(*number));
+/// The page of a report.
+///
+/// # Errors
+/// The data cannot be written as JSON.
+pub fn report_html(
+    kind: ReportKind,
+    data: &impl Serialize,
+    cards: Option<&GraspCards>,
+) -> Result<String, PictureError> {
+    Ok(format!(
+        include_str!("../assets/report.html"),
+        style = STYLE,
+        data = json_for_page(&Page { kind, data, cards })?,
+        modules = if cards.is_some() { stage_modules() } else { String::new() },
+        script = format!("{CHART_JS}{REPORT_JS}"),
+    ))
+}
+
+/// JSON that can stand in a script of a page: a name in it does not end the script.
+pub(super) fn json_for_page(data: &impl Serialize) -> Result<String, PictureError> {
+    let json = serde_json::to_string(data).map_err(|source| PictureError::Data { source })?;
+    Ok(json.replace('<', "\\u003c"))
+}
+
+/// The modules of a page that shows a hand in three dimensions: its script loads them out of the page.
+pub(super) fn stage_modules() -> String {
+    format!(
+        "<script type=\"text/plain\" id=\"three.js\">{THREE_JS}</script>\n\
+         <script type=\"text/plain\" id=\"stage.js\">{STAGE_JS}</script>\n"
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_strangers_stay_data_and_the_page_may_not_use_the_network() {
+        let hostile = serde_json::json!({ "name": "</script><script>alert(1)</script><!--" });
+        let html = report_html(ReportKind::Trials, &hostile, None).expect("a page");
+        assert_eq!(html.matches("</script>").count(), 2, "only the page's own scripts end");
+        assert!(html.contains("\\u003c/script>\\u003cscript>alert(1)") && !html.contains("<!--"));
+        assert!(html.contains("default-src 'none'; script-src 'unsafe-inline' blob:;"));
+        // Texts are set, never read as HTML.
+        for reads in ["innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval("] {
+            assert!(!CHART_JS.contains(reads) && !REPORT_JS.contains(reads), "{reads}");
         }
-        text.push_str("</tr>\n");
     }
-    text.push_str("</tbody>\n</table></div>\n");
-    text
 }

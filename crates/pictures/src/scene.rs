@@ -106,12 +106,6 @@ fn scale_colours() -> Vec<[u8; 3]> {
     colours.map(|colour: Rgb| bytes(colour)).collect()
 }
 
-/// The same, as the stops of a gradient of CSS.
-pub(super) fn scale_stops() -> String {
-    let stops = scale_colours().into_iter().map(|[red, green, blue]| format!("rgb({red} {green} {blue})"));
-    stops.collect::<Vec<_>>().join(",")
-}
-
 fn cells(hand: &Hand) -> Vec<CellData> {
     hand.cells()
         .zip(cells_in_link(hand))

@@ -121,7 +121,7 @@ pub(super) fn fit_text(text: &str, font_size: f64, width: f64) -> String {
 }
 
 /// For text and attributes of XML and HTML. Characters that XML cannot hold become the replacement character.
-pub fn escape(text: &str) -> String {
+pub(super) fn escape(text: &str) -> String {
     let mut escaped = String::with_capacity(text.len());
     for letter in text.chars() {
         match letter {

@@ -166,16 +166,12 @@ fn frames_and_contacts_of_another_hand_are_refused() {
 fn cards_hold_a_frame_each_and_hostile_names_are_only_text() {
     let (hand, mut grasp) = simulated("can", 1);
     grasp.truth.as_mut().expect("a truth").object = "</script><b>\"&".into();
-    let mut cards = GraspCards::new(&hand);
-    assert!(cards.is_empty());
-    let html = cards.add(&[grasp.clone(), grasp]).expect("cards") + &cards.add(&[]).expect("no cards");
-    assert_eq!(html.matches("data-grasp=").count(), 2);
-    assert!(html.contains("known to be stable; object &lt;/script&gt;") && !html.contains("<b>\""), "{html}");
-    let scripts = cards.scripts().expect("scripts");
-    assert_eq!(scripts.matches("\"grasp_id\"").count(), 2);
-    assert_eq!(scripts.matches("</script>").count(), 4, "only the page's own scripts end");
-    assert!(cards.view().contains("linear-gradient"));
+    let cards = GraspCards::new(&hand, [&grasp, &grasp]).expect("cards");
+    let html = report_html(ReportKind::Run, &(), Some(&cards)).expect("a page");
+    assert_eq!(html.matches("\"grasp_id\"").count(), 2);
+    assert!(html.contains("known to be stable; object \\u003c/script>\\u003cb>"), "{}", &html[..2000]);
+    assert_eq!(html.matches("</script>").count(), 4, "only the page's own scripts end");
     let (_, mut other) = simulated("can", 1);
     other.frames[0].message.cells_newtons.pop();
-    cards.add(&[other]).expect_err("a frame of another hand");
+    assert!(GraspCards::new(&hand, [&other]).is_err(), "a frame of another hand");
 }

@@ -1,6 +1,6 @@
 //! The report of a run as a page: its decisions in time, latencies, losses, changes, and pictures of wrong decisions.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 use std::path::Path;
 use std::time::Instant;
 
@@ -9,13 +9,10 @@ use blindgrasp_graph::log::AUDIT;
 use blindgrasp_graph::log::{LogFolder, LogTail};
 use blindgrasp_graph::run::{RunSummary, SeenDecision};
 use blindgrasp_messages::{Action, GraspTruth, LiftDecision, Phase, Record, Stamped, TactileFrame};
-use blindgrasp_operator::ages::Ages;
 use blindgrasp_operator::wiring::LogLevel;
-use blindgrasp_pictures::chart::{
-    Axis, BarChart, COLOURS, Chart, Line, NumberFormat, Series, bar_chart_svg, chart_svg, range_from_zero,
-};
-use blindgrasp_pictures::{GraspCards, ObjectSurface, PictureError, RecordedGrasp, ReportPage, escape, report_table};
+use blindgrasp_pictures::{GraspCards, ObjectSurface, RecordedGrasp, ReportKind, report_html};
 use blindgrasp_stages::hand::Hand;
+use serde::Serialize;
 
 use crate::output::write_report;
 
@@ -60,11 +57,34 @@ struct ReportedGrasp {
     is_counted: bool,
 }
 
-#[derive(Default)]
+#[derive(Default, Serialize)]
 struct Wrong {
     n: usize,
     points: Vec<Point>,
+    #[serde(rename = "shown", serialize_with = "count")]
     pictures: Vec<RecordedGrasp>,
+}
+
+/// The data of the page.
+#[derive(Serialize)]
+struct RunPage<'a> {
+    summary: &'a RunSummary,
+    /// Every `step`th of the right decisions.
+    step: usize,
+    others: &'a [Point],
+    wrong_lifts: &'a Wrong,
+    wrong_holds: &'a Wrong,
+    changes: Changes,
+    /// The reason for the lack of cards, if there is one.
+    problem: Option<String>,
+}
+
+/// Lines of the log: time, operator, level and text.
+#[derive(Default, Serialize)]
+struct Changes {
+    lines: Vec<[String; 4]>,
+    n_left_out: usize,
+    problem: Option<String>,
 }
 
 impl RunReport {
@@ -202,194 +222,41 @@ impl RunReport {
         for (_, grasp) in std::mem::take(&mut self.grasps) {
             self.add_without_truth(&grasp);
         }
-        write_report(path, &self.page(summary)).context("--report")
+        write_report(path, &self.page(summary)?).context("--report")
     }
 
-    fn page(&self, summary: &RunSummary) -> String {
-        let mut page = ReportPage::begin(&format!("Run of {}", summary.graph), &lead(summary));
-        page.section("Decisions", &reasons(summary));
-        page.figure(&chart_svg(&self.timeline()), &self.timeline_caption());
-        page.section("Edges", &edges(summary));
-        let decided = summary.edges.iter().rev().find(|edge| edge.to == "run" && edge.ages.n_samples() > 0);
-        let charts = decided.into_iter().chain(summary.edges.iter().filter(|edge| edge.to != "run"));
-        page.pairs(charts.filter(|edge| edge.ages.n_samples() > 0).map(|edge| {
-            bar_chart_svg(&histogram(&format!("Age on arrival, {} to {}", edge.from, edge.to), &edge.ages))
-        }));
-        page.section("Changes and messages", &changes(summary));
-        if let Some(hand) = &self.hand {
-            self.add_wrong(&mut page, hand).unwrap_or_else(|error| {
-                page.raw(&format!("<p>{}</p>\n", escape(&error.to_string())));
-            });
-        }
-        page.finish()
-    }
-
-    /// The wrong decisions as cards, which the page draws.
-    fn add_wrong(&self, page: &mut ReportPage, hand: &Hand) -> Result<(), PictureError> {
-        let mut cards = GraspCards::new(hand);
-        let mut sections = Vec::new();
-        for (title, wrong) in
-            [("Lifts of unstable grasps", &self.wrong_lifts), ("Holds of stable grasps", &self.wrong_holds)]
+    fn page(&self, summary: &RunSummary) -> anyhow::Result<String> {
+        let mut page = RunPage {
+            summary,
+            step: self.step,
+            others: &self.others,
+            wrong_lifts: &self.wrong_lifts,
+            wrong_holds: &self.wrong_holds,
+            changes: changes(summary),
+            problem: None,
+        };
+        let mut cards = None;
+        if let Some(hand) = &self.hand
+            && self.wrong_lifts.pictures.len() + self.wrong_holds.pictures.len() > 0
         {
-            if wrong.n > 0 {
-                let shown = wrong.pictures.len();
-                let count = format!("<p>{} in all; the first {shown} are shown.</p>\n", wrong.n);
-                sections.push((title, count + &cards.add(&wrong.pictures)?));
+            match GraspCards::new(hand, self.wrong_lifts.pictures.iter().chain(&self.wrong_holds.pictures)) {
+                Ok(made) => cards = Some(made),
+                Err(error) => page.problem = Some(error.to_string()),
             }
         }
-        if !cards.is_empty() {
-            page.section("Wrong decisions", &cards.view());
-        }
-        for (title, body) in sections {
-            page.section(title, &body);
-        }
-        if !cards.is_empty() {
-            page.raw(&cards.scripts()?);
-        }
-        Ok(())
-    }
-
-    fn timeline(&self) -> Chart {
-        let series = |name: &str, colour, points: &[Point], radius| Series {
-            name: name.into(),
-            colour,
-            line: Line::Solid,
-            points: Vec::new(),
-            discs: points.iter().map(|[secs, probability]| [*secs, *probability, radius]).collect(),
-            intervals: Vec::new(),
-        };
-        let all = [&self.others, &self.wrong_holds.points, &self.wrong_lifts.points];
-        Chart {
-            title: "Probability of stable, by decision".into(),
-            size: [860.0, 340.0],
-            x: Axis {
-                label: "seconds since the start".into(),
-                range: range_around(all.into_iter().flatten().map(|[secs, _]| *secs)),
-                format: NumberFormat::Count,
-            },
-            y: Axis { label: "probability (%)".into(), range: [0.0, 1.0], format: NumberFormat::Percent },
-            series: vec![
-                series("right, or without a label", COLOURS[4], &self.others, 2.0),
-                series("held, stable", COLOURS[1], &self.wrong_holds.points, 3.5),
-                series("lifted, unstable", COLOURS[5], &self.wrong_lifts.points, 4.5),
-            ],
-        }
-    }
-
-    fn timeline_caption(&self) -> String {
-        let others = match self.step {
-            1 => String::new(),
-            n => format!("Of the right decisions, every {n}th is drawn. "),
-        };
-        match self.wrong_lifts.n.max(self.wrong_holds.n) {
-            n if n > MAX_WRONG => format!("{others}Of the wrong ones of a kind, the first {MAX_WRONG} are drawn."),
-            _ => others,
-        }
+        Ok(report_html(ReportKind::Run, &page, cards.as_ref())?)
     }
 }
 
-/// From a round value up to the first one to a round value from the last one on.
-fn range_around(values: impl Iterator<Item = f64>) -> [f64; 2] {
-    let [first, last] = values.fold([f64::INFINITY, 0.0], |[first, last], value| [value.min(first), value.max(last)]);
-    if !first.is_finite() {
-        return [0.0, 1.0];
-    }
-    let step = if last > first { 10_f64.powf((last - first).log10().floor()) } else { 1.0 };
-    let from = (first / step).floor() * step;
-    [from, ((last / step).ceil() * step).max(from + step)]
-}
-
-fn lead(summary: &RunSummary) -> String {
-    let losses = [
-        (summary.samples_lost, "samples were lost"),
-        (summary.samples_dropped, "samples were dropped for newer ones"),
-        (summary.edges_unknown as u64, "edges do not tell their losses"),
-        (summary.undecided as u64, "grasps were not decided"),
-    ];
-    let losses = losses.iter().filter(|(n, _)| *n > 0).map(|(n, what)| format!("<b>{n} {what}.</b>"));
-    let losses: Vec<String> = losses.collect();
-    let loss = if losses.is_empty() { "No sample was lost.".into() } else { losses.join(" ") };
-    let truth = match summary.with_truth {
-        0 => "No grasp has a label.".into(),
-        n => format!("Of {n} grasps with a label, {} were lifted and unstable.", summary.false_positives),
-    };
-    let latency = summary.latency_nanos.as_ref().map_or(String::new(), |latency| {
-        format!(" A decision took {} in the median and {} at 99 %.", time(latency.p50), time(latency.p99))
-    });
-    format!(
-        "{}: {} grasps, {} lifted, {} held. {truth}{latency} {loss} {} restarts, {} swaps.",
-        escape(summary.end),
-        summary.grasps,
-        summary.lift,
-        summary.hold,
-        summary.restarts,
-        summary.swaps
-    )
-}
-
-fn time(nanos: u64) -> String {
-    match nanos as f64 {
-        nanos if nanos < 1e6 => format!("{:.0} µs", nanos / 1e3),
-        nanos if nanos < 1e9 => format!("{:.1} ms", nanos / 1e6),
-        nanos => format!("{:.1} s", nanos / 1e9),
-    }
-}
-
-fn reasons(summary: &RunSummary) -> String {
-    let rows = summary.reasons.iter().map(|(reason, n)| (false, vec![escape(reason), n.to_string()]));
-    report_table(&[("reason", false), ("grasps", true)], &rows.collect::<Vec<_>>())
-}
-
-fn edges(summary: &RunSummary) -> String {
-    let rows = summary.edges.iter().map(|edge| {
-        let age = |share| edge.ages.quantile_nanos(share).map_or("–".into(), time);
-        let cells = vec![
-            escape(&edge.from),
-            escape(&edge.to),
-            edge.sent.to_string(),
-            edge.received.to_string(),
-            edge.missing.to_string(),
-            edge.dropped.to_string(),
-            edge.late.to_string(),
-            age(0.5),
-            age(0.99),
-        ];
-        (edge.missing > 0, cells)
-    });
-    let head = ["from", "to", "sent", "received", "missing", "dropped", "late", "age p50", "age p99"];
-    let head: Vec<(&str, bool)> = head.iter().enumerate().map(|(idx, name)| (*name, idx > 1)).collect();
-    report_table(&head, &rows.collect::<Vec<_>>())
-}
-
-/// A bar for each doubling of the age.
-fn histogram(title: &str, ages: &Ages) -> BarChart {
-    let mut octaves: BTreeMap<u32, u64> = BTreeMap::new();
-    for (upper_nanos, count) in ages.buckets() {
-        *octaves.entry(upper_nanos.saturating_sub(1).max(1).ilog2()).or_default() += count;
-    }
-    let n = ages.n_samples().max(1) as f64;
-    let (first, last) = (octaves.keys().next().copied(), octaves.keys().last().copied());
-    let all: Vec<u32> = first.zip(last).map(|(first, last)| (first..=last).collect()).unwrap_or_default();
-    let shares: Vec<f64> =
-        all.iter().map(|octave| octaves.get(octave).copied().unwrap_or_default() as f64 / n).collect();
-    BarChart {
-        title: title.into(),
-        size: [566.0, 280.0],
-        y: Axis {
-            label: "share of samples (%)".into(),
-            range: range_from_zero(shares.iter().copied()),
-            format: NumberFormat::Percent,
-        },
-        groups: all.iter().map(|octave| format!("≤ {}", time(2_u64 << octave))).collect(),
-        series: vec![(String::new(), COLOURS[0], shares)],
-    }
+fn count<S: serde::Serializer>(pictures: &[RecordedGrasp], serializer: S) -> Result<S::Ok, S::Error> {
+    pictures.len().serialize(serializer)
 }
 
 /// The lines of this run in the logs of the launcher and of its clients, and the warnings and errors of its operators.
-fn changes(summary: &RunSummary) -> String {
+fn changes(summary: &RunSummary) -> Changes {
     let mut lines = match LogTail::open(LogFolder::of_graph(&summary.graph), None, usize::MAX, 1 << 20) {
         Ok((_, lines)) => lines,
-        Err(error) => return format!("<p>The logs cannot be read: {}</p>\n", escape(&error.to_string())),
+        Err(error) => return Changes { problem: Some(error.to_string()), ..Changes::default() },
     };
     // All logs begin the run at the same time.
     let begin = lines.iter().rposition(|line| line.operator == "run" && line.text.starts_with("== new run"));
@@ -400,21 +267,13 @@ fn changes(summary: &RunSummary) -> String {
         is_telling && !line.text.starts_with("== new run")
     });
     let n_left_out = lines.len().saturating_sub(MAX_LINES);
-    let rows = lines.iter().skip(n_left_out).map(|line| {
+    let mut shown = Vec::new();
+    for line in lines.drain(n_left_out..) {
         let level = line.level.map(|level| format!("{level:?}").to_lowercase()).unwrap_or_default();
         let fields: String = line.fields.iter().map(|(name, value)| format!(" {name}={value}")).collect();
-        let text = escape(&format!("{}{fields}", line.text));
-        (level == "error", vec![escape(&line.time), escape(&line.operator), level, text])
-    });
-    let rows: Vec<_> = rows.collect();
-    if rows.is_empty() {
-        return "<p>None.</p>\n".into();
+        shown.push([line.time, line.operator, level, line.text + &fields]);
     }
-    let left_out = match n_left_out {
-        0 => String::new(),
-        n => format!("<p class=\"caption\">{n} earlier lines are left out: see blindgrasp logs.</p>\n"),
-    };
-    report_table(&[("time", false), ("operator", false), ("level", false), ("text", false)], &rows) + &left_out
+    Changes { lines: shown, n_left_out, problem: None }
 }
 
 #[cfg(test)]
@@ -422,15 +281,6 @@ mod tests {
     use blindgrasp_messages::{Header, Reason};
 
     use super::*;
-
-    #[test]
-    fn the_time_axis_begins_near_the_first_decision() {
-        assert_eq!(range_around([62.4, 61.9, 70.0].into_iter()), [61.0, 70.0]);
-        assert_eq!(range_around([3.0].into_iter()), [3.0, 4.0]);
-        assert_eq!(range_around(std::iter::empty()), [0.0, 1.0]);
-        let short = range_around([0.058, 0.097].into_iter());
-        assert!((short[0] - 0.05).abs() < 1e-9 && (short[1] - 0.1).abs() < 1e-9, "{short:?}");
-    }
 
     /// A source that starts again may count its grasps from 0, in an epoch that is not above the one before.
     #[test]

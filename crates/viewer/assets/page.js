@@ -1,7 +1,8 @@
-// Small helpers of the page: elements, tables, colours, and texts of times. The server joins page.js, chart.js, history.js,
+// Small helpers of the page: elements, tables, colours, and texts of times. The server joins page.js, timeline.js, history.js,
 // player.js, control.js and app.js, in this order, into one module: over a slow line each file more would cost a round trip.
 import * as three from "/three.js";
 import { MAX_CONTACTS, colourStep, makeStage } from "/stage.js";
+import { add, lineChart, roundUp, time, write } from "/chart.js";
 
 const byId = (id) => document.getElementById(id);
 
@@ -50,12 +51,7 @@ const showKeys = (element, keys) => {
 
 // A name as it is written in a sentence.
 const spoken = (name) => name.replaceAll("_", " ");
-const time = (nanos) => nanos < 1e6 ? `${(nanos / 1e3).toFixed(0)} µs` : nanos < 1e9 ? `${(nanos / 1e6).toFixed(1)} ms` : `${(nanos / 1e9).toFixed(1)} s`;
 const clock = (millis) => new Date(millis).toLocaleTimeString([], { hour12: false });
-const roundUp = (value) => {
-  const power = 10 ** Math.floor(Math.log10(value));
-  return power * ([1, 1.5, 2, 3, 4, 5, 6, 8].find((step) => step * power >= value) ?? 10);
-};
 // The outcome of a decision by the label, which is null or missing where it is not known.
 const verdict = ({ action, truth }) => {
   if (action === null || truth === null || truth === undefined) return "other";

@@ -26,7 +26,7 @@ use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use axum::{Extension, Router};
-use blindgrasp_pictures::{STAGE_JS, THREE_JS};
+use blindgrasp_pictures::{CHART_JS, STAGE_JS, THREE_JS};
 use futures_util::stream;
 use tokio::sync::broadcast;
 use tokio::sync::broadcast::error::RecvError;
@@ -60,16 +60,17 @@ const CONTENT_POLICY: &str = "default-src 'none'; script-src 'self'; style-src '
 /// The parts of the page's script are one file for the browser: a round trip may take half a second.
 const APP_JS: &str = concat!(
     include_str!("../assets/page.js"),
-    include_str!("../assets/chart.js"),
+    include_str!("../assets/timeline.js"),
     include_str!("../assets/history.js"),
     include_str!("../assets/player.js"),
     include_str!("../assets/control.js"),
     include_str!("../assets/app.js"),
 );
-const FILES: [(&str, &str, &str); 5] = [
+const FILES: [(&str, &str, &str); 6] = [
     ("/", "text/html; charset=utf-8", include_str!("../assets/index.html")),
     ("/app.css", "text/css; charset=utf-8", include_str!("../assets/app.css")),
     ("/app.js", "text/javascript; charset=utf-8", APP_JS),
+    ("/chart.js", "text/javascript; charset=utf-8", CHART_JS),
     ("/stage.js", "text/javascript; charset=utf-8", STAGE_JS),
     ("/three.js", "text/javascript; charset=utf-8", THREE_JS),
 ];

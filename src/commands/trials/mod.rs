@@ -163,7 +163,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     report.count();
     if let Some(path) = &arguments.report {
         let strips = strips(&setup, &targets, &report, &n_stops);
-        write_report(path, &trials_page(&report, &strips))?;
+        write_report(path, &trials_page(&report, &strips)?)?;
     }
     print_report(arguments, &report)?;
     let late = report.late.and_then(|late| late.advice());

@@ -1,14 +1,13 @@
-//! The report of trials as a page: one HTML file that asks the network for nothing and runs no script.
+//! The report of trials as a page.
 //!
 //! Its pictures are simulated again: an attempt is a function of seed, trial and attempt alone.
 
-use std::fmt::Write;
-
 use nalgebra::{Isometry3, Quaternion, UnitQuaternion};
+use serde::Serialize;
 
 use super::tables::{Table, TrialsReport, tables};
 use super::tally::TrialRecord;
-use blindgrasp_pictures::{PictureError, PosedScene, ReportPage, escape, posed_scene_images};
+use blindgrasp_pictures::{PictureError, PosedScene, ReportKind, posed_scene_images, report_html};
 use blindgrasp_simulator::trial::{
     Attempt, LiftTarget, ProbeMove, Snapshot, TrialError, TrialOptions, choose_start, sensor_seed,
 };
@@ -23,7 +22,7 @@ const DROPPED_M: f64 = 0.09;
 const IMAGE: [usize; 2] = [220, 250];
 
 /// A lift, or a grasp that was not lifted, as a strip of images.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Serialize)]
 pub struct Strip {
     pub caption: String,
     /// Each with its time, seconds since the attempt began.
@@ -41,43 +40,40 @@ pub enum StripError {
     Picture(#[from] PictureError),
 }
 
+/// The data of the page.
+#[derive(Serialize)]
+struct TrialsPage<'a> {
+    lead: String,
+    tables: Vec<Table>,
+    strips: &'a [Strip],
+    /// Of an image, pixels.
+    size: [usize; 2],
+    /// How this was made: names and values.
+    made: [(&'static str, &'a str); 6],
+}
+
 /// The page.
-pub fn trials_page(report: &TrialsReport, strips: &[Strip]) -> String {
-    let mut page = ReportPage::begin("Lift trials", &escape(&lead(report)));
-    for table in tables(report) {
-        page.section(&table.title, &html(&table));
-    }
-    if !strips.is_empty() {
-        let mut body = String::new();
-        for strip in strips {
-            body.push_str("<figure>\n<div class=\"strip\">\n");
-            for (secs, image) in &strip.images {
-                let [width, height] = IMAGE;
-                // Writing to a string cannot fail.
-                let _ = writeln!(
-                    body,
-                    "<img src=\"{image}\" width=\"{width}\" height=\"{height}\" alt=\"after {secs:.2} s\" \
-                     title=\"after {secs:.2} s\">"
-                );
-            }
-            let caption = escape(&strip.caption);
-            let _ = write!(body, "</div>\n<figcaption class=\"caption\">{caption}</figcaption>\n</figure>\n");
-        }
-        page.section("Some of the trials", &body);
-    }
-    let mut made = String::from("<dl>\n");
-    for (name, value) in [
-        ("command", report.command.clone()),
-        ("objects", report.objects.clone()),
-        ("model", report.model.clone()),
-        ("trials", format!("{}, {} attempts each at most, seed {}", report.n_trials, report.max_attempts, report.seed)),
-        ("intervals", "95 %, Wilson's; lifts count as independent".into()),
-        ("assumed", "the objects' sizes and their friction; the paper's masses".into()),
-    ] {
-        let _ = writeln!(made, "<dt>{name}</dt><dd>{}</dd>", escape(&value));
-    }
-    page.section("How this was made", &format!("{made}</dl>\n"));
-    page.finish()
+///
+/// # Errors
+/// The data cannot be written as JSON.
+pub fn trials_page(report: &TrialsReport, strips: &[Strip]) -> Result<String, PictureError> {
+    let TrialsReport { n_trials, max_attempts, seed, .. } = report;
+    let trials = format!("{n_trials}, {max_attempts} attempts each at most, seed {seed}");
+    let page = TrialsPage {
+        lead: lead(report),
+        tables: tables(report),
+        strips,
+        size: IMAGE,
+        made: [
+            ("command", &report.command),
+            ("objects", &report.objects),
+            ("model", &report.model),
+            ("trials", &trials),
+            ("intervals", "95 %, Wilson's; lifts count as independent"),
+            ("assumed", "the objects' sizes and their friction; the paper's masses"),
+        ],
+    };
+    report_html(ReportKind::Trials, &page, None)
 }
 
 /// Of each group, with the gate (or without, if there was none), the first grasp that held, the first that was dropped
@@ -225,20 +221,6 @@ fn lead(report: &TrialsReport) -> String {
     parts.join(" ")
 }
 
-fn html(table: &Table) -> String {
-    let class = |column: usize| if column == 0 { "" } else { " class=\"number\"" };
-    let row = |cells: &[String], tag: &str| {
-        let cells = cells.iter().enumerate();
-        let cells = cells.map(|(column, cell)| format!("<{tag}{}>{}</{tag}>", class(column), escape(cell)));
-        format!("<tr>{}</tr>\n", cells.collect::<String>())
-    };
-    let rows: String = table.rows.iter().map(|cells| row(cells, "td")).collect();
-    format!(
-        "<div class=\"scroll\"><table>\n<thead>{}</thead>\n<tbody>\n{rows}</tbody>\n</table></div>\n",
-        row(&table.head, "th")
-    )
-}
-
 #[cfg(test)]
 mod tests {
     use std::path::Path;
@@ -272,19 +254,19 @@ mod tests {
                 strip(&hand, target, made, 1, record).expect("a strip")
             })
             .collect();
-        let page = trials_page(&report, &strips);
+        let page = trials_page(&report, &strips).expect("a page");
         for expected in [
             "2 of 3 lifts kept (8 attempts, 1 of 4 trials given up)",
             "Of 2 drops, 2 were avoided.",
-            "<td class=\"number\">2 of 2, 100 % (34-100)</td>",
+            "\"2 of 2, 100 % (34-100)\"",
             "Table IV: the mug by mass",
             "decorative rock: held (trial 3, attempt 0; epsilon -0.100)",
-            "models/&lt;any&gt;.json",
-            "src=\"data:image/png;base64,",
+            "models/\\u003cany>.json",
+            "\"data:image/png;base64,",
         ] {
             assert!(page.contains(expected), "no '{expected}'");
         }
-        assert!(!page.contains("http") && !page.contains("<script"));
+        assert!(!page.contains("https:") && page.matches("<script").count() == 2);
         assert!(page.len() < 500_000, "{}", page.len());
     }
 }

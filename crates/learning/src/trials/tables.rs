@@ -69,7 +69,7 @@ impl TrialsReport {
 }
 
 /// A table to be read, as text or on a page.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Table {
     /// Its title.
     pub title: String,
