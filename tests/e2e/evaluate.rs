@@ -495,7 +495,9 @@ fn the_example_with_scikit_learn_is_judged_beside_the_recipes() {
     let features = folder.path().join("features.csv");
     run(&["export", RECORDING, "--features", MODEL, "--out", utf8(&features)], 0);
     let page = std::fs::read_to_string(project().join("docs/learning.md")).expect("a page");
-    let block = page.split("```python\n").nth(1).expect("an example").split("```").next().expect("its end");
+    let blocks: Vec<&str> =
+        page.split("```python\n").skip(1).map(|block| block.split("```").next().expect("its end")).collect();
+    let block = blocks.iter().find(|block| block.contains("mine.csv")).expect("an example");
     let program = folder.path().join("mine.py");
     std::fs::write(&program, block).expect("written");
     let printed = text(&shell(folder.path(), python(), &[utf8(&program)], 0).stdout);

@@ -6,7 +6,7 @@ use crate::common::{
 use serde_json::Value;
 
 fn drawn(arguments: &[&str]) -> String {
-    text(&run(&[&["graph"], arguments].concat(), 0).stdout)
+    text(&run(&[&["view"], arguments].concat(), 0).stdout)
 }
 
 fn json(arguments: &[&str]) -> Value {
@@ -76,7 +76,7 @@ fn the_default_graph_as_svg_is_laid_out_by_graphviz() {
     let unknown = folder.path().join("graph.png");
     let refused = run(&["view", "--out", unknown.to_str().expect("UTF-8")], 1);
     assert!(text(&refused.stderr).contains(".svg, .mmd or .dot"), "{}", text(&refused.stderr));
-    run(&["graph", "--out", "dataflow.yaml", "--format", "dot"], 1);
+    run(&["view", "--out", "dataflow.yaml", "--format", "dot"], 1);
 }
 
 #[test]
@@ -134,15 +134,15 @@ fn mistakes_are_reported_as_by_check() {
     let folder = tempfile::tempdir().expect("a folder");
     let file = dataflow(folder.path(), &[("votes", "vots")]);
     let file = file.to_str().expect("UTF-8");
-    let graph = text(&run(&["graph", file], 1).stderr);
+    let graph = text(&run(&["view", file], 1).stderr);
     let check = text(&run(&["run", "--check", file], 1).stderr);
     assert_eq!(graph, check);
     assert!(graph.contains("did you mean 'votes'?"), "{graph}");
     let name = unique_name();
-    let missing = run(&["graph", &name, "--json"], 1);
+    let missing = run(&["view", &name, "--json"], 1);
     assert!(text(&missing.stderr).contains(&format!("no graph '{name}' is running")), "{}", text(&missing.stderr));
-    run(&["graph", "dataflow.yaml", "--interval", "1"], 2);
-    run(&["graph", &name, "--interval", "1"], 2);
+    run(&["view", "dataflow.yaml", "--interval", "1"], 2);
+    run(&["view", &name, "--interval", "1"], 2);
 }
 
 #[test]
@@ -210,6 +210,6 @@ flowchart LR
         (&"brain".into(), &serde_json::json!(["robot", "brain"]))
     );
     assert_eq!(json["edges"][0]["crossing"], Value::Null);
-    run(&["graph", file, "--machine", "robot"], 0);
-    run(&["graph", file, "--machine", "rebot"], 1);
+    run(&["view", file, "--machine", "robot"], 0);
+    run(&["view", file, "--machine", "rebot"], 1);
 }

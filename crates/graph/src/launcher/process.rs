@@ -407,9 +407,10 @@ impl Process {
             })
     }
 
-    /// Whether it has died of shared memory that was not there when it was written to.
+    /// Whether it has died of shared memory that was not there when it was written to, or could not begin without it.
     pub(super) fn has_died_of_full_memory(&self) -> bool {
-        self.exit.is_some_and(|status| status.signal() == Some(Signal::BUS.as_raw())) && namespace::is_full()
+        let wrote_in_vain = self.exit.is_some_and(|status| status.signal() == Some(Signal::BUS.as_raw()));
+        (wrote_in_vain || !self.is_ready()) && namespace::is_full()
     }
 
     /// How it ended, for a person: "failed: …", "was killed (signal 9)", "ended with exit status 1".
