@@ -75,6 +75,6 @@ fn the_report_of_a_run_tells_its_changes() {
     for change in ["set lift_arbiter.votes=2", "'classifier' swapped after", "node 'contacts'"] {
         assert!(html.contains(change), "{change}");
     }
-    let summary = &report_data(&html)["summary"];
+    let summary = &report_data(&html)["data"]["summary"];
     assert_eq!((&summary["restarts"], &summary["swaps"]), (&1.into(), &1.into()), "{summary}");
 }
