@@ -346,12 +346,13 @@ fn a_graph_goes_on_when_shared_memory_was_full() {
         let target = format!("--target={}", graph.pid());
         Command::new("nsenter").args([&target, "--mount"]).args(arguments).output().expect("started")
     };
-    // It fills what becomes free, again and again.
-    let fill = "while :; do dd if=/dev/zero of=/dev/shm/filler bs=64k oflag=append conv=notrunc 2> /dev/null; done";
+    // It fills what becomes free, again and again, until it is ended or the graph is, as after a failure of this test.
+    let dd = "dd if=/dev/zero of=/dev/shm/filler bs=64k oflag=append conv=notrunc 2> /dev/null";
+    let fill = format!("while kill -0 {} 2> /dev/null; do {dd}; done", graph.pid());
     let target = format!("--target={}", graph.pid());
     let mut filler = Command::new("nsenter");
     // A group of its own: a program that the shell has started would go on filling.
-    let mut filler = filler.args([&target, "--mount", "sh", "-c", fill]).process_group(0).spawn().expect("started");
+    let mut filler = filler.args([&target, "--mount", "sh", "-c", &fill]).process_group(0).spawn().expect("started");
     let n_free_kib = || {
         let free = text(&in_shm(&["df", "--output=avail", "/dev/shm"]).stdout);
         free.lines().last().and_then(|line| line.trim().parse::<u64>().ok()).expect("a number")
