@@ -1,9 +1,12 @@
 //! Other users of the machine, and files and programs of strangers: they reach no graph, no terminal and no other file.
 
+use std::io::Write;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
-use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use blindgrasp_recording::{Record, RecordingInfo, RecordingReader, RecordingWriter};
 use rustix::process::{Signal, getuid};
@@ -342,32 +345,39 @@ fn a_graph_goes_on_when_shared_memory_was_full() {
     let flow = dataflow(folder.path(), &[]);
     let graph = Graph::launch_on(within(&[env!("CARGO_BIN_EXE_blindgrasp")]), &unique_name(), &flow, &FAST_FOREVER);
     graph.wait_for_decisions(A_FEW_GRASPS);
-    let in_shm = |arguments: &[&str]| {
-        let target = format!("--target={}", graph.pid());
-        Command::new("nsenter").args([&target, "--mount"]).args(arguments).output().expect("started")
-    };
-    // It fills what becomes free, again and again, until it is ended or the graph is, as after a failure of this test.
-    let dd = "dd if=/dev/zero of=/dev/shm/filler bs=64k oflag=append conv=notrunc 2> /dev/null";
-    let fill = format!("while kill -0 {} 2> /dev/null; do {dd}; done", graph.pid());
-    let target = format!("--target={}", graph.pid());
-    let mut filler = Command::new("nsenter");
-    // A group of its own: a program that the shell has started would go on filling.
-    let mut filler = filler.args([&target, "--mount", "sh", "-c", &fill]).process_group(0).spawn().expect("started");
-    let n_free_kib = || {
-        let free = text(&in_shm(&["df", "--output=avail", "/dev/shm"]).stdout);
-        free.lines().last().and_then(|line| line.trim().parse::<u64>().ok()).expect("a number")
-    };
+    // The folder as the graph sees it.
+    let shm = PathBuf::from(format!("/proc/{}/root/dev/shm", graph.pid()));
+    let is_over = Arc::new(AtomicBool::new(false));
+    let (fills_on, filler) = (Arc::clone(&is_over), shm.join("filler"));
+    // It takes all that becomes free, until it is told to end or the graph has ended, as after a failure of this test.
+    let filling = std::thread::spawn(move || {
+        let mut file = std::fs::File::create(&filler).expect("a file");
+        while !fills_on.load(Ordering::Relaxed) && filler.exists() {
+            if file.write(&[0; 1 << 14]).is_err() {
+                std::thread::sleep(Duration::from_micros(200));
+            }
+        }
+        let _ = std::fs::remove_file(&filler);
+    });
+    let n_free_kib = || rustix::fs::statvfs(&shm).map_or(0, |stats| stats.f_bavail * stats.f_frsize / 1024);
     wait_until(|| n_free_kib() == 0, || format!("{} KiB are free", n_free_kib()));
     // What the graph needs is its own: it goes on while the rest is full.
     graph.wait_for_decisions(5 * A_FEW_GRASPS);
     assert_eq!(graph.node("contacts")["n_restarts"], 0, "{}", graph.said());
-    // A process that is started again has no room, and waits for it.
-    crate::common::signal(graph.pid_of("contacts"), Signal::KILL);
-    wait_until(|| graph.said().contains("when there is room in /dev/shm"), || graph.said());
-    let group = rustix::process::Pid::from_child(&filler);
-    rustix::process::kill_process_group(group, Signal::KILL).expect("killed");
-    filler.wait().expect("ended");
-    in_shm(&["rm", "/dev/shm/filler"]);
+    // A process that is started again has no room, and waits for it. It may be faster than the filler, and is killed again.
+    let waits_for_room = || {
+        let contacts = graph.node("contacts");
+        if contacts["state"] == "running"
+            && let Some(pid) = contacts["pid"].as_i64().and_then(|pid| rustix::process::Pid::from_raw(pid as i32))
+        {
+            // It may have ended meanwhile.
+            let _ = rustix::process::kill_process(pid, Signal::KILL);
+        }
+        graph.said().contains("when there is room in /dev/shm")
+    };
+    wait_until(waits_for_room, || graph.said());
+    is_over.store(true, Ordering::Relaxed);
+    filling.join().expect("ended");
     wait_until(|| graph.node("contacts")["state"] == "running", || graph.said());
     graph.wait_for_decisions(A_FEW_GRASPS);
     assert!(!graph.said().contains("given up"), "{}", graph.said());

@@ -166,9 +166,9 @@ fn a_person_watches_a_graph() {
     top.press("r");
     top.wait_for("r counts from r");
     top.press("g");
-    // The next graph is another test's, which may be ending.
+    // The next graph is another test's, which may be ending: a line of its own then says why it is not shown.
     let has_gone_on = |text: &str| {
-        text.contains("no other graph is running") || text.contains("no graph '") || !text.starts_with(&graph.name)
+        text.contains("no other graph is running") || text.contains("graph '") || !text.starts_with(&graph.name)
     };
     wait_until(|| has_gone_on(&top.text()), || top.text());
     top.press("q");

@@ -290,8 +290,12 @@ fn own_uid() -> u32 {
     rustix::process::getuid().as_raw()
 }
 
-/// Frees the resources that dead processes of a graph still hold in iceoryx2.
+/// Frees the resources that dead processes of a graph still hold in iceoryx2. Nothing is freed while files lack their memory,
+/// as those of a process that died of full shared memory do: to read such a file would end the calling process (SIGBUS).
 pub fn clean_dead_nodes(domain: &NamespaceWiring) {
+    if take_room(domain).is_err() {
+        return;
+    }
     let Ok(config) = config(domain) else {
         return;
     };
