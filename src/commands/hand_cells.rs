@@ -49,12 +49,3 @@ pub(super) fn print(hand: &Path, joints: &[(String, f64)], json: bool) -> anyhow
     }
     Ok(Outcome::Done)
 }
-
-pub(super) fn joint(text: &str) -> Result<(String, f64), String> {
-    let (name, value) = text.split_once('=').ok_or("expected NAME=VALUE: radians, or metres of a slide")?;
-    let value = value
-        .trim()
-        .parse()
-        .map_err(|_| format!("'{value}' is not a number: expected radians, or metres of a slide, without the unit"))?;
-    Ok((name.trim().into(), value))
-}

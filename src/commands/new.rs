@@ -1,7 +1,5 @@
 //! `blindgrasp new`
 
-mod hand;
-
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -9,6 +7,7 @@ use blindgrasp_operators::{PYTHON_MESSAGES, PYTHON_OPERATOR};
 use clap::{Args, Subcommand};
 
 use super::{Outcome, print_line, print_text};
+use blindgrasp_cli::{check_free, in_shell, is_plain};
 
 /// Make a folder with an operator or a hand of your own
 ///
@@ -22,7 +21,6 @@ pub(super) struct Arguments {
 #[derive(Debug, Subcommand)]
 enum What {
     Operator(OperatorArguments),
-    Hand(Box<hand::Arguments>),
 }
 
 /// An operator in Rust, or in Python: program, test, README with the next commands.
@@ -53,7 +51,7 @@ struct OperatorArguments {
 }
 
 /// The versions that blindgrasp is tested with: the new operator is built with the same.
-const CARGO_LOCK: &str = include_str!("../../../Cargo.lock");
+const CARGO_LOCK: &str = include_str!("../../Cargo.lock");
 const REQUIREMENTS: &str = "numpy>=1.26\n";
 const MAX_NAME_CHARS: usize = 32;
 /// Names that Cargo refuses, or that a dependency of the new operator has.
@@ -85,9 +83,9 @@ const KINDS: [Kind; 4] = [
         function: "measure",
         param: "min_newtons: 5.0",
         source: "recorded_source/tactile",
-        rust: include_str!("../templates/judge_frames.rs.in"),
-        python: include_str!("../templates/judge_frames.py.in"),
-        python_test: include_str!("../templates/test_judge_frames.py.in"),
+        rust: include_str!("templates/judge_frames.rs.in"),
+        python: include_str!("templates/judge_frames.py.in"),
+        python_test: include_str!("templates/test_judge_frames.py.in"),
     },
     Kind {
         from: "ContactSet",
@@ -96,9 +94,9 @@ const KINDS: [Kind; 4] = [
         function: "measure",
         param: "min_newtons: 5.0",
         source: "contacts/contacts",
-        rust: include_str!("../templates/judge_contacts.rs.in"),
-        python: include_str!("../templates/judge_contacts.py.in"),
-        python_test: include_str!("../templates/test_judge_contacts.py.in"),
+        rust: include_str!("templates/judge_contacts.rs.in"),
+        python: include_str!("templates/judge_contacts.py.in"),
+        python_test: include_str!("templates/test_judge_contacts.py.in"),
     },
     Kind {
         from: "GraspFeature",
@@ -107,9 +105,9 @@ const KINDS: [Kind; 4] = [
         function: "measure",
         param: "min_pads: 2.0",
         source: "encoder/feature",
-        rust: include_str!("../templates/judge_features.rs.in"),
-        python: include_str!("../templates/judge_features.py.in"),
-        python_test: include_str!("../templates/test_judge_features.py.in"),
+        rust: include_str!("templates/judge_features.rs.in"),
+        python: include_str!("templates/judge_features.py.in"),
+        python_test: include_str!("templates/test_judge_features.py.in"),
     },
     Kind {
         from: "TactileFrame",
@@ -118,17 +116,14 @@ const KINDS: [Kind; 4] = [
         function: "filtered",
         param: "min_newtons: 0.1",
         source: "recorded_source/tactile",
-        rust: include_str!("../templates/filter.rs.in"),
-        python: include_str!("../templates/filter.py.in"),
-        python_test: include_str!("../templates/test_filter.py.in"),
+        rust: include_str!("templates/filter.rs.in"),
+        python: include_str!("templates/filter.py.in"),
+        python_test: include_str!("templates/test_filter.py.in"),
     },
 ];
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let arguments = match &arguments.what {
-        What::Operator(arguments) => arguments,
-        What::Hand(arguments) => return hand::run(arguments),
-    };
+    let What::Operator(arguments) = &arguments.what;
     let folder = &arguments.name;
     let name = checked_name(folder, arguments.python)?;
     let kind = Kind::of(arguments)?;
@@ -186,31 +181,9 @@ fn checked_name(folder: &Path, is_python: bool) -> anyhow::Result<String> {
     Ok(name.into())
 }
 
-/// Refuses a folder that is there already, or that cannot be made.
-fn check_free(folder: &Path) -> anyhow::Result<()> {
-    if folder.symlink_metadata().is_ok() {
-        anyhow::bail!("{} is there already, and nothing is overwritten: choose another name", folder.display());
-    }
-    match folder.parent() {
-        Some(parent) if parent != Path::new("") && !parent.is_dir() => {
-            anyhow::bail!("there is no folder {} to make it in: make it first", parent.display())
-        }
-        _ => Ok(()),
-    }
-}
-
-/// A path as one word of a shell command.
-fn in_shell(path: &str) -> String {
-    if is_plain(path) { path.into() } else { format!("'{}'", path.replace('\'', "'\\''")) }
-}
-
 /// A path as a text in YAML.
 fn in_yaml(path: &str) -> String {
     if is_plain(path) { path.into() } else { serde_json::Value::from(path).to_string() }
-}
-
-fn is_plain(path: &str) -> bool {
-    path.chars().all(|char| char.is_ascii_alphanumeric() || "/._-+".contains(char))
 }
 
 impl Kind {
@@ -285,10 +258,10 @@ fn patch(source: &Path) -> anyhow::Result<String> {
 
 fn rust_files(kind: &Kind) -> Vec<File> {
     vec![
-        ("Cargo.toml", include_str!("../templates/Cargo.toml.in"), false),
+        ("Cargo.toml", include_str!("templates/Cargo.toml.in"), false),
         ("Cargo.lock", CARGO_LOCK, false),
         ("src/main.rs", kind.rust, false),
-        ("README.md", include_str!("../templates/README-rust.md.in"), false),
+        ("README.md", include_str!("templates/README-rust.md.in"), false),
         (".gitignore", "/target\n", false),
     ]
 }
@@ -301,7 +274,7 @@ fn python_files(kind: &Kind) -> Vec<File> {
         ("blindgrasp_operator.py", PYTHON_OPERATOR, false),
         ("blindgrasp_messages.py", PYTHON_MESSAGES, false),
         ("requirements.txt", REQUIREMENTS, false),
-        ("README.md", include_str!("../templates/README-python.md.in"), false),
+        ("README.md", include_str!("templates/README-python.md.in"), false),
         (".gitignore", "/.venv\n__pycache__/\n", false),
     ]
 }

@@ -6,24 +6,22 @@ mod xacro;
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::process::{Command, Stdio};
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{RecordedGrasp, grasp_svg};
-use blindgrasp_ros::cdr::{self, Value};
-use blindgrasp_ros::node::{Convention, MAX_RECEIVED_BYTES, MessageType, Quality, Rights, RosNode, topic_name};
-use blindgrasp_ros::standard;
 use blindgrasp_stages::hand::{BareHand, Cell, Hand, find_mesh, part_below, read_urdf, with_meshes_renamed};
 use clap::Args;
 use nalgebra::{Unit, Vector3};
 use serde::Deserialize;
 
-use super::super::hand_cells::joint;
-use super::super::ros2_network::Ros2Network;
-use super::super::{Outcome, print_line, print_text};
-use super::{check_free, in_shell};
+use blindgrasp_cli::houses::NETWORK;
+use blindgrasp_cli::ros2_network::Ros2Network;
+use blindgrasp_cli::{check_free, in_shell, joint};
+
+use super::{Outcome, print_line, print_text};
 use draft::Draft;
 
 /// A hand: its URDF, a pad layout, and a picture.
@@ -94,9 +92,6 @@ pub(super) struct Arguments {
     threshold: f64,
 }
 
-/// The description of a robot must come within this time.
-const DESCRIPTION_LIMIT: Duration = Duration::from_secs(10);
-
 /// A pad of the layout to be written.
 #[derive(Clone)]
 struct NewPad {
@@ -129,7 +124,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let name = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default().to_owned();
     check_free(folder)?;
     let (source, mut urdf) = match (&arguments.urdf, &arguments.robot_description) {
-        (Some(_), _) if arguments.network.is_given() => {
+        (Some(_), _) if !arguments.network.arguments().is_empty() => {
             bail!("--connect, --keys and --domain are of no use to --urdf: they belong to --robot-description")
         }
         (Some(path), _) => (path.clone(), urdf_text(path, &arguments.xacro_arg)?),
@@ -218,34 +213,11 @@ fn write_folder(
 
 /// The URDF that a robot publishes, as its `robot_state_publisher` does.
 fn described(topic: &str, network: &Ros2Network) -> anyhow::Result<String> {
-    let (network, domain) = network.network()?;
-    let topic = topic_name("/", topic)?;
-    let definition = standard::definition("std_msgs/msg/String").context("no definition of std_msgs/msg/String")?;
-    let message = MessageType { name: definition.name.clone(), hash: definition.hash() };
-    let rights = Rights { takes: vec![Convention::RmwZenoh.key(domain, &topic)], ..Rights::default() };
-    let mut node = RosNode::new(network.open(&rights)?, Convention::RmwZenoh, domain, "/", "blindgrasp_new_hand")?;
-    let (sender, received) = std::sync::mpsc::channel();
-    let _subscriber = node.subscriber(&topic, &message, Quality::KeepLast(1), move |it| drop(sender.send(it)))?;
-    let received = received.recv_timeout(DESCRIPTION_LIMIT).map_err(|_| {
-        anyhow::anyhow!(
-            "{topic}: no message has come in {} s: does robot_state_publisher run, with rmw_zenoh and in domain {domain}?",
-            DESCRIPTION_LIMIT.as_secs()
-        )
-    })?;
-    if received.message.name != message.name || received.n_bytes > MAX_RECEIVED_BYTES {
-        bail!(
-            "{topic}: a message of type {} and {} bytes, expected {}",
-            received.message.name,
-            received.n_bytes,
-            message.name
-        );
-    }
-    let value = cdr::read(&definition, &received.bytes).with_context(|| topic.clone())?;
-    let text = value.at("data").as_ref().and_then(Value::text).unwrap_or_default().to_owned();
-    if !text.contains("<robot") {
-        bail!("{topic}: the message is no URDF: it has no <robot> element");
-    }
-    Ok(text)
+    let mut program = Command::new(NETWORK.path()?);
+    let output = program.args(["robot-description", topic]).args(network.arguments()).stderr(Stdio::inherit()).output();
+    let output = output.with_context(|| format!("cannot start {}", NETWORK.program))?;
+    ensure!(output.status.success(), "no description of the robot");
+    Ok(String::from_utf8(output.stdout)?)
 }
 
 /// The text of the URDF. A xacro file is expanded.

@@ -1,9 +1,10 @@
-//! `blindgrasp info CASES.json`: epsilon and volume of a user's grasps.
+//! `blindgrasp-lab quality`, which `blindgrasp info CASES.json` calls: epsilon and volume of a user's grasps.
 
 use std::io::Read;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
+use clap::Args;
 use serde::Serialize;
 
 use super::{Outcome, print_line};
@@ -11,6 +12,16 @@ use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_simulator::case_file::parse_cases;
 use blindgrasp_simulator::wrench_space::{Quality, quality};
+
+/// Print epsilon and volume of grasp cases
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Grasp cases (JSON, docs/simulator.md), - for stdin.
+    file: PathBuf,
+    /// Print a line of JSON for each case
+    #[arg(long)]
+    json: bool,
+}
 
 #[derive(Serialize)]
 struct Row<'a> {
@@ -34,13 +45,8 @@ enum Judged {
     },
 }
 
-/// Whether a path names grasp cases: a JSON file, or `-` for stdin.
-pub(super) fn are_at(path: &Path) -> bool {
-    path == Path::new("-") || path.extension().is_some_and(|extension| extension == "json" || extension == "jsonl")
-}
-
-/// Prints epsilon and volume of the cases in a file; `-` is stdin.
-pub(super) fn print(path: &Path, as_json: bool) -> anyhow::Result<Outcome> {
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let (path, as_json) = (arguments.file.as_path(), arguments.json);
     let shown = if path == Path::new("-") { "stdin".into() } else { path.display().to_string() };
     if let Some(kind) = FileKind::at(path).filter(|kind| !matches!(kind, FileKind::GraspCases | FileKind::Json)) {
         bail!("{shown}: expected grasp cases (JSON), found {}", kind.description());

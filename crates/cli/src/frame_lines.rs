@@ -23,11 +23,11 @@ const MAX_BYTES: u64 = 1 << 30;
 const MAX_LINE_BYTES: u64 = 4 << 20;
 
 /// The frames of lines, and the labels of their grasps by number.
-pub(super) struct FrameLines {
-    pub(super) frames: Vec<Stamped<TactileFrame>>,
-    pub(super) truths: BTreeMap<u64, GraspTruth>,
+pub struct FrameLines {
+    pub frames: Vec<Stamped<TactileFrame>>,
+    pub truths: BTreeMap<u64, GraspTruth>,
     /// Of the labels that have a line of their own.
-    pub(super) headers_of_truths: BTreeMap<u64, Header>,
+    pub headers_of_truths: BTreeMap<u64, Header>,
 }
 
 /// A line: a frame, with the outcome of its lift if it says it and names the object; a label; or a sample of another topic.
@@ -42,7 +42,7 @@ enum Line {
 /// # Errors
 /// A file that is no regular one or has more than 1 GiB, a line of more than 4 MiB or that is no frame, or no frame at all. The
 /// text names the line.
-pub(super) fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines> {
+pub fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines> {
     let is_other = |kind: &FileKind| !matches!(kind, FileKind::FrameLines | FileKind::Json | FileKind::Empty);
     if let Some(kind) = FileKind::at(file).filter(is_other) {
         bail!("{}: expected frames as lines of JSON, found {}", file.display(), kind.description());

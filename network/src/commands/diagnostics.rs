@@ -11,12 +11,13 @@ use blindgrasp_graph::control::{EdgeStatus, GraphState, NodeState, NodeStatus};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_recording::cdr;
-use blindgrasp_ros::node::{Convention, MessageType, Quality, Rights, RosNode, RosPublisher};
+use blindgrasp_ros_node::node::{Convention, MessageType, Quality, Rights, RosNode, RosPublisher};
 use blindgrasp_ros::standard;
+use blindgrasp_cli::ros2_network::Ros2Network;
 use clap::Args;
 use serde::Serialize;
 
-use super::ros2_network::Ros2Network;
+use super::ros2_network::network_of;
 use super::{Outcome, completions, secs_in};
 
 /// Publish a graph's state to ROS 2, on /diagnostics
@@ -72,7 +73,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         Some(graph) => graph.to_owned(),
         None => pick_graph(None)?,
     };
-    let (network, domain) = arguments.network.network()?;
+    let (network, domain) = network_of(&arguments.network)?;
     let definition = standard::definition(TYPE).context("no definition of the diagnostics")?;
     let message = MessageType { name: TYPE.into(), hash: definition.hash() };
     let rights = Rights { sends: vec![Convention::RmwZenoh.key(domain, "/diagnostics")], ..Rights::default() };

@@ -5,11 +5,12 @@ use std::path::Path;
 use anyhow::{Context, bail};
 use serde_json::Value;
 
+use crate::houses::robot_program;
 use blindgrasp_graph::client::status;
 use blindgrasp_graph::control::SwapRequest;
 use blindgrasp_graph::dataflow::{self, DataflowError, DataflowFile, Diagnostic, Graph, Override, Scope};
 use blindgrasp_graph::describe;
-use blindgrasp_graph::operators::{Operators, running_program};
+use blindgrasp_graph::operators::Operators;
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operators::beginning::{UnableNode, unable_to_begin};
@@ -18,23 +19,26 @@ use blindgrasp_operators::{SHIPPED, form_of, operators_of};
 
 /// What becomes of a graph with which nothing can be lifted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum OnMisfit {
+pub enum OnMisfit {
     Refuse,
     Warn,
 }
 
-/// The operators that come with this program.
-pub(super) fn shipped() -> anyhow::Result<Operators> {
-    Ok(operators_of(&running_program().context("the path of this program is unknown")?))
+/// The operators that come with blindgrasp.
+///
+/// # Errors
+/// The path of the running program is unknown.
+pub fn shipped() -> anyhow::Result<Operators> {
+    Ok(operators_of(&robot_program().context("the path of this program is unknown")?))
 }
 
-/// Ports and parameters of an operator. An operator of this program is described without starting a process.
+/// Ports and parameters of an operator. A robot's operator is described without starting a process.
 ///
 /// # Errors
 /// As [`describe::describe`].
-pub(super) fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, String> {
+pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, String> {
     // The path of a running program that was replaced on the disk is another one, so that the new program is asked.
-    if std::env::current_exe().is_ok_and(|running| running == program)
+    if std::env::current_exe().is_ok_and(|running| running.with_file_name("blindgrasp") == program)
         && let Some(form) = form_of(args)
     {
         return Ok((form.describe)());
@@ -43,12 +47,12 @@ pub(super) fn describe(program: &Path, args: &[String]) -> Result<OperatorDescri
 }
 
 /// The graph of a file, which need not be able to lift.
-pub(super) fn checked(file: &DataflowFile, overrides: &[Override], scope: Scope<'_>) -> anyhow::Result<Graph> {
+pub fn checked(file: &DataflowFile, overrides: &[Override], scope: Scope<'_>) -> anyhow::Result<Graph> {
     Ok(dataflow::check(file, &shipped()?, overrides, scope, describe)?)
 }
 
 /// As [`checked`]; arbiter, model and hand are compared as well.
-pub(super) fn fitting(
+pub fn fitting(
     file: &DataflowFile,
     overrides: &[Override],
     scope: Scope<'_>,
@@ -78,7 +82,7 @@ pub(super) fn fitting(
 }
 
 /// As [`fitting`]; each operator of this program is asked as well whether it could begin.
-pub(super) fn able_to_begin(
+pub fn able_to_begin(
     file: &DataflowFile,
     overrides: &[Override],
     scope: Scope<'_>,
@@ -115,7 +119,7 @@ fn diagnostic(file: &DataflowFile, misfit: Misfit) -> Diagnostic {
 ///
 /// # Errors
 /// The graph does not answer, or the reasons.
-pub(super) fn refuse_misfit(graph: &str, request: &SwapRequest) -> anyhow::Result<()> {
+pub fn refuse_misfit(graph: &str, request: &SwapRequest) -> anyhow::Result<()> {
     let before = running_parts(&status(graph)?);
     let mut after = before.clone();
     for part in after.iter_mut().filter(|part| request.nodes.contains(&part.node)) {
@@ -143,7 +147,7 @@ pub(super) fn refuse_misfit(graph: &str, request: &SwapRequest) -> anyhow::Resul
 ///
 /// # Errors
 /// The graph does not answer.
-pub(super) fn warn_of_misfit(graph: &str, node: &str, param: &str, value: &Value) -> anyhow::Result<()> {
+pub fn warn_of_misfit(graph: &str, node: &str, param: &str, value: &Value) -> anyhow::Result<()> {
     let before = running_parts(&status(graph)?);
     let mut after = before.clone();
     for part in after.iter_mut().filter(|part| part.node == node) {

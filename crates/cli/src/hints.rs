@@ -10,7 +10,7 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{Arg, Command};
 
 /// The words of ROS 2, Docker, systemd, git and dora, each with the command that does it here.
-const WORDS: [(&str, &str); 40] = [
+pub const WORDS: [(&str, &str); 40] = [
     ("launch", "run"),
     ("node", "ps"),
     ("topic echo", "echo NODE/PORT"),
@@ -56,7 +56,7 @@ const WORDS: [(&str, &str); 40] = [
 /// The error with a hint: the command or the option that is probably meant.
 ///
 /// `root` is the command line's definition, and `words` are those that were typed, the program's name first.
-pub(super) fn with_hint(mut error: clap::Error, mut root: Command, words: &[OsString]) -> clap::Error {
+pub fn with_hint(mut error: clap::Error, mut root: Command, words: &[OsString]) -> clap::Error {
     root.build();
     let mut command = &root;
     let mut words = words.iter().skip(1).map(|word| word.to_string_lossy()).peekable();
@@ -134,57 +134,5 @@ fn number_hint(error: &clap::Error) -> Option<String> {
             Some("expected a number like 0.5, without a unit".into())
         }
         _ => None,
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use clap::CommandFactory;
-
-    use super::super::Cli;
-    use super::*;
-
-    /// The text of the error for a line, with its hint.
-    fn told(line: &str) -> String {
-        let words: Vec<OsString> = std::iter::once("blindgrasp").chain(line.split(' ')).map(OsString::from).collect();
-        let error = Cli::command().try_get_matches_from(&words).expect_err("a mistake");
-        with_hint(error, Cli::command(), &words).to_string()
-    }
-
-    #[test]
-    fn a_word_of_another_program_is_answered_with_a_command_that_there_is() {
-        let command = Cli::command();
-        for (word, hint) in WORDS {
-            let name = hint.split(' ').next().unwrap_or_default();
-            assert!(name == "--version" || command.find_subcommand(name).is_some(), "there is no '{name}'");
-            let text = told(word);
-            assert!(text.contains(&format!("tip: use 'blindgrasp {hint}'")), "{word}: {text}");
-            assert!(!text.contains("similar"), "{word}: {text}");
-        }
-        assert!(told("topic list").contains("'blindgrasp ps'"));
-    }
-
-    #[test]
-    fn mistakes_are_likened_and_unknown_words_get_no_false_hint() {
-        for (line, expected) in [
-            ("evalute m.json", "tip: did you mean 'evaluate'?"),
-            ("run --chek", "tip: did you mean '--check'?"),
-            ("run --votes 4", "tip: a parameter of an operator is given by --set"),
-            ("simulate --zzz 1", "tip: --print-options"),
-            ("simulate --grasps many --out x.mcap", "expected a whole number"),
-        ] {
-            let text = told(line);
-            assert!(text.contains(expected) && !text.contains("as a value"), "blindgrasp {line}: {text}");
-        }
-        for line in ["zzz", "model list", "Cargo.toml/none", "ps --zzz", "info a --zzz", "predict m.json a.mcap -z"] {
-            let text = told(line);
-            assert!(!text.contains("tip"), "blindgrasp {line}: {text}");
-        }
-    }
-
-    #[test]
-    fn a_file_in_the_place_of_the_command_says_what_it_is() {
-        let text = told(concat!(env!("CARGO_MANIFEST_DIR"), "/dataflow.yaml"));
-        assert!(text.contains("the command is missing before") && text.contains("blindgrasp run"), "{text}");
     }
 }

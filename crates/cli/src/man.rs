@@ -1,0 +1,128 @@
+//! The manual pages and the reference of a program's commands.
+
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+
+use anyhow::{Context, ensure};
+use clap::{Args, Command};
+
+use crate::help::grouped;
+use crate::houses::House;
+use crate::{Outcome, print_line, print_text};
+
+/// Write the manual pages of all commands
+#[derive(Debug, Args)]
+#[command(hide = true, after_help = "Example: blindgrasp man /usr/share/man/man1")]
+pub struct Arguments {
+    /// Folder for the pages: blindgrasp.1, blindgrasp-run.1, …; it is made
+    #[arg(required_unless_present = "markdown")]
+    pub folder: Option<PathBuf>,
+    /// Print the reference of the command line in Markdown
+    #[arg(long, conflicts_with = "folder")]
+    pub markdown: bool,
+}
+
+/// Writes the pages of a house's commands, or prints their reference. `others` are the houses whose programs write theirs as well.
+///
+/// # Errors
+/// A page cannot be written, or the program of another house is missing or fails.
+pub fn run(arguments: &Arguments, mut command: Command, others: &[&House]) -> anyhow::Result<Outcome> {
+    let Some(folder) = &arguments.folder else {
+        print_text(reference(command, others)?.trim_end())?;
+        return Ok(Outcome::Done);
+    };
+    std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+    // The page of the program itself is the robot's, which lists all commands: it comes last.
+    for house in others {
+        let status = std::process::Command::new(house.path()?).arg("man").arg(folder).stdout(Stdio::null()).status();
+        ensure!(status.with_context(|| house.program)?.success(), "{} man has failed", house.program);
+    }
+    command = command.disable_help_subcommand(true);
+    command.build();
+    write_pages(&command, "", folder, others).with_context(|| folder.display().to_string())?;
+    print_line(&folder.display().to_string())?;
+    Ok(Outcome::Done)
+}
+
+fn write_pages(command: &Command, words: &str, folder: &Path, others: &[&House]) -> std::io::Result<()> {
+    for subcommand in command.get_subcommands().filter(|subcommand| !subcommand.is_hide_set()) {
+        let words = format!("{words} {}", subcommand.get_name());
+        if !is_of(others, words.trim_start()) {
+            write_pages(subcommand, &words, folder, others)?;
+        }
+    }
+    clap_mangen::Man::new(command.clone()).generate_to(folder).map(drop)
+}
+
+fn is_of(houses: &[&House], command: &str) -> bool {
+    houses.iter().any(|house| house.commands.iter().any(|(name, _)| *name == command))
+}
+
+/// Each command with its help, as Markdown.
+fn reference(command: Command, others: &[&House]) -> anyhow::Result<String> {
+    let mut command = grouped(command.term_width(100));
+    // It names the commands and their options in full.
+    command.build();
+    let mut text = String::new();
+    if !others.is_empty() {
+        text += "# Command line\n\nThis page is made from the program (`blindgrasp man --markdown`): `blindgrasp COMMAND --help` prints \
+                 the same.\n\n";
+        text += &block(&mut command);
+    }
+    text += &sections(&command, &[], others);
+    for house in others {
+        let output = std::process::Command::new(house.path()?).args(["man", "--markdown"]).output();
+        text += &String::from_utf8(output.with_context(|| house.program)?.stdout)?;
+        text += "\n";
+    }
+    Ok(text)
+}
+
+fn sections(command: &Command, parents: &[&str], others: &[&House]) -> String {
+    let mut text = String::new();
+    for subcommand in command.get_subcommands() {
+        let path = [parents, &[subcommand.get_name()]].concat();
+        if subcommand.is_hide_set() || subcommand.get_name() == "help" || is_of(others, &path.join(" ")) {
+            continue;
+        }
+        text += &format!("## {}\n\n", path.join(" "));
+        text += &block(&mut subcommand.clone());
+        text += &sections(subcommand, &path, others);
+    }
+    text
+}
+
+fn block(command: &mut Command) -> String {
+    let help = command.render_long_help().to_string();
+    let lines: Vec<&str> = help.trim_end().lines().map(str::trim_end).collect();
+    format!("```text\n{}\n```\n\n", lines.join("\n"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn command() -> Command {
+        let options = Command::new("run").arg(clap::Arg::new("name").long("name"));
+        let hidden = Command::new("man").hide(true);
+        Command::new("blindgrasp").subcommand(options).subcommand(hidden).subcommand(Command::new("simulate"))
+    }
+
+    #[test]
+    fn the_reference_has_each_command_and_its_options() {
+        let reference = reference(command(), &[]).expect("no other program");
+        assert!(reference.contains("## run") && reference.contains("--name"), "{reference}");
+        assert!(!reference.contains("## man"), "a hidden command");
+        assert!(!sections(&command(), &[], &[&crate::houses::LAB]).contains("## simulate"));
+    }
+
+    #[test]
+    fn each_command_has_a_manual_page() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let arguments = Arguments { folder: Some(folder.path().join("man1")), markdown: false };
+        run(&arguments, command(), &[]).expect("written");
+        let page = |name: &str| std::fs::read_to_string(folder.path().join("man1").join(name)).expect(name);
+        assert!(page("blindgrasp.1").contains("blindgrasp\\-run(1)"), "{}", page("blindgrasp.1"));
+        assert!(page("blindgrasp-run.1").contains(".SH SYNOPSIS"));
+    }
+}
