@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use crate::common::{
     FAST_FOREVER, Graph, assert_nothing_left, blindgrasp, classifier_runs, dataflow, dataflow_with, of_node, operator,
-    program, run, script, signal, stubborn_classifier, text, unique_name, wait_until,
+    program, project, run, script, signal, stubborn_classifier, text, unique_name, wait_until,
 };
 use rustix::process::Signal;
 
