@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""A browser for tests/e2e/live_page.rs: headless Chromium, driven by selenium.
+"""A browser for tests/common/browser.rs: headless Chromium, driven by selenium.
 
 Opens URL and prints null. Then it reads lines from stdin: an expression in JavaScript, whose value is printed as a line of JSON;
 `axe`, for the list of problems that axe-core finds; `errors`, for what the console said; `picture FILE`, for a screenshot;

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""A robot in ROS 2 over Zenoh, for tests/e2e/ros2.rs: a router, and nodes of zenoh-ros2-sdk.
+"""A robot in ROS 2 over Zenoh, for network/tests/e2e/ros2.rs: a router, and nodes of zenoh-ros2-sdk.
 
 Reads frames of a recording, one JSON object a line, from stdin. It publishes each as joint_states, phase and cells, prints
 each decision as a line, and ends after the last one. Types and their hashes are those of rosbags, which knows ROS 2 Jazzy.

@@ -1,7 +1,7 @@
 """One edge between two machines, beside bare Zenoh on the same network, without TLS and with it.
 
 The robot sends one of a recording's tactile frames over and over (steady_source), and brain's contacts reads it. Bare
-Zenoh (examples/zenoh_latency.rs) is a put and a callback, with the size of this frame in bincode, at the same times and
+Zenoh (network/benches/programs/zenoh_latency.rs) is a put and a callback, with the size of this frame in bincode, at the same times and
 with the same keys. The latency of the graph is the time from the source's send to its receipt by contacts, with two hops
 of iceoryx2 and the link's correction of clocks, to within 6.25 %. CPU time is that of all processes on both sides, their
 start included. It needs root: the machines are network namespaces.

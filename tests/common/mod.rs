@@ -1,6 +1,9 @@
 //! Runs the real program, and waits for it.
 #![allow(dead_code, reason = "each test program uses a part of it")]
 
+pub(crate) mod browser;
+pub(crate) mod live;
+pub(crate) mod mistakes;
 pub(crate) mod python;
 mod times;
 
@@ -29,9 +32,28 @@ pub(crate) const ON_TWO_MACHINES: [(&str, &str); 6] = [
     ("  lift_arbiter:\n", "  lift_arbiter:\n    on: robot\n"),
 ];
 
+/// The `blindgrasp` of this build. Beside it are the programs of the other houses, which it starts. They are in the folder above
+/// that of the test program.
+pub(crate) fn program() -> &'static str {
+    static PROGRAM: OnceLock<String> = OnceLock::new();
+    PROGRAM.get_or_init(|| {
+        let test = std::env::current_exe().expect("the test program");
+        let folder = test.ancestors().nth(2).expect("a folder");
+        for name in ["blindgrasp", "blindgrasp-lab", "blindgrasp-network"] {
+            let program = folder.join(name);
+            assert!(
+                program.exists(),
+                "{} is missing: build it with cargo build --release --workspace",
+                program.display()
+            );
+        }
+        folder.join("blindgrasp").into_os_string().into_string().expect("UTF-8")
+    })
+}
+
 /// The `blindgrasp` of this build, in the project's folder.
 pub(crate) fn blindgrasp() -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_blindgrasp"));
+    let mut command = Command::new(program());
     // Nothing comes from the user's folders, and nothing goes there: logs of graphs, and convex parts for MuJoCo.
     let own = Path::new(env!("CARGO_TARGET_TMPDIR"));
     command.env("XDG_STATE_HOME", own.join("state")).env("XDG_CACHE_HOME", own.join("cache"));
@@ -42,7 +64,9 @@ pub(crate) fn blindgrasp() -> Command {
 /// Nearly every test calls this or [`unique_name`] early: its time begins there.
 pub(crate) fn project() -> &'static Path {
     times::note();
-    Path::new(env!("CARGO_MANIFEST_DIR"))
+    // The packages of the lab and of the network have their own folders in it.
+    let mut folders = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors();
+    folders.find(|folder| folder.join("dataflow.yaml").exists()).expect("a folder with dataflow.yaml")
 }
 
 /// A graph name, and with it an iceoryx2 domain, that no other test has.
@@ -207,7 +231,7 @@ pub(crate) fn script(folder: &Path, name: &str, body: &str) -> PathBuf {
 
 /// The shell command of a shipped operator.
 pub(crate) fn operator(name: &str) -> String {
-    format!("{} operator {name}", env!("CARGO_BIN_EXE_blindgrasp"))
+    format!("{} operator {name}", program())
 }
 
 /// A program of one's own that does what a shipped operator does.
@@ -217,8 +241,12 @@ pub(crate) fn own_operator(folder: &Path, name: &str) -> PathBuf {
 
 /// A program of this build's examples.
 pub(crate) fn example(name: &str) -> PathBuf {
-    let program = Path::new(env!("CARGO_BIN_EXE_blindgrasp")).with_file_name("examples").join(name);
-    assert!(program.exists(), "{} is missing: build it with cargo build --examples", program.display());
+    let program = Path::new(program()).with_file_name("examples").join(name);
+    assert!(
+        program.exists(),
+        "{} is missing: build it with cargo build --release --workspace --examples",
+        program.display()
+    );
     program
 }
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use super::{Ended, project, script, text};
+use super::{Ended, program, project, script, text};
 
 /// The environment with what Python operators need, made once.
 pub(crate) fn python() -> &'static Path {
@@ -26,6 +26,16 @@ pub(crate) fn python_operator(folder: &Path, program: &Path) -> PathBuf {
         &name,
         &format!("exec env PYTHONDONTWRITEBYTECODE=1 {} {} \"$@\"", python().display(), program.display()),
     )
+}
+
+/// `scripts/benchsuite` with the program of this build.
+pub(crate) fn benchsuite(arguments: &[&str]) -> Output {
+    Command::new(python())
+        .arg(project().join("scripts/benchsuite"))
+        .args(arguments)
+        .env("BLINDGRASP", program())
+        .output()
+        .expect("started")
 }
 
 pub(crate) fn shell(folder: &Path, program: &Path, arguments: &[&str], exit_code: i32) -> Output {

@@ -1,21 +1,9 @@
 //! `scripts/benchsuite`: one subject on a real graph. The figures of the others are measured by hand.
 
-use std::process::{Command, Output};
-
 use serde_json::Value;
 
-use crate::common::python::python;
-use crate::common::{blindgrasp, project, text};
-
-/// Runs the suite with the program of this build.
-pub(crate) fn benchsuite(arguments: &[&str]) -> Output {
-    Command::new(python())
-        .arg(project().join("scripts/benchsuite"))
-        .args(arguments)
-        .env("BLINDGRASP", blindgrasp().get_program())
-        .output()
-        .expect("started")
-}
+use crate::common::python::benchsuite;
+use crate::common::text;
 
 #[test]
 fn a_quick_run_measures_a_graph_watched_by_top() {

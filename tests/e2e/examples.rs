@@ -19,12 +19,3 @@ fn a_judge_without_a_graph_decides_as_predict_does() {
     let n_predicted = predicted.lines().filter(|line| line.contains(r#""action":"lift""#)).count();
     assert_eq!((judged.lines().count(), n_lifts), (240, n_predicted), "{judged}");
 }
-
-#[test]
-fn a_model_is_trained_on_grasps_in_memory() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let out = folder.path().join("model.json");
-    let said = output_of(Command::new(example("train")).arg(&out).arg("recordings/held-out.mcap"));
-    assert!(said.contains("% right about objects not seen"), "{said}");
-    run(&["model", "show", out.to_str().expect("UTF-8")], 0);
-}

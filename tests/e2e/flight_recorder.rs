@@ -4,8 +4,8 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Stdio};
 
+use crate::common::live::{Bridge, PATIENT, changed, free_port, grasps, live_dataflow};
 use crate::common::{FAST_FOREVER, Graph, blindgrasp, dataflow, run, signal, text, unique_name, wait_until};
-use crate::tactile_source::{Bridge, PATIENT, changed, free_port, grasps, live_dataflow};
 use rustix::process::Signal;
 use serde_json::{Value, json};
 

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use crate::common::{
     FAST_FOREVER, Graph, assert_nothing_left, blindgrasp, classifier_runs, dataflow, dataflow_with, of_node, operator,
-    run, script, signal, stubborn_classifier, text, unique_name, wait_until,
+    program, project, run, script, signal, stubborn_classifier, text, unique_name, wait_until,
 };
 use rustix::process::Signal;
 
@@ -168,7 +168,7 @@ fn a_permanent_error_ends_at_once_and_says_why() {
 fn a_launcher_and_its_operators_may_have_as_many_descriptors_as_the_hard_limit() {
     let folder = tempfile::tempdir().expect("a folder");
     let mut limited = Command::new("prlimit");
-    limited.args(["--nofile=512:3456", env!("CARGO_BIN_EXE_blindgrasp")]).current_dir(env!("CARGO_MANIFEST_DIR"));
+    limited.args(["--nofile=512:3456", program()]).current_dir(project());
     limited.stdin(Stdio::null()).env("XDG_STATE_HOME", folder.path());
     let graph = Graph::launch_on(limited, &unique_name(), &dataflow(folder.path(), &[]), &FAST_FOREVER);
     graph.wait_for_decisions(1);

@@ -13,7 +13,7 @@ use serde_json::Value;
 use crate::common::python::{assert_each_once, python_operator};
 use crate::common::{
     Ended, FAST_FOREVER, Graph, HAND, MODEL, NODES, RECORDING, blindgrasp, classifier_runs, dataflow_with,
-    decisions_of, of_node, project, run, signal, swap, text, undisturbed, unique_name, wait_until,
+    decisions_of, of_node, program, project, run, signal, swap, text, undisturbed, unique_name, wait_until,
 };
 
 /// A graph that decides this many grasps goes on well.
@@ -452,7 +452,7 @@ fn a_run_with_few_descriptors_loses_nothing_or_is_refused_in_words() {
     for n_files in (40..=56).step_by(2) {
         let mut limited = Command::new("sh");
         let exec = format!("ulimit -n {n_files} && exec \"$0\" \"$@\"");
-        limited.args(["-c", &exec, env!("CARGO_BIN_EXE_blindgrasp")]).current_dir(project());
+        limited.args(["-c", &exec, program()]).current_dir(project());
         limited.env("XDG_STATE_HOME", folder.path()).stdin(Stdio::null());
         let ended = Graph::launch_on(limited, &unique_name(), &flow, &AS_FAST_AS_IT_GOES).finish();
         if ended.code == Some(1) && ended.decisions.is_empty() {

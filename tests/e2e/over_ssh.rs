@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
 use crate::common::{
-    FAST_FOREVER, Graph, ON_TWO_MACHINES, blindgrasp, dataflow, json_lines, own_operator, run, script, signal, skipped,
-    text, unique_name, wait_until,
+    FAST_FOREVER, Graph, ON_TWO_MACHINES, blindgrasp, dataflow, json_lines, own_operator, program, run, script, signal,
+    skipped, text, unique_name, wait_until,
 };
 use blindgrasp_recording::RecordingReader;
 use rustix::process::Signal;
@@ -24,7 +24,7 @@ impl Sshd {
     /// `None` if there is no `sshd`; the test is skipped then.
     #[track_caller]
     pub(crate) fn start() -> Option<Sshd> {
-        let programs = Path::new(env!("CARGO_BIN_EXE_blindgrasp")).parent().expect("a folder");
+        let programs = Path::new(program()).parent().expect("a folder");
         Sshd::with_programs(programs)
     }
 
@@ -405,11 +405,8 @@ fn exit_codes_and_the_programs_there() {
         "for word; do :; done; exec sh -c \"$(echo \"$word\" | sed 's/SSH=[^ ]*/SSH=9.9/')\"",
     );
     let mut command = blindgrasp();
-    let path = std::env::join_paths([
-        Path::new(env!("CARGO_BIN_EXE_blindgrasp")).parent().expect("a folder"),
-        "/usr/bin".as_ref(),
-        "/bin".as_ref(),
-    ]);
+    let path =
+        std::env::join_paths([Path::new(program()).parent().expect("a folder"), "/usr/bin".as_ref(), "/bin".as_ref()]);
     command.args(["ps", "--machine", "brain"]).env("BLINDGRASP_SSH", &other).env("PATH", path.expect("a path"));
     let output = command.output().expect("started");
     assert_eq!(output.status.code(), Some(1));

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::sync::atomic::AtomicUsize;
 
-use crate::common::{assert_nothing_left, dataflow, unique_name};
+use crate::common::{assert_nothing_left, dataflow, program, unique_name};
 use blindgrasp_graph::dataflow::{self, Graph, Override, Scope};
 use blindgrasp_graph::describe::describe;
 use blindgrasp_graph::operators::Operators;
@@ -29,7 +29,7 @@ fn checked(folder: &Path, operators: &Operators) -> Result<Graph, String> {
 fn another_program_runs_a_graph_with_the_operators_of_blindgrasp() {
     let folder = tempfile::tempdir().expect("a folder");
     let names = ["recorded_source", "contacts", "encoder", "classifier", "lift_arbiter"];
-    let operators = Operators::of_program(Path::new(env!("CARGO_BIN_EXE_blindgrasp")), names);
+    let operators = Operators::of_program(Path::new(program()), names);
     let graph = checked(folder.path(), &operators).expect("a graph");
     let name = unique_name();
     let options = RunOptions { is_quiet: true, ..RunOptions::default() };

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
 use crate::common::python::python;
-use crate::common::{project, skipped, text};
+use crate::common::{program, project, skipped, text};
 
 /// The tools of `scripts/release` that a machine with Rust may lack.
 const TOOLS: [&str; 4] = ["git", "python3", "readelf", "dpkg-deb"];
@@ -122,7 +122,7 @@ fn a_version_is_published_only_if_it_is_the_same_everywhere() {
     };
     let publish = |is_right: bool| {
         let mut command = Command::new(clone.join("scripts/publish"));
-        command.arg("--program").arg(env!("CARGO_BIN_EXE_blindgrasp")).arg("--out").arg(&out).arg("--fast");
+        command.arg("--program").arg(program()).arg("--out").arg(&out).arg("--fast");
         command.env("PATH", path_with_python()).env_remove("CARGO_TARGET_DIR");
         let output = output(&mut command).expect("started");
         let said = format!("{}{}", text(&output.stdout), text(&output.stderr));
@@ -168,7 +168,7 @@ fn path_with_python() -> std::ffi::OsString {
 /// Packs the program of this build.
 fn release(out: &Path) {
     let mut command = Command::new(project().join("scripts/release"));
-    command.arg("--program").arg(env!("CARGO_BIN_EXE_blindgrasp")).arg("--out").arg(out).arg("--fast");
+    command.arg("--program").arg(program()).arg("--out").arg(out).arg("--fast");
     succeed(&mut command);
 }
 

@@ -4,9 +4,7 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::common::python::{python, shell, utf8};
-use crate::common::{project, text};
-
-const PROGRAM: &str = env!("CARGO_BIN_EXE_blindgrasp");
+use crate::common::{program, project, text};
 
 #[test]
 fn the_python_packages_own_tests_pass() {
@@ -15,7 +13,7 @@ fn the_python_packages_own_tests_pass() {
     command.env("PYTHONPATH", project().join("python")).env("PYTHONDONTWRITEBYTECODE", "1");
     // Logs of the tests' graphs stay out of the user's state folder.
     let state = Path::new(env!("CARGO_TARGET_TMPDIR")).join("state");
-    command.env("BLINDGRASP_PROGRAM", PROGRAM).env("XDG_STATE_HOME", state);
+    command.env("BLINDGRASP_PROGRAM", program()).env("XDG_STATE_HOME", state);
     let output = command.output().expect("started");
     let said = text(&output.stderr);
     assert!(output.status.success(), "{said}");
@@ -27,7 +25,7 @@ fn a_wheel_with_the_program_installs_package_operator_modules_and_command() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path();
     let script = project().join("scripts/python-wheel");
-    let arguments = ["--with-program", PROGRAM, "--python", utf8(python()), "--out", utf8(folder)];
+    let arguments = ["--with-program", program(), "--python", utf8(python()), "--out", utf8(folder)];
     let wheel = text(&shell(folder, &script, &arguments, 0).stdout).trim().to_string();
     assert!(wheel.contains("-py3-none-manylinux_2_") && wheel.ends_with("_x86_64.whl"), "{wheel}");
     // The environment has the dependencies, so that nothing is downloaded.
@@ -46,6 +44,6 @@ fn a_wheel_with_the_program_installs_package_operator_modules_and_command() {
     // pytest finds the fixture by the wheel's entry point.
     let fixtures = run(python(), &["-m", "pytest", "--fixtures", "-p", "no:cacheprovider"]);
     assert!(fixtures.contains("\nreplay -- "), "{fixtures}");
-    let version = run(Path::new(PROGRAM), &["--version"]);
+    let version = run(Path::new(program()), &["--version"]);
     assert_eq!(run(&installed.join("bin/blindgrasp"), &["--version"]), version);
 }

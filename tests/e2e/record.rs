@@ -7,7 +7,7 @@ use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use crate::common::{FAST_FOREVER, Graph, blindgrasp, dataflow, run, signal, skipped, text, wait_until};
+use crate::common::{FAST_FOREVER, Graph, blindgrasp, dataflow, program, run, signal, skipped, text, wait_until};
 use blindgrasp_messages::Header;
 use blindgrasp_recording::{Record, RecordingReader};
 use rustix::process::Signal;
@@ -292,7 +292,7 @@ fn a_limit_of_file_sizes_ends_the_recording_and_not_the_graph() {
     let name = crate::common::unique_name();
     // Larger than the graph's files in shared memory.
     let output = Command::new("prlimit")
-        .args(["--fsize=40000000", env!("CARGO_BIN_EXE_blindgrasp"), "run", "--json", "--name", &name, "--record"])
+        .args(["--fsize=40000000", program(), "run", "--json", "--name", &name, "--record"])
         .arg(&out)
         .args(["--set", "recorded_source.repeat=100"])
         .arg(&flow)
@@ -325,7 +325,7 @@ fn a_full_disk_ends_the_recording_and_not_the_graph() {
         return;
     }
     let out = small.join("full.mcap");
-    let (program, out) = (env!("CARGO_BIN_EXE_blindgrasp"), out.to_str().expect("UTF-8"));
+    let (program, out) = (program(), out.to_str().expect("UTF-8"));
     // An attached recorder ends, and the graph goes on. The recording is read where the file system is seen.
     let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
     let script = "\"$@\"; code=$?; \"$1\" info \"$6\" >&2 || code=9; exit $code";

@@ -17,6 +17,8 @@ use blindgrasp_recording::{
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use crate::common::program;
+
 const EPOCH: u64 = 7;
 const N_CELLS: usize = 96;
 
@@ -94,7 +96,7 @@ fn written_file(path: &Path, samples: &[(&str, Record)]) {
 }
 
 fn info_command(arguments: &[&str]) -> (i32, String, String) {
-    let output = Command::new(env!("CARGO_BIN_EXE_blindgrasp")).arg("info").args(arguments).output().expect("run");
+    let output = Command::new(program()).arg("info").args(arguments).output().expect("run");
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
     (output.status.code().unwrap_or(-1), text(&output.stdout), text(&output.stderr))
 }
@@ -677,7 +679,7 @@ fn info_repairs_and_says_with_its_exit_code_whether_something_is_lost() {
     // A name that is not UTF-8.
     let other = folder.path().join(OsStr::from_bytes(b"other\xff.mcap"));
     std::fs::copy(&path, &other).expect("copied");
-    let mut command = Command::new(env!("CARGO_BIN_EXE_blindgrasp"));
+    let mut command = Command::new(program());
     let output = command.args(["info", "--repair", "--json"]).arg(&other).output().expect("run");
     let found: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!(found["repairs"][0]["input"], other.to_string_lossy().into_owned());

@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use crate::common::{MODEL, assert_nothing_left, dataflow, json_lines, project, run, shared_folder, text, unique_name};
+use crate::common::{
+    MODEL, assert_nothing_left, dataflow, json_lines, program, project, run, shared_folder, text, unique_name,
+};
 use blindgrasp_messages::{Header, Prediction, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingInfo, RecordingReader, RecordingWriter};
 use blindgrasp_stages::model::Model;
@@ -139,7 +141,7 @@ fn the_same_bytes_come_out_at_any_rate_on_any_number_of_cores() {
     }
     for cores in ["0", "0,1"] {
         let name = unique_name();
-        let program = env!("CARGO_BIN_EXE_blindgrasp");
+        let program = program();
         let mut command = Command::new("taskset");
         command.args(["-c", cores, program, "replay", &own.recording, "--dataflow", &own.flow, "--name", &name]);
         command.args(["--rate", "max", "--record", &found, "--overwrite"]).env("XDG_STATE_HOME", own.folder.path());

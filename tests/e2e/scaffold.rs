@@ -5,7 +5,8 @@ use std::process::Command;
 
 use crate::common::python::{assert_each_once, python, python_operator, shell, utf8};
 use crate::common::{
-    FAST_FOREVER, Graph, blindgrasp, classifier_runs, dataflow, dataflow_with, of_node, project, run, swap, text,
+    FAST_FOREVER, Graph, blindgrasp, classifier_runs, dataflow, dataflow_with, of_node, program, project, run, swap,
+    text,
 };
 use serde_json::Value;
 
@@ -37,7 +38,7 @@ fn files_of(folder: &Path) -> Vec<PathBuf> {
 /// Builds and tests a scaffold in Rust as its README says. Folder, profile and versions are those of this build, so
 /// that its libraries need not be compiled again.
 fn build(made: &Path) -> PathBuf {
-    let programs = Path::new(env!("CARGO_BIN_EXE_blindgrasp")).parent().expect("a folder");
+    let programs = Path::new(program()).parent().expect("a folder");
     let is_release = programs.ends_with("release");
     for command in ["build", "test"] {
         let output = Command::new(env!("CARGO"))

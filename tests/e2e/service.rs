@@ -3,7 +3,7 @@
 use std::os::unix::net::UnixDatagram;
 use std::process::{Command, Stdio};
 
-use crate::common::{Graph, blindgrasp, dataflow, project, run, skipped, text, unique_name};
+use crate::common::{Graph, blindgrasp, dataflow, program, project, run, skipped, text, unique_name};
 
 /// systemd's scale goes from 0, safe, to 100.
 const MAX_EXPOSURE: &str = "20";
@@ -41,7 +41,7 @@ fn the_unit_is_valid_and_has_few_rights() {
     let installed = "ExecStart=blindgrasp";
     assert!(unit.contains(installed), "{unit}");
     let path = folder.path().join("blindgrasp@robot7.service");
-    let here = format!("ExecStart={}", env!("CARGO_BIN_EXE_blindgrasp"));
+    let here = format!("ExecStart={}", program());
     std::fs::write(&path, unit.replace(installed, &here)).expect("written");
     let analyze = |arguments: &[&str]| {
         let mut command = Command::new("systemd-analyze");

@@ -3,7 +3,7 @@
 use std::os::unix::fs::DirBuilderExt;
 use std::process::Command;
 
-use crate::common::{Graph, assert_nothing_left, blindgrasp, dataflow, json_lines, run, text, unique_name};
+use crate::common::{Graph, assert_nothing_left, blindgrasp, dataflow, json_lines, program, run, text, unique_name};
 
 #[test]
 fn a_new_project_runs_and_is_never_overwritten() {
@@ -108,7 +108,7 @@ fn completions_know_the_commands_and_bash_takes_them() {
     let completed = |words: &[&str]| {
         let complete = "source \"$1\"; shift; COMP_TYPE=9; COMP_WORDS=(blindgrasp \"$@\"); COMP_CWORD=$#; \
                         $(complete -p blindgrasp | grep -o '_[a-z_]*' | head -1) blindgrasp \"${@: -1}\"; echo \"${COMPREPLY[@]}\"";
-        let program = std::path::Path::new(env!("CARGO_BIN_EXE_blindgrasp")).parent().expect("a folder");
+        let program = std::path::Path::new(program()).parent().expect("a folder");
         let mut command = Command::new("bash");
         command.env("PATH", format!("{}:/usr/bin:/bin", program.display()));
         let output = command.args(["-c", complete, "-"]).arg(&path).args(words).output().expect("bash");

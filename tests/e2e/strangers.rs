@@ -13,7 +13,7 @@ use rustix::process::{Signal, getuid};
 
 use crate::common::{
     FAST_FOREVER, Graph, HAND, MODEL, NODES, RECORDING, REPORTS, blindgrasp, classifier_runs, dataflow, dataflow_with,
-    operator, project, run, script, skipped, swap, text, unique_name, wait_until,
+    operator, program, project, run, script, skipped, swap, text, unique_name, wait_until,
 };
 
 const A_FEW_GRASPS: usize = 20;
@@ -300,7 +300,7 @@ fn a_process_that_may_open_few_files_says_so() {
     let flow = dataflow(folder.path(), &[("rate: 10", "rate: max")]);
     for limit in ["16", "20", "24", "28"] {
         let mut command = Command::new("prlimit");
-        command.args([&format!("--nofile={limit}"), env!("CARGO_BIN_EXE_blindgrasp"), "run", "--name", &unique_name()]);
+        command.args([&format!("--nofile={limit}"), program(), "run", "--name", &unique_name()]);
         let state = Path::new(env!("CARGO_TARGET_TMPDIR")).join("state");
         let output = command.arg(&flow).env("XDG_STATE_HOME", state).current_dir(project()).output().expect("started");
         let said = text(&output.stderr);
@@ -343,7 +343,7 @@ fn a_graph_goes_on_when_shared_memory_was_full() {
     }
     let folder = tempfile::tempdir().expect("a folder");
     let flow = dataflow(folder.path(), &[]);
-    let graph = Graph::launch_on(within(&[env!("CARGO_BIN_EXE_blindgrasp")]), &unique_name(), &flow, &FAST_FOREVER);
+    let graph = Graph::launch_on(within(&[program()]), &unique_name(), &flow, &FAST_FOREVER);
     graph.wait_for_decisions(A_FEW_GRASPS);
     // The folder as the graph sees it.
     let shm = PathBuf::from(format!("/proc/{}/root/dev/shm", graph.pid()));

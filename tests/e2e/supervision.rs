@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use crate::common::{
     Ended, FAST_FOREVER, Graph, MODEL, NODES, assert_nothing_left, classifier_runs, dataflow, dataflow_with,
-    json_lines, left_overs, of_node, operator, run, script, signal, skipped, stubborn_classifier, text, unique_name,
-    wait_until,
+    json_lines, left_overs, of_node, operator, program, run, script, signal, skipped, stubborn_classifier, text,
+    unique_name, wait_until,
 };
 use rustix::process::{Resource, Signal, getrlimit, prlimit};
 use serde_json::Value;
@@ -438,7 +438,7 @@ fn full_shared_memory_ends_the_run_in_words() {
         [(4, false), (16, false), (64, false), (1024, false), (8192, false), (20480, false), (65536, true)]
     {
         let name = unique_name();
-        let program = env!("CARGO_BIN_EXE_blindgrasp");
+        let program = program();
         let command = format!(
             "mount -t tmpfs -o size={kilobytes}k none /dev/shm && exec {program} run --json --set recorded_source.rate=max \
              --name {name} --startup-limit 5 dataflow.yaml"

@@ -1,10 +1,10 @@
 //! Live frames of a hand through the real processes. Each test is the bridge, and also sends faulty frames.
 
 use std::io::{BufRead, BufReader, Read, Write};
-use std::net::{TcpListener, TcpStream};
-use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::path::Path;
+use std::time::Duration;
 
+use crate::common::live::{Bridge, PATIENT, changed, free_port, grasps, line, live_dataflow};
 use crate::common::{
     Graph, MODEL, RECORDING, assert_nothing_left, blindgrasp, dataflow, decisions_of, project, run, signal, text,
     undisturbed, unique_name, wait_until,
@@ -15,104 +15,11 @@ use rustix::process::Signal;
 use rustix::pty::OpenptFlags;
 use serde_json::{Value, json};
 
-/// Limits that a busy machine does not reach.
-pub(crate) const PATIENT: &str = "max_delay_ms: 20000";
-
-/// The project's live graph, its source with these parameters.
-pub(crate) fn live_dataflow(folder: &Path, params: &str) -> PathBuf {
-    let text = std::fs::read_to_string(project().join("dataflow-live.yaml")).expect("dataflow-live.yaml");
-    let source = format!("  tactile_source:\n    params:\n      {params}\n");
-    let mut text = text.clone();
-    for (what, by) in [
-        ("  source:\n", source.as_str()),
-        ("    run: ${SOURCE:-tactile_source}\n", ""),
-        ("source/tactile}", "tactile_source/tactile}"),
-        // The recordings were decided by the model of dataflow.yaml.
-        ("${MODEL:-models/barrett-bh8-280-lifts.json}", "models/barrett-bh8-280.json"),
-        ("${PROBE:-test_lift}", "none"),
-        ("${MAX_AGE_MS:-200}", "20000\n      max_gap_ms: 1000"),
-    ] {
-        assert!(text.contains(what), "dataflow-live.yaml has no '{what}'");
-        text = text.replace(what, by);
-    }
-    for shared in ["models", "hands"] {
-        text = text.replace(&format!(" {shared}/"), &format!(" {}/{shared}/", project().display()));
-    }
-    let path = folder.join("live.yaml");
-    std::fs::write(&path, text).expect("written");
-    path
-}
-
-/// A free port of this machine.
-pub(crate) fn free_port() -> u16 {
-    TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr()).expect("a port").port()
-}
-
 fn listening(folder: &Path, port: u16) -> Graph {
     let params = format!("driver: listen\n      address: 127.0.0.1:{port}\n      {PATIENT}");
     let graph = Graph::launch(&unique_name(), &live_dataflow(folder, &params), &[]);
     wait_until(|| graph.said().contains("listening on"), || graph.said());
     graph
-}
-
-/// The frames of the first grasps of the project's recording.
-pub(crate) fn grasps(n: u64) -> Vec<Stamped<TactileFrame>> {
-    let records = RecordingReader::open(&project().join(RECORDING)).expect("a recording");
-    let frames = records.filter_map(|record| match record.expect("readable").1 {
-        Record::Tactile(frame) => Some(frame),
-        _ => None,
-    });
-    frames.take_while(|frame| frame.message.grasp_id < n).collect()
-}
-
-fn line(frame: &Stamped<TactileFrame>) -> Value {
-    json!({
-        "joints": frame.message.joints,
-        "cells_newtons": frame.message.cells_newtons,
-        "phase": frame.message.phase,
-        "grasp_id": frame.message.grasp_id,
-        "seq": frame.header.seq,
-        "stamp_nanos": frame.header.stamp_nanos,
-    })
-}
-
-/// A connection to a source.
-pub(crate) struct Bridge {
-    stream: TcpStream,
-    answers: BufReader<TcpStream>,
-    greeting: Value,
-}
-
-impl Bridge {
-    pub(crate) fn connect(port: u16) -> Bridge {
-        let start = Instant::now();
-        loop {
-            if let Ok(stream) = TcpStream::connect(("127.0.0.1", port)) {
-                let mut answers = BufReader::new(stream.try_clone().expect("cloned"));
-                let mut first = String::new();
-                if matches!(answers.read_line(&mut first), Ok(1..)) {
-                    let greeting = serde_json::from_str(&first).expect("a line of JSON");
-                    return Bridge { stream, answers, greeting };
-                }
-            }
-            assert!(start.elapsed() < Duration::from_secs(60), "nobody listens on {port}");
-            std::thread::sleep(Duration::from_millis(5));
-        }
-    }
-
-    pub(crate) fn send(&mut self, bytes: &[u8]) {
-        self.stream.write_all(bytes).expect("sent");
-    }
-
-    fn send_frame(&mut self, frame: &Stamped<TactileFrame>) {
-        self.send(format!("{}\n", line(frame)).as_bytes());
-    }
-
-    fn answer(&mut self) -> Value {
-        let mut answer = String::new();
-        self.answers.read_line(&mut answer).expect("read");
-        serde_json::from_str(&answer).expect("a line of JSON")
-    }
 }
 
 fn counts(graph: &Graph) -> Value {
@@ -203,12 +110,6 @@ fn frames_have_their_own_day_or_that_of_the_source() {
 
 /// A fault of a frame: the counter that counts it, and the bytes that have it.
 type Wrong = (&'static str, fn(&Stamped<TactileFrame>) -> Vec<u8>);
-
-pub(crate) fn changed(frame: &Stamped<TactileFrame>, change: impl FnOnce(&mut Value)) -> Vec<u8> {
-    let mut line = line(frame);
-    change(&mut line);
-    format!("{line}\n").into_bytes()
-}
 
 const WRONG: [Wrong; 14] = [
     ("malformed", |_| b"not JSON\n".to_vec()),

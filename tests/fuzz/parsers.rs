@@ -7,83 +7,12 @@ use blindgrasp_graph::control::Request;
 use blindgrasp_graph::dataflow;
 use blindgrasp_mesh::read::read_mesh;
 use blindgrasp_mesh::{Mesh, write_off};
-use blindgrasp_simulator::case_file::parse_cases;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 use blindgrasp_tactile::line_protocol;
 use nalgebra::Point3;
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
 
-use crate::seeds::seeds;
-
-/// Words that are at the edge of something.
-const WORDS: [&str; 18] = [
-    "",
-    "-1",
-    "0",
-    "1e308",
-    "1e-320",
-    "nan",
-    "inf",
-    "4294967296",
-    "18446744073709551616",
-    "[",
-    "{",
-    "<a>",
-    "<!--",
-    "-->",
-    "\\\n",
-    "\u{feff}",
-    "\0",
-    ",",
-];
-
-/// A text with a few changes: bytes replaced, pieces cut out, repeated or moved, numbers replaced by words.
-fn damaged(rng: &mut ChaCha8Rng, original: &[u8]) -> Vec<u8> {
-    let mut bytes = original.to_vec();
-    for _ in 0..rng.random_range(1..5) {
-        if bytes.is_empty() {
-            break;
-        }
-        let start = rng.random_range(0..bytes.len());
-        let end = (start + rng.random_range(0..40)).min(bytes.len());
-        match rng.random_range(0..6) {
-            0 => bytes[start] = rng.random(),
-            1 => drop(bytes.drain(start..end)),
-            2 => {
-                let piece = bytes[start..end].repeat(rng.random_range(1..2000));
-                drop(bytes.splice(end..end, piece));
-            }
-            3 => bytes.truncate(start),
-            4 => {
-                let word = WORDS[rng.random_range(0..WORDS.len())].repeat(rng.random_range(1..50));
-                drop(bytes.splice(start..end, word.into_bytes()));
-            }
-            _ => {
-                let is_digit = |byte: &u8| byte.is_ascii_digit();
-                let Some(first) = bytes[start..].iter().position(is_digit).map(|idx| start + idx) else { continue };
-                let n_digits = bytes[first..].iter().take_while(|byte| is_digit(byte)).count();
-                let word = WORDS[rng.random_range(0..WORDS.len())].bytes();
-                drop(bytes.splice(first..first + n_digits, word));
-            }
-        }
-    }
-    bytes
-}
-
-/// Reads `n_cases` damaged versions of a file, and says how many of them are still read.
-fn check(n_cases: u64, original: &[u8], mut is_read: impl FnMut(&[u8]) -> bool) {
-    assert!(is_read(original), "the original is refused");
-    let mut n_read = 0;
-    let mut n_tried = 0;
-    for seed in seeds(n_cases) {
-        n_read += u64::from(is_read(&damaged(&mut ChaCha8Rng::seed_from_u64(seed), original)));
-        n_tried += 1;
-    }
-    println!("{n_read} of {n_tried} damaged versions are read, the others refused");
-    assert!(n_read < n_tried || n_tried == 1, "no damage was noticed");
-}
+use crate::damage::check;
 
 fn project(file: &str) -> Vec<u8> {
     std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join(file)).expect("a file of the project")
@@ -163,10 +92,6 @@ fn models() {
 fn texts_of_people_and_processes() {
     let flow = project("dataflow-machines.yaml");
     check(5000, &flow, |bytes| dataflow::parse(Path::new("/flow.yaml"), bytes).is_ok());
-    let cases =
-        br#"[{"centre_of_mass_m": [0, 0, 0], "max_radius_m": 0.05, "contacts": [{"point_m": [0, 0, 0.02], "normal":
-                  [0, 0, 1], "friction": 0.5, "torsion_m": 0.001}]}]"#;
-    check(20_000, cases, |bytes| parse_cases(&text(bytes)).is_ok());
     let frame = br#"{"joints":[0.5],"cells_newtons":[0,1],"phase":"open","grasp_id":1,"seq":12,"stamp_nanos":7}"#;
     check(50_000, frame, |bytes| line_protocol::parse(bytes).is_ok());
     let request = br#"{"request":"set","node":"lift_arbiter","param":"votes","value":5}"#;

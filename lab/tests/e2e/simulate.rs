@@ -198,3 +198,50 @@ fn recordings_of_lifts_are_named_as_such_by_every_command() {
     let refused = run(&by_wrench_space, 2);
     assert!(text(&refused.stderr).contains("cannot be used with"), "{}", text(&refused.stderr));
 }
+
+#[test]
+fn objects_are_listed_and_written() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("bottles");
+    let out = out.to_str().expect("UTF-8");
+    let listed: Value =
+        serde_json::from_slice(&run(&["simulate", "--list", "--objects", "bottle", "--json"], 0).stdout).expect("JSON");
+    let listed = listed.as_array().expect("a list");
+    let table = text(&run(&["simulate", "--list", "--objects", "bottle"], 0).stdout);
+    assert_eq!(table.lines().count(), listed.len() + 1);
+    for (row, line) in listed.iter().zip(table.lines().skip(1)) {
+        assert!(line.starts_with(row["name"].as_str().expect("a name")), "{line}");
+        assert_eq!(row["class"], "bottle");
+        assert!(
+            row["size_m"][2].as_f64().expect("metres") > 0.01 && row["n_triangles"].as_u64().expect("a number") > 10
+        );
+    }
+    run(&["simulate", "--list", "--objects", "bottle", "--out", out], 0);
+    let files = || {
+        let mut files: Vec<_> = std::fs::read_dir(out).expect("made").flatten().map(|entry| entry.path()).collect();
+        files.sort();
+        files.into_iter().map(|path| (path.clone(), std::fs::read(path).expect("readable"))).collect::<Vec<_>>()
+    };
+    let first = files();
+    assert_eq!(first.len(), listed.len() + 1, "a mesh each and the catalogue");
+    let catalogue = std::fs::read_to_string(Path::new(out).join("catalogue.csv")).expect("written");
+    let rows: Vec<Vec<&str>> = catalogue.lines().map(|line| line.split(',').collect()).collect();
+    assert_eq!(rows[0], ["file", "name", "class", "scale", "mass_kg", "split"]);
+    for (row, object) in rows[1..].iter().zip(listed) {
+        assert_eq!(
+            (row[1], row[5]),
+            (object["name"].as_str().expect("a name"), object["split"].as_str().expect("a split"))
+        );
+        assert!(Path::new(out).join(row[0]).is_file());
+    }
+    run(&["simulate", "--list", "--objects", "bottle", "--out", out], 0);
+    assert!(first == files(), "the same bytes again");
+    // The written folder is a folder of meshes.
+    let back = run(&["simulate", "--list", "--objects", out, "--json"], 0).stdout;
+    let back: Value = serde_json::from_slice(&back).expect("JSON");
+    for (found, written) in back.as_array().expect("a list").iter().zip(listed) {
+        for field in ["name", "class", "mass_kg", "split", "size_m"] {
+            assert_eq!(found[field], written[field]);
+        }
+    }
+}

@@ -1,7 +1,7 @@
 //! One graph on several machines, each a network namespace with its own shared memory. Needs root; elsewhere these
 //! tests are skipped.
 
-#[path = "../common/mod.rs"]
+#[path = "../../../tests/common/mod.rs"]
 mod common;
 mod hosts;
 mod split;

@@ -1,9 +1,9 @@
 //! Training by command: recipes, repeated readings, several frictions.
 
 use std::path::Path;
-use std::process::Output;
+use std::process::{Command, Output};
 
-use crate::common::{MODEL, RECORDING, blindgrasp, paper_model, run, text};
+use crate::common::{MODEL, RECORDING, blindgrasp, example, paper_model, project, run, text};
 use crate::import::pincer;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -51,7 +51,7 @@ fn every_recipe_makes_a_model_that_says_how_it_was_made() {
 fn equal_readings_count_once() {
     let folder = tempfile::tempdir().expect("a folder");
     let (copy, out) = (folder.path().join("copy.mcap"), folder.path().join("m.json"));
-    std::fs::copy(crate::common::project().join(RECORDING), &copy).expect("a copy");
+    std::fs::copy(project().join(RECORDING), &copy).expect("a copy");
     let (copy, out) = (copy.to_str().expect("UTF-8"), out.to_str().expect("UTF-8"));
     let once = text(&run(&["train", RECORDING, "--out", out], 0).stdout);
     let twice = text(&run(&["train", RECORDING, copy, "--overwrite", "--out", out], 0).stdout);
@@ -277,4 +277,15 @@ fn an_svm_is_written_for_libsvm_and_trees_are_not() {
     assert!(said.contains(&format!(": {} support vectors", vectors.lines().count())), "{said}");
     let refused = text(&run(&["model", "export", MODEL, "--overwrite", "--out", out], 1).stderr);
     assert!(refused.contains("has no SVM") && refused.contains("--recipe paper"), "{refused}");
+}
+
+#[test]
+fn the_example_trains_a_model_on_grasps_in_memory() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let out = folder.path().join("model.json");
+    let mut train = Command::new(example("train"));
+    let output = train.arg(&out).arg(RECORDING).current_dir(project()).output().expect("started");
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    assert!(text(&output.stdout).contains("% right about objects not seen"), "{}", text(&output.stdout));
+    run(&["model", "show", out.to_str().expect("UTF-8")], 0);
 }

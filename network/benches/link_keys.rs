@@ -1,6 +1,6 @@
 //! Times what keys cost a link: encryption per frame, signatures per hello. One thread.
 //!
-//! `cargo bench --bench link_keys` prints the least of five times for each.
+//! `cargo bench -p blindgrasp-network --bench link_keys` prints the least of five times for each.
 
 use std::sync::Arc;
 use std::time::Instant;

@@ -6,7 +6,7 @@
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
 
-use crate::common::{project, skipped};
+use crate::common::{program, project, skipped};
 
 /// Needs root, and a kernel with network namespaces, veth pairs and bridges.
 pub(crate) struct Network {
@@ -109,13 +109,13 @@ impl Host {
 
     /// The `blindgrasp` of this build on this host, in the project's folder.
     pub(crate) fn blindgrasp(&self) -> Command {
-        Self::at_home(self.enter(env!("CARGO_BIN_EXE_blindgrasp")))
+        Self::at_home(self.enter(program()))
     }
 
     /// As [`Host::blindgrasp`], where no process can have more descriptors than these.
     pub(crate) fn blindgrasp_with_descriptors(&self, n: u32) -> Command {
         let mut command = self.enter("prlimit");
-        command.args([&format!("--nofile={n}:{n}"), env!("CARGO_BIN_EXE_blindgrasp")]);
+        command.args([&format!("--nofile={n}:{n}"), program()]);
         Self::at_home(command)
     }
 

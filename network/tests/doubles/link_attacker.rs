@@ -1,4 +1,4 @@
-//! Attacks on a machine over the network, for `tests/machines_security.rs` and `tests/machines_fleet.rs`.
+//! Attacks on a machine over the network, for `machines/security.rs` and `machines/fleet.rs`.
 //!
 //!     link_attacker zenoh CONFIG PREFIX KINDS PAUSE_MICROS SECS   a session that breaks the rules sends these kinds of frames
 //!                                                                 under the keys of robot and brain, in both directions

@@ -2,9 +2,9 @@
 
 use std::path::Path;
 
+use crate::common::live::{Bridge, changed, free_port, grasps, live_dataflow};
 use crate::common::{Graph, HAND, MODEL, dataflow, json_lines, project, run, text, unique_name, wait_until};
 use crate::import::pincer;
-use crate::tactile_source::{Bridge, changed, free_port, grasps, live_dataflow};
 use blindgrasp_messages::{Header, Phase, Stamped, TactileFrame};
 use blindgrasp_stages::own_lifts::Adapt;
 use blindgrasp_stages::{Hand, Judge, Model};
@@ -182,7 +182,7 @@ fn a_graph_learns_from_its_lifts_through_kills_and_swaps() {
         ["--set", "lift_arbiter.promised_drops=1", "--set", "classifier.adapt=on", "--record", utf8(&recorded)];
     let graph = Graph::launch(&unique_name(), &flow, &settings);
     wait_until(|| graph.said().contains("listening on"), || graph.said());
-    let hand = Hand::load(Path::new(HAND)).expect("a hand");
+    let hand = Hand::load(&project().join(HAND)).expect("a hand");
     let model = Model::load(&project().join(MODEL)).expect("a model");
     let mut judge = Judge::new(hand.clone(), model).expect("of one hand");
     judge.adapt(Adapt::On);

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::Command;
 
 use crate::common::python::{python, utf8};
-use crate::common::{blindgrasp, project, run, text, unique_name};
+use crate::common::{blindgrasp, program, project, run, text, unique_name};
 
 fn read(path: &str) -> String {
     std::fs::read_to_string(project().join(path)).expect("readable")
@@ -27,7 +27,7 @@ fn try_hand(hand: &str, folder: &Path, options: &[&str]) -> String {
     let output = Command::new(project().join("scripts/try-hand"))
         .args([hand, utf8(folder), "250"])
         .args(options)
-        .env("BLINDGRASP", env!("CARGO_BIN_EXE_blindgrasp"))
+        .env("BLINDGRASP", program())
         .output()
         .expect("started");
     let (stdout, stderr) = (text(&output.stdout), text(&output.stderr));
@@ -56,7 +56,7 @@ fn hands_that_people_own_are_simulated_trained_and_run() {
         run(&["init", utf8(folder.path()), "--hand", hand], 0);
         let succeed = |line: &str| {
             let words: Vec<&str> = line.split(' ').collect();
-            let mut command = Command::new(env!("CARGO_BIN_EXE_blindgrasp"));
+            let mut command = Command::new(program());
             let output = command.current_dir(folder.path()).args(&words).output().expect("started");
             let said = format!("{}{}", text(&output.stdout), text(&output.stderr));
             assert!(output.status.success(), "{hand}: {line}\n{said}");

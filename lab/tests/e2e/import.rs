@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use crate::benchsuite::benchsuite;
-use crate::common::{HAND, RECORDING, json_lines, reference, run, text};
+use crate::common::python::benchsuite;
+use crate::common::{HAND, RECORDING, json_lines, project, reference, run, text};
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::hand::Hand;
 use rand::{RngExt, SeedableRng};
@@ -407,12 +407,12 @@ fn units_are_those_of_the_hand() {
 
 #[test]
 fn a_hand_in_counts_is_another_hand_and_newtons_are_what_they_were() {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(HAND);
+    let path = project().join(HAND);
     let layout = std::fs::read_to_string(&path).expect("readable");
     let urdf = std::fs::read_to_string(path.with_extension("urdf")).expect("readable");
     let id = |layout: &str| Hand::parse(&path, layout, |_| Ok(urdf.clone())).expect("a hand").id();
     // The recording was made before layouts had a unit.
-    let recording = Path::new(env!("CARGO_MANIFEST_DIR")).join(RECORDING);
+    let recording = project().join(RECORDING);
     let recorded = blindgrasp_recording::RecordingReader::open(&recording).expect("readable").info().hand_id;
     assert_eq!(id(&layout), recorded);
     assert_eq!(id(&layout.replace("pads:", "cell_unit: newtons\npads:")), recorded);

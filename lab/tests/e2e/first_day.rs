@@ -4,7 +4,7 @@ use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::process::Command;
 
-use crate::common::{Graph, blindgrasp, project, text, unique_name, wait_until};
+use crate::common::{Graph, blindgrasp, program, project, text, unique_name, wait_until};
 
 /// The blocks of a language in a part of the page.
 fn blocks(part: &str, language: &str) -> String {
@@ -34,7 +34,7 @@ fn the_commands_of_the_first_day_make_a_graph_that_lifts() {
         found.unwrap_or_else(|| panic!("docs/start.md has no part {number}"))
     };
     let folder = tempfile::tempdir().expect("a folder");
-    symlink(env!("CARGO_BIN_EXE_blindgrasp"), folder.path().join("blindgrasp")).expect("linked");
+    symlink(program(), folder.path().join("blindgrasp")).expect("linked");
     let urdf = folder.path().join("trio.urdf");
     std::fs::write(&urdf, blocks(part(2), "xml")).expect("written");
 

@@ -4,14 +4,13 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader, Write};
-use std::net::TcpListener;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use crate::common::live::{free_port, grasps, live_dataflow};
 use crate::common::python::python;
 use crate::common::{Graph, RECORDING, project, run, undisturbed, unique_name, wait_until};
-use crate::tactile_source::{grasps, live_dataflow};
 use blindgrasp_messages::{Action, GraspTruth, Recorded, Stamped, TactileFrame, of_each_type};
 use blindgrasp_recording::cdr;
 use blindgrasp_ros::definition::Definition;
@@ -39,10 +38,6 @@ fn cdr_of(frame: &Stamped<TactileFrame>) -> String {
     let mut bytes = Vec::new();
     cdr::encode(&frame, &mut bytes).expect("CDR");
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
-pub(crate) fn free_port() -> u16 {
-    TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr()).expect("a port").port()
 }
 
 /// The live graph, its source with these parameters and with a node that publishes decisions and frames.

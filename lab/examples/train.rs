@@ -1,7 +1,7 @@
 //! Trains a model on labelled grasps in memory, and saves it.
 //!
 //! ```sh
-//! cargo run --release --example train -- my-model.json recordings/held-out.mcap
+//! cargo run --release -p blindgrasp-lab --example train -- my-model.json recordings/held-out.mcap
 //! ```
 //!
 //! The grasps are a recording's here. Grasps of your own are the same: the frames of each grasp in order, and a

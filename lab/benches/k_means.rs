@@ -1,6 +1,6 @@
 //! Times K-means over contact positions, for `scripts/benchsuite k-means`, which times scikit-learn's beside it.
 //!
-//! `cargo bench --bench k_means -- contacts N OUT RECORDING …` writes the first N contact positions of the grasps of
+//! `cargo bench -p blindgrasp-lab --bench k_means -- contacts N OUT RECORDING …` writes the first N contact positions of the grasps of
 //! recordings, taken as training takes them, as little-endian doubles x, y, z; `-- learn POSITIONS N_CLUSTERS N_INIT
 //! TOLERANCE MAX_ITER SEED` learns words from such a file. Results are lines of JSON on stdout.
 
@@ -34,7 +34,7 @@ fn main() -> Result<(), Failure> {
             eprintln!("run by scripts/benchsuite k-means");
             Ok(())
         }
-        _ => Err(format!("unknown arguments {arguments:?}: see the top of benches/k_means.rs").into()),
+        _ => Err(format!("unknown arguments {arguments:?}: see the top of lab/benches/k_means.rs").into()),
     }
 }
 

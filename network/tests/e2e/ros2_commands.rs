@@ -4,8 +4,9 @@
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Stdio};
 
+use crate::common::live::free_port;
 use crate::common::{Graph, blindgrasp, project, run, text, unique_name, wait_until};
-use crate::ros2::{Peer, free_port};
+use crate::ros2::Peer;
 use serde_json::Value;
 
 /// A router and the types of ROS 2 Jazzy, for the scripts below.

@@ -6,10 +6,10 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 
+use crate::common::browser::Browser;
 use crate::common::python::{python, shell, utf8};
 use crate::common::{MODEL, RECORDING, project, report_data, run, skipped, text};
 use crate::import::pincer;
-use crate::live_page::Browser;
 
 const SPLIT: [&str; 9] =
     ["evaluate", RECORDING, "--split", "object", "--folds", "3", "--recipe", "boosted,paper", "--json"];

@@ -7,9 +7,9 @@ use std::process::{Child, Command, Stdio};
 
 use serde_json::{Value, json};
 
+use crate::common::live::{free_port, grasps, live_dataflow};
 use crate::common::python::python;
 use crate::common::{Graph, project, skipped, undisturbed, unique_name, wait_until};
-use crate::tactile_source::{free_port, grasps, live_dataflow};
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};
 use blindgrasp_ros::definition::Definition;
 use blindgrasp_ros::standard;

@@ -11,9 +11,9 @@ use serde_json::{Value, json};
 use time::OffsetDateTime;
 use zenoh::{Session, Wait};
 
-use crate::common::{Graph, example, project, run, text, unique_name};
+use crate::common::live::live_dataflow;
+use crate::common::{Graph, example, program, project, run, text, unique_name};
 use crate::link_security::{Heard, free_endpoint, keys, put, says, stranger, tls_of, wait_until};
-use crate::tactile_source::live_dataflow;
 
 const FRAMES: &str = "hand/frames";
 const DECISIONS: &str = "robot/hand/decision";
@@ -181,7 +181,7 @@ fn a_flood_of_connections_does_not_keep_the_hands_bridge_out_for_good() {
     );
     let flow = live_dataflow(folder.path(), &params);
     let mut limited = Command::new("prlimit");
-    limited.args([&format!("--nofile={N_DESCRIPTORS}:{N_DESCRIPTORS}"), env!("CARGO_BIN_EXE_blindgrasp")]);
+    limited.args([&format!("--nofile={N_DESCRIPTORS}:{N_DESCRIPTORS}"), program()]);
     limited.current_dir(project()).env("XDG_STATE_HOME", folder.path()).stdin(Stdio::null());
     let graph = Graph::launch_on(limited, &unique_name(), &flow, &[]);
     wait_until("the source listens", || graph.said().contains("receives key"));

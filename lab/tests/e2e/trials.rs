@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::process::Stdio;
 
+use crate::common::browser::Browser;
 use crate::common::{assert_nothing_left, blindgrasp, project, run, signal, text, unique_name};
-use crate::live_page::Browser;
 use rustix::process::Signal;
 use serde_json::Value;
 

@@ -1,0 +1,5 @@
+//! Damaged frames of links, with the seeds of `tests/fuzz`.
+
+#[path = "../../../tests/fuzz/seeds.rs"]
+mod seeds;
+mod wire;
