@@ -82,7 +82,10 @@ fn no_house_needs_the_crates_of_another() {
         let needed = needed_by(&lock, program);
         assert!(needed.len() > 10, "{needed:?}");
         for other in others {
-            assert!(!needed.contains(other), "{program} depends on {other}, which is of another house: ARCHITECTURE.md");
+            assert!(
+                !needed.contains(other),
+                "{program} depends on {other}, which is of another house: ARCHITECTURE.md"
+            );
         }
     }
 }
