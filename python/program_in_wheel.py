@@ -1,4 +1,7 @@
-"""Puts the program into the wheel if BLINDGRASP_WHEEL_PROGRAM names it: `scripts/python-wheel --with-program` sets it."""
+"""Puts the programs into the wheel if BLINDGRASP_WHEEL_PROGRAM names `blindgrasp`, with the two others beside it.
+
+`scripts/python-wheel --with-program` sets it.
+"""
 
 import os
 
@@ -6,14 +9,15 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
 class ProgramInWheel(BuildHookInterface):
-    """Adds the program, the command that starts it, and the platform that it needs."""
+    """Adds the programs, the command that starts them, and the platform that they need."""
 
     def initialize(self, version, build_data):
         program = os.environ.get("BLINDGRASP_WHEEL_PROGRAM")
         if not program or version == "editable":
             return
         command = os.path.join(self.root, "command", "blindgrasp")
-        build_data["force_include"][program] = "blindgrasp/bin/blindgrasp"
+        for part in ("", "-lab", "-network"):
+            build_data["force_include"][program + part] = f"blindgrasp/bin/blindgrasp{part}"
         build_data["shared_scripts"][command] = "blindgrasp"
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-{os.environ['BLINDGRASP_WHEEL_PLATFORM']}"

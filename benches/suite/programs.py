@@ -25,7 +25,7 @@ HELD_OUT = PROJECT / "recordings" / "held-out.mcap"
 
 def build(examples):
     words = [word for example in sorted(examples) for word in ("--example", example)]
-    subprocess.run(["cargo", "build", "--release", "--quiet", "--bins", *words], cwd=PROJECT, check=True, stdout=sys.stderr)
+    subprocess.run(["cargo", "build", "--release", "--workspace", "--quiet", "--bins", *words], cwd=PROJECT, check=True, stdout=sys.stderr)
 
 
 def output(*command):
@@ -52,12 +52,12 @@ def build_peer(name):
 @functools.cache
 def bench_program(name):
     """The program of benches/, built."""
-    command = ["cargo", "bench", "--quiet", "--no-run", "--bench", name, "--message-format", "json"]
+    command = ["cargo", "bench", "--workspace", "--quiet", "--no-run", "--bench", name, "--message-format", "json"]
     for line in output(*command).splitlines():
         message = json.loads(line)
         if message.get("executable") and message["target"]["name"] == name:
             return message["executable"]
-    sys.exit(f"cargo bench --bench {name} has built no program")
+    sys.exit(f"cargo bench --workspace --bench {name} has built no program")
 
 
 def use_packages(names):

@@ -70,7 +70,7 @@ def simulate(arguments):
 
 
 def wrenches(scene):
-    """The edge wrenches of a recorded scene, as crates/simulator/src/wrench_space.rs defines them."""
+    """The edge wrenches of a recorded scene, as lab/crates/simulator/src/wrench_space.rs defines them."""
     import numpy as np
 
     rows = []

@@ -56,7 +56,8 @@ def program() -> Path:
     if found is None:
         raise ProgramNotFoundError(
             f"the program blindgrasp was not found: {PROGRAM_VARIABLE} is not set, this package has no copy of it, and "
-            f"it is not on PATH; build it (cargo build --release) and set {PROGRAM_VARIABLE}=target/release/blindgrasp"
+            "it is not on PATH; build it (cargo build --release --workspace) and set "
+            f"{PROGRAM_VARIABLE}=target/release/blindgrasp"
         )
     return Path(found).absolute()
 

@@ -38,6 +38,8 @@ fn the_same_program_is_packed_into_the_same_bytes_and_runs_from_them() {
     let root = folder.path().join("root");
     succeed(Command::new("dpkg-deb").arg("--extract").arg(&package).arg(&root));
     for file in [
+        "usr/bin/blindgrasp-lab",
+        "usr/bin/blindgrasp-network",
         "usr/lib/systemd/system/blindgrasp@.service",
         "usr/share/bash-completion/completions/blindgrasp",
         "usr/share/doc/blindgrasp/README.md",
@@ -47,12 +49,16 @@ fn the_same_program_is_packed_into_the_same_bytes_and_runs_from_them() {
         "usr/share/doc/blindgrasp/docs/install.md",
         "usr/share/doc/blindgrasp/third-party-licences.txt.gz",
         "usr/share/fish/vendor_completions.d/blindgrasp.fish",
+        "usr/share/man/man1/blindgrasp-keys.1.gz",
+        "usr/share/man/man1/blindgrasp-simulate.1.gz",
         "usr/share/man/man1/blindgrasp.1.gz",
         "usr/share/zsh/vendor-completions/_blindgrasp",
     ] {
         assert!(root.join(file).is_file(), "{file} is missing in {}", package.display());
     }
     assert_eq!(succeed(Command::new(root.join("usr/bin/blindgrasp")).arg("--version")), version);
+    let help = succeed(Command::new(root.join("usr/bin/blindgrasp")).args(["simulate", "--help"]));
+    assert!(help.contains("--grasps"), "{help}");
 
     let tarball = first.join(one(&names, ".tar.gz"));
     succeed(Command::new("tar").arg("-xf").arg(&tarball).arg("-C").arg(folder.path()));

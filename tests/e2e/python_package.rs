@@ -46,4 +46,6 @@ fn a_wheel_with_the_program_installs_package_operator_modules_and_command() {
     assert!(fixtures.contains("\nreplay -- "), "{fixtures}");
     let version = run(Path::new(program()), &["--version"]);
     assert_eq!(run(&installed.join("bin/blindgrasp"), &["--version"]), version);
+    // The lab's program is beside it.
+    assert!(run(&installed.join("bin/blindgrasp"), &["simulate", "--help"]).contains("--grasps"));
 }

@@ -1,6 +1,6 @@
 //! The work of others that the project uses: crates with known faults, and the actions of workflows.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::{Value, json};
 
@@ -68,6 +68,46 @@ fn is_within(version: &str, range: &str) -> bool {
 fn numbers(version: &str) -> Vec<u64> {
     let end = version.find(['-', '+']).unwrap_or(version.len());
     version[..end].split('.').map(|number| number.parse().expect("a number")).collect()
+}
+
+/// Also for its tests, so that each house is built and tested by itself.
+#[test]
+fn no_house_needs_the_crates_of_another() {
+    let lock = read(&project().join("Cargo.lock"));
+    for (program, others) in [
+        ("blindgrasp", &["blindgrasp-learning", "blindgrasp-bridge", "rapier3d-f64", "zenoh"][..]),
+        ("blindgrasp-lab", &["blindgrasp", "blindgrasp-bridge", "zenoh"]),
+        ("blindgrasp-network", &["blindgrasp", "blindgrasp-learning", "rapier3d-f64"]),
+    ] {
+        let needed = needed_by(&lock, program);
+        assert!(needed.len() > 10, "{needed:?}");
+        for other in others {
+            assert!(
+                !needed.contains(other),
+                "{program} depends on {other}, which is of another house: ARCHITECTURE.md"
+            );
+        }
+    }
+}
+
+/// What a package of Cargo.lock depends on, over others as well.
+fn needed_by<'a>(lock: &'a str, package: &'a str) -> BTreeSet<&'a str> {
+    let mut needed = BTreeSet::new();
+    let mut ahead = vec![package];
+    while let Some(name) = ahead.pop() {
+        let head = format!("\nname = \"{name}\"\n");
+        for of_name in lock.split("[[package]]").filter(|package| package.starts_with(&head)) {
+            let dependencies = of_name.split_once("dependencies = [").unwrap_or_default().1;
+            for words in dependencies.split('"').skip(1).step_by(2) {
+                // A version follows the name where there are several.
+                let dependency = words.split(' ').next().unwrap_or_default();
+                if needed.insert(dependency) {
+                    ahead.push(dependency);
+                }
+            }
+        }
+    }
+    needed
 }
 
 /// A tag of an action can be moved to other content, and a checkout's credentials can be read by all later steps.
