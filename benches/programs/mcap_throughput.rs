@@ -86,7 +86,7 @@ struct Message {
 fn samples(recording: &Path, n_samples: usize) -> anyhow::Result<(RecordingInfo, Vec<(&'static str, Record)>)> {
     let reader = RecordingReader::open(recording)?;
     let info = reader.info().clone();
-    let hand = blindgrasp_learning::dataset::hand_of(recording, None)?;
+    let hand = blindgrasp_grasps::dataset::hand_of(recording, None)?;
     let mut recorded = Vec::new();
     for record in reader {
         if let (_, Record::Tactile(frame)) = record? {

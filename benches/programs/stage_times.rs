@@ -8,7 +8,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
-use blindgrasp_learning::dataset::hand_of;
+use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_messages::{Fault, Phase, Prediction};
 use blindgrasp_recording::{Record, RecordingReader};
 use blindgrasp_stages::contacts::ContactFinder;

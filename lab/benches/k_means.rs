@@ -7,7 +7,7 @@
 use std::path::Path;
 use std::time::Instant;
 
-use blindgrasp_learning::dataset::{hand_of, read_grasps};
+use blindgrasp_grasps::dataset::{hand_of, read_grasps};
 use blindgrasp_learning::learners::k_means::{KMeansParams, learn_dictionary};
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::contacts::contacts_from_frame;

@@ -8,7 +8,7 @@ use std::fmt::Write;
 use std::path::Path;
 use std::time::Instant;
 
-use blindgrasp_learning::dataset::{hand_of, read_grasps};
+use blindgrasp_grasps::dataset::{hand_of, read_grasps};
 use blindgrasp_learning::learners::libsvm_format::write_libsvm;
 use blindgrasp_learning::learners::svm::train_svm;
 use blindgrasp_messages::Phase;

@@ -11,7 +11,7 @@
 use std::path::Path;
 
 use anyhow::Context;
-use blindgrasp_learning::dataset::{hand_of, read_grasps};
+use blindgrasp_grasps::dataset::{hand_of, read_grasps};
 use blindgrasp_learning::training::{Examples, TrainingOptions, train};
 
 fn main() -> anyhow::Result<()> {

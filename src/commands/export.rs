@@ -10,8 +10,8 @@ use clap::{Args, ValueEnum};
 use serde_json::json;
 
 use super::{Outcome, check_new, data_on_stdout, print_line};
-use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::training::{FeatureTableError, write_feature_table};
+use blindgrasp_grasps::dataset::hand_of;
+use blindgrasp_grasps::feature_table::{FeatureTableError, write_feature_table};
 use blindgrasp_messages::files::{keep_mode, partial_path, private_file};
 use blindgrasp_recording::export::{CsvTable, ExportError, row, table_shapes};
 use blindgrasp_recording::{Record, RecordingReader, recordings_in};
@@ -95,7 +95,7 @@ fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::R
     }
     let written = write_feature_table(&hand, &model, &recordings, BufWriter::new(&file.file));
     let written = written.map_err(|error| match error {
-        FeatureTableError::Examples(of_recordings) => anyhow::Error::from(of_recordings),
+        FeatureTableError::Dataset(of_recordings) => anyhow::Error::from(of_recordings),
         error => anyhow::Error::from(error).context(format!("cannot write {}", out.display())),
     })?;
     file.finish()?;

@@ -8,10 +8,8 @@ use clap::Args;
 
 use super::{Outcome, cases, completions, hand_cells, percent, print_line, print_text};
 use blindgrasp_graph::client::{is_graph_name, running_graphs};
-use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::evaluation::paper_label::PaperLabel;
-use blindgrasp_learning::evaluation::statistics::Interval;
-use blindgrasp_learning::summary::{Overview, RecordingsSummary};
+use blindgrasp_grasps::dataset::{REPORT_METADATA, hand_of};
+use blindgrasp_grasps::summary::{Overview, RecordingsSummary};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::text::did_you_mean;
 use blindgrasp_recording::{RecordingIndex, RepairReport, recordings_in, repair};
@@ -196,7 +194,8 @@ fn overview_lines(overview: &Overview) -> Vec<(&str, String)> {
         let n_messages = topic.n_messages.map_or("?".into(), |n| n.to_string());
         lines.push(("not ours", format!("{name} {n_messages} ({})", topic.schema)));
     }
-    for (name, metadata) in &overview.metadata {
+    // A simulation's report is long; --json has it.
+    for (name, metadata) in overview.metadata.iter().filter(|(name, _)| *name != REPORT_METADATA) {
         for (key, value) in metadata {
             let value = match value.split_once('\n') {
                 Some((first, rest)) => format!("{first} … ({} more lines)", rest.lines().count()),
@@ -240,19 +239,6 @@ fn print_summary(hand: &Hand, summary: &RecordingsSummary) -> anyhow::Result<()>
             lines.push(("pad", format!("{:<12} feels {felt} of the grasps, {mean:.1} cells each", pad.name)));
         }
     }
-    if let Some(report) = &summary.simulation {
-        lines.push((
-            "simulation",
-            format!(
-                "{} candidates, {} stable before balancing; {} without touch, {} over their quota, {} hull failures",
-                report.n_candidates,
-                share(report.n_judged_stable, report.n_judged),
-                report.n_without_touch,
-                report.n_over_quota,
-                report.n_hull_failures
-            ),
-        ));
-    }
     for found in &summary.problems {
         lines.push(("problem", format!("{}: {}", found.recording, found.message)));
     }
@@ -262,59 +248,18 @@ fn print_summary(hand: &Hand, summary: &RecordingsSummary) -> anyhow::Result<()>
     }
     print_lines(lines)?;
     if !summary.classes.is_empty() {
-        print_text("\nclass              grasps    stable  by nature")?;
+        print_text("\nclass              grasps    stable")?;
     }
     for (class, group) in &summary.classes {
-        let natural = percent(group.natural_stable_rate);
         let stable = share(group.n_stable, group.n_grasps);
-        print_line(&format!("{class:<16} {:>8} {stable:>9} {natural:>10}", group.n_grasps))?;
+        print_line(&format!("{class:<16} {:>8} {stable:>9}", group.n_grasps))?;
     }
-    summary.paper_label.as_ref().map_or(Ok(()), print_paper_label)
+    Ok(())
 }
 
 fn labels(labels: &BTreeSet<Label>) -> String {
     let meanings: Vec<&str> = labels.iter().map(|label| label.meaning()).collect();
     if meanings.is_empty() { "as recorded; not from a simulation".into() } else { meanings.join("; ") }
-}
-
-/// So many classes are printed whose truth and paper's label disagree most.
-const N_CLASSES: usize = 5;
-
-/// The paper's label beside another truth.
-fn print_paper_label(found: &PaperLabel) -> anyhow::Result<()> {
-    let all = &found.all;
-    print_text("\nthe paper's label (epsilon > 0.07 and volume > 0.1) beside the truth, in grasps")?;
-    print_line("                    truth stable  truth unstable")?;
-    for (row, stable, unstable) in [
-        ("label stable", all.n_stable_by_both, all.n_stable_by_paper_only),
-        ("label unstable", all.n_stable_by_truth_only, all.n_unstable_by_both),
-    ] {
-        print_line(&format!("{row:<18} {stable:>13} {unstable:>15}"))?;
-    }
-    let interval = all.accuracy.and_then(|accuracy| accuracy.interval);
-    let interval = interval.map(|Interval { low, high }| format!(" ({:.1}..{:.1})", 100.0 * low, 100.0 * high));
-    let area = |area: Option<f64>| area.map_or("n/a".into(), |area| format!("{area:.3}"));
-    print_line(&format!(
-        "they agree in {}{}, always the same would in {}; ROC area of epsilon {}, of the volume {}",
-        percent(all.accuracy.map(|accuracy| accuracy.value)),
-        interval.unwrap_or_default(),
-        percent(all.majority_class),
-        area(found.epsilon_roc_auc),
-        area(found.volume_roc_auc),
-    ))?;
-    for (class, agreement) in found.by_disagreement().into_iter().take(N_CLASSES) {
-        print_line(&format!(
-            "  {class:<16} differs in {} of {}: {} stable by the label only, {} by the truth only",
-            agreement.n_different(),
-            agreement.n(),
-            agreement.n_stable_by_paper_only,
-            agreement.n_stable_by_truth_only
-        ))?;
-    }
-    if found.n_without_quality > 0 {
-        print_line(&format!("  without epsilon and volume, not counted: {}", found.n_without_quality))?;
-    }
-    Ok(())
 }
 
 fn print_lines(lines: Vec<(&str, String)>) -> anyhow::Result<()> {

@@ -8,8 +8,8 @@ use serde_json::json;
 
 use super::frame_lines::read_frames;
 use super::{Outcome, print_line};
-use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::evaluation::{Decided, decide, decide_frames, has_probability};
+use blindgrasp_grasps::dataset::hand_of;
+use blindgrasp_grasps::decide::{Decided, decide, decide_frames, has_probability};
 use blindgrasp_messages::{GraspTruth, LiftDecision};
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::{ArbiterOptions, Hand, Judge, Model, Probe};

@@ -15,7 +15,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{anyhow, bail};
-use blindgrasp_learning::dataset::hand_of;
+use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_recording::{Record, RecordingReader};
 use blindgrasp_stages::Model;
 use cu29::prelude::*;

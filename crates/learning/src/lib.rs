@@ -14,16 +14,14 @@
 //!
 //! [`training::train`] makes such a model of the grasps of recordings, or of grasps in memory ([`training::Examples`]).
 //!
-//! * [`dataset`] - recordings as data sets. [`summary`] - recordings summed up. [`import`] - tables of tactile readings as recordings.
+//! * [`import`] - tables of tactile readings as recordings.
 //! * [`training`] - the model, by the [`learners`].
 //! * [`evaluation`] - decisions compared with labels. [`promise`] - bounds for the drops to come. [`trials`] - lift trials counted and shown.
 
-pub mod dataset;
 pub mod evaluation;
 pub mod import;
 pub mod learners;
 pub mod promise;
 pub mod sensors;
-pub mod summary;
 pub mod training;
 pub mod trials;

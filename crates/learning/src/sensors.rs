@@ -8,8 +8,8 @@ use std::path::PathBuf;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::dataset::{DatasetError, read_grasps};
 use crate::learners::booster::train_boosted;
+use blindgrasp_grasps::dataset::{DatasetError, read_grasps};
 use blindgrasp_messages::{Contact, Fault, Phase, TactileFrame};
 use blindgrasp_stages::classifier::boosting::{BoostedTrees, BoostingError, BoostingParams};
 use blindgrasp_stages::contacts::contacts_from_frame;

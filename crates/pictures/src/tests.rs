@@ -1,46 +1,36 @@
-//! Pictures of simulated grasps.
+//! Pictures of recorded grasps.
 
 use std::path::Path;
 
 use super::*;
-use blindgrasp_messages::{Header, SceneContact, Stamped};
-use blindgrasp_objects::select;
-use blindgrasp_simulator::simulator::{SimulatorOptions, simulate_all};
+use blindgrasp_messages::SceneContact;
+use blindgrasp_objects::find_mesh;
+use blindgrasp_recording::{Record, RecordingReader};
 use blindgrasp_stages::hand::Hand;
 
-/// A grasp of a built-in object.
-pub(super) fn simulated(objects: &str, seed: u64) -> (Hand, RecordedGrasp) {
+/// The first stable grasp of an object of this class in a recording.
+fn recorded(class: &str) -> (Hand, RecordedGrasp) {
     let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-    let objects = select(objects).expect("built in");
-    let options = SimulatorOptions { n_grasps: 1, seed, stable_fraction: Some(1.0), ..SimulatorOptions::default() };
-    let mut found = None;
-    simulate_all(&hand, &objects, &options, |grasp| {
-        found = Some(grasp);
-        Ok::<(), ()>(())
-    })
-    .expect("a grasp");
-    let grasp = found.expect("a grasp");
-    let object = objects.iter().find(|object| object.name == grasp.truth.object).expect("one of these");
-    let frames = grasp
-        .frames
-        .into_iter()
-        .map(|timed| Stamped {
-            header: Header { stamp_nanos: timed.offset_nanos, ..Header::default() },
-            message: timed.frame,
-        })
-        .collect();
-    let object = ObjectSurface::Known(object.to_mesh());
-    let recorded = RecordedGrasp {
-        grasp_id: grasp.truth.grasp_id,
-        frames,
-        truth: Some(grasp.truth),
-        scene: Some(grasp.scene),
-        object,
-        prediction: None,
-        decision: None,
-        is_hand_alone: false,
-    };
-    (hand, recorded)
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../recordings/held-out.mcap");
+    let read = || RecordingReader::open(&path).expect("readable").map(|record| record.expect("readable").1);
+    let truth = read().find_map(|record| match record {
+        Record::Truth(truth) if truth.message.class == class && truth.message.stable => Some(truth.message),
+        _ => None,
+    });
+    let truth = truth.expect("a grasp");
+    let mut grasp = RecordedGrasp { is_hand_alone: false, ..RecordedGrasp::hand_alone(&hand, &[]) };
+    for record in read() {
+        match record {
+            Record::Tactile(frame) if frame.message.grasp_id == truth.grasp_id => grasp.frames.push(frame),
+            Record::Scene(scene) if scene.message.grasp_id == truth.grasp_id => grasp.scene = Some(scene.message),
+            _ => {}
+        }
+    }
+    let mesh = find_mesh(&truth.object, None).expect("readable");
+    grasp.grasp_id = truth.grasp_id;
+    grasp.object = ObjectSurface::Known(mesh.expect("built in"));
+    grasp.truth = Some(truth);
+    (hand, grasp)
 }
 
 /// Fails where the text is no XML. Returns the classes of all elements.
@@ -77,7 +67,7 @@ fn n_arrows(classes: &[String], kind: &str) -> usize {
 
 #[test]
 fn the_picture_says_what_the_grasp_is_and_shows_every_contact() {
-    let (hand, mut grasp) = simulated("can", 1);
+    let (hand, mut grasp) = recorded("can");
     let scene = grasp.scene.as_mut().expect("a scene");
     let first = scene.contacts[0].clone();
     scene.contacts.push(SceneContact { other_link: 2, felt_newtons: 1.0, ..first });
@@ -101,7 +91,7 @@ fn the_picture_says_what_the_grasp_is_and_shows_every_contact() {
 
 #[test]
 fn without_a_scene_the_picture_shows_the_active_cells_and_says_so() {
-    let (hand, mut grasp) = simulated("box", 2);
+    let (hand, mut grasp) = recorded("box");
     grasp.scene = None;
     grasp.truth = None;
     let svg = grasp_svg(&hand, &grasp).expect("a picture");
@@ -117,7 +107,7 @@ fn without_a_scene_the_picture_shows_the_active_cells_and_says_so() {
 
 #[test]
 fn an_object_that_is_not_found_is_said_and_hostile_names_are_only_text() {
-    let (hand, mut grasp) = simulated("ball", 5);
+    let (hand, mut grasp) = recorded("ball");
     grasp.object = ObjectSurface::Unknown("The object 'x' is not drawn: <why> & what to do.".into());
     grasp.truth.as_mut().expect("a truth").object = "</script><b>\"&".into();
     let svg = grasp_svg(&hand, &grasp).expect("a picture");
@@ -129,7 +119,7 @@ fn an_object_that_is_not_found_is_said_and_hostile_names_are_only_text() {
 
 #[test]
 fn the_page_needs_nothing_else_and_holds_the_frames_and_contacts() {
-    let (hand, grasp) = simulated("cup", 3);
+    let (hand, grasp) = recorded("cup");
     let html = grasp_html(&hand, &grasp).expect("a page");
     // Namespaces are names, not addresses.
     let names = ["http://www.w3.org/2000/svg", "http://www.w3.org/1999/xhtml"];
@@ -145,7 +135,7 @@ fn the_page_needs_nothing_else_and_holds_the_frames_and_contacts() {
 
 #[test]
 fn frames_and_contacts_of_another_hand_are_refused() {
-    let (hand, grasp) = simulated("can", 1);
+    let (hand, grasp) = recorded("can");
     let refused = |change: &dyn Fn(&mut RecordedGrasp), expected: &str| {
         let mut changed = grasp.clone();
         change(&mut changed);
@@ -164,14 +154,14 @@ fn frames_and_contacts_of_another_hand_are_refused() {
 
 #[test]
 fn cards_hold_a_frame_each_and_hostile_names_are_only_text() {
-    let (hand, mut grasp) = simulated("can", 1);
+    let (hand, mut grasp) = recorded("can");
     grasp.truth.as_mut().expect("a truth").object = "</script><b>\"&".into();
     let cards = GraspCards::new(&hand, [&grasp, &grasp]).expect("cards");
     let html = report_html(ReportKind::Run, &(), Some(&cards)).expect("a page");
     assert_eq!(html.matches("\"grasp_id\"").count(), 2);
     assert!(html.contains("known to be stable; object \\u003c/script>\\u003cb>"), "{}", &html[..2000]);
     assert_eq!(html.matches("</script>").count(), 4, "only the page's own scripts end");
-    let (_, mut other) = simulated("can", 1);
+    let (_, mut other) = recorded("can");
     other.frames[0].message.cells_newtons.pop();
     assert!(GraspCards::new(&hand, [&other]).is_err(), "a frame of another hand");
 }

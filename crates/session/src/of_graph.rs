@@ -7,7 +7,7 @@ use std::time::SystemTime;
 use serde_json::{Map, Value, json};
 
 use blindgrasp_graph::recorded_graph::{Beginning, RecordedGraph};
-use blindgrasp_learning::dataset::{TRUTH_METADATA, label_of};
+use blindgrasp_grasps::dataset::{TRUTH_METADATA, label_of};
 use blindgrasp_messages::{LiftOutcome, Recorded};
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_stages::hand::Hand;

@@ -76,11 +76,10 @@ impl<'a> Mechanism<'a> {
             .iter()
             .enumerate()
             .filter(|(_, joint)| !joint.is_preshape)
-            .map(|(joint_idx, joint)| {
-                let rate = hand.closing_rate(joint_idx);
-                let limit = if rate > 0.0 { joint.upper } else { joint.lower };
-                let end = if rate == 0.0 { 0.0 } else { ((limit - joint.open()) / rate).max(0.0) };
-                ClosingJoint { joint_idx, rate, end }
+            .map(|(joint_idx, _)| ClosingJoint {
+                joint_idx,
+                rate: hand.closing_rate(joint_idx),
+                end: hand.closing_end(joint_idx),
             })
             .collect();
         let shapes: Vec<PlacedShape<'a>> = hand
@@ -124,24 +123,6 @@ impl<'a> Mechanism<'a> {
             Mechanism { hand, shapes, shapes_of_links, joints, movers, top_speed, fingers, pairs: Vec::new() };
         mechanism.pairs = mechanism.pairs();
         mechanism
-    }
-
-    /// The joints' values while the hand closes on nothing from a posture on, in so many steps of equal progress. Links pass
-    /// through each other.
-    pub fn closing_postures(&self, from: &[f64], n_steps: usize) -> Vec<Vec<f64>> {
-        let end = self.joints.iter().map(|joint| joint.end).fold(0.0, f64::max);
-        (0..=n_steps)
-            .map(|step| {
-                let mut posture = from.to_vec();
-                let progress = end * step as f64 / n_steps as f64;
-                for joint in &self.joints {
-                    let of_hand = &self.hand.joints[joint.joint_idx];
-                    let value = from[joint.joint_idx] + joint.rate * progress;
-                    posture[joint.joint_idx] = value.clamp(of_hand.lower, of_hand.upper);
-                }
-                posture
-            })
-            .collect()
     }
 
     /// The progress at which a link came to its final place.

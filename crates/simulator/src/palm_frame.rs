@@ -88,7 +88,7 @@ pub fn idle_pads(hand: &Hand) -> Result<Vec<usize>, JointError> {
 /// The hand's joints do not fit together.
 pub fn self_pressing(hand: &Hand) -> Result<(f64, Option<(usize, usize)>), JointError> {
     const N_STEPS: usize = 20;
-    let postures = Mechanism::new(hand).closing_postures(&hand.open_joints_rad(), N_STEPS);
+    let postures = hand.closing_postures(&hand.open_joints_rad(), N_STEPS);
     // The second half of an empty closing is always fingers on fingers.
     let postures = &postures[..=N_STEPS / 2];
     let mut pressing = Vec::new();
@@ -213,7 +213,7 @@ fn directions(hand: &Hand) -> Result<Vec<UnitVector3<f64>>, JointError> {
 fn frame_along(hand: &Hand, direction: &UnitVector3<f64>) -> Result<Isometry3<f64>, JointError> {
     let rotation = UnitQuaternion::rotation_between(&Vector3::z(), direction)
         .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
-    let postures = Mechanism::new(hand).closing_postures(&hand.open_joints_rad(), 2);
+    let postures = hand.closing_postures(&hand.open_joints_rad(), 2);
     let palm_from_links = hand.palm_from_links(&postures[1])?;
     let middles = hand.pads.iter().map(|pad| (palm_from_links[pad.link_idx] * pad.middle_in_link_m()).coords);
     let middle = middles.sum::<Vector3<f64>>() / hand.pads.len() as f64;

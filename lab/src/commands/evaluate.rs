@@ -7,10 +7,11 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{Outcome, check_output, check_page, number_in, percent, print_line, print_text, write_out, write_report};
-use blindgrasp_learning::dataset::{hand_of, label_line, labels_of};
+use blindgrasp_grasps::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::looks::{Look, looks};
 use blindgrasp_learning::evaluation::page::{FIGURE_1_FILE, figure_1, report_page, tables};
+use blindgrasp_learning::evaluation::paper_label::PaperLabel;
 use blindgrasp_learning::evaluation::predictions::{OutsidePredictions, predictions_csv};
 use blindgrasp_learning::evaluation::report::{
     Origin, Report, THRESHOLD_PROBABILITY, report_on_model, report_on_predictions, report_on_recipes,
@@ -162,6 +163,9 @@ impl Job<'_> {
         if is_table {
             print_scores(&evaluated)?;
             print_label(self.recordings)?;
+            if let Some(found) = &evaluated.paper_label {
+                print_paper_label(found)?;
+            }
         }
         let has_probes = model.squeezed.is_some() || model.test_lifted.is_some();
         let is_asked_for_more =
@@ -366,14 +370,54 @@ fn print_looks(looks: &[Look]) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// The paper's label beside another truth.
+fn print_paper_label(found: &PaperLabel) -> anyhow::Result<()> {
+    /// So many classes are printed whose truth and paper's label disagree most.
+    const N_CLASSES: usize = 5;
+    let all = &found.all;
+    print_text("\nthe paper's label (epsilon > 0.07 and volume > 0.1) beside the truth, in grasps")?;
+    print_line("                    truth stable  truth unstable")?;
+    for (row, stable, unstable) in [
+        ("label stable", all.n_stable_by_both, all.n_stable_by_paper_only),
+        ("label unstable", all.n_stable_by_truth_only, all.n_unstable_by_both),
+    ] {
+        print_line(&format!("{row:<18} {stable:>13} {unstable:>15}"))?;
+    }
+    let area = |area: Option<f64>| area.map_or("n/a".into(), |area| format!("{area:.3}"));
+    print_line(&format!(
+        "they agree in {}, always the same would in {}; ROC area of epsilon {}, of the volume {}",
+        with_interval(all.accuracy),
+        percent(all.majority_class),
+        area(found.epsilon_roc_auc),
+        area(found.volume_roc_auc),
+    ))?;
+    for (class, agreement) in found.by_disagreement().into_iter().take(N_CLASSES) {
+        print_line(&format!(
+            "  {class:<16} differs in {} of {}: {} stable by the label only, {} by the truth only",
+            agreement.n_different(),
+            agreement.n(),
+            agreement.n_stable_by_paper_only,
+            agreement.n_stable_by_truth_only
+        ))?;
+    }
+    if found.n_without_quality > 0 {
+        print_line(&format!("  without epsilon and volume, not counted: {}", found.n_without_quality))?;
+    }
+    Ok(())
+}
+
+fn share(estimate: Option<Estimate>) -> String {
+    percent(estimate.map(|estimate| estimate.value))
+}
+
+fn with_interval(estimate: Option<Estimate>) -> String {
+    let interval = estimate.and_then(|estimate| estimate.interval);
+    let interval = interval.map(|interval| format!(" ({:.1}..{:.1})", 100.0 * interval.low, 100.0 * interval.high));
+    format!("{}{}", share(estimate), interval.unwrap_or_default())
+}
+
 /// Prints the judges and their comparisons.
 fn print_judges(report: &Report) -> anyhow::Result<()> {
-    let share = |estimate: Option<Estimate>| percent(estimate.map(|estimate| estimate.value));
-    let with_interval = |estimate: Option<Estimate>| {
-        let interval = estimate.and_then(|estimate| estimate.interval);
-        let interval = interval.map(|interval| format!(" ({:.1}..{:.1})", 100.0 * interval.low, 100.0 * interval.high));
-        format!("{}{}", share(estimate), interval.unwrap_or_default())
-    };
     let width = report.judges.iter().map(|judge| judge.name.chars().count()).max().unwrap_or(0).max(11);
     let head = if report.made.predictions.is_some() { "model" } else { "recipe" };
     print_line(&format!(

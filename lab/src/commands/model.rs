@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::train::{probe_lines, threshold_line};
 use super::{Outcome, check_new, check_output, completions, percent, print_line, print_text, write_out};
-use blindgrasp_learning::dataset::{hand_of, label_line};
+use blindgrasp_grasps::dataset::{hand_of, label_line};
 use blindgrasp_learning::learners::libsvm_format::write_libsvm;
 use blindgrasp_learning::training::adapt;
 use blindgrasp_recording::recordings_in;

@@ -8,7 +8,7 @@ use indicatif::ProgressBar;
 use serde_json::json;
 
 use super::{Outcome, check_new, completions, print_line, print_text};
-use blindgrasp_learning::dataset::hand_of;
+use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_learning::sensors::{alarms, learn, read};
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::sensors::{Described, SensorCheck};

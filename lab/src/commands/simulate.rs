@@ -14,7 +14,7 @@ use serde::Serialize;
 use super::object_list::list;
 use super::trials::physics;
 use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text};
-use blindgrasp_learning::dataset::{REPORT_METADATA, report_in};
+use blindgrasp_grasps::dataset::REPORT_METADATA;
 use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::read_regular;
 use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
@@ -332,8 +332,11 @@ fn progress_bar(n_grasps: usize) -> ProgressBar {
 }
 
 fn report_of(recording: &Path) -> anyhow::Result<SimulationReport> {
-    let report = report_in(recording, &RecordingReader::open(recording)?)?;
-    report.with_context(|| format!("recording {}: expected one that a simulation made", recording.display()))
+    let reader = RecordingReader::open(recording)?;
+    let report = reader.metadata(REPORT_METADATA).and_then(|metadata| metadata.get("report"));
+    let report =
+        report.with_context(|| format!("recording {}: expected one that a simulation made", recording.display()))?;
+    serde_json::from_str(report).with_context(|| format!("recording {}: its simulation's report", recording.display()))
 }
 
 fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {

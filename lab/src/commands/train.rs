@@ -7,7 +7,7 @@ use clap::{Args, ValueEnum};
 
 use super::evaluate::print_label;
 use super::{Outcome, check_new, completions, number_in, percent, print_line};
-use blindgrasp_learning::dataset::hand_of;
+use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, TrainingSummary, train};
 use blindgrasp_messages::Fault;
 use blindgrasp_operator::diagnostics::print_diagnostic;

@@ -15,7 +15,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use blindgrasp_learning::dataset::{hand_of, read_grasps};
+use blindgrasp_grasps::dataset::{hand_of, read_grasps};
 use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, adapt_on, train};
 use blindgrasp_messages::{Action, GraspTruth, Header, Phase, Stamped, TactileFrame};
 use blindgrasp_stages::own_lifts::Adapt;

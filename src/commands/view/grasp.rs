@@ -7,8 +7,8 @@ use anyhow::{Context, bail};
 
 use super::super::{Outcome, check_output, print_line, write_out};
 use super::GraspArguments;
-use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::evaluation::decide_alone;
+use blindgrasp_grasps::dataset::hand_of;
+use blindgrasp_grasps::decide::decide_alone;
 use blindgrasp_messages::{Fault, Phase, Prediction};
 use blindgrasp_objects::find_mesh;
 use blindgrasp_operator::diagnostics::print_diagnostic;

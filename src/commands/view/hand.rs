@@ -7,7 +7,6 @@ use super::grasp::{Format, format_of};
 use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{RecordedGrasp, grasp_html, grasp_svg};
-use blindgrasp_simulator::mechanism::Mechanism;
 use blindgrasp_stages::hand::Hand;
 
 /// Postures in the page, from the open hand to the closed one.
@@ -32,7 +31,7 @@ pub(super) fn draw(path: &Path, out: &Path, joints: &[(String, f64)]) -> anyhow:
     let picture = match format {
         Format::Svg => grasp_svg(&hand, &RecordedGrasp::hand_alone(&hand, &[posture]))?,
         Format::Html => {
-            let mut postures = Mechanism::new(&hand).closing_postures(&posture, N_POSTURES);
+            let mut postures = hand.closing_postures(&posture, N_POSTURES);
             // Links that touch in the given posture leave nothing to close.
             postures.truncate(n_apart(&hand, &postures)?.max(1));
             grasp_html(&hand, &RecordedGrasp::hand_alone(&hand, &postures))?

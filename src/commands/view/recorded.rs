@@ -6,8 +6,8 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use anyhow::bail;
-use blindgrasp_learning::dataset::hand_of;
-use blindgrasp_learning::evaluation::decide_alone;
+use blindgrasp_grasps::dataset::hand_of;
+use blindgrasp_grasps::decide::decide_alone;
 use blindgrasp_messages::{Action, ContactSet, GraspTruth, LiftDecision, Phase, Recorded as _, Stamped, TactileFrame};
 use blindgrasp_objects::find_mesh;
 use blindgrasp_operator::diagnostics::print_diagnostic;

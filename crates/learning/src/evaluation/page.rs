@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::decisions::JudgedRecipe;
 use super::report::Report;
 use super::statistics::Estimate;
-use crate::dataset::label_line;
+use blindgrasp_grasps::dataset::label_line;
 use blindgrasp_pictures::{DrawnWord, PictureError, ReportKind, dictionary_svg, report_html};
 use blindgrasp_stages::hand::Hand;
 

@@ -10,10 +10,11 @@ use std::path::PathBuf;
 
 use nalgebra::{DMatrix, DVector};
 
-use super::{Example, Examples, Felt, Relabelling, TrainingError, composed, file_name, folds_by_object};
+use super::{Example, Examples, Relabelling, TrainingError, composed, file_name, folds_by_object};
 use crate::learners::decision_values;
 use crate::learners::training_range::learn_training_range;
 use crate::promise::{ObjectTrials, promise};
+use blindgrasp_grasps::reading::Felt;
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::Classifier;
 use blindgrasp_stages::day::{DayMethod, DayModel, DayStatistics, LabelledGrasp, Recalibration, covariance};

@@ -1,23 +1,19 @@
 //! The grasps of recordings as examples to learn from.
 
-use std::collections::hash_map::Entry;
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use super::TrainingError;
 use super::friction::{Judged, stable_by_friction};
-use crate::dataset::{DatasetError, Grasp, label_of, read_grasps};
+use blindgrasp_grasps::dataset::{DatasetError, Grasp, check_once, label_of, read_grasps};
+use blindgrasp_grasps::reading::{Felt, SeenReadings, Settled, check_classes, note_reading};
 use blindgrasp_messages::{Contact, Fault, GraspTruth, OwnedSenses, Phase, Stamped, TactileFrame};
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
-use blindgrasp_stages::contacts::{clip_to_limits, contacts_from_frame};
 use blindgrasp_stages::encoder::{FeltReading, wrist_values};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::training_summary::{ReadingId, TrainedOn};
-
-/// The first recording with a reading, and whether that grasp was stable.
-type Seen = HashMap<ReadingId, (usize, bool)>;
 
 /// A grasp to learn from: its first settled frame and its label.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -65,40 +61,9 @@ impl Signals {
     }
 }
 
-/// What a frame felt. A frame that cannot be used has no contacts.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Felt {
-    pub joints: Vec<f64>,
-    pub contacts: Vec<Contact>,
-    pub senses: OwnedSenses,
-}
-
-impl Felt {
-    fn of(hand: &Hand, frame: &Stamped<TactileFrame>) -> Felt {
-        Felt::with_fault(hand, frame).0
-    }
-
-    /// What the encoder gets of a frame, and why it cannot be used.
-    fn with_fault(hand: &Hand, frame: &Stamped<TactileFrame>) -> (Felt, Fault) {
-        let TactileFrame { joints, cells_newtons, senses, .. } = &frame.message;
-        let mut felt = Felt { joints: joints.clone(), contacts: Vec::new(), senses: senses.clone() };
-        let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells_newtons, &mut felt.contacts);
-        clip_to_limits(hand, &mut felt.joints);
-        (felt, summary.fault)
-    }
-
-    pub fn reading(&self) -> FeltReading<'_> {
-        FeltReading { joints: &self.joints, contacts: &self.contacts, senses: self.senses.view() }
-    }
-}
-
 /// The frames of a grasp that are learned from.
 struct FeltGrasp {
-    settled: Felt,
-    /// Why the settled frame has no feature.
-    fault: Fault,
-    reading_id: ReadingId,
-    day: u32,
+    settled: Settled,
     squeezed: Option<Felt>,
     test_lifted: Option<Felt>,
     moving: [Vec<Signals>; 2],
@@ -106,17 +71,13 @@ struct FeltGrasp {
 
 impl FeltGrasp {
     /// `None` if the hand never settled.
-    fn of(hand: &Hand, frames: Vec<Stamped<TactileFrame>>) -> Option<FeltGrasp> {
+    fn of(hand: &Hand, frames: &[Stamped<TactileFrame>]) -> Option<FeltGrasp> {
         let is_of = |phase: Phase| move |frame: &&Stamped<TactileFrame>| frame.message.phase == phase;
         let squeezed = frames.iter().rev().find(is_of(Phase::Squeezed)).map(|frame| Felt::of(hand, frame));
         let test_lifted = frames.iter().find(is_of(Phase::TestLifted)).map(|frame| Felt::of(hand, frame));
         let moving = [Phase::Squeezing, Phase::TestLifting]
             .map(|phase| frames.iter().filter(is_of(phase)).map(|frame| Signals::of(hand, frame)).collect::<Vec<_>>());
-        let frame = frames.into_iter().find(|frame| frame.message.phase == Phase::Settled)?;
-        let reading_id = ReadingId::of(&frame.message.joints, &frame.message.cells_newtons);
-        let (settled, fault) = Felt::with_fault(hand, &frame);
-        let day = frame.message.day;
-        Some(FeltGrasp { settled, fault, reading_id, day, squeezed, test_lifted, moving })
+        Some(FeltGrasp { settled: Settled::of(hand, frames)?, squeezed, test_lifted, moving })
     }
 }
 
@@ -171,13 +132,10 @@ impl Examples {
         relabelling: &Relabelling,
         mut progress: impl FnMut(usize, usize),
     ) -> Result<Examples, TrainingError> {
-        let mut canonical = BTreeSet::new();
+        check_once(recordings)?;
         let mut read = Examples::default();
-        let mut seen = Seen::new();
+        let mut seen = SeenReadings::new();
         for (recording_idx, path) in recordings.iter().enumerate() {
-            if !canonical.insert(path.canonicalize().unwrap_or(path.clone())) {
-                return Err(TrainingError::Data(format!("{} is given twice", path.display())));
-            }
             read.add(hand, path, recording_idx, relabelling, &mut seen)?;
             progress(recording_idx + 1, recordings.len());
         }
@@ -191,7 +149,7 @@ impl Examples {
         path: &Path,
         recording_idx: usize,
         relabelling: &Relabelling,
-        seen: &mut Seen,
+        seen: &mut SeenReadings,
     ) -> Result<(), TrainingError> {
         let Relabelling { frictions, by_wrench_space } = relabelling;
         let reader = RecordingReader::open(path).map_err(DatasetError::from)?;
@@ -211,7 +169,7 @@ impl Examples {
             [] => None,
             _ => Some(stable_by_friction(path, frictions).map_err(DatasetError::from)?),
         };
-        let grasps = read_grasps(path, hand, |_, frames| FeltGrasp::of(hand, frames))?;
+        let grasps = read_grasps(path, hand, |_, frames| FeltGrasp::of(hand, &frames))?;
         self.add_grasps(grasps, recording_idx, *by_wrench_space, by_friction.as_mut(), seen);
         Ok(())
     }
@@ -227,11 +185,11 @@ impl Examples {
     ) -> Result<Examples, TrainingError> {
         let felt = grasps.into_iter().map(|(frames, truth)| Grasp {
             grasp_id: truth.grasp_id,
-            value: FeltGrasp::of(hand, frames),
+            value: FeltGrasp::of(hand, &frames),
             truth: Some(truth),
         });
         let mut examples = Examples::default();
-        examples.add_grasps(felt, 0, false, None, &mut Seen::new());
+        examples.add_grasps(felt, 0, false, None, &mut SeenReadings::new());
         examples.check_classes()?;
         Ok(examples)
     }
@@ -242,7 +200,7 @@ impl Examples {
         recording_idx: usize,
         by_wrench_space: bool,
         mut by_friction: Option<&mut BTreeMap<u64, Judged>>,
-        seen: &mut Seen,
+        seen: &mut SeenReadings,
     ) {
         let mut exclude = |reason: &str| *self.n_excluded.entry(reason.into()).or_default() += 1;
         for grasp in grasps {
@@ -261,23 +219,25 @@ impl Examples {
             match (grasp.value, truth) {
                 (_, None) => exclude("no truth"),
                 (None, _) => exclude("no settled frame"),
-                (Some(felt), Some(truth)) if felt.fault == Fault::None => {
+                (Some(FeltGrasp { settled, squeezed, test_lifted, moving }), Some(truth))
+                    if settled.fault == Fault::None =>
+                {
                     let outcomes = friction_outcomes(by_friction.as_deref_mut(), grasp_id).and_then(|outcomes| {
-                        note_reading(seen, felt.reading_id, recording_idx, truth.stable).map(|()| outcomes)
+                        note_reading(seen, settled.reading_id, recording_idx, truth.stable).map(|()| outcomes)
                     });
                     match outcomes {
                         Err(reason) => exclude(reason),
                         Ok(stable_by_friction) => self.examples.push(Example {
                             recording_idx,
                             grasp_id,
-                            reading_id: felt.reading_id,
-                            day: felt.day,
-                            joints: felt.settled.joints,
-                            contacts: felt.settled.contacts,
-                            senses: felt.settled.senses,
-                            squeezed: felt.squeezed,
-                            test_lifted: felt.test_lifted,
-                            moving: felt.moving,
+                            reading_id: settled.reading_id,
+                            day: settled.day,
+                            joints: settled.felt.joints,
+                            contacts: settled.felt.contacts,
+                            senses: settled.felt.senses,
+                            squeezed,
+                            test_lifted,
+                            moving,
                             stable: truth.stable,
                             stable_by_friction,
                             object: truth.object,
@@ -285,11 +245,11 @@ impl Examples {
                         }),
                     }
                 }
-                (Some(felt), Some(truth)) => {
-                    exclude(felt.fault.as_str());
+                (Some(FeltGrasp { settled, .. }), Some(truth)) => {
+                    exclude(settled.fault.as_str());
                     // Two grasps of one recording may have equal readings. In two recordings it is the same grasp.
-                    let first = seen.entry(felt.reading_id).or_insert((recording_idx, truth.stable)).0;
-                    if felt.fault == Fault::NoContact && first == recording_idx {
+                    let first = seen.entry(settled.reading_id).or_insert((recording_idx, truth.stable)).0;
+                    if settled.fault == Fault::NoContact && first == recording_idx {
                         let GraspTruth { object, class, stable, .. } = truth;
                         self.unfelt.push(UnfeltGrasp { recording_idx, grasp_id, object, class, stable });
                     }
@@ -306,19 +266,9 @@ impl Examples {
         }
     }
 
-    /// Refuses an object of two classes: splits by class would put it on both sides.
     fn check_classes(&self) -> Result<(), TrainingError> {
-        let mut class_of: BTreeMap<&str, &str> = BTreeMap::new();
-        for Example { object, class, .. } in &self.examples {
-            let known = class_of.entry(object).or_insert(class);
-            if *known != class.as_str() {
-                return Err(TrainingError::Data(format!(
-                    "the object '{object}' is of class '{known}' in one grasp and '{class}' in another: expected one name \
-                     for one object"
-                )));
-            }
-        }
-        Ok(())
+        let objects = self.examples.iter().map(|example| (example.object.as_str(), example.class.as_str()));
+        Ok(check_classes(objects)?)
     }
 }
 
@@ -354,18 +304,6 @@ fn friction_outcomes(
         Some(Some(Ok(stable))) => Ok(stable),
         Some(Some(Err(_))) => Err("no quality for other frictions"),
         Some(None) => Err("no scene to judge other frictions by"),
-    }
-}
-
-/// Remembers a reading; or gives the reason why its grasp is left out, because another grasp has it already.
-fn note_reading(seen: &mut Seen, reading: ReadingId, recording_idx: usize, stable: bool) -> Result<(), &'static str> {
-    match seen.entry(reading) {
-        Entry::Occupied(known) if known.get().1 == stable => Err("the reading of another grasp"),
-        Entry::Occupied(_) => Err("the reading of another grasp, which ended otherwise"),
-        Entry::Vacant(new) => {
-            new.insert((recording_idx, stable));
-            Ok(())
-        }
     }
 }
 

@@ -8,7 +8,6 @@ mod adaptation;
 mod approach;
 mod day;
 mod examples;
-mod feature_table;
 mod friction;
 mod probes;
 
@@ -18,11 +17,9 @@ use std::path::{Path, PathBuf};
 pub use adaptation::{adapt, adapt_on};
 pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 pub use blindgrasp_stages::training_summary::{PolicySummary, TrainingSummary};
-pub use examples::{Example, Examples, Felt, Relabelling, Signals, UnfeltGrasp};
-pub use feature_table::{FeatureTable, FeatureTableError, write_feature_table};
+pub use examples::{Example, Examples, Relabelling, Signals, UnfeltGrasp};
 pub(crate) use probes::composed;
 
-use crate::dataset::DatasetError;
 use crate::evaluation::measures::{area_under_roc, curve};
 use crate::evaluation::reliability::{N_RELIABILITY_BINS, reliability};
 use crate::evaluation::split::Split;
@@ -32,6 +29,7 @@ use crate::learners::k_means::{DictionaryError, KMeansParams, learn_dictionary};
 use crate::learners::platt::{PlattError, fit_platt};
 use crate::learners::svm::train_svm;
 use crate::learners::training_range::{learn_training_range, widened_for_other_days};
+use blindgrasp_grasps::dataset::DatasetError;
 use blindgrasp_messages::{MAX_FEATURES, Phase};
 use blindgrasp_stages::classifier::boosting::BoostingError;
 use blindgrasp_stages::classifier::calibration::PlattCalibration;

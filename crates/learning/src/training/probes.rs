@@ -6,12 +6,13 @@
 
 use rayon::prelude::*;
 
-use super::{Example, Felt, OutOfFold, Signals, TrainingError, calibrate, out_of_fold_probabilities, prepare};
+use super::{Example, OutOfFold, Signals, TrainingError, calibrate, out_of_fold_probabilities, prepare};
 use crate::evaluation::measures::{area_under_roc, curve};
 use crate::evaluation::reliability::{N_RELIABILITY_BINS, reliability};
 use crate::learners::booster::train_boosted;
 use crate::learners::training_range::learn_training_range;
 use crate::promise::{ObjectTrials, promise};
+use blindgrasp_grasps::reading::Felt;
 use blindgrasp_messages::{Fault, Phase};
 use blindgrasp_stages::classifier::boosting::BoostingParams;
 use blindgrasp_stages::classifier::{Classifier, Predictor};

@@ -570,6 +570,36 @@ impl Hand {
         }
     }
 
+    /// The progress of closing, of which [`Hand::closing_rate`] is the change for each unit, at which a joint that was open is at its
+    /// closed end.
+    pub fn closing_end(&self, joint_idx: usize) -> f64 {
+        let rate = self.closing_rate(joint_idx);
+        if rate == 0.0 {
+            return 0.0;
+        }
+        let joint = &self.joints[joint_idx];
+        let limit = if rate > 0.0 { joint.upper } else { joint.lower };
+        ((limit - joint.open()) / rate).max(0.0)
+    }
+
+    /// The joints' values while the hand closes on nothing from a posture on, in so many steps of equal progress. Links pass
+    /// through each other.
+    pub fn closing_postures(&self, from: &[f64], n_steps: usize) -> Vec<Vec<f64>> {
+        let closing: Vec<usize> = (0..self.joints.len()).filter(|idx| !self.joints[*idx].is_preshape).collect();
+        let end = closing.iter().map(|idx| self.closing_end(*idx)).fold(0.0, f64::max);
+        let mut postures = Vec::new();
+        for step in 0..=n_steps {
+            let mut posture = from.to_vec();
+            let progress = end * step as f64 / n_steps as f64;
+            for idx in &closing {
+                let joint = &self.joints[*idx];
+                posture[*idx] = (from[*idx] + self.closing_rate(*idx) * progress).clamp(joint.lower, joint.upper);
+            }
+            postures.push(posture);
+        }
+        postures
+    }
+
     /// Index of the joint of that name.
     pub fn joint_idx(&self, name: &str) -> Option<usize> {
         self.joints.iter().position(|joint| joint.name == name)

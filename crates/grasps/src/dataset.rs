@@ -7,7 +7,6 @@ use serde::Deserialize;
 
 use blindgrasp_messages::{GraspTruth, Phase, Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingError, RecordingReader};
-use blindgrasp_simulator::simulator::SimulationReport;
 use blindgrasp_stages::OtherHand;
 use blindgrasp_stages::hand::{Hand, HandError};
 use blindgrasp_stages::label::Label;
@@ -38,6 +37,25 @@ pub enum DatasetError {
     OtherHand(#[from] OtherHand),
     #[error("recording {}: {message}", path.display())]
     Unusable { path: PathBuf, message: String },
+    #[error(
+        "the object '{object}' is of class '{known}' in one grasp and '{class}' in another: expected one name for one object"
+    )]
+    Classes { object: String, known: String, class: String },
+}
+
+/// Refuses a recording that is given twice: its grasps would count twice.
+///
+/// # Errors
+/// It names the recording.
+pub fn check_once(recordings: &[PathBuf]) -> Result<(), DatasetError> {
+    let mut canonical = BTreeSet::new();
+    for path in recordings {
+        if !canonical.insert(path.canonicalize().unwrap_or(path.clone())) {
+            let message = "it is given twice: its grasps would count twice".into();
+            return Err(DatasetError::Unusable { path: path.clone(), message });
+        }
+    }
+    Ok(())
 }
 
 /// The hand of `recording`: `hand` if given, else the built-in hand that the recording names.
@@ -85,22 +103,6 @@ pub fn label_of(path: &Path, reader: &RecordingReader) -> Result<Option<Label>, 
     match serde_json::from_str::<Report>(report) {
         Ok(report) => Ok(Some(report.label)),
         Err(error) => Err(unknown(&format!("the report of its simulation has {error}"))),
-    }
-}
-
-/// The report of the simulation that made a recording; `None` if it was not a simulation.
-///
-/// # Errors
-/// The report is of another version, or damaged.
-pub fn report_in(path: &Path, reader: &RecordingReader) -> Result<Option<SimulationReport>, DatasetError> {
-    let Some(report) = reader.metadata(REPORT_METADATA).and_then(|metadata| metadata.get("report")) else {
-        return Ok(None);
-    };
-    match serde_json::from_str(report) {
-        Ok(report) => Ok(Some(report)),
-        Err(error) => {
-            Err(DatasetError::Unusable { path: path.into(), message: format!("its simulation's report: {error}") })
-        }
     }
 }
 

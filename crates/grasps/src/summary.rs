@@ -5,11 +5,9 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use crate::dataset::{DatasetError, REPORT_METADATA, label_of, report_in, reported_truth};
-use crate::evaluation::paper_label::PaperLabel;
+use crate::dataset::{DatasetError, label_of, reported_truth};
 use blindgrasp_messages::{GraspTruth, Phase, TactileFrame};
 use blindgrasp_recording::{IndexedTopic, Problem, Problems, Record, RecordingIndex, RecordingReader};
-use blindgrasp_simulator::simulator::SimulationReport;
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
@@ -32,7 +30,7 @@ pub struct Overview {
     pub n_uncompressed_bytes: u64,
     /// All topics, also those of other types than blindgrasp's.
     pub topics: BTreeMap<String, IndexedTopic>,
-    /// The first recording's metadata by name, without the simulation's report.
+    /// The first recording's metadata by name.
     pub metadata: BTreeMap<String, BTreeMap<String, String>>,
 }
 
@@ -58,12 +56,8 @@ pub struct RecordingsSummary {
     pub pads: BTreeMap<String, PadSummary>,
     pub classes: BTreeMap<String, Group>,
     pub objects: BTreeMap<String, Group>,
-    /// The simulation's report, if a simulation made all recordings.
-    pub simulation: Option<SimulationReport>,
     /// The definitions of stable in the simulated recordings.
     pub labels: BTreeSet<Label>,
-    /// The paper's label compared with the recorded labels, if those are others.
-    pub paper_label: Option<PaperLabel>,
     pub problems: Vec<FoundProblem>,
 }
 
@@ -90,8 +84,6 @@ pub struct PadSummary {
 pub struct Group {
     pub n_grasps: usize,
     pub n_stable: usize,
-    /// The stable share of the simulation's candidates, before balancing.
-    pub natural_stable_rate: Option<f64>,
 }
 
 /// The sums over recordings that the summary is made of.
@@ -101,7 +93,6 @@ struct Sums {
     read_secs: f64,
     /// Epsilon and volume of the grasps with force closure.
     qualities: Vec<(f64, f64)>,
-    truths: Vec<GraspTruth>,
 }
 
 impl Overview {
@@ -120,7 +111,6 @@ impl Overview {
             if idx == 0 {
                 overview.hand = index.info.hand;
                 overview.metadata = index.metadata;
-                overview.metadata.remove(REPORT_METADATA);
             }
             for (name, topic) in index.topics {
                 if topic.is_ours {
@@ -146,8 +136,7 @@ impl RecordingsSummary {
     /// A recording cannot be read.
     pub fn read(hand: &Hand, recordings: &[PathBuf], overview: Overview) -> Result<Self, DatasetError> {
         let overview = Overview { hand: hand.name.clone(), is_full: true, ..overview };
-        let simulation = Some(SimulationReport::default());
-        let mut summary = RecordingsSummary { overview, simulation, ..RecordingsSummary::default() };
+        let mut summary = RecordingsSummary { overview, ..RecordingsSummary::default() };
         for pad in &hand.pads {
             summary.pads.insert(pad.name.clone(), PadSummary::default());
         }
@@ -155,14 +144,9 @@ impl RecordingsSummary {
         for path in recordings {
             summary.add(hand, path, &mut sums)?;
         }
-        let Sums { n_samples, read_secs, qualities, truths } = sums;
+        let Sums { n_samples, read_secs, qualities } = sums;
         summary.overview.n_samples = n_samples.into_iter().map(|(topic, n)| (topic, Some(n))).collect();
         summary.overview.duration_secs.get_or_insert(read_secs);
-        let paper_label = PaperLabel::of(&truths);
-        if summary.labels.contains(&Label::Lift) || paper_label.all.n_different() > 0 {
-            summary.paper_label = Some(paper_label);
-        }
-        summary.add_natural_rates();
         summary.n_force_closure = qualities.len();
         summary.epsilon_quantiles = quantiles(qualities.iter().map(|(epsilon, _)| *epsilon).collect());
         summary.volume_quantiles = quantiles(qualities.iter().map(|(_, volume)| *volume).collect());
@@ -172,10 +156,6 @@ impl RecordingsSummary {
     /// Reads a recording.
     fn add(&mut self, hand: &Hand, path: &Path, sums: &mut Sums) -> Result<(), DatasetError> {
         let reader = RecordingReader::open(path)?;
-        match (report_in(path, &reader)?, &mut self.simulation) {
-            (Some(report), Some(reports)) => reports.add(&report),
-            _ => self.simulation = None,
-        }
         self.labels.extend(label_of(path, &reader)?);
         let mut last: Option<TactileFrame> = None;
         // The outcomes of lifts that frames report, for grasps without a label.
@@ -211,7 +191,6 @@ impl RecordingsSummary {
                 Record::Truth(truth) => {
                     labelled.insert(truth.message.grasp_id);
                     self.count_truth(&truth.message, &mut sums.qualities);
-                    sums.truths.push(truth.message);
                 }
                 _ => {}
             }
@@ -258,25 +237,6 @@ impl RecordingsSummary {
             if let Some(pad) = self.pads.get_mut(&pad.name) {
                 pad.n_grasps += usize::from(n_contacts > 0);
                 pad.n_contacts += n_contacts;
-            }
-        }
-    }
-
-    fn add_natural_rates(&mut self) {
-        let Some(report) = &self.simulation else { return };
-        let rate = |n_stable: usize, n: usize| (n > 0).then(|| n_stable as f64 / n as f64);
-        let mut of_classes: BTreeMap<&str, (usize, usize)> = BTreeMap::new();
-        for (name, object) in &report.objects {
-            if let Some(group) = self.objects.get_mut(name) {
-                group.natural_stable_rate = rate(object.n_judged_stable, object.n_judged);
-            }
-            let sums = of_classes.entry(&object.class).or_default();
-            sums.0 += object.n_judged_stable;
-            sums.1 += object.n_judged;
-        }
-        for (class, (n_stable, n)) in of_classes {
-            if let Some(group) = self.classes.get_mut(class) {
-                group.natural_stable_rate = rate(n_stable, n);
             }
         }
     }
