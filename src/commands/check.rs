@@ -4,7 +4,7 @@ use std::path::Path;
 
 use serde_json::json;
 
-use super::graph_file::{OnMisfit, able_to_begin};
+use blindgrasp_cli::graph_file::{OnMisfit, able_to_begin};
 use super::text_table::TextTable;
 use super::{Outcome, print_line, print_text};
 use blindgrasp_graph::dataflow::{

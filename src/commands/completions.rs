@@ -7,6 +7,7 @@ use clap_complete::env::Shells;
 
 use super::Outcome;
 use blindgrasp_cli::completions::VARIABLE;
+pub(super) use blindgrasp_cli::completions::{assignments, graphs, hands, machines, nodes, outputs};
 
 /// Print a script that completes commands in a shell
 ///
@@ -16,12 +17,12 @@ use blindgrasp_cli::completions::VARIABLE;
                         blindgrasp completions bash > ~/.local/share/bash-completion/completions/blindgrasp\n  \
                         blindgrasp completions zsh > \"${fpath[1]}/_blindgrasp\"\n  \
                         blindgrasp completions fish > ~/.config/fish/completions/blindgrasp.fish")]
-pub struct Arguments {
+pub(super) struct Arguments {
     /// The shell.
     shell: Shell,
 }
 
-pub fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let shells = Shells::builtins();
     let shell = shells.completer(&arguments.shell.to_string()).context("this shell cannot be served")?;
     let mut script = Vec::new();

@@ -3,7 +3,7 @@
 use clap::Args;
 use serde_json::json;
 
-use super::graph_file::shipped;
+use blindgrasp_cli::graph_file::shipped;
 use super::{Outcome, print_line};
 use blindgrasp_graph::doctor::{Fitness, Measurement, examine};
 use blindgrasp_operator::diagnostics::print_diagnostic;

@@ -1,12 +1,15 @@
 //! `blindgrasp info`
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use clap::Args;
 
-use super::{Outcome, cases, completions, hand_cells, percent, print_line, print_text};
+use super::{Outcome, completions, hand_cells, percent, print_line, print_text};
+use blindgrasp_cli::houses::LAB;
+use blindgrasp_cli::joint;
 use blindgrasp_graph::client::{is_graph_name, running_graphs};
 use blindgrasp_grasps::dataset::{REPORT_METADATA, hand_of};
 use blindgrasp_grasps::summary::{Overview, RecordingsSummary};
@@ -47,7 +50,7 @@ pub(super) struct Arguments {
     #[arg(long, conflicts_with_all = ["full", "hand"])]
     repair: bool,
     /// Joint values of a hand, radians or metres of a slide; other joints are open or follow their coupling
-    #[arg(long, value_name = "NAME=VALUE,…", value_delimiter = ',', value_parser = hand_cells::joint)]
+    #[arg(long, value_name = "NAME=VALUE,…", value_delimiter = ',', value_parser = joint)]
     joints: Vec<(String, f64)>,
     /// Print JSON, with every object
     #[arg(long)]
@@ -59,8 +62,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         if hand_cells::is_hand(path) {
             return hand_cells::print(path, &arguments.joints, arguments.json);
         }
-        if cases::are_at(path) {
-            return cases::print(path, arguments.json);
+        if are_cases(path) {
+            let is_json = arguments.json.then_some("--json");
+            match LAB.become_it([OsStr::new("quality"), path.as_os_str()].into_iter().chain(is_json.map(OsStr::new)))? {}
         }
     }
     if let [path] = arguments.recordings.as_slice()
@@ -106,6 +110,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         print_summary(&hand, &summary)?;
     }
     Ok(Outcome::Done)
+}
+
+/// Whether a path names grasp cases: a JSON file, or `-` for stdin.
+fn are_cases(path: &Path) -> bool {
+    path == Path::new("-") || path.extension().is_some_and(|extension| extension == "json" || extension == "jsonl")
 }
 
 fn repair_all(recordings: &[PathBuf], json: bool) -> anyhow::Result<Outcome> {

@@ -33,8 +33,12 @@ use std::process::ExitCode;
 
 use clap::{CommandFactory, Parser};
 
+use blindgrasp_cli::completions::{VARIABLE, answer_shell};
 use blindgrasp_cli::houses::{self, HOUSES};
-use blindgrasp_cli::{Outcome, completions as words, data_on_stdout, man, print_line, print_text, secs_in, stop_signal};
+use blindgrasp_cli::{
+    Outcome, data_on_stdout, man, number_in, print_line, print_text, secs_in, stop_requests, stop_signal,
+};
+use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_session::output::{check_new, check_output, check_page, write_out, write_report};
 use blindgrasp_session::text_table::{self, percent};
 
@@ -68,7 +72,7 @@ mod manual {
 impl Cli {
     /// Parses the command line. A mistake ends the process with its explanation and code 2.
     pub(crate) fn read() -> Cli {
-        words::answer_shell(command);
+        answer_shell(command);
         elsewhere::answer_caller();
         blindgrasp_cli::parse(command())
     }
@@ -85,4 +89,78 @@ impl Cli {
 /// The command line, with the commands of the other houses, which it lists.
 fn command() -> clap::Command {
     houses::with_other_houses(Cli::command())
+}
+
+/// Replaces this process by the program of the house that has the command, unless that is the robot's.
+pub(crate) fn hand_over() {
+    let arguments: Vec<OsString> = std::env::args_os().skip(1).collect();
+    let mut words = arguments.as_slice();
+    // A shell that asks for words gives the line so far behind the options of its own.
+    if std::env::var_os(VARIABLE).is_some() {
+        let at = words.iter().position(|word| word == "--").map_or(words.len(), |at| (at + 2).min(words.len()));
+        words = &words[at..];
+    }
+    let Some(house) = houses::house_of_command(words) else { return };
+    let Err(error) = house.become_it(&arguments);
+    print_diagnostic(&format!("blindgrasp: {error:#}"));
+    std::process::exit(1);
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use blindgrasp_cli::hints;
+    use blindgrasp_cli::testing::{mistakes_in_docs, mistakes_in_table};
+
+    use super::*;
+
+    #[test]
+    fn the_commands_of_the_docs_are_accepted_and_the_help_lists_all() {
+        assert_eq!(mistakes_in_table(&[], &command()), [""; 0]);
+        let (n, mistakes) = mistakes_in_docs(Path::new(env!("CARGO_MANIFEST_DIR")), &Cli::command());
+        assert!(mistakes.is_empty() && n > 60, "{n} commands\n{}", mistakes.join("\n"));
+    }
+
+    /// The text of the error for a line, with its hint.
+    fn told(line: &str) -> String {
+        let words: Vec<OsString> = std::iter::once("blindgrasp").chain(line.split(' ')).map(OsString::from).collect();
+        let error = command().try_get_matches_from(&words).expect_err("a mistake");
+        hints::with_hint(error, command(), &words).to_string()
+    }
+
+    #[test]
+    fn a_word_of_another_program_is_answered_with_a_command_that_there_is() {
+        let all = command();
+        for (word, hint) in hints::WORDS {
+            let name = hint.split(' ').next().unwrap_or_default();
+            assert!(name == "--version" || all.find_subcommand(name).is_some(), "there is no '{name}'");
+            let text = told(word);
+            assert!(text.contains(&format!("tip: use 'blindgrasp {hint}'")), "{word}: {text}");
+            assert!(!text.contains("similar"), "{word}: {text}");
+        }
+        assert!(told("topic list").contains("'blindgrasp ps'"));
+    }
+
+    #[test]
+    fn mistakes_are_likened_and_unknown_words_get_no_false_hint() {
+        for (line, expected) in [
+            ("evalute m.json", "tip: did you mean 'evaluate'?"),
+            ("run --chek", "tip: did you mean '--check'?"),
+            ("run --votes 4", "tip: a parameter of an operator is given by --set"),
+        ] {
+            let text = told(line);
+            assert!(text.contains(expected) && !text.contains("as a value"), "blindgrasp {line}: {text}");
+        }
+        for line in ["zzz", "Cargo.toml/none", "ps --zzz", "info a --zzz", "predict m.json a.mcap -z"] {
+            let text = told(line);
+            assert!(!text.contains("tip"), "blindgrasp {line}: {text}");
+        }
+    }
+
+    #[test]
+    fn a_file_in_the_place_of_the_command_says_what_it_is() {
+        let text = told(concat!(env!("CARGO_MANIFEST_DIR"), "/dataflow.yaml"));
+        assert!(text.contains("the command is missing before") && text.contains("blindgrasp run"), "{text}");
+    }
 }

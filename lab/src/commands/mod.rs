@@ -77,8 +77,10 @@ impl Cli {
 
 #[cfg(test)]
 mod tests {
+    use std::ffi::OsString;
     use std::path::Path;
 
+    use blindgrasp_cli::hints::with_hint;
     use blindgrasp_cli::houses::LAB;
     use blindgrasp_cli::testing::{mistakes_in_docs, mistakes_in_table};
 
@@ -90,5 +92,19 @@ mod tests {
         let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the project");
         let (n, mistakes) = mistakes_in_docs(root, &Cli::command());
         assert!(mistakes.is_empty() && n > 40, "{n} commands\n{}", mistakes.join("\n"));
+    }
+
+    #[test]
+    fn mistakes_get_a_hint_where_there_is_one() {
+        for (line, expected) in [
+            ("simulate --zzz 1", "tip: --print-options"),
+            ("simulate --grasps many --out x.mcap", "expected a whole number"),
+            ("model list", "unrecognized subcommand"),
+        ] {
+            let words: Vec<OsString> = std::iter::once("blindgrasp").chain(line.split(' ')).map(OsString::from).collect();
+            let error = Cli::command().try_get_matches_from(&words).expect_err("a mistake");
+            let text = with_hint(error, Cli::command(), &words).to_string();
+            assert!(text.contains(expected) && !text.contains("as a value"), "blindgrasp {line}: {text}");
+        }
     }
 }

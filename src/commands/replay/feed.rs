@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use serde_json::{Map, Value, json};
 
-use super::super::graph_file::{describe, shipped};
+use blindgrasp_cli::graph_file::{describe, shipped};
 use blindgrasp_graph::dataflow::{Graph, Node, Override, Program, accept_param_value};
 use blindgrasp_graph::plan::Port;
 use blindgrasp_graph::run::observed_topics;

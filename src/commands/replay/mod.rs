@@ -10,7 +10,7 @@ use clap::Args;
 use serde_json::{Value, json};
 
 pub(super) use self::feed::{Fed, Feed};
-use super::graph_file::{OnMisfit, fitting};
+use blindgrasp_cli::graph_file::{OnMisfit, fitting};
 use super::recording_arguments::RecordingArguments;
 use super::{Outcome, stop_requests};
 use blindgrasp_graph::dataflow::{self, Override};

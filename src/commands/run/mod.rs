@@ -10,7 +10,7 @@ use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 
 use self::page::Page;
-use super::graph_file::{OnMisfit, fitting, shipped};
+use blindgrasp_cli::graph_file::{OnMisfit, fitting, shipped};
 use super::recording_arguments::RecordingArguments;
 use super::view::Rights;
 use super::{Outcome, background, check, secs_in, stop_requests};

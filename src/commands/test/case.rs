@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::json;
 
-use super::super::graph_file::{OnMisfit, fitting};
+use blindgrasp_cli::graph_file::{OnMisfit, fitting};
 use super::scratch::Scratch;
 use super::settings;
 use crate::commands::replay::{Fed, Feed};

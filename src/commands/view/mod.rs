@@ -15,8 +15,8 @@ use blindgrasp_graph::client::is_graph_name;
 use blindgrasp_graph::dataflow::Override;
 use clap::{Args, ValueEnum};
 
-use super::hand_cells::joint;
 use super::{Outcome, secs_in};
+use blindgrasp_cli::joint;
 
 /// Show a graph or a recording in a browser; draw it, or a hand.
 ///
