@@ -1,16 +1,15 @@
 //! The manual pages and the reference of a program's commands.
 
 use std::path::{Path, PathBuf};
-use std::process::Stdio;
 
-use anyhow::{Context, ensure};
+use anyhow::Context;
 use clap::{Args, Command};
 
 use crate::help::grouped;
 use crate::houses::House;
 use crate::{Outcome, print_line, print_text};
 
-/// Write the manual pages of all commands
+/// Write the manual pages of this program's commands
 #[derive(Debug, Args)]
 #[command(hide = true, after_help = "Example: blindgrasp man /usr/share/man/man1")]
 pub struct Arguments {
@@ -22,21 +21,17 @@ pub struct Arguments {
     pub markdown: bool,
 }
 
-/// Writes the pages of a house's commands, or prints their reference. `others` are the houses whose programs write theirs as well.
+/// Writes the pages of a house's commands, or prints their reference. Those of `others`, whose commands it only lists, are left to
+/// their programs.
 ///
 /// # Errors
-/// A page cannot be written, or the program of another house is missing or fails.
+/// A page cannot be written.
 pub fn run(arguments: &Arguments, mut command: Command, others: &[&House]) -> anyhow::Result<Outcome> {
     let Some(folder) = &arguments.folder else {
-        print_text(reference(command, others)?.trim_end())?;
+        print_text(reference(command, others).trim_end())?;
         return Ok(Outcome::Done);
     };
     std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
-    // The page of the program itself is the robot's, which lists all commands: it comes last.
-    for house in others {
-        let status = std::process::Command::new(house.path()?).arg("man").arg(folder).stdout(Stdio::null()).status();
-        ensure!(status.with_context(|| house.program)?.success(), "{} man has failed", house.program);
-    }
     command = command.disable_help_subcommand(true);
     command.build();
     write_pages(&command, "", folder, others).with_context(|| folder.display().to_string())?;
@@ -59,7 +54,7 @@ fn is_of(houses: &[&House], command: &str) -> bool {
 }
 
 /// Each command with its help, as Markdown.
-fn reference(command: Command, others: &[&House]) -> anyhow::Result<String> {
+fn reference(command: Command, others: &[&House]) -> String {
     let mut command = grouped(command.term_width(100));
     // It names the commands and their options in full.
     command.build();
@@ -69,13 +64,7 @@ fn reference(command: Command, others: &[&House]) -> anyhow::Result<String> {
                  the same.\n\n";
         text += &block(&mut command);
     }
-    text += &sections(&command, &[], others);
-    for house in others {
-        let output = std::process::Command::new(house.path()?).args(["man", "--markdown"]).output();
-        text += &String::from_utf8(output.with_context(|| house.program)?.stdout)?;
-        text += "\n";
-    }
-    Ok(text)
+    text + &sections(&command, &[], others)
 }
 
 fn sections(command: &Command, parents: &[&str], others: &[&House]) -> String {
@@ -110,7 +99,7 @@ mod tests {
 
     #[test]
     fn the_reference_has_each_command_and_its_options() {
-        let reference = reference(command(), &[]).expect("no other program");
+        let reference = reference(command(), &[]);
         assert!(reference.contains("## run") && reference.contains("--name"), "{reference}");
         assert!(!reference.contains("## man"), "a hidden command");
         assert!(!sections(&command(), &[], &[&crate::houses::LAB]).contains("## simulate"));
