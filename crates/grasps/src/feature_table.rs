@@ -33,7 +33,7 @@ pub enum FeatureTableError {
 /// data are not applied.
 ///
 /// # Errors
-/// A recording cannot be read, or the table cannot be written.
+/// A recording cannot be used or is given twice, an object is of two classes, or the table cannot be written.
 pub fn write_feature_table(
     hand: &Hand,
     model: &Model,
@@ -57,13 +57,13 @@ pub fn write_feature_table(
                     continue;
                 }
             };
-            let stable = u8::from(truth.stable);
             objects.push((truth.object.clone(), truth.class.clone()));
             if let Err(fault) = model.features.extract(&settled.felt.reading(), &mut values) {
                 *n_excluded.entry(fault.as_str().into()).or_default() += 1;
                 continue;
             }
-            let row = [path.display().to_string(), grasp_id.to_string(), truth.object, truth.class, stable.to_string()];
+            let (recording, stable) = (path.display().to_string(), u8::from(truth.stable).to_string());
+            let row = [recording, grasp_id.to_string(), truth.object, truth.class, stable];
             table.write_record(row.into_iter().chain(identity.clone()).chain(values.iter().map(f64::to_string)))?;
             n_rows += 1;
         }
