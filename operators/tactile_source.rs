@@ -143,6 +143,7 @@ pub fn describe() -> OperatorDescription {
             "ros2: a frame of /tf whose z axis points upwards, like world: gravity in the palm frame comes from it",
         ),
         ("palm_frame", "ros2: the palm frame in /tf, the hand's palm link by default"),
+        ("tf_topic", "ros2: tf2_msgs/msg/TFMessage, /tf by default"),
     ]
     .into_iter()
     .fold(description, |description, (name, summary)| topic(description, name, summary));

@@ -11,8 +11,8 @@ use blindgrasp_graph::control::{EdgeStatus, GraphState, NodeState, NodeStatus};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_recording::cdr;
-use blindgrasp_ros::node::{Convention, MessageType, Quality, Rights, RosNode, RosPublisher};
 use blindgrasp_ros::standard;
+use blindgrasp_ros_node::node::{self, Convention, MessageType, Quality, Rights, RosNode, RosPublisher};
 use clap::Args;
 use serde::Serialize;
 
@@ -78,7 +78,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let rights = Rights { sends: vec![Convention::RmwZenoh.key(domain, "/diagnostics")], ..Rights::default() };
     let open = || -> anyhow::Result<Publishing> {
         let mut node =
-            RosNode::new(network.open(&rights)?, Convention::RmwZenoh, domain, "/", "blindgrasp_diagnostics")?;
+            RosNode::new(node::open(&network, &rights)?, Convention::RmwZenoh, domain, "/", "blindgrasp_diagnostics")?;
         let publisher = node.publisher("/diagnostics", &message, Quality::KeepLast(1))?;
         Ok((node, publisher))
     };

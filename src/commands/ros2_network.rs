@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use blindgrasp_operators::connection::{ConnectionParams, warn_if_open};
-use blindgrasp_ros::node::{MAX_DOMAIN, Network};
+use blindgrasp_ros::network::{MAX_DOMAIN, Network};
 use clap::Args;
 
 #[derive(Debug, Args)]

@@ -52,7 +52,7 @@ fn only_lines_outside_tests_count_as_the_products() {
     for (path, is_test) in [
         ("tests/e2e/main.rs", true),
         ("crates/stages/tests/arbiter_histories.rs", true),
-        ("crates/bridge/src/wire/tests.rs", true),
+        ("network/crates/bridge/src/wire/tests.rs", true),
         ("crates/stages/src/shift_test.rs", true),
         ("operators/allocations.rs", true),
         ("src/commands/test/mod.rs", false),

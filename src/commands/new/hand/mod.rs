@@ -13,8 +13,10 @@ use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{RecordedGrasp, grasp_svg};
 use blindgrasp_ros::cdr::{self, Value};
-use blindgrasp_ros::node::{Convention, MAX_RECEIVED_BYTES, MessageType, Quality, Rights, RosNode, topic_name};
 use blindgrasp_ros::standard;
+use blindgrasp_ros_node::node::{
+    self, Convention, MAX_RECEIVED_BYTES, MessageType, Quality, Rights, RosNode, topic_name,
+};
 use blindgrasp_stages::hand::{BareHand, Cell, Hand, find_mesh, part_below, read_urdf, with_meshes_renamed};
 use clap::Args;
 use nalgebra::{Unit, Vector3};
@@ -223,7 +225,8 @@ fn described(topic: &str, network: &Ros2Network) -> anyhow::Result<String> {
     let definition = standard::definition("std_msgs/msg/String").context("no definition of std_msgs/msg/String")?;
     let message = MessageType { name: definition.name.clone(), hash: definition.hash() };
     let rights = Rights { takes: vec![Convention::RmwZenoh.key(domain, &topic)], ..Rights::default() };
-    let mut node = RosNode::new(network.open(&rights)?, Convention::RmwZenoh, domain, "/", "blindgrasp_new_hand")?;
+    let mut node =
+        RosNode::new(node::open(&network, &rights)?, Convention::RmwZenoh, domain, "/", "blindgrasp_new_hand")?;
     let (sender, received) = std::sync::mpsc::channel();
     let _subscriber = node.subscriber(&topic, &message, Quality::KeepLast(1), move |it| drop(sender.send(it)))?;
     let received = received.recv_timeout(DESCRIPTION_LIMIT).map_err(|_| {
