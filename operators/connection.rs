@@ -3,12 +3,11 @@
 use std::net::IpAddr;
 use std::path::PathBuf;
 
-use blindgrasp_bridge::certificates::{ROUTER_COMMON_NAME, key_files};
-use blindgrasp_bridge::config::KeyFiles;
+use blindgrasp_graph::link::config::{KeyFiles, ROUTER_COMMON_NAME, key_files};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_ros::node::{Keys, Network, RosError};
+use blindgrasp_ros::network::{Keys, MAX_DOMAIN, Network, RosError};
 use serde::Deserialize;
 
 /// The router of rmw_zenoh.
@@ -30,7 +29,7 @@ pub struct ConnectionParams {
 }
 
 /// Adds the parameters of a connection.
-pub(crate) fn with_connection_params(description: OperatorDescription) -> OperatorDescription {
+pub fn with_connection_params(description: OperatorDescription) -> OperatorDescription {
     description
         .optional_param("connect", ParamKind::String {}, "A Zenoh router or node, like tcp/localhost:7447, the default")
         .optional_param("listen", ParamKind::String {}, "An endpoint at which others connect, like tcp/127.0.0.1:7448")
@@ -45,6 +44,22 @@ pub(crate) fn with_connection_params(description: OperatorDescription) -> Operat
             "With keys: the common names of the certificates at the other end that take part, like ros2,arm; ros2 by default, and \
              with connect also @router",
         )
+}
+
+/// Adds the parameters of a connection to ROS 2.
+pub fn with_network_params(description: OperatorDescription) -> OperatorDescription {
+    with_connection_params(description)
+        .optional_param(
+            "convention",
+            ParamKind::Choice { values: vec!["rmw_zenoh".into(), "ros2dds".into()] },
+            "The speaker of Zenoh: the nodes, by rmw_zenoh (default), or a zenoh-bridge-ros2dds for nodes of DDS",
+        )
+        .optional_param(
+            "domain",
+            ParamKind::Integer { min: Some(0), max: Some(MAX_DOMAIN.into()) },
+            "The ROS domain, 0 by default",
+        )
+        .optional_param("namespace", ParamKind::String {}, "Before the names of topics, /blindgrasp by default")
 }
 
 impl ConnectionParams {

@@ -50,8 +50,8 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
 }
 
 /// The mistakes with which [`work`] would fail at once.
-pub(crate) fn check(node: &FileNode<'_>) -> anyhow::Result<()> {
-    files_of(&parse_params(node.params)?).map(drop)
+pub(crate) fn check(node: &FileNode) -> anyhow::Result<()> {
+    files_of(&parse_params(&node.params)?).map(drop)
 }
 
 /// The hand, its identity, and the sensor check.

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
-use blindgrasp_bridge::certificates::REVOKED_FILE;
 use blindgrasp_graph::control::GraphStatus;
 use blindgrasp_graph::dataflow::Graph;
+use blindgrasp_graph::link::config::REVOKED_FILE;
 use blindgrasp_stages::classifier::Classifier;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;

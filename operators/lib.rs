@@ -11,20 +11,14 @@ pub mod connection;
 mod contacts;
 mod encoder;
 pub mod fit;
-mod joint_map;
+pub mod houses;
 mod lift_arbiter;
-mod link;
-mod publishing;
 mod recorded_source;
-mod ros2;
-mod ros2_decision;
 mod ros2_markers;
 mod senses;
-mod simulated_hand;
-mod tactile_source;
-mod zenoh;
+pub mod tactile_source;
 
-pub use ros2_markers::hand_markers;
+pub use ros2_markers::{cell_points, hand_markers};
 
 use std::path::Path;
 
@@ -33,6 +27,7 @@ use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 
 use crate::beginning::FileNode;
+use crate::houses::OTHER_HOUSES;
 
 /// The module for operators in Python, and the messages that it knows.
 pub const PYTHON_OPERATOR: &str = include_str!("blindgrasp_operator.py");
@@ -59,47 +54,44 @@ pub struct Form {
 }
 
 /// See [`Form::check`].
-pub type CheckNode = fn(&FileNode<'_>) -> anyhow::Result<()>;
+pub type CheckNode = fn(&FileNode) -> anyhow::Result<()>;
 
-/// All of them. A new one is its file and a line here.
-pub const SHIPPED: [Shipped; 11] = [
+/// Those of the robot's program. A new one is its file and a line here.
+pub const SHIPPED: [Shipped; 7] = [
     recorded_source::SHIPPED,
     Shipped::new("tactile_source", tactile_source::describe, tactile_source::work, tactile_source::check),
-    Shipped::new("simulated_hand", simulated_hand::describe, simulated_hand::work, simulated_hand::check),
     Shipped::new("senses", senses::describe, senses::work, senses::check).sharing_process(),
     Shipped::new("contacts", contacts::describe, contacts::work, contacts::check).sharing_process(),
     Shipped::new("encoder", encoder::describe, encoder::work, encoder::check).sharing_process(),
     Shipped::new("classifier", classifier::describe, classifier::work, classifier::check).sharing_process(),
     Shipped::new("lift_arbiter", lift_arbiter::describe, lift_arbiter::work, lift_arbiter::check).sharing_process(),
-    Shipped::new("ros2", ros2::describe, ros2::work, ros2::check),
-    Shipped::new("zenoh", zenoh::describe, zenoh::work, zenoh::check),
-    // The launcher adds it and gives it its params.
-    Shipped::new(LINK_OPERATOR, link::describe, link::work, |_| Ok(())),
 ];
 
-/// The operator of this name with these arguments, if there is one.
-pub fn form_named(name: &str, arguments: &[&str]) -> Option<Form> {
-    SHIPPED.iter().find(|shipped| shipped.name == name)?.with_arguments(arguments)
+/// The operator of this name with these arguments, if it is one of these.
+pub fn form_named(shipped: &[Shipped], name: &str, arguments: &[&str]) -> Option<Form> {
+    shipped.iter().find(|shipped| shipped.name == name)?.with_arguments(arguments)
 }
 
-/// The operator that blindgrasp runs with these arguments, `operator NAME [VARIANT]`; `None` for those of another program.
+/// The operator that the robot's program runs itself with these arguments, `operator NAME [VARIANT]`; `None` for those of another program.
 pub fn form_of(args: &[String]) -> Option<Form> {
     let args: Vec<&str> = args.iter().map(String::as_str).collect();
     match args.as_slice() {
-        ["operator", name, arguments @ ..] => form_named(name, arguments),
+        ["operator", name, arguments @ ..] => form_named(&SHIPPED, name, arguments),
         _ => None,
     }
 }
 
-/// These operators as a dataflow file can name them. `program` must run each as `PROGRAM operator NAME`, as blindgrasp does.
+/// The operators of all houses as a dataflow file can name them. `program` must run each as `PROGRAM operator NAME`, as
+/// blindgrasp does.
 pub fn operators_of(program: &Path) -> Operators {
-    let in_files = || SHIPPED.iter().filter(|shipped| shipped.name != LINK_OPERATOR);
-    let sharing = in_files().filter(|shipped| shipped.can_share_process);
-    Operators::of_program(program, in_files().map(|shipped| shipped.name)).sharing(sharing.map(|shipped| shipped.name))
+    let own = SHIPPED.iter().map(|shipped| shipped.name);
+    let others = OTHER_HOUSES.iter().map(|(name, _)| *name).filter(|name| *name != LINK_OPERATOR);
+    let sharing = SHIPPED.iter().filter(|shipped| shipped.can_share_process);
+    Operators::of_program(program, own.chain(others)).sharing(sharing.map(|shipped| shipped.name))
 }
 
 impl Shipped {
-    const fn new(
+    pub const fn new(
         name: &'static str,
         describe: fn() -> OperatorDescription,
         work: fn(&Operator) -> anyhow::Result<()>,

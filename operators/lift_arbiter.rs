@@ -73,8 +73,8 @@ pub(crate) fn describe() -> OperatorDescription {
 }
 
 /// The mistakes with which [`work`] would fail at once.
-pub(crate) fn check(node: &FileNode<'_>) -> anyhow::Result<()> {
-    parse_params::<Params>(node.params)?;
+pub(crate) fn check(node: &FileNode) -> anyhow::Result<()> {
+    parse_params::<Params>(&node.params)?;
     Ok(())
 }
 

@@ -85,8 +85,8 @@ fn describe<M: Played>() -> OperatorDescription {
 }
 
 /// The mistakes with which [`work`] would fail at once.
-fn check<M: Played>(node: &FileNode<'_>) -> anyhow::Result<()> {
-    opened::<M>(&parse_params(node.params)?).map(drop)
+fn check<M: Played>(node: &FileNode) -> anyhow::Result<()> {
+    opened::<M>(&parse_params(&node.params)?).map(drop)
 }
 
 fn opened<M: Played>(params: &Params) -> anyhow::Result<Player<M>> {

@@ -119,7 +119,7 @@ pub fn hand_markers(hand: &Hand, sample: &Stamped<TactileFrame>, data: &mut Vec<
 ///
 /// # Errors
 /// The frame is another hand's.
-pub(crate) fn cell_points(hand: &Hand, sample: &Stamped<TactileFrame>, data: &mut Vec<u8>) -> Result<(), String> {
+pub fn cell_points(hand: &Hand, sample: &Stamped<TactileFrame>, data: &mut Vec<u8>) -> Result<(), String> {
     let frame = &sample.message;
     let cells = hand.cells_in_palm(&frame.joints).map_err(|error| error.to_string())?;
     if frame.cells_newtons.len() != cells.len() {

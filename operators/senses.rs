@@ -30,8 +30,8 @@ pub(crate) fn describe() -> OperatorDescription {
 }
 
 /// The mistakes with which [`work`] would fail at once.
-pub(crate) fn check(node: &FileNode<'_>) -> anyhow::Result<()> {
-    let params: Params = parse_params(node.params)?;
+pub(crate) fn check(node: &FileNode) -> anyhow::Result<()> {
+    let params: Params = parse_params(&node.params)?;
     crate::contacts::hand_of(&params.hand).map(drop)
 }
 

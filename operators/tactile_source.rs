@@ -4,6 +4,8 @@
 //! A frame that is malformed, late or out of order is counted and refused. It leaves a gap in the numbers, so that the
 //! arbiter holds the grasp it belonged to. The source finds a lost sender again by itself. A source that is started again
 //! after a crash, or swapped in, goes on with the numbers and grasps of the one before, after a gap.
+//!
+//! The drivers ros2 and zenoh are those of the network's program, which runs the same source with them.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -21,114 +23,63 @@ use blindgrasp_operator::port::Publisher;
 use blindgrasp_operator::source::{self, Source, Step, send};
 use blindgrasp_operator::stage::STATE_FORMAT;
 use blindgrasp_operator::waiter::PollFd;
-use blindgrasp_ros::node::topic_name;
 use blindgrasp_stages::day::MAX_DAY;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_tactile::cell_zeros::{CellZeros, Zeroed};
 use blindgrasp_tactile::gate::{Accepted, Counts, FrameFilter, Shape};
-use blindgrasp_tactile::line_protocol::max_line_bytes;
-use blindgrasp_tactile::phases::PhaseFinder;
 use blindgrasp_tactile::replay::Replay;
-use blindgrasp_tactile::ros2::{Ros2, Topics};
 use blindgrasp_tactile::stream::{Link, Stream};
-use blindgrasp_tactile::zenoh_key::ZenohKey;
 use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, RefusalKind, TactileDriver};
 use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use crate::beginning::FileNode;
-use crate::connection::warn_if_open;
-use crate::joint_map::hand_joints;
-use crate::ros2::{NetworkParams, definition_of, with_network_params};
+use crate::connection::{with_connection_params, with_network_params};
+use crate::houses::NETWORK_PROGRAM;
 
 const DEFAULT_BAUD: u32 = 115_200;
+/// The parameters that the source has with each driver.
+const COMMON_PARAMS: [&str; 5] = ["driver", "hand", "max_delay_ms", "day", "zero_when_open"];
 /// Half of the age that the arbiter allows by default, which counts from the source on.
 const DEFAULT_MAX_DELAY_MS: f64 = 100.0;
-/// The parameters of the driver ros2.
-const ROS2_PARAMS: [&str; 23] = [
-    "convention",
-    "domain",
-    "namespace",
-    "connect",
-    "listen",
-    "keys",
-    "from",
-    "joints_topic",
-    "joint_prefix",
-    "joint_map",
-    "cells_topic",
-    "cells_type",
-    "cells_field",
-    "cells_definition",
-    "phase_topic",
-    "wrench_topic",
-    "imu_topic",
-    "tf_topic",
-    "gravity_frame",
-    "palm_frame",
-    "tolerance_ms",
-    "moving_rad_per_s",
-    "still_ms",
-];
 /// The shortest pause between two reports of counts.
 const COUNTS_PAUSE_NANOS: u64 = 250_000_000;
-/// ROS 2: a joint that is slower stands still.
-const MOVING_RAD_PER_S: f64 = 0.05;
 /// The shortest pause between two refusals that are logged.
 const LOG_PAUSE_NANOS: u64 = 1_000_000_000;
 
 #[derive(Deserialize)]
 struct Params {
-    driver: DriverWord,
+    driver: String,
     hand: PathBuf,
+    max_delay_ms: f64,
+    day: Option<u32>,
+    zero_when_open: bool,
+}
+
+/// The parameters of the robot's drivers.
+#[derive(Deserialize)]
+struct RobotParams {
     address: Option<String>,
     device: Option<PathBuf>,
     baud: Option<u32>,
     recording: Option<PathBuf>,
-    max_delay_ms: f64,
     idle_limit_ms: Option<f64>,
-    day: Option<u32>,
-    zero_when_open: bool,
-    key: Option<String>,
-    #[serde(flatten)]
-    network: NetworkParams,
-    #[serde(flatten)]
-    topics: TopicParams,
 }
 
-/// The parameters of topics of ROS 2.
-#[derive(Deserialize)]
-struct TopicParams {
-    joints_topic: Option<String>,
-    joint_prefix: Option<String>,
-    joint_map: Option<PathBuf>,
-    cells_topic: Option<String>,
-    cells_type: Option<String>,
-    cells_field: Option<String>,
-    cells_definition: Option<PathBuf>,
-    phase_topic: Option<String>,
-    wrench_topic: Option<String>,
-    imu_topic: Option<String>,
-    tf_topic: Option<String>,
-    gravity_frame: Option<String>,
-    palm_frame: Option<String>,
-    tolerance_ms: Option<f64>,
-    moving_rad_per_s: Option<f64>,
-    still_ms: Option<f64>,
+/// A driver to be made.
+pub struct AskedDriver<'a> {
+    /// The param `driver`.
+    pub name: &'a str,
+    /// All params of the node.
+    pub params: &'a Map<String, Value>,
+    pub hand: &'a Hand,
+    pub has_sandbox: bool,
 }
 
-#[derive(Deserialize, Clone, Copy)]
-#[serde(rename_all = "snake_case")]
-enum DriverWord {
-    Listen,
-    Connect,
-    Serial,
-    Recording,
-    Ros2,
-    Zenoh,
-}
+/// Makes a driver, which is not open yet, or tells the mistake in the params.
+pub type MakeDriver = fn(&AskedDriver<'_>) -> anyhow::Result<Box<dyn TactileDriver>>;
 
-pub(crate) fn describe() -> OperatorDescription {
+pub fn describe() -> OperatorDescription {
     let drivers = ["listen", "connect", "serial", "recording", "ros2", "zenoh"].map(String::from).to_vec();
     let millis = |min: f64| ParamKind::Number { above: None, min: Some(min), max: Some(3.6e6), words: vec![] };
     let file = |must_exist| ParamKind::Path { must_exist };
@@ -192,6 +143,7 @@ pub(crate) fn describe() -> OperatorDescription {
             "ros2: a frame of /tf whose z axis points upwards, like world: gravity in the palm frame comes from it",
         ),
         ("palm_frame", "ros2: the palm frame in /tf, the hand's palm link by default"),
+        ("tf_topic", "ros2: tf2_msgs/msg/TFMessage, /tf by default"),
     ]
     .into_iter()
     .fold(description, |description, (name, summary)| topic(description, name, summary));
@@ -224,12 +176,22 @@ pub(crate) fn describe() -> OperatorDescription {
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
-    let params: Params = operator.params()?;
-    let SourceParts { hand, driver, zeros } = setup(&params, operator.has_sandbox())?;
+    work_with(operator, robot_driver)
+}
+
+/// The mistakes with which [`work`] would fail at once, but for devices and sockets, which it opens.
+pub(crate) fn check(node: &FileNode) -> anyhow::Result<()> {
+    check_with(node, robot_driver)
+}
+
+/// Publishes the frames of a driver until it ends.
+///
+/// # Errors
+/// The params are of no use, or the driver or an edge fails.
+pub fn work_with(operator: &Operator, make_driver: MakeDriver) -> anyhow::Result<()> {
+    let params = operator.params()?;
+    let SourceParts { params, hand, driver, zeros } = setup(&params, operator.has_sandbox(), make_driver)?;
     let (n_joints, n_cells) = (hand.joints.len(), hand.n_cells());
-    if matches!(params.driver, DriverWord::Ros2 | DriverWord::Zenoh) {
-        warn_if_open(&params.network.connection.network()?);
-    }
     operator.reserve_state()?;
     let shape = Shape { n_joints, n_cells };
     let wall_offset_nanos = wall_nanos().saturating_sub(monotonic_nanos());
@@ -257,165 +219,101 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     source::run(operator, BTreeMap::from([("hand".into(), format!("{:016x}", hand.id()))]), source)
 }
 
-/// The mistakes with which [`work`] would fail at once, but for devices and sockets, which it opens.
-pub(crate) fn check(node: &FileNode<'_>) -> anyhow::Result<()> {
-    setup(&parse_params(node.params)?, node.has_sandbox).map(drop)
+/// The mistakes with which [`work_with`] would fail at once.
+///
+/// # Errors
+/// See above.
+pub fn check_with(node: &FileNode, make_driver: MakeDriver) -> anyhow::Result<()> {
+    setup(&node.params, node.has_sandbox, make_driver).map(drop)
 }
 
 /// The hand, its driver, which is not open yet, and the zeros of its cells.
 struct SourceParts {
+    params: Params,
     hand: Hand,
     driver: Box<dyn TactileDriver>,
     zeros: CellZeros,
 }
 
-fn setup(params: &Params, has_sandbox: bool) -> anyhow::Result<SourceParts> {
+fn setup(node_params: &Map<String, Value>, has_sandbox: bool, make_driver: MakeDriver) -> anyhow::Result<SourceParts> {
+    let params: Params = parse_params(node_params)?;
     let hand = Hand::load(&params.hand)?;
     let (n_joints, n_cells) = (hand.joints.len(), hand.n_cells());
     if n_joints > MAX_JOINTS || n_cells > MAX_CELLS {
         bail!("hand {}: {n_joints} joints and {n_cells} cells, at most {MAX_JOINTS} and {MAX_CELLS}", hand.name);
     }
-    let driver = driver(params, &hand, has_sandbox)?;
+    refuse_unused(&params.driver, node_params)?;
+    let driver = make_driver(&AskedDriver { name: &params.driver, params: node_params, hand: &hand, has_sandbox })?;
     let mut sensed = hand.clone();
-    if let DriverWord::Recording = params.driver {
+    if params.driver == "recording" {
         // A recording holds forces, which rise.
         sensed.pads.iter_mut().for_each(|pad| pad.falls_under_load = false);
     }
     let zeros =
         CellZeros::new(&sensed, params.zero_when_open).map_err(|reason| anyhow!("hand {}: {reason}", hand.name))?;
-    Ok(SourceParts { hand, driver, zeros })
+    Ok(SourceParts { params, hand, driver, zeros })
 }
 
-/// The driver that the parameters ask for. A parameter that the driver does not use is a mistake.
-fn driver(params: &Params, hand: &Hand, has_sandbox: bool) -> anyhow::Result<Box<dyn TactileDriver>> {
-    let (word, needs): (_, &[&str]) = match params.driver {
-        DriverWord::Listen => ("listen", &["address", "idle_limit_ms"]),
-        DriverWord::Connect => ("connect", &["address", "idle_limit_ms"]),
-        DriverWord::Serial => ("serial", &["device", "baud", "idle_limit_ms"]),
-        DriverWord::Recording => ("recording", &["recording"]),
-        DriverWord::Ros2 => ("ros2", &ROS2_PARAMS),
-        DriverWord::Zenoh => ("zenoh", &["connect", "listen", "keys", "from", "key"]),
-    };
-    let topics = &params.topics;
-    let given = [
-        ("address", params.address.is_some()),
-        ("device", params.device.is_some()),
-        ("baud", params.baud.is_some()),
-        ("recording", params.recording.is_some()),
-        ("idle_limit_ms", params.idle_limit_ms.is_some()),
-        ("key", params.key.is_some()),
-        ("connect", params.network.connection.connect.is_some()),
-        ("listen", params.network.connection.listen.is_some()),
-        ("keys", params.network.connection.keys.is_some()),
-        ("from", params.network.connection.from.is_some()),
-        ("domain", params.network.domain.is_some()),
-        ("namespace", params.network.namespace.is_some()),
-        ("joints_topic", topics.joints_topic.is_some()),
-        ("joint_prefix", topics.joint_prefix.is_some()),
-        ("joint_map", topics.joint_map.is_some()),
-        ("convention", params.network.convention.is_some()),
-        ("cells_topic", topics.cells_topic.is_some()),
-        ("cells_type", topics.cells_type.is_some()),
-        ("cells_field", topics.cells_field.is_some()),
-        ("cells_definition", topics.cells_definition.is_some()),
-        ("phase_topic", topics.phase_topic.is_some()),
-        ("wrench_topic", topics.wrench_topic.is_some()),
-        ("imu_topic", topics.imu_topic.is_some()),
-        ("tf_topic", topics.tf_topic.is_some()),
-        ("gravity_frame", topics.gravity_frame.is_some()),
-        ("palm_frame", topics.palm_frame.is_some()),
-        ("tolerance_ms", topics.tolerance_ms.is_some()),
-        ("moving_rad_per_s", topics.moving_rad_per_s.is_some()),
-        ("still_ms", topics.still_ms.is_some()),
-    ];
-    if let Some((name, _)) = given.iter().find(|(name, is_given)| *is_given && !needs.contains(name)) {
-        bail!("param '{name}' is of no use to driver {word}, which takes {}: leave it out", needs.join(", "));
+/// Refuses a parameter that the driver does not use: it is a mistake.
+fn refuse_unused(driver: &str, params: &Map<String, Value>) -> anyhow::Result<()> {
+    let needs = params_of(driver);
+    for name in params.keys() {
+        if !COMMON_PARAMS.contains(&name.as_str()) && !needs.contains(name) {
+            bail!("param '{name}' is of no use to driver {driver}, which takes {}: leave it out", needs.join(", "));
+        }
     }
-    let expected = ExpectedHand::of(hand);
-    let lacks = |name: &str, example: &str| format!("driver {word} needs the param '{name}', like {example}");
-    let link = match params.driver {
-        DriverWord::Listen => Link::Listen {
-            address: match params.address.clone() {
+    Ok(())
+}
+
+/// The names of the params that a driver has beside [`COMMON_PARAMS`].
+fn params_of(driver: &str) -> Vec<String> {
+    let connection = OperatorDescription::new("", "");
+    let connection = match driver {
+        "listen" | "connect" => return vec!["address".into(), "idle_limit_ms".into()],
+        "serial" => return vec!["device".into(), "baud".into(), "idle_limit_ms".into()],
+        "ros2" => with_network_params(connection),
+        "zenoh" => with_connection_params(connection),
+        _ => connection,
+    };
+    let prefix = format!("{driver}:");
+    let own = describe().params.into_iter().filter(|param| param.summary.starts_with(&prefix));
+    connection.params.into_iter().chain(own).map(|param| param.name).collect()
+}
+
+/// A driver for the line protocol or a recording.
+///
+/// # Errors
+/// A param is missing, or the recording cannot be read.
+pub fn robot_driver(asked: &AskedDriver<'_>) -> anyhow::Result<Box<dyn TactileDriver>> {
+    let params: RobotParams = parse_params(asked.params)?;
+    let name = asked.name;
+    let lacks = |param: &str, example: &str| format!("driver {name} needs the param '{param}', like {example}");
+    let link = match name {
+        "listen" => Link::Listen {
+            address: match params.address {
                 Some(address) => address,
                 None => format!("unix:{}", control_socket::tactile_path()?.display()),
             },
         },
-        DriverWord::Connect => {
-            Link::Connect { address: params.address.clone().with_context(|| lacks("address", "robot.local:7400"))? }
-        }
-        DriverWord::Serial => Link::Serial {
-            device: params.device.clone().with_context(|| lacks("device", "/dev/ttyACM0"))?,
+        "connect" => Link::Connect { address: params.address.with_context(|| lacks("address", "robot.local:7400"))? },
+        "serial" => Link::Serial {
+            device: params.device.with_context(|| lacks("device", "/dev/ttyACM0"))?,
             baud: params.baud.unwrap_or(DEFAULT_BAUD),
         },
-        DriverWord::Recording => {
-            let recording = params.recording.as_ref().with_context(|| lacks("recording", "recordings/mine.mcap"))?;
-            return Ok(Box::new(Replay::new(recording, hand)?));
+        "recording" => {
+            let recording = params.recording.with_context(|| lacks("recording", "recordings/mine.mcap"))?;
+            return Ok(Box::new(Replay::new(&recording, asked.hand)?));
         }
-        DriverWord::Ros2 => return ros2(params, hand).map(|driver| Box::new(driver) as Box<dyn TactileDriver>),
-        DriverWord::Zenoh => {
-            let key = params.key.clone().with_context(|| lacks("key", "hand/frames"))?;
-            let network = params.network.connection.network()?;
-            return Ok(Box::new(ZenohKey::new(network, key, max_line_bytes(&expected), hand.id())?));
-        }
+        _ => bail!("the driver {name} is in {NETWORK_PROGRAM}, not in this program"),
     };
-    let is_local = |address: &String| address.starts_with("unix:");
     if let Link::Listen { address } | Link::Connect { address } = &link
-        && is_local(address)
-        && has_sandbox
+        && address.starts_with("unix:")
+        && asked.has_sandbox
     {
         bail!("a sandbox has no unix sockets, and the address is {address}: write `sandbox: off`, or HOST:PORT");
     }
     let idle_limit_nanos = params.idle_limit_ms.map(|millis| (millis * 1e6) as u64);
-    Ok(Box::new(Stream::new(link, expected, idle_limit_nanos)))
-}
-
-/// The driver for topics of ROS 2.
-fn ros2(params: &Params, hand: &Hand) -> anyhow::Result<Ros2> {
-    let topics = &params.topics;
-    let (network, domain, namespace) = params.network.network()?;
-    let convention = params.network.convention();
-    let named = |name: &Option<String>| {
-        name.as_ref().map(|name| topic_name(&namespace, name)).transpose().map_err(anyhow::Error::from)
-    };
-    let cells = named(&topics.cells_topic)?.context("driver ros2 needs the param 'cells_topic', like /hand/tactile")?;
-    let cells_type = topics.cells_type.as_deref().unwrap_or("std_msgs/msg/Float64MultiArray");
-    let prefix = topics.joint_prefix.as_deref().unwrap_or_default();
-    let frame = |name: &String| name.trim_start_matches('/').to_owned();
-    let gravity = match (&topics.gravity_frame, &topics.palm_frame) {
-        (Some(_), _) if topics.imu_topic.is_some() => {
-            bail!("params 'gravity_frame' and 'imu_topic' both tell gravity: leave one of them out")
-        }
-        (Some(upright), Some(palm)) if frame(upright) != frame(palm) => {
-            let topic = named(&topics.tf_topic)?.unwrap_or_else(|| "/tf".into());
-            Some((topic, [frame(upright), frame(palm)]))
-        }
-        (None, None) if topics.tf_topic.is_none() => None,
-        _ => bail!(
-            "params 'gravity_frame' (a frame whose z axis points upwards, like world) and 'palm_frame' (the frame of the hand's \
-             {}) belong together, and are different frames",
-            hand.palm_link().name
-        ),
-    };
-    let topics = Topics {
-        network,
-        convention,
-        domain,
-        joints: named(&topics.joints_topic)?.unwrap_or_else(|| "/joint_states".into()),
-        cells,
-        cells_definition: definition_of(cells_type, topics.cells_definition.as_deref())?,
-        cells_field: topics.cells_field.clone().unwrap_or_else(|| "data".into()),
-        phase: named(&topics.phase_topic)?,
-        wrench: named(&topics.wrench_topic)?,
-        imu: named(&topics.imu_topic)?,
-        gravity,
-        hand_joints: hand_joints(hand, prefix, topics.joint_map.as_deref())?,
-        tolerance_nanos: (topics.tolerance_ms.unwrap_or(20.0) * 1e6) as u64,
-        still_per_s: topics.moving_rad_per_s.unwrap_or(MOVING_RAD_PER_S),
-        namespace,
-    };
-    let still_nanos = (params.topics.still_ms.unwrap_or(200.0) * 1e6) as u64;
-    let finder = PhaseFinder::new(params.topics.moving_rad_per_s.unwrap_or(MOVING_RAD_PER_S), still_nanos);
-    Ok(Ros2::new(topics, finder))
+    Ok(Box::new(Stream::new(link, ExpectedHand::of(asked.hand), idle_limit_nanos)))
 }
 
 impl Params {

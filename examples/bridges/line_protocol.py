@@ -144,7 +144,7 @@ class Source:
 
 
 class MotionPhase:
-    """The phase by the fingers' motion, as the driver `ros2` of blindgrasp finds it (crates/tactile/src/phases.rs), but for the
+    """The phase by the fingers' motion, as the driver `ros2` of blindgrasp finds it (network/src/drivers/phases.rs), but for the
     beginning: the hand must open first."""
 
     WINDOW_NANOS = 50_000_000

@@ -6,12 +6,11 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use blindgrasp_bridge::agreement::{Agreement, PairKeys};
-use blindgrasp_bridge::certificates::key_files;
-use blindgrasp_bridge::config::{Endpoints, KeyKind, LinkConfig};
 use blindgrasp_bridge::identity::Identity;
 use blindgrasp_bridge::keys::{KeyRequest, make};
 use blindgrasp_bridge::protection::Protection;
 use blindgrasp_bridge::wire::{Body, Frame, Hello};
+use blindgrasp_graph::link::config::{Endpoints, KeyKind, LinkConfig, key_files};
 use time::OffsetDateTime;
 
 /// The least of these times counts; the rest is other programs'.

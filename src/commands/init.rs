@@ -9,7 +9,7 @@ use clap::Args;
 use clap::builder::PossibleValuesParser;
 use serde_json::json;
 
-use super::schema::schema;
+use super::schema::SCHEMA;
 use super::{Outcome, print_text};
 
 /// Write a new project that runs at once
@@ -105,8 +105,6 @@ fn of_hand(name: &str) -> Vec<(String, &'static [u8])> {
     layout_and_urdf.into_iter().flatten().chain(bridge).collect()
 }
 
-const SCHEMA: &str = "docs/dataflow.schema.json";
-
 const README: &str = "\
 # A blindgrasp project
 
@@ -135,10 +133,9 @@ a model; `blindgrasp --help` lists the rest.
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let folder = &arguments.folder;
-    let made_schema = schema();
     let mut files: Vec<(String, &[u8])> = FILES.iter().map(|(name, content)| ((*name).to_owned(), *content)).collect();
     // The dataflow files name it, for editors.
-    files.push((SCHEMA.into(), made_schema.as_bytes()));
+    files.push(("docs/dataflow.schema.json".into(), SCHEMA.as_bytes()));
     let of_ros2: &[File] = if arguments.ros2 { &ROS2_FILES } else { &[] };
     let of_ros2 = of_ros2.iter().map(|(name, content)| ((*name).to_owned(), *content));
     for file in arguments.hand.iter().flat_map(|hand| of_hand(hand)).chain(of_ros2) {

@@ -7,6 +7,8 @@ use blindgrasp_graph::operators::HOST_OPERATOR;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::host;
 use blindgrasp_operator::operator::{self, GroupMember, name_process};
+use blindgrasp_operators::beginning::check_from_stdin;
+use blindgrasp_operators::houses::CHECK;
 use blindgrasp_operators::{SHIPPED, form_named};
 use clap::Args;
 use clap::builder::PossibleValuesParser;
@@ -50,9 +52,10 @@ pub(crate) fn run(arguments: &Arguments) -> ExitCode {
         };
         return host::run(program, rest);
     }
+    let is_check = arguments.arguments.iter().any(|text| text == CHECK);
     let given: Vec<&str> =
-        arguments.arguments.iter().map(String::as_str).filter(|text| *text != "--describe").collect();
-    let Some(form) = form_named(name, &given) else {
+        arguments.arguments.iter().map(String::as_str).filter(|text| !["--describe", CHECK].contains(text)).collect();
+    let Some(form) = form_named(&SHIPPED, name, &given) else {
         let variants = SHIPPED.iter().filter(|shipped| shipped.name == name).flat_map(|shipped| shipped.variants);
         let known: Vec<&str> = variants.map(|(argument, _)| *argument).collect();
         let known =
@@ -61,6 +64,9 @@ pub(crate) fn run(arguments: &Arguments) -> ExitCode {
         print_diagnostic(&format!("blindgrasp operator {name}: unknown argument '{given}': expected {known}"));
         return ExitCode::from(2);
     };
+    if is_check {
+        return check_from_stdin(form);
+    }
     name_process(name);
     operator::run(&(form.describe)(), form.work)
 }
@@ -69,7 +75,7 @@ pub(crate) fn run(arguments: &Arguments) -> ExitCode {
 fn member(args: &[String]) -> Option<GroupMember> {
     let (name, arguments) = args.split_first()?;
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
-    let form = form_named(name, &arguments)?;
+    let form = form_named(&SHIPPED, name, &arguments)?;
     Some(((form.describe)(), form.work))
 }
 

@@ -1,8 +1,5 @@
 //! `blindgrasp schema`
 
-use blindgrasp_graph::dataflow;
-use blindgrasp_graph::operators::LINK_OPERATOR;
-use blindgrasp_operators::SHIPPED;
 use clap::Args;
 
 use super::{Outcome, print_text};
@@ -14,29 +11,10 @@ use super::{Outcome, print_text};
                         # yaml-language-server: $schema=dataflow.schema.json")]
 pub(super) struct Arguments {}
 
+/// The schema with the operators of all programs of blindgrasp; a test (tests/e2e/schema.rs) makes it from their descriptions.
+pub(super) const SCHEMA: &str = include_str!("../../docs/dataflow.schema.json");
+
 pub(super) fn run(_: &Arguments) -> anyhow::Result<Outcome> {
-    print_text(schema().trim_end())?;
+    print_text(SCHEMA.trim_end())?;
     Ok(Outcome::Done)
-}
-
-/// The schema as a file holds it, with the operators that come with blindgrasp.
-pub(super) fn schema() -> String {
-    let in_files = SHIPPED.iter().filter(|shipped| shipped.name != LINK_OPERATOR);
-    let operators: Vec<_> = in_files.map(|shipped| (shipped.form.describe)()).collect();
-    format!("{:#}\n", dataflow::schema(&operators))
-}
-
-#[cfg(test)]
-mod tests {
-    /// Editors that open the project's dataflow files read the schema there. BLINDGRASP_REMAKE=1 writes it.
-    #[test]
-    fn the_committed_schema_is_that_of_the_operators() {
-        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/dataflow.schema.json");
-        let schema = super::schema();
-        if std::env::var_os("BLINDGRASP_REMAKE").is_some() {
-            std::fs::write(&path, &schema).expect("written");
-        }
-        let committed = std::fs::read_to_string(&path).expect("docs/dataflow.schema.json");
-        assert!(committed == schema, "docs/dataflow.schema.json is another: blindgrasp schema > {}", path.display());
-    }
 }

@@ -2,8 +2,14 @@
 
 use std::path::Path;
 
+use blindgrasp_graph::dataflow;
+use blindgrasp_graph::operators::LINK_OPERATOR;
+use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operators::SHIPPED;
+use blindgrasp_operators::houses::OTHER_HOUSES;
+
 use crate::common::python::{python, shell, utf8};
-use crate::common::{json_lines, project, run};
+use crate::common::{json_lines, project, run, text};
 
 /// The mistakes that the validator finds in files with these contents.
 fn errors(folder: &Path, contents: &[&str]) -> Vec<Vec<String>> {
@@ -63,4 +69,21 @@ fn the_schema_accepts_good_files_and_names_mistakes() {
     for (errors, (part, by, expected)) in found[n_good..].iter().zip(cases) {
         assert!(errors.iter().any(|error| error.contains(expected)), "{part} -> {by}: {errors:?}");
     }
+}
+
+/// The program and editors that open the project's dataflow files read the schema there. BLINDGRASP_REMAKE=1 writes it.
+#[test]
+fn the_committed_schema_is_that_of_the_operators() {
+    let names = SHIPPED.iter().map(|shipped| shipped.name).chain(OTHER_HOUSES.iter().map(|(name, _)| *name));
+    let operators = names.filter(|name| *name != LINK_OPERATOR).map(|name| {
+        let description = run(&["operator", name, "--describe"], 0).stdout;
+        OperatorDescription::from_json(&text(&description)).expect("a description")
+    });
+    let schema = format!("{:#}\n", dataflow::schema(&operators.collect::<Vec<_>>()));
+    let path = project().join("docs/dataflow.schema.json");
+    if std::env::var_os("BLINDGRASP_REMAKE").is_some() {
+        std::fs::write(&path, &schema).expect("written");
+    }
+    let committed = std::fs::read_to_string(&path).expect("docs/dataflow.schema.json");
+    assert!(committed == schema, "docs/dataflow.schema.json is another: write it with BLINDGRASP_REMAKE=1");
 }

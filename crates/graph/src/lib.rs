@@ -15,6 +15,7 @@
 //!   [`describe`] - asks programs what they are.
 //! * [`plan`] - the readers and writers of a graph, and their cursor slots.
 //! * [`launcher`] - starts, supervises, swaps and stops a graph's processes. It never touches samples.
+//! * [`link`] - one machine's part of a graph that runs on several.
 //! * [`run`] - a graph from its start to its end in this process.
 //! * [`control`] - the requests to a running graph and its replies. [`client`] - what asks, watches and compares from outside.
 //! * [`log`] - the graph's log files. [`recorded_graph`] - the facts about a graph that its recording holds.
@@ -26,6 +27,7 @@ pub mod dataflow;
 pub mod describe;
 pub mod doctor;
 pub mod launcher;
+pub mod link;
 pub mod log;
 pub mod operators;
 pub mod plan;

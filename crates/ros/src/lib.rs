@@ -1,4 +1,4 @@
-//! ROS 2 without ROS: messages by their definitions, and nodes over Zenoh by the conventions of rmw_zenoh (Jazzy, Kilted).
+//! ROS 2 without ROS: messages by their definitions. Nodes are in the network's house.
 //!
 //! ```
 //! use blindgrasp_ros::definition::Definition;
@@ -11,10 +11,9 @@
 //! * [`definition`] - parses definitions as recordings carry them, and computes the hash that names a type (RIHS01).
 //! * [`cdr`] - reads any message whose definition is known into a [`cdr::Value`].
 //! * [`standard`] - the definitions of the standard messages that blindgrasp reads.
-//! * [`node`] - a node that other nodes see: publishers and subscribers with tokens, attachments and qualities of service.
+//! * [`network`] - the endpoints and keys of a connection to other nodes.
 
-mod access;
 pub mod cdr;
 pub mod definition;
-pub mod node;
+pub mod network;
 pub mod standard;

@@ -17,25 +17,16 @@
 //! * [`line_protocol`] - lines of JSON, one frame each; pure.
 //! * [`gate`] - order, lateness, numbers; pure.
 //! * [`stream`] - the driver for the line protocol over TCP or a serial device.
-//! * [`ros2`] - the driver for topics of ROS 2; [`phases`] infers the phase of a grasp.
-//! * [`zenoh_key`] - the driver for frames on a key of Zenoh.
 //! * [`replay`] - the driver that plays a recording at its own speed.
 //!
-//! The caller passes the time, in nanoseconds of CLOCK_BOOTTIME. Only messages of Zenoh get their time of arrival here, because
-//! they come on threads of its own.
+//! The caller passes the time, in nanoseconds of CLOCK_BOOTTIME.
 
 pub mod cell_zeros;
 pub mod gate;
-mod inbox;
 pub mod line_protocol;
 mod link;
-pub mod phases;
 pub mod replay;
-pub mod ros2;
-mod ros2_cells;
 pub mod stream;
-mod transforms;
-pub mod zenoh_key;
 
 use rustix::event::PollFd;
 use serde::{Deserialize, Serialize};

@@ -8,12 +8,12 @@ use time::OffsetDateTime;
 
 use super::{Outcome, print_line, write_out};
 use blindgrasp_bridge::access;
-use blindgrasp_bridge::certificates::{AUTHORITY_FILE, CertificateSummary, ROUTER_COMMON_NAME};
-use blindgrasp_bridge::config::KeyFiles;
+use blindgrasp_bridge::certificates::CertificateSummary;
 use blindgrasp_bridge::keys::{
     self, AUTHORITY_DAYS, AUTHORITY_KEY_FILE, KeyRequest, MadeKeys, ROUTER_FILES, drop_old_authorities, list,
     renew_authority,
 };
+use blindgrasp_graph::link::config::{AUTHORITY_FILE, KeyFiles, ROUTER_COMMON_NAME};
 
 /// Make keys and certificates for several machines
 ///

@@ -7,12 +7,12 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use blindgrasp_bridge::agreement::Agreement;
-use blindgrasp_bridge::config::{Endpoints, KeyKind, LinkConfig};
 use blindgrasp_bridge::identity::Identity;
 use blindgrasp_bridge::peer::{Own, Peer};
 use blindgrasp_bridge::protection::{Opened, Protection};
 use blindgrasp_bridge::session::open;
 use blindgrasp_bridge::wire::{Body, Frame, Hello, WireError};
+use blindgrasp_graph::link::config::{Endpoints, KeyKind, LinkConfig};
 use blindgrasp_operator::link_status::PeerState;
 use blindgrasp_operator::monotonic_nanos;
 use serde_json::json;

@@ -7,10 +7,10 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use blindgrasp_bridge::access;
-use blindgrasp_bridge::certificates::{self, key_files};
-use blindgrasp_bridge::config::{Endpoints, KeyFiles, KeyKind, LinkConfig};
+use blindgrasp_bridge::certificates;
 use blindgrasp_bridge::keys::{KeyRequest, list, make};
 use blindgrasp_bridge::session::{SessionError, open, warning};
+use blindgrasp_graph::link::config::{Endpoints, KeyFiles, KeyKind, LinkConfig, key_files};
 use blindgrasp_operator::control_socket::link_path;
 use serde_json::{Value, json};
 use time::OffsetDateTime;

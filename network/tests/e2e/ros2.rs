@@ -78,7 +78,7 @@ impl Peer {
         let mut child = Command::new(python())
             .arg(project().join("tests/ros2_peer.py"))
             .args([port.to_string(), rate_hz.to_string(), n_decisions.to_string()])
-            .arg(project().join("operators/Decision.msg"))
+            .arg(project().join("network/src/operators/Decision.msg"))
             .env("PYTHONDONTWRITEBYTECODE", "1")
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())

@@ -3,10 +3,10 @@
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-use blindgrasp_bridge::certificates::key_files;
-use blindgrasp_bridge::config::KeyFiles;
 use blindgrasp_bridge::keys::revoke;
-use blindgrasp_ros::node::{Keys, Network, Rights};
+use blindgrasp_graph::link::config::{KeyFiles, key_files};
+use blindgrasp_ros::network::{Keys, Network};
+use blindgrasp_ros_node::node::{Rights, open};
 use serde_json::{Value, json};
 use time::OffsetDateTime;
 use zenoh::{Session, Wait};
@@ -74,7 +74,7 @@ fn folder_of_keys() -> tempfile::TempDir {
 fn a_source_takes_frames_of_the_names_that_may_send_and_on_its_key_alone() {
     let (folder, other) = (folder_of_keys(), keys(&["arm"]));
     let endpoint = free_endpoint("tls");
-    let source = network(&endpoint, "", Some(folder.path())).open(&source()).expect("a session");
+    let source = open(&network(&endpoint, "", Some(folder.path())), &source()).expect("a session");
     let (heard, everywhere) = (Heard::listen(&source, FRAMES), Heard::listen(&source, "**"));
     let arm = stranger(&endpoint, tls_of(folder.path(), "arm"));
     let arm_hears = Heard::listen(&arm, "**");
@@ -113,7 +113,7 @@ fn an_output_passes_no_decisions_of_others_on() {
         says(&laptop, DECISIONS, "forged", &Heard::listen(&arm, DECISIONS));
 
         let endpoint = free_endpoint(scheme);
-        let output = network(&endpoint, "", has_keys.then(|| folder.path())).open(&output()).expect("a session");
+        let output = open(&network(&endpoint, "", has_keys.then(|| folder.path())), &output()).expect("a session");
         let own = Heard::listen(&output, "**");
         let arm = client(&endpoint, &of("arm"));
         let arm_hears = Heard::listen(&arm, "**");
@@ -147,7 +147,7 @@ fn what_a_node_connects_to_must_bear_a_name_that_takes_part() {
         let router_hears = Heard::listen(&router, "**");
         let connects = network("", &endpoint, Some(folder.path()));
         let (source, output) =
-            (connects.open(&source()).expect("a session"), connects.open(&output()).expect("a session"));
+            (open(&connects, &source()).expect("a session"), open(&connects, &output()).expect("a session"));
         let heard = Heard::listen(&source, FRAMES);
         wait_until("both are connected", || is_connected(&source) && is_connected(&output));
         if takes_part {
@@ -157,7 +157,7 @@ fn what_a_node_connects_to_must_bear_a_name_that_takes_part() {
         }
         // In the time in which the right one is heard again and again.
         let right = free_endpoint("tls");
-        let other = network(&right, "", Some(folder.path())).open(&self::source()).expect("a session");
+        let other = open(&network(&right, "", Some(folder.path())), &self::source()).expect("a session");
         let other_heard = Heard::listen(&other, FRAMES);
         let arm = stranger(&right, tls_of(folder.path(), "arm"));
         for round in 0..20 {

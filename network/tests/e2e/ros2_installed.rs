@@ -208,7 +208,7 @@ fn the_package_of_messages_compiles_and_the_gate_of_the_arm_reads_them() {
     let folder = tempfile::tempdir().expect("a folder");
     let built = compile(&project().join("examples/blindgrasp_msgs"), folder.path());
 
-    let decision = std::fs::read_to_string(project().join("operators/Decision.msg")).expect("readable");
+    let decision = std::fs::read_to_string(project().join("network/src/operators/Decision.msg")).expect("readable");
     let decision = standard::with_parts(&decision, &["builtin_interfaces/Time"]);
     for (name, definition) in [
         (TactileFrame::SCHEMA, TactileFrame::definition()),

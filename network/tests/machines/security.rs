@@ -8,8 +8,8 @@ use crate::split::{
     Attacker, FOREVER, assert_lost_nothing, assert_nothing_unsafe, decided, keys, on_one_machine, part, patient, peer,
     pid_of, rejected, split, stop, wait_for_state,
 };
-use blindgrasp_bridge::certificates::key_files;
 use blindgrasp_bridge::wire::PROTOCOL;
+use blindgrasp_graph::link::config::key_files;
 use rustix::process::Signal;
 use serde_json::{Value, json};
 

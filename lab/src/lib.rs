@@ -1,0 +1,3 @@
+//! The lab's house: simulated grasps, training and evaluation.
+
+pub mod operators;
