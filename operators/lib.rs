@@ -22,7 +22,7 @@ pub use ros2_markers::{cell_points, hand_markers};
 
 use std::path::Path;
 
-use blindgrasp_graph::operators::{LINK_OPERATOR, Operators};
+use blindgrasp_graph::operators::Operators;
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 
@@ -82,12 +82,14 @@ pub fn form_of(args: &[String]) -> Option<Form> {
 }
 
 /// The operators of all houses as a dataflow file can name them. `program` must run each as `PROGRAM operator NAME`, as
-/// blindgrasp does.
+/// blindgrasp does; those of the other houses are run by their programs, where these lie beside it.
 pub fn operators_of(program: &Path) -> Operators {
-    let own = SHIPPED.iter().map(|shipped| shipped.name);
-    let others = OTHER_HOUSES.iter().map(|(name, _)| *name).filter(|name| *name != LINK_OPERATOR);
-    let sharing = SHIPPED.iter().filter(|shipped| shipped.can_share_process);
-    Operators::of_program(program, own.chain(others)).sharing(sharing.map(|shipped| shipped.name))
+    let mut operators = Operators::of_program(program, SHIPPED.iter().map(|shipped| shipped.name));
+    for (name, house) in OTHER_HOUSES {
+        let beside = program.with_file_name(house);
+        operators = operators.with(name, if beside.is_file() { &beside } else { program });
+    }
+    operators.sharing(SHIPPED.iter().filter(|shipped| shipped.can_share_process).map(|shipped| shipped.name))
 }
 
 impl Shipped {

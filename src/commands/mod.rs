@@ -12,7 +12,6 @@ mod info;
 mod init;
 mod logs;
 mod new;
-mod operator;
 mod predict;
 mod promises;
 mod ps;
@@ -39,7 +38,8 @@ use blindgrasp_cli::{
     Outcome, data_on_stdout, man, number_in, print_line, print_text, secs_in, stop_requests, stop_signal,
 };
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_session::output::{check_new, check_output, check_page, write_out, write_report};
+use blindgrasp_operators::SHIPPED;
+use blindgrasp_session::output::{check_new, check_output, write_out};
 use blindgrasp_session::text_table::{self, percent};
 
 /// Decides from touch and joint angles whether a grasp will hold before the lift.
@@ -69,6 +69,17 @@ mod manual {
     }
 }
 
+/// `blindgrasp operator`
+mod operator {
+    pub(super) use blindgrasp_cli::operator::Arguments;
+
+    /// `main` has run it.
+    #[expect(clippy::unnecessary_wraps, reason = "the form of a command")]
+    pub(super) fn run(_: &Arguments) -> anyhow::Result<super::Outcome> {
+        Ok(super::Outcome::Done)
+    }
+}
+
 impl Cli {
     /// Parses the command line. A mistake ends the process with its explanation and code 2.
     pub(crate) fn read() -> Cli {
@@ -80,7 +91,7 @@ impl Cli {
     /// Runs the operator that this process is to be. An operator reports its end to the launcher, not to a person.
     pub(crate) fn run_operator(&self) -> Option<ExitCode> {
         match &self.command {
-            Command::Operator(arguments) => Some(operator::start(arguments)),
+            Command::Operator(arguments) => Some(blindgrasp_cli::operator::run(arguments, &SHIPPED)),
             _ => None,
         }
     }

@@ -1,6 +1,7 @@
 //! The three programs: `blindgrasp` for a robot, `blindgrasp-lab` for data and models, `blindgrasp-network` for other machines
 //! and ROS 2. People, launchers and scripts call `blindgrasp`, which hands over to the others.
 
+use std::borrow::Cow;
 use std::ffi::{OsStr, OsString};
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
@@ -8,6 +9,7 @@ use std::process::Command;
 
 use anyhow::Context;
 use blindgrasp_graph::operators::running_program;
+use blindgrasp_operators::houses::{LAB_PROGRAM, NETWORK_PROGRAM, house_of_process};
 
 /// A program beside `blindgrasp`, and the commands that it has, each with its line in the help.
 #[derive(Debug)]
@@ -17,7 +19,7 @@ pub struct House {
 }
 
 pub const LAB: House = House {
-    program: "blindgrasp-lab",
+    program: LAB_PROGRAM,
     commands: &[
         ("simulate", "Simulate grasps with labels, or list the objects"),
         ("import", "Turn a table (CSV) or lines of frames into a recording"),
@@ -31,7 +33,7 @@ pub const LAB: House = House {
 };
 
 pub const NETWORK: House = House {
-    program: "blindgrasp-network",
+    program: NETWORK_PROGRAM,
     commands: &[
         ("diagnostics", "Publish a graph's state to ROS 2, on /diagnostics"),
         ("keys", "Make keys and certificates for several machines"),
@@ -82,10 +84,17 @@ pub fn robot_program() -> std::io::Result<PathBuf> {
     Ok(running_program()?.with_file_name("blindgrasp"))
 }
 
-/// The house that has the command of these words, which follow the program's name.
+/// The house that has the command of these words, which follow the program's name. An operator's house may depend on its params,
+/// which this process was given.
 pub fn house_of_command(words: &[OsString]) -> Option<&'static House> {
     let mut words = words.iter().map(|word| word.to_string_lossy()).filter(|word| word != "help");
     let first = words.next()?;
+    if first == "operator" {
+        let name = words.next()?;
+        let arguments: Vec<String> = words.map(Cow::into_owned).collect();
+        let program = house_of_process(&name, &arguments)?;
+        return HOUSES.into_iter().find(|house| house.program == program);
+    }
     let both = format!("{first} {}", words.next().unwrap_or_default());
     HOUSES.into_iter().find(|house| house.commands.iter().any(|(name, _)| *name == first || *name == both))
 }

@@ -34,13 +34,24 @@ pub struct Operators {
 impl Operators {
     /// The operators of a program that runs each as `PROGRAM operator NAME`.
     pub fn of_program<'a>(program: &Path, names: impl IntoIterator<Item = &'a str>) -> Operators {
-        let started = |name: &str| Program { path: program.into(), args: vec!["operator".into(), name.into()] };
         Operators {
-            programs: names.into_iter().map(|name| (name.to_owned(), started(name))).collect(),
-            link: Some(started(LINK_OPERATOR)),
-            host: Some(started(HOST_OPERATOR)),
+            programs: names.into_iter().map(|name| (name.to_owned(), started(program, name))).collect(),
+            link: Some(started(program, LINK_OPERATOR)),
+            host: Some(started(program, HOST_OPERATOR)),
             ..Operators::default()
         }
+    }
+
+    /// With this one, or the link, run by a program in the same way.
+    #[must_use]
+    pub fn with(mut self, name: &str, program: &Path) -> Operators {
+        let started = started(program, name);
+        if name == LINK_OPERATOR {
+            self.link = Some(started);
+        } else {
+            self.programs.insert(name.into(), started);
+        }
+        self
     }
 
     /// Operators of which each is a program of its name in a folder.
@@ -112,6 +123,10 @@ impl Operators {
         let similar = did_you_mean(name, known()).map_or(String::new(), |similar| format!("{similar} "));
         format!("{similar}{}", list("operators", known()))
     }
+}
+
+fn started(program: &Path, name: &str) -> Program {
+    Program { path: program.into(), args: vec!["operator".into(), name.into()] }
 }
 
 fn program_of_path(run: &Path, folder: &Path) -> Program {

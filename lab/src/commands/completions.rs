@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
 
-pub(super) use blindgrasp_cli::completions::{graphs, hands};
+pub(super) use blindgrasp_cli::completions::hands;
 use blindgrasp_cli::completions::with_files;
 use blindgrasp_objects::catalogue_specs;
 use clap_complete::ArgValueCompleter;

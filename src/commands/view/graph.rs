@@ -140,7 +140,7 @@ fn svg(dot: &str) -> anyhow::Result<String> {
 
 fn checked(file: &Path, overrides: &[Override], scope: Scope) -> anyhow::Result<Graph> {
     let file = dataflow::load(file)?;
-    super::super::graph_file::checked(&file, overrides, scope)
+    blindgrasp_cli::graph_file::checked(&file, overrides, scope)
 }
 
 fn file_picture(graph: &Graph) -> Picture {
