@@ -8,7 +8,7 @@ const WINDOW_NANOS: u64 = 50_000_000;
 /// Finds the phase from joint angles. The hand is open until its fingers close, settled once they have stood still, and open
 /// again, for the next grasp, as soon as they go back.
 #[derive(Debug, Clone)]
-pub struct PhaseFinder {
+pub(crate) struct PhaseFinder {
     /// Fingers that move more slowly stand still.
     moving_rad_per_s: f64,
     still_nanos: u64,
@@ -19,12 +19,12 @@ pub struct PhaseFinder {
 }
 
 impl PhaseFinder {
-    pub fn new(moving_rad_per_s: f64, still_nanos: u64) -> Self {
+    pub(crate) fn new(moving_rad_per_s: f64, still_nanos: u64) -> Self {
         PhaseFinder { moving_rad_per_s, still_nanos, phase: Phase::Open, anchor: None, still_since_nanos: None }
     }
 
     /// The phase at a posture of the fingers: for each, how far it has closed, radians, from anywhere on.
-    pub fn phase(&mut self, stamp_nanos: u64, fingers_rad: &[f64]) -> Phase {
+    pub(crate) fn phase(&mut self, stamp_nanos: u64, fingers_rad: &[f64]) -> Phase {
         let Some((since_nanos, before)) = &self.anchor else {
             self.anchor = Some((stamp_nanos, fingers_rad.to_vec()));
             return self.phase;

@@ -38,7 +38,7 @@ const GRAVITY_M_PER_S2: f64 = 9.81;
 
 /// The topics and how to read them.
 #[derive(Debug, Clone)]
-pub struct Topics {
+pub(crate) struct Topics {
     pub network: Network,
     pub convention: Convention,
     pub domain: u32,
@@ -68,7 +68,7 @@ pub struct Topics {
 
 /// A joint of the hand, as the topic has it.
 #[derive(Debug, Clone, PartialEq)]
-pub struct JointTopic {
+pub(crate) struct JointTopic {
     pub name: String,
     /// The joint's value is this times that of the topic, plus `offset`.
     pub scale: f64,
@@ -114,7 +114,7 @@ impl JointAngle {
 }
 
 /// Reads frames from topics of ROS 2.
-pub struct Ros2 {
+pub(crate) struct Ros2 {
     topics: Topics,
     definitions: BTreeMap<Topic, (String, Definition, String)>,
     finder: PhaseFinder,
@@ -134,7 +134,7 @@ pub struct Ros2 {
 }
 
 impl Ros2 {
-    pub fn new(topics: Topics, finder: PhaseFinder) -> Self {
+    pub(crate) fn new(topics: Topics, finder: PhaseFinder) -> Self {
         let joints = vec![None; topics.hand_joints.len()];
         let mut definitions = BTreeMap::new();
         let mut add = |topic: Topic, name: &Option<String>, definition: Option<Definition>| {

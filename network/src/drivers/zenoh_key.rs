@@ -20,7 +20,7 @@ type FrameBytes = (Vec<u8>, usize);
 const CDR_BEGIN: [u8; 2] = [0, 1];
 
 /// Reads frames from a key.
-pub struct ZenohKey {
+pub(crate) struct ZenohKey {
     network: Network,
     key: String,
     max_bytes: usize,
@@ -37,7 +37,7 @@ impl ZenohKey {
     ///
     /// # Errors
     /// It is no key expression.
-    pub fn new(network: Network, key: String, max_bytes: usize, hand_id: u64) -> Result<Self, DriverError> {
+    pub(crate) fn new(network: Network, key: String, max_bytes: usize, hand_id: u64) -> Result<Self, DriverError> {
         let error = zenoh::key_expr::KeyExpr::new(key.as_str()).err().map(|error| error.to_string());
         match error {
             Some(why) => Err(DriverError::Key { key, why }),

@@ -162,7 +162,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
 /// The mistakes with which [`work`] would fail at once.
 pub(crate) fn check(node: &FileNode) -> anyhow::Result<()> {
     network_and_hand(&parse_params(&node.params)?)?;
-    check_inputs(node.inputs())
+    check_inputs(node.inputs.iter().map(|(port, is_lossless)| (port.as_str(), *is_lossless)))
 }
 
 type NetworkAndHand = ((Network, u32, String), Option<Hand>);

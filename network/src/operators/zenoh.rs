@@ -60,7 +60,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
 /// The mistakes with which [`work`] would fail at once.
 pub(crate) fn check(node: &FileNode) -> anyhow::Result<()> {
     network_and_prefix(parse_params(&node.params)?)?;
-    check_inputs(node.inputs())
+    check_inputs(node.inputs.iter().map(|(port, is_lossless)| (port.as_str(), *is_lossless)))
 }
 
 fn network_and_prefix(params: Params) -> anyhow::Result<(Network, String)> {
