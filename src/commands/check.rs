@@ -4,9 +4,9 @@ use std::path::Path;
 
 use serde_json::json;
 
-use blindgrasp_cli::graph_file::{OnMisfit, able_to_begin};
 use super::text_table::TextTable;
 use super::{Outcome, print_line, print_text};
+use blindgrasp_cli::graph_file::{OnMisfit, able_to_begin};
 use blindgrasp_graph::dataflow::{
     self, DataflowError, Edge, Graph, Input, Machine, Machines, Node, Override, Restart, RestartPolicy, Scope,
 };

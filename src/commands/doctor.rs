@@ -3,8 +3,8 @@
 use clap::Args;
 use serde_json::json;
 
-use blindgrasp_cli::graph_file::shipped;
 use super::{Outcome, print_line};
+use blindgrasp_cli::graph_file::shipped;
 use blindgrasp_graph::doctor::{Fitness, Measurement, examine};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::namespace::{left_over, sweep};

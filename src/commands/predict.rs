@@ -6,8 +6,8 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 use serde_json::json;
 
-use blindgrasp_cli::frame_lines::read_frames;
 use super::{Outcome, print_line};
+use blindgrasp_cli::frame_lines::read_frames;
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::decide::{Decided, decide, decide_frames, has_probability};
 use blindgrasp_messages::{GraspTruth, LiftDecision};

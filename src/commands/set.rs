@@ -8,9 +8,9 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use super::elsewhere::MachineArgument;
-use blindgrasp_cli::graph_file::{describe, warn_of_misfit};
 use super::text_table::TextTable;
 use super::{Outcome, completions, print_line, print_text};
+use blindgrasp_cli::graph_file::{describe, warn_of_misfit};
 use blindgrasp_graph::client::{Connection, pick_graph, status};
 use blindgrasp_graph::control::{NodeStatus, Reply, Request};
 use blindgrasp_operator::text::did_you_mean;

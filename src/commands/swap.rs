@@ -10,8 +10,8 @@ use clap::Args;
 use serde::Serialize;
 
 use super::elsewhere::{MachineArgument, is_over_ssh};
-use blindgrasp_cli::graph_file::{refuse_misfit, shipped};
 use super::{Outcome, completions, number_in, percent, print_line, secs_in, stop_signal};
+use blindgrasp_cli::graph_file::{refuse_misfit, shipped};
 use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::client::shadow_comparison::{
     ComparisonReport, Latency, PromotionLimits, Saying, ShadowComparison, Side, objections,

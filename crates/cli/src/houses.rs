@@ -69,7 +69,10 @@ impl House {
     ///
     /// # Errors
     /// There is no such program, or it cannot be started.
-    pub fn become_it<S: AsRef<OsStr>>(&self, arguments: impl IntoIterator<Item = S>) -> anyhow::Result<std::convert::Infallible> {
+    pub fn become_it<S: AsRef<OsStr>>(
+        &self,
+        arguments: impl IntoIterator<Item = S>,
+    ) -> anyhow::Result<std::convert::Infallible> {
         let path = self.path()?;
         let error = Command::new(&path).args(arguments).exec();
         Err(error).with_context(|| format!("cannot start {}", path.display()))

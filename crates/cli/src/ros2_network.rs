@@ -3,25 +3,24 @@
 use std::ffi::OsString;
 use std::path::PathBuf;
 
+use blindgrasp_operators::connection::{ConnectionParams, warn_if_open};
+use blindgrasp_ros::network::{MAX_DOMAIN, Network};
 use clap::Args;
-
-/// The largest domain of ROS 2.
-pub const MAX_DOMAIN: u32 = 232;
 
 #[derive(Debug, Args)]
 pub struct Ros2Network {
     /// Zenoh router of the robot [default: tcp/localhost:7447]
     #[arg(long, value_name = "ENDPOINT")]
-    pub connect: Option<String>,
+    connect: Option<String>,
     /// Folder with ca.pem, ros2.pem and ros2.key.pem, for an endpoint tls/HOST:PORT
     #[arg(long, value_name = "DIR")]
-    pub keys: Option<PathBuf>,
+    keys: Option<PathBuf>,
     /// With --keys: common names of the certificates at the other end that take part [default: ros2,@router]
     #[arg(long, value_name = "NAMES", requires = "keys")]
-    pub from: Option<String>,
+    from: Option<String>,
     /// ROS domain [default: 0]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=i64::from(MAX_DOMAIN)))]
-    pub domain: Option<u32>,
+    domain: Option<u32>,
 }
 
 impl Ros2Network {
@@ -36,5 +35,16 @@ impl Ros2Network {
         ];
         let given = options.into_iter().filter_map(|(name, value)| Some([name.into(), value?]));
         given.flatten().collect()
+    }
+
+    /// The network and the domain.
+    ///
+    /// # Errors
+    /// The endpoint is not valid.
+    pub fn network(&self) -> anyhow::Result<(Network, u32)> {
+        let (connect, keys, from) = (self.connect.clone(), self.keys.clone(), self.from.clone());
+        let network = ConnectionParams { connect, listen: None, keys, from }.network()?;
+        warn_if_open(&network);
+        Ok((network, self.domain.unwrap_or(0)))
     }
 }

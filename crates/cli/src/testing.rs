@@ -91,6 +91,8 @@ pub fn mistakes_in_table(commands: &[(&str, &str)], command: &clap::Command) -> 
         }
     }
     let help = grouped(command.clone()).render_help().to_string();
-    mistakes.extend(help.lines().filter(|line| line.chars().count() > 80).map(|line| format!("more than 80 characters: {line}")));
+    mistakes.extend(
+        help.lines().filter(|line| line.chars().count() > 80).map(|line| format!("more than 80 characters: {line}")),
+    );
     mistakes
 }

@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use clap::{ArgGroup, Args};
 
+use super::{Outcome, check_new, completions, percent, print_line, print_text};
 use blindgrasp_cli::frame_lines::{FrameLines, read_frames};
 use blindgrasp_cli::joint;
-use super::{Outcome, check_new, completions, percent, print_line, print_text};
 use blindgrasp_learning::import::{Day, ImportOptions, ImportReport, Joints, import_frames, import_table};
 use blindgrasp_stages::hand::Hand;
 

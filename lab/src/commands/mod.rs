@@ -101,7 +101,8 @@ mod tests {
             ("simulate --grasps many --out x.mcap", "expected a whole number"),
             ("model list", "unrecognized subcommand"),
         ] {
-            let words: Vec<OsString> = std::iter::once("blindgrasp").chain(line.split(' ')).map(OsString::from).collect();
+            let words: Vec<OsString> =
+                std::iter::once("blindgrasp").chain(line.split(' ')).map(OsString::from).collect();
             let error = Cli::command().try_get_matches_from(&words).expect_err("a mistake");
             let text = with_hint(error, Cli::command(), &words).to_string();
             assert!(text.contains(expected) && !text.contains("as a value"), "blindgrasp {line}: {text}");

@@ -4,7 +4,7 @@ mod simulated_hand;
 
 use blindgrasp_operators::Shipped;
 
-pub const SHIPPED: [Shipped; 1] =
+pub(crate) const SHIPPED: [Shipped; 1] =
     [Shipped::new("simulated_hand", simulated_hand::describe, simulated_hand::work, simulated_hand::check)];
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::Context as _;
+use blindgrasp_cli::ros2_network::Ros2Network;
 use blindgrasp_graph::client::activity::{Look, Measured, MeasuredEdge, MeasuredNode, Window, measure};
 use blindgrasp_graph::client::poller::Poller;
 use blindgrasp_graph::client::words::{node_state_word, state_word, warnings};
@@ -11,13 +12,11 @@ use blindgrasp_graph::control::{EdgeStatus, GraphState, NodeState, NodeStatus};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_recording::cdr;
-use blindgrasp_ros_node::node::{Convention, MessageType, Quality, Rights, RosNode, RosPublisher};
 use blindgrasp_ros::standard;
-use blindgrasp_cli::ros2_network::Ros2Network;
+use blindgrasp_ros_node::node::{self, Convention, MessageType, Quality, Rights, RosNode, RosPublisher};
 use clap::Args;
 use serde::Serialize;
 
-use super::ros2_network::network_of;
 use super::{Outcome, completions, secs_in};
 
 /// Publish a graph's state to ROS 2, on /diagnostics
@@ -73,13 +72,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         Some(graph) => graph.to_owned(),
         None => pick_graph(None)?,
     };
-    let (network, domain) = network_of(&arguments.network)?;
+    let (network, domain) = arguments.network.network()?;
     let definition = standard::definition(TYPE).context("no definition of the diagnostics")?;
     let message = MessageType { name: TYPE.into(), hash: definition.hash() };
     let rights = Rights { sends: vec![Convention::RmwZenoh.key(domain, "/diagnostics")], ..Rights::default() };
     let open = || -> anyhow::Result<Publishing> {
         let mut node =
-            RosNode::new(network.open(&rights)?, Convention::RmwZenoh, domain, "/", "blindgrasp_diagnostics")?;
+            RosNode::new(node::open(&network, &rights)?, Convention::RmwZenoh, domain, "/", "blindgrasp_diagnostics")?;
         let publisher = node.publisher("/diagnostics", &message, Quality::KeepLast(1))?;
         Ok((node, publisher))
     };

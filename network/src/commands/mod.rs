@@ -3,7 +3,6 @@
 mod diagnostics;
 mod keys;
 mod robot_description;
-mod ros2_network;
 
 use std::process::ExitCode;
 

@@ -7,10 +7,11 @@ use anyhow::{Context, bail};
 use blindgrasp_cli::ros2_network::Ros2Network;
 use blindgrasp_ros::cdr::{self, Value};
 use blindgrasp_ros::standard;
-use blindgrasp_ros_node::node::{Convention, MAX_RECEIVED_BYTES, MessageType, Quality, Rights, RosNode, topic_name};
+use blindgrasp_ros_node::node::{
+    self, Convention, MAX_RECEIVED_BYTES, MessageType, Quality, Rights, RosNode, topic_name,
+};
 use clap::Args;
 
-use super::ros2_network::network_of;
 use super::{Outcome, data_on_stdout};
 
 /// Print the URDF that a robot in ROS 2 publishes
@@ -32,12 +33,13 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 
 /// The URDF that a robot publishes, as its `robot_state_publisher` does.
 fn described(topic: &str, network: &Ros2Network) -> anyhow::Result<String> {
-    let (network, domain) = network_of(network)?;
+    let (network, domain) = network.network()?;
     let topic = topic_name("/", topic)?;
     let definition = standard::definition("std_msgs/msg/String").context("no definition of std_msgs/msg/String")?;
     let message = MessageType { name: definition.name.clone(), hash: definition.hash() };
     let rights = Rights { takes: vec![Convention::RmwZenoh.key(domain, &topic)], ..Rights::default() };
-    let mut node = RosNode::new(network.open(&rights)?, Convention::RmwZenoh, domain, "/", "blindgrasp_new_hand")?;
+    let mut node =
+        RosNode::new(node::open(&network, &rights)?, Convention::RmwZenoh, domain, "/", "blindgrasp_new_hand")?;
     let (sender, received) = std::sync::mpsc::channel();
     let _subscriber = node.subscriber(&topic, &message, Quality::KeepLast(1), move |it| drop(sender.send(it)))?;
     let received = received.recv_timeout(DESCRIPTION_LIMIT).map_err(|_| {

@@ -12,7 +12,7 @@ use blindgrasp_graph::operators::LINK_OPERATOR;
 use blindgrasp_operators::{Shipped, tactile_source as source};
 
 /// All of them. `tactile_source` is the robot's; here it has the drivers ros2 and zenoh as well.
-pub const SHIPPED: [Shipped; 4] = [
+pub(crate) const SHIPPED: [Shipped; 4] = [
     Shipped::new("tactile_source", source::describe, tactile_source::work, tactile_source::check),
     Shipped::new("ros2", ros2::describe, ros2::work, ros2::check),
     Shipped::new("zenoh", zenoh::describe, zenoh::work, zenoh::check),

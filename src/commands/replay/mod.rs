@@ -10,9 +10,9 @@ use clap::Args;
 use serde_json::{Value, json};
 
 pub(super) use self::feed::{Fed, Feed};
-use blindgrasp_cli::graph_file::{OnMisfit, fitting};
 use super::recording_arguments::RecordingArguments;
 use super::{Outcome, stop_requests};
+use blindgrasp_cli::graph_file::{OnMisfit, fitting};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_operator::wiring::Clock;

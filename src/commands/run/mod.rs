@@ -10,10 +10,10 @@ use anyhow::{Context, bail};
 use clap::{Args, ValueEnum};
 
 use self::page::Page;
-use blindgrasp_cli::graph_file::{OnMisfit, fitting, shipped};
 use super::recording_arguments::RecordingArguments;
 use super::view::Rights;
 use super::{Outcome, background, check, secs_in, stop_requests};
+use blindgrasp_cli::graph_file::{OnMisfit, fitting, shipped};
 use blindgrasp_graph::dataflow::{self, Graph, Override, Scope};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_graph::link::{Placement, local_graph};

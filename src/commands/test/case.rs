@@ -9,10 +9,10 @@ use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::json;
 
-use blindgrasp_cli::graph_file::{OnMisfit, fitting};
 use super::scratch::Scratch;
 use super::settings;
 use crate::commands::replay::{Fed, Feed};
+use blindgrasp_cli::graph_file::{OnMisfit, fitting};
 use blindgrasp_graph::dataflow::{self, Graph, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_graph::run::{RunSummary, observed_topics};

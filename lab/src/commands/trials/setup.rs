@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 
-use blindgrasp_cli::graph_file::{OnMisfit, checked, fitting};
 use super::{Arguments, Way, physics};
+use blindgrasp_cli::graph_file::{OnMisfit, checked, fitting};
 use blindgrasp_graph::dataflow::{self, DataflowFile, Graph, Node, Override, Scope};
 use blindgrasp_messages::{LiftOutcome, Recorded};
 use blindgrasp_simulator::trial::{PhysicsEngine, ProbeMove, TrialOptions};
