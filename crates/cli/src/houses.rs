@@ -74,7 +74,7 @@ impl House {
         arguments: impl IntoIterator<Item = S>,
     ) -> anyhow::Result<std::convert::Infallible> {
         let path = self.path()?;
-        let error = Command::new(&path).args(arguments).exec();
+        let error = Command::new(&path).arg0("blindgrasp").args(arguments).exec();
         Err(error).with_context(|| format!("cannot start {}", path.display()))
     }
 }
