@@ -1,3 +1,0 @@
-//! The lab's house: simulated grasps, training and evaluation.
-
-pub mod operators;
