@@ -37,6 +37,7 @@ use crate::beginning::FileNode;
 use crate::connection::{with_connection_params, with_network_params};
 use crate::houses::NETWORK_PROGRAM;
 
+const DRIVERS: [&str; 6] = ["listen", "connect", "serial", "recording", "ros2", "zenoh"];
 const DEFAULT_BAUD: u32 = 115_200;
 /// The parameters that the source has with each driver.
 const COMMON_PARAMS: [&str; 5] = ["driver", "hand", "max_delay_ms", "day", "zero_when_open"];
@@ -80,12 +81,9 @@ pub struct AskedDriver<'a> {
 pub type MakeDriver = fn(&AskedDriver<'_>) -> anyhow::Result<Box<dyn TactileDriver>>;
 
 pub fn describe() -> OperatorDescription {
-    let drivers = ["listen", "connect", "serial", "recording", "ros2", "zenoh"].map(String::from).to_vec();
+    let drivers = DRIVERS.map(String::from).to_vec();
     let millis = |min: f64| ParamKind::Number { above: None, min: Some(min), max: Some(3.6e6), words: vec![] };
     let file = |must_exist| ParamKind::Path { must_exist };
-    let topic = |description: OperatorDescription, name: &str, summary: &str| {
-        description.optional_param(name, ParamKind::String {}, summary)
-    };
     let description = OperatorDescription::new("tactile_source", "Publishes a hand's live tactile frames")
         .uses_network()
         .output("truth", GraspTruth::TYPE_NAME, "How each lift ended whose object the bridge names")
@@ -128,8 +126,8 @@ pub fn describe() -> OperatorDescription {
             "Whether the mean reading of each cell while the hand is open is its zero, for sensors whose readings drift",
         )
         .optional_param("key", ParamKind::String {}, "zenoh: the key expression of the frames, like hand/frames");
-    let description = with_network_params(description);
-    let description = [
+    let mut description = with_network_params(description);
+    for (name, summary) in [
         ("joints_topic", "ros2: sensor_msgs/msg/JointState, /joint_states by default"),
         ("joint_prefix", "ros2: before the hand's names of its joints, like left_"),
         ("cells_topic", "ros2: the readings of all cells, pad after pad in the hand's order"),
@@ -144,9 +142,9 @@ pub fn describe() -> OperatorDescription {
         ),
         ("palm_frame", "ros2: the palm frame in /tf, the hand's palm link by default"),
         ("tf_topic", "ros2: tf2_msgs/msg/TFMessage, /tf by default"),
-    ]
-    .into_iter()
-    .fold(description, |description, (name, summary)| topic(description, name, summary));
+    ] {
+        description = description.optional_param(name, ParamKind::String {}, summary);
+    }
     description
         .optional_param(
             "joint_map",
@@ -534,5 +532,23 @@ impl RefusalLog {
         if self.n_more > 0 && now_nanos >= self.due_nanos {
             print_diagnostic(&format!("refused: {} more", std::mem::take(&mut self.n_more)));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The summaries tell the params of the driver ros2 from others.
+    #[test]
+    fn each_param_is_of_a_driver_or_of_all() {
+        let of_drivers = DRIVERS.map(params_of).concat();
+        for param in describe().params {
+            assert!(COMMON_PARAMS.contains(&param.name.as_str()) || of_drivers.contains(&param.name), "{}", param.name);
+        }
+        assert!(params_of("ros2").contains(&"still_ms".into()) && !params_of("ros2").contains(&"key".into()));
+        let refused = refuse_unused("listen", &Map::from_iter([("keys".into(), "/k".into())]));
+        let message = "param 'keys' is of no use to driver listen, which takes address, idle_limit_ms: leave it out";
+        assert_eq!(refused.expect_err("refused").to_string(), message);
     }
 }
