@@ -129,7 +129,7 @@ mod tests {
     #[test]
     fn the_commands_of_the_docs_are_accepted_and_the_help_lists_all() {
         assert_eq!(mistakes_in_table(&[], &command()), [""; 0]);
-        let (n, mistakes) = mistakes_in_docs(Path::new(env!("CARGO_MANIFEST_DIR")), &Cli::command());
+        let (n, mistakes) = mistakes_in_docs(Path::new(env!("CARGO_MANIFEST_DIR")), &Cli::command(), None);
         assert!(mistakes.is_empty() && n > 60, "{n} commands\n{}", mistakes.join("\n"));
     }
 

@@ -1,12 +1,13 @@
 //! Checks that the tests of each house make of its own command line.
 
+use std::ffi::OsString;
 use std::path::Path;
 
 use clap::Command;
 use clap::error::ErrorKind;
 
 use crate::help::grouped;
-use crate::houses::GROUPS;
+use crate::houses::{GROUPS, House, house_of_command};
 
 /// The words of a command line of a shell, up to a pipe, a comment or another command.
 fn words(line: &str) -> Vec<String> {
@@ -27,12 +28,12 @@ fn words(line: &str) -> Vec<String> {
     words.into_iter().chain(word).collect()
 }
 
-/// The commands of this house in the shell blocks of the pages that its command line does not accept, and how many it was asked:
+/// The commands of this `house`, or of the robot, in the shell blocks of the pages that its command line does not accept, and how many it was asked:
 /// names, options and numbers of arguments; `…` stands for any further options.
 ///
 /// # Panics
 /// A folder of pages is missing.
-pub fn mistakes_in_docs(root: &Path, command: &Command) -> (usize, Vec<String>) {
+pub fn mistakes_in_docs(root: &Path, command: &Command, house: Option<&House>) -> (usize, Vec<String>) {
     let folders = ["", "docs", "hands"].map(|folder| root.join(folder));
     let pages = folders.iter().flat_map(|folder| std::fs::read_dir(folder).expect("a folder").flatten());
     let (mut n, mut mistakes) = (0, Vec::new());
@@ -58,7 +59,8 @@ pub fn mistakes_in_docs(root: &Path, command: &Command) -> (usize, Vec<String>) 
                 if !is_command || !is_complete || words.is_empty() || before.contains('#') {
                     continue;
                 }
-                if !command.get_subcommands().any(|known| known.get_name() == words[0]) {
+                let of: Vec<OsString> = words.iter().map(OsString::from).collect();
+                if house_of_command(&of).map(|house| house.program) != house.map(|house| house.program) {
                     continue;
                 }
                 n += 1;

@@ -30,6 +30,7 @@ mod off;
 mod ply;
 pub mod read;
 mod scene;
+pub mod shape;
 mod stl;
 #[cfg(test)]
 mod tests;
@@ -39,9 +40,10 @@ pub use error::MeshError;
 pub use off::write_off;
 
 use nalgebra::{Isometry3, Point3, Vector3};
+use serde::{Deserialize, Serialize};
 
 /// A triangle mesh, metres. A closed surface's triangles are counter-clockwise seen from outside.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Mesh {
     pub vertices_m: Vec<Point3<f64>>,
     /// Indices of each triangle's corners.

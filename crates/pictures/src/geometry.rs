@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use blindgrasp_mesh::Mesh;
-use blindgrasp_objects::shape::mesh_of_shape;
+use blindgrasp_mesh::shape::mesh_of_shape;
 use blindgrasp_stages::hand::{Hand, Link};
 use nalgebra::{Point3, Vector3};
 

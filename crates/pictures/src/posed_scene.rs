@@ -10,7 +10,7 @@ use super::geometry::link_mesh;
 use super::png_image::{Image, data_uri};
 use super::raster::{Camera, SAMPLES_PER_SIDE, Samples};
 use blindgrasp_mesh::Mesh;
-use blindgrasp_objects::shape::mesh_of_shape;
+use blindgrasp_mesh::shape::mesh_of_shape;
 use blindgrasp_stages::hand::{Hand, JointError};
 
 /// The place of everything at one moment. The post's top is z = 0 of the world.
@@ -118,7 +118,6 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use blindgrasp_objects::PaperShape;
 
     fn scene(hand: &Hand, height_m: f64) -> PosedScene {
         let down = nalgebra::UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
@@ -132,7 +131,7 @@ mod tests {
     #[test]
     fn each_moment_is_a_small_image_of_its_own() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
-        let thing = PaperShape::Mug.object(0.43).expect("an object").to_mesh();
+        let thing = mesh_of_shape(&SharedShape::cylinder(0.04, 0.05));
         let scenes = [0.0, 0.0, 0.15].map(|height_m| scene(&hand, height_m));
         let images = posed_scene_images(&hand, &thing, 0.04, &scenes, [120, 150]).expect("images");
         assert_eq!(images.len(), 3);

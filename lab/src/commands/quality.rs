@@ -15,6 +15,7 @@ use blindgrasp_simulator::wrench_space::{Quality, quality};
 
 /// Print epsilon and volume of grasp cases
 #[derive(Debug, Args)]
+#[command(hide = true)]
 pub(super) struct Arguments {
     /// Grasp cases (JSON, docs/simulator.md), - for stdin.
     file: PathBuf,

@@ -16,6 +16,7 @@ use super::{Outcome, data_on_stdout};
 
 /// Print the URDF that a robot in ROS 2 publishes
 #[derive(Debug, Args)]
+#[command(hide = true)]
 pub(super) struct Arguments {
     /// The topic, like /robot_description.
     topic: String,

@@ -2,15 +2,17 @@
 
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::process::Command;
 
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 
 use super::super::{Outcome, check_output, print_line, write_out};
 use super::GraspArguments;
+use blindgrasp_cli::houses::LAB;
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::decide::decide_alone;
+use blindgrasp_mesh::Mesh;
 use blindgrasp_messages::{Fault, Phase, Prediction};
-use blindgrasp_objects::find_mesh;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{AnimatedGrasp, ObjectSurface, RecordedGrasp, animation_svg, grasp_html, grasp_svg};
 use blindgrasp_recording::{Record, RecordingReader};
@@ -163,6 +165,9 @@ fn surface(grasp: &RecordedGrasp, folder: Option<&Path>) -> anyhow::Result<Objec
         let reason = "The object is not drawn: the recording does not say which it was.";
         return Ok(ObjectSurface::Unknown(reason.into()));
     }
+    if let Err(missing) = LAB.path() {
+        return Ok(ObjectSurface::Unknown(format!("The object '{name}' is not drawn: {missing}.")));
+    }
     Ok(match (find_mesh(name, folder)?, folder) {
         (Some(mesh), _) => ObjectSurface::Known(mesh),
         (None, None) => ObjectSurface::Unknown(format!(
@@ -172,4 +177,22 @@ fn surface(grasp: &RecordedGrasp, folder: Option<&Path>) -> anyhow::Result<Objec
             ObjectSurface::Unknown(format!("The object '{name}' is not drawn: {} does not have it.", folder.display()))
         }
     })
+}
+
+/// The mesh of an object: of the folder's, if one is given, else of the built-in one of that name. The lab has them: `None` without
+/// its program.
+///
+/// # Errors
+/// A folder or a mesh cannot be read.
+pub(super) fn find_mesh(name: &str, folder: Option<&Path>) -> anyhow::Result<Option<Mesh>> {
+    let Ok(program) = LAB.path() else { return Ok(None) };
+    let mut command = Command::new(program);
+    command.args(["mesh", name]);
+    if let Some(folder) = folder {
+        command.arg("--objects").arg(folder);
+    }
+    let output = command.output().with_context(|| format!("cannot start {}", LAB.program))?;
+    let said = String::from_utf8_lossy(&output.stderr);
+    ensure!(output.status.success(), "{}", said.trim().trim_start_matches("blindgrasp: "));
+    serde_json::from_slice(&output.stdout).context("the mesh of an object")
 }

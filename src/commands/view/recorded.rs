@@ -9,7 +9,6 @@ use anyhow::bail;
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::decide::decide_alone;
 use blindgrasp_messages::{Action, ContactSet, GraspTruth, LiftDecision, Phase, Recorded as _, Stamped, TactileFrame};
-use blindgrasp_objects::find_mesh;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, ObjectScene};
 use blindgrasp_recording::{ChosenSamples, Reach, Record};
@@ -20,7 +19,7 @@ use serde_json::{Value, json};
 
 use super::super::{Outcome, print_line, stop_signal};
 use super::GraspArguments;
-use super::grasp::judge_of;
+use super::grasp::{find_mesh, judge_of};
 use super::live::{add_frame, shadow_event};
 
 const POLL: Duration = Duration::from_millis(100);

@@ -5,8 +5,8 @@
 //! use blindgrasp_stages::{ArbiterOptions, Hand, Model};
 //!
 //! let hand = Hand::load("barrett-bh8-280".as_ref())?;
-//! let model = Model::load("../../models/barrett-bh8-280.json".as_ref())?;
-//! let recordings = [std::path::PathBuf::from("../../recordings/held-out.mcap")];
+//! let model = Model::load("../../../models/barrett-bh8-280.json".as_ref())?;
+//! let recordings = [std::path::PathBuf::from("../../../recordings/held-out.mcap")];
 //! let evaluated = evaluate(&hand, &model, &recordings, &ArbiterOptions::default())?;
 //! assert!(evaluated.evaluation.score.accuracy > Some(0.85));
 //! # Ok::<(), Box<dyn std::error::Error>>(())

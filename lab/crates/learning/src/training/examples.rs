@@ -314,7 +314,7 @@ mod tests {
     #[test]
     fn grasps_in_memory_are_the_examples_of_their_recording() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../recordings/held-out.mcap");
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../recordings/held-out.mcap");
         let grasps = read_grasps(&path, &hand, |_, frames| frames).expect("readable");
         let labelled = grasps.into_iter().filter_map(|grasp| Some((grasp.value, grasp.truth?)));
         let of_memory = Examples::of_grasps(&hand, labelled).expect("examples");
@@ -328,7 +328,7 @@ mod tests {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
         let by_wrench_space = Relabelling { by_wrench_space: true, ..Relabelling::default() };
         let read = |name: &str, relabelling: &Relabelling| {
-            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../recordings").join(name);
+            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../recordings").join(name);
             Examples::read(&hand, &[path], relabelling, |_, _| {}).expect("readable")
         };
         let (own, again) = (read("held-out.mcap", &Relabelling::default()), read("held-out.mcap", &by_wrench_space));

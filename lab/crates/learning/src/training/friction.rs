@@ -45,7 +45,7 @@ mod tests {
 
     #[test]
     fn the_recordings_own_friction_gives_its_own_truth_and_more_friction_never_less() {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../recordings/held-out.mcap");
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../recordings/held-out.mcap");
         let judged = stable_by_friction(&path, &[0.3, 1.0, 2.0]).expect("readable");
         let mut n_changed = 0;
         for record in RecordingReader::open(&path).expect("readable") {

@@ -21,7 +21,7 @@ use serde_json::{Value, json};
 
 use super::engine::{AxleCommand, Engine, GRAVITY, HandPlan, Side, StandForce, Touch};
 use super::{LiftTarget, MujocoOptions, PhysicsOptions, TrialError};
-use blindgrasp_objects::shape::mesh_of_shape;
+use blindgrasp_mesh::shape::mesh_of_shape;
 use blindgrasp_stages::hand::JointKind;
 
 const SCRIPT: &str = include_str!("mujoco.py");

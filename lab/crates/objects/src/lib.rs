@@ -22,7 +22,6 @@ pub mod folder;
 mod named;
 mod outline;
 mod paper;
-pub mod shape;
 mod solid;
 
 use nalgebra::Point3;
@@ -30,8 +29,8 @@ use parry3d_f64::math::Vector;
 use parry3d_f64::shape::{Shape, SharedShape};
 use rayon::prelude::*;
 
-use crate::shape::mesh_of_shape;
 use blindgrasp_mesh::mass::{SolidProperties, solid_properties};
+use blindgrasp_mesh::shape::mesh_of_shape;
 use blindgrasp_mesh::{Mesh, MeshError};
 use classes::{CLASSES, Class, Draw, Made};
 

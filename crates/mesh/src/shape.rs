@@ -4,7 +4,7 @@ use nalgebra::Point3;
 use parry3d_f64::math::Vector;
 use parry3d_f64::shape::{SharedShape, TypedShape};
 
-use blindgrasp_mesh::Mesh;
+use crate::Mesh;
 
 /// How many flat pieces go around a round shape.
 const N_AROUND: u32 = 64;
