@@ -73,25 +73,19 @@ impl Session {
     /// # Errors
     /// The graph cannot start, or an operator failed; the summary has been printed then.
     pub fn run(self, graph: &Graph, name: &str, n_stops: &AtomicUsize) -> anyhow::Result<Ended> {
-        let params = graph.nodes.iter().flat_map(|node| node.params.values());
-        let inputs: Vec<PathBuf> = params.filter_map(|param| Some(PathBuf::from(param.as_str()?))).collect();
-        if let Some(path) = &self.record {
-            check_output(path, &inputs)?;
-            self.record_options.check(path)?;
-        }
-        if let Some(path) = &self.report {
-            check_page(path, &inputs)?;
-            check_new(path, &inputs, self.record_options.overwrite)?;
-            if self.record.as_ref() == Some(path) {
-                bail!("{} is given for --record and for --report: choose two files", path.display());
+        self.check_files(graph)?;
+        let metrics = match self.metrics {
+            Some(port) => {
+                let listener = metrics::listen(port);
+                Some(listener.with_context(|| format!("cannot answer on port {port} (--metrics)"))?)
             }
-        }
-        let listen = |port| metrics::listen(port).with_context(|| format!("cannot answer on port {port} (--metrics)"));
+            None => None,
+        };
         let options = RunOptions {
             launch: self.launch,
             clock: self.clock,
             reads_all: self.record.is_some() || self.tap.is_some() || self.report.is_some(),
-            metrics: self.metrics.map(listen).transpose()?,
+            metrics,
             is_quiet: self.is_quiet,
         };
         let run = Run::prepare(graph, name, options)?;
@@ -121,16 +115,10 @@ impl Session {
             recording_error: recorded.error,
             samples_not_recorded: recorded.n_not_recorded,
         };
-        let lines = if self.is_quiet {
-            Vec::new()
-        } else if self.json {
-            vec![json!({ "summary": summary }).to_string()]
-        } else if outcome.is_ok() || summary.run.grasps > 0 {
-            table(&summary.run)
-        } else {
-            Vec::new()
-        };
-        lines.into_iter().for_each(|line| printer.print(&line));
+        let has_table = outcome.is_ok() || summary.run.grasps > 0;
+        for line in summary.lines(self.is_quiet, self.json, has_table) {
+            printer.print(&line);
+        }
         printer.flush(&|| n_stops.load(Ordering::Relaxed) > n_seen);
         if printer.n_dropped() > 0 {
             let n = printer.n_dropped();
@@ -157,6 +145,24 @@ impl Session {
         let is_lossy = summary.run.is_lossy(self.clock) || is_recording_lossy;
         Ok(Ended { summary, is_lossy })
     }
+
+    /// Refuses files to write that would overwrite others.
+    fn check_files(&self, graph: &Graph) -> anyhow::Result<()> {
+        let params = graph.nodes.iter().flat_map(|node| node.params.values());
+        let inputs: Vec<PathBuf> = params.filter_map(|param| Some(PathBuf::from(param.as_str()?))).collect();
+        if let Some(path) = &self.record {
+            check_output(path, &inputs)?;
+            self.record_options.check(path)?;
+        }
+        if let Some(path) = &self.report {
+            check_page(path, &inputs)?;
+            check_new(path, &inputs, self.record_options.overwrite)?;
+            if self.record.as_ref() == Some(path) {
+                bail!("{} is given for --record and for --report: choose two files", path.display());
+            }
+        }
+        Ok(())
+    }
 }
 
 /// The hand of the first node with a pad layout. The operator itself says if it cannot be read.
@@ -166,6 +172,19 @@ fn hand_of(graph: &Graph) -> Option<Hand> {
 }
 
 impl SessionSummary {
+    /// The summary as printed on stdout.
+    fn lines(&self, is_quiet: bool, is_json: bool, has_table: bool) -> Vec<String> {
+        if is_quiet {
+            Vec::new()
+        } else if is_json {
+            vec![json!({ "summary": self }).to_string()]
+        } else if has_table {
+            table(&self.run)
+        } else {
+            Vec::new()
+        }
+    }
+
     fn print_recording(&self) {
         if let Some(samples) = self.recorded_samples.as_ref()
             && !self.recorded_files.is_empty()

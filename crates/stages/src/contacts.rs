@@ -117,9 +117,11 @@ impl ContactFinder {
                 let cell = &pad.cells[cell_idx];
                 let position = palm_from_link * cell.position_in_link_m;
                 let feels = |other| hand.distance_to_link_m(&position, other, palm_from_links) <= SELF_CONTACT_M;
-                let feels_hand =
-                    |&(a, b): &(usize, usize)| (a == pad.link_idx && feels(b)) || (b == pad.link_idx && feels(a));
-                if self.touching.iter().any(feels_hand) {
+                let feels_hand = self
+                    .touching
+                    .iter()
+                    .any(|&(a, b)| (a == pad.link_idx && feels(b)) || (b == pad.link_idx && feels(a)));
+                if feels_hand {
                     n_self_contacts += 1;
                     continue;
                 }
