@@ -74,18 +74,11 @@ impl Session {
     /// The graph cannot start, or an operator failed; the summary has been printed then.
     pub fn run(self, graph: &Graph, name: &str, n_stops: &AtomicUsize) -> anyhow::Result<Ended> {
         self.check_files(graph)?;
-        let metrics = match self.metrics {
-            Some(port) => {
-                let listener = metrics::listen(port);
-                Some(listener.with_context(|| format!("cannot answer on port {port} (--metrics)"))?)
-            }
-            None => None,
-        };
         let options = RunOptions {
             launch: self.launch,
             clock: self.clock,
             reads_all: self.record.is_some() || self.tap.is_some() || self.report.is_some(),
-            metrics,
+            metrics: self.metrics.map(listen).transpose()?,
             is_quiet: self.is_quiet,
         };
         let run = Run::prepare(graph, name, options)?;
@@ -108,20 +101,14 @@ impl Session {
         if outcome.is_err() {
             recorded.remove_if_empty();
         }
-        let summary = SessionSummary {
-            run: summary,
-            recorded_samples: is_recorded.then_some(recorded.samples),
-            recorded_files: recorded.files.iter().map(|file| file.display().to_string()).collect(),
-            recording_error: recorded.error,
-            samples_not_recorded: recorded.n_not_recorded,
-        };
+        let summary = SessionSummary::new(summary, recorded, is_recorded);
         let has_table = outcome.is_ok() || summary.run.grasps > 0;
         for line in summary.lines(self.is_quiet, self.json, has_table) {
             printer.print(&line);
         }
         printer.flush(&|| n_stops.load(Ordering::Relaxed) > n_seen);
-        if printer.n_dropped() > 0 {
-            let n = printer.n_dropped();
+        let n = printer.n_dropped();
+        if n > 0 {
             print_diagnostic(&format!("blindgrasp: {n} lines were not printed: the reader of stdout was too slow"));
         }
         if !self.is_quiet {
@@ -141,8 +128,8 @@ impl Session {
         if let Some(error) = printer.take_failure() {
             return Err(error).context("decisions were made that could not be written to stdout");
         }
-        let is_recording_lossy = summary.recording_error.is_some() || summary.samples_not_recorded > 0;
-        let is_lossy = summary.run.is_lossy(self.clock) || is_recording_lossy;
+        let is_lossy =
+            summary.run.is_lossy(self.clock) || summary.recording_error.is_some() || summary.samples_not_recorded > 0;
         Ok(Ended { summary, is_lossy })
     }
 
@@ -165,6 +152,11 @@ impl Session {
     }
 }
 
+/// Answers Prometheus on a port.
+fn listen(port: u16) -> anyhow::Result<std::net::TcpListener> {
+    metrics::listen(port).with_context(|| format!("cannot answer on port {port} (--metrics)"))
+}
+
 /// The hand of the first node with a pad layout. The operator itself says if it cannot be read.
 fn hand_of(graph: &Graph) -> Option<Hand> {
     let paths = graph.nodes.iter().filter_map(|node| node.params.get("hand")?.as_str());
@@ -172,6 +164,16 @@ fn hand_of(graph: &Graph) -> Option<Hand> {
 }
 
 impl SessionSummary {
+    fn new(run: run::RunSummary, recorded: Recorded, is_recorded: bool) -> SessionSummary {
+        SessionSummary {
+            run,
+            recorded_samples: is_recorded.then_some(recorded.samples),
+            recorded_files: recorded.files.iter().map(|file| file.display().to_string()).collect(),
+            recording_error: recorded.error,
+            samples_not_recorded: recorded.n_not_recorded,
+        }
+    }
+
     /// The summary as printed on stdout.
     fn lines(&self, is_quiet: bool, is_json: bool, has_table: bool) -> Vec<String> {
         if is_quiet {

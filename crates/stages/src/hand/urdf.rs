@@ -172,8 +172,11 @@ fn motions(joints: &[urdf_xml::Joint]) -> Result<BTreeMap<&str, JointMotion>, St
             return Err(format!("two joints are called '{}'", joint.name));
         }
     }
-    let motion = |joint| motion(joint, &by_name).map_err(|what| format!("joint '{}' {what}", joint.name));
-    by_name.iter().map(|(name, joint)| Ok((*name, motion(joint)?))).collect()
+    let mut motions = BTreeMap::new();
+    for (name, joint) in &by_name {
+        motions.insert(*name, motion(joint, &by_name).map_err(|what| format!("joint '{name}' {what}"))?);
+    }
+    Ok(motions)
 }
 
 fn motion(joint: &urdf_xml::Joint, by_name: &BTreeMap<&str, &urdf_xml::Joint>) -> Result<JointMotion, String> {
