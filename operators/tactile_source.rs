@@ -80,10 +80,16 @@ pub struct AskedDriver<'a> {
 /// Makes a driver, which is not open yet, or tells the mistake in the params.
 pub type MakeDriver = fn(&AskedDriver<'_>) -> anyhow::Result<Box<dyn TactileDriver>>;
 
+fn millis(min: f64) -> ParamKind {
+    ParamKind::Number { above: None, min: Some(min), max: Some(3.6e6), words: vec![] }
+}
+
+fn file(must_exist: bool) -> ParamKind {
+    ParamKind::Path { must_exist }
+}
+
 pub fn describe() -> OperatorDescription {
     let drivers = DRIVERS.map(String::from).to_vec();
-    let millis = |min: f64| ParamKind::Number { above: None, min: Some(min), max: Some(3.6e6), words: vec![] };
-    let file = |must_exist| ParamKind::Path { must_exist };
     let description = OperatorDescription::new("tactile_source", "Publishes a hand's live tactile frames")
         .uses_network()
         .output("truth", GraspTruth::TYPE_NAME, "How each lift ended whose object the bridge names")
@@ -126,7 +132,10 @@ pub fn describe() -> OperatorDescription {
             "Whether the mean reading of each cell while the hand is open is its zero, for sensors whose readings drift",
         )
         .optional_param("key", ParamKind::String {}, "zenoh: the key expression of the frames, like hand/frames");
-    let mut description = with_network_params(description);
+    with_ros2_params(with_network_params(description))
+}
+
+fn with_ros2_params(mut description: OperatorDescription) -> OperatorDescription {
     for (name, summary) in [
         ("joints_topic", "ros2: sensor_msgs/msg/JointState, /joint_states by default"),
         ("joint_prefix", "ros2: before the hand's names of its joints, like left_"),

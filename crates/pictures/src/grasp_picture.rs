@@ -121,52 +121,66 @@ fn draw_header(svg: &mut Svg, placed: &Placed<'_>) {
         about.push(format!("friction {}", px(scene.friction)));
     }
     svg.text([MARGIN, 76.0], Anchor::Start, "sub", &fit_text(&about.join("  ·  "), 14.0, 600.0));
-    // From the right: what was decided, what was predicted, what is true.
-    let mut right = WIDTH - MARGIN;
-    let mut chip = |svg: &mut Svg, text: &str, note: &str, fill: &str, class: &str| {
-        let width = text_width(text, 14.5).max(text_width(note, 12.0) - 16.0) + 28.0;
-        let left = right - width;
-        svg.element(
-            "rect",
-            &[("x", &px(left)), ("y", &28), ("width", &px(width)), ("height", &30), ("rx", &15), ("fill", &fill)],
-        );
-        let middle = left + width / 2.0;
-        svg.text([middle, 48.0], Anchor::Middle, &format!("chip {class}"), text);
-        svg.text([middle, 75.0], Anchor::Middle, "note", note);
-        right = left - 14.0;
-    };
+    draw_chips(&mut Chips { svg, right: WIDTH - MARGIN }, placed);
+    svg.element("line", &[("x1", &MARGIN), ("x2", &(WIDTH - MARGIN)), ("y1", &93), ("y2", &93), ("class", &"rule")]);
+}
+
+/// Draws a row of chips from the right: the decision, the prediction, the label.
+fn draw_chips(chips: &mut Chips<'_>, placed: &Placed<'_>) {
+    let grasp = placed.grasp;
     let (green, red, grey) = ("#2b8a3e", "#c92a2a", "#eceff3");
     if let Some(decision) = &grasp.decision {
         let text = format!("{}: {}", decision.action.as_str(), decision.reason.as_str().replace('_', " "));
-        chip(svg, &text, "decided", grey, "");
+        chips.draw(&text, "decided", grey, "");
     }
     if let Some(prediction) = &grasp.prediction {
         let text = match prediction.fault {
             blindgrasp_messages::Fault::None => format!("p(stable) {:.2}", prediction.probability_stable),
             fault => fault.as_str().replace('_', " "),
         };
-        chip(svg, &text, "predicted", grey, "");
+        chips.draw(&text, "predicted", grey, "");
     }
     match &grasp.truth {
         Some(truth) => {
             // NaN where nobody computed them.
             if !truth.epsilon.is_nan() {
-                chip(svg, &number(truth.volume), "volume", grey, "");
+                chips.draw(&number(truth.volume), "volume", grey, "");
                 let note = if truth.epsilon < 0.0 { "epsilon: no force closure" } else { "epsilon" };
-                chip(svg, &format!("ε {}", number(truth.epsilon)), note, grey, "");
+                chips.draw(&format!("ε {}", number(truth.epsilon)), note, grey, "");
             }
             let (text, fill) = if truth.stable { ("stable", green) } else { ("unstable", red) };
-            chip(svg, text, "true label", fill, "light");
+            chips.draw(text, "true label", fill, "light");
         }
         None if grasp.is_hand_alone => {
             let (n_joints, n_pads) = (placed.hand.joints.len(), placed.hand.pads.len());
-            chip(svg, &placed.hand.n_cells().to_string(), "cells", grey, "");
-            chip(svg, &n_pads.to_string(), "pads", grey, "");
-            chip(svg, &n_joints.to_string(), "joints", grey, "");
+            chips.draw(&placed.hand.n_cells().to_string(), "cells", grey, "");
+            chips.draw(&n_pads.to_string(), "pads", grey, "");
+            chips.draw(&n_joints.to_string(), "joints", grey, "");
         }
-        None => chip(svg, "not labelled", "true label", grey, ""),
+        None => chips.draw("not labelled", "true label", grey, ""),
     }
-    svg.element("line", &[("x1", &MARGIN), ("x2", &(WIDTH - MARGIN)), ("y1", &93), ("y2", &93), ("class", &"rule")]);
+}
+
+/// Chips, each with a note below, from the right to the left.
+struct Chips<'a> {
+    svg: &'a mut Svg,
+    /// The right edge of the next one.
+    right: f64,
+}
+
+impl Chips<'_> {
+    fn draw(&mut self, text: &str, note: &str, fill: &str, class: &str) {
+        let width = text_width(text, 14.5).max(text_width(note, 12.0) - 16.0) + 28.0;
+        let left = self.right - width;
+        self.svg.element(
+            "rect",
+            &[("x", &px(left)), ("y", &28), ("width", &px(width)), ("height", &30), ("rx", &15), ("fill", &fill)],
+        );
+        let middle = left + width / 2.0;
+        self.svg.text([middle, 48.0], Anchor::Middle, &format!("chip {class}"), text);
+        self.svg.text([middle, 75.0], Anchor::Middle, "note", note);
+        self.right = left - 14.0;
+    }
 }
 
 /// Three significant digits.
@@ -202,6 +216,12 @@ fn draw_contacts(svg: &mut Svg, placed: &Placed<'_>, top: f64) -> f64 {
         }
         return y + ROW;
     }
+    draw_legend(svg, placed, y, width);
+    draw_table(svg, placed, y + 30.0, width)
+}
+
+/// The kinds of contacts, with their numbers, and the scale of the arrows.
+fn draw_legend(svg: &mut Svg, placed: &Placed<'_>, y: f64, width: f64) {
     let largest = placed.contacts.iter().map(|contact| contact.force_newtons).fold(0.0, f64::max);
     let mut x = MARGIN;
     for (kind, what) in [
@@ -219,7 +239,10 @@ fn draw_contacts(svg: &mut Svg, placed: &Placed<'_>, top: f64) -> f64 {
     }
     let scale = format!("arrow length is force, the longest {} N", number(largest));
     svg.text([MARGIN + width, y + 4.5], Anchor::End, "note", &scale);
-    y += 30.0;
+}
+
+/// The table of contacts; returns where it ends.
+fn draw_table(svg: &mut Svg, placed: &Placed<'_>, y: f64, width: f64) -> f64 {
     let n_columns = placed.contacts.len().div_ceil(N_ROWS).min(3);
     let n_rows = placed.contacts.len().div_ceil(n_columns);
     let column_width = (width - 24.0 * (n_columns as f64 - 1.0)) / n_columns as f64;

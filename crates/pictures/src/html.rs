@@ -116,7 +116,6 @@ fn data<'a>(placed: &'a Placed<'_>, azimuth_rad: f64) -> Result<Data<'a>, Pictur
             })
         })
         .collect::<Result<_, PictureError>>()?;
-    let is_dark = |colour: Rgb| lightness(colour) < super::pads::DARK;
     let mut scale = (0..N_COLOURS).map(|idx| force_colour(idx as f64 / (N_COLOURS - 1) as f64));
     Ok(Data {
         scene: HandScene::new(hand),
@@ -136,7 +135,7 @@ fn data<'a>(placed: &'a Placed<'_>, azimuth_rad: f64) -> Result<Data<'a>, Pictur
         azimuth_rad: rounded(azimuth_rad),
         shown: chosen.iter().position(|idx| *idx == shown).unwrap_or(0),
         scale_newtons: placed.scale_newtons,
-        first_dark_colour: scale.position(is_dark).unwrap_or(N_COLOURS),
+        first_dark_colour: scale.position(|colour: Rgb| lightness(colour) < super::pads::DARK).unwrap_or(N_COLOURS),
     })
 }
 

@@ -156,42 +156,46 @@ pub(super) fn draw_pads(
             _ => sum,
         };
         svg.text_with([left, top + 27.0], Anchor::Start, "note", &sum, &[("data-pad", &pad_idx)]);
-        for (idx, (cell, [cell_x, cell_y, cell_width, cell_height])) in pad.cells.iter().zip(&flat.cells).enumerate() {
-            let cell_idx = pad.first_cell_idx + idx;
-            let scale = panel.pixels_per_m;
-            let corner = [left + cell_x * scale, top + CAPTION_HEIGHT + cell_y * scale];
-            let size = [cell_width * scale, cell_height * scale];
-            let active = placed.active_newtons(cell_idx, cell.noise_threshold_newtons);
-            let fill = active.map_or(SILENT_CELL, |newtons| force_colour(newtons / placed.scale_newtons));
-            svg.element(
-                "rect",
-                &[
-                    ("x", &px(corner[0] + 0.5)),
-                    ("y", &px(corner[1] + 0.5)),
-                    ("width", &px((size[0] - 1.0).max(1.0))),
-                    ("height", &px((size[1] - 1.0).max(1.0))),
-                    ("rx", &1.5),
-                    ("fill", &hex(fill)),
-                    ("class", &"cell"),
-                    ("data-cell", &cell_idx),
-                ],
-            );
-            if size[0] >= 15.0 && size[1] >= 10.5 {
-                let label = match active {
-                    Some(newtons) if !placed.grasp.is_hand_alone => cell_label(newtons),
-                    _ => String::new(),
-                };
-                let class = if lightness(fill) < DARK { "cell-force on-dark" } else { "cell-force" };
-                let at = [corner[0] + size[0] / 2.0, corner[1] + size[1] / 2.0 + 3.2];
-                svg.text_with(at, Anchor::Middle, class, &label, &[("data-force", &cell_idx)]);
-            }
-        }
+        draw_cells(svg, placed, pad, flat, [left, top + CAPTION_HEIGHT], panel.pixels_per_m);
     }
     if placed.grasp.is_hand_alone {
         return Ok(panel.height);
     }
     draw_scale(svg, [x, y + panel.height + 16.0], width.min(230.0), placed.scale_newtons, hand.cell_unit);
     Ok(panel.height + SCALE_HEIGHT)
+}
+
+/// Draws the cells of a pad at `[left, top]`, with their numbers where there is room.
+fn draw_cells(svg: &mut Svg, placed: &Placed<'_>, pad: &Pad, flat: &FlatPad, [left, top]: [f64; 2], pixels_per_m: f64) {
+    for (idx, (cell, [cell_x, cell_y, cell_width, cell_height])) in pad.cells.iter().zip(&flat.cells).enumerate() {
+        let cell_idx = pad.first_cell_idx + idx;
+        let corner = [left + cell_x * pixels_per_m, top + cell_y * pixels_per_m];
+        let size = [cell_width * pixels_per_m, cell_height * pixels_per_m];
+        let active = placed.active_newtons(cell_idx, cell.noise_threshold_newtons);
+        let fill = active.map_or(SILENT_CELL, |newtons| force_colour(newtons / placed.scale_newtons));
+        svg.element(
+            "rect",
+            &[
+                ("x", &px(corner[0] + 0.5)),
+                ("y", &px(corner[1] + 0.5)),
+                ("width", &px((size[0] - 1.0).max(1.0))),
+                ("height", &px((size[1] - 1.0).max(1.0))),
+                ("rx", &1.5),
+                ("fill", &hex(fill)),
+                ("class", &"cell"),
+                ("data-cell", &cell_idx),
+            ],
+        );
+        if size[0] >= 15.0 && size[1] >= 10.5 {
+            let label = match active {
+                Some(newtons) if !placed.grasp.is_hand_alone => cell_label(newtons),
+                _ => String::new(),
+            };
+            let class = if lightness(fill) < DARK { "cell-force on-dark" } else { "cell-force" };
+            let at = [corner[0] + size[0] / 2.0, corner[1] + size[1] / 2.0 + 3.2];
+            svg.text_with(at, Anchor::Middle, class, &label, &[("data-force", &cell_idx)]);
+        }
+    }
 }
 
 /// The sum of a pad's active cells, and how many they are.

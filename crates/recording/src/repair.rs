@@ -91,11 +91,10 @@ pub fn repaired_path(path: &Path) -> PathBuf {
 /// # Errors The recording is no MCAP file, is still being recorded or has no whole sample; there is a repaired
 /// recording already; or the repaired recording cannot be written.
 pub fn repair(path: &Path) -> Result<RepairReport, RecordingError> {
-    let io = |source| RecordingError::Io { path: path.into(), source };
-    let invalid = |message: String| RecordingError::Invalid { path: path.into(), message };
-    let mut file = open_mcap(path)?;
+    let file = open_mcap(path)?;
     if is_being_written(&file) {
-        return Err(invalid("it is still being recorded: it can be repaired when its recorder has ended".into()));
+        let message = "it is still being recorded: it can be repaired when its recorder has ended".into();
+        return Err(RecordingError::Invalid { path: path.into(), message });
     }
     if let Some(report) = report_of_whole(path) {
         return Ok(report);
@@ -105,64 +104,11 @@ pub fn repair(path: &Path) -> Result<RepairReport, RecordingError> {
         let message = "there is a repaired recording of that name: use it, or move it away".into();
         return Err(RecordingError::Invalid { path: output, message });
     }
-    let n_file_bytes = file.metadata().map_err(io)?.len();
-    let summary = raw_summary(&mut file, n_file_bytes).ok();
-    let mut chunk_offsets = Vec::new();
-    let (channels, expected) = match summary {
-        Some(summary) => {
-            chunk_offsets.extend(summary.chunks.iter().map(|index| index.chunk_start_offset));
-            (summary.channels, summary.statistics.map(|statistics| statistics.channel_message_counts))
-        }
-        None => (Channels::default(), None),
-    };
-    let partial = lock_partial(&output)?;
-    let writer = write_options().create(BufWriter::new(partial)).map_err(|error| write_error(&output, error))?;
-    let mut repair = Repair {
-        file,
-        n_file_bytes,
-        is_past_data: false,
-        chunk_offsets,
-        channels,
-        salvage: Salvage { writer, ids: BTreeMap::new(), n_replaced: 0, n_of_chunk: BTreeMap::new(), failed: None },
-        metadata: BTreeMap::new(),
-        growth: Growth::default(),
-        report: RepairReport { input: path.into(), ..RepairReport::default() },
-    };
-    let scanned = repair.scan().map_err(io);
-    let Repair { channels, salvage, mut metadata, mut report, .. } = repair;
-    if let Some(expected) = expected {
-        // The summary is complete, the rest of the indexes may not be.
-        report.n_lost.clear();
-        for known in channels.iter() {
-            let n_expected = expected.get(&known.channel.id).copied().unwrap_or(0);
-            *report.n_lost.entry(known.channel.topic.clone()).or_default() += n_expected;
-        }
-        for (topic, n_lost) in &mut report.n_lost {
-            *n_lost = n_lost.saturating_sub(report.n_recovered.get(topic).copied().unwrap_or(0));
-        }
+    let repaired = Repair::begin(path, file, &output)?.finish(path, &output);
+    if repaired.is_err() {
+        let _ = std::fs::remove_file(partial_path(&output));
     }
-    report.n_lost.retain(|_, n_lost| *n_lost > 0);
-    let info = metadata.remove(METADATA_NAME).and_then(|found| info_from_metadata(found).ok());
-    report.has_info = info.is_some();
-    let completed = scanned.and_then(|()| {
-        if report.n_recovered.is_empty() {
-            let why = channels.other_version().map_or(String::new(), |difference| format!(": {difference}"));
-            return Err(invalid(format!("there is no whole sample in it to recover{why}")));
-        }
-        metadata.insert(METADATA_NAME.into(), info_metadata(&info.unwrap_or_else(unknown_info)));
-        metadata.insert(REPAIR_METADATA_NAME.into(), repair_metadata(path, &report));
-        salvage.complete(&output, metadata)
-    });
-    match completed {
-        Ok(()) => {
-            report.output = Some(output);
-            Ok(report)
-        }
-        Err(error) => {
-            let _ = std::fs::remove_file(partial_path(&output));
-            Err(error)
-        }
-    }
+    repaired
 }
 
 /// A repair in progress.
@@ -173,6 +119,8 @@ struct Repair {
     is_past_data: bool,
     /// The chunks' offsets by the summary; none without a summary.
     chunk_offsets: Vec<u64>,
+    /// The messages of each channel by the summary.
+    expected: Option<BTreeMap<u16, u64>>,
     channels: Channels,
     salvage: Salvage,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
@@ -205,6 +153,67 @@ struct ChunkAt {
 }
 
 impl Repair {
+    fn begin(path: &Path, mut file: File, output: &Path) -> Result<Repair, RecordingError> {
+        let metadata = file.metadata().map_err(|source| RecordingError::Io { path: path.into(), source })?;
+        let n_file_bytes = metadata.len();
+        let mut chunk_offsets = Vec::new();
+        let (mut channels, mut expected) = (Channels::default(), None);
+        if let Ok(summary) = raw_summary(&mut file, n_file_bytes) {
+            chunk_offsets.extend(summary.chunks.iter().map(|index| index.chunk_start_offset));
+            channels = summary.channels;
+            expected = summary.statistics.map(|statistics| statistics.channel_message_counts);
+        }
+        let partial = lock_partial(output)?;
+        let writer = write_options().create(BufWriter::new(partial)).map_err(|error| write_error(output, error))?;
+        Ok(Repair {
+            file,
+            n_file_bytes,
+            is_past_data: false,
+            chunk_offsets,
+            expected,
+            channels,
+            salvage: Salvage { writer, ids: BTreeMap::new(), n_replaced: 0, n_of_chunk: BTreeMap::new(), failed: None },
+            metadata: BTreeMap::new(),
+            growth: Growth::default(),
+            report: RepairReport { input: path.into(), ..RepairReport::default() },
+        })
+    }
+
+    fn finish(mut self, path: &Path, output: &Path) -> Result<RepairReport, RecordingError> {
+        self.scan().map_err(|source| RecordingError::Io { path: path.into(), source })?;
+        self.count_lost();
+        let Repair { channels, salvage, mut metadata, mut report, .. } = self;
+        let info = metadata.remove(METADATA_NAME).and_then(|found| info_from_metadata(found).ok());
+        report.has_info = info.is_some();
+        if report.n_recovered.is_empty() {
+            let why = channels.other_version().map_or(String::new(), |difference| format!(": {difference}"));
+            let message = format!("there is no whole sample in it to recover{why}");
+            return Err(RecordingError::Invalid { path: path.into(), message });
+        }
+        metadata.insert(METADATA_NAME.into(), info_metadata(&info.unwrap_or_else(unknown_info)));
+        metadata.insert(REPAIR_METADATA_NAME.into(), repair_metadata(path, &report));
+        salvage.complete(output, metadata)?;
+        report.output = Some(output.into());
+        Ok(report)
+    }
+
+    /// Counts the lost messages of each topic by the summary, if there is one: it is complete, the rest of the indexes may
+    /// not be.
+    fn count_lost(&mut self) {
+        let report = &mut self.report;
+        if let Some(expected) = &self.expected {
+            report.n_lost.clear();
+            for known in self.channels.iter() {
+                let n_expected = expected.get(&known.channel.id).copied().unwrap_or(0);
+                *report.n_lost.entry(known.channel.topic.clone()).or_default() += n_expected;
+            }
+            for (topic, n_lost) in &mut report.n_lost {
+                *n_lost = n_lost.saturating_sub(report.n_recovered.get(topic).copied().unwrap_or(0));
+            }
+        }
+        report.n_lost.retain(|_, n_lost| *n_lost > 0);
+    }
+
     /// Goes through the file, record by record. Where there is no record, it searches for the next chunk.
     fn scan(&mut self) -> std::io::Result<()> {
         let mut at = mcap::MAGIC.len() as u64;

@@ -48,11 +48,10 @@ impl FileSummary {
 
 /// Opens a file and reads its summary.
 pub(super) fn open(path: &Path) -> Result<(File, FileSummary), RecordingError> {
-    let io = |source| RecordingError::Io { path: path.into(), source };
     let invalid = |message: String| RecordingError::Invalid { path: path.into(), message };
     let damaged = |message: String| RecordingError::Damaged { path: path.into(), message };
     let mut file = open_mcap(path)?;
-    let n_file_bytes = file.metadata().map_err(io)?.len();
+    let n_file_bytes = file.metadata().map_err(|source| RecordingError::Io { path: path.into(), source })?.len();
     let mut raw = raw_summary(&mut file, n_file_bytes).map_err(|error| {
         if is_being_written(&file) {
             invalid("it is still being recorded: it can be read when its recorder has ended".into())

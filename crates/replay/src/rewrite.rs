@@ -8,7 +8,7 @@ use super::played::PLAYED;
 use blindgrasp_graph::dataflow::pins::Pins;
 use blindgrasp_graph::dataflow::{EdgeOptions, Graph, Input, Node, Program, Restart, RestartPolicy};
 use blindgrasp_messages::{GraspTruth, Recorded};
-use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::description::{OperatorDescription, PortDescription};
 use blindgrasp_operator::wiring::EdgePolicy;
 
 /// The program that plays recordings.
@@ -70,63 +70,8 @@ impl Replaced {
     /// There is no such node, or there are several sources; recordings do not hold the node's output; no node lies behind
     /// it, or a node behind it also reads from elsewhere.
     pub fn find(graph: &Graph, named: Option<&str>) -> Result<Replaced, RewriteError> {
-        let refused = |what: String| Err(RewriteError(what));
-        let node = match named {
-            Some(id) => match graph.node(id) {
-                Some(node) => node,
-                None => return refused(format!("there is no node '{id}'; nodes: {}", ids(&graph.nodes))),
-            },
-            None => {
-                let sources: Vec<&Node> = graph.nodes.iter().filter(|node| node.is_source()).collect();
-                match sources.as_slice() {
-                    [only] => *only,
-                    _ => {
-                        return refused(format!(
-                            "graph '{}' has {} sources, {}: choose one with --replace NODE",
-                            graph.name,
-                            sources.len(),
-                            ids(sources)
-                        ));
-                    }
-                }
-            }
-        };
-        let inputs = || {
-            graph
-                .nodes
-                .iter()
-                .flat_map(|node| &node.inputs)
-                .filter(|input| input.from_node == node.id && !input.feedback)
-        };
-        let is_read = |port: &str| inputs().any(|input| input.from_port == port);
-        let playable: Vec<_> = node
-            .outputs()
-            .iter()
-            .filter(|output| is_read(&output.name))
-            .filter_map(|output| {
-                let played = PLAYED.iter().find(|(_, type_name)| *type_name == output.type_name)?;
-                Some((output, played.0))
-            })
-            .collect();
-        let (output, played_port) = match playable.as_slice() {
-            [only] => *only,
-            [] if inputs().next().is_none() => return refused(format!("nothing lies behind node '{}'", node.id)),
-            [] => {
-                return refused(format!(
-                    "a recording cannot replace node '{}': expected an output that is read and of a type among {}",
-                    node.id,
-                    PLAYED.map(|(_, type_name)| type_name).join(", ")
-                ));
-            }
-            several => {
-                let ports: Vec<_> = several.iter().map(|(output, _)| output.name.as_str()).collect();
-                return refused(format!(
-                    "a recording cannot replace node '{}': several of its outputs are read, {}; expected one",
-                    node.id,
-                    ports.join(", ")
-                ));
-            }
-        };
+        let node = replaced_node(graph, named)?;
+        let (output, played_port) = played_output(graph, node)?;
         let replaced = Replaced {
             node: node.id.clone(),
             port: output.name.clone(),
@@ -137,16 +82,16 @@ impl Replaced {
         let running = graph.nodes.iter().filter(|other| other.id != node.id && replaced.running.contains(&other.id));
         for (reader, input) in running.flat_map(|node| node.inputs.iter().map(move |input| (node, input))) {
             if !replaced.running.contains(&input.from_node) {
-                return refused(format!(
+                return Err(RewriteError(format!(
                     "node '{}' also reads {}/{}, which nothing would feed: replace a node before both",
                     reader.id, input.from_node, input.from_port
-                ));
+                )));
             }
             if replaced.played_port_of(input).is_none() {
-                return refused(format!(
+                return Err(RewriteError(format!(
                     "node '{}' reads {}/{}, a {}, which the recording cannot feed beside {}",
                     reader.id, input.from_node, input.from_port, input.type_name, replaced.port
-                ));
+                )));
             }
         }
         Ok(replaced)
@@ -186,6 +131,59 @@ impl Replaced {
             Some(self.played_port)
         } else {
             (input.type_name == GraspTruth::TYPE_NAME).then_some("truth")
+        }
+    }
+}
+
+/// The named node, or the graph's only source.
+fn replaced_node<'a>(graph: &'a Graph, named: Option<&str>) -> Result<&'a Node, RewriteError> {
+    if let Some(id) = named {
+        return match graph.node(id) {
+            Some(node) => Ok(node),
+            None => Err(RewriteError(format!("there is no node '{id}'; nodes: {}", ids(&graph.nodes)))),
+        };
+    }
+    let sources: Vec<&Node> = graph.nodes.iter().filter(|node| node.is_source()).collect();
+    match sources.as_slice() {
+        [only] => Ok(only),
+        _ => Err(RewriteError(format!(
+            "graph '{}' has {} sources, {}: choose one with --replace NODE",
+            graph.name,
+            sources.len(),
+            ids(sources)
+        ))),
+    }
+}
+
+/// The only output of a node that is read and that a recording can play, and the player's port for it.
+fn played_output<'a>(graph: &Graph, node: &'a Node) -> Result<(&'a PortDescription, &'static str), RewriteError> {
+    let inputs = graph.nodes.iter().flat_map(|node| &node.inputs);
+    let read: Vec<_> = inputs.filter(|input| input.from_node == node.id && !input.feedback).collect();
+    if read.is_empty() {
+        return Err(RewriteError(format!("nothing lies behind node '{}'", node.id)));
+    }
+    let mut playable = Vec::new();
+    for output in node.outputs() {
+        if let Some((port, _)) = PLAYED.iter().find(|(_, type_name)| *type_name == output.type_name)
+            && read.iter().any(|input| input.from_port == output.name)
+        {
+            playable.push((output, *port));
+        }
+    }
+    match playable.as_slice() {
+        [only] => Ok(*only),
+        [] => Err(RewriteError(format!(
+            "a recording cannot replace node '{}': expected an output that is read and of a type among {}",
+            node.id,
+            PLAYED.map(|(_, type_name)| type_name).join(", ")
+        ))),
+        several => {
+            let ports: Vec<_> = several.iter().map(|(output, _)| output.name.as_str()).collect();
+            Err(RewriteError(format!(
+                "a recording cannot replace node '{}': several of its outputs are read, {}; expected one",
+                node.id,
+                ports.join(", ")
+            )))
         }
     }
 }

@@ -73,20 +73,7 @@ impl Session {
     /// # Errors
     /// The graph cannot start, or an operator failed; the summary has been printed then.
     pub fn run(self, graph: &Graph, name: &str, n_stops: &AtomicUsize) -> anyhow::Result<Ended> {
-        let params = graph.nodes.iter().flat_map(|node| node.params.values());
-        let inputs: Vec<PathBuf> = params.filter_map(|param| Some(PathBuf::from(param.as_str()?))).collect();
-        if let Some(path) = &self.record {
-            check_output(path, &inputs)?;
-            self.record_options.check(path)?;
-        }
-        if let Some(path) = &self.report {
-            check_page(path, &inputs)?;
-            check_new(path, &inputs, self.record_options.overwrite)?;
-            if self.record.as_ref() == Some(path) {
-                bail!("{} is given for --record and for --report: choose two files", path.display());
-            }
-        }
-        let listen = |port| metrics::listen(port).with_context(|| format!("cannot answer on port {port} (--metrics)"));
+        self.check_files(graph)?;
         let options = RunOptions {
             launch: self.launch,
             clock: self.clock,
@@ -114,26 +101,14 @@ impl Session {
         if outcome.is_err() {
             recorded.remove_if_empty();
         }
-        let summary = SessionSummary {
-            run: summary,
-            recorded_samples: is_recorded.then_some(recorded.samples),
-            recorded_files: recorded.files.iter().map(|file| file.display().to_string()).collect(),
-            recording_error: recorded.error,
-            samples_not_recorded: recorded.n_not_recorded,
-        };
-        let lines = if self.is_quiet {
-            Vec::new()
-        } else if self.json {
-            vec![json!({ "summary": summary }).to_string()]
-        } else if outcome.is_ok() || summary.run.grasps > 0 {
-            table(&summary.run)
-        } else {
-            Vec::new()
-        };
-        lines.into_iter().for_each(|line| printer.print(&line));
+        let summary = SessionSummary::new(summary, recorded, is_recorded);
+        let has_table = outcome.is_ok() || summary.run.grasps > 0;
+        for line in summary.lines(self.is_quiet, self.json, has_table) {
+            printer.print(&line);
+        }
         printer.flush(&|| n_stops.load(Ordering::Relaxed) > n_seen);
-        if printer.n_dropped() > 0 {
-            let n = printer.n_dropped();
+        let n = printer.n_dropped();
+        if n > 0 {
             print_diagnostic(&format!("blindgrasp: {n} lines were not printed: the reader of stdout was too slow"));
         }
         if !self.is_quiet {
@@ -153,10 +128,33 @@ impl Session {
         if let Some(error) = printer.take_failure() {
             return Err(error).context("decisions were made that could not be written to stdout");
         }
-        let is_recording_lossy = summary.recording_error.is_some() || summary.samples_not_recorded > 0;
-        let is_lossy = summary.run.is_lossy(self.clock) || is_recording_lossy;
+        let is_lossy =
+            summary.run.is_lossy(self.clock) || summary.recording_error.is_some() || summary.samples_not_recorded > 0;
         Ok(Ended { summary, is_lossy })
     }
+
+    /// Refuses files to write that would overwrite others.
+    fn check_files(&self, graph: &Graph) -> anyhow::Result<()> {
+        let params = graph.nodes.iter().flat_map(|node| node.params.values());
+        let inputs: Vec<PathBuf> = params.filter_map(|param| Some(PathBuf::from(param.as_str()?))).collect();
+        if let Some(path) = &self.record {
+            check_output(path, &inputs)?;
+            self.record_options.check(path)?;
+        }
+        if let Some(path) = &self.report {
+            check_page(path, &inputs)?;
+            check_new(path, &inputs, self.record_options.overwrite)?;
+            if self.record.as_ref() == Some(path) {
+                bail!("{} is given for --record and for --report: choose two files", path.display());
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Answers Prometheus on a port.
+fn listen(port: u16) -> anyhow::Result<std::net::TcpListener> {
+    metrics::listen(port).with_context(|| format!("cannot answer on port {port} (--metrics)"))
 }
 
 /// The hand of the first node with a pad layout. The operator itself says if it cannot be read.
@@ -166,6 +164,29 @@ fn hand_of(graph: &Graph) -> Option<Hand> {
 }
 
 impl SessionSummary {
+    fn new(run: run::RunSummary, recorded: Recorded, is_recorded: bool) -> SessionSummary {
+        SessionSummary {
+            run,
+            recorded_samples: is_recorded.then_some(recorded.samples),
+            recorded_files: recorded.files.iter().map(|file| file.display().to_string()).collect(),
+            recording_error: recorded.error,
+            samples_not_recorded: recorded.n_not_recorded,
+        }
+    }
+
+    /// The summary as printed on stdout.
+    fn lines(&self, is_quiet: bool, is_json: bool, has_table: bool) -> Vec<String> {
+        if is_quiet {
+            Vec::new()
+        } else if is_json {
+            vec![json!({ "summary": self }).to_string()]
+        } else if has_table {
+            table(&self.run)
+        } else {
+            Vec::new()
+        }
+    }
+
     fn print_recording(&self) {
         if let Some(samples) = self.recorded_samples.as_ref()
             && !self.recorded_files.is_empty()

@@ -5,9 +5,9 @@
 //! cells. So a pad on a link that touches another one counts only if other pads show that an object is there: see
 //! [`contacts_from_frame`]. Pads' normals are not corrected.
 
-use nalgebra::{Isometry3, Vector3};
+use nalgebra::{Isometry3, Point3, Vector3};
 
-use crate::hand::{Hand, Joint, PosedShapes};
+use crate::hand::{Hand, PosedShapes};
 use blindgrasp_messages::{Contact, Fault, MAX_PADS};
 
 /// How far beyond its limits a joint may read: an encoder's offset. It counts as at the limit then.
@@ -98,9 +98,8 @@ impl ContactFinder {
         self.joints.clear();
         self.joints.extend_from_slice(joints);
         clip_to_limits(hand, &mut self.joints);
-        let in_range = |(value, joint): (&f64, &Joint)| joint.allows(*value, 0.0);
         if !are_forces(cells_newtons)
-            || !self.joints.iter().zip(&hand.joints).all(in_range)
+            || !self.joints.iter().zip(&hand.joints).all(|(value, joint)| joint.allows(*value, 0.0))
             || hand.write_palm_from_links(&self.joints, &mut self.palm_from_links).is_err()
         {
             return faulty(Fault::InvalidValue);
@@ -116,10 +115,7 @@ impl ContactFinder {
             for cell_idx in active_idxs(&cells_newtons[cells.clone()], &thresholds_newtons[cells.clone()]) {
                 let cell = &pad.cells[cell_idx];
                 let position = palm_from_link * cell.position_in_link_m;
-                let feels = |other| hand.distance_to_link_m(&position, other, palm_from_links) <= SELF_CONTACT_M;
-                let feels_hand =
-                    |&(a, b): &(usize, usize)| (a == pad.link_idx && feels(b)) || (b == pad.link_idx && feels(a));
-                if self.touching.iter().any(feels_hand) {
+                if self.feels_hand(hand, pad.link_idx, &position) {
                     n_self_contacts += 1;
                     continue;
                 }
@@ -140,6 +136,19 @@ impl ContactFinder {
         let fault = if contacts.is_empty() { Fault::NoContact } else { Fault::None };
         ContactSummary { n_pads_in_contact, self_collision: !self.touching.is_empty(), n_self_contacts, fault }
     }
+
+    /// Whether a point of a link, in the palm frame, is near to a link that touches that link.
+    fn feels_hand(&self, hand: &Hand, link_idx: usize, position: &Point3<f64>) -> bool {
+        for &(a, b) in &self.touching {
+            for (own, other) in [(a, b), (b, a)] {
+                if own == link_idx && hand.distance_to_link_m(position, other, &self.palm_from_links) <= SELF_CONTACT_M
+                {
+                    return true;
+                }
+            }
+        }
+        false
+    }
 }
 
 /// For each pad, whether its contacts are with the object: those of links that touch no other link, and those that are
@@ -153,19 +162,26 @@ fn pads_on_the_object(hand: &Hand, touching: &[(usize, usize)], contacts: &[Cont
     }
     // Each round finds a pad, or is the last one.
     loop {
-        let opposed = |of_pad: &&[Contact]| {
+        let mut found = None;
+        for of_pad in contacts.chunk_by(|a, b| a.pad == b.pad) {
             let pad_idx = of_pad[0].pad as usize;
+            if is_object[pad_idx] {
+                continue;
+            }
             let link_idx = hand.pads[pad_idx].link_idx;
             let sum: Vector3<f64> = of_pad.iter().map(|contact| Vector3::from(contact.normal)).sum();
-            let opposes = |other: &Contact| {
+            let is_opposed = contacts.iter().any(|other| {
                 is_object[other.pad as usize]
                     && !touch(link_idx, hand.pads[other.pad as usize].link_idx)
                     && sum.dot(&Vector3::from(other.normal)) < 0.0
-            };
-            !is_object[pad_idx] && contacts.iter().any(opposes)
-        };
-        let Some(found) = contacts.chunk_by(|a, b| a.pad == b.pad).find(opposed) else { return is_object };
-        is_object[found[0].pad as usize] = true;
+            });
+            if is_opposed {
+                found = Some(pad_idx);
+                break;
+            }
+        }
+        let Some(pad_idx) = found else { return is_object };
+        is_object[pad_idx] = true;
     }
 }
 

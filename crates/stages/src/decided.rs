@@ -26,10 +26,9 @@ impl Decided {
 
     /// Adds a grasp, and forgets the oldest ones beyond `n_remembered`.
     pub(crate) fn push(&mut self, (epoch, grasp_id): (u64, u64), n_remembered: usize) {
-        let is_next = |run: &&mut Run| run.epoch == epoch && run.first.checked_add(run.n) == Some(grasp_id);
-        match self.runs.back_mut().filter(is_next) {
-            Some(run) => run.n += 1,
-            None => self.runs.push_back(Run { epoch, first: grasp_id, n: 1 }),
+        match self.runs.back_mut() {
+            Some(run) if run.epoch == epoch && run.first.checked_add(run.n) == Some(grasp_id) => run.n += 1,
+            _ => self.runs.push_back(Run { epoch, first: grasp_id, n: 1 }),
         }
         let mut n_to_forget = self.runs.iter().map(|run| run.n).sum::<u64>().saturating_sub(n_remembered as u64);
         while let Some(oldest) = self.runs.front_mut()

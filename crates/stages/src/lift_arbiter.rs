@@ -9,8 +9,8 @@
 //!   a settled prediction is faulty; at the first settled prediction, when an earlier one of the grasp raised a doubt; and at
 //!   the grasp's end, when it is not decided by then.
 //!
-//! A wrong "stable" drops the object. So there is one path to LIFT, an `Ok(Vote::Stable)` of `OpenGrasp::assess`, and every
-//! other path ends in HOLD with its reason. With the option `probe`, settled predictions that are not unstable ask for a
+//! A wrong "stable" drops the object. So there is one path to LIFT, the `Vote::Stable` of `OpenGrasp::vote`, and every other
+//! path ends in HOLD with its reason. With the option `probe`, settled predictions that are not unstable ask for a
 //! probe, which decides nothing: the grasp stays open, and only the frames after the probe can lead to a LIFT. Before a
 //! test lift, the frames of the tight hand may end the grasp with HOLD. If the
 //! outcomes of lifts refute [`ArbiterOptions::promised_drops`], every later grasp is held.
@@ -145,21 +145,66 @@ struct OpenGrasp {
 }
 
 impl OpenGrasp {
-    /// The vote of a settled prediction, or the reason why the grasp cannot be lifted any more.
-    fn assess(
-        &self,
-        prediction: &Prediction,
-        is_before_test_lift: bool,
-        options: &ArbiterOptions,
-    ) -> Result<Vote, Reason> {
-        match self.doubt {
-            Some(reason) => Err(reason),
-            None => {
-                let decides = !is_before_test_lift && self.asks_for(options).is_none();
-                let is_promising = prediction.stable || prediction.unsure;
-                Ok(if is_promising && !decides { Vote::Promising } else { Vote::of(prediction, options) })
+    /// What a frame of this phase means to the grasp.
+    fn meaning_of(&mut self, phase: Phase) -> PhaseMeaning {
+        // The frames of the other phases show that the source has heard of the probe, or needs another one.
+        self.is_probe_pending &= matches!(phase, Phase::Settled | Phase::Ended);
+        self.is_before_test_lift = self.awaited == Phase::TestLifted
+            && (phase == Phase::Squeezed || phase == Phase::Ended && self.is_before_test_lift);
+        match phase {
+            _ if phase == self.awaited => PhaseMeaning::Vote,
+            Phase::Squeezed if self.is_before_test_lift => PhaseMeaning::Vote,
+            Phase::Ended if self.is_probe_pending => PhaseMeaning::Nothing,
+            Phase::Ended if self.is_before_test_lift => PhaseMeaning::Wait,
+            Phase::Ended | Phase::Lifting | Phase::Kept | Phase::Dropped => PhaseMeaning::End,
+            Phase::Open | Phase::Closing => PhaseMeaning::OtherGrip,
+            Phase::Settled | Phase::Squeezing | Phase::Squeezed | Phase::TestLifting | Phase::TestLifted => {
+                PhaseMeaning::Motion
             }
         }
+    }
+
+    /// Takes a frame that votes, and returns the decision that follows from it, or the probe that it asks for.
+    fn vote(
+        &mut self,
+        header: &Header,
+        prediction: &Prediction,
+        is_new_reading: bool,
+        options: &ArbiterOptions,
+    ) -> Option<LiftDecision> {
+        self.n_settled += 1;
+        if let Some(doubt) = self.doubt {
+            return Some(self.says(Action::Hold, doubt, 0.0));
+        }
+        // With a probe, the frames before it, and those of a tight hand before a test lift, cannot decide for LIFT.
+        let is_before_probe = self.is_before_test_lift || self.asks_for(options).is_some();
+        let is_promising = is_before_probe && (prediction.stable || prediction.unsure);
+        let vote = if is_promising { Vote::Promising } else { Vote::of(prediction, options) };
+        if !is_new_reading {
+            // It has no vote, but if it contradicts the votes, they don't count either.
+            if self.agreeing.is_some_and(|(said, ..)| said != vote) || self.made_by != header.made_by {
+                self.agreeing = None;
+            }
+            return None;
+        }
+        let (n_agreeing, lowest) = self.count(vote, prediction.probability_stable, header.made_by);
+        if n_agreeing < options.votes.max(1) {
+            return None;
+        }
+        match vote {
+            Vote::Stable => Some(self.says(Action::Lift, Reason::Stable, lowest)),
+            Vote::Unsure => Some(self.says(Action::Hold, Reason::Unsure, lowest)),
+            Vote::Unstable => Some(self.says(Action::Hold, Reason::Unstable, lowest)),
+            Vote::Promising => {
+                let (action, awaited) = self.asks_for(options)?;
+                (self.awaited, self.agreeing, self.is_probe_pending) = (awaited, None, true);
+                Some(self.says(action, Reason::Promising, lowest))
+            }
+        }
+    }
+
+    fn says(&self, action: Action, reason: Reason, probability_stable: f64) -> LiftDecision {
+        LiftDecision { grasp_id: self.grasp_id, action, reason, probability_stable }
     }
 
     /// The probe that a promising grasp is asked for, if it has not been.
@@ -185,6 +230,31 @@ impl OpenGrasp {
     }
 }
 
+/// What a prediction means to the open grasp, by its phase.
+enum PhaseMeaning {
+    /// The hand is at rest in the phase that is awaited, or tight before a test lift: the prediction votes.
+    Vote,
+    /// The source did not know yet that a probe was asked for.
+    Nothing,
+    /// The source waits for an answer before the test lift. Other sources go on by themselves.
+    Wait,
+    /// The source has no more frames of the grasp, or the robot lifts, or has lifted, although it was not decided.
+    End,
+    /// The hand has moved again, so the votes until now were about another grip, and a probe as well.
+    OtherGrip,
+    /// The hand or the arm moves on: votes after it are not consecutive with those before it.
+    Motion,
+}
+
+/// How a prediction comes after the one before it.
+struct Arrival {
+    break_in_order: Option<Reason>,
+    /// The reason why its numbers have no use: invalid or stale.
+    unusable: Option<Reason>,
+    /// Frames of one time are one reading: only the first of them votes.
+    is_new_reading: bool,
+}
+
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 enum Vote {
     Stable,
@@ -201,15 +271,6 @@ impl Vote {
             (false, false) => Vote::Unstable,
             // This includes a prediction that is stable to the model, but too improbable for the arbiter.
             _ => Vote::Unsure,
-        }
-    }
-
-    fn reason(self) -> Reason {
-        match self {
-            Vote::Stable => Reason::Stable,
-            Vote::Unsure => Reason::Unsure,
-            Vote::Unstable => Reason::Unstable,
-            Vote::Promising => Reason::Promising,
         }
     }
 }
@@ -262,105 +323,43 @@ impl LiftArbiter {
         decisions: &mut Vec<LiftDecision>,
     ) {
         let options = self.options;
-        let break_in_order = self.break_in_order(header, prediction.grasp_id);
-        let last = self.state.last.replace(*header);
-        // A source that was started again may go on with a grasp that is decided, unless it begins with its first sample.
-        if let Some(last) = last.filter(|last| last.epoch != header.epoch && header.seq != 0)
-            && self.state.decided.contains((last.epoch, prediction.grasp_id))
+        let arrival = self.arrive(header, prediction, age_nanos);
+        self.observe_outcome(header, prediction, arrival.break_in_order);
+        if let Some(watch) = &mut self.state.watch
+            && (arrival.is_new_reading || prediction.phase == Phase::Ended)
         {
-            self.state.decided.push((header.epoch, prediction.grasp_id), options.n_remembered);
-        }
-        let is_of_a_lift = matches!(prediction.phase, Phase::Kept | Phase::Dropped)
-            && break_in_order != Some(Reason::WrongHand)
-            && self.state.decided.contains((header.epoch, prediction.grasp_id));
-        if is_of_a_lift && self.state.lifted.take_if(|lifted| *lifted == prediction.grasp_id).is_some() {
-            if prediction.fault == Fault::Changed {
-                self.state.promise.begin_anew();
-            }
-            self.state.promise.observe(prediction.phase == Phase::Dropped, options.promised_drops);
-        }
-        // The samples of a grasp are not mixed with those of the next one, so the doubtful samples were not of that one.
-        let is_known = |open: &OpenGrasp| open.grasp_id == prediction.grasp_id;
-        if break_in_order.is_none()
-            && (self.state.decided.contains((header.epoch, prediction.grasp_id))
-                || self.state.open.as_ref().is_some_and(is_known))
-        {
-            self.state.pending_doubt = None;
-        }
-        // Frames of one time are one reading: only the first of them votes.
-        let is_new_reading =
-            last.is_none_or(|last| last.epoch != header.epoch || last.stamp_nanos != header.stamp_nanos);
-        let numbers = [prediction.probability_stable, prediction.decision_value];
-        let is_valid = numbers.iter().all(|number| number.is_finite())
-            && (0.0..=1.0).contains(&prediction.probability_stable)
-            && !(prediction.stable && prediction.unsure);
-        if let Some(watch) = &mut self.state.watch {
-            let is_trusted = break_in_order.is_none() && is_valid && age_nanos <= options.max_age_nanos;
-            if is_new_reading || prediction.phase == Phase::Ended {
-                decisions.extend(watch.on_prediction(header, prediction, is_trusted, options.votes.max(1)));
-            }
+            let is_trusted = arrival.break_in_order.is_none() && arrival.unusable.is_none();
+            decisions.extend(watch.on_prediction(header, prediction, is_trusted, options.votes.max(1)));
         }
         let Some(open) = self.open((header.epoch, prediction.grasp_id), decisions) else {
             return;
         };
-        let votes = prediction.phase == open.awaited;
-        let has_begun = Phase::Settled.is_before(prediction.phase) && !prediction.phase.is_over();
-        open.is_probe_pending &= !has_begun;
-        let is_before_test_lift = open.awaited == Phase::TestLifted
-            && (prediction.phase == Phase::Squeezed || prediction.phase == Phase::Ended && open.is_before_test_lift);
-        open.is_before_test_lift = is_before_test_lift;
-        let votes = votes || is_before_test_lift && prediction.phase == Phase::Squeezed;
-        let invalid = (!is_valid).then_some(Reason::Invalid);
-        let stale = (age_nanos > options.max_age_nanos).then_some(Reason::Stale);
-        let faulty = reason_of(prediction.fault, votes);
-        open.doubt = open.doubt.or(break_in_order).or(faulty).or(invalid).or(stale);
-        match prediction.phase {
-            _ if votes => {
-                open.n_settled += 1;
-                match open.assess(prediction, is_before_test_lift, &options) {
-                    Err(reason) => decisions.extend(self.decide(Action::Hold, reason, 0.0)),
-                    // It has no vote, but if it contradicts the votes, they don't count either.
-                    Ok(vote) if !is_new_reading => {
-                        let is_by_same = open.made_by == header.made_by;
-                        open.agreeing = open.agreeing.filter(|(said, ..)| *said == vote && is_by_same);
-                    }
-                    Ok(vote) => {
-                        let (n_agreeing, lowest) = open.count(vote, prediction.probability_stable, header.made_by);
-                        if n_agreeing >= options.votes.max(1) {
-                            let reason = vote.reason();
-                            if vote == Vote::Promising {
-                                if let Some((action, awaited)) = open.asks_for(&options) {
-                                    (open.awaited, open.agreeing, open.is_probe_pending) = (awaited, None, true);
-                                    let (grasp_id, probability_stable) = (open.grasp_id, lowest);
-                                    decisions.push(LiftDecision { grasp_id, action, reason, probability_stable });
-                                }
-                                return;
-                            }
-                            let action = if vote == Vote::Stable { Action::Lift } else { Action::Hold };
-                            decisions.extend(self.decide(action, reason, lowest));
-                        }
-                    }
-                }
-            }
-            // The source did not know yet that a probe was asked for.
-            Phase::Ended if open.is_probe_pending => {}
-            // A source that waits for an answer before the test lift is told to go on; others do.
-            Phase::Ended if is_before_test_lift && open.doubt.is_none() => {
-                let (grasp_id, action, reason) = (open.grasp_id, Action::TestLift, Reason::Promising);
+        let meaning = open.meaning_of(prediction.phase);
+        let faulty = reason_of(prediction.fault, matches!(meaning, PhaseMeaning::Vote));
+        open.doubt = open.doubt.or(arrival.break_in_order).or(faulty).or(arrival.unusable);
+        let decision = match meaning {
+            PhaseMeaning::Vote => open.vote(header, prediction, arrival.is_new_reading, &options),
+            PhaseMeaning::Nothing => None,
+            PhaseMeaning::Wait if open.doubt.is_none() => {
                 (open.is_before_test_lift, open.is_probe_pending) = (false, true);
                 let probability_stable = open.agreeing.map_or(0.0, |(.., lowest)| lowest);
-                decisions.push(LiftDecision { grasp_id, action, reason, probability_stable });
+                Some(open.says(Action::TestLift, Reason::Promising, probability_stable))
             }
-            // The robot lifts, or has lifted, although the grasp was not decided.
-            Phase::Ended | Phase::Lifting | Phase::Kept | Phase::Dropped => {
-                let reason = open.reason_at_end();
-                decisions.extend(self.decide(Action::Hold, reason, 0.0));
+            PhaseMeaning::Wait | PhaseMeaning::End => Some(open.says(Action::Hold, open.reason_at_end(), 0.0)),
+            PhaseMeaning::OtherGrip => {
+                (open.agreeing, open.awaited) = (None, Phase::Settled);
+                None
             }
-            // The hand has moved again, so the votes until now were about another grip, and a probe as well.
-            Phase::Open | Phase::Closing => {
-                (open.agreeing, open.awaited, open.is_probe_pending) = (None, Phase::Settled, false);
+            PhaseMeaning::Motion => {
+                open.agreeing = None;
+                None
             }
-            _ => open.agreeing = None,
+        };
+        if let Some(decision) = decision {
+            if decision.action.decides() {
+                self.close(&decision);
+            }
+            decisions.push(decision);
         }
     }
 
@@ -373,31 +372,78 @@ impl LiftArbiter {
             watch.forget_votes();
         }
         if self.open((header.epoch, grasp_id), decisions).is_some() {
-            decisions.extend(self.decide(Action::Hold, Reason::Invalid, 0.0));
+            decisions.extend(self.hold(Reason::Invalid));
         }
         self.state.pending_doubt = self.state.pending_doubt.or(break_in_order).or(Some(Reason::Invalid));
     }
 
     /// Holds the open grasp, if any, because no prediction has come for longer than a prediction may be old.
     pub fn on_silence(&mut self) -> Option<LiftDecision> {
-        self.state.open.as_ref()?;
-        self.decide(Action::Hold, Reason::Stale, 0.0)
+        self.hold(Reason::Stale)
     }
 
     /// Holds the open grasp, if any, because the link to the machine that predicts is down.
     pub fn on_cut_off(&mut self) -> Option<LiftDecision> {
-        self.decide(Action::Hold, Reason::LinkDown, 0.0)
+        self.hold(Reason::LinkDown)
     }
 
     /// Holds the open grasp, if any, because the next grasp began or the stream ended before its source ended it.
     pub fn on_end(&mut self) -> Option<LiftDecision> {
         let reason = self.state.open.as_ref()?.reason_at_end();
-        self.decide(Action::Hold, reason, 0.0)
+        self.hold(reason)
     }
 
     /// Whether a grasp has begun and is not decided.
     pub fn has_open_grasp(&self) -> bool {
         self.state.open.is_some()
+    }
+
+    /// Takes the place of a prediction in the stream: whether it is in order, valid and fresh.
+    fn arrive(&mut self, header: &Header, prediction: &Prediction, age_nanos: u64) -> Arrival {
+        let grasp_id = prediction.grasp_id;
+        let break_in_order = self.break_in_order(header, grasp_id);
+        let state = &mut self.state;
+        let mut is_new_reading = true;
+        if let Some(last) = state.last.replace(*header) {
+            is_new_reading = (last.epoch, last.stamp_nanos) != (header.epoch, header.stamp_nanos);
+            // A source that was started again may go on with a grasp that is decided, unless it begins with its first sample.
+            let goes_on = last.epoch != header.epoch && header.seq != 0;
+            if goes_on && state.decided.contains((last.epoch, grasp_id)) {
+                state.decided.push((header.epoch, grasp_id), self.options.n_remembered);
+            }
+        }
+        // The samples of a grasp are not mixed with those of the next one, so the doubtful samples were not of that one.
+        let is_open = state.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
+        if break_in_order.is_none() && (is_open || state.decided.contains((header.epoch, grasp_id))) {
+            state.pending_doubt = None;
+        }
+        // A probability that is NaN is not in the range.
+        let is_valid = prediction.decision_value.is_finite()
+            && (0.0..=1.0).contains(&prediction.probability_stable)
+            && !(prediction.stable && prediction.unsure);
+        let unusable = if !is_valid {
+            Some(Reason::Invalid)
+        } else if age_nanos > self.options.max_age_nanos {
+            Some(Reason::Stale)
+        } else {
+            None
+        };
+        Arrival { break_in_order, unusable, is_new_reading }
+    }
+
+    /// Counts the outcome of the last lift, once.
+    fn observe_outcome(&mut self, header: &Header, prediction: &Prediction, break_in_order: Option<Reason>) {
+        let is_outcome = matches!(prediction.phase, Phase::Kept | Phase::Dropped);
+        let is_of_lift = self.state.lifted == Some(prediction.grasp_id)
+            && self.state.decided.contains((header.epoch, prediction.grasp_id));
+        if !is_outcome || !is_of_lift || break_in_order == Some(Reason::WrongHand) {
+            return;
+        }
+        self.state.lifted = None;
+        if prediction.fault == Fault::Changed {
+            self.state.promise.begin_anew();
+        }
+        self.state.promise.observe(prediction.phase == Phase::Dropped, self.options.promised_drops);
     }
 
     /// The grasp of that number, opened if it is new, after the one before it has been ended; `None` if it is decided.
@@ -415,36 +461,40 @@ impl LiftArbiter {
             decisions.extend(self.on_end());
         }
         let ArbiterState { open, pending_doubt, promise, .. } = &mut self.state;
-        let open = open.get_or_insert_with(|| {
-            let doubt = pending_doubt.take().or(promise.is_withdrawn().then_some(Reason::PromiseWithdrawn));
-            OpenGrasp {
-                epoch,
-                grasp_id,
-                doubt,
-                n_settled: 0,
-                awaited: Phase::Settled,
-                is_probe_pending: false,
-                is_before_test_lift: false,
-                made_by: 0,
-                agreeing: None,
-            }
+        let open = open.get_or_insert_with(|| OpenGrasp {
+            epoch,
+            grasp_id,
+            doubt: pending_doubt.take().or(promise.is_withdrawn().then_some(Reason::PromiseWithdrawn)),
+            n_settled: 0,
+            awaited: Phase::Settled,
+            is_probe_pending: false,
+            is_before_test_lift: false,
+            made_by: 0,
+            agreeing: None,
         });
         // A source that was started again may go on with the grasp.
         open.epoch = epoch;
         Some(open)
     }
 
-    fn decide(&mut self, action: Action, reason: Reason, probability_stable: f64) -> Option<LiftDecision> {
-        let OpenGrasp { epoch, grasp_id, .. } = self.state.open.take()?;
+    /// Holds the open grasp, if any.
+    fn hold(&mut self, reason: Reason) -> Option<LiftDecision> {
+        let decision = self.state.open.as_ref()?.says(Action::Hold, reason, 0.0);
+        self.close(&decision);
+        Some(decision)
+    }
+
+    /// Remembers that the open grasp is decided, and begins to watch it if it is lifted.
+    fn close(&mut self, decision: &LiftDecision) {
+        let Some(OpenGrasp { epoch, grasp_id, .. }) = self.state.open.take() else { return };
         self.state.decided.push((epoch, grasp_id), self.options.n_remembered);
-        if action == Action::Lift {
+        if decision.action == Action::Lift {
             let before = self.state.lifted.replace(grasp_id);
-            let watch = self.state.watch.replace(LiftWatch::new(epoch, grasp_id, probability_stable));
+            let watch = self.state.watch.replace(LiftWatch::new(epoch, grasp_id, decision.probability_stable));
             // A lift that was broken off has no outcome, unless the object was dropped.
             let is_unreported = before.is_some() && !watch.is_some_and(|watch| watch.is_set_down());
             self.state.n_unreported += u64::from(is_unreported);
         }
-        Some(LiftDecision { grasp_id, action, reason, probability_stable })
     }
 
     /// The problem of `header` after the last one. A gap between grasps counts against the new grasp, because its first frames

@@ -74,9 +74,8 @@ impl Correction {
     pub fn fit(prior: Prior, grasps: impl Iterator<Item = (f64, bool)> + Clone) -> Correction {
         let (slope_weight, offset_weight) = (prior.slope_deviation.powi(-2), prior.offset_deviation.powi(-2));
         let cost = |a: f64, b: f64| {
-            let of_grasp = |(l, stable): (f64, bool)| log_loss(a * l + b, stable);
             let of_prior = slope_weight * (a - 1.0).powi(2) + offset_weight * b.powi(2);
-            grasps.clone().map(of_grasp).sum::<f64>() + 0.5 * of_prior
+            grasps.clone().map(|(l, stable)| log_loss(a * l + b, stable)).sum::<f64>() + 0.5 * of_prior
         };
         let (mut a, mut b) = (1.0, 0.0);
         for _ in 0..100 {

@@ -156,8 +156,7 @@ impl GraspHistory {
             // Pads without contact have no load.
             Phase::Squeezing | Phase::TestLifting => {
                 let values = values.unwrap_or_default();
-                let signal = |idx: &usize| values.get(*idx).copied().unwrap_or(0.0);
-                self.track.add(phase, signals.iter().map(signal));
+                self.track.add(phase, signals.iter().map(|idx| values.get(*idx).copied().unwrap_or(0.0)));
             }
             // The hand has moved again.
             Phase::Open | Phase::Closing => *self = GraspHistory { grasp: self.grasp, ..GraspHistory::default() },

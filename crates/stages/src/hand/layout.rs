@@ -131,60 +131,14 @@ impl Layout {
     }
 
     fn build(self, tree: Tree, least_cells: usize) -> Result<Hand, String> {
-        let link_idx = |name: &str, used_by: &str| {
-            tree.links.iter().position(|link| link.name == name).ok_or_else(|| {
-                let known: Vec<_> = tree.links.iter().map(|link| link.name.as_str()).collect();
-                format!("{used_by}: the URDF has no link '{name}' (it has {})", known.join(", "))
-            })
-        };
         let joints = self.joints(&tree)?;
-        let reference_link_idx = link_idx(&self.reference_link, "reference_link")?;
-        let mut pads: Vec<Pad> = Vec::new();
-        let mut first_cell_idx = 0;
-        for pad in &self.pads {
-            let used_by = format!("pad '{}'", pad.name);
-            if pads.iter().any(|other| other.name == pad.name) {
-                return Err(format!("two pads are called '{}'", pad.name));
-            }
-            let cells = self
-                .layouts
-                .get(&pad.layout)
-                .ok_or_else(|| format!("{used_by}: there is no layout '{}' under 'layouts'", pad.layout))?
-                .iter()
-                .enumerate()
-                .map(|(idx, entry)| {
-                    entry.build(pad.noise_threshold_newtons).map_err(|what| format!("{used_by}, entry {idx}: {what}"))
-                })
-                .collect::<Result<Vec<_>, _>>()?
-                .concat();
-            if cells.is_empty() {
-                return Err(format!("{used_by} has no cells"));
-            }
-            let n_cells = cells.len();
-            let link_idx = link_idx(&pad.link, &used_by)?;
-            for (idx, cell) in cells.iter().enumerate() {
-                check_place(cell, &tree.links[link_idx])
-                    .map_err(|what| format!("{used_by}, cell {idx}, on link '{}': {what}", pad.link))?;
-            }
-            if pad.saturates_at_newtons.is_some_and(|reading| !reading.is_finite()) {
-                return Err(format!("{used_by}: saturates_at_newtons is no finite number"));
-            }
-            let (name, falls_under_load, may_be_missing) = (pad.name.clone(), pad.falls_under_load, pad.may_be_missing);
-            let saturates_at_newtons = pad.saturates_at_newtons;
-            pads.push(Pad {
-                name,
-                link_idx,
-                first_cell_idx,
-                cells,
-                falls_under_load,
-                may_be_missing,
-                saturates_at_newtons,
-            });
-            first_cell_idx += n_cells;
-        }
+        let reference_link_idx = link_idx(&tree, &self.reference_link, "reference_link")?;
+        let pads = self.pads(&tree)?;
+        let cells = pads.iter().flat_map(|pad| &pad.cells);
+        let noise_thresholds_newtons: Vec<f64> = cells.map(|cell| cell.noise_threshold_newtons).collect();
         for (what, found, least, most) in [
             ("pads", pads.len(), least_cells, MAX_PADS),
-            ("cells", first_cell_idx, least_cells, MAX_CELLS),
+            ("cells", noise_thresholds_newtons.len(), least_cells, MAX_CELLS),
             ("joints", joints.len(), 1, MAX_JOINTS),
         ] {
             if found < least || found > most {
@@ -208,10 +162,7 @@ impl Layout {
             name: self.name,
             joints,
             links,
-            noise_thresholds_newtons: pads
-                .iter()
-                .flat_map(|pad| pad.cells.iter().map(|cell| cell.noise_threshold_newtons))
-                .collect(),
+            noise_thresholds_newtons,
             pads,
             ignored_shapes: tree.ignored_shapes,
             fixed_joints: tree.fixed_joints,
@@ -222,6 +173,48 @@ impl Layout {
             self_collision_margin_m: self.self_collision_margin_m,
             self_collision_pairs: Vec::new(),
         })
+    }
+
+    fn pads(&self, tree: &Tree) -> Result<Vec<Pad>, String> {
+        let mut pads: Vec<Pad> = Vec::new();
+        let mut first_cell_idx = 0;
+        for pad in &self.pads {
+            let used_by = format!("pad '{}'", pad.name);
+            if pads.iter().any(|other| other.name == pad.name) {
+                return Err(format!("two pads are called '{}'", pad.name));
+            }
+            let Some(entries) = self.layouts.get(&pad.layout) else {
+                return Err(format!("{used_by}: there is no layout '{}' under 'layouts'", pad.layout));
+            };
+            let mut cells = Vec::new();
+            for (idx, entry) in entries.iter().enumerate() {
+                let built = entry.build(pad.noise_threshold_newtons);
+                cells.extend(built.map_err(|what| format!("{used_by}, entry {idx}: {what}"))?);
+            }
+            if cells.is_empty() {
+                return Err(format!("{used_by} has no cells"));
+            }
+            let n_cells = cells.len();
+            let link_idx = link_idx(tree, &pad.link, &used_by)?;
+            for (idx, cell) in cells.iter().enumerate() {
+                check_place(cell, &tree.links[link_idx])
+                    .map_err(|what| format!("{used_by}, cell {idx}, on link '{}': {what}", pad.link))?;
+            }
+            if pad.saturates_at_newtons.is_some_and(|reading| !reading.is_finite()) {
+                return Err(format!("{used_by}: saturates_at_newtons is no finite number"));
+            }
+            pads.push(Pad {
+                name: pad.name.clone(),
+                link_idx,
+                first_cell_idx,
+                cells,
+                falls_under_load: pad.falls_under_load,
+                may_be_missing: pad.may_be_missing,
+                saturates_at_newtons: pad.saturates_at_newtons,
+            });
+            first_cell_idx += n_cells;
+        }
+        Ok(pads)
     }
 
     fn joints(&self, tree: &Tree) -> Result<Vec<Joint>, String> {
@@ -261,14 +254,15 @@ impl Layout {
         if let Some(unknown) = self.open.keys().find(|name| !self.joints.contains(name)) {
             return Err(format!("open: '{unknown}' is not listed under 'joints' ({})", self.joints.join(", ")));
         }
+        self.couple(&mut joints)?;
+        Ok(joints)
+    }
+
+    /// Couples the joints that follow others.
+    fn couple(&self, joints: &mut [Joint]) -> Result<(), String> {
         for coupling in &self.couplings {
-            let idx = |name: &str| {
-                self.joints
-                    .iter()
-                    .position(|joint| joint == name)
-                    .ok_or_else(|| format!("couplings: '{name}' is not listed under 'joints'"))
-            };
-            let (follower_idx, follows_idx) = (idx(&coupling.joint)?, idx(&coupling.follows)?);
+            let (follower_idx, follows_idx) =
+                (self.coupled_idx(&coupling.joint)?, self.coupled_idx(&coupling.follows)?);
             if follower_idx == follows_idx || !coupling.ratio.is_finite() {
                 return Err(format!(
                     "couplings: '{}' follows '{}' at {}: expected another joint and a finite ratio",
@@ -280,12 +274,28 @@ impl Layout {
             }
             joints[follower_idx].coupling = Some(Coupling { follows_idx, ratio: coupling.ratio });
         }
-        let chained = joints
-            .iter()
-            .find(|joint| joint.coupling.is_some_and(|coupling| joints[coupling.follows_idx].coupling.is_some()));
-        match chained {
-            Some(joint) => Err(format!("couplings: '{}' follows a joint that follows another", joint.name)),
-            None => Ok(joints),
+        for joint in joints.iter() {
+            if joint.coupling.is_some_and(|coupling| joints[coupling.follows_idx].coupling.is_some()) {
+                return Err(format!("couplings: '{}' follows a joint that follows another", joint.name));
+            }
+        }
+        Ok(())
+    }
+
+    fn coupled_idx(&self, name: &str) -> Result<usize, String> {
+        match self.joints.iter().position(|joint| joint == name) {
+            Some(idx) => Ok(idx),
+            None => Err(format!("couplings: '{name}' is not listed under 'joints'")),
+        }
+    }
+}
+
+fn link_idx(tree: &Tree, name: &str, used_by: &str) -> Result<usize, String> {
+    match tree.links.iter().position(|link| link.name == name) {
+        Some(idx) => Ok(idx),
+        None => {
+            let known: Vec<_> = tree.links.iter().map(|link| link.name.as_str()).collect();
+            Err(format!("{used_by}: the URDF has no link '{name}' (it has {})", known.join(", ")))
         }
     }
 }
@@ -293,16 +303,8 @@ impl Layout {
 impl LayoutCell {
     /// The cell, or the cells of a grid, row by row: the second direction changes first.
     fn build(&self, pad_threshold_newtons: f64) -> Result<Vec<Cell>, String> {
-        let unit = |vector: [f64; 3], what: &str| {
-            let vector = Vector3::from(vector);
-            let length = vector.norm();
-            if (length - 1.0).abs() > 1e-3 || !length.is_finite() {
-                return Err(format!("{what} has length {length}, expected 1"));
-            }
-            Ok(UnitVector3::new_normalize(vector))
-        };
-        let normal_in_link = unit(self.normal, "normal")?;
-        let along_in_link = unit(self.along, "along")?;
+        let normal_in_link = unit_vector(self.normal, "normal")?;
+        let along_in_link = unit_vector(self.along, "along")?;
         if normal_in_link.dot(&along_in_link).abs() > 1e-3 {
             return Err("'along' is not at right angles to 'normal'".into());
         }
@@ -324,13 +326,17 @@ impl LayoutCell {
         if !(noise_threshold_newtons.is_finite() && noise_threshold_newtons >= 0.0) {
             return Err("noise_threshold_newtons: expected 0 or more".into());
         }
-        let middle = Cell {
+        self.grid(Cell {
             position_in_link_m: self.at_m.into(),
             normal_in_link,
             along_in_link,
             size_m: self.size_m,
             noise_threshold_newtons,
-        };
+        })
+    }
+
+    /// The cells of a grid around `middle`, or `middle` alone.
+    fn grid(&self, middle: Cell) -> Result<Vec<Cell>, String> {
         let ([n_rows, n_columns], [row_pitch_m, column_pitch_m]) = match (self.grid, self.pitch_m) {
             (None, None) => return Ok(vec![middle]),
             (Some(grid), Some(pitch_m)) => (grid, pitch_m),
@@ -341,17 +347,17 @@ impl LayoutCell {
         if n_rows == 0 || n_columns == 0 || n_rows.saturating_mul(n_columns) > MAX_CELLS {
             return Err(format!("grid is [{n_rows}, {n_columns}], expected 1 to {MAX_CELLS} cells"));
         }
-        let across = normal_in_link.cross(&along_in_link);
-        let from_middle = |idx: usize, n: usize, pitch_m: f64| (idx as f64 - (n as f64 - 1.0) / 2.0) * pitch_m;
-        let cells: Vec<Cell> = (0..n_rows * n_columns)
-            .map(|idx| {
-                let row_m = from_middle(idx / n_columns, n_rows, row_pitch_m);
-                let column_m = from_middle(idx % n_columns, n_columns, column_pitch_m);
-                let position_in_link_m =
-                    middle.position_in_link_m + along_in_link.into_inner() * row_m + across * column_m;
-                Cell { position_in_link_m, ..middle.clone() }
-            })
-            .collect();
+        let along = middle.along_in_link.into_inner();
+        let across = middle.normal_in_link.cross(&along);
+        let mut cells = Vec::new();
+        for row in 0..n_rows {
+            for column in 0..n_columns {
+                let row_m = from_middle(row, n_rows, row_pitch_m);
+                let column_m = from_middle(column, n_columns, column_pitch_m);
+                let position_in_link_m = middle.position_in_link_m + along * row_m + across * column_m;
+                cells.push(Cell { position_in_link_m, ..middle.clone() });
+            }
+        }
         if !cells.iter().all(|cell| cell.position_in_link_m.coords.norm() <= MAX_CELL_LENGTH_M) {
             return Err(format!(
                 "pitch_m is [{row_pitch_m}, {column_pitch_m}], which puts cells more than {MAX_CELL_LENGTH_M} m from the \
@@ -360,6 +366,20 @@ impl LayoutCell {
         }
         Ok(cells)
     }
+}
+
+fn unit_vector(numbers: [f64; 3], what: &str) -> Result<UnitVector3<f64>, String> {
+    let vector = Vector3::from(numbers);
+    let length = vector.norm();
+    if (length - 1.0).abs() > 1e-3 || !length.is_finite() {
+        return Err(format!("{what} has length {length}, expected 1"));
+    }
+    Ok(UnitVector3::new_normalize(vector))
+}
+
+/// The distance of a grid's row or column from the grid's middle.
+fn from_middle(idx: usize, n: usize, pitch_m: f64) -> f64 {
+    (idx as f64 - (n as f64 - 1.0) / 2.0) * pitch_m
 }
 
 /// Refuses a cell that is far from every collision shape of its link, or whose normal points into them.

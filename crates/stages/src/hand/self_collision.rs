@@ -70,8 +70,7 @@ impl Hand {
 
     /// The pairs of links (indices) that touch but should not.
     pub(crate) fn touching_pairs(&self, shapes: &PosedShapes) -> impl Iterator<Item = (usize, usize)> {
-        let touch = |(a, b)| links_touch(self, a, b, shapes);
-        self.self_collision_pairs.iter().copied().filter(move |pair| touch(*pair))
+        self.self_collision_pairs.iter().copied().filter(move |&(a, b)| links_touch(self, a, b, shapes))
     }
 
     /// Distance of a point of the palm frame to a link's collision shapes, metres; 0 inside, infinite without shapes.

@@ -57,38 +57,23 @@ pub(super) struct Mimic {
 pub(super) fn parse(
     path: &Path,
     text: &str,
-    mut hull: impl FnMut(&str, &str, [f64; 3]) -> Result<SharedShape, String>,
+    hull: impl FnMut(&str, &str, [f64; 3]) -> Result<SharedShape, String>,
 ) -> Result<Tree, HandError> {
-    let invalid = |message: String| HandError::Invalid { path: path.into(), message };
-    let robot = urdf_xml::read(text).map_err(invalid)?;
-    for (idx, link) in robot.links.iter().enumerate() {
-        if robot.links[..idx].iter().any(|other| other.name == link.name) {
-            return Err(invalid(format!("two links are called '{}'", link.name)));
-        }
-    }
-    if robot.links.is_empty() {
-        return Err(invalid("the URDF has no link".into()));
-    }
-    let mut joint_above: BTreeMap<&str, &urdf_xml::Joint> = BTreeMap::new();
-    for joint in &robot.joints {
-        for (end, element) in [(&joint.parent, "parent"), (&joint.child, "child")] {
-            if end.is_empty() {
-                return Err(invalid(format!("joint '{}': expected a <{element} link=…>, found none", joint.name)));
-            }
-            if !robot.links.iter().any(|link| link.name == *end) {
-                return Err(invalid(format!("joint '{}' names link '{end}', which the URDF doesn't have", joint.name)));
-            }
-        }
-        if joint_above.insert(&joint.child, joint).is_some() {
-            return Err(invalid(format!("link '{}' is the child of two joints", joint.child)));
-        }
-    }
+    read_tree(text, hull).map_err(|message| HandError::Invalid { path: path.into(), message })
+}
+
+fn read_tree(
+    text: &str,
+    mut hull: impl FnMut(&str, &str, [f64; 3]) -> Result<SharedShape, String>,
+) -> Result<Tree, String> {
+    let robot = urdf_xml::read(text)?;
+    let joint_above = joints_above(&robot)?;
     let roots: Vec<_> = robot.links.iter().filter(|link| !joint_above.contains_key(link.name.as_str())).collect();
     let [root] = roots[..] else {
         let names: Vec<_> = roots.iter().map(|link| format!("'{}'", link.name)).collect();
-        return Err(invalid(format!("expected one root link (child of no joint), found {}", names.join(", "))));
+        return Err(format!("expected one root link (child of no joint), found {}", names.join(", ")));
     };
-    let joints = motions(&robot.joints).map_err(invalid)?;
+    let joints = motions(&robot.joints)?;
     let mut tree =
         Tree { links: Vec::new(), joints: BTreeMap::new(), ignored_shapes: Vec::new(), fixed_joints: Vec::new() };
     let mut pending = vec![(root, None)];
@@ -114,7 +99,7 @@ pub(super) fn parse(
         }
         for collision in &link.collisions {
             let of_link = |file: &str, scale| hull(&link.name, file, scale);
-            match shape(collision, of_link).map_err(|what| invalid(format!("link '{}': {what}", link.name)))? {
+            match shape(collision, of_link).map_err(|what| format!("link '{}': {what}", link.name))? {
                 Ok(shape) => tree_link.shapes.push(shape),
                 Err(reason) => tree.ignored_shapes.push(format!("link '{}': {reason}", link.name)),
             }
@@ -127,16 +112,41 @@ pub(super) fn parse(
         }
     }
     if tree.links.len() != robot.links.len() {
-        return Err(invalid("the joints form a cycle".into()));
+        return Err("the joints form a cycle".into());
     }
-    tree.joints = joints
-        .into_iter()
-        .filter_map(|(name, motion)| match motion {
-            JointMotion::Moving { joint, .. } => Some((name.to_owned(), joint)),
-            _ => None,
-        })
-        .collect();
+    for (name, motion) in joints {
+        if let JointMotion::Moving { joint, .. } = motion {
+            tree.joints.insert(name.to_owned(), joint);
+        }
+    }
     Ok(tree)
+}
+
+/// The joint above each link that has one, by the link's name.
+fn joints_above(robot: &urdf_xml::Robot) -> Result<BTreeMap<&str, &urdf_xml::Joint>, String> {
+    for (idx, link) in robot.links.iter().enumerate() {
+        if robot.links[..idx].iter().any(|other| other.name == link.name) {
+            return Err(format!("two links are called '{}'", link.name));
+        }
+    }
+    if robot.links.is_empty() {
+        return Err("the URDF has no link".into());
+    }
+    let mut joint_above: BTreeMap<&str, &urdf_xml::Joint> = BTreeMap::new();
+    for joint in &robot.joints {
+        for (end, element) in [(&joint.parent, "parent"), (&joint.child, "child")] {
+            if end.is_empty() {
+                return Err(format!("joint '{}': expected a <{element} link=…>, found none", joint.name));
+            }
+            if !robot.links.iter().any(|link| link.name == *end) {
+                return Err(format!("joint '{}' names link '{end}', which the URDF doesn't have", joint.name));
+            }
+        }
+        if joint_above.insert(&joint.child, joint).is_some() {
+            return Err(format!("link '{}' is the child of two joints", joint.child));
+        }
+    }
+    Ok(joint_above)
 }
 
 /// The motion that a joint of the URDF allows.
@@ -162,8 +172,11 @@ fn motions(joints: &[urdf_xml::Joint]) -> Result<BTreeMap<&str, JointMotion>, St
             return Err(format!("two joints are called '{}'", joint.name));
         }
     }
-    let motion = |joint| motion(joint, &by_name).map_err(|what| format!("joint '{}' {what}", joint.name));
-    by_name.iter().map(|(name, joint)| Ok((*name, motion(joint)?))).collect()
+    let mut motions = BTreeMap::new();
+    for (name, joint) in &by_name {
+        motions.insert(*name, motion(joint, &by_name).map_err(|what| format!("joint '{name}' {what}"))?);
+    }
+    Ok(motions)
 }
 
 fn motion(joint: &urdf_xml::Joint, by_name: &BTreeMap<&str, &urdf_xml::Joint>) -> Result<JointMotion, String> {
