@@ -281,7 +281,6 @@ impl Launcher {
     ) -> Result<Launcher, LaunchError> {
         raise_descriptor_limit();
         let (sender, events) = sync_channel(MAX_PENDING_EVENTS);
-        let now = Instant::now();
         let log_folder = LogFolder::of_graph(name);
         let logs = LogWriter::new(log_folder.clone(), options.log_format);
         let mut launcher = Launcher {
@@ -313,14 +312,13 @@ impl Launcher {
             service: Service::of_this_process(),
             is_to_begin_again: false,
             has_ended: false,
-            started: now,
+            started: Instant::now(),
             slow_nodes: SlowNodes::new(),
             wake_policy: WakePolicy::new(),
             last_look_nanos: monotonic_nanos(),
         };
         for node in &graph.nodes {
-            let log = launcher.logs.log(&node.id);
-            launcher.members.push(Member::new(node, log));
+            launcher.members.push(Member::new(node, launcher.logs.log(&node.id)));
         }
         for idx in 0..launcher.members.len() {
             if launcher.members[idx].active.is_none() {
