@@ -329,9 +329,9 @@ impl Plan {
 
     /// The readers that a port's writer waits for.
     pub fn consumers(&self, port: &Port) -> Vec<ConsumerWiring> {
-        let lossless = |edge: &&PlannedEdge| edge.from == *port && edge.options.policy == EdgePolicy::Lossless;
-        let edges = self.edges.iter().filter(lossless);
-        let own = edges.filter_map(|edge| {
+        let edges = self.edges.iter();
+        let lossless = edges.filter(|edge| edge.from == *port && edge.options.policy == EdgePolicy::Lossless);
+        let own = lossless.filter_map(|edge| {
             let slot = self.reader_slot(edge)?;
             let (attached_slots, attached_limit_millis) = match edge.to {
                 Some(_) => (Vec::new(), 0),
@@ -401,11 +401,10 @@ impl Plan {
             return Vec::new();
         };
         // The launching command is given up like an attached reader: no source waits for it.
-        let is_next = |next: &&PlannedEdge| {
+        let next = self.edges.iter().filter(|next| {
             let is_waited_for = next.options.policy == EdgePolicy::Lossless && !next.feedback && next.to.is_some();
             next.from.0 == *node && is_waited_for
-        };
-        let next = self.edges.iter().filter(is_next);
+        });
         next.filter_map(|next| Some(ReaderWiring { slot: self.reader_slot(next)?, behind: self.behind(next) }))
             .collect()
     }
@@ -419,7 +418,7 @@ impl Plan {
 
     /// The counts of each edge; `has_ended` when no sample is on its way any more.
     pub fn edges(&self, cursors: &SharedCursors, has_ended: bool) -> Vec<EdgeStatus> {
-        let edge_status = |edge: &PlannedEdge| {
+        let statuses = self.edges.iter().filter_map(|edge| {
             let output = cursors.output(*self.output_slots.get(&edge.from)?);
             let reader_slot = self.reader_slot(edge)?;
             let slot = cursors.input(reader_slot);
@@ -445,8 +444,8 @@ impl Plan {
                 blocked_nanos: output.blocked_nanos(),
                 ages: cursors.ages(reader_slot).read(),
             })
-        };
-        self.edges.iter().filter_map(edge_status).collect()
+        });
+        statuses.collect()
     }
 }
 

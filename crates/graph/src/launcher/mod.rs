@@ -36,7 +36,7 @@ use serde_json::Value;
 
 use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
 use crate::dataflow::pins::PinError;
-use crate::dataflow::{Graph, Node, ProcessOptions, Program};
+use crate::dataflow::{Graph, Node, Program};
 use crate::launcher::clients::Clients;
 use crate::launcher::link_book::LinkBook;
 use crate::launcher::log_writer::{Log, LogWriter};
@@ -397,11 +397,10 @@ impl Launcher {
         let leaving = self.leaving.iter().map(|leaving| &leaving.process);
         let living: Vec<usize> =
             member.active.iter().chain(&member.standby).chain(leaving).map(|process| process.instance_slot).collect();
-        let is_free = |n_before: &usize| {
+        let mut numbers = member.n_instances..member.n_instances + crate::plan::N_INSTANCES;
+        numbers.find(|n_before| {
             self.plan.instance_slot(&member.node.id, *n_before).is_some_and(|slot| !living.contains(&slot))
-        };
-        let next = member.n_instances;
-        (next..next + crate::plan::N_INSTANCES).find(is_free)
+        })
     }
 
     /// Ends old instances of a node until a new one has a heartbeat slot of its own.
@@ -695,13 +694,13 @@ impl Launcher {
         if !killed.is_empty() {
             return Err(LaunchError::Killed { nodes: killed, grace_secs: self.options.grace.as_secs_f64() });
         }
-        let has_ended_badly = |member: &&Member| {
-            !member.is_given_up() && member.active.as_ref().is_some_and(|process| !process.has_ended_well())
-        };
-        match self.members.iter().find(has_ended_badly).map(|member| member.node.id.clone()) {
-            Some(id) => Err(self.failed(&id, false)),
-            None => Ok(()),
+        for member in &self.members {
+            if !member.is_given_up() && member.active.as_ref().is_some_and(|process| !process.has_ended_well()) {
+                let id = member.node.id.clone();
+                return Err(self.failed(&id, false));
+            }
         }
+        Ok(())
     }
 
     /// One round: listens for up to `limit`, finds dead and hung processes, restarts them, goes on with a swap.
@@ -734,10 +733,10 @@ impl Launcher {
     fn give_wake_policy(&mut self) {
         // A node that polls does not give way: the others must interrupt it.
         let polls = self.members.iter().any(|member| member.node.process.wait != WaitMode::Event);
-        let is_open = |options: &ProcessOptions| {
+        let open = self.members.iter().filter(|member| {
+            let options = &member.node.process;
             options.scheduling.is_none() && options.nice.is_none() && options.cpus.is_empty()
-        };
-        let open = self.members.iter().filter(|member| is_open(&member.node.process));
+        });
         let processes = open.flat_map(|member| member.active.iter().chain(&member.standby));
         let ready = processes.filter(|process| process.is_ready() && process.is_running());
         let pids: BTreeSet<u32> = ready.map(Process::pid).collect();
