@@ -105,8 +105,8 @@ impl Operators {
 
     /// Whether a program with these arguments can run in one process with others.
     pub(crate) fn can_share_process(&self, program: &Path, args: &[String]) -> bool {
-        let is_it = |known: &Program| known.path == program && args.starts_with(&known.args);
-        self.sharing.iter().filter_map(|name| self.get(name)).any(is_it)
+        let mut sharing = self.sharing.iter().filter_map(|name| self.get(name));
+        sharing.any(|known| known.path == program && args.starts_with(&known.args))
     }
 
     /// The names of those that can share a process.
@@ -119,9 +119,9 @@ impl Operators {
         if self.programs.is_empty() {
             return "there are no operators by name here".into();
         }
-        let known = || self.programs.keys().map(String::as_str);
-        let similar = did_you_mean(name, known()).map_or(String::new(), |similar| format!("{similar} "));
-        format!("{similar}{}", list("operators", known()))
+        let known = self.programs.keys().map(String::as_str);
+        let similar = did_you_mean(name, known.clone()).map_or(String::new(), |similar| format!("{similar} "));
+        format!("{similar}{}", list("operators", known))
     }
 }
 

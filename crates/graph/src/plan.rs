@@ -101,29 +101,21 @@ impl Plan {
             n_slots: N_COMMAND_BELLS,
             edges: Vec::new(),
         };
-        let next = |n_slots: &mut usize, n: usize| std::mem::replace(n_slots, *n_slots + n);
         for (idx, node) in graph.nodes.iter().enumerate() {
-            plan.instance_slots.insert(node.id.clone(), next(&mut plan.n_slots, N_INSTANCES));
+            let first = plan.take_slots(N_INSTANCES);
+            plan.instance_slots.insert(node.id.clone(), first);
             plan.state_regions.insert(node.id.clone(), idx);
             for input in &node.inputs {
-                let slot = next(&mut plan.n_slots, N_INPUT_SLOTS);
+                let slot = plan.take_slots(N_INPUT_SLOTS);
                 plan.input_slots.insert((node.id.clone(), input.port.clone()), slot);
             }
             for (from, output) in node.output_ports() {
-                plan.output_slots.insert(from.clone(), next(&mut plan.n_slots, 1));
-                for consumer in &graph.nodes {
-                    let inputs =
-                        consumer.inputs.iter().filter(|input| input.from_node == from.0 && input.from_port == from.1);
-                    plan.edges.extend(inputs.map(|input| PlannedEdge {
-                        from: from.clone(),
-                        to: Some((consumer.id.clone(), input.port.clone())),
-                        options: input.edge,
-                        feedback: input.feedback,
-                        partner: input.partner,
-                    }));
-                }
+                let slot = plan.take_slots(1);
+                plan.output_slots.insert(from.clone(), slot);
+                plan.add_edges(&from, &graph.nodes);
                 if observed.contains(&from) {
-                    plan.observer_slots.insert(from.clone(), next(&mut plan.n_slots, N_INPUT_SLOTS));
+                    let slot = plan.take_slots(N_INPUT_SLOTS);
+                    plan.observer_slots.insert(from.clone(), slot);
                     let options = EdgeOptions { capacity: OBSERVER_CAPACITY, ..EdgeOptions::default() };
                     plan.edges.push(PlannedEdge {
                         from: from.clone(),
@@ -133,13 +125,36 @@ impl Plan {
                         partner: false,
                     });
                 }
-                let slots = std::array::from_fn(|_| next(&mut plan.n_slots, N_INPUT_SLOTS));
+                let slots = std::array::from_fn(|_| plan.take_slots(N_INPUT_SLOTS));
                 plan.attached_slots.insert(from.clone(), slots);
                 let service = plan.service(&from, &output.type_name);
                 plan.services.insert(from, service);
             }
         }
         plan
+    }
+
+    fn take_slots(&mut self, n: usize) -> usize {
+        let first = self.n_slots;
+        self.n_slots += n;
+        first
+    }
+
+    /// The edges from an output to the nodes that read it.
+    fn add_edges(&mut self, from: &Port, nodes: &[Node]) {
+        for consumer in nodes {
+            for input in &consumer.inputs {
+                if (&input.from_node, &input.from_port) == (&from.0, &from.1) {
+                    self.edges.push(PlannedEdge {
+                        from: from.clone(),
+                        to: Some((consumer.id.clone(), input.port.clone())),
+                        options: input.edge,
+                        feedback: input.feedback,
+                        partner: input.partner,
+                    });
+                }
+            }
+        }
     }
 
     fn service(&self, from: &Port, type_name: &str) -> ServiceWiring {
@@ -314,9 +329,9 @@ impl Plan {
 
     /// The readers that a port's writer waits for.
     pub fn consumers(&self, port: &Port) -> Vec<ConsumerWiring> {
-        let lossless = |edge: &&PlannedEdge| edge.from == *port && edge.options.policy == EdgePolicy::Lossless;
-        let edges = self.edges.iter().filter(lossless);
-        let own = edges.filter_map(|edge| {
+        let edges = self.edges.iter();
+        let lossless = edges.filter(|edge| edge.from == *port && edge.options.policy == EdgePolicy::Lossless);
+        let own = lossless.filter_map(|edge| {
             let slot = self.reader_slot(edge)?;
             let (attached_slots, attached_limit_millis) = match edge.to {
                 Some(_) => (Vec::new(), 0),
@@ -386,11 +401,10 @@ impl Plan {
             return Vec::new();
         };
         // The launching command is given up like an attached reader: no source waits for it.
-        let is_next = |next: &&PlannedEdge| {
+        let next = self.edges.iter().filter(|next| {
             let is_waited_for = next.options.policy == EdgePolicy::Lossless && !next.feedback && next.to.is_some();
             next.from.0 == *node && is_waited_for
-        };
-        let next = self.edges.iter().filter(is_next);
+        });
         next.filter_map(|next| Some(ReaderWiring { slot: self.reader_slot(next)?, behind: self.behind(next) }))
             .collect()
     }
@@ -404,7 +418,7 @@ impl Plan {
 
     /// The counts of each edge; `has_ended` when no sample is on its way any more.
     pub fn edges(&self, cursors: &SharedCursors, has_ended: bool) -> Vec<EdgeStatus> {
-        let edge_status = |edge: &PlannedEdge| {
+        let statuses = self.edges.iter().filter_map(|edge| {
             let output = cursors.output(*self.output_slots.get(&edge.from)?);
             let reader_slot = self.reader_slot(edge)?;
             let slot = cursors.input(reader_slot);
@@ -430,8 +444,8 @@ impl Plan {
                 blocked_nanos: output.blocked_nanos(),
                 ages: cursors.ages(reader_slot).read(),
             })
-        };
-        self.edges.iter().filter_map(edge_status).collect()
+        });
+        statuses.collect()
     }
 }
 

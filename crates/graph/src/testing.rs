@@ -36,19 +36,6 @@ pub fn serve(graph: &str, answers: Vec<(Request, Vec<Reply>)>) -> JoinHandle<()>
 
 /// A status with something in each field.
 pub fn made_status(graph: &str) -> GraphStatus {
-    let node = |node: &str, state| NodeStatus {
-        node: node.into(),
-        program: format!("/opt/{node}").into(),
-        args: Vec::new(),
-        state,
-        pid: None,
-        standby_pid: None,
-        n_restarts: 0,
-        n_swaps: 0,
-        heartbeat_age_millis: None,
-        params: serde_json::Map::new(),
-        counts: [("refused".to_string(), 3)].into(),
-    };
     let lifted = DecidedGrasp {
         grasp_id: 99,
         action: Action::Lift,
@@ -73,9 +60,9 @@ pub fn made_status(graph: &str) -> GraphStatus {
                 n_restarts: 2,
                 n_swaps: 1,
                 heartbeat_age_millis: Some(12),
-                ..node("contacts", NodeState::Running)
+                ..made_node("contacts", NodeState::Running)
             },
-            node("classifier", NodeState::Failed),
+            made_node("classifier", NodeState::Failed),
         ],
         decisions: DecisionStatus { n_lift: 60, n_hold: 40, n_false_positives: 1, latest: [lifted].into() },
         edges: vec![EdgeStatus {
@@ -95,6 +82,22 @@ pub fn made_status(graph: &str) -> GraphStatus {
         }],
         link: None,
         ssh_hosts: std::collections::BTreeMap::new(),
+    }
+}
+
+fn made_node(node: &str, state: NodeState) -> NodeStatus {
+    NodeStatus {
+        node: node.into(),
+        program: format!("/opt/{node}").into(),
+        args: Vec::new(),
+        state,
+        pid: None,
+        standby_pid: None,
+        n_restarts: 0,
+        n_swaps: 0,
+        heartbeat_age_millis: None,
+        params: serde_json::Map::new(),
+        counts: [("refused".to_string(), 3)].into(),
     }
 }
 

@@ -124,52 +124,20 @@ impl Look {
 pub fn measure(now: &Look, window: Window) -> Measured {
     let status = &now.status;
     let interval_secs = secs_since(status, window.rates_since);
-    let cpu_secs = now.at.saturating_duration_since(window.previous.at).as_secs_f64();
-    let cpu_percent = |pid: u32| {
-        let (used, before) = (now.usage.get(&pid)?, window.previous.usage.get(&pid)?);
-        (cpu_secs > 0.0).then(|| 100.0 * (used.cpu_secs - before.cpu_secs).max(0.0) / cpu_secs)
-    };
-    let shares: Vec<f64> = now.usage.keys().filter_map(|&pid| cpu_percent(pid)).collect();
+    let shares: Vec<f64> = now.usage.keys().filter_map(|pid| cpu_percent(now, window, *pid)).collect();
     let nodes = status.nodes.iter().map(|node| MeasuredNode {
         node: node.node.clone(),
         state: node.state,
         pid: node.pid,
         standby_pid: node.standby_pid,
-        cpu_percent: node.pid.and_then(cpu_percent),
+        cpu_percent: node.pid.and_then(|pid| cpu_percent(now, window, pid)),
         resident_bytes: node.pid.and_then(|pid| Some(now.usage.get(&pid)?.resident_bytes)),
         n_restarts: node.n_restarts,
         n_swaps: node.n_swaps,
         heartbeat_age_millis: node.heartbeat_age_millis,
         counts: node.counts.clone(),
     });
-    let ages_of = |edge: &EdgeStatus| {
-        let before = window.rates_since.and_then(|look| look.edge(&edge.from, &edge.to));
-        quantiles(&before.map_or_else(|| edge.ages.clone(), |before| edge.ages.since(&before.ages)))
-    };
-    let edges = status.edges.iter().map(|edge| {
-        let before = window.rates_since.and_then(|look| look.edge(&edge.from, &edge.to));
-        let counted = window.counts_since.and_then(|look| look.edge(&edge.from, &edge.to));
-        let since = |count: fn(&EdgeStatus) -> u64| count(edge).saturating_sub(counted.map_or(0, count));
-        MeasuredEdge {
-            from: edge.from.clone(),
-            to: edge.to.clone(),
-            policy: edge.policy,
-            capacity: edge.capacity,
-            rate_hz: per_sec(edge.received.saturating_sub(before.map_or(0, |before| before.received)), interval_secs),
-            age_nanos: ages_of(edge),
-            n_queued: n_queued(edge, &status.edges),
-            sent: since(|edge| edge.sent),
-            received: since(|edge| edge.received),
-            dropped: since(|edge| edge.dropped),
-            missing: since(|edge| edge.missing),
-            late: since(|edge| edge.late),
-            repeated: since(|edge| edge.repeated),
-            reordered: since(|edge| edge.reordered),
-            blocked_nanos: since(|edge| edge.blocked_nanos),
-        }
-    });
-
-    let total = |look: &Look| look.status.decisions.n_lift + look.status.decisions.n_hold;
+    let edges = status.edges.iter().map(|edge| measured_edge(edge, status, window, interval_secs));
     let counted = window.counts_since.map(|look| &look.status.decisions);
     let decisions = &status.decisions;
     Measured {
@@ -181,33 +149,78 @@ pub fn measure(now: &Look, window: Window) -> Measured {
         interval_secs,
         load_average: now.load_average,
         cpu_percent: (!shares.is_empty()).then(|| shares.iter().sum()),
-        launcher_cpu_percent: cpu_percent(status.pid),
+        launcher_cpu_percent: cpu_percent(now, window, status.pid),
         nodes: nodes.collect(),
         edges: edges.collect(),
-        decision_latency_nanos: decision_edge(&status.edges).and_then(ages_of),
+        decision_latency_nanos: decision_edge(&status.edges).and_then(|edge| ages_in(edge, window)),
         decisions: MeasuredDecisions {
             n_lift: decisions.n_lift.saturating_sub(counted.map_or(0, |before| before.n_lift)),
             n_hold: decisions.n_hold.saturating_sub(counted.map_or(0, |before| before.n_hold)),
             n_false_positives: decisions
                 .n_false_positives
                 .saturating_sub(counted.map_or(0, |before| before.n_false_positives)),
-            rate_hz: per_sec(total(now).saturating_sub(window.rates_since.map_or(0, total)), interval_secs),
+            rate_hz: per_sec(n_decided(now).saturating_sub(window.rates_since.map_or(0, n_decided)), interval_secs),
             new: new_decisions(now, window.previous),
         },
         link: status.link.clone(),
     }
 }
 
+/// The share of one processor that a process has used.
+fn cpu_percent(now: &Look, window: Window, pid: u32) -> Option<f64> {
+    let secs = now.at.saturating_duration_since(window.previous.at).as_secs_f64();
+    let (used, before) = (now.usage.get(&pid)?, window.previous.usage.get(&pid)?);
+    if secs > 0.0 { Some(100.0 * (used.cpu_secs - before.cpu_secs).max(0.0) / secs) } else { None }
+}
+
+fn measured_edge(edge: &EdgeStatus, status: &GraphStatus, window: Window, interval_secs: f64) -> MeasuredEdge {
+    let before = window.rates_since.and_then(|look| look.edge(&edge.from, &edge.to));
+    let counted = window.counts_since.and_then(|look| look.edge(&edge.from, &edge.to));
+    let since = |count: fn(&EdgeStatus) -> u64| count(edge).saturating_sub(counted.map_or(0, count));
+    MeasuredEdge {
+        from: edge.from.clone(),
+        to: edge.to.clone(),
+        policy: edge.policy,
+        capacity: edge.capacity,
+        rate_hz: per_sec(edge.received.saturating_sub(before.map_or(0, |before| before.received)), interval_secs),
+        age_nanos: ages_in(edge, window),
+        n_queued: n_queued(edge, &status.edges),
+        sent: since(|edge| edge.sent),
+        received: since(|edge| edge.received),
+        dropped: since(|edge| edge.dropped),
+        missing: since(|edge| edge.missing),
+        late: since(|edge| edge.late),
+        repeated: since(|edge| edge.repeated),
+        reordered: since(|edge| edge.reordered),
+        blocked_nanos: since(|edge| edge.blocked_nanos),
+    }
+}
+
+fn ages_in(edge: &EdgeStatus, window: Window) -> Option<Quantiles> {
+    match window.rates_since.and_then(|look| look.edge(&edge.from, &edge.to)) {
+        Some(before) => quantiles(&edge.ages.since(&before.ages)),
+        None => quantiles(&edge.ages),
+    }
+}
+
+fn n_decided(look: &Look) -> u64 {
+    look.status.decisions.n_lift + look.status.decisions.n_hold
+}
+
 /// The edge over which the launching command reads decisions: among its edges from nodes with inputs (a source's truth
 /// has none), the port `decision`, or otherwise the last in the graph's order.
 fn decision_edge(edges: &[EdgeStatus]) -> Option<&EdgeStatus> {
-    let node_of = |port: &'_ str| port.split_once('/').map_or(port.to_string(), |(node, _)| node.to_string());
-    let is_made = |edge: &&EdgeStatus| {
-        let writer = node_of(&edge.from);
-        edges.iter().any(|other| other.to != RUN && node_of(&other.to) == writer)
-    };
-    let read = || edges.iter().filter(|edge| edge.to == RUN).filter(is_made);
-    read().find(|edge| edge.from.ends_with("/decision")).or_else(|| read().next_back())
+    let mut last = None;
+    for edge in edges {
+        let writer = edge.from.split('/').next();
+        if edge.to == RUN && edges.iter().any(|other| other.to != RUN && other.to.split('/').next() == writer) {
+            if edge.from.ends_with("/decision") {
+                return Some(edge);
+            }
+            last = Some(edge);
+        }
+    }
+    last
 }
 
 /// The launching command, as the end of an edge.
@@ -231,8 +244,7 @@ fn n_queued(edge: &EdgeStatus, edges: &[EdgeStatus]) -> u64 {
 }
 
 fn quantiles(ages: &Ages) -> Option<Quantiles> {
-    let quantile = |share| ages.quantile_nanos(share);
-    Some(Quantiles { p50: quantile(0.5)?, p90: quantile(0.9)?, p99: quantile(0.99)? })
+    Some(Quantiles { p50: ages.quantile_nanos(0.5)?, p90: ages.quantile_nanos(0.9)?, p99: ages.quantile_nanos(0.99)? })
 }
 
 /// By the graph's own clock, because its answer takes a while to arrive.

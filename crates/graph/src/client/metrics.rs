@@ -6,7 +6,7 @@
 
 use std::fmt;
 use std::io::{Read, Write};
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener, TcpStream};
+use std::net::{Ipv4Addr, Ipv6Addr, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -41,12 +41,13 @@ const AGE_BOUNDS_SECS: [f64; 16] =
 /// # Errors
 /// The port is taken.
 pub fn listen(port: u16) -> std::io::Result<TcpListener> {
-    let bind = |host: IpAddr| TcpListener::bind(SocketAddr::from((host, port)));
-    // A machine of IPv6 alone has only the other address.
-    bind(Ipv4Addr::LOCALHOST.into()).or_else(|error| match error.kind() {
-        std::io::ErrorKind::AddrNotAvailable => bind(Ipv6Addr::LOCALHOST.into()),
-        _ => Err(error),
-    })
+    match TcpListener::bind((Ipv4Addr::LOCALHOST, port)) {
+        // A machine of IPv6 alone has only the other address.
+        Err(error) if error.kind() == std::io::ErrorKind::AddrNotAvailable => {
+            TcpListener::bind((Ipv6Addr::LOCALHOST, port))
+        }
+        bound => bound,
+    }
 }
 
 /// Answers clients on threads of their own, until the process ends.

@@ -224,7 +224,9 @@ impl Drop for Seat {
             self.failed.store(true, Ordering::Relaxed);
         }
         if self.is_left {
-            self.slots.iter().for_each(|slot| self.cursors.input(*slot).give_up(true));
+            for slot in &self.slots {
+                self.cursors.input(*slot).give_up(true);
+            }
         }
     }
 }
@@ -246,19 +248,13 @@ fn observe<S: Sink>(
     on_ready: impl FnOnce(),
 ) -> anyhow::Result<(S, BTreeMap<String, InputCounts>)> {
     let node = namespace::join(domain, "observer").map_err(|error| with_lack_of_files(error.into()))?;
-    let mut ports = Vec::new();
-    for edge in edges {
-        let type_name = &edge.input.service.type_name;
-        let opened = with_message(type_name, Opener(&node, cursors, edge))
-            .with_context(|| format!("{}: cannot observe a {type_name}", edge.topic))?;
-        ports.push((edge.topic.clone(), opened.map_err(|error| with_lack_of_files(error.into()))?));
-    }
+    let mut ports = open(&node, cursors, edges)?;
     if watch.role == Role::Attached {
         sink.begin(&begin(&mut ports)?);
     }
     on_ready();
     let (mut pace, mut comeback) = (Pace::of(edges), Comeback::default());
-    let (mut ending, mut last_look) = (None, Instant::now());
+    let (mut ending, mut last_look) = (None::<Instant>, Instant::now());
     loop {
         // Looked at before the last look at the ports, as in an operator.
         let request = watch.request.load(Ordering::Relaxed);
@@ -271,10 +267,7 @@ fn observe<S: Sink>(
         let is_connected = watch.connected.load(Ordering::Relaxed);
         if !is_connected || last_look.elapsed() >= WAIT {
             last_look = Instant::now();
-            let mut are_all = true;
-            for (_, port) in &mut ports {
-                are_all &= port.connect()?;
-            }
+            let are_all = connect(&mut ports)?;
             watch.connected.store(is_connected || are_all, Ordering::Relaxed);
         }
         let round = match receive_round(&mut ports) {
@@ -286,20 +279,12 @@ fn observe<S: Sink>(
             }
             Err(error) => return Err(error),
         };
-        let n_most = round.n_most;
-        for (idx, record, received_nanos) in round.records {
-            sink.take(&ports[idx].0, record, received_nanos)?;
-        }
-        for ((_, port), header) in ports.iter_mut().zip(round.furthest) {
-            if let Some(header) = header {
-                port.commit(&header);
-            }
-        }
+        let n_most = hand_on(round, &ports, &mut sink)?;
         comeback.look(&ports);
-        let has_waited = |limit| ending.is_some_and(|since: Instant| since.elapsed() > limit);
+        let waited = ending.map_or(Duration::ZERO, |since| since.elapsed());
         let is_over = match request {
-            LEAVE => sink.has_enough() || has_waited(LEAVE_LIMIT),
-            DRAIN => n_most == 0 && (has_waited(DRAIN_LIMIT) || ports.iter().all(|(_, port)| port.is_caught_up())),
+            LEAVE => sink.has_enough() || waited > LEAVE_LIMIT,
+            DRAIN => n_most == 0 && (waited > DRAIN_LIMIT || ports.iter().all(|(_, port)| port.is_caught_up())),
             _ => false,
         };
         if is_over {
@@ -309,11 +294,44 @@ fn observe<S: Sink>(
             continue;
         }
         let is_at_ends = request != GO_ON || !watch.connected.load(Ordering::Relaxed);
-        let wait = pace.next(n_most);
-        watch.waiter.wait(if is_at_ends { wait.min(WAIT_AT_ENDS) } else { wait });
+        watch.waiter.wait(pace.next(n_most).min(if is_at_ends { WAIT_AT_ENDS } else { Duration::MAX }));
     }
     let counts = ports.iter().map(|(topic, port)| (topic.clone(), port.counts())).collect();
     Ok((sink, counts))
+}
+
+/// Opens a port for each edge.
+fn open(node: &Node<PrivateService>, cursors: &Arc<SharedCursors>, edges: &[ObservedEdge]) -> anyhow::Result<Ports> {
+    let mut ports = Vec::new();
+    for edge in edges {
+        let type_name = &edge.input.service.type_name;
+        let opened = with_message(type_name, Opener(node, cursors, edge))
+            .with_context(|| format!("{}: cannot observe a {type_name}", edge.topic))?;
+        ports.push((edge.topic.clone(), opened.map_err(|error| with_lack_of_files(error.into()))?));
+    }
+    Ok(ports)
+}
+
+/// Connects all ports to the publishers that are there; whether all are.
+fn connect(ports: &mut Ports) -> anyhow::Result<bool> {
+    let mut are_all = true;
+    for (_, port) in ports {
+        are_all &= port.connect()?;
+    }
+    Ok(are_all)
+}
+
+/// Hands the samples of a round to the sink, and then tells their writers; the most samples of a port.
+fn hand_on(round: Round, ports: &Ports, sink: &mut impl Sink) -> anyhow::Result<usize> {
+    for (idx, record, received_nanos) in round.records {
+        sink.take(&ports[idx].0, record, received_nanos)?;
+    }
+    for ((_, port), header) in ports.iter().zip(round.furthest) {
+        if let Some(header) = header {
+            port.commit(&header);
+        }
+    }
+    Ok(round.n_most)
 }
 
 /// When writers that have given up the observer are to wait for it again. The more often that happens, the longer they are
@@ -326,7 +344,7 @@ struct Comeback {
 }
 
 impl Comeback {
-    fn look(&mut self, ports: &[(String, Box<dyn AnySubscriber>)]) {
+    fn look(&mut self, ports: &Ports) {
         if !ports.iter().any(|(_, port)| port.is_given_up()) {
             return;
         }
@@ -337,18 +355,18 @@ impl Comeback {
             now + self.pause
         });
         if now >= at {
-            ports.iter().for_each(|(_, port)| port.give_up(false));
+            for (_, port) in ports {
+                port.give_up(false);
+            }
             (self.at, self.last) = (None, Some(now));
         }
     }
 }
 
 /// Begins to read on all ports of an attached observer.
-fn begin(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Vec<Option<SampleId>>> {
-    for (_, port) in ports.iter_mut() {
-        // Before this, the newest sample is dropped from a full queue, not the oldest.
-        port.connect()?;
-    }
+fn begin(ports: &mut Ports) -> anyhow::Result<Vec<Option<SampleId>>> {
+    // Before this, the newest sample is dropped from a full queue, not the oldest.
+    connect(ports)?;
     Ok(ports.iter_mut().map(|(_, port)| port.begin_here()).collect())
 }
 
@@ -389,7 +407,7 @@ struct Round {
 
 /// Reads all ports, downstream ports first: the sample that another one answers is then in the same round or an earlier
 /// one, and the sink gets it first. A round is bounded, so that no port starves the others.
-fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Result<Round> {
+fn receive_round(ports: &mut Ports) -> anyhow::Result<Round> {
     let mut by_port = Vec::with_capacity(ports.len());
     let mut round = Round { records: Vec::new(), furthest: vec![None; ports.len()], n_most: 0 };
     for (idx, (topic, port)) in ports.iter_mut().enumerate().rev() {
@@ -401,8 +419,9 @@ fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Resu
             match record {
                 Ok(record) => {
                     let header = *record.header();
-                    let is_ahead = |last: &Header| last.epoch != header.epoch || last.seq < header.seq;
-                    furthest = furthest.filter(|last| !is_ahead(last)).or(Some(header));
+                    if furthest.is_none_or(|last| last.epoch != header.epoch || last.seq < header.seq) {
+                        furthest = Some(header);
+                    }
                     samples.push((idx, record, monotonic_nanos()));
                 }
                 // The port counts it as not received, and so as lost.
@@ -416,6 +435,9 @@ fn receive_round(ports: &mut [(String, Box<dyn AnySubscriber>)]) -> anyhow::Resu
     round.records = by_port.into_iter().rev().flatten().collect();
     Ok(round)
 }
+
+/// The topics of the edges and their ports.
+type Ports = Vec<(String, Box<dyn AnySubscriber>)>;
 
 /// A subscriber whose message type is not known at compile time.
 trait AnySubscriber {

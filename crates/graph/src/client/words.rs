@@ -31,10 +31,11 @@ pub fn warnings(status: &GraphStatus) -> Vec<String> {
         let which = if failed.is_empty() { "an operator".into() } else { failed.join(", ") };
         warnings.push(format!("grasps are not decided without {which}: swap it (blindgrasp swap) or stop the graph"));
     }
-    let lost = |edge: &&EdgeStatus| edge.policy == EdgePolicy::Lossless && edge.dropped > 0;
-    warnings.extend(status.edges.iter().filter(lost).map(|edge| {
-        format!("{} samples were lost between {} and {}, whose edge is lossless", edge.dropped, edge.from, edge.to)
-    }));
+    for EdgeStatus { policy, dropped, from, to, .. } in &status.edges {
+        if *policy == EdgePolicy::Lossless && *dropped > 0 {
+            warnings.push(format!("{dropped} samples were lost between {from} and {to}, whose edge is lossless"));
+        }
+    }
     warnings.extend(status.link.iter().flat_map(|link| &link.peers).filter_map(trouble));
     warnings
 }

@@ -10,7 +10,7 @@ use crate::dataflow::crossing::check_crossings;
 use crate::dataflow::diagnostic::{DataflowError, Diagnostics, did_you_mean_or_list, list, quote_path};
 use crate::dataflow::file::DataflowFile;
 use crate::dataflow::graph::{Graph, Input, Node};
-use crate::dataflow::node::{NodeEntry, PinEntry, Source};
+use crate::dataflow::node::{InputEntry, NodeEntry, PinEntry, Source};
 use crate::dataflow::order::levels;
 use crate::dataflow::pins::{PinError, Pins, RUN};
 use crate::dataflow::process_options::PROCESS_KEYS;
@@ -21,7 +21,7 @@ use crate::dataflow::yaml::Text;
 use crate::describe::program_on_path;
 use crate::operators::Operators;
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
-use blindgrasp_operator::param::{ParamDescription, ParamKind};
+use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::text::{did_you_mean, quote};
 use blindgrasp_operator::wiring::{OnLate, WaitMode};
 
@@ -34,10 +34,38 @@ pub(super) struct ResolvedNode<'a> {
     pub(super) operator: Option<Operator>,
 }
 
+impl ResolvedNode<'_> {
+    /// The description of its operator, by the operator itself.
+    fn known(&self) -> Option<&OperatorDescription> {
+        let description = &self.operator.as_ref()?.description;
+        if description.version == UNKNOWN_VERSION { None } else { Some(description) }
+    }
+}
+
 #[derive(Clone)]
 pub(super) struct Operator {
     pub(super) program: Program,
     pub(super) description: OperatorDescription,
+}
+
+impl Operator {
+    fn node(&self, entry: &NodeEntry, inputs: Vec<Input>, params: Map<String, Value>, sha256: Pins) -> Node {
+        Node {
+            id: entry.id.text.clone(),
+            program: self.program.path.clone(),
+            args: self.program.args.clone(),
+            description: self.description.clone(),
+            inputs,
+            params,
+            restart: entry.restart,
+            heartbeat_millis: entry.heartbeat_millis,
+            sandbox: entry.sandbox,
+            memory_max_mib: entry.memory_max_mib,
+            process: entry.process.clone(),
+            sha256,
+            machine: entry.on.as_ref().map(|on| on.text.clone()),
+        }
+    }
 }
 
 /// Checks a dataflow file against its operators' descriptions.
@@ -67,44 +95,27 @@ pub fn check(
     for node in &resolved {
         let entry = node.entry;
         let inputs = check_inputs(node, &resolved, &mut diagnostics);
-        if let Some(Operator { program, description }) = &node.operator {
-            let params = match (scope.elsewhere(entry), description.version.as_str()) {
-                (None, _) => {
-                    check_params(entry, &description.params, &file.params, overrides, folder, &mut diagnostics)
-                }
-                (Some(_), UNKNOWN_VERSION) => Map::new(),
-                (Some(_), _) => {
-                    let params = without_files(&description.params);
-                    check_params(entry, &params, &file.params, &[], folder, &mut diagnostics)
-                }
+        if let Some(operator) = &node.operator {
+            let description = &operator.description;
+            let (params, sha256) = if scope.elsewhere(entry).is_none() {
+                let params =
+                    check_params(entry, &description.params, &file.params, overrides, folder, &mut diagnostics);
+                let pins = check_pins(entry, description, &params, &mut diagnostics);
+                (params, pins)
+            } else if description.version == UNKNOWN_VERSION {
+                (Map::new(), entry.pins())
+            } else {
+                let params = without_files(&description.params);
+                (check_params(entry, &params, &file.params, &[], folder, &mut diagnostics), entry.pins())
             };
-            let pins = match scope.elsewhere(entry) {
-                None => check_pins(entry, description, &params, &mut diagnostics),
-                Some(_) => entry.pins(),
-            };
-            nodes.push(Node {
-                id: entry.id.text.clone(),
-                program: program.path.clone(),
-                args: program.args.clone(),
-                description: description.clone(),
-                inputs,
-                params,
-                restart: entry.restart,
-                heartbeat_millis: entry.heartbeat_millis,
-                sandbox: entry.sandbox,
-                memory_max_mib: entry.memory_max_mib,
-                process: entry.process.clone(),
-                sha256: pins,
-                machine: entry.on.as_ref().map(|on| on.text.clone()),
-            });
+            nodes.push(operator.node(entry, inputs, params, sha256));
         }
     }
     check_overrides(overrides, &file.nodes, &mut diagnostics);
-    let descriptions: Option<Vec<&OperatorDescription>> =
-        resolved.iter().map(|node| node.operator.as_ref().map(|operator| &operator.description)).collect();
+    let known: Vec<&OperatorDescription> = resolved.iter().filter_map(ResolvedNode::known).collect();
     // An operator that is not known may have any param.
-    if let Some(descriptions) = descriptions.filter(|all| all.iter().all(|of| of.version != UNKNOWN_VERSION)) {
-        check_shared(&file.params, overrides, &descriptions, &mut diagnostics);
+    if known.len() == resolved.len() {
+        check_shared(&file.params, overrides, &known, &mut diagnostics);
     }
     scope.check_overrides(overrides, &file.nodes, &mut diagnostics);
     check_crossings(file, &nodes, &mut diagnostics);
@@ -131,12 +142,11 @@ fn check_groups(file: &DataflowFile, nodes: &[Node], operators: &Operators, diag
         let at = file.nodes.iter().find(|entry| entry.id.text == node.id).map(|entry| entry.group_at);
         let mut others =
             nodes.iter().filter(|other| other.process.group.as_ref() == Some(group) && other.id != node.id);
-        let of_process = |node: &Node| (node.process.clone(), node.sandbox, node.memory_max_mib, node.machine.clone());
         if !operators.can_share_process(&node.program, &node.args) {
             let message = format!("node {}: its operator cannot share a process with others", quote(&node.id));
             let help = format!("the operators that can: {}", operators.sharing_names());
             diagnostics.push_with_help(at, message, Some(help));
-        } else if let Some(other) = others.clone().find(|other| of_process(other) != of_process(node)) {
+        } else if let Some(other) = others.clone().find(|other| !can_share(other, node)) {
             let message = format!(
                 "nodes {} and {} of group {} share a process, and must have the same values of 'on', 'sandbox', \
                  'memory_max_mib', {}",
@@ -157,11 +167,22 @@ fn check_groups(file: &DataflowFile, nodes: &[Node], operators: &Operators, diag
     }
 }
 
+fn can_share(a: &Node, b: &Node) -> bool {
+    (&a.process, a.sandbox, a.memory_max_mib, &a.machine) == (&b.process, b.sandbox, b.memory_max_mib, &b.machine)
+}
+
 /// A process that polls takes a core, and the others need at least one.
 fn check_polling(file: &DataflowFile, scope: Scope<'_>, diagnostics: &mut Diagnostics) {
     let n_cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let is_polling = |entry: &&NodeEntry| entry.process.wait == WaitMode::Poll && scope.elsewhere(entry).is_none();
-    for entry in file.nodes.iter().filter(is_polling).skip(n_cores - 1) {
+    let mut n_polling = 0;
+    for entry in &file.nodes {
+        if entry.process.wait != WaitMode::Poll || scope.elsewhere(entry).is_some() {
+            continue;
+        }
+        n_polling += 1;
+        if n_polling < n_cores {
+            continue;
+        }
         let message = format!(
             "node {}: 'wait: poll' takes a core, and of the {n_cores} cores of this machine {} can be spared",
             quote(&entry.id.text),
@@ -185,36 +206,36 @@ fn resolve<'a>(
     let mut unreported = diagnostics.clone();
     let mut asked: HashMap<(PathBuf, Vec<String>), Result<OperatorDescription, String>> = HashMap::new();
     let mut resolved = Vec::with_capacity(file.nodes.len());
-    for entry in &file.nodes {
+    for (idx, entry) in file.nodes.iter().enumerate() {
         let is_elsewhere = scope.elsewhere(entry).is_some();
         let diagnostics = if is_elsewhere { &mut unreported } else { &mut *diagnostics };
-        let operator = entry.run.as_ref().and_then(|run| {
-            let program = find_program(run, entry, folder, operators, diagnostics)?;
-            let program = Program { args: program.args_with(&entry.args), ..program };
-            // Before it runs for the first time, at `--describe`.
-            if let (false, Err(error)) = (is_elsewhere, entry.pins().check_program(&program.path)) {
-                diagnostics.push(entry.pin_at(RUN), of_node(entry, &error));
-                return None;
-            }
-            let answer = asked.entry((program.path.clone(), program.args.clone())).or_insert_with(|| {
-                let description = describe(&program.path, &program.args)?;
-                description.validate().map_err(|error| error.to_string())?;
-                Ok(description)
-            });
-            match answer {
-                Ok(description) => Some(Operator { program, description: description.clone() }),
-                Err(error) => {
-                    let with_args = match program.args.as_slice() {
-                        [] => String::new(),
-                        args => format!(" with the arguments {}", quote(&args.join(" "))),
-                    };
-                    let program = quote_path(&program.path);
-                    diagnostics.push(run.at, format!("program {program}{with_args} cannot be used: {error}"));
-                    None
-                }
-            }
+        resolved.push(ResolvedNode { entry, operator: None });
+        let (Some(run), Some(args)) = (&entry.run, &entry.args) else { continue };
+        let Some(program) = find_program(run, entry, folder, operators, diagnostics) else { continue };
+        let program = Program { args: program.args_with(args), ..program };
+        // Before it runs for the first time, at `--describe`.
+        if let (false, Err(error)) = (is_elsewhere, entry.pins().check_program(&program.path)) {
+            diagnostics.push(entry.pin_at(RUN), of_node(entry, &error));
+            continue;
+        }
+        let answer = asked.entry((program.path.clone(), program.args.clone())).or_insert_with(|| {
+            let description = describe(&program.path, &program.args)?;
+            description.validate().map_err(|error| error.to_string())?;
+            Ok(description)
         });
-        resolved.push(ResolvedNode { entry, operator });
+        match answer {
+            Ok(description) => {
+                resolved[idx].operator = Some(Operator { program, description: description.clone() });
+            }
+            Err(error) => {
+                let with_args = match program.args.as_slice() {
+                    [] => String::new(),
+                    args => format!(" with the arguments {}", quote(&args.join(" "))),
+                };
+                let program = quote_path(&program.path);
+                diagnostics.push(run.at, format!("program {program}{with_args} cannot be used: {error}"));
+            }
+        }
     }
     make_up(&mut resolved, scope, folder);
     resolved
@@ -228,12 +249,17 @@ fn check_pins(
     diagnostics: &mut Diagnostics,
 ) -> Pins {
     let pins = entry.pins();
-    let is_path = |param: &&ParamDescription| matches!(param.kind, ParamKind::Path { .. });
-    let paths = || description.params.iter().filter(is_path).map(|param| param.name.as_str());
+    let mut files = Vec::new();
+    for param in &description.params {
+        if matches!(param.kind, ParamKind::Path { .. }) {
+            files.push(param.name.as_str());
+        }
+    }
+    files.push(RUN);
     for PinEntry { of, .. } in entry.pins.iter().filter(|pin| pin.of.text != RUN) {
-        if !paths().any(|name| name == of.text) {
+        if !files.contains(&of.text.as_str()) {
             let message = format!("'sha256' of node {}: there is no file {}", quote(&entry.id.text), quote(&of.text));
-            let help = did_you_mean_or_list(&of.text, "files", paths().chain([RUN]).collect::<Vec<_>>());
+            let help = did_you_mean_or_list(&of.text, "files", files.iter().copied());
             diagnostics.push_with_help(of.at, message, help);
         } else if let Err(error) = pins.check_param(&of.text, params) {
             diagnostics.push(of.at, of_node(entry, &error));
@@ -318,23 +344,7 @@ fn check_inputs(node: &ResolvedNode, resolved: &[ResolvedNode], diagnostics: &mu
             diagnostics.push_with_help(source.at, message, outputs_of_type(&port.type_name, resolved));
             continue;
         }
-        let is_paired = input.edge.tolerance_millis.is_some() || input.edge.partner_wait_millis.is_some();
-        if is_paired && !port.partner {
-            let message = format!(
-                "'tolerance_ms' and 'partner_wait_ms' have no meaning for input {} of {node_name}: its samples are not \
-                 found by the stamps of those of another input",
-                quote(&port.name)
-            );
-            diagnostics.push(input.port.at, message);
-        }
-        if port.partner && input.edge.on_late != OnLate::Count {
-            let message = format!(
-                "'on_late' of input {} of {node_name} must be 'count': give 'partner_wait_ms' to say how long the node waits \
-                 for its samples",
-                quote(&port.name)
-            );
-            diagnostics.push(input.port.at, message);
-        }
+        check_partner(input, port, &node_name, diagnostics);
         connected.insert(port.name.as_str(), (source, input.edge));
     }
 
@@ -358,14 +368,33 @@ fn check_inputs(node: &ResolvedNode, resolved: &[ResolvedNode], diagnostics: &mu
     inputs
 }
 
+/// Whether the options of an edge that is there fit an input whose samples are found by their stamps, or another one.
+fn check_partner(input: &InputEntry, port: &PortDescription, node_name: &str, diagnostics: &mut Diagnostics) {
+    let is_paired = input.edge.tolerance_millis.is_some() || input.edge.partner_wait_millis.is_some();
+    let name = quote(&port.name);
+    if is_paired && !port.partner {
+        let message = format!(
+            "'tolerance_ms' and 'partner_wait_ms' have no meaning for input {name} of {node_name}: its samples are not found \
+             by the stamps of those of another input"
+        );
+        diagnostics.push(input.port.at, message);
+    }
+    if port.partner && input.edge.on_late != OnLate::Count {
+        let message = format!(
+            "'on_late' of input {name} of {node_name} must be 'count': give 'partner_wait_ms' to say how long the node waits \
+             for its samples"
+        );
+        diagnostics.push(input.port.at, message);
+    }
+}
+
 /// Whether an input was given, rightly or wrongly, or an unknown input may be a misspelling of it.
 fn is_meant(entry: &NodeEntry, name: &str, ports: &[PortDescription]) -> bool {
     entry.is_damaged
-        || entry
-            .inputs
-            .iter()
-            .map(|input| input.port.text.as_str())
-            .any(|given| given == name || (find_port(ports, given).is_none() && did_you_mean(given, [name]).is_some()))
+        || entry.inputs.iter().any(|input| {
+            let given = input.port.text.as_str();
+            given == name || (find_port(ports, given).is_none() && did_you_mean(given, [name]).is_some())
+        })
 }
 
 fn find_output<'a>(
@@ -374,9 +403,11 @@ fn find_output<'a>(
     diagnostics: &mut Diagnostics,
 ) -> Option<&'a PortDescription> {
     let Some(from) = resolved.iter().find(|node| node.entry.id.text == source.node) else {
-        let nodes = resolved.iter().map(|node| node.entry.id.text.as_str());
-        let is_helpful = diagnostics.len() < MAX_MISTAKES_WITH_SIMILAR_NODES;
-        let help = is_helpful.then(|| did_you_mean_or_list(&source.node, "nodes", nodes)).flatten();
+        let mut help = None;
+        if diagnostics.len() < MAX_MISTAKES_WITH_SIMILAR_NODES {
+            let nodes = resolved.iter().map(|node| node.entry.id.text.as_str());
+            help = did_you_mean_or_list(&source.node, "nodes", nodes);
+        }
         diagnostics.push_with_help(source.at, format!("there is no node {}", quote(&source.node)), help);
         return None;
     };
@@ -391,14 +422,15 @@ fn find_output<'a>(
 }
 
 fn outputs_of_type(type_name: &str, resolved: &[ResolvedNode]) -> Option<String> {
-    let outputs: Vec<String> = resolved
-        .iter()
-        .filter_map(|node| Some((&node.entry.id.text, node.operator.as_ref()?)))
-        .flat_map(|(id, operator)| operator.description.outputs.iter().map(move |output| (id, output)))
-        .filter(|(_, output)| output.type_name == type_name)
-        .map(|(id, output)| format!("{id}/{}", output.name))
-        .collect();
-    (!outputs.is_empty()).then(|| list("outputs of that type", outputs.iter().map(String::as_str)))
+    let mut found = Vec::new();
+    for ResolvedNode { entry, operator } in resolved {
+        for output in operator.iter().flat_map(|operator| &operator.description.outputs) {
+            if output.type_name == type_name {
+                found.push(format!("{}/{}", entry.id.text, output.name));
+            }
+        }
+    }
+    if found.is_empty() { None } else { Some(list("outputs of that type", found.iter().map(String::as_str))) }
 }
 
 fn find_port<'a>(ports: &'a [PortDescription], name: &str) -> Option<&'a PortDescription> {

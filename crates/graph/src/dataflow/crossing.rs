@@ -13,9 +13,9 @@ use blindgrasp_operator::text::quote;
 impl Graph {
     /// The two machines of an edge; `None` if both its ends are on one machine.
     pub fn crossing(&self, edge: &Edge<'_>) -> Option<(&str, &str)> {
-        let machine = |node: &str| self.node(node)?.machine.as_deref();
-        let (from, to) = (machine(edge.from_node)?, machine(edge.to_node)?);
-        (from != to).then_some((from, to))
+        let from = self.node(edge.from_node)?.machine.as_deref()?;
+        let to = self.node(edge.to_node)?.machine.as_deref()?;
+        if from == to { None } else { Some((from, to)) }
     }
 }
 
@@ -57,17 +57,20 @@ pub(super) fn check_crossings(file: &DataflowFile, nodes: &[Node], diagnostics: 
 }
 
 fn crossings(file: &DataflowFile) -> Vec<Crossing<'_>> {
-    let machine_of = |node: &str| {
-        let entry = file.nodes.iter().find(|entry| entry.id.text == node)?;
-        Some(entry.on.as_ref()?.text.as_str())
-    };
-    let inputs = file.nodes.iter().flat_map(|reader| reader.inputs.iter().map(move |input| (reader, input)));
-    let crossing = inputs.filter_map(|(reader, input)| {
-        let source = input.source.as_ref()?;
-        let (from, to) = (machine_of(&source.node)?, machine_of(&reader.id.text)?);
-        (from != to).then_some(Crossing { reader, port: &input.port.text, source, from, to })
-    });
-    crossing.collect()
+    let mut crossings = Vec::new();
+    for reader in &file.nodes {
+        for input in &reader.inputs {
+            let Some(source) = &input.source else { continue };
+            let writer = file.nodes.iter().find(|entry| entry.id.text == source.node);
+            let Some(from) = writer.and_then(|writer| writer.on.as_ref()) else { continue };
+            if let Some(to) = &reader.on
+                && from.text != to.text
+            {
+                crossings.push(Crossing { reader, port: &input.port.text, source, from: &from.text, to: &to.text });
+            }
+        }
+    }
+    crossings
 }
 
 /// One of two machines that an edge joins must listen, unless there is a router.
@@ -78,9 +81,6 @@ fn check_listeners(file: &DataflowFile, crossings: &[Crossing], diagnostics: &mu
     let Some(machines) = &file.machines else { return };
     // A machine that the file does not have is another mistake.
     let listens = |name: &str| machines.find(name).is_none_or(|machine| machine.listens);
-    let ways_out = |name: &str| {
-        format!("let one listen, like '{name}: {{listen: tls/192.168.1.10:7447}}', or name a 'router' in 'link'")
-    };
     let is_any = machines.names().any(listens);
     let mut seen = BTreeSet::new();
     for crossing in crossings {
@@ -88,13 +88,13 @@ fn check_listeners(file: &DataflowFile, crossings: &[Crossing], diagnostics: &mu
         if listens(from) || listens(to) || !seen.insert((from.min(to), from.max(to))) {
             continue;
         }
-        if is_any {
-            let message = format!("{}, but neither of them listens", crossing.shown());
-            diagnostics.push_with_help(crossing.source.at, message, Some(ways_out(to)));
-        } else {
+        let help =
+            format!("let one listen, like '{to}: {{listen: tls/192.168.1.10:7447}}', or name a 'router' in 'link'");
+        if !is_any {
             let message = format!("no machine listens, but edges cross: {}", crossing.shown());
-            diagnostics.push_with_help(machines.at, message, Some(ways_out(to)));
-            return;
+            return diagnostics.push_with_help(machines.at, message, Some(help));
         }
+        let message = format!("{}, but neither of them listens", crossing.shown());
+        diagnostics.push_with_help(crossing.source.at, message, Some(help));
     }
 }

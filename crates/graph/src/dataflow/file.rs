@@ -39,16 +39,6 @@ pub struct DataflowFile {
     pub(super) diagnostics: Diagnostics,
 }
 
-struct Written {
-    absolute_path: PathBuf,
-    name: String,
-    params: Vec<Entry>,
-    nodes: Vec<NodeEntry>,
-    machines: Option<MachinesEntry>,
-    link: LinkEntry,
-    is_for_one_machine: bool,
-}
-
 impl DataflowFile {
     /// The file, as the caller named it.
     pub fn path(&self) -> &Path {
@@ -109,20 +99,7 @@ pub fn parse(path: &Path, content: &[u8]) -> Result<DataflowFile, DataflowError>
 fn parse_with(path: &Path, content: &[u8], variables: &[(&str, &str)]) -> Result<DataflowFile, DataflowError> {
     let mut diagnostics = Diagnostics::new(path);
     match read_file(path, content, variables, &mut diagnostics) {
-        Some(content) => {
-            let Written { absolute_path, name, params, nodes, machines, link, is_for_one_machine } = content;
-            Ok(DataflowFile {
-                path: path.to_owned(),
-                absolute_path,
-                name,
-                params,
-                nodes,
-                machines,
-                link,
-                is_for_one_machine,
-                diagnostics,
-            })
-        }
+        Some(file) => Ok(DataflowFile { diagnostics, ..file }),
         None => Err(diagnostics.into_error()),
     }
 }
@@ -134,43 +111,106 @@ fn read(path: &Path) -> std::io::Result<Vec<u8>> {
     Ok(content)
 }
 
-/// Whether a file is of a kind of its own. JSON is YAML as well.
-fn is_other(kind: FileKind) -> bool {
-    !matches!(kind, FileKind::Dataflow | FileKind::Empty | FileKind::Json)
-}
-
 fn read_file(
     path: &Path,
     content: &[u8],
     variables: &[(&str, &str)],
     diagnostics: &mut Diagnostics,
-) -> Option<Written> {
-    if let Some(kind) = FileKind::of(content).filter(|kind| is_other(*kind)) {
-        let message = format!("not a dataflow file: expected YAML with operators, found {}", kind.description());
-        diagnostics.push(None, message);
-        return None;
+) -> Option<DataflowFile> {
+    let text = text_of(content, diagnostics)?;
+    let absolute_path = match std::path::absolute(path) {
+        Ok(absolute_path) => absolute_path,
+        Err(error) => {
+            diagnostics.push(None, format!("cannot make the path absolute: {error}"));
+            return None;
+        }
+    };
+    let root = read_root(text, variables, diagnostics)?;
+    let start = root.at;
+    let entries = entries_of_this_version(root, diagnostics)?;
+    let mut file = DataflowFile {
+        path: path.to_owned(),
+        absolute_path,
+        name: String::new(),
+        params: Vec::new(),
+        nodes: Vec::new(),
+        machines: None,
+        link: LinkEntry::default(),
+        is_for_one_machine: true,
+        diagnostics: Diagnostics::new(path),
+    };
+    let (mut has_name, mut has_nodes, mut link_at) = (false, false, None);
+    for entry in entries {
+        match entry.key.text.as_str() {
+            "version" => {}
+            "name" => (has_name, file.name) = (true, read_name(&entry.value, diagnostics)),
+            "params" => file.params = entries_or_nothing(entry.value, "params", diagnostics).unwrap_or_default(),
+            "operators" => (has_nodes, file.nodes) = (true, read_nodes(entry, diagnostics)),
+            "machines" => {
+                file.is_for_one_machine = false;
+                file.machines = read_machines(entry, diagnostics);
+            }
+            "link" => (link_at, file.link) = (Some(entry.key.at), read_link(entry, diagnostics)),
+            _ => {
+                unknown_key(&entry.key, "", &FILE_KEYS, diagnostics);
+                // A key that was meant to be 'machines' is mistake enough.
+                file.is_for_one_machine &= did_you_mean(&entry.key.text, ["machines"]).is_none();
+            }
+        }
+    }
+    if !has_name {
+        let help = Some("give the graph a name, like 'name: grasp_gate'".to_owned());
+        diagnostics.push_with_help(start, "the key 'name' is missing", help);
+    }
+    if !has_nodes {
+        diagnostics.push(start, "the key 'operators' is missing");
+    }
+    check_places_and_link(&file, link_at, diagnostics);
+    Some(file)
+}
+
+/// The text of a file that may be a dataflow file.
+fn text_of<'a>(content: &'a [u8], diagnostics: &mut Diagnostics) -> Option<&'a str> {
+    // JSON is YAML as well.
+    match FileKind::of(content) {
+        None | Some(FileKind::Dataflow | FileKind::Empty | FileKind::Json) => {}
+        Some(other) => {
+            let message = format!("not a dataflow file: expected YAML with operators, found {}", other.description());
+            diagnostics.push(None, message);
+            return None;
+        }
     }
     if content.len() > MAX_FILE_BYTES {
         diagnostics.push(None, "larger than 1 MiB, so it is not a dataflow file");
         return None;
     }
-    let absolute_path = std::path::absolute(path)
-        .map_err(|error| diagnostics.push(None, format!("cannot make the path absolute: {error}")))
-        .ok()?;
-    let text = std::str::from_utf8(content)
-        .map_err(|error| diagnostics.push(position_after(&content[..error.valid_up_to()]), "not UTF-8 text"))
-        .ok()?;
+    match std::str::from_utf8(content) {
+        Ok(text) => Some(text),
+        Err(error) => {
+            diagnostics.push(position_after(&content[..error.valid_up_to()]), "not UTF-8 text");
+            None
+        }
+    }
+}
+
+/// The document with its variables filled in.
+fn read_root(text: &str, variables: &[(&str, &str)], diagnostics: &mut Diagnostics) -> Option<Value> {
     let mut root = yaml::parse(text, diagnostics)?;
     let n_before = diagnostics.len();
-    let variable = |name: &str| match variables.iter().find(|(known, _)| *known == name) {
+    fill_in(&mut root, &|name| variable(variables, name), diagnostics);
+    // A value that is not known would be a second mistake.
+    if diagnostics.len() > n_before { None } else { Some(root) }
+}
+
+fn variable(variables: &[(&str, &str)], name: &str) -> Option<String> {
+    match variables.iter().find(|(known, _)| *known == name) {
         Some((_, value)) => Some((*value).to_owned()),
         None => std::env::var(name).ok(),
-    };
-    fill_in(&mut root, &variable, diagnostics);
-    if diagnostics.len() > n_before {
-        // A value that is not known would be a second mistake.
-        return None;
     }
+}
+
+/// The keys of a file with their values. In another version, the other keys may mean something else.
+fn entries_of_this_version(root: Value, diagnostics: &mut Diagnostics) -> Option<Vec<Entry>> {
     let start = root.at;
     let Content::Mapping(entries) = root.content else {
         let help = format!("it begins with 'version: 1' and has the keys {}", FILE_KEYS.join(", "));
@@ -178,76 +218,33 @@ fn read_file(
         diagnostics.push_with_help(start, message, Some(help));
         return None;
     };
+    let Some(version) = entries.iter().find(|entry| entry.key.text == "version") else {
+        let help = Some("write 'version: 1'".to_owned());
+        diagnostics.push_with_help(start, "the key 'version' is missing", help);
+        return Some(entries);
+    };
+    match &version.value.content {
+        Content::Scalar { text, plain: true } if text == "1" => Some(entries),
+        _ => {
+            let message = format!("version must be 1, found {}", version.value.found());
+            diagnostics.push(version.value.at, message);
+            None
+        }
+    }
+}
 
-    // In another version, the other keys may mean something else.
-    let version = entries.iter().find(|entry| entry.key.text == "version");
-    match version.map(|entry| (entry, &entry.value.content)) {
-        None => {
-            let help = Some("write 'version: 1'".to_owned());
-            diagnostics.push_with_help(start, "the key 'version' is missing", help);
+/// Checks that the nodes' places, the machines and the link fit together.
+fn check_places_and_link(file: &DataflowFile, link_at: Option<Position>, diagnostics: &mut Diagnostics) {
+    if file.is_for_one_machine {
+        if let Some(at) = link_at {
+            let help = Some("leave it out, or name the machines that it links".to_owned());
+            diagnostics.push_with_help(at, "'link' has no meaning without the key 'machines'", help);
         }
-        Some((_, Content::Scalar { text, plain: true })) if text == "1" => {}
-        Some((entry, _)) => {
-            let message = format!("version must be 1, found {}", entry.value.found());
-            diagnostics.push(entry.value.at, message);
-            return None;
-        }
+        check_no_places(&file.nodes, diagnostics);
+    } else if let Some(machines) = &file.machines {
+        check_security(machines, &file.link, diagnostics);
+        check_places(machines, &file.nodes, diagnostics);
     }
-
-    let mut name = None;
-    let mut params = Vec::new();
-    let mut nodes = None;
-    let mut machines = None;
-    // A key that was meant to be 'machines' is mistake enough.
-    let mut has_machines = false;
-    let mut link = None;
-    for entry in entries {
-        match entry.key.text.as_str() {
-            "version" => {}
-            "name" => name = Some(read_name(&entry.value, diagnostics)),
-            "params" => params = entries_or_nothing(entry.value, "params", diagnostics).unwrap_or_default(),
-            "operators" => nodes = Some(read_nodes(entry, diagnostics)),
-            "machines" => {
-                has_machines = true;
-                machines = read_machines(entry, diagnostics);
-            }
-            "link" => link = Some((entry.key.at, read_link(entry, diagnostics))),
-            _ => {
-                unknown_key(&entry.key, "", &FILE_KEYS, diagnostics);
-                has_machines |= did_you_mean(&entry.key.text, ["machines"]).is_some();
-            }
-        }
-    }
-    if name.is_none() {
-        let help = Some("give the graph a name, like 'name: grasp_gate'".to_owned());
-        diagnostics.push_with_help(start, "the key 'name' is missing", help);
-    }
-    if nodes.is_none() {
-        diagnostics.push(start, "the key 'operators' is missing");
-    }
-    let nodes = nodes.unwrap_or_default();
-    if let (Some((at, _)), false) = (&link, has_machines) {
-        let help = Some("leave it out, or name the machines that it links".to_owned());
-        diagnostics.push_with_help(*at, "'link' has no meaning without the key 'machines'", help);
-    }
-    let link = link.map(|(_, link)| link).unwrap_or_default();
-    match &machines {
-        Some(machines) => {
-            check_security(machines, &link, diagnostics);
-            check_places(machines, &nodes, diagnostics);
-        }
-        None if !has_machines => check_no_places(&nodes, diagnostics),
-        None => {}
-    }
-    Some(Written {
-        absolute_path,
-        name: name.unwrap_or_default(),
-        params,
-        nodes,
-        machines,
-        link,
-        is_for_one_machine: !has_machines,
-    })
 }
 
 fn read_name(value: &Value, diagnostics: &mut Diagnostics) -> String {

@@ -33,6 +33,29 @@ pub(super) fn unknown_key(key: &Text, place: &str, known: &[&str], diagnostics: 
     diagnostics.push_with_help(key.at, format!("unknown key {}{place}", quote(&key.text)), help);
 }
 
+/// An integer within bounds, which the type holds; see [`accept`].
+pub(super) fn accept_integer<T: TryFrom<i64>>(
+    value: &Value,
+    [min, max]: [i64; 2],
+    what: &str,
+    help: Option<&str>,
+    diagnostics: &mut Diagnostics,
+) -> Option<T> {
+    let kind = ParamKind::Integer { min: Some(min), max: Some(max) };
+    T::try_from(accept(value, &kind, what, help, diagnostics)?.as_i64()?).ok()
+}
+
+/// A number within bounds; see [`accept`].
+pub(super) fn accept_number(
+    value: &Value,
+    [min, max]: [f64; 2],
+    what: &str,
+    diagnostics: &mut Diagnostics,
+) -> Option<f64> {
+    let kind = ParamKind::Number { above: None, min: Some(min), max: Some(max), words: Vec::new() };
+    accept(value, &kind, what, None, diagnostics)?.as_f64()
+}
+
 /// The value, if it is of this kind; otherwise a diagnostic, with `help` if the kind has no hint of its own.
 pub(super) fn accept(
     value: &Value,

@@ -183,9 +183,9 @@ impl Graph {
 
     /// The first node of this node's process.
     pub fn leader<'a>(&'a self, node: &'a Node) -> &'a Node {
-        let group = node.process.group.as_ref();
-        let first = |group| self.nodes.iter().find(|other| other.process.group.as_ref() == Some(group));
-        group.and_then(first).unwrap_or(node)
+        let mut others = self.nodes.iter();
+        let first = others.find(|other| other.process.group.is_some() && other.process.group == node.process.group);
+        first.unwrap_or(node)
     }
 
     /// All connections, in the order of the nodes and inputs that read.

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use crate::dataflow::diagnostic::{Diagnostics, Position, did_you_mean_or_list, list};
 use crate::dataflow::endpoint::Endpoint;
-use crate::dataflow::form::{accept, check_name, entries_or_nothing, unknown_key};
+use crate::dataflow::form::{accept, accept_integer, check_name, entries_or_nothing, unknown_key};
 use crate::dataflow::machines::{LinkSettings, Machine, Machines};
 use crate::dataflow::node::NodeEntry;
 use crate::dataflow::settings::absolute;
@@ -61,20 +61,22 @@ impl MachinesEntry {
 
     /// As a graph has them; a path is relative to `folder`.
     pub(super) fn settle(&self, link: &LinkEntry, folder: &Path) -> Machines {
-        let written =
-            |endpoints: &[(Text, Endpoint)]| endpoints.iter().map(|(text, _)| text.text.clone()).collect::<Vec<_>>();
         let machines = self.machines.iter().map(|machine| Machine {
             name: machine.name.text.clone(),
-            listen: written(&machine.listen),
+            listen: as_written(&machine.listen),
             ssh: machine.ssh.clone(),
         });
         let link = LinkSettings {
-            router: written(&link.router),
+            router: as_written(&link.router),
             keys: link.keys.as_ref().map(|keys| absolute(folder, keys)),
             ..link.settings.clone()
         };
         Machines { machines: machines.collect(), link }
     }
+}
+
+fn as_written(endpoints: &[(Text, Endpoint)]) -> Vec<String> {
+    endpoints.iter().map(|(text, _)| text.text.clone()).collect()
 }
 
 /// The machines of the file; `None` when they cannot be known.
@@ -151,14 +153,12 @@ pub(super) fn read_link(entry: Entry, diagnostics: &mut Diagnostics) -> LinkEntr
                 link.settings.insecure = accepted.is_none_or(|insecure| insecure == true);
             }
             "deadline_ms" => {
-                let kind = ParamKind::Integer { min: Some(MIN_DEADLINE_MILLIS), max: Some(MAX_DEADLINE_MILLIS) };
-                let accepted = accept(&value, &kind, &what, None, diagnostics).and_then(|millis| millis.as_u64());
+                let bounds = [MIN_DEADLINE_MILLIS, MAX_DEADLINE_MILLIS];
+                let accepted = accept_integer(&value, bounds, &what, None, diagnostics);
                 link.settings.deadline_millis = accepted.unwrap_or(link.settings.deadline_millis);
             }
             "buffer" => {
-                let kind = ParamKind::Integer { min: Some(1), max: Some(MAX_BUFFER) };
-                let accepted = accept(&value, &kind, &what, None, diagnostics);
-                let accepted = accepted.and_then(|buffer| usize::try_from(buffer.as_u64()?).ok());
+                let accepted = accept_integer(&value, [1, MAX_BUFFER], &what, None, diagnostics);
                 link.settings.buffer = accepted.unwrap_or(link.settings.buffer);
             }
             _ => {
@@ -205,19 +205,14 @@ fn read_texts(value: Value, what: &str, like: &str, diagnostics: &mut Diagnostic
             return None;
         }
     };
-    let mut texts = Some(Vec::with_capacity(items.len()));
-    for item in items {
+    let mut texts = Vec::with_capacity(items.len());
+    for item in &items {
         match &item.content {
-            Content::Scalar { text, .. } if !item.is_null() => {
-                texts = texts.map(|texts| [texts, vec![Text { text: text.clone(), at: item.at }]].concat());
-            }
-            _ => {
-                diagnostics.push(item.at, format!("{must_be}, found {} in it", item.found()));
-                texts = None;
-            }
+            Content::Scalar { text, .. } if !item.is_null() => texts.push(Text { text: text.clone(), at: item.at }),
+            _ => diagnostics.push(item.at, format!("{must_be}, found {} in it", item.found())),
         }
     }
-    texts
+    if texts.len() == items.len() { Some(texts) } else { None }
 }
 
 /// Reads endpoints, and refuses addresses to which no machine can connect.
@@ -248,15 +243,12 @@ fn check_endpoints(entry: &MachinesEntry, diagnostics: &mut Diagnostics) {
         let of = format!("of machine {}", quote(&machine.name.text));
         let before = &entry.machines[..machine_idx];
         for (text, endpoint) in &machine.listen {
-            let is_same =
-                |other: &&MachineEntry| other.listen.iter().any(|(_, other)| address(other) == address(endpoint));
-            if let Some(other) = before.iter().find(is_same) {
-                let message = format!(
-                    "'listen' {of}: machine {} listens at {} already",
-                    quote(&other.name.text),
-                    quote(&text.text)
-                );
-                diagnostics.push(text.at, message);
+            for other in before {
+                if other.listen.iter().any(|(_, other)| address(other) == address(endpoint)) {
+                    let (other, address) = (quote(&other.name.text), quote(&text.text));
+                    diagnostics.push(text.at, format!("'listen' {of}: machine {other} listens at {address} already"));
+                    break;
+                }
             }
         }
     }
@@ -272,16 +264,14 @@ fn address(endpoint: &Endpoint) -> (&str, u16) {
 
 /// Checks the keys of the link against the machines' endpoints.
 pub(super) fn check_security(machines: &MachinesEntry, link: &LinkEntry, diagnostics: &mut Diagnostics) {
-    let endpoints = || machines.machines.iter().flat_map(|machine| &machine.listen).chain(&link.router);
-    let is_tls = |endpoint: &Endpoint| matches!(endpoint, Endpoint::Tls { .. });
-    if let Some((text, _)) = endpoints().find(|(_, endpoint)| is_tls(endpoint))
-        && !link.has_keys
-    {
+    let endpoints: Vec<_> = machines.machines.iter().flat_map(|machine| &machine.listen).chain(&link.router).collect();
+    let first_tls = endpoints.iter().find(|(_, endpoint)| matches!(endpoint, Endpoint::Tls { .. }));
+    if let (Some((text, _)), false) = (first_tls, link.has_keys) {
         let message = format!("{} needs certificates, but 'link' has no 'keys'", quote(&text.text));
         let help = "make them with 'blindgrasp keys' and write 'link: {keys: FOLDER}'".to_owned();
         diagnostics.push_with_help(text.at, message, Some(help));
     }
-    for (text, endpoint) in endpoints() {
+    for (text, endpoint) in endpoints {
         let Endpoint::Tcp { host, port } = endpoint else {
             continue;
         };

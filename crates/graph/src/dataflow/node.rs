@@ -1,7 +1,7 @@
 //! A node in the file: its operator, inputs, params and supervision.
 
 use crate::dataflow::diagnostic::{Diagnostics, Position};
-use crate::dataflow::form::{accept, check_name, entries_or_nothing, unknown_key};
+use crate::dataflow::form::{accept, accept_integer, accept_number, check_name, entries_or_nothing, unknown_key};
 use crate::dataflow::graph::{DEFAULT_HEARTBEAT_MILLIS, EdgeOptions, Restart, RestartPolicy};
 use crate::dataflow::pins::Pins;
 use crate::dataflow::process_options::{PROCESS_KEYS, ProcessOptions, read_option};
@@ -43,6 +43,7 @@ pub(super) const MAX_RESTARTS: i64 = 1000;
 /// hang.
 pub(super) const MIN_HEARTBEAT_MILLIS: f64 = 250.0;
 pub(super) const HOUR_MILLIS: f64 = 3.6e6;
+const FROM_ZERO: [f64; 2] = [0.0, HOUR_MILLIS];
 pub(super) const DAY_SECS: f64 = 86_400.0;
 /// An operator that does nothing has about this much.
 pub(super) const MIN_MEMORY_MIB: i64 = 16;
@@ -53,12 +54,13 @@ pub(super) const MIN_WINDOW_SECS: f64 = 0.001;
 #[derive(Debug, Clone)]
 pub(super) struct NodeEntry {
     pub(super) id: Text,
-    /// The operator; `None` if it or its arguments could not be read.
+    /// The operator; `None` if it could not be read.
     pub(super) run: Option<Text>,
     pub(super) on: Option<Text>,
     /// Whether the file has the key `on`, rightly or not.
     pub(super) has_on: bool,
-    pub(super) args: Vec<String>,
+    /// `None` if they could not be read: others may make the program another operator.
+    pub(super) args: Option<Vec<String>>,
     pub(super) inputs: Vec<InputEntry>,
     pub(super) params: Vec<Entry>,
     pub(super) restart: Restart,
@@ -104,6 +106,82 @@ pub(super) struct Source {
 }
 
 impl NodeEntry {
+    /// A node of which the file says nothing but its id.
+    fn new(id: Text) -> NodeEntry {
+        NodeEntry {
+            run: Some(id.clone()),
+            on: None,
+            has_on: false,
+            args: Some(Vec::new()),
+            inputs: Vec::new(),
+            params: Vec::new(),
+            restart: Restart::default(),
+            heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
+            sandbox: Sandbox::default(),
+            memory_max_mib: None,
+            process: ProcessOptions::default(),
+            wait_at: id.at,
+            group_at: id.at,
+            pins: Vec::new(),
+            inputs_at: id.at,
+            params_at: id.at,
+            is_damaged: false,
+            id,
+        }
+    }
+
+    fn read_key(&mut self, key: Text, value: Value, node_name: &str, diagnostics: &mut Diagnostics) {
+        let what = format!("{} of {node_name}", quote(&key.text));
+        match key.text.as_str() {
+            "run" => self.run = read_run(value, &what, diagnostics),
+            "on" => {
+                self.has_on = true;
+                self.on = read_on(&value, &what, diagnostics);
+            }
+            "args" => self.args = read_args(value, &what, diagnostics),
+            "inputs" => {
+                self.inputs_at = key.at;
+                match entries_or_nothing(value, &what, diagnostics) {
+                    Some(entries) => self.inputs = read_inputs(entries, node_name, diagnostics),
+                    None => self.is_damaged = true,
+                }
+            }
+            "params" => {
+                self.params_at = key.at;
+                match entries_or_nothing(value, &what, diagnostics) {
+                    Some(entries) => self.params = entries,
+                    None => self.is_damaged = true,
+                }
+            }
+            "restart" => self.restart = read_restart(value, &what, diagnostics),
+            "heartbeat_ms" => self.heartbeat_millis = read_heartbeat(&value, &what, diagnostics),
+            "sandbox" => {
+                let choices = [Sandbox::Off, Sandbox::On, Sandbox::Required];
+                self.sandbox = one_of(&choices, &value, &what, None, diagnostics).unwrap_or_default();
+            }
+            "memory_max_mib" => {
+                let bounds = [MIN_MEMORY_MIB, MAX_MEMORY_MIB];
+                self.memory_max_mib = accept_integer(&value, bounds, &what, None, diagnostics);
+            }
+            "sha256" => {
+                let entries = entries_or_nothing(value, &what, diagnostics).unwrap_or_default();
+                self.pins = entries.into_iter().filter_map(|pin| read_pin(pin, &what, diagnostics)).collect();
+            }
+            text if PROCESS_KEYS.contains(&text) => {
+                match text {
+                    "wait" => self.wait_at = value.at,
+                    "group" => self.group_at = value.at,
+                    _ => {}
+                }
+                read_option(&mut self.process, text, value, &what, diagnostics);
+            }
+            _ => {
+                unknown_key(&key, &format!(" in {node_name}"), &NODE_KEYS, diagnostics);
+                self.is_damaged = true;
+            }
+        }
+    }
+
     pub(super) fn pins(&self) -> Pins {
         Pins(self.pins.iter().map(|pin| (pin.of.text.clone(), pin.digests.clone())).collect())
     }
@@ -115,95 +193,19 @@ impl NodeEntry {
 }
 
 pub(super) fn read_node(entry: Entry, diagnostics: &mut Diagnostics) -> NodeEntry {
-    let id = entry.key;
-    check_name(&id, "node id", diagnostics);
-    if id.text == AUDIT {
+    let mut node = NodeEntry::new(entry.key);
+    check_name(&node.id, "node id", diagnostics);
+    if node.id.text == AUDIT {
         let message = format!("node id '{AUDIT}' is taken: it is the name of the audit log");
-        diagnostics.push_with_help(id.at, message, Some("choose another".to_owned()));
+        diagnostics.push_with_help(node.id.at, message, Some("choose another".to_owned()));
     }
-    let node_name = format!("node {}", quote(&id.text));
-    let mut node = NodeEntry {
-        run: Some(id.clone()),
-        on: None,
-        has_on: false,
-        args: Vec::new(),
-        inputs: Vec::new(),
-        params: Vec::new(),
-        restart: Restart::default(),
-        heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
-        sandbox: Sandbox::default(),
-        memory_max_mib: None,
-        process: ProcessOptions::default(),
-        wait_at: id.at,
-        group_at: id.at,
-        pins: Vec::new(),
-        inputs_at: id.at,
-        params_at: id.at,
-        is_damaged: false,
-        id,
-    };
+    let node_name = format!("node {}", quote(&node.id.text));
     let Some(entries) = entries_or_nothing(entry.value, &node_name, diagnostics) else {
         node.is_damaged = true;
         return node;
     };
-    let mut has_args = true;
     for Entry { key, value } in entries {
-        let what = format!("{} of {node_name}", quote(&key.text));
-        match key.text.as_str() {
-            "run" => node.run = read_run(value, &what, diagnostics),
-            "on" => {
-                node.has_on = true;
-                node.on = read_on(&value, &what, diagnostics);
-            }
-            "args" => match read_args(value, &what, diagnostics) {
-                Some(args) => node.args = args,
-                None => has_args = false,
-            },
-            "inputs" => {
-                node.inputs_at = key.at;
-                match entries_or_nothing(value, &what, diagnostics) {
-                    Some(entries) => node.inputs = read_inputs(entries, &node_name, diagnostics),
-                    None => node.is_damaged = true,
-                }
-            }
-            "params" => {
-                node.params_at = key.at;
-                match entries_or_nothing(value, &what, diagnostics) {
-                    Some(entries) => node.params = entries,
-                    None => node.is_damaged = true,
-                }
-            }
-            "restart" => node.restart = read_restart(value, &what, diagnostics),
-            "heartbeat_ms" => node.heartbeat_millis = read_heartbeat(&value, &what, diagnostics),
-            "sandbox" => {
-                let choices = [Sandbox::Off, Sandbox::On, Sandbox::Required];
-                node.sandbox = one_of(&choices, &value, &what, None, diagnostics).unwrap_or_default();
-            }
-            "memory_max_mib" => {
-                let kind = ParamKind::Integer { min: Some(MIN_MEMORY_MIB), max: Some(MAX_MEMORY_MIB) };
-                node.memory_max_mib = accept(&value, &kind, &what, None, diagnostics).and_then(|mib| mib.as_u64());
-            }
-            text if PROCESS_KEYS.contains(&text) => {
-                match text {
-                    "wait" => node.wait_at = value.at,
-                    "group" => node.group_at = value.at,
-                    _ => {}
-                }
-                read_option(&mut node.process, text, value, &what, diagnostics);
-            }
-            "sha256" => {
-                let entries = entries_or_nothing(value, &what, diagnostics).unwrap_or_default();
-                node.pins = entries.into_iter().filter_map(|pin| read_pin(pin, &what, diagnostics)).collect();
-            }
-            _ => {
-                unknown_key(&key, &format!(" in {node_name}"), &NODE_KEYS, diagnostics);
-                node.is_damaged = true;
-            }
-        }
-    }
-    if !has_args {
-        // Other arguments may make the program another operator.
-        node.run = None;
+        node.read_key(key, value, &node_name, diagnostics);
     }
     node
 }
@@ -332,19 +334,15 @@ fn read_input(entry: Entry, node_name: &str, diagnostics: &mut Diagnostics) -> I
                 let policies = [EdgePolicy::Lossless, EdgePolicy::Latest];
                 edge.policy = one_of(&policies, &value, &of_what, None, diagnostics).unwrap_or(edge.policy);
             }
-            "capacity" => {
-                let kind = ParamKind::Integer { min: Some(1), max: Some(MAX_CAPACITY) };
-                let accepted = accept(&value, &kind, &of_what, None, diagnostics);
-                capacity = accepted.and_then(|capacity| usize::try_from(capacity.as_u64()?).ok());
-            }
+            "capacity" => capacity = accept_integer(&value, [1, MAX_CAPACITY], &of_what, None, diagnostics),
             "deadline_ms" => {
                 let kind = ParamKind::Number { above: Some(0.0), min: None, max: Some(HOUR_MILLIS), words: Vec::new() };
                 let accepted = accept(&value, &kind, &of_what, None, diagnostics);
                 edge.deadline_millis = accepted.and_then(|deadline| deadline.as_f64());
                 has_deadline = true;
             }
-            "tolerance_ms" => edge.tolerance_millis = millis_from_zero(&value, &of_what, diagnostics),
-            "partner_wait_ms" => edge.partner_wait_millis = millis_from_zero(&value, &of_what, diagnostics),
+            "tolerance_ms" => edge.tolerance_millis = accept_number(&value, FROM_ZERO, &of_what, diagnostics),
+            "partner_wait_ms" => edge.partner_wait_millis = accept_number(&value, FROM_ZERO, &of_what, diagnostics),
             "on_late" => {
                 let choices = [OnLate::Count, OnLate::Hold, OnLate::Stop];
                 edge.on_late = one_of(&choices, &value, &of_what, None, diagnostics).unwrap_or_default();
@@ -364,17 +362,9 @@ fn read_input(entry: Entry, node_name: &str, diagnostics: &mut Diagnostics) -> I
         let help = Some("write from which age on a sample is late, like 'deadline_ms: 20'".to_owned());
         diagnostics.push_with_help(at, format!("'on_late' of {what} has no meaning without 'deadline_ms'"), help);
     }
-    match (capacity, edge.policy) {
-        (Some(capacity), _) => edge.capacity = capacity,
-        (None, EdgePolicy::Latest) => edge.capacity = LATEST_CAPACITY,
-        (None, EdgePolicy::Lossless) => {}
-    }
+    let by_default = if edge.policy == EdgePolicy::Latest { LATEST_CAPACITY } else { edge.capacity };
+    edge.capacity = capacity.unwrap_or(by_default);
     InputEntry { port, is_left_out_without_port, source, edge }
-}
-
-fn millis_from_zero(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> Option<f64> {
-    let kind = ParamKind::Number { above: None, min: Some(0.0), max: Some(HOUR_MILLIS), words: Vec::new() };
-    accept(value, &kind, what, None, diagnostics)?.as_f64()
 }
 
 fn read_source(value: &Value, key: &str, what: &str, diagnostics: &mut Diagnostics) -> Option<Source> {
@@ -406,22 +396,18 @@ fn read_restart(value: Value, what: &str, diagnostics: &mut Diagnostics) -> Rest
                 continue;
             }
             "limit" => {
-                let kind = ParamKind::Integer { min: Some(1), max: Some(MAX_RESTARTS) };
                 let is_none = matches!(&value.content, Content::Scalar { text, .. } if text == "0");
                 let help = is_none.then_some("to never restart it write 'restart: never'");
-                let accepted = accept(&value, &kind, &of_what, help, diagnostics);
-                let accepted = accepted.and_then(|limit| u32::try_from(limit.as_u64()?).ok());
+                let accepted = accept_integer(&value, [1, MAX_RESTARTS], &of_what, help, diagnostics);
                 restart.limit = accepted.unwrap_or(restart.limit);
             }
             "within_s" => {
-                let accepted = accept(&value, &number(MIN_WINDOW_SECS, DAY_SECS), &of_what, None, diagnostics);
-                let accepted = accepted.and_then(|secs| secs.as_f64()).map(|secs| whole(1000.0 * secs));
-                restart.within_millis = accepted.unwrap_or(restart.within_millis);
+                let accepted = accept_number(&value, [MIN_WINDOW_SECS, DAY_SECS], &of_what, diagnostics);
+                restart.within_millis = accepted.map_or(restart.within_millis, |secs| whole(1000.0 * secs));
             }
             "backoff_ms" => {
-                let accepted = accept(&value, &number(0.0, HOUR_MILLIS), &of_what, None, diagnostics);
-                let accepted = accepted.and_then(|millis| millis.as_f64()).map(whole);
-                restart.backoff_millis = accepted.unwrap_or(restart.backoff_millis);
+                let accepted = accept_number(&value, FROM_ZERO, &of_what, diagnostics);
+                restart.backoff_millis = accepted.map_or(restart.backoff_millis, whole);
             }
             _ => {
                 unknown_key(&key, &format!(" in {what}"), &RESTART_KEYS, diagnostics);
@@ -467,10 +453,6 @@ pub(super) fn one_of<T: Copy + ToString>(
     let kind = ParamKind::Choice { values: choices.iter().map(T::to_string).collect() };
     let word = accept(value, &kind, what, help, diagnostics)?;
     choices.iter().copied().find(|choice| word == choice.to_string())
-}
-
-fn number(min: f64, max: f64) -> ParamKind {
-    ParamKind::Number { above: None, min: Some(min), max: Some(max), words: Vec::new() }
 }
 
 /// Rounds an accepted number, which is neither negative nor too large.

@@ -73,8 +73,7 @@ impl<'a> Search<'a, '_> {
 
     fn report(&mut self, start_idx: usize, at: Position) {
         let cycle = &self.path[start_idx..];
-        let is_known = |id: &&str| self.resolved.get(id).is_some_and(|node| node.operator.is_some());
-        if !cycle.iter().all(is_known) {
+        if !cycle.iter().all(|id| self.resolved.get(id).is_some_and(|node| node.operator.is_some())) {
             // One of them may have feedback. That it could not be asked is said elsewhere.
             return;
         }

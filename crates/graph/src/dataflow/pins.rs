@@ -80,8 +80,7 @@ impl Pins {
 }
 
 fn check_file(of: &str, file: &Path, expected: &[String]) -> Result<(), PinError> {
-    let unreadable = |source| PinError::Unreadable { of: of.into(), file: file.into(), source };
-    let found = digest(file).map_err(unreadable)?;
+    let found = digest(file).map_err(|source| PinError::Unreadable { of: of.into(), file: file.into(), source })?;
     if expected.contains(&found) {
         return Ok(());
     }
@@ -98,8 +97,8 @@ fn digest(path: &Path) -> std::io::Result<String> {
     let mut file = open_regular(path)?;
     let metadata = file.metadata()?;
     let stamp = stamp(&metadata);
-    let known = || KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
-    let found = known().as_ref().and_then(|known| known.get(path).cloned());
+    let found =
+        KNOWN.lock().unwrap_or_else(PoisonError::into_inner).as_ref().and_then(|known| known.get(path).cloned());
     if let Some((_, digest)) = found.filter(|(before, _)| *before == stamp) {
         return Ok(digest);
     }
@@ -113,7 +112,11 @@ fn digest(path: &Path) -> std::io::Result<String> {
     }
     let digest: String = hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
     if metadata.ctime() + SETTLED_SECS < now_secs {
-        known().get_or_insert_default().insert(path.into(), (stamp, digest.clone()));
+        KNOWN
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .get_or_insert_default()
+            .insert(path.into(), (stamp, digest.clone()));
     }
     Ok(digest)
 }

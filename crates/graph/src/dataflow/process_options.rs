@@ -5,7 +5,7 @@ use std::fmt;
 use serde::Serialize;
 
 use crate::dataflow::diagnostic::Diagnostics;
-use crate::dataflow::form::{accept, entries_or_nothing, unknown_key};
+use crate::dataflow::form::{accept, accept_integer, entries_or_nothing, unknown_key};
 use crate::dataflow::node::one_of;
 use crate::dataflow::yaml::{Content, Entry, Value};
 use blindgrasp_operator::param::ParamKind;
@@ -79,7 +79,6 @@ fn is_default<T: Default + PartialEq>(value: &T) -> bool {
 
 /// Reads one of [`PROCESS_KEYS`]. A value that is not accepted leaves the default.
 pub(super) fn read_option(options: &mut ProcessOptions, key: &str, value: Value, what: &str, found: &mut Diagnostics) {
-    let integer = |min, max| ParamKind::Integer { min: Some(min), max: Some(max) };
     match key {
         "group" => {
             let text = accept(&value, &ParamKind::String {}, what, None, found);
@@ -92,10 +91,7 @@ pub(super) fn read_option(options: &mut ProcessOptions, key: &str, value: Value,
             let accepted = accept(&value, &ParamKind::Boolean {}, what, None, found);
             options.lock_memory = accepted.and_then(|is_locked| is_locked.as_bool()).unwrap_or_default();
         }
-        _ => {
-            let accepted = accept(&value, &integer(-20, 19), what, None, found);
-            options.nice = accepted.and_then(|nice| i32::try_from(nice.as_i64()?).ok());
-        }
+        _ => options.nice = accept_integer(&value, [-20, 19], what, None, found),
     }
 }
 
@@ -108,9 +104,8 @@ fn read_wait(value: Value, what: &str, found: &mut Diagnostics) -> Option<WaitMo
     let mut wait = None;
     for Entry { key, value } in entries {
         if key.text == "poll_us" {
-            let kind = ParamKind::Integer { min: Some(1), max: Some(MAX_POLL_MICROS) };
-            let micros = accept(&value, &kind, &format!("'poll_us' of {what}"), None, found);
-            wait = micros.and_then(|micros| micros.as_u64()).map(WaitMode::PollMicros);
+            let micros = accept_integer(&value, [1, MAX_POLL_MICROS], &format!("'poll_us' of {what}"), None, found);
+            wait = micros.map(WaitMode::PollMicros);
         } else {
             unknown_key(&key, &format!(" in {what}"), &["poll_us"], found);
         }
@@ -129,11 +124,7 @@ fn read_scheduling(value: Value, what: &str, found: &mut Diagnostics) -> Option<
                 let policies = [SchedulingPolicy::Fifo, SchedulingPolicy::RoundRobin];
                 policy = one_of(&policies, &value, &of_what, None, found);
             }
-            "priority" => {
-                let kind = ParamKind::Integer { min: Some(1), max: Some(99) };
-                let accepted = accept(&value, &kind, &of_what, None, found);
-                priority = accepted.and_then(|priority| u32::try_from(priority.as_u64()?).ok());
-            }
+            "priority" => priority = accept_integer(&value, [1, 99], &of_what, None, found),
             _ => unknown_key(&key, &format!(" in {what}"), &SCHEDULING_KEYS, found),
         }
     }
@@ -152,11 +143,9 @@ fn read_cpus(value: Value, what: &str, found: &mut Diagnostics) -> Option<Vec<us
         found.push_with_help(value.at, message, Some("write [2, 3]".to_owned()));
         return None;
     };
-    let kind = ParamKind::Integer { min: Some(0), max: Some(MAX_CPUS - 1) };
     let mut cpus = Vec::new();
     for item in &items {
-        let cpu = accept(item, &kind, what, None, found).and_then(|cpu| usize::try_from(cpu.as_u64()?).ok());
-        cpus.extend(cpu);
+        cpus.extend(accept_integer::<usize>(item, [0, MAX_CPUS - 1], what, None, found));
     }
     Some(cpus)
 }

@@ -126,26 +126,17 @@ fn of_param(param: &ParamDescription) -> Value {
 }
 
 fn of_kind(kind: &ParamKind) -> Value {
-    let bounded = |of_type: &str, bounds: &[(&str, Option<Value>)]| {
-        let mut schema = json!({"type": of_type});
-        for (bound, value) in bounds {
-            if let Some(value) = value {
-                schema[*bound] = value.clone();
-            }
-        }
-        schema
-    };
     let of_value = match kind {
         ParamKind::Path { .. } => return json!({"type": "string", "minLength": 1}),
         // A dataflow file needs no quotes for a text: 010 and no are texts, too.
         ParamKind::String {} => return json!({"type": ["string", "number", "boolean"]}),
         ParamKind::Boolean {} => json!({"type": "boolean"}),
         ParamKind::Integer { min, max } => {
-            bounded("integer", &[("minimum", min.map(Value::from)), ("maximum", max.map(Value::from))])
+            bounded("integer", [("minimum", min.map(Value::from)), ("maximum", max.map(Value::from))])
         }
         ParamKind::Number { above, min, max, words } => {
             let bounds = [("exclusiveMinimum", above), ("minimum", min), ("maximum", max)];
-            let number = bounded("number", &bounds.map(|(name, bound)| (name, bound.map(Value::from))));
+            let number = bounded("number", bounds.map(|(name, bound)| (name, bound.map(Value::from))));
             match words.as_slice() {
                 [] => number,
                 words => json!({"anyOf": [number, {"enum": words}]}),
@@ -154,6 +145,16 @@ fn of_kind(kind: &ParamKind) -> Value {
         ParamKind::Choice { values } => json!({"enum": values}),
     };
     or_variable(of_value)
+}
+
+fn bounded<const N: usize>(of_type: &str, bounds: [(&str, Option<Value>); N]) -> Value {
+    let mut schema = json!({"type": of_type});
+    for (bound, value) in bounds {
+        if let Some(value) = value {
+            schema[bound] = value;
+        }
+    }
+    schema
 }
 
 fn node_keys() -> Value {
@@ -172,20 +173,7 @@ fn node_keys() -> Value {
         "inputs": {
             "type": ["object", "null"],
             "description": "Where each input comes from: NODE/PORT",
-            "additionalProperties": {"anyOf": [source(), {
-                "type": "object",
-                "required": ["from"],
-                "additionalProperties": false,
-                "properties": {
-                    "from": source(),
-                    "policy": words(&["lossless", "latest"]),
-                    "capacity": integer(1, MAX_CAPACITY),
-                    "deadline_ms": or_variable(json!({"type": "number", "exclusiveMinimum": 0, "maximum": HOUR_MILLIS})),
-                    "on_late": words(&["count", "hold", "stop"]),
-                    "tolerance_ms": number(0.0, HOUR_MILLIS),
-                    "partner_wait_ms": number(0.0, HOUR_MILLIS),
-                },
-            }]},
+            "additionalProperties": {"anyOf": [source(), edge()]},
         },
         "params": {"type": ["object", "null"], "description": "The parameters of the operator"},
         "sha256": {
@@ -222,6 +210,23 @@ fn node_keys() -> Value {
         "cpus": {"type": "array", "items": integer(0, MAX_CPUS - 1)},
         "lock_memory": or_variable(json!({"type": "boolean"})),
         "nice": integer(-20, 19),
+    })
+}
+
+fn edge() -> Value {
+    json!({
+        "type": "object",
+        "required": ["from"],
+        "additionalProperties": false,
+        "properties": {
+            "from": source(),
+            "policy": words(&["lossless", "latest"]),
+            "capacity": integer(1, MAX_CAPACITY),
+            "deadline_ms": or_variable(json!({"type": "number", "exclusiveMinimum": 0, "maximum": HOUR_MILLIS})),
+            "on_late": words(&["count", "hold", "stop"]),
+            "tolerance_ms": number(0.0, HOUR_MILLIS),
+            "partner_wait_ms": number(0.0, HOUR_MILLIS),
+        },
     })
 }
 

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::dataflow::check::{Operator, ResolvedNode};
 use crate::dataflow::diagnostic::{Diagnostics, did_you_mean_or_list};
 use crate::dataflow::file::DataflowFile;
-use crate::dataflow::node::NodeEntry;
+use crate::dataflow::node::{InputEntry, NodeEntry};
 use crate::dataflow::program::Program;
 use crate::dataflow::settings::{Override, absolute};
 use blindgrasp_operator::description::{OperatorDescription, PortDescription};
@@ -65,24 +65,28 @@ impl Scope<'_> {
 
 /// The params of an operator that runs elsewhere: its files need not be here.
 pub(super) fn without_files(params: &[ParamDescription]) -> Vec<ParamDescription> {
-    let without = |param: &ParamDescription| match &param.kind {
-        ParamKind::Path { .. } => ParamDescription { kind: ParamKind::Path { must_exist: false }, ..param.clone() },
-        _ => param.clone(),
-    };
-    params.iter().map(without).collect()
+    let mut params = params.to_vec();
+    for param in &mut params {
+        if let ParamKind::Path { must_exist } = &mut param.kind {
+            *must_exist = false;
+        }
+    }
+    params
 }
 
 /// Describes nodes of other machines whose programs are not here by their readers.
 pub(super) fn make_up(resolved: &mut [ResolvedNode], scope: Scope, folder: &Path) {
-    let is_missing = |node: &ResolvedNode| node.operator.is_none() && scope.elsewhere(node.entry).is_some();
-    let missing: Vec<usize> = (0..resolved.len()).filter(|&idx| is_missing(&resolved[idx])).collect();
-    let made_up: Vec<Option<Operator>> =
-        missing.iter().map(|&idx| described_by_readers(resolved[idx].entry, resolved, folder)).collect();
-    for (&idx, operator) in missing.iter().zip(made_up) {
-        resolved[idx].operator = operator;
+    let mut made_up = Vec::new();
+    for (idx, node) in resolved.iter().enumerate() {
+        if node.operator.is_none() && scope.elsewhere(node.entry).is_some() {
+            made_up.push((idx, described_by_readers(node.entry, resolved, folder)));
+        }
+    }
+    for (idx, operator) in &made_up {
+        resolved[*idx].operator.clone_from(operator);
     }
     // All outputs are known now.
-    for idx in missing {
+    for (idx, _) in made_up {
         let inputs = inputs_as_written(resolved[idx].entry, resolved);
         if let Some(operator) = &mut resolved[idx].operator {
             operator.description.inputs = inputs;
@@ -92,7 +96,7 @@ pub(super) fn make_up(resolved: &mut [ResolvedNode], scope: Scope, folder: &Path
 
 /// `None` if the node's operator could not be read.
 fn described_by_readers(entry: &NodeEntry, resolved: &[ResolvedNode], folder: &Path) -> Option<Operator> {
-    let run = &entry.run.as_ref()?.text;
+    let (run, args) = (&entry.run.as_ref()?.text, entry.args.clone()?);
     let program = if run.contains('/') { absolute(folder, run) } else { PathBuf::from(run) };
     let name = program.file_name().map_or_else(|| run.clone(), |name| name.to_string_lossy().into_owned());
     let mut description = OperatorDescription::new(&name, "Known from its readers only: its program is not here");
@@ -114,28 +118,26 @@ fn described_by_readers(entry: &NodeEntry, resolved: &[ResolvedNode], folder: &P
             }
         }
     }
-    let program = Program { path: program, args: entry.args.clone() };
-    Some(Operator { program, description })
+    Some(Operator { program: Program { path: program, args }, description })
 }
 
 fn inputs_as_written(entry: &NodeEntry, resolved: &[ResolvedNode]) -> Vec<PortDescription> {
-    let type_of = |id: &str, port: &str| {
-        let from = resolved.iter().find(|node| node.entry.id.text == id)?;
-        Some(find(&from.operator.as_ref()?.description.outputs, port)?.type_name.clone())
-    };
-    let inputs = entry.inputs.iter().map(|input| {
-        let type_name = input.source.as_ref().and_then(|source| type_of(&source.node, &source.port));
-        let type_name = type_name.unwrap_or_else(|| UNKNOWN_TYPE.to_owned());
-        PortDescription {
-            name: input.port.text.clone(),
-            type_name,
-            optional: false,
-            feedback: false,
-            partner: false,
-            summary: String::new(),
-        }
+    let inputs = entry.inputs.iter().map(|input| PortDescription {
+        name: input.port.text.clone(),
+        type_name: type_of(input, resolved).unwrap_or(UNKNOWN_TYPE).to_owned(),
+        optional: false,
+        feedback: false,
+        partner: false,
+        summary: String::new(),
     });
     inputs.collect()
+}
+
+/// The type that an input's source gives, if that is known.
+fn type_of<'a>(input: &InputEntry, resolved: &'a [ResolvedNode]) -> Option<&'a str> {
+    let source = input.source.as_ref()?;
+    let from = resolved.iter().find(|node| node.entry.id.text == source.node)?;
+    Some(&find(&from.operator.as_ref()?.description.outputs, &source.port)?.type_name)
 }
 
 fn find<'a>(ports: &'a [PortDescription], name: &str) -> Option<&'a PortDescription> {

@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 
 use crate::dataflow::diagnostic::{Diagnostics, did_you_mean_or_list, list, quote_path};
 use crate::dataflow::node::NodeEntry;
-use crate::dataflow::yaml::{Content, Entry};
+use crate::dataflow::yaml::{Content, Entry, Value as Written};
 use blindgrasp_messages::files::neighbours;
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::param::{ParamDescription, ParamKind};
@@ -147,35 +147,29 @@ pub(super) fn check_params(
             misspelled.push(key.text.as_str());
         }
     }
-    // Of this node alone before those of all nodes.
-    let own = || overrides.iter().filter(|set| set.node.as_ref() == Some(&entry.id.text));
-    let overrides = || own().chain(overrides.iter().filter(|set| set.node.is_none()));
-    let given = || entry.params.iter().chain(shared);
-    for set in own() {
+    let mut sets: Vec<_> = overrides.iter().filter(|set| set.node.as_ref() == Some(&entry.id.text)).collect();
+    for set in &sets {
         if let Err(Refusal { message, help }) = find_param(descriptions, &set.param, &of) {
             diagnostics.push_of_setting(set, message, help);
             misspelled.push(set.param.as_str());
         }
     }
+    // Of this node alone before those of all nodes.
+    sets.extend(overrides.iter().filter(|set| set.node.is_none()));
 
     let mut params = Map::new();
     for param in descriptions {
-        let set = overrides().find(|set| set.param == param.name);
+        let set = sets.iter().find(|set| set.param == param.name);
         if param.optional && set.is_some_and(|set| param.kind.is_left_out(&set.text)) {
             continue;
         }
         let value = if let Some(set) = set {
             let accepted = accept_text(param, &set.text, &of, Path::new(""));
             accepted.map_err(|Refusal { message, help }| diagnostics.push_of_setting(set, message, help)).ok()
-        } else if let Some(Entry { value, .. }) = given().find(|given| given.key.text == param.name) {
-            let accepted = match &value.content {
-                Content::Scalar { text, plain } => param.kind.accept_scalar(text, *plain).ok_or_else(|| {
-                    let help = param.kind.help(text, *plain);
-                    wrong(param, &of, &value.found(), help)
-                }),
-                Content::List(_) | Content::Mapping(_) => Err(wrong(param, &of, &value.found(), None)),
-            };
-            let settled = accepted.and_then(|accepted| settle(param, accepted, &of, folder));
+        } else if let Some(Entry { value, .. }) =
+            entry.params.iter().chain(shared).find(|given| given.key.text == param.name)
+        {
+            let settled = accept_written(param, value, &of, folder);
             settled.map_err(|Refusal { message, help }| diagnostics.push_with_help(value.at, message, help)).ok()
         } else if let Some(accepted) = param.default.as_ref().and_then(|default| param.kind.accept(default)) {
             let settled = settle(param, accepted, &format!("{of}, by default"), folder);
@@ -196,6 +190,17 @@ pub(super) fn check_params(
     params
 }
 
+/// A value of the file.
+fn accept_written(param: &ParamDescription, value: &Written, of: &str, folder: &Path) -> Result<Value, Refusal> {
+    let Content::Scalar { text, plain } = &value.content else {
+        return Err(wrong(param, of, &value.found(), None));
+    };
+    match param.kind.accept_scalar(text, *plain) {
+        Some(accepted) => settle(param, accepted, of, folder),
+        None => Err(wrong(param, of, &value.found(), param.kind.help(text, *plain))),
+    }
+}
+
 /// Overrides of nodes that are not there, and a param given twice.
 pub(super) fn check_overrides(overrides: &[Override], nodes: &[NodeEntry], diagnostics: &mut Diagnostics) {
     for (set_idx, set) in overrides.iter().enumerate() {
@@ -206,8 +211,8 @@ pub(super) fn check_overrides(overrides: &[Override], nodes: &[NodeEntry], diagn
             let help = did_you_mean_or_list(id, "nodes", nodes.iter().map(|node| node.id.text.as_str()));
             diagnostics.push_of_setting(set, format!("there is no node {}", quote(id)), help);
         }
-        let is_same = |other: &&Override| other.node == set.node && other.param == set.param;
-        if let Some(first) = overrides[..set_idx].iter().find(is_same) {
+        let mut before = overrides[..set_idx].iter();
+        if let Some(first) = before.find(|other| other.node == set.node && other.param == set.param) {
             diagnostics.push_of_setting(set, format!("given twice, first as {}", quote(&first.to_string())), None);
         }
     }
@@ -220,20 +225,18 @@ pub(super) fn check_shared(
     descriptions: &[&OperatorDescription],
     diagnostics: &mut Diagnostics,
 ) {
-    let known = || descriptions.iter().flat_map(|of| &of.params).map(|param| param.name.as_str());
-    let mistake = |name: &str| {
-        let names: BTreeSet<&str> = known().collect();
-        let help = did_you_mean_or_list(name, "params", names.iter().copied());
-        (!names.contains(name)).then(|| (format!("no node has the param {}", quote(name)), help))
-    };
+    let names: BTreeSet<&str> =
+        descriptions.iter().flat_map(|of| &of.params).map(|param| param.name.as_str()).collect();
     for Entry { key, .. } in shared {
-        if let Some((message, help)) = mistake(&key.text) {
-            diagnostics.push_with_help(key.at, message, help);
+        if !names.contains(key.text.as_str()) {
+            let help = did_you_mean_or_list(&key.text, "params", names.iter().copied());
+            diagnostics.push_with_help(key.at, format!("no node has the param {}", quote(&key.text)), help);
         }
     }
-    for set in overrides.iter().filter(|set| set.node.is_none()) {
-        if let Some((message, help)) = mistake(&set.param) {
-            diagnostics.push_of_setting(set, message, help);
+    for set in overrides {
+        if set.node.is_none() && !names.contains(set.param.as_str()) {
+            let help = did_you_mean_or_list(&set.param, "params", names.iter().copied());
+            diagnostics.push_of_setting(set, format!("no node has the param {}", quote(&set.param)), help);
         }
     }
 }

@@ -68,36 +68,34 @@ impl Launcher {
     }
 
     fn attachment(&self, wanted: &[String], place: usize) -> Result<Attachment, String> {
-        let nodes = || self.members.iter().map(|member| &member.node);
-        let name = |port: &Port| format!("{}/{}", port.0, port.1);
-        let all: Vec<Port> = nodes().flat_map(Node::output_ports).map(|(port, _)| port).collect();
+        let nodes = self.members.iter().map(|member| &member.node);
+        let all: Vec<Port> = nodes.clone().flat_map(Node::output_ports).map(|(port, _)| port).collect();
         // NODE/PORT, the topic of a recording, with or without its '/', or a node with all its outputs.
         let is_named = |port: &Port, wanted: &str| {
             let wanted = wanted.trim_start_matches('/');
-            name(port) == wanted || self.plan.topic(port).trim_start_matches('/') == wanted || port.0 == wanted
+            name_of(port) == wanted || self.plan.topic(port).trim_start_matches('/') == wanted || port.0 == wanted
         };
         if let Some(unknown) = wanted.iter().find(|wanted| !all.iter().any(|port| is_named(port, wanted))) {
-            let known: Vec<String> = all.iter().map(name).collect();
+            let known: Vec<String> = all.iter().map(name_of).collect();
             let alike = did_you_mean(unknown, known.iter().map(String::as_str));
             let alike = alike.map(|alike| format!("; {alike}")).unwrap_or_default();
             let known = known.join(", ");
             return Err(format!("graph '{}' has no edge from '{unknown}'; it has: {known}{alike}", self.name));
         }
         let is_at_start = all.iter().all(|port| self.last_sent_at(port).is_none());
-        let is_wanted = |port: &&Port| wanted.is_empty() || wanted.iter().any(|wanted| is_named(port, wanted));
-        let edges = all.iter().filter(is_wanted);
-        let edges = edges.filter_map(|port| {
-            Some(AttachedEdge {
-                port: name(port),
-                topic: self.plan.topic(port),
-                input: self.plan.attached_input(port, place)?,
-                answered_slots: self.plan.input_slots(&port.0).collect(),
-            })
-        });
+        let mut edges = Vec::new();
+        for port in &all {
+            if (wanted.is_empty() || wanted.iter().any(|wanted| is_named(port, wanted)))
+                && let Some(input) = self.plan.attached_input(port, place)
+            {
+                let answered_slots = self.plan.input_slots(&port.0).collect();
+                edges.push(AttachedEdge { port: name_of(port), topic: self.plan.topic(port), input, answered_slots });
+            }
+        }
         Ok(Attachment {
             domain: self.plan.domain().clone(),
-            edges: edges.collect(),
-            graph: describe_graph(&self.name, nodes()),
+            edges,
+            graph: describe_graph(&self.name, nodes),
             is_at_start,
         })
     }
@@ -128,4 +126,8 @@ impl Launcher {
             self.kill_hung();
         }
     }
+}
+
+fn name_of(port: &Port) -> String {
+    format!("{}/{}", port.0, port.1)
 }

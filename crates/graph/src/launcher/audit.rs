@@ -48,13 +48,14 @@ impl Trail {
     }
 
     fn write(&self, what: &str, outcome: &str, level: LogLevel) {
-        let short = |text: &str| {
-            let beginning: String = text.replace('\n', " ").chars().take(MAX_CHARS).collect();
-            if beginning.len() < text.len() { beginning + " …" } else { beginning }
-        };
         let text = format!("{}: {}: {}", self.client, short(what), short(outcome));
         self.log.write_patiently(LogEntry { level: Some(level), ..LogEntry::plain(text) });
     }
+}
+
+fn short(text: &str) -> String {
+    let beginning: String = text.replace('\n', " ").chars().take(MAX_CHARS).collect();
+    if beginning.len() < text.len() { beginning + " …" } else { beginning }
 }
 
 /// A request in words, like the command that makes it.
@@ -81,21 +82,21 @@ pub fn summary(request: &Request) -> String {
 
 /// The outcome of a request; `None` if more replies follow.
 fn outcome(reply: &Reply) -> Option<(String, LogLevel)> {
-    let accepted = |text: &str| Some((format!("accepted{text}"), LogLevel::Info));
-    match reply {
-        Reply::Stopping | Reply::Attached(_) | Reply::Abandoned => accepted(""),
-        Reply::Set { old, new, .. } => accepted(&format!(": {old} became {new}")),
-        Reply::Shadowing { .. } => accepted(": it computes beside the running operator"),
+    let accepted = match reply {
+        Reply::Stopping | Reply::Attached(_) | Reply::Abandoned => "accepted".to_owned(),
+        Reply::Set { old, new, .. } => format!("accepted: {old} became {new}"),
+        Reply::Shadowing { .. } => "accepted: it computes beside the running operator".to_owned(),
         Reply::Swapped { nodes } => {
             let pids = nodes.iter().map(|node| format!("{} {} became {}", node.node, node.old_pid, node.new_pid));
-            accepted(&format!(": process {}", pids.collect::<Vec<_>>().join(", ")))
+            format!("accepted: process {}", pids.collect::<Vec<_>>().join(", "))
         }
         Reply::Error { message, rolled_back } => {
             let word = if *rolled_back { "rolled back" } else { "refused" };
-            Some((format!("{word}: {message}"), LogLevel::Warn))
+            return Some((format!("{word}: {message}"), LogLevel::Warn));
         }
-        Reply::Status(_) | Reply::Drained | Reply::Keep | Reply::Asked { .. } | Reply::Progress { .. } => None,
-    }
+        Reply::Status(_) | Reply::Drained | Reply::Keep | Reply::Asked { .. } | Reply::Progress { .. } => return None,
+    };
+    Some((accepted, LogLevel::Info))
 }
 
 #[cfg(test)]

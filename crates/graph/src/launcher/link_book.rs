@@ -85,10 +85,11 @@ impl LinkBook {
             let port = format!("{}/{}", input.from_node, input.from_port);
             // A graph that is stopped does not wait for the sources of other machines to end, but for its own link.
             let is_link_awaited = self.takes_more_until.is_some_and(|until| Instant::now() < until);
-            let is_awaited = |(import, is_driven): &(String, bool)| {
-                *import == port && (!(*is_driven && self.was_stopped) || is_link_awaited)
-            };
-            local.imports.iter().any(is_awaited) && !self.ended_imports.contains(&port) && self.may_come(&port)
+            let is_awaited = local
+                .imports
+                .iter()
+                .any(|(import, is_driven)| *import == port && (!(*is_driven && self.was_stopped) || is_link_awaited));
+            is_awaited && !self.ended_imports.contains(&port) && self.may_come(&port)
         })
     }
 

@@ -36,7 +36,7 @@ use serde_json::Value;
 
 use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
 use crate::dataflow::pins::PinError;
-use crate::dataflow::{Graph, Node, ProcessOptions, Program};
+use crate::dataflow::{Graph, Node, Program};
 use crate::launcher::clients::Clients;
 use crate::launcher::link_book::LinkBook;
 use crate::launcher::log_writer::{Log, LogWriter};
@@ -281,7 +281,6 @@ impl Launcher {
     ) -> Result<Launcher, LaunchError> {
         raise_descriptor_limit();
         let (sender, events) = sync_channel(MAX_PENDING_EVENTS);
-        let now = Instant::now();
         let log_folder = LogFolder::of_graph(name);
         let logs = LogWriter::new(log_folder.clone(), options.log_format);
         let mut launcher = Launcher {
@@ -313,14 +312,13 @@ impl Launcher {
             service: Service::of_this_process(),
             is_to_begin_again: false,
             has_ended: false,
-            started: now,
+            started: Instant::now(),
             slow_nodes: SlowNodes::new(),
             wake_policy: WakePolicy::new(),
             last_look_nanos: monotonic_nanos(),
         };
         for node in &graph.nodes {
-            let log = launcher.logs.log(&node.id);
-            launcher.members.push(Member::new(node, log));
+            launcher.members.push(Member::new(node, launcher.logs.log(&node.id)));
         }
         for idx in 0..launcher.members.len() {
             if launcher.members[idx].active.is_none() {
@@ -399,11 +397,10 @@ impl Launcher {
         let leaving = self.leaving.iter().map(|leaving| &leaving.process);
         let living: Vec<usize> =
             member.active.iter().chain(&member.standby).chain(leaving).map(|process| process.instance_slot).collect();
-        let is_free = |n_before: &usize| {
+        let mut numbers = member.n_instances..member.n_instances + crate::plan::N_INSTANCES;
+        numbers.find(|n_before| {
             self.plan.instance_slot(&member.node.id, *n_before).is_some_and(|slot| !living.contains(&slot))
-        };
-        let next = member.n_instances;
-        (next..next + crate::plan::N_INSTANCES).find(is_free)
+        })
     }
 
     /// Ends old instances of a node until a new one has a heartbeat slot of its own.
@@ -697,13 +694,13 @@ impl Launcher {
         if !killed.is_empty() {
             return Err(LaunchError::Killed { nodes: killed, grace_secs: self.options.grace.as_secs_f64() });
         }
-        let has_ended_badly = |member: &&Member| {
-            !member.is_given_up() && member.active.as_ref().is_some_and(|process| !process.has_ended_well())
-        };
-        match self.members.iter().find(has_ended_badly).map(|member| member.node.id.clone()) {
-            Some(id) => Err(self.failed(&id, false)),
-            None => Ok(()),
+        for member in &self.members {
+            if !member.is_given_up() && member.active.as_ref().is_some_and(|process| !process.has_ended_well()) {
+                let id = member.node.id.clone();
+                return Err(self.failed(&id, false));
+            }
         }
+        Ok(())
     }
 
     /// One round: listens for up to `limit`, finds dead and hung processes, restarts them, goes on with a swap.
@@ -736,10 +733,10 @@ impl Launcher {
     fn give_wake_policy(&mut self) {
         // A node that polls does not give way: the others must interrupt it.
         let polls = self.members.iter().any(|member| member.node.process.wait != WaitMode::Event);
-        let is_open = |options: &ProcessOptions| {
+        let open = self.members.iter().filter(|member| {
+            let options = &member.node.process;
             options.scheduling.is_none() && options.nice.is_none() && options.cpus.is_empty()
-        };
-        let open = self.members.iter().filter(|member| is_open(&member.node.process));
+        });
         let processes = open.flat_map(|member| member.active.iter().chain(&member.standby));
         let ready = processes.filter(|process| process.is_ready() && process.is_running());
         let pids: BTreeSet<u32> = ready.map(Process::pid).collect();

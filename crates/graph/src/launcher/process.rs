@@ -3,7 +3,7 @@
 use std::cell::RefCell;
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{BufRead, BufReader, PipeReader, Read, Write};
-use std::os::fd::{AsRawFd, BorrowedFd};
+use std::os::fd::{AsRawFd, BorrowedFd, RawFd};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::process::{Child, ChildStdin, Command as Program, ExitStatus, Stdio};
 use std::rc::Rc;
@@ -148,37 +148,13 @@ impl Process {
         host: Option<&dataflow::Program>,
         events: &SyncSender<Event>,
     ) -> std::io::Result<Vec<Process>> {
-        let launcher_pid = rustix::process::getpid();
         let node = starts.first().ok_or(std::io::ErrorKind::InvalidInput)?.node;
-        let mut command = if node.description.hosted {
-            let no_host = || std::io::Error::other("the program that runs the graph has no host for other languages");
-            let host = host.ok_or_else(no_host)?;
-            let mut command = Program::new(&host.path);
-            command.args(&host.args).arg(&node.program);
-            command
-        } else {
-            Program::new(&node.program)
-        };
-        let wiring = match starts.as_slice() {
-            [start] => {
-                command.args(&start.node.args);
-                serde_json::to_string(&start.wiring)?
-            }
-            _ => {
-                command.args(GROUP_ARGS);
-                let member = |start: &Start<'_>| GroupMemberWiring {
-                    args: start.node.args.iter().skip(1).cloned().collect(),
-                    wiring: start.wiring.clone(),
-                };
-                serde_json::to_string(&GroupWiring { members: starts.iter().map(member).collect() })?
-            }
-        };
+        let mut command = wired_program(node, &starts, host)?;
         // Text for the log has a pipe, and reports have another: no text is ever a report.
         let (lines, its_lines) = std::io::pipe()?;
         let (reports, its_reports) = std::io::pipe()?;
         let reports_number = its_reports.as_raw_fd();
         command
-            .env(WIRING_VARIABLE, wiring)
             .env(REPORTS_VARIABLE, reports_number.to_string())
             .env_remove(service::SOCKET_VARIABLE)
             .stdin(Stdio::piped())
@@ -190,28 +166,9 @@ impl Process {
         }
         let options = node.process.clone();
         let memory_max = node.memory_max_mib.map(|mib| Rlimit { current: Some(mib << 20), maximum: Some(mib << 20) });
-        let before_exec = move || {
-            // No program that it runs gets more rights than it has: setuid has no effect.
-            set_no_new_privs(true)?;
-            // Not the address space: of the graph's shared memory, an operator maps far more than it uses.
-            if let Some(limit) = memory_max {
-                setrlimit(Resource::Data, limit)?;
-            }
-            give_options(&options)?;
-            set_parent_process_death_signal(Some(Signal::TERM))?;
-            // The launcher may have died before the signal was set.
-            if rustix::process::getppid() != Some(launcher_pid) {
-                return Err(rustix::io::Errno::SRCH.into());
-            }
-            // iceoryx2 0.10 opens its sockets and files without O_CLOEXEC: the operators must not inherit the launcher's.
-            // SAFETY: it marks descriptors, and nothing of this process uses them between here and exec.
-            unsafe { libc::syscall(libc::SYS_close_range, 3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC) };
-            // SAFETY: the descriptor is open until the program begins.
-            fcntl_setfd(unsafe { BorrowedFd::borrow_raw(reports_number) }, FdFlags::empty())?;
-            Ok(())
-        };
+        let launcher_pid = rustix::process::getpid();
         // SAFETY: between fork and exec the closure makes system calls alone; it neither allocates nor takes a lock.
-        unsafe { command.pre_exec(before_exec) };
+        unsafe { command.pre_exec(move || before_exec(&options, memory_max, launcher_pid, reports_number)) };
         let mut child = command.spawn().map_err(|error| explain(error, &node.process))?;
         // The ends of the pipes that are the process's alone: the others see its end.
         drop((command, its_reports));
@@ -233,7 +190,12 @@ impl Process {
         let shared =
             Shared { child, stdin, unwritten: Vec::new(), exit: None, failure: None, is_killed: false, n_needed };
         let shared = Rc::new(RefCell::new(shared));
-        let process = |(start, hearer): (Start<'_>, Hearer)| Process {
+        Ok(starts.iter().zip(hearers).map(|(start, hearer)| Process::new(start, hearer.lines, &shared)).collect())
+    }
+
+    fn new(start: &Start<'_>, lines: Lines, shared: &Rc<RefCell<Shared>>) -> Process {
+        let is_alone = shared.borrow().n_needed == 1;
+        Process {
             id: start.id,
             started: Instant::now(),
             instance_slot: start.wiring.instance_slot,
@@ -254,12 +216,11 @@ impl Process {
             wanted_sandbox: start.node.sandbox,
             sandbox: Enforcement::default(),
             memory_max_mib: start.node.memory_max_mib,
-            lines: hearer.lines,
-            shared: Rc::clone(&shared),
-            addressee: (n_needed > 1).then(|| start.node.id.clone()),
+            lines,
+            shared: Rc::clone(shared),
+            addressee: if is_alone { None } else { Some(start.node.id.clone()) },
             is_let_go: false,
-        };
-        Ok(starts.into_iter().zip(hearers).map(process).collect())
+        }
     }
 
     pub(super) fn pid(&self) -> u32 {
@@ -498,11 +459,68 @@ impl Drop for Process {
     }
 }
 
+/// The program of a node, or of the nodes of a group, with its arguments and its wiring.
+fn wired_program(node: &Node, starts: &[Start<'_>], host: Option<&dataflow::Program>) -> std::io::Result<Program> {
+    let mut command = Program::new(&node.program);
+    if node.description.hosted {
+        let Some(host) = host else {
+            return Err(std::io::Error::other("the program that runs the graph has no host for other languages"));
+        };
+        command = Program::new(&host.path);
+        command.args(&host.args).arg(&node.program);
+    }
+    let wiring = if let [start] = starts {
+        command.args(&start.node.args);
+        serde_json::to_string(&start.wiring)?
+    } else {
+        command.args(GROUP_ARGS);
+        let mut members = Vec::with_capacity(starts.len());
+        for start in starts {
+            let args = start.node.args.iter().skip(1).cloned().collect();
+            members.push(GroupMemberWiring { args, wiring: start.wiring.clone() });
+        }
+        serde_json::to_string(&GroupWiring { members })?
+    };
+    command.env(WIRING_VARIABLE, wiring);
+    Ok(command)
+}
+
+/// Runs between fork and exec, and makes system calls only.
+fn before_exec(
+    options: &ProcessOptions,
+    memory_max: Option<Rlimit>,
+    launcher: Pid,
+    reports_number: RawFd,
+) -> std::io::Result<()> {
+    // No program that it runs gets more rights than it has: setuid has no effect.
+    set_no_new_privs(true)?;
+    // Not the address space: of the graph's shared memory, an operator maps far more than it uses.
+    if let Some(limit) = memory_max {
+        setrlimit(Resource::Data, limit)?;
+    }
+    give_options(options)?;
+    set_parent_process_death_signal(Some(Signal::TERM))?;
+    // The launcher may have died before the signal was set.
+    if rustix::process::getppid() != Some(launcher) {
+        return Err(rustix::io::Errno::SRCH.into());
+    }
+    // iceoryx2 0.10 opens its sockets and files without O_CLOEXEC: the operators must not inherit the launcher's.
+    // SAFETY: it marks descriptors, and nothing of this process uses them between here and exec.
+    unsafe { libc::syscall(libc::SYS_close_range, 3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC) };
+    // SAFETY: the descriptor is open until the program begins.
+    fcntl_setfd(unsafe { BorrowedFd::borrow_raw(reports_number) }, FdFlags::empty())?;
+    Ok(())
+}
+
 /// Asks the kernel for a node's options. It runs between fork and exec and makes system calls only.
 fn give_options(options: &ProcessOptions) -> std::io::Result<()> {
     if !options.cpus.is_empty() {
         let mut cpus = CpuSet::new();
-        options.cpus.iter().filter(|cpu| **cpu < CpuSet::MAX_CPU).for_each(|cpu| cpus.set(*cpu));
+        for cpu in &options.cpus {
+            if *cpu < CpuSet::MAX_CPU {
+                cpus.set(*cpu);
+            }
+        }
         sched_setaffinity(None, &cpus)?;
     }
     if let Some(nice) = options.nice {
@@ -586,8 +604,8 @@ fn forward_reports(stream: impl Read, hearers: &[Hearer], events: &SyncSender<Ev
         }
         match serde_json::from_slice::<Addressed<Report>>(&bytes) {
             Ok(Addressed { member, message }) => {
-                let named = |hearer: &&Hearer| member.as_ref().is_some_and(|member| *member == hearer.sink.node);
-                let hearer = hearers.iter().find(named).unwrap_or(first);
+                let named = hearers.iter().find(|hearer| member.as_ref() == Some(&hearer.sink.node));
+                let hearer = named.unwrap_or(first);
                 match message {
                     Report::Log(entry) => hearer.take(entry),
                     report => {

@@ -15,6 +15,8 @@
 use std::sync::mpsc::SyncSender;
 use std::time::{Duration, Instant};
 
+use serde_json::{Map, Value};
+
 use crate::control::{GraphState, NodeState, Reply, SwapRequest, SwappedNode};
 use crate::dataflow::{Node, accept_param, accept_param_value};
 use crate::launcher::process::Process;
@@ -87,23 +89,20 @@ impl Launcher {
         client: u64,
         reply: SyncSender<Reply>,
     ) {
-        let refuse = |message: String| {
-            let _ = reply.try_send(Reply::Error { message, rolled_back: false });
-        };
         if !matches!(self.state, GraphState::Running | GraphState::Degraded) {
-            return refuse("the graph is starting or stopping".into());
+            return refuse(&reply, "the graph is starting or stopping");
         }
         if let Some(swap) = &self.swap {
             let nodes: Vec<_> = swap.targets.iter().map(|target| target.node.id.as_str()).collect();
-            return refuse(format!("a swap of {} is under way; wait for its end", nodes.join(", ")));
+            return refuse(&reply, &format!("a swap of {} is under way; wait for its end", nodes.join(", ")));
         }
         let description = match description.transpose() {
             Ok(description) => description,
-            Err(error) => return refuse(format!("the replacement cannot be used: {error}")),
+            Err(error) => return refuse(&reply, &format!("the replacement cannot be used: {error}")),
         };
         let targets = match self.plan_swap(&request, description.as_ref()) {
             Ok(targets) => targets,
-            Err(message) => return refuse(message),
+            Err(message) => return refuse(&reply, &message),
         };
         let mut swap = Swap { request, client, reply, targets, phase: Phase::Starting, since: Instant::now() };
         for at in 0..swap.targets.len() {
@@ -118,10 +117,11 @@ impl Launcher {
             match self.spawn(&nodes, true) {
                 Ok(processes) => {
                     for ((idx, _), process) in nodes.into_iter().zip(processes) {
-                        swap.targets
-                            .iter_mut()
-                            .filter(|target| target.idx == idx)
-                            .for_each(|target| target.new_pid = process.pid());
+                        for target in &mut swap.targets {
+                            if target.idx == idx {
+                                target.new_pid = process.pid();
+                            }
+                        }
                         self.members[idx].standby = Some(process);
                     }
                 }
@@ -158,7 +158,6 @@ impl Launcher {
                     .into(),
             );
         }
-        let mut unused: Vec<&String> = request.set.keys().collect();
         let mut targets = Vec::new();
         for idx in idxs {
             let member = &self.members[idx];
@@ -178,35 +177,7 @@ impl Launcher {
                 node.args = request.args.clone().unwrap_or_default();
                 node.description = description.clone();
             }
-            let mut params = serde_json::Map::new();
-            for param in &node.description.params {
-                let asked = request.set.get(&param.name);
-                if param.optional && asked.is_some_and(|text| param.kind.is_left_out(text)) {
-                    unused.retain(|name| **name != param.name);
-                    continue;
-                }
-                let value = match (asked, member.node.params.get(&param.name), &param.default) {
-                    (Some(text), _, _) => {
-                        unused.retain(|name| **name != param.name);
-                        accept_param(&node.description, &param.name, text, &request.folder)?
-                    }
-                    (None, Some(value), _) => {
-                        accept_param_value(&node.description, &param.name, value, &request.folder)?
-                    }
-                    (None, None, Some(default)) => {
-                        accept_param_value(&node.description, &param.name, default, &self.folder)?
-                    }
-                    (None, None, None) if param.is_required() => {
-                        return Err(format!(
-                            "the replacement of '{}' needs the param '{}': give it with --set {}=…",
-                            node.id, param.name, param.name
-                        ));
-                    }
-                    (None, None, None) => continue,
-                };
-                params.insert(param.name.clone(), value);
-            }
-            node.params = params;
+            node.params = self.swapped_params(&node, request)?;
             let old_pid = member.active.as_ref().map_or(0, Process::pid);
             targets.push(Target {
                 idx,
@@ -219,12 +190,41 @@ impl Launcher {
                 was_given_up: member.is_given_up(),
             });
         }
-        if let Some(name) = unused.first() {
-            // Its error says what there is.
-            let description = &targets[0].node.description;
-            accept_param(description, name, "", &request.folder)?;
+        for name in request.set.keys() {
+            if targets.iter().all(|target| target.node.description.params.iter().all(|param| param.name != *name)) {
+                // Its error says what there is.
+                accept_param(&targets[0].node.description, name, "", &request.folder)?;
+            }
         }
         Ok(targets)
+    }
+
+    /// The params of a replacement: as asked for, or as the node has them, or by default.
+    fn swapped_params(&self, node: &Node, request: &SwapRequest) -> Result<Map<String, Value>, String> {
+        let description = &node.description;
+        let mut params = Map::new();
+        for param in &description.params {
+            let name = &param.name;
+            let value = if let Some(text) = request.set.get(name) {
+                if param.optional && param.kind.is_left_out(text) {
+                    continue;
+                }
+                accept_param(description, name, text, &request.folder)?
+            } else if let Some(value) = node.params.get(name) {
+                accept_param_value(description, name, value, &request.folder)?
+            } else if let Some(default) = &param.default {
+                accept_param_value(description, name, default, &self.folder)?
+            } else if param.is_required() {
+                return Err(format!(
+                    "the replacement of '{}' needs the param '{name}': give it with --set {name}=…",
+                    node.id
+                ));
+            } else {
+                continue;
+            };
+            params.insert(name.clone(), value);
+        }
+        Ok(params)
     }
 
     /// Takes a swap a step further, if one is under way.
@@ -361,11 +361,7 @@ impl Launcher {
                 (process.has_handed_over, process.has_sent_all) = (false, false);
                 process.tell(&Command::HandOver);
             }
-            let has_handed_over = self.wait_until(&swap, |launcher| {
-                let active = launcher.members[idx].active.as_ref();
-                active.is_none_or(|process| process.has_handed_over || !process.is_running())
-            });
-            if !has_handed_over {
+            if !self.wait_until(&swap, |launcher| launcher.has_answered(idx, |process| process.has_handed_over)) {
                 let message = format!("the running '{}' did not hand over", swap.targets[at].node.id);
                 return self.take_back(swap, at + 1, &message);
             }
@@ -373,24 +369,10 @@ impl Launcher {
             swap.targets[at].last = self.last_answered(idx);
             swap.targets[at].sent = self.last_sent(idx);
         }
-        for target in swap.targets.iter().rev() {
-            let member = &mut self.members[target.idx];
-            std::mem::swap(&mut member.active, &mut member.standby);
-            // A restart that was due is no longer needed.
-            (member.restart_at, member.died) = (None, None);
-            let is_handed_over = member.standby.as_ref().is_some_and(has_handed_over_all);
-            if let Some(process) = &mut member.active {
-                process.has_taken_over = false;
-                process.tell(&Command::Go);
-                process.tell(&Command::TakeOver { is_handed_over });
-            }
-        }
+        self.exchange(&swap.targets);
         for at in 0..swap.targets.len() {
             let idx = swap.targets[at].idx;
-            self.wait_until(&swap, |launcher| {
-                let active = launcher.members[idx].active.as_ref();
-                active.is_none_or(|process| process.has_taken_over || !process.is_running())
-            });
+            self.wait_until(&swap, |launcher| launcher.has_answered(idx, |process| process.has_taken_over));
             if !self.members[idx].active.as_ref().is_some_and(|process| process.has_taken_over) {
                 // Its last lines may still be on their way.
                 self.listen(Duration::from_millis(5));
@@ -412,6 +394,28 @@ impl Launcher {
         let pause = swap.targets.iter().map(|target| target.handover_pause).max().unwrap_or_default();
         swap.progress(format!("has taken over, {:.2} ms without an answer; on probation", pause.as_secs_f64() * 1e3));
         self.swap = Some(swap);
+    }
+
+    /// Lets the replacements take over, downstream ones first.
+    fn exchange(&mut self, targets: &[Target]) {
+        for target in targets.iter().rev() {
+            let member = &mut self.members[target.idx];
+            std::mem::swap(&mut member.active, &mut member.standby);
+            // A restart that was due is no longer needed.
+            (member.restart_at, member.died) = (None, None);
+            let is_handed_over = member.standby.as_ref().is_some_and(has_handed_over_all);
+            if let Some(process) = &mut member.active {
+                process.has_taken_over = false;
+                process.tell(&Command::Go);
+                process.tell(&Command::TakeOver { is_handed_over });
+            }
+        }
+    }
+
+    /// Whether a node's process has answered a command, or will not.
+    fn has_answered(&self, idx: usize, has: fn(&Process) -> bool) -> bool {
+        let active = self.members[idx].active.as_ref();
+        active.is_none_or(|process| has(process) || !process.is_running())
     }
 
     /// Before any replacement is active: the first `n` running operators go on.
@@ -465,18 +469,23 @@ impl Launcher {
             let written = self.plan.output_slot(port).and_then(|slot| self.cursors.output(slot).written());
             self.plan.reader_slots(port).iter().all(|slot| {
                 let slot = self.cursors.input(*slot);
-                let is_past = |key| written.is_none_or(|written| written.is_past(key, *last));
-                slot.is_given_up() || slot.key().is_some_and(is_past)
+                slot.is_given_up()
+                    || slot.key().is_some_and(|key| written.is_none_or(|written| written.is_past(key, *last)))
             })
         })
     }
 
     /// The last sample that a node has sent at each of its outputs.
     fn last_sent(&self, idx: usize) -> Vec<(Port, SampleId)> {
-        let node = &self.members[idx].node;
-        let ports = node.output_ports().map(|(port, _)| port);
-        let sent = |port: Port| self.cursors.output(self.plan.output_slot(&port)?).key().map(|key| (port, key));
-        ports.filter_map(sent).collect()
+        let mut sent = Vec::new();
+        for (port, _) in self.members[idx].node.output_ports() {
+            if let Some(slot) = self.plan.output_slot(&port)
+                && let Some(key) = self.cursors.output(slot).key()
+            {
+                sent.push((port, key));
+            }
+        }
+        sent
     }
 
     fn conclude_swap(&mut self) {
@@ -540,10 +549,7 @@ impl Launcher {
             process.has_taken_over = false;
             process.tell(&Command::TakeOver { is_handed_over: false });
             // If it has died meanwhile, supervision starts it again.
-            self.wait_until(&swap, |launcher| {
-                let active = launcher.members[idx].active.as_ref();
-                active.is_none_or(|process| process.has_taken_over || !process.is_running())
-            });
+            self.wait_until(&swap, |launcher| launcher.has_answered(idx, |process| process.has_taken_over));
             has_taken_over &= self.members[idx].active.as_ref().is_some_and(|process| process.has_taken_over);
         }
         self.reap();
@@ -587,9 +593,7 @@ impl Launcher {
         let is_shadowing =
             self.swap.as_ref().is_some_and(|swap| swap.client == client && swap.phase == Phase::Shadowing);
         if !is_shadowing {
-            let message = "no replacement of yours runs in the shadow".into();
-            let _ = reply.try_send(Reply::Error { message, rolled_back: false });
-            return;
+            return refuse(&reply, "no replacement of yours runs in the shadow");
         }
         if let Some(swap) = &mut self.swap {
             swap.reply = reply;
@@ -665,16 +669,21 @@ impl Launcher {
     }
 }
 
+fn refuse(reply: &SyncSender<Reply>, message: &str) {
+    let _ = reply.try_send(Reply::Error { message: message.into(), rolled_back: false });
+}
+
 /// Whether the readers will receive all that an operator, and those before it, have sent.
 fn has_handed_over_all(process: &Process) -> bool {
     process.is_running() && process.has_handed_over && process.has_sent_all
 }
 
+fn type_of<'a>(ports: &'a [PortDescription], name: &str) -> Option<&'a str> {
+    ports.iter().find(|port| port.name == name).map(|port| port.type_name.as_str())
+}
+
 /// Whether a program can stand where a node stands.
 fn check_ports(node: &Node, description: &OperatorDescription) -> Result<(), String> {
-    let type_of = |ports: &[PortDescription], name: &str| {
-        ports.iter().find(|port| port.name == name).map(|port| port.type_name.clone())
-    };
     for input in &node.inputs {
         match type_of(&description.inputs, &input.port) {
             None => return Err(format!("the replacement has no input '{}', which '{}' has", input.port, node.id)),
@@ -688,9 +697,10 @@ fn check_ports(node: &Node, description: &OperatorDescription) -> Result<(), Str
             Some(_) => {}
         }
     }
-    let is_wired = |port: &&PortDescription| node.inputs.iter().any(|input| input.port == port.name);
-    if let Some(port) = description.inputs.iter().find(|port| !port.optional && !is_wired(port)) {
-        return Err(format!("the replacement needs an input '{}', which '{}' lacks", port.name, node.id));
+    for port in &description.inputs {
+        if !port.optional && node.inputs.iter().all(|input| input.port != port.name) {
+            return Err(format!("the replacement needs an input '{}', which '{}' lacks", port.name, node.id));
+        }
     }
     for output in node.outputs() {
         match type_of(&description.outputs, &output.name) {

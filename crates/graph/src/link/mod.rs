@@ -61,8 +61,8 @@ pub fn local_graph(graph: &Graph, placement: &Placement, link_program: &Program)
         LocalError::Unknown { machine: placement.machine.clone(), known }
     })?;
     let mut nodes: Vec<Node> = graph.nodes.iter().filter(|node| is_on(node, &this.name)).cloned().collect();
-    let others = || machines.machines.iter().filter(|machine| machine.name != this.name);
-    let ssh_hosts = others().filter_map(|machine| Some((machine.name.clone(), machine.ssh.clone()?))).collect();
+    let others = machines.machines.iter().filter(|machine| machine.name != this.name);
+    let ssh_hosts = others.filter_map(|machine| Some((machine.name.clone(), machine.ssh.clone()?))).collect();
     let elsewhere = graph.nodes.iter().filter(|node| !is_on(node, &this.name));
     let elsewhere = elsewhere.filter_map(|node| Some((node.id.clone(), node.machine.clone()?))).collect();
     let mut view = LocalView { machine: this.name.clone(), imports: Vec::new(), ssh_hosts, elsewhere };
@@ -92,7 +92,7 @@ fn link_config(
     placement: &Placement,
 ) -> Result<LinkConfig, LocalError> {
     let channels = channels(graph);
-    let others = || machines.machines.iter().filter(|machine| machine.name != this.name);
+    let others = machines.machines.iter().filter(|machine| machine.name != this.name);
     let folder = placement.keys.as_ref().or(machines.link.keys.as_ref());
     Ok(LinkConfig {
         graph: graph.name.clone(),
@@ -100,7 +100,7 @@ fn link_config(
         machine: this.name.clone(),
         run: placement.run,
         fingerprint: fingerprint(graph),
-        peers: others().map(|machine| machine.name.clone()).collect(),
+        peers: others.map(|machine| machine.name.clone()).collect(),
         exports: channels.iter().filter(|channel| channel.from == this.name).cloned().collect(),
         imports: channels.iter().filter(|channel| channel.to == this.name).cloned().collect(),
         endpoints: endpoints(machines, this, placement)?,

@@ -137,11 +137,10 @@ pub(super) fn missing_from_machines(graph: &Graph, edges: &[EdgeStatus]) -> u64 
     let missing = |edges: &mut dyn Iterator<Item = &EdgeStatus>| {
         edges.map(|edge| edge.missing.saturating_sub(edge.dropped)).max().unwrap_or(0)
     };
-    let is_of_source = |edge: &&EdgeStatus| {
+    let before = missing(&mut edges.iter().filter(|edge| {
         let node = edge.from.split('/').next().and_then(|node| graph.node(node));
         node.is_some_and(Node::is_source)
-    };
-    let before = missing(&mut edges.iter().filter(is_of_source));
+    }));
     // Missing samples of another machine's source are counted there: a part that begins later has not lost earlier
     // samples.
     let answers = imports.filter(|(_, is_driven)| !is_driven);
@@ -149,7 +148,6 @@ pub(super) fn missing_from_machines(graph: &Graph, edges: &[EdgeStatus]) -> u64 
 }
 
 pub(super) fn latency(nanos: &Histogram<u64>) -> Option<Latency> {
-    let quantile = |share: f64| nanos.value_at_quantile(share);
-    let summary = Latency { p50: quantile(0.5), p90: quantile(0.9), p99: quantile(0.99), max: nanos.max() };
-    (!nanos.is_empty()).then_some(summary)
+    let [p50, p90, p99] = [0.5, 0.9, 0.99].map(|share| nanos.value_at_quantile(share));
+    if nanos.is_empty() { None } else { Some(Latency { p50, p90, p99, max: nanos.max() }) }
 }
