@@ -303,12 +303,12 @@ impl Credit {
         places: &impl Places,
         written: Option<Written>,
     ) -> Vec<&Reader> {
-        let lacks = |reader: &&Reader| match (reader.least(places, written.as_ref()), written) {
+        let lacking = self.readers.iter().filter(|reader| match (reader.least(places, written.as_ref()), written) {
             (None, _) | (_, None) => false,
             (Some(None), _) => true,
             (Some(Some(place)), Some(written)) => !written.is_past(place, key),
-        };
-        self.readers.iter().filter(lacks).collect()
+        });
+        lacking.collect()
     }
 }
 

@@ -106,11 +106,10 @@ impl Namespace {
             return Err(NamespaceError::Name { name: name.into() });
         }
         sweep();
-        let failed = |source: Error| match source.kind() {
+        let socket = ControlSocket::bind(name).map_err(|source| match source.kind() {
             std::io::ErrorKind::AddrInUse => NamespaceError::NameTaken { name: name.into() },
             _ => NamespaceError::Lock { name: name.into(), source },
-        };
-        let socket = ControlSocket::bind(name).map_err(failed)?;
+        })?;
         let (wiring, lock) = make_folder(name)?;
         let domain = Namespace { name: name.into(), wiring, socket, _lock: lock };
         check_room()?;

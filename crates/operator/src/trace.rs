@@ -42,12 +42,11 @@ pub(super) fn install(tells_refused: bool, say: impl Fn(LogEntry) + Send + Sync 
     let filter = filter.and_then(Result::ok);
     // A user who asks for certain levels gets every line of them.
     let repeats = filter.is_none().then(|| Repeats { tells_refused, ..Repeats::default() });
-    let usual = || {
+    let filter = filter.unwrap_or_else(|| {
         let levels =
             [(ZENOH, LevelFilter::WARN), (ACCESS_CONTROL, LevelFilter::INFO), (ORCHESTRATOR, LevelFilter::DEBUG)];
         Targets::new().with_default(LevelFilter::INFO).with_targets(levels)
-    };
-    let filter = filter.unwrap_or_else(usual);
+    });
     let _ = tracing_subscriber::registry().with(Sayer { say, repeats }.with_filter(filter)).try_init();
     if let Some(error) = unreadable {
         tracing::warn!("{FILTER_VARIABLE} is not read: {error}");

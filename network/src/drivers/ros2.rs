@@ -314,7 +314,40 @@ impl Ros2 {
     ) -> Result<Event, String> {
         let cells_newtons = cells(value, &self.topics.cells_field)?;
         self.take_gravity(stamp_nanos, at_nanos)?;
-        let is_near = |other: u64| other.abs_diff(stamp_nanos) <= self.topics.tolerance_nanos;
+        let joints = self.joints_at(stamp_nanos, at_nanos)?;
+        let (phase, _) = self
+            .phase
+            .ok_or_else(|| format!("no phase has come on {}", self.topics.phase.as_deref().unwrap_or_default()))?;
+        let gravity_topic = self.topics.imu.as_ref().or(self.topics.gravity.as_ref().map(|(topic, _)| topic));
+        let named = [
+            (Sense::Gravity, gravity_topic, &self.gravity),
+            (Sense::WristWrench, self.topics.wrench.as_ref(), &self.wrench),
+        ];
+        let mut senses = OwnedSenses::default();
+        // A frame has all senses that the parameters name: a model must not decide without one.
+        for (sense, topic, last) in named {
+            match (topic, last) {
+                (None, _) => {}
+                (Some(_), Some((values, at))) if self.are_near(*at, stamp_nanos) => senses.set(sense, values),
+                (Some(topic), _) => {
+                    return Err(format!("no message of {topic} has come that is near the cells in time"));
+                }
+            }
+        }
+        let seq = received.seq.and_then(|seq| u64::try_from(i128::from(seq) + self.offset).ok());
+        let reading = Reading { joints, cells_newtons, phase, senses, seq, stamp_nanos: stamp, ..Reading::default() };
+        Ok(Event::Frame(reading, Arrival { at_nanos, waited_nanos: 0 }))
+    }
+
+    fn are_near(&self, nanos: u64, other_nanos: u64) -> bool {
+        nanos.abs_diff(other_nanos) <= self.topics.tolerance_nanos
+    }
+
+    /// The joints of a frame.
+    ///
+    /// # Errors
+    /// An angle is missing, too old or contradicted, for a person.
+    fn joints_at(&self, stamp_nanos: u64, at_nanos: u64) -> Result<Vec<f64>, String> {
         if let Some((joint, since)) = &self.contradiction
             && at_nanos.saturating_sub(*since) < SILENT_NANOS
         {
@@ -330,8 +363,7 @@ impl Ros2 {
             let angle =
                 joint.ok_or_else(|| format!("no angle of joint '{name}' has come on {}", self.topics.joints))?;
             let is_slow = angle.is_last_of_a_slow_topic(stamp_nanos, is_held, self.topics.still_per_s);
-            if !(is_near(angle.stamp_nanos) || is_slow) {
-                let millis = |nanos: u64| nanos as f64 / 1e6;
+            if !(self.are_near(angle.stamp_nanos, stamp_nanos) || is_slow) {
                 return Err(format!(
                     "the angle of joint '{name}' is {:.1} ms from the cells in time, tolerance_ms is {:.1}, and {} comes each \
                      {:.1} ms",
@@ -343,29 +375,12 @@ impl Ros2 {
             }
             joints.push(angle.value);
         }
-        let (phase, _) = self
-            .phase
-            .ok_or_else(|| format!("no phase has come on {}", self.topics.phase.as_deref().unwrap_or_default()))?;
-        let gravity_topic = self.topics.imu.as_ref().or(self.topics.gravity.as_ref().map(|(topic, _)| topic));
-        let named = [
-            (Sense::Gravity, gravity_topic, &self.gravity),
-            (Sense::WristWrench, self.topics.wrench.as_ref(), &self.wrench),
-        ];
-        let mut senses = OwnedSenses::default();
-        // A frame has all senses that the parameters name: a model must not decide without one.
-        for (sense, topic, last) in named {
-            match (topic, last) {
-                (None, _) => {}
-                (Some(_), Some((values, at))) if is_near(*at) => senses.set(sense, values),
-                (Some(topic), _) => {
-                    return Err(format!("no message of {topic} has come that is near the cells in time"));
-                }
-            }
-        }
-        let seq = received.seq.and_then(|seq| u64::try_from(i128::from(seq) + self.offset).ok());
-        let reading = Reading { joints, cells_newtons, phase, senses, seq, stamp_nanos: stamp, ..Reading::default() };
-        Ok(Event::Frame(reading, Arrival { at_nanos, waited_nanos: 0 }))
+        Ok(joints)
     }
+}
+
+fn millis(nanos: u64) -> f64 {
+    nanos as f64 / 1e6
 }
 
 impl TactileDriver for Ros2 {

@@ -264,10 +264,10 @@ impl Program {
                 if rest.len() >= FRAME_BYTES + n_body {
                     let body = rest[FRAME_BYTES..FRAME_BYTES + n_body].to_vec();
                     self.used += FRAME_BYTES + n_body;
-                    let found = || format!("a message of the unknown kind {kind}");
-                    let say = Say::of(kind);
-                    let say =
-                        say.ok_or_else(|| ProgramError::Unexpected { found: found(), expected: "one from 1 to 7" })?;
+                    let Some(say) = Say::of(kind) else {
+                        let found = format!("a message of the unknown kind {kind}");
+                        return Err(ProgramError::Unexpected { found, expected: "one from 1 to 7" });
+                    };
                     return Ok(Some((say, body)));
                 }
             }

@@ -178,7 +178,7 @@ impl HostedSource {
     /// Takes in feedback, and sends the next sample.
     fn take_step(&mut self) -> anyhow::Result<Step> {
         if let Some(store) = &self.store
-            && store.send(&mut self.outputs, |_, _, _, _| true, false)? == Sent::GaveWay
+            && store.send(&mut self.outputs, false, |_, _, _, _| true)? == Sent::GaveWay
         {
             return Ok(Step::GaveWay);
         }
@@ -306,7 +306,7 @@ impl HostedSource {
         if store.save(&self.inputs, &mut self.outputs, &self.state, false)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
-        Ok(store.send(&mut self.outputs, |_, _, _, _| true, false)?)
+        Ok(store.send(&mut self.outputs, false, |_, _, _, _| true)?)
     }
 
     /// Sends samples unless readers have them.

@@ -256,10 +256,9 @@ impl HostedStage {
         if !self.is_active {
             return partners;
         }
-        let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(monotonic_nanos()));
         let silence = if self.operator.clock() == Clock::Machine { self.deadline_nanos } else { None };
         let held = self.inputs.iter().filter_map(|input| input.port.hold_deadline());
-        held.chain(partners).chain(silence.map(|deadline| Instant::now() + left(deadline))).min()
+        held.chain(partners).chain(silence.map(crate::instant_of)).min()
     }
 
     fn obey(&mut self) -> anyhow::Result<()> {
@@ -414,8 +413,8 @@ impl HostedStage {
         }
         let readers = self.outputs.iter().filter(|output| output.port.has_readers());
         let answered = readers.map(|output| output.port.answered_by_readers());
-        let is_after = |key, other| self.inputs[idx].port.is_after(key, other);
-        let least = answered.reduce(|a, b| if a.is_some_and(|a| is_after(a, b)) { b } else { a });
+        let port = &self.inputs[idx].port;
+        let least = answered.reduce(|a, b| if a.is_some_and(|a| port.is_after(a, b)) { b } else { a });
         least.unwrap_or(self.last)
     }
 
@@ -653,11 +652,10 @@ impl HostedStage {
         let is_checked = self.ready.hears.contains(&Hears::Check);
         let (operator, child) = (&self.operator, &mut self.child);
         let mut failure = None;
-        let check = |output: usize, header: &Header, head: &mut Vec<u8>, items: &[u8]| {
+        let sent = store.send(&mut self.outputs, is_checked, |output, header, head, items| {
             failure = checked(child, output, head, items, arrival_nanos(operator, header)).err();
             failure.is_none()
-        };
-        let sent = store.send(&mut self.outputs, check, is_checked)?;
+        })?;
         match failure {
             Some(failure) => Err(failure.into()),
             None => Ok(sent),

@@ -256,8 +256,8 @@ impl Store {
     pub(super) fn send(
         &self,
         outputs: &mut [Output],
-        mut check: impl FnMut(usize, &Header, &mut Vec<u8>, &[u8]) -> bool,
         is_checked: bool,
+        mut check: impl FnMut(usize, &Header, &mut Vec<u8>, &[u8]) -> bool,
     ) -> Result<Sent, PortError> {
         for output in outputs {
             while let Some(answer) = output.saved.next() {
