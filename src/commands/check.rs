@@ -8,7 +8,7 @@ use super::text_table::TextTable;
 use super::{Outcome, print_line, print_text};
 use blindgrasp_cli::graph_file::{OnMisfit, able_to_begin};
 use blindgrasp_graph::dataflow::{
-    self, DataflowError, Edge, Graph, Input, Machine, Machines, Node, Override, Restart, RestartPolicy, Scope,
+    self, DataflowError, Edge, Graph, Input, Machines, Node, Override, Restart, RestartPolicy, Scope,
 };
 
 /// Prints the graph with every value filled in, or its mistakes. With --json: {"graph": …}, with "crossing" edges where

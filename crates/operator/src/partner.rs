@@ -52,8 +52,11 @@ impl<T> Timeline<T> {
     }
 
     fn push(&mut self, stamp_nanos: u64, sample: T) {
-        let last = self.segments.back().map(|segment| segment.kept.back());
-        if last.is_none_or(|last| last.is_some_and(|(last, _)| *last > stamp_nanos)) {
+        let goes_on = match self.segments.back() {
+            Some(segment) => segment.kept.back().is_none_or(|(last, _)| *last <= stamp_nanos),
+            None => false,
+        };
+        if !goes_on {
             self.segments.push_back(Segment { kept: VecDeque::with_capacity(MAX_KEPT), from_nanos: stamp_nanos });
         }
         if let Some(segment) = self.segments.back_mut() {

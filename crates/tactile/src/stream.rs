@@ -124,8 +124,8 @@ impl Stream {
     }
 
     fn listen(&mut self, address: &str, now_nanos: u64) -> Result<(), DriverError> {
-        let refused = |source| DriverError::Listen { address: address.into(), source };
-        let listener = Listener::bind(address).map_err(refused)?;
+        let listener =
+            Listener::bind(address).map_err(|source| DriverError::Listen { address: address.into(), source })?;
         let bound = listener.local_address();
         print_diagnostic(&format!("listening on {}", bound.map_or(address.into(), |bound| bound.to_string())));
         if let Some(bound) = bound.filter(|bound| !bound.ip().is_loopback()) {
@@ -276,8 +276,7 @@ impl Stream {
                 }
                 continue;
             }
-            let is_idle = |limit: u64| now_nanos.saturating_sub(connection.last_byte_nanos) > limit;
-            if self.idle_limit_nanos.is_some_and(is_idle) {
+            if self.idle_limit_nanos.is_some_and(|limit| now_nanos.saturating_sub(connection.last_byte_nanos) > limit) {
                 connection.end = Some("it was silent for idle_limit_ms".into());
                 continue;
             }

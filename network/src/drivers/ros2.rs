@@ -149,9 +149,9 @@ impl Ros2 {
         add(Topic::Wrench, &topics.wrench, standard::definition("geometry_msgs/msg/WrenchStamped"));
         add(Topic::Imu, &topics.imu, standard::definition("sensor_msgs/msg/Imu"));
         if let Some((topic, _)) = &topics.gravity {
-            let message = || standard::definition("tf2_msgs/msg/TFMessage");
-            add(Topic::Transforms, &Some(topic.clone()), message());
-            add(Topic::StaticTransforms, &Some(format!("{topic}_static")), message());
+            let definition = standard::definition("tf2_msgs/msg/TFMessage");
+            add(Topic::Transforms, &Some(topic.clone()), definition.clone());
+            add(Topic::StaticTransforms, &Some(format!("{topic}_static")), definition);
         }
         Ros2 {
             topics,

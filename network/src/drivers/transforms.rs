@@ -39,11 +39,10 @@ impl Transforms {
             return;
         };
         for transform in &transforms {
-            let name = |path: &str| {
+            let [parent, frame] = ["header.frame_id", "child_frame_id"].map(|path| {
                 let found = transform.at(path);
                 found.as_ref().and_then(Value::text).unwrap_or_default().trim_start_matches('/').to_owned()
-            };
-            let (parent, frame) = (name("header.frame_id"), name("child_frame_id"));
+            });
             if parent.len().max(frame.len()) > MAX_NAME_BYTES {
                 continue;
             }

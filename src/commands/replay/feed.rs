@@ -7,11 +7,10 @@ use anyhow::{Context, bail};
 use serde_json::{Map, Value, json};
 
 use blindgrasp_cli::graph_file::{describe, shipped};
-use blindgrasp_graph::dataflow::{Graph, Node, Override, Program, accept_param_value};
+use blindgrasp_graph::dataflow::{Graph, Override, Program, accept_param_value};
 use blindgrasp_graph::plan::Port;
 use blindgrasp_graph::run::observed_topics;
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, TactileFrame};
-use blindgrasp_operator::description::PortDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::{Reach, RecordingReader};
 use blindgrasp_replay::playback::{Next, Playback};

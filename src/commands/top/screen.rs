@@ -11,7 +11,7 @@ use ratatui::widgets::{Block, Clear, Paragraph, RenderDirection, Sparkline};
 use super::table::{Cell, Column, table};
 use super::view::{Condition, Table, View};
 use crate::commands::promises::shown_counts;
-use blindgrasp_graph::client::activity::{Measured, MeasuredEdge, MeasuredNode, Quantiles, RUN};
+use blindgrasp_graph::client::activity::{Measured, MeasuredEdge, MeasuredNode, RUN};
 use blindgrasp_graph::client::words::{
     clock_offset, node_state_word, peer_state_word, short_rate, short_time, state_word, warnings,
 };
@@ -241,11 +241,10 @@ fn edge_table(measured: &Measured, width: u16) -> (Line<'static>, Vec<Line<'stat
         column("BLOCKED", 10),
     ];
     // These are rare: a column of zeros would take a name's place.
-    let edges = measured.edges.iter();
     let kept = (0..columns.len()).filter(|&idx| match columns[idx].title {
-        "LATE" => edges.clone().any(|edge| edge.late > 0),
-        "REPEATED" => edges.clone().any(|edge| edge.repeated > 0),
-        "BLOCKED" => edges.clone().any(|edge| edge.blocked_nanos > 0),
+        "LATE" => measured.edges.iter().any(|edge| edge.late > 0),
+        "REPEATED" => measured.edges.iter().any(|edge| edge.repeated > 0),
+        "BLOCKED" => measured.edges.iter().any(|edge| edge.blocked_nanos > 0),
         _ => true,
     });
     let kept: Vec<usize> = kept.collect();

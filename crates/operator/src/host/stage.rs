@@ -4,7 +4,7 @@
 //! sample: nothing is saved, and after a restart it answers again what readers may lack. Any other is saved after each sample,
 //! with its answers and the places of all its inputs, before the answers are sent.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use blindgrasp_messages::Header;
 
