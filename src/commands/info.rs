@@ -181,27 +181,16 @@ fn counts(counts: &BTreeMap<String, u64>) -> String {
 }
 
 fn overview_lines(overview: &Overview) -> Vec<(&str, String)> {
-    let mut samples = Vec::new();
-    for (topic, n) in &overview.n_samples {
-        samples.push(match n {
-            Some(n) => format!("{topic} {n}"),
-            None => format!("{topic} unknown"),
-        });
-    }
+    let samples = overview.n_samples.iter();
+    let samples = samples.map(|(topic, n)| format!("{topic} {}", n.map_or("unknown".into(), |n| n.to_string())));
+    let [on_disk_mib, raw_mib] =
+        [overview.n_file_bytes, overview.n_uncompressed_bytes].map(|n_bytes| n_bytes as f64 / f64::from(1 << 20));
     let mut lines = vec![
         ("recordings", overview.n_recordings.to_string()),
         ("hand", overview.hand.clone()),
-        ("samples", samples.join(", ")),
+        ("samples", samples.collect::<Vec<String>>().join(", ")),
         ("duration", overview.duration_secs.map_or("unknown".into(), |secs| format!("{secs:.1} s"))),
-        (
-            "size",
-            format!(
-                "{:.1} MiB in {} chunks, {:.1} MiB before compression",
-                mebibytes(overview.n_file_bytes),
-                overview.n_chunks,
-                mebibytes(overview.n_uncompressed_bytes)
-            ),
-        ),
+        ("size", format!("{on_disk_mib:.1} MiB in {} chunks, {raw_mib:.1} MiB before compression", overview.n_chunks)),
     ];
     for (name, topic) in overview.topics.iter().filter(|(_, topic)| !topic.is_ours) {
         let n_messages = topic.n_messages.map_or("?".into(), |n| n.to_string());
@@ -218,10 +207,6 @@ fn overview_lines(overview: &Overview) -> Vec<(&str, String)> {
         }
     }
     lines
-}
-
-fn mebibytes(n_bytes: u64) -> f64 {
-    n_bytes as f64 / f64::from(1 << 20)
 }
 
 fn print_summary(hand: &Hand, summary: &RecordingsSummary) -> anyhow::Result<()> {

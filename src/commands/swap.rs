@@ -184,9 +184,7 @@ fn request(arguments: &Arguments) -> anyhow::Result<SwapRequest> {
 
 /// The swap with the program as it is found here.
 fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
-    let Some(run) = &request.program else {
-        return Ok(request);
-    };
+    let Some(run) = &request.program else { return Ok(request) };
     let args = request.args.as_deref().unwrap_or_default();
     let program = shipped()?
         .program_to_run(run, args, &request.folder)

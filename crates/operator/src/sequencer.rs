@@ -181,9 +181,7 @@ impl<T> Sequencer<T> {
         has_other_publishers: impl FnOnce() -> bool,
         now: impl FnOnce() -> Instant,
     ) -> Placing<T> {
-        let Some(place) = self.place(key, written) else {
-            return Placing::Drop;
-        };
+        let Some(place) = self.place(key, written) else { return Placing::Drop };
         let known = self.publishers.iter_mut().find(|(id, _)| *id == publisher);
         let is_first_of_publisher = known.is_none();
         match known {

@@ -96,37 +96,46 @@ pub trait Source {
 /// # Errors
 /// An error of the source.
 pub fn run(operator: &Operator, identity: BTreeMap<String, String>, mut source: impl Source) -> anyhow::Result<()> {
-    let mut instance = SourceInstance {
-        is_active: !operator.begins_as_standby(),
-        may_go: false,
-        is_handed_over: false,
-        is_placed: false,
-    };
-    let mut is_done = false;
+    let (mut is_active, mut may_go) = (!operator.begins_as_standby(), false);
+    let (mut is_handed_over, mut is_placed, mut is_done) = (false, false, false);
     let mut last_look = Instant::now();
     operator.ready(identity);
     while !operator.should_stop() {
         while let Some(command) = operator.next_command() {
-            instance.obey(command, operator, &mut source)?;
+            match command {
+                Command::Go => may_go = true,
+                Command::TakeOver { is_handed_over: handed_over } => {
+                    source.take_over()?;
+                    (is_active, is_handed_over, is_placed) = (true, handed_over, false);
+                    operator.took_over();
+                }
+                Command::HandOver => {
+                    (is_active, is_placed) = (false, false);
+                    source.close();
+                    operator.handed_over();
+                }
+                Command::Set { id, params } => {
+                    let from_seq = source.next_seq();
+                    operator.has_set(id, source.set(&params), from_seq);
+                }
+                Command::NodeEnded { .. } | Command::TakeNoMore { .. } | Command::Drain | Command::Quit => {}
+            }
         }
         operator.beat();
-        let takes_steps = instance.is_active && instance.may_go;
-        if takes_steps && !instance.is_placed {
-            instance.is_placed = source.resume(instance.is_handed_over)?;
+        let takes_steps = is_active && may_go;
+        if takes_steps && !is_placed {
+            is_placed = source.resume(is_handed_over)?;
             is_done = false;
         }
-        let step = if takes_steps && instance.is_placed { source.step()? } else { Step::Wait(None) };
+        let step = if takes_steps && is_placed { source.step()? } else { Step::Wait(None) };
         if last_look.elapsed() >= TICK {
             last_look = Instant::now();
             operator.look_at_descriptors()?;
             source.look()?;
         }
+        is_placed &= step != Step::GaveWay;
         let until = match step {
-            Step::Next => continue,
-            Step::GaveWay => {
-                instance.is_placed = false;
-                continue;
-            }
+            Step::Next | Step::GaveWay => continue,
             Step::Wait(until) => until,
             Step::Done => {
                 if !std::mem::replace(&mut is_done, true) {
@@ -139,44 +148,10 @@ pub fn run(operator: &Operator, identity: BTreeMap<String, String>, mut source: 
         if takes_steps {
             source.watch(&mut fds);
         }
-        let limit = until.map_or(TICK, |until| until.saturating_duration_since(Instant::now()));
-        operator.wait_for(&fds, limit);
+        operator.wait_for(&fds, until.map_or(TICK, |until| until.saturating_duration_since(Instant::now())));
     }
     source.close();
     operator.drained(|| source.look())
-}
-
-/// What the launcher has told an instance of a source, and how far it is.
-struct SourceInstance {
-    is_active: bool,
-    may_go: bool,
-    is_handed_over: bool,
-    /// Whether the source has found its place in the samples ([`Source::resume`]).
-    is_placed: bool,
-}
-
-impl SourceInstance {
-    fn obey(&mut self, command: Command, operator: &Operator, source: &mut impl Source) -> anyhow::Result<()> {
-        match command {
-            Command::Go => self.may_go = true,
-            Command::TakeOver { is_handed_over } => {
-                source.take_over()?;
-                (self.is_active, self.is_handed_over, self.is_placed) = (true, is_handed_over, false);
-                operator.took_over();
-            }
-            Command::HandOver => {
-                (self.is_active, self.is_placed) = (false, false);
-                source.close();
-                operator.handed_over();
-            }
-            Command::Set { id, params } => {
-                let from_seq = source.next_seq();
-                operator.has_set(id, source.set(&params), from_seq);
-            }
-            Command::NodeEnded { .. } | Command::TakeNoMore { .. } | Command::Drain | Command::Quit => {}
-        }
-        Ok(())
-    }
 }
 
 /// Sends a message under this header, whose `origin_nanos` is set to the current time.

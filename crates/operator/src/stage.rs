@@ -625,9 +625,7 @@ impl<S: Stage> Instance<S> {
 
     /// Answers live samples beside the active instance.
     fn read_along(&mut self) -> anyhow::Result<()> {
-        let Some(shadow) = &mut self.shadow else {
-            return Ok(());
-        };
+        let Some(shadow) = &mut self.shadow else { return Ok(()) };
         while !self.operator.has_command()
             && !self.operator.should_stop()
             && let Some(sample) = next(&mut shadow.subscriber)?

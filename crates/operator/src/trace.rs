@@ -123,9 +123,7 @@ fn without_places(text: &str) -> String {
     let (mut kept, mut rest) = (String::new(), text);
     while let Some(at) = rest.find(" at /") {
         let place = &rest[at + 1..];
-        let Some(line) = place.find(".rs:").map(|end| &place[end + 4..]) else {
-            break;
-        };
+        let Some(line) = place.find(".rs:").map(|end| &place[end + 4..]) else { break };
         kept += &rest[..at];
         let behind = line.trim_start_matches(|char: char| char.is_ascii_digit());
         rest = behind.strip_prefix('.').unwrap_or(behind);

@@ -384,8 +384,7 @@ impl FrameFilter {
     }
 
     fn judge_next(&mut self, reading: &Reading, arrival: &Arrival) -> Result<Accepted, Refusal> {
-        let malformed = |why: String| Refusal { kind: RefusalKind::Malformed, why };
-        check_values(reading, self.shape, self.allowed.as_deref()).map_err(malformed)?;
+        check_values(reading, self.shape, self.allowed.as_deref()).map_err(Refusal::malformed)?;
         let keys = Keys {
             grasp_id: reading.grasp_id.is_some(),
             seq: reading.seq.is_some(),
@@ -393,7 +392,7 @@ impl FrameFilter {
             senses: Sense::ALL.map(|sense| !reading.senses.get(sense).is_empty()),
         };
         if let Some(first) = self.connection.keys {
-            check_keys(first, keys).map_err(malformed)?;
+            check_keys(first, keys).map_err(Refusal::malformed)?;
         }
         if let Err(why) = self.check_order(reading) {
             let goes_back = match (reading.stamp_nanos, self.stamp_nanos) {

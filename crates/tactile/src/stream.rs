@@ -157,9 +157,7 @@ impl Stream {
                     return false;
                 }
                 let since_nanos = self.no_client_nanos;
-                let Some((stream, peer)) = self.accept(now_nanos) else {
-                    return false;
-                };
+                let Some((stream, peer)) = self.accept(now_nanos) else { return false };
                 self.begin(stream, peer, false, since_nanos, now_nanos, place);
                 true
             }
@@ -359,9 +357,7 @@ impl TactileDriver for Stream {
     }
 
     fn refused(&mut self, refusal: &Refusal, now_nanos: u64) {
-        let Some(connection) = &mut self.connection else {
-            return;
-        };
+        let Some(connection) = &mut self.connection else { return };
         if now_nanos.saturating_sub(connection.told.0) >= SEC_NANOS {
             connection.told = (now_nanos, 0);
         }

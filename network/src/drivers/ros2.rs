@@ -21,7 +21,7 @@ use blindgrasp_ros::standard;
 use blindgrasp_ros_node::node::{
     Convention, MAX_RECEIVED_BYTES, MessageType, Quality, Received, Rights, RosNode, open,
 };
-use blindgrasp_tactile::{Arrival, DriverError, Event, Place, Reading, Refusal, RefusalKind, TactileDriver};
+use blindgrasp_tactile::{Arrival, DriverError, Event, Place, Reading, Refusal, TactileDriver};
 
 /// A sender that has sent nothing for so long gives way to another one.
 const SILENT_NANOS: u64 = 2_000_000_000;
@@ -190,7 +190,7 @@ impl Ros2 {
         }
         let event = self.take_known(topic, &received, at_nanos).unwrap_or_else(|why| {
             let why = format!("{}: {why}", self.definitions[&topic].0);
-            Some(Event::Refused(Refusal { kind: RefusalKind::Malformed, why }))
+            Some(Event::Refused(Refusal::malformed(why)))
         });
         if begins {
             self.pending = event;
@@ -289,9 +289,7 @@ impl Ros2 {
     /// # Errors
     /// They do not tell it, for a person.
     fn take_gravity(&mut self, stamp_nanos: u64, at_nanos: u64) -> Result<(), String> {
-        let Some((topic, [upright, palm])) = &self.topics.gravity else {
-            return Ok(());
-        };
+        let Some((topic, [upright, palm])) = &self.topics.gravity else { return Ok(()) };
         let palm_from_upright = self.transforms.rotation(palm, upright, stamp_nanos, TRANSFORM_NANOS, at_nanos);
         let palm_from_upright = palm_from_upright.ok_or_else(|| {
             format!(
@@ -364,23 +362,19 @@ impl Ros2 {
                 joint.ok_or_else(|| format!("no angle of joint '{name}' has come on {}", self.topics.joints))?;
             let is_slow = angle.is_last_of_a_slow_topic(stamp_nanos, is_held, self.topics.still_per_s);
             if !(self.are_near(angle.stamp_nanos, stamp_nanos) || is_slow) {
+                let distance_nanos = angle.stamp_nanos.abs_diff(stamp_nanos);
+                let [distance_ms, tolerance_ms, period_ms] =
+                    [distance_nanos, self.topics.tolerance_nanos, angle.period_nanos].map(|nanos| nanos as f64 / 1e6);
                 return Err(format!(
-                    "the angle of joint '{name}' is {:.1} ms from the cells in time, tolerance_ms is {:.1}, and {} comes each \
-                     {:.1} ms",
-                    millis(angle.stamp_nanos.abs_diff(stamp_nanos)),
-                    millis(self.topics.tolerance_nanos),
-                    self.topics.joints,
-                    millis(angle.period_nanos)
+                    "the angle of joint '{name}' is {distance_ms:.1} ms from the cells in time, tolerance_ms is \
+                     {tolerance_ms:.1}, and {} comes each {period_ms:.1} ms",
+                    self.topics.joints
                 ));
             }
             joints.push(angle.value);
         }
         Ok(joints)
     }
-}
-
-fn millis(nanos: u64) -> f64 {
-    nanos as f64 / 1e6
 }
 
 impl TactileDriver for Ros2 {
@@ -438,9 +432,7 @@ impl TactileDriver for Ros2 {
         if let Some(event) = self.pending.take() {
             return Ok(Some(event));
         }
-        let Some(inbox) = self.inbox.clone() else {
-            return Ok(None);
-        };
+        let Some(inbox) = self.inbox.clone() else { return Ok(None) };
         loop {
             match inbox.next() {
                 Ok(None) => return Ok(None),

@@ -35,9 +35,7 @@ impl Transforms {
     /// Takes a `tf2_msgs/msg/TFMessage` that came at a time. As `tf2`, it passes over a transform whose rotation is no unit
     /// quaternion; the frame is not known until the next one.
     pub(super) fn take(&mut self, message: &Value, is_static: bool, sender: [u8; 16], at_nanos: u64) {
-        let Some(Value::List(transforms)) = message.at("transforms") else {
-            return;
-        };
+        let Some(Value::List(transforms)) = message.at("transforms") else { return };
         for transform in &transforms {
             let [parent, frame] = ["header.frame_id", "child_frame_id"].map(|path| {
                 let found = transform.at(path);

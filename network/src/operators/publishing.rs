@@ -159,9 +159,7 @@ impl<M: Message> Forward for Edge<M> {
     }
 
     fn forward(&mut self, epochs: &RandomState, data: &mut Vec<u8>) -> anyhow::Result<Forwarded> {
-        let Some(sample) = self.subscriber.receive()? else {
-            return Ok(Forwarded::NoSample);
-        };
+        let Some(sample) = self.subscriber.receive()? else { return Ok(Forwarded::NoSample) };
         let header = *M::header(sample.head());
         let message = M::from_parts(sample.head(), sample.items());
         self.subscriber.commit(&header);

@@ -73,8 +73,7 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
         connection.graph()
     ));
     let end = arguments.for_secs.map(|secs| start + Duration::from_secs_f64(secs));
-    let writer = Writer { out, about, is_json: arguments.json, has_loss: false };
-    let mut keeping = Keeping { recorder, writer, stop, asked, end };
+    let mut keeping = Keeping { recorder, stop, asked, end, out, about, is_json: arguments.json, has_loss: false };
     let ending = keeping.follow(&mut connection, &observer)?;
     let finished = if ending == Ending::Detached { observer.leave() } else { observer.finish() };
     let graph = connection.graph().to_string();
@@ -91,13 +90,16 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
         Ending::Detached => "the graph goes on",
     };
     print_diagnostic(&format!("graph '{graph}' is kept no longer: {how}"));
-    Ok(Outcome::of(keeping.writer.has_loss))
+    Ok(Outcome::of(keeping.has_loss))
 }
 
 /// A flight recorder and the orders that it follows.
 struct Keeping<'a> {
     recorder: SharedRecorder,
-    writer: Writer<'a>,
+    out: &'a Path,
+    about: RecordedGraph,
+    is_json: bool,
+    has_loss: bool,
     stop: Arc<AtomicBool>,
     asked: Arc<AtomicBool>,
     /// When it ends, if not earlier.
@@ -116,7 +118,7 @@ impl Keeping<'_> {
                 self.ask(ASKED);
             }
             if let Some(excerpt) = self.recorder.with(|recorder| recorder.excerpt_when_due(monotonic_nanos())) {
-                self.writer.write(excerpt)?;
+                self.write(excerpt)?;
             }
             if !is_full && self.recorder.with(|recorder| recorder.is_full()) {
                 is_full = true;
@@ -152,47 +154,11 @@ impl Keeping<'_> {
             self.ask(Ending::Broken.word());
         }
         while let Some(excerpt) = self.recorder.with(FlightRecorder::excerpt_now) {
-            self.writer.write(excerpt)?;
+            self.write(excerpt)?;
         }
         Ok(())
     }
-}
 
-/// The nodes that send frames and read none.
-fn n_sources_of_frames(graph: &Value) -> usize {
-    let nodes = list(&graph["nodes"]);
-    let frames: BTreeSet<String> = nodes.iter().flat_map(ports_of_frames).collect();
-    let mut n_sources = 0;
-    for node in nodes {
-        let reads_frames = list(&node["inputs"]).iter().any(|input| frames.contains(word(&input["from"])));
-        if !reads_frames && !ports_of_frames(node).is_empty() {
-            n_sources += 1;
-        }
-    }
-    n_sources
-}
-
-fn ports_of_frames(node: &Value) -> Vec<String> {
-    let ports = list(&node["outputs"]).iter().filter(|port| port["type"] == TactileFrame::TYPE_NAME);
-    ports.map(|port| format!("{}/{}", word(&node["id"]), word(&port["port"]))).collect()
-}
-
-fn list(value: &Value) -> &[Value] {
-    value.as_array().map_or(&[], Vec::as_slice)
-}
-
-fn word(value: &Value) -> &str {
-    value.as_str().unwrap_or_default()
-}
-
-struct Writer<'a> {
-    out: &'a Path,
-    about: RecordedGraph,
-    is_json: bool,
-    has_loss: bool,
-}
-
-impl Writer<'_> {
     fn write(&mut self, excerpt: Excerpt) -> anyhow::Result<()> {
         if excerpt.is_empty() {
             self.has_loss = true;
@@ -227,4 +193,25 @@ impl Writer<'_> {
         };
         Ok(print_line(&line)?)
     }
+}
+
+/// The nodes that send frames and read none.
+fn n_sources_of_frames(graph: &Value) -> usize {
+    let nodes = list(&graph["nodes"]);
+    let frames: BTreeSet<String> = nodes.iter().flat_map(ports_of_frames).collect();
+    let senders = nodes.iter().filter(|node| !ports_of_frames(node).is_empty());
+    senders.filter(|node| !list(&node["inputs"]).iter().any(|input| frames.contains(word(&input["from"])))).count()
+}
+
+fn ports_of_frames(node: &Value) -> Vec<String> {
+    let ports = list(&node["outputs"]).iter().filter(|port| port["type"] == TactileFrame::TYPE_NAME);
+    ports.map(|port| format!("{}/{}", word(&node["id"]), word(&port["port"]))).collect()
+}
+
+fn list(value: &Value) -> &[Value] {
+    value.as_array().map_or(&[], Vec::as_slice)
+}
+
+fn word(value: &Value) -> &str {
+    value.as_str().unwrap_or_default()
 }

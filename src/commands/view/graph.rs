@@ -33,7 +33,7 @@ struct Picture {
     edges: Vec<PictureEdge>,
 }
 
-#[derive(Serialize)]
+#[derive(Default, Serialize)]
 struct PictureNode {
     id: String,
     /// As the dataflow file says; nothing of a running graph whose file has changed.
@@ -212,17 +212,8 @@ fn measured_picture(measured: Measured, file: Option<Picture>) -> Picture {
         file.map(|file| (file.nodes, file.edges, file.machines)).unwrap_or_default();
     let nodes = measured.nodes.into_iter().map(|node| {
         let known = file_nodes.iter().position(|known| known.id == node.node).map(|idx| file_nodes.swap_remove(idx));
-        match known {
-            Some(known) => PictureNode { running: Some(node), ..known },
-            None => PictureNode {
-                id: node.node.clone(),
-                operator: None,
-                machine: None,
-                restart: None,
-                heartbeat_millis: None,
-                running: Some(node),
-            },
-        }
+        let known = known.unwrap_or_default();
+        PictureNode { id: node.node.clone(), running: Some(node), ..known }
     });
     let nodes = nodes.collect();
     let edges = measured.edges.into_iter().map(|edge| {

@@ -203,9 +203,7 @@ impl Program {
     fn send(&mut self, ask: Ask) -> Result<(), ProgramError> {
         let n_body = self.out.len() - FRAME_BYTES;
         self.out[..4].copy_from_slice(&(n_body as u32).to_ne_bytes());
-        let Some(to) = &mut self.to else {
-            return Err(ProgramError::Ended(String::new(), ask));
-        };
+        let Some(to) = &mut self.to else { return Err(ProgramError::Ended(String::new(), ask)) };
         match to.write_all(&self.out) {
             Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Err(self.reason_of_end(ask)),
             outcome => outcome.map_err(ProgramError::Pipe),

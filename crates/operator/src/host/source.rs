@@ -299,9 +299,7 @@ impl HostedSource {
         if self.ready.has_state {
             self.state = work.state;
         }
-        let Some(store) = &mut self.store else {
-            return Ok(Sent::Yes);
-        };
+        let Some(store) = &mut self.store else { return Ok(Sent::Yes) };
         // A device cannot give a reading again: it is saved before another instance takes over, which then sends it.
         if store.save(&self.inputs, &mut self.outputs, &self.state, false)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);

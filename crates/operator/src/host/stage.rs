@@ -430,9 +430,7 @@ impl HostedStage {
     }
 
     fn ask_all(&mut self, idx: usize, samples: &[&RawSample]) -> anyhow::Result<Vec<Work>> {
-        let Some(first) = samples.first() else {
-            return Ok(Vec::new());
-        };
+        let Some(first) = samples.first() else { return Ok(Vec::new()) };
         self.operator.works_on(Some(self.name_of(idx, first)));
         let mut partners = Vec::new();
         for (port, partner) in &self.partner_ports {
@@ -646,9 +644,7 @@ impl HostedStage {
     }
 
     fn send_saved(&mut self) -> anyhow::Result<Sent> {
-        let Some(store) = &self.store else {
-            return Ok(Sent::Yes);
-        };
+        let Some(store) = &self.store else { return Ok(Sent::Yes) };
         let is_checked = self.ready.hears.contains(&Hears::Check);
         let (operator, child) = (&self.operator, &mut self.child);
         let mut failure = None;
@@ -676,9 +672,7 @@ impl HostedStage {
 
     /// Takes over what was saved, and gives the program its state.
     fn restore(&mut self, is_handed_over: bool) -> anyhow::Result<()> {
-        let Some(store) = &mut self.store else {
-            return Ok(());
-        };
+        let Some(store) = &mut self.store else { return Ok(()) };
         let restored = store.restore(&mut self.inputs, &mut self.outputs, is_handed_over, false)?;
         if self.ready.has_state {
             let work = super::restore(&mut self.child, restored.state.as_deref())?;

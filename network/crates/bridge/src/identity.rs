@@ -131,9 +131,7 @@ impl Identity {
         let certificates: Vec<CertificateDer<'_>> =
             proof.certificates.iter().map(|bytes| CertificateDer::from(bytes.as_ref())).collect();
         let unfit = |message: String| Unverified(format!("the certificate in the hello of machine '{from}' {message}"));
-        let [own, intermediates @ ..] = &certificates[..] else {
-            return Err(unfit("is missing".into()));
-        };
+        let [own, intermediates @ ..] = &certificates[..] else { return Err(unfit("is missing".into())) };
         let invalid = |error: webpki::Error| unfit(self.in_words(&error));
         let certificate = EndEntityCert::try_from(own).map_err(invalid)?;
         let algorithms = default_provider().signature_verification_algorithms;

@@ -175,9 +175,7 @@ impl<'a> Link<'a> {
 
     /// Connects to Zenoh when the session has been opened.
     fn connect(&mut self) -> anyhow::Result<()> {
-        let Some(session) = self.opening.session()? else {
-            return Ok(());
-        };
+        let Some(session) = self.opening.session()? else { return Ok(()) };
         for connection in &mut self.connections {
             connection.connect(self.operator, self.config, &session)?;
         }
@@ -246,9 +244,7 @@ impl<'a> Link<'a> {
         let start = Instant::now();
         let protection = Arc::clone(&self.connections[idx].protection);
         for n in 0.. {
-            let Some((kind, bytes)) = self.connections[idx].next_frame() else {
-                break;
-            };
+            let Some((kind, bytes)) = self.connections[idx].next_frame() else { break };
             let bytes = bytes.to_bytes();
             self.connections[idx].peer.bytes[1] += bytes.len() as u64;
             let opened = protection.open(kind, &bytes);

@@ -151,9 +151,7 @@ impl PeerConnection {
 
     /// Sends bytes as they are. Zenoh drops them if the connection cannot keep up; frames that matter are repeated.
     pub(super) fn put(&mut self, kind: KeyKind, frame: &[u8]) {
-        let Some(zenoh) = &self.zenoh else {
-            return;
-        };
+        let Some(zenoh) = &self.zenoh else { return };
         self.peer.bytes[0] += frame.len() as u64;
         if let Err(error) = zenoh.publishers[usize::from(kind == KeyKind::Data)].put(frame).wait() {
             tracing::debug!("not sent to machine '{}': {error}", self.peer.machine);
@@ -165,15 +163,11 @@ impl PeerConnection {
     /// # Errors
     /// A frame cannot be encoded.
     pub(super) fn send_samples(&mut self, channel: u16, instance: u64, bytes: &mut Vec<u8>) -> Result<(), WireError> {
-        let Some(uplink) = self.uplinks.get(usize::from(channel)) else {
-            return Ok(());
-        };
+        let Some(uplink) = self.uplinks.get(usize::from(channel)) else { return Ok(()) };
         let (kind, schema_id) = (uplink.channel.kind(), uplink.schema_id);
         loop {
             let sent_nanos = monotonic_nanos();
-            let Some(next) = self.uplinks[usize::from(channel)].outgoing.next(sent_nanos) else {
-                return Ok(());
-            };
+            let Some(next) = self.uplinks[usize::from(channel)].outgoing.next(sent_nanos) else { return Ok(()) };
             let frame = SampleFrame {
                 channel,
                 run: next.run,

@@ -157,15 +157,19 @@ fn checked(config: &LinkConfig) -> Result<Option<&KeyFiles>, SessionError> {
     }
 }
 
-/// The endpoint as Zenoh writes it.
+/// The endpoints as Zenoh writes them.
 ///
 /// # Errors
 /// The folder of sockets cannot be made, or is open to other users.
-fn of_zenoh(endpoint: &str) -> std::io::Result<String> {
-    match Endpoint::parse(endpoint) {
-        Ok(Endpoint::Unix { name }) => Ok(format!("unixsock-stream/{}", control_socket::link_path(&name)?.display())),
-        _ => Ok(endpoint.into()),
+fn of_zenoh(endpoints: &[String]) -> std::io::Result<Vec<String>> {
+    let mut written = Vec::new();
+    for endpoint in endpoints {
+        written.push(match Endpoint::parse(endpoint) {
+            Ok(Endpoint::Unix { name }) => format!("unixsock-stream/{}", control_socket::link_path(&name)?.display()),
+            _ => endpoint.clone(),
+        });
     }
+    Ok(written)
 }
 
 fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> std::io::Result<Value> {
@@ -175,7 +179,7 @@ fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> std::io::Result
     } else {
         ("peer", &config.endpoints.listen, &config.endpoints.connect)
     };
-    let (listen, connect) = (all_of_zenoh(listen)?, all_of_zenoh(connect)?);
+    let (listen, connect) = (of_zenoh(listen)?, of_zenoh(connect)?);
     // -1 means for ever, in the background. A client (with a router) would not start before it is connected.
     let connect_millis = if by_router { i64::try_from(ROUTER_MILLIS).unwrap_or(0) } else { -1 };
     let [first, last] = RETRY_MILLIS;
@@ -235,14 +239,6 @@ fn tls_config(KeyFiles { authority, certificate, private_key }: &KeyFiles) -> Va
     })
 }
 
-/// The endpoints as Zenoh writes them.
-///
-/// # Errors
-/// See [`of_zenoh`].
-fn all_of_zenoh(endpoints: &[String]) -> std::io::Result<Vec<String>> {
-    endpoints.iter().map(|endpoint| of_zenoh(endpoint)).collect()
-}
-
 fn open_error(config: &LinkConfig, found: &str) -> SessionError {
     // Zenoh appends the place in its source code.
     let found = found.split(" at /").next().unwrap_or(found);
@@ -270,9 +266,7 @@ fn open_error(config: &LinkConfig, found: &str) -> SessionError {
 fn key_warnings(keys: &KeyFiles, now: OffsetDateTime) -> Vec<String> {
     let mut warnings = Vec::new();
     for file in [&keys.certificate, &keys.authority] {
-        let Some(found) = certificates::read(file).ok().and_then(|found| soonest(found, now)) else {
-            continue;
-        };
+        let Some(found) = certificates::read(file).ok().and_then(|found| soonest(found, now)) else { continue };
         let kind = if found.is_authority { "the authority" } else { "the certificate" };
         warnings.push(format!(
             "{}: {kind} '{}' ends on {}: renew it (docs/security.md)",
