@@ -64,10 +64,8 @@ impl<S: Subscriber, F: Fn(LogEntry) + 'static> Layer<S> for Sayer<F> {
         if event.metadata().target().starts_with(ZENOH) {
             entry.text = without_places(&entry.text);
         }
-        let is_held_back = self
-            .repeats
-            .as_ref()
-            .is_some_and(|repeats| repeats.holds_back(event.metadata().target(), &entry, Instant::now()));
+        let (target, repeats) = (event.metadata().target(), self.repeats.as_ref());
+        let is_held_back = repeats.is_some_and(|repeats| repeats.holds_back(target, &entry, Instant::now()));
         if !is_held_back {
             if self.repeats.is_some() && event.metadata().target() == ORCHESTRATOR {
                 // People want to see why a link does not come up.

@@ -204,14 +204,8 @@ fn of_node(graph: &str, node: &MeasuredNode, before: Option<&NodeStatus>) -> Sta
     let refused: Vec<String> = refused.collect();
     let level = match node.state {
         NodeState::Failed => ERROR,
-        NodeState::Starting | NodeState::Restarting => WARN,
-        NodeState::Running | NodeState::Done => {
-            if refused.is_empty() {
-                OK
-            } else {
-                WARN
-            }
-        }
+        NodeState::Running | NodeState::Done if refused.is_empty() => OK,
+        _ => WARN,
     };
     let state = node_state_word(node.state).to_lowercase();
     let message = if refused.is_empty() { state } else { format!("{state}; {}", refused.join(", ")) };

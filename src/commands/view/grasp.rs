@@ -12,7 +12,7 @@ use blindgrasp_cli::houses::LAB;
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::decide::decide_alone;
 use blindgrasp_mesh::Mesh;
-use blindgrasp_messages::{Fault, Phase, Prediction};
+use blindgrasp_messages::{Fault, Phase};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{AnimatedGrasp, ObjectSurface, RecordedGrasp, animation_svg, grasp_html, grasp_svg};
 use blindgrasp_recording::{Record, RecordingReader};
@@ -59,8 +59,10 @@ pub(super) fn animate(recording: &Path, out: &Path, arguments: &GraspArguments) 
         grasp.object = surface(&grasp, arguments.objects.as_deref())?;
         let alone = decide_alone(&mut judge, &grasp.frames);
         grasp.decision = alone.decision;
+        let probabilities =
+            alone.predictions.iter().map(|it| (it.fault == Fault::None).then_some(it.probability_stable));
         animated.push(AnimatedGrasp {
-            probabilities: alone.predictions.iter().map(probability).collect(),
+            probabilities: probabilities.collect(),
             decided_at: alone.decided_at,
             threshold: judge.model().classifier.threshold_probability,
             grasp,
@@ -70,10 +72,6 @@ pub(super) fn animate(recording: &Path, out: &Path, arguments: &GraspArguments) 
     write_out(out, &picture)?;
     print_line(&format!("{} grasps drawn to {}", animated.len(), out.display()))?;
     Ok(Outcome::Done)
-}
-
-fn probability(prediction: &Prediction) -> Option<f64> {
-    (prediction.fault == Fault::None).then_some(prediction.probability_stable)
 }
 
 /// Judges grasps of this hand by a model.

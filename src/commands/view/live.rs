@@ -482,10 +482,8 @@ fn frame_event(hand: Option<&Hand>, model: &ShownModel, latest: Latest) -> Optio
         event
     });
     let decisions: Vec<Value> = decisions.collect();
-    let labels = latest
-        .new_truths
-        .iter()
-        .map(|((epoch, grasp_id), stable)| json!([epoch.to_string(), grasp_id.to_string(), stable]));
+    let labels = latest.new_truths.iter();
+    let labels = labels.map(|((epoch, grasp_id), stable)| json!([epoch.to_string(), grasp_id.to_string(), stable]));
     let labels: Vec<Value> = labels.collect();
     let mut event = json!({
         "probabilities": probabilities, "shadow": shadow_probabilities, "decisions": decisions, "labels": labels,

@@ -299,10 +299,8 @@ impl RosNode {
         self.endpoint("MS", topic, message, quality)?;
         // Of a message of a bridge, the type is the one that is expected.
         let told = (self.convention == Convention::Ros2dds).then(|| message.clone());
-        let builder = self
-            .session
-            .declare_subscriber(self.convention.key(self.domain, topic))
-            .callback(move |sample| take(Received::of(&sample, told.as_ref())));
+        let builder = self.session.declare_subscriber(self.convention.key(self.domain, topic));
+        let builder = builder.callback(move |sample| take(Received::of(&sample, told.as_ref())));
         let subscriber: Box<dyn Send> = match quality {
             Quality::Sensor => Box::new(builder.wait().map_err(of_zenoh)?),
             Quality::KeepLast(n) => {
