@@ -137,9 +137,9 @@ impl<T> Sequencer<T> {
     /// The place of a sample, whose writer has come to `written`; `None` if its epoch is over and this reader has left it.
     fn place(&mut self, key: SampleId, written: Option<&Written>) -> Option<Place> {
         let current = written.filter(|written| written.is_current(key));
-        // An epoch that comes back with higher numbers is another one.
         let known = self.epochs.iter().rposition(|epoch| epoch.value == key.epoch);
         let first_seq = current.map(|written| written.first_seq);
+        // An epoch that comes back with higher numbers is another one.
         if let Some(at) = known
             && (current.is_none() || at + 1 == self.epochs.len())
         {

@@ -452,13 +452,11 @@ impl<S: Stage> Instance<S> {
     fn delay_or_ring(&mut self) {
         let has_answer = !self.answers.heads.is_empty();
         let is_one_of_many = std::mem::replace(&mut self.had_answer, has_answer) && has_answer;
+        let received_nanos = self.subscriber.received_nanos();
         let delays = is_one_of_many
             && self.n_unrung < MOST_UNRUNG
             && self.subscriber.has_more()
-            && self
-                .subscriber
-                .received_nanos()
-                .is_some_and(|since| crate::monotonic_nanos().saturating_sub(since) < QUICK_NANOS);
+            && received_nanos.is_some_and(|since| crate::monotonic_nanos().saturating_sub(since) < QUICK_NANOS);
         self.n_unrung = if delays { self.n_unrung + 1 } else { 0 };
         self.publisher.delay_bells(delays);
         // An answer wakes them once it is sent.

@@ -340,8 +340,8 @@ impl Peer {
         Ok(self.take_proved(hello, is_in_use, now_nanos))
     }
 
-    /// Takes the hello of the instance in use, which was so before the hello or is so by it; the second value is whether
-    /// it must be answered.
+    /// Takes a hello of the instance that is in use now, and was so before with `was_in_use`; the second value is whether it
+    /// must be answered.
     fn take_proved(&mut self, hello: &Hello, was_in_use: bool, now_nanos: u64) -> (Option<Change>, bool) {
         (self.candidate, self.candidate_key) = (None, None);
         self.proved_nanos = now_nanos;
