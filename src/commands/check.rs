@@ -8,7 +8,7 @@ use super::text_table::TextTable;
 use super::{Outcome, print_line, print_text};
 use blindgrasp_cli::graph_file::{OnMisfit, able_to_begin};
 use blindgrasp_graph::dataflow::{
-    self, DataflowError, Edge, Graph, Input, Machine, Machines, Node, Override, Restart, RestartPolicy, Scope,
+    self, DataflowError, Edge, Graph, Input, Machines, Node, Override, Restart, RestartPolicy, Scope,
 };
 
 /// Prints the graph with every value filled in, or its mistakes. With --json: {"graph": …}, with "crossing" edges where
@@ -108,12 +108,11 @@ fn print_graph(graph: &Graph) -> std::io::Result<()> {
 }
 
 fn print_machines(machines: &Machines) -> std::io::Result<()> {
-    let listed = |texts: &[String]| if texts.is_empty() { "-".into() } else { texts.join(", ") };
-    let row = |machine: &Machine| {
-        vec![machine.name.clone(), listed(&machine.listen), machine.ssh.clone().unwrap_or_else(|| machine.name.clone())]
-    };
-    let titles = ["machine", "listens at", "for ssh"].map(String::from).to_vec();
-    print_table(titles, machines.machines.iter().map(row))?;
+    let rows = machines.machines.iter().map(|machine| {
+        let listen = if machine.listen.is_empty() { "-".into() } else { machine.listen.join(", ") };
+        vec![machine.name.clone(), listen, machine.ssh.clone().unwrap_or_else(|| machine.name.clone())]
+    });
+    print_table(["machine", "listens at", "for ssh"].map(String::from).to_vec(), rows)?;
     let link = &machines.link;
     let mut said =
         vec![format!("cut off after {} ms", link.deadline_millis), format!("buffer {} samples", link.buffer)];

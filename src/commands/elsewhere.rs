@@ -306,8 +306,7 @@ fn words_for_shell(words: impl Iterator<Item = OsString>) -> OsString {
 
 /// A word that sh, bash, zsh and fish take as it is. fish takes a backslash in single quotes for an escape.
 pub(super) fn quoted(word: &OsStr) -> OsString {
-    let is_plain = |byte: &u8| byte.is_ascii_alphanumeric() || b"_-./".contains(byte);
-    if !word.is_empty() && word.as_bytes().iter().all(is_plain) {
+    if !word.is_empty() && word.as_bytes().iter().all(|byte| byte.is_ascii_alphanumeric() || b"_-./".contains(byte)) {
         return word.to_owned();
     }
     let mut bytes = vec![b'\''];

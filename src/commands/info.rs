@@ -139,10 +139,6 @@ fn print_repair(report: &RepairReport) -> anyhow::Result<()> {
         print_line(&format!("{} is whole: there is nothing to repair", report.input.display()))?;
         return Ok(());
     };
-    let counts = |counts: &BTreeMap<String, u64>| {
-        let counts: Vec<_> = counts.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
-        counts.join(", ")
-    };
     let mut lost: Vec<String> = Vec::new();
     if report.n_damaged_chunks > 0 {
         lost.push(format!("{} damaged chunks", report.n_damaged_chunks));
@@ -179,25 +175,22 @@ fn print_repair(report: &RepairReport) -> anyhow::Result<()> {
     print_lines(lines)
 }
 
+fn counts(counts: &BTreeMap<String, u64>) -> String {
+    let counts: Vec<_> = counts.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
+    counts.join(", ")
+}
+
 fn overview_lines(overview: &Overview) -> Vec<(&str, String)> {
-    let unknown = || "unknown".to_string();
-    let number = |n: &Option<u64>| n.map_or_else(unknown, |n| n.to_string());
-    let samples: Vec<_> = overview.n_samples.iter().map(|(topic, n)| format!("{topic} {}", number(n))).collect();
-    let mebibytes = |n_bytes: u64| n_bytes as f64 / f64::from(1 << 20);
+    let samples = overview.n_samples.iter();
+    let samples = samples.map(|(topic, n)| format!("{topic} {}", n.map_or("unknown".into(), |n| n.to_string())));
+    let [on_disk_mib, raw_mib] =
+        [overview.n_file_bytes, overview.n_uncompressed_bytes].map(|n_bytes| n_bytes as f64 / f64::from(1 << 20));
     let mut lines = vec![
         ("recordings", overview.n_recordings.to_string()),
         ("hand", overview.hand.clone()),
-        ("samples", samples.join(", ")),
-        ("duration", overview.duration_secs.map_or_else(unknown, |secs| format!("{secs:.1} s"))),
-        (
-            "size",
-            format!(
-                "{:.1} MiB in {} chunks, {:.1} MiB before compression",
-                mebibytes(overview.n_file_bytes),
-                overview.n_chunks,
-                mebibytes(overview.n_uncompressed_bytes)
-            ),
-        ),
+        ("samples", samples.collect::<Vec<String>>().join(", ")),
+        ("duration", overview.duration_secs.map_or("unknown".into(), |secs| format!("{secs:.1} s"))),
+        ("size", format!("{on_disk_mib:.1} MiB in {} chunks, {raw_mib:.1} MiB before compression", overview.n_chunks)),
     ];
     for (name, topic) in overview.topics.iter().filter(|(_, topic)| !topic.is_ours) {
         let n_messages = topic.n_messages.map_or("?".into(), |n| n.to_string());
@@ -217,10 +210,6 @@ fn overview_lines(overview: &Overview) -> Vec<(&str, String)> {
 }
 
 fn print_summary(hand: &Hand, summary: &RecordingsSummary) -> anyhow::Result<()> {
-    let share = |part: usize, whole: usize| percent((whole > 0).then(|| part as f64 / whole as f64));
-    let quantiles = |quantiles: Option<[f64; 5]>| {
-        quantiles.map_or("n/a".into(), |values| values.map(|value| format!("{value:.3}")).join("  "))
-    };
     let mut lines = overview_lines(&summary.overview);
     lines.extend([
         ("grasps", format!("{}, {} with a label", summary.n_grasps, summary.n_with_truth)),
@@ -264,6 +253,14 @@ fn print_summary(hand: &Hand, summary: &RecordingsSummary) -> anyhow::Result<()>
         print_line(&format!("{class:<16} {:>8} {stable:>9}", group.n_grasps))?;
     }
     Ok(())
+}
+
+fn share(part: usize, whole: usize) -> String {
+    percent((whole > 0).then(|| part as f64 / whole as f64))
+}
+
+fn quantiles(quantiles: Option<[f64; 5]>) -> String {
+    quantiles.map_or("n/a".into(), |values| values.map(|value| format!("{value:.3}")).join("  "))
 }
 
 fn labels(labels: &BTreeSet<Label>) -> String {

@@ -191,11 +191,10 @@ impl Kind {
         let default_from = if arguments.like.as_deref() == Some("filter") { "TactileFrame" } else { "GraspFeature" };
         let default_to = if arguments.like.as_deref() == Some("filter") { "TactileFrame" } else { "Prediction" };
         // `blindgrasp/GraspFeature/4` means the same as `GraspFeature`.
-        let type_of = |given: &Option<String>, default: &str| -> String {
+        let [from, to] = [(&arguments.from, default_from), (&arguments.to, default_to)].map(|(given, default)| {
             let given = given.as_deref().unwrap_or(default);
-            given.trim_start_matches("blindgrasp/").split('/').next().unwrap_or_default().into()
-        };
-        let (from, to) = (type_of(&arguments.from, default_from), type_of(&arguments.to, default_to));
+            given.trim_start_matches("blindgrasp/").split('/').next().unwrap_or_default()
+        });
         KINDS.iter().find(|kind| kind.from == from && kind.to == to).with_context(|| {
             format!(
                 "there is no template from {from} to {to}: expected --from TactileFrame, ContactSet or GraspFeature with \

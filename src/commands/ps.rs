@@ -105,8 +105,8 @@ fn listing() -> anyhow::Result<Listing> {
 /// Adds the use of the processes.
 fn completed(status: GraphStatus) -> RunningGraph {
     let usage = status.nodes.iter().filter_map(|node| Some((node.node.clone(), usage(node.pid?)?))).collect();
-    let promise = |node: &NodeStatus| Some((node.node.clone(), RobotPromise::of(&node.counts)?));
-    let promises = status.nodes.iter().filter_map(promise).collect();
+    let promises = status.nodes.iter();
+    let promises = promises.filter_map(|node| Some((node.node.clone(), RobotPromise::of(&node.counts)?))).collect();
     RunningGraph { status, usage, promises }
 }
 

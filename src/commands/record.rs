@@ -231,11 +231,11 @@ impl RecordSummary {
 
 /// The summary for a person.
 fn table(summary: &RecordSummary) -> Vec<String> {
-    let number = |number: Option<u64>| number.map_or("-".to_string(), |number| number.to_string());
     let mut edges = TextTable::new(["topic", "samples", "first", "last", "missing"], 1);
     for edge in &summary.edges {
         let (samples, missing) = (edge.samples.to_string(), edge.missing.to_string());
-        edges.row([edge.topic.clone(), samples, number(edge.first), number(edge.last), missing]);
+        let [first, last] = [edge.first, edge.last].map(|seq| seq.map_or("-".to_string(), |seq| seq.to_string()));
+        edges.row([edge.topic.clone(), samples, first, last, missing]);
     }
     let how = match summary.ended {
         "graph" => "the graph has ended",

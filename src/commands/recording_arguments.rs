@@ -31,9 +31,12 @@ impl RecordingArguments {
 
 /// A size with its unit: `500MB`, `2GiB`.
 fn bytes(text: &str) -> Result<u64, String> {
-    let expected = || "expected a size of at least 1MB like 500MB, 1GB or 2GiB".to_string();
+    bytes_of(text).ok_or("expected a size of at least 1MB like 500MB, 1GB or 2GiB".into())
+}
+
+fn bytes_of(text: &str) -> Option<u64> {
     let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
-    let number: f64 = digits.trim().parse().map_err(|_| expected())?;
+    let number: f64 = digits.trim().parse().ok()?;
     let unit = match text[digits.len()..].to_ascii_lowercase().as_str() {
         "mb" => 1e6,
         "gb" => 1e9,
@@ -41,10 +44,10 @@ fn bytes(text: &str) -> Result<u64, String> {
         "mib" => f64::from(1 << 20),
         "gib" => f64::from(1 << 30),
         "tib" => 1024.0 * f64::from(1 << 30),
-        _ => return Err(expected()),
+        _ => return None,
     };
     let n_bytes = number * unit;
-    if (1e6..=1e15).contains(&n_bytes) { Ok(n_bytes as u64) } else { Err(expected()) }
+    if (1e6..=1e15).contains(&n_bytes) { Some(n_bytes as u64) } else { None }
 }
 
 #[cfg(test)]

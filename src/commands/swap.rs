@@ -184,9 +184,7 @@ fn request(arguments: &Arguments) -> anyhow::Result<SwapRequest> {
 
 /// The swap with the program as it is found here.
 fn found_here(request: SwapRequest) -> anyhow::Result<SwapRequest> {
-    let Some(run) = &request.program else {
-        return Ok(request);
-    };
+    let Some(run) = &request.program else { return Ok(request) };
     let args = request.args.as_deref().unwrap_or_default();
     let program = shipped()?
         .program_to_run(run, args, &request.folder)
@@ -256,7 +254,6 @@ fn compare(
 ) -> anyhow::Result<Comparison> {
     let (outputs, others): (Vec<_>, Vec<_>) =
         outputs.into_iter().partition(|output| can_observe(&output.active.service.type_name));
-    let name = |output: &ShadowOutput| format!("{}/{}", output.node, output.port);
     let not_compared: Vec<String> = others.iter().map(name).collect();
     for output in &not_compared {
         print_diagnostic(&format!("blindgrasp: {output} is not compared: its message type is unknown"));
@@ -303,15 +300,21 @@ fn watch(
 
 /// Both streams of each output, as the observer reads them.
 fn observed_edges(outputs: &[ShadowOutput]) -> Vec<ObservedEdge> {
-    let edge = |side, output: &ShadowOutput| {
-        let input = if side == Side::Active { &output.active } else { &output.shadow };
-        ObservedEdge { topic: topic(side, output), input: input.clone(), is_prompt: true }
-    };
-    outputs.iter().flat_map(|output| [edge(Side::Active, output), edge(Side::Shadow, output)]).collect()
+    let mut edges = Vec::new();
+    for output in outputs {
+        for (side, input) in [(Side::Active, &output.active), (Side::Shadow, &output.shadow)] {
+            edges.push(ObservedEdge { topic: topic(side, output), input: input.clone(), is_prompt: true });
+        }
+    }
+    edges
 }
 
 fn topic(side: Side, output: &ShadowOutput) -> String {
-    format!("{side:?}/{}/{}", output.node, output.port)
+    format!("{side:?}/{}", name(output))
+}
+
+fn name(output: &ShadowOutput) -> String {
+    format!("{}/{}", output.node, output.port)
 }
 
 /// The comparison of each output.
@@ -325,10 +328,10 @@ struct ShadowLog {
 
 impl ShadowLog {
     fn new(outputs: &[ShadowOutput]) -> Self {
-        let of_output = |(idx, output)| [Side::Active, Side::Shadow].map(|side| (topic(side, output), (side, idx)));
-        let sides = outputs.iter().enumerate().flat_map(of_output).collect();
+        let sides = outputs.iter().enumerate();
+        let sides = sides.flat_map(|(idx, it)| [Side::Active, Side::Shadow].map(|side| (topic(side, it), (side, idx))));
         let comparisons = outputs.iter().map(|_| ShadowComparison::default()).collect();
-        ShadowLog { sides, comparisons, start_nanos: monotonic_nanos() }
+        ShadowLog { sides: sides.collect(), comparisons, start_nanos: monotonic_nanos() }
     }
 }
 
@@ -389,9 +392,6 @@ fn formatted(report: &ComparisonReport) -> Vec<String> {
         Some(share) => format!("{} of {} samples agree", percent(Some(share)), report.n_pairs),
         None => "agreement unknown: no sample was answered by both".into(),
     };
-    let latency = |latency: Option<Latency>| {
-        latency.map_or("unknown".into(), |at| format!("{:.0} and {:.0} µs", at.p50_micros, at.p99_micros))
-    };
     let mut lines = vec![
         format!("{}: {agreement}, {} grasps with disagreement", report.output, report.disagreements.len()),
         format!(
@@ -404,11 +404,6 @@ fn formatted(report: &ComparisonReport) -> Vec<String> {
             latency(report.shadow_latency)
         ),
     ];
-    let saying = |saying: &Saying| {
-        saying
-            .probability_stable
-            .map_or(saying.says.clone(), |probability| format!("{} (p {probability:.3})", saying.says))
-    };
     for one in report.disagreements.iter().take(MAX_PRINTED) {
         lines.push(format!(
             "  grasp {:>5}  {} → {}  in {} of its samples",
@@ -422,6 +417,17 @@ fn formatted(report: &ComparisonReport) -> Vec<String> {
         lines.push(format!("  … and {} more grasps (--json has all)", report.disagreements.len() - MAX_PRINTED));
     }
     lines
+}
+
+fn latency(latency: Option<Latency>) -> String {
+    latency.map_or("unknown".into(), |at| format!("{:.0} and {:.0} µs", at.p50_micros, at.p99_micros))
+}
+
+fn saying(saying: &Saying) -> String {
+    match saying.probability_stable {
+        Some(probability) => format!("{} (p {probability:.3})", saying.says),
+        None => saying.says.clone(),
+    }
 }
 
 fn assignment(text: &str) -> Result<(String, String), String> {

@@ -69,11 +69,15 @@ pub fn with_files(current: &OsStr, words: Vec<&str>) -> Vec<CompletionCandidate>
 /// Words of all running graphs: the others of the command line are not known here.
 fn of_status(words: fn(&GraphStatus) -> Vec<String>) -> ArgValueCandidates {
     ArgValueCandidates::new(move || {
-        let status = |graph: String| match Connection::open(&graph).ok()?.ask(&Request::Status, ANSWER_LIMIT) {
-            Ok(Reply::Status(status)) => Some(words(&status)),
-            _ => None,
-        };
-        candidates(running_graphs().unwrap_or_default().into_iter().filter_map(status).flatten().collect())
+        let mut found = Vec::new();
+        for graph in running_graphs().unwrap_or_default() {
+            if let Ok(mut connection) = Connection::open(&graph)
+                && let Ok(Reply::Status(status)) = connection.ask(&Request::Status, ANSWER_LIMIT)
+            {
+                found.extend(words(&status));
+            }
+        }
+        candidates(found)
     })
 }
 

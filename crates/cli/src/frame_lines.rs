@@ -43,8 +43,9 @@ enum Line {
 /// A file that is no regular one or has more than 1 GiB, a line of more than 4 MiB or that is no frame, or no frame at all. The
 /// text names the line.
 pub fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines> {
-    let is_other = |kind: &FileKind| !matches!(kind, FileKind::FrameLines | FileKind::Json | FileKind::Empty);
-    if let Some(kind) = FileKind::at(file).filter(is_other) {
+    if let Some(kind) = FileKind::at(file)
+        && !matches!(kind, FileKind::FrameLines | FileKind::Json | FileKind::Empty)
+    {
         bail!("{}: expected frames as lines of JSON, found {}", file.display(), kind.description());
     }
     let input: Box<dyn BufRead> = match file.to_str() {
@@ -134,9 +135,8 @@ fn read_line(
     if line.topic == GraspTruth::TOPIC {
         let truth: TruthLine = serde_json::from_value(line.data)
             .context("not a label: expected grasp_id, epsilon, volume, stable, object and class")?;
-        let unknown = |number: Option<f64>| number.unwrap_or(f64::NAN);
         let TruthLine { grasp_id, epsilon, volume, stable, object, class } = truth;
-        let (epsilon, volume) = (unknown(epsilon), unknown(volume));
+        let [epsilon, volume] = [epsilon, volume].map(|number| number.unwrap_or(f64::NAN));
         let message = GraspTruth { grasp_id, epsilon, volume, stable, object, class };
         return Ok(Line::Truth(Stamped { header, message }));
     }

@@ -132,9 +132,7 @@ pub fn refuse_misfit(graph: &str, request: &SwapRequest) -> anyhow::Result<()> {
             part.params.insert(name.clone(), value.into());
         }
     }
-    let Some(misfit) = new_misfits(&before, &after).into_iter().next() else {
-        return Ok(());
-    };
+    let Some(misfit) = new_misfits(&before, &after).into_iter().next() else { return Ok(()) };
     if request.allow_mismatch {
         warn(&misfit);
         return Ok(());

@@ -165,9 +165,9 @@ fn stop_signals() -> Vec<i32> {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
     let ignored = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).unwrap_or(0);
-    let is_ignored = |signal: &i32| ignored & (1 << (signal - 1)) != 0;
+    let takes_hang_up = ignored & (1 << (signal_hook::consts::SIGHUP - 1)) == 0;
     let signals = [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP];
-    signals.into_iter().filter(|signal| *signal != signal_hook::consts::SIGHUP || !is_ignored(signal)).collect()
+    signals.into_iter().filter(|signal| *signal != signal_hook::consts::SIGHUP || takes_hang_up).collect()
 }
 
 /// A number that clap takes only within `range`.
@@ -190,9 +190,12 @@ fn share_hint(text: &str, range: &RangeInclusive<f64>) -> Option<String> {
 
 /// A length of time in seconds, within `range`: a number of seconds, or with units, as 500ms, 1m 30s.
 pub fn secs_in(text: &str, range: RangeInclusive<f64>) -> Result<f64, String> {
-    let with_unit = || humantime::parse_duration(text).ok().map(|time| time.as_secs_f64());
-    match text.parse().ok().or_else(with_unit) {
-        Some(secs) if range.contains(&secs) => Ok(secs),
+    let secs = match text.parse() {
+        Ok(secs) => Ok(secs),
+        Err(_) => humantime::parse_duration(text).map(|time| time.as_secs_f64()),
+    };
+    match secs {
+        Ok(secs) if range.contains(&secs) => Ok(secs),
         _ => Err(format!("expected a time from {} to {} seconds, like 2.5, 500ms or 1m", range.start(), range.end())),
     }
 }

@@ -64,13 +64,13 @@ pub fn check_once(recordings: &[PathBuf]) -> Result<(), DatasetError> {
 /// The hand cannot be read, or is not the recording's.
 pub fn hand_of(recording: &Path, hand: Option<&Path>) -> Result<Hand, DatasetError> {
     let reader = RecordingReader::open(recording)?;
-    let unusable = |message| DatasetError::Unusable { path: recording.into(), message };
     let info = reader.info();
     let hand = match hand {
         Some(path) => Hand::load(path)?,
         // A stranger's recording names a hand, and no file.
-        None => Hand::built_in(&info.hand).ok_or_else(|| {
-            unusable(format!("it was made with the hand '{}': name its pad layout with --hand", info.hand))
+        None => Hand::built_in(&info.hand).ok_or_else(|| DatasetError::Unusable {
+            path: recording.into(),
+            message: format!("it was made with the hand '{}': name its pad layout with --hand", info.hand),
         })?,
     };
     check_hand(recording, &reader, &hand)?;
@@ -146,8 +146,8 @@ pub fn reported_truth(recording: &Path, grasp_id: u64, is_kept: bool) -> GraspTr
 
 /// The outcome that the frames of a grasp report: the first one counts.
 fn reported_outcome(frames: &[Stamped<TactileFrame>]) -> Option<bool> {
-    let phase = |frame: &Stamped<TactileFrame>| frame.message.phase;
-    let outcome = frames.iter().map(phase).find(|phase| matches!(phase, Phase::Kept | Phase::Dropped))?;
+    let outcome =
+        frames.iter().map(|frame| frame.message.phase).find(|phase| matches!(phase, Phase::Kept | Phase::Dropped))?;
     Some(outcome == Phase::Kept)
 }
 
@@ -169,19 +169,12 @@ pub fn read_grasps<T>(
     let mut seen = BTreeSet::new();
     let mut truths = BTreeMap::new();
     let mut frames: Vec<Stamped<TactileFrame>> = Vec::new();
-    let mut finish = |frames: Vec<Stamped<TactileFrame>>, grasps: &mut Vec<Grasp<T>>| {
-        if let Some(first) = frames.first() {
-            let grasp_id = first.message.grasp_id;
-            let truth = reported_outcome(&frames).map(|is_kept| reported_truth(path, grasp_id, is_kept));
-            grasps.push(Grasp { grasp_id, value: reduce(grasp_id, frames), truth });
-        }
-    };
     for record in reader {
         match record?.1 {
             Record::Tactile(frame) => {
                 let grasp_id = frame.message.grasp_id;
                 if frames.last().is_none_or(|last| last.message.grasp_id != grasp_id) {
-                    finish(std::mem::take(&mut frames), &mut grasps);
+                    grasps.extend(finished(path, std::mem::take(&mut frames), &mut reduce));
                     if !seen.insert(grasp_id) {
                         return Err(unusable(format!("frames of another grasp lie between those of grasp {grasp_id}")));
                     }
@@ -197,11 +190,22 @@ pub fn read_grasps<T>(
             _ => {}
         }
     }
-    finish(frames, &mut grasps);
+    grasps.extend(finished(path, frames, &mut reduce));
     for grasp in &mut grasps {
         grasp.truth = truths.remove(&grasp.grasp_id).or(grasp.truth.take());
     }
     Ok(grasps)
+}
+
+/// The grasp of these frames, if there are any.
+fn finished<T>(
+    path: &Path,
+    frames: Vec<Stamped<TactileFrame>>,
+    reduce: &mut impl FnMut(u64, Vec<Stamped<TactileFrame>>) -> T,
+) -> Option<Grasp<T>> {
+    let grasp_id = frames.first()?.message.grasp_id;
+    let truth = reported_outcome(&frames).map(|is_kept| reported_truth(path, grasp_id, is_kept));
+    Some(Grasp { grasp_id, value: reduce(grasp_id, frames), truth })
 }
 
 fn check_hand(path: &Path, reader: &RecordingReader, hand: &Hand) -> Result<(), DatasetError> {

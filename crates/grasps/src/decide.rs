@@ -42,11 +42,11 @@ pub fn decide_frames(judge: &mut Judge, frames: &[Stamped<TactileFrame>]) -> Vec
 /// The decisions that come with a frame.
 fn sample(judge: &mut Judge, frame: &Stamped<TactileFrame>) -> Vec<Decided> {
     let decisions = judge.sample(frame).decisions;
-    let explained = |decision: LiftDecision| {
+    let explained = decisions.into_iter().map(|decision| {
         let violations = judge.violations(&decision).to_vec();
         Decided { violations, ..Decided::from(decision) }
-    };
-    decisions.into_iter().map(explained).collect()
+    });
+    explained.collect()
 }
 
 impl From<LiftDecision> for Decided {
@@ -82,16 +82,15 @@ pub fn decide_recording(judge: &mut Judge, path: &Path) -> Result<Vec<Decided>, 
     }
     let deciding = decisions.into_iter().filter(|decided| decided.decision.action.decides());
     let mut by_grasp: BTreeMap<u64, Decided> = deciding.map(|decided| (decided.decision.grasp_id, decided)).collect();
-    let mut decide = |grasp_id| {
-        let undecided = || Decided::from(LiftDecision { grasp_id, ..LiftDecision::default() });
-        by_grasp.remove(&grasp_id).unwrap_or_else(undecided)
-    };
-    let decided = |grasp: Grasp<Option<ReadingId>>| Decided {
-        reading_id: grasp.value,
-        truth: grasp.truth,
-        ..decide(grasp.grasp_id)
-    };
-    Ok(grasps.into_iter().map(decided).collect())
+    let mut all = Vec::with_capacity(grasps.len());
+    for Grasp { grasp_id, value, truth } in grasps {
+        let decided = match by_grasp.remove(&grasp_id) {
+            Some(decided) => decided,
+            None => LiftDecision { grasp_id, ..LiftDecision::default() }.into(),
+        };
+        all.push(Decided { reading_id: value, truth, ..decided });
+    }
+    Ok(all)
 }
 
 /// A grasp decided by itself.

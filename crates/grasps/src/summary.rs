@@ -99,7 +99,6 @@ impl Overview {
     /// The sums over indexes, with the hand and the metadata of the first.
     pub fn of(indexes: Vec<RecordingIndex>) -> Self {
         let mut overview = Overview { n_recordings: indexes.len(), duration_secs: Some(0.0), ..Overview::default() };
-        let added = |sum: Option<u64>, more: Option<u64>| sum.zip(more).map(|(sum, more)| sum.saturating_add(more));
         for (idx, index) in indexes.into_iter().enumerate() {
             let secs = index.duration_nanos().map(|nanos| nanos as f64 / 1e9);
             overview.duration_secs = overview.duration_secs.zip(secs).map(|(sum, more)| sum + more);
@@ -127,6 +126,10 @@ impl Overview {
         }
         overview
     }
+}
+
+fn added(sum: Option<u64>, more: Option<u64>) -> Option<u64> {
+    Some(sum?.saturating_add(more?))
 }
 
 impl RecordingsSummary {

@@ -54,10 +54,10 @@ impl Ages {
     /// The samples that were counted since `earlier`.
     #[must_use]
     pub fn since(&self, earlier: &Ages) -> Ages {
-        let before = |upper: u64| {
-            earlier.buckets.binary_search_by_key(&upper, |bucket| bucket.0).map_or(0, |idx| earlier.buckets[idx].1)
-        };
-        let counts = self.buckets.iter().map(|&(upper, count)| (upper, count.saturating_sub(before(upper))));
+        let counts = self.buckets.iter().map(|&(upper, count)| {
+            let found = earlier.buckets.binary_search_by_key(&upper, |bucket| bucket.0);
+            (upper, count.saturating_sub(found.map_or(0, |idx| earlier.buckets[idx].1)))
+        });
         Ages { buckets: counts.filter(|(_, count)| *count > 0).collect() }
     }
 

@@ -64,10 +64,9 @@ impl ControlSocket {
 impl Drop for ControlSocket {
     fn drop(&mut self) {
         // A socket that was shut down may have been taken for a dead one, and replaced.
-        let is_own = |path: &PathBuf| std::fs::metadata(path).is_ok_and(|found| found.ino() == self.inode);
         if let Some(folder) = self.path.parent()
             && let Ok(_lock) = lock(folder)
-            && is_own(&self.path)
+            && std::fs::metadata(&self.path).is_ok_and(|found| found.ino() == self.inode)
         {
             let _ = std::fs::remove_file(&self.path);
         }
@@ -152,13 +151,13 @@ fn dead_in(folder: &Path) -> Result<Vec<(String, PathBuf)>> {
 fn listening(sockets: &str, folder: &Path) -> Vec<String> {
     /// `__SO_ACCEPTCON`: it listens. Sockets of accepted connections have the same name.
     const LISTENS: u32 = 1 << 16;
-    let name_of = |line: &str| {
+    let names = sockets.lines().filter_map(|line| {
         let columns: Vec<&str> = line.split_whitespace().collect();
         let is_listening = u32::from_str_radix(columns.get(3)?, 16).is_ok_and(|flags| flags & LISTENS != 0);
         let name = Path::new(columns.get(7)?).strip_prefix(folder).ok()?.to_str()?.strip_suffix(SUFFIX)?;
         is_listening.then(|| name.to_string())
-    };
-    let mut names: Vec<String> = sockets.lines().filter_map(name_of).collect();
+    });
+    let mut names: Vec<String> = names.collect();
     names.sort();
     names.dedup();
     names

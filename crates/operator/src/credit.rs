@@ -123,9 +123,7 @@ impl Reader {
     }
 
     fn is_near(&self, next: &Next) -> bool {
-        let Some(written) = &next.written else {
-            return true;
-        };
+        let Some(written) = &next.written else { return true };
         let (Limit::Queue(limit) | Limit::History(limit)) = self.limit;
         let limit = limit.saturating_sub(self.n_repeats);
         // A reader that has answered all samples has room for one more, however far the numbers jump.
@@ -257,9 +255,7 @@ impl Credit {
     /// Whether all samples that were sent and not answered lie in the memory of this publisher, or in that of one which has
     /// handed over to it. If not, an instance that takes over from it must send them again.
     pub(crate) fn has_sent_all(&self, written: Option<Written>) -> bool {
-        let (Some(written), Some(begun_after)) = (written, self.begun_after) else {
-            return true;
-        };
+        let (Some(written), Some(begun_after)) = (written, self.begun_after) else { return true };
         let reached = written.ahead(begun_after, self.own_last);
         reached.is_some_and(|reached| written.is_past(reached, written.last))
     }
@@ -303,12 +299,12 @@ impl Credit {
         places: &impl Places,
         written: Option<Written>,
     ) -> Vec<&Reader> {
-        let lacks = |reader: &&Reader| match (reader.least(places, written.as_ref()), written) {
+        let lacking = self.readers.iter().filter(|reader| match (reader.least(places, written.as_ref()), written) {
             (None, _) | (_, None) => false,
             (Some(None), _) => true,
             (Some(Some(place)), Some(written)) => !written.is_past(place, key),
-        };
-        self.readers.iter().filter(lacks).collect()
+        });
+        lacking.collect()
     }
 }
 

@@ -209,20 +209,19 @@ impl SharedCursors {
     /// The file cannot be opened or mapped, or has another layout.
     pub fn open(path: &Path) -> Result<SharedCursors, CursorsError> {
         let failed = |source: std::io::Error| CursorsError::Io { path: path.display().to_string(), source };
-        let alien = || CursorsError::Alien { path: path.display().to_string() };
         let no_follow = rustix::fs::OFlags::NOFOLLOW.bits() as i32;
         let file = OpenOptions::new().read(true).write(true).custom_flags(no_follow).open(path).map_err(failed)?;
         let metadata = file.metadata().map_err(failed)?;
         let n_bytes = metadata.len() as usize;
         let is_own = metadata.is_file() && metadata.uid() == rustix::process::getuid().as_raw();
         if !is_own || n_bytes < HEADER_BYTES {
-            return Err(alien());
+            return Err(CursorsError::Alien { path: path.display().to_string() });
         }
         let header = Self::map(file.try_clone().map_err(failed)?, 0, 0).map_err(failed)?;
         let words: Vec<u64> = (0..4).map(|word| header.word(word * 8).load(Ordering::Acquire)).collect();
         let (n_slots, n_regions) = (words[2] as usize, words[3] as usize);
         if words[..2] != [MAGIC, LAYOUT] || size_of_cursors(n_slots, n_regions) != Some(n_bytes) {
-            return Err(alien());
+            return Err(CursorsError::Alien { path: path.display().to_string() });
         }
         Self::map(file, n_slots, n_regions).map_err(failed)
     }

@@ -25,9 +25,7 @@ pub const ENOUGH_FILES: u64 = 1024;
 /// An error with its likely cause, if this process has nearly as many files open as it may: iceoryx2 says only that something
 /// has failed. To be called right where the error came.
 pub fn with_lack_of_files(error: anyhow::Error) -> anyhow::Error {
-    let Some(limit) = getrlimit(Resource::Nofile).current else {
-        return error;
-    };
+    let Some(limit) = getrlimit(Resource::Nofile).current else { return error };
     let n_open = match std::fs::read_dir("/proc/self/fd") {
         Ok(entries) => entries.count() as u64,
         Err(error) if error.raw_os_error() == Some(Errno::MFILE.raw_os_error()) => limit,

@@ -86,3 +86,8 @@ pub fn monotonic_nanos() -> u64 {
     let now = rustix::time::clock_gettime(rustix::time::ClockId::Boottime);
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
+
+/// When a time of [`monotonic_nanos`] comes; now, if it is over.
+pub(crate) fn instant_of(deadline_nanos: u64) -> std::time::Instant {
+    std::time::Instant::now() + std::time::Duration::from_nanos(deadline_nanos.saturating_sub(monotonic_nanos()))
+}

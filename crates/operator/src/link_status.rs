@@ -81,9 +81,7 @@ impl LinkStatus {
             *self.rejected.entry(why.clone()).or_default() += count;
         }
         for peer in &mut self.peers {
-            let Some(before) = before.peers.iter().find(|before| before.machine == peer.machine) else {
-                continue;
-            };
+            let Some(before) = before.peers.iter().find(|before| before.machine == peer.machine) else { continue };
             peer.n_times_up += before.n_times_up;
             peer.bytes_sent += before.bytes_sent;
             peer.bytes_received += before.bytes_received;

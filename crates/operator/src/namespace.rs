@@ -106,11 +106,10 @@ impl Namespace {
             return Err(NamespaceError::Name { name: name.into() });
         }
         sweep();
-        let failed = |source: Error| match source.kind() {
+        let socket = ControlSocket::bind(name).map_err(|source| match source.kind() {
             std::io::ErrorKind::AddrInUse => NamespaceError::NameTaken { name: name.into() },
             _ => NamespaceError::Lock { name: name.into(), source },
-        };
-        let socket = ControlSocket::bind(name).map_err(failed)?;
+        })?;
         let (wiring, lock) = make_folder(name)?;
         let domain = Namespace { name: name.into(), wiring, socket, _lock: lock };
         check_room()?;
@@ -163,9 +162,7 @@ fn make_locked(wiring: &NamespaceWiring) -> std::io::Result<File> {
     let mut private = DirBuilder::new();
     private.mode(0o700).create(&wiring.folder)?;
     // Another launcher may have taken it for a dead graph's before it was locked, and removes it.
-    let Ok(folder) = lock(&wiring.folder) else {
-        return Err(std::io::ErrorKind::AlreadyExists.into());
-    };
+    let Ok(folder) = lock(&wiring.folder) else { return Err(std::io::ErrorKind::AlreadyExists.into()) };
     for inner in [wiring.ports(), wiring.link()] {
         private.create(inner).map_err(|_| std::io::ErrorKind::AlreadyExists)?;
     }
@@ -296,9 +293,7 @@ pub fn clean_dead_nodes(domain: &NamespaceWiring) {
     if take_room(domain).is_err() {
         return;
     }
-    let Ok(config) = config(domain) else {
-        return;
-    };
+    let Ok(config) = config(domain) else { return };
     let _ = Node::<PrivateService>::list(&config, |state| {
         if let NodeState::Dead(view) = state {
             let _ = view.try_remove_stale_resources();
@@ -355,12 +350,8 @@ pub fn take_room(wiring: &NamespaceWiring) -> Result<(), NamespaceError> {
     let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
     for entry in std::fs::read_dir(wiring.ports()).into_iter().flatten().flatten() {
         // A file may go meanwhile, with its process, and some are read-only: these are written already.
-        let Ok(file) = std::fs::OpenOptions::new().write(true).custom_flags(flags).open(entry.path()) else {
-            continue;
-        };
-        let Ok(metadata) = file.metadata() else {
-            continue;
-        };
+        let Ok(file) = std::fs::OpenOptions::new().write(true).custom_flags(flags).open(entry.path()) else { continue };
+        let Ok(metadata) = file.metadata() else { continue };
         if !metadata.is_file() || metadata.uid() != own_uid() {
             continue;
         }

@@ -432,11 +432,11 @@ impl Operator {
     /// the reader.
     pub fn should_yield(&self) -> bool {
         self.beat();
-        let is_group_told = || {
-            let inboxes = self.0.group.iter().flat_map(|group| &group.inboxes);
-            inboxes.into_iter().any(|inbox| inbox.is_full.load(Ordering::Acquire))
-        };
-        self.0.inbox.is_to_hand_over.load(Ordering::Acquire) || self.should_quit() || is_group_told()
+        if self.0.inbox.is_to_hand_over.load(Ordering::Acquire) || self.should_quit() {
+            return true;
+        }
+        let mut inboxes = self.0.group.iter().flat_map(|group| &group.inboxes);
+        inboxes.any(|inbox| inbox.is_full.load(Ordering::Acquire))
     }
 
     fn node(&self) -> &str {
@@ -696,7 +696,6 @@ pub(crate) fn run_in_turn(mut tasks: Vec<Box<dyn Task>>) -> anyhow::Result<()> {
 pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyhow::Result<Vec<Operator>> {
     let leader = wirings.first().context("a process without operators")?.clone();
     let is_group = wirings.len() > 1;
-    let voice = |node: &str| Voice(is_group.then(|| Arc::from(node)));
     let has_link = descriptions.iter().any(|description| description.operator == LINK_OPERATOR);
     trace::install(has_link, |entry| Voice(SPEAKER.with_borrow(Option::clone)).report(&Report::Log(entry)));
     if leader.lock_memory {
@@ -739,7 +738,7 @@ pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyho
             identity: (program, Cell::new(identity::with_params(program, &wiring.params))),
             sandbox: (entered, sandbox.clone()),
             descriptors,
-            voice: voice(&wiring.node),
+            voice: Voice(is_group.then(|| Arc::from(wiring.node.as_str()))),
             partners: RefCell::default(),
             counts: RefCell::default(),
             has_sent_all: RefCell::default(),
@@ -767,15 +766,19 @@ fn read_commands(
 ) {
     for line in std::io::stdin().lines().map_while(Result::ok) {
         // This thread began before the files were read, and reads none itself.
-        let is_ready = || inboxes.iter().all(|(_, inbox)| inbox.is_ready.load(Ordering::Relaxed));
-        if let Some(sandbox) = sandbox.take_if(|_| is_ready()) {
-            sandbox::or_none(sandbox.close());
+        if let Some(unclosed) = sandbox
+            && inboxes.iter().all(|(_, inbox)| inbox.is_ready.load(Ordering::Relaxed))
+        {
+            sandbox::or_none(unclosed.close());
+            sandbox = None;
         }
-        let addressed = serde_json::from_str::<Addressed<Command>>(&line);
-        let inbox = |node: Option<&String>| inboxes.iter().find(|(name, _)| node.is_none_or(|node| node == name));
-        match addressed.map(|Addressed { member, message }| (inbox(member.as_ref()), message)) {
-            Ok((Some((_, inbox)), command)) => inbox.push(command),
-            Ok((None, _)) => tracing::warn!(line, "a command for an operator that is not here"),
+        match serde_json::from_str::<Addressed<Command>>(&line) {
+            Ok(Addressed { member, message }) => {
+                match inboxes.iter().find(|(name, _)| member.as_ref().is_none_or(|node| node == name)) {
+                    Some((_, inbox)) => inbox.push(message),
+                    None => tracing::warn!(line, "a command for an operator that is not here"),
+                }
+            }
             Err(error) => tracing::warn!(line, "not a command of this version: {error}"),
         }
         waker.wake();

@@ -166,9 +166,7 @@ impl<M: Message> Outbox<M> {
     /// # Errors
     /// It was saved by another version.
     pub(crate) fn next(&self) -> anyhow::Result<Option<Answer<M>>> {
-        let Some(entry) = self.kept.next() else {
-            return Ok(None);
-        };
+        let Some(entry) = self.kept.next() else { return Ok(None) };
         let (sample, _): (Stamped<M>, _) = bincode::serde::decode_from_slice(&entry.sample, STATE_FORMAT)
             .context("a saved answer of the node cannot be read")?;
         let Entry { origin_nanos, valid_nanos, made_by, .. } = *entry;

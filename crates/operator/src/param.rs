@@ -131,11 +131,10 @@ impl ParamKind {
 
     /// Reads a scalar of the file; `plain` when it had no quotes. The kind alone decides what the text means.
     pub fn accept_scalar(&self, text: &str, plain: bool) -> Option<Value> {
-        let string = || Some(Value::from(text));
         let value = match self {
             Self::Path { .. } | Self::String {} if plain && is_null(text) => None,
-            Self::Path { .. } | Self::String {} | Self::Choice { .. } => string(),
-            Self::Number { words, .. } if words.iter().any(|word| word == text) => string(),
+            Self::Path { .. } | Self::String {} | Self::Choice { .. } => Some(Value::from(text)),
+            Self::Number { words, .. } if words.iter().any(|word| word == text) => Some(Value::from(text)),
             _ if !plain => None,
             Self::Boolean {} => text.parse::<bool>().ok().map(Value::from),
             Self::Integer { .. } => integer(text).map(Value::from),
@@ -170,7 +169,6 @@ impl ParamKind {
 
 impl fmt::Display for ParamKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let bound = |what: &str, bound: Option<String>| bound.map(|bound| format!("{what} {bound}"));
         match self {
             Self::Path { .. } => f.write_str("a path"),
             Self::String {} => f.write_str("a string"),
@@ -197,6 +195,10 @@ impl fmt::Display for ParamKind {
             }
         }
     }
+}
+
+fn bound(word: &str, bound: Option<String>) -> Option<String> {
+    Some(format!("{word} {}", bound?))
 }
 
 fn is_one_of(value: &Value, words: &[String]) -> bool {

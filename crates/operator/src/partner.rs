@@ -52,8 +52,11 @@ impl<T> Timeline<T> {
     }
 
     fn push(&mut self, stamp_nanos: u64, sample: T) {
-        let goes_on = |segment: &Segment<T>| segment.kept.back().is_none_or(|(last, _)| *last <= stamp_nanos);
-        if !self.segments.back().is_some_and(goes_on) {
+        let goes_on = match self.segments.back() {
+            Some(segment) => segment.kept.back().is_none_or(|(last, _)| *last <= stamp_nanos),
+            None => false,
+        };
+        if !goes_on {
             self.segments.push_back(Segment { kept: VecDeque::with_capacity(MAX_KEPT), from_nanos: stamp_nanos });
         }
         if let Some(segment) = self.segments.back_mut() {
@@ -63,22 +66,22 @@ impl<T> Timeline<T> {
 
     /// The first segment in which no sample to come can be nearer to this stamp.
     fn covering(&self, stamp_nanos: u64) -> Option<usize> {
-        let covers = |segment: &Segment<T>| {
+        self.segments.iter().position(|segment| {
             segment.from_nanos <= stamp_nanos.saturating_add(self.tolerance_nanos)
                 && segment.kept.back().is_some_and(|(last, _)| *last >= stamp_nanos)
-        };
-        self.segments.iter().position(covers)
+        })
     }
 
     /// Chooses the sample nearest to this stamp, the earlier one of two: its index in the first segment. Samples that later
     /// stamps do not need are taken out.
     fn choose(&mut self, stamp_nanos: u64, mut forget: impl FnMut(T)) -> Option<usize> {
-        let nearest_in = |segment: &Segment<T>| segment.nearest(stamp_nanos, self.tolerance_nanos);
-        let at =
-            self.covering(stamp_nanos).or_else(|| self.segments.iter().position(|one| nearest_in(one).is_some()))?;
+        let tolerance_nanos = self.tolerance_nanos;
+        let at = match self.covering(stamp_nanos) {
+            Some(at) => at,
+            None => self.segments.iter().position(|one| one.nearest(stamp_nanos, tolerance_nanos).is_some())?,
+        };
         let earlier = self.segments.drain(..at).flat_map(|segment| segment.kept);
         earlier.for_each(|(_, sample)| forget(sample));
-        let tolerance_nanos = self.tolerance_nanos;
         let segment = self.segments.front_mut()?;
         while segment.kept.front().is_some_and(|(first, _)| first.saturating_add(tolerance_nanos) < stamp_nanos) {
             segment.pop().into_iter().for_each(&mut forget);
@@ -307,14 +310,14 @@ impl Partners {
 
     /// Reports how many samples were answered without a partner.
     pub(crate) fn report(&mut self, operator: &Operator) {
-        let count = |input: &Rc<RefCell<dyn PairedInput>>| {
-            let input = input.borrow();
-            let (port, n) = input.n_without();
-            (format!("{port}_without_partner"), n)
-        };
         let n_without = self.inputs.iter().map(|input| input.borrow().n_without().1).sum();
         if std::mem::replace(&mut self.n_without, n_without) != n_without {
-            operator.has_counted(self.inputs.iter().map(count).collect());
+            let counts = self.inputs.iter().map(|input| {
+                let input = input.borrow();
+                let (port, n) = input.n_without();
+                (format!("{port}_without_partner"), n)
+            });
+            operator.has_counted(counts.collect());
         }
     }
 }

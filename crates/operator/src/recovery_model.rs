@@ -355,9 +355,7 @@ impl Search {
 
     /// The worlds after one step of a node's active process.
     fn step(&self, world: &World, node: usize) -> Vec<World> {
-        let Some(process) = &world.nodes[node].active else {
-            return Vec::new();
-        };
+        let Some(process) = &world.nodes[node].active else { return Vec::new() };
         let mut next = world.clone();
         match (node, process.place, process.sample) {
             (SOURCE, 0, _) => {

@@ -137,11 +137,12 @@ impl<T> Sequencer<T> {
     /// The place of a sample, whose writer has come to `written`; `None` if its epoch is over and this reader has left it.
     fn place(&mut self, key: SampleId, written: Option<&Written>) -> Option<Place> {
         let current = written.filter(|written| written.is_current(key));
-        // An epoch that comes back with higher numbers is another one.
-        let is_begun_again = |at: usize| current.is_some() && at + 1 < self.epochs.len();
-        let known = self.epochs.iter().rposition(|epoch| epoch.value == key.epoch).filter(|at| !is_begun_again(*at));
+        let known = self.epochs.iter().rposition(|epoch| epoch.value == key.epoch);
         let first_seq = current.map(|written| written.first_seq);
-        if let Some(at) = known {
+        // An epoch that comes back with higher numbers is another one.
+        if let Some(at) = known
+            && (current.is_none() || at + 1 == self.epochs.len())
+        {
             let epoch = &mut self.epochs[at];
             epoch.first_seq = epoch.first_seq.or(first_seq);
             return Some((epoch.generation, key.seq));
@@ -180,9 +181,7 @@ impl<T> Sequencer<T> {
         has_other_publishers: impl FnOnce() -> bool,
         now: impl FnOnce() -> Instant,
     ) -> Placing<T> {
-        let Some(place) = self.place(key, written) else {
-            return Placing::Drop;
-        };
+        let Some(place) = self.place(key, written) else { return Placing::Drop };
         let known = self.publishers.iter_mut().find(|(id, _)| *id == publisher);
         let is_first_of_publisher = known.is_none();
         match known {
@@ -208,13 +207,12 @@ impl<T> Sequencer<T> {
         // a gap of the stream; only before its first sample may be samples of the publisher that it took over from.
         // A reader that takes what comes begins with the first sample of all publishers. Their queues are read in any order.
         let may_begin_elsewhere = self.takes_what_comes && self.last.is_none();
-        let may_come = || {
+        if self.may_hold && (self.is_early(place) || may_begin_elsewhere) {
             let may_be_elsewhere = (n_before > 0 || may_begin_elsewhere) && is_first_of_publisher;
-            !self.held.is_empty() || (may_be_elsewhere && (self.publishers.len() > 1 || has_other_publishers()))
-        };
-        if self.may_hold && (self.is_early(place) || may_begin_elsewhere) && may_come() {
-            self.held.insert(place, (sample, now()));
-            return Placing::Hold;
+            if !self.held.is_empty() || (may_be_elsewhere && (self.publishers.len() > 1 || has_other_publishers())) {
+                self.held.insert(place, (sample, now()));
+                return Placing::Hold;
+            }
         }
         self.deliver(place, n_before);
         Placing::Deliver(sample)
@@ -303,19 +301,20 @@ impl<T> Sequencer<T> {
 
     /// The number of samples before `place`, which is after the last one, that have not come.
     fn n_before(&self, place: Place) -> u64 {
-        let since_first = || {
-            let first_seq = self.epoch(place.0).and_then(|epoch| epoch.first_seq);
-            first_seq.map_or(0, |first_seq| place.1.saturating_sub(first_seq))
-        };
         match self.last {
             Some((generation, seq)) if generation == place.0 => place.1.saturating_sub(seq).saturating_sub(1),
             // A new epoch may begin at any number; its writer says at which.
-            Some(_) => since_first(),
+            Some(_) => self.since_first(place),
             None if self.takes_what_comes => 0,
             None if self.begins_at_zero && self.counted.is_none() => place.1,
-            None if self.begins_at_zero => since_first(),
+            None if self.begins_at_zero => self.since_first(place),
             None => 0,
         }
+    }
+
+    fn since_first(&self, place: Place) -> u64 {
+        let first_seq = self.epoch(place.0).and_then(|epoch| epoch.first_seq);
+        first_seq.map_or(0, |first_seq| place.1.saturating_sub(first_seq))
     }
 
     fn deliver(&mut self, place: Place, n_missing: u64) {

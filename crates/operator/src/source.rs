@@ -96,8 +96,8 @@ pub trait Source {
 /// # Errors
 /// An error of the source.
 pub fn run(operator: &Operator, identity: BTreeMap<String, String>, mut source: impl Source) -> anyhow::Result<()> {
-    let mut is_active = !operator.begins_as_standby();
-    let (mut may_go, mut is_handed_over, mut is_placed, mut is_done) = (false, false, false, false);
+    let (mut is_active, mut may_go) = (!operator.begins_as_standby(), false);
+    let (mut is_handed_over, mut is_placed, mut is_done) = (false, false, false);
     let mut last_look = Instant::now();
     operator.ready(identity);
     while !operator.should_stop() {
@@ -133,12 +133,9 @@ pub fn run(operator: &Operator, identity: BTreeMap<String, String>, mut source: 
             operator.look_at_descriptors()?;
             source.look()?;
         }
+        is_placed &= step != Step::GaveWay;
         let until = match step {
-            Step::Next => continue,
-            Step::GaveWay => {
-                is_placed = false;
-                continue;
-            }
+            Step::Next | Step::GaveWay => continue,
             Step::Wait(until) => until,
             Step::Done => {
                 if !std::mem::replace(&mut is_done, true) {
@@ -151,8 +148,7 @@ pub fn run(operator: &Operator, identity: BTreeMap<String, String>, mut source: 
         if takes_steps {
             source.watch(&mut fds);
         }
-        let limit = until.map_or(TICK, |until| until.saturating_duration_since(Instant::now()));
-        operator.wait_for(&fds, limit);
+        operator.wait_for(&fds, until.map_or(TICK, |until| until.saturating_duration_since(Instant::now())));
     }
     source.close();
     operator.drained(|| source.look())

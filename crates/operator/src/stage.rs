@@ -300,8 +300,9 @@ impl<S: Stage> Task for Instance<S> {
         } else {
             self.read_along()?;
         }
-        let is_caught_up = || !self.is_active || (self.subscriber.is_caught_up() && self.partners.is_caught_up());
-        if self.operator.should_quit() || (stop && is_caught_up()) {
+        if self.operator.should_quit()
+            || (stop && (!self.is_active || (self.subscriber.is_caught_up() && self.partners.is_caught_up())))
+        {
             self.stage.look();
             self.partners.report(&self.operator);
             self.partners.have_ended();
@@ -374,10 +375,9 @@ impl<S: Stage> Instance<S> {
 
     /// When it must look again, if no sample comes before.
     fn deadline(&self) -> Option<Instant> {
-        let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(crate::monotonic_nanos()));
         let is_timed = self.is_active && self.operator.clock() == Clock::Machine;
         let deadline = if is_timed { self.stage.deadline_nanos() } else { None };
-        let deadline = deadline.map(|deadline| Instant::now() + left(deadline));
+        let deadline = deadline.map(crate::instant_of);
         let hold_deadline = if self.is_active { self.subscriber.hold_deadline() } else { None };
         deadline.into_iter().chain(hold_deadline).chain(self.partners.deadline()).min()
     }
@@ -452,11 +452,11 @@ impl<S: Stage> Instance<S> {
     fn delay_or_ring(&mut self) {
         let has_answer = !self.answers.heads.is_empty();
         let is_one_of_many = std::mem::replace(&mut self.had_answer, has_answer) && has_answer;
-        let is_quick = |since: u64| crate::monotonic_nanos().saturating_sub(since) < QUICK_NANOS;
+        let received_nanos = self.subscriber.received_nanos();
         let delays = is_one_of_many
             && self.n_unrung < MOST_UNRUNG
             && self.subscriber.has_more()
-            && self.subscriber.received_nanos().is_some_and(is_quick);
+            && received_nanos.is_some_and(|since| crate::monotonic_nanos().saturating_sub(since) < QUICK_NANOS);
         self.n_unrung = if delays { self.n_unrung + 1 } else { 0 };
         self.publisher.delay_bells(delays);
         // An answer wakes them once it is sent.
@@ -517,11 +517,11 @@ impl<S: Stage> Instance<S> {
         self.name_makers(answered);
         let (operator, stage) = (&self.operator, &self.stage);
         for (head, items) in self.answers.iter() {
-            let check = |head: &mut _| {
+            let sent = self.publisher.send_checked(head, items, &mut || operator.should_yield(), |head| {
                 stage.before_sending(head, arrival_nanos(operator, S::Out::header(head)));
                 true
-            };
-            if self.publisher.send_checked(head, items, &mut || operator.should_yield(), check)? == Sent::GaveWay {
+            });
+            if sent? == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
             }
         }
@@ -577,11 +577,11 @@ impl<S: Stage> Instance<S> {
     fn send_outbox(&mut self) -> anyhow::Result<Sent> {
         let (operator, stage) = (&self.operator, &self.stage);
         while let Some((head, items)) = self.outbox.next()? {
-            let check = |head: &mut _| {
+            let sent = self.publisher.send_checked(head, &items, &mut || operator.should_yield(), |head| {
                 stage.before_sending(head, arrival_nanos(operator, S::Out::header(head)));
                 true
-            };
-            if self.publisher.send_checked(head, &items, &mut || operator.should_yield(), check)? == Sent::GaveWay {
+            });
+            if sent? == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
             }
             self.outbox.has_sent_next();
@@ -623,9 +623,7 @@ impl<S: Stage> Instance<S> {
 
     /// Answers live samples beside the active instance.
     fn read_along(&mut self) -> anyhow::Result<()> {
-        let Some(shadow) = &mut self.shadow else {
-            return Ok(());
-        };
+        let Some(shadow) = &mut self.shadow else { return Ok(()) };
         while !self.operator.has_command()
             && !self.operator.should_stop()
             && let Some(sample) = next(&mut shadow.subscriber)?

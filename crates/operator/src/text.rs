@@ -159,8 +159,8 @@ fn lacks_unit(wrong: &str, name: &str) -> bool {
 
 /// Edits between two names; letter case and `-` for `_` count as none.
 fn distance(a: &str, b: &str) -> usize {
-    let plain = |text: &str| text.to_lowercase().replace('-', "_");
-    strsim::osa_distance(&plain(a), &plain(b))
+    let [a, b] = [a, b].map(|text| text.to_lowercase().replace('-', "_"));
+    strsim::osa_distance(&a, &b)
 }
 
 #[cfg(test)]

@@ -42,12 +42,11 @@ pub(super) fn install(tells_refused: bool, say: impl Fn(LogEntry) + Send + Sync 
     let filter = filter.and_then(Result::ok);
     // A user who asks for certain levels gets every line of them.
     let repeats = filter.is_none().then(|| Repeats { tells_refused, ..Repeats::default() });
-    let usual = || {
+    let filter = filter.unwrap_or_else(|| {
         let levels =
             [(ZENOH, LevelFilter::WARN), (ACCESS_CONTROL, LevelFilter::INFO), (ORCHESTRATOR, LevelFilter::DEBUG)];
         Targets::new().with_default(LevelFilter::INFO).with_targets(levels)
-    };
-    let filter = filter.unwrap_or_else(usual);
+    });
     let _ = tracing_subscriber::registry().with(Sayer { say, repeats }.with_filter(filter)).try_init();
     if let Some(error) = unreadable {
         tracing::warn!("{FILTER_VARIABLE} is not read: {error}");
@@ -65,10 +64,8 @@ impl<S: Subscriber, F: Fn(LogEntry) + 'static> Layer<S> for Sayer<F> {
         if event.metadata().target().starts_with(ZENOH) {
             entry.text = without_places(&entry.text);
         }
-        let is_held_back = self
-            .repeats
-            .as_ref()
-            .is_some_and(|repeats| repeats.holds_back(event.metadata().target(), &entry, Instant::now()));
+        let (target, repeats) = (event.metadata().target(), self.repeats.as_ref());
+        let is_held_back = repeats.is_some_and(|repeats| repeats.holds_back(target, &entry, Instant::now()));
         if !is_held_back {
             if self.repeats.is_some() && event.metadata().target() == ORCHESTRATOR {
                 // People want to see why a link does not come up.
@@ -124,9 +121,7 @@ fn without_places(text: &str) -> String {
     let (mut kept, mut rest) = (String::new(), text);
     while let Some(at) = rest.find(" at /") {
         let place = &rest[at + 1..];
-        let Some(line) = place.find(".rs:").map(|end| &place[end + 4..]) else {
-            break;
-        };
+        let Some(line) = place.find(".rs:").map(|end| &place[end + 4..]) else { break };
         kept += &rest[..at];
         let behind = line.trim_start_matches(|char: char| char.is_ascii_digit());
         rest = behind.strip_prefix('.').unwrap_or(behind);

@@ -32,9 +32,7 @@ enum Place {
 impl Written {
     /// The record after this sample was sent; `None` if it was sent before, so that the record stays.
     pub fn with(record: Option<Written>, key: SampleId) -> Option<Written> {
-        let Some(record) = record else {
-            return Some(Written { last: key, first_seq: key.seq, before: None });
-        };
+        let Some(record) = record else { return Some(Written { last: key, first_seq: key.seq, before: None }) };
         if key.epoch == record.last.epoch {
             return (key.seq > record.last.seq).then_some(Written { last: key, ..record });
         }

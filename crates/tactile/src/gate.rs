@@ -296,8 +296,10 @@ impl FrameFilter {
             }
         }
         let last = self.place.grasp_id;
-        let is_far = |id: u64| last.is_none_or(|last| id > last.saturating_add(1) && id - last <= MAX_GRASP_JUMP);
-        if reading.grasp_id.is_some_and(is_far) && check_values(reading, self.shape, self.allowed.as_deref()).is_ok() {
+        if let Some(id) = reading.grasp_id
+            && last.is_none_or(|last| id > last.saturating_add(1) && id - last <= MAX_GRASP_JUMP)
+            && check_values(reading, self.shape, self.allowed.as_deref()).is_ok()
+        {
             self.waiting = Some((reading.clone(), *arrival));
             return Ok(None);
         }
@@ -382,8 +384,7 @@ impl FrameFilter {
     }
 
     fn judge_next(&mut self, reading: &Reading, arrival: &Arrival) -> Result<Accepted, Refusal> {
-        let malformed = |why: String| Refusal { kind: RefusalKind::Malformed, why };
-        check_values(reading, self.shape, self.allowed.as_deref()).map_err(malformed)?;
+        check_values(reading, self.shape, self.allowed.as_deref()).map_err(Refusal::malformed)?;
         let keys = Keys {
             grasp_id: reading.grasp_id.is_some(),
             seq: reading.seq.is_some(),
@@ -391,7 +392,7 @@ impl FrameFilter {
             senses: Sense::ALL.map(|sense| !reading.senses.get(sense).is_empty()),
         };
         if let Some(first) = self.connection.keys {
-            check_keys(first, keys).map_err(malformed)?;
+            check_keys(first, keys).map_err(Refusal::malformed)?;
         }
         if let Err(why) = self.check_order(reading) {
             let goes_back = match (reading.stamp_nanos, self.stamp_nanos) {
@@ -437,31 +438,25 @@ impl FrameFilter {
     /// Adds a reading that is wrong by the known clock. Returns whether it and the ones before it prove a new clock.
     fn is_by_a_new_clock(&mut self, reading: &Reading, arrival: &Arrival) -> bool {
         let delay_nanos = reading.stamp_nanos.map(|stamp| i128::from(arrival.at_nanos) - i128::from(stamp));
-        let follows = |clock: &NewClock| {
-            let grows = |now: Option<u64>, last: Option<u64>| now.zip(last).is_none_or(|(now, last)| now > last);
-            arrival.at_nanos.saturating_sub(clock.at_nanos) <= LONGEST_PAUSE_NANOS
-                && grows(reading.seq, clock.seq)
-                && grows(reading.stamp_nanos, clock.stamp_nanos)
-        };
-        let widened = |clock: NewClock| {
-            let (least, most) = clock
-                .delay_nanos
-                .zip(delay_nanos)
-                .map_or((0, 0), |((least, most), delay)| (least.min(delay), most.max(delay)));
-            let is_steady = most - least <= i128::from(self.max_delay_nanos);
-            is_steady.then_some(NewClock { delay_nanos: delay_nanos.map(|_| (least, most)), ..clock })
-        };
-        let clock = self.new_clock.filter(follows).and_then(widened).unwrap_or(NewClock {
-            since_nanos: arrival.at_nanos,
-            at_nanos: arrival.at_nanos,
-            seq: None,
-            stamp_nanos: None,
-            delay_nanos: delay_nanos.map(|delay| (delay, delay)),
-        });
-        let NewClock { since_nanos, .. } = clock;
-        let (seq, stamp_nanos) = (reading.seq, reading.stamp_nanos);
-        self.new_clock = Some(NewClock { at_nanos: arrival.at_nanos, seq, stamp_nanos, ..clock });
-        arrival.at_nanos.saturating_sub(since_nanos) >= RESET_NANOS
+        let (seq, stamp_nanos, at_nanos) = (reading.seq, reading.stamp_nanos, arrival.at_nanos);
+        let mut since_nanos = at_nanos;
+        let mut range_nanos = delay_nanos.map(|delay| (delay, delay));
+        if let Some(clock) = self.new_clock
+            && at_nanos.saturating_sub(clock.at_nanos) <= LONGEST_PAUSE_NANOS
+            && grows(seq, clock.seq)
+            && grows(stamp_nanos, clock.stamp_nanos)
+        {
+            let (least, most) = match (clock.delay_nanos, delay_nanos) {
+                (Some((least, most)), Some(delay)) => (least.min(delay), most.max(delay)),
+                _ => (0, 0),
+            };
+            if most - least <= i128::from(self.max_delay_nanos) {
+                since_nanos = clock.since_nanos;
+                range_nanos = delay_nanos.map(|_| (least, most));
+            }
+        }
+        self.new_clock = Some(NewClock { since_nanos, at_nanos, seq, stamp_nanos, delay_nanos: range_nanos });
+        at_nanos.saturating_sub(since_nanos) >= RESET_NANOS
     }
 
     fn believe_new_clock(&mut self, arrival: &Arrival) {
@@ -561,6 +556,10 @@ impl FrameFilter {
         };
         Ok(Some(Delay { least_nanos, at_nanos: arrival.at_nanos }))
     }
+}
+
+fn grows(now: Option<u64>, last: Option<u64>) -> bool {
+    now.zip(last).is_none_or(|(now, last)| now > last)
 }
 
 fn check_values(reading: &Reading, shape: Shape, allowed: Option<&AllowedReadings>) -> Result<(), String> {

@@ -169,6 +169,12 @@ pub enum RefusalKind {
     OutOfOrder,
 }
 
+impl Refusal {
+    pub fn malformed(why: String) -> Refusal {
+        Refusal { kind: RefusalKind::Malformed, why }
+    }
+}
+
 impl RefusalKind {
     pub fn word(self) -> &'static str {
         match self {

@@ -5,7 +5,7 @@ use std::borrow::Cow;
 use blindgrasp_messages::{MAX_NAME_BYTES, TactileFrame};
 use serde::Serialize;
 
-use super::{ExpectedHand, Place, Reading, Refusal, RefusalKind};
+use super::{ExpectedHand, Place, Reading, Refusal};
 
 /// The protocol's version in the greeting. It changes when old bridges can no longer send.
 pub const PROTOCOL: u32 = 1;
@@ -28,17 +28,17 @@ pub fn max_line_bytes(hand: &ExpectedHand) -> usize {
 /// # Errors
 /// The line is not JSON, or it has an unknown or missing key, a value of another type, or a wrong checksum.
 pub fn parse(line: &[u8]) -> Result<Reading, Refusal> {
-    let malformed = |why: String| Refusal { kind: RefusalKind::Malformed, why };
-    let text = std::str::from_utf8(line).map_err(|error| malformed(format!("not UTF-8: {error}")))?;
-    let text = &*without_checksum(text).map_err(malformed)?;
+    let text = std::str::from_utf8(line).map_err(|error| Refusal::malformed(format!("not UTF-8: {error}")))?;
+    let text = &*without_checksum(text).map_err(Refusal::malformed)?;
     // serde would accept a list of the values as well.
     if !text.trim_start().starts_with('{') {
-        return Err(malformed("not a frame: expected an object with joints, cells_newtons and phase".into()));
+        return Err(Refusal::malformed("not a frame: expected an object with joints, cells_newtons and phase".into()));
     }
-    let reading: Reading = serde_json::from_str(text).map_err(|error| malformed(format!("not a frame: {error}")))?;
+    let reading: Reading =
+        serde_json::from_str(text).map_err(|error| Refusal::malformed(format!("not a frame: {error}")))?;
     match reading.object.as_ref().map(String::len) {
         Some(n_bytes @ (0 | NAME_TOO_LONG..)) => {
-            Err(malformed(format!("object has {n_bytes} bytes: expected a name of 1 to {MAX_NAME_BYTES}")))
+            Err(Refusal::malformed(format!("object has {n_bytes} bytes: expected a name of 1 to {MAX_NAME_BYTES}")))
         }
         _ => Ok(reading),
     }
@@ -48,9 +48,7 @@ const NAME_TOO_LONG: usize = MAX_NAME_BYTES + 1;
 
 /// A line without its checksum: the last key `crc`, if it has one, is the CRC-32 of the line without that key.
 fn without_checksum(text: &str) -> Result<Cow<'_, str>, String> {
-    let Some((before, after)) = text.rsplit_once(CRC_KEY) else {
-        return Ok(text.into());
-    };
+    let Some((before, after)) = text.rsplit_once(CRC_KEY) else { return Ok(text.into()) };
     let given = after.trim_end().strip_suffix('}').and_then(|number| number.trim().parse::<u32>().ok());
     let given = given.ok_or("crc must be the last key, a whole number below 2^32")?;
     let line = format!("{before}}}");

@@ -113,9 +113,7 @@ impl TactileDriver for Replay {
         if now_nanos < due_nanos {
             return Ok(None);
         }
-        let Some(reading) = self.next.take() else {
-            return Ok(None);
-        };
+        let Some(reading) = self.next.take() else { return Ok(None) };
         self.advance(None)?;
         let arrival = Arrival { at_nanos: now_nanos, waited_nanos: now_nanos - due_nanos };
         Ok(Some(Event::Frame(reading, arrival)))

@@ -124,8 +124,8 @@ impl Stream {
     }
 
     fn listen(&mut self, address: &str, now_nanos: u64) -> Result<(), DriverError> {
-        let refused = |source| DriverError::Listen { address: address.into(), source };
-        let listener = Listener::bind(address).map_err(refused)?;
+        let listener =
+            Listener::bind(address).map_err(|source| DriverError::Listen { address: address.into(), source })?;
         let bound = listener.local_address();
         print_diagnostic(&format!("listening on {}", bound.map_or(address.into(), |bound| bound.to_string())));
         if let Some(bound) = bound.filter(|bound| !bound.ip().is_loopback()) {
@@ -157,9 +157,7 @@ impl Stream {
                     return false;
                 }
                 let since_nanos = self.no_client_nanos;
-                let Some((stream, peer)) = self.accept(now_nanos) else {
-                    return false;
-                };
+                let Some((stream, peer)) = self.accept(now_nanos) else { return false };
                 self.begin(stream, peer, false, since_nanos, now_nanos, place);
                 true
             }
@@ -276,8 +274,7 @@ impl Stream {
                 }
                 continue;
             }
-            let is_idle = |limit: u64| now_nanos.saturating_sub(connection.last_byte_nanos) > limit;
-            if self.idle_limit_nanos.is_some_and(is_idle) {
+            if self.idle_limit_nanos.is_some_and(|limit| now_nanos.saturating_sub(connection.last_byte_nanos) > limit) {
                 connection.end = Some("it was silent for idle_limit_ms".into());
                 continue;
             }
@@ -360,9 +357,7 @@ impl TactileDriver for Stream {
     }
 
     fn refused(&mut self, refusal: &Refusal, now_nanos: u64) {
-        let Some(connection) = &mut self.connection else {
-            return;
-        };
+        let Some(connection) = &mut self.connection else { return };
         if now_nanos.saturating_sub(connection.told.0) >= SEC_NANOS {
             connection.told = (now_nanos, 0);
         }

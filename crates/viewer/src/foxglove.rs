@@ -237,10 +237,8 @@ impl Client<'_> {
                 }
             }
             Ok(Wish::Unsubscribe { ids }) => {
-                let gone = |_: &u32, id: &mut u32| ids.contains(id);
-                let gone: Vec<u32> =
-                    self.subscriptions.extract_if(.., gone).map(|(channel_id, _)| channel_id).collect();
-                gone.into_iter().for_each(|channel_id| self.forget(channel_id));
+                let gone: Vec<_> = self.subscriptions.extract_if(.., |_, id| ids.contains(id)).collect();
+                gone.into_iter().for_each(|(channel_id, _)| self.forget(channel_id));
             }
             Ok(Wish::Other) => {}
             Err(error) => {

@@ -272,12 +272,12 @@ async fn guard(
         connection.mark();
     }
     request.extensions_mut().insert(IsOwner(is_owner));
-    let refused = |status: StatusCode, why: &'static str| (status, why).into_response();
     let is_allowed = if request.uri().path() == FOXGLOVE { may_be_foxglove } else { is_from_here };
     let mut response = if !is_allowed(request.headers()) {
-        refused(StatusCode::FORBIDDEN, "expected Host: localhost or 127.0.0.1, and no page from elsewhere\n")
+        let why = "expected Host: localhost or 127.0.0.1, and no page from elsewhere\n";
+        (StatusCode::FORBIDDEN, why).into_response()
     } else if !matches!(*request.method(), Method::GET | Method::HEAD) && request.uri().path() != ORDERS {
-        refused(StatusCode::METHOD_NOT_ALLOWED, "expected GET: this can only be read\n")
+        (StatusCode::METHOD_NOT_ALLOWED, "expected GET: this can only be read\n").into_response()
     } else if request.uri().path() == ORDERS && !is_owner {
         control::refusal(&shared)
     } else {

@@ -44,9 +44,7 @@ pub(crate) async fn serve(listener: TcpListener, pages: Router) {
         };
         connections.retain(|(task, _)| !task.is_finished());
         if connections.len() >= MAX_CONNECTIONS {
-            let Some(eldest) = connections.iter().position(|(_, owned)| !owned.is_so()) else {
-                continue;
-            };
+            let Some(eldest) = connections.iter().position(|(_, owned)| !owned.is_so()) else { continue };
             connections.remove(eldest).0.abort();
         }
         let owned = Owned::default();

@@ -12,6 +12,7 @@ use blindgrasp_graph::control::{EdgeStatus, GraphState, NodeState, NodeStatus};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_recording::cdr;
+use blindgrasp_ros::network::Network;
 use blindgrasp_ros::standard;
 use blindgrasp_ros_node::node::{self, Convention, MessageType, Quality, Rights, RosNode, RosPublisher};
 use clap::Args;
@@ -66,6 +67,13 @@ struct Status {
 /// The node of ROS and its publisher.
 type Publishing = (RosNode, RosPublisher);
 
+fn open(network: &Network, rights: &Rights, domain: u32, message: &MessageType) -> anyhow::Result<Publishing> {
+    let session = node::open(network, rights)?;
+    let mut node = RosNode::new(session, Convention::RmwZenoh, domain, "/", "blindgrasp_diagnostics")?;
+    let publisher = node.publisher("/diagnostics", message, Quality::KeepLast(1))?;
+    Ok((node, publisher))
+}
+
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let graph = match arguments.graph.as_deref() {
         // It need not run yet.
@@ -76,18 +84,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let definition = standard::definition(TYPE).context("no definition of the diagnostics")?;
     let message = MessageType { name: TYPE.into(), hash: definition.hash() };
     let rights = Rights { sends: vec![Convention::RmwZenoh.key(domain, "/diagnostics")], ..Rights::default() };
-    let open = || -> anyhow::Result<Publishing> {
-        let mut node =
-            RosNode::new(node::open(&network, &rights)?, Convention::RmwZenoh, domain, "/", "blindgrasp_diagnostics")?;
-        let publisher = node.publisher("/diagnostics", &message, Quality::KeepLast(1))?;
-        Ok((node, publisher))
-    };
     let (mut publishing, mut said) = (None, String::new());
     let mut watched = Watched { graph, connection: None };
     let (interval, mut due) = (Duration::from_secs_f64(arguments.interval), Instant::now());
     loop {
         if publishing.is_none() {
-            match open() {
+            match open(&network, &rights, domain, &message) {
                 Ok(opened) => {
                     print_diagnostic(&format!("publishes the state of graph '{}' on /diagnostics", watched.graph));
                     publishing = Some(opened);
@@ -202,33 +204,34 @@ fn of_node(graph: &str, node: &MeasuredNode, before: Option<&NodeStatus>) -> Sta
     let refused: Vec<String> = refused.collect();
     let level = match node.state {
         NodeState::Failed => ERROR,
-        NodeState::Starting | NodeState::Restarting => WARN,
-        NodeState::Running | NodeState::Done => {
-            if refused.is_empty() {
-                OK
-            } else {
-                WARN
-            }
-        }
+        NodeState::Running | NodeState::Done if refused.is_empty() => OK,
+        _ => WARN,
     };
     let state = node_state_word(node.state).to_lowercase();
     let message = if refused.is_empty() { state } else { format!("{state}; {}", refused.join(", ")) };
     let mut values = vec![("restarts", node.n_restarts.to_string()), ("swaps", node.n_swaps.to_string())];
-    let mut add = |name, value: Option<String>| values.extend(value.map(|value| (name, value)));
-    add("pid", node.pid.map(|pid| pid.to_string()));
-    add("cpu_percent", node.cpu_percent.map(|percent| format!("{percent:.1}")));
-    add("resident_bytes", node.resident_bytes.map(|bytes| bytes.to_string()));
-    add("heartbeat_age_millis", node.heartbeat_age_millis.map(|millis| millis.to_string()));
     let counts: Vec<String> = node.counts.iter().map(|(name, count)| format!("{name} {count}")).collect();
-    add("counts", Some(counts.join(", ")).filter(|counts| !counts.is_empty()));
+    let known = [
+        ("pid", node.pid.map(|pid| pid.to_string())),
+        ("cpu_percent", node.cpu_percent.map(|percent| format!("{percent:.1}"))),
+        ("resident_bytes", node.resident_bytes.map(|bytes| bytes.to_string())),
+        ("heartbeat_age_millis", node.heartbeat_age_millis.map(|millis| millis.to_string())),
+        ("counts", if counts.is_empty() { None } else { Some(counts.join(", ")) }),
+    ];
+    values.extend(known.into_iter().filter_map(|(name, value)| Some((name, value?))));
     status(level, graph, &node.node, message, values)
 }
 
 /// Samples that came late or that a lossless edge lost since the look before are a warning.
 fn of_edge(graph: &str, edge: &MeasuredEdge, before: Option<&EdgeStatus>) -> Status {
-    let since = |now: u64, count: fn(&EdgeStatus) -> u64| before.map_or(0, |before| now.saturating_sub(count(before)));
-    let lost = if edge.policy == EdgePolicy::Lossless { since(edge.dropped, |edge| edge.dropped) } else { 0 };
-    let troubles = [("lost", lost), ("late", since(edge.late, |edge| edge.late))];
+    let (mut lost, mut late) = (0, 0);
+    if let Some(before) = before {
+        late = edge.late.saturating_sub(before.late);
+        if edge.policy == EdgePolicy::Lossless {
+            lost = edge.dropped.saturating_sub(before.dropped);
+        }
+    }
+    let troubles = [("lost", lost), ("late", late)];
     let words: Vec<String> =
         troubles.iter().filter(|(_, n)| *n > 0).map(|(word, n)| format!("{n} samples {word}")).collect();
     let level = if words.is_empty() { OK } else { WARN };

@@ -8,7 +8,6 @@ use time::OffsetDateTime;
 
 use super::{Outcome, print_line, write_out};
 use blindgrasp_bridge::access;
-use blindgrasp_bridge::certificates::CertificateSummary;
 use blindgrasp_bridge::keys::{
     self, AUTHORITY_DAYS, AUTHORITY_KEY_FILE, KeyRequest, MadeKeys, ROUTER_FILES, drop_old_authorities, list,
     renew_authority,
@@ -187,7 +186,7 @@ fn write_router_config(folder: &Path) -> anyhow::Result<PathBuf> {
 
 fn show(arguments: &Arguments, now: OffsetDateTime) -> anyhow::Result<Outcome> {
     let found = list(&arguments.folder)?;
-    let line = |found: &CertificateSummary| {
+    let lines = found.iter().map(|found| {
         let ends = if found.until_unix_secs < now.unix_timestamp() { "ended" } else { "until" };
         let kind = if found.is_authority { "authority" } else { "machine" };
         format!(
@@ -197,8 +196,8 @@ fn show(arguments: &Arguments, now: OffsetDateTime) -> anyhow::Result<Outcome> {
             found.until(),
             found.issuer
         )
-    };
-    say(arguments, &json!({ "certificates": found }), &found.iter().map(line).collect::<Vec<_>>())
+    });
+    say(arguments, &json!({ "certificates": found }), &lines.collect::<Vec<_>>())
 }
 
 fn say(arguments: &Arguments, report: &Value, lines: &[String]) -> anyhow::Result<Outcome> {

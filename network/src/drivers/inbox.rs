@@ -77,9 +77,7 @@ impl<T: Send + 'static> Inbox<T> {
         let at_nanos = monotonic_nanos();
         let mut queue = self.queue();
         while queue.waiting.len() >= MAX_WAITING || queue.n_bytes + n_bytes > MAX_WAITING_BYTES {
-            let Some((_, n_bytes, _)) = queue.waiting.pop_front() else {
-                break;
-            };
+            let Some((_, n_bytes, _)) = queue.waiting.pop_front() else { break };
             queue.n_bytes -= n_bytes;
             queue.n_dropped += 1;
         }

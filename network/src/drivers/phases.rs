@@ -39,9 +39,9 @@ impl PhaseFinder {
             return self.phase;
         }
         let secs = nanos as f64 / 1e9;
-        let speeds = || fingers_rad.iter().zip(before).map(|(now, before)| (now - before) / secs);
-        let is_moving = speeds().any(|speed| speed.abs() > self.moving_rad_per_s);
-        let is_closing = speeds().sum::<f64>() > 0.0;
+        let speeds = fingers_rad.iter().zip(before).map(|(now, before)| (now - before) / secs);
+        let is_moving = speeds.clone().any(|speed| speed.abs() > self.moving_rad_per_s);
+        let is_closing = speeds.sum::<f64>() > 0.0;
         if is_moving {
             self.still_since_nanos = None;
             self.phase = match (self.phase, is_closing) {

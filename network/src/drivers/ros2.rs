@@ -21,7 +21,7 @@ use blindgrasp_ros::standard;
 use blindgrasp_ros_node::node::{
     Convention, MAX_RECEIVED_BYTES, MessageType, Quality, Received, Rights, RosNode, open,
 };
-use blindgrasp_tactile::{Arrival, DriverError, Event, Place, Reading, Refusal, RefusalKind, TactileDriver};
+use blindgrasp_tactile::{Arrival, DriverError, Event, Place, Reading, Refusal, TactileDriver};
 
 /// A sender that has sent nothing for so long gives way to another one.
 const SILENT_NANOS: u64 = 2_000_000_000;
@@ -149,9 +149,9 @@ impl Ros2 {
         add(Topic::Wrench, &topics.wrench, standard::definition("geometry_msgs/msg/WrenchStamped"));
         add(Topic::Imu, &topics.imu, standard::definition("sensor_msgs/msg/Imu"));
         if let Some((topic, _)) = &topics.gravity {
-            let message = || standard::definition("tf2_msgs/msg/TFMessage");
-            add(Topic::Transforms, &Some(topic.clone()), message());
-            add(Topic::StaticTransforms, &Some(format!("{topic}_static")), message());
+            let definition = standard::definition("tf2_msgs/msg/TFMessage");
+            add(Topic::Transforms, &Some(topic.clone()), definition.clone());
+            add(Topic::StaticTransforms, &Some(format!("{topic}_static")), definition);
         }
         Ros2 {
             topics,
@@ -190,7 +190,7 @@ impl Ros2 {
         }
         let event = self.take_known(topic, &received, at_nanos).unwrap_or_else(|why| {
             let why = format!("{}: {why}", self.definitions[&topic].0);
-            Some(Event::Refused(Refusal { kind: RefusalKind::Malformed, why }))
+            Some(Event::Refused(Refusal::malformed(why)))
         });
         if begins {
             self.pending = event;
@@ -289,9 +289,7 @@ impl Ros2 {
     /// # Errors
     /// They do not tell it, for a person.
     fn take_gravity(&mut self, stamp_nanos: u64, at_nanos: u64) -> Result<(), String> {
-        let Some((topic, [upright, palm])) = &self.topics.gravity else {
-            return Ok(());
-        };
+        let Some((topic, [upright, palm])) = &self.topics.gravity else { return Ok(()) };
         let palm_from_upright = self.transforms.rotation(palm, upright, stamp_nanos, TRANSFORM_NANOS, at_nanos);
         let palm_from_upright = palm_from_upright.ok_or_else(|| {
             format!(
@@ -314,7 +312,40 @@ impl Ros2 {
     ) -> Result<Event, String> {
         let cells_newtons = cells(value, &self.topics.cells_field)?;
         self.take_gravity(stamp_nanos, at_nanos)?;
-        let is_near = |other: u64| other.abs_diff(stamp_nanos) <= self.topics.tolerance_nanos;
+        let joints = self.joints_at(stamp_nanos, at_nanos)?;
+        let (phase, _) = self
+            .phase
+            .ok_or_else(|| format!("no phase has come on {}", self.topics.phase.as_deref().unwrap_or_default()))?;
+        let gravity_topic = self.topics.imu.as_ref().or(self.topics.gravity.as_ref().map(|(topic, _)| topic));
+        let named = [
+            (Sense::Gravity, gravity_topic, &self.gravity),
+            (Sense::WristWrench, self.topics.wrench.as_ref(), &self.wrench),
+        ];
+        let mut senses = OwnedSenses::default();
+        // A frame has all senses that the parameters name: a model must not decide without one.
+        for (sense, topic, last) in named {
+            match (topic, last) {
+                (None, _) => {}
+                (Some(_), Some((values, at))) if self.are_near(*at, stamp_nanos) => senses.set(sense, values),
+                (Some(topic), _) => {
+                    return Err(format!("no message of {topic} has come that is near the cells in time"));
+                }
+            }
+        }
+        let seq = received.seq.and_then(|seq| u64::try_from(i128::from(seq) + self.offset).ok());
+        let reading = Reading { joints, cells_newtons, phase, senses, seq, stamp_nanos: stamp, ..Reading::default() };
+        Ok(Event::Frame(reading, Arrival { at_nanos, waited_nanos: 0 }))
+    }
+
+    fn are_near(&self, nanos: u64, other_nanos: u64) -> bool {
+        nanos.abs_diff(other_nanos) <= self.topics.tolerance_nanos
+    }
+
+    /// The joints of a frame.
+    ///
+    /// # Errors
+    /// An angle is missing, too old or contradicted, for a person.
+    fn joints_at(&self, stamp_nanos: u64, at_nanos: u64) -> Result<Vec<f64>, String> {
         if let Some((joint, since)) = &self.contradiction
             && at_nanos.saturating_sub(*since) < SILENT_NANOS
         {
@@ -330,41 +361,19 @@ impl Ros2 {
             let angle =
                 joint.ok_or_else(|| format!("no angle of joint '{name}' has come on {}", self.topics.joints))?;
             let is_slow = angle.is_last_of_a_slow_topic(stamp_nanos, is_held, self.topics.still_per_s);
-            if !(is_near(angle.stamp_nanos) || is_slow) {
-                let millis = |nanos: u64| nanos as f64 / 1e6;
+            if !(self.are_near(angle.stamp_nanos, stamp_nanos) || is_slow) {
+                let distance_nanos = angle.stamp_nanos.abs_diff(stamp_nanos);
+                let [distance_ms, tolerance_ms, period_ms] =
+                    [distance_nanos, self.topics.tolerance_nanos, angle.period_nanos].map(|nanos| nanos as f64 / 1e6);
                 return Err(format!(
-                    "the angle of joint '{name}' is {:.1} ms from the cells in time, tolerance_ms is {:.1}, and {} comes each \
-                     {:.1} ms",
-                    millis(angle.stamp_nanos.abs_diff(stamp_nanos)),
-                    millis(self.topics.tolerance_nanos),
-                    self.topics.joints,
-                    millis(angle.period_nanos)
+                    "the angle of joint '{name}' is {distance_ms:.1} ms from the cells in time, tolerance_ms is \
+                     {tolerance_ms:.1}, and {} comes each {period_ms:.1} ms",
+                    self.topics.joints
                 ));
             }
             joints.push(angle.value);
         }
-        let (phase, _) = self
-            .phase
-            .ok_or_else(|| format!("no phase has come on {}", self.topics.phase.as_deref().unwrap_or_default()))?;
-        let gravity_topic = self.topics.imu.as_ref().or(self.topics.gravity.as_ref().map(|(topic, _)| topic));
-        let named = [
-            (Sense::Gravity, gravity_topic, &self.gravity),
-            (Sense::WristWrench, self.topics.wrench.as_ref(), &self.wrench),
-        ];
-        let mut senses = OwnedSenses::default();
-        // A frame has all senses that the parameters name: a model must not decide without one.
-        for (sense, topic, last) in named {
-            match (topic, last) {
-                (None, _) => {}
-                (Some(_), Some((values, at))) if is_near(*at) => senses.set(sense, values),
-                (Some(topic), _) => {
-                    return Err(format!("no message of {topic} has come that is near the cells in time"));
-                }
-            }
-        }
-        let seq = received.seq.and_then(|seq| u64::try_from(i128::from(seq) + self.offset).ok());
-        let reading = Reading { joints, cells_newtons, phase, senses, seq, stamp_nanos: stamp, ..Reading::default() };
-        Ok(Event::Frame(reading, Arrival { at_nanos, waited_nanos: 0 }))
+        Ok(joints)
     }
 }
 
@@ -423,9 +432,7 @@ impl TactileDriver for Ros2 {
         if let Some(event) = self.pending.take() {
             return Ok(Some(event));
         }
-        let Some(inbox) = self.inbox.clone() else {
-            return Ok(None);
-        };
+        let Some(inbox) = self.inbox.clone() else { return Ok(None) };
         loop {
             match inbox.next() {
                 Ok(None) => return Ok(None),

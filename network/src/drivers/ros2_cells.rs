@@ -6,14 +6,6 @@ use blindgrasp_ros::cdr::Value;
 /// The readings of the cells in a message: the numbers of a field, the pixels of an image, or a field of the points of a
 /// cloud.
 pub(super) fn cells(value: &Value, field: &str) -> Result<Vec<f64>, String> {
-    let is_big = || value.at("is_bigendian").and_then(|it| it.numbers()).is_some_and(|it| it.first() == Some(&1.0));
-    let whole = |name: &str| {
-        value
-            .at(name)
-            .and_then(|it| it.integer())
-            .and_then(|it| usize::try_from(it).ok())
-            .ok_or(format!("it has no {name}"))
-    };
     if let (Some(encoding), Some(Value::Bytes(data))) = (value.at("encoding"), value.at("data")) {
         let encoding = encoding.text().unwrap_or_default().to_owned();
         let kind = match encoding.as_str() {
@@ -25,28 +17,44 @@ pub(super) fn cells(value: &Value, field: &str) -> Result<Vec<f64>, String> {
                 return Err(format!("its encoding is {encoding}, expected mono8, mono16, 8UC1, 16UC1, 32FC1 or 64FC1"));
             }
         };
-        let (height, width, step) = (whole("height")?, whole("width")?, whole("step")?);
+        let (height, width, step) = (whole(value, "height")?, whole(value, "width")?, whole(value, "step")?);
         at_most_cells(height, width)?;
         let offsets = (0..height).flat_map(|row| (0..width).map(move |column| (row, column)));
-        return scalars(&data, offsets.map(|(row, column)| row * step + column * kind.n_bytes()), kind, is_big());
+        return scalars(
+            &data,
+            offsets.map(|(row, column)| row * step + column * kind.n_bytes()),
+            kind,
+            is_big_endian(value),
+        );
     }
     if let (Some(Value::List(fields)), Some(Value::Bytes(data))) = (value.at("fields"), value.at("data")) {
-        let is_it = |found: &&Value| found.at("name").as_ref().and_then(Value::text) == Some(field);
-        let found = fields.iter().find(is_it).ok_or_else(|| format!("its points have no field '{field}'"))?;
-        let part = |name: &str| found.at(name).and_then(|it| it.integer()).unwrap_or(-1);
-        let kind = match part("datatype") {
+        let found = fields.iter().find(|it| it.at("name").as_ref().and_then(Value::text) == Some(field));
+        let found = found.ok_or_else(|| format!("its points have no field '{field}'"))?;
+        let [datatype, offset] =
+            ["datatype", "offset"].map(|name| found.at(name).and_then(|it| it.integer()).unwrap_or(-1));
+        let kind = match datatype {
             2 => Scalar::U8,
             4 => Scalar::U16,
             7 => Scalar::F32,
             8 => Scalar::F64,
             other => return Err(format!("its field '{field}' has the datatype {other}, expected 2, 4, 7 or 8")),
         };
-        let offset = usize::try_from(part("offset")).map_err(|_| "its field has no offset")?;
-        let (n, step) = (at_most_cells(whole("height")?, whole("width")?)?, whole("point_step")?);
-        return scalars(&data, (0..n).map(|point| point * step + offset), kind, is_big());
+        let offset = usize::try_from(offset).map_err(|_| "its field has no offset")?;
+        let n = at_most_cells(whole(value, "height")?, whole(value, "width")?)?;
+        let step = whole(value, "point_step")?;
+        return scalars(&data, (0..n).map(|point| point * step + offset), kind, is_big_endian(value));
     }
     let found = value.at(field).ok_or_else(|| format!("it has no field '{field}'"))?;
     found.numbers().ok_or_else(|| format!("its field '{field}' is no number or list of numbers"))
+}
+
+fn is_big_endian(value: &Value) -> bool {
+    value.at("is_bigendian").and_then(|it| it.numbers()).is_some_and(|it| it.first() == Some(&1.0))
+}
+
+fn whole(value: &Value, name: &str) -> Result<usize, String> {
+    let number = value.at(name).and_then(|it| it.integer());
+    number.and_then(|it| usize::try_from(it).ok()).ok_or(format!("it has no {name}"))
 }
 
 /// The number of pixels or points. A size that no hand has takes no memory, whatever the message claims.
@@ -76,6 +84,10 @@ impl Scalar {
     }
 }
 
+fn appended(bits: u64, byte: &u8) -> u64 {
+    bits << 8 | u64::from(*byte)
+}
+
 /// The numbers at these offsets.
 fn scalars(data: &[u8], offsets: impl Iterator<Item = usize>, kind: Scalar, is_big: bool) -> Result<Vec<f64>, String> {
     let n = kind.n_bytes();
@@ -83,8 +95,7 @@ fn scalars(data: &[u8], offsets: impl Iterator<Item = usize>, kind: Scalar, is_b
     for offset in offsets {
         let end = offset.checked_add(n);
         let bytes = end.and_then(|end| data.get(offset..end)).ok_or("its data are too short for its size")?;
-        let add = |sum: u64, byte: &u8| sum << 8 | u64::from(*byte);
-        let bits = if is_big { bytes.iter().fold(0, add) } else { bytes.iter().rev().fold(0, add) };
+        let bits = if is_big { bytes.iter().fold(0, appended) } else { bytes.iter().rev().fold(0, appended) };
         numbers.push(match kind {
             Scalar::U8 | Scalar::U16 => bits as f64,
             Scalar::F32 => f32::from_bits(bits as u32).into(),

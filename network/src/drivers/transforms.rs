@@ -35,15 +35,12 @@ impl Transforms {
     /// Takes a `tf2_msgs/msg/TFMessage` that came at a time. As `tf2`, it passes over a transform whose rotation is no unit
     /// quaternion; the frame is not known until the next one.
     pub(super) fn take(&mut self, message: &Value, is_static: bool, sender: [u8; 16], at_nanos: u64) {
-        let Some(Value::List(transforms)) = message.at("transforms") else {
-            return;
-        };
+        let Some(Value::List(transforms)) = message.at("transforms") else { return };
         for transform in &transforms {
-            let name = |path: &str| {
+            let [parent, frame] = ["header.frame_id", "child_frame_id"].map(|path| {
                 let found = transform.at(path);
                 found.as_ref().and_then(Value::text).unwrap_or_default().trim_start_matches('/').to_owned()
-            };
-            let (parent, frame) = (name("header.frame_id"), name("child_frame_id"));
+            });
             if parent.len().max(frame.len()) > MAX_NAME_BYTES {
                 continue;
             }

@@ -61,12 +61,14 @@ impl ZenohKey {
     /// # Errors
     /// It is no such message, or of another hand.
     fn frame_of(&self, bytes: &[u8]) -> Result<Reading, Refusal> {
-        let malformed = |why| Refusal { kind: RefusalKind::Malformed, why };
         let found = cdr::decode::<TactileFrame>(bytes);
-        let found = found.map_err(|why| malformed(format!("not a TactileFrame in CDR: {why}")))?;
+        let found = found.map_err(|why| Refusal::malformed(format!("not a TactileFrame in CDR: {why}")))?;
         let (header, frame) = (found.header, found.message);
         if header.hand_id != 0 && header.hand_id != self.hand_id {
-            return Err(malformed(format!("the hand is {:016x}, expected {:016x}", header.hand_id, self.hand_id)));
+            return Err(Refusal::malformed(format!(
+                "the hand is {:016x}, expected {:016x}",
+                header.hand_id, self.hand_id
+            )));
         }
         Ok(Reading {
             joints: frame.joints,
@@ -124,9 +126,7 @@ impl TactileDriver for ZenohKey {
         if let Some(event) = self.pending.take() {
             return Ok(Some(event));
         }
-        let Some(inbox) = &self.inbox else {
-            return Ok(None);
-        };
+        let Some(inbox) = &self.inbox else { return Ok(None) };
         if !std::mem::replace(&mut self.has_begun, true) {
             return Ok(Some(Event::Began));
         }

@@ -132,18 +132,20 @@ pub(super) fn edge<M: Message>(
 
 impl<M: Message> Forward for Edge<M> {
     fn open(&mut self, node: &mut Node, namespace: &str) -> Result<(), RosError> {
-        let open = |topic: &Topic<M>| match (&mut *node, &topic.message) {
-            (Node::Ros(node), Some(message)) => {
-                Ok(Publisher::Ros(node.publisher(&topic_name(namespace, topic.name)?, message, topic.quality)?))
-            }
-            (Node::Ros(_), None) => Err(RosError::Topic(topic.name.into())),
-            (Node::Json(session), _) => {
-                let key = format!("{namespace}/{}", topic.name);
-                let publisher = KeyPublisher::new(session, &key, topic.quality)?;
-                Ok(Publisher::Json(publisher))
-            }
-        };
-        self.publishers = self.topics.iter().map(open).collect::<Result<_, _>>()?;
+        let mut publishers = Vec::with_capacity(self.topics.len());
+        for topic in &self.topics {
+            publishers.push(match (&mut *node, &topic.message) {
+                (Node::Ros(node), Some(message)) => {
+                    Publisher::Ros(node.publisher(&topic_name(namespace, topic.name)?, message, topic.quality)?)
+                }
+                (Node::Ros(_), None) => return Err(RosError::Topic(topic.name.into())),
+                (Node::Json(session), _) => {
+                    let key = format!("{namespace}/{}", topic.name);
+                    Publisher::Json(KeyPublisher::new(session, &key, topic.quality)?)
+                }
+            });
+        }
+        self.publishers = publishers;
         Ok(())
     }
 
@@ -157,9 +159,7 @@ impl<M: Message> Forward for Edge<M> {
     }
 
     fn forward(&mut self, epochs: &RandomState, data: &mut Vec<u8>) -> anyhow::Result<Forwarded> {
-        let Some(sample) = self.subscriber.receive()? else {
-            return Ok(Forwarded::NoSample);
-        };
+        let Some(sample) = self.subscriber.receive()? else { return Ok(Forwarded::NoSample) };
         let header = *M::header(sample.head());
         let message = M::from_parts(sample.head(), sample.items());
         self.subscriber.commit(&header);
@@ -178,8 +178,9 @@ impl<M: Message> Forward for Edge<M> {
         let stamped = Stamped { header: told, message };
         let mut outcome = Forwarded::Published;
         for ((topic, publisher), state) in self.topics.iter().zip(&mut self.publishers).zip(&mut self.states) {
-            let is_soon = |sent: u64| header.stamp_nanos.wrapping_sub(sent) < topic.interval_nanos;
-            if state.sent_nanos.is_some_and(is_soon) {
+            if let Some(sent_nanos) = state.sent_nanos
+                && header.stamp_nanos.wrapping_sub(sent_nanos) < topic.interval_nanos
+            {
                 continue;
             }
             state.sent_nanos = Some(header.stamp_nanos);

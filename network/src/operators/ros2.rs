@@ -97,34 +97,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let last = Arc::new(LastDecision::default());
     edges.extend(edge::<LiftDecision>(operator, "decision", vec![decision_topic(&last)?])?);
     let decides = !edges.is_empty();
-    let mut tactile = vec![topic_of::<TactileFrame>("tactile")?];
-    if let Some(hand) = hand {
-        let joint_names: Vec<String> = hand.joints.iter().map(|joint| joint.name.clone()).collect();
-        tactile.push(Topic {
-            name: "joint_states",
-            message: Some(standard_type("sensor_msgs/msg/JointState")?),
-            quality: Quality::Sensor,
-            encode: Box::new(move |sample, data| cdr::joint_state(&sample.header, &joint_names, &sample.message, data)),
-            interval_nanos: 0,
-        });
-        let hand = Arc::new(hand);
-        let of_cells = Arc::clone(&hand);
-        tactile.push(Topic {
-            name: "cell_points",
-            message: Some(standard_type("sensor_msgs/msg/PointCloud2")?),
-            quality: Quality::Sensor,
-            encode: Box::new(move |sample, data| cell_points(&of_cells, sample, data)),
-            interval_nanos: 0,
-        });
-        tactile.push(Topic {
-            name: "hand_markers",
-            message: Some(standard_type("visualization_msgs/msg/MarkerArray")?),
-            quality: Quality::Sensor,
-            encode: Box::new(move |sample, data| hand_markers(&hand, sample, data)),
-            interval_nanos: MARKER_NANOS,
-        });
-    }
-    edges.extend(edge::<TactileFrame>(operator, "tactile", tactile)?);
+    edges.extend(edge::<TactileFrame>(operator, "tactile", tactile_topics(hand)?)?);
     let points = Topic {
         name: "contact_points",
         message: Some(standard_type("sensor_msgs/msg/PointCloud2")?),
@@ -157,6 +130,37 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         Ok(Node::Ros(node))
     });
     publish(operator, Outside { open, prefix, opened }, edges)
+}
+
+/// The topics of frames. Three of them need the hand.
+fn tactile_topics(hand: Option<Hand>) -> anyhow::Result<Vec<Topic<TactileFrame>>> {
+    let mut topics = vec![topic_of::<TactileFrame>("tactile")?];
+    let Some(hand) = hand else { return Ok(topics) };
+    let joint_names: Vec<String> = hand.joints.iter().map(|joint| joint.name.clone()).collect();
+    topics.push(Topic {
+        name: "joint_states",
+        message: Some(standard_type("sensor_msgs/msg/JointState")?),
+        quality: Quality::Sensor,
+        encode: Box::new(move |sample, data| cdr::joint_state(&sample.header, &joint_names, &sample.message, data)),
+        interval_nanos: 0,
+    });
+    let hand = Arc::new(hand);
+    let of_cells = Arc::clone(&hand);
+    topics.push(Topic {
+        name: "cell_points",
+        message: Some(standard_type("sensor_msgs/msg/PointCloud2")?),
+        quality: Quality::Sensor,
+        encode: Box::new(move |sample, data| cell_points(&of_cells, sample, data)),
+        interval_nanos: 0,
+    });
+    topics.push(Topic {
+        name: "hand_markers",
+        message: Some(standard_type("visualization_msgs/msg/MarkerArray")?),
+        quality: Quality::Sensor,
+        encode: Box::new(move |sample, data| hand_markers(&hand, sample, data)),
+        interval_nanos: MARKER_NANOS,
+    });
+    Ok(topics)
 }
 
 /// The mistakes with which [`work`] would fail at once.

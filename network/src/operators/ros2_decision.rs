@@ -44,19 +44,21 @@ struct Time {
     nanosec: u32,
 }
 
+impl Time {
+    fn of(nanos: u64) -> Time {
+        Time { sec: i32::try_from(nanos / 1_000_000_000).unwrap_or(i32::MAX), nanosec: (nanos % 1_000_000_000) as u32 }
+    }
+}
+
 impl Decision {
     /// As it is said now, of a decision that is valid until a time of this machine; without such a time it is not valid.
     pub(super) fn new(decision: &LiftDecision, until_nanos: Option<u64>) -> Decision {
-        let time = |nanos: u64| Time {
-            sec: i32::try_from(nanos / 1_000_000_000).unwrap_or(i32::MAX),
-            nanosec: (nanos % 1_000_000_000) as u32,
-        };
         let (now, now_nanos) = (unix_nanos(), monotonic_nanos());
         let mut decision = decision.clone();
         decision.expire(until_nanos, now_nanos);
         Decision {
-            stamp: time(now),
-            valid_until: time(now + until_nanos.unwrap_or(0).saturating_sub(now_nanos)),
+            stamp: Time::of(now),
+            valid_until: Time::of(now + until_nanos.unwrap_or(0).saturating_sub(now_nanos)),
             grasp_id: decision.grasp_id,
             action: decision.action.code() as u8,
             reason: decision.reason.as_str().into(),
@@ -124,8 +126,9 @@ impl LastDecision {
 
     /// The last decision if it is valid, or else the next one that is, within the time and as long as the call has its place.
     fn wait(&self, call: u64, longest: Duration) -> Option<Decision> {
-        let has_to_wait = |calls: &mut Calls| !calls.is_valid() && calls.waiting.contains(&call);
-        let waited = self.changes.wait_timeout_while(self.calls(), longest, has_to_wait);
+        let waited = self
+            .changes
+            .wait_timeout_while(self.calls(), longest, |calls| !calls.is_valid() && calls.waiting.contains(&call));
         let (mut calls, _) = waited.unwrap_or_else(PoisonError::into_inner);
         calls.waiting.retain(|waiting| *waiting != call);
         if !calls.is_valid() {
@@ -143,7 +146,7 @@ impl LastDecision {
         let timeout_secs = read.and_then(|numbers| numbers.first().copied()).filter(|secs| *secs > 0.0).unwrap_or(0.0);
         let longest = Duration::from_secs_f64(timeout_secs.min(MAX_TIMEOUT_SECS));
         let call = self.enter();
-        let answering = move || {
+        let thread = std::thread::Builder::new().name("decide".into()).spawn(move || {
             let decision = last.wait(call, longest);
             let mut data = Vec::new();
             let answer = (decision.is_some(), decision.unwrap_or_default());
@@ -152,8 +155,8 @@ impl LastDecision {
             {
                 print_diagnostic(&format!("a call of decide is not answered: {error}"));
             }
-        };
-        if std::thread::Builder::new().name("decide".into()).spawn(answering).is_err() {
+        });
+        if thread.is_err() {
             self.calls().waiting.retain(|waiting| *waiting != call);
         }
     }

@@ -87,14 +87,15 @@ fn ros2(params: &Ros2Params, hand: &Hand) -> anyhow::Result<Ros2> {
     let cells = named(&params.cells_topic)?.context("driver ros2 needs the param 'cells_topic', like /hand/tactile")?;
     let cells_type = params.cells_type.as_deref().unwrap_or("std_msgs/msg/Float64MultiArray");
     let prefix = params.joint_prefix.as_deref().unwrap_or_default();
-    let frame = |name: &String| name.trim_start_matches('/').to_owned();
-    let gravity = match (&params.gravity_frame, &params.palm_frame) {
+    let [gravity_frame, palm_frame] = [&params.gravity_frame, &params.palm_frame]
+        .map(|name| name.as_deref().map(|name| name.trim_start_matches('/').to_owned()));
+    let gravity = match (gravity_frame, palm_frame) {
         (Some(_), _) if params.imu_topic.is_some() => {
             bail!("params 'gravity_frame' and 'imu_topic' both tell gravity: leave one of them out")
         }
-        (Some(upright), Some(palm)) if frame(upright) != frame(palm) => {
+        (Some(upright), Some(palm)) if upright != palm => {
             let topic = named(&params.tf_topic)?.unwrap_or_else(|| "/tf".into());
-            Some((topic, [frame(upright), frame(palm)]))
+            Some((topic, [upright, palm]))
         }
         (None, None) if params.tf_topic.is_none() => None,
         _ => bail!(

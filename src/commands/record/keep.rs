@@ -73,53 +73,16 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
         connection.graph()
     ));
     let end = arguments.for_secs.map(|secs| start + Duration::from_secs_f64(secs));
-    let mut writer = Writer { out, about, is_json: arguments.json, has_loss: false };
-    let mut is_full = false;
-    let ending = loop {
-        if stop.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end) {
-            break Ending::Detached;
-        }
-        if asked.swap(false, Ordering::Relaxed) {
-            recorder.with(|recorder| recorder.ask(ASKED, monotonic_nanos()));
-        }
-        if let Some(excerpt) = recorder.with(|recorder| recorder.excerpt_when_due(monotonic_nanos())) {
-            writer.write(excerpt)?;
-        }
-        if !is_full && recorder.with(|recorder| recorder.is_full()) {
-            is_full = true;
-            print_diagnostic(
-                "blindgrasp: --keep holds 512 MiB, which is less than that time: older samples are forgotten",
-            );
-        }
-        match connection.receive_within(POLL) {
-            Ok(None) if observer.has_failed() => break Ending::Broken,
-            Ok(None) => {}
-            Ok(Some(Reply::Keep)) => recorder.with(|recorder| recorder.ask(ASKED, monotonic_nanos())),
-            Ok(Some(Reply::Drained)) => break Ending::Graph,
-            Err(ClientError::Ended { .. }) => break Ending::Broken,
-            Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
-            Err(error) => return Err(error.into()),
-        }
-    };
+    let mut keeping = Keeping { recorder, stop, asked, end, out, about, is_json: arguments.json, has_loss: false };
+    let ending = keeping.follow(&mut connection, &observer)?;
     let finished = if ending == Ending::Detached { observer.leave() } else { observer.finish() };
     let graph = connection.graph().to_string();
     // Somebody may have asked since the last look.
     while let Ok(Some(Reply::Keep)) = connection.receive_within(Duration::ZERO) {
-        asked.store(true, Ordering::Relaxed);
+        keeping.asked.store(true, Ordering::Relaxed);
     }
     drop(connection);
-    if ending == Ending::Graph {
-        recorder.with(FlightRecorder::graph_has_ended);
-    }
-    if asked.load(Ordering::Relaxed) {
-        recorder.with(|recorder| recorder.ask(ASKED, monotonic_nanos()));
-    }
-    if ending == Ending::Broken {
-        recorder.with(|recorder| recorder.ask(Ending::Broken.word(), monotonic_nanos()));
-    }
-    while let Some(excerpt) = recorder.with(FlightRecorder::excerpt_now) {
-        writer.write(excerpt)?;
-    }
+    keeping.finish(ending)?;
     finished.context("cannot read the graph's edges any more")?;
     let how = match ending {
         Ending::Graph => "the graph has ended",
@@ -127,34 +90,75 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
         Ending::Detached => "the graph goes on",
     };
     print_diagnostic(&format!("graph '{graph}' is kept no longer: {how}"));
-    Ok(Outcome::of(writer.has_loss))
+    Ok(Outcome::of(keeping.has_loss))
 }
 
-/// The nodes that send frames and read none.
-fn n_sources_of_frames(graph: &Value) -> usize {
-    let list = |value: &Value| value.as_array().cloned().unwrap_or_default();
-    let nodes = list(&graph["nodes"]);
-    let ports_of_frames = |node: &Value| {
-        let ports = list(&node["outputs"]).into_iter().filter(|port| port["type"] == TactileFrame::TYPE_NAME);
-        ports.map(|port| format!("{}/{}", word(&node["id"]), word(&port["port"]))).collect::<Vec<_>>()
-    };
-    let frames: BTreeSet<String> = nodes.iter().flat_map(ports_of_frames).collect();
-    let reads_frames = |node: &Value| list(&node["inputs"]).iter().any(|input| frames.contains(word(&input["from"])));
-    nodes.iter().filter(|node| !ports_of_frames(node).is_empty() && !reads_frames(node)).count()
-}
-
-fn word(value: &Value) -> &str {
-    value.as_str().unwrap_or_default()
-}
-
-struct Writer<'a> {
+/// A flight recorder and the orders that it follows.
+struct Keeping<'a> {
+    recorder: SharedRecorder,
     out: &'a Path,
     about: RecordedGraph,
     is_json: bool,
     has_loss: bool,
+    stop: Arc<AtomicBool>,
+    asked: Arc<AtomicBool>,
+    /// When it ends, if not earlier.
+    end: Option<Instant>,
 }
 
-impl Writer<'_> {
+impl Keeping<'_> {
+    /// Writes the files that are asked for until the graph or the command ends.
+    fn follow(&mut self, connection: &mut Connection, observer: &Observer<SharedRecorder>) -> anyhow::Result<Ending> {
+        let mut is_full = false;
+        loop {
+            if self.stop.load(Ordering::Relaxed) || self.end.is_some_and(|end| Instant::now() >= end) {
+                return Ok(Ending::Detached);
+            }
+            if self.asked.swap(false, Ordering::Relaxed) {
+                self.ask(ASKED);
+            }
+            if let Some(excerpt) = self.recorder.with(|recorder| recorder.excerpt_when_due(monotonic_nanos())) {
+                self.write(excerpt)?;
+            }
+            if !is_full && self.recorder.with(|recorder| recorder.is_full()) {
+                is_full = true;
+                print_diagnostic(
+                    "blindgrasp: --keep holds 512 MiB, which is less than that time: older samples are forgotten",
+                );
+            }
+            match connection.receive_within(POLL) {
+                Ok(None) if observer.has_failed() => return Ok(Ending::Broken),
+                Ok(None) => {}
+                Ok(Some(Reply::Keep)) => self.ask(ASKED),
+                Ok(Some(Reply::Drained)) => return Ok(Ending::Graph),
+                Err(ClientError::Ended { .. }) => return Ok(Ending::Broken),
+                Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
+                Err(error) => return Err(error.into()),
+            }
+        }
+    }
+
+    fn ask(&self, why: &str) {
+        self.recorder.with(|recorder| recorder.ask(why, monotonic_nanos()));
+    }
+
+    /// Writes the files that are asked for, and one of a graph that broke off.
+    fn finish(&mut self, ending: Ending) -> anyhow::Result<()> {
+        if ending == Ending::Graph {
+            self.recorder.with(FlightRecorder::graph_has_ended);
+        }
+        if self.asked.load(Ordering::Relaxed) {
+            self.ask(ASKED);
+        }
+        if ending == Ending::Broken {
+            self.ask(Ending::Broken.word());
+        }
+        while let Some(excerpt) = self.recorder.with(FlightRecorder::excerpt_now) {
+            self.write(excerpt)?;
+        }
+        Ok(())
+    }
+
     fn write(&mut self, excerpt: Excerpt) -> anyhow::Result<()> {
         if excerpt.is_empty() {
             self.has_loss = true;
@@ -189,4 +193,25 @@ impl Writer<'_> {
         };
         Ok(print_line(&line)?)
     }
+}
+
+/// The nodes that send frames and read none.
+fn n_sources_of_frames(graph: &Value) -> usize {
+    let nodes = list(&graph["nodes"]);
+    let frames: BTreeSet<String> = nodes.iter().flat_map(ports_of_frames).collect();
+    let senders = nodes.iter().filter(|node| !ports_of_frames(node).is_empty());
+    senders.filter(|node| !list(&node["inputs"]).iter().any(|input| frames.contains(word(&input["from"])))).count()
+}
+
+fn ports_of_frames(node: &Value) -> Vec<String> {
+    let ports = list(&node["outputs"]).iter().filter(|port| port["type"] == TactileFrame::TYPE_NAME);
+    ports.map(|port| format!("{}/{}", word(&node["id"]), word(&port["port"]))).collect()
+}
+
+fn list(value: &Value) -> &[Value] {
+    value.as_array().map_or(&[], Vec::as_slice)
+}
+
+fn word(value: &Value) -> &str {
+    value.as_str().unwrap_or_default()
 }

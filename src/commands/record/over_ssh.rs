@@ -75,10 +75,7 @@ pub(super) fn record_for_caller(arguments: &Arguments) -> anyhow::Result<Outcome
     let folder = Path::new(FOLDER).join(format!("blindgrasp-{}-{}", std::process::id(), monotonic_nanos()));
     let made = DirBuilder::new().mode(0o700).create(&folder);
     made.with_context(|| format!("{}: the folder for the recording cannot be made", folder.display()))?;
-    let sent = print_line(&serde_json::to_string(&Begun { folder: folder.clone() })?)
-        .map_err(anyhow::Error::from)
-        .and_then(|()| record(arguments, &folder.join(name)))
-        .and_then(|summary| send(arguments, summary));
+    let sent = record_and_send(arguments, &folder, name);
     let is_kept = sent.is_ok() && has_caller_kept();
     if is_kept {
         std::fs::remove_dir_all(&folder).with_context(|| format!("{} cannot be removed", folder.display()))?;
@@ -87,6 +84,11 @@ pub(super) fn record_for_caller(arguments: &Arguments) -> anyhow::Result<Outcome
         print_diagnostic(&format!("blindgrasp: the recording stays in {}", folder.display()));
     }
     sent
+}
+
+fn record_and_send(arguments: &Arguments, folder: &Path, name: &str) -> anyhow::Result<Outcome> {
+    print_line(&serde_json::to_string(&Begun { folder: folder.to_owned() })?)?;
+    send(arguments, record(arguments, &folder.join(name))?)
 }
 
 fn send(arguments: &Arguments, mut summary: super::RecordSummary) -> anyhow::Result<Outcome> {

@@ -7,11 +7,10 @@ use anyhow::{Context, bail};
 use serde_json::{Map, Value, json};
 
 use blindgrasp_cli::graph_file::{describe, shipped};
-use blindgrasp_graph::dataflow::{Graph, Node, Override, Program, accept_param_value};
+use blindgrasp_graph::dataflow::{Graph, Override, Program, accept_param_value};
 use blindgrasp_graph::plan::Port;
 use blindgrasp_graph::run::observed_topics;
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, TactileFrame};
-use blindgrasp_operator::description::PortDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::{Reach, RecordingReader};
 use blindgrasp_replay::playback::{Next, Playback};
@@ -58,13 +57,12 @@ impl Feed<'_> {
                 bail!("--set {set}: node '{node}' does not run, the recording replaces it");
             }
         }
-        let has_param = |id: &String, set: &Override| {
-            graph.node(id).is_some_and(|node| node.description.params.iter().any(|param| param.name == set.param))
-        };
-        let without_node =
-            |set: &&Override| set.node.is_none() && !replaced.running.iter().any(|id| has_param(id, set));
-        if let Some(set) = overrides.iter().find(without_node) {
-            bail!("--set {set}: no node that runs has this param, the recording replaces node '{}'", replaced.node);
+        let running: Vec<_> = replaced.running.iter().filter_map(|id| graph.node(id)).collect();
+        for set in overrides.iter().filter(|set| set.node.is_none()) {
+            let mut params = running.iter().flat_map(|node| &node.description.params);
+            if !params.any(|param| param.name == set.param) {
+                bail!("--set {set}: no node that runs has this param, the recording replaces node '{}'", replaced.node);
+            }
         }
         let reader = RecordingReader::open(self.recording)?;
         compare_hands(graph, &reader, self.recording)?;
@@ -86,15 +84,15 @@ impl Feed<'_> {
         let description = describe(&program.path, &program.args)
             .map_err(|error| anyhow::anyhow!("the operator {PLAYER} cannot be used: {error}"))?;
         let Selection { from_nanos, to_nanos, grasps } = self.selection;
-        let secs = |nanos: &Option<u64>| nanos.map(|nanos| json!(nanos as f64 / 1e9));
+        let [from_s, to_s] = [from_nanos, to_nanos].map(|nanos| nanos.map(|nanos| json!(nanos as f64 / 1e9)));
         let recording = std::path::absolute(self.recording)?;
         let params = [
             ("recording", Some(json!(recording.to_str().context("the recording's path is not UTF-8")?))),
             ("rate", Some(self.rate.clone())),
             ("repeat", Some(self.repeat.clone())),
             ("steps", Some(json!("unlimited"))),
-            ("from_s", secs(from_nanos)),
-            ("to_s", secs(to_nanos)),
+            ("from_s", from_s),
+            ("to_s", to_s),
             ("grasps", grasps.as_ref().map(|grasps| json!(grasps.to_string()))),
             ("topic", Some(json!(topic))),
         ];
@@ -127,7 +125,7 @@ impl Feed<'_> {
 fn edges(rewritten: &Graph, replaced: &Replaced, played: &str, topics: &BTreeMap<Port, String>) -> Vec<FedEdge> {
     let found = observed_topics(rewritten, true);
     let outputs = rewritten.nodes.iter().flat_map(|node| node.outputs().iter().map(move |output| (node, output)));
-    let edge = |(node, output): (&Node, &PortDescription)| {
+    let fed = outputs.filter_map(|(node, output)| {
         let port = (node.id.clone(), output.name.clone());
         let found_topic = found.get(&port)?.clone();
         let origin = if node.id != replaced.node {
@@ -142,8 +140,8 @@ fn edges(rewritten: &Graph, replaced: &Replaced, played: &str, topics: &BTreeMap
             Origin::Truth | Origin::Stage => topics.get(&port).unwrap_or(&found_topic).clone(),
         };
         Some(FedEdge { recorded_topic, found_topic, origin })
-    };
-    outputs.filter_map(edge).collect()
+    });
+    fed.collect()
 }
 
 /// Reads to the first selected sample.
@@ -159,9 +157,9 @@ fn seek<M: Played>(recording: &Path, selection: &Selection, topic: &str) -> anyh
 /// The recorded topic of an output: the topic of its name, or the only topic of its type.
 fn find_topic(reader: &RecordingReader, expected: &str, type_name: &str) -> anyhow::Result<String> {
     let topics = reader.topics();
-    let short = |name: &str, separator_idx: usize| name.split('/').nth(separator_idx).map(str::to_owned);
-    let of_type: Vec<&String> =
-        topics.iter().filter(|(_, schema)| short(schema, 2) == short(type_name, 1)).map(|(topic, _)| topic).collect();
+    let short = type_name.split('/').nth(1);
+    let of_type = topics.iter().filter(|(_, schema)| schema.split('/').nth(2) == short);
+    let of_type: Vec<&String> = of_type.map(|(topic, _)| topic).collect();
     match of_type.as_slice() {
         _ if of_type.iter().any(|topic| *topic == expected) => Ok(expected.into()),
         [only] => Ok((*only).clone()),

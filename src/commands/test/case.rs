@@ -95,11 +95,11 @@ impl Runner<'_> {
             );
         }
         let coverage = Coverage::of(&recording, &fed.topic)?;
-        let compare = |edge: &ComparedEdge| {
+        let compared = edges.par_iter().map(|edge| {
             self.check_stop()?;
             Ok(Check::of_edge(compare_edge(&recording, &found, edge, &coverage)?, is_update))
-        };
-        let compared: Vec<anyhow::Result<Check>> = edges.par_iter().map(compare).collect();
+        });
+        let compared: Vec<anyhow::Result<Check>> = compared.collect();
         for check in compared {
             case.checks.push(check?);
         }

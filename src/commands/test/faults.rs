@@ -20,19 +20,19 @@ use blindgrasp_stages::hand::Hand;
 pub(super) fn run(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) -> anyhow::Result<Outcome> {
     let (mut n_lifted_now, mut all, mut n_replayed) = (0, Vec::new(), 0);
     for recording in recordings {
-        let shown = || recording.display().to_string();
+        let shown = recording.display().to_string();
         let expected = Expectations::of(recording)?.unwrap_or_default();
         let graph = runner.graph(&expected, runner.overrides)?;
         let (hand, of_recording) = (hand_of(&graph)?, RecordingReader::open(recording)?.info().hand_id);
         if of_recording != 0 && of_recording != hand.id() {
-            print_diagnostic(&format!("{}: left out: it is of another hand than graph '{}'", shown(), graph.name));
+            print_diagnostic(&format!("{}: left out: it is of another hand than graph '{}'", shown, graph.name));
             continue;
         }
         let found = runner.scratch.path(recording);
-        let fed = runner.replay_whole(recording, &graph, runner.overrides, &found).with_context(shown)?;
+        let fed = runner.replay_whole(recording, &graph, runner.overrides, &found).with_context(|| shown.clone())?;
         n_replayed += 1;
         if fed.replaced.played_port != "tactile" {
-            bail!("{}: --faults are of frames, and the recording plays {}", shown(), fed.topic);
+            bail!("{}: --faults are of frames, and the recording plays {}", shown, fed.topic);
         }
         let whole = Decisions::read(&found)?;
         let pad_of_cell: Vec<usize> = hand.cells().map(|(pad_idx, _)| pad_idx).collect();
@@ -40,19 +40,19 @@ pub(super) fn run(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) ->
         let mut told = Vec::new();
         for fault in InjectedFault::ALL {
             let faulty = runner.scratch.path(Path::new(&format!(".{}-with-fault.mcap", std::process::id())));
-            write_with_fault(recording, &fed.topic, fault, &pad_of_cell, &faulty).with_context(shown)?;
+            write_with_fault(recording, &fed.topic, fault, &pad_of_cell, &faulty).with_context(|| shown.clone())?;
             // A doubled frame is dropped on the way, which counts as a loss.
             let replayed = runner.replay(&faulty, &graph, runner.overrides, &found);
-            replayed.with_context(|| format!("{} with a fault: {}", shown(), fault.describe()))?;
+            replayed.with_context(|| format!("{} with a fault: {}", shown, fault.describe()))?;
             let changed = Decisions::read(&found)?.changed_since(&whole);
             let (lifted, held): (Vec<_>, Vec<_>) = changed.iter().partition(|changed| changed.is_lifted_now());
             n_lifted_now += lifted.len();
             table.row([fault.describe().into(), lifted.len().to_string(), held.len().to_string()]);
             told.extend(lifted.into_iter().map(|changed: &ChangedDecision| format!("{}: {changed}", fault.describe())));
-            all.push(json!({"recording": shown(), "fault": fault, "changed_actions": changed}));
+            all.push(json!({"recording": &shown, "fault": fault, "changed_actions": changed}));
         }
         if !is_json {
-            print_line(&format!("{}: {} lifts without a fault", shown(), whole.tally().n_lifts))?;
+            print_line(&format!("{}: {} lifts without a fault", shown, whole.tally().n_lifts))?;
             for line in table.lines().iter().chain(&told) {
                 print_line(&format!("  {line}"))?;
             }

@@ -19,8 +19,8 @@ const HEAD: &str = "# What `blindgrasp test` expects of the recording's replay (
 /// The project's recordings that have no expectations.
 pub(super) fn without_expectations(dataflow: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let (folder, files) = project_recordings(dataflow)?;
-    let is_new = |path: &PathBuf| path.extension().is_some_and(|end| end == "mcap") && !path_of(path).exists();
-    let found: Vec<PathBuf> = files.into_iter().filter(is_new).collect();
+    let recordings = files.into_iter().filter(|path| path.extension().is_some_and(|end| end == "mcap"));
+    let found: Vec<PathBuf> = recordings.filter(|path| !path_of(path).exists()).collect();
     if found.is_empty() {
         bail!("each recording in {} has expectations: name the recording", folder.display());
     }
@@ -81,9 +81,12 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
     Ok(Outcome::Done)
 }
 
+fn absolute(path: &Path) -> anyhow::Result<PathBuf> {
+    path.canonicalize().with_context(|| path.display().to_string())
+}
+
 /// The dataflow file relative to the recording's folder; `None` if it is the one that `test` takes by itself.
 fn other_dataflow(dataflow: &Path, recording: &Path) -> anyhow::Result<Option<PathBuf>> {
-    let absolute = |path: &Path| path.canonicalize().with_context(|| path.display().to_string());
     let (given, recording) = (dataflow, absolute(recording)?);
     let dataflow = absolute(given)?;
     let folder = recording.parent().unwrap_or(Path::new("/"));

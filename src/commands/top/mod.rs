@@ -149,18 +149,7 @@ fn show(mut poller: Poller, mut view: View, n_intervals: Option<u64>) -> anyhow:
             }
         }
         if poller.waited().is_some() && !view.has_ended() {
-            match poller.answer_within(ANSWER_WAIT) {
-                Ok(Some(look)) => {
-                    view.take(look);
-                    n_left = n_left.map(|n_left| n_left - 1);
-                    is_dirty = true;
-                }
-                Ok(None) => is_dirty |= say_if_silent(&poller, &mut view),
-                Err(error) => {
-                    view.condition = ended(&error);
-                    is_dirty = true;
-                }
-            }
+            is_dirty |= take_answer(&mut poller, &mut view, &mut n_left);
         }
         if is_dirty {
             screen.draw(&mut view)?;
@@ -193,6 +182,19 @@ fn show(mut poller: Poller, mut view: View, n_intervals: Option<u64>) -> anyhow:
         }
     }
     Ok(())
+}
+
+/// Takes the answer, if it comes; true if the screen is another one.
+fn take_answer(poller: &mut Poller, view: &mut View, n_left: &mut Option<u64>) -> bool {
+    match poller.answer_within(ANSWER_WAIT) {
+        Ok(Some(look)) => {
+            view.take(look);
+            *n_left = n_left.map(|n_left| n_left - 1);
+        }
+        Ok(None) => return say_if_silent(poller, view),
+        Err(error) => view.condition = ended(&error),
+    }
+    true
 }
 
 fn ended(error: &ClientError) -> Condition {

@@ -11,7 +11,7 @@ use ratatui::widgets::{Block, Clear, Paragraph, RenderDirection, Sparkline};
 use super::table::{Cell, Column, table};
 use super::view::{Condition, Table, View};
 use crate::commands::promises::shown_counts;
-use blindgrasp_graph::client::activity::{Measured, MeasuredEdge, MeasuredNode, Quantiles, RUN};
+use blindgrasp_graph::client::activity::{Measured, MeasuredEdge, MeasuredNode, RUN};
 use blindgrasp_graph::client::words::{
     clock_offset, node_state_word, peer_state_word, short_rate, short_time, state_word, warnings,
 };
@@ -176,18 +176,25 @@ fn link_line(link: &LinkStatus) -> Line<'static> {
     Line::from(spans)
 }
 
+fn column(title: &'static str, expendable: u8) -> Column {
+    Column { title, expendable, is_left: false }
+}
+
+fn left(title: &'static str, expendable: u8) -> Column {
+    Column { title, expendable, is_left: true }
+}
+
 fn node_table(measured: &Measured, width: u16) -> (Line<'static>, Vec<Line<'static>>) {
-    let column = |title, expendable| Column { title, expendable, is_left: false };
     let columns = [
-        Column { title: "NODE", expendable: 0, is_left: true },
-        Column { title: "STATE", expendable: 1, is_left: true },
+        left("NODE", 0),
+        left("STATE", 1),
         column("PID", 4),
         column("CPU%", 2),
         column("MEMORY", 5),
         column("RESTARTS", 3),
         column("SWAPS", 7),
         column("HEARTBEAT", 6),
-        Column { title: "COUNTS", expendable: 8, is_left: true },
+        left("COUNTS", 8),
     ];
     let rows: Vec<Vec<Cell>> = measured.nodes.iter().map(node_row).collect();
     let has_counts = measured.nodes.iter().any(|node| !node.counts.is_empty());
@@ -220,9 +227,8 @@ fn node_row(node: &MeasuredNode) -> Vec<Cell> {
 }
 
 fn edge_table(measured: &Measured, width: u16) -> (Line<'static>, Vec<Line<'static>>) {
-    let column = |title, expendable| Column { title, expendable, is_left: false };
     let columns = [
-        Column { title: "EDGE", expendable: 0, is_left: true },
+        left("EDGE", 0),
         column("RATE/S", 2),
         column("P50", 1),
         column("P90", 8),
@@ -235,14 +241,13 @@ fn edge_table(measured: &Measured, width: u16) -> (Line<'static>, Vec<Line<'stat
         column("BLOCKED", 10),
     ];
     // These are rare: a column of zeros would take a name's place.
-    let is_any = |count: fn(&MeasuredEdge) -> u64| measured.edges.iter().any(|edge| count(edge) > 0);
-    let is_shown = |title| match title {
-        "LATE" => is_any(|edge| edge.late),
-        "REPEATED" => is_any(|edge| edge.repeated),
-        "BLOCKED" => is_any(|edge| edge.blocked_nanos),
+    let kept = (0..columns.len()).filter(|&idx| match columns[idx].title {
+        "LATE" => measured.edges.iter().any(|edge| edge.late > 0),
+        "REPEATED" => measured.edges.iter().any(|edge| edge.repeated > 0),
+        "BLOCKED" => measured.edges.iter().any(|edge| edge.blocked_nanos > 0),
         _ => true,
-    };
-    let kept: Vec<usize> = (0..columns.len()).filter(|&idx| is_shown(columns[idx].title)).collect();
+    });
+    let kept: Vec<usize> = kept.collect();
     let rows: Vec<Vec<Cell>> = measured
         .edges
         .iter()
@@ -256,20 +261,24 @@ fn edge_table(measured: &Measured, width: u16) -> (Line<'static>, Vec<Line<'stat
 }
 
 fn edge_row(edge: &MeasuredEdge) -> Vec<Cell> {
-    let age = |of: fn(&Quantiles) -> u64| Cell::new(edge.age_nanos.map_or("-".into(), |age| short_time(of(&age))));
-    let lost = |count: u64| match edge.policy {
+    let ages = match edge.age_nanos {
+        Some(age) => [age.p50, age.p90, age.p99].map(short_time),
+        None => ["-"; 3].map(String::from),
+    };
+    let [p50, p90, p99] = ages.map(Cell::new);
+    let [dropped, missing] = [edge.dropped, edge.missing].map(|count| match edge.policy {
         EdgePolicy::Latest if count > 0 => Cell::styled(short_count(count), NOTED),
         _ => Cell::styled(short_count(count), loud_if(count > 0)),
-    };
+    });
     vec![
         Cell::new(printable(&edge_label(edge))),
         Cell::new(short_rate(edge.rate_hz)),
-        age(|age| age.p50),
-        age(|age| age.p90),
-        age(|age| age.p99),
+        p50,
+        p90,
+        p99,
         Cell::new(edge.n_queued.to_string()),
-        lost(edge.dropped),
-        lost(edge.missing),
+        dropped,
+        missing,
         Cell::styled(short_count(edge.late), loud_if(edge.late > 0)),
         Cell::new(short_count(edge.repeated)),
         Cell::new(short_time(edge.blocked_nanos)),
@@ -278,18 +287,14 @@ fn edge_row(edge: &MeasuredEdge) -> Vec<Cell> {
 
 /// The reader's port is left out where it is called as the writer's.
 fn edge_label(edge: &MeasuredEdge) -> String {
-    let port_of = |end: &str| end.split_once('/').map(|(_, port)| port.to_string());
+    let writers_port = edge.from.split_once('/').map(|(_, port)| port);
     match edge.to.split_once('/') {
-        Some((node, port)) if edge.to != RUN && port_of(&edge.from).as_deref() == Some(port) => {
-            format!("{} → {node}", edge.from)
-        }
+        Some((node, port)) if edge.to != RUN && writers_port == Some(port) => format!("{} → {node}", edge.from),
         _ => format!("{} → {}", edge.from, edge.to),
     }
 }
 
 fn decision_table(view: &View, width: u16) -> (Line<'static>, Vec<Line<'static>>) {
-    let column = |title, expendable| Column { title, expendable, is_left: false };
-    let left = |title, expendable| Column { title, expendable, is_left: true };
     let columns = [
         left("GRASP", 0),
         left("DECISION", 1),

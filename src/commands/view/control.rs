@@ -19,17 +19,19 @@ pub(super) fn control_of(graph: &str) -> std::io::Result<Control> {
     }))
 }
 
+/// The name of a node, if the graph has it.
+fn known(graph: &str, node: String) -> Result<String, String> {
+    let status = status(graph).map_err(|error| error.to_string())?;
+    let is_known = status.nodes.iter().any(|known| known.node == node);
+    if is_known { Ok(node) } else { Err(format!("graph '{graph}' has no node '{node}'")) }
+}
+
 /// The command line of an order. A node must be one of the graph's, so that no text of the page counts as an option.
 fn arguments(graph: &str, order: Order) -> Result<Vec<String>, String> {
-    let known = |node: String| {
-        let status = status(graph).map_err(|error| error.to_string())?;
-        let is_known = status.nodes.iter().any(|known| known.node == node);
-        if is_known { Ok(node) } else { Err(format!("graph '{graph}' has no node '{node}'")) }
-    };
     let mut arguments = match order {
-        Order::Set { node, param, value } => vec!["set".into(), format!("{}.{param}={value}", known(node)?)],
+        Order::Set { node, param, value } => vec!["set".into(), format!("{}.{param}={value}", known(graph, node)?)],
         Order::Swap { node, changes, compare_secs, min_agreement } => {
-            let mut arguments = vec!["swap".into(), known(node)?];
+            let mut arguments = vec!["swap".into(), known(graph, node)?];
             arguments.extend(changes.into_iter().map(|change| format!("--set={change}")));
             if compare_secs > 0.0 {
                 arguments.push(format!("--shadow={compare_secs}"));

@@ -33,7 +33,7 @@ struct Picture {
     edges: Vec<PictureEdge>,
 }
 
-#[derive(Serialize)]
+#[derive(Default, Serialize)]
 struct PictureNode {
     id: String,
     /// As the dataflow file says; nothing of a running graph whose file has changed.
@@ -152,7 +152,36 @@ fn file_picture(graph: &Graph) -> Picture {
         heartbeat_millis: Some(node.heartbeat_millis),
         running: None,
     });
-    let edge = |from: (&str, &str), to: (&str, Option<&str>), type_name: &str, options: EdgeOptions| PictureEdge {
+    let inputs = graph.nodes.iter().flat_map(|node| node.inputs.iter().map(move |input| (node, input)));
+    let edges = inputs.map(|(node, input)| {
+        let drawn = file_edge(
+            (&input.from_node, &input.from_port),
+            (&node.id, Some(&input.port)),
+            &input.type_name,
+            input.edge,
+        );
+        PictureEdge { feedback: input.feedback, ..drawn }
+    });
+    // In the same order.
+    let edges = edges.zip(graph.edges()).map(|(drawn, edge)| {
+        let crossing = graph.crossing(&edge).map(|(from, to)| [from.to_owned(), to.to_owned()]);
+        PictureEdge { crossing, ..drawn }
+    });
+    // What the launching command always reads.
+    let outputs = graph.nodes.iter().flat_map(|node| node.outputs().iter().map(move |output| (node, output)));
+    let read = outputs.filter(|(_, output)| is_needed(&output.type_name)).map(|(node, output)| {
+        file_edge((&node.id, &output.name), (RUN, None), &output.type_name, EdgeOptions::default())
+    });
+    Picture {
+        graph: graph.name.clone(),
+        machines: graph.machines.clone(),
+        nodes: nodes.collect(),
+        edges: edges.chain(read).collect(),
+    }
+}
+
+fn file_edge(from: (&str, &str), to: (&str, Option<&str>), type_name: &str, options: EdgeOptions) -> PictureEdge {
+    PictureEdge {
         from_node: from.0.into(),
         from_port: from.1.into(),
         to_node: to.0.into(),
@@ -164,28 +193,6 @@ fn file_picture(graph: &Graph) -> Picture {
         feedback: false,
         crossing: None,
         running: None,
-    };
-    let inputs = graph.nodes.iter().flat_map(|node| node.inputs.iter().map(move |input| (node, input)));
-    let edges = inputs.map(|(node, input)| {
-        let drawn =
-            edge((&input.from_node, &input.from_port), (&node.id, Some(&input.port)), &input.type_name, input.edge);
-        PictureEdge { feedback: input.feedback, ..drawn }
-    });
-    // In the same order.
-    let edges = edges.zip(graph.edges()).map(|(drawn, edge)| {
-        let crossing = graph.crossing(&edge).map(|(from, to)| [from.to_owned(), to.to_owned()]);
-        PictureEdge { crossing, ..drawn }
-    });
-    // What the launching command always reads.
-    let outputs = graph.nodes.iter().flat_map(|node| node.outputs().iter().map(move |output| (node, output)));
-    let read = outputs
-        .filter(|(_, output)| is_needed(&output.type_name))
-        .map(|(node, output)| edge((&node.id, &output.name), (RUN, None), &output.type_name, EdgeOptions::default()));
-    Picture {
-        graph: graph.name.clone(),
-        machines: graph.machines.clone(),
-        nodes: nodes.collect(),
-        edges: edges.chain(read).collect(),
     }
 }
 
@@ -205,26 +212,19 @@ fn measured_picture(measured: Measured, file: Option<Picture>) -> Picture {
         file.map(|file| (file.nodes, file.edges, file.machines)).unwrap_or_default();
     let nodes = measured.nodes.into_iter().map(|node| {
         let known = file_nodes.iter().position(|known| known.id == node.node).map(|idx| file_nodes.swap_remove(idx));
-        let unknown = || PictureNode {
-            id: node.node.clone(),
-            operator: None,
-            machine: None,
-            restart: None,
-            heartbeat_millis: None,
-            running: None,
-        };
-        PictureNode { running: Some(node.clone()), ..known.unwrap_or_else(unknown) }
+        let known = known.unwrap_or_default();
+        PictureNode { id: node.node.clone(), running: Some(node), ..known }
     });
     let nodes = nodes.collect();
     let edges = measured.edges.into_iter().map(|edge| {
         let (from_node, from_port) = edge.from.split_once('/').unwrap_or((&edge.from, ""));
         let (to_node, to_port) =
             edge.to.split_once('/').map_or((edge.to.as_str(), None), |(node, port)| (node, Some(port)));
-        let is_it = |known: &PictureEdge| {
+        let known = file_edges.iter().position(|known| {
             (known.from_node.as_str(), known.from_port.as_str()) == (from_node, from_port)
                 && (known.to_node.as_str(), known.to_port.as_deref()) == (to_node, to_port)
-        };
-        let known = file_edges.iter().position(is_it).map(|idx| file_edges.swap_remove(idx));
+        });
+        let known = known.map(|idx| file_edges.swap_remove(idx));
         PictureEdge {
             from_node: from_node.into(),
             from_port: from_port.into(),
@@ -259,10 +259,13 @@ fn drawn(picture: &Picture) -> DrawnGraph {
         ..DrawnNode::default()
     }));
     let idx_of = |id: &str| picture.nodes.iter().position(|node| node.id == id);
-    let reader_of = |id: &str| Some(picture.nodes.len() + readers.iter().position(|group| *group == group_of(id))?);
     let edges = picture.edges.iter().filter_map(|edge| {
-        let to = if is_read_by_run(edge) { reader_of(&edge.from_node) } else { idx_of(&edge.to_node) };
-        Some(drawn_edge(edge, idx_of(&edge.from_node)?, to?))
+        let to = if is_read_by_run(edge) {
+            picture.nodes.len() + readers.iter().position(|group| *group == group_of(&edge.from_node))?
+        } else {
+            idx_of(&edge.to_node)?
+        };
+        Some(drawn_edge(edge, idx_of(&edge.from_node)?, to))
     });
     let groups = machines.iter().map(|machine| {
         let note = match machine.listen.as_slice() {
@@ -304,7 +307,6 @@ fn drawn_node(node: &PictureNode, group: Option<usize>) -> DrawnNode {
         }
         notes.extend(shown_counts(&running.counts));
     }
-    let harmless = |lines: Vec<String>| lines.iter().map(|line| printable(line)).collect();
     DrawnNode {
         name: printable(&node.id),
         notes: harmless(notes),
@@ -312,6 +314,10 @@ fn drawn_node(node: &PictureNode, group: Option<usize>) -> DrawnNode {
         is_outside: false,
         group,
     }
+}
+
+fn harmless(lines: Vec<String>) -> Vec<String> {
+    lines.iter().map(|line| printable(line)).collect()
 }
 
 fn drawn_edge(edge: &PictureEdge, from: usize, to: usize) -> DrawnEdge {
@@ -339,7 +345,6 @@ fn drawn_edge(edge: &PictureEdge, from: usize, to: usize) -> DrawnEdge {
         let seen = [(running.missing, "missing"), (running.late, "late")];
         warnings.extend(seen.iter().filter(|(count, _)| *count > 0).map(|(count, word)| format!("{count} {word}")));
     }
-    let harmless = |lines: Vec<String>| lines.iter().map(|line| printable(line)).collect();
     let is_dashed = edge.policy == EdgePolicy::Latest;
     let carrier = edge.crossing.is_some().then(|| "Zenoh".to_owned());
     DrawnEdge {

@@ -12,7 +12,7 @@ use blindgrasp_cli::houses::LAB;
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::decide::decide_alone;
 use blindgrasp_mesh::Mesh;
-use blindgrasp_messages::{Fault, Phase, Prediction};
+use blindgrasp_messages::{Fault, Phase};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{AnimatedGrasp, ObjectSurface, RecordedGrasp, animation_svg, grasp_html, grasp_svg};
 use blindgrasp_recording::{Record, RecordingReader};
@@ -59,9 +59,10 @@ pub(super) fn animate(recording: &Path, out: &Path, arguments: &GraspArguments) 
         grasp.object = surface(&grasp, arguments.objects.as_deref())?;
         let alone = decide_alone(&mut judge, &grasp.frames);
         grasp.decision = alone.decision;
-        let probability = |it: &Prediction| (it.fault == Fault::None).then_some(it.probability_stable);
+        let probabilities =
+            alone.predictions.iter().map(|it| (it.fault == Fault::None).then_some(it.probability_stable));
         animated.push(AnimatedGrasp {
-            probabilities: alone.predictions.iter().map(probability).collect(),
+            probabilities: probabilities.collect(),
             decided_at: alone.decided_at,
             threshold: judge.model().classifier.threshold_probability,
             grasp,
@@ -101,15 +102,10 @@ fn read_grasp(path: &Path, wanted: Option<u64>) -> anyhow::Result<RecordedGrasp>
         decision: None,
         is_hand_alone: false,
     };
-    let mut wanted_id = wanted;
-    if wanted_id.is_none() {
-        for record in RecordingReader::open(path)? {
-            if let Record::Tactile(frame) = record?.1 {
-                wanted_id = Some(frame.message.grasp_id);
-                break;
-            }
-        }
-    }
+    let wanted_id = match wanted {
+        Some(grasp_id) => Some(grasp_id),
+        None => first_grasp_id(path)?,
+    };
     let mut grasp_ids = BTreeSet::new();
     for record in RecordingReader::open(path)? {
         let record = record?.1;
@@ -124,10 +120,8 @@ fn read_grasp(path: &Path, wanted: Option<u64>) -> anyhow::Result<RecordedGrasp>
             Record::Scene(scene) if Some(scene.message.grasp_id) == wanted_id => found.scene = Some(scene.message),
             // The last one of a settled frame is what the picture's frame was told.
             Record::Prediction(prediction) if Some(prediction.message.grasp_id) == wanted_id => {
-                let is_settled = |phase| phase == Phase::Settled;
-                if is_settled(prediction.message.phase)
-                    || !found.prediction.as_ref().is_some_and(|last| is_settled(last.phase))
-                {
+                let has_settled = found.prediction.as_ref().is_some_and(|last| last.phase == Phase::Settled);
+                if prediction.message.phase == Phase::Settled || !has_settled {
                     found.prediction = Some(prediction.message);
                 }
             }
@@ -140,22 +134,29 @@ fn read_grasp(path: &Path, wanted: Option<u64>) -> anyhow::Result<RecordedGrasp>
             _ => {}
         }
     }
-    match (wanted_id, grasp_ids.first(), grasp_ids.last()) {
-        (Some(grasp_id), Some(first), Some(last)) => {
-            if found.frames.is_empty() {
-                let n = grasp_ids.len();
-                let gaps = if n as u64 == last - first + 1 { "" } else { ", with gaps" };
-                bail!(
-                    "{} has no grasp {grasp_id}: it holds {n} grasp{}, {first} to {last}{gaps}",
-                    path.display(),
-                    if n == 1 { "" } else { "s" }
-                );
-            }
-            found.grasp_id = grasp_id;
-            Ok(found)
-        }
-        _ => bail!("{} holds no frames on /tactile: there is no grasp to draw", path.display()),
+    let (Some(grasp_id), Some(first), Some(last)) = (wanted_id, grasp_ids.first(), grasp_ids.last()) else {
+        bail!("{} holds no frames on /tactile: there is no grasp to draw", path.display());
+    };
+    if found.frames.is_empty() {
+        let n = grasp_ids.len();
+        let gaps = if n as u64 == last - first + 1 { "" } else { ", with gaps" };
+        bail!(
+            "{} has no grasp {grasp_id}: it holds {n} grasp{}, {first} to {last}{gaps}",
+            path.display(),
+            if n == 1 { "" } else { "s" }
+        );
     }
+    found.grasp_id = grasp_id;
+    Ok(found)
+}
+
+fn first_grasp_id(path: &Path) -> anyhow::Result<Option<u64>> {
+    for record in RecordingReader::open(path)? {
+        if let Record::Tactile(frame) = record?.1 {
+            return Ok(Some(frame.message.grasp_id));
+        }
+    }
+    Ok(None)
 }
 
 /// The surface of the object that the grasp's truth names.

@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::hash::{BuildHasher, RandomState};
 use std::path::Path;
-use std::sync::atomic::Ordering;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
@@ -74,22 +74,24 @@ pub(super) fn show(
             stop.store(true, Ordering::Relaxed);
         });
     }
-    let is_interrupted = || stop.load(Ordering::Relaxed);
     let address = viewer.address();
     print_diagnostic(&format!("shows graph '{graph}' in a browser on this machine: {address}"));
     if let Some(address) = viewer.foxglove_address() {
         print_diagnostic(&format!("Foxglove: open the connection {address}"));
     }
     print_line(&address)?;
-    let say = |message: &str| viewer.keep("ended", &json!(message).to_string());
-    say(&format!("waits for graph '{graph}'"));
-    while !is_interrupted() {
+    viewer.keep("ended", &json!(format!("waits for graph '{graph}'")).to_string());
+    while !stop.load(Ordering::Relaxed) {
+        let opened = match connection.take() {
+            Some(connection) => Ok(connection),
+            None => Connection::open(graph),
+        };
         // The graph may not run at this moment.
-        if let Ok(connection) = connection.take().map_or_else(|| Connection::open(graph), Ok)
-            && let Err(error) = watch(connection, &viewer, shadow, &is_interrupted)
+        if let Ok(connection) = opened
+            && let Err(error) = watch(connection, &viewer, shadow, &stop)
         {
             viewer.forget("graph");
-            say(&format!("{error:#}"));
+            viewer.keep("ended", &json!(format!("{error:#}")).to_string());
         }
         std::thread::sleep(RETRY);
     }
@@ -102,12 +104,7 @@ pub(super) fn show(
 }
 
 /// Feeds the page until the graph ends, which is an error, or the command is interrupted.
-fn watch(
-    mut connection: Connection,
-    viewer: &Viewer,
-    shadow: Option<&Path>,
-    is_interrupted: &dyn Fn() -> bool,
-) -> anyhow::Result<()> {
+fn watch(mut connection: Connection, viewer: &Viewer, shadow: Option<&Path>, stop: &AtomicBool) -> anyhow::Result<()> {
     let attachment =
         match connection.ask(&Request::Attach { ports: Vec::new(), is_flight_recorder: false }, ANSWER_LIMIT)? {
             Reply::Attached(attachment) => attachment,
@@ -115,7 +112,7 @@ fn watch(
         };
     let Attachment { domain, edges, graph, .. } = attachment;
     let hand = hand_of(&graph);
-    let (mut poller, mut before) = Poller::connect(connection.graph())?;
+    let (mut poller, before) = Poller::connect(connection.graph())?;
     let first = graph_event(&before, None)?;
     // The decision and the hand of an earlier run are not shown any more.
     viewer.forget("decision");
@@ -135,96 +132,115 @@ fn watch(
     let observer = Observer::start_attached(&domain, edges, reader).context("cannot read the graph's edges")?;
     viewer.forget("ended");
     viewer.keep("graph", &first);
-    let mut model = ShownModel::default();
-    let mut log = ShownLog::open(&before.status.log_folder);
-    let min_probability_of = |now: &Look| {
+    let (model, log) = (ShownModel::default(), ShownLog::open(&before.status.log_folder));
+    let mut page = GraphPage { viewer, hand, latest, model, log };
+    page.show_model_and_log(&before);
+    let followed = page.follow(&mut connection, &observer, &mut poller, before, stop);
+    // A graph that goes on has no end to wait for.
+    drop(if let Ok(true) = followed { observer.finish() } else { observer.leave() });
+    page.show_decision();
+    page.show_frame();
+    page.show_log();
+    if followed? {
+        bail!("graph '{}' has ended; waiting for it", connection.graph());
+    }
+    Ok(())
+}
+
+/// The page of one run of the graph.
+struct GraphPage<'a> {
+    viewer: &'a Viewer,
+    hand: Option<Hand>,
+    latest: Arc<Mutex<Latest>>,
+    model: ShownModel,
+    log: ShownLog,
+}
+
+impl GraphPage<'_> {
+    /// Shows the changes until the graph ends, which is `true`, or the command is interrupted.
+    fn follow(
+        &mut self,
+        connection: &mut Connection,
+        observer: &Observer<Reader>,
+        poller: &mut Poller,
+        mut before: Look,
+        stop: &AtomicBool,
+    ) -> anyhow::Result<bool> {
+        let mut frame_due = Instant::now();
+        let mut graph_due = Instant::now() + GRAPH_PAUSE;
+        while !stop.load(Ordering::Relaxed) {
+            match connection.receive_within(POLL) {
+                Ok(None) if observer.has_failed() => bail!("the graph cannot be read any more"),
+                Ok(None) => {}
+                Ok(Some(Reply::Drained)) | Err(ClientError::Ended { .. }) => return Ok(true),
+                Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
+                Err(error) => return Err(error.into()),
+            }
+            self.show_decision();
+            if Instant::now() >= frame_due {
+                frame_due = Instant::now() + TICK;
+                self.show_frame();
+            }
+            if Instant::now() >= graph_due {
+                graph_due = Instant::now() + GRAPH_PAUSE;
+                let now = poller.look()?;
+                self.viewer.keep("graph", &graph_event(&now, Some(&before))?);
+                self.show_model_and_log(&now);
+                before = now;
+            }
+        }
+        Ok(false)
+    }
+
+    fn latest(&self) -> MutexGuard<'_, Latest> {
+        self.latest.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn show_model_and_log(&mut self, now: &Look) {
+        if let Some(event) = self.model.update(&now.status) {
+            self.viewer.keep("model", &event);
+        }
         let mut params = now.status.nodes.iter().filter_map(|node| node.params.get("min_probability_stable"));
-        params.next().and_then(Value::as_f64).unwrap_or_default()
-    };
-    let tell = |model: &mut ShownModel, log: &mut ShownLog, now: &Look| {
-        if let Some(event) = model.update(&now.status) {
-            viewer.keep("model", &event);
+        self.latest().min_probability_stable = params.next().and_then(Value::as_f64).unwrap_or_default();
+        self.show_log();
+    }
+
+    fn show_log(&mut self) {
+        if self.log.update() {
+            self.viewer.show_log(json!(self.log.lines).to_string());
         }
-        latest.lock().unwrap_or_else(PoisonError::into_inner).min_probability_stable = min_probability_of(now);
-        if log.update() {
-            viewer.show_log(json!(log.lines).to_string());
-        }
-    };
-    tell(&mut model, &mut log, &before);
-    let mut frame_due = Instant::now();
-    let mut graph_due = Instant::now() + GRAPH_PAUSE;
-    let pass_on_decision = || {
-        let mut latest = latest.lock().unwrap_or_else(PoisonError::into_inner);
+    }
+
+    fn show_decision(&self) {
+        let mut latest = self.latest();
         if std::mem::take(&mut latest.is_decided)
             && let Some(decided) = latest.decisions.last()
         {
             let event = decision_event(decided, &latest.truths);
             drop(latest);
-            viewer.keep("decision", &event.to_string());
+            self.viewer.keep("decision", &event.to_string());
         }
-    };
-    let pass_on = |model: &ShownModel| {
-        let mut locked = latest.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut taken = std::mem::take(&mut *locked);
-        // Labels wait for decisions that come later, and votes for more of their kind.
-        locked.truths.clone_from(&taken.truths);
-        locked.recent = std::mem::take(&mut taken.recent);
-        locked.votes = taken.votes;
-        locked.min_probability_stable = taken.min_probability_stable;
-        drop(locked);
-        if let Some(decision) = &taken.shadow_decision {
-            viewer.keep("shadow", &shadow_event(decision).to_string());
-        }
-        if viewer.n_browsers() > 0
-            && let Some(event) = frame_event(hand.as_ref(), model, taken)
-        {
-            viewer.send("frame", &event);
-        }
-    };
-    let (ended, is_over) = loop {
-        if is_interrupted() {
-            break (Ok(()), false);
-        }
-        match connection.receive_within(POLL) {
-            Ok(None) if observer.has_failed() => {
-                break (Err(anyhow::anyhow!("the graph cannot be read any more")), false);
-            }
-            Ok(None) => {}
-            Ok(Some(Reply::Drained)) | Err(ClientError::Ended { .. }) => {
-                break (Err(anyhow::anyhow!("graph '{}' has ended; waiting for it", connection.graph())), true);
-            }
-            Ok(Some(other)) => break (Err(connection.unexpected(&other).into()), false),
-            Err(error) => break (Err(error.into()), false),
-        }
-        pass_on_decision();
-        if Instant::now() >= frame_due {
-            frame_due = Instant::now() + TICK;
-            pass_on(&model);
-        }
-        if Instant::now() >= graph_due {
-            graph_due = Instant::now() + GRAPH_PAUSE;
-            match poller
-                .look()
-                .map_err(anyhow::Error::from)
-                .and_then(|now| Ok((graph_event(&now, Some(&before))?, now)))
-            {
-                Ok((event, now)) => {
-                    viewer.keep("graph", &event);
-                    tell(&mut model, &mut log, &now);
-                    before = now;
-                }
-                Err(error) => break (Err(error), false),
-            }
-        }
-    };
-    // A graph that goes on has no end to wait for.
-    drop(if is_over { observer.finish() } else { observer.leave() });
-    pass_on_decision();
-    pass_on(&model);
-    if log.update() {
-        viewer.show_log(json!(log.lines).to_string());
     }
-    ended
+
+    /// Shows the samples since the last tick.
+    fn show_frame(&self) {
+        let mut latest = self.latest();
+        let mut taken = std::mem::take(&mut *latest);
+        // Labels wait for decisions that come later, and votes for more of their kind.
+        latest.truths.clone_from(&taken.truths);
+        latest.recent = std::mem::take(&mut taken.recent);
+        latest.votes = taken.votes;
+        latest.min_probability_stable = taken.min_probability_stable;
+        drop(latest);
+        if let Some(decision) = &taken.shadow_decision {
+            self.viewer.keep("shadow", &shadow_event(decision).to_string());
+        }
+        if self.viewer.n_browsers() > 0
+            && let Some(event) = frame_event(self.hand.as_ref(), &self.model, taken)
+        {
+            self.viewer.send("frame", &event);
+        }
+    }
 }
 
 /// The last lines of a graph's logs. Logs that cannot be read are left out.
@@ -365,13 +381,13 @@ impl Sink for Reader {
         // Every user of this machine can read the page, and a user who forges samples needs the epoch.
         with_sample!(&mut record, sample => sample.header.epoch = self.epochs.hash_one(sample.header.epoch));
         // A graph may have several hands: the page shows one. 0 stands for an unknown hand.
-        let shown = self.hand_id;
-        let is_shown = |hand_id: u64| hand_id == 0 || shown.is_none_or(|shown| shown == hand_id);
+        let hand_id = record.header().hand_id;
+        let is_shown = hand_id == 0 || self.hand_id.is_none_or(|shown| shown == hand_id);
         if let Some(streams) = &mut self.streams {
-            streams.send(topic, &record, is_shown(record.header().hand_id));
+            streams.send(topic, &record, is_shown);
         }
         let judged = match (&mut self.shadow, &record) {
-            (Some(judge), Record::Tactile(sample)) if is_shown(sample.header.hand_id) => Some(judge.sample(sample)),
+            (Some(judge), Record::Tactile(sample)) if is_shown => Some(judge.sample(sample)),
             _ => None,
         };
         let mut latest = self.latest.lock().unwrap_or_else(PoisonError::into_inner);
@@ -382,47 +398,54 @@ impl Sink for Reader {
             let decided = decisions.into_iter().rfind(|decision| decision.action.decides());
             latest.shadow_decision = decided.or(latest.shadow_decision.take());
         }
+        latest.take(record, is_shown);
+        Ok(())
+    }
+}
+
+impl Latest {
+    /// Takes a sample, which `is_shown` if it is of the hand on the page.
+    fn take(&mut self, record: Record, is_shown: bool) {
         match record {
-            Record::Tactile(sample) if is_shown(sample.header.hand_id) => {
+            Record::Tactile(sample) if is_shown => {
                 let Header { epoch, stamp_nanos, .. } = sample.header;
                 let shown = ShownFrame { epoch, stamp_nanos, frame: Arc::new(sample.message) };
-                if latest.recent.len() * shown.frame.cells_newtons.len().max(64) >= MAX_RECENT_CELLS {
-                    latest.recent.pop_front();
+                if self.recent.len() * shown.frame.cells_newtons.len().max(64) >= MAX_RECENT_CELLS {
+                    self.recent.pop_front();
                 }
-                latest.recent.push_back(shown.clone());
-                latest.frame = Some(shown);
+                self.recent.push_back(shown.clone());
+                self.frame = Some(shown);
             }
-            Record::Contacts(sample) if is_shown(sample.header.hand_id) => latest.contacts = Some(sample.message),
-            Record::Feature(sample) if is_shown(sample.header.hand_id) => latest.feature = Some(sample.message),
-            Record::Prediction(sample) if is_shown(sample.header.hand_id) => {
-                if latest.probabilities.len() < MAX_PROBABILITIES {
-                    latest.probabilities.push(sample.message.probability_stable);
+            Record::Contacts(sample) if is_shown => self.contacts = Some(sample.message),
+            Record::Feature(sample) if is_shown => self.feature = Some(sample.message),
+            Record::Prediction(sample) if is_shown => {
+                if self.probabilities.len() < MAX_PROBABILITIES {
+                    self.probabilities.push(sample.message.probability_stable);
                 }
-                let min_probability_stable = latest.min_probability_stable;
-                latest.votes.count(&sample.header, &sample.message, min_probability_stable);
+                self.votes.count(&sample.header, &sample.message, self.min_probability_stable);
             }
             // Several a second, and nothing to look at.
             Record::Decision(sample) if sample.message.action == Action::GoOn => {}
-            Record::Decision(sample) if is_shown(sample.header.hand_id) => {
-                latest.is_decided = true;
+            Record::Decision(sample) if is_shown => {
+                self.is_decided = true;
                 // An arbiter decides under the stamp of the last prediction, and that is the frame's.
                 let Header { epoch, stamp_nanos, .. } = sample.header;
-                let is_it = |shown: &&ShownFrame| (shown.epoch, shown.stamp_nanos) == (epoch, stamp_nanos);
-                let frame = latest.recent.iter().rev().find(is_it).cloned();
+                let mut latest_first = self.recent.iter().rev();
+                let frame =
+                    latest_first.find(|shown| (shown.epoch, shown.stamp_nanos) == (epoch, stamp_nanos)).cloned();
                 let key = (epoch, sample.message.grasp_id);
-                latest.decisions.push(Decided { key, decision: sample.message, frame });
+                self.decisions.push(Decided { key, decision: sample.message, frame });
             }
             Record::Truth(sample) => {
                 let key = (sample.header.epoch, sample.message.grasp_id);
-                latest.truths.insert(key, sample.message.stable);
-                latest.new_truths.push((key, sample.message.stable));
-                if latest.truths.len() > MAX_TRUTHS {
-                    latest.truths.pop_first();
+                self.truths.insert(key, sample.message.stable);
+                self.new_truths.push((key, sample.message.stable));
+                if self.truths.len() > MAX_TRUTHS {
+                    self.truths.pop_first();
                 }
             }
             _ => {}
         }
-        Ok(())
     }
 }
 
@@ -459,10 +482,8 @@ fn frame_event(hand: Option<&Hand>, model: &ShownModel, latest: Latest) -> Optio
         event
     });
     let decisions: Vec<Value> = decisions.collect();
-    let labels = latest
-        .new_truths
-        .iter()
-        .map(|((epoch, grasp_id), stable)| json!([epoch.to_string(), grasp_id.to_string(), stable]));
+    let labels = latest.new_truths.iter();
+    let labels = labels.map(|((epoch, grasp_id), stable)| json!([epoch.to_string(), grasp_id.to_string(), stable]));
     let labels: Vec<Value> = labels.collect();
     let mut event = json!({
         "probabilities": probabilities, "shadow": shadow_probabilities, "decisions": decisions, "labels": labels,

@@ -150,23 +150,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if arguments.wait {
         return live::show(&arguments.file.to_string_lossy(), port, true, arguments.rights, shadow);
     }
-    let is_drawn = arguments.out.is_some() || graph.format.is_some() || graph.json;
     if let Some(name) = graph_name(arguments) {
-        if !graph.overrides.is_empty() || graph.machine.is_some() {
-            refuse("--set and --machine are for a dataflow file: name one (.yaml)");
-        }
-        if is_drawn && (arguments.port.is_some() || arguments.rights.is_any() || shadow.is_some()) {
-            refuse(
-                "--port, --view-control, --foxglove and --shadow are for the page: leave out --out, --format and --json",
-            );
-        }
-        if is_drawn {
-            return graph::draw_running(name, arguments.out.as_deref(), graph);
-        }
-        if graph.interval.is_some() {
-            refuse("--interval is for a drawing: add --out, --format or --json");
-        }
-        return live::show(name, port, false, arguments.rights, shadow);
+        return run_on_graph(name, arguments);
     }
     if graph.interval.is_some() {
         refuse("--interval is for a running graph: name one");
@@ -210,6 +195,26 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         Some(out) => grasp::draw(&arguments.file, out, grasp),
         None => recorded::show(&arguments.file, port, grasp, shadow),
     }
+}
+
+/// Shows or draws a running graph.
+fn run_on_graph(name: &str, arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let (graph, shadow) = (&arguments.graph, arguments.shadow.as_deref());
+    if !graph.overrides.is_empty() || graph.machine.is_some() {
+        refuse("--set and --machine are for a dataflow file: name one (.yaml)");
+    }
+    if arguments.out.is_some() || graph.format.is_some() || graph.json {
+        if arguments.port.is_some() || arguments.rights.is_any() || shadow.is_some() {
+            refuse(
+                "--port, --view-control, --foxglove and --shadow are for the page: leave out --out, --format and --json",
+            );
+        }
+        return graph::draw_running(name, arguments.out.as_deref(), graph);
+    }
+    if graph.interval.is_some() {
+        refuse("--interval is for a drawing: add --out, --format or --json");
+    }
+    live::show(name, arguments.port.unwrap_or(0), false, arguments.rights, shadow)
 }
 
 /// The name of a running graph, if the argument is one.

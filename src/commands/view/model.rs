@@ -21,9 +21,9 @@ impl ShownModel {
     /// Reads the model of a graph, if it is another one than before; an event for the page if so. A model that cannot be read is
     /// said, and the page is without.
     pub(super) fn update(&mut self, status: &GraphStatus) -> Option<String> {
-        let with_model = |node: &str| status.nodes.iter().find(|status| status.node == node);
         // The thresholds are those of the classifier.
-        let nodes = with_model("classifier").into_iter().chain(&status.nodes);
+        let classifier = status.nodes.iter().find(|status| status.node == "classifier");
+        let nodes = classifier.into_iter().chain(&status.nodes);
         let source = nodes
             .into_iter()
             .find_map(|node| Some((node.params.get("model")?.as_str()?.to_owned(), node.n_swaps + node.n_restarts)));
@@ -64,14 +64,14 @@ impl ShownModel {
         }
         let Some(at) = features.blocks.iter().position(|block| *block == Block::Histogram) else { return Vec::new() };
         let first: usize = features.blocks[..at].iter().map(|block| features.block_len(*block)).sum();
-        let unscaled = |idx: usize| match &features.scaling {
+        let unscaled = (first..first + features.dictionary.len()).map(|idx| match &features.scaling {
             Some(scaling) if scaling.per_deviation[idx] > 0.0 => {
                 values[idx] / scaling.per_deviation[idx] + scaling.mean[idx]
             }
             Some(scaling) => scaling.mean[idx],
             None => values[idx],
-        };
-        (first..first + features.dictionary.len()).map(unscaled).collect()
+        });
+        unscaled.collect()
     }
 }
 

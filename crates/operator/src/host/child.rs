@@ -203,9 +203,7 @@ impl Program {
     fn send(&mut self, ask: Ask) -> Result<(), ProgramError> {
         let n_body = self.out.len() - FRAME_BYTES;
         self.out[..4].copy_from_slice(&(n_body as u32).to_ne_bytes());
-        let Some(to) = &mut self.to else {
-            return Err(ProgramError::Ended(String::new(), ask));
-        };
+        let Some(to) = &mut self.to else { return Err(ProgramError::Ended(String::new(), ask)) };
         match to.write_all(&self.out) {
             Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Err(self.reason_of_end(ask)),
             outcome => outcome.map_err(ProgramError::Pipe),
@@ -264,10 +262,10 @@ impl Program {
                 if rest.len() >= FRAME_BYTES + n_body {
                     let body = rest[FRAME_BYTES..FRAME_BYTES + n_body].to_vec();
                     self.used += FRAME_BYTES + n_body;
-                    let found = || format!("a message of the unknown kind {kind}");
-                    let say = Say::of(kind);
-                    let say =
-                        say.ok_or_else(|| ProgramError::Unexpected { found: found(), expected: "one from 1 to 7" })?;
+                    let Some(say) = Say::of(kind) else {
+                        let found = format!("a message of the unknown kind {kind}");
+                        return Err(ProgramError::Unexpected { found, expected: "one from 1 to 7" });
+                    };
                     return Ok(Some((say, body)));
                 }
             }

@@ -72,8 +72,11 @@ fn started(program: &OsStr, arguments: &[OsString]) -> anyhow::Result<(OperatorD
     }
     let sandbox = Sandbox::of_program(&description, &wiring.params);
     sandbox::enter_scope().context("the sandbox cannot be entered")?;
-    let restrict = move || sandbox.enter_program().map(|_| ()).map_err(std::io::Error::other);
-    Ok((description, Program::spawn(program, arguments, restrict)?))
+    let spawned = Program::spawn(program, arguments, move || {
+        sandbox.enter_program().map_err(std::io::Error::other)?;
+        Ok(())
+    });
+    Ok((description, spawned?))
 }
 
 fn work(operator: &Operator, description: &OperatorDescription, mut child: Program) -> anyhow::Result<()> {

@@ -79,9 +79,7 @@ impl<M: Message> InputPort for Input<M> {
         if let Some(sample) = self.back.pop_front() {
             return Ok(Some(sample));
         }
-        let Some(sample) = self.subscriber.receive()? else {
-            return Ok(None);
-        };
+        let Some(sample) = self.subscriber.receive()? else { return Ok(None) };
         let mut head = *sample.head();
         let late = self.subscriber.lateness();
         if self.may_expire && late.is_some_and(|(on_late, _)| on_late != OnLate::Count) {
@@ -225,9 +223,7 @@ impl<M: Message> OutputPort for Output<M> {
         check: Option<Check<'_>>,
     ) -> Result<Sent, PortError> {
         // Lengths were checked when the answer came.
-        let Some((head, items)) = Self::parts(answer) else {
-            return Ok(Sent::Yes);
-        };
+        let Some((head, items)) = Self::parts(answer) else { return Ok(Sent::Yes) };
         self.publisher.send_checked(head, &items, should_yield, |head| {
             let Some(check) = check else { return true };
             let header = *M::header(head);
@@ -294,9 +290,7 @@ impl<M: Message> OutputPort for Output<M> {
     }
 
     fn with_header(&self, head: &[u8], header: Header) -> Vec<u8> {
-        let Some(mut head) = head_of::<M>(head) else {
-            return head.to_vec();
-        };
+        let Some(mut head) = head_of::<M>(head) else { return head.to_vec() };
         *M::header_mut(&mut head) = header;
         head.as_bytes().to_vec()
     }

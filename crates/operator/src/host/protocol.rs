@@ -223,9 +223,7 @@ struct Rest<'a> {
 
 impl<'a> Rest<'a> {
     fn take(&mut self, n_bytes: usize, what: &'static str) -> Result<&'a [u8], WorkError> {
-        let Some((taken, rest)) = self.rest.split_at_checked(n_bytes) else {
-            return Err(self.failed(what));
-        };
+        let Some((taken, rest)) = self.rest.split_at_checked(n_bytes) else { return Err(self.failed(what)) };
         self.rest = rest;
         Ok(taken)
     }

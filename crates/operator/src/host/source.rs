@@ -178,7 +178,7 @@ impl HostedSource {
     /// Takes in feedback, and sends the next sample.
     fn take_step(&mut self) -> anyhow::Result<Step> {
         if let Some(store) = &self.store
-            && store.send(&mut self.outputs, |_, _, _, _| true, false)? == Sent::GaveWay
+            && store.send(&mut self.outputs, false, |_, _, _, _| true)? == Sent::GaveWay
         {
             return Ok(Step::GaveWay);
         }
@@ -299,14 +299,12 @@ impl HostedSource {
         if self.ready.has_state {
             self.state = work.state;
         }
-        let Some(store) = &mut self.store else {
-            return Ok(Sent::Yes);
-        };
+        let Some(store) = &mut self.store else { return Ok(Sent::Yes) };
         // A device cannot give a reading again: it is saved before another instance takes over, which then sends it.
         if store.save(&self.inputs, &mut self.outputs, &self.state, false)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
-        Ok(store.send(&mut self.outputs, |_, _, _, _| true, false)?)
+        Ok(store.send(&mut self.outputs, false, |_, _, _, _| true)?)
     }
 
     /// Sends samples unless readers have them.

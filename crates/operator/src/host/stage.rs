@@ -4,7 +4,7 @@
 //! sample: nothing is saved, and after a restart it answers again what readers may lack. Any other is saved after each sample,
 //! with its answers and the places of all its inputs, before the answers are sent.
 
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use blindgrasp_messages::Header;
 
@@ -256,10 +256,9 @@ impl HostedStage {
         if !self.is_active {
             return partners;
         }
-        let left = |deadline: u64| Duration::from_nanos(deadline.saturating_sub(monotonic_nanos()));
         let silence = if self.operator.clock() == Clock::Machine { self.deadline_nanos } else { None };
         let held = self.inputs.iter().filter_map(|input| input.port.hold_deadline());
-        held.chain(partners).chain(silence.map(|deadline| Instant::now() + left(deadline))).min()
+        held.chain(partners).chain(silence.map(crate::instant_of)).min()
     }
 
     fn obey(&mut self) -> anyhow::Result<()> {
@@ -414,8 +413,8 @@ impl HostedStage {
         }
         let readers = self.outputs.iter().filter(|output| output.port.has_readers());
         let answered = readers.map(|output| output.port.answered_by_readers());
-        let is_after = |key, other| self.inputs[idx].port.is_after(key, other);
-        let least = answered.reduce(|a, b| if a.is_some_and(|a| is_after(a, b)) { b } else { a });
+        let port = &self.inputs[idx].port;
+        let least = answered.reduce(|a, b| if a.is_some_and(|a| port.is_after(a, b)) { b } else { a });
         least.unwrap_or(self.last)
     }
 
@@ -431,9 +430,7 @@ impl HostedStage {
     }
 
     fn ask_all(&mut self, idx: usize, samples: &[&RawSample]) -> anyhow::Result<Vec<Work>> {
-        let Some(first) = samples.first() else {
-            return Ok(Vec::new());
-        };
+        let Some(first) = samples.first() else { return Ok(Vec::new()) };
         self.operator.works_on(Some(self.name_of(idx, first)));
         let mut partners = Vec::new();
         for (port, partner) in &self.partner_ports {
@@ -647,17 +644,14 @@ impl HostedStage {
     }
 
     fn send_saved(&mut self) -> anyhow::Result<Sent> {
-        let Some(store) = &self.store else {
-            return Ok(Sent::Yes);
-        };
+        let Some(store) = &self.store else { return Ok(Sent::Yes) };
         let is_checked = self.ready.hears.contains(&Hears::Check);
         let (operator, child) = (&self.operator, &mut self.child);
         let mut failure = None;
-        let check = |output: usize, header: &Header, head: &mut Vec<u8>, items: &[u8]| {
+        let sent = store.send(&mut self.outputs, is_checked, |output, header, head, items| {
             failure = checked(child, output, head, items, arrival_nanos(operator, header)).err();
             failure.is_none()
-        };
-        let sent = store.send(&mut self.outputs, check, is_checked)?;
+        })?;
         match failure {
             Some(failure) => Err(failure.into()),
             None => Ok(sent),
@@ -678,9 +672,7 @@ impl HostedStage {
 
     /// Takes over what was saved, and gives the program its state.
     fn restore(&mut self, is_handed_over: bool) -> anyhow::Result<()> {
-        let Some(store) = &mut self.store else {
-            return Ok(());
-        };
+        let Some(store) = &mut self.store else { return Ok(()) };
         let restored = store.restore(&mut self.inputs, &mut self.outputs, is_handed_over, false)?;
         if self.ready.has_state {
             let work = super::restore(&mut self.child, restored.state.as_deref())?;

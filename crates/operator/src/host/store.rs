@@ -226,10 +226,8 @@ impl Store {
                 *waited = if are_attached { *waited + since } else { Duration::ZERO };
             }
             if start.elapsed() > limit {
-                let slow = outputs
-                    .iter()
-                    .filter(|output| output.saved.first_sent().is_some())
-                    .map(|output| output.name.as_str());
+                let slow = outputs.iter().filter(|output| output.saved.first_sent().is_some());
+                let slow = slow.map(|output| output.name.as_str());
                 let slow: Vec<&str> = slow.collect();
                 break Err(anyhow::anyhow!(
                     "no saved sample of the output {} was answered within {} ms: a reader is stopped or too slow",
@@ -256,8 +254,8 @@ impl Store {
     pub(super) fn send(
         &self,
         outputs: &mut [Output],
-        mut check: impl FnMut(usize, &Header, &mut Vec<u8>, &[u8]) -> bool,
         is_checked: bool,
+        mut check: impl FnMut(usize, &Header, &mut Vec<u8>, &[u8]) -> bool,
     ) -> Result<Sent, PortError> {
         for output in outputs {
             while let Some(answer) = output.saved.next() {

@@ -30,7 +30,7 @@ pub(super) fn pub_sub(
         return Err(PortError::WrongType { service, found, expected: type_name });
     }
     let name = service_name(wiring)?;
-    let open = || {
+    let opened = open_with_retries(|| {
         node.service_builder(&name)
             .publish_subscribe::<[Word]>()
             .user_header::<Envelope>()
@@ -42,8 +42,8 @@ pub(super) fn pub_sub(
             .max_subscribers(wiring.max_subscribers)
             .max_nodes(wiring.max_nodes)
             .open_or_create()
-    };
-    open_with_retries(open).map_err(|error| open_failed(wiring, error))
+    });
+    opened.map_err(|error| open_failed(wiring, error))
 }
 
 /// On a busy machine, two processes that open a service at once can each take the other for its maker, and iceoryx2 0.10

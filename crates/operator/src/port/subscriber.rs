@@ -216,9 +216,7 @@ impl UntypedSubscriber {
 
     /// Whether all samples that its writer has sent are answered.
     pub fn is_caught_up(&self) -> bool {
-        let Some((cursors, slot)) = &self.cursors else {
-            return true;
-        };
+        let Some((cursors, slot)) = &self.cursors else { return true };
         let sent = cursors.output(self.writer_slot).key();
         let answered = cursors.input(*slot).key();
         sent.is_none_or(|sent| {
@@ -247,9 +245,7 @@ impl UntypedSubscriber {
 
     /// The last sample that any instance of the node has answered, and its counts of that time.
     pub(crate) fn place(&self) -> (Option<SampleId>, InputCounts) {
-        let Some((cursors, slot)) = &self.cursors else {
-            return (None, InputCounts::default());
-        };
+        let Some((cursors, slot)) = &self.cursors else { return (None, InputCounts::default()) };
         (cursors.input(*slot).key(), cursors.input(*slot).counts())
     }
 

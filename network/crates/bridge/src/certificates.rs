@@ -11,6 +11,7 @@ use x509_parser::certificate::X509Certificate;
 use x509_parser::pem::Pem;
 use x509_parser::prelude::FromDer;
 use x509_parser::revocation_list::CertificateRevocationList;
+use x509_parser::x509::X509Name;
 
 use blindgrasp_graph::link::config::KeyFiles;
 
@@ -111,27 +112,15 @@ pub fn check(
             names.iter().map(|name| format!("'{name}'")).collect::<Vec<_>>().join(" or ")
         )));
     }
-    if now.unix_timestamp() > found.until_unix_secs {
-        return Err(unfit(format!(
-            "this certificate ended on {}: renew it (blindgrasp keys DIR --machine {machine} --renew, where the \
-             authority's key is) and copy it here",
-            found.until()
-        )));
-    }
-    if now.unix_timestamp() < found.from_unix_secs {
-        return Err(unfit(format!(
-            "this certificate is valid from {} on, but this machine's clock says {}: set the clock",
-            day(found.from_unix_secs),
-            day(now.unix_timestamp())
-        )));
+    if let Some(message) = outside_its_time(&found, machine, now) {
+        return Err(unfit(message));
     }
     let authority = pems(&files.authority)?;
     let authorities =
         authority.iter().map(|pem| parsed(&files.authority, pem)).collect::<Result<Vec<X509Certificate<'_>>, _>>()?;
-    let is_signed_by =
-        |authority: &X509Certificate<'_>| certificate.verify_signature(Some(authority.public_key())).is_ok();
     // If there are intermediate certificates, TLS checks the chain.
-    if pems_here.len() == 1 && !authorities.iter().any(is_signed_by) {
+    if pems_here.len() == 1 && !authorities.iter().any(|it| certificate.verify_signature(Some(it.public_key())).is_ok())
+    {
         return Err(unfit(format!(
             "this certificate was signed by '{}', which is not in {}: copy both files from the same folder",
             found.issuer,
@@ -150,6 +139,25 @@ pub fn check(
         )));
     }
     Ok(found)
+}
+
+/// Why a machine's certificate is not valid now, for a person; `None` if it is.
+fn outside_its_time(found: &CertificateSummary, machine: &str, now: OffsetDateTime) -> Option<String> {
+    if now.unix_timestamp() > found.until_unix_secs {
+        return Some(format!(
+            "this certificate ended on {}: renew it (blindgrasp keys DIR --machine {machine} --renew, where the \
+             authority's key is) and copy it here",
+            found.until()
+        ));
+    }
+    if now.unix_timestamp() < found.from_unix_secs {
+        return Some(format!(
+            "this certificate is valid from {} on, but this machine's clock says {}: set the clock",
+            day(found.from_unix_secs),
+            day(now.unix_timestamp())
+        ));
+    }
+    None
 }
 
 /// As ssh does: a key that others can read is no secret.
@@ -181,17 +189,15 @@ pub(super) fn revoked(
     authority: &str,
 ) -> Result<(Vec<(String, OffsetDateTime)>, String), CertificateError> {
     const END: &str = "-----END X509 CRL-----\n";
-    let malformed = |error: String| CertificateError::Malformed {
+    let malformed = |error: &dyn std::fmt::Display| CertificateError::Malformed {
         file: file.to_path_buf(),
         message: format!("not a list of revoked certificates: {error}"),
     };
     let (mut all, mut others) = (Vec::new(), String::new());
     for block in text.split_inclusive(END).filter(|block| !block.trim().is_empty()) {
-        let (pem, _) =
-            Pem::read(std::io::Cursor::new(block.as_bytes())).map_err(|error| malformed(error.to_string()))?;
-        let (_, list) =
-            CertificateRevocationList::from_der(&pem.contents).map_err(|error| malformed(error.to_string()))?;
-        if list.issuer().iter_common_name().next().and_then(|name| name.as_str().ok()) != Some(authority) {
+        let (pem, _) = Pem::read(std::io::Cursor::new(block.as_bytes())).map_err(|error| malformed(&error))?;
+        let (_, list) = CertificateRevocationList::from_der(&pem.contents).map_err(|error| malformed(&error))?;
+        if first_common_name(list.issuer()) != Some(authority) {
             others.push_str(block);
             continue;
         }
@@ -206,8 +212,11 @@ pub(super) fn revoked(
 /// The common name of a certificate; `None` if it has none.
 pub(super) fn common_name_of(der: &[u8]) -> Option<String> {
     let (_, certificate) = X509Certificate::from_der(der).ok()?;
-    let name = certificate.subject().iter_common_name().next()?.as_str().ok()?.to_string();
-    Some(name)
+    first_common_name(certificate.subject()).map(str::to_string)
+}
+
+fn first_common_name<'a>(name: &'a X509Name<'_>) -> Option<&'a str> {
+    name.iter_common_name().next()?.as_str().ok()
 }
 
 /// A day, as `2027-11-22`.
@@ -241,13 +250,10 @@ fn parsed<'a>(file: &Path, pem: &'a Pem) -> Result<X509Certificate<'a>, Certific
 }
 
 fn summary(file: &Path, certificate: &X509Certificate<'_>) -> CertificateSummary {
-    let name = |name: &x509_parser::x509::X509Name<'_>| {
-        name.iter_common_name().next().and_then(|name| name.as_str().ok()).unwrap_or_default().to_string()
-    };
     CertificateSummary {
         file: file.to_path_buf(),
-        common_name: name(certificate.subject()),
-        issuer: name(certificate.issuer()),
+        common_name: first_common_name(certificate.subject()).unwrap_or_default().to_string(),
+        issuer: first_common_name(certificate.issuer()).unwrap_or_default().to_string(),
         is_authority: certificate.is_ca(),
         from_unix_secs: certificate.validity().not_before.timestamp(),
         until_unix_secs: certificate.validity().not_after.timestamp(),

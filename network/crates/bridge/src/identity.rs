@@ -131,9 +131,7 @@ impl Identity {
         let certificates: Vec<CertificateDer<'_>> =
             proof.certificates.iter().map(|bytes| CertificateDer::from(bytes.as_ref())).collect();
         let unfit = |message: String| Unverified(format!("the certificate in the hello of machine '{from}' {message}"));
-        let [own, intermediates @ ..] = &certificates[..] else {
-            return Err(unfit("is missing".into()));
-        };
+        let [own, intermediates @ ..] = &certificates[..] else { return Err(unfit("is missing".into())) };
         let invalid = |error: webpki::Error| unfit(self.in_words(&error));
         let certificate = EndEntityCert::try_from(own).map_err(invalid)?;
         let algorithms = default_provider().signature_verification_algorithms;
@@ -215,17 +213,12 @@ fn load(
     now: OffsetDateTime,
 ) -> Result<Loaded, CertificateError> {
     certificates::check(files, machine, namespace, now)?;
-    let malformed = |file: &Path, message: String| CertificateError::Malformed { file: file.to_path_buf(), message };
-    let all = |file: &Path| -> Result<Vec<CertificateDer<'static>>, CertificateError> {
-        let read = CertificateDer::pem_file_iter(file).and_then(Iterator::collect);
-        read.map_err(|error| malformed(file, error.to_string()))
-    };
-    let authorities = all(&files.authority)?;
-    let anchor = |certificate| anchor_from_trusted_cert(certificate).map(|anchor| anchor.to_owned());
-    let authorities: Result<Vec<_>, _> = authorities.iter().map(anchor).collect();
+    let authorities = certificates_in(&files.authority)?;
+    let authorities: Result<Vec<_>, _> =
+        authorities.iter().map(|it| anchor_from_trusted_cert(it).map(|anchor| anchor.to_owned())).collect();
     let key = PrivateKeyDer::from_pem_file(&files.private_key)
         .map_err(|error| malformed(&files.private_key, error.to_string()))?;
-    let certificates = all(&files.certificate)?;
+    let certificates = certificates_in(&files.certificate)?;
     if certificates.len() > MAX_CERTIFICATES {
         let message = format!("{} certificates, expected at most {MAX_CERTIFICATES}", certificates.len());
         return Err(malformed(&files.certificate, message));
@@ -238,14 +231,23 @@ fn load(
     } else {
         Vec::new()
     };
-    let parse = |der: &CertificateRevocationListDer<'_>| OwnedCertRevocationList::from_der(der).map(Into::into);
-    let revoked: Result<Vec<_>, _> = revoked.iter().map(parse).collect();
+    let revoked: Result<Vec<_>, _> =
+        revoked.iter().map(|der| OwnedCertRevocationList::from_der(der).map(Into::into)).collect();
     Ok(Loaded {
         certificates,
         key: any_supported_type(&key).map_err(|error| malformed(&files.private_key, error.to_string()))?,
         authorities: authorities.map_err(|error| malformed(&files.authority, error.to_string()))?,
         revoked: revoked.map_err(|error| malformed(&file, error.to_string()))?,
     })
+}
+
+fn certificates_in(file: &Path) -> Result<Vec<CertificateDer<'static>>, CertificateError> {
+    let read = CertificateDer::pem_file_iter(file).and_then(Iterator::collect);
+    read.map_err(|error| malformed(file, error.to_string()))
+}
+
+fn malformed(file: &Path, message: String) -> CertificateError {
+    CertificateError::Malformed { file: file.to_path_buf(), message }
 }
 
 fn stamps(files: &KeyFiles) -> Stamps {

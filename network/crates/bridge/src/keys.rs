@@ -227,13 +227,11 @@ fn check_names(request: &KeyRequest) -> Result<(), KeysError> {
     let names = request.machines.iter().map(|machine| ("the machine's name", machine));
     let names = names.chain(request.namespace.iter().map(|namespace| ("the namespace", namespace)));
     let machines = &request.machines;
-    let is_reserved = |machine: &&String| ["ca", "crl"].contains(&machine.as_str()) || *machine == ROUTER_FILES;
-    let is_twice = |machine: &&String| machines.iter().filter(|other| other == machine).count() > 1;
     let refused = if let Some((what, name)) = names.into_iter().find(|(_, name)| !is_name(name)) {
         format!("{what} '{name}' must consist of letters (a-z, A-Z), digits, _ and -, as in the dataflow file")
-    } else if let Some(machine) = machines.iter().find(is_reserved) {
+    } else if let Some(machine) = machines.iter().find(|it| ["ca", "crl", ROUTER_FILES].contains(&it.as_str())) {
         format!("'{machine}' is a reserved name; choose another machine name")
-    } else if let Some(machine) = machines.iter().find(is_twice) {
+    } else if let Some((_, machine)) = machines.iter().enumerate().find(|(at, it)| machines[at + 1..].contains(it)) {
         format!("--machine {machine} is given twice")
     } else if machines.is_empty() && !request.router {
         "no machine is given, expected --machine NAME once for each machine".into()
@@ -364,21 +362,26 @@ fn in_file(file: &Path) -> impl FnOnce(std::io::Error) -> KeysError {
     move |source| KeysError::File { file: file.to_path_buf(), source }
 }
 
+fn partial(file: &Path) -> PathBuf {
+    file.with_extension("pem.partial")
+}
+
+fn write_partial(file: &Path, text: &str, mode: u32) -> std::io::Result<()> {
+    // A file that an interrupted command has left may have another mode.
+    if let Err(error) = std::fs::remove_file(partial(file))
+        && error.kind() != ErrorKind::NotFound
+    {
+        return Err(error);
+    }
+    let mut opened = OpenOptions::new().write(true).create_new(true).mode(mode).open(partial(file))?;
+    opened.write_all(text.as_bytes())?;
+    opened.sync_all()
+}
+
 /// Writes files with their modes. All are complete under temporary names before the first gets its own name.
 fn write_files(files: &[(&PathBuf, &String, u32)]) -> Result<(), KeysError> {
-    let partial = |file: &Path| file.with_extension("pem.partial");
-    let write = |file: &Path, text: &str, mode: u32| -> std::io::Result<()> {
-        // A file that an interrupted command has left may have another mode.
-        if let Err(error) = std::fs::remove_file(partial(file))
-            && error.kind() != ErrorKind::NotFound
-        {
-            return Err(error);
-        }
-        let mut opened = OpenOptions::new().write(true).create_new(true).mode(mode).open(partial(file))?;
-        opened.write_all(text.as_bytes())?;
-        opened.sync_all()
-    };
-    let written = files.iter().try_for_each(|(file, text, mode)| write(file, text, *mode).map_err(in_file(file)));
+    let written =
+        files.iter().try_for_each(|(file, text, mode)| write_partial(file, text, *mode).map_err(in_file(file)));
     let placed = written.and_then(|()| {
         files.iter().try_for_each(|(file, ..)| std::fs::rename(partial(file), file).map_err(in_file(file)))
     });

@@ -175,9 +175,7 @@ impl<'a> Link<'a> {
 
     /// Connects to Zenoh when the session has been opened.
     fn connect(&mut self) -> anyhow::Result<()> {
-        let Some(session) = self.opening.session()? else {
-            return Ok(());
-        };
+        let Some(session) = self.opening.session()? else { return Ok(()) };
         for connection in &mut self.connections {
             connection.connect(self.operator, self.config, &session)?;
         }
@@ -188,12 +186,12 @@ impl<'a> Link<'a> {
     /// Waits until something may have arrived or is due.
     fn wait(&self, is_stopping: bool) {
         let now_nanos = monotonic_nanos();
-        let connections = || self.connections.iter();
-        let mut downlinks = connections().flat_map(|connection| &connection.downlinks);
-        let mut due_nanos = connections().map(|connection| connection.peer.next_due_nanos()).min().unwrap_or(u64::MAX);
+        let mut downlinks = self.connections.iter().flat_map(|connection| &connection.downlinks);
+        let mut due_nanos =
+            self.connections.iter().map(|connection| connection.peer.next_due_nanos()).min().unwrap_or(u64::MAX);
         if is_stopping || downlinks.any(|downlink| downlink.writer.n_waiting() > 0) {
             due_nanos = due_nanos.min(now_nanos + 500_000);
-        } else if connections().any(PeerConnection::awaits_answers) {
+        } else if self.connections.iter().any(PeerConnection::awaits_answers) {
             due_nanos = due_nanos.min(now_nanos + ANSWER_PAUSE_NANOS);
         }
         let limit = Duration::from_nanos(due_nanos.saturating_sub(now_nanos)).min(LOOK_PAUSE);
@@ -246,9 +244,7 @@ impl<'a> Link<'a> {
         let start = Instant::now();
         let protection = Arc::clone(&self.connections[idx].protection);
         for n in 0.. {
-            let Some((kind, bytes)) = self.connections[idx].next_frame() else {
-                break;
-            };
+            let Some((kind, bytes)) = self.connections[idx].next_frame() else { break };
             let bytes = bytes.to_bytes();
             self.connections[idx].peer.bytes[1] += bytes.len() as u64;
             let opened = protection.open(kind, &bytes);
@@ -624,9 +620,11 @@ impl<'a> Link<'a> {
     }
 
     fn tell_launcher(&mut self) {
-        let needed = || self.connections.iter().filter(|connection| connection.peer.is_needed());
         if !self.is_connected && self.own.is_ready {
-            if needed().all(|connection| connection.peer.is_ready()) {
+            let connections = self.connections.iter();
+            let missing = connections.filter(|connection| connection.peer.is_needed() && !connection.peer.is_ready());
+            let missing: Vec<_> = missing.map(|connection| connection.peer.machine.as_str()).collect();
+            if missing.is_empty() {
                 self.is_connected = true;
                 // The launcher needs this report first. Otherwise a graph that ends before the next one would count the
                 // machine as away.
@@ -634,10 +632,6 @@ impl<'a> Link<'a> {
                 self.operator.connected();
             } else if !self.has_said_waiting && self.started.elapsed() > SAY_WAITING {
                 self.has_said_waiting = true;
-                let missing: Vec<_> = needed()
-                    .filter(|connection| !connection.peer.is_ready())
-                    .map(|connection| connection.peer.machine.as_str())
-                    .collect();
                 tracing::warn!("waiting for machine {}", missing.join(", "));
             }
         }

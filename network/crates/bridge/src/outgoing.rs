@@ -455,17 +455,17 @@ impl Outgoing {
 
     /// Number of samples that the receiver has not acknowledged.
     pub fn n_waiting(&self) -> u64 {
-        let is_waiting = |kept: &&Kept| match (kept.sent, &self.run) {
+        let waiting = self.kept.iter().filter(|kept| match (kept.sent, &self.run) {
             (Some(sent), Some(run)) => sent.run != run.number || sent.index >= run.n_received,
             _ => true,
-        };
-        self.kept.iter().filter(is_waiting).count() as u64
+        });
+        waiting.count() as u64
     }
 
     /// For `ps`; `port` is `NODE/PORT`. A sample that was sent and then given up counts as lost when the receiver says
     /// that it does not have it.
     pub fn status(&self, port: &str, now_nanos: u64) -> ChannelStatus {
-        let since = |since_nanos| now_nanos.saturating_sub(since_nanos);
+        let now_blocked_nanos = self.blocked_since_nanos.map_or(0, |since_nanos| now_nanos.saturating_sub(since_nanos));
         ChannelStatus {
             port: port.to_owned(),
             is_sent: true,
@@ -473,7 +473,7 @@ impl Outgoing {
             n_repeated: self.n_repeated,
             n_waiting: self.n_waiting(),
             n_lost: self.n_lost,
-            blocked_nanos: self.blocked_nanos + self.blocked_since_nanos.map_or(0, since),
+            blocked_nanos: self.blocked_nanos + now_blocked_nanos,
         }
     }
 
@@ -514,10 +514,11 @@ impl Outgoing {
     /// belongs to an earlier run of this machine's part of the graph; then the receiver lacks all kept samples. But a
     /// process that took over from another one may not have reached the position of that one yet.
     fn position_after(&self, key: &SampleId) -> u64 {
-        let last = |is_before: &dyn Fn(&SampleId) -> bool| {
-            self.kept.iter().rposition(|kept| is_before(&kept.key)).map(|idx| self.first + idx as u64 + 1)
-        };
-        last(&|kept| kept == key).or_else(|| last(&|kept| self.is_before_or_at(kept, key))).unwrap_or(self.first)
+        let found = self.kept.iter().rposition(|kept| kept.key == *key);
+        match found.or_else(|| self.kept.iter().rposition(|kept| self.is_before_or_at(&kept.key, key))) {
+            Some(idx) => self.first + idx as u64 + 1,
+            None => self.first,
+        }
     }
 
     fn is_before_or_at(&self, kept: &SampleId, key: &SampleId) -> bool {

@@ -337,6 +337,12 @@ impl Peer {
             }
             self.replace(instance, counter);
         }
+        Ok(self.take_proved(hello, is_in_use, now_nanos))
+    }
+
+    /// Takes a hello of the instance that is in use now, and was so before with `was_in_use`; the second value is whether it
+    /// must be answered.
+    fn take_proved(&mut self, hello: &Hello, was_in_use: bool, now_nanos: u64) -> (Option<Change>, bool) {
         (self.candidate, self.candidate_key) = (None, None);
         self.proved_nanos = now_nanos;
         self.version = Some(hello.version.clone());
@@ -344,20 +350,16 @@ impl Peer {
         self.last_heard_nanos = Some(now_nanos);
         self.reason = None;
         let is_anew = self.run.replace(hello.run).is_some_and(|before| before != hello.run);
-        match self.state {
-            PeerState::Up if !is_anew => {
-                let is_asked = hello.is_cut_off || hello.lacks_request;
-                Ok((is_asked.then_some(Change::Asked), hello.is_cut_off))
-            }
-            _ => {
-                self.come_up();
-                // It may not know that it was cut off or refused here. A new instance requests samples by itself.
-                if is_in_use && !is_anew && !hello.is_cut_off {
-                    self.ask_for_requests();
-                }
-                Ok((Some(if is_anew { Change::FoundAnew } else { Change::Found }), true))
-            }
+        if self.state == PeerState::Up && !is_anew {
+            let is_asked = hello.is_cut_off || hello.lacks_request;
+            return (is_asked.then_some(Change::Asked), hello.is_cut_off);
         }
+        self.come_up();
+        // It may not know that it was cut off or refused here. A new instance requests samples by itself.
+        if was_in_use && !is_anew && !hello.is_cut_off {
+            self.ask_for_requests();
+        }
+        (Some(if is_anew { Change::FoundAnew } else { Change::Found }), true)
     }
 
     /// Notes why a hello in the peer's name was not believed. Only the state of a peer that was never found depends on it.

@@ -73,29 +73,28 @@ impl PeerConnection {
         instance: u64,
         identity: Option<&Arc<Identity>>,
     ) -> anyhow::Result<PeerConnection> {
-        let own = |channels: &[Channel], is_its: fn(&Channel) -> &str| -> Vec<Channel> {
-            channels.iter().filter(|channel| is_its(channel) == machine).cloned().collect()
-        };
-        let exports = own(&config.exports, |channel| &channel.to);
-        let imports = own(&config.imports, |channel| &channel.from);
-        let open_uplink = |channel: &Channel| {
-            let opened = with_message(&channel.type_name, OpenUplink(operator, channel, config));
-            opened.unwrap_or_else(|| Err(cannot_cross(channel)))
-        };
-        let open_downlink = |channel: &Channel| {
-            let opened = with_message(&channel.type_name, OpenDownlink(operator, channel, instance));
-            opened.unwrap_or_else(|| Err(cannot_cross(channel)))
-        };
+        let exports: Vec<_> = config.exports.iter().filter(|channel| channel.to == machine).cloned().collect();
+        let imports: Vec<_> = config.imports.iter().filter(|channel| channel.from == machine).cloned().collect();
         let agreement = identity.map(|_| Agreement::new(&config.key_prefix(), &config.machine, machine, instance));
         let agreement = agreement.transpose()?;
         let protection = identity.zip(agreement.as_ref());
         let protection = protection
             .map(|(identity, agreement)| Protection::new(Arc::clone(identity), machine, agreement))
             .unwrap_or_default();
+        let mut uplinks = Vec::new();
+        for channel in &exports {
+            let opened = with_message(&channel.type_name, OpenUplink(operator, channel, config));
+            uplinks.push(opened.ok_or_else(|| cannot_cross(channel))??);
+        }
+        let mut downlinks = Vec::new();
+        for channel in &imports {
+            let opened = with_message(&channel.type_name, OpenDownlink(operator, channel, instance));
+            downlinks.push(opened.ok_or_else(|| cannot_cross(channel))??);
+        }
         Ok(PeerConnection {
             protection: Arc::new(protection),
-            uplinks: exports.iter().map(open_uplink).collect::<anyhow::Result<_>>()?,
-            downlinks: imports.iter().map(open_downlink).collect::<anyhow::Result<_>>()?,
+            uplinks,
+            downlinks,
             peer: Peer::new(machine.into(), exports, imports, config.deadline_millis * 1_000_000, agreement),
             stall_logged: false,
             refusal_logged: None,
@@ -152,9 +151,7 @@ impl PeerConnection {
 
     /// Sends bytes as they are. Zenoh drops them if the connection cannot keep up; frames that matter are repeated.
     pub(super) fn put(&mut self, kind: KeyKind, frame: &[u8]) {
-        let Some(zenoh) = &self.zenoh else {
-            return;
-        };
+        let Some(zenoh) = &self.zenoh else { return };
         self.peer.bytes[0] += frame.len() as u64;
         if let Err(error) = zenoh.publishers[usize::from(kind == KeyKind::Data)].put(frame).wait() {
             tracing::debug!("not sent to machine '{}': {error}", self.peer.machine);
@@ -166,15 +163,11 @@ impl PeerConnection {
     /// # Errors
     /// A frame cannot be encoded.
     pub(super) fn send_samples(&mut self, channel: u16, instance: u64, bytes: &mut Vec<u8>) -> Result<(), WireError> {
-        let Some(uplink) = self.uplinks.get(usize::from(channel)) else {
-            return Ok(());
-        };
+        let Some(uplink) = self.uplinks.get(usize::from(channel)) else { return Ok(()) };
         let (kind, schema_id) = (uplink.channel.kind(), uplink.schema_id);
         loop {
             let sent_nanos = monotonic_nanos();
-            let Some(next) = self.uplinks[usize::from(channel)].outgoing.next(sent_nanos) else {
-                return Ok(());
-            };
+            let Some(next) = self.uplinks[usize::from(channel)].outgoing.next(sent_nanos) else { return Ok(()) };
             let frame = SampleFrame {
                 channel,
                 run: next.run,
@@ -227,9 +220,8 @@ impl PeerConnection {
 
     /// Why it counts as cut off although it is up.
     pub(super) fn stall_reason(&self) -> Option<String> {
-        let is_stalled = |uplink: &&Uplink| uplink.outgoing.is_stalled();
-        let ports: Vec<&str> =
-            self.uplinks.iter().filter(is_stalled).map(|uplink| uplink.channel.port.as_str()).collect();
+        let stalled = self.uplinks.iter().filter(|uplink| uplink.outgoing.is_stalled());
+        let ports: Vec<&str> = stalled.map(|uplink| uplink.channel.port.as_str()).collect();
         self.is_stalled().then(|| {
             format!(
                 "it is connected but answers no sample of {}: the graph goes on without it, and samples that find no \
@@ -275,7 +267,7 @@ impl Inbox {
         waker: Waker,
     ) -> anyhow::Result<Subscriber<()>> {
         let inbox = Arc::clone(self);
-        let callback = move |sample: zenoh::sample::Sample| {
+        let subscriber = session.declare_subscriber(key).callback(move |sample| {
             let mut frames = inbox.frames.lock().unwrap_or_else(PoisonError::into_inner);
             let n_bytes = sample.payload().len();
             if frames.len() >= MAX_INBOX || inbox.n_bytes.load(Ordering::Relaxed) + n_bytes > MAX_INBOX_BYTES {
@@ -289,22 +281,20 @@ impl Inbox {
             if is_first {
                 waker.wake();
             }
-        };
-        let subscriber = session.declare_subscriber(key).callback(callback).wait();
-        subscriber.map_err(|error| anyhow!("Zenoh: {error}")).context("cannot listen to another machine")
+        });
+        subscriber.wait().map_err(|error| anyhow!("Zenoh: {error}")).context("cannot listen to another machine")
     }
 
     /// Watches the liveliness token of the peer.
     fn watch(self: &Arc<Self>, session: &zenoh::Session, key: String, waker: Waker) -> anyhow::Result<Subscriber<()>> {
         let inbox = Arc::clone(self);
-        let callback = move |sample: zenoh::sample::Sample| {
+        let subscriber = session.liveliness().declare_subscriber(key).callback(move |sample| {
             if sample.kind() == SampleKind::Delete {
                 inbox.is_gone.store(true, Ordering::Release);
                 waker.wake();
             }
-        };
-        let subscriber = session.liveliness().declare_subscriber(key).callback(callback).wait();
-        subscriber.map_err(|error| anyhow!("Zenoh: {error}")).context("cannot watch another machine")
+        });
+        subscriber.wait().map_err(|error| anyhow!("Zenoh: {error}")).context("cannot watch another machine")
     }
 }
 

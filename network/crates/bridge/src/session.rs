@@ -80,18 +80,17 @@ pub fn open(config: &LinkConfig) -> Result<Session, SessionError> {
         certificates::check(keys, &machine, config.namespace.as_deref(), OffsetDateTime::now_utc())
             .map_err(|source| SessionError::Keys { machine: machine.clone(), source })?;
     }
-    let refused = |error: zenoh::Error| SessionError::Zenoh { machine: machine.clone(), message: error.to_string() };
-    let zenoh_config = zenoh_config(config, keys)
-        .map_err(|error| SessionError::Zenoh { machine: machine.clone(), message: error.to_string() })?;
-    let zenoh_config = Config::from_json5(&zenoh_config.to_string()).map_err(refused)?;
+    let refused = |message: String| SessionError::Zenoh { machine: machine.clone(), message };
+    let zenoh_config = zenoh_config(config, keys).map_err(|error| refused(error.to_string()))?;
+    let zenoh_config = Config::from_json5(&zenoh_config.to_string()).map_err(|error| refused(error.to_string()))?;
     zenoh::open(zenoh_config).wait().map_err(|error| open_error(config, &error.to_string()))
 }
 
 /// Warnings about a link that can be started: it has no TLS, or its certificate ends soon.
 pub fn warning(config: &LinkConfig) -> Option<String> {
     let mut warnings = Vec::new();
-    let is_open = |endpoint: &&str| matches!(Endpoint::parse(endpoint), Ok(Endpoint::Tcp { .. }));
-    let open: Vec<&str> = endpoints(config).filter(is_open).collect();
+    let open: Vec<&str> =
+        endpoints(config).filter(|it| matches!(Endpoint::parse(it), Ok(Endpoint::Tcp { .. }))).collect();
     // With keys, links sign and encrypt by themselves.
     if config.insecure && !open.is_empty() && config.keys.is_none() {
         warnings.push(format!(
@@ -158,15 +157,19 @@ fn checked(config: &LinkConfig) -> Result<Option<&KeyFiles>, SessionError> {
     }
 }
 
-/// The endpoint as Zenoh writes it.
+/// The endpoints as Zenoh writes them.
 ///
 /// # Errors
 /// The folder of sockets cannot be made, or is open to other users.
-fn of_zenoh(endpoint: &str) -> std::io::Result<String> {
-    match Endpoint::parse(endpoint) {
-        Ok(Endpoint::Unix { name }) => Ok(format!("unixsock-stream/{}", control_socket::link_path(&name)?.display())),
-        _ => Ok(endpoint.into()),
+fn of_zenoh(endpoints: &[String]) -> std::io::Result<Vec<String>> {
+    let mut written = Vec::new();
+    for endpoint in endpoints {
+        written.push(match Endpoint::parse(endpoint) {
+            Ok(Endpoint::Unix { name }) => format!("unixsock-stream/{}", control_socket::link_path(&name)?.display()),
+            _ => endpoint.clone(),
+        });
     }
+    Ok(written)
 }
 
 fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> std::io::Result<Value> {
@@ -176,7 +179,6 @@ fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> std::io::Result
     } else {
         ("peer", &config.endpoints.listen, &config.endpoints.connect)
     };
-    let of_zenoh = |endpoints: &[String]| endpoints.iter().map(|it| of_zenoh(it)).collect::<std::io::Result<Vec<_>>>();
     let (listen, connect) = (of_zenoh(listen)?, of_zenoh(connect)?);
     // -1 means for ever, in the background. A client (with a router) would not start before it is connected.
     let connect_millis = if by_router { i64::try_from(ROUTER_MILLIS).unwrap_or(0) } else { -1 };
@@ -216,21 +218,25 @@ fn zenoh_config(config: &LinkConfig, keys: Option<&KeyFiles>) -> std::io::Result
             "shared_memory": {"enabled": false},
         },
     });
-    if let Some(KeyFiles { authority, certificate, private_key }) = keys {
-        zenoh["transport"]["link"]["tls"] = json!({
-            "root_ca_certificate": authority,
-            "enable_mtls": true,
-            "listen_certificate": certificate,
-            "listen_private_key": private_key,
-            "connect_certificate": certificate,
-            "connect_private_key": private_key,
-            // Access control goes by the common name of a machine; its address does not matter.
-            "verify_name_on_connect": false,
-            "close_link_on_expiration": true,
-        });
+    if let Some(keys) = keys {
+        zenoh["transport"]["link"]["tls"] = tls_config(keys);
         zenoh["access_control"] = access::for_machine(config);
     }
     Ok(zenoh)
+}
+
+fn tls_config(KeyFiles { authority, certificate, private_key }: &KeyFiles) -> Value {
+    json!({
+        "root_ca_certificate": authority,
+        "enable_mtls": true,
+        "listen_certificate": certificate,
+        "listen_private_key": private_key,
+        "connect_certificate": certificate,
+        "connect_private_key": private_key,
+        // Access control goes by the common name of a machine; its address does not matter.
+        "verify_name_on_connect": false,
+        "close_link_on_expiration": true,
+    })
 }
 
 fn open_error(config: &LinkConfig, found: &str) -> SessionError {
@@ -260,9 +266,7 @@ fn open_error(config: &LinkConfig, found: &str) -> SessionError {
 fn key_warnings(keys: &KeyFiles, now: OffsetDateTime) -> Vec<String> {
     let mut warnings = Vec::new();
     for file in [&keys.certificate, &keys.authority] {
-        let Some(found) = certificates::read(file).ok().and_then(|found| soonest(found, now)) else {
-            continue;
-        };
+        let Some(found) = certificates::read(file).ok().and_then(|found| soonest(found, now)) else { continue };
         let kind = if found.is_authority { "the authority" } else { "the certificate" };
         warnings.push(format!(
             "{}: {kind} '{}' ends on {}: renew it (docs/security.md)",

@@ -108,9 +108,7 @@ impl Uplink {
             if !self.outgoing.wants_more(is_up, now_nanos) {
                 return Ok(false);
             }
-            let Some((header, message)) = self.reader.next(&self.channel.port)? else {
-                return Ok(false);
-            };
+            let Some((header, message)) = self.reader.next(&self.channel.port)? else { return Ok(false) };
             let key = sample_id(&header);
             if self.bears_source_number {
                 origins.remember(key, header.origin_nanos);
@@ -150,12 +148,8 @@ impl Uplink {
     /// Lets the writer go on as far as the other machine has answered, or samples are saved for it.
     pub(super) fn commit(&mut self) {
         self.save();
-        let Some(point) = self.outgoing.commit_point() else {
-            return;
-        };
-        let Some(idx) = self.uncommitted.iter().position(|(key, _)| *key == point) else {
-            return;
-        };
+        let Some(point) = self.outgoing.commit_point() else { return };
+        let Some(idx) = self.uncommitted.iter().position(|(key, _)| *key == point) else { return };
         // A reader that is restarted continues after this sample, with the counts of that time.
         if let Some((key, counts)) = self.uncommitted.drain(..=idx).next_back() {
             self.reader.commit_late(key, &counts);
@@ -180,9 +174,7 @@ impl Uplink {
 
 impl<M: Message> Reader for Subscriber<M> {
     fn next(&mut self, port: &str) -> anyhow::Result<Option<(Header, Vec<u8>)>> {
-        let Some(received) = self.receive()? else {
-            return Ok(None);
-        };
+        let Some(received) = self.receive()? else { return Ok(None) };
         let head = received.head();
         let header = *M::header(head);
         let mut message = Vec::new();

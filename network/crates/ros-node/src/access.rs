@@ -26,8 +26,7 @@ const ALL_KEYS: [&str; 3] = ["**", "**/@adv/**", ROS_TOKENS];
 pub(super) fn access_control(rights: &Rights, names: Option<&[String]>) -> Value {
     let Rights { takes, sends, answers } = rights;
     // What publishers keep for subscribers that come later, and the tokens of such publishers.
-    let beside = |keys: &[String]| keys.iter().map(|key| format!("{key}/@adv/**")).collect::<Vec<_>>();
-    let (taken, sent) = (beside(takes), beside(sends));
+    let [taken, sent] = [takes, sends].map(|keys| keys.iter().map(|key| format!("{key}/@adv/**")).collect::<Vec<_>>());
     let all_keys = ALL_KEYS.map(String::from).to_vec();
     let wanted: [(&str, &[&str], Vec<String>); 13] = [
         ("egress", &["declare_subscriber"], takes.clone()),

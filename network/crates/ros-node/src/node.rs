@@ -82,15 +82,15 @@ pub fn open(network: &Network, rights: &Rights) -> Result<Session, RosError> {
             "close_link_on_expiration": true,
         });
     }
-    let endpoints = || [network.connect.as_slice(), &network.listen].concat().join(", ");
     let refused = |error: zenoh::Error| {
+        let endpoints = [network.connect.as_slice(), &network.listen].concat().join(", ");
         let message = error.to_string();
         // Zenoh appends the place in its source code.
         let message = message.split(" at /").next().unwrap_or_default();
         if message.contains(NO_ANSWER) {
-            RosError::NoRouter { endpoints: endpoints(), with_keys: network.keys.is_some() }
+            RosError::NoRouter { endpoints, with_keys: network.keys.is_some() }
         } else {
-            RosError::Open { endpoints: endpoints(), message: message.into() }
+            RosError::Open { endpoints, message: message.into() }
         }
     };
     let config = Config::from_json5(&config.to_string()).map_err(refused)?;
@@ -104,12 +104,13 @@ pub fn open(network: &Network, rights: &Rights) -> Result<Session, RosError> {
 pub fn topic_name(namespace: &str, topic: &str) -> Result<String, RosError> {
     let full =
         if topic.starts_with('/') { topic.to_owned() } else { format!("{}/{topic}", namespace.trim_end_matches('/')) };
-    let is_word = |word: &str| {
-        word.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
-            && word.chars().all(|char| char.is_ascii_alphanumeric() || char == '_')
-    };
     let rest = full.strip_prefix('/').ok_or_else(|| RosError::Topic(topic.into()))?;
     if rest.split('/').all(is_word) { Ok(full) } else { Err(RosError::Topic(topic.into())) }
+}
+
+fn is_word(word: &str) -> bool {
+    word.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
+        && word.chars().all(|char| char.is_ascii_alphanumeric() || char == '_')
 }
 
 /// The program that speaks Zenoh for the nodes. It decides how the keys of topics are named.
@@ -273,13 +274,13 @@ impl RosNode {
     ) -> Result<(), RosError> {
         self.endpoint("SS", name, service, Quality::KeepLast(1))?;
         let key = format!("{}{name}/{}/{}", self.domain, dds_name(service)?, service.hash);
-        let call = move |query: zenoh::query::Query| match Request::of(&query) {
-            Some(request) => take(request),
-            // The caller learns it; an answer that does not reach it is lost with the call.
-            None => drop(query.reply_err("expected a request of a ROS 2 node, with its attachment").wait()),
-        };
-        let queryable = self.session.declare_queryable(key).complete(true).callback(call).wait().map_err(of_zenoh)?;
-        self.services.push(queryable);
+        let queryable =
+            self.session.declare_queryable(key).complete(true).callback(move |query| match Request::of(&query) {
+                Some(request) => take(request),
+                // The caller learns it; an answer that does not reach it is lost with the call.
+                None => drop(query.reply_err("expected a request of a ROS 2 node, with its attachment").wait()),
+            });
+        self.services.push(queryable.wait().map_err(of_zenoh)?);
         Ok(())
     }
 
@@ -298,10 +299,8 @@ impl RosNode {
         self.endpoint("MS", topic, message, quality)?;
         // Of a message of a bridge, the type is the one that is expected.
         let told = (self.convention == Convention::Ros2dds).then(|| message.clone());
-        let builder = self
-            .session
-            .declare_subscriber(self.convention.key(self.domain, topic))
-            .callback(move |sample| take(Received::of(&sample, told.as_ref())));
+        let builder = self.session.declare_subscriber(self.convention.key(self.domain, topic));
+        let builder = builder.callback(move |sample| take(Received::of(&sample, told.as_ref())));
         let subscriber: Box<dyn Send> = match quality {
             Quality::Sensor => Box::new(builder.wait().map_err(of_zenoh)?),
             Quality::KeepLast(n) => {
