@@ -104,6 +104,10 @@ struct Row {
 }
 
 impl Row {
+    fn stem(&self) -> String {
+        slashed(&self.file.with_extension(""))
+    }
+
     fn problem(&self, text: &str) -> String {
         if self.line == 0 { format!("{}: {text}", self.file.display()) } else { format!("line {}: {text}", self.line) }
     }
@@ -206,11 +210,6 @@ fn read_row(
     if !folder.join(&file).is_file() {
         return Err(format!("file: there is no file {} in the folder", file.display()));
     }
-    let positive = |column: &str, cell: Option<&str>| {
-        let Some(cell) = cell else { return Ok(None) };
-        let value = cell.parse().ok().filter(|value: &f64| value.is_finite() && *value > 0.0);
-        value.map(Some).ok_or_else(|| format!("{column}: expected a positive number, found {cell:?}"))
-    };
     let held_out = match split {
         _ if !has_split => None,
         Some(split) if split.eq_ignore_ascii_case("train") => Some(false),
@@ -229,6 +228,14 @@ fn read_row(
     })
 }
 
+fn positive(column: &str, cell: Option<&str>) -> Result<Option<f64>, String> {
+    let Some(cell) = cell else { return Ok(None) };
+    match cell.parse::<f64>() {
+        Ok(value) if value.is_finite() && value > 0.0 => Ok(Some(value)),
+        _ => Err(format!("{column}: expected a positive number, found {cell:?}")),
+    }
+}
+
 /// Fills in missing values, and checks names. `source` is the file or folder that errors name.
 fn entries(
     folder: &Path,
@@ -236,21 +243,20 @@ fn entries(
     rows: Vec<Row>,
     mut problems: Vec<String>,
 ) -> Result<Vec<MeshEntry>, FolderError> {
-    let stem = |row: &Row| slashed(&row.file.with_extension(""));
     // Two files that differ in nothing but the extension keep it.
     let mut n_by_stem: HashMap<String, usize> = HashMap::new();
     for row in rows.iter().filter(|row| row.name.is_none()) {
-        *n_by_stem.entry(stem(row)).or_default() += 1;
+        *n_by_stem.entry(row.stem()).or_default() += 1;
     }
     let mut first_by_name: HashMap<String, String> = HashMap::new();
     let mut n_by_class: BTreeMap<String, usize> = BTreeMap::new();
     let mut entries = Vec::new();
     for row in rows {
-        let derived = || {
-            let stem = stem(&row);
-            shortened(if n_by_stem.get(&stem).is_some_and(|n| *n > 1) { slashed(&row.file) } else { stem })
+        let name = match &row.name {
+            Some(name) => name.clone(),
+            None if n_by_stem[&row.stem()] > 1 => shortened(slashed(&row.file)),
+            None => shortened(row.stem()),
         };
-        let name = row.name.clone().unwrap_or_else(derived);
         let parent = row.file.parent().and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned());
         let class = row.class.clone().or(parent).unwrap_or_else(|| DEFAULT_CLASS.into());
         for (what, text) in [("name", &name), ("class", &class)] {

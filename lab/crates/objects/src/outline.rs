@@ -59,18 +59,13 @@ pub(super) fn closed_fillet(corners: &[[f64; 3]]) -> Vec<Point> {
 /// ends on x = 0 it does so at a right angle, so that turning it gives no tip.
 pub(super) fn spline(knots: &[Point]) -> Vec<Point> {
     const N_PER_SPAN: usize = 24;
-    let beyond = |end: Point, next: Point| {
-        if end[0].abs() < 1e-9 { [-next[0], next[1]] } else { [2.0 * end[0] - next[0], 2.0 * end[1] - next[1]] }
-    };
     let n = knots.len();
-    let at = |idx: isize| match idx {
-        -1 => beyond(knots[0], knots[1]),
-        idx if idx as usize == n => beyond(knots[n - 1], knots[n - 2]),
-        idx => knots[idx as usize],
-    };
     let mut points = vec![knots[0]];
-    for span in 0..n as isize - 1 {
-        let [p0, p1, p2, p3] = [span - 1, span, span + 1, span + 2].map(at);
+    let mut line = vec![beyond(knots[0], knots[1])];
+    line.extend(knots);
+    line.push(beyond(knots[n - 1], knots[n - 2]));
+    for span in line.windows(4) {
+        let [p0, p1, p2, p3] = [span[0], span[1], span[2], span[3]];
         for step in 1..=N_PER_SPAN {
             let t = step as f64 / N_PER_SPAN as f64;
             points.push(std::array::from_fn(|axis| {
@@ -83,6 +78,11 @@ pub(super) fn spline(knots: &[Point]) -> Vec<Point> {
         }
     }
     simplify(&points)
+}
+
+/// The knot that a line would have beyond its end.
+fn beyond(end: Point, next: Point) -> Point {
+    if end[0].abs() < 1e-9 { [-next[0], next[1]] } else { [2.0 * end[0] - next[0], 2.0 * end[1] - next[1]] }
 }
 
 /// Half of an ellipse around (0, centre) from its lowest to its highest point, on the side of positive x.
@@ -101,10 +101,14 @@ pub(super) fn superellipse([a, b]: [f64; 2], exponent: f64, n: usize) -> Vec<Poi
     (0..n)
         .map(|idx| {
             let (sin, cos) = (std::f64::consts::TAU * idx as f64 / n as f64).sin_cos();
-            let round = |value: f64| value.signum() * value.abs().powf(2.0 / exponent);
-            [a * round(cos), b * round(sin)]
+            [a * squared(cos, exponent), b * squared(sin, exponent)]
         })
         .collect()
+}
+
+/// A sine or cosine as a superellipse of that exponent has it.
+pub(super) fn squared(value: f64, exponent: f64) -> f64 {
+    value.signum() * value.abs().powf(2.0 / exponent)
 }
 
 /// An ellipse.
@@ -157,10 +161,6 @@ pub(super) fn subdivide(line: &[Point], step_mm: f64) -> Vec<Point> {
 /// Points of a line moved to its left by `by_mm`, corners kept sharp; `closed` tells whether the ends are neighbours.
 pub(super) fn offset(points: &[Point], by_mm: f64, closed: bool) -> Vec<Point> {
     let n = points.len();
-    let left = |from: Point, to: Point| {
-        let length = distance(from, to);
-        [(from[1] - to[1]) / length, (to[0] - from[0]) / length]
-    };
     (0..n)
         .map(|idx| {
             let before = if idx > 0 { Some(idx - 1) } else { closed.then_some(n - 1) };
@@ -172,6 +172,12 @@ pub(super) fn offset(points: &[Point], by_mm: f64, closed: bool) -> Vec<Point> {
             [points[idx][0] + (a[0] + b[0]) * stretch, points[idx][1] + (a[1] + b[1]) * stretch]
         })
         .collect()
+}
+
+/// The direction to the left of a line.
+fn left(from: Point, to: Point) -> Point {
+    let length = distance(from, to);
+    [(from[1] - to[1]) / length, (to[0] - from[0]) / length]
 }
 
 /// Points nearer than this to the one before are left out, so that no triangle is without area.
@@ -188,11 +194,10 @@ fn without_repeats(points: Vec<Point>) -> Vec<Point> {
 }
 
 fn arc_in_corner(before: Point, corner: Point, after: Point, radius_mm: f64, points: &mut Vec<Point>) {
-    let unit = |to: Point| {
+    let [a, b] = [before, after].map(|to| {
         let length = distance(corner, to);
         [(to[0] - corner[0]) / length, (to[1] - corner[1]) / length]
-    };
-    let (a, b) = (unit(before), unit(after));
+    });
     let turn_rad = std::f64::consts::PI - (a[0] * b[0] + a[1] * b[1]).clamp(-1.0, 1.0).acos();
     if turn_rad < 0.02 {
         points.push(corner);

@@ -114,8 +114,8 @@ impl PaperShape {
             }
             _ => properties.centre_of_mass_m,
         };
-        let from_centre = |corner: &Point3<f64>| (corner - properties.centre_of_mass_m).norm();
-        properties.max_radius_m = mesh.vertices_m.iter().map(from_centre).fold(0.0, f64::max);
+        let far_m = mesh.vertices_m.iter().map(|corner| (corner - properties.centre_of_mass_m).norm());
+        properties.max_radius_m = far_m.fold(0.0, f64::max);
         Object::from_mesh(name, self.name().into(), &mesh, &properties, mass_kg, true)
     }
 }
@@ -190,14 +190,13 @@ fn canteen() -> Assembly {
     ]);
     let n = ellipse([a, b]).len();
     // Oval below, squarish; a round neck.
-    let section = |[x, z]: Point| {
+    let mut body: Vec<(f64, Vec<Point>)> = Vec::new();
+    for [x, z] in crate::outline::subdivide(&line, 12.0) {
         let round = ((z - SHOULDER_MM + 20.0) / (NECK_MM - SHOULDER_MM + 20.0)).clamp(0.0, 1.0).powi(2);
         let depth = b / a * x * (1.0 - round) + x * round;
-        superellipse([x, depth], CANTEEN_EXPONENT + (2.0 - CANTEEN_EXPONENT) * round, n)
-    };
+        body.push((z, superellipse([x, depth], CANTEEN_EXPONENT + (2.0 - CANTEEN_EXPONENT) * round, n)));
+    }
     let mut made = Assembly::default();
-    let body: Vec<(f64, Vec<Point>)> =
-        crate::outline::subdivide(&line, 12.0).iter().map(|&point| (point[1], section(point))).collect();
     made.add(&Solid::stack(&body), PLASTIC_KG_PER_M3);
     let cap = fillet(&[[0.0, 178.0, 0.0], [19.0, 178.0, 0.5], [19.0, 200.0, 2.0], [0.0, 200.0, 0.0]]);
     made.add(&Solid::lathe(&cap), PLASTIC_KG_PER_M3);

@@ -274,10 +274,11 @@ impl Solid {
             }
             for a in 0..n_low {
                 let b = (a + 1) % n_low;
-                let at = |idx: u32| self.points_mm[idx as usize];
                 // The shorter diagonal, on a tie always the same one.
-                let rising = (at(low + a) - at(high + b)).norm();
-                let falling = (at(low + b) - at(high + a)).norm();
+                let [rising, falling] = [[low + a, high + b], [low + b, high + a]].map(|[from, to]| {
+                    let difference: Vector3<f64> = self.points_mm[from as usize] - self.points_mm[to as usize];
+                    difference.norm()
+                });
                 let quad = if rising <= falling + 1e-9 {
                     [[low + a, low + b, high + b], [low + a, high + b, high + a]]
                 } else {
@@ -310,11 +311,15 @@ impl Solid {
     }
 
     fn facing_outwards(mut self) -> Solid {
-        let corner = |idx: u32| self.points_mm[idx as usize].coords;
-        let six_volumes: f64 =
-            self.triangles.iter().map(|[a, b, c]| corner(*a).dot(&corner(*b).cross(&corner(*c)))).sum();
+        let mut six_volumes = 0.0;
+        for triangle in &self.triangles {
+            let [a, b, c] = triangle.map(|idx| self.points_mm[idx as usize].coords);
+            six_volumes += a.dot(&b.cross(&c));
+        }
         if six_volumes < 0.0 {
-            self.triangles.iter_mut().for_each(|triangle| triangle.swap(1, 2));
+            for triangle in &mut self.triangles {
+                triangle.swap(1, 2);
+            }
         }
         self
     }
@@ -377,28 +382,34 @@ fn inner_side(outer: &[Point], wall_mm: f64, floor_mm: f64) -> Vec<Point> {
     profile
 }
 
+fn cross(a: Point, b: Point, c: Point) -> f64 {
+    (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+}
+
+/// Twice the area over the longest side squared; none for a corner that is no ear.
+fn ear_quality(polygon: &[Point], left: &[usize], at: usize) -> Option<f64> {
+    let n = left.len();
+    let ids = [left[(at + n - 1) % n], left[at], left[(at + 1) % n]];
+    let [a, b, c] = ids.map(|idx| polygon[idx]);
+    let area = cross(a, b, c);
+    if area <= 1e-9 {
+        return None;
+    }
+    for idx in left.iter().filter(|idx| !ids.contains(idx)) {
+        let p = polygon[*idx];
+        if cross(a, b, p) >= 0.0 && cross(b, c, p) >= 0.0 && cross(c, a, p) >= 0.0 {
+            return None;
+        }
+    }
+    let longest = [(a, b), (b, c), (c, a)].map(|(p, q)| crate::outline::distance(p, q)).into_iter().fold(0.0, f64::max);
+    Some(area / (longest * longest))
+}
+
 /// Triangles over a polygon, counter-clockwise like it: clips ears, always the one with the widest smallest angle.
 fn triangulate(polygon: &[Point]) -> Vec<[u32; 3]> {
-    let cross = |a: Point, b: Point, c: Point| (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
     let mut left: Vec<usize> = (0..polygon.len()).collect();
     let mut triangles = Vec::new();
-    // Twice the area over the longest side squared; none for a corner that is no ear.
-    let quality = |left: &[usize], at: usize| -> Option<f64> {
-        let n = left.len();
-        let ids = [left[(at + n - 1) % n], left[at], left[(at + 1) % n]];
-        let [a, b, c] = ids.map(|idx| polygon[idx]);
-        let area = cross(a, b, c);
-        let longest =
-            [(a, b), (b, c), (c, a)].map(|(p, q)| crate::outline::distance(p, q)).into_iter().fold(0.0, f64::max);
-        let blocked = || {
-            left.iter().filter(|idx| !ids.contains(idx)).any(|idx| {
-                let p = polygon[*idx];
-                cross(a, b, p) >= 0.0 && cross(b, c, p) >= 0.0 && cross(c, a, p) >= 0.0
-            })
-        };
-        (area > 1e-9 && !blocked()).then(|| area / (longest * longest))
-    };
-    let mut qualities: Vec<Option<f64>> = (0..left.len()).map(|at| quality(&left, at)).collect();
+    let mut qualities: Vec<Option<f64>> = (0..left.len()).map(|at| ear_quality(polygon, &left, at)).collect();
     while left.len() > 3 {
         let best = (0..left.len())
             .filter_map(|at| qualities[at].map(|quality| (at, quality)))
@@ -410,7 +421,7 @@ fn triangulate(polygon: &[Point]) -> Vec<[u32; 3]> {
         qualities.remove(at);
         let n = left.len();
         for neighbour in [(at + n - 1) % n, at % n] {
-            qualities[neighbour] = quality(&left, neighbour);
+            qualities[neighbour] = ear_quality(polygon, &left, neighbour);
         }
     }
     if left.len() == 3 {

@@ -313,7 +313,7 @@ mod tests {
         let palm_from_links = mechanism.hand.palm_from_links(&exploration.posture(progress)).expect("7 joints");
         let object_pose = pose_from_isometry(&exploration.palm_from_object);
         let to_object = mechanism.shapes.iter().map(|shape| {
-            let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
+            let pose = shape.pose_in_palm(&palm_from_links);
             shape.closest_to_object(&pose, &object_pose, object, 10.0).expect("nearer than 10 m").distance_m
         });
         let between = mechanism.pairs.iter().map(|&(a, b)| {

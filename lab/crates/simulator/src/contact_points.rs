@@ -103,7 +103,10 @@ pub fn self_contacts(
         if closest.distance_m > touch_tolerance_m {
             continue;
         }
-        let mut push = |shape_idx: usize, other_idx: usize, point: Vector, outward: Vector| {
+        let [a, b] = found.shape_idxs;
+        for (shape_idx, other_idx, point, outward) in
+            [(a, b, closest.point_on_second, -closest.direction), (b, a, closest.point_on_first, closest.direction)]
+        {
             let [link_idx, other_link_idx] = [shape_idx, other_idx].map(|idx| mechanism.shapes[idx].link_idx);
             contacts.push(ContactPoint {
                 link_idx,
@@ -113,9 +116,7 @@ pub fn self_contacts(
                 object_normal_in_palm: UnitVector3::new_normalize(vector_from_parry(outward)),
                 distance_m: closest.distance_m,
             });
-        };
-        push(found.shape_idxs[0], found.shape_idxs[1], closest.point_on_second, -closest.direction);
-        push(found.shape_idxs[1], found.shape_idxs[0], closest.point_on_first, closest.direction);
+        }
     }
     contacts
 }
@@ -189,7 +190,6 @@ fn touching_points(
 
 /// The nearest point; or, if the points are spread, the points farthest from each other.
 fn separated(candidates: &[ContactPoint], options: &ContactOptions) -> Vec<ContactPoint> {
-    let far = |a: &ContactPoint, b: &ContactPoint| (a.point_in_palm_m - b.point_in_palm_m).norm();
     let Some(nearest) = candidates.iter().min_by(|a, b| a.distance_m.total_cmp(&b.distance_m)) else {
         return Vec::new();
     };
@@ -197,17 +197,22 @@ fn separated(candidates: &[ContactPoint], options: &ContactOptions) -> Vec<Conta
         candidates.iter().map(|point| point.point_in_palm_m.coords).sum::<Vector3<f64>>() / candidates.len() as f64;
     let from_middle = |point: &ContactPoint| (point.point_in_palm_m.coords - middle).norm();
     let is_spread =
-        options.contacts_per_link > 1 && candidates.iter().any(|point| far(point, nearest) > options.separation_m);
+        options.contacts_per_link > 1 && candidates.iter().any(|point| far_m(point, nearest) > options.separation_m);
     let outermost = candidates.iter().max_by(|a, b| from_middle(a).total_cmp(&from_middle(b))).unwrap_or(nearest);
     let mut chosen = vec![if is_spread { *outermost } else { *nearest }];
     while is_spread && chosen.len() < options.contacts_per_link {
-        let from_chosen = |point: &ContactPoint| chosen.iter().map(|other| far(point, other)).fold(f64::MAX, f64::min);
+        let from_chosen =
+            |point: &ContactPoint| chosen.iter().map(|other| far_m(point, other)).fold(f64::MAX, f64::min);
         match candidates.iter().max_by(|a, b| from_chosen(a).total_cmp(&from_chosen(b))) {
             Some(next) if from_chosen(next) > options.separation_m => chosen.push(*next),
             _ => break,
         }
     }
     chosen
+}
+
+fn far_m(a: &ContactPoint, b: &ContactPoint) -> f64 {
+    (a.point_in_palm_m - b.point_in_palm_m).norm()
 }
 
 fn point_from_parry(vector: Vector) -> Point3<f64> {

@@ -74,8 +74,12 @@ impl Plane {
 
 /// The planes of a hull's faces. Faces that are nearly parallel are one, whose plane is put at the outermost corner.
 fn faces(hull: &ConvexPolyhedron) -> Vec<Plane> {
-    let plane = |normal: Vector| Plane { normal, offset_m: normal.dot(hull.local_support_point(normal)) };
-    hull.faces().iter().map(|face| plane(face.normal)).collect()
+    let mut planes = Vec::new();
+    for face in hull.faces() {
+        let normal = face.normal;
+        planes.push(Plane { normal, offset_m: normal.dot(hull.local_support_point(normal)) });
+    }
+    planes
 }
 
 /// The points that are in a shape or near it.
@@ -89,9 +93,8 @@ pub(super) struct Within<'a> {
 
 impl Within<'_> {
     pub(super) fn contains(&self, point: Vector) -> bool {
-        let exact = || self.shape.distance_to_point_m(&self.pose, point) <= self.reach_m;
         if self.shape.faces.is_empty() {
-            return exact();
+            return self.reaches(point);
         }
         // The distance to a hull takes GJK, and the faces tell most points.
         let in_shape = self.pose.inverse_transform_point(point);
@@ -106,7 +109,11 @@ impl Within<'_> {
         if distance_m <= 0.0 || distance_m > self.reach_m {
             return distance_m <= 0.0;
         }
-        self.faces.iter().all(|face| face.distance_m(on_face) <= 1e-9) || exact()
+        self.faces.iter().all(|face| face.distance_m(on_face) <= 1e-9) || self.reaches(point)
+    }
+
+    fn reaches(&self, point: Vector) -> bool {
+        self.shape.distance_to_point_m(&self.pose, point) <= self.reach_m
     }
 }
 
@@ -132,6 +139,11 @@ impl<'a> PlacedShape<'a> {
             centre_in_link: shape.link_from_shape * Point3::new(sphere.center.x, sphere.center.y, sphere.center.z),
             radius_m: sphere.radius + shape.edge_radius_m,
         }
+    }
+
+    /// The pose of the core in the palm frame.
+    pub(super) fn pose_in_palm(&self, palm_from_links: &[Isometry3<f64>]) -> Pose {
+        pose_from_isometry(&(palm_from_links[self.link_idx] * self.link_from_shape))
     }
 
     /// Distance of the bounding spheres: the shape and the object are at least so far from each other.
@@ -161,29 +173,31 @@ impl<'a> PlacedShape<'a> {
         let shape_from_object = palm_from_shape.inv_mul(palm_from_object);
         // Where the surface curves away from the shape, the plane at the nearest part so far leaves out all others.
         let plane: Cell<Option<Plane>> = Cell::new(None);
-        let of_part = |part_idx: u32, best_m: f64| {
-            with_part(composite, part_idx, palm_from_object, |palm_from_part, part| {
-                if let Some(triangle) = part.as_triangle()
-                    && (plane.get().is_some_and(|plane| plane.triangle_bound_m(triangle) >= best_m)
-                        || self.triangle_bound_m(triangle, &shape_from_object) >= best_m)
-                {
-                    return None;
+        let (part_idx, closest) = composite.bvh().find_best(
+            within_m,
+            |node, best_m| {
+                let bound_m = self.node_bound_m(node, &shape_from_object);
+                if bound_m >= best_m {
+                    return bound_m;
                 }
-                let closest = self.closest_to_convex(palm_from_shape, palm_from_part, part, best_m)?;
-                if closest.distance_m < best_m {
-                    plane.set(self.plane(palm_from_shape, palm_from_object, closest.direction));
-                }
-                Some(closest)
-            })
-        };
-        let at_least_m = |node: &BvhNode, best_m: f64| {
-            let bound_m = self.node_bound_m(node, &shape_from_object);
-            if bound_m >= best_m {
-                return bound_m;
-            }
-            plane.get().map_or(bound_m, |plane| bound_m.max(plane.node_bound_m(node)))
-        };
-        let (part_idx, closest) = composite.bvh().find_best(within_m, at_least_m, of_part)?;
+                plane.get().map_or(bound_m, |plane| bound_m.max(plane.node_bound_m(node)))
+            },
+            |part_idx, best_m| {
+                with_part(composite, part_idx, palm_from_object, |palm_from_part, part| {
+                    if let Some(triangle) = part.as_triangle()
+                        && (plane.get().is_some_and(|plane| plane.triangle_bound_m(triangle) >= best_m)
+                            || self.triangle_bound_m(triangle, &shape_from_object) >= best_m)
+                    {
+                        return None;
+                    }
+                    let closest = self.closest_to_convex(palm_from_shape, palm_from_part, part, best_m)?;
+                    if closest.distance_m < best_m {
+                        plane.set(self.plane(palm_from_shape, palm_from_object, closest.direction));
+                    }
+                    Some(closest)
+                })
+            },
+        )?;
         // The distance is exact, the points that GJK names need not be: on a face, many are as near.
         let on_part = with_part(composite, part_idx, palm_from_object, |palm_from_part, part| {
             Some(part.project_point(palm_from_part, closest.point_on_second, false).point)
@@ -201,9 +215,12 @@ impl<'a> PlacedShape<'a> {
     ) -> f64 {
         let Some(mesh) = object.shape.as_trimesh() else { return f64::NEG_INFINITY };
         let shape_from_object = palm_from_shape.inv_mul(palm_from_object);
-        let at_least_m = |node: &BvhNode, _: f64| self.node_bound_m(node, &shape_from_object);
-        let of_triangle = |idx: u32, _: f64| Some(self.triangle_bound_m(&mesh.triangle(idx), &shape_from_object));
-        mesh.bvh().find_best(within_m, at_least_m, of_triangle).map_or(within_m, |(_, bound_m)| bound_m)
+        let least = mesh.bvh().find_best(
+            within_m,
+            |node, _| self.node_bound_m(node, &shape_from_object),
+            |idx, _| Some(self.triangle_bound_m(&mesh.triangle(idx), &shape_from_object)),
+        );
+        least.map_or(within_m, |(_, bound_m)| bound_m)
     }
 
     /// A bound below the distance to all that is in a node: its sphere against the core's box.
@@ -224,8 +241,8 @@ impl<'a> PlacedShape<'a> {
     /// A bound below the distance to a triangle: the largest of those along the axes of the core's box together, and
     /// along the triangle's normal.
     fn triangle_bound_m(&self, triangle: &Triangle, shape_from_object: &Pose) -> f64 {
-        let from_centre = |corner: Vector| shape_from_object.transform_point(corner) - self.box_centre;
-        let (a, b, c) = (from_centre(triangle.a), from_centre(triangle.b), from_centre(triangle.c));
+        let corners = [triangle.a, triangle.b, triangle.c];
+        let [a, b, c] = corners.map(|corner| shape_from_object.transform_point(corner) - self.box_centre);
         let (low, high) = (a.min(b).min(c), a.max(b).max(c));
         let along_axes_m = (low - self.box_half).max(-high - self.box_half).max(Vector::ZERO).length();
         let normal = (b - a).cross(c - a);
@@ -282,24 +299,27 @@ impl<'a> PlacedShape<'a> {
             if is_beside { f64::NEG_INFINITY } else { around.maxs.z - low.z }
         };
         // The tree is searched for the least cost: the cost is -z.
-        let node_cost = |node: &BvhNode, _: f64| {
-            let half_m = (node.maxs() - node.mins()).length() * 0.5;
-            let middle = at_zero.transform_point(node.center());
-            let half = Vector::new(half_m, half_m, half_m);
-            -at_most(middle, half_m).min(boxes_at_most(middle - half, middle + half))
-        };
-        let leaf_cost = |part_idx: u32, best_cost: f64| {
-            with_part(composite, part_idx, &at_zero, |palm_from_part, part| {
-                let bounds = part.compute_aabb(palm_from_part);
-                let half_m = bounds.half_extents().length();
-                let first_z = at_most(bounds.center(), half_m).min(boxes_at_most(bounds.mins, bounds.maxs));
-                if -first_z >= best_cost {
-                    return None;
-                }
-                Some(-of_convex(palm_from_part, part, first_z, -best_cost))
-            })
-        };
-        composite.bvh().find_best(-at_least_z, node_cost, leaf_cost).map_or(at_least_z, |(_, cost)| -cost)
+        let least = composite.bvh().find_best(
+            -at_least_z,
+            |node, _| {
+                let half_m = (node.maxs() - node.mins()).length() * 0.5;
+                let middle = at_zero.transform_point(node.center());
+                let half = Vector::new(half_m, half_m, half_m);
+                -at_most(middle, half_m).min(boxes_at_most(middle - half, middle + half))
+            },
+            |part_idx, best_cost| {
+                with_part(composite, part_idx, &at_zero, |palm_from_part, part| {
+                    let bounds = part.compute_aabb(palm_from_part);
+                    let half_m = bounds.half_extents().length();
+                    let first_z = at_most(bounds.center(), half_m).min(boxes_at_most(bounds.mins, bounds.maxs));
+                    if -first_z >= best_cost {
+                        return None;
+                    }
+                    Some(-of_convex(palm_from_part, part, first_z, -best_cost))
+                })
+            },
+        );
+        least.map_or(at_least_z, |(_, cost)| -cost)
     }
 
     /// [`PlacedShape::stop_z`] for one convex part, coming down from `first_z`; anything up to `at_least_z` if it is no more
@@ -366,8 +386,8 @@ impl<'a> PlacedShape<'a> {
     /// frame in which `pose` places the shape.
     pub(super) fn within(&self, pose: Pose, reach_m: f64, centre: Vector, radius_m: f64) -> Within<'_> {
         let centre = pose.inverse_transform_point(centre);
-        let is_near = |face: &&Plane| face.distance_m(centre) > -radius_m - reach_m;
-        Within { shape: self, pose, reach_m, faces: self.faces.iter().filter(is_near).copied().collect() }
+        let faces = self.faces.iter().filter(|face| face.distance_m(centre) > -radius_m - reach_m);
+        Within { shape: self, pose, reach_m, faces: faces.copied().collect() }
     }
 
     /// Curvature of the shape's surface where its outward normal is `normal`, both in the shape's frame: a symmetric

@@ -593,8 +593,8 @@ impl Surface {
         let normal = sum.map(|x| x / length);
         let offset = (of_visible * visible.offset + of_hidden * hidden.offset) / length;
         let limit = BLEND_TOLERANCE * self.tolerance;
-        let is_on = |vertex: &u32| (dot(&normal, &self.points[*vertex as usize]) - offset).abs() <= limit;
-        vertices.iter().all(is_on).then(|| Plane::new(normal, offset, BLENDED))
+        let mut off = vertices.iter().map(|vertex| (dot(&normal, &self.points[*vertex as usize]) - offset).abs());
+        off.all(|off| off <= limit).then(|| Plane::new(normal, offset, BLENDED))
     }
 
     /// The plane that a point is furthest outside of. A point outside of no plane is inside or on the hull.
@@ -933,10 +933,11 @@ type Block = [[f64; LANES]; DIM];
 
 /// The last block is filled up with its last point.
 fn blocks(points: &[[f64; DIM]]) -> Vec<Block> {
-    let block = |group: &[[f64; DIM]]| {
-        std::array::from_fn(|axis| std::array::from_fn(|lane| group[lane.min(group.len() - 1)][axis]))
-    };
-    points.chunks(LANES).map(block).collect()
+    let mut blocks = Vec::with_capacity(points.len().div_ceil(LANES));
+    for group in points.chunks(LANES) {
+        blocks.push(std::array::from_fn(|axis| std::array::from_fn(|lane| group[lane.min(group.len() - 1)][axis])));
+    }
+    blocks
 }
 
 /// The greatest n·x over points x.

@@ -6,7 +6,7 @@ use nalgebra::{Isometry3, Point3, Vector3};
 use parry3d_f64::math::Vector;
 
 use super::distance::{ClosestPoints, PlacedShape};
-use blindgrasp_stages::hand::{Hand, JointKind, Motion, pose_from_isometry};
+use blindgrasp_stages::hand::{Hand, JointKind, Motion};
 
 /// A joint that closes.
 #[derive(Debug, Clone)]
@@ -57,6 +57,26 @@ struct Mover {
 }
 
 impl Mover {
+    /// It is the same for the links that a joint moves together.
+    fn key(&self) -> (usize, usize) {
+        (self.closing_idx, self.moved_link_idx)
+    }
+
+    /// A bound on the speed of the points of its link, which lie within a radius of the link's origin.
+    fn top_speed(&self, hand: &Hand, joints: &[ClosingJoint], link_idx: usize, radius_m: f64) -> f64 {
+        let rate = (joints[self.closing_idx].rate * self.multiplier).abs();
+        if self.kind == JointKind::Prismatic {
+            return rate;
+        }
+        let mut reach_m = radius_m;
+        let mut idx = link_idx;
+        while idx != self.moved_link_idx {
+            reach_m += hand.links[idx].parent_from_joint.translation.vector.norm() + slide_m(hand, idx);
+            idx = hand.links[idx].parent_idx.unwrap_or(self.moved_link_idx);
+        }
+        rate * reach_m
+    }
+
     /// Velocity of a point of the mover's link in the palm frame, for a speed of the joint.
     fn velocity(&self, point: &Point3<f64>, speed: f64, palm_from_links: &[Isometry3<f64>]) -> Vector3<f64> {
         let palm_from_moved = &palm_from_links[self.moved_link_idx];
@@ -102,20 +122,7 @@ impl<'a> Mechanism<'a> {
                     .filter(|shape| shape.link_idx == link_idx)
                     .map(|shape| shape.centre_in_link.coords.norm() + shape.radius_m)
                     .fold(0.0, f64::max);
-                let speed_of = |mover: &Mover| {
-                    let rate = (joints[mover.closing_idx].rate * mover.multiplier).abs();
-                    if mover.kind == JointKind::Prismatic {
-                        return rate;
-                    }
-                    let mut reach_m = radius_m;
-                    let mut idx = link_idx;
-                    while idx != mover.moved_link_idx {
-                        reach_m += hand.links[idx].parent_from_joint.translation.vector.norm() + slide_m(hand, idx);
-                        idx = hand.links[idx].parent_idx.unwrap_or(mover.moved_link_idx);
-                    }
-                    rate * reach_m
-                };
-                movers[link_idx].iter().map(speed_of).sum()
+                movers[link_idx].iter().map(|mover| mover.top_speed(hand, &joints, link_idx, radius_m)).sum()
             })
             .collect();
         let fingers = joints.iter().map(|joint| fingers(hand, joint.joint_idx)).collect();
@@ -133,12 +140,8 @@ impl<'a> Mechanism<'a> {
     /// Stops every joint that moves `link_idx`, except the joints that move `except` as well.
     pub(super) fn stop(&self, joints: &mut [ClosingJoint], progress: f64, link_idx: usize, except: Option<usize>) {
         for mover in &self.movers[link_idx] {
-            let is_shared = |other: usize| {
-                self.movers[other].iter().any(|theirs| {
-                    theirs.closing_idx == mover.closing_idx && theirs.moved_link_idx == mover.moved_link_idx
-                })
-            };
-            if !except.is_some_and(is_shared) {
+            let theirs = except.map_or(&[][..], |other| &self.movers[other][..]);
+            if !theirs.iter().any(|theirs| theirs.key() == mover.key()) {
                 let joint = &mut joints[mover.closing_idx];
                 joint.end = joint.end.min(progress);
             }
@@ -176,21 +179,23 @@ impl<'a> Mechanism<'a> {
     pub(crate) fn opposed_joints(&self, palm_from_links: &[Isometry3<f64>]) -> Vec<(usize, usize)> {
         /// Cosine of the angle between axes that count as parallel, and opposite.
         const OPPOSED: f64 = -0.9;
-        let turn = |mover: &Mover| {
-            let joint = &self.joints[mover.closing_idx];
-            let axis = palm_from_links[mover.moved_link_idx].rotation * mover.axis;
-            (joint.joint_idx, axis * (joint.rate * mover.multiplier).signum())
-        };
-        let chains = self.movers.iter().map(|movers| {
-            let turns: Vec<_> = movers.iter().filter(|mover| mover.kind == JointKind::Revolute).map(turn).collect();
-            turns
-                .windows(2)
-                .filter(|pair| pair[0].1.dot(&pair[1].1) < OPPOSED && pair[0].0 != pair[1].0)
-                .map(|pair| (pair[0].0, pair[1].0))
-                .collect()
-        });
-        let chains: Vec<Vec<(usize, usize)>> = chains.collect();
-        chains.concat()
+        let mut opposed = Vec::new();
+        for movers in &self.movers {
+            let mut below: Option<(usize, Vector3<f64>)> = None;
+            for mover in movers.iter().filter(|mover| mover.kind == JointKind::Revolute) {
+                let joint = &self.joints[mover.closing_idx];
+                let axis = palm_from_links[mover.moved_link_idx].rotation * mover.axis;
+                let turn = axis * (joint.rate * mover.multiplier).signum();
+                if let Some((joint_idx, other)) = below
+                    && other.dot(&turn) < OPPOSED
+                    && joint_idx != joint.joint_idx
+                {
+                    opposed.push((joint_idx, joint.joint_idx));
+                }
+                below = Some((joint.joint_idx, turn));
+            }
+        }
+        opposed
     }
 
     /// Velocity of a link's point (palm frame) per speed of the value of a closing joint.
@@ -213,13 +218,9 @@ impl<'a> Mechanism<'a> {
         palm_from_links: &[Isometry3<f64>],
     ) -> Option<ClosestLinks> {
         let mut nearest: Option<ClosestLinks> = None;
-        let shapes_of = |link_idx: usize| {
-            let range = self.shapes_of_links[link_idx].clone();
-            range.clone().zip(&self.shapes[range])
-        };
-        for (idx_a, shape_a) in shapes_of(a) {
+        for (idx_a, shape_a) in self.shapes_of(a) {
             let centre_a = palm_from_links[a] * shape_a.centre_in_link;
-            for (idx_b, shape_b) in shapes_of(b) {
+            for (idx_b, shape_b) in self.shapes_of(b) {
                 let between = palm_from_links[b] * shape_b.centre_in_link - centre_a;
                 let apart_m = between.norm() - shape_a.radius_m - shape_b.radius_m;
                 if nearest.is_some_and(|nearest| nearest.points.distance_m <= apart_m) {
@@ -235,10 +236,8 @@ impl<'a> Mechanism<'a> {
                         direction,
                     })
                 } else {
-                    let pose = |shape: &PlacedShape<'_>| {
-                        pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape))
-                    };
-                    shape_a.closest_to_shape(&pose(shape_a), shape_b, &pose(shape_b))
+                    let [pose_a, pose_b] = [shape_a, shape_b].map(|shape| shape.pose_in_palm(palm_from_links));
+                    shape_a.closest_to_shape(&pose_a, shape_b, &pose_b)
                 };
                 if let Some(closest) = closest
                     && nearest.is_none_or(|nearest| closest.distance_m < nearest.points.distance_m)
@@ -250,11 +249,17 @@ impl<'a> Mechanism<'a> {
         nearest
     }
 
+    /// The shapes of a link, with their places among all.
+    fn shapes_of(&self, link_idx: usize) -> impl Iterator<Item = (usize, &PlacedShape<'a>)> {
+        let range = self.shapes_of_links[link_idx].clone();
+        range.clone().zip(&self.shapes[range])
+    }
+
     /// The pairs of links that must not touch and that closing can bring together.
     fn pairs(&self) -> Vec<(usize, usize)> {
-        let key = |mover: &Mover| (mover.closing_idx, mover.moved_link_idx);
-        let moves_against = |(a, b): (usize, usize)| self.movers[a].iter().map(key).ne(self.movers[b].iter().map(key));
-        self.hand.self_collision_pairs().iter().copied().filter(|pair| moves_against(*pair)).collect()
+        let mut pairs = self.hand.self_collision_pairs().to_vec();
+        pairs.retain(|(a, b)| self.movers[*a].iter().map(Mover::key).ne(self.movers[*b].iter().map(Mover::key)));
+        pairs
     }
 }
 
@@ -284,8 +289,8 @@ fn slide_m(hand: &Hand, link_idx: usize) -> f64 {
     match hand.links[link_idx].motion {
         Motion::Joint { joint_idx, kind: JointKind::Prismatic, multiplier, offset, .. } => {
             let joint = &hand.joints[joint_idx];
-            let far_m = |value: f64| (multiplier * value + offset).abs();
-            far_m(joint.lower).max(far_m(joint.upper))
+            let [lower_m, upper_m] = [joint.lower, joint.upper].map(|value| (multiplier * value + offset).abs());
+            lower_m.max(upper_m)
         }
         _ => 0.0,
     }

@@ -37,40 +37,37 @@ pub fn pad_grid(
     let inner = inner_direction(mechanism, link_idx).map_err(|error| error.to_string())?;
     let (along, across) = face_directions(hand, link_idx, &inner);
     let [row_range, column_range] = [along, across].map(|direction| extent(hand, link_idx, &direction));
-    let place = |[least, most]: [f64; 2], idx: usize, n: usize| {
-        let middle = (least + most) / 2.0;
-        let length = (most - least) * SHARE_OF_FACE;
-        middle + length * ((idx as f64 + 0.5) / n as f64 - 0.5)
-    };
-    let pitch_m = |[least, most]: [f64; 2], n: usize| (most - least) * SHARE_OF_FACE / n as f64;
-    let size_m = [pitch_m(row_range, n_rows), pitch_m(column_range, n_columns)].map(|pitch_m| pitch_m * SHARE_OF_PITCH);
+    let ranges = [(row_range, n_rows), (column_range, n_columns)];
+    let size_m = ranges.map(|([least, most], n)| (most - least) * SHARE_OF_FACE / n as f64 * SHARE_OF_PITCH);
     let [_, outermost_m] = extent(hand, link_idx, &inner);
     let surfaces: Vec<(Pose, SharedShape)> =
         link.shapes.iter().map(|shape| (pose_from_isometry(&shape.link_from_shape), shape.rounded())).collect();
-    let cells: Vec<Cell> = (0..n_rows * n_columns)
-        .filter_map(|idx| {
-            let (row, column) = (idx / n_columns, idx % n_columns);
-            let from = along.into_inner() * place(row_range, row, n_rows)
-                + across.into_inner() * place(column_range, column, n_columns)
-                + inner.into_inner() * (outermost_m + 0.01);
-            let (position_in_link_m, normal_in_link) = meet(&surfaces, &from, &inner)?;
-            let along = along.into_inner() - normal_in_link.into_inner() * normal_in_link.dot(&along);
-            let along_in_link = Unit::try_new(along, 1e-6)?;
-            (normal_in_link.dot(&inner) >= LEAST_FACING).then_some(Cell {
-                position_in_link_m,
-                normal_in_link,
-                along_in_link,
-                size_m,
-                noise_threshold_newtons,
-            })
-        })
-        .collect();
+    let mut cells: Vec<Cell> = Vec::new();
+    for idx in 0..n_rows * n_columns {
+        let (row, column) = (idx / n_columns, idx % n_columns);
+        let from = along.into_inner() * place(row_range, row, n_rows)
+            + across.into_inner() * place(column_range, column, n_columns)
+            + inner.into_inner() * (outermost_m + 0.01);
+        let Some((position_in_link_m, normal_in_link)) = meet(&surfaces, &from, &inner) else { continue };
+        let along = along.into_inner() - normal_in_link.into_inner() * normal_in_link.dot(&along);
+        let Some(along_in_link) = Unit::try_new(along, 1e-6) else { continue };
+        if normal_in_link.dot(&inner) >= LEAST_FACING {
+            cells.push(Cell { position_in_link_m, normal_in_link, along_in_link, size_m, noise_threshold_newtons });
+        }
+    }
     if cells.is_empty() {
         return Err(format!(
             "no cell of {n_rows} x {n_columns} lies on its shapes: give another size, or a table of cells with --cells"
         ));
     }
     Ok(cells)
+}
+
+/// The middle of a row or column among `n` of the face.
+fn place([least, most]: [f64; 2], idx: usize, n: usize) -> f64 {
+    let middle = (least + most) / 2.0;
+    let length = (most - least) * SHARE_OF_FACE;
+    middle + length * ((idx as f64 + 0.5) / n as f64 - 0.5)
 }
 
 /// The mean direction in the link's frame in which its middle moves until the hand is half closed, along the nearest axis of

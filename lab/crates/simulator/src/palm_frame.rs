@@ -12,7 +12,7 @@ use crate::mechanism::Mechanism;
 use crate::pad_grid::extent;
 use crate::protocol::{ProtocolOptions, Start};
 use blindgrasp_objects::Object;
-use blindgrasp_stages::hand::{Cell, Hand, JointError, Pad, pose_from_isometry};
+use blindgrasp_stages::hand::{Hand, JointError, pose_from_isometry};
 
 /// Radii of the balls, metres: those of a golf ball and of an apple.
 const BALL_RADII_M: [f64; 2] = [0.02, 0.035];
@@ -162,16 +162,20 @@ impl Trial {
 
 /// For each pad, how well it lies on the ball: 1 where a cell touches it and faces its centre, 0 where none is near or faces it.
 fn felt(hand: &Hand, palm_from_links: &[Isometry3<f64>], centre: &Point3<f64>, radius_m: f64) -> Vec<f64> {
-    let of_pad = |pad: &Pad| {
-        let of_cell = |cell: &Cell| {
-            let to_centre = centre - palm_from_links[pad.link_idx] * cell.position_in_link_m;
-            let normal = palm_from_links[pad.link_idx].rotation * cell.normal_in_link;
+    let mut felt = Vec::with_capacity(hand.pads.len());
+    for pad in &hand.pads {
+        let palm_from_link = &palm_from_links[pad.link_idx];
+        let mut most: f64 = 0.0;
+        for cell in &pad.cells {
+            let to_centre = centre - palm_from_link * cell.position_in_link_m;
+            let normal = palm_from_link.rotation * cell.normal_in_link;
             let off_m = (to_centre.norm() - radius_m).abs();
-            (1.0 - off_m / NEAR_M).max(0.0) * (normal.dot(&to_centre) / to_centre.norm()).max(0.0)
-        };
-        pad.cells.iter().map(of_cell).fold(0.0, f64::max)
-    };
-    hand.pads.iter().map(of_pad).collect()
+            let facing = (normal.dot(&to_centre) / to_centre.norm()).max(0.0);
+            most = most.max((1.0 - off_m / NEAR_M).max(0.0) * facing);
+        }
+        felt.push(most);
+    }
+    felt
 }
 
 /// 1 if the links that touch an object press on it from all sides, 0 if from one side only.
@@ -184,7 +188,7 @@ fn balance(
     let object_pose = pose_from_isometry(palm_from_object);
     let (mut sum, mut n) = (Vector3::zeros(), 0.0);
     for shape in &mechanism.shapes {
-        let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
+        let pose = shape.pose_in_palm(palm_from_links);
         if let Some(closest) = shape.closest_to_object(&pose, &object_pose, object, TOUCHES_M) {
             sum += Vector3::new(closest.direction.x, closest.direction.y, closest.direction.z);
             n += 1.0;
@@ -242,7 +246,9 @@ pub fn odd_joints(hand: &Hand) -> Result<OddJoints, JointError> {
     let mechanism = Mechanism::new(hand);
     let palm_from_links = hand.palm_from_links(&hand.open_joints_rad())?;
     let opposed = mechanism.opposed_joints(&palm_from_links);
-    let is_sideways = |joint_idx: usize| {
+    let mut odd = OddJoints { sideways: Vec::new(), opposed: Vec::new() };
+    let mut others = Vec::new();
+    for joint_idx in 0..hand.joints.len() {
         let (mut towards, mut all) = (0.0, 0.0);
         for pad in &hand.pads {
             let palm_from_link = &palm_from_links[pad.link_idx];
@@ -253,12 +259,15 @@ pub fn odd_joints(hand: &Hand) -> Result<OddJoints, JointError> {
             towards += velocity.dot(&normal).abs();
             all += velocity.norm();
         }
-        all > 1e-9 && towards < LEAST_TOWARDS * all
-    };
-    let (sideways, others): (Vec<usize>, Vec<usize>) = (0..hand.joints.len()).partition(|idx| is_sideways(*idx));
-    let is_opposed = |idx: &usize| opposed.iter().any(|(below, above)| below == idx && !sideways.contains(above));
-    let opposed = others.into_iter().filter(is_opposed).collect();
-    Ok(OddJoints { sideways, opposed })
+        let is_sideways = all > 1e-9 && towards < LEAST_TOWARDS * all;
+        if is_sideways { odd.sideways.push(joint_idx) } else { others.push(joint_idx) }
+    }
+    for joint_idx in others {
+        if opposed.iter().any(|(below, above)| *below == joint_idx && !odd.sideways.contains(above)) {
+            odd.opposed.push(joint_idx);
+        }
+    }
+    Ok(odd)
 }
 
 /// The value of a joint that is set before the grasp with which the hand closes best on a ball: 0 of a joint that goes about as

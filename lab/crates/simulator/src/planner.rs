@@ -150,18 +150,19 @@ pub(crate) fn energy(
 ) -> Result<f64, JointError> {
     let palm_from_links = hand.palm_from_links(&exploration.posture(exploration.end))?;
     let object_pose = pose_from_isometry(&exploration.palm_from_object);
-    let of_pad = |pad: &blindgrasp_stages::hand::Pad| {
+    let mut sum = 0.0;
+    for pad in &hand.pads {
         let palm_from_link: &Isometry3<f64> = &palm_from_links[pad.link_idx];
         let middle = pad.middle_in_link_m();
         let far = |cell: &blindgrasp_stages::hand::Cell| (cell.position_in_link_m - middle).norm();
-        let Some(cell) = pad.cells.iter().min_by(|a, b| far(a).total_cmp(&far(b))) else { return 0.0 };
+        let Some(cell) = pad.cells.iter().min_by(|a, b| far(a).total_cmp(&far(b))) else { continue };
         let point = palm_from_link * cell.position_in_link_m;
         let normal = palm_from_link.rotation * cell.normal_in_link;
         let nearest = object.shape.project_point(&object_pose, Vector::new(point.x, point.y, point.z), false).point;
         let to_object = Vector3::new(nearest.x, nearest.y, nearest.z) - point.coords;
         let distance_m = to_object.norm();
         let misalignment = 1.0 - if distance_m > 1e-6 { normal.dot(&to_object) / distance_m } else { 1.0 };
-        (distance_m / options.distance_scale_m).min(1.0) + misalignment
-    };
-    Ok(hand.pads.iter().map(of_pad).sum::<f64>() / hand.pads.len() as f64)
+        sum += (distance_m / options.distance_scale_m).min(1.0) + misalignment;
+    }
+    Ok(sum / hand.pads.len() as f64)
 }

@@ -15,6 +15,7 @@
 //! with its back closes. The reference link must not be moved by a closing joint.
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use parry3d_f64::math::{Pose, Vector};
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
@@ -227,34 +228,57 @@ impl Mechanism<'_> {
             if fingers.len() < 2 || joints[closing_idx].end >= self.joints[closing_idx].end {
                 continue;
             }
-            // Of each finger: its distance, and the direction in which its nearest point moves.
-            let closest = fingers.iter().filter_map(|links| {
-                let shapes = self.shapes.iter().filter(|shape| links.contains(&shape.link_idx));
-                let (link_idx, closest) = shapes
-                    .filter_map(|shape| {
-                        let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
-                        let closest = shape.closest_to_object(&pose, &object_pose, object, FARTHEST_PUSH_M)?;
-                        Some((shape.link_idx, closest))
-                    })
-                    .min_by(|(_, a), (_, b)| a.distance_m.total_cmp(&b.distance_m))?;
-                let velocity = self.velocity(link_idx, closest.point_on_first, &palm_from_links, &self.joints, 0.0);
-                let direction = Vector3::new(velocity.x, velocity.y, velocity.z).try_normalize(1e-12)?;
-                Some((closest.distance_m, direction))
-            });
-            let (touching, apart): (Vec<_>, Vec<_>) =
-                closest.partition(|(distance_m, _)| *distance_m <= options.touch_tolerance_m);
-            let mean = touching.iter().map(|(_, direction)| direction).sum::<Vector3<f64>>();
+            let (mut touching, mut apart) = (Vec::new(), Vec::new());
+            for links in fingers {
+                let Some((distance_m, direction)) = self.finger_motion(links, object, &object_pose, &palm_from_links)
+                else {
+                    continue;
+                };
+                if distance_m <= options.touch_tolerance_m {
+                    touching.push(direction);
+                } else {
+                    apart.push((distance_m, direction));
+                }
+            }
+            let mean = touching.iter().sum::<Vector3<f64>>();
             let Some(mean) = mean.try_normalize(1e-9) else { continue };
-            if touching.iter().any(|(_, direction)| direction.dot(&mean) <= 0.0) {
+            if touching.iter().any(|direction| direction.dot(&mean) <= 0.0) {
                 continue;
             }
-            let against = apart.iter().filter(|(_, direction)| direction.dot(&mean) < 0.0);
-            let nearest_m = against.map(|(distance_m, _)| *distance_m).fold(f64::INFINITY, f64::min);
+            let mut nearest_m = f64::INFINITY;
+            for (distance_m, direction) in apart {
+                if direction.dot(&mean) < 0.0 {
+                    nearest_m = nearest_m.min(distance_m);
+                }
+            }
             if nearest_m.is_finite() {
                 return Ok(Some(mean * (nearest_m / 2.0)));
             }
         }
         Ok(None)
+    }
+
+    /// The distance of a finger from the object, and the direction in which its nearest point moves.
+    fn finger_motion(
+        &self,
+        links: &[usize],
+        object: &Object,
+        object_pose: &Pose,
+        palm_from_links: &[Isometry3<f64>],
+    ) -> Option<(f64, Vector3<f64>)> {
+        let mut nearest: Option<(usize, ClosestPoints)> = None;
+        for shape in self.shapes.iter().filter(|shape| links.contains(&shape.link_idx)) {
+            let pose = shape.pose_in_palm(palm_from_links);
+            if let Some(closest) = shape.closest_to_object(&pose, object_pose, object, FARTHEST_PUSH_M)
+                && nearest.as_ref().is_none_or(|(_, best)| closest.distance_m.total_cmp(&best.distance_m).is_lt())
+            {
+                nearest = Some((shape.link_idx, closest));
+            }
+        }
+        let (link_idx, closest) = nearest?;
+        let velocity = self.velocity(link_idx, closest.point_on_first, palm_from_links, &self.joints, 0.0);
+        let direction = Vector3::new(velocity.x, velocity.y, velocity.z).try_normalize(1e-12)?;
+        Some((closest.distance_m, direction))
     }
 
     /// Whether no link of the hand is in the object.
@@ -267,7 +291,7 @@ impl Mechanism<'_> {
         let palm_from_links = self.hand.palm_from_links(posture)?;
         let object_pose = pose_from_isometry(palm_from_object);
         Ok(self.shapes.iter().all(|shape| {
-            let pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
+            let pose = shape.pose_in_palm(&palm_from_links);
             shape.closest_to_object(&pose, &object_pose, object, EXACT_M).is_none_or(|closest| closest.distance_m > 0.0)
         }))
     }
@@ -287,17 +311,18 @@ impl Mechanism<'_> {
             Isometry3::from_parts(centre.into(), rotation)
         };
         let at_zero = at(0.0);
-        let bound_of = |shape: &PlacedShape<'_>| {
-            shape.spheres_stop_z(&palm_from_links[shape.link_idx], &at_zero, object, stop_m(options))
-        };
         // The shapes that may touch first come first, and spare most of the others the search.
-        let mut shapes: Vec<(f64, &PlacedShape<'_>)> =
-            self.shapes.iter().map(|shape| (bound_of(shape), shape)).collect();
+        let mut shapes: Vec<(f64, &PlacedShape<'_>)> = Vec::with_capacity(self.shapes.len());
+        for shape in &self.shapes {
+            let palm_from_link = &palm_from_links[shape.link_idx];
+            shapes.push((shape.spheres_stop_z(palm_from_link, &at_zero, object, stop_m(options)), shape));
+        }
         shapes.sort_by(|(a, _), (b, _)| b.total_cmp(a));
-        let stop_z = shapes.iter().fold(f64::NEG_INFINITY, |z, (_, shape)| {
-            shape.stop_z(&palm_from_links[shape.link_idx], &at_zero, object, stop_m(options), z)
-        });
-        Ok(stop_z.is_finite().then(|| at(stop_z)))
+        let mut stop_z = f64::NEG_INFINITY;
+        for (_, shape) in shapes {
+            stop_z = shape.stop_z(&palm_from_links[shape.link_idx], &at_zero, object, stop_m(options), stop_z);
+        }
+        Ok(if stop_z.is_finite() { Some(at(stop_z)) } else { None })
     }
 
     /// Closes by conservative advancement: a distance and a bound of the speed give a progress before which the distance cannot be
@@ -309,86 +334,111 @@ impl Mechanism<'_> {
         open_joints_rad: &[f64],
         options: &ProtocolOptions,
     ) -> Result<Vec<ClosingJoint>, JointError> {
-        let mut joints = self.joints.clone();
-        let object_pose = pose_from_isometry(palm_from_object);
-        let stop_m = stop_m(options);
+        let mut closing = Closing {
+            mechanism: self,
+            object,
+            palm_from_object,
+            object_pose: pose_from_isometry(palm_from_object),
+            options,
+            joints: self.joints.clone(),
+            progress: 0.0,
+            palm_from_links: Vec::new(),
+        };
         let mut shape_due = vec![0.0; self.shapes.len()];
         let mut pair_due = vec![0.0; self.pairs.len()];
-        let mut progress = 0.0;
         loop {
-            let palm_from_links = self.hand.palm_from_links(&posture(open_joints_rad, &joints, progress))?;
+            let progress = closing.progress;
+            closing.palm_from_links =
+                self.hand.palm_from_links(&posture(open_joints_rad, &closing.joints, progress))?;
             for (shape, due) in self.shapes.iter().zip(&mut shape_due) {
-                if *due > progress {
-                    continue;
-                }
-                let speed = self.top_speed[shape.link_idx];
-                if !self.is_moving(shape.link_idx, &joints, progress) {
-                    *due = f64::INFINITY;
-                    continue;
-                }
-                let palm_from_link = &palm_from_links[shape.link_idx];
-                let apart_m = shape.sphere_distance_m(palm_from_link, palm_from_object, object);
-                if apart_m > 0.01 {
-                    *due = progress + (apart_m - stop_m) / speed;
-                    continue;
-                }
-                let shape_pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
-                let bound_m = shape.bound_m(&shape_pose, &object_pose, object, CHEAP_M);
-                if bound_m > EXACT_M {
-                    *due = progress + (bound_m - stop_m) / speed;
-                    continue;
-                }
-                let Some(closest) = shape.closest_to_object(&shape_pose, &object_pose, object, CHEAP_M) else {
-                    *due = progress + (CHEAP_M - stop_m) / speed;
-                    continue;
-                };
-                if closest.distance_m > stop_m {
-                    *due = progress + (closest.distance_m - 0.8 * stop_m) / speed;
-                } else if self
-                    .velocity(shape.link_idx, closest.point_on_first, &palm_from_links, &joints, progress)
-                    .dot(closest.direction)
-                    > 0.0
-                {
-                    self.stop(&mut joints, progress, shape.link_idx, None);
-                    *due = f64::INFINITY;
-                } else {
-                    *due = progress + LEAVING_STEP;
+                if *due <= progress {
+                    *due = closing.look_at_shape(shape);
                 }
             }
             for (&(a, b), due) in self.pairs.iter().zip(&mut pair_due) {
-                if *due > progress {
-                    continue;
-                }
-                if !self.is_moving(a, &joints, progress) && !self.is_moving(b, &joints, progress) {
-                    *due = f64::INFINITY;
-                    continue;
-                }
-                let speed = self.top_speed[a] + self.top_speed[b];
-                let Some(ClosestLinks { points: closest, .. }) = self.closest_of_links(a, b, &palm_from_links) else {
-                    *due = progress + LEAST_STEP;
-                    continue;
-                };
-                let nearing = |closest: &ClosestPoints| {
-                    let of = |idx, point| self.velocity(idx, point, &palm_from_links, &joints, progress);
-                    (of(a, closest.point_on_first) - of(b, closest.point_on_second)).dot(closest.direction) > 0.0
-                };
-                if closest.distance_m > options.clearance_m {
-                    *due = progress + (closest.distance_m - 0.98 * options.clearance_m) / speed;
-                } else if nearing(&closest) {
-                    self.stop(&mut joints, progress, a, Some(b));
-                    self.stop(&mut joints, progress, b, Some(a));
-                    *due = progress + LEAVING_STEP;
-                } else {
-                    *due = progress + LEAVING_STEP;
+                if *due <= progress {
+                    *due = closing.look_at_pair(a, b);
                 }
             }
-            let end = joints.iter().map(|joint| joint.end).fold(0.0, f64::max);
+            let end = closing.joints.iter().map(|joint| joint.end).fold(0.0, f64::max);
             if progress >= end {
-                return Ok(joints);
+                return Ok(closing.joints);
             }
             let next = shape_due.iter().chain(&pair_due).copied().fold(end, f64::min);
-            progress = next.max(progress + LEAST_STEP).min(end);
+            closing.progress = next.max(progress + LEAST_STEP).min(end);
         }
+    }
+}
+
+/// A hand that closes around an object.
+struct Closing<'a> {
+    mechanism: &'a Mechanism<'a>,
+    object: &'a Object,
+    palm_from_object: &'a Isometry3<f64>,
+    object_pose: Pose,
+    options: &'a ProtocolOptions,
+    joints: Vec<ClosingJoint>,
+    progress: f64,
+    /// At this progress.
+    palm_from_links: Vec<Isometry3<f64>>,
+}
+
+impl Closing<'_> {
+    /// Stops a link whose shape touches the object. Returns the progress at which the shape is looked at again.
+    fn look_at_shape(&mut self, shape: &PlacedShape<'_>) -> f64 {
+        let Closing { mechanism, object, progress, .. } = *self;
+        let link_idx = shape.link_idx;
+        if !mechanism.is_moving(link_idx, &self.joints, progress) {
+            return f64::INFINITY;
+        }
+        let (stop_m, speed) = (stop_m(self.options), mechanism.top_speed[link_idx]);
+        let palm_from_link = &self.palm_from_links[link_idx];
+        let apart_m = shape.sphere_distance_m(palm_from_link, self.palm_from_object, object);
+        if apart_m > 0.01 {
+            return progress + (apart_m - stop_m) / speed;
+        }
+        let shape_pose = pose_from_isometry(&(palm_from_link * shape.link_from_shape));
+        let bound_m = shape.bound_m(&shape_pose, &self.object_pose, object, CHEAP_M);
+        if bound_m > EXACT_M {
+            return progress + (bound_m - stop_m) / speed;
+        }
+        let Some(closest) = shape.closest_to_object(&shape_pose, &self.object_pose, object, CHEAP_M) else {
+            return progress + (CHEAP_M - stop_m) / speed;
+        };
+        if closest.distance_m > stop_m {
+            return progress + (closest.distance_m - 0.8 * stop_m) / speed;
+        }
+        if self.velocity(link_idx, closest.point_on_first).dot(closest.direction) > 0.0 {
+            mechanism.stop(&mut self.joints, progress, link_idx, None);
+            return f64::INFINITY;
+        }
+        progress + LEAVING_STEP
+    }
+
+    /// Stops two links that come too near to each other. Returns the progress at which they are looked at again.
+    fn look_at_pair(&mut self, a: usize, b: usize) -> f64 {
+        let Closing { mechanism, progress, .. } = *self;
+        if !mechanism.is_moving(a, &self.joints, progress) && !mechanism.is_moving(b, &self.joints, progress) {
+            return f64::INFINITY;
+        }
+        let Some(ClosestLinks { points: closest, .. }) = mechanism.closest_of_links(a, b, &self.palm_from_links) else {
+            return progress + LEAST_STEP;
+        };
+        let clearance_m = self.options.clearance_m;
+        if closest.distance_m > clearance_m {
+            let speed = mechanism.top_speed[a] + mechanism.top_speed[b];
+            return progress + (closest.distance_m - 0.98 * clearance_m) / speed;
+        }
+        let nearing = self.velocity(a, closest.point_on_first) - self.velocity(b, closest.point_on_second);
+        if nearing.dot(closest.direction) > 0.0 {
+            mechanism.stop(&mut self.joints, progress, a, Some(b));
+            mechanism.stop(&mut self.joints, progress, b, Some(a));
+        }
+        progress + LEAVING_STEP
+    }
+
+    fn velocity(&self, link_idx: usize, point: Vector) -> Vector {
+        self.mechanism.velocity(link_idx, point, &self.palm_from_links, &self.joints, self.progress)
     }
 }
 

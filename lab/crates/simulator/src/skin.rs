@@ -52,8 +52,8 @@ impl SkinOptions {
             return None;
         }
         let [is_bell, width, kept] = [(); 3].map(|()| rng.random::<f64>());
-        let between = |[low, high]: [f64; 2], part: f64| low + (high - low) * part;
-        let bell = Bell { sigma_m: between(self.bell_m.map(f64::ln), width).exp(), kept: between(self.kept, kept) };
+        let ([low_m, high_m], [least, most]) = (self.bell_m.map(f64::ln), self.kept);
+        let bell = Bell { sigma_m: (low_m + (high_m - low_m) * width).exp(), kept: least + (most - least) * kept };
         (is_bell < self.bell_share).then_some(bell)
     }
 }
@@ -82,6 +82,12 @@ const CELL_DEPTH_M: f64 = 0.006;
 /// pad they feel little.
 const MOST_GAIN: f64 = 3.0;
 
+/// The part of a logistic bell in a strip that is `x_m` beside it.
+fn part_within(x_m: f64, width_m: f64, scale_m: f64) -> f64 {
+    let [to, from] = [x_m + width_m / 2.0, x_m - width_m / 2.0].map(|x_m| 1.0 / (1.0 + (-x_m / scale_m).exp()));
+    to - from
+}
+
 impl Bell {
     /// The forces on the cells of a hand, newtons.
     pub(crate) fn cells_newtons(
@@ -98,8 +104,6 @@ impl Bell {
             let direction = palm_from_link.rotation.inverse() * direction.into_inner();
             // Of a logistic bell: its standard deviation is π/√3 times its scale.
             let scale_m = self.sigma_m * newtons.powf(0.25) * 3.0_f64.sqrt() / std::f64::consts::PI;
-            let below = |x: f64| 1.0 / (1.0 + (-x / scale_m).exp());
-            let within = |x: f64, width_m: f64| below(x + width_m / 2.0) - below(x - width_m / 2.0);
             felt.clear();
             let mut on_cells = 0.0;
             for pad in hand.pads.iter().filter(|pad| pad.link_idx == link_idx) {
@@ -110,14 +114,16 @@ impl Bell {
                     if along_normal <= 0.0 || from_cell.dot(&cell.normal_in_link).abs() > CELL_DEPTH_M {
                         continue;
                     }
-                    let part = within(from_cell.dot(&cell.along_in_link), cell.size_m[0])
-                        * within(from_cell.dot(&across), cell.size_m[1]);
+                    let part = part_within(from_cell.dot(&cell.along_in_link), cell.size_m[0], scale_m)
+                        * part_within(from_cell.dot(&across), cell.size_m[1], scale_m);
                     on_cells += part;
                     felt.push((pad.first_cell_idx + cell_idx, part * along_normal));
                 }
             }
             let gain = 1.0 - self.kept + self.kept * (1.0 / on_cells).min(MOST_GAIN);
-            felt.iter().for_each(|(idx, part)| cells_newtons[*idx] += newtons * gain * part);
+            for (idx, part) in &felt {
+                cells_newtons[*idx] += newtons * gain * part;
+            }
         }
         cells_newtons
     }

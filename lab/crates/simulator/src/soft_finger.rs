@@ -20,7 +20,7 @@ use parry3d_f64::query::Ray;
 use parry3d_f64::shape::Shape;
 use serde::{Deserialize, Serialize};
 
-use super::distance::PlacedShape;
+use super::distance::{PlacedShape, Within};
 use super::mechanism::Mechanism;
 use super::option_check::{OptionError, positive, require};
 use blindgrasp_stages::hand::{Cell, Hand, Pad, pose_from_isometry};
@@ -103,6 +103,10 @@ impl ContactFrame {
     }
 }
 
+fn semi_axis_m(indentation_m: f64, radius_m: f64) -> f64 {
+    (2.0 * indentation_m * radius_m).sqrt()
+}
+
 /// The patch of a load on a relative curvature (1/m, in the basis of the tangents), on a link of that half width.
 pub fn patch(
     relative_curvature: &Matrix2<f64>,
@@ -111,14 +115,13 @@ pub fn patch(
     options: &SoftFingerOptions,
 ) -> Patch {
     let eigen = SymmetricEigen::new(*relative_curvature);
-    let radius_m = |curvature: f64| 1.0 / curvature.max(1.0 / options.largest_radius_m);
     // The first axis is that of the larger radius.
     let first = if eigen.eigenvalues[0] <= eigen.eigenvalues[1] { 0 } else { 1 };
-    let radii_m = [radius_m(eigen.eigenvalues[first]), radius_m(eigen.eigenvalues[1 - first])];
+    let curvatures = [eigen.eigenvalues[first], eigen.eigenvalues[1 - first]];
+    let radii_m = curvatures.map(|curvature| 1.0 / curvature.max(1.0 / options.largest_radius_m));
     let axis = eigen.eigenvectors.column(first).into_owned();
     // The mattress under an ellipse carries N = (E/h) · δ · πab/2. With a = √(2δR₁), b = √(2δR₂):
     let softness = load_newtons * options.thickness_m / (options.youngs_modulus_pa * std::f64::consts::PI);
-    let semi_axis_m = |indentation_m: f64, radius_m: f64| (2.0 * indentation_m * radius_m).sqrt();
     let mut indentation_m = (softness / (radii_m[0] * radii_m[1]).sqrt()).sqrt();
     if semi_axis_m(indentation_m, radii_m[0]) > half_width_m {
         // a = half width: N = (E/h) · δ^1.5 · π · (half width) · √(2R₂) / 2.
@@ -224,14 +227,16 @@ pub struct PatchLoad {
 static PIECES: LazyLock<Vec<[f64; 2]>> = LazyLock::new(|| {
     const N_RINGS: usize = 32;
     const N_ANGLES: usize = 64;
-    let ring = |ring: usize| {
+    let mut pieces = Vec::with_capacity(N_RINGS * N_ANGLES);
+    for ring in 0..N_RINGS {
         // Within the part r of the ellipse lies 1 - (1 - r²)^1.5 of the load.
         let outside = 1.0 - (ring as f64 + 0.5) / N_RINGS as f64;
         let r = (1.0 - outside.powf(2.0 / 3.0)).sqrt();
-        let turn = move |angle: usize| (angle as f64 + 0.5 * (ring % 2) as f64) / N_ANGLES as f64;
-        (0..N_ANGLES).map(move |angle| on_circle(r, turn(angle)))
-    };
-    (0..N_RINGS).flat_map(ring).collect()
+        for angle in 0..N_ANGLES {
+            pieces.push(on_circle(r, (angle as f64 + 0.5 * (ring % 2) as f64) / N_ANGLES as f64));
+        }
+    }
+    pieces
 });
 
 fn on_circle(r: f64, turn: f64) -> [f64; 2] {
@@ -259,89 +264,95 @@ pub fn patch_load(
     let push_out_of_link = palm_from_link.rotation.inverse() * frame.inward_normal.into_inner();
     let centre = palm_from_link.inverse_transform_point(&frame.point_m);
     let reach_m = patch.indentation_m + REACH_SLACK_M;
-    let shapes: Vec<_> = mechanism
-        .shapes
-        .iter()
-        .filter(|shape| {
-            shape.link_idx == link_idx && (shape.centre_in_link - centre).norm() <= shape.radius_m + a.max(b) + reach_m
-        })
-        .map(|shape| {
+    let mut shapes: Vec<Within<'_>> = Vec::new();
+    for shape in mechanism.shapes.iter().filter(|shape| shape.link_idx == link_idx) {
+        if (shape.centre_in_link - centre).norm() <= shape.radius_m + a.max(b) + reach_m {
             let around = Vector::new(centre.x, centre.y, centre.z);
-            shape.within(pose_from_isometry(&shape.link_from_shape), reach_m, around, a.max(b))
-        })
-        .collect();
-    let is_on_link = |point: &Point3<f64>| {
-        let point = Vector::new(point.x, point.y, point.z);
-        shapes.iter().any(|shape| shape.contains(point))
-    };
+            shapes.push(shape.within(pose_from_isometry(&shape.link_from_shape), reach_m, around, a.max(b)));
+        }
+    }
     let at = |[x, y]: [f64; 2]| centre + first * (a * x) + second * (b * y);
     // Links are unions of few convex shapes: where the rim is on the link, the rest is.
-    let is_whole = (0..16).all(|idx| is_on_link(&at(on_circle(1.0, f64::from(idx) / 16.0))));
-    struct NearCell<'a> {
-        idx: usize,
-        cell: &'a Cell,
-        across_in_link: Vector3<f64>,
-        along_normal: f64,
-    }
-    let cells: Vec<NearCell> = hand_cells_near(mechanism.hand, link_idx, &centre, a.max(b))
-        .map(|(idx, cell)| NearCell {
-            idx,
-            cell,
-            across_in_link: cell.normal_in_link.cross(&cell.along_in_link),
-            along_normal: cell.normal_in_link.dot(&push_out_of_link),
-        })
-        .filter(|near| near.along_normal > 0.0)
-        .collect();
+    let is_whole = (0..16).all(|idx| is_on_link(&shapes, &at(on_circle(1.0, f64::from(idx) / 16.0))));
+    let cells = cells_near(mechanism.hand, link_idx, &centre, a.max(b), &push_out_of_link);
     if is_whole && cells.is_empty() {
         return PatchLoad { on_link: 1.0, cell_shares: Vec::new() };
     }
     let mut n_on_link = 0_u32;
     let mut n_on_cell = vec![0_u32; cells.len()];
     for piece in PIECES.iter().map(|piece| at(*piece)) {
-        if !is_whole && !is_on_link(&piece) {
+        if !is_whole && !is_on_link(&shapes, &piece) {
             continue;
         }
         n_on_link += 1;
-        let hit = cells
-            .iter()
-            .enumerate()
-            .filter_map(|(near_idx, NearCell { cell, across_in_link, .. })| {
-                let from_cell = piece - cell.position_in_link_m;
-                let depth_m = from_cell.dot(&cell.normal_in_link).abs();
-                let along_m = from_cell.dot(&cell.along_in_link).abs();
-                let across_m = from_cell.dot(across_in_link).abs();
-                (depth_m <= CELL_DEPTH_M && along_m <= cell.size_m[0] / 2.0 && across_m <= cell.size_m[1] / 2.0)
-                    .then_some((near_idx, depth_m))
-            })
-            .min_by(|(_, a), (_, b)| a.total_cmp(b));
-        if let Some((near_idx, _)) = hit {
+        let mut hit = None;
+        let mut least_depth_m = f64::INFINITY;
+        for (near_idx, near) in cells.iter().enumerate() {
+            if let Some(depth_m) = near.depth_m(&piece)
+                && depth_m < least_depth_m
+            {
+                (hit, least_depth_m) = (Some(near_idx), depth_m);
+            }
+        }
+        if let Some(near_idx) = hit {
             n_on_cell[near_idx] += 1;
         }
     }
-    let cell_shares = cells
-        .iter()
-        .zip(&n_on_cell)
-        .filter(|(_, n)| **n > 0)
-        .map(|(near, n)| (near.idx, f64::from(*n) / f64::from(n_on_link) * near.along_normal))
-        .collect();
+    let mut cell_shares = Vec::new();
+    for (near, n) in cells.iter().zip(n_on_cell).filter(|(_, n)| *n > 0) {
+        cell_shares.push((near.idx, f64::from(n) / f64::from(n_on_link) * near.along_normal));
+    }
     PatchLoad { on_link: f64::from(n_on_link) / PIECES.len() as f64, cell_shares }
 }
 
-/// The cells of a link's pads that a patch of that size may reach, with their indices among the hand's cells.
-fn hand_cells_near<'a>(
+fn is_on_link(shapes: &[Within<'_>], point: &Point3<f64>) -> bool {
+    let point = Vector::new(point.x, point.y, point.z);
+    shapes.iter().any(|shape| shape.contains(point))
+}
+
+/// A cell that a patch may reach.
+struct NearCell<'a> {
+    /// Among the hand's cells.
+    idx: usize,
+    cell: &'a Cell,
+    across_in_link: Vector3<f64>,
+    /// The part of a force on the link that goes along the cell's normal.
+    along_normal: f64,
+}
+
+impl NearCell<'_> {
+    /// The distance of a point from the cell's plane; `None` beside the cell.
+    fn depth_m(&self, point: &Point3<f64>) -> Option<f64> {
+        let cell = self.cell;
+        let from_cell = point - cell.position_in_link_m;
+        let depth_m = from_cell.dot(&cell.normal_in_link).abs();
+        let along_m = from_cell.dot(&cell.along_in_link).abs();
+        let across_m = from_cell.dot(&self.across_in_link).abs();
+        (depth_m <= CELL_DEPTH_M && along_m <= cell.size_m[0] / 2.0 && across_m <= cell.size_m[1] / 2.0)
+            .then_some(depth_m)
+    }
+}
+
+/// The cells of a link's pads that a patch of that size may reach and press on.
+fn cells_near<'a>(
     hand: &'a Hand,
     link_idx: usize,
     centre: &Point3<f64>,
     patch_radius_m: f64,
-) -> impl Iterator<Item = (usize, &'a Cell)> {
-    let centre = *centre;
-    hand.pads.iter().filter(move |pad| pad.link_idx == link_idx).flat_map(move |pad| {
-        pad.cells.iter().enumerate().filter_map(move |(cell_idx, cell)| {
+    push_out_of_link: &Vector3<f64>,
+) -> Vec<NearCell<'a>> {
+    let mut near = Vec::new();
+    for pad in hand.pads.iter().filter(|pad| pad.link_idx == link_idx) {
+        for (cell_idx, cell) in pad.cells.iter().enumerate() {
             let reach_m = patch_radius_m + cell.size_m[0].hypot(cell.size_m[1]) / 2.0 + CELL_DEPTH_M;
-            let is_near = (cell.position_in_link_m - centre).norm() <= reach_m;
-            is_near.then_some((pad.first_cell_idx + cell_idx, cell))
-        })
-    })
+            let along_normal = cell.normal_in_link.dot(push_out_of_link);
+            if (cell.position_in_link_m - centre).norm() <= reach_m && along_normal > 0.0 {
+                let across_in_link = cell.normal_in_link.cross(&cell.along_in_link);
+                near.push(NearCell { idx: pad.first_cell_idx + cell_idx, cell, across_in_link, along_normal });
+            }
+        }
+    }
+    near
 }
 
 /// A piece of a patch this far from the link, beyond the indentation, is still on it: the touch tolerance and rounding.

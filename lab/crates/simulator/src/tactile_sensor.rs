@@ -148,48 +148,37 @@ const HAND_STREAM: u64 = u64::MAX - 1;
 impl Sensor {
     /// Draws a sensor's faults: the hand's from `seed`, or this grasp's from `grasp_rng`.
     pub fn draw(hand: &Hand, options: &SensorOptions, seed: u64, grasp_rng: &mut impl rand::Rng) -> Sensor {
-        let draw_all = |rng: &mut dyn rand::Rng| {
-            let cells = hand.cells().map(|_| {
-                let (gain, fault) = ((options.gain_sigma * gaussian(rng)).exp(), rng.random::<f64>());
-                if fault < options.dead_fraction {
-                    CellState::Dead
-                } else if fault < options.dead_fraction + options.stuck_fraction {
-                    CellState::Stuck
-                } else {
-                    CellState::Gain(gain)
-                }
-            });
-            let cells = cells.collect();
-            // Drawn only where there are any: the noise of other sensors stays as it was.
-            let mut offsets = |sigma: f64, n: usize| -> Vec<f64> {
-                (0..if sigma > 0.0 { n } else { 0 }).map(|_| sigma * gaussian(rng)).collect()
-            };
-            let offsets_newtons = offsets(options.offset_newtons, hand.n_cells());
-            let encoder_offsets_rad = offsets(options.encoder_offset_rad, hand.joints.len());
-            let neighbours = if options.crosstalk > 0.0 { neighbours(hand) } else { Vec::new() };
-            let common_gain =
-                if options.common_gain_sigma > 0.0 { options.common_gain_sigma * gaussian(rng) } else { 0.0 };
-            let mut part = |of: f64| if of > 0.0 { of * rng.random::<f64>() } else { 0.0 };
-            let lag_secs = part(options.lag_secs);
-            let reads_joints = options.joint_encoders > 0.0 && part(1.0) < options.joint_encoders;
-            Sensor {
-                cells,
-                offsets_newtons,
-                neighbours,
-                encoder_offsets_rad,
-                common_gain: common_gain.exp(),
-                bell: options.skin.draw(rng),
-                lag_secs,
-                reads_joints,
-            }
-        };
         match options.faults_of {
-            FaultsOf::Grasp => draw_all(grasp_rng),
+            FaultsOf::Grasp => Sensor::draw_faults(hand, options, grasp_rng),
             FaultsOf::Hand => {
                 let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 rng.set_stream(HAND_STREAM);
-                draw_all(&mut rng)
+                Sensor::draw_faults(hand, options, &mut rng)
             }
+        }
+    }
+
+    fn draw_faults(hand: &Hand, options: &SensorOptions, rng: &mut dyn rand::Rng) -> Sensor {
+        let mut cells = Vec::with_capacity(hand.n_cells());
+        for _ in 0..hand.n_cells() {
+            let (gain, fault) = ((options.gain_sigma * gaussian(rng)).exp(), rng.random::<f64>());
+            cells.push(if fault < options.dead_fraction {
+                CellState::Dead
+            } else if fault < options.dead_fraction + options.stuck_fraction {
+                CellState::Stuck
+            } else {
+                CellState::Gain(gain)
+            });
+        }
+        Sensor {
+            cells,
+            offsets_newtons: offsets(options.offset_newtons, hand.n_cells(), rng),
+            encoder_offsets_rad: offsets(options.encoder_offset_rad, hand.joints.len(), rng),
+            neighbours: if options.crosstalk > 0.0 { neighbours(hand) } else { Vec::new() },
+            common_gain: offsets(options.common_gain_sigma, 1, rng).first().map_or(1.0, |gain| gain.exp()),
+            lag_secs: if options.lag_secs > 0.0 { options.lag_secs * rng.random::<f64>() } else { 0.0 },
+            reads_joints: options.joint_encoders > 0.0 && rng.random::<f64>() < options.joint_encoders,
+            bell: options.skin.draw(rng),
         }
     }
 
@@ -205,7 +194,9 @@ impl Sensor {
         for (idx, around) in self.neighbours.iter().enumerate().filter(|(_, around)| !around.is_empty()) {
             let lost_newtons = options.crosstalk * cells_newtons[idx];
             pressed_newtons[idx] -= lost_newtons;
-            around.iter().for_each(|near| pressed_newtons[*near] += lost_newtons / around.len() as f64);
+            for near in around {
+                pressed_newtons[*near] += lost_newtons / around.len() as f64;
+            }
         }
         for (newtons, offset) in pressed_newtons.iter_mut().zip(&self.offsets_newtons) {
             *newtons += offset;
@@ -255,14 +246,24 @@ impl Sensor {
 /// The cells around each cell on its pad: those up to half as far again as the nearest one.
 fn neighbours(hand: &Hand) -> Vec<Vec<usize>> {
     let cells: Vec<(usize, &Cell)> = hand.cells().collect();
-    let far_m = |a: &Cell, b: &Cell| (a.position_in_link_m - b.position_in_link_m).norm();
-    let of_cell = |idx: usize| -> Vec<usize> {
-        let (pad_idx, cell) = cells[idx];
-        let others = || (0..cells.len()).filter(|other| *other != idx && cells[*other].0 == pad_idx);
-        let nearest_m = others().map(|other| far_m(cell, cells[other].1)).fold(f64::INFINITY, f64::min);
-        others().filter(|other| far_m(cell, cells[*other].1) <= 1.5 * nearest_m).collect()
-    };
-    (0..cells.len()).map(of_cell).collect()
+    let mut neighbours = Vec::with_capacity(cells.len());
+    for (idx, (pad_idx, cell)) in cells.iter().enumerate() {
+        let mut others = Vec::new();
+        for (other, (other_pad_idx, other_cell)) in cells.iter().enumerate() {
+            if other != idx && other_pad_idx == pad_idx {
+                others.push((other, (cell.position_in_link_m - other_cell.position_in_link_m).norm()));
+            }
+        }
+        let nearest_m = others.iter().map(|(_, far_m)| *far_m).fold(f64::INFINITY, f64::min);
+        others.retain(|(_, far_m)| *far_m <= 1.5 * nearest_m);
+        neighbours.push(others.into_iter().map(|(other, _)| other).collect());
+    }
+    neighbours
+}
+
+/// Drawn only where there are any: the noise of other sensors stays as it was.
+fn offsets(sigma: f64, n: usize, rng: &mut dyn rand::Rng) -> Vec<f64> {
+    if sigma > 0.0 { (0..n).map(|_| sigma * gaussian(rng)).collect() } else { Vec::new() }
 }
 
 /// The reading of the load on the wrist: force, then torque.
@@ -272,8 +273,8 @@ pub(crate) fn read_wrench(
     options: &SensorOptions,
     rng: &mut impl rand::Rng,
 ) -> Vec<f64> {
-    let mut read = |of: &Vector3<f64>, noise: f64| of.map(|exact| exact + noise * gaussian(rng));
-    let (force, torque) = (read(force, options.wrist_noise_newtons), read(torque, options.wrist_noise_torque));
+    let force = force.map(|exact| exact + options.wrist_noise_newtons * gaussian(rng));
+    let torque = torque.map(|exact| exact + options.wrist_noise_torque * gaussian(rng));
     force.iter().chain(&torque).copied().collect()
 }
 

@@ -201,30 +201,36 @@ fn n_edges(contact: &GraspContact) -> usize {
 
 /// Edges (e0, e1, e5) of a contact: tangential directions in units of friction, torsion in metres.
 fn edges(torsion_m: f64) -> Vec<[f64; 3]> {
-    let ring = |latitude: f64, n: u32| {
-        (0..n).map(move |k| {
-            let longitude = std::f64::consts::TAU * f64::from(k) / f64::from(n);
-            [latitude.cos() * longitude.cos(), latitude.cos() * longitude.sin(), latitude.sin() * torsion_m]
-        })
-    };
+    let mut edges = Vec::with_capacity(20);
     if torsion_m > 0.0 {
         // At the poles only torsion is left. Written out: the cosine of π/2 as a float is not quite zero.
-        let pole = |e5| std::iter::once([0.0, 0.0, e5]);
-        let north = pole(torsion_m).chain(ring(FRAC_PI_4, 5)).chain(ring(0.0, 8));
-        north.chain(ring(-FRAC_PI_4, 5)).chain(pole(-torsion_m)).collect()
-    } else {
-        ring(0.0, 8).collect()
+        edges.push([0.0, 0.0, torsion_m]);
+        add_ring(&mut edges, torsion_m, FRAC_PI_4, 5);
+    }
+    add_ring(&mut edges, torsion_m, 0.0, 8);
+    if torsion_m > 0.0 {
+        add_ring(&mut edges, torsion_m, -FRAC_PI_4, 5);
+        edges.push([0.0, 0.0, -torsion_m]);
+    }
+    edges
+}
+
+fn add_ring(edges: &mut Vec<[f64; 3]>, torsion_m: f64, latitude: f64, n: u32) {
+    for k in 0..n {
+        let longitude = std::f64::consts::TAU * f64::from(k) / f64::from(n);
+        edges.push([latitude.cos() * longitude.cos(), latitude.cos() * longitude.sin(), latitude.sin() * torsion_m]);
     }
 }
 
 fn check(case: &GraspCase) -> Result<(), QualityError> {
-    let object = |field, expected, found: &[f64]| QualityError::Object { field, expected, found: found.to_vec() };
-    let centre = &case.centre_of_mass_m;
+    let (centre, radius_m) = (&case.centre_of_mass_m, case.max_radius_m);
     if !is_finite(centre) {
-        return Err(object("centre_of_mass_m", "finite numbers", centre));
+        let (field, expected) = ("centre_of_mass_m", "finite numbers");
+        return Err(QualityError::Object { field, expected, found: centre.to_vec() });
     }
-    if !(case.max_radius_m > 0.0 && case.max_radius_m.is_finite()) {
-        return Err(object("max_radius_m", "a finite number above 0", &[case.max_radius_m]));
+    if !(radius_m > 0.0 && radius_m.is_finite()) {
+        let (field, expected) = ("max_radius_m", "a finite number above 0");
+        return Err(QualityError::Object { field, expected, found: vec![radius_m] });
     }
     for (contact_idx, contact) in case.contacts.iter().enumerate() {
         let GraspContact { point_m, inward_normal, tangent, friction, torsion_m } = contact;

@@ -2,7 +2,7 @@
 
 use nalgebra::{Point3, Vector3};
 
-use super::super::outline::{Point, ellipse, fillet, half_ellipse, simplify, spline, subdivide, superellipse};
+use super::super::outline::{Point, ellipse, fillet, half_ellipse, simplify, spline, squared, subdivide, superellipse};
 use super::super::solid::{Assembly, Solid};
 use super::{Draw, Made, capped, radius_at};
 
@@ -394,14 +394,13 @@ pub(super) fn knife(draw: &mut Draw) -> Made {
 pub(crate) fn loop_handle(ends: [Point; 2], reach: f64, squareness: f64, section: [f64; 2]) -> Solid {
     let [[x_high, high], [x_low, low]] = ends;
     let (middle, half) = ((high + low) / 2.0, (high - low) / 2.0);
-    let round = |value: f64| value.signum() * value.abs().powf(2.0 / squareness);
     // On to the outermost point, measured from the upper end.
     let arc: Vec<Point> = (0..=240)
         .map(|idx| {
             let (sin, cos) = (std::f64::consts::FRAC_PI_2 * (1.0 - f64::from(idx) / 120.0)).sin_cos();
-            let z = middle + half * round(sin);
+            let z = middle + half * squared(sin, squareness);
             let x = x_low + (x_high - x_low) * (z - low) / (high - low);
-            [x + (reach + x_high.max(x_low) - x) * round(cos.max(0.0)), z]
+            [x + (reach + x_high.max(x_low) - x) * squared(cos.max(0.0), squareness), z]
         })
         .collect();
     let path: Vec<_> = simplify(&arc).iter().map(|[x, z]| Point3::new(*x, 0.0, *z)).collect();

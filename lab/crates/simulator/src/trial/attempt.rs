@@ -12,7 +12,9 @@ use super::mujoco::Mujoco;
 use super::sensing::patches;
 use super::start::first_touch;
 use super::world::World;
-use super::{LiftResult, LiftTarget, PhysicsEngine, Snapshot, Start, TrialError, TrialOptions, TrialProtocol};
+use super::{
+    LiftResult, LiftTarget, PhysicsEngine, PhysicsOptions, Snapshot, Start, TrialError, TrialOptions, TrialProtocol,
+};
 use crate::candidate::TimedFrame;
 use crate::loaded_contacts::{SimulatedContact, grasp_case};
 use crate::mechanism::Mechanism;
@@ -147,7 +149,7 @@ impl<'a> Attempt<'a> {
         sensor_seed: u64,
     ) -> Result<Attempt<'a>, TrialError> {
         options.check()?;
-        check_hand(hand).map_err(|error| TrialError::Hand { hand: hand.name.clone(), reason: error.to_string() })?;
+        check_hand(hand).map_err(|error| TrialError::hand(hand, error))?;
         let mechanism = Mechanism::new(hand);
         let Some(touch) = first_touch(&mechanism, target, start)? else {
             return Err(TrialError::NoApproach { target: target.name.clone(), n_draws: 1 });
@@ -292,7 +294,9 @@ impl<'a> Attempt<'a> {
         let (felt, at_nanos) = self.felt.get_or_insert_with(|| (vec![0.0; cells_newtons.len()], offset_nanos));
         let passed_secs = offset_nanos.saturating_sub(*at_nanos) as f64 * 1e-9;
         let part = 1.0 - (-passed_secs / self.sensor.lag_secs).exp();
-        felt.iter_mut().zip(&cells_newtons).for_each(|(felt, newtons)| *felt += part * (newtons - *felt));
+        for (felt, newtons) in felt.iter_mut().zip(&cells_newtons) {
+            *felt += part * (newtons - *felt);
+        }
         *at_nanos = offset_nanos;
         felt.clone()
     }
@@ -396,8 +400,13 @@ impl<'a> Attempt<'a> {
     }
 
     fn is_lift_over(&self) -> bool {
-        let over_secs = self.lift_path(&self.options.protocol).secs() - 0.5 * self.options.physics.step_secs;
-        self.stage == Stage::Lift && (self.is_lost || self.stage_secs >= over_secs)
+        let secs = self.lift_path(&self.options.protocol).secs();
+        self.stage == Stage::Lift && (self.is_lost || self.is_over(secs))
+    }
+
+    /// Whether the stage has taken so long. Sums of time steps are not exact.
+    fn is_over(&self, secs: f64) -> bool {
+        self.stage_secs >= secs - 0.5 * self.options.physics.step_secs
     }
 
     fn lift_path<'p>(&self, protocol: &'p TrialProtocol) -> LiftPath<'p> {
@@ -450,10 +459,9 @@ impl<'a> Attempt<'a> {
     /// Whether the simulation has come to a state that cannot be: the hand's links swing without bounds, which happens to a
     /// few in a thousand shaken hands.
     pub fn has_diverged(&self) -> bool {
-        let hand = self.mechanism.hand;
-        let is_joint = |(joint, value): (&blindgrasp_stages::hand::Joint, &f64)| joint.allows(*value, MOST_BEYOND_RAD);
-        let is_target = self.palm_from_target().translation.vector.iter().all(|number| number.is_finite());
-        !(is_target && hand.joints.iter().zip(&self.joints()).all(is_joint))
+        let mut joints = self.mechanism.hand.joints.iter().zip(self.joints());
+        let is_lost = !self.palm_from_target().translation.vector.iter().all(|number| number.is_finite());
+        is_lost || joints.any(|(joint, value)| !joint.allows(value, MOST_BEYOND_RAD))
     }
 
     /// Why the physics has stopped, if it has: what the attempt says then is not to be used.
@@ -497,61 +505,68 @@ impl<'a> Attempt<'a> {
     fn step(&mut self) {
         let physics = self.options.physics.clone();
         let protocol = self.options.protocol.clone();
+        self.act(&physics, &protocol);
+        self.engine.step();
+        self.n_steps += 1;
+        self.stage_secs += physics.step_secs;
+        self.change_stage(&physics, &protocol);
+    }
+
+    /// What arm and fingers do in the next time step.
+    fn act(&mut self, physics: &PhysicsOptions, protocol: &TrialProtocol) {
         if self.stage == Stage::TestLift {
-            let path = TestLiftPath(&protocol);
+            let path = TestLiftPath(protocol);
             self.move_palm(path.motion(self.stage_secs, physics.step_secs));
             self.lifted = path.place_m(self.stage_secs + physics.step_secs);
         }
         if self.stage == Stage::Lift {
-            let path = self.lift_path(&protocol);
+            let path = self.lift_path(protocol);
             let secs = self.stage_secs;
             let (motion, lifted) = (path.motion(secs, physics.step_secs), path.place_m(secs + physics.step_secs));
             self.move_palm(motion);
             self.lifted = lifted;
             if self.holds_force {
-                self.body.grip(&mut *self.engine, 1.0, &physics);
+                self.body.grip(&mut *self.engine, 1.0, physics);
             }
         }
         if self.stage == Stage::Squeeze {
             let part = ((self.stage_secs + physics.step_secs) / protocol.grip_secs).min(1.0);
-            self.body.grip(&mut *self.engine, part, &physics);
+            self.body.grip(&mut *self.engine, part, physics);
         }
-        self.engine.step();
-        self.n_steps += 1;
-        self.stage_secs += physics.step_secs;
-        // Sums of time steps are not exact.
-        let is_over = |secs: f64| self.stage_secs >= secs - 0.5 * physics.step_secs;
+    }
+
+    /// Goes on to the next stage where this one is over.
+    fn change_stage(&mut self, physics: &PhysicsOptions, protocol: &TrialProtocol) {
         match self.stage {
             Stage::Approach => {
                 self.palm_from_start.z += protocol.approach_speed * physics.step_secs;
-                let newtons: f64 = self
-                    .engine
-                    .touches()
-                    .iter()
-                    .filter(|touch| !matches!(touch.side, Side::Hand { .. }))
-                    .map(|touch| touch.newtons)
-                    .sum();
+                let mut newtons = 0.0;
+                for touch in self.engine.touches() {
+                    if !matches!(touch.side, Side::Hand { .. }) {
+                        newtons += touch.newtons;
+                    }
+                }
                 if newtons >= protocol.touch_newtons || self.palm_from_start.z >= protocol.stand_off_m + OVERSHOOT_M {
                     self.engine.stop_palm(&Vector3::new(0.0, 0.0, protocol.approach_speed));
                     self.enter(Stage::Close);
                 }
             }
             Stage::Close => {
-                let has_stopped = self.body.close(&mut *self.engine, &physics);
+                let has_stopped = self.body.close(&mut *self.engine, physics);
                 if has_stopped || self.stage_secs >= MOST_CLOSING_SECS {
-                    self.body.stop(&mut *self.engine, &physics);
+                    self.body.stop(&mut *self.engine, physics);
                     self.enter(Stage::Settle);
                 }
             }
-            Stage::Settle if is_over(protocol.settle_secs) => self.enter(Stage::Settled),
-            Stage::Squeeze if is_over(protocol.grip_secs) => self.enter(Stage::Squeezed),
+            Stage::Settle if self.is_over(protocol.settle_secs) => self.enter(Stage::Settled),
+            Stage::Squeeze if self.is_over(protocol.grip_secs) => self.enter(Stage::Squeezed),
             Stage::Squeezed if self.last_stage != Stage::Squeezed && self.n_frames_of_stage == protocol.n_settled => {
                 self.enter(Stage::TestLift);
             }
             Stage::Lift if self.n_steps.is_multiple_of(self.steps_per_frame()) => {
                 self.is_lost = self.slip_m() > protocol.lost_m;
             }
-            Stage::TestLift if is_over(TestLiftPath(&protocol).secs() + protocol.test_rest_secs) => {
+            Stage::TestLift if self.is_over(TestLiftPath(protocol).secs() + protocol.test_rest_secs) => {
                 self.enter(Stage::TestLifted);
             }
             _ => {}

@@ -86,7 +86,7 @@ impl Course {
         self.finished.push_back(finished);
     }
 
-    /// Goes on to the next trial without an attempt: the hand cannot come to the thing as it stands in this one.
+    /// Goes on to the next trial without an attempt: the hand cannot come to the target as it stands in this one.
     pub fn leave_out(&mut self) {
         self.next = Place { trial: self.next.trial + 1, attempt: 0, ..self.next.clone() };
     }

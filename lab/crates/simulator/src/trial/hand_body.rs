@@ -34,6 +34,27 @@ struct Axle {
     stiffness: f64,
 }
 
+impl Axle {
+    /// The joint of a link that closes, and its axle; `None` of another link.
+    fn of_link(
+        mechanism: &Mechanism<'_>,
+        link_idx: usize,
+        idx: usize,
+        options: &PhysicsOptions,
+    ) -> Option<(usize, Axle)> {
+        let (joint_idx, kind, multiplier) = closing_joint(mechanism, link_idx)?;
+        let per_radian = kind.per_radian();
+        let axle = Axle {
+            idx,
+            kind,
+            ratio: multiplier.abs(),
+            reach: if kind == JointKind::Prismatic { 1.0 } else { reach_m(mechanism.hand, link_idx) },
+            stiffness: options.gear_stiffness / (per_radian * per_radian),
+        };
+        Some((joint_idx, axle))
+    }
+}
+
 /// A joint with its motor. Its travel is measured from the open joint on, and grows as it closes: radians, or metres of a
 /// slide.
 struct Drive {
@@ -67,6 +88,52 @@ struct Drive {
 }
 
 impl Drive {
+    /// A motor with its first axle, whose force [`Drive::add_up`] sets.
+    fn new(hand: &Hand, joint_idx: usize, open: f64, axle: Axle) -> Drive {
+        let spec = &hand.joints[joint_idx];
+        let rate = hand.closing_rate(joint_idx);
+        let sign = if rate < 0.0 { -1.0 } else { 1.0 };
+        Drive {
+            joint_idx,
+            axles: vec![axle],
+            follows: None,
+            rate: rate.abs(),
+            open,
+            sign,
+            range: if sign < 0.0 { open - spec.lower } else { spec.upper - open }.max(0.0),
+            lever: 0.0,
+            limit: 0.0,
+            target: 0.0,
+            target_speed: 0.0,
+            stiffness: 0.0,
+            is_stopped: false,
+            has_broken_away: false,
+            lagging_secs: 0.0,
+        }
+    }
+
+    /// Sets the stiffness and the force of the motor, once it has all its axles.
+    fn add_up(&mut self, mechanism: &Mechanism<'_>, palm_from_links: &[Isometry3<f64>], options: &PhysicsOptions) {
+        self.stiffness = self.axles.iter().map(|axle| axle.ratio * axle.ratio * axle.stiffness).sum();
+        if self.axles.len() > 1 {
+            self.lever = lever(mechanism, self.joint_idx, palm_from_links);
+        }
+        // Fingers without pads have no speed.
+        if self.lever == 0.0 {
+            self.lever = self.axles.iter().map(|axle| axle.ratio * axle.reach).fold(0.0, f64::max);
+        }
+        self.limit = options.grip_newtons * self.lever;
+    }
+
+    /// A motor has one rotor, whose inertia its axles share.
+    fn share_rotor(&self, bodies: &mut [BodyPlan], options: &PhysicsOptions) {
+        let whole: f64 = self.axles.iter().map(|axle| axle.ratio * axle.ratio).sum();
+        for axle in &self.axles {
+            let per_radian = axle.kind.per_radian();
+            bodies[axle.idx].armature = options.rotor_inertia / whole / (per_radian * per_radian);
+        }
+    }
+
     /// Stops, and keeps pressing with at most its largest torque.
     fn stop(&mut self, travel: f64) {
         if !self.is_stopped {
@@ -105,139 +172,54 @@ impl HandBody {
         options: &PhysicsOptions,
     ) -> Result<(HandPlan, HandBody), TrialError> {
         let hand = mechanism.hand;
-        let refuse = |reason: String| TrialError::Hand { hand: hand.name.clone(), reason };
-        let palm_from_links = hand.palm_from_links(open_joints_rad).map_err(|error| refuse(error.to_string()))?;
-        let is_closing = |joint_idx: usize| mechanism.joints.iter().any(|joint| joint.joint_idx == joint_idx);
+        let palm_from_links = hand.palm_from_links(open_joints_rad).map_err(|error| TrialError::hand(hand, error))?;
         let mut plan = HandPlan::default();
-        // The body of each link, `None` for the palm, and where the link is on it.
-        let mut link_bodies: Vec<Option<usize>> = Vec::with_capacity(hand.links.len());
-        let mut body_from_links: Vec<Isometry3<f64>> = Vec::with_capacity(hand.links.len());
+        let mut placed = LinkBodies { hand, bodies: Vec::new(), body_from_links: Vec::new() };
         let mut drives: Vec<Drive> = Vec::new();
         for (link_idx, link) in hand.links.iter().enumerate() {
             let palm_from_link = palm_from_links[link_idx];
-            let parent = link.parent_idx.and_then(|parent_idx| link_bodies[parent_idx]);
-            let (joint_idx, kind, multiplier, axis) = match link.motion {
-                Motion::Joint { joint_idx, kind, multiplier, axis, .. } if is_closing(joint_idx) => {
-                    (joint_idx, kind, multiplier, axis)
-                }
-                motion => {
-                    let parent_from_link = link.parent_from_joint * motion.joint_from_link(open_joints_rad);
-                    link_bodies.push(parent);
-                    body_from_links.push(match link.parent_idx {
-                        Some(parent_idx) if parent.is_some() => body_from_links[parent_idx] * parent_from_link,
-                        _ => palm_from_link,
-                    });
-                    continue;
-                }
+            let parent = link.parent_idx.and_then(|parent_idx| placed.bodies[parent_idx]);
+            let joint_from_link = link.motion.joint_from_link(open_joints_rad);
+            let Some((joint_idx, axle)) = Axle::of_link(mechanism, link_idx, plan.bodies.len(), options) else {
+                let parent_from_link = link.parent_from_joint * joint_from_link;
+                placed.bodies.push(parent);
+                placed.body_from_links.push(match link.parent_idx {
+                    Some(parent_idx) if parent.is_some() => placed.body_from_links[parent_idx] * parent_from_link,
+                    _ => palm_from_link,
+                });
+                continue;
             };
-            let spec = &hand.joints[joint_idx];
-            let rate = hand.closing_rate(joint_idx);
-            let sign = if rate < 0.0 { -1.0 } else { 1.0 };
-            let reach_m = reach_m(hand, link_idx);
-            // Where the parent's body has the joint, and its axis as x, in the direction of closing.
             let parent_from_joint = match link.parent_idx {
                 None => link.parent_from_joint,
-                Some(parent_idx) => body_from_links[parent_idx] * link.parent_from_joint,
+                Some(parent_idx) => placed.body_from_links[parent_idx] * link.parent_from_joint,
             };
-            let closing_axis = if sign * multiplier < 0.0 { -axis } else { axis };
-            let x_to_axis = UnitQuaternion::rotation_between(&Vector3::x(), &closing_axis)
-                .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI));
-            let body_from_axis = Isometry3::from_parts(Default::default(), x_to_axis);
-            let joint_from_axis = link.motion.joint_from_link(open_joints_rad) * body_from_axis;
-            let per_radian = kind.per_radian();
-            let axle = Axle {
-                idx: plan.bodies.len(),
-                kind,
-                ratio: multiplier.abs(),
-                reach: if kind == JointKind::Prismatic { 1.0 } else { reach_m },
-                stiffness: options.gear_stiffness / (per_radian * per_radian),
-            };
-            link_bodies.push(Some(plan.bodies.len()));
-            body_from_links.push(Isometry3::identity());
+            let body_from_axis = body_from_axis(hand, &link.motion);
+            placed.bodies.push(Some(axle.idx));
+            placed.body_from_links.push(Isometry3::identity());
             plan.bodies.push(BodyPlan {
                 parent,
                 palm_from_body: palm_from_link,
-                kind,
-                parent_from_axis: parent_from_joint * joint_from_axis,
+                kind: axle.kind,
+                parent_from_axis: parent_from_joint * (joint_from_link * body_from_axis),
                 body_from_axis,
-                mass: body_mass(hand, link_idx, open_joints_rad, &is_closing, options),
+                mass: body_mass(mechanism, link_idx, open_joints_rad, options),
                 armature: 0.0,
             });
-            if let Some(drive) = drives.iter_mut().find(|drive| drive.joint_idx == joint_idx) {
-                drive.axles.push(axle);
-                continue;
+            match drives.iter_mut().find(|drive| drive.joint_idx == joint_idx) {
+                Some(drive) => drive.axles.push(axle),
+                None => drives.push(Drive::new(hand, joint_idx, open_joints_rad[joint_idx], axle)),
             }
-            let open = open_joints_rad[joint_idx];
-            drives.push(Drive {
-                joint_idx,
-                follows: None,
-                rate: rate.abs(),
-                open,
-                sign,
-                range: if sign < 0.0 { open - spec.lower } else { spec.upper - open }.max(0.0),
-                lever: 0.0,
-                limit: 0.0,
-                target: 0.0,
-                target_speed: 0.0,
-                stiffness: 0.0,
-                axles: vec![axle],
-                is_stopped: false,
-                has_broken_away: false,
-                lagging_secs: 0.0,
-            });
         }
         for drive in &mut drives {
-            drive.stiffness = drive.axles.iter().map(|axle| axle.ratio * axle.ratio * axle.stiffness).sum();
-            drive.lever = match &drive.axles[..] {
-                [axle] => axle.ratio * axle.reach,
-                axles => Some(lever(mechanism, drive.joint_idx, &palm_from_links))
-                    .filter(|lever| *lever > 0.0)
-                    .unwrap_or_else(|| axles.iter().map(|axle| axle.ratio * axle.reach).fold(0.0, f64::max)),
-            };
-            drive.limit = options.grip_newtons * drive.lever;
+            drive.add_up(mechanism, &palm_from_links, options);
+            drive.share_rotor(&mut plan.bodies, options);
         }
         for idx in 0..drives.len() {
-            let follows = hand.joints[drives[idx].joint_idx].coupling.map(|coupling| coupling.follows_idx);
-            drives[idx].follows = follows.and_then(|leader| drives.iter().position(|drive| drive.joint_idx == leader));
-        }
-        let body_above = |idx: usize| {
-            let links = std::iter::successors(Some(idx), |idx| hand.links[*idx].parent_idx);
-            links.map(|idx| link_bodies[idx]).find(|body| *body != link_bodies[idx]).flatten()
-        };
-        let are_joined = |a: usize, b: usize| {
-            let (body_a, body_b) = (link_bodies[a], link_bodies[b]);
-            body_a == body_b || body_above(a) == body_b || body_above(b) == body_a
-        };
-        let is_on_palm = |idx: usize| link_bodies[idx].is_none();
-        let groups = link_groups(mechanism, &palm_from_links, are_joined, is_on_palm).ok_or_else(|| {
-            let n = MAX_LINKS_APART - 1;
-            refuse(format!(
-                "more than {n} links overlap others in the open hand, which no joint joins: give another open hand (--open of \
-                 new hand), or simpler collision shapes"
-            ))
-        })?;
-        for (shape_idx, placed) in mechanism.shapes.iter().enumerate() {
-            let link_idx = placed.link_idx;
-            let (own, touched) = groups[link_idx];
-            plan.shapes.push(ShapePlan {
-                shape_idx,
-                link_idx,
-                body: link_bodies[link_idx],
-                body_from_shape: body_from_links[link_idx] * placed.link_from_shape,
-                core: SharedShape(placed.core.clone_dyn().into()),
-                edge_radius_m: placed.edge_radius_m,
-                own,
-                touched,
-            });
-        }
-        for drive in &drives {
-            // A motor has one rotor, whose inertia its axles share.
-            let whole: f64 = drive.axles.iter().map(|axle| axle.ratio * axle.ratio).sum();
-            for axle in &drive.axles {
-                let per_radian = axle.kind.per_radian();
-                plan.bodies[axle.idx].armature = options.rotor_inertia / whole / (per_radian * per_radian);
+            if let Some(coupling) = hand.joints[drives[idx].joint_idx].coupling {
+                drives[idx].follows = drives.iter().position(|drive| drive.joint_idx == coupling.follows_idx);
             }
         }
+        plan.shapes = placed.shapes(mechanism, &palm_from_links)?;
         let n_axles = plan.bodies.len();
         Ok((plan, HandBody { drives, n_axles, open_joints_rad: open_joints_rad.to_vec() }))
     }
@@ -367,49 +349,106 @@ impl HandBody {
     }
 }
 
-/// For each link its collision group, and those of the links that it may touch: all but those that it overlaps in the open
-/// hand, which are built into each other, and those on the palm that a joint joins to it. The engine itself disables the contacts
-/// of other joined links. A contact takes two links that may touch each other, so one of them is enough to rule it out. Links
-/// that are left out by the same links share a group. `None` if there are too few groups.
-fn link_groups(
-    mechanism: &Mechanism<'_>,
-    palm_from_links: &[Isometry3<f64>],
-    are_joined: impl Fn(usize, usize) -> bool,
-    is_on_palm: impl Fn(usize) -> bool,
-) -> Option<Vec<(Group, Group)>> {
-    let links = &mechanism.hand.links;
-    let leaves_out = |a: usize, b: usize| {
-        let closest = || mechanism.closest_of_links(a, b, palm_from_links);
-        if are_joined(a, b) {
-            return !is_on_palm(a) && is_on_palm(b);
+/// The bodies of a hand's links.
+struct LinkBodies<'a> {
+    hand: &'a Hand,
+    /// The body of each link, `None` for the palm.
+    bodies: Vec<Option<usize>>,
+    /// Where each link is on its body.
+    body_from_links: Vec<Isometry3<f64>>,
+}
+
+impl LinkBodies<'_> {
+    /// The body that a link's body hangs on.
+    fn body_above(&self, link_idx: usize) -> Option<usize> {
+        let mut above_idx = link_idx;
+        while self.bodies[above_idx] == self.bodies[link_idx] {
+            above_idx = self.hand.links[above_idx].parent_idx?;
         }
-        closest().is_some_and(|closest| closest.points.distance_m <= 0.0)
-    };
-    let with_shapes: Vec<usize> = (0..links.len()).filter(|idx| !links[*idx].shapes.is_empty()).collect();
-    let left_out_by =
-        |idx: usize| with_shapes.iter().copied().filter(|other| leaves_out(*other, idx)).collect::<Vec<_>>();
-    let left_out_by: Vec<Vec<usize>> = (0..links.len()).map(left_out_by).collect();
-    // The first group is that of the links which nothing leaves out.
-    let by_none = Vec::new();
-    let mut kinds: Vec<&Vec<usize>> = vec![&by_none];
-    kinds.extend(with_shapes.iter().map(|idx| &left_out_by[*idx]).filter(|by| !by.is_empty()));
-    kinds[1..].sort();
-    kinds.dedup();
-    let group_of_kind = |kind: usize| Group::from_bits_truncate(1_u32.checked_shl(kind as u32).unwrap_or(0));
-    let own = |idx: usize| {
-        if links[idx].shapes.is_empty() {
-            return Group::NONE;
+        self.bodies[above_idx]
+    }
+
+    fn are_joined(&self, a: usize, b: usize) -> bool {
+        let (body_a, body_b) = (self.bodies[a], self.bodies[b]);
+        body_a == body_b || self.body_above(a) == body_b || self.body_above(b) == body_a
+    }
+
+    /// Whether link `b` must not touch link `a`.
+    fn leaves_out(&self, mechanism: &Mechanism<'_>, a: usize, b: usize, palm_from_links: &[Isometry3<f64>]) -> bool {
+        if self.are_joined(a, b) {
+            return self.bodies[a].is_some() && self.bodies[b].is_none();
         }
-        let kind = kinds.iter().position(|kind| **kind == left_out_by[idx]);
-        kind.map_or(Group::NONE, group_of_kind)
-    };
-    let own: Vec<Group> = (0..links.len()).map(own).collect();
-    let all = own.iter().fold(Group::NONE, |all, group| all | *group);
-    let touched = |idx: usize| {
-        let left_out = (0..links.len()).filter(|other| left_out_by[*other].contains(&idx));
-        left_out.fold(all, |rest, other| rest & !own[other])
-    };
-    (kinds.len() <= MAX_LINKS_APART as usize).then(|| (0..own.len()).map(|idx| (own[idx], touched(idx))).collect())
+        let closest = mechanism.closest_of_links(a, b, palm_from_links);
+        closest.is_some_and(|closest| closest.points.distance_m <= 0.0)
+    }
+
+    /// For each link its collision group, and those of the links that it may touch: all but those that it overlaps in the open
+    /// hand, which are built into each other, and those on the palm that a joint joins to it. The engine itself disables the
+    /// contacts of other joined links. A contact takes two links that may touch each other, so one of them is enough to rule it
+    /// out. Links that are left out by the same links share a group. `None` if there are too few groups.
+    fn groups(&self, mechanism: &Mechanism<'_>, palm_from_links: &[Isometry3<f64>]) -> Option<Vec<(Group, Group)>> {
+        let n_links = self.bodies.len();
+        let with_shapes: Vec<usize> = (0..n_links).filter(|idx| !self.hand.links[*idx].shapes.is_empty()).collect();
+        let mut left_out_by: Vec<Vec<usize>> = vec![Vec::new(); n_links];
+        for (idx, by) in left_out_by.iter_mut().enumerate() {
+            by.extend(with_shapes.iter().filter(|other| self.leaves_out(mechanism, **other, idx, palm_from_links)));
+        }
+        // The empty one comes first: that of the links which nothing leaves out.
+        let by_none = Vec::new();
+        let mut kinds: Vec<&Vec<usize>> = vec![&by_none];
+        kinds.extend(with_shapes.iter().map(|idx| &left_out_by[*idx]));
+        kinds.sort();
+        kinds.dedup();
+        if kinds.len() > MAX_LINKS_APART as usize {
+            return None;
+        }
+        let mut own = vec![Group::NONE; n_links];
+        for idx in with_shapes {
+            if let Some(kind) = kinds.iter().position(|kind| **kind == left_out_by[idx]) {
+                own[idx] = Group::from_bits_truncate(1 << kind);
+            }
+        }
+        let all = own.iter().fold(Group::NONE, |all, group| all | *group);
+        let mut groups: Vec<(Group, Group)> = own.iter().map(|own| (*own, all)).collect();
+        for (other, by) in left_out_by.iter().enumerate() {
+            for idx in by {
+                groups[*idx].1 &= !own[other];
+            }
+        }
+        Some(groups)
+    }
+
+    /// The shapes of the hand on their bodies.
+    fn shapes(
+        &self,
+        mechanism: &Mechanism<'_>,
+        palm_from_links: &[Isometry3<f64>],
+    ) -> Result<Vec<ShapePlan>, TrialError> {
+        let Some(groups) = self.groups(mechanism, palm_from_links) else {
+            let n = MAX_LINKS_APART - 1;
+            let reason = format!(
+                "more than {n} links overlap others in the open hand, which no joint joins: give another open hand (--open of \
+                 new hand), or simpler collision shapes"
+            );
+            return Err(TrialError::hand(self.hand, reason));
+        };
+        let mut shapes = Vec::with_capacity(mechanism.shapes.len());
+        for (shape_idx, placed) in mechanism.shapes.iter().enumerate() {
+            let link_idx = placed.link_idx;
+            let (own, touched) = groups[link_idx];
+            shapes.push(ShapePlan {
+                shape_idx,
+                link_idx,
+                body: self.bodies[link_idx],
+                body_from_shape: self.body_from_links[link_idx] * placed.link_from_shape,
+                core: SharedShape(placed.core.clone_dyn().into()),
+                edge_radius_m: placed.edge_radius_m,
+                own,
+                touched,
+            });
+        }
+        Ok(shapes)
+    }
 }
 
 /// The motor's torque or force for each newton at the fingertips that a joint with several links moves: the sum of the
@@ -431,44 +470,56 @@ fn lever(mechanism: &Mechanism<'_>, joint_idx: usize, palm_from_links: &[Isometr
 
 /// The lever of a link's tip: the distance from its joint to the farthest point of the straight finger.
 fn reach_m(hand: &Hand, link_idx: usize) -> f64 {
-    let own_m = hand.links[link_idx]
-        .shapes
-        .iter()
-        .map(|shape| {
-            let sphere = shape.core.compute_local_bounding_sphere();
-            let centre =
-                shape.link_from_shape * nalgebra::Point3::new(sphere.center.x, sphere.center.y, sphere.center.z);
-            centre.coords.norm() + sphere.radius
-        })
-        .fold(0.0, f64::max);
-    let children = hand.links.iter().enumerate().filter(|(_, link)| link.parent_idx == Some(link_idx));
-    children
-        .map(|(child_idx, child)| child.parent_from_joint.translation.vector.norm() + reach_m(hand, child_idx))
-        .fold(own_m, f64::max)
+    let mut farthest_m: f64 = 0.0;
+    for shape in &hand.links[link_idx].shapes {
+        let sphere = shape.core.compute_local_bounding_sphere();
+        let centre = shape.link_from_shape * nalgebra::Point3::new(sphere.center.x, sphere.center.y, sphere.center.z);
+        farthest_m = farthest_m.max(centre.coords.norm() + sphere.radius);
+    }
+    for (child_idx, child) in hand.links.iter().enumerate().filter(|(_, link)| link.parent_idx == Some(link_idx)) {
+        farthest_m = farthest_m.max(child.parent_from_joint.translation.vector.norm() + reach_m(hand, child_idx));
+    }
+    farthest_m
+}
+
+/// The joint of a link that closes, and how the link moves with it. `None` of a link that is fixed while the hand closes.
+fn closing_joint(mechanism: &Mechanism<'_>, link_idx: usize) -> Option<(usize, JointKind, f64)> {
+    let Motion::Joint { joint_idx, kind, multiplier, .. } = mechanism.hand.links[link_idx].motion else { return None };
+    let closes = mechanism.joints.iter().any(|joint| joint.joint_idx == joint_idx);
+    closes.then_some((joint_idx, kind, multiplier))
+}
+
+/// Turns x to the axis of a link that moves, in the direction of closing.
+fn body_from_axis(hand: &Hand, motion: &Motion) -> Isometry3<f64> {
+    let Motion::Joint { joint_idx, multiplier, axis, .. } = *motion else { return Isometry3::identity() };
+    let sign = if hand.closing_rate(joint_idx) < 0.0 { -1.0 } else { 1.0 };
+    let closing_axis = if sign * multiplier < 0.0 { -axis } else { axis };
+    let x_to_axis = UnitQuaternion::rotation_between(&Vector3::x(), &closing_axis)
+        .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI));
+    Isometry3::from_parts(Default::default(), x_to_axis)
 }
 
 /// The mass of a link's shapes and of those of the links that are fixed on it, overlaps counted twice. Rotors are heavier
 /// than links: see [`PhysicsOptions::rotor_inertia`].
 fn body_mass(
-    hand: &Hand,
+    mechanism: &Mechanism<'_>,
     link_idx: usize,
     open_joints_rad: &[f64],
-    is_closing: &impl Fn(usize) -> bool,
     options: &PhysicsOptions,
 ) -> MassProperties {
-    let own = hand.links[link_idx].shapes.iter().map(|shape| {
-        SharedShape::clone(&shape.core)
-            .mass_properties(options.link_density_kg_per_m3)
-            .transform_by(&pose_from_isometry(&shape.link_from_shape))
-    });
-    let is_fixed = |motion: &Motion| !matches!(motion, Motion::Joint { joint_idx, .. } if is_closing(*joint_idx));
-    let children = hand.links.iter().enumerate().filter(|(_, child)| child.parent_idx == Some(link_idx));
-    let fixed = children.filter(|(_, child)| is_fixed(&child.motion)).map(|(child_idx, child)| {
-        let link_from_child = child.parent_from_joint * child.motion.joint_from_link(open_joints_rad);
-        body_mass(hand, child_idx, open_joints_rad, is_closing, options)
-            .transform_by(&pose_from_isometry(&link_from_child))
-    });
-    own.chain(fixed).sum()
+    let mut parts: Vec<MassProperties> = Vec::new();
+    for shape in &mechanism.hand.links[link_idx].shapes {
+        let mass = SharedShape::clone(&shape.core).mass_properties(options.link_density_kg_per_m3);
+        parts.push(mass.transform_by(&pose_from_isometry(&shape.link_from_shape)));
+    }
+    for (child_idx, child) in mechanism.hand.links.iter().enumerate() {
+        if child.parent_idx == Some(link_idx) && closing_joint(mechanism, child_idx).is_none() {
+            let link_from_child = child.parent_from_joint * child.motion.joint_from_link(open_joints_rad);
+            let mass = body_mass(mechanism, child_idx, open_joints_rad, options);
+            parts.push(mass.transform_by(&pose_from_isometry(&link_from_child)));
+        }
+    }
+    parts.into_iter().sum()
 }
 
 #[cfg(test)]

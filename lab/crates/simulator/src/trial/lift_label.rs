@@ -39,11 +39,7 @@ pub(crate) fn try_candidate(
     let hand = mechanism.hand;
     let mut rng = candidate_rng(options.seed, candidate, 0);
     let object_idx = rng.random_range(0..objects.len());
-    let object = &objects[object_idx];
-    let (name, class) = (object.name.clone(), object.class.clone());
-    let (object, friction) = varied(object, options, &mut rng);
-    let mass_kg = object.mass_kg;
-    let target = LiftTarget::new(name, class, object, mass_kg, friction);
+    let target = varied(&objects[object_idx], options, &mut rng);
     let start_seed = rng.random();
     let trial_options = trial_options(options, &mut rng);
     let begun = draw_start(hand, &target, &trial_options, start_seed, 0, 0)
@@ -56,7 +52,7 @@ pub(crate) fn try_candidate(
     let mut rng = candidate_rng(options.seed, candidate, 1);
     let sensor = Sensor::draw(hand, &options.sensor, options.seed, &mut rng);
     let mut attempt = attempt.sensed_by(sensor, rng);
-    let moments: Vec<Moment> = std::iter::from_fn(|| attempt.next_moment()).collect();
+    let mut frames = settled_frames(&mut attempt, &options.frames);
     let contacts = attempt.contacts();
     let is_empty = !contacts.iter().any(|contact| contact.of_object);
     let quality = match quality(&attempt.grasp_case(LABEL_FRICTION)) {
@@ -64,10 +60,6 @@ pub(crate) fn try_candidate(
         Err(QualityError::Hull { .. }) => return Ok(Outcome::HullFailure),
         Err(source) => return Err(CandidateError::Quality { candidate, source }),
     };
-    // The forces on cells take as long to compute as a time step, so they are computed for the frames that are kept alone.
-    let kept = kept(&moments.iter().map(|moment| moment.phase).collect::<Vec<_>>(), &options.frames);
-    let moments = moments.into_iter().enumerate().filter(|(idx, _)| kept.contains(idx));
-    let mut frames: Vec<TimedFrame> = moments.map(|(_, moment)| attempt.feel(moment, 0)).collect();
     let scene = scene(&attempt, &target, candidate, &contacts);
     attempt.probe(ProbeMove::TestLift);
     frames.extend(std::iter::from_fn(|| attempt.next_frame(0)));
@@ -80,14 +72,7 @@ pub(crate) fn try_candidate(
         frames.extend(std::iter::from_fn(|| attempt.next_frame(0)));
     }
     let is_stable = !is_empty && attempt.lift_result().held;
-    // The times leave no room for the frames that are left out.
-    let mut next_nanos = 0;
-    for timed in &mut frames {
-        timed.offset_nanos = next_nanos;
-        let is_lifting = timed.frame.phase == Phase::Lifting;
-        let period_nanos = options.frames.period_nanos;
-        next_nanos += if is_lifting { trial_options.protocol.lifting_frame_nanos } else { period_nanos };
-    }
+    set_times(&mut frames, options.frames.period_nanos, trial_options.protocol.lifting_frame_nanos);
     attempt.check().map_err(|source| CandidateError::Lift { candidate, source: source.into() })?;
     if attempt.has_diverged() {
         return Ok(Outcome::Diverged);
@@ -104,18 +89,45 @@ pub(crate) fn try_candidate(
     Ok(Outcome::Judged(Box::new(Judged { object_idx, is_stable, quality, made: Made::Lifted(grasp) })))
 }
 
-/// The object and its friction as they are in one lift.
-fn varied(object: &Object, options: &SimulatorOptions, rng: &mut impl rand::Rng) -> (Object, f64) {
+/// Goes on to the settled hand. The forces on cells take as long to compute as a time step, so they are computed for the frames
+/// that are kept alone.
+fn settled_frames(attempt: &mut Attempt<'_>, options: &FrameOptions) -> Vec<TimedFrame> {
+    let moments: Vec<Moment> = std::iter::from_fn(|| attempt.next_moment()).collect();
+    let kept = kept(&moments.iter().map(|moment| moment.phase).collect::<Vec<_>>(), options);
+    let moments = moments.into_iter().enumerate().filter(|(idx, _)| kept.contains(idx));
+    moments.map(|(_, moment)| attempt.feel(moment, 0)).collect()
+}
+
+/// Gives frames times that leave no room for the frames that are left out.
+fn set_times(frames: &mut [TimedFrame], period_nanos: u64, lifting_period_nanos: u64) {
+    let mut next_nanos = 0;
+    for timed in frames {
+        timed.offset_nanos = next_nanos;
+        next_nanos += if timed.frame.phase == Phase::Lifting { lifting_period_nanos } else { period_nanos };
+    }
+}
+
+/// The object as it is in one lift.
+fn varied(object: &Object, options: &SimulatorOptions, rng: &mut impl rand::Rng) -> LiftTarget {
     let LiftOptions { friction_factor, mass_factor, centre_shift_m, .. } = &options.lift;
-    let mut between = |[low, high]: [f64; 2]| low + (high - low) * rng.random::<f64>();
-    let friction = options.friction * between(*friction_factor);
+    let friction = options.friction * between(*friction_factor, rng);
     let mut object = object.clone();
-    object.mass_kg *= between(mass_factor.map(f64::ln)).exp();
-    let shift = Vector3::from_fn(|_, _| between([-1.0, 1.0]) * centre_shift_m);
+    object.mass_kg *= between(mass_factor.map(f64::ln), rng).exp();
+    let shift = Vector3::from_fn(|_, _| between([-1.0, 1.0], rng) * centre_shift_m);
     if shift.norm() <= *centre_shift_m {
         object.centre_of_mass_m += shift;
     }
-    (object, friction)
+    let (name, class, mass_kg) = (object.name.clone(), object.class.clone(), object.mass_kg);
+    LiftTarget::new(name, class, object, mass_kg, friction)
+}
+
+fn between([low, high]: [f64; 2], rng: &mut impl rand::Rng) -> f64 {
+    low + (high - low) * rng.random::<f64>()
+}
+
+/// A factor from a range, its logarithm uniform.
+fn factor([low, high]: [f64; 2], rng: &mut impl rand::Rng) -> f64 {
+    (low.ln() + (high / low).ln() * rng.random::<f64>()).exp()
 }
 
 /// The options of the physics in one lift: the simulator's where it has them, drawn from its ranges; defaults elsewhere.
@@ -123,9 +135,9 @@ fn trial_options(options: &SimulatorOptions, rng: &mut impl rand::Rng) -> TrialO
     let LiftOptions { stand_radius_m, force_factor, speed_factor, rubber_factor, contact_factor, gear_factor, .. } =
         options.lift;
     let default = PhysicsOptions::default();
-    let mut factor = |[low, high]: [f64; 2]| (low.ln() + (high / low).ln() * rng.random::<f64>()).exp();
-    let (stand_radius_m, force, speed) = (factor(stand_radius_m), factor(force_factor), factor(speed_factor));
-    let (rubber, contact, gear) = (factor(rubber_factor), factor(contact_factor), factor(gear_factor));
+    let stand_radius_m = factor(stand_radius_m, rng);
+    let (force, speed) = (factor(force_factor, rng), factor(speed_factor, rng));
+    let (rubber, contact, gear) = (factor(rubber_factor, rng), factor(contact_factor, rng), factor(gear_factor, rng));
     let creeps = rng.random::<f64>() < options.lift.creep_share;
     let mut soft_finger = options.soft_finger.clone();
     soft_finger.youngs_modulus_pa *= rubber;
@@ -168,7 +180,6 @@ fn trial_options(options: &SimulatorOptions, rng: &mut impl rand::Rng) -> TrialO
 /// The settled grasp, without the contacts of the stand.
 fn scene(attempt: &Attempt<'_>, target: &LiftTarget, candidate: u64, contacts: &[SimulatedContact]) -> GraspScene {
     let palm_from_object = attempt.palm_from_target();
-    let is_of_hand = |contact: &&SimulatedContact| contact.point.other.is_some();
     GraspScene {
         grasp_id: 0,
         candidate,
@@ -179,10 +190,10 @@ fn scene(attempt: &Attempt<'_>, target: &LiftTarget, candidate: u64, contacts: &
         mass_kg: target.mass_kg,
         friction: target.friction,
         joints: attempt.joints(),
-        self_collision: contacts.iter().any(|contact| is_of_hand(&contact)),
+        self_collision: contacts.iter().any(|contact| contact.point.other.is_some()),
         contacts: contacts
             .iter()
-            .filter(|contact| contact.of_object || is_of_hand(contact))
+            .filter(|contact| contact.of_object || contact.point.other.is_some())
             .map(SimulatedContact::to_scene)
             .collect(),
     }
@@ -191,8 +202,8 @@ fn scene(attempt: &Attempt<'_>, target: &LiftTarget, candidate: u64, contacts: &
 /// The indices of the frames that are kept: the first ones before the touch, evenly spaced ones of the closing, and all from the
 /// settled hand on.
 fn kept(phases: &[Phase], options: &FrameOptions) -> BTreeSet<usize> {
-    let n_of = |wanted: Phase| phases.iter().filter(|phase| **phase == wanted).count();
-    let (n_open, n_closing) = (n_of(Phase::Open), n_of(Phase::Closing));
+    let n_open = phases.iter().filter(|phase| **phase == Phase::Open).count();
+    let n_closing = phases.iter().filter(|phase| **phase == Phase::Closing).count();
     let closing = (1..=options.n_closing).map(|mark| n_open + mark * n_closing / (options.n_closing + 1));
     let settled = n_open + n_closing..phases.len();
     (0..n_open.min(options.n_open)).chain(closing).chain(settled).collect()

@@ -104,6 +104,12 @@ pub enum TrialError {
     Mesh { path: PathBuf, reason: String },
 }
 
+impl TrialError {
+    fn hand(hand: &blindgrasp_stages::hand::Hand, reason: impl ToString) -> TrialError {
+        TrialError::Hand { hand: hand.name.clone(), reason: reason.to_string() }
+    }
+}
+
 /// The outcome of a lift.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct LiftResult {

@@ -63,15 +63,18 @@ impl LiftPath<'_> {
         let by_m = protocol.lift_m - self.from_m;
         let up = Path { from_m: self.from_m, by_m, secs: protocol.lift_secs };
         let shaking_since = secs - protocol.lift_secs - protocol.hold_secs;
-        let shake_m = |secs: f64| {
-            if secs <= 0.0 || secs >= protocol.shake_secs {
-                return 0.0;
-            }
-            // It comes and goes gently.
-            let envelope = (std::f64::consts::PI * secs / protocol.shake_secs).sin().powi(2);
-            protocol.shake_m * envelope * (std::f64::consts::TAU * protocol.shake_hertz * secs).sin()
-        };
-        up.place_m(secs) + Vector3::new(shake_m(shaking_since), 0.0, shake_m(shaking_since - protocol.shake_secs))
+        let [x, z] = [shaking_since, shaking_since - protocol.shake_secs].map(|secs| self.shake_m(secs));
+        up.place_m(secs) + Vector3::new(x, 0.0, z)
+    }
+
+    fn shake_m(&self, secs: f64) -> f64 {
+        let protocol = self.protocol;
+        if secs <= 0.0 || secs >= protocol.shake_secs {
+            return 0.0;
+        }
+        // It comes and goes gently.
+        let envelope = (std::f64::consts::PI * secs / protocol.shake_secs).sin().powi(2);
+        protocol.shake_m * envelope * (std::f64::consts::TAU * protocol.shake_hertz * secs).sin()
     }
 
     /// How long it takes in all.

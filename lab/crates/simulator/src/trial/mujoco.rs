@@ -82,10 +82,8 @@ impl Process {
         let written = writeln!(self.commands, "{command}").and_then(|()| self.commands.flush());
         let n_read = self.answers.read_line(&mut line).map_err(|error| format!("MuJoCo does not answer: {error}"))?;
         if n_read == 0 {
-            return Err(format!(
-                "the process of MuJoCo has ended{}",
-                written.err().map_or(String::new(), |error| format!(": {error}"))
-            ));
+            let why = written.err().map_or(String::new(), |error| format!(": {error}"));
+            return Err(format!("the process of MuJoCo has ended{why}"));
         }
         let answer: Value = serde_json::from_str(&line).map_err(|error| format!("MuJoCo's answer: {error}"))?;
         match answer.get("error").and_then(Value::as_str) {
@@ -93,6 +91,14 @@ impl Process {
             None => Ok(answer),
         }
     }
+}
+
+fn read_answer<T: DeserializeOwned>(answer: Value) -> Result<T, String> {
+    serde_json::from_value(answer).map_err(|error| format!("MuJoCo's answer: {error}"))
+}
+
+fn refused(reason: String) -> TrialError {
+    TrialError::Engine { reason }
 }
 
 /// The entries of PYTHONPATH, without empty ones: these mean the current folder, whose files must not decide what runs.
@@ -155,17 +161,18 @@ impl Mujoco {
         hand: &HandPlan,
         options: &PhysicsOptions,
     ) -> Result<Mujoco, TrialError> {
-        let refuse = |reason: String| TrialError::Engine { reason };
         let idle = IDLE.lock().unwrap_or_else(PoisonError::into_inner).pop();
-        let mut process = idle.map_or_else(Process::start, Ok).map_err(refuse)?;
+        let mut process = match idle {
+            Some(process) => process,
+            None => Process::start().map_err(refused)?,
+        };
         let begin = json!({"begin": {
             "xml": model(target, world_from_target, palm_from_world, hand, options),
             "mesh": concave(target, options),
             "n_axles": hand.bodies.len(),
             "step_secs": options.mujoco.step_secs,
         }});
-        let answer = process.ask(&begin).map_err(refuse)?;
-        let state = serde_json::from_value(answer).map_err(|error| refuse(format!("MuJoCo's answer: {error}")))?;
+        let state = process.ask(&begin).and_then(read_answer).map_err(refused)?;
         Ok(Mujoco {
             process: Mutex::new(Some(process)),
             failure: Mutex::new(None),
@@ -183,9 +190,7 @@ impl Mujoco {
     /// Asks the process. `None` once it has failed, or its answer cannot be read.
     fn ask<T: DeserializeOwned>(&self, command: &Value) -> Option<T> {
         let mut process = self.process.lock().unwrap_or_else(PoisonError::into_inner);
-        let answer = process.as_mut()?.ask(command);
-        let read = |answer| serde_json::from_value(answer).map_err(|error| format!("MuJoCo's answer: {error}"));
-        match answer.and_then(read) {
+        match process.as_mut()?.ask(command).and_then(read_answer) {
             Ok(answer) => Some(answer),
             Err(error) => {
                 *process = None;
@@ -198,6 +203,12 @@ impl Mujoco {
     /// The forces between two bodies.
     fn forces(&self) -> Vec<Force> {
         self.ask(&json!({"touches": {}})).unwrap_or_default()
+    }
+
+    /// The link of a shape of the hand, and the shape.
+    fn link_and_shape(&self, shape: i64) -> Option<(usize, usize)> {
+        let shape_idx = usize::try_from(shape).ok()?;
+        Some((*self.links.get(shape_idx)?, shape_idx))
     }
 }
 
@@ -230,11 +241,11 @@ impl Engine for Mujoco {
     }
 
     fn step(&mut self) {
-        // What the motor does at its speed is a place ahead of it.
-        let control = |command: &AxleCommand| command.target + command.speed * command.damping / command.stiffness;
-        let commands = self.commands.take();
-        let controls = commands.as_ref().map(|all| all.iter().map(control).collect::<Vec<_>>());
-        let most = commands.as_ref().map(|all| all.iter().map(|command| command.most).collect::<Vec<_>>());
+        let (mut controls, mut most) = (Value::Null, Value::Null);
+        if let Some(commands) = self.commands.take() {
+            controls = commands.iter().map(control).collect();
+            most = commands.iter().map(|command| command.most).collect();
+        }
         let step = json!({"step": {
             "controls": controls,
             "most": most,
@@ -267,31 +278,29 @@ impl Engine for Mujoco {
     }
 
     fn touches(&self) -> Vec<Touch> {
-        let touch = |Force(own, other, point_m, outward, newtons)| {
-            let shape = |idx: i64| {
-                let idx = usize::try_from(idx).ok()?;
-                Some((*self.links.get(idx)?, idx))
-            };
-            let (link_idx, shape_idx) = shape(own)?;
-            let side = match other {
-                -1 => Side::Target,
-                -2 => Side::Stand,
-                other => shape(other).map(|(link_idx, shape_idx)| Side::Hand { link_idx, shape_idx })?,
+        let mut touches = Vec::new();
+        for Force(own, other, point_m, outward, newtons) in self.forces() {
+            let Some((link_idx, shape_idx)) = self.link_and_shape(own) else { continue };
+            let side = match (other, self.link_and_shape(other)) {
+                (-1, _) => Side::Target,
+                (-2, _) => Side::Stand,
+                (_, Some((link_idx, shape_idx))) => Side::Hand { link_idx, shape_idx },
+                (_, None) => continue,
             };
             let (point_m, outward) = (point_m.into(), UnitVector3::new_normalize(outward.into()));
-            Some(Touch { link_idx, shape_idx, side, point_m, outward, newtons })
-        };
-        self.forces().into_iter().filter_map(touch).collect()
+            touches.push(Touch { link_idx, shape_idx, side, point_m, outward, newtons });
+        }
+        touches
     }
 
     fn stand_forces(&self) -> Vec<StandForce> {
-        let of_stand = self.forces().into_iter().filter(|Force(own, other, ..)| (*own, *other) == (-1, -2));
-        let force = |Force(_, _, point_m, onto_target, newtons)| StandForce {
-            point_m: point_m.into(),
-            onto_target: onto_target.into(),
-            newtons,
-        };
-        of_stand.map(force).collect()
+        let mut forces = Vec::new();
+        for Force(own, other, point_m, onto_target, newtons) in self.forces() {
+            if (own, other) == (-1, -2) {
+                forces.push(StandForce { point_m: point_m.into(), onto_target: onto_target.into(), newtons });
+            }
+        }
+        forces
     }
 
     fn gravity_in_palm(&self) -> Vector3<f64> {
@@ -301,6 +310,11 @@ impl Engine for Mujoco {
     fn failure(&self) -> Option<String> {
         self.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
+}
+
+/// The place to which a motor is driven: its speed is a place ahead of its target.
+fn control(command: &AxleCommand) -> f64 {
+    command.target + command.speed * command.damping / command.stiffness
 }
 
 /// The mesh of a target that is not convex, and how its parts touch; `null` of a convex one.
@@ -342,47 +356,15 @@ fn model(
     }
     let on_palm = write_shapes(hand, None, &mut meshes);
 
-    let radius_m = options.stand_radius_m;
-    let half_height_m = options.stand_height_m / 2.0;
-    let palm_from_stand = palm_from_world * Isometry3::translation(0.0, 0.0, -half_height_m);
-    let around = (0..32).map(|idx| (std::f64::consts::TAU * f64::from(idx) / 32.0).sin_cos());
-    let prism: Vec<Point3<f64>> = around
-        .flat_map(|(sin, cos)| [-1.0, 1.0].map(|z| Point3::new(radius_m * cos, radius_m * sin, z * half_height_m)))
-        .collect();
-    let stand = meshes.geom(&prism);
+    let palm_from_stand = palm_from_world * Isometry3::translation(0.0, 0.0, -options.stand_height_m / 2.0);
+    let stand = meshes.geom(&prism(options.stand_radius_m, options.stand_height_m / 2.0));
     let ground = palm_from_world * Isometry3::translation(0.0, 0.0, -options.stand_height_m - 0.05);
-    let [slide, twist, roll] = friction(target.friction, options);
-    let surface = format!(r#"condim="4" priority="1" friction="{slide} {twist} {roll}" solref="{contact_secs} 1""#);
-    let solid = match target.object.shape.as_typed_shape() {
-        TypedShape::TriMesh(_) => String::new(),
-        _ => {
-            let geom = geom(&*target.object.shape, &Isometry3::identity(), &mut meshes);
-            format!(r#"<geom name="target" contype="{TARGET}" conaffinity="{HAND}" {surface} {geom}/>"#)
-        }
-    };
-    let foot = meshes.geom(&mesh_of_shape(&target.hull).vertices_m);
-    let palm_from_target = palm_from_world * world_from_target;
-    let centre = target.object.centre_of_mass_m;
-    let mass = target.mass_properties(parry3d_f64::math::Vector::new(centre.x, centre.y, centre.z));
+    let target = target_body(target, &(palm_from_world * world_from_target), options, &mut meshes);
     let on_stand = format!(
         r#"contype="{STAND}" conaffinity="{}" priority="2" friction="{} 0 0" solref="{contact_secs} 1""#,
         HAND | FOOT,
         options.stand_friction
     );
-    let mut excluded = String::new();
-    for (a, b) in apart(hand) {
-        let _ = writeln!(excluded, r#"<exclude body1="{}" body2="{}"/>"#, body_name(a), body_name(b));
-    }
-    let mut actuators = String::new();
-    for (idx, body) in hand.bodies.iter().enumerate() {
-        let per_radian = body.kind.per_radian();
-        let (stiffness, damping) =
-            (options.gear_stiffness / (per_radian * per_radian), options.gear_damping / (per_radian * per_radian));
-        let _ = writeln!(
-            actuators,
-            r#"<general joint="axle{idx}" gainprm="{stiffness}" biastype="affine" biasprm="0 -{stiffness} -{damping}" forcelimited="true" forcerange="-1 1"/>"#
-        );
-    }
     format!(
         r#"<mujoco>
 <compiler angle="radian" autolimits="false" balanceinertia="true" boundmass="1e-6" boundinertia="1e-9"/>
@@ -398,19 +380,77 @@ fn model(
 <joint name="palm_x" type="slide" axis="1 0 0"/><joint name="palm_y" type="slide" axis="0 1 0"/><joint name="palm_z" type="slide" axis="0 0 1"/>
 <inertial pos="0 0 0" mass="3000" diaginertia="300 300 300"/>
 {on_palm}{bodies}</body>
-<body name="target" {}><freejoint/>{}{solid}
-<geom name="foot" contype="{FOOT}" conaffinity="{STAND}" friction="1 0 0" {foot}/></body>
+{target}
 </worldbody>
-<contact>{excluded}</contact>
-<actuator>{actuators}</actuator>
+<contact>{}</contact>
+<actuator>{}</actuator>
 </mujoco>"#,
         vector(&gravity),
         meshes.assets,
         pose(&palm_from_stand),
         pose(&ground),
-        pose(&palm_from_target),
+        exclusions(hand),
+        actuators(hand, options),
+    )
+}
+
+fn target_body(
+    target: &LiftTarget,
+    palm_from_target: &Isometry3<f64>,
+    options: &PhysicsOptions,
+    meshes: &mut Meshes,
+) -> String {
+    let [slide, twist, roll] = friction(target.friction, options);
+    let contact_secs = options.mujoco.contact_secs;
+    let surface = format!(r#"condim="4" priority="1" friction="{slide} {twist} {roll}" solref="{contact_secs} 1""#);
+    let solid = match target.object.shape.as_typed_shape() {
+        TypedShape::TriMesh(_) => String::new(),
+        _ => {
+            let geom = geom(&*target.object.shape, &Isometry3::identity(), meshes);
+            format!(r#"<geom name="target" contype="{TARGET}" conaffinity="{HAND}" {surface} {geom}/>"#)
+        }
+    };
+    let foot = meshes.geom(&mesh_of_shape(&target.hull).vertices_m);
+    let centre = target.object.centre_of_mass_m;
+    let mass = target.mass_properties(parry3d_f64::math::Vector::new(centre.x, centre.y, centre.z));
+    format!(
+        r#"<body name="target" {}><freejoint/>{}{solid}
+<geom name="foot" contype="{FOOT}" conaffinity="{STAND}" friction="1 0 0" {foot}/></body>"#,
+        pose(palm_from_target),
         inertial(&mass),
     )
+}
+
+/// The corners of the stand, which MuJoCo has as a prism of 32 sides.
+fn prism(radius_m: f64, half_height_m: f64) -> Vec<Point3<f64>> {
+    let mut corners = Vec::new();
+    for idx in 0..32 {
+        let (sin, cos) = (std::f64::consts::TAU * f64::from(idx) / 32.0).sin_cos();
+        corners.extend([-1.0, 1.0].map(|z| Point3::new(radius_m * cos, radius_m * sin, z * half_height_m)));
+    }
+    corners
+}
+
+fn exclusions(hand: &HandPlan) -> String {
+    let mut excluded = String::new();
+    for (a, b) in apart(hand) {
+        let _ = writeln!(excluded, r#"<exclude body1="{}" body2="{}"/>"#, body_name(a), body_name(b));
+    }
+    excluded
+}
+
+fn actuators(hand: &HandPlan, options: &PhysicsOptions) -> String {
+    let mut actuators = String::new();
+    for (idx, body) in hand.bodies.iter().enumerate() {
+        let per_radian = body.kind.per_radian();
+        let stiffness = options.gear_stiffness / (per_radian * per_radian);
+        let damping = options.gear_damping / (per_radian * per_radian);
+        let _ = writeln!(
+            actuators,
+            r#"<general joint="axle{idx}" gainprm="{stiffness}" biastype="affine" biasprm="0 -{stiffness} -{damping}" forcelimited="true" forcerange="-1 1"/>"#
+        );
+    }
+    actuators
 }
 
 fn body_name(body: Option<usize>) -> String {
@@ -455,12 +495,13 @@ fn write_body(hand: &HandPlan, idx: usize, meshes: &mut Meshes, out: &mut String
 }
 
 fn write_shapes(hand: &HandPlan, body: Option<usize>, meshes: &mut Meshes) -> String {
-    let of_body = hand.shapes.iter().filter(|shape| shape.body == body);
-    let geoms = of_body.map(|shape| {
+    let mut geoms = String::new();
+    for shape in hand.shapes.iter().filter(|shape| shape.body == body) {
         let geom = geom(&*shape.core, &shape.body_from_shape, meshes);
-        format!("<geom name=\"shape{}\" margin=\"{}\" {geom}/>\n", shape.shape_idx, shape.edge_radius_m)
-    });
-    geoms.collect()
+        let (idx, margin) = (shape.shape_idx, shape.edge_radius_m);
+        let _ = writeln!(geoms, r#"<geom name="shape{idx}" margin="{margin}" {geom}/>"#);
+    }
+    geoms
 }
 
 /// Meshes of the model, by their corners: MuJoCo takes their convex hulls.
@@ -504,7 +545,7 @@ fn geom(shape: &dyn Shape, body_from_shape: &Isometry3<f64>, meshes: &mut Meshes
 
 fn inertial(mass: &MassProperties) -> String {
     let inertia = mass.reconstruct_inertia_matrix();
-    let at = |row: usize, column: usize| inertia.col(column)[row];
+    let [x, y, z] = [0, 1, 2].map(|column| inertia.col(column));
     let centre = mass.local_com;
     format!(
         r#"<inertial pos="{} {} {}" mass="{}" fullinertia="{} {} {} {} {} {}"/>"#,
@@ -512,12 +553,12 @@ fn inertial(mass: &MassProperties) -> String {
         centre.y,
         centre.z,
         mass.mass(),
-        at(0, 0),
-        at(1, 1),
-        at(2, 2),
-        at(0, 1),
-        at(0, 2),
-        at(1, 2)
+        x[0],
+        y[1],
+        z[2],
+        y[0],
+        z[0],
+        z[1]
     )
 }
 
@@ -549,7 +590,7 @@ mod tests {
     }
 
     fn standing(object: Object, mass_kg: f64) -> (Mujoco, LiftTarget) {
-        let target = LiftTarget::new("thing".into(), "thing".into(), object, mass_kg, 1.0);
+        let target = LiftTarget::new("target".into(), "target".into(), object, mass_kg, 1.0);
         let stands = crate::trial::start::world_from_standing(&target, 0.3);
         // The palm is far away, and tilted.
         let palm_from_world = Isometry3::new(Vector3::new(0.1, 0.2, 1.0), Vector3::new(0.5, -0.4, 0.2));
@@ -566,8 +607,8 @@ mod tests {
     }
 
     #[test]
-    fn a_thing_on_the_table_weighs_what_it_weighs_and_stays() {
-        if !can_run("mujoco::a_thing_on_the_table") {
+    fn a_target_on_the_table_weighs_what_it_weighs_and_stays() {
+        if !can_run("mujoco::a_target_on_the_table") {
             return;
         }
         // Convex, and a vessel that CoACD cuts.
@@ -585,7 +626,7 @@ mod tests {
     }
 
     #[test]
-    fn the_palm_moves_and_the_thing_does_not() {
+    fn the_palm_moves_and_the_target_does_not() {
         if !can_run("mujoco::the_palm_moves") {
             return;
         }

@@ -1,4 +1,4 @@
-//! A robot that tries to lift one thing after another: what it feels, what it asks for, and what becomes of each attempt.
+//! A robot that tries to lift one target after another: what it feels, what it asks for, and what becomes of each attempt.
 //!
 //! The caller sends what the robot has to say and tells it the decisions. What the robot does depends on its options and the
 //! decisions alone; it reads no clock and waits for nobody.
@@ -48,7 +48,7 @@ pub enum Doing {
     AsksForDecision { grasp_id: u64, n_before: usize },
     /// An attempt is over: its outcome is to be told, then [`Robot::conclude`] called.
     IsOver(Finished),
-    /// A trial is left out, because the hand cannot come to the thing as it stands.
+    /// A trial is left out, because the hand cannot come to the target as it stands.
     LeavesOut { trial: u64, why: TrialError },
     /// All trials are done.
     IsDone,
@@ -57,7 +57,7 @@ pub enum Doing {
 /// A robot in the middle of its trials.
 pub struct Robot<'a> {
     hand: &'a Hand,
-    things: Vec<LiftTarget>,
+    targets: Vec<LiftTarget>,
     trial_options: TrialOptions,
     options: RobotOptions,
     /// It chooses among approaches.
@@ -88,7 +88,7 @@ enum State<'a> {
 /// An attempt under way.
 struct TriedGrasp<'a> {
     place: Place,
-    thing: LiftTarget,
+    target: LiftTarget,
     attempt: Attempt<'a>,
     n_frames: u64,
     /// Simulated time from its beginning to the last frame.
@@ -113,12 +113,12 @@ impl<'a> Robot<'a> {
     /// A robot at its first trial.
     pub fn new(
         hand: &'a Hand,
-        things: Vec<LiftTarget>,
+        targets: Vec<LiftTarget>,
         trial_options: TrialOptions,
         options: RobotOptions,
     ) -> Robot<'a> {
         let (course, again, state) = (Course::default(), VecDeque::new(), State::Between);
-        Robot { hand, things, trial_options, options, prior: None, course, again, known_seq: None, state }
+        Robot { hand, targets, trial_options, options, prior: None, course, again, known_seq: None, state }
     }
 
     /// The same with a prior, which chooses where random attempts begin.
@@ -138,7 +138,7 @@ impl<'a> Robot<'a> {
         &self.course
     }
 
-    /// Whether the next thing that it does is to begin a new attempt.
+    /// Whether it begins a new attempt next.
     pub fn is_about_to_begin(&self) -> bool {
         matches!(self.state, State::Between) && self.again.is_empty()
     }
@@ -151,7 +151,7 @@ impl<'a> Robot<'a> {
     /// What the robot does next. What it waits for, it goes on asking for.
     ///
     /// # Errors
-    /// A hand or thing that cannot be simulated.
+    /// A hand or target that cannot be simulated.
     pub fn advance(&mut self) -> Result<Doing, TrialError> {
         match std::mem::replace(&mut self.state, State::Between) {
             State::Between => self.begin(),
@@ -181,7 +181,7 @@ impl<'a> Robot<'a> {
                 let reaction = match action {
                     Action::GoOn => Reaction::GoOn,
                     Action::Tighten => Reaction::Tighten,
-                    // In doubt it sets the thing down.
+                    // In doubt it sets the target down.
                     _ => Reaction::SetDown,
                 };
                 self.react(grasp, reaction);
@@ -239,46 +239,46 @@ impl<'a> Robot<'a> {
                 self.state = State::Over { finished, told: None, is_again: true };
                 return self.advance();
             }
-            let (thing, attempt) = self.thing_and_attempt(&finished.place)?;
-            return self.grasp(finished.place.clone(), thing, attempt, Some(finished));
+            let (target, attempt) = self.target_and_attempt(&finished.place)?;
+            return self.grasp(finished.place.clone(), target, attempt, Some(finished));
         }
         let place = self.course.next.clone();
         if place.trial >= self.options.n_trials {
             return Ok(Doing::IsDone);
         }
-        match self.thing_and_attempt(&place) {
+        match self.target_and_attempt(&place) {
             Err(why @ TrialError::NoApproach { .. }) => {
                 self.course.leave_out();
                 Ok(Doing::LeavesOut { trial: place.trial, why })
             }
             drawn => {
-                let (thing, attempt) = drawn?;
-                self.grasp(place, thing, attempt, None)
+                let (target, attempt) = drawn?;
+                self.grasp(place, target, attempt, None)
             }
         }
     }
 
-    fn thing_and_attempt(&self, place: &Place) -> Result<(LiftTarget, Attempt<'a>), TrialError> {
-        let Some(thing) = target_of_trial(&self.things, place.trial) else {
+    fn target_and_attempt(&self, place: &Place) -> Result<(LiftTarget, Attempt<'a>), TrialError> {
+        let Some(target) = target_of_trial(&self.targets, place.trial) else {
             let reason = "there is nothing to lift: expected at least one thing".into();
             return Err(TrialError::Target { name: String::new(), reason });
         };
         let (options, prior, seed) = (&self.trial_options, self.prior.as_ref(), self.options.seed);
-        let start = choose_start(self.hand, thing, options, prior, seed, place.trial, place.attempt)?;
+        let start = choose_start(self.hand, target, options, prior, seed, place.trial, place.attempt)?;
         let sensors = sensor_seed(seed, place.trial, place.attempt);
-        Ok((thing.clone(), Attempt::begin(self.hand, thing, options, &start, sensors)?))
+        Ok((target.clone(), Attempt::begin(self.hand, target, options, &start, sensors)?))
     }
 
     fn grasp(
         &mut self,
         place: Place,
-        thing: LiftTarget,
+        target: LiftTarget,
         attempt: Attempt<'a>,
         outcome: Option<Finished>,
     ) -> Result<Doing, TrialError> {
         let grasp = TriedGrasp {
             place,
-            thing,
+            target,
             attempt,
             n_frames: 0,
             elapsed_nanos: 0,
@@ -317,7 +317,7 @@ impl<'a> Robot<'a> {
                 }
                 let Some(last) = grasp.last.clone() else {
                     let reason = format!("grasp {} has no frames", grasp.place.grasp_id);
-                    return Err(TrialError::Target { name: grasp.thing.name.clone(), reason });
+                    return Err(TrialError::Target { name: grasp.target.name.clone(), reason });
                 };
                 (TactileFrame { phase: Phase::Ended, ..last }, true)
             }
@@ -349,7 +349,7 @@ impl<'a> Robot<'a> {
         let Some(finished) = &grasp.outcome else { return };
         if let Some(lift) = &grasp.lift {
             let reactions = finished.reactions.iter().flatten().skip(lift.reactions.len()).copied();
-            // The hand asked once, and was answered until it went on or set the thing down.
+            // The hand asked once, and was answered until it went on or set the target down.
             let answers: Vec<Reaction> = reactions.collect();
             let until = answers.iter().position(|answer| *answer != Reaction::Tighten).map_or(0, |idx| idx + 1);
             self.state = State::Deciding(grasp);
@@ -409,7 +409,7 @@ impl<'a> Robot<'a> {
         self.finish(*grasp, quality, Some(result));
     }
 
-    /// Ends an attempt with a lift, or lets go: after a test lift, or in the middle of a lift, it sets the thing down.
+    /// Ends an attempt with a lift, or lets go: after a test lift, or in the middle of a lift, it sets the target down.
     fn finish(&mut self, mut grasp: TriedGrasp<'a>, quality: Option<(f64, f64)>, lift: Option<LiftResult>) {
         let is_broken_off = lift.is_none() && grasp.lift.is_some();
         let is_set_down = is_broken_off || lift.is_none() && grasp.probes.last() == Some(&ProbeMove::TestLift);
@@ -423,7 +423,7 @@ impl<'a> Robot<'a> {
         let lift = lift.or(is_lost.then_some(LiftResult { held: false, slip_m: moved_m, turn_rad: turned_rad }));
         let disturbed = lift.is_none() && (moved_m > DISTURBED_M || turned_rad > DISTURBED_RAD);
         let (epsilon, volume) = quality.unwrap_or((-1.0, 0.0));
-        let TriedGrasp { place, thing, attempt, n_frames, elapsed_nanos, probes, last, lift: watched, .. } = grasp;
+        let TriedGrasp { place, target, attempt, n_frames, elapsed_nanos, probes, last, lift: watched, .. } = grasp;
         let n_frames = n_frames + u64::from(lift.is_some());
         let outcome = LiftOutcome {
             grasp_id: place.grasp_id,
@@ -436,10 +436,10 @@ impl<'a> Robot<'a> {
             turn_rad: lift.map_or(turned_rad, |lift| lift.turn_rad),
             epsilon,
             volume,
-            mass_kg: thing.mass_kg,
-            friction: thing.friction,
-            thing: thing.name,
-            group: thing.group,
+            mass_kg: target.mass_kg,
+            friction: target.friction,
+            thing: target.name,
+            group: target.group,
             probed: !probes.is_empty(),
             disturbed,
         };
@@ -480,10 +480,12 @@ fn probe_of(action: Action) -> Option<ProbeMove> {
 
 /// The last frame of an attempt with a lift, which says how it ended.
 fn told_frame(finished: &Finished, last: Option<TactileFrame>, hand_id: u64) -> Option<Box<Stamped<TactileFrame>>> {
+    if !finished.outcome.lifted {
+        return None;
+    }
     let phase = if finished.outcome.held { Phase::Kept } else { Phase::Dropped };
     let header = told_header(finished, finished.last_seq(), hand_id);
-    let tell = |last| Box::new(Stamped { header, message: TactileFrame { phase, ..last } });
-    if finished.outcome.lifted { last.map(tell) } else { None }
+    Some(Box::new(Stamped { header, message: TactileFrame { phase, ..last? } }))
 }
 
 /// The header of what is told of an attempt that is over, under its own number.

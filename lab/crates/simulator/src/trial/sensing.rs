@@ -20,13 +20,8 @@ pub(super) fn patches(
 ) -> Vec<SimulatedContact> {
     let mut pressed = Vec::new();
     touches.retain(|touch| touch.newtons >= LEAST_NEWTONS);
-    let kind = |touch: &Touch| match touch.side {
-        Side::Target => 0,
-        Side::Stand => 1,
-        Side::Hand { link_idx, .. } => 2 + link_idx,
-    };
-    touches.sort_by_key(|touch| (touch.link_idx, kind(touch)));
-    for group in touches.chunk_by(|a, b| (a.link_idx, kind(a)) == (b.link_idx, kind(b))) {
+    touches.sort_by_key(sides);
+    for group in touches.chunk_by(|a, b| sides(a) == sides(b)) {
         for merged in merge(group, options) {
             let other = match merged.side {
                 Side::Hand { link_idx, shape_idx } => Some(OtherLink { link_idx, shape_idx }),
@@ -49,6 +44,16 @@ pub(super) fn patches(
     press(mechanism, palm_from_links, palm_from_target, &pressed, &options.soft_finger)
 }
 
+/// Link and other side of a touch.
+fn sides(touch: &Touch) -> (usize, usize) {
+    let other = match touch.side {
+        Side::Target => 0,
+        Side::Stand => 1,
+        Side::Hand { link_idx, .. } => 2 + link_idx,
+    };
+    (touch.link_idx, other)
+}
+
 /// Weaker forces are ignored.
 const LEAST_NEWTONS: f64 = 1e-3;
 
@@ -67,22 +72,22 @@ fn merge(touches: &[Touch], options: &PhysicsOptions) -> Vec<Touch> {
             _ => chosen.push((touch.point_m, vec![touch])),
         }
     }
-    chosen
-        .into_iter()
-        .map(|(_, members)| {
-            let newtons: f64 = members.iter().map(|member| member.newtons).sum();
-            let mean = |of: &dyn Fn(&Touch) -> Vector3<f64>| -> Vector3<f64> {
-                members.iter().map(|member| of(member) * member.newtons).sum::<Vector3<f64>>() / newtons
-            };
-            let outward = mean(&|member| member.outward.into_inner());
-            Touch {
-                point_m: mean(&|member| member.point_m.coords).into(),
-                outward: UnitVector3::try_new(outward, 1e-6).unwrap_or(members[0].outward),
-                newtons,
-                ..*members[0]
-            }
-        })
-        .collect()
+    let mut merged = Vec::with_capacity(chosen.len());
+    for (_, members) in chosen {
+        let newtons: f64 = members.iter().map(|member| member.newtons).sum();
+        let (mut point, mut outward) = (Vector3::zeros(), Vector3::zeros());
+        for member in &members {
+            point += member.point_m.coords * member.newtons;
+            outward += member.outward.into_inner() * member.newtons;
+        }
+        merged.push(Touch {
+            point_m: (point / newtons).into(),
+            outward: UnitVector3::try_new(outward / newtons, 1e-6).unwrap_or(members[0].outward),
+            newtons,
+            ..*members[0]
+        });
+    }
+    merged
 }
 
 #[cfg(test)]

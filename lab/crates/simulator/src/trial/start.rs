@@ -18,7 +18,7 @@ use blindgrasp_stages::hand::{Hand, pose_from_isometry};
 const MOST_DRAWS: usize = 1000;
 
 /// Beside the attempts' own: no trial has so many.
-const THING_STREAM: u64 = (1 << 20) - 1;
+const TARGET_STREAM: u64 = (1 << 20) - 1;
 
 /// Draws attempt number `attempt` of trial number `trial`: a pure function of them, the target and the seed. Approaches
 /// on which the open hand would come to the stand before it touches the target are drawn again: where the stand is, the
@@ -34,14 +34,9 @@ pub fn draw_start(
     trial: u64,
     attempt: u32,
 ) -> Result<Start, TrialError> {
-    let stream = |number: u64| {
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        rng.set_stream(trial << 20 | number);
-        rng
-    };
     // The target stands as it stood for all attempts of a trial.
-    let yaw_rad = std::f64::consts::TAU * stream(THING_STREAM).random::<f64>();
-    let mut rng = stream(u64::from(attempt));
+    let yaw_rad = std::f64::consts::TAU * stream(seed, trial << 20 | TARGET_STREAM).random::<f64>();
+    let mut rng = stream(seed, trial << 20 | u64::from(attempt));
     let mechanism = Mechanism::new(hand);
     let (protocol, range) = (
         &options.protocol,
@@ -92,7 +87,6 @@ fn plan(
     yaw_rad: f64,
     rng: &mut ChaCha8Rng,
 ) -> Result<Start, TrialError> {
-    let refuse = |reason: String| TrialError::Hand { hand: mechanism.hand.name.clone(), reason };
     let (protocol, planner) = (&options.protocol, &options.planner);
     let world_from_target = world_from_standing(target, yaw_rad);
     let approaches = Approaches::new(mechanism.hand, &target.object, range, planner);
@@ -116,9 +110,9 @@ fn plan(
         }
         let explored =
             mechanism.close_from(&target.object, touch.palm_from_target, start.open_joints_rad.clone(), range);
-        let exploration = explored.map_err(|error| refuse(error.to_string()))?;
+        let exploration = explored.map_err(|error| TrialError::hand(mechanism.hand, error))?;
         let energy = energy(mechanism.hand, &target.object, &exploration, planner);
-        let energy = energy.map_err(|error| refuse(error.to_string()))?;
+        let energy = energy.map_err(|error| TrialError::hand(mechanism.hand, error))?;
         if best.as_ref().is_none_or(|(least, _)| energy < *least) {
             best = Some((energy, start));
         }
@@ -127,8 +121,10 @@ fn plan(
             break;
         }
     }
-    let none = || TrialError::NoApproach { target: target.name.clone(), n_draws: MOST_DRAWS };
-    best.map(|(_, start)| start).ok_or_else(none)
+    match best {
+        Some((_, start)) => Ok(start),
+        None => Err(TrialError::NoApproach { target: target.name.clone(), n_draws: MOST_DRAWS }),
+    }
 }
 
 /// Draws attempt number `attempt` of trial number `trial` as [`draw_start`] does, or, with a prior, several of them, of
@@ -147,16 +143,11 @@ pub fn choose_start(
 ) -> Result<Start, TrialError> {
     let mut chosen = draw_start(hand, target, options, seed, trial, attempt)?;
     let Some(prior) = prior else { return Ok(chosen) };
-    let probability_kept = |start: &Start| {
-        let world_from_palm = UnitQuaternion::from_quaternion(nalgebra::Quaternion::from(start.world_from_palm_xyzw));
-        let down = world_from_palm.inverse() * -Vector3::z();
-        prior.probability_kept(down.into(), &start.open_joints_rad).unwrap_or(0.0)
-    };
-    let mut best = probability_kept(&chosen);
+    let mut best = probability_kept(prior, &chosen);
     for number in 1..options.protocol.n_approaches {
         // Attempts have 16 bits.
         let drawn = draw_start(hand, target, options, seed, trial, attempt | number << 16)?;
-        let probability = probability_kept(&drawn);
+        let probability = probability_kept(prior, &drawn);
         if probability > best {
             (chosen, best) = (drawn, probability);
         }
@@ -164,13 +155,23 @@ pub fn choose_start(
     Ok(chosen)
 }
 
+fn probability_kept(prior: &ApproachPrior, start: &Start) -> f64 {
+    let world_from_palm = UnitQuaternion::from_quaternion(nalgebra::Quaternion::from(start.world_from_palm_xyzw));
+    let down = world_from_palm.inverse() * -Vector3::z();
+    prior.probability_kept(down.into(), &start.open_joints_rad).unwrap_or(0.0)
+}
+
 /// The seed of the sensor's noise in attempt number `attempt` of trial number `trial`: a pure function of them and the
 /// seed.
 pub fn sensor_seed(seed: u64, trial: u64, attempt: u32) -> u64 {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
     // Beside the streams that `draw_start` draws from.
-    rng.set_stream(1 << 63 | trial << 20 | u64::from(attempt));
-    rng.random()
+    stream(seed, 1 << 63 | trial << 20 | u64::from(attempt)).random()
+}
+
+fn stream(seed: u64, number: u64) -> ChaCha8Rng {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(number);
+    rng
 }
 
 /// Where everything is when the open hand first touches.
@@ -186,7 +187,6 @@ pub(super) fn first_touch(
     target: &LiftTarget,
     start: &Start,
 ) -> Result<Option<FirstTouch>, TrialError> {
-    let refuse = |reason: String| TrialError::Hand { hand: mechanism.hand.name.clone(), reason };
     let world_from_target = world_from_standing(target, start.yaw_rad);
     let world_from_palm = UnitQuaternion::from_quaternion(nalgebra::Quaternion::from(start.world_from_palm_xyzw));
     let from = protocol::Start {
@@ -195,12 +195,12 @@ pub(super) fn first_touch(
         lateral_offset_m: start.lateral_offset_m,
         back_off_m: 0.0,
     };
-    if mechanism.hand.self_collides(&start.open_joints_rad).map_err(|error| refuse(error.to_string()))? {
+    if mechanism.hand.self_collides(&start.open_joints_rad).map_err(|error| TrialError::hand(mechanism.hand, error))? {
         return Ok(None);
     }
     let palm_from_target = mechanism
         .approach(&target.object, &from, &ProtocolOptions::default())
-        .map_err(|error| refuse(error.to_string()))?;
+        .map_err(|error| TrialError::hand(mechanism.hand, error))?;
     Ok(palm_from_target.map(|palm_from_target| FirstTouch {
         palm_from_target,
         palm_from_world: palm_from_target * world_from_target.inverse(),
@@ -227,10 +227,10 @@ pub(super) fn stand_distance_m(
     let palm_from_links = mechanism
         .hand
         .palm_from_links(&start.open_joints_rad)
-        .map_err(|error| TrialError::Hand { hand: mechanism.hand.name.clone(), reason: error.to_string() })?;
+        .map_err(|error| TrialError::hand(mechanism.hand, error))?;
     let (stand, pose) = (stand_shape(options), pose_from_isometry(&(palm_from_world * world_from_stand(options))));
     let distance_m = mechanism.shapes.iter().map(|shape| {
-        let shape_pose = pose_from_isometry(&(palm_from_links[shape.link_idx] * shape.link_from_shape));
+        let shape_pose = shape.pose_in_palm(&palm_from_links);
         // No hand has a shape that cannot be measured against a cylinder.
         distance(&shape_pose, shape.core, &pose, &*stand).map_or(0.0, |found| found.distance) - shape.edge_radius_m
     });

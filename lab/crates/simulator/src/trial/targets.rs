@@ -94,7 +94,7 @@ pub fn target_of_trial(targets: &[LiftTarget], trial: u64) -> Option<&LiftTarget
 }
 
 /// Looks for an approach to each target, as the first attempt at it begins: the names of targets without one are known before
-/// the first of `n_trials` trials, which are left out. Flat things on a table are such.
+/// the first of `n_trials` trials, which are left out. Flat objects on a table are such.
 ///
 /// # Errors
 /// No target has an approach, or a hand that cannot be simulated.
@@ -180,18 +180,18 @@ fn paper_targets(name: &str) -> Result<Option<Vec<LiftTarget>>, TrialError> {
             reason: format!("not one of the paper's: expected paper, {}", groups.join(", ")),
         });
     }
-    let refused = |error: &dyn std::fmt::Display| TrialError::Target { name: name.into(), reason: error.to_string() };
-    wanted
-        .into_iter()
-        .map(|&(name, shape, mass_kg, friction, _)| {
-            let object = shape.object(mass_kg).map_err(|error| refused(&error))?;
-            Ok(LiftTarget::new(name.into(), shape.name().into(), object, mass_kg, friction))
-        })
-        .collect::<Result<_, _>>()
-        .map(Some)
+    let mut targets = Vec::with_capacity(wanted.len());
+    for &(of_paper, shape, mass_kg, friction, _) in wanted {
+        let object = match shape.object(mass_kg) {
+            Ok(object) => object,
+            Err(error) => return Err(TrialError::Target { name: name.into(), reason: error.to_string() }),
+        };
+        targets.push(LiftTarget::new(of_paper.into(), shape.name().into(), object, mass_kg, friction));
+    }
+    Ok(Some(targets))
 }
 
-/// Things of the catalogue, and meshes; with warnings.
+/// Objects of the catalogue, and meshes; with warnings.
 fn others(name: &str) -> Result<(Vec<LiftTarget>, Vec<String>), TrialError> {
     let (objects, warnings) = objects_named(name).map_err(|error| match error {
         NamedError::Selection(SelectionError::Unknown { .. }) => TrialError::Target {
@@ -210,14 +210,11 @@ fn others(name: &str) -> Result<(Vec<LiftTarget>, Vec<String>), TrialError> {
     let mut targets: Vec<LiftTarget> = targets.collect();
     // Groups take turns, so that any number of trials reaches all of them.
     let mut n_of_group: BTreeMap<String, usize> = BTreeMap::new();
-    let mut turn = |target: &LiftTarget| {
+    targets.sort_by_cached_key(|target| {
         let n = n_of_group.entry(target.group.clone()).or_default();
         *n += 1;
         *n
-    };
-    let turns: Vec<usize> = targets.iter().map(&mut turn).collect();
-    let mut turns = turns.into_iter();
-    targets.sort_by_cached_key(|_| turns.next());
+    });
     Ok((targets, warnings))
 }
 

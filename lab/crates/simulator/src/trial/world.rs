@@ -63,16 +63,7 @@ impl World {
         hand: &HandPlan,
         options: &PhysicsOptions,
     ) -> Result<World, TrialError> {
-        let mut engine = PhysicsWorld::new();
-        let parameters = &mut engine.integration_parameters;
-        parameters.dt = options.step_secs;
-        parameters.length_unit = LENGTH_UNIT_M;
-        parameters.num_solver_iterations = options.n_solver_iterations;
-        parameters.contact_softness.natural_frequency = options.contact_hertz;
-        parameters.contact_softness.damping_ratio = options.contact_damping_ratio;
-        parameters.static_contact_softness = parameters.contact_softness;
-        parameters.normalized_contact_recycle_distance = RECYCLE_M / LENGTH_UNIT_M;
-        parameters.friction_model = rapier3d_f64::dynamics::FrictionModel::Coulomb;
+        let mut engine = empty_world(options);
         let up = palm_from_world.rotation * Vector3::z();
         engine.gravity = to_engine(&(up * -GRAVITY));
 
@@ -103,13 +94,16 @@ impl World {
             .can_sleep(false)
             .additional_mass_properties(target.mass_properties(centre));
         let target_handle = engine.insert_body(body);
-        let surface = |builder: ColliderBuilder| builder.density(0.0).friction(target.friction);
         engine.insert_collider(
-            surface(ColliderBuilder::new(object.shape.clone())).collision_groups(groups(TARGET, HAND)),
+            ColliderBuilder::new(object.shape.clone())
+                .density(0.0)
+                .friction(target.friction)
+                .collision_groups(groups(TARGET, HAND)),
             Some(target_handle),
         );
         engine.insert_collider(
-            surface(ColliderBuilder::new(target.hull.clone()))
+            ColliderBuilder::new(target.hull.clone())
+                .density(0.0)
                 .friction(1.0)
                 .friction_combine_rule(CoefficientCombineRule::Min)
                 .collision_groups(groups(FOOT, STAND)),
@@ -170,6 +164,10 @@ impl World {
         Ok(())
     }
 
+    fn shape_of(&self, collider: ColliderHandle) -> Option<&ShapeCollider> {
+        self.shapes.iter().find(|shape| shape.collider == collider)
+    }
+
     /// A collider of the hand, with its link's own group and those of the links that it may touch. Its friction is the
     /// target's alone.
     pub(super) fn hand_collider(
@@ -189,14 +187,13 @@ impl World {
 impl Engine for World {
     fn travel(&self, axle: usize) -> f64 {
         let (handle, kind) = self.axles[axle];
-        let joints = &self.engine.multibody_joints;
-        joints.get(handle).and_then(|(multibody, id)| multibody.link(id)).map_or(0.0, |link| {
-            // Three shifts, then the turn about x.
-            match kind {
-                JointKind::Prismatic => link.joint.coords()[0],
-                JointKind::Revolute => link.joint.coords()[3],
-            }
-        })
+        let Some((multibody, link_id)) = self.engine.multibody_joints.get(handle) else { return 0.0 };
+        let Some(link) = multibody.link(link_id) else { return 0.0 };
+        // Three shifts, then the turn about x.
+        match kind {
+            JointKind::Prismatic => link.joint.coords()[0],
+            JointKind::Revolute => link.joint.coords()[3],
+        }
     }
 
     fn drive(&mut self, commands: &[AxleCommand]) {
@@ -254,13 +251,13 @@ impl Engine for World {
     }
 
     fn touches(&self) -> Vec<Touch> {
-        let of_hand = |collider: ColliderHandle| self.shapes.iter().find(|shape| shape.collider == collider);
         let mut touches = Vec::new();
         for pair in self.engine.narrow_phase.contact_pairs() {
             let sides = [pair.collider1, pair.collider2];
-            for (idx, shape) in sides.iter().enumerate().filter_map(|(idx, side)| Some((idx, of_hand(*side)?))) {
+            for idx in [0, 1] {
+                let Some(shape) = self.shape_of(sides[idx]) else { continue };
                 let other = sides[1 - idx];
-                let side = match of_hand(other) {
+                let side = match self.shape_of(other) {
                     Some(other) => Side::Hand { link_idx: other.link_idx, shape_idx: other.shape_idx },
                     None if self.engine.colliders[other].parent() == Some(self.target) => Side::Target,
                     None => Side::Stand,
@@ -314,6 +311,20 @@ const RECYCLE_M: f64 = 1e-4;
 
 /// Half the thickness of the ground under the stand.
 const GROUND_HALF_M: f64 = 0.05;
+
+fn empty_world(options: &PhysicsOptions) -> PhysicsWorld {
+    let mut engine = PhysicsWorld::new();
+    let parameters = &mut engine.integration_parameters;
+    parameters.dt = options.step_secs;
+    parameters.length_unit = LENGTH_UNIT_M;
+    parameters.num_solver_iterations = options.n_solver_iterations;
+    parameters.contact_softness.natural_frequency = options.contact_hertz;
+    parameters.contact_softness.damping_ratio = options.contact_damping_ratio;
+    parameters.static_contact_softness = parameters.contact_softness;
+    parameters.normalized_contact_recycle_distance = RECYCLE_M / LENGTH_UNIT_M;
+    parameters.friction_model = rapier3d_f64::dynamics::FrictionModel::Coulomb;
+    engine
+}
 
 /// A table or post, its axis along y as the engine has cylinders.
 pub(super) fn stand_shape(options: &PhysicsOptions) -> SharedShape {
