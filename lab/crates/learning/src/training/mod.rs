@@ -247,6 +247,8 @@ fn learn_probes(
         } else if let Learner::Boosting(_) = options.recipe.learner {
             *probe = probes::learn(hand, &options.recipe, features, phase, examples, folds, options.seed)?;
             match probe {
+                // For an aim, it never lifts before a policy is chosen.
+                Some(_) if options.aim.is_some() => {}
                 Some(probe) => probe.set_threshold(options.threshold_probability),
                 None => {
                     progress(&format!("not learned: on new objects, frames after the {name} do no better than a guess"))

@@ -109,37 +109,15 @@ pub(super) fn choose_thresholds(
         ));
     }
     let settled = out_of_fold_probabilities(judged)?;
-    let (mut chosen_looks, mut refusals) = (Vec::new(), Vec::new());
-    // With a promise, a tight hand is not lifted before its test lift, so that no threshold of its own lets it go on.
-    let mut stable_from = [NEVER; 2];
-    for look in LastLook::ALL {
-        if look != LastLook::Settled && probes.after(look).is_none() {
-            continue;
-        }
-        match aim.choose(&Policies::new(&attempts(judged, &settled, probes, look), look, stable_from), look) {
-            Ok(chosen) => {
-                match (look, aim) {
-                    (LastLook::Settled, _) => stable_from[0] = chosen.policy.lift,
-                    (LastLook::Squeezed, Aim::DropSecs(_)) => stable_from[1] = chosen.policy.lift,
-                    _ => {}
-                }
-                chosen_looks.push(chosen);
-            }
-            Err(refusal) => refusals.push(refusal),
-        }
-    }
+    let (chosen_looks, refusals) = choose_looks(aim, judged, &settled, probes);
     if chosen_looks.is_empty() || matches!(aim, Aim::DropSecs(_)) && !refusals.is_empty() {
         return Err(TrainingError::Data(refusals.join("; ")));
     }
-    classifier.threshold_probability = stable_from[0];
-    classifier.unsure_from_probability = stable_from[0];
-    for probe in [&mut probes.squeezed, &mut probes.test_lifted].into_iter().flatten() {
-        probe.set_threshold(NEVER);
-    }
+    classifier.threshold_probability = NEVER;
     let stable: Vec<bool> = judged.examples.iter().map(|example| example.stable).collect();
     let settled_roc_area = area_under_roc(&curve(&settled, &stable)).unwrap_or(0.5);
     let has_test_lift = chosen_looks.iter().any(|chosen| chosen.look == LastLook::TestLifted);
-    let mut summaries = Vec::new();
+    let (mut summaries, mut unsure_from) = (Vec::new(), NEVER);
     for mut chosen in chosen_looks {
         let policy = chosen.policy;
         let is_before_test_lift = chosen.look == LastLook::Squeezed && has_test_lift;
@@ -155,8 +133,11 @@ pub(super) fn choose_thresholds(
         let mut roc_area = settled_roc_area;
         if let Some(learned) = probes.after(chosen.look) {
             learned.set_threshold(policy.lift);
-            classifier.unsure_from_probability = policy.promising;
+            unsure_from = policy.promising;
             roc_area = learned.probe.cross_validated_roc_area;
+        } else {
+            classifier.threshold_probability = policy.lift;
+            unsure_from = policy.lift;
         }
         if chosen.look == LastLook::TestLifted
             && let Some(squeezed) = &mut probes.squeezed
@@ -165,10 +146,41 @@ pub(super) fn choose_thresholds(
         }
         summaries.push(chosen.summary(roc_area));
     }
+    classifier.unsure_from_probability = unsure_from;
     for refusal in refusals {
         progress(&format!("not lifted: {refusal}"));
     }
     Ok(summaries)
+}
+
+/// Chooses the policies of all looks that the model has, and says why looks have none.
+fn choose_looks(
+    aim: Aim,
+    judged: &OutOfFold<'_>,
+    settled: &[f64],
+    probes: &mut LearnedProbes,
+) -> (Vec<Chosen>, Vec<String>) {
+    let (mut chosen_looks, mut refusals) = (Vec::new(), Vec::new());
+    let mut stable_from = [NEVER; 2];
+    for look in LastLook::ALL {
+        if look != LastLook::Settled && probes.after(look).is_none() {
+            continue;
+        }
+        match aim.choose(&Policies::new(&attempts(judged, settled, probes, look), look, stable_from), look) {
+            Ok(chosen) => {
+                match (look, aim) {
+                    (LastLook::Settled, _) => stable_from[0] = chosen.policy.lift,
+                    (LastLook::Squeezed, Aim::DropSecs(_)) => stable_from[1] = chosen.policy.lift,
+                    // With a promise, a tight hand is not lifted before its test lift, so that no threshold of its own lets
+                    // it go on.
+                    _ => {}
+                }
+                chosen_looks.push(chosen);
+            }
+            Err(refusal) => refusals.push(refusal),
+        }
+    }
+    (chosen_looks, refusals)
 }
 
 /// The grasps as attempts that a look decides.
