@@ -183,55 +183,66 @@ fn own_lifts_lines(model: &Model) -> Vec<String> {
 
 fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
     let model = Model::load(&arguments.model)?;
-    let calibration = &model.classifier.calibration;
-    let training = &model.training;
     if arguments.json {
-        let mut training_json = serde_json::to_value(training)?;
-        if let Some(trained_on) = training_json.get_mut("trained_on").and_then(serde_json::Value::as_object_mut) {
-            trained_on.remove("grasps");
-        }
-        let shown = json!({
-            "format": model.format,
-            "hand": model.hand.name,
-            "hand_id": format!("{:016x}", model.hand.id),
-            "recipe": training.recipe,
-            "sigma_m": model.features.sigma_m,
-            "dictionary_m": model.features.dictionary.words_m,
-            "predictor": predictor_json(&model.classifier.predictor),
-            "calibration": { "method": "platt", "a": calibration.a, "b": calibration.b },
-            "threshold_probability": model.classifier.threshold_probability,
-            "unsure_from_probability": model.classifier.unsure_from_probability,
-            "training_range": model.training_range,
-            "squeezed": model.squeezed.as_ref().map(probe_json),
-            "test_lifted": model.test_lifted.as_ref().map(probe_json),
-            "approach": model.approach.as_ref().map(|prior| json!({
-                "predictor": trees_json(&prior.trees),
-                "cross_validated_roc_area": prior.cross_validated_roc_area,
-            })),
-            "day": model.day,
-            "training": training_json,
-            "checksum": model.checksum,
-        });
-        print_text(&serde_json::to_string_pretty(&shown)?)?;
+        print_text(&serde_json::to_string_pretty(&model_json(&model)?)?)?;
         return Ok(Outcome::Done);
     }
-    for (what, value) in [
+    for (name, value) in described(&model) {
+        print_line(&format!("{name:<16} {value}"))?;
+    }
+    for line in probe_lines(&model) {
+        print_line(&line)?;
+    }
+    Ok(Outcome::Done)
+}
+
+fn model_json(model: &Model) -> anyhow::Result<serde_json::Value> {
+    let calibration = &model.classifier.calibration;
+    let mut training = serde_json::to_value(&model.training)?;
+    if let Some(trained_on) = training.get_mut("trained_on").and_then(serde_json::Value::as_object_mut) {
+        trained_on.remove("grasps");
+    }
+    Ok(json!({
+        "format": model.format,
+        "hand": model.hand.name,
+        "hand_id": format!("{:016x}", model.hand.id),
+        "recipe": model.training.recipe,
+        "sigma_m": model.features.sigma_m,
+        "dictionary_m": model.features.dictionary.words_m,
+        "predictor": predictor_json(&model.classifier.predictor),
+        "calibration": { "method": "platt", "a": calibration.a, "b": calibration.b },
+        "threshold_probability": model.classifier.threshold_probability,
+        "unsure_from_probability": model.classifier.unsure_from_probability,
+        "training_range": model.training_range,
+        "squeezed": model.squeezed.as_ref().map(probe_json),
+        "test_lifted": model.test_lifted.as_ref().map(probe_json),
+        "approach": model.approach.as_ref().map(|prior| json!({
+            "predictor": trees_json(&prior.trees),
+            "cross_validated_roc_area": prior.cross_validated_roc_area,
+        })),
+        "day": model.day,
+        "training": training,
+        "checksum": model.checksum,
+    }))
+}
+
+/// The properties of a model by their names, for people.
+fn described(model: &Model) -> Vec<(&'static str, String)> {
+    let Model { training, features, classifier, training_range, .. } = model;
+    let mut described = vec![
         ("format", model.format.clone()),
         ("hand", format!("{} ({:016x})", model.hand.name, model.hand.id)),
-        ("recipe", format!("{}, {} values", training.recipe.name, model.features.len())),
-        (
-            "dictionary",
-            format!("{} words, sigma {} m", model.features.dictionary.words_m.len(), model.features.sigma_m),
-        ),
-        ("predictor", model.classifier.predictor.summary()),
-        ("calibration", format!("Platt, a {:.4}, b {:.4}", calibration.a, calibration.b)),
-        ("threshold", threshold_line(&model.classifier)),
+        ("recipe", format!("{}, {} values", training.recipe.name, features.len())),
+        ("dictionary", format!("{} words, sigma {} m", features.dictionary.words_m.len(), features.sigma_m)),
+        ("predictor", classifier.predictor.summary()),
+        ("calibration", format!("Platt, a {:.4}, b {:.4}", classifier.calibration.a, classifier.calibration.b)),
+        ("threshold", threshold_line(classifier)),
         (
             "training range",
             format!(
                 "{} quantities have limits; those of other objects' grasps flag {} of the training grasps",
-                model.training_range.limits.len(),
-                percent(Some(model.training_range.share_flagged))
+                training_range.limits.len(),
+                percent(Some(training_range.share_flagged))
             ),
         ),
         (
@@ -261,19 +272,18 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
             ),
         ),
         ("checksum", model.checksum.clone()),
-    ] {
-        print_line(&format!("{what:<16} {value}"))?;
-    }
+    ];
     let relabelled = training.labels.contains_key(&Label::WrenchSpace).then(|| Label::WrenchSpace.meaning().to_owned());
-    if let Some(label) = label_line(&training.labels).or(relabelled) {
-        print_line(&format!("{:<16} {label}", "label"))?;
+    let optional = [
+        ("label", label_line(&training.labels).or(relabelled)),
+        ("day", day_line(model)),
+        ("recalibrated", recalibration_line(model)),
+    ];
+    for (name, line) in optional {
+        described.extend(line.map(|line| (name, line)));
     }
-    for (what, line) in [("day", day_line(&model)), ("recalibrated", recalibration_line(&model))] {
-        line.map_or(Ok(()), |line| print_line(&format!("{what:<16} {line}")))?;
-    }
-    own_lifts_lines(&model).iter().try_for_each(|line| print_line(&format!("{:<16} {line}", "adapted")))?;
-    probe_lines(&model).iter().try_for_each(|line| print_line(line))?;
-    Ok(Outcome::Done)
+    described.extend(own_lifts_lines(model).into_iter().map(|line| ("adapted", line)));
+    described
 }
 
 /// The size and parameters of a predictor, without its support vectors or nodes.

@@ -111,7 +111,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         let out = arguments.out.display();
         anyhow::bail!("{out}: expected a name that ends in .json, by which evaluate tells a model from a recording");
     }
-    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
+    for warning in hand.warnings() {
+        print_diagnostic(&warning);
+    }
     let options = TrainingOptions {
         recipe: recipe(arguments)?,
         threshold_probability: arguments.thresholds.threshold_probability,
@@ -128,6 +130,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     })?;
     let model = train(&hand, &examples, &recordings, &options, progress)?;
     model.save(&arguments.out)?;
+    report(&model, &recordings, arguments)?;
+    Ok(Outcome::Done)
+}
+
+fn report(model: &Model, recordings: &[PathBuf], arguments: &Arguments) -> anyhow::Result<()> {
     let training = &model.training;
     print_line(&format!(
         "{}: {} grasps ({} stable) of {} objects, {} contacts, recipe {}: {}",
@@ -139,10 +146,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         training.recipe.name,
         model.classifier.predictor.summary(),
     ))?;
-    if options.by_wrench_space {
+    if arguments.label == TrainingLabel::WrenchSpace {
         print_line("stable: epsilon > 0.07 and volume > 0.1, whatever the recordings say")?
     } else {
-        print_label(&recordings)?
+        print_label(recordings)?
     }
     let (n_words, n_asked) = (model.features.dictionary.len(), training.recipe.n_words);
     if n_words < n_asked {
@@ -170,8 +177,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         training.cross_validated_brier, training.cross_validated_ece
     ))?;
     print_line(&threshold_line(&model.classifier))?;
-    probe_lines(&model).iter().try_for_each(|line| print_line(line))?;
-    Ok(Outcome::Done)
+    for line in probe_lines(model) {
+        print_line(&line)?;
+    }
+    Ok(())
 }
 
 impl ThresholdArguments {

@@ -117,7 +117,9 @@ impl Draft {
                 best = other;
             }
         }
-        best.told.iter().for_each(|line| print_diagnostic(line));
+        for line in &best.told {
+            print_diagnostic(line);
+        }
         *self = best.draft;
         Ok(())
     }
@@ -134,95 +136,17 @@ impl Draft {
 
     /// The draft with an open hand, its palm frame and the joints that do not close.
     fn fitted(&self, table: &[NewPad], arguments: &Arguments, opening: Opening) -> anyhow::Result<Fitted> {
-        let mut draft = self.clone();
-        let mut told = Vec::new();
+        let mut fitted = Fitted { draft: self.clone(), score: 0.0, told: Vec::new() };
         if let Opening::Reversed = opening {
-            let is_given = |joint: &&Joint| arguments.open.iter().any(|(name, _)| *name == joint.name);
-            let joints = self.hand.joints.iter().filter(|joint| !joint.is_preshape && !is_given(joint));
-            let opened: Vec<(String, f64)> = joints.map(|joint| (joint.name.clone(), joint.closed())).collect();
-            told.push(format!("the hand is open where it could be taken for closed: as by --open {}", listed(&opened)));
-            draft.bare.open.extend(opened);
-            draft.read()?;
+            fitted.open_reversed(arguments)?;
         }
-        let (mut still, mut turned) = (Vec::new(), Vec::new());
-        if arguments.preshape.is_empty() {
-            let hand = draft.with_pads(&draft.pads(table, arguments, false)?);
-            let mut odd = odd_joints(&hand)?;
-            let two_way = draft.two_way_joints(arguments);
-            // A joint that turns back and can close the other way does so.
-            odd.opposed.retain(|idx| {
-                let joint = &hand.joints[*idx];
-                let is_two_way = two_way.contains(&joint.name);
-                if is_two_way {
-                    let value = round(joint.open() + TURNED * (joint.upper - joint.lower), 1e4);
-                    turned.push((joint.name.clone(), value));
-                    draft.bare.open.insert(joint.name.clone(), value);
-                }
-                !is_two_way
-            });
-            still = [odd.sideways, odd.opposed].concat();
-            still.retain(|idx| !arguments.open.iter().any(|(name, _)| *name == hand.joints[*idx].name));
-            // A hand that closes with no joint at all is judged wrongly.
-            if still.len() == hand.joints.len() {
-                still.clear();
-            }
-        }
-        if !turned.is_empty() {
-            told.push(format!("these joints close towards their lower limits: as by --open {}", listed(&turned)));
-        }
-        for idx in &still {
-            let joint = &draft.hand.joints[*idx];
-            draft.bare.preshape_joints.push(joint.name.clone());
-            draft.bare.open.insert(joint.name.clone(), joint.open());
-        }
-        draft.read()?;
+        let still = fitted.keep_still(table, arguments)?;
         if let Opening::TwoWay(part) = opening {
-            let mut opened = Vec::new();
-            for name in draft.two_way_joints(arguments) {
-                let joint = draft.hand.joint_idx(&name).map(|idx| &draft.hand.joints[idx]).context("a joint")?;
-                opened.push((name, round(joint.open() + part * (joint.upper - joint.lower), 1e4)));
-            }
-            told.push(format!("these joints could close either way: the hand closes as by --open {}", listed(&opened)));
-            draft.bare.open.extend(opened);
-            draft.read()?;
+            fitted.open_two_way(part, arguments)?;
         }
-        let palm = draft.hand.palm_link().name.clone();
-        let hand = draft.with_pads(&draft.pads(table, arguments, false)?).with_moving_pads();
-        let fit = palm_fit(&hand)?;
-        let pose = rounded(&fit.link_from_palm);
-        if let Some(given) = draft.palm_pose
-            && fit.is_better
-        {
-            let better = rounded(&(isometry(given) * fit.link_from_palm)).map(|number| number.to_string()).join(",");
-            told.push(format!(
-                "the hand closes on an object before --palm-pose {better}, not before the one that is given"
-            ));
-        } else if fit.is_better && pose != [0.0; 6] {
-            let text = pose.map(|number| number.to_string()).join(",");
-            told.push(format!(
-                "the hand closes on an object before --palm {palm} --palm-pose {text}, not before +z of link '{palm}': the layout \
-                 has that palm frame; give --palm {palm} --palm-pose 0,0,0,0,0,0 to keep the link's own"
-            ));
-            draft.put_palm_frame(pose)?;
-        }
-        let mut values = Vec::new();
-        for idx in still {
-            let hand = draft.with_pads(&draft.pads(table, arguments, false)?).with_moving_pads();
-            let value = round(best_value(&hand, idx)?, 1e4);
-            let name = draft.hand.joints[idx].name.clone();
-            values.push((name.clone(), value));
-            draft.bare.open.insert(name, value);
-            draft.read()?;
-        }
-        if !values.is_empty() {
-            told.push(format!(
-                "these joints move no pad towards an object, so they are set before a grasp and do not close: as by --preshape \
-                 {} --open {}",
-                draft.bare.preshape_joints.join(","),
-                listed(&values)
-            ));
-        }
-        Ok(Fitted { draft, score: fit.score, told })
+        fitted.find_palm_frame(table, arguments)?;
+        fitted.set_still(&still, table, arguments)?;
+        Ok(fitted)
     }
 
     /// Says which pads come to no object or lie inside another link, and whether the hand closes on itself.
@@ -300,6 +224,122 @@ impl Draft {
             first_cell_idx += n_cells;
         }
         hand
+    }
+}
+
+impl Fitted {
+    /// Opens each joint at the limit to which it would close, unless the user gave its open value.
+    fn open_reversed(&mut self, arguments: &Arguments) -> anyhow::Result<()> {
+        let mut opened = Vec::new();
+        for joint in &self.draft.hand.joints {
+            if !joint.is_preshape && !arguments.open.iter().any(|(name, _)| *name == joint.name) {
+                opened.push((joint.name.clone(), joint.closed()));
+            }
+        }
+        self.told
+            .push(format!("the hand is open where it could be taken for closed: as by --open {}", listed(&opened)));
+        self.draft.bare.open.extend(opened);
+        self.draft.read()
+    }
+
+    /// Finds the joints that do not close, and turns those that can close the other way.
+    fn keep_still(&mut self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<Vec<usize>> {
+        let Fitted { draft, told, .. } = self;
+        let (mut still, mut turned) = (Vec::new(), Vec::new());
+        if arguments.preshape.is_empty() {
+            let hand = draft.with_pads(&draft.pads(table, arguments, false)?);
+            let odd = odd_joints(&hand)?;
+            let two_way = draft.two_way_joints(arguments);
+            still = odd.sideways;
+            for idx in odd.opposed {
+                let joint = &hand.joints[idx];
+                // A joint that turns back and can close the other way does so.
+                if two_way.contains(&joint.name) {
+                    let value = round(joint.open() + TURNED * (joint.upper - joint.lower), 1e4);
+                    turned.push((joint.name.clone(), value));
+                    draft.bare.open.insert(joint.name.clone(), value);
+                } else {
+                    still.push(idx);
+                }
+            }
+            still.retain(|idx| !arguments.open.iter().any(|(name, _)| *name == hand.joints[*idx].name));
+            // A hand that closes with no joint at all is judged wrongly.
+            if still.len() == hand.joints.len() {
+                still.clear();
+            }
+        }
+        if !turned.is_empty() {
+            told.push(format!("these joints close towards their lower limits: as by --open {}", listed(&turned)));
+        }
+        for idx in &still {
+            let joint = &draft.hand.joints[*idx];
+            draft.bare.preshape_joints.push(joint.name.clone());
+            draft.bare.open.insert(joint.name.clone(), joint.open());
+        }
+        draft.read()?;
+        Ok(still)
+    }
+
+    /// Opens the joints that could close either way by a part of their range.
+    fn open_two_way(&mut self, part: f64, arguments: &Arguments) -> anyhow::Result<()> {
+        let Fitted { draft, told, .. } = self;
+        let mut opened = Vec::new();
+        for name in draft.two_way_joints(arguments) {
+            let joint = draft.hand.joint_idx(&name).map(|idx| &draft.hand.joints[idx]).context("a joint")?;
+            opened.push((name, round(joint.open() + part * (joint.upper - joint.lower), 1e4)));
+        }
+        told.push(format!("these joints could close either way: the hand closes as by --open {}", listed(&opened)));
+        draft.bare.open.extend(opened);
+        draft.read()
+    }
+
+    /// Finds the palm frame in which the hand closes best, and takes it unless the user gave one.
+    fn find_palm_frame(&mut self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<()> {
+        let Fitted { draft, told, score } = self;
+        let palm = draft.hand.palm_link().name.clone();
+        let hand = draft.with_pads(&draft.pads(table, arguments, false)?).with_moving_pads();
+        let fit = palm_fit(&hand)?;
+        *score = fit.score;
+        let pose = rounded(&fit.link_from_palm);
+        if let Some(given) = draft.palm_pose
+            && fit.is_better
+        {
+            let better = rounded(&(isometry(given) * fit.link_from_palm)).map(|number| number.to_string()).join(",");
+            told.push(format!(
+                "the hand closes on an object before --palm-pose {better}, not before the one that is given"
+            ));
+        } else if fit.is_better && pose != [0.0; 6] {
+            let text = pose.map(|number| number.to_string()).join(",");
+            told.push(format!(
+                "the hand closes on an object before --palm {palm} --palm-pose {text}, not before +z of link '{palm}': the layout \
+                 has that palm frame; give --palm {palm} --palm-pose 0,0,0,0,0,0 to keep the link's own"
+            ));
+            draft.put_palm_frame(pose)?;
+        }
+        Ok(())
+    }
+
+    /// Sets the joints that do not close to the values with which the hand closes best.
+    fn set_still(&mut self, still: &[usize], table: &[NewPad], arguments: &Arguments) -> anyhow::Result<()> {
+        let Fitted { draft, told, .. } = self;
+        let mut values = Vec::new();
+        for idx in still {
+            let hand = draft.with_pads(&draft.pads(table, arguments, false)?).with_moving_pads();
+            let value = round(best_value(&hand, *idx)?, 1e4);
+            let name = draft.hand.joints[*idx].name.clone();
+            values.push((name.clone(), value));
+            draft.bare.open.insert(name, value);
+            draft.read()?;
+        }
+        if !values.is_empty() {
+            told.push(format!(
+                "these joints move no pad towards an object, so they are set before a grasp and do not close: as by --preshape \
+                 {} --open {}",
+                draft.bare.preshape_joints.join(","),
+                listed(&values)
+            ));
+        }
+        Ok(())
     }
 }
 

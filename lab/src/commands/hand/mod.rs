@@ -121,33 +121,22 @@ struct Row {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let folder = &arguments.name;
-    let name = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default().to_owned();
+    let name = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default();
     check_free(folder)?;
-    let (source, mut urdf) = match (&arguments.urdf, &arguments.robot_description) {
-        (Some(_), _) if !arguments.network.arguments().is_empty() => {
-            bail!("--connect, --keys and --domain are of no use to --urdf: they belong to --robot-description")
-        }
-        (Some(path), _) => (path.clone(), urdf_text(path, &arguments.xacro_arg)?),
-        (None, topic) => {
-            let topic = topic.as_deref().unwrap_or("/robot_description");
-            (PathBuf::from("robot_description.urdf"), described(topic, &arguments.network)?)
-        }
-    };
-    if let Some(base) = &arguments.base {
-        urdf = part_below(&urdf, base).map_err(|reason| anyhow::anyhow!("--base: {reason}"))?;
+    let (source, urdf) = source_urdf(arguments)?;
+    let mut table = Vec::new();
+    if let Some(cells) = &arguments.cells {
+        table = read_table(cells, arguments.threshold)?;
     }
-    let table =
-        arguments.cells.as_deref().map(|table| read_table(table, arguments.threshold)).transpose()?.unwrap_or_default();
     let of_table = table.iter().map(|pad| pad.link.clone());
     let bare = BareHand {
         padded_links: of_table.chain(arguments.grids.iter().map(|(link, _)| link.clone())).collect(),
-        name: name.clone(),
+        name: name.into(),
         palm: arguments.palm.clone(),
         open: arguments.open.iter().cloned().collect(),
         preshape_joints: arguments.preshape.clone(),
     };
-    let palm_pose = palm_pose(arguments)?;
-    let draft = Draft::new(&source, urdf, bare, palm_pose);
+    let draft = Draft::new(&source, urdf, bare, palm_pose(arguments)?);
     let mut draft = draft.map_err(|error| with_base_advice(error, arguments))?;
     print_parts(&draft.hand)?;
     if let Some(joint) = draft.hand.joint_above_palm() {
@@ -164,9 +153,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     draft.warn(&pads)?;
     let Draft { urdf, hand, bare, .. } = draft;
     let (urdf, meshes) = with_meshes_beside(&urdf, source.parent().unwrap_or(Path::new("")))?;
-    let layout = layout(&name, &hand, &pads, &bare);
+    let layout = layout(name, &hand, &pads, &bare);
     std::fs::create_dir(folder).with_context(|| format!("cannot make {}", folder.display()))?;
-    let written = write_folder(folder, &name, &urdf, &layout, &meshes);
+    let written = write_folder(folder, name, &urdf, &layout, &meshes);
     if written.is_err() {
         let _ = std::fs::remove_dir_all(folder);
     }
@@ -183,6 +172,23 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         hand.n_cells()
     ))?;
     Ok(Outcome::Done)
+}
+
+/// The URDF of the hand, and the file that it is from.
+fn source_urdf(arguments: &Arguments) -> anyhow::Result<(PathBuf, String)> {
+    let (source, urdf) = match (&arguments.urdf, &arguments.robot_description) {
+        (Some(_), _) if !arguments.network.arguments().is_empty() => {
+            bail!("--connect, --keys and --domain are of no use to --urdf: they belong to --robot-description")
+        }
+        (Some(path), _) => (path.clone(), urdf_text(path, &arguments.xacro_arg)?),
+        (None, topic) => {
+            let topic = topic.as_deref().unwrap_or("/robot_description");
+            (PathBuf::from("robot_description.urdf"), described(topic, &arguments.network)?)
+        }
+    };
+    let Some(base) = &arguments.base else { return Ok((source, urdf)) };
+    let part = part_below(&urdf, base).map_err(|reason| anyhow::anyhow!("--base: {reason}"))?;
+    Ok((source, part))
 }
 
 /// Writes all files, and reads the hand from them.

@@ -48,27 +48,16 @@ impl Setup {
         if graph.machines.is_some() {
             bail!("{}: trials run on one machine, and the file names several", arguments.dataflow.display());
         }
-        let tries = |node: &&Node| node.outputs().iter().any(|output| output.type_name == LiftOutcome::TYPE_NAME);
-        let node = graph.nodes.iter().find(tries).with_context(|| {
+        let node = graph.nodes.iter().find(|node| reports_lifts(node)).with_context(|| {
             format!(
                 "{}: no node reports the outcomes of lifts; expected a source with run: ${{SOURCE:-…}} and the input \
                  decision?, as in the dataflow-live.yaml that 'blindgrasp init DIR' writes",
                 arguments.dataflow.display()
             )
         })?;
-        let set =
-            |node: &str, param: &str, text: String| Override { node: Some(node.into()), param: param.into(), text };
         let mut overrides = arguments.overrides.clone();
         for judge in &graph.nodes {
-            let is_short = judge.params.get("max_age_ms").is_some_and(|age| age.as_f64() < Some(LEAST_MAX_AGE_MS));
-            if is_short && !overrides.iter().any(|set| set.is_of(&judge.id) && set.param == "max_age_ms") {
-                overrides.push(set(&judge.id, "max_age_ms", LEAST_MAX_AGE_MS.to_string()));
-            }
-            // Trials count the drops; a promise that is withdrawn would end them.
-            let is_given = overrides.iter().any(|set| set.is_of(&judge.id) && set.param == "promised_drops");
-            if judge.params.contains_key("promised_drops") && !is_given {
-                overrides.push(set(&judge.id, "promised_drops", "1".into()));
-            }
+            adjust(judge, &mut overrides);
         }
         if let Some(set) = overrides.iter().find(|set| set.is_of(&node.id) && own_option(&set.param).is_some()) {
             bail!("--set {set}: use {} instead", own_option(&set.param).unwrap_or_default());
@@ -88,33 +77,11 @@ impl Setup {
             overrides.extend(judges.map(|node| set(&node.id, "model", path.into())));
             model = path.into();
         }
-        let mut options = match (&arguments.options, node.params.get("options").and_then(|path| path.as_str())) {
-            (Some(path), _) => {
-                let text = path.to_str().context("--options: the path is not UTF-8")?;
-                overrides.push(set(&node.id, "options", text.into()));
-                TrialOptions::load(path)?
-            }
-            (None, Some(path)) => TrialOptions::load(Path::new(path))?,
-            (None, None) => TrialOptions::default(),
-        };
-        if let Some(engine) = arguments.physics {
-            let engine_word = if engine == PhysicsEngine::Mujoco { "mujoco" } else { "rapier" };
-            overrides.push(set(&node.id, "physics", engine_word.into()));
-        }
-        let own = node.params.get("physics").and_then(|engine| engine.as_str()).and_then(|word| physics(word).ok());
-        options.physics.engine = arguments.physics.or(own).unwrap_or(options.physics.engine);
+        let options = trial_options(arguments, node, &mut overrides)?;
         let hand = node.params.get("hand").and_then(|hand| hand.as_str()).unwrap_or(DEFAULT_HAND);
         let hand = Hand::load(Path::new(hand))?;
         let friction = node.params.get("friction").and_then(|friction| friction.as_f64());
-        // The hand may have a model of its own, or none.
-        let chooses = node.params.get("model").and_then(|model| model.as_str());
-        let prior = match (chooses, &arguments.model) {
-            (None, _) => None,
-            // The nodes refuse a model that cannot be read, and say why.
-            (Some(own), other) => {
-                Model::load(other.as_deref().unwrap_or(Path::new(own))).ok().and_then(|it| it.approach)
-            }
-        };
+        let prior = approach_prior(arguments, node);
         let probe = match text_param(&graph, "probe").as_deref() {
             Some("squeeze") => Some(ProbeMove::Squeeze),
             Some("test_lift") => Some(ProbeMove::TestLift),
@@ -139,6 +106,55 @@ impl Setup {
         overrides.push(Override { node: Some(self.node.clone()), param: "gate".into(), text: text.into() });
         fitting(&self.file, &overrides, Scope::Everything, OnMisfit::Refuse)
     }
+}
+
+fn set(node: &str, param: &str, text: String) -> Override {
+    Override { node: Some(node.into()), param: param.into(), text }
+}
+
+fn reports_lifts(node: &Node) -> bool {
+    node.outputs().iter().any(|output| output.type_name == LiftOutcome::TYPE_NAME)
+}
+
+/// Sets the params of a node that trials need otherwise than robots, unless the user gave them.
+fn adjust(judge: &Node, overrides: &mut Vec<Override>) {
+    let is_short = judge.params.get("max_age_ms").is_some_and(|age| age.as_f64() < Some(LEAST_MAX_AGE_MS));
+    // Trials count the drops; a promise that is withdrawn would end them.
+    let is_promised = judge.params.contains_key("promised_drops");
+    for (is_unfit, param, text) in
+        [(is_short, "max_age_ms", LEAST_MAX_AGE_MS.to_string()), (is_promised, "promised_drops", "1".into())]
+    {
+        if is_unfit && !overrides.iter().any(|set| set.is_of(&judge.id) && set.param == param) {
+            overrides.push(set(&judge.id, param, text));
+        }
+    }
+}
+
+/// The options of the node that lifts, and the overrides that give it those of the command.
+fn trial_options(arguments: &Arguments, node: &Node, overrides: &mut Vec<Override>) -> anyhow::Result<TrialOptions> {
+    let mut options = match (&arguments.options, node.params.get("options").and_then(|path| path.as_str())) {
+        (Some(path), _) => {
+            let text = path.to_str().context("--options: the path is not UTF-8")?;
+            overrides.push(set(&node.id, "options", text.into()));
+            TrialOptions::load(path)?
+        }
+        (None, Some(path)) => TrialOptions::load(Path::new(path))?,
+        (None, None) => TrialOptions::default(),
+    };
+    if let Some(engine) = arguments.physics {
+        let engine_word = if engine == PhysicsEngine::Mujoco { "mujoco" } else { "rapier" };
+        overrides.push(set(&node.id, "physics", engine_word.into()));
+    }
+    let own = node.params.get("physics").and_then(|engine| engine.as_str()).and_then(|word| physics(word).ok());
+    options.physics.engine = arguments.physics.or(own).unwrap_or(options.physics.engine);
+    Ok(options)
+}
+
+/// The prior with which the hand chooses its approaches. It may have a model of its own, or none.
+fn approach_prior(arguments: &Arguments, node: &Node) -> Option<ApproachPrior> {
+    let own = node.params.get("model")?.as_str()?;
+    // The nodes refuse a model that cannot be read, and say why.
+    Model::load(arguments.model.as_deref().unwrap_or(Path::new(own))).ok()?.approach
 }
 
 /// The command's option for a param of the node that lifts.

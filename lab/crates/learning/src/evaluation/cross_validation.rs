@@ -13,7 +13,7 @@ use serde::Serialize;
 use super::EvaluationError;
 use super::split::{Split, SplitError, check_disjoint, shuffle, split_into_folds};
 use crate::learners::platt::fit_platt;
-use crate::training::{Example, Fitted, TrainingError, cross_validate, fit};
+use crate::training::{Example, Fitted, TrainingError, cross_validate, fit, picked};
 use blindgrasp_stages::dictionary::Dictionary;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::recipe::Recipe;
@@ -102,32 +102,11 @@ pub fn judge_held_out(
     let splits: Vec<Vec<usize>> =
         seeds.iter().map(|seed| split_into_folds(*split, examples, *n_folds, *seed)).collect::<Result<_, _>>()?;
     let n_shares = if *learning_curve { LEARNING_SHARES.len() } else { 0 };
-    let mut step = Step { n_done: 0, n: recipes.len() * (n_repeats * n_folds + n_shares), what: String::new() };
-    let mut judge = |recipe: &Recipe, parts: (&[usize], &[usize]), what: String| {
-        step.what = format!("recipe {}, {what}", recipe.name);
-        progress(&step);
-        let of = |idxs: &[usize]| idxs.iter().map(|idx| examples[*idx]).collect::<Vec<&Example>>();
-        let (training, held_out) = (of(parts.0), of(parts.1));
-        let judged = judge(hand, *split, recipe, &training, &held_out, *seed);
-        step.n_done += 1;
-        judged.map_err(|source| EvaluationError::Fit { what: step.what.clone(), source })
-    };
-
+    let step = Step { n_done: 0, n: recipes.len() * (n_repeats * n_folds + n_shares), what: String::new() };
+    let mut judging = Judging { hand, examples, options, step, progress: &mut progress };
     let mut learned = Vec::new();
     if let (true, Some(folds)) = (learning_curve, splits.first()) {
-        let (held_out, training) = parts(folds, 0);
-        for (share, training) in nested(*split, examples, &training, *seed) {
-            for (recipe_idx, recipe) in recipes.iter().enumerate() {
-                let what = format!("learning curve at {:.0} %", 100.0 * share);
-                let judged = match judge(recipe, (&training, &held_out), what) {
-                    Ok((probabilities, _)) => Ok(held_out.iter().copied().zip(probabilities).collect()),
-                    // A small part may have too few contacts for a dictionary; larger parts are still tried.
-                    Err(EvaluationError::Fit { source, .. }) => Err(with_causes(&source)),
-                    Err(other) => return Err(other),
-                };
-                learned.push(learning_step(examples, recipe_idx, share, &training, judged));
-            }
-        }
+        learned = judging.learning_curve(folds)?;
     }
     let (mut repeats, mut words) = (Vec::new(), Vec::new());
     for (repeat_idx, (folds, seed)) in splits.into_iter().zip(seeds).enumerate() {
@@ -139,7 +118,7 @@ pub fn judge_held_out(
                 let of_repeats =
                     if *n_repeats > 1 { format!(", repeat {} of {n_repeats}", repeat_idx + 1) } else { String::new() };
                 let what = format!("fold {} of {n_folds}{of_repeats}", fold + 1);
-                let (probabilities, fitted) = judge(recipe, (&training, &held_out), what)?;
+                let (probabilities, fitted) = judging.judge(recipe, &training, &held_out, what)?;
                 if (repeat_idx, fold) == (0, 0) {
                     if *learning_curve {
                         let judged = held_out.iter().copied().zip(probabilities.iter().copied()).collect();
@@ -158,6 +137,53 @@ pub fn judge_held_out(
     }
     learned.sort_by_key(|step| step.recipe_idx);
     Ok(HeldOut { repeats, learning_curve: learned, words })
+}
+
+/// The work on examples, step by step.
+struct Judging<'a> {
+    hand: &'a Hand,
+    examples: &'a [&'a Example],
+    options: &'a HeldOutOptions,
+    step: Step,
+    progress: &'a mut dyn FnMut(&Step),
+}
+
+impl Judging<'_> {
+    fn judge(
+        &mut self,
+        recipe: &Recipe,
+        training: &[usize],
+        held_out: &[usize],
+        what: String,
+    ) -> Result<(Vec<f64>, Fitted), EvaluationError> {
+        let HeldOutOptions { split, seed, .. } = self.options;
+        self.step.what = format!("recipe {}, {what}", recipe.name);
+        (self.progress)(&self.step);
+        let (training, held_out) = (picked(self.examples, training), picked(self.examples, held_out));
+        let judged = judge(self.hand, *split, recipe, &training, &held_out, *seed);
+        self.step.n_done += 1;
+        judged.map_err(|source| EvaluationError::Fit { what: self.step.what.clone(), source })
+    }
+
+    /// Recipes trained on growing parts of all folds but the first, before all of them.
+    fn learning_curve(&mut self, folds: &[usize]) -> Result<Vec<LearningStep>, EvaluationError> {
+        let HeldOutOptions { split, recipes, seed, .. } = self.options;
+        let (held_out, training) = parts(folds, 0);
+        let mut learned = Vec::new();
+        for (share, training) in nested(*split, self.examples, &training, *seed) {
+            for (recipe_idx, recipe) in recipes.iter().enumerate() {
+                let what = format!("learning curve at {:.0} %", 100.0 * share);
+                let judged = match self.judge(recipe, &training, &held_out, what) {
+                    Ok((probabilities, _)) => Ok(held_out.iter().copied().zip(probabilities).collect()),
+                    // A small part may have too few contacts for a dictionary; larger parts are still tried.
+                    Err(EvaluationError::Fit { source, .. }) => Err(with_causes(&source)),
+                    Err(other) => return Err(other),
+                };
+                learned.push(learning_step(self.examples, recipe_idx, share, &training, judged));
+            }
+        }
+        Ok(learned)
+    }
 }
 
 /// A dictionary's words and their use in these examples.

@@ -51,18 +51,9 @@ pub fn import_frames(
     // The header of each grasp's first frame.
     let (mut last, mut seen) = (None, BTreeMap::new());
     for frame in frames {
-        let TactileFrame { grasp_id, phase, joints, cells_newtons, .. } = &frame.message;
+        let TactileFrame { grasp_id, phase, .. } = &frame.message;
         let place = format!("grasp {grasp_id}, frame {} ({})", frame.header.seq, phase.as_str());
-        for (what, found, expected) in
-            [("joints", joints.len(), hand.joints.len()), ("cells_newtons", cells_newtons.len(), hand.n_cells())]
-        {
-            if found != expected {
-                return Err(refused(format!("{place}: {what} has {found} numbers, the hand {} {expected}", hand.name)));
-            }
-        }
-        if frame.header.hand_id != hand.id() {
-            return Err(refused(format!("{place}: it is of another hand than {}", hand.name)));
-        }
+        check_frame(hand, frame).map_err(|problem| refused(format!("{place}: {problem}")))?;
         if last.replace(grasp_id) != Some(grasp_id) && seen.insert(grasp_id, frame.header).is_some() {
             return Err(refused(format!(
                 "{place}: frames of another grasp come before it; expected each grasp's together"
@@ -71,24 +62,19 @@ pub fn import_frames(
         if matches!(phase, Phase::Kept | Phase::Dropped) {
             outcomes.entry(grasp_id).or_insert(*phase == Phase::Kept);
         }
-        let has: BTreeSet<_> = frame
-            .message
-            .senses
-            .view()
-            .iter()
-            .filter(|(_, values)| !values.is_empty())
-            .map(|(sense, _)| sense.name())
-            .collect();
+        let has = senses_of(&frame.message);
         senses = Some(senses.map_or(has.clone(), |known| &known & &has));
         recording.write(TactileFrame::TOPIC, frame)?;
     }
-    let labelled = truths.iter().filter_map(|(grasp_id, truth)| Some((seen.get(grasp_id)?, grasp_id, truth)));
-    for (seq, (first, grasp_id, truth)) in labelled.enumerate() {
+    let mut seq = 0;
+    for (grasp_id, truth) in truths {
+        let Some(first) = seen.get(grasp_id) else { continue };
         outcomes.insert(grasp_id, truth.stable);
         let header = match headers_of_truths.get(grasp_id) {
             Some(own) => Header { hand_id: hand.id(), ..*own },
-            None => Header { seq: seq as u64, ..*first },
+            None => Header { seq, ..*first },
         };
+        seq += 1;
         recording.write(GraspTruth::TOPIC, &Stamped { header, message: truth.clone() })?;
     }
     recording.finish()?;
@@ -102,4 +88,25 @@ pub fn import_frames(
         n_objects: truths.values().map(|truth| &truth.object).collect::<BTreeSet<_>>().len(),
         senses: senses.unwrap_or_default().into_iter().map(String::from).collect(),
     })
+}
+
+/// Whether a frame is of this hand, and what is wrong with it otherwise.
+fn check_frame(hand: &Hand, frame: &Stamped<TactileFrame>) -> Result<(), String> {
+    let TactileFrame { joints, cells_newtons, .. } = &frame.message;
+    for (what, found, expected) in
+        [("joints", joints.len(), hand.joints.len()), ("cells_newtons", cells_newtons.len(), hand.n_cells())]
+    {
+        if found != expected {
+            return Err(format!("{what} has {found} numbers, the hand {} {expected}", hand.name));
+        }
+    }
+    if frame.header.hand_id != hand.id() {
+        return Err(format!("it is of another hand than {}", hand.name));
+    }
+    Ok(())
+}
+
+/// The senses that a frame has values of.
+fn senses_of(frame: &TactileFrame) -> BTreeSet<&'static str> {
+    frame.senses.view().iter().filter(|(_, values)| !values.is_empty()).map(|(sense, _)| sense.name()).collect()
 }

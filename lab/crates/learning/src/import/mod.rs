@@ -195,39 +195,8 @@ pub fn import_table(
     let row_reader = RowReader { header: &header, columns: &columns, hand, options };
     let mut report = row_reader.empty_report();
     let mut writer = GraspWriter::create(table, hand, options, out)?;
-    let mut lines = Lines::new(text);
     let mut grasps = Grasps::default();
-    let mut largest_reading = 0.0_f64;
-    let mut records = reader.records();
-    loop {
-        records.reader_mut().get_mut().begin_row();
-        let line = lines.line_of(records.reader().position().byte());
-        let Some(record) = records.next() else { break };
-        report.n_rows += 1;
-        let mut name = None;
-        let row = match record {
-            Ok(record) => {
-                name = columns.grasp.map(|idx| record[idx].to_string());
-                report.n_below_zero += usize::from(row_reader.is_below_zero(&record));
-                row_reader.read(&record, line).map_err(|problem| BadRow { line, problem })
-            }
-            Err(error) => Err(bad_row(&error, line).ok_or_else(|| table_error(table, error, line))?),
-        };
-        if let Ok(grasp) = &row {
-            largest_reading = grasp.readings[0].cells.iter().copied().fold(largest_reading, f64::max);
-        }
-        if let Some(grasp) = grasps.add(name, row, line).map_err(refused)? {
-            report.count(&grasp);
-            writer.write(grasp)?;
-        }
-        if grasps.bad_rows.len() > MAX_BAD_ROWS {
-            return Err(ImportError::Rows { path: table.into(), n_rows: report.n_rows, rows: grasps.bad_rows });
-        }
-    }
-    if let Some(grasp) = grasps.close() {
-        report.count(&grasp);
-        writer.write(grasp)?;
-    }
+    let largest_reading = import_rows(table, text, reader, &row_reader, &mut grasps, &mut writer, &mut report)?;
     if report.n_rows == 0 {
         return Err(refused("there is no row below the header: expected one for each grasp or frame".into()));
     }
@@ -244,6 +213,53 @@ pub fn import_table(
     report.n_frames = writer.header.seq;
     writer.recording.finish()?;
     Ok(report)
+}
+
+/// Writes the grasps of all rows, but stops at too many bad ones. Returns the largest reading of a cell.
+fn import_rows(
+    table: &Path,
+    text: &[u8],
+    mut reader: csv::Reader<RowLimit<'_>>,
+    rows: &RowReader<'_>,
+    grasps: &mut Grasps,
+    writer: &mut GraspWriter,
+    report: &mut ImportReport,
+) -> Result<f64, ImportError> {
+    let mut lines = Lines::new(text);
+    let mut largest_reading = 0.0_f64;
+    let mut records = reader.records();
+    loop {
+        records.reader_mut().get_mut().begin_row();
+        let line = lines.line_of(records.reader().position().byte());
+        let Some(record) = records.next() else { break };
+        report.n_rows += 1;
+        let mut name = None;
+        let row = match record {
+            Ok(record) => {
+                name = rows.columns.grasp.map(|idx| record[idx].to_string());
+                report.n_below_zero += usize::from(rows.is_below_zero(&record));
+                rows.read(&record, line).map_err(|problem| BadRow { line, problem })
+            }
+            Err(error) => Err(bad_row(&error, line).ok_or_else(|| table_error(table, error, line))?),
+        };
+        if let Ok(grasp) = &row {
+            largest_reading = grasp.readings[0].cells.iter().copied().fold(largest_reading, f64::max);
+        }
+        if let Some(grasp) =
+            grasps.add(name, row, line).map_err(|message| ImportError::Table { path: table.into(), message })?
+        {
+            report.count(&grasp);
+            writer.write(grasp)?;
+        }
+        if grasps.bad_rows.len() > MAX_BAD_ROWS {
+            return Ok(largest_reading);
+        }
+    }
+    if let Some(grasp) = grasps.close() {
+        report.count(&grasp);
+        writer.write(grasp)?;
+    }
+    Ok(largest_reading)
 }
 
 /// A table and a bridge's lines hold readings as they are, of which nobody knows the zero.

@@ -84,24 +84,10 @@ struct JudgedLift<'a> {
 }
 
 fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[PathBuf]) -> Result<Model, TrainingError> {
-    let looks = [Phase::TestLifted, Phase::Squeezed, Phase::Settled];
-    let look = looks.into_iter().find(|look| {
-        model.look(*look).is_some_and(|classifier| classifier.threshold_probability < 1.0)
-            && read.examples.iter().any(|example| felt(*look, example).is_some())
-    });
-    let Some((look, classifier)) = look.and_then(|look| Some((look, model.look(look)?))) else {
+    let Some((look, classifier)) = deciding_look(model, &read.examples) else {
         return refused("no grasp with an outcome has frames that the model decides by: record whole grasps".into());
     };
-    let judge = |example| Some(JudgedLift { example, log_odds: log_odds(model, look, example)? });
-    // A robot that obeys gives up the others.
-    let goes_on = |example: &&Example| {
-        looks
-            .iter()
-            .skip_while(|earlier| **earlier != look)
-            .skip(1)
-            .all(|earlier| !is_unstable(model, *earlier, example))
-    };
-    let lifts: Vec<JudgedLift<'_>> = read.examples.iter().filter(goes_on).filter_map(judge).collect();
+    let lifts = judged_lifts(look, model, &read.examples);
     if lifts.len() < FEWEST_OUTCOMES {
         return refused(format!(
             "{} lifts with an outcome that the model can judge when the hand is {}: expected {FEWEST_OUTCOMES} or more (left \
@@ -117,7 +103,7 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
         return refused("all lifts are of one object: expected several, so that some can judge the others".into());
     }
     let folds = folds_by_object(&examples, N_FOLDS.min(n_objects))?;
-    let n_grasps = read.examples.len() + read.n_excluded.values().sum::<usize>();
+    let n_grasps = (read.examples.len() + read.n_excluded.values().sum::<usize>()) as f64;
     let mut wider = model.clone();
     let all: Vec<&Example> = read.examples.iter().collect();
     let n_outside = widen(hand, &mut wider, &all)?;
@@ -125,7 +111,6 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
     let mut adapted = if is_unlike { wider } else { model.clone() };
     // The place of a threshold among grasps that the model does not know means nothing: there it keeps its probability.
     let (prior, drop_secs) = if is_unlike { (OF_AN_UNLIKE_ROBOT, None) } else { (OF_A_ROBOT, model.drop_secs(look)) };
-    let n_grasps = n_grasps as f64;
     let own = Judged { classifier, prior, drop_secs, n_grasps, lifts: &lifts }.learn(&folds);
     let of_look = match look {
         Phase::TestLifted => adapted.test_lifted.as_mut().map(|probe| &mut probe.classifier),
@@ -150,6 +135,36 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
         promise: own.promise,
     });
     Ok(adapted)
+}
+
+/// The looks, from the last on.
+const LOOKS: [Phase; 3] = [Phase::TestLifted, Phase::Squeezed, Phase::Settled];
+
+/// The last look that lifts and that a grasp has, and its classifier.
+fn deciding_look<'a>(model: &'a Model, examples: &[Example]) -> Option<(Phase, &'a Classifier)> {
+    for look in LOOKS {
+        if let Some(classifier) = model.look(look)
+            && classifier.threshold_probability < 1.0
+            && examples.iter().any(|example| felt(look, example).is_some())
+        {
+            return Some((look, classifier));
+        }
+    }
+    None
+}
+
+/// The grasps that the model judges at a look. A robot that obeys gives up those that an earlier look calls unstable.
+fn judged_lifts<'a>(look: Phase, model: &Model, examples: &'a [Example]) -> Vec<JudgedLift<'a>> {
+    let mut lifts = Vec::new();
+    for example in examples {
+        let mut earlier = LOOKS.into_iter().skip_while(|other| *other != look).skip(1);
+        if !earlier.any(|earlier| is_unstable(model, earlier, example))
+            && let Some(log_odds) = log_odds(model, look, example)
+        {
+            lifts.push(JudgedLift { example, log_odds });
+        }
+    }
+    lifts
 }
 
 /// The lifts that a look decides, with all that learning from them needs.

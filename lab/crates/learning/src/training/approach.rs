@@ -2,9 +2,8 @@
 
 use std::collections::BTreeSet;
 
-use super::{Example, TrainingError, calibrate};
+use super::{Example, TrainingError, calibrate, fit_trees};
 use crate::evaluation::measures::{area_under_roc, curve};
-use crate::learners::booster::train_boosted;
 use blindgrasp_messages::Sense;
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::classifier::boosting::BoostingParams;
@@ -29,28 +28,30 @@ pub(super) fn learn(
     seed: u64,
 ) -> Result<Option<ApproachPrior>, TrainingError> {
     let preshape_idxs: Vec<usize> = (0..hand.joints.len()).filter(|idx| hand.joints[*idx].is_preshape).collect();
-    let row = |example: &&Example| {
-        let gravity = example.senses.get(Sense::Gravity).try_into().ok()?;
-        ApproachPrior::values(&preshape_idxs, gravity, &example.joints)
-    };
-    let Some(rows) = examples.iter().map(row).collect::<Option<Vec<Vec<f64>>>>() else { return Ok(None) };
-    let trees = |is_used: &dyn Fn(usize) -> bool| {
-        let used = || (0..rows.len()).filter(|idx| is_used(*idx));
-        let values: Vec<f64> = used().flat_map(|idx| rows[idx].iter().copied()).collect();
-        let targets: Vec<f64> = used().map(|idx| examples[idx].target()).collect();
-        train_boosted(&values, 3 + preshape_idxs.len(), &targets, &PARAMS, seed)
-    };
+    let mut rows = Vec::new();
+    for example in examples {
+        let Ok(gravity) = example.senses.get(Sense::Gravity).try_into() else { return Ok(None) };
+        rows.push(ApproachPrior::values(&preshape_idxs, gravity, &example.joints));
+    }
+    if rows.iter().any(Option::is_none) {
+        return Ok(None);
+    }
+    let n_values = 3 + preshape_idxs.len();
     let mut decision_values = vec![0.0; rows.len()];
     for fold in folds.iter().copied().collect::<BTreeSet<_>>() {
-        let trees = trees(&|idx| folds[idx] != fold)?;
-        for idx in (0..rows.len()).filter(|idx| folds[*idx] == fold) {
-            decision_values[idx] = trees.decision_value(&rows[idx]);
+        let trees = fit_trees(&rows, n_values, examples, folds, Some(fold), &PARAMS, seed)?;
+        for (idx, row) in rows.iter().enumerate() {
+            if let Some(row) = row
+                && folds[idx] == fold
+            {
+                decision_values[idx] = trees.decision_value(row);
+            }
         }
     }
     let calibration = calibrate(examples, &decision_values)?;
     let stable: Vec<bool> = examples.iter().map(|example| example.stable).collect();
     let cross_validated_roc_area = area_under_roc(&curve(&decision_values, &stable)).unwrap_or(0.5);
-    let trees = trees(&|_| true)?;
+    let trees = fit_trees(&rows, n_values, examples, folds, None, &PARAMS, seed)?;
     let prior = ApproachPrior { preshape_idxs, trees, calibration, cross_validated_roc_area };
     Ok((prior.calibration.a < 0.0 && cross_validated_roc_area > 0.5).then_some(prior))
 }

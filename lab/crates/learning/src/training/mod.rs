@@ -10,6 +10,7 @@ mod day;
 mod examples;
 mod friction;
 mod probes;
+mod thresholds;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -19,8 +20,8 @@ pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 pub use blindgrasp_stages::training_summary::{PolicySummary, TrainingSummary};
 pub use examples::{Example, Examples, Relabelling, Signals, UnfeltGrasp};
 pub(crate) use probes::composed;
+pub use thresholds::Aim;
 
-use crate::evaluation::measures::{area_under_roc, curve};
 use crate::evaluation::reliability::{N_RELIABILITY_BINS, reliability};
 use crate::evaluation::split::Split;
 use crate::learners::booster::train_boosted;
@@ -31,7 +32,7 @@ use crate::learners::svm::train_svm;
 use crate::learners::training_range::{learn_training_range, widened_for_other_days};
 use blindgrasp_grasps::dataset::DatasetError;
 use blindgrasp_messages::{MAX_FEATURES, Phase};
-use blindgrasp_stages::classifier::boosting::BoostingError;
+use blindgrasp_stages::classifier::boosting::{BoostedTrees, BoostingError, BoostingParams};
 use blindgrasp_stages::classifier::calibration::PlattCalibration;
 use blindgrasp_stages::classifier::svm::SvmError;
 use blindgrasp_stages::classifier::{Blend, Classifier, Predictor};
@@ -39,8 +40,8 @@ use blindgrasp_stages::encoder::{FeatureExtractor, FeltReading, Scaling};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::{FORMAT, Model, ModelHand};
-use blindgrasp_stages::training_summary::{Bounded, Promise};
-use probes::Last;
+use probes::LearnedProbes;
+use thresholds::choose_thresholds;
 
 /// How a model is trained.
 #[derive(Debug, Clone, PartialEq)]
@@ -59,15 +60,6 @@ pub struct TrainingOptions {
     pub by_wrench_space: bool,
     /// Seeds K-means and boosting.
     pub seed: u64,
-}
-
-/// The aim of thresholds that are chosen for trials, in which a hand grasps again until it lifts.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Aim {
-    /// The least time for each kept object if a drop takes so many seconds more.
-    DropSecs(f64),
-    /// At most this share of the lifts drops.
-    MaxDrops(f64),
 }
 
 impl Default for TrainingOptions {
@@ -163,16 +155,7 @@ pub fn train(
     check_examples(read, recordings, &options.frictions)?;
     let examples: Vec<&Example> = read.examples.iter().collect();
     let folds = folds_by_object(&examples, options.n_folds)?;
-    let mut cross_validating = |fold| progress(&format!("cross-validating, fold {} of {}", fold + 1, options.n_folds));
-    let judged = if recipe.day_baseline {
-        day::cross_validate(hand, recipe, &examples, &folds, options.seed, &mut cross_validating)?
-    } else {
-        OutOfFold {
-            decision_values: cross_validate(hand, recipe, &examples, &folds, options.seed, &mut cross_validating)?,
-            examples: examples.clone(),
-            folds: folds.clone(),
-        }
-    };
+    let judged = judge_out_of_fold(hand, &examples, &folds, options, &mut progress)?;
     let calibration = calibrate(&judged.examples, &judged.decision_values)?;
     progress("training on all grasps");
     let fitted = fit(hand, recipe, &examples, options.seed)?;
@@ -188,6 +171,7 @@ pub fn train(
             "not learned: whether a day is like those of the training; every recording must say its days, with several objects each",
         );
     }
+    let mut training = summary(read, recordings, options, &fitted, &validated);
     let mut classifier = Classifier {
         predictor: fitted.predictor,
         calibration,
@@ -195,48 +179,100 @@ pub fn train(
         // "Unstable" is to be as certain as "stable".
         unsure_from_probability: threshold_probability.min(1.0 - threshold_probability),
     };
-    let mut learned = Vec::new();
-    for phase in [Phase::Squeezed, Phase::TestLifted] {
-        if recipe.day_baseline {
-            // Frames after a probe have no baseline.
-            learned.push(None);
-            continue;
-        }
-        let n_without = probes::n_without(phase, &examples);
-        if n_without == examples.len() {
-            // Recordings without this probe have nothing to learn from.
-            learned.push(None);
-            continue;
-        }
-        let probe_name = if phase == Phase::Squeezed { "squeeze" } else { "test lift" };
-        progress(&format!("learning the decision after the {probe_name}"));
-        if n_without > 0 {
-            progress(&format!("not learned: {n_without} of {} grasps have no such frames", examples.len()));
-        }
-        let mut probe = probes::learn(hand, recipe, &fitted.features, phase, &examples, &folds, options.seed)?;
-        if probe.is_none() && n_without == 0 && matches!(recipe.learner, Learner::Boosting(_)) {
-            progress(&format!("not learned: on new objects, frames after the {probe_name} do no better than a guess"));
-        }
-        if phase == Phase::TestLifted && matches!(learned[..], [None]) && probe.take().is_some() {
-            progress("not learned: a test lift follows a squeeze, and the decision after that was not learned");
-        }
-        if let Some(learned) = &mut probe {
-            learned.probe.classifier.threshold_probability = threshold_probability;
-            learned.probe.classifier.unsure_from_probability = threshold_probability;
-        }
-        learned.push(probe);
-    }
-    let mut policies = Vec::new();
+    let mut probes = learn_probes(hand, &fitted.features, &examples, &folds, options, &mut progress)?;
     if let Some(aim) = options.aim {
         progress("choosing thresholds for trials");
         let of_lifts = !options.by_wrench_space && !read.labels.contains_key(&Label::WrenchSpace);
         let promises = of_lifts && !recipe.day_baseline;
-        policies = choose_policies(&mut classifier, &mut learned, &judged, (aim, promises), &mut progress)?;
+        training.policies = choose_thresholds(aim, promises, &judged, &mut classifier, &mut probes, &mut progress)?;
     }
-    let mut learned = learned.into_iter().map(|learned| learned.map(|learned| learned.probe));
-    let (squeezed, test_lifted) = (learned.next().flatten(), learned.next().flatten());
-    let training = TrainingSummary {
-        policies,
+    Ok(Model {
+        format: FORMAT.into(),
+        hand: ModelHand { name: hand.name.clone(), id: hand.id() },
+        features: fitted.features,
+        classifier,
+        training_range,
+        squeezed: probes.squeezed.map(|learned| learned.probe),
+        test_lifted: probes.test_lifted.map(|learned| learned.probe),
+        day,
+        approach: approach::learn(hand, &examples, &folds, options.seed)?,
+        training,
+        checksum: String::new(),
+    })
+}
+
+/// Judges the examples by machines that have not seen their fold.
+fn judge_out_of_fold<'a>(
+    hand: &Hand,
+    examples: &[&'a Example],
+    folds: &[usize],
+    options: &TrainingOptions,
+    progress: &mut impl FnMut(&str),
+) -> Result<OutOfFold<'a>, TrainingError> {
+    let TrainingOptions { recipe, n_folds, seed, .. } = options;
+    let cross_validating = |fold: usize| progress(&format!("cross-validating, fold {} of {n_folds}", fold + 1));
+    if recipe.day_baseline {
+        return day::cross_validate(hand, recipe, examples, folds, *seed, cross_validating);
+    }
+    let decision_values = cross_validate(hand, recipe, examples, folds, *seed, cross_validating)?;
+    Ok(OutOfFold { examples: examples.to_vec(), decision_values, folds: folds.to_vec() })
+}
+
+/// Learns to judge the frames after each probe, where examples and recipe let it.
+fn learn_probes(
+    hand: &Hand,
+    features: &FeatureExtractor,
+    examples: &[&Example],
+    folds: &[usize],
+    options: &TrainingOptions,
+    progress: &mut impl FnMut(&str),
+) -> Result<LearnedProbes, TrainingError> {
+    let mut learned = LearnedProbes::default();
+    // Frames after a probe have no baseline.
+    if options.recipe.day_baseline {
+        return Ok(learned);
+    }
+    for (phase, name, probe) in [
+        (Phase::Squeezed, "squeeze", &mut learned.squeezed),
+        (Phase::TestLifted, "test lift", &mut learned.test_lifted),
+    ] {
+        let n_without = probes::n_without(phase, examples);
+        // Recordings without this probe have nothing to learn from.
+        if n_without == examples.len() {
+            continue;
+        }
+        progress(&format!("learning the decision after the {name}"));
+        if n_without > 0 {
+            progress(&format!("not learned: {n_without} of {} grasps have no such frames", examples.len()));
+        } else if let Learner::Boosting(_) = options.recipe.learner {
+            *probe = probes::learn(hand, &options.recipe, features, phase, examples, folds, options.seed)?;
+            match probe {
+                // For an aim, it never lifts before a policy is chosen.
+                Some(_) if options.aim.is_some() => {}
+                Some(probe) => probe.set_threshold(options.threshold_probability),
+                None => {
+                    progress(&format!("not learned: on new objects, frames after the {name} do no better than a guess"))
+                }
+            }
+        }
+    }
+    if learned.squeezed.is_none() && learned.test_lifted.take().is_some() {
+        progress("not learned: a test lift follows a squeeze, and the decision after that was not learned");
+    }
+    Ok(learned)
+}
+
+/// The record of a training, before policies are chosen.
+fn summary(
+    read: &Examples,
+    recordings: &[PathBuf],
+    options: &TrainingOptions,
+    fitted: &Fitted,
+    validated: &CrossValidated,
+) -> TrainingSummary {
+    let examples = &read.examples;
+    TrainingSummary {
+        policies: Vec::new(),
         recordings: recordings.iter().map(|path| file_name(path)).collect(),
         made_by: read.made_by.clone(),
         labels: if options.by_wrench_space || read.labels.contains_key(&Label::Lift) {
@@ -244,7 +280,7 @@ pub fn train(
         } else {
             BTreeMap::new()
         },
-        recipe: recipe.clone(),
+        recipe: options.recipe.clone(),
         frictions: options.frictions.clone(),
         n_grasps: examples.len(),
         n_stable: examples.iter().filter(|example| example.stable).count(),
@@ -263,188 +299,7 @@ pub fn train(
         version: env!("CARGO_PKG_VERSION").into(),
         trained_on: Some(read.trained_on()),
         own_lifts: None,
-    };
-    Ok(Model {
-        format: FORMAT.into(),
-        hand: ModelHand { name: hand.name.clone(), id: hand.id() },
-        features: fitted.features,
-        classifier,
-        training_range,
-        squeezed,
-        test_lifted,
-        day,
-        approach: approach::learn(hand, &examples, &folds, options.seed)?,
-        training,
-        checksum: String::new(),
-    })
-}
-
-/// The prices of a drop that are tried for [`Aim::MaxDrops`], from strict to loose: fixed, so that the tests in this order need no
-/// correction (fixed sequence testing, Angelopoulos et al. 2021, section 3).
-const DROP_SECS: [f64; 10] = [1000.0, 500.0, 240.0, 120.0, 60.0, 30.0, 15.0, 8.0, 4.0, 0.0];
-
-/// A look's policy with the price of a drop that it was chosen for, and its promise.
-type Chosen = (probes::Policy, f64, Option<Promise>);
-
-impl Aim {
-    /// Chooses the policy of a look. The error is the reason why the look has none.
-    fn choose(self, policies: &probes::Policies, look: &str) -> Result<Chosen, String> {
-        match self {
-            Aim::DropSecs(drop_secs) => {
-                let policy = policies.cheapest(drop_secs).ok_or_else(|| {
-                    format!("no threshold leads to a lift when the hand is {look}: record more grasps of more objects")
-                })?;
-                Ok((policy, drop_secs, policies.promise(drop_secs)))
-            }
-            Aim::MaxDrops(max_drops) => {
-                let promises = DROP_SECS.map(|drop_secs| (drop_secs, policies.promise(drop_secs)));
-                let is_kept = |promise: &Promise| promise.drops_of_lifts.at_most <= max_drops;
-                let passed = promises.iter().take_while(|(_, promise)| promise.as_ref().is_some_and(is_kept)).last();
-                if let Some((drop_secs, Some(promise))) = passed
-                    && let Some(policy) = policies.cheapest(*drop_secs)
-                {
-                    // The sequence of tests bounds drops by this share, and not by the bound that the last test alone gives.
-                    let bounded = |bounded| Bounded { at_most: max_drops, ..bounded };
-                    let (drops_of_lifts, drops_of_trials) =
-                        (bounded(promise.drops_of_lifts), bounded(promise.drops_of_trials));
-                    return Ok((policy, *drop_secs, Some(Promise { drops_of_lifts, drops_of_trials, ..*promise })));
-                }
-                Err(match &promises[0].1 {
-                    None => format!("nothing is lifted when the hand is {look}: record more grasps of more objects"),
-                    Some(promise) => format!(
-                        "when the hand is {look}, the strictest threshold promises at most {:.1} % of the lifts to drop, from {} \
-                         objects: record more objects, or allow more drops",
-                        100.0 * promise.drops_of_lifts.at_most,
-                        promise.drops_of_lifts.n_objects
-                    ),
-                })
-            }
-        }
     }
-}
-
-/// The threshold of a look that never lifts.
-const NEVER: f64 = 1.0;
-
-/// Chooses the thresholds of all looks, each for hands that can do this probe and no other. A look without a policy never lifts.
-/// Attempts are grasps with contact: those that no cell feels are attempts of a robot as well, and are not counted.
-/// `promises` says whether the labels are outcomes of lifts, for which a promise can be made.
-fn choose_policies(
-    classifier: &mut Classifier,
-    learned: &mut [Option<probes::Learned>],
-    judged: &OutOfFold<'_>,
-    (aim, promises): (Aim, bool),
-    progress: &mut impl FnMut(&str),
-) -> Result<Vec<PolicySummary>, TrainingError> {
-    if matches!(aim, Aim::MaxDrops(_)) && !promises {
-        return Err(TrainingError::Data(
-            "a share of drops can be promised for lifts alone: expected recordings of lifts (simulate --label lift, import), without \
-             --label wrench-space and without --day-baseline"
-                .into(),
-        ));
-    }
-    let examples = &judged.examples;
-    let settled = out_of_fold_probabilities(judged)?;
-    let names: BTreeSet<&String> = examples.iter().map(|example| &example.object).collect();
-    let objects: BTreeMap<&String, usize> = names.into_iter().zip(0..).collect();
-    let [squeezed, test_lifted] = learned else {
-        return Err(TrainingError::Data(format!("{} looks after a probe, expected two", learned.len())));
-    };
-    let policies = |last: Last, learned: [&Option<probes::Learned>; 2], stable_from: [f64; 2]| {
-        let probability = |learned: &Option<probes::Learned>, idx: usize| learned.as_ref()?.probabilities[idx];
-        let attempts = examples.iter().zip(&settled).enumerate();
-        let attempted = attempts.map(|(idx, (example, settled))| probes::Attempted {
-            object: objects[&example.object],
-            fold: judged.folds[idx],
-            settled: *settled,
-            // A tight hand that feels nothing is given up.
-            squeezed: if last == Last::TestLift { probability(learned[0], idx).unwrap_or(-1.0) } else { 1.0 },
-            decided: match last {
-                Last::Settled => Some(*settled),
-                Last::Squeeze => probability(learned[0], idx),
-                Last::TestLift => probability(learned[1], idx),
-            },
-            stable: example.stable,
-        });
-        probes::Policies::new(&attempted.collect::<Vec<_>>(), last, stable_from)
-    };
-    let summary = |look: &str, roc_area: f64, (policy, drop_secs, promise): &Chosen| PolicySummary {
-        roc_area,
-        look: look.into(),
-        drop_secs: *drop_secs,
-        kept: policy.expected.kept,
-        attempts_per_lift: policy.expected.attempts_per_lift,
-        given_up: policy.expected.given_up,
-        secs_per_kept: policy.expected.secs_per_kept,
-        promise: if promises { *promise } else { None },
-    };
-    let (mut summaries, mut refusals) = (Vec::new(), Vec::new());
-    match aim.choose(&policies(Last::Settled, [squeezed, test_lifted], [NEVER; 2]), "settled") {
-        Ok(without) => {
-            classifier.threshold_probability = without.0.lift;
-            let stable: Vec<bool> = examples.iter().map(|example| example.stable).collect();
-            let roc_area = area_under_roc(&curve(&settled, &stable)).unwrap_or(0.5);
-            summaries.push(summary("settled", roc_area, &without));
-        }
-        Err(refusal) => {
-            classifier.threshold_probability = NEVER;
-            refusals.push(refusal);
-        }
-    }
-    classifier.unsure_from_probability = classifier.threshold_probability;
-    let settled_threshold = classifier.threshold_probability;
-    let choose = |last: Last, look: &str, squeezed_threshold: f64| {
-        let stable_from = [settled_threshold, squeezed_threshold];
-        aim.choose(&policies(last, [squeezed, test_lifted], stable_from), look)
-    };
-    let of_squeeze = squeezed.is_some().then(|| choose(Last::Squeeze, "squeezed", NEVER));
-    // With a promise, a tight hand is not lifted before its test lift, so that no threshold of its own lets it go on.
-    let squeezed_threshold = match (&of_squeeze, aim) {
-        (Some(Ok(chosen)), Aim::DropSecs(_)) => chosen.0.lift,
-        _ => NEVER,
-    };
-    let of_test_lift = test_lifted.is_some().then(|| choose(Last::TestLift, "test_lifted", squeezed_threshold));
-    for learned in [&mut *squeezed, &mut *test_lifted].into_iter().flatten() {
-        let probe = &mut learned.probe.classifier;
-        (probe.threshold_probability, probe.unsure_from_probability) = (NEVER, NEVER);
-    }
-    let has_test_lift = matches!(of_test_lift, Some(Ok(_)));
-    if let (Some(learned), Some(chosen)) = (&mut *squeezed, of_squeeze) {
-        match chosen {
-            // Without a promise a look does not lift, if one was asked for, and that of this look was for another choice of
-            // the grasps to probe.
-            Ok(_) if has_test_lift && matches!(aim, Aim::MaxDrops(_)) => {
-                progress("squeezed hands are never lifted: the thresholds are for the test lift");
-            }
-            Ok(chosen) => {
-                let (probe, policy) = (&mut learned.probe.classifier, &chosen.0);
-                (probe.threshold_probability, probe.unsure_from_probability) = (policy.lift, policy.lift);
-                classifier.unsure_from_probability = policy.promising;
-                let promised = if has_test_lift { (chosen.0, chosen.1, None) } else { chosen };
-                summaries.push(summary("squeezed", learned.probe.cross_validated_roc_area, &promised));
-            }
-            Err(refusal) => refusals.push(refusal),
-        }
-    }
-    if let (Some(learned), Some(before), Some(chosen)) = (test_lifted, squeezed, of_test_lift) {
-        match chosen {
-            Ok(chosen) => {
-                let (probe, policy) = (&mut learned.probe.classifier, &chosen.0);
-                (probe.threshold_probability, probe.unsure_from_probability) = (policy.lift, policy.lift);
-                classifier.unsure_from_probability = policy.promising;
-                let before = &mut before.probe.classifier;
-                // A tight hand without a feature counts as -1 above.
-                before.unsure_from_probability = policy.promising_squeezed.max(0.0);
-                summaries.push(summary("test_lifted", learned.probe.cross_validated_roc_area, &chosen));
-            }
-            Err(refusal) => refusals.push(refusal),
-        }
-    }
-    if summaries.is_empty() || matches!(aim, Aim::DropSecs(_)) && !refusals.is_empty() {
-        return Err(TrainingError::Data(refusals.join("; ")));
-    }
-    refusals.iter().for_each(|refusal| progress(&format!("not lifted: {refusal}")));
-    Ok(summaries)
 }
 
 /// Examples that were judged by a machine that had not seen their fold: each with its decision value and its fold.
@@ -473,14 +328,15 @@ impl CrossValidated {
         let reliability = reliability(&probabilities, &outcomes, N_RELIABILITY_BINS);
         check_skill(calibration, &outcomes, reliability.brier)?;
         let (values, _) = by_outcome(&judged.examples, &judged.decision_values);
-        let called_stable = values.iter().map(|value| calibration.probability(*value) >= threshold_probability);
-        let decided: Vec<(bool, bool)> = called_stable.zip(outcomes).collect();
-        let share = |wanted: fn(&(bool, bool)) -> bool| {
-            decided.iter().filter(|outcome| wanted(outcome)).count() as f64 / decided.len() as f64
-        };
+        let (mut n_right, mut n_false_positives) = (0, 0);
+        for (value, stable) in values.iter().zip(&outcomes) {
+            let called_stable = calibration.probability(*value) >= threshold_probability;
+            n_right += usize::from(called_stable == *stable);
+            n_false_positives += usize::from(called_stable && !stable);
+        }
         Ok(CrossValidated {
-            accuracy: share(|(called, stable)| called == stable),
-            false_positive_share: share(|(called, stable)| *called && !stable),
+            accuracy: n_right as f64 / outcomes.len() as f64,
+            false_positive_share: n_false_positives as f64 / outcomes.len() as f64,
             brier: reliability.brier,
             ece: reliability.ece,
         })
@@ -489,8 +345,14 @@ impl CrossValidated {
 
 /// Each example's number, once for each of its outcomes, and the outcomes.
 fn by_outcome(examples: &[&Example], numbers: &[f64]) -> (Vec<f64>, Vec<bool>) {
-    let each = examples.iter().zip(numbers);
-    each.flat_map(|(example, number)| example.outcomes().iter().map(move |outcome| (*number, *outcome))).unzip()
+    let (mut repeated, mut outcomes) = (Vec::new(), Vec::new());
+    for (example, number) in examples.iter().zip(numbers) {
+        for outcome in example.outcomes() {
+            repeated.push(*number);
+            outcomes.push(*outcome);
+        }
+    }
+    (repeated, outcomes)
 }
 
 /// Platt's calibration. An example with labels for several frictions counts once for each.
@@ -528,7 +390,7 @@ fn out_of_fold_probabilities(judged: &OutOfFold<'_>) -> Result<Vec<f64>, PlattEr
     for fold in folds.iter().copied().collect::<BTreeSet<_>>() {
         let kept: Vec<usize> = (0..examples.len()).filter(|idx| folds[*idx] != fold).collect();
         let values: Vec<f64> = kept.iter().map(|idx| decision_values[*idx]).collect();
-        let calibration = calibrate(&kept.iter().map(|idx| examples[*idx]).collect::<Vec<_>>(), &values)?;
+        let calibration = calibrate(&picked(examples, &kept), &values)?;
         for idx in (0..examples.len()).filter(|idx| folds[*idx] == fold) {
             probabilities[idx] = calibration.probability(decision_values[idx]);
         }
@@ -557,13 +419,9 @@ fn check_examples(read: &Examples, recordings: &[PathBuf], frictions: &[f64]) ->
             "{n_stable} of {n} grasps with contact are stable: expected some of each (left out: {n_excluded:?})"
         )));
     }
-    let targets = || read.examples.iter().map(Example::target);
-    if targets().all(|target| target <= 0.0) || targets().all(|target| target >= 1.0) {
-        let which = if targets().all(|target| target <= 0.0) {
-            "no grasp is stable for any"
-        } else {
-            "every grasp is stable for each"
-        };
+    let none = read.examples.iter().all(|example| example.target() <= 0.0);
+    if none || read.examples.iter().all(|example| example.target() >= 1.0) {
+        let which = if none { "no grasp is stable for any" } else { "every grasp is stable for each" };
         return Err(TrainingError::Data(format!(
             "{which} of the frictions {:?}: expected some of which only a part is stable",
             frictions
@@ -671,6 +529,28 @@ impl Fitted {
     }
 }
 
+/// Boosted trees that learn from the examples that have a row, but not from those of the fold that is held out.
+fn fit_trees(
+    rows: &[Option<Vec<f64>>],
+    n_values: usize,
+    examples: &[&Example],
+    folds: &[usize],
+    held_out: Option<usize>,
+    params: &BoostingParams,
+    seed: u64,
+) -> Result<BoostedTrees, BoostingError> {
+    let (mut values, mut targets) = (Vec::new(), Vec::new());
+    for ((row, example), fold) in rows.iter().zip(examples).zip(folds) {
+        if let Some(row) = row
+            && held_out != Some(*fold)
+        {
+            values.extend_from_slice(row);
+            targets.push(example.target());
+        }
+    }
+    train_boosted(&values, n_values, &targets, params, seed)
+}
+
 /// The features of the examples, row after row.
 fn rows(features: &FeatureExtractor, examples: &[&Example]) -> Result<Vec<f64>, TrainingError> {
     let mut rows = Vec::with_capacity(examples.len() * features.len());
@@ -701,13 +581,18 @@ pub fn cross_validate(
     for fold in folds.iter().copied().collect::<BTreeSet<_>>() {
         progress(fold);
         let (held_out, kept): (Vec<usize>, Vec<usize>) = (0..examples.len()).partition(|idx| folds[*idx] == fold);
-        let of = |idxs: &[usize]| idxs.iter().map(|idx| examples[*idx]).collect::<Vec<&Example>>();
-        let values = fit(hand, recipe, &of(&kept), seed)?.decision_values(&of(&held_out))?;
+        let fitted = fit(hand, recipe, &picked(examples, &kept), seed)?;
+        let values = fitted.decision_values(&picked(examples, &held_out))?;
         for (idx, value) in held_out.iter().zip(values) {
             decision_values[*idx] = value;
         }
     }
     Ok(decision_values)
+}
+
+/// The examples of these indices.
+pub(crate) fn picked<'a>(examples: &[&'a Example], idxs: &[usize]) -> Vec<&'a Example> {
+    idxs.iter().map(|idx| examples[*idx]).collect()
 }
 
 fn file_name(path: &Path) -> String {

@@ -6,10 +6,11 @@
 
 use rayon::prelude::*;
 
-use super::{Example, OutOfFold, Signals, TrainingError, calibrate, out_of_fold_probabilities, prepare};
+use super::{
+    Example, OutOfFold, Signals, TrainingError, calibrate, fit_trees, out_of_fold_probabilities, picked, prepare,
+};
 use crate::evaluation::measures::{area_under_roc, curve};
 use crate::evaluation::reliability::{N_RELIABILITY_BINS, reliability};
-use crate::learners::booster::train_boosted;
 use crate::learners::training_range::learn_training_range;
 use crate::promise::{ObjectTrials, promise};
 use blindgrasp_grasps::reading::Felt;
@@ -20,7 +21,7 @@ use blindgrasp_stages::encoder::{Block, FeatureExtractor, FeltReading};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::own_lifts::{ATTEMPT_SECS, LIFT_SECS, SQUEEZE_SECS, TEST_LIFT_SECS};
 use blindgrasp_stages::probe::{GraspHistory, ProbeModel, n_values, signals};
-use blindgrasp_stages::recipe::{Learner, Recipe};
+use blindgrasp_stages::recipe::Recipe;
 use blindgrasp_stages::training_summary::Promise;
 
 /// The attempts of a trial that is never lifted.
@@ -40,10 +41,36 @@ const PARAMS: BoostingParams = BoostingParams {
 };
 
 /// A probe that was learned, before its threshold is chosen.
-pub(super) struct Learned {
+pub(super) struct LearnedProbe {
     pub(super) probe: ProbeModel,
     /// The probability of each example by machines that have not seen its object; `None` if it has no such reading.
     pub(super) probabilities: Vec<Option<f64>>,
+}
+
+impl LearnedProbe {
+    /// From here on a grasp is stable; below it is unstable.
+    pub(super) fn set_threshold(&mut self, probability: f64) {
+        self.probe.classifier.threshold_probability = probability;
+        self.probe.classifier.unsure_from_probability = probability;
+    }
+}
+
+/// The probes that could be learned; there is none of a test lift without one of a squeeze.
+#[derive(Default)]
+pub(super) struct LearnedProbes {
+    pub(super) squeezed: Option<LearnedProbe>,
+    pub(super) test_lifted: Option<LearnedProbe>,
+}
+
+impl LearnedProbes {
+    /// The probe that this look comes after.
+    pub(super) fn after(&mut self, look: LastLook) -> Option<&mut LearnedProbe> {
+        match look {
+            LastLook::Settled => None,
+            LastLook::Squeezed => self.squeezed.as_mut(),
+            LastLook::TestLifted => self.test_lifted.as_mut(),
+        }
+    }
 }
 
 /// The number of grasps without a frame of this phase.
@@ -51,8 +78,8 @@ pub(super) fn n_without(phase: Phase, examples: &[&Example]) -> usize {
     examples.iter().filter(|example| felt(phase, example).is_none()).count()
 }
 
-/// Learns to judge the frames of a phase; `None` if a grasp has none, the recipe has no boosted trees, or the frames of
-/// objects not seen say nothing of the outcome.
+/// Learns to judge the frames of a phase, which all grasps have; `None` if the frames of objects not seen say nothing of the
+/// outcome.
 pub(super) fn learn(
     hand: &Hand,
     recipe: &Recipe,
@@ -61,38 +88,27 @@ pub(super) fn learn(
     examples: &[&Example],
     folds: &[usize],
     seed: u64,
-) -> Result<Option<Learned>, TrainingError> {
-    if n_without(phase, examples) > 0 {
-        return Ok(None);
-    }
-    let params = match &recipe.learner {
-        Learner::Boosting(_) => &PARAMS,
-        _ => return Ok(None),
-    };
-    let rows = |features: &FeatureExtractor| -> Vec<Option<Vec<f64>>> {
-        examples.par_iter().map(|example| composed(features, phase, example)).collect()
-    };
-    let fitted = |rows: &[Option<Vec<f64>>], is_used: &dyn Fn(usize) -> bool| {
-        let used = || rows.iter().enumerate().filter(|(idx, row)| is_used(*idx) && row.is_some());
-        let values: Vec<f64> = used().filter_map(|(_, row)| row.as_deref()).flatten().copied().collect();
-        let targets: Vec<f64> = used().map(|(idx, _)| examples[idx].target()).collect();
-        train_boosted(&values, n_values(features), &targets, params, seed)
-    };
-    let all = rows(features);
-    let kept_idxs: Vec<usize> = (0..examples.len()).filter(|idx| all[*idx].is_some()).collect();
+) -> Result<Option<LearnedProbe>, TrainingError> {
+    let n_values = n_values(features);
+    let rows = composed_rows(features, phase, examples);
     let mut decision_values = vec![0.0; examples.len()];
     let n_folds = folds.iter().max().map_or(0, |last| last + 1);
     for fold in 0..n_folds {
-        let others: Vec<&Example> =
-            (0..examples.len()).filter(|idx| folds[*idx] != fold).map(|idx| examples[idx]).collect();
-        let rows = rows(&prepare(hand, recipe, &others, seed)?.features);
-        let trees = fitted(&rows, &|idx| folds[idx] != fold)?;
-        for idx in (0..examples.len()).filter(|idx| folds[*idx] == fold) {
-            decision_values[idx] = rows[idx].as_ref().map_or(0.0, |row| trees.decision_value(row));
+        let others: Vec<usize> = (0..examples.len()).filter(|idx| folds[*idx] != fold).collect();
+        let features = prepare(hand, recipe, &picked(examples, &others), seed)?.features;
+        let rows = composed_rows(&features, phase, examples);
+        let trees = fit_trees(&rows, n_values, examples, folds, Some(fold), &PARAMS, seed)?;
+        for (idx, row) in rows.iter().enumerate() {
+            if let Some(row) = row
+                && folds[idx] == fold
+            {
+                decision_values[idx] = trees.decision_value(row);
+            }
         }
     }
+    let kept_idxs: Vec<usize> = (0..examples.len()).filter(|idx| rows[*idx].is_some()).collect();
     let kept = OutOfFold {
-        examples: kept_idxs.iter().map(|idx| examples[*idx]).collect(),
+        examples: picked(examples, &kept_idxs),
         decision_values: kept_idxs.iter().map(|idx| decision_values[*idx]).collect(),
         folds: kept_idxs.iter().map(|idx| folds[*idx]).collect(),
     };
@@ -106,11 +122,12 @@ pub(super) fn learn(
     for (idx, probability) in kept_idxs.iter().zip(&judged) {
         probabilities[*idx] = Some(*probability);
     }
-    let readings: Vec<FeltReading<'_>> =
-        kept.examples.iter().filter_map(|example| felt(phase, example)).map(Felt::reading).collect();
+    let felt = kept.examples.iter().filter_map(|example| felt(phase, example));
+    let readings: Vec<FeltReading<'_>> = felt.map(Felt::reading).collect();
+    let trees = fit_trees(&rows, n_values, examples, folds, None, &PARAMS, seed)?;
     let probe = ProbeModel {
         classifier: Classifier {
-            predictor: Predictor::Boosting(fitted(&all, &|_| true)?),
+            predictor: Predictor::Boosting(trees),
             calibration,
             threshold_probability: 1.0,
             unsure_from_probability: 1.0,
@@ -119,7 +136,11 @@ pub(super) fn learn(
         cross_validated_roc_area: area_under_roc(&curve(&judged, &stable)).unwrap_or(0.5),
         cross_validated_ece: reliability(&judged, &stable, N_RELIABILITY_BINS).ece,
     };
-    Ok(Some(Learned { probe, probabilities }))
+    Ok(Some(LearnedProbe { probe, probabilities }))
+}
+
+fn composed_rows(features: &FeatureExtractor, phase: Phase, examples: &[&Example]) -> Vec<Option<Vec<f64>>> {
+    examples.par_iter().map(|example| composed(features, phase, example)).collect()
 }
 
 fn felt(phase: Phase, example: &Example) -> Option<&Felt> {
@@ -128,31 +149,50 @@ fn felt(phase: Phase, example: &Example) -> Option<&Felt> {
 
 /// The values from which a probe is judged; `None` if a reading has no feature.
 pub(crate) fn composed(features: &FeatureExtractor, phase: Phase, example: &Example) -> Option<Vec<f64>> {
-    let (mut history, mut values, mut composed) = (GraspHistory::default(), Vec::new(), Vec::new());
     let followed = signals(features);
-    let mut add = |phase, values: Result<Vec<f64>, Fault>| {
-        history.add((0, 0), phase, values.as_deref().map_err(|fault| *fault), &followed);
-    };
-    let moves = |moving: &[Signals], phase, add: &mut dyn FnMut(Phase, Result<Vec<f64>, Fault>)| {
-        let mut row = vec![0.0; features.len()];
-        for signals in moving {
-            let pads = if features.blocks.contains(&Block::Pads) { &signals.pad_newtons[..] } else { &[] };
-            let numbers = pads.iter().copied().chain(signals.wrist_newtons);
-            followed.iter().zip(numbers).for_each(|(idx, number)| row[*idx] = number);
-            add(phase, Ok(row.clone()));
-        }
-    };
     let [squeezing, test_lifting] = &example.moving;
-    let mut extract = |reading: &FeltReading<'_>| features.extract(reading, &mut values).map(|_| values.clone());
-    add(Phase::Settled, extract(&example.reading()));
-    moves(squeezing, Phase::Squeezing, &mut add);
+    let mut history = GraspHistory::default();
+    history.add(
+        (0, 0),
+        Phase::Settled,
+        extracted(features, &example.reading()).as_deref().map_err(|fault| *fault),
+        &followed,
+    );
+    add_moves(&mut history, Phase::Squeezing, squeezing, features, &followed);
     if phase == Phase::TestLifted {
-        add(Phase::Squeezed, extract(&example.squeezed.as_ref()?.reading()));
-        moves(test_lifting, Phase::TestLifting, &mut add);
+        let squeezed = extracted(features, &example.squeezed.as_ref()?.reading());
+        history.add((0, 0), Phase::Squeezed, squeezed.as_deref().map_err(|fault| *fault), &followed);
+        add_moves(&mut history, Phase::TestLifting, test_lifting, features, &followed);
     }
-    let now = extract(&felt(phase, example)?.reading()).ok()?;
+    let now = extracted(features, &felt(phase, example)?.reading()).ok()?;
+    let mut composed = Vec::new();
     history.compose(phase, &now, &followed, &mut composed).ok()?;
     Some(composed)
+}
+
+fn extracted(features: &FeatureExtractor, reading: &FeltReading<'_>) -> Result<Vec<f64>, Fault> {
+    let mut values = Vec::new();
+    features.extract(reading, &mut values)?;
+    Ok(values)
+}
+
+/// Adds the frames of a hand that moves, of which the followed signals alone are known.
+fn add_moves(
+    history: &mut GraspHistory,
+    phase: Phase,
+    moving: &[Signals],
+    features: &FeatureExtractor,
+    followed: &[usize],
+) {
+    let mut row = vec![0.0; features.len()];
+    for signals in moving {
+        let pads = if features.blocks.contains(&Block::Pads) { &signals.pad_newtons[..] } else { &[] };
+        let numbers = pads.iter().copied().chain(signals.wrist_newtons);
+        for (idx, number) in followed.iter().zip(numbers) {
+            row[*idx] = number;
+        }
+        history.add((0, 0), phase, Ok(&row), followed);
+    }
 }
 
 /// The thresholds of a policy, and what to expect of it.
@@ -200,13 +240,28 @@ pub(super) struct Attempted {
     pub(super) stable: bool,
 }
 
-/// What decides.
+/// The look that decides.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Last {
+pub(super) enum LastLook {
     Settled,
-    Squeeze,
-    TestLift,
+    Squeezed,
+    TestLifted,
 }
+
+impl LastLook {
+    pub(super) const ALL: [LastLook; 3] = [LastLook::Settled, LastLook::Squeezed, LastLook::TestLifted];
+
+    pub(super) fn as_str(self) -> &'static str {
+        match self {
+            LastLook::Settled => "settled",
+            LastLook::Squeezed => "squeezed",
+            LastLook::TestLifted => "test_lifted",
+        }
+    }
+}
+
+/// Takes the place of a probability where a look has no feature: only a threshold that gives up no grasp lets it go on.
+pub(super) const NO_FEATURE: f64 = -1.0;
 
 /// The policies that grasps offer, from all of them and from those of all folds but one.
 pub(super) struct Policies {
@@ -220,18 +275,18 @@ pub(super) struct Policies {
 impl Policies {
     /// Without a probe, `decided` is `settled`, and no grasp is given up before. With one, no grasp is given up from
     /// the first of `stable_from` on when it has settled, and from the second on when it is tight: it counts as stable there.
-    pub(super) fn new(grasps: &[Attempted], last: Last, stable_from: [f64; 2]) -> Policies {
-        let policies = |grasps: &[Attempted]| policies(grasps, last, stable_from);
+    pub(super) fn new(grasps: &[Attempted], last: LastLook, stable_from: [f64; 2]) -> Policies {
         let all = Thresholds { promising: 0.0, promising_squeezed: 0.0, lift: 0.0 };
         let mut n_grasps: Vec<u32> = counts(grasps, all).iter().map(|count| count.n as u32).collect();
         n_grasps.sort_unstable();
         let n_attempts = n_grasps.get(n_grasps.len() / 10).copied().unwrap_or(0).min(MOST_ATTEMPTS);
         let n_folds = grasps.iter().map(|grasp| grasp.fold + 1).max().unwrap_or(0);
-        let without = |fold: usize| {
+        let mut folds = Vec::new();
+        for fold in 0..n_folds {
             let (own, others): (Vec<_>, Vec<_>) = grasps.iter().partition(|grasp| grasp.fold == fold);
-            (own, policies(&others))
-        };
-        Policies { all: policies(grasps), folds: (0..n_folds).map(without).collect(), n_attempts }
+            folds.push((own, policies(&others, last, stable_from)));
+        }
+        Policies { all: policies(grasps, last, stable_from), folds, n_attempts }
     }
 
     /// The policy that takes the least time for each kept object if each drop takes `drop_secs` more, or hardly more time with
@@ -243,13 +298,12 @@ impl Policies {
     /// The bounds of drops for new objects if the policy is chosen like this. Each fold's objects are tried with the policy that is
     /// the cheapest for the probabilities of the other folds, and all objects count.
     pub(super) fn promise(&self, drop_secs: f64) -> Option<Promise> {
-        let tried = self.folds.iter().map(|(grasps, policies)| {
-            let policy = cheapest(policies, drop_secs)?;
-            let counts = counts(grasps, policy.thresholds());
-            Some(counts.iter().map(|count| count.trials(self.n_attempts)).collect::<Vec<_>>())
-        });
-        let promise = promise(&tried.collect::<Option<Vec<_>>>()?.concat())?;
-        Some(Promise { n_attempts: Some(self.n_attempts), ..promise })
+        let mut tried = Vec::new();
+        for (grasps, policies) in &self.folds {
+            let counts = counts(grasps, cheapest(policies, drop_secs)?.thresholds());
+            tried.extend(counts.iter().map(|count| count.trials(self.n_attempts)));
+        }
+        Some(Promise { n_attempts: Some(self.n_attempts), ..promise(&tried)? })
     }
 }
 
@@ -278,37 +332,36 @@ impl Policy {
 
 /// The policies among which one is chosen: quantiles of the probabilities as thresholds. All grasps from
 /// `stable_from` on go on, settled and tight.
-fn policies(grasps: &[Attempted], last: Last, [settled_from, squeezed_from]: [f64; 2]) -> Vec<Policy> {
-    let quantiles = |mut values: Vec<f64>, n: usize| -> Vec<f64> {
-        values.sort_by(f64::total_cmp);
-        values.dedup();
-        (0..n).filter_map(|idx| values.get(idx * values.len() / n).copied()).collect()
-    };
-    let of_stable = |probability: &dyn Fn(&Attempted) -> f64, n: usize| {
-        quantiles(grasps.iter().filter(|grasp| grasp.stable).map(probability).collect(), n)
-    };
+fn policies(grasps: &[Attempted], last: LastLook, [settled_from, squeezed_from]: [f64; 2]) -> Vec<Policy> {
+    let stable = || grasps.iter().filter(|grasp| grasp.stable);
+    let settled = stable().map(|grasp| grasp.settled.min(settled_from)).collect();
+    let squeezed = stable().map(|grasp| grasp.squeezed.min(squeezed_from)).collect();
     let (promising, promising_squeezed, n_lifts) = match last {
-        Last::Settled => (vec![0.0], vec![0.0], 400),
-        Last::Squeeze => (of_stable(&|grasp| grasp.settled.min(settled_from), 20), vec![0.0], 400),
-        Last::TestLift => {
-            let settled = of_stable(&|grasp| grasp.settled.min(settled_from), 16);
-            (settled, of_stable(&|grasp| grasp.squeezed.min(squeezed_from), 12), 200)
-        }
+        LastLook::Settled => (vec![0.0], vec![0.0], 400),
+        LastLook::Squeezed => (quantiles(settled, 20), vec![0.0], 400),
+        LastLook::TestLifted => (quantiles(settled, 16), quantiles(squeezed, 12), 200),
     };
+    let mut candidates = Vec::new();
     let lifts = quantiles(grasps.iter().filter_map(|grasp| grasp.decided).collect(), n_lifts);
-    let pairs: Vec<(f64, f64)> = promising
-        .iter()
-        .flat_map(|promising| promising_squeezed.iter().map(move |squeezed| (*promising, *squeezed)))
-        .collect();
-    pairs
+    for promising in promising {
+        for &promising_squeezed in &promising_squeezed {
+            candidates.extend(lifts.iter().map(|&lift| Thresholds { promising, promising_squeezed, lift }));
+        }
+    }
+    candidates
         .par_iter()
-        .flat_map_iter(|&(promising, promising_squeezed)| {
-            lifts.iter().filter_map(move |&lift| {
-                let expected = expect(grasps, Thresholds { promising, promising_squeezed, lift }, last)?;
-                Some(Policy { promising, promising_squeezed, lift, expected })
-            })
+        .filter_map(|thresholds| {
+            let Thresholds { promising, promising_squeezed, lift } = *thresholds;
+            Some(Policy { promising, promising_squeezed, lift, expected: expect(grasps, *thresholds, last)? })
         })
         .collect()
+}
+
+/// At most `n` of the values, evenly spread among all different ones, in ascending order.
+fn quantiles(mut values: Vec<f64>, n: usize) -> Vec<f64> {
+    values.sort_by(f64::total_cmp);
+    values.dedup();
+    (0..n).filter_map(|idx| values.get(idx * values.len() / n).copied()).collect()
 }
 
 /// The grasps of an object, and those of them that thresholds let pass.
@@ -413,7 +466,7 @@ fn trial(count: &Count, chances: &Chances) -> (f64, f64) {
 }
 
 /// What thresholds lead to in trials of objects like these; each object weighs the same. `None` if nothing is lifted.
-fn expect(grasps: &[Attempted], thresholds: Thresholds, last: Last) -> Option<Expected> {
+fn expect(grasps: &[Attempted], thresholds: Thresholds, last: LastLook) -> Option<Expected> {
     let objects = counts(grasps, thresholds);
     let chances = Chances::of(&objects);
     let (mut lifted, mut attempts, mut secs) = (0.0, 0.0, 0.0);
@@ -429,9 +482,11 @@ fn expect(grasps: &[Attempted], thresholds: Thresholds, last: Last) -> Option<Ex
         // The attempts before a lift are a random part of the grasps that are not lifted.
         let n_of = |part: f64| ends + (n_attempts - ends) * (part - count.lifted) / (count.n - count.lifted).max(1.0);
         let probe_secs = match last {
-            Last::Settled => 0.0,
-            Last::Squeeze => n_of(count.promising) * SQUEEZE_SECS,
-            Last::TestLift => n_of(count.promising) * SQUEEZE_SECS + n_of(count.promising_squeezed) * TEST_LIFT_SECS,
+            LastLook::Settled => 0.0,
+            LastLook::Squeezed => n_of(count.promising) * SQUEEZE_SECS,
+            LastLook::TestLifted => {
+                n_of(count.promising) * SQUEEZE_SECS + n_of(count.promising_squeezed) * TEST_LIFT_SECS
+            }
         };
         secs += n_attempts * ATTEMPT_SECS + probe_secs + ends * LIFT_SECS;
     }
@@ -477,24 +532,24 @@ mod tests {
             ("b", 0.9, 0.2, false),
         ]);
         let with = |lift: f64| Thresholds { promising: 0.5, promising_squeezed: 0.0, lift };
-        let expected = expect(&grasps, with(0.5), Last::TestLift).expect("lifts");
+        let expected = expect(&grasps, with(0.5), LastLook::TestLifted).expect("lifts");
         // In random order, the lift is number 1.5 and 2.5 in the mean. A probe comes before each lift, and in all grasps of b.
         let secs = (1.5 + 2.5) * ATTEMPT_SECS + (1.0 + 2.5) * (SQUEEZE_SECS + TEST_LIFT_SECS) + 2.0 * LIFT_SECS;
         assert_eq!((expected.kept, expected.attempts_per_lift, expected.given_up), (0.5, 2.0, 0.0));
         assert!((expected.secs_per_kept - secs).abs() < 1e-12, "{expected:?}");
         // A higher threshold lifts none of b's grasps, and keeps each object that it lifts. As both shares of lifts, 1/2 and 0,
         // vary less than chance makes them, b has the mean of the two from its fifth attempt on.
-        let strict = expect(&grasps, with(0.85), Last::TestLift).expect("lifts");
+        let strict = expect(&grasps, with(0.85), LastLook::TestLifted).expect("lifts");
         assert_eq!(strict.kept, 1.0);
         assert!((strict.given_up - 0.75_f64.powi(16) / 2.0).abs() < 1e-12, "{strict:?}");
-        assert_eq!(expect(&grasps, with(1.0), Last::TestLift), None);
+        assert_eq!(expect(&grasps, with(1.0), LastLook::TestLifted), None);
     }
 
     #[test]
     fn drops_that_cost_more_are_worth_more_attempts() {
         let grasps =
             grasps(&[("a", 0.9, 0.9, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, false)]);
-        let policies = Policies::new(&grasps, Last::Squeeze, [1.0, 1.0]);
+        let policies = Policies::new(&grasps, LastLook::Squeezed, [1.0, 1.0]);
         let chosen = |drop_secs| policies.cheapest(drop_secs).map(|policy| (policy.lift, policy.expected.kept));
         assert_eq!((chosen(0.0), chosen(1000.0)), (Some((0.3, 0.75)), Some((0.9, 1.0))));
     }
@@ -532,7 +587,7 @@ mod tests {
                         }));
                     }
                     let with = Thresholds { promising: 0.5, promising_squeezed: 0.0, lift: 0.5 };
-                    let expected = expect(&grasps, with, Last::Squeeze).expect("lifts");
+                    let expected = expect(&grasps, with, LastLook::Squeezed).expect("lifts");
                     of_given_up += expected.given_up / f64::from(n_runs);
                     of_attempts += expected.attempts_per_lift / f64::from(n_runs);
                     of_secs += expected.secs_per_kept / f64::from(n_runs);
@@ -555,7 +610,7 @@ mod tests {
             decided: Some(decided),
             stable,
         });
-        let policy = Policies::new(&grasps, Last::TestLift, [1.0, 1.0]).cheapest(10.0).expect("a policy");
+        let policy = Policies::new(&grasps, LastLook::TestLifted, [1.0, 1.0]).cheapest(10.0).expect("a policy");
         assert_eq!((policy.promising_squeezed, policy.expected.kept), (0.9, 1.0), "{policy:?}");
     }
 
@@ -563,9 +618,12 @@ mod tests {
     fn grasps_that_count_as_stable_are_probed() {
         let grasps =
             grasps(&[("a", 0.9, 0.9, true), ("a", 0.7, 0.1, false), ("b", 0.9, 0.9, true), ("b", 0.6, 0.1, false)]);
-        let free = Policies::new(&grasps, Last::Squeeze, [1.0, 1.0]).cheapest(0.0).expect("a policy");
+        let free = Policies::new(&grasps, LastLook::Squeezed, [1.0, 1.0]).cheapest(0.0).expect("a policy");
         assert_eq!(free.promising, 0.9, "the others are not worth a probe");
-        assert_eq!(Policies::new(&grasps, Last::Squeeze, [0.65, 1.0]).cheapest(0.0).expect("a policy").promising, 0.65);
+        assert_eq!(
+            Policies::new(&grasps, LastLook::Squeezed, [0.65, 1.0]).cheapest(0.0).expect("a policy").promising,
+            0.65
+        );
     }
 
     #[test]
@@ -591,7 +649,7 @@ mod tests {
             ("b", 0.9, 0.9, true),
             ("b", 0.9, 0.3, false),
         ]);
-        let policies = Policies::new(&grasps, Last::Settled, [1.0, 1.0]);
+        let policies = Policies::new(&grasps, LastLook::Settled, [1.0, 1.0]);
         let found = policies.promise(1000.0).expect("lifts");
         // b with the threshold 0.3: a lift of three is dropped. a with 0.9 or more drops none.
         let dropped = (1.0 / 3.0) / 2.0;

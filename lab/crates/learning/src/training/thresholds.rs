@@ -1,0 +1,209 @@
+//! Chooses the thresholds of all looks of a model, each for hands that can do this probe and no other.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::probes::{Attempted, LastLook, LearnedProbes, NO_FEATURE, Policies, Policy};
+use super::{OutOfFold, TrainingError, out_of_fold_probabilities};
+use crate::evaluation::measures::{area_under_roc, curve};
+use blindgrasp_stages::classifier::Classifier;
+use blindgrasp_stages::training_summary::{Bounded, PolicySummary, Promise};
+
+/// The aim of thresholds that are chosen for trials, in which a hand grasps again until it lifts.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Aim {
+    /// The least time for each kept object if a drop takes so many seconds more.
+    DropSecs(f64),
+    /// At most this share of the lifts drops.
+    MaxDrops(f64),
+}
+
+/// The prices of a drop that are tried for [`Aim::MaxDrops`], from strict to loose: fixed, so that the tests in this order need no
+/// correction (fixed sequence testing, Angelopoulos et al. 2021, section 3).
+const DROP_SECS: [f64; 10] = [1000.0, 500.0, 240.0, 120.0, 60.0, 30.0, 15.0, 8.0, 4.0, 0.0];
+
+/// The threshold of a look that never lifts.
+const NEVER: f64 = 1.0;
+
+/// A look's policy with the price of a drop that it was chosen for, and its promise.
+struct Chosen {
+    look: LastLook,
+    policy: Policy,
+    drop_secs: f64,
+    promise: Option<Promise>,
+}
+
+impl Aim {
+    /// Chooses the policy of a look. The error is the reason why the look has none.
+    fn choose(self, policies: &Policies, look: LastLook) -> Result<Chosen, String> {
+        let max_drops = match self {
+            Aim::MaxDrops(max_drops) => max_drops,
+            Aim::DropSecs(drop_secs) => {
+                let Some(policy) = policies.cheapest(drop_secs) else {
+                    return Err(format!(
+                        "no threshold leads to a lift when the hand is {}: record more grasps of more objects",
+                        look.as_str()
+                    ));
+                };
+                return Ok(Chosen { look, policy, drop_secs, promise: policies.promise(drop_secs) });
+            }
+        };
+        let mut passed = None;
+        for drop_secs in DROP_SECS {
+            match policies.promise(drop_secs) {
+                Some(promise) if promise.drops_of_lifts.at_most <= max_drops => passed = Some((drop_secs, promise)),
+                _ => break,
+            }
+        }
+        if let Some((drop_secs, mut promise)) = passed
+            && let Some(policy) = policies.cheapest(drop_secs)
+        {
+            // The sequence of tests bounds drops by this share, and not by the bound that the last test alone gives.
+            promise.drops_of_lifts = Bounded { at_most: max_drops, ..promise.drops_of_lifts };
+            promise.drops_of_trials = Bounded { at_most: max_drops, ..promise.drops_of_trials };
+            return Ok(Chosen { look, policy, drop_secs, promise: Some(promise) });
+        }
+        Err(match policies.promise(DROP_SECS[0]) {
+            None => format!("nothing is lifted when the hand is {}: record more grasps of more objects", look.as_str()),
+            Some(promise) => format!(
+                "when the hand is {}, the strictest threshold promises at most {:.1} % of the lifts to drop, from {} objects: \
+                 record more objects, or allow more drops",
+                look.as_str(),
+                100.0 * promise.drops_of_lifts.at_most,
+                promise.drops_of_lifts.n_objects
+            ),
+        })
+    }
+}
+
+impl Chosen {
+    fn summary(&self, roc_area: f64) -> PolicySummary {
+        PolicySummary {
+            roc_area,
+            look: self.look.as_str().into(),
+            drop_secs: self.drop_secs,
+            kept: self.policy.expected.kept,
+            attempts_per_lift: self.policy.expected.attempts_per_lift,
+            given_up: self.policy.expected.given_up,
+            secs_per_kept: self.policy.expected.secs_per_kept,
+            promise: self.promise,
+        }
+    }
+}
+
+/// Chooses the thresholds and sets them. A look without a policy never lifts. Attempts are grasps with contact: those that no
+/// cell feels are attempts of a robot as well, and are not counted. `promises` says whether the labels are outcomes of lifts, for
+/// which a promise can be made.
+pub(super) fn choose_thresholds(
+    aim: Aim,
+    promises: bool,
+    judged: &OutOfFold<'_>,
+    classifier: &mut Classifier,
+    probes: &mut LearnedProbes,
+    progress: &mut impl FnMut(&str),
+) -> Result<Vec<PolicySummary>, TrainingError> {
+    if matches!(aim, Aim::MaxDrops(_)) && !promises {
+        return Err(TrainingError::Data(
+            "a share of drops can be promised for lifts alone: expected recordings of lifts (simulate --label lift, import), without \
+             --label wrench-space and without --day-baseline"
+                .into(),
+        ));
+    }
+    let settled = out_of_fold_probabilities(judged)?;
+    let (chosen_looks, refusals) = choose_looks(aim, judged, &settled, probes);
+    if chosen_looks.is_empty() || matches!(aim, Aim::DropSecs(_)) && !refusals.is_empty() {
+        return Err(TrainingError::Data(refusals.join("; ")));
+    }
+    classifier.threshold_probability = NEVER;
+    let stable: Vec<bool> = judged.examples.iter().map(|example| example.stable).collect();
+    let settled_roc_area = area_under_roc(&curve(&settled, &stable)).unwrap_or(0.5);
+    let has_test_lift = chosen_looks.iter().any(|chosen| chosen.look == LastLook::TestLifted);
+    let (mut summaries, mut unsure_from) = (Vec::new(), NEVER);
+    for mut chosen in chosen_looks {
+        let policy = chosen.policy;
+        let is_before_test_lift = chosen.look == LastLook::Squeezed && has_test_lift;
+        // Without a promise a look does not lift, if one was asked for, and that of this look was for another choice of
+        // the grasps to probe.
+        if is_before_test_lift && matches!(aim, Aim::MaxDrops(_)) {
+            progress("squeezed hands are never lifted: the thresholds are for the test lift");
+            continue;
+        }
+        if is_before_test_lift || !promises {
+            chosen.promise = None;
+        }
+        let mut roc_area = settled_roc_area;
+        if let Some(learned) = probes.after(chosen.look) {
+            learned.set_threshold(policy.lift);
+            unsure_from = policy.promising;
+            roc_area = learned.probe.cross_validated_roc_area;
+        } else {
+            classifier.threshold_probability = policy.lift;
+            unsure_from = policy.lift;
+        }
+        if chosen.look == LastLook::TestLifted
+            && let Some(squeezed) = &mut probes.squeezed
+        {
+            squeezed.probe.classifier.unsure_from_probability = policy.promising_squeezed.max(0.0);
+        }
+        summaries.push(chosen.summary(roc_area));
+    }
+    classifier.unsure_from_probability = unsure_from;
+    for refusal in refusals {
+        progress(&format!("not lifted: {refusal}"));
+    }
+    Ok(summaries)
+}
+
+/// Chooses the policies of all looks that the model has, and says why looks have none.
+fn choose_looks(
+    aim: Aim,
+    judged: &OutOfFold<'_>,
+    settled: &[f64],
+    probes: &mut LearnedProbes,
+) -> (Vec<Chosen>, Vec<String>) {
+    let (mut chosen_looks, mut refusals) = (Vec::new(), Vec::new());
+    let mut stable_from = [NEVER; 2];
+    for look in LastLook::ALL {
+        if look != LastLook::Settled && probes.after(look).is_none() {
+            continue;
+        }
+        match aim.choose(&Policies::new(&attempts(judged, settled, probes, look), look, stable_from), look) {
+            Ok(chosen) => {
+                match (look, aim) {
+                    (LastLook::Settled, _) => stable_from[0] = chosen.policy.lift,
+                    (LastLook::Squeezed, Aim::DropSecs(_)) => stable_from[1] = chosen.policy.lift,
+                    // With a promise, a tight hand is not lifted before its test lift, so that no threshold of its own lets
+                    // it go on.
+                    _ => {}
+                }
+                chosen_looks.push(chosen);
+            }
+            Err(refusal) => refusals.push(refusal),
+        }
+    }
+    (chosen_looks, refusals)
+}
+
+/// The grasps as attempts that a look decides.
+fn attempts(judged: &OutOfFold<'_>, settled: &[f64], probes: &LearnedProbes, look: LastLook) -> Vec<Attempted> {
+    let names: BTreeSet<&String> = judged.examples.iter().map(|example| &example.object).collect();
+    let objects: BTreeMap<&String, usize> = names.into_iter().zip(0..).collect();
+    let mut attempts = Vec::new();
+    for (idx, example) in judged.examples.iter().enumerate() {
+        let squeezed = probes.squeezed.as_ref().and_then(|learned| learned.probabilities[idx]);
+        let test_lifted = probes.test_lifted.as_ref().and_then(|learned| learned.probabilities[idx]);
+        attempts.push(Attempted {
+            object: objects[&example.object],
+            fold: judged.folds[idx],
+            settled: settled[idx],
+            // A tight hand that feels nothing is given up.
+            squeezed: if look == LastLook::TestLifted { squeezed.unwrap_or(NO_FEATURE) } else { 1.0 },
+            decided: match look {
+                LastLook::Settled => Some(settled[idx]),
+                LastLook::Squeezed => squeezed,
+                LastLook::TestLifted => test_lifted,
+            },
+            stable: example.stable,
+        });
+    }
+    attempts
+}
