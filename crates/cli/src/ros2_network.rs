@@ -15,7 +15,7 @@ pub struct Ros2Network {
     /// Folder with ca.pem, ros2.pem and ros2.key.pem, for an endpoint tls/HOST:PORT
     #[arg(long, value_name = "DIR")]
     keys: Option<PathBuf>,
-    /// With --keys: common names of the certificates at the other end that take part [default: ros2,@router]
+    /// With --keys: common names of the certificates at the other end that take part; ros2,@router by default
     #[arg(long, value_name = "NAMES", requires = "keys")]
     from: Option<String>,
     /// ROS domain [default: 0]
