@@ -2,10 +2,12 @@
 //! params that do not go together, inputs that must not hold up the graph. An operator asks the same functions when it
 //! begins.
 
+use std::path::Path;
 use std::process::{Command, ExitCode, Stdio};
 
 use anyhow::{Context as _, bail};
 use blindgrasp_graph::dataflow::{EdgePolicy, Graph, Node};
+use blindgrasp_graph::operators::running_program;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Sandbox;
 use serde::{Deserialize, Serialize};
@@ -64,7 +66,7 @@ fn check(node: &Node) -> anyhow::Result<()> {
     let file_node = FileNode { params: node.params.clone(), inputs: inputs.collect(), has_sandbox };
     if let [word, name, ..] = node.args.as_slice()
         && word == "operator"
-        && house_of(name, Some(&node.params)).is_some()
+        && house_of(name, Some(&node.params)).is_some_and(|house| is_beside(&node.program, house))
     {
         return check_elsewhere(node, &file_node);
     }
@@ -72,6 +74,13 @@ fn check(node: &Node) -> anyhow::Result<()> {
         Some(form) => (form.check)(&file_node),
         None => Ok(()),
     }
+}
+
+/// Whether a node's program is that of a house, or the one that hands over to it, in the folder of the running one: programs of
+/// strangers are not asked.
+fn is_beside(program: &Path, house: &str) -> bool {
+    let Ok(running) = running_program() else { return false };
+    program == running || program == running.with_file_name(house) || program == running.with_file_name("blindgrasp")
 }
 
 /// Asks the program of another house.
@@ -91,9 +100,10 @@ fn check_elsewhere(node: &Node, file_node: &FileNode) -> anyhow::Result<()> {
     }
     let output = child.wait_with_output().with_context(|| format!("{program} {CHECK}"))?;
     let said = String::from_utf8_lossy(&output.stderr);
+    let said = said.trim_end().trim_start_matches("blindgrasp: ");
     match output.status.code() {
         Some(0) => Ok(()),
-        Some(1) => bail!("{}", said.trim_end()),
-        _ => bail!("{program} failed at {CHECK} ({}): {}", output.status, said.trim_end()),
+        Some(1) => bail!("{said}"),
+        _ => bail!("{program} failed at {CHECK} ({}): {said}", output.status),
     }
 }

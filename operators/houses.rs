@@ -18,7 +18,7 @@ pub const OTHER_HOUSES: [(&str, &str); 4] = [
     (LINK_OPERATOR, NETWORK_PROGRAM),
 ];
 
-/// The other program that runs an operator with these params; `None` for one of the robot's, and for names of nothing.
+/// The other program that runs an operator with these params; `None` for one of the robot's and for an unknown name.
 pub fn house_of(name: &str, params: Option<&Map<String, Value>>) -> Option<&'static str> {
     let driver = params.and_then(|params| params.get("driver")?.as_str());
     if name == "tactile_source" && matches!(driver, Some("ros2" | "zenoh")) {

@@ -22,7 +22,7 @@ pub use ros2_markers::{cell_points, hand_markers};
 
 use std::path::Path;
 
-use blindgrasp_graph::operators::Operators;
+use blindgrasp_graph::operators::{LINK_OPERATOR, Operators};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::Operator;
 
@@ -84,10 +84,24 @@ pub fn form_of(args: &[String]) -> Option<Form> {
 /// The operators of all houses as a dataflow file can name them. `program` must run each as `PROGRAM operator NAME`, as
 /// blindgrasp does; those of the other houses are run by their programs, where these lie beside it.
 pub fn operators_of(program: &Path) -> Operators {
+    let mut operators = installed_operators_of(program);
+    for (name, _) in OTHER_HOUSES {
+        if operators.get(name).is_none() && name != LINK_OPERATOR {
+            // It says how to get the program of its house.
+            operators = operators.with(name, program);
+        }
+    }
+    operators
+}
+
+/// As [`operators_of`], without those whose programs do not lie beside `program`.
+pub fn installed_operators_of(program: &Path) -> Operators {
     let mut operators = Operators::of_program(program, SHIPPED.iter().map(|shipped| shipped.name));
     for (name, house) in OTHER_HOUSES {
         let beside = program.with_file_name(house);
-        operators = operators.with(name, if beside.is_file() { &beside } else { program });
+        if beside.is_file() {
+            operators = operators.with(name, &beside);
+        }
     }
     operators.sharing(SHIPPED.iter().filter(|shipped| shipped.can_share_process).map(|shipped| shipped.name))
 }

@@ -8,7 +8,7 @@ The first paragraph of a subject's docstring says what it measures. The module h
 
 and where it needs them:
 
-    EXAMPLES         the programs of examples/ to build
+    EXAMPLES         the examples of all packages to build
     PACKAGES         the packages of PyPI, by the name to import
     verdict(result)  why the result is bad, or None: the exit code is then 1
     PAGE             its options for benches/benchmarks.md, with page(result): rows of figure, peer and ratio

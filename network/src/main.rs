@@ -14,10 +14,5 @@ fn main() -> ExitCode {
         // SAFETY: no other thread has begun yet, which could read the environment meanwhile.
         unsafe { std::env::set_var(name, value) };
     }
-    blindgrasp_cli::survive_limit_of_file_sizes();
-    let cli = commands::Cli::read();
-    match cli.run_operator() {
-        Some(code) => code,
-        None => blindgrasp_cli::end(commands::run(&cli)),
-    }
+    commands::main()
 }

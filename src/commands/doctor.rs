@@ -4,10 +4,11 @@ use clap::Args;
 use serde_json::json;
 
 use super::{Outcome, print_line};
-use blindgrasp_cli::graph_file::shipped;
+use blindgrasp_cli::houses::robot_program;
 use blindgrasp_graph::doctor::{Fitness, Measurement, examine};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::namespace::{left_over, sweep};
+use blindgrasp_operators::installed_operators_of;
 
 /// Check whether this machine can run a graph
 ///
@@ -42,7 +43,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         }
     }
     let measurement = if arguments.quick { Measurement::Skipped } else { Measurement::TwoSeconds };
-    let findings = examine(measurement, &shipped()?);
+    let findings = examine(measurement, &installed_operators_of(&robot_program()?));
     let verdict = findings.iter().map(|finding| finding.verdict).max().unwrap_or(Fitness::Ok);
     if arguments.json {
         print_line(&json!({ "verdict": verdict, "removed": removed, "findings": findings }).to_string())?;

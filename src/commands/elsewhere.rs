@@ -218,7 +218,7 @@ impl There {
 }
 
 /// Listens to the caller, if this process was called over ssh without a terminal. Another version ends the process.
-pub(super) fn answer_caller() {
+pub(crate) fn answer_caller() {
     let Some(theirs) = std::env::var_os(VARIABLE) else { return };
     // A program that the command asks with --describe has no caller of its own.
     if std::env::args_os().nth(1).is_some_and(|word| word == "operator") {

@@ -27,79 +27,22 @@ mod test;
 mod top;
 mod view;
 
+pub(crate) use elsewhere::answer_caller;
+
 use std::ffi::OsString;
-use std::process::ExitCode;
 
-use clap::{CommandFactory, Parser};
-
-use blindgrasp_cli::completions::{VARIABLE, answer_shell};
-use blindgrasp_cli::houses::{self, HOUSES};
-use blindgrasp_cli::{
-    Outcome, data_on_stdout, man, number_in, print_line, print_text, secs_in, stop_requests, stop_signal,
-};
+use blindgrasp_cli::completions::VARIABLE;
+use blindgrasp_cli::houses::{HOUSES, house_of_command};
+use blindgrasp_cli::{Outcome, data_on_stdout, number_in, print_line, print_text, secs_in, stop_requests, stop_signal};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operators::SHIPPED;
 use blindgrasp_session::output::{check_new, check_output, write_out};
 use blindgrasp_session::text_table::{self, percent};
 
-/// Decides from touch and joint angles whether a grasp will hold before the lift.
-///
-/// Exit codes: 0 done, 1 failed, 2 usage, 3 finished with loss.
-#[derive(Debug, Parser)]
-#[command(name = "blindgrasp", version, propagate_version = true)]
-#[command(after_help = "Example: blindgrasp init my-robot && blindgrasp run my-robot/dataflow.yaml")]
-pub(crate) struct Cli {
-    #[command(subcommand)]
-    command: Command,
-}
-
-blindgrasp_cli::commands! {
+blindgrasp_cli::program! {
     Run run, Ps ps, Top top, Echo echo, Stop stop, Set set, Swap swap, Logs logs, Doctor doctor, Record record, Replay replay,
     Test test, Export export, Info info, View view, Predict predict, Init init, New new, Schema schema,
-    Completions completions;
-    hidden Man manual, Operator operator
-}
-
-/// `blindgrasp man`
-mod manual {
-    pub(super) use super::man::Arguments;
-
-    pub(super) fn run(arguments: &Arguments) -> anyhow::Result<super::Outcome> {
-        super::man::run(arguments, super::command(), &super::HOUSES)
-    }
-}
-
-/// `blindgrasp operator`
-mod operator {
-    pub(super) use blindgrasp_cli::operator::Arguments;
-
-    /// `main` has run it.
-    #[expect(clippy::unnecessary_wraps, reason = "the form of a command")]
-    pub(super) fn run(_: &Arguments) -> anyhow::Result<super::Outcome> {
-        Ok(super::Outcome::Done)
-    }
-}
-
-impl Cli {
-    /// Parses the command line. A mistake ends the process with its explanation and code 2.
-    pub(crate) fn read() -> Cli {
-        answer_shell(command);
-        elsewhere::answer_caller();
-        blindgrasp_cli::parse(command())
-    }
-
-    /// Runs the operator that this process is to be. An operator reports its end to the launcher, not to a person.
-    pub(crate) fn run_operator(&self) -> Option<ExitCode> {
-        match &self.command {
-            Command::Operator(arguments) => Some(blindgrasp_cli::operator::run(arguments, &SHIPPED)),
-            _ => None,
-        }
-    }
-}
-
-/// The command line, with the commands of the other houses, which it lists.
-fn command() -> clap::Command {
-    houses::with_other_houses(Cli::command())
+    Completions completions; hidden;
+    operators blindgrasp_operators::SHIPPED; others &HOUSES
 }
 
 /// Replaces this process by the program of the house that has the command, unless that is the robot's.
@@ -111,9 +54,12 @@ pub(crate) fn hand_over() {
         let at = words.iter().position(|word| word == "--").map_or(words.len(), |at| (at + 2).min(words.len()));
         words = &words[at..];
     }
-    let Some(house) = houses::house_of_command(words) else { return };
+    let Some(house) = house_of_command(words) else { return };
     let Err(error) = house.become_it(&arguments);
-    print_diagnostic(&format!("blindgrasp: {error:#}"));
+    // The shell would show it in the line that is being typed.
+    if std::env::var_os(VARIABLE).is_none() {
+        print_diagnostic(&format!("blindgrasp: {error:#}"));
+    }
     std::process::exit(1);
 }
 
@@ -129,7 +75,7 @@ mod tests {
     #[test]
     fn the_commands_of_the_docs_are_accepted_and_the_help_lists_all() {
         assert_eq!(mistakes_in_table(&[], &command()), [""; 0]);
-        let (n, mistakes) = mistakes_in_docs(Path::new(env!("CARGO_MANIFEST_DIR")), &Cli::command(), None);
+        let (n, mistakes) = mistakes_in_docs(Path::new(env!("CARGO_MANIFEST_DIR")), &command(), None);
         assert!(mistakes.is_empty() && n > 60, "{n} commands\n{}", mistakes.join("\n"));
     }
 

@@ -1,4 +1,4 @@
-//! Mistakes of users: each gives one clear error that names the file and what was expected.
+//! Files with mistakes, and the commands that read them.
 
 use super::{project, run, text};
 

@@ -50,6 +50,29 @@ fn without_a_dataflow_file_the_error_says_how_to_get_one() {
 }
 
 #[test]
+fn commands_of_other_programs_are_handed_over_or_say_what_to_install() {
+    for words in [["help", "simulate"], ["simulate", "--help"]] {
+        let told = text(&run(&words, 0).stdout);
+        assert!(told.contains("Usage: blindgrasp simulate"), "{told}");
+    }
+
+    let alone = tempfile::tempdir().expect("a folder");
+    let program_alone = alone.path().join("blindgrasp");
+    std::fs::copy(program(), &program_alone).expect("copied");
+    for (words, missing) in [
+        (&["simulate", "--list"][..], "blindgrasp-lab"),
+        (&["keys", "folder"], "blindgrasp-network"),
+        (&["run", "--check", "dataflow-ros2.yaml"], "blindgrasp-network"),
+    ] {
+        let mut command = Command::new(&program_alone);
+        let output = command.args(words).current_dir(crate::common::project()).output().expect("started");
+        let told = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{words:?}: {told}");
+        assert!(told.contains(missing) && told.contains("cargo build --release --workspace"), "{words:?}: {told}");
+    }
+}
+
+#[test]
 fn the_doctor_finds_what_a_dead_graph_left_and_removes_only_that() {
     let folder_of = |name: &str| {
         let folder = std::path::PathBuf::from(format!("/dev/shm/blindgrasp_{name}.42424242"));
@@ -115,6 +138,8 @@ fn completions_know_the_commands_and_bash_takes_them() {
         text(&output.stdout).trim().to_owned() + &text(&output.stderr)
     };
     assert_eq!(completed(&["sw"]), "swap");
+    // The lab's program answers.
+    assert_eq!(completed(&["simulate", "--grasps"]), "--grasps");
     // Words of a running graph.
     let graph = Graph::start(&dataflow(folder.path(), &[]), &["--set", "recorded_source.repeat=forever"]);
     graph.wait_for_decisions(1);

@@ -346,7 +346,7 @@ fn a_graph_goes_on_when_shared_memory_was_full() {
     let graph = Graph::launch_on(within(&[program()]), &unique_name(), &flow, &FAST_FOREVER);
     graph.wait_for_decisions(A_FEW_GRASPS);
     // The folder as the graph sees it.
-    let shm = PathBuf::from(format!("/proc/{}/root/dev/shm", graph.pid()));
+    let shm = Path::new("/proc").join(graph.pid().to_string()).join("root/dev/shm");
     let is_over = Arc::new(AtomicBool::new(false));
     let (fills_on, filler) = (Arc::clone(&is_over), shm.join("filler"));
     // It takes all that becomes free, until it is told to end or the graph has ended, as after a failure of this test.

@@ -1,4 +1,4 @@
-//! Dataflow files with the operators of this program, checked.
+//! Dataflow files with the operators that come with blindgrasp, checked.
 
 use std::path::Path;
 
@@ -38,7 +38,7 @@ pub fn shipped() -> anyhow::Result<Operators> {
 /// As [`describe::describe`].
 pub fn describe(program: &Path, args: &[String]) -> Result<OperatorDescription, String> {
     // The path of a running program that was replaced on the disk is another one, so that the new program is asked.
-    if std::env::current_exe().is_ok_and(|running| running.with_file_name("blindgrasp") == program)
+    if std::env::current_exe().is_ok_and(|running| running == program)
         && let Some(form) = form_of(args)
     {
         return Ok((form.describe)());
@@ -81,7 +81,7 @@ pub fn fitting(
     Err(DataflowError { diagnostics }.into())
 }
 
-/// As [`fitting`]; each operator of this program is asked as well whether it could begin.
+/// As [`fitting`]; each operator that comes with blindgrasp is asked as well whether it could begin.
 pub fn able_to_begin(
     file: &DataflowFile,
     overrides: &[Override],

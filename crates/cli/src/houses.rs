@@ -54,15 +54,30 @@ impl House {
     /// The path of its program: beside the running one.
     ///
     /// # Errors
-    /// There is none. The text says how to get it.
+    /// The program is missing. The text says how to get it.
     pub fn path(&self) -> anyhow::Result<PathBuf> {
-        let path = running_program().context("the path of this program is unknown")?.with_file_name(self.program);
+        let running = running_program().context("the path of this program is unknown")?;
+        let path = running.with_file_name(self.program);
+        // A link to the running program would hand over to itself for ever.
         anyhow::ensure!(
-            path.is_file(),
-            "there is no {}: build it with 'cargo build --release --workspace', or install the package again, which has it",
+            path.canonicalize().is_ok_and(|found| found.is_file() && found != running),
+            "there is no {}: build it with 'cargo build --release --workspace', or install a package, which has all programs",
             path.display()
         );
         Ok(path)
+    }
+
+    /// The stdout of its program with these arguments.
+    ///
+    /// # Errors
+    /// The program is missing, or it fails: then the text is that of its own error.
+    pub fn answer<S: AsRef<OsStr>>(&self, arguments: impl IntoIterator<Item = S>) -> anyhow::Result<Vec<u8>> {
+        let path = self.path()?;
+        let output = Command::new(&path).args(arguments).output();
+        let output = output.with_context(|| format!("cannot start {}", path.display()))?;
+        let said = String::from_utf8_lossy(&output.stderr);
+        anyhow::ensure!(output.status.success(), "{}", said.trim_end().trim_start_matches("blindgrasp: "));
+        Ok(output.stdout)
     }
 
     /// Replaces this process by its program with these arguments.
@@ -79,12 +94,14 @@ impl House {
     }
 }
 
-/// The robot's program: the running one, or the one beside it.
+/// The robot's program: the running one, or the one beside that of another house.
 ///
 /// # Errors
 /// The path of the running program is unknown.
 pub fn robot_program() -> std::io::Result<PathBuf> {
-    Ok(running_program()?.with_file_name("blindgrasp"))
+    let running = running_program()?;
+    let is_of_house = HOUSES.iter().any(|house| running.file_name() == Some(OsStr::new(house.program)));
+    Ok(if is_of_house { running.with_file_name("blindgrasp") } else { running })
 }
 
 /// The house that has the command of these words, which follow the program's name. An operator's house may depend on its params,
@@ -102,9 +119,9 @@ pub fn house_of_command(words: &[OsString]) -> Option<&'static House> {
     HOUSES.into_iter().find(|house| house.commands.iter().any(|(name, _)| *name == first || *name == both))
 }
 
-/// The robot's command line with the commands of the other houses, which it only lists.
-pub fn with_other_houses(mut command: clap::Command) -> clap::Command {
-    for (name, about) in HOUSES.into_iter().flat_map(|house| house.commands) {
+/// A command line with the commands of other houses, which it only lists.
+pub fn with_commands_of(houses: &[&House], mut command: clap::Command) -> clap::Command {
+    for (name, about) in houses.iter().flat_map(|house| house.commands) {
         match name.split_once(' ') {
             Some((parent, name)) => {
                 command = command.mut_subcommand(parent, |parent| parent.subcommand(listed(name, about)));

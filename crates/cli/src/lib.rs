@@ -30,25 +30,49 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::text::{HarmlessWriter, harmless};
 use clap::{Command, FromArgMatches};
 
-/// The subcommands of a house, each a module with `Arguments` and `run`; those behind `hidden` are in no help.
+/// A program's command line and its `main`: the subcommands, each a module with `Arguments` and `run`, of which those behind
+/// `hidden` are in no help; the operators that it runs; the other houses, whose commands it lists.
 #[macro_export]
-macro_rules! commands {
-    ($($name:ident $module:ident),*; hidden $($hidden_name:ident $hidden_module:ident),*) => {
+macro_rules! program {
+    (
+        $($name:ident $module:ident),*; hidden $($hidden_name:ident $hidden_module:ident),*;
+        operators $operators:expr; others $others:expr
+    ) => {
+        /// Decides from touch and joint angles whether a grasp will hold before the lift.
+        ///
+        /// Exit codes: 0 done, 1 failed, 2 usage, 3 finished with loss.
+        #[derive(Debug, clap::Parser)]
+        #[command(name = "blindgrasp", version, propagate_version = true)]
+        #[command(after_help = "Example: blindgrasp init my-robot && blindgrasp run my-robot/dataflow.yaml")]
+        struct Cli {
+            #[command(subcommand)]
+            command: Command,
+        }
+
         #[derive(Debug, clap::Subcommand)]
         enum Command {
             $($name($module::Arguments),)*
             $($hidden_name($hidden_module::Arguments),)*
+            Man($crate::man::Arguments),
+            Operator($crate::operator::Arguments),
         }
 
-        /// Carries out a command.
-        ///
-        /// # Errors
-        /// What failed, for a person to read.
-        pub(crate) fn run(cli: &Cli) -> anyhow::Result<$crate::Outcome> {
-            match &cli.command {
+        fn command() -> clap::Command {
+            $crate::houses::with_commands_of($others, <Cli as clap::CommandFactory>::command())
+        }
+
+        /// Carries out the command line. A mistake in it ends the process with its explanation and code 2.
+        pub(crate) fn main() -> std::process::ExitCode {
+            $crate::survive_limit_of_file_sizes();
+            $crate::completions::answer_shell(command);
+            let cli: Cli = $crate::parse(command());
+            $crate::end(match &cli.command {
+                // An operator reports its end to the launcher, not to a person.
+                Command::Operator(arguments) => return $crate::operator::run(arguments, &$operators),
+                Command::Man(arguments) => $crate::man::run(arguments, command(), $others),
                 $(Command::$name(arguments) => $module::run(arguments),)*
                 $(Command::$hidden_name(arguments) => $hidden_module::run(arguments),)*
-            }
+            })
         }
     };
 }

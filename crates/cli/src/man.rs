@@ -6,7 +6,7 @@ use anyhow::Context;
 use clap::{Args, Command};
 
 use crate::help::grouped;
-use crate::houses::House;
+use crate::houses::{HOUSES, House};
 use crate::{Outcome, print_line, print_text};
 
 /// Write the manual pages of this program's commands
@@ -74,8 +74,12 @@ fn sections(command: &Command, parents: &[&str], others: &[&House]) -> String {
         if subcommand.is_hide_set() || subcommand.get_name() == "help" || is_of(others, &path.join(" ")) {
             continue;
         }
-        text += &format!("## {}\n\n", path.join(" "));
-        text += &block(&mut subcommand.clone());
+        // The robot's program tells of a command that a house shares with it, as it shares 'new' with 'new hand'.
+        let is_shared = others.is_empty() && parents.is_empty() && !is_of(&HOUSES, path[0]);
+        if !is_shared {
+            text += &format!("## {}\n\n", path.join(" "));
+            text += &block(&mut subcommand.clone());
+        }
         text += &sections(subcommand, &path, others);
     }
     text
@@ -99,10 +103,11 @@ mod tests {
 
     #[test]
     fn the_reference_has_each_command_and_its_options() {
-        let reference = reference(command(), &[]);
-        assert!(reference.contains("## run") && reference.contains("--name"), "{reference}");
-        assert!(!reference.contains("## man"), "a hidden command");
-        assert!(!sections(&command(), &[], &[&crate::houses::LAB]).contains("## simulate"));
+        let of_robot = reference(command(), &HOUSES);
+        assert!(of_robot.contains("## run") && of_robot.contains("--name"), "{of_robot}");
+        assert!(!of_robot.contains("## man"), "a hidden command");
+        assert!(!of_robot.contains("## simulate"), "a command of the lab's");
+        assert!(reference(command(), &[]).contains("## simulate"));
     }
 
     #[test]

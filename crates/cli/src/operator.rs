@@ -55,6 +55,10 @@ pub fn run(arguments: &Arguments, shipped: &[Shipped]) -> ExitCode {
     let is_check = arguments.arguments.iter().any(|text| text == CHECK);
     let given: Vec<&str> =
         arguments.arguments.iter().map(String::as_str).filter(|text| !["--describe", CHECK].contains(text)).collect();
+    if !shipped.iter().any(|shipped| shipped.name == name) {
+        print_diagnostic(&format!("{name} is an operator of another program: expected 'blindgrasp operator {name}'"));
+        return ExitCode::from(2);
+    }
     let Some(form) = form_named(shipped, name, &given) else {
         let variants = shipped.iter().filter(|shipped| shipped.name == name).flat_map(|shipped| shipped.variants);
         let known: Vec<&str> = variants.map(|(argument, _)| *argument).collect();

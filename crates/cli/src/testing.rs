@@ -28,8 +28,8 @@ fn words(line: &str) -> Vec<String> {
     words.into_iter().chain(word).collect()
 }
 
-/// The commands of this `house`, or of the robot, in the shell blocks of the pages that its command line does not accept, and how many it was asked:
-/// names, options and numbers of arguments; `…` stands for any further options.
+/// Reads the commands of this `house`, or of the robot, in the shell blocks of the pages. Returns how many there are, and those that
+/// its command line does not accept: names, options and numbers of arguments; `…` stands for any further options.
 ///
 /// # Panics
 /// A folder of pages is missing.
@@ -76,7 +76,7 @@ pub fn mistakes_in_docs(root: &Path, command: &Command, house: Option<&House>) -
     (n, mistakes)
 }
 
-/// What is wrong with a house's rows of the table ([`crate::houses`]), and a list of its commands in which a line is too long.
+/// The mistakes in a house's rows of the table ([`crate::houses`]) and in the list of its commands.
 pub fn mistakes_in_table(commands: &[(&str, &str)], command: &clap::Command) -> Vec<String> {
     let mut mistakes = Vec::new();
     for (name, about) in commands {
@@ -90,6 +90,16 @@ pub fn mistakes_in_table(commands: &[(&str, &str)], command: &clap::Command) -> 
         let name = command.get_name();
         if !GROUPS.iter().any(|(_, names)| names.contains(&name)) {
             mistakes.push(format!("{name} is in no group"));
+        }
+        let is_listed = commands.iter().any(|(listed, _)| listed.split(' ').next() == Some(name));
+        if !is_listed && !commands.is_empty() {
+            mistakes.push(format!("{name} is not in the table: 'blindgrasp {name}' would not find it"));
+        }
+    }
+    // The robot's program lists all commands.
+    for name in GROUPS.iter().flat_map(|(_, names)| *names) {
+        if commands.is_empty() && command.find_subcommand(name).is_none() {
+            mistakes.push(format!("'{name}' of the groups is no command"));
         }
     }
     let help = grouped(command.clone()).render_help().to_string();

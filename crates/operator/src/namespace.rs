@@ -39,6 +39,8 @@ const FOLDER_PREFIX: &str = "blindgrasp_";
 const BLOCK_BYTES: u64 = 512;
 /// The names of all files that iceoryx2 makes begin with this.
 const FILE_PREFIX: &str = "x";
+/// The end of the names of the files that hold samples, which iceoryx2 removes without a look into them.
+const SAMPLES_SUFFIX: &str = ".data";
 /// The names of folders have so much of the graph's name. iceoryx2 has room for about 60 characters before the name of a socket.
 const MAX_NAME_BYTES: usize = 11;
 /// The random letters in a name: so many that no other user can take all names first (36^8 is about 3 · 10^12).
@@ -287,10 +289,11 @@ fn own_uid() -> u32 {
     rustix::process::getuid().as_raw()
 }
 
-/// Frees the resources that dead processes of a graph still hold in iceoryx2. Nothing is freed while files lack their memory,
-/// as those of a process that died of full shared memory do: to read such a file would end the calling process (SIGBUS).
+/// Frees the resources that dead processes of a graph still hold in iceoryx2. Nothing is freed while the small files that it reads
+/// for this lack their memory, as those of a process that died of full shared memory do: it would end the calling process
+/// (SIGBUS).
 pub fn clean_dead_nodes(domain: &NamespaceWiring) {
-    if take_room(domain).is_err() {
+    if take_room_of(domain, |name| !name.ends_with(SAMPLES_SUFFIX)).is_err() {
         return;
     }
     let Ok(config) = config(domain) else { return };
@@ -345,10 +348,18 @@ fn config(domain: &NamespaceWiring) -> Result<Config, NamespaceError> {
 /// # Errors
 /// Shared memory has too little room. The part that was taken stays taken.
 pub fn take_room(wiring: &NamespaceWiring) -> Result<(), NamespaceError> {
+    take_room_of(wiring, |_| true)
+}
+
+/// As [`take_room`], for the files whose name is among them.
+fn take_room_of(wiring: &NamespaceWiring, is_among: fn(&str) -> bool) -> Result<(), NamespaceError> {
     let mut n_missing_bytes = 0;
     // Links are not followed and pipes are not waited for: an operator may have put any file here.
     let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK).bits() as i32;
     for entry in std::fs::read_dir(wiring.ports()).into_iter().flatten().flatten() {
+        if !is_among(&entry.file_name().to_string_lossy()) {
+            continue;
+        }
         // A file may go meanwhile, with its process, and some are read-only: these are written already.
         let Ok(file) = std::fs::OpenOptions::new().write(true).custom_flags(flags).open(entry.path()) else { continue };
         let Ok(metadata) = file.metadata() else { continue };

@@ -11,7 +11,6 @@ use blindgrasp_grasps::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::looks::{Look, looks};
 use blindgrasp_learning::evaluation::page::{FIGURE_1_FILE, figure_1, report_page, tables};
-use blindgrasp_learning::evaluation::paper_label::PaperLabel;
 use blindgrasp_learning::evaluation::predictions::{OutsidePredictions, predictions_csv};
 use blindgrasp_learning::evaluation::report::{
     Origin, Report, THRESHOLD_PROBABILITY, report_on_model, report_on_predictions, report_on_recipes,
@@ -163,9 +162,6 @@ impl Job<'_> {
         if is_table {
             print_scores(&evaluated)?;
             print_label(self.recordings)?;
-            if let Some(found) = &evaluated.paper_label {
-                print_paper_label(found)?;
-            }
         }
         let has_probes = model.squeezed.is_some() || model.test_lifted.is_some();
         let is_asked_for_more =
@@ -367,42 +363,6 @@ fn print_looks(looks: &[Look]) -> anyhow::Result<()> {
         ))?;
     }
     print_line("stages: of the grasps that some cell feels, each by one frame")?;
-    Ok(())
-}
-
-/// The paper's label beside another truth.
-fn print_paper_label(found: &PaperLabel) -> anyhow::Result<()> {
-    /// So many classes are printed whose truth and paper's label disagree most.
-    const N_CLASSES: usize = 5;
-    let all = &found.all;
-    print_text("\nthe paper's label (epsilon > 0.07 and volume > 0.1) beside the truth, in grasps")?;
-    print_line("                    truth stable  truth unstable")?;
-    for (row, stable, unstable) in [
-        ("label stable", all.n_stable_by_both, all.n_stable_by_paper_only),
-        ("label unstable", all.n_stable_by_truth_only, all.n_unstable_by_both),
-    ] {
-        print_line(&format!("{row:<18} {stable:>13} {unstable:>15}"))?;
-    }
-    let area = |area: Option<f64>| area.map_or("n/a".into(), |area| format!("{area:.3}"));
-    print_line(&format!(
-        "they agree in {}, always the same would in {}; ROC area of epsilon {}, of the volume {}",
-        with_interval(all.accuracy),
-        percent(all.majority_class),
-        area(found.epsilon_roc_auc),
-        area(found.volume_roc_auc),
-    ))?;
-    for (class, agreement) in found.by_disagreement().into_iter().take(N_CLASSES) {
-        print_line(&format!(
-            "  {class:<16} differs in {} of {}: {} stable by the label only, {} by the truth only",
-            agreement.n_different(),
-            agreement.n(),
-            agreement.n_stable_by_paper_only,
-            agreement.n_stable_by_truth_only
-        ))?;
-    }
-    if found.n_without_quality > 0 {
-        print_line(&format!("  without epsilon and volume, not counted: {}", found.n_without_quality))?;
-    }
     Ok(())
 }
 

@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::{Outcome, print_line};
 
-/// Print the mesh of an object as JSON, null if there is none of this name
+/// Print the mesh of an object as JSON; null stands for an unknown object
 #[derive(Debug, Args)]
 #[command(hide = true)]
 pub(super) struct Arguments {

@@ -1,4 +1,4 @@
-//! Mistakes of users: each gives one clear error that names the file and what was expected.
+//! Mistakes of users of the lab: each gives one clear error that names the file and what was expected.
 
 use std::path::Path;
 

@@ -545,5 +545,5 @@ fn arguments_that_do_not_fit_are_refused_with_a_way_out() {
         let stderr = text(&run(&arguments, exit_code).stderr);
         assert!(stderr.contains(expected), "{arguments:?}: {stderr}");
     }
-    assert!(!Path::new("absent").exists());
+    assert!(!project().join("absent").exists());
 }

@@ -183,15 +183,8 @@ fn recordings_of_lifts_are_named_as_such_by_every_command() {
     let printed = run(&["info", &out], 0);
     assert!(text(&printed.stdout).contains("label             lift (stable: kept"), "{}", text(&printed.stdout));
 
-    let evaluated: Value = serde_json::from_slice(&run(&["evaluate", MODEL, &out, "--json"], 0).stdout).expect("JSON");
-    let beside = &evaluated["paper_label"];
-    let n = |cell: &str| beside["all"][cell].as_u64().expect("a count");
-    assert_eq!(n("n_stable_by_both") + n("n_stable_by_truth_only"), info["n_stable"].as_u64().expect("a count"));
-    assert_eq!(n("n_stable_by_paper_only") + n("n_unstable_by_both") + info["n_stable"].as_u64().expect("a count"), 3);
-    let printed = run(&["evaluate", MODEL, &out], 0);
-    for expected in ["label: lift (stable: kept", "the paper's label (epsilon > 0.07", "they agree in"] {
-        assert!(text(&printed.stdout).contains(expected), "{expected}: {}", text(&printed.stdout));
-    }
+    let printed = text(&run(&["evaluate", MODEL, &out], 0).stdout);
+    assert!(printed.contains("label: lift (stable: kept"), "{printed}");
     let model = folder.path().join("model.json");
     let frictions = ["train", &out, "--frictions", "0.5,1", "--out", model.to_str().expect("UTF-8")];
     let refused = run(&frictions, 1);

@@ -1,10 +1,10 @@
 //! Pictures of recorded grasps: the hand, the object, the contacts and the cells.
 
 use std::collections::BTreeSet;
+use std::ffi::OsStr;
 use std::path::Path;
-use std::process::Command;
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, bail};
 
 use super::super::{Outcome, check_output, print_line, write_out};
 use super::GraspArguments;
@@ -180,20 +180,20 @@ fn surface(grasp: &RecordedGrasp, folder: Option<&Path>) -> anyhow::Result<Objec
     })
 }
 
-/// The mesh of an object: of the folder's, if one is given, else of the built-in one of that name. The lab has them: `None` without
-/// its program.
+/// The mesh of an object: the folder's if one is given, else the built-in one of that name. `None` without the lab's program, which
+/// has them.
 ///
 /// # Errors
 /// A folder or a mesh cannot be read.
 pub(super) fn find_mesh(name: &str, folder: Option<&Path>) -> anyhow::Result<Option<Mesh>> {
-    let Ok(program) = LAB.path() else { return Ok(None) };
-    let mut command = Command::new(program);
-    command.args(["mesh", name]);
-    if let Some(folder) = folder {
-        command.arg("--objects").arg(folder);
+    if LAB.path().is_err() {
+        return Ok(None);
     }
-    let output = command.output().with_context(|| format!("cannot start {}", LAB.program))?;
-    let said = String::from_utf8_lossy(&output.stderr);
-    ensure!(output.status.success(), "{}", said.trim().trim_start_matches("blindgrasp: "));
-    serde_json::from_slice(&output.stdout).context("the mesh of an object")
+    let mut arguments = vec![OsStr::new("mesh")];
+    if let Some(folder) = folder {
+        arguments.extend([OsStr::new("--objects"), folder.as_os_str()]);
+    }
+    // A stranger's recording may name its object like an option.
+    arguments.extend([OsStr::new("--"), OsStr::new(name)]);
+    serde_json::from_slice(&LAB.answer(arguments)?).context("the mesh of an object")
 }

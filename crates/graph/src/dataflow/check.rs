@@ -36,7 +36,7 @@ pub(super) struct ResolvedNode<'a> {
 
 impl ResolvedNode<'_> {
     /// The description of its operator, by the operator itself.
-    fn known(&self) -> Option<&OperatorDescription> {
+    pub(super) fn known(&self) -> Option<&OperatorDescription> {
         let description = &self.operator.as_ref()?.description;
         if description.version == UNKNOWN_VERSION { None } else { Some(description) }
     }

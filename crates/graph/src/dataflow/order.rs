@@ -73,8 +73,8 @@ impl<'a> Search<'a, '_> {
 
     fn report(&mut self, start_idx: usize, at: Position) {
         let cycle = &self.path[start_idx..];
-        if !cycle.iter().all(|id| self.resolved.get(id).is_some_and(|node| node.operator.is_some())) {
-            // One of them may have feedback. That it could not be asked is said elsewhere.
+        if !cycle.iter().all(|id| self.resolved.get(id).is_some_and(|node| node.known().is_some())) {
+            // One of them may have feedback. That it could not be asked is said elsewhere, or its program is on another machine.
             return;
         }
         let message = match cycle {

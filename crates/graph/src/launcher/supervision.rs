@@ -275,6 +275,8 @@ impl Launcher {
         let waits_for_room = idxs.iter().any(|idx| self.members[*idx].waits_for_room);
         if waits_for_room && namespace::is_full() {
             let again = Instant::now() + ROOM_PAUSE;
+            // Dead processes may hold memory that could not be freed before.
+            self.reap();
             return idxs.into_iter().for_each(|idx| self.members[idx].restart_at = Some(again));
         }
         let failure = self.spawn_active(idx).err().map(|error| (error.is_shortage(), anyhow::Error::from(error)));

@@ -4,11 +4,11 @@ mod draft;
 mod xacro;
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
 
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, bail};
 use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{RecordedGrasp, grasp_svg};
@@ -219,11 +219,8 @@ fn write_folder(
 
 /// The URDF that a robot publishes, as its `robot_state_publisher` does.
 fn described(topic: &str, network: &Ros2Network) -> anyhow::Result<String> {
-    let mut program = Command::new(NETWORK.path()?);
-    let output = program.args(["robot-description", topic]).args(network.arguments()).stderr(Stdio::inherit()).output();
-    let output = output.with_context(|| format!("cannot start {}", NETWORK.program))?;
-    ensure!(output.status.success(), "no description of the robot");
-    Ok(String::from_utf8(output.stdout)?)
+    let topic = [OsString::from("robot-description"), topic.into()];
+    Ok(String::from_utf8(NETWORK.answer(topic.into_iter().chain(network.arguments()))?)?)
 }
 
 /// The text of the URDF. A xacro file is expanded.

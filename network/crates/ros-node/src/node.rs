@@ -17,7 +17,7 @@ use zenoh_ext::{
     CacheConfig, HistoryConfig,
 };
 
-pub use blindgrasp_ros::network::{Keys, MAX_DOMAIN, Network, RosError};
+pub use blindgrasp_ros::network::{Keys, Network, RosError};
 pub use zenoh::Session;
 
 pub use super::access::Rights;

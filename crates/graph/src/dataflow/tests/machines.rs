@@ -372,6 +372,8 @@ fn a_loop_may_cross_but_not_its_feedback() {
     let folder = Folder::new();
     let yaml = SPLIT.replace("models/a.json", "hands/a.yaml").replace("  sense: {on: robot}\n", arm);
     let graph = check_in(&folder, &yaml, Scope::Everything, &ALL, &[]).expect("feedback on one machine");
+    check_in(&folder, &yaml, Scope::Machine("laptop"), &[], &[])
+        .expect("an operator that is not here may have feedback");
     assert_eq!(graph.nodes.iter().map(|node| node.id.as_str()).collect::<Vec<_>>(), ["sense", "judge", "gate"]);
     check_instead(
         "  sense: {on: robot}\n",

@@ -6,7 +6,6 @@
 //!   shows them.
 //! * [`predictions`] reads what a model that is not blindgrasp's says of the same grasps, to judge it as the others.
 //! * [`looks`] judges the probes of models of lifts.
-//! * [`paper_label`] compares the paper's label with other labels.
 
 pub mod comparison;
 pub mod cross_validation;
@@ -14,7 +13,6 @@ pub mod decisions;
 pub mod looks;
 pub mod measures;
 pub mod page;
-pub mod paper_label;
 pub mod predictions;
 pub mod reliability;
 pub mod report;
@@ -26,15 +24,13 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use crate::training::TrainingError;
-use blindgrasp_grasps::dataset::{DatasetError, check_once, labels_of};
+use blindgrasp_grasps::dataset::{DatasetError, check_once};
 use blindgrasp_grasps::decide::{Decided, decide_recording, has_probability};
 use blindgrasp_messages::score::is_judged;
 pub use blindgrasp_messages::score::{Evaluation, Score};
 use blindgrasp_messages::{Action, GraspTruth, LiftDecision, Reason};
-use blindgrasp_stages::label::Label;
 use blindgrasp_stages::{ArbiterOptions, Hand, Judge, Model};
 use decisions::JudgedGrasp;
-use paper_label::PaperLabel;
 use split::SplitError;
 
 #[derive(Debug, thiserror::Error)]
@@ -58,8 +54,6 @@ pub struct Evaluated {
     pub decided: Vec<JudgedGrasp>,
     /// `None` if the model does not name its training grasps.
     pub trained: Option<Trained>,
-    /// The paper's label compared with the recorded labels, if those are others.
-    pub paper_label: Option<PaperLabel>,
 }
 
 /// The grasps of an evaluation, by whether the model was trained on them or on their objects.
@@ -86,7 +80,6 @@ pub fn evaluate(
     check_once(recordings)?;
     let trained_on = model.training.trained_on.as_ref();
     let mut evaluated = Evaluated { trained: trained_on.map(|_| Trained::default()), ..Evaluated::default() };
-    let mut truths = Vec::new();
     let mut judge = Judge::with_options(hand.clone(), model.clone(), *options)?;
     for (recording_idx, path) in recordings.iter().enumerate() {
         for Decided { decision, reading_id, truth, .. } in decide_recording(&mut judge, path)? {
@@ -102,13 +95,8 @@ pub fn evaluate(
                 }
             }
             evaluated.evaluation.add(&decision, truth.as_ref());
-            truths.extend(truth.clone());
             evaluated.decided.extend(truth.map(|truth| decided_grasp(recording_idx, &decision, truth)));
         }
-    }
-    let paper_label = PaperLabel::of(&truths);
-    if paper_label.all.n_different() > 0 || labels_of(recordings)?.contains_key(&Label::Lift) {
-        evaluated.paper_label = Some(paper_label);
     }
     // Grasps that no cell feels are part of no training.
     let is_rest_unfelt = evaluated.evaluation.by_reason.keys().all(|reason| reason == Reason::NoContact.as_str());

@@ -8,7 +8,6 @@ use super::comparison::{Comparison, compare};
 use super::cross_validation::{HeldOut, HeldOutOptions, N_INNER_FOLDS, Word, used_words};
 use super::decisions::{JudgedGrasp, JudgedRecipe, Unit, measure};
 use super::looks::{Look, looks};
-use super::paper_label::PaperLabel;
 use super::predictions::{OutsideModel, OutsidePredictions};
 use super::split::Split;
 use super::statistics::{Estimate, N_RESAMPLES};
@@ -28,9 +27,6 @@ pub struct Report {
     /// Which of the grasps a model was trained on; only of a model that names them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub trained: Option<Trained>,
-    /// The paper's label compared with the recorded labels; only of a model, if those are others.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub paper_label: Option<PaperLabel>,
     /// The looks of a model with probes; empty otherwise.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub looks: Vec<Look>,
@@ -215,7 +211,6 @@ pub fn report_on_recipes(
         made: made(origin, read, unit, Some(options), outside),
         graph: None,
         trained: None,
-        paper_label: None,
         looks: Vec::new(),
         data: data(any, read.n_excluded.clone()),
         table_1: table_1(Some(training), &judges),
@@ -249,7 +244,7 @@ pub fn report_on_model(
     read: &Examples,
     outside: Option<&OutsidePredictions>,
 ) -> Report {
-    let Evaluated { evaluation: graph, decided, trained, paper_label } = evaluated;
+    let Evaluated { evaluation: graph, decided, trained } = evaluated;
     let training = &model.training;
     let unit = Unit::Object;
     let recipe = &training.recipe;
@@ -276,7 +271,6 @@ pub fn report_on_model(
         },
         graph: Some(graph),
         trained,
-        paper_label,
         looks: looks(model, &read.examples),
     }
 }
@@ -289,7 +283,6 @@ pub fn report_on_predictions(origin: Origin, read: &Examples, outside: &OutsideP
         made: made(origin, read, unit, None, Some(outside)),
         graph: None,
         trained: None,
-        paper_label: None,
         looks: Vec::new(),
         data: data(judges.first().map_or(&[][..], |judge| judge.decided.as_slice()), read.n_excluded.clone()),
         table_1: table_1(None, &judges),

@@ -90,7 +90,7 @@ pub fn import_frames(
     })
 }
 
-/// Whether a frame is of this hand, and what is wrong with it otherwise.
+/// Refuses a frame that is not of this hand, with the reason.
 fn check_frame(hand: &Hand, frame: &Stamped<TactileFrame>) -> Result<(), String> {
     let TactileFrame { joints, cells_newtons, .. } = &frame.message;
     for (what, found, expected) in

@@ -247,7 +247,7 @@ fn learn_probes(
         } else if let Learner::Boosting(_) = options.recipe.learner {
             *probe = probes::learn(hand, &options.recipe, features, phase, examples, folds, options.seed)?;
             match probe {
-                // For an aim, it never lifts before a policy is chosen.
+                // A policy sets its threshold later; until then it never lifts.
                 Some(_) if options.aim.is_some() => {}
                 Some(probe) => probe.set_threshold(options.threshold_probability),
                 None => {

@@ -55,7 +55,7 @@ impl LearnedProbe {
     }
 }
 
-/// The probes that could be learned; there is none of a test lift without one of a squeeze.
+/// The probes that could be learned. A test lift needs a squeeze before it, so that its probe never stands alone.
 #[derive(Default)]
 pub(super) struct LearnedProbes {
     pub(super) squeezed: Option<LearnedProbe>,

@@ -30,7 +30,7 @@ const SCRIPT: &str = include_str!("mujoco.py");
 const PYTHON: &str = "BLINDGRASP_PYTHON";
 /// The interpreter where the variable is not set. Tests have an environment of their own.
 const DEFAULT_PYTHON: &str =
-    if cfg!(test) { concat!(env!("CARGO_MANIFEST_DIR"), "/../../target/python-env/bin/python") } else { "python3" };
+    if cfg!(test) { concat!(env!("CARGO_MANIFEST_DIR"), "/../../../target/python-env/bin/python") } else { "python3" };
 
 /// Processes that wait for an attempt.
 static IDLE: Mutex<Vec<Process>> = Mutex::new(Vec::new());

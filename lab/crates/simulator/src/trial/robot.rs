@@ -1,4 +1,4 @@
-//! A robot that tries to lift one target after another: what it feels, what it asks for, and what becomes of each attempt.
+//! A robot that tries to lift one target after another: its readings, its questions, and the outcome of each attempt.
 //!
 //! The caller sends what the robot has to say and tells it the decisions. What the robot does depends on its options and the
 //! decisions alone; it reads no clock and waits for nobody.
