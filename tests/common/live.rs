@@ -9,7 +9,7 @@ use blindgrasp_messages::{Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingReader};
 use serde_json::{Value, json};
 
-use super::{RECORDING, project};
+use super::{Graph, RECORDING, project, shared_folder, unique_name, wait_until};
 
 /// Limits that a busy machine does not reach.
 pub(crate) const PATIENT: &str = "max_delay_ms: 20000";
@@ -65,8 +65,18 @@ pub(crate) fn line(frame: &Stamped<TactileFrame>) -> Value {
     })
 }
 
+/// A live graph whose source listens, with more parameters of the source and arguments of `run`, and a bridge of it.
+pub(crate) fn listening(params: &[&str], arguments: &[&str]) -> (Graph, Bridge) {
+    let (port, name) = (free_port(), unique_name());
+    let params = format!("driver: listen\n      address: 127.0.0.1:{port}\n      {}", params.join("\n      "));
+    let graph = Graph::launch(&name, &live_dataflow(&shared_folder(&name), &params), arguments);
+    wait_until(|| graph.said().contains("listening on"), || graph.said());
+    (graph, Bridge::connect(port))
+}
+
 /// A connection to a source.
 pub(crate) struct Bridge {
+    pub(crate) port: u16,
     pub(crate) stream: TcpStream,
     pub(crate) answers: BufReader<TcpStream>,
     pub(crate) greeting: Value,
@@ -81,7 +91,7 @@ impl Bridge {
                 let mut first = String::new();
                 if matches!(answers.read_line(&mut first), Ok(1..)) {
                     let greeting = serde_json::from_str(&first).expect("a line of JSON");
-                    return Bridge { stream, answers, greeting };
+                    return Bridge { port, stream, answers, greeting };
                 }
             }
             assert!(start.elapsed() < Duration::from_secs(60), "nobody listens on {port}");

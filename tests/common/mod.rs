@@ -90,6 +90,18 @@ pub(crate) fn run(arguments: &[&str], exit_code: i32) -> Output {
     output
 }
 
+/// The JSON that a command prints.
+pub(crate) fn json_of(arguments: &[&str]) -> Value {
+    serde_json::from_slice(&run(arguments, 0).stdout).expect("JSON")
+}
+
+/// Runs a command that must be refused with these words.
+#[track_caller]
+pub(crate) fn fails(arguments: &[&str], expected: &str) {
+    let said = text(&run(arguments, 1).stderr);
+    assert!(said.contains(expected), "blindgrasp {arguments:?}: expected '{expected}' in\n{said}");
+}
+
 pub(crate) fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }
@@ -198,6 +210,8 @@ pub(crate) fn skipped(reason: &str) {
 
 /// The nodes of the project's own dataflow file, in its order.
 pub(crate) const NODES: [&str; 5] = ["recorded_source", "contacts", "encoder", "classifier", "lift_arbiter"];
+/// A graph that decides this many grasps goes on well.
+pub(crate) const A_FEW_GRASPS: usize = 20;
 /// Arguments of `run` that play the recording over and over, at about a thousand frames a second. No grasp is stale,
 /// even on a busy machine.
 pub(crate) const FAST_FOREVER: [&str; 6] = [
@@ -300,6 +314,11 @@ impl Graph {
         let graph = Graph::launch(&unique_name(), dataflow, arguments);
         graph.wait_for_decisions(1);
         graph
+    }
+
+    /// The project's graph, which plays its recording over and over.
+    pub(crate) fn fast() -> Graph {
+        Graph::start(&project().join("dataflow.yaml"), &FAST_FOREVER)
     }
 
     pub(crate) fn launch(name: &str, dataflow: &Path, arguments: &[&str]) -> Graph {

@@ -1,6 +1,6 @@
 //! A dataflow file is checked against the real operators, without starting the graph.
 
-use crate::common::{ON_TWO_MACHINES, dataflow, operator, project, run, text, unique_name};
+use crate::common::{ON_TWO_MACHINES, dataflow, fails, json_of, operator, project, run, text, unique_name};
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};
 use serde_json::{Value, json};
 
@@ -56,8 +56,7 @@ fn json_holds_the_graph_with_what_was_set() {
     let recording = project().join("recordings/held-out.mcap");
     let set =
         ["--set", "lift_arbiter.votes=5", "--set", "recorded_source.recording=recordings/../recordings/held-out.mcap"];
-    let output = run(&[&["run", "--check", "dataflow.yaml", "--json"], &set[..]].concat(), 0);
-    let checked: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    let checked = json_of(&[&["run", "--check", "dataflow.yaml", "--json"], &set[..]].concat());
     let nodes = checked["graph"]["nodes"].as_array().expect("nodes");
     let found = nodes[0]["params"]["recording"].as_str().expect("a path");
     assert_eq!(std::path::Path::new(found).canonicalize().ok(), recording.canonicalize().ok());
@@ -174,7 +173,7 @@ fn machines_and_the_edges_between_them_are_shown() {
     let node = |name: &str| lines.iter().find(|line| line.first() == Some(&name)).map(|line| line[1]);
     assert_eq!((node("contacts"), node("classifier")), (Some("robot"), Some("brain")));
 
-    let checked: Value = serde_json::from_slice(&run(&["run", "--check", path, "--json"], 0).stdout).expect("JSON");
+    let checked = json_of(&["run", "--check", path, "--json"]);
     assert_eq!(checked["graph"]["nodes"][2]["machine"], "brain");
     assert_eq!(checked["graph"]["machines"]["machines"][1]["listen"], json!(["unix/gate"]));
     let crossing = json!([
@@ -184,7 +183,7 @@ fn machines_and_the_edges_between_them_are_shown() {
          "to_machine": "robot", "type_name": Prediction::TYPE_NAME},
     ]);
     assert_eq!(checked["crossing"], crossing);
-    let whole: Value = serde_json::from_slice(&run(&["run", "--check", "--json"], 0).stdout).expect("JSON");
+    let whole = json_of(&["run", "--check", "--json"]);
     assert_eq!((&whole["crossing"], &whole["graph"]["machines"]), (&Value::Null, &Value::Null));
 }
 
@@ -227,8 +226,7 @@ fn a_graph_that_could_never_lift_is_refused() {
     assert!(error["message"].as_str().is_some_and(|message| message.starts_with(expected)), "{errors}");
     assert!(error["line"].as_u64() > Some(10) && error["help"].as_str().is_some(), "{errors}");
     let name = unique_name();
-    let refused = run(&[&["run", "dataflow.yaml", "--name", &name], &probe[..]].concat(), 1);
-    assert!(text(&refused.stderr).contains(expected), "{}", text(&refused.stderr));
+    fails(&[&["run", "dataflow.yaml", "--name", &name], &probe[..]].concat(), expected);
     let warned = run(&[&["run", "dataflow.yaml", "--check", "--allow-mismatch"], &probe[..]].concat(), 0);
     assert!(text(&warned.stderr).contains(expected), "{}", text(&warned.stderr));
     let warned = run(&[&["replay", "recordings/ordinary.mcap", "--name", &name], &probe[..]].concat(), 0);
@@ -239,11 +237,7 @@ fn a_graph_that_could_never_lift_is_refused() {
 #[test]
 fn files_that_an_operator_could_not_begin_with_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
-    let text = std::fs::read_to_string(project().join("dataflow.yaml")).expect("readable");
-    let root = project().display().to_string();
-    let text = text.replace("hands/", &format!("{root}/hands/")).replace("models/", &format!("{root}/models/"));
-    let flow = folder.path().join("dataflow.yaml");
-    std::fs::write(&flow, text.replace("recordings/", &format!("{root}/recordings/"))).expect("written");
+    let flow = dataflow(folder.path(), &[]);
     let broken = folder.path().join("broken");
     std::fs::write(&broken, "no file of this kind").expect("written");
     let broken = broken.to_str().expect("UTF-8");

@@ -3,7 +3,7 @@
 use std::io::{BufRead, BufReader};
 use std::process::Stdio;
 
-use crate::common::{FAST_FOREVER, Graph, blindgrasp, json_lines, project, run, text, unique_name};
+use crate::common::{FAST_FOREVER, Graph, blindgrasp, fails, json_lines, project, run, text, unique_name};
 
 #[test]
 fn the_samples_of_a_running_graph_are_printed_as_they_are() {
@@ -33,8 +33,7 @@ fn the_samples_of_a_running_graph_are_printed_as_they_are() {
         let lines = json_lines(&echo(&["-n", "2", name]).stdout);
         assert!(lines.len() == 2 && lines.iter().all(|line| line["topic"] == "/decision"), "{name}: {lines:?}");
     }
-    let wrong = run(&["echo", "--graph", &graph.name, "lift_arbiter/decisions"], 1);
-    assert!(text(&wrong.stderr).contains("did you mean 'lift_arbiter/decision'?"), "{}", text(&wrong.stderr));
+    fails(&["echo", "--graph", &graph.name, "lift_arbiter/decisions"], "did you mean 'lift_arbiter/decision'?");
     // A parameter is named as with run --set.
     let set = |argument: &str, exit_code| run(&["set", "--graph", &graph.name, argument], exit_code);
     assert!(text(&set("votes=4", 0).stdout).contains("lift_arbiter.votes: 3 → 4"));

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Stdio;
 
 use crate::common::python::utf8;
-use crate::common::{MODEL, RECORDING, blindgrasp, json_lines, project, run, text};
+use crate::common::{MODEL, RECORDING, blindgrasp, json_lines, json_of, project, run, text};
 use blindgrasp_messages::{Header, Prediction, Stamped};
 use blindgrasp_recording::{RecordingInfo, RecordingWriter};
 
@@ -72,8 +72,7 @@ fn a_column_of_features_says_what_it_is() {
         assert!(header.contains(&column), "{column}: {header:?}");
     }
     // Every grasp with a label and a contact has a row, and every row as many numbers as the header says.
-    let data = run(&["evaluate", RECORDING, "--split", "object", "--folds", "2", "--recipe", "boosted", "--json"], 0);
-    let data: serde_json::Value = serde_json::from_slice(&data.stdout).expect("JSON");
+    let data = json_of(&["evaluate", RECORDING, "--split", "object", "--folds", "2", "--recipe", "boosted", "--json"]);
     let n_judged = data["data"]["n_judged"].as_u64().expect("a number");
     assert_eq!(table.lines().count() as u64, 1 + n_judged);
     assert!(made.contains(&format!("{n_judged} grasps, {} values each", header.len() - 7)), "{made}");
@@ -162,28 +161,6 @@ fn file_names_follow_topics_and_never_collide() {
     let none = record("none.mcap", &[]);
     refused(&[&none, "--format", "csv", "--out", &at("two")], &["none.mcap", "no samples"]);
     assert!(run(&["export", &none], 0).stdout.is_empty());
-}
-
-#[test]
-fn a_topic_with_two_types_is_refused_as_a_table() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let path = folder.path().join("mixed.mcap");
-    let bytes = std::fs::read(project().join(RECORDING)).expect("read");
-    let mut writer = mcap::Writer::new(std::fs::File::create(&path).expect("created")).expect("begun");
-    let metadata = ["hand", "made_by", "version"].map(|key| (key.to_string(), "x".to_string()));
-    let metadata = metadata.into_iter().chain([("hand_id".to_string(), "0".to_string())]).collect();
-    writer.write_metadata(&mcap::records::Metadata { name: "blindgrasp".into(), metadata }).expect("written");
-    for message in mcap::MessageStream::new(&bytes).expect("MCAP") {
-        let mut message = message.expect("read");
-        let channel = mcap::Channel { topic: "/all".into(), ..(*message.channel).clone() };
-        message.channel = std::sync::Arc::new(channel);
-        writer.write(&message).expect("written");
-    }
-    writer.finish().expect("finished");
-    let out = folder.path().join("all.csv");
-    let says = ["mixed.mcap", "/all", "blindgrasp/GraspTruth/1", "blindgrasp/GraspScene/1"];
-    refused(&[utf8(&path), "--format", "csv", "--out", utf8(&out)], &says);
-    assert_eq!(json_lines(&run(&["export", utf8(&path)], 0).stdout).len(), 3840);
 }
 
 #[test]

@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Stdio};
 
 use crate::common::live::{Bridge, PATIENT, changed, free_port, grasps, live_dataflow};
-use crate::common::{FAST_FOREVER, Graph, blindgrasp, dataflow, run, signal, text, unique_name, wait_until};
+use crate::common::{
+    FAST_FOREVER, Graph, blindgrasp, dataflow, fails, json_of, run, signal, text, unique_name, wait_until,
+};
 use rustix::process::Signal;
 use serde_json::{Value, json};
 
@@ -64,8 +66,7 @@ fn the_last_seconds_are_written_when_asked_for_and_pass_as_a_test() {
     let graph = Graph::launch(&unique_name(), &flow, &FAST_FOREVER);
     graph.wait_for_decisions(5);
     let out = folder.path().join("robot.mcap");
-    let refused = run(&["record", &graph.name, "--write-kept"], 1);
-    assert!(text(&refused.stderr).contains("no flight recorder reads graph"), "{}", text(&refused.stderr));
+    fails(&["record", &graph.name, "--write-kept"], "no flight recorder reads graph");
     let mut recorder = FlightRecorder::start(&graph.name, &out, &["--keep", "2s", "--after", "0.2"]);
     graph.wait_for_decisions(100);
     run(&["record", &graph.name, "--write-kept"], 0);
@@ -112,8 +113,7 @@ fn a_drop_becomes_a_test_that_fails_until_the_grasp_is_held() {
     assert_eq!(written["why"], json!(["dropped"]), "{written}");
     assert!(file.to_string_lossy().ends_with("-dropped.mcap"), "{}", file.display());
     let (file, flow) = (file.to_str().expect("UTF-8"), flow.to_str().expect("UTF-8"));
-    let made = run(&["test", "--init", file, "--dataflow", flow, "--json"], 0);
-    let made: Value = serde_json::from_slice(&made.stdout).expect("JSON");
+    let made = json_of(&["test", "--init", file, "--dataflow", flow, "--json"]);
     assert_eq!(made["recordings"][0]["dropped"], json!([4]), "{made}");
     let expectations = Path::new(file).with_extension("expect.yaml");
     let expected = std::fs::read_to_string(&expectations).expect("written");
@@ -124,6 +124,5 @@ fn a_drop_becomes_a_test_that_fails_until_the_grasp_is_held() {
     let failed = run(&["test", file, "--dataflow", flow], 1);
     assert!(text(&failed.stdout).contains("grasp 4: expected hold, found lift"), "{}", text(&failed.stdout));
     // A second run leaves the file as it is.
-    let again = run(&["test", "--init", file, "--dataflow", flow], 1);
-    assert!(text(&again.stderr).contains("the file exists"), "{}", text(&again.stderr));
+    fails(&["test", "--init", file, "--dataflow", flow], "the file exists");
 }

@@ -1,7 +1,7 @@
 //! `blindgrasp view` of graphs, as a user runs it.
 
 use crate::common::{
-    FAST_FOREVER, Graph, ON_TWO_MACHINES, blindgrasp, dataflow, project, run, script, text, unique_name,
+    FAST_FOREVER, Graph, ON_TWO_MACHINES, blindgrasp, dataflow, fails, project, run, script, text, unique_name,
 };
 use serde_json::Value;
 
@@ -35,20 +35,6 @@ flowchart LR
     assert_eq!(drawn(&["--format", "mermaid"]), expected);
 }
 
-#[test]
-fn the_default_graph_as_dot() {
-    let found = drawn(&["dataflow.yaml", "--format", "dot"]);
-    let lines: Vec<&str> = found.lines().map(str::trim).collect();
-    assert_eq!((lines[0], lines[lines.len() - 1]), ("digraph \"grasp_gate\" {", "}"));
-    for expected in [
-        "n0 [label=\"recorded_source\"];",
-        "n0 -> n1 [label=\"tactile\\nTactileFrame/5\"];",
-        "n4 -> n5 [label=\"decision\\nLiftDecision/3\"];",
-    ] {
-        assert!(lines.contains(&expected), "no '{expected}' in\n{found}");
-    }
-}
-
 /// Graphviz lays out pictures. A program of its name that prints its input stands for it.
 #[test]
 fn the_default_graph_as_svg_is_laid_out_by_graphviz() {
@@ -74,8 +60,7 @@ fn the_default_graph_as_svg_is_laid_out_by_graphviz() {
     drawn(&["--out", text_file.to_str().expect("UTF-8")]);
     assert!(std::fs::read_to_string(text_file).expect("written").starts_with("digraph"));
     let unknown = folder.path().join("graph.png");
-    let refused = run(&["view", "--out", unknown.to_str().expect("UTF-8")], 1);
-    assert!(text(&refused.stderr).contains(".svg, .mmd or .dot"), "{}", text(&refused.stderr));
+    fails(&["view", "--out", unknown.to_str().expect("UTF-8")], ".svg, .mmd or .dot");
     run(&["view", "--out", "dataflow.yaml", "--format", "dot"], 1);
 }
 
@@ -105,31 +90,6 @@ fn settings_other_than_the_defaults_are_drawn() {
 }
 
 #[test]
-fn json_agrees_with_check() {
-    let found = json(&[]);
-    let check = run(&["run", "--check", "--json"], 0);
-    let check: Value = serde_json::from_str(&text(&check.stdout)).expect("JSON");
-    let graph = &check["graph"];
-    assert_eq!(found["graph"], graph["name"]);
-    for (node, expected) in
-        found["nodes"].as_array().expect("nodes").iter().zip(graph["nodes"].as_array().expect("nodes"))
-    {
-        for field in ["id", "restart", "heartbeat_millis"] {
-            assert_eq!(node[field], expected[field], "{field}");
-        }
-    }
-    let edge = &found["edges"][0];
-    let input = &graph["nodes"][1]["inputs"][0];
-    for field in ["from_node", "from_port", "type_name"] {
-        assert_eq!(edge[field], input[field], "{field}");
-    }
-    for field in ["policy", "capacity", "deadline_millis"] {
-        assert_eq!(edge[field], input["edge"][field], "{field}");
-    }
-    assert_eq!((&edge["to_node"], &edge["to_port"]), (&graph["nodes"][1]["id"], &input["port"]));
-}
-
-#[test]
 fn mistakes_are_reported_as_by_check() {
     let folder = tempfile::tempdir().expect("a folder");
     let file = dataflow(folder.path(), &[("votes", "vots")]);
@@ -139,8 +99,7 @@ fn mistakes_are_reported_as_by_check() {
     assert_eq!(graph, check);
     assert!(graph.contains("did you mean 'votes'?"), "{graph}");
     let name = unique_name();
-    let missing = run(&["view", &name, "--json"], 1);
-    assert!(text(&missing.stderr).contains(&format!("no graph '{name}' is running")), "{}", text(&missing.stderr));
+    fails(&["view", &name, "--json"], &format!("no graph '{name}' is running"));
     run(&["view", "dataflow.yaml", "--interval", "1"], 2);
     run(&["view", &name, "--interval", "1"], 2);
 }

@@ -9,11 +9,9 @@ use rustix::process::Signal;
 
 use crate::common::python::{assert_each_once, python_operator, utf8};
 use crate::common::{
-    Ended, FAST_FOREVER, Graph, HAND, RECORDING, classifier_runs, dataflow, dataflow_with, of_node, project, run,
-    script, signal, skipped, swap, text, unique_name, wait_until,
+    A_FEW_GRASPS, Ended, FAST_FOREVER, Graph, HAND, RECORDING, classifier_runs, dataflow, dataflow_with, of_node,
+    project, run, script, signal, skipped, swap, text, unique_name, wait_until,
 };
-
-const A_FEW_GRASPS: usize = 20;
 
 fn role(folder: &Path) -> PathBuf {
     python_operator(folder, &project().join("tests/python_roles.py"))
@@ -210,7 +208,7 @@ fn a_sample_that_kills_a_program_among_others_is_found_and_left_out() {
 #[test]
 fn a_program_without_a_state_leaves_none_to_the_stage_that_takes_its_place() {
     let folder = tempfile::tempdir().expect("a folder");
-    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    let graph = Graph::fast();
     let lifts = format!("model={}", project().join("models/barrett-bh8-280-lifts.json").display());
     swap(&graph, &["encoder", "classifier", "--set", &lifts, "--probation", "0"], 0);
     graph.wait_for_decisions(A_FEW_GRASPS);

@@ -1,17 +1,15 @@
 //! A launcher that is killed, stopped, asked, or given a disk that blocks: the graph goes on, or ends whole.
 
-use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::os::unix::fs::DirBuilderExt;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use crate::common::{
-    FAST_FOREVER, Graph, assert_nothing_left, blindgrasp, classifier_runs, dataflow, dataflow_with, of_node, operator,
-    program, project, run, script, signal, stubborn_classifier, text, unique_name, wait_until,
+    A_FEW_GRASPS, FAST_FOREVER, Graph, assert_nothing_left, blindgrasp, classifier_runs, dataflow, dataflow_with,
+    fails, of_node, operator, program, project, run, script, signal, stubborn_classifier, text, unique_name,
+    wait_until,
 };
 use rustix::process::Signal;
-
-/// A graph that decides this many grasps goes on well.
-const A_FEW_GRASPS: usize = 20;
 
 /// An endless loop hears neither a signal nor the end of its stdin.
 #[test]
@@ -110,46 +108,14 @@ fn decisions_that_cannot_be_written_are_an_error() {
     }
 }
 
-/// Another user who could foresee the folder could make it first, and lead the graph's services anywhere.
-#[test]
-fn the_folder_of_a_graph_is_of_its_user_alone_and_cannot_be_foreseen() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
-    let entries = std::fs::read_dir("/dev/shm").expect("readable").flatten();
-    let own = |entry: &std::fs::DirEntry| {
-        let name = entry.file_name().to_string_lossy().into_owned();
-        name.strip_prefix(&format!("blindgrasp_{}.", &graph.name[..graph.name.len().min(11)])).map(str::to_owned)
-    };
-    let found: Vec<_> = entries.filter_map(|entry| Some((own(&entry)?, entry.metadata().ok()?))).collect();
-    let [(number, metadata)] = &found[..] else { panic!("{found:?}") };
-    assert_eq!(metadata.permissions().mode() & 0o777, 0o700);
-    assert_ne!(*number, graph.pid().to_string());
-    graph.stop();
-}
-
-/// The second command of that name must not print the running graph's decisions as its own reason.
-#[test]
-fn a_graph_that_runs_in_the_background_is_not_started_twice() {
-    let (folder, name) = (tempfile::tempdir().expect("a folder"), unique_name());
-    let flow = dataflow(folder.path(), &[]);
-    let arguments = ["run", "--detach", "--name", &name, "--set", "recorded_source.repeat=forever"];
-    let arguments = [&arguments[..], &[flow.to_str().expect("UTF-8")]].concat();
-    run(&arguments, 0);
-    let refused = text(&run(&arguments, 1).stderr);
-    run(&["stop", &name], 0);
-    assert!(refused.contains("is running: stop it") && !refused.contains("HOLD"), "{refused}");
-    assert_nothing_left(&name);
-}
-
 /// The reason of a program that fails at its start is in the message, and it is not tried again and again.
 #[test]
 fn a_permanent_error_ends_at_once_and_says_why() {
     let folder = tempfile::tempdir().expect("a folder");
-    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    let graph = Graph::fast();
     let broken = script(folder.path(), "broken.py", "echo \"TypeError: not a model\" >&2; exit 1");
     let broken = broken.to_str().expect("UTF-8");
-    let refused = run(&["swap", "classifier", "--run", broken, "--graph", &graph.name], 1);
-    assert!(text(&refused.stderr).contains("TypeError: not a model"), "{}", text(&refused.stderr));
+    fails(&["swap", "classifier", "--run", broken, "--graph", &graph.name], "TypeError: not a model");
     // The model's file is damaged while the graph runs.
     let model = folder.path().join("model.json");
     std::fs::copy(crate::common::MODEL, &model).expect("copied");

@@ -12,12 +12,11 @@ use serde_json::Value;
 
 use crate::common::python::{assert_each_once, python_operator};
 use crate::common::{
-    Ended, FAST_FOREVER, Graph, HAND, MODEL, NODES, RECORDING, blindgrasp, classifier_runs, dataflow_with,
-    decisions_of, of_node, program, project, run, signal, swap, text, undisturbed, unique_name, wait_until,
+    A_FEW_GRASPS, Ended, FAST_FOREVER, Graph, HAND, MODEL, NODES, RECORDING, blindgrasp, classifier_runs,
+    dataflow_with, decisions_of, of_node, program, project, run, signal, swap, text, undisturbed, unique_name,
+    wait_until,
 };
 
-/// A graph that decides this many grasps goes on well.
-const A_FEW_GRASPS: usize = 20;
 /// As many samples as an edge takes that nobody has answered.
 const CAPACITY: u64 = 256;
 /// A check of the sensors, with which the contacts have a state and long answers.
@@ -173,10 +172,11 @@ fn a_stage_with_a_state_and_long_answers_waits_for_a_reader_that_stands_still_or
     assert_whole(&graph.stop(), undisturbed(), 1, "contacts with sensors behind a slow reader");
 }
 
-/// A recording of three epochs, each of which is numbered from 0, of 20 grasps and 280 frames each.
-fn of_three_epochs(folder: &Path) -> (String, String) {
-    const N_GRASPS: u64 = 20;
-    const N_FRAMES: u64 = 14 * N_GRASPS;
+/// A recording of twelve epochs, each of which is numbered from 0, of 20 grasps and 280 frames each.
+const N_GRASPS: u64 = 20;
+const N_FRAMES: u64 = 14 * N_GRASPS;
+
+fn of_many_epochs(folder: &Path) -> (String, String) {
     let path = folder.join("epochs.mcap");
     let reader = RecordingReader::open(&project().join(RECORDING)).expect("opened");
     let mut writer = RecordingWriter::create(&path, reader.info()).expect("created");
@@ -188,97 +188,57 @@ fn of_three_epochs(folder: &Path) -> (String, String) {
             _ => continue,
         };
         let epoch = grasp_id / N_GRASPS;
-        if epoch < 3 {
-            header.seq -= epoch * n_numbers;
-            header.epoch += epoch;
-            writer.write_record(&topic, &record).expect("written");
-        }
+        header.seq -= epoch * n_numbers;
+        header.epoch += epoch;
+        writer.write_record(&topic, &record).expect("written");
     }
     writer.finish().expect("finished");
     change("recordings/held-out.mcap", path.to_str().expect("UTF-8"))
 }
 
-/// The frames of the first epoch and of a part of the second: the histories have samples of both.
-const INTO_THE_SECOND_EPOCH: u64 = 280 + 70;
-
-/// Does something to a graph soon after an epoch has begun, which must not disturb it.
-fn act_in_a_new_epoch(changes: &[(String, String)], n_restarts: u64, what: &str, act: impl Fn(&Graph)) {
+/// Acts on a graph soon after an epoch has begun, an epoch for each act: the histories have samples of two epochs then. It must
+/// not disturb the graph.
+fn act_in_new_epochs(changes: &[(String, String)], n_restarts: u64, acts: &[(&str, &dyn Fn(&Graph))]) {
     let folder = tempfile::tempdir().expect("a folder");
-    let changes = [changes, &[of_three_epochs(folder.path())]].concat();
-    let flow = patient(folder.path(), &changes);
-    let graph = paused(&flow, INTO_THE_SECOND_EPOCH, &[]);
-    act(&graph);
+    let flow = patient(folder.path(), &[changes, &[of_many_epochs(folder.path())]].concat());
+    let graph = paused(&flow, N_FRAMES, &[]);
+    for (epoch, (what, act)) in (1..).zip(acts) {
+        let n_frames = epoch * N_FRAMES + 70;
+        let_send(&graph, n_frames);
+        wait_for_answers(&graph, n_frames);
+        act(&graph);
+        assert!(!graph.said().contains("is degraded"), "{what}: {}", graph.said());
+    }
     let_finish(&graph);
     let ended = end(graph);
-    assert_whole(&ended, &decisions_of(&flow), n_restarts, what);
-    assert_eq!(ended.summary["edges"][0]["sent"], 3 * 280, "{what}");
+    assert_whole(&ended, &decisions_of(&flow), n_restarts, "acts in new epochs");
+    assert_eq!(ended.summary["edges"][0]["sent"], 12 * N_FRAMES);
 }
 
-fn kill_in_a_new_epoch(node: &str) {
-    act_in_a_new_epoch(&[], 1, &format!("{node} killed"), |graph| graph.kill(node));
-}
-
-fn swap_in_a_new_epoch(node: &str) {
-    act_in_a_new_epoch(&[], 0, &format!("{node} swapped"), |graph| drop(swap(graph, &[node, "--probation", "0"], 0)));
+fn swap_at_once(graph: &Graph, node: &str) {
+    swap(graph, &[node, "--probation", "0"], 0);
 }
 
 #[test]
-fn contacts_killed_in_a_new_epoch() {
-    kill_in_a_new_epoch("contacts");
-}
-
-#[test]
-fn an_encoder_killed_in_a_new_epoch() {
-    kill_in_a_new_epoch("encoder");
-}
-
-#[test]
-fn a_classifier_killed_in_a_new_epoch() {
-    kill_in_a_new_epoch("classifier");
-}
-
-#[test]
-fn an_arbiter_killed_in_a_new_epoch() {
-    kill_in_a_new_epoch("lift_arbiter");
-}
-
-#[test]
-fn a_source_killed_in_a_new_epoch() {
-    kill_in_a_new_epoch("recorded_source");
-}
-
-#[test]
-fn contacts_swapped_in_a_new_epoch() {
-    swap_in_a_new_epoch("contacts");
-}
-
-#[test]
-fn an_encoder_swapped_in_a_new_epoch() {
-    swap_in_a_new_epoch("encoder");
-}
-
-#[test]
-fn a_classifier_swapped_in_a_new_epoch() {
-    swap_in_a_new_epoch("classifier");
-}
-
-#[test]
-fn an_arbiter_swapped_in_a_new_epoch() {
-    swap_in_a_new_epoch("lift_arbiter");
-}
-
-#[test]
-fn a_source_swapped_in_a_new_epoch() {
-    swap_in_a_new_epoch("recorded_source");
-}
-
-/// The whole graph is killed, and each of its nodes finds samples of two epochs.
-#[test]
-fn all_nodes_killed_in_a_new_epoch() {
-    act_in_a_new_epoch(&[], 5, "all killed", |graph| {
-        kill(&NODES.map(|node| graph.pid_of(node)));
-        NODES.iter().for_each(|node| graph.wait_for_restart(node, 1));
-    });
+fn nodes_killed_or_swapped_in_a_new_epoch_lose_nothing() {
+    let acts: [(&str, &dyn Fn(&Graph)); 11] = [
+        ("contacts killed", &|graph| graph.kill("contacts")),
+        ("encoder killed", &|graph| graph.kill("encoder")),
+        ("classifier killed", &|graph| graph.kill("classifier")),
+        ("arbiter killed", &|graph| graph.kill("lift_arbiter")),
+        ("source killed", &|graph| graph.kill("recorded_source")),
+        ("contacts swapped", &|graph| swap_at_once(graph, "contacts")),
+        ("encoder swapped", &|graph| swap_at_once(graph, "encoder")),
+        ("classifier swapped", &|graph| swap_at_once(graph, "classifier")),
+        ("arbiter swapped", &|graph| swap_at_once(graph, "lift_arbiter")),
+        ("source swapped", &|graph| swap_at_once(graph, "recorded_source")),
+        // Each node finds samples of two epochs.
+        ("all killed", &|graph| {
+            kill(&NODES.map(|node| graph.pid_of(node)));
+            NODES.iter().for_each(|node| graph.wait_for_restart(node, 2));
+        }),
+    ];
+    act_in_new_epochs(&[], 10, &acts);
 }
 
 /// A classifier in Python, in a role of `tests/python_roles.py`.
@@ -289,19 +249,14 @@ fn python_classifier(folder: &Path, role: &str) -> (String, String) {
 }
 
 #[test]
-fn a_python_stage_killed_in_a_new_epoch() {
+fn a_python_stage_killed_or_swapped_in_a_new_epoch_loses_nothing() {
     let folder = tempfile::tempdir().expect("a folder");
     let python = [python_classifier(folder.path(), "plain")];
-    act_in_a_new_epoch(&python, 1, "a stage in Python killed", |graph| graph.kill("classifier"));
-}
-
-#[test]
-fn a_python_stage_swapped_in_a_new_epoch() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let python = [python_classifier(folder.path(), "plain")];
-    act_in_a_new_epoch(&python, 0, "a stage in Python swapped", |graph| {
-        swap(graph, &["classifier", "--probation", "0"], 0);
-    });
+    let acts: [(&str, &dyn Fn(&Graph)); 2] = [
+        ("a stage in Python killed", &|graph| graph.kill("classifier")),
+        ("a stage in Python swapped", &|graph| swap_at_once(graph, "classifier")),
+    ];
+    act_in_new_epochs(&python, 1, &acts);
 }
 
 /// A swap that is on probation until its graph ends.
@@ -348,28 +303,11 @@ fn kill_the_old_one_and_its_reader(writer: &str, reader: &str, changes: &[(Strin
 }
 
 #[test]
-fn an_old_source_and_its_reader_killed_on_probation() {
-    kill_the_old_one_and_its_reader("recorded_source", "contacts", &[]);
-}
-
-#[test]
-fn old_contacts_and_their_reader_killed_on_probation() {
-    kill_the_old_one_and_its_reader("contacts", "encoder", &[]);
-}
-
-#[test]
-fn an_old_encoder_and_its_reader_killed_on_probation() {
-    kill_the_old_one_and_its_reader("encoder", "classifier", &[]);
-}
-
-#[test]
-fn an_old_classifier_and_its_reader_killed_on_probation() {
-    kill_the_old_one_and_its_reader("classifier", "lift_arbiter", &[]);
-}
-
-/// What the reader has not taken is among the saved answers.
-#[test]
-fn an_old_classifier_with_a_state_and_its_reader_killed_on_probation() {
+fn an_old_process_and_its_reader_killed_on_probation() {
+    for pair in NODES.windows(2) {
+        kill_the_old_one_and_its_reader(pair[0], pair[1], &[]);
+    }
+    // With a state, the samples that the reader has not taken are among the saved answers.
     kill_the_old_one_and_its_reader("classifier", "lift_arbiter", &[change(MODEL, LIFTS)]);
 }
 
@@ -402,20 +340,21 @@ fn has_looked_since(graph: &Graph, node: &str, since: Instant) -> bool {
     age.is_some_and(|age| since.elapsed() > age + Duration::from_millis(500))
 }
 
-/// Nodes, one after the other, have no free descriptor when a neighbour is started again, so that they cannot connect to it.
-fn connect_later(deaf_and_killed: [[&str; 2]; 4]) {
+/// Nodes, one after the other, have no free descriptor when a neighbour, their reader or their writer, is started again, so that
+/// they cannot connect to it at once.
+#[test]
+fn a_node_that_cannot_connect_to_a_neighbour_at_once_connects_later() {
     let folder = tempfile::tempdir().expect("a folder");
     let graph = paused(&patient(folder.path(), &[]), 100, &["--wait-limit", "20"]);
     let n_restarts = |node: &str| graph.node(node)["n_restarts"].as_u64().expect("a count");
     let mut n_frames = 100;
-    for [deaf, killed] in deaf_and_killed {
+    let mut connect_later = |deaf: &str, killed: &str, reader: &str| {
         let n_before = n_restarts(deaf);
         let limited = WithoutDescriptors::of(graph.pid_of(deaf));
         graph.kill(killed);
         n_frames += 10;
         let_send(&graph, n_frames);
         // Then it has tried, or has failed and is started again.
-        let reader = NODES.into_iter().rfind(|node| [deaf, killed].contains(node)).expect("a node");
         let is_sent = || count(&graph, input_of(reader), "sent") >= n_frames;
         let has_failed = || n_restarts(deaf) > n_before;
         let describe = || format!("{deaf}: {}\n{}", edge_counts(&graph.status()), graph.said());
@@ -424,23 +363,17 @@ fn connect_later(deaf_and_killed: [[&str; 2]; 4]) {
         wait_until(|| has_looked_since(&graph, deaf, sent_at) || has_failed(), describe);
         drop(limited);
         wait_for_answers(&graph, n_frames);
+    };
+    for pair in NODES.windows(2) {
+        connect_later(pair[0], pair[1], pair[1]);
+        connect_later(pair[1], pair[0], pair[1]);
     }
     let_finish(&graph);
     let ended = end(graph);
     // A node that cannot connect may fail and be started again.
     let n_restarts = ended.summary["restarts"].as_u64().expect("a count");
-    assert!((4..=8).contains(&n_restarts), "4 kills, {n_restarts} restarts: {}", ended.stderr);
+    assert!((8..=16).contains(&n_restarts), "8 kills, {n_restarts} restarts: {}", ended.stderr);
     assert_whole(&ended, undisturbed(), n_restarts, "nodes without descriptors");
-}
-
-#[test]
-fn a_writer_that_cannot_connect_to_a_reader_at_once_connects_later() {
-    connect_later([0, 1, 2, 3].map(|idx| [NODES[idx], NODES[idx + 1]]));
-}
-
-#[test]
-fn a_reader_that_cannot_connect_to_a_writer_at_once_connects_later() {
-    connect_later([0, 1, 2, 3].map(|idx| [NODES[idx + 1], NODES[idx]]));
 }
 
 /// The runs need about fifty descriptors.
@@ -560,14 +493,11 @@ fn swap_before_all_is_sent_again(nodes: &[&str]) {
     assert_whole(&end(graph), undisturbed(), 2, &format!("swap {nodes:?}: {}", text(&output.stderr)));
 }
 
+/// If the encoder is swapped as well, it cannot answer the samples that the contacts have not sent again: they take back what
+/// they have handed over.
 #[test]
-fn a_swap_before_all_is_sent_again() {
+fn a_swap_before_all_is_sent_again_or_one_that_is_taken_back() {
     swap_before_all_is_sent_again(&["contacts"]);
-}
-
-/// The encoder cannot answer what the contacts have not sent again, so that the contacts take back what they have handed over.
-#[test]
-fn a_swap_that_is_taken_back_before_all_is_sent_again() {
     swap_before_all_is_sent_again(&["contacts", "encoder"]);
 }
 

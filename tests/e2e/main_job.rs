@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use crate::common::{
-    Graph, HAND, MODEL, NODES, RECORDING, REPORTS, assert_nothing_left, classifier_runs, dataflow, json_lines,
-    paper_model, run, script, signal, stubborn_classifier, text, unique_name,
+    Graph, HAND, MODEL, NODES, RECORDING, REPORTS, assert_nothing_left, classifier_runs, dataflow, fails, json_lines,
+    json_of, paper_model, run, script, signal, stubborn_classifier, text, unique_name,
 };
 use rustix::process::Signal;
 use serde_json::Value;
@@ -59,8 +59,7 @@ fn five_processes_decide_every_grasp_and_lose_nothing() {
     );
 
     // The same stages offline come to the same result.
-    let evaluation: Value =
-        serde_json::from_slice(&run(&["evaluate", MODEL, RECORDING, "--json"], 0).stdout).expect("JSON");
+    let evaluation = json_of(&["evaluate", MODEL, RECORDING, "--json"]);
     assert_eq!(summary["accuracy"], evaluation["score"]["accuracy"]);
     assert_eq!(summary["lift"], evaluation["score"]["n_lift"]);
     assert_eq!(summary["false_positives"], evaluation["score"]["n_false_positive"]);
@@ -89,7 +88,7 @@ fn every_edge_can_be_recomputed_from_outside() {
     for topic in ["/contacts", "/feature", "/prediction"] {
         assert_eq!(edges[topic].len(), n_frames, "{topic}");
     }
-    let shown: Value = serde_json::from_slice(&run(&["model", "show", model_path, "--json"], 0).stdout).expect("JSON");
+    let shown = json_of(&["model", "show", model_path, "--json"]);
     let model: Value = serde_json::from_str(&std::fs::read_to_string(model_path).expect("a model")).expect("JSON");
     let svm = &model["classifier"]["predictor"]["svm"];
     let (sigma, gamma, rho) = (f(&shown["sigma_m"]), f(&shown["predictor"]["gamma"]), f(&shown["predictor"]["rho"]));
@@ -192,8 +191,7 @@ fn check_contacts(frame: &Value, set: &Value, positions: bool) {
     let names = ["spread", "finger_1", "finger_2", "finger_3", "distal_1", "distal_2", "distal_3"];
     let joints: Vec<String> =
         names.iter().zip(floats(&frame["joints"])).map(|(name, value)| format!("{name}={value}")).collect();
-    let cells = run(&["info", HAND, "--json", "--joints", &joints.join(",")], 0);
-    let cells: Value = serde_json::from_slice(&cells.stdout).expect("JSON");
+    let cells = json_of(&["info", HAND, "--json", "--joints", &joints.join(",")]);
     for (idx, contact) in active.iter().zip(contacts) {
         for field in ["position_m", "normal"] {
             let expected = floats(&cells[*idx][field]);
@@ -394,13 +392,11 @@ fn a_model_of_another_hand_never_lifts() {
     run(&["train", &recording, "--hand", &hand, "--words", "8", "--out", &model], 0);
     let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), (MODEL, &model)]);
     let flow = flow.to_str().expect("UTF-8");
-    let refused = run(&["run", "--name", &unique_name(), flow], 1);
-    assert!(text(&refused.stderr).contains("is not the one that the model of node"), "{}", text(&refused.stderr));
+    fails(&["run", "--name", &unique_name(), flow], "is not the one that the model of node");
     let output = run(&["run", "--allow-mismatch", "--json", "--name", &unique_name(), flow], 0);
     let lines = json_lines(&output.stdout);
     let summary = &lines.last().expect("a summary")["summary"];
     assert_eq!((&summary["lift"], &summary["hold"]), (&0.into(), &240.into()));
     assert_eq!(summary["reasons"], serde_json::json!({ "wrong_hand": 240 }));
-    let refused = run(&["evaluate", &model, RECORDING], 1);
-    assert!(text(&refused.stderr).contains("hand"), "{}", text(&refused.stderr));
+    fails(&["evaluate", &model, RECORDING], "hand");
 }

@@ -289,8 +289,7 @@ fn a_recording_there_is_written_here() {
 #[test]
 fn ctrl_c_ends_the_command_there() {
     let Some(sshd) = Sshd::start() else { return };
-    let folder = tempfile::tempdir().expect("a folder");
-    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    let graph = Graph::fast();
     // The arbiter says a line as it begins, and no more.
     let log = || blindgrasp().args(["logs", "lift_arbiter", "--graph", &graph.name]).output().expect("started");
     wait_until(|| log().status.success(), || text(&log().stderr));

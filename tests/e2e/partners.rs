@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use crate::common::{
-    FAST_FOREVER, Graph, HAND, RECORDING, dataflow, json_lines, run, signal, swap, unique_name, wait_until,
+    A_FEW_GRASPS, FAST_FOREVER, Graph, HAND, RECORDING, dataflow, json_lines, run, signal, swap, unique_name,
+    wait_until,
 };
 use rustix::process::Signal;
 
-const A_FEW_GRASPS: usize = 20;
 /// Arguments of `run` that play the wrist's recording as [`FAST_FOREVER`] plays the hand's.
 const WRIST: [&str; 4] = ["--set", "wrist.rate=16", "--set", "wrist.repeat=forever"];
 const COUNT: &str = "senses_without_partner";

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use crate::common::mistakes::check;
 use crate::common::{RECORDING, project, run, text};
 use blindgrasp_messages::{GraspScene, LiftDecision, Prediction, Recorded, SceneContact, TactileFrame};
 use blindgrasp_recording::{Record, RecordingReader, RecordingWriter};
@@ -102,14 +103,6 @@ fn any_grasp_of_a_recording_can_be_chosen() {
 fn drawings_that_are_impossible_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_string();
-    let check = |arguments: &[&str], exit_code: i32, expected: &[&str]| {
-        let output = run(arguments, exit_code);
-        let stderr = text(&output.stderr);
-        for part in expected {
-            assert!(stderr.contains(part), "blindgrasp {arguments:?}: expected '{part}' in\n{stderr}");
-        }
-        assert!(!stderr.contains("panicked") && output.stdout.is_empty(), "{stderr}");
-    };
     check(&["view", RECORDING, "--grasp", "99999", "--out", &at("a.svg")], 1, &["no grasp 99999", "0 to "]);
     check(&["view", RECORDING, "--out", &at("a.png")], 1, &["a.png", ".svg", ".html"]);
     check(&["view", RECORDING, "--out", &at("a")], 1, &[".svg", ".html"]);
@@ -143,12 +136,9 @@ fn drawings_that_are_impossible_are_refused() {
 fn grasps_are_drawn_as_a_moving_picture() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_owned();
-    let draw = |out: &str| {
-        let (model, out) = ("models/barrett-bh8-280.json", at(out));
-        run(&["view", RECORDING, "--grasp", "4,2", "--animate", model, "--out", &out], 0);
-        std::fs::read_to_string(out).expect("written")
-    };
-    let svg = draw("a.svg");
+    let (model, out) = ("models/barrett-bh8-280.json", at("a.svg"));
+    run(&["view", RECORDING, "--grasp", "4,2", "--animate", model, "--out", &out], 0);
+    let svg = std::fs::read_to_string(out).expect("written");
     let frames = |id: u64| {
         let records = RecordingReader::open(&project().join(RECORDING)).expect("a recording");
         records.filter(
@@ -165,7 +155,6 @@ fn grasps_are_drawn_as_a_moving_picture() {
     assert!(svg.find("LIFT</text>") < svg.find("HOLD</text>"));
     assert!(svg.contains("The grasp is stable.") && svg.contains("The grasp is not stable."));
     assert!(svg.contains("prefers-reduced-motion"));
-    assert_eq!(svg, draw("b.svg"), "the same bytes again");
     let refused = |arguments: &[&str], exit_code: i32, expected: &str| {
         let output = run(&[&["view", RECORDING][..], arguments].concat(), exit_code);
         let said = String::from_utf8_lossy(&output.stderr).into_owned();

@@ -2,11 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::common::{FAST_FOREVER, Graph, NODES, dataflow_with, of_node, project, run, signal, swap, text};
+use crate::common::{
+    A_FEW_GRASPS, FAST_FOREVER, Graph, NODES, dataflow_with, of_node, project, run, signal, swap, text,
+};
 use rustix::process::Signal;
 use serde_json::Value;
 
-const A_FEW_GRASPS: usize = 20;
 const GROUP: &str = "group: judge";
 
 /// The default graph with these nodes in one process.

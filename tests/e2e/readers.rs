@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use crate::common::python::{python, shell, utf8};
-use crate::common::{RECORDING, dataflow, json_lines, project, run, unique_name};
+use crate::common::{RECORDING, json_lines, project, run, unique_name};
 use serde_json::{Value, json};
 
 /// Compares a recording with its export. Returns what was compared.
@@ -36,13 +36,13 @@ fn other_readers_find_the_simulated_recording_as_exported() {
 #[test]
 fn other_readers_find_the_recording_of_a_graph_as_exported() {
     let folder = tempfile::tempdir().expect("a folder");
-    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max")]);
     let recording = folder.path().join("run.mcap");
-    run(&["run", "--json", "--name", &unique_name(), "--record", utf8(&recording), utf8(&flow)], 0);
+    let part = ["replay", RECORDING, "--grasps", "0-39", "--rate", "max", "--name", &unique_name()];
+    run(&[&part[..], &["--record", utf8(&recording)]].concat(), 0);
     let found = compare(folder.path(), &recording);
     let each_frame = ["/tactile", "/contacts", "/feature", "/prediction"];
-    assert!(each_frame.iter().all(|topic| found["n_samples"][topic] == 3360), "{found}");
-    assert!(["/decision", "/truth"].iter().all(|topic| found["n_samples"][topic] == 240), "{found}");
+    assert!(each_frame.iter().all(|topic| found["n_samples"][topic] == 40 * 14), "{found}");
+    assert!(["/decision", "/truth"].iter().all(|topic| found["n_samples"][topic] == 40), "{found}");
 }
 
 #[test]

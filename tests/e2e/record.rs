@@ -7,7 +7,9 @@ use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use crate::common::{FAST_FOREVER, Graph, blindgrasp, dataflow, program, run, signal, skipped, text, wait_until};
+use crate::common::{
+    FAST_FOREVER, Graph, blindgrasp, dataflow, fails, program, run, signal, skipped, text, wait_until,
+};
 use blindgrasp_messages::Header;
 use blindgrasp_recording::{Record, RecordingReader};
 use rustix::process::Signal;
@@ -153,12 +155,11 @@ fn an_attached_recording_equals_the_graphs_own() {
 fn operators_that_are_killed_and_swapped_lose_nothing_of_two_recordings() {
     let folder = tempfile::tempdir().expect("a folder");
     let outs = ["a.mcap", "b.mcap", "c.mcap"].map(|name| folder.path().join(name));
-    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    let graph = Graph::fast();
     let first = Recorder::start(&graph.name, &outs[0], &[]);
     let second = Recorder::start(&graph.name, &outs[1], &[]);
     let third = outs[2].to_str().expect("UTF-8");
-    let refused = run(&["record", &graph.name, "--out", third], 1);
-    assert!(text(&refused.stderr).contains("is being recorded by 2 already"), "{}", text(&refused.stderr));
+    fails(&["record", &graph.name, "--out", third], "is being recorded by 2 already");
     assert!(!outs[2].exists());
     for node in ["classifier", "contacts", "recorded_source"] {
         graph.kill(node);
@@ -244,7 +245,7 @@ fn recordings_that_are_impossible_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let out = folder.path().join("out.mcap");
     let out_text = out.to_str().expect("UTF-8");
-    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    let graph = Graph::fast();
     let record = |arguments: &[&str], code: i32| {
         let all = [&["record", graph.name.as_str(), "--out", out_text][..], arguments].concat();
         text(&run(&all, code).stderr)
@@ -264,15 +265,17 @@ fn recordings_that_are_impossible_are_refused() {
     assert_ne!(std::fs::read(&out).expect("recorded"), before);
     assert!(record(&["--rotate-size", "12"], 2).contains("500MB"));
     graph.stop().assert_undisturbed("recorded thrice");
-    let none = run(&["record", "no-such-graph", "--out", folder.path().join("x.mcap").to_str().expect("UTF-8")], 1);
-    assert!(text(&none.stderr).contains("no graph 'no-such-graph' is running"), "{}", text(&none.stderr));
+    fails(
+        &["record", "no-such-graph", "--out", folder.path().join("x.mcap").to_str().expect("UTF-8")],
+        "no graph 'no-such-graph' is running",
+    );
 }
 
 #[test]
 fn a_recording_in_parts_is_whole() {
     let folder = tempfile::tempdir().expect("a folder");
     let out = folder.path().join("long.mcap");
-    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    let graph = Graph::fast();
     let recorder = Recorder::start(&graph.name, &out, &["--rotate-every", "700ms"]);
     wait_until(|| folder.path().join("long-00002.mcap").exists(), || "there is no third part".into());
     let (code, summary, said) = recorder.stop();
@@ -327,7 +330,7 @@ fn a_full_disk_ends_the_recording_and_not_the_graph() {
     let out = small.join("full.mcap");
     let (program, out) = (program(), out.to_str().expect("UTF-8"));
     // An attached recorder ends, and the graph goes on. The recording is read where the file system is seen.
-    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    let graph = Graph::fast();
     let script = "\"$@\"; code=$?; \"$1\" info \"$6\" >&2 || code=9; exit $code";
     let recorder =
         Recorder::spawn(within(&["sh", "-c", script, "sh", program, "record", &graph.name, "--json", "--out", out]));

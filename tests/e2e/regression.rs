@@ -4,7 +4,7 @@ use std::ffi::OsStr;
 use std::os::unix::ffi::OsStrExt;
 use std::path::Path;
 
-use crate::common::{MODEL, blindgrasp, json_lines, project, run, skipped, text, unique_name};
+use crate::common::{MODEL, blindgrasp, fails, json_lines, json_of, project, run, skipped, text, unique_name};
 use serde_json::{Value, json};
 
 #[test]
@@ -98,20 +98,17 @@ fn names_that_are_not_utf8_are_text_in_json() {
 fn a_sweep_shows_the_decisions_with_each_value() {
     let folder = tempfile::tempdir().expect("a folder");
     let recording = recorded_run(folder.path());
-    let output = run(&["test", &recording, "--sweep", "lift_arbiter.votes=2,3", "--json"], 0);
-    let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    let report = json_of(&["test", &recording, "--sweep", "lift_arbiter.votes=2,3", "--json"]);
     let of = |value: usize, name: &str| report["values"][value][name].clone();
     assert_eq!((of(0, "value"), of(0, "n_actions_changed")), (json!("2"), json!(1)), "{report}");
     assert_eq!((of(1, "value"), of(1, "n_actions_changed")), (json!("3"), json!(0)), "{report}");
     assert_eq!(of(0, "decisions")["n_lifts"].as_u64(), of(1, "decisions")["n_lifts"].as_u64().map(|n| n + 1));
-    let refused = run(&["test", &recording, "--sweep", "lift_arbiter.votse=2,3"], 1);
-    assert!(text(&refused.stderr).contains("votes"), "{}", text(&refused.stderr));
+    fails(&["test", &recording, "--sweep", "lift_arbiter.votse=2,3"], "votes");
 }
 
 #[test]
 fn faults_show_the_decisions_that_they_change() {
-    let output = run(&["test", "recordings/slip-prone.mcap", "--faults", "--json"], 0);
-    let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    let report = json_of(&["test", "recordings/slip-prone.mcap", "--faults", "--json"]);
     let faults = report["faults"].as_array().expect("faults");
     let of = |name: &str| faults.iter().find(|row| row["fault"] == name).expect(name)["changed_actions"].clone();
     // Its eight lifts are held when a frame is lost, and nothing is lifted that is held without.

@@ -11,18 +11,14 @@ use std::time::Duration;
 use blindgrasp_recording::{Record, RecordingInfo, RecordingReader, RecordingWriter};
 use rustix::process::{Signal, getuid};
 
+use crate::common::python::utf8;
 use crate::common::{
-    FAST_FOREVER, Graph, HAND, MODEL, NODES, RECORDING, REPORTS, blindgrasp, classifier_runs, dataflow, dataflow_with,
-    operator, program, project, run, script, skipped, swap, text, unique_name, wait_until,
+    A_FEW_GRASPS, FAST_FOREVER, Graph, HAND, MODEL, NODES, RECORDING, REPORTS, blindgrasp, classifier_runs, dataflow,
+    dataflow_with, operator, program, project, run, script, skipped, swap, text, unique_name, wait_until,
 };
 
-const A_FEW_GRASPS: usize = 20;
 /// It names the terminal's window, rings, clears the screen, and turns text around.
 const EVIL: &str = "\u{1b}]0;own\u{7}\u{1b}[2J\u{9b}1m\u{202e}";
-
-fn utf8(path: &Path) -> &str {
-    path.to_str().expect("UTF-8")
-}
 
 /// The files of a graph: its folder with all that is in it.
 fn files_of(name: &str) -> Vec<PathBuf> {
@@ -45,7 +41,7 @@ fn files_of(name: &str) -> Vec<PathBuf> {
 #[test]
 fn another_user_cannot_touch_a_running_graph() {
     let folder = tempfile::tempdir().expect("a folder");
-    let graph = Graph::start(&dataflow(folder.path(), &[]), &FAST_FOREVER);
+    let graph = Graph::fast();
     let files = files_of(&graph.name[..graph.name.len().min(11)]);
     assert!(files.len() > 20, "{files:?}");
     for path in &files {
@@ -229,28 +225,24 @@ run(Description("chatterer", "", ("feature", GraspFeature), ("prediction", Predi
 fn a_printed_line_is_a_line_of_the_log_and_no_report() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("chatterer.py");
-    for line in [
-        r#"no object of the name @blindgrasp {"report":"unfit","message":"by a message"}"#,
-        r#"@blindgrasp {"report":"unfit","message":"by a message"}"#,
-        r#"{"report":"unfit","message":"by a message"}"#,
-    ] {
-        let body = format!(
-            "case \"$*\" in *--describe*) ;; *) echo '{line}'; echo '{line}' >&2;; esac\nexec {} \"$@\"",
-            operator("classifier")
-        );
-        let in_rust = script(folder.path(), "chatty", &body);
-        let program = CHATTERER.replace("OPERATORS", utf8(&project().join("operators"))).replace("LINE", line);
-        std::fs::write(&path, program).expect("written");
-        let in_python = script(folder.path(), "chatterer", &format!("exec python3 -B {} \"$@\"", path.display()));
-        for (program, params) in [(in_rust, format!("{{model: {MODEL}}}")), (in_python, "{}".to_owned())] {
-            let flow = dataflow_with(folder.path(), &[classifier_runs(&program, &params)]);
-            let graph = Graph::start(&flow, &FAST_FOREVER);
-            let log = || text(&run(&["logs", "classifier", "--graph", &graph.name], 0).stdout);
-            wait_until(|| log().matches(line).count() >= 2, log);
-            graph.wait_for_decisions(2);
-            let ended = graph.stop();
-            assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-        }
+    let report = r#"{"report":"unfit","message":"by a message"}"#;
+    let lines = format!("no object of the name @blindgrasp {report}\n@blindgrasp {report}\n{report}");
+    let body = format!(
+        "case \"$*\" in *--describe*) ;; *) echo '{lines}'; echo '{lines}' >&2;; esac\nexec {} \"$@\"",
+        operator("classifier")
+    );
+    let in_rust = script(folder.path(), "chatty", &body);
+    let program = CHATTERER.replace("OPERATORS", utf8(&project().join("operators"))).replace("LINE", &lines);
+    std::fs::write(&path, program).expect("written");
+    let in_python = script(folder.path(), "chatterer", &format!("exec python3 -B {} \"$@\"", path.display()));
+    for (program, params) in [(in_rust, format!("{{model: {MODEL}}}")), (in_python, "{}".to_owned())] {
+        let flow = dataflow_with(folder.path(), &[classifier_runs(&program, &params)]);
+        let graph = Graph::start(&flow, &FAST_FOREVER);
+        let log = || text(&run(&["logs", "classifier", "--graph", &graph.name], 0).stdout);
+        wait_until(|| log().matches(report).count() >= 2 * 3, log);
+        graph.wait_for_decisions(2);
+        let ended = graph.stop();
+        assert_eq!(ended.code, Some(0), "{}", ended.stderr);
     }
 }
 

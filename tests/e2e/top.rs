@@ -8,9 +8,7 @@ use std::os::unix::process::CommandExt;
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
 
-use crate::common::{
-    FAST_FOREVER, Graph, NODES, blindgrasp, json_lines, project, run, signal, text, unique_name, wait_until,
-};
+use crate::common::{Graph, NODES, blindgrasp, fails, json_lines, run, signal, text, unique_name, wait_until};
 use crate::over_ssh::Sshd;
 use rustix::process::Signal;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
@@ -121,13 +119,9 @@ fn size(rows: u16, columns: u16) -> Winsize {
     Winsize { ws_row: rows, ws_col: columns, ws_xpixel: 0, ws_ypixel: 0 }
 }
 
-fn graph() -> Graph {
-    Graph::start(&project().join("dataflow.yaml"), &FAST_FOREVER)
-}
-
 #[test]
 fn a_person_watches_a_graph() {
-    let graph = graph();
+    let graph = Graph::fast();
     let mut top = OnTerminal::start(&[&graph.name, "--interval", "0.2"], 24, 80);
     top.wait_for("LIFT");
     let text = top.text();
@@ -178,7 +172,7 @@ fn a_person_watches_a_graph() {
 
 #[test]
 fn restarts_a_silent_launcher_and_the_end_are_seen() {
-    let graph = graph();
+    let graph = Graph::fast();
     let top = OnTerminal::start(&[&graph.name, "--interval", "0.1"], 24, 80);
     top.wait_for("lift_arbiter/decision → run");
     let restarts = |text: &str| {
@@ -205,8 +199,8 @@ fn restarts_a_silent_launcher_and_the_end_are_seen() {
 }
 
 #[test]
-fn every_terminal_size_works() {
-    let graph = graph();
+fn every_terminal_size_works_and_any_end_gives_the_terminal_back() {
+    let graph = Graph::fast();
     for (rows, columns) in [(1, 1), (2, 20), (10, 40), (60, 250)] {
         let mut top = OnTerminal::start(&[&graph.name, "--interval", "0.1"], rows, columns);
         top.wait_for(&graph.name[..1]);
@@ -217,29 +211,16 @@ fn every_terminal_size_works() {
         top.press("q");
         top.finish(Some(0));
     }
-    graph.stop();
-}
-
-#[test]
-fn a_signal_gives_the_terminal_back() {
-    let graph = graph();
-    for end in [Signal::TERM, Signal::HUP, Signal::INT] {
-        let top = OnTerminal::start(&[&graph.name], 24, 80);
+    for end in [Some(Signal::TERM), Some(Signal::HUP), Some(Signal::INT), None] {
+        let mut top = OnTerminal::start(&[&graph.name], 24, 80);
         top.wait_for("q quit");
-        signal(top.child.id() as i32, end);
+        match end {
+            Some(end) => signal(top.child.id() as i32, end),
+            None => top.press("\u{3}"),
+        }
         top.finish(Some(0));
     }
-    let mut top = OnTerminal::start(&[&graph.name], 24, 80);
-    top.wait_for("q quit");
-    top.press("\u{3}");
-    top.finish(Some(0));
-    graph.stop();
-}
-
-#[test]
-fn top_ends_with_its_terminal() {
-    let graph = graph();
-    // Before it has begun to draw, and while it does.
+    // It ends with its terminal, before it has begun to draw, and while it does.
     for millis in [0, 100, 600] {
         let (terminal, line, _, mut child) = start(blindgrasp(), &[&graph.name, "--interval", "0.1"], 24, 80);
         std::thread::sleep(std::time::Duration::from_millis(millis));
@@ -258,7 +239,7 @@ fn top_ends_with_its_terminal() {
 
 #[test]
 fn a_script_reads_a_line_an_interval() {
-    let graph = graph();
+    let graph = Graph::fast();
     graph.wait_for_decisions(50);
     let output = run(&["top", &graph.name, "--json", "-n", "2", "--interval", "0.3"], 0);
     let lines = json_lines(&output.stdout);
@@ -296,27 +277,8 @@ fn a_script_reads_a_line_an_interval() {
     child.stdout.take().expect("piped").read_exact(&mut begun).expect("a line");
     let ended = child.wait_with_output().expect("waited");
     assert_eq!((ended.status.code(), text(&ended.stderr).as_str()), (Some(0), ""));
-    graph.stop();
-}
 
-#[test]
-fn top_without_a_graph_or_a_terminal_is_refused() {
-    let name = unique_name();
-    let output = run(&["top", &name, "--json"], 1);
-    assert!(text(&output.stderr).contains(&format!("no graph '{name}' is running")), "{}", text(&output.stderr));
-    let output = run(&["top", &name], 1);
-    assert!(text(&output.stderr).contains("stdout is no terminal"), "{}", text(&output.stderr));
-    assert!(text(&output.stderr).contains("--json"), "{}", text(&output.stderr));
-    let top = OnTerminal::start(&[&name], 24, 80);
-    top.wait_for(&format!("no graph '{name}' is running"));
-    top.finish(Some(1));
-    run(&["top", "--interval", "0", "--json"], 2);
-    run(&["top", "-n", "0", "--json"], 2);
-}
-
-#[test]
-fn a_script_sees_the_graph_end() {
-    let graph = graph();
+    // The graph ends.
     let mut command = blindgrasp();
     command.args(["top", &graph.name, "--json", "--interval", "0.1"]).stdout(Stdio::piped()).stderr(Stdio::piped());
     let child = command.spawn().expect("started");
@@ -330,9 +292,22 @@ fn a_script_sees_the_graph_end() {
 }
 
 #[test]
+fn top_without_a_graph_or_a_terminal_is_refused() {
+    let name = unique_name();
+    fails(&["top", &name, "--json"], &format!("no graph '{name}' is running"));
+    fails(&["top", &name], "stdout is no terminal");
+    fails(&["top", &name], "--json");
+    let top = OnTerminal::start(&[&name], 24, 80);
+    top.wait_for(&format!("no graph '{name}' is running"));
+    top.finish(Some(1));
+    run(&["top", "--interval", "0", "--json"], 2);
+    run(&["top", "-n", "0", "--json"], 2);
+}
+
+#[test]
 fn a_person_watches_a_graph_over_ssh() {
     let Some(sshd) = Sshd::start() else { return };
-    let graph = graph();
+    let graph = Graph::fast();
     let there = [&graph.name, "--machine", "brain", "--interval", "0.2"];
     let mut top = OnTerminal::of(sshd.blindgrasp(), &there, 24, 80);
     top.wait_for("LIFT");

@@ -2,8 +2,9 @@
 
 use std::path::Path;
 
-use crate::common::live::{Bridge, changed, free_port, grasps, live_dataflow};
-use crate::common::{Graph, HAND, MODEL, dataflow, json_lines, project, run, text, unique_name, wait_until};
+use crate::common::live::{PATIENT, changed, grasps, listening};
+use crate::common::python::utf8;
+use crate::common::{Graph, HAND, MODEL, dataflow, json_lines, json_of, project, run, text, wait_until};
 use crate::import::pincer;
 use blindgrasp_messages::{Header, Phase, Stamped, TactileFrame};
 use blindgrasp_stages::own_lifts::Adapt;
@@ -11,10 +12,6 @@ use blindgrasp_stages::{Hand, Judge, Model};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde_json::{Value, json};
-
-fn utf8(path: &Path) -> &str {
-    path.to_str().expect("UTF-8")
-}
 
 /// The lines of a bridge: grasps of a pincer that holds an object the likelier, the more force there is on the first cell.
 /// `drops` is the part of the objects that fall although they should not. Each object is lifted five times.
@@ -65,8 +62,7 @@ fn the_outcomes_of_a_bridge_are_labels_and_correct_a_model() {
     let model = at("model.json");
     run(&["train", &known, "--hand", &hand, "--words", "2", "--drop-secs", "60", "--out", &model], 0);
     for (recording, n_grasps, n_objects) in [(&own, 300, 60), (&nameless, 60, 60)] {
-        let shown: Value =
-            serde_json::from_slice(&run(&["info", recording, "--hand", &hand, "--json"], 0).stdout).expect("JSON");
+        let shown = json_of(&["info", recording, "--hand", &hand, "--json"]);
         assert_eq!(shown["n_with_truth"], n_grasps);
         assert_eq!(shown["objects"].as_object().map(serde_json::Map::len), Some(n_objects));
     }
@@ -102,7 +98,7 @@ fn the_outcomes_of_a_bridge_are_labels_and_correct_a_model() {
     let (said, _) = adapt(&model, &own, 0);
     assert!(said.contains("by 300 lifts of 60 objects on this robot"), "{said}");
     assert!(said.contains("when settled, log-odds are"), "{said}");
-    let shown: Value = serde_json::from_slice(&run(&["model", "show", &adapted, "--json"], 0).stdout).expect("JSON");
+    let shown = json_of(&["model", "show", &adapted, "--json"]);
     let lifts = &shown["training"]["own_lifts"];
     let number = |name: &str| lifts[name].as_f64().expect("a number");
     assert!(number("log_loss_after") < number("log_loss_before"), "{lifts}");
@@ -174,19 +170,15 @@ fn decision(line: &Value) -> (u64, String, f64) {
 fn a_graph_learns_from_its_lifts_through_kills_and_swaps() {
     const N_GRASPS: u64 = 120;
     let folder = tempfile::tempdir().expect("a folder");
-    let port = free_port();
-    let params = format!("driver: listen\n      address: 127.0.0.1:{port}\n      max_delay_ms: 20000");
-    let flow = live_dataflow(folder.path(), &params);
     let recorded = folder.path().join("lifts.mcap");
     let settings =
         ["--set", "lift_arbiter.promised_drops=1", "--set", "classifier.adapt=on", "--record", utf8(&recorded)];
-    let graph = Graph::launch(&unique_name(), &flow, &settings);
-    wait_until(|| graph.said().contains("listening on"), || graph.said());
+    let (graph, mut bridge) = listening(&[PATIENT], &settings);
     let hand = Hand::load(&project().join(HAND)).expect("a hand");
     let model = Model::load(&project().join(MODEL)).expect("a model");
     let mut judge = Judge::new(hand.clone(), model).expect("of one hand");
     judge.adapt(Adapt::On);
-    let (mut bridge, mut expected) = (Bridge::connect(port), Vec::new());
+    let mut expected = Vec::new();
     let frames = with_outcomes(N_GRASPS);
     let mut tell =
         |judge: &mut Judge, grasps: std::ops::Range<u64>| {

@@ -8,7 +8,7 @@ use serde_json::Value;
 
 fn reproduce(folder: &Path, seed: &str) -> Output {
     Command::new(project().join("scripts/reproduce"))
-        .args([folder.to_str().expect("UTF-8"), "300", "2", seed])
+        .args([folder.to_str().expect("UTF-8"), "150", "2", seed])
         .env("BLINDGRASP", blindgrasp().get_program())
         .output()
         .expect("started")
@@ -22,10 +22,10 @@ fn tables_and_figures_are_made_once_and_an_interrupted_run_goes_on() {
     let tables = text(&first.stdout);
     assert!(first.status.success(), "{}", text(&first.stderr));
     let expected =
-        ["grasp; Dang & Allen; 12320: 81.0 %, 8.6 %", "class; joints; 300: ", "Table III", "Table IV", "10 of 10"];
+        ["grasp; Dang & Allen; 12320: 81.0 %, 8.6 %", "class; joints; 150: ", "Table III", "Table IV", "10 of 10"];
     assert!(expected.iter().all(|part| tables.contains(part)), "{tables}");
     // Three splits, three recipes.
-    assert_eq!(tables.matches("; 300: ").count(), 9, "{tables}");
+    assert_eq!(tables.matches("; 150: ").count(), 9, "{tables}");
     let svg = std::fs::read_to_string(folder.join("figures/figure-1.svg")).expect("a figure");
     assert!(svg.starts_with("<svg ") && svg.trim_end().ends_with("</svg>"), "{svg}");
     let scores = std::fs::read_to_string(folder.join("figures/figure-2.csv")).expect("points");
@@ -49,5 +49,5 @@ fn tables_and_figures_are_made_once_and_an_interrupted_run_goes_on() {
 
     let refused = reproduce(&folder, "2");
     assert_eq!(refused.status.code(), Some(1));
-    assert!(text(&refused.stderr).contains("was begun with 300 grasps, 2 trials, seed 1"), "{}", text(&refused.stderr));
+    assert!(text(&refused.stderr).contains("was begun with 150 grasps, 2 trials, seed 1"), "{}", text(&refused.stderr));
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
 
-use crate::common::{MODEL, blindgrasp, run, text};
+use crate::common::{MODEL, blindgrasp, fails, json_of, run, text};
 use serde_json::Value;
 
 /// Four parts of 15 grasps and one of 3.
@@ -70,8 +70,7 @@ fn one_run_shards_and_an_interrupted_run_give_the_same_bytes() {
 
     let other_seed: Vec<&str> =
         arguments(&options, &stopped).into_iter().map(|word| if word == "3" { "4" } else { word }).collect();
-    let refused = run(&other_seed, 1);
-    assert!(text(&refused.stderr).contains("options.seed is 3, now it is 4"), "{}", text(&refused.stderr));
+    fails(&other_seed, "options.seed is 3, now it is 4");
 }
 
 #[test]
@@ -81,8 +80,8 @@ fn info_adds_up_and_agrees_with_the_simulations_report() {
     let data = folder.path().join("data").to_str().expect("UTF-8").to_string();
     let mut arguments = arguments(&options, &data);
     arguments.push("--json");
-    let report: Value = serde_json::from_slice(&run(&arguments, 0).stdout).expect("JSON");
-    let info: Value = serde_json::from_slice(&run(&["info", &data, "--json"], 0).stdout).expect("JSON");
+    let report = json_of(&arguments);
+    let info = json_of(&["info", &data, "--json"]);
     assert_eq!((&info["n_grasps"], &info["n_with_truth"], &info["n_recordings"]), (&63.into(), &63.into(), &5.into()));
     assert_eq!(info["n_stable"], report["n_stable"]);
     assert_eq!(info["n_stable"], 30, "0.48 of 63, rounded");
@@ -135,7 +134,7 @@ fn the_best_of_several_planned_approaches_is_better_than_the_first() {
         let (options, out) = (at("options.yaml"), at("planned.mcap"));
         let arguments: Vec<&str> =
             arguments.split(' ').chain(["--options", options.as_str(), "--overwrite", "--out", out.as_str()]).collect();
-        let report: Value = serde_json::from_slice(&run(&arguments, 0).stdout).expect("JSON");
+        let report = json_of(&arguments);
         report["n_stable"].as_u64().expect("a count")
     };
     let (first, best) = (n_stable(1), n_stable(16));
@@ -163,8 +162,7 @@ fn options_show_the_label() {
     let own = printed(&["--thresholds", "0.03,0.02"]);
     assert!(own.contains("epsilon: 0.03") && own.contains("volume: 0.02"), "{own}");
     let both = ["simulate", "--label", "lift", "--thresholds", "0.03,0.02", "--out", "x.mcap"];
-    let refused = run(&both, 1);
-    assert!(text(&refused.stderr).contains("option thresholds is set"), "{}", text(&refused.stderr));
+    fails(&both, "option thresholds is set");
 }
 
 #[test]
@@ -176,7 +174,7 @@ fn recordings_of_lifts_are_named_as_such_by_every_command() {
     let said = run(&arguments, 0);
     assert!(text(&said.stdout).contains("kept while lifted and shaken"), "{}", text(&said.stdout));
 
-    let info: Value = serde_json::from_slice(&run(&["info", &out, "--json"], 0).stdout).expect("JSON");
+    let info = json_of(&["info", &out, "--json"]);
     assert_eq!(info["labels"], serde_json::json!(["lift"]));
     let own = info["metadata"]["simulation"]["report"].as_str().expect("the simulation's report");
     assert_eq!(serde_json::from_str::<Value>(own).expect("JSON")["label"], "lift");
@@ -187,8 +185,7 @@ fn recordings_of_lifts_are_named_as_such_by_every_command() {
     assert!(printed.contains("label: lift (stable: kept"), "{printed}");
     let model = folder.path().join("model.json");
     let frictions = ["train", &out, "--frictions", "0.5,1", "--out", model.to_str().expect("UTF-8")];
-    let refused = run(&frictions, 1);
-    assert!(text(&refused.stderr).contains("its truth is that of lifts"), "{}", text(&refused.stderr));
+    fails(&frictions, "its truth is that of lifts");
     let by_wrench_space = ["train", &out, "--label", "wrench-space", "--frictions", "1", "--out", "x.json"];
     let refused = run(&by_wrench_space, 2);
     assert!(text(&refused.stderr).contains("cannot be used with"), "{}", text(&refused.stderr));
@@ -199,8 +196,7 @@ fn objects_are_listed_and_written() {
     let folder = tempfile::tempdir().expect("a folder");
     let out = folder.path().join("bottles");
     let out = out.to_str().expect("UTF-8");
-    let listed: Value =
-        serde_json::from_slice(&run(&["simulate", "--list", "--objects", "bottle", "--json"], 0).stdout).expect("JSON");
+    let listed = json_of(&["simulate", "--list", "--objects", "bottle", "--json"]);
     let listed = listed.as_array().expect("a list");
     let table = text(&run(&["simulate", "--list", "--objects", "bottle"], 0).stdout);
     assert_eq!(table.lines().count(), listed.len() + 1);
@@ -232,8 +228,7 @@ fn objects_are_listed_and_written() {
     run(&["simulate", "--list", "--objects", "bottle", "--out", out], 0);
     assert!(first == files(), "the same bytes again");
     // The written folder is a folder of meshes.
-    let back = run(&["simulate", "--list", "--objects", out, "--json"], 0).stdout;
-    let back: Value = serde_json::from_slice(&back).expect("JSON");
+    let back = json_of(&["simulate", "--list", "--objects", out, "--json"]);
     for (found, written) in back.as_array().expect("a list").iter().zip(listed) {
         for field in ["name", "class", "mass_kg", "split", "size_m"] {
             assert_eq!(found[field], written[field]);

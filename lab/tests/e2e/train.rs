@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
-use crate::common::{MODEL, RECORDING, blindgrasp, example, paper_model, project, run, text};
+use crate::common::{MODEL, RECORDING, blindgrasp, example, json_of, paper_model, project, run, text};
 use crate::import::pincer;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -27,7 +27,7 @@ fn every_recipe_makes_a_model_that_says_how_it_was_made() {
         let out = folder.path().join(format!("{recipe}.json"));
         let out = out.to_str().expect("UTF-8");
         run(&["train", RECORDING, "--recipe", recipe, "--overwrite", "--out", out], 0);
-        let shown: Value = serde_json::from_slice(&run(&["model", "show", out, "--json"], 0).stdout).expect("JSON");
+        let shown = json_of(&["model", "show", out, "--json"]);
         assert_eq!((&shown["recipe"]["name"], &shown["predictor"]["kind"]), (&recipe.into(), &kind.into()));
         run(&["evaluate", out, OTHER_RECORDING], 0);
     }
@@ -71,8 +71,7 @@ fn several_frictions_give_a_probability_over_them() {
         let out = folder.path().join(name);
         let out = out.to_str().expect("UTF-8");
         run(&[&["train", RECORDING, "--overwrite", "--out", out], more].concat(), 0);
-        let evaluation: Value =
-            serde_json::from_slice(&run(&["evaluate", out, judged, "--json"], 0).stdout).expect("JSON");
+        let evaluation = json_of(&["evaluate", out, judged, "--json"]);
         evaluation["score"]["n_lift"].as_u64().expect("a count")
     };
     // Smooth objects slip, and rough ones do not: with more friction, more grasps are lifted.
@@ -183,7 +182,7 @@ fn a_promise_about_drops_holds_for_new_objects_or_nothing_is_lifted() {
         assert!(printed.contains(promised) && printed.contains(" of the lifted objects kept, "), "{printed}");
         let shown = run(&["model", "show", &model], 0);
         assert!(text(&shown.stdout).contains(promised), "{}", text(&shown.stdout));
-        let shown: Value = serde_json::from_slice(&run(&["model", "show", &model, "--json"], 0).stdout).expect("JSON");
+        let shown = json_of(&["model", "show", &model, "--json"]);
         let promise = &shown["training"]["policies"][0]["promise"];
         let at_most = promise["drops_of_lifts"]["at_most"].as_f64().expect("a bound");
         assert!(at_most <= most && promise["n_attempts"] == 20, "{promise}");
@@ -255,7 +254,7 @@ fn a_look_that_cannot_keep_the_promise_never_lifts() {
     let (stdout, stderr) = (text(&trained.stdout), text(&trained.stderr));
     assert!(stderr.contains("not lifted: when the hand is settled, the strictest threshold promises"), "{stderr}");
     assert!(stdout.contains("never stable, unsure from"), "{stdout}");
-    let shown: Value = serde_json::from_slice(&run(&["model", "show", &model, "--json"], 0).stdout).expect("JSON");
+    let shown = json_of(&["model", "show", &model, "--json"]);
     let policies = shown["training"]["policies"].as_array().expect("policies");
     assert_eq!(policies.iter().map(|policy| &policy["look"]).collect::<Vec<_>>(), ["squeezed"]);
     assert_eq!(policies[0]["promise"]["drops_of_lifts"]["at_most"], 0.12, "{policies:?}");

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use crate::common::{
-    Graph, assert_nothing_left, blindgrasp, json_lines, project, run, shared_folder, signal, stubborn_classifier, text,
-    unique_name,
+    Graph, assert_nothing_left, blindgrasp, fails, json_lines, json_of, project, run, shared_folder, signal,
+    stubborn_classifier, text, unique_name,
 };
 use rustix::process::Signal;
 use serde_json::Value;
@@ -20,11 +20,6 @@ fn flow(folder: &Path) -> PathBuf {
     );
     let probe = "${PROBE:-test_lift}";
     trial_flow(folder, "trials: 6, attempts: 2", &[(probe, "none"), (classifier, &stubborn)])
-}
-
-/// The project's trials as they are, with their probes, on the same objects.
-fn probing_flow(folder: &Path) -> PathBuf {
-    trial_flow(folder, "trials: 4", &[])
 }
 
 /// The project's live graph with a simulated hand, whose nodes may be killed often, and in which no grasp is stale, even on a
@@ -176,41 +171,26 @@ fn without_the_gate_every_grasp_is_lifted() {
     assert!(reasons.contains_key("no_agreement") && !reasons.contains_key("stale"), "{summary}");
 }
 
+/// With the project's probes, and while it lifts and asks.
 #[test]
-fn a_hand_that_is_killed_goes_on_where_it_was() {
-    assert_killed_hand_goes_on(&made().flow, &made().run.outcomes, (4, 2), &["lift_arbiter"]);
-}
-
-#[test]
-fn a_hand_that_is_killed_with_its_classifier_and_arbiter_amid_probes_goes_on_where_it_was() {
+fn a_hand_that_is_killed_with_its_classifier_and_arbiter_goes_on_where_it_was() {
     let folder = tempfile::tempdir().expect("a folder");
-    let flow = probing_flow(folder.path());
+    let flow = trial_flow(folder.path(), "trials: 4, watch: 'on'", &[]);
     let Run { outcomes, summary, decisions } = run_to_end(&flow, &[]);
+    let of = |action: &str| decisions.iter().filter(|line| line["action"] == action).collect::<Vec<_>>();
+    let (lifts, asked, n_answers) = (of("lift"), of("test_lift"), of("go_on").len());
     let n_probed = outcomes.iter().filter(|outcome| outcome["probed"] == true).count();
-    let asked: Vec<&Value> = decisions.iter().filter(|line| line["action"] == "test_lift").collect();
-    let n_asked = asked.len();
     // A tight hand waits for the answer once more before its test lift.
     let grasps: BTreeSet<u64> = asked.iter().filter_map(|line| line["grasp_id"].as_u64()).collect();
+    let n_asked = asked.len();
     assert!(n_probed > 0 && n_probed == grasps.len() && n_asked > n_probed, "{n_probed}, {n_asked}: {summary}");
     assert!(n_asked <= 2 * n_probed && summary["probes"] == n_asked, "{n_asked}: {summary}");
     // A lift follows a probe, and each grasp is decided once beside it.
     assert!(outcomes.iter().all(|outcome| outcome["probed"] == true || outcome["lifted"] == false), "{outcomes:?}");
-    assert_eq!(decisions.len(), n_asked + outcomes.len(), "{decisions:?}");
-    assert_killed_hand_goes_on(&flow, &outcomes, (3, 1), &["lift_arbiter", "classifier"]);
-}
-
-#[test]
-fn a_hand_that_is_killed_with_its_arbiter_while_it_lifts_and_asks_goes_on_where_it_was() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let flow = trial_flow(folder.path(), "trials: 4, watch: 'on'", &[]);
-    let Run { outcomes, summary, decisions } = run_to_end(&flow, &[]);
-    let lifts: Vec<&Value> = decisions.iter().filter(|line| line["action"] == "lift").collect();
-    let n_answers = decisions.iter().filter(|line| line["action"] == "go_on").count();
+    assert_eq!(lifts.len() + of("hold").len(), outcomes.len(), "{decisions:?}");
+    assert_eq!(summary["lift"], lifts.len(), "{summary}");
     // A lift takes 4 s, in which the hand asks five times a second; a thing that is lost at once ends it.
     assert!(!lifts.is_empty() && n_answers >= 10, "{n_answers} answers, {} lifts: {summary}", lifts.len());
-    let n_decided = decisions.iter().filter(|line| line["action"] == "lift" || line["action"] == "hold").count();
-    assert_eq!(n_decided, outcomes.len(), "{decisions:?}");
-    assert_eq!(summary["lift"], lifts.len(), "{summary}");
     assert_killed_hand_goes_on(&flow, &outcomes, (3, 1), &["lift_arbiter", "classifier"]);
 }
 
@@ -240,11 +220,10 @@ fn recorded_trials_are_replayed_with_the_same_decisions() {
     let ordinary = ordinary.to_str().expect("UTF-8");
     run(&["run", ordinary, "--name", &name, "--set", &play, "--record", again], 0);
     for recording in [recording, again] {
-        let info: Value = serde_json::from_slice(&run(&["info", recording, "--json"], 0).stdout).expect("JSON");
+        let info = json_of(&["info", recording, "--json"]);
         assert_eq!(info["labels"], serde_json::json!(["lift"]), "{recording}");
         let model = folder.path().join("model.json");
         let frictions = ["train", recording, "--frictions", "0.5,1", "--out", model.to_str().expect("UTF-8")];
-        let refused = run(&frictions, 1);
-        assert!(text(&refused.stderr).contains("its truth is that of lifts"), "{}", text(&refused.stderr));
+        fails(&frictions, "its truth is that of lifts");
     }
 }

@@ -236,16 +236,6 @@ fn stranger(id: Option<&Session>, endpoints: &Endpoints) -> Stranger {
     Stranger::new(stranger_as(id.map(|session| session.zid().to_string()), endpoints, json!({}), 2))
 }
 
-#[test]
-fn two_machines_and_a_stranger() {
-    let (folder, endpoint) = (keys(&["robot", "brain", "laptop"]), tcp());
-    let folder = folder.path();
-    let brain = Link::open("brain", "robot", listen(&endpoint), folder, 1);
-    let robot = Link::open("robot", "brain", connect(&endpoint), folder, 2);
-    let strangers = [None, Some(&robot.session)].map(|id| stranger(id, &connect(&endpoint)));
-    check("two machines", folder, robot, brain, &strangers);
-}
-
 /// Robot listens and dials brain. Strangers dial both, with their own Zenoh ids and with those of the machines.
 #[test]
 fn two_machines_that_listen_and_a_stranger() {

@@ -17,7 +17,7 @@ use time::OffsetDateTime;
 use zenoh::qos::CongestionControl;
 use zenoh::{Session, Wait};
 
-use crate::common::unique_name;
+use crate::common::{json_of, unique_name};
 
 /// Long enough for any machine; nothing waits that long unless it fails.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -565,8 +565,7 @@ fn the_command_makes_shows_renews_and_rotates_keys() {
     let mode = |file: &str| std::fs::metadata(folder.join(file)).expect("there").permissions().mode() & 0o777;
     let read = |file: &str| std::fs::read_to_string(folder.join(file)).expect("there");
     let shown = || {
-        let shown = crate::common::run(&["keys", path, "--show", "--json"], 0);
-        let shown: Value = serde_json::from_slice(&shown.stdout).expect("JSON");
+        let shown = json_of(&["keys", path, "--show", "--json"]);
         shown["certificates"].as_array().expect("a list").clone()
     };
 

@@ -10,7 +10,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use crate::common::live::{free_port, grasps, live_dataflow};
 use crate::common::python::python;
-use crate::common::{Graph, RECORDING, project, run, undisturbed, unique_name, wait_until};
+use crate::common::{Graph, RECORDING, dataflow, project, run, undisturbed, unique_name, wait_until};
 use blindgrasp_messages::{Action, GraspTruth, Recorded, Stamped, TactileFrame, of_each_type};
 use blindgrasp_recording::cdr;
 use blindgrasp_ros::definition::Definition;
@@ -530,17 +530,12 @@ fn frames_of_another_hand_are_counted_as_unpublished() {
     let folder = tempfile::tempdir().expect("a folder");
     let hand = project().join("hands/parallel-gripper.yaml");
     let node = format!(
-        "\n  ros2:\n    inputs:\n      tactile: {{from: recorded_source/tactile, policy: latest, capacity: 256}}\n    \
+        "operators:\n  ros2:\n    inputs:\n      tactile: {{from: recorded_source/tactile, policy: latest, capacity: 256}}\n    \
          params: {{hand: {}, listen: tcp/127.0.0.1:{}}}\n    sandbox: on\n",
         hand.display(),
         free_port()
     );
-    let flow = std::fs::read_to_string(project().join("dataflow.yaml")).expect("readable");
-    let absolute =
-        |text: String, part: &str| text.replace(&format!(": {part}/"), &format!(": {}/{part}/", project().display()));
-    let flow = ["hands", "models", "recordings"].iter().fold(flow + &node, |text, part| absolute(text, part));
-    let path = folder.path().join("dataflow.yaml");
-    std::fs::write(&path, flow).expect("written");
+    let path = dataflow(folder.path(), &[("operators:\n", &node)]);
     let graph = Graph::launch(&unique_name(), &path, &["--set", "recorded_source.repeat=forever"]);
     let unpublished = || graph.node("ros2")["counts"]["unpublished"].as_u64().unwrap_or(0);
     wait_until(|| graph.n_decisions() > 5, || graph.said());
@@ -553,49 +548,6 @@ fn frames_of_another_hand_are_counted_as_unpublished() {
     let environment = std::fs::read(format!("/proc/{}/environ", graph.node("ros2")["pid"])).expect("readable");
     assert!(String::from_utf8_lossy(&environment).contains("ZENOH_RUNTIME=(tx: (worker_threads: 1)"));
     graph.stop();
-}
-
-/// The example node, with stand-ins for ROS: it lifts each grasp once, and only while the LIFT is valid.
-#[test]
-fn the_example_node_lifts_only_on_a_fresh_lift() {
-    const ROBOT: &str = "
-import importlib.util, sys, time, types
-from unittest.mock import MagicMock
-class Node:
-    def __init__(self, name): pass
-    def create_subscription(self, message, topic, take, qos): self.topic = topic
-    def get_logger(self): return MagicMock()
-class Time:
-    def __init__(self, nanoseconds): self.nanoseconds = nanoseconds
-    @staticmethod
-    def from_msg(nanos): return Time(nanos)
-class Decision:
-    HOLD, LIFT, SQUEEZE, TEST_LIFT, TIGHTEN, SET_DOWN, GO_ON = 0, 1, 3, 4, 5, 6, 7
-    def __init__(self, grasp_id, action, left_secs):
-        self.grasp_id, self.action, self.reason, self.probability_stable = grasp_id, action, 'stable', 0.9
-        self.valid_until = time.time_ns() + int(left_secs * 1e9)
-for name in ['rclpy', 'rclpy.clock', 'rclpy.executors', 'rclpy.node', 'rclpy.qos', 'rclpy.time', 'blindgrasp_msgs',
-             'blindgrasp_msgs.msg']:
-    sys.modules[name] = MagicMock()
-sys.modules['rclpy.node'].Node = Node
-sys.modules['rclpy.time'].Time = Time
-sys.modules['blindgrasp_msgs.msg'].Decision = Decision
-spec = importlib.util.spec_from_file_location('gate', sys.argv[1])
-gate = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(gate)
-node, lifted = gate.LiftGate(), []
-node.lift = lambda decision: lifted.append(decision.grasp_id)
-for decision in [Decision(1, Decision.HOLD, 60), Decision(2, Decision.LIFT, -1), Decision(3, Decision.LIFT, 0),
-                 Decision(4, Decision.LIFT, 60), Decision(4, Decision.LIFT, 60), Decision(5, Decision.SQUEEZE, 60),
-                 Decision(6, Decision.TEST_LIFT, 60), Decision(4, Decision.TIGHTEN, 60), Decision(7, Decision.LIFT, 60)]:
-    node.on_decision(decision)
-print(node.topic, lifted)
-";
-    let example = project().join("examples/ros2_lift_gate.py");
-    let output = Command::new(python()).args(["-c", ROBOT]).arg(example).env("PYTHONDONTWRITEBYTECODE", "1").output();
-    let output = output.expect("started");
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(String::from_utf8_lossy(&output.stdout).trim(), "/blindgrasp/decision [4, 7]", "{said}");
 }
 
 /// Rosbags computes the hashes of types on its own, from its own definitions of ROS 2 Jazzy and from our package.

@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader};
 use std::process::{Child, Stdio};
 
 use crate::common::live::free_port;
-use crate::common::{Graph, blindgrasp, project, run, text, unique_name, wait_until};
+use crate::common::{Graph, blindgrasp, fails, project, run, text, unique_name, wait_until};
 use crate::ros2::Peer;
 use serde_json::Value;
 
@@ -56,8 +56,7 @@ time.sleep(60)
     assert!(said.contains("2 pads, 8 cells"), "{said}");
     let of = |path: &str| std::fs::read_to_string(path).expect("readable");
     assert_eq!(of(&format!("{made}/mine.urdf")), of(&urdf));
-    let mixed = run(&["new", "hand", &format!("{made}2"), "--urdf", &urdf, "--domain", "1"], 1);
-    assert!(text(&mixed.stderr).contains("--domain are of no use to --urdf"), "{}", text(&mixed.stderr));
+    fails(&["new", "hand", &format!("{made}2"), "--urdf", &urdf, "--domain", "1"], "--domain are of no use to --urdf");
 }
 
 struct Running(Child);

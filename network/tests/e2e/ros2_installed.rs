@@ -235,6 +235,9 @@ fn the_package_of_messages_compiles_and_the_gate_of_the_arm_reads_them() {
         // A grasp is lifted once.
         (json!([3, "LIFT", 600]), "grasp 3: LIFT came before, ignored"),
         (json!([4, "TEST_LIFT", 600]), "grasp 4: hold, stable"),
+        (json!([4, "SQUEEZE", 600]), "grasp 4: hold, stable"),
+        (json!([3, "TIGHTEN", 600]), "grasp 3: what to do while the arm lifts is ignored"),
+        (json!([5, "LIFT", 600]), "grasp 5: lift, probability 0.90"),
     ] {
         writeln!(stdin, "{decision}").expect("written");
         let mut said = String::new();

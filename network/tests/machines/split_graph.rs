@@ -237,27 +237,3 @@ fn a_brain_that_answers_no_samples_is_cut_off_and_the_hands_side_goes_on() {
         assert!(line["action"] == "hold" || undisturbed["action"] == "lift", "{line} {undisturbed}");
     }
 }
-
-#[test]
-fn machines_with_different_files_refuse_each_other_on_both_sides() {
-    let Some(network) = Network::new(&[0, 0]) else { return };
-    let [robot, brain] = &network.hosts[..] else { panic!("two hosts") };
-    let (folder, other) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder"));
-    let flow = split(folder.path(), &plain(brain, DEADLINE_MILLIS), &[]);
-    let different = split(
-        other.path(),
-        &plain(brain, DEADLINE_MILLIS),
-        &[("contacts/contacts}".into(), "{from: contacts/contacts, policy: latest}}".into())],
-    );
-    let brain_part = part(brain, &different, "brain", &[]);
-    let robot_part = part(robot, &flow, "robot", &FOREVER);
-    for (host, part, peer_name) in [(robot, &robot_part, "brain"), (brain, &brain_part, "robot")] {
-        wait_for_state(host, part, peer_name, "refused");
-        let peer = peer(host, part, peer_name);
-        assert!(peer["reason"].as_str().is_some_and(|reason| reason.contains("different dataflow files")), "{peer}");
-        assert!(part.said().contains("different dataflow files"), "{}", part.said());
-    }
-    assert_eq!(robot_part.n_decisions(), 0);
-    stop(robot, robot_part);
-    stop(brain, brain_part);
-}
