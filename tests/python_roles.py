@@ -3,8 +3,8 @@
 
 senses: gives frames the senses of a partner input. watch: has no output, an optional input, and a state; it fails if a sample
 is not there once and in order. hand: a source with a feedback input that sends the frames of a grasp when the grasp before is
-decided. nag: answers silence and the end of the stream. plain: a classifier without a state. fragile: fails on one
-sample, of several that it gets at once. mortal: dies of it.
+decided. nag: answers silence and the end of the stream. plain: a classifier without a state. mortal: dies of one
+sample, of several that it gets at once.
 """
 
 import json
@@ -43,7 +43,6 @@ HAND = Description(
 )
 NAG = Description("nag", "Answers silence", ("tactile", TactileFrame), ("prediction", Prediction), answers_each=False)
 PLAIN = Description("plain", "Judges without a state", ("feature", GraspFeature), ("prediction", Prediction))
-FRAGILE = Description("fragile", "Fails on a sample", ("feature", GraspFeature), ("prediction", Prediction))
 MORTAL = Description("mortal", "Dies of a sample", ("feature", GraspFeature), ("prediction", Prediction))
 # The grasp to which the answers of nag belong.
 NAGS = 1_000_000
@@ -136,23 +135,12 @@ def plain(_params):
     return Stage(lambda head, _items: PredictionHead(grasp_id=head.grasp_id, phase=head.phase, fault=head.fault))
 
 
-def fragile(_params):
-    def fail():
-        raise ValueError("a sample too far")
-
-    return many_but_one(fail)
-
-
 def mortal(_params):
-    return many_but_one(lambda: os.kill(os.getpid(), signal.SIGSEGV))
-
-
-def many_but_one(on_the_one):
     """Answers several samples at once, and none of them if sample 100 is among them."""
 
     def answer_many(heads, _items):
         if any(head.header.seq == 100 for head in heads):
-            on_the_one()
+            os.kill(os.getpid(), signal.SIGSEGV)
         return [PredictionHead(grasp_id=head.grasp_id, phase=head.phase, fault=head.fault) for head in heads]
 
     return Stage(answer_many=answer_many)
@@ -160,5 +148,5 @@ def many_but_one(on_the_one):
 
 if __name__ == "__main__":
     roles = {"senses": (SENSES, senses), "watch": (WATCH, watch), "hand": (HAND, hand), "nag": (NAG, nag),
-             "plain": (PLAIN, plain), "fragile": (FRAGILE, fragile), "mortal": (MORTAL, mortal)}
+             "plain": (PLAIN, plain), "mortal": (MORTAL, mortal)}
     run(*roles[sys.argv[1]])

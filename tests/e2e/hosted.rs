@@ -185,25 +185,6 @@ fn a_program_that_dies_or_hangs_is_started_again_and_ends_with_its_host() {
     assert!(ended.stderr.contains("its program ended (signal: 9 (SIGKILL))"), "{}", ended.stderr);
 }
 
-#[test]
-fn a_sample_that_kills_a_program_among_others_is_found_and_left_out() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let (what, by) = classifier_runs(&role(folder.path()), "{}");
-    let by = by.replace("    params:", "    args: [fragile]\n    params:");
-    // Samples queue up while it starts.
-    let flow = dataflow_with(folder.path(), &[(what, by)]);
-    let graph = Graph::start(&flow, &[&FAST_FOREVER[..], &["--wait-limit", "60"]].concat());
-    let told = "node 'classifier' has died twice on sample 100: the sample is left without an answer";
-    wait_until(|| graph.said().contains(told), || graph.said());
-    graph.wait_for_decisions(A_FEW_GRASPS);
-    let ended = graph.stop();
-    assert_eq!(ended.summary["restarts"], 2, "{}", ended.stderr);
-    let edges = ended.summary["edges"].as_array().expect("edges");
-    let missing = |to: &str| edges.iter().find(|edge| edge["to"] == to).map(|edge| edge["missing"].clone());
-    assert_eq!(missing("lift_arbiter/prediction"), Some(1.into()), "{}", ended.summary);
-    assert_eq!(missing("classifier/feature"), Some(0.into()), "{}", ended.summary);
-}
-
 /// The state of an instance that is long gone must not come back: it names samples that no writer keeps any more.
 #[test]
 fn a_program_without_a_state_leaves_none_to_the_stage_that_takes_its_place() {

@@ -231,15 +231,6 @@ fn ctrl_c_stops_cleanly_with_a_summary() {
 }
 
 #[test]
-fn killing_the_launcher_leaves_no_process_and_no_file() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let graph = Graph::start(&dataflow(folder.path(), &[("rate: 10", "rate: 1")]), &[]);
-    signal(graph.pid(), Signal::KILL);
-    // It asserts that nothing is left.
-    assert_eq!(graph.finish().code, None);
-}
-
-#[test]
 fn a_killed_operator_fails_the_run_by_name_and_the_open_grasp_is_held() {
     for node in NODES {
         let folder = tempfile::tempdir().expect("a folder");

@@ -287,21 +287,6 @@ fn what_is_no_regular_file_is_refused_at_once() {
 }
 
 #[test]
-fn a_process_that_may_open_few_files_says_so() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let flow = dataflow(folder.path(), &[("rate: 10", "rate: max")]);
-    for limit in ["16", "20", "24", "28"] {
-        let mut command = Command::new("prlimit");
-        command.args([&format!("--nofile={limit}"), program(), "run", "--name", &unique_name()]);
-        let state = Path::new(env!("CARGO_TARGET_TMPDIR")).join("state");
-        let output = command.arg(&flow).env("XDG_STATE_HOME", state).current_dir(project()).output().expect("started");
-        let said = text(&output.stderr);
-        assert_eq!(output.status.code(), Some(1), "{limit}: {said}");
-        assert!(said.contains("ulimit -n") || said.contains("Too many open files"), "{limit}: {said}");
-    }
-}
-
-#[test]
 fn a_graph_is_stopped_right_after_its_start() {
     let folder = tempfile::tempdir().expect("a folder");
     let flow = dataflow(folder.path(), &[]);

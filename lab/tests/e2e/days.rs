@@ -254,7 +254,7 @@ fn a_real_hand_on_another_day_is_judged_or_held() {
     });
     let [down, tilted, side, other] = &recordings;
     let judged = |recipe: &str, more: &[&str]| -> Value {
-        let model = at(recipe);
+        let model = at(&format!("{recipe}.json"));
         run(&[&["train", down, tilted, side, "--recipe", recipe, "--out", &model], more].concat(), 0);
         let report = run(&["evaluate", &model, other, "--json"], 0).stdout;
         serde_json::from_slice(&report).expect("JSON")
