@@ -448,8 +448,8 @@ mod tests {
     use blindgrasp_operator::wiring::EdgePolicy;
     use blindgrasp_operator::wiring::{InputWiring, OnLate, ServiceWiring};
 
-    fn parsed(arguments: &[&str]) -> Result<Arguments, clap::Error> {
-        match Cli::try_parse_from(["blindgrasp", "swap"].iter().chain(arguments))?.command {
+    fn parsed(line: &str) -> Result<Arguments, clap::Error> {
+        match Cli::try_parse_from(["blindgrasp", "swap"].into_iter().chain(line.split_whitespace()))?.command {
             Command::Swap(arguments) => Ok(arguments),
             other => panic!("{other:?}"),
         }
@@ -461,25 +461,9 @@ mod tests {
 
     #[test]
     fn the_request_says_what_the_arguments_say() {
-        let arguments = parsed(&[
-            "classifier",
-            "--set",
-            "model=a=b",
-            "--shadow",
-            "1.5",
-            "--min-agreement",
-            "0.9",
-            "--max-disagreements",
-            "2",
-            "--ready-limit",
-            "0.25",
-            "--run",
-            "/bin/true",
-            "--args",
-            "-v",
-            "--fast",
-        ]);
-        let arguments = arguments.expect("accepted");
+        let line = "classifier --set model=a=b --shadow 1.5 --min-agreement 0.9 --max-disagreements 2 --ready-limit 0.25 \
+                    --run /bin/true --args -v --fast";
+        let arguments = parsed(line).expect("accepted");
         let limits = arguments.promote.limits();
         assert_eq!(
             (limits.min_agreement, limits.max_disagreements, limits.max_latency_p99_micros),
@@ -491,10 +475,10 @@ mod tests {
         assert_eq!((found.ready_limit_millis, found.probation_millis), (250, 2000));
         assert_eq!((found.shadow_limit_millis, found.program), (13_000, Some("/bin/true".into())));
         assert!(found.folder.is_absolute());
-        let two = request(&parsed(&["a", "b", "--run", "/bin/true"]).expect("accepted"));
+        let two = request(&parsed("a b --run /bin/true").expect("accepted"));
         assert!(two.expect_err("two nodes").to_string().contains("one node"));
-        parsed(&["a", "--args", "-v"]).expect_err("arguments of which program?");
-        let missing = parsed(&["a", "--run", "no/such/program"]).expect("accepted");
+        parsed("a --args -v").expect_err("arguments of which program?");
+        let missing = parsed("a --run no/such/program").expect("accepted");
         let found = found_here(request(&missing).expect("consistent")).expect_err("missing");
         assert!(found.to_string().contains("there is no such program"), "{found}");
     }
@@ -502,18 +486,18 @@ mod tests {
     #[test]
     fn arguments_that_cannot_be_meant_are_refused() {
         for wrong in [
-            &["--shadow", "1"][..],
-            &["a", "--min-agreement", "0.9"],
-            &["a", "--shadow", "1", "--min-agreement", "99"],
-            &["a", "--shadow", "1", "--min-agreement", "nan"],
-            &["a", "--shadow", "1", "--max-disagreements", "-1"],
-            &["a", "--shadow", "1", "--max-latency-p99-us", ""],
-            &["a", "--shadow", "0"],
-            &["a", "--set", "model"],
+            "--shadow 1",
+            "a --min-agreement 0.9",
+            "a --shadow 1 --min-agreement 99",
+            "a --shadow 1 --min-agreement nan",
+            "a --shadow 1 --max-disagreements -1",
+            "a --shadow 1 --max-latency-p99-us x",
+            "a --shadow 0",
+            "a --set model",
         ] {
-            parsed(wrong).expect_err(&wrong.join(" "));
+            parsed(wrong).expect_err(wrong);
         }
-        let twice = parsed(&["a", "--set", "x=1", "--set", "x=2"]).expect("accepted");
+        let twice = parsed("a --set x=1 --set x=2").expect("accepted");
         assert!(request(&twice).expect_err("twice").to_string().contains("given twice"));
     }
 
@@ -535,7 +519,7 @@ mod tests {
 
     #[test]
     fn a_swap_ends_with_what_the_graph_says() {
-        let arguments = parsed(&["classifier"]).expect("accepted");
+        let arguments = parsed("classifier").expect("accepted");
         let node = SwappedNode {
             node: "classifier".into(),
             old_pid: 10,
@@ -565,10 +549,10 @@ mod tests {
         let domain = NamespaceWiring { folder: "/nowhere".into() };
         let shadowing = || vec![Reply::Shadowing { domain: domain.clone(), outputs: Vec::new() }];
         let abandoned = || vec![(Request::Abandon, vec![Reply::Abandoned])];
-        let only = parsed(&["a", "--shadow", "0.1"]).expect("accepted");
+        let only = parsed("a --shadow 0.1").expect("accepted");
         let ended = ran("only", &only, abandoned(), shadowing()).expect("compared");
         assert!(matches!(ended, Ended::Compared { .. }), "{ended:?}");
-        let gated = parsed(&["a", "--shadow", "0.1", "--min-agreement", "0"]).expect("accepted");
+        let gated = parsed("a --shadow 0.1 --min-agreement 0").expect("accepted");
         match ran("gated", &gated, abandoned(), shadowing()).expect("compared") {
             Ended::HeldBack { objections, .. } => assert_eq!(objections, ["there is no output to compare"]),
             other => panic!("{other:?}"),

@@ -221,21 +221,10 @@ fn rounded(value: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::tests::block;
+    use crate::tests::{block, inside_out, together};
 
     fn cube() -> Mesh {
         block([0.0; 3], [1.0; 3])
-    }
-
-    fn inside_out(mut mesh: Mesh) -> Mesh {
-        mesh.triangles.iter_mut().for_each(|triangle| triangle.swap(0, 1));
-        mesh
-    }
-
-    fn together(meshes: &[Mesh]) -> Mesh {
-        let mut all = Mesh::default();
-        meshes.iter().for_each(|mesh| all.append(mesh));
-        all
     }
 
     #[test]
@@ -335,14 +324,10 @@ mod tests {
         let mut mesh = cube();
         let halved = mesh.triangles.iter().position(|triangle| triangle.contains(&0) && triangle.contains(&1));
         let halved = halved.expect("a triangle at the edge");
+        while mesh.triangles[halved][2] <= 1 {
+            mesh.triangles[halved].rotate_left(1);
+        }
         let [a, b, c] = mesh.triangles[halved];
-        let [a, b, c] = if a > 1 {
-            [b, c, a]
-        } else if b > 1 {
-            [c, a, b]
-        } else {
-            [a, b, c]
-        };
         mesh.vertices_m.push(Point3::new(0.5, 0.0, 0.0));
         mesh.triangles[halved] = [a, 8, c];
         mesh.triangles.push([8, b, c]);

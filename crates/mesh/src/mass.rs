@@ -258,16 +258,10 @@ mod tests {
 
     use super::*;
     use crate::check::repair;
-    use crate::tests::{block, random_motion};
+    use crate::tests::{block, inside_out, random_motion, together};
 
     fn solid(mesh: Mesh) -> SolidProperties {
         solid_properties(&repair(mesh).0).expect("a solid")
-    }
-
-    fn together(meshes: &[Mesh]) -> Mesh {
-        let mut all = Mesh::default();
-        meshes.iter().for_each(|mesh| all.append(mesh));
-        all
     }
 
     fn assert_near(found: Point3<f64>, expected: [f64; 3], tolerance_m: f64) {
@@ -301,8 +295,7 @@ mod tests {
         assert_eq!(overlap.basis, Basis::OccupiedColumns);
         assert_eq!(overlap.warnings().len(), 1);
 
-        let mut cavity = block([0.25; 3], [0.75, 0.75, 0.5]);
-        cavity.triangles.iter_mut().for_each(|triangle| triangle.swap(0, 1));
+        let cavity = inside_out(block([0.25; 3], [0.75, 0.75, 0.5]));
         let hollow = solid(together(&[block([0.0; 3], [1.0; 3]), cavity]));
         assert!((hollow.volume_m3 - 0.9375).abs() < 1e-14);
         // (1·0.5 - 0.0625·0.375) / 0.9375
@@ -319,8 +312,7 @@ mod tests {
     #[test]
     fn a_surface_through_itself_counts_what_is_within() {
         // One component: an inner wall that passes out through the outer one counts negative in signed sums.
-        let mut inner = block([0.5, 0.25, 0.25], [1.5, 0.75, 0.75]);
-        inner.triangles.iter_mut().for_each(|triangle| triangle.swap(0, 1));
+        let inner = inside_out(block([0.5, 0.25, 0.25], [1.5, 0.75, 0.75]));
         let mesh = together(&[block([0.0; 3], [1.0; 3]), inner]);
         assert!((mesh.signed_volume_m3() - 0.75).abs() < 1e-14);
         let found = solid_properties(&mesh).expect("a solid");
@@ -335,9 +327,7 @@ mod tests {
         assert!((found.volume_m3 - 1.0).abs() < 1e-14);
         assert_near(found.centre_of_mass_m, [0.5; 3], 1e-14);
         // And with an overlap, all of it inside out.
-        let mut overlap = together(&[open, block([0.0, 0.0, 0.5], [1.0, 1.0, 1.5])]);
-        overlap.triangles.iter_mut().for_each(|triangle| triangle.swap(0, 1));
-        let found = solid(overlap);
+        let found = solid(inside_out(together(&[open, block([0.0, 0.0, 0.5], [1.0, 1.0, 1.5])])));
         assert!((found.volume_m3 - 1.5).abs() < 0.0075, "{found:?}");
         assert_near(found.centre_of_mass_m, [0.5, 0.5, 0.75], 0.005);
     }

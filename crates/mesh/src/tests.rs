@@ -19,6 +19,17 @@ pub(crate) fn block(least: [f64; 3], most: [f64; 3]) -> Mesh {
     Mesh { vertices_m, triangles: faces.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]).collect() }
 }
 
+pub(crate) fn inside_out(mut mesh: Mesh) -> Mesh {
+    mesh.triangles.iter_mut().for_each(|triangle| triangle.swap(0, 1));
+    mesh
+}
+
+pub(crate) fn together(meshes: &[Mesh]) -> Mesh {
+    let mut all = Mesh::default();
+    meshes.iter().for_each(|mesh| all.append(mesh));
+    all
+}
+
 /// A turn and a shift.
 pub(crate) fn random_motion(random: &mut ChaCha8Rng) -> Isometry3<f64> {
     let mut vector = || Vector3::from_fn(|_, _| random.random_range(-1.0..1.0));

@@ -11,10 +11,12 @@ fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
+fn header() -> Header {
+    Header { seq: 7, stamp_nanos: 1 << 40, epoch: 3, hand_id: u64::MAX - 1, origin_nanos: 9, ..Header::default() }
+}
+
 fn recorded<M: Recorded>(message: &M) -> Map<String, Value> {
-    let header =
-        Header { seq: 7, stamp_nanos: 1 << 40, epoch: 3, hand_id: u64::MAX - 1, origin_nanos: 9, ..Header::default() };
-    let sample = Stamped { header, message: message.clone() };
+    let sample = Stamped { header: header(), message: message.clone() };
     let mut cdr = Vec::new();
     cdr_encoding::to_writer::<_, byteorder::LittleEndian, _>(&mut cdr, &sample).expect("CDR");
     let wire = bincode::serde::encode_to_vec(&sample, bincode::config::standard()).expect("bincode");
@@ -32,11 +34,9 @@ fn recorded<M: Recorded>(message: &M) -> Map<String, Value> {
 }
 
 fn sent<M: Message + PartialEq>(message: &M) -> Map<String, Value> {
-    let header =
-        Header { seq: 7, stamp_nanos: 1 << 40, epoch: 3, hand_id: u64::MAX - 1, origin_nanos: 9, ..Header::default() };
-    let (head, items) = message.to_parts(header);
+    let (head, items) = message.to_parts(header());
     assert_eq!(M::from_parts(&head, &items).as_ref(), Ok(message));
-    assert_eq!(M::header(&head), &header);
+    assert_eq!(M::header(&head), &header());
     let mut shapes = recorded(message);
     shapes.insert("head".into(), hex(head.as_bytes()).into());
     shapes.insert("items".into(), hex(items.as_bytes()).into());

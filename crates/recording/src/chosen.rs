@@ -131,17 +131,19 @@ mod tests {
     use mcap::records::{MessageHeader, Metadata};
 
     use super::*;
-    use crate::tests::{info, records};
+    use crate::tests::{info, records, write_all};
     use crate::types::{MESSAGE_ENCODING, SCHEMA_ENCODING, encode};
     use crate::writer::{info_metadata, write_options};
-    use crate::{METADATA_NAME, RecordingIndex, RecordingWriter};
+    use crate::{METADATA_NAME, RecordingIndex};
     use blindgrasp_messages::{Prediction, Recorded, Stamped};
 
     const REACHES: [Reach; 2] = [Reach::Whole, Reach::ByIndex];
 
-    /// Writes predictions, each in a chunk of its own, with its topic and its time. Those on `/damaged` are no predictions.
-    fn write_chunks(path: &Path, chunks: &[(&str, u64)]) {
-        let file = std::io::BufWriter::new(std::fs::File::create(path).expect("created"));
+    /// A recording of predictions, each in a chunk of its own, with its topic and its time. Those on `/damaged` are no
+    /// predictions.
+    fn in_chunks(chunks: &[(&str, u64)]) -> tempfile::TempPath {
+        let path = tempfile::NamedTempFile::new().expect("a file").into_temp_path();
+        let file = std::io::BufWriter::new(std::fs::File::create(&path).expect("created"));
         let mut writer = write_options().create(file).expect("begun");
         let metadata = Metadata { name: METADATA_NAME.into(), metadata: info_metadata(&info()) };
         writer.write_metadata(&metadata).expect("written");
@@ -161,7 +163,8 @@ mod tests {
             writer.flush().expect("flushed");
         }
         writer.finish().expect("finished");
-        assert_eq!(RecordingIndex::open(path).expect("opened").n_chunks, chunks.len() as u64);
+        assert_eq!(RecordingIndex::open(&path).expect("opened").n_chunks, chunks.len() as u64);
+        path
     }
 
     fn open(path: &Path, topic: &'static str, reach: Reach) -> ChosenSamples {
@@ -185,9 +188,7 @@ mod tests {
     fn chosen_samples_are_those_of_the_whole_recording() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("all.mcap");
-        let mut writer = RecordingWriter::create(&path, &info()).expect("created");
-        records().iter().for_each(|(topic, record)| writer.write_record(topic, record).expect("written"));
-        writer.finish().expect("finished");
+        write_all(&path);
         for (topic, record) in records() {
             for reach in REACHES {
                 let mut samples = open(&path, topic, reach);
@@ -201,9 +202,7 @@ mod tests {
 
     #[test]
     fn samples_of_other_topics_are_not_decoded() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("undecodable.mcap");
-        write_chunks(&path, &[("/a", 0), ("/damaged", 1), ("/a", 2)]);
+        let path = in_chunks(&[("/a", 0), ("/damaged", 1), ("/a", 2)]);
         for reach in REACHES {
             assert_eq!(rest(&mut open(&path, "/a", reach)).expect("read"), [0, 2]);
             let error = rest(&mut open(&path, "/damaged", reach)).expect_err("no prediction").to_string();
@@ -213,9 +212,7 @@ mod tests {
 
     #[test]
     fn chunks_without_a_chosen_topic_are_skipped_by_the_index_alone() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("chunks.mcap");
-        write_chunks(&path, &[("/b", 0), ("/a", 1), ("/b", 2), ("/b", 3), ("/a", 4)]);
+        let path = in_chunks(&[("/b", 0), ("/a", 1), ("/b", 2), ("/b", 3), ("/a", 4)]);
         for reach in REACHES {
             assert_eq!(rest(&mut open(&path, "/a", reach)).expect("read"), [1, 4]);
         }
@@ -227,10 +224,8 @@ mod tests {
 
     #[test]
     fn chunks_of_an_earlier_time_are_skipped_but_for_the_last_one() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("times.mcap");
         // The clock of the source once went back.
-        write_chunks(&path, &[("/a", 10), ("/a", 11), ("/b", 12), ("/a", 13), ("/a", 14), ("/a", 15), ("/a", 9)]);
+        let path = in_chunks(&[("/a", 10), ("/a", 11), ("/b", 12), ("/a", 13), ("/a", 14), ("/a", 15), ("/a", 9)]);
         let read = |reach, stamp_nanos| {
             let mut samples = open(&path, "/a", reach);
             assert_eq!(samples.advance().expect("read").map(|sample| sample.header.seq), Some(0));

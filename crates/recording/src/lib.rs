@@ -103,95 +103,54 @@ mod tests {
         RecordingInfo { hand: "h".into(), hand_id: u64::MAX, made_by: "a test".into(), version: "0".into() }
     }
 
+    /// A sample of each type, on its topic.
     pub(super) fn records() -> Vec<(&'static str, Record)> {
-        fn stamped<M>(seq: u64, message: M) -> Stamped<M> {
+        fn record<M>(seq: u64, message: M) -> Record
+        where
+            Stamped<M>: Into<Record>,
+        {
             let header = Header { seq, stamp_nanos: 1 + seq, epoch: 3, hand_id: u64::MAX, ..Header::default() };
-            Stamped { header, message }
+            Stamped { header, message }.into()
         }
         let contact = Contact { position_m: [0.1; 3], normal: [0.0, 0.0, 1.0], force_newtons: 2.5, pad: 1, cell: 23 };
+        let (joints, cells_newtons) = (vec![0.1, 0.2], vec![0.3; 5]);
+        let frame =
+            TactileFrame { grasp_id: 7, phase: Phase::Closing, joints, cells_newtons, ..TactileFrame::default() };
+        let contacts = ContactSet {
+            grasp_id: 7,
+            phase: Phase::Settled,
+            joints: vec![0.2, -0.4],
+            contacts: vec![contact; 2],
+            n_pads_in_contact: 1,
+            self_collision: true,
+            n_self_contacts: 3,
+            fault: Fault::SelfCollision,
+            ..ContactSet::default()
+        };
+        let feature = GraspFeature { values: vec![0.5; 64], ..GraspFeature::default() };
+        let prediction = Prediction { decision_value: -0.1, stable: true, ..Prediction::default() };
+        let (action, reason) = (Action::Lift, Reason::Stable);
+        let decision = LiftDecision { grasp_id: 7, action, reason, probability_stable: 0.75 };
+        let contacts_of_scene = vec![SceneContact { other_link: -1, ..SceneContact::default() }; 2];
+        let scene = GraspScene { joints: vec![0.5; 7], contacts: contacts_of_scene, ..GraspScene::default() };
+        let (object, class) = ("bücher-1".into(), "book".into());
+        let truth = GraspTruth { epsilon: -1.0, object, class, ..GraspTruth::default() };
+        let outcome = LiftOutcome { attempt: 3, lifted: true, thing: "tasse".into(), ..LiftOutcome::default() };
         vec![
-            (
-                "/tactile",
-                Record::Tactile(stamped(
-                    0,
-                    TactileFrame {
-                        grasp_id: 7,
-                        phase: Phase::Closing,
-                        joints: vec![0.1, 0.2],
-                        cells_newtons: vec![0.3; 5],
-                        ..Default::default()
-                    },
-                )),
-            ),
-            (
-                "/contacts",
-                Record::Contacts(stamped(
-                    1,
-                    ContactSet {
-                        grasp_id: 7,
-                        phase: Phase::Settled,
-                        joints: vec![0.2, -0.4],
-                        contacts: vec![contact; 2],
-                        n_pads_in_contact: 1,
-                        self_collision: true,
-                        n_self_contacts: 3,
-                        fault: Fault::SelfCollision,
-                        ..Default::default()
-                    },
-                )),
-            ),
-            ("/feature", Record::Feature(stamped(2, GraspFeature { values: vec![0.5; 64], ..Default::default() }))),
-            (
-                "/prediction",
-                Record::Prediction(stamped(3, Prediction { decision_value: -0.1, stable: true, ..Default::default() })),
-            ),
-            (
-                "/decision",
-                Record::Decision(stamped(
-                    4,
-                    LiftDecision {
-                        grasp_id: 7,
-                        action: Action::Lift,
-                        reason: Reason::Stable,
-                        probability_stable: 0.75,
-                    },
-                )),
-            ),
-            (
-                "/scene",
-                Record::Scene(stamped(
-                    5,
-                    GraspScene {
-                        joints: vec![0.5; 7],
-                        contacts: vec![SceneContact { other_link: -1, ..Default::default() }; 2],
-                        ..Default::default()
-                    },
-                )),
-            ),
-            (
-                "/truth",
-                Record::Truth(stamped(
-                    5,
-                    GraspTruth {
-                        epsilon: -1.0, object: "bücher-1".into(), class: "book".into(), ..Default::default()
-                    },
-                )),
-            ),
-            (
-                "/outcome",
-                Record::Outcome(stamped(
-                    6,
-                    LiftOutcome { attempt: 3, lifted: true, thing: "tasse".into(), ..Default::default() },
-                )),
-            ),
+            ("/tactile", record(0, frame)),
+            ("/contacts", record(1, contacts)),
+            ("/feature", record(2, feature)),
+            ("/prediction", record(3, prediction)),
+            ("/decision", record(4, decision)),
+            ("/scene", record(5, scene)),
+            ("/truth", record(5, truth)),
+            ("/outcome", record(6, outcome)),
         ]
     }
 
-    fn write_all(path: &std::path::Path) {
+    pub(super) fn write_all(path: &std::path::Path) {
         let mut writer = RecordingWriter::create(path, &info()).expect("created");
-        for (topic, record) in records() {
-            writer.write_record(topic, &record).expect("written");
-        }
+        records().iter().for_each(|(topic, record)| writer.write_record(topic, record).expect("written"));
         writer.finish().expect("finished");
     }
 
@@ -215,9 +174,7 @@ mod tests {
         let mut writer = RecordingWriter::create(&path, &info()).expect("created");
         let Err(refused) = RecordingWriter::create(&path, &info()) else { panic!("two writers") };
         assert!(refused.to_string().contains("another process is writing it"), "{refused}");
-        for (topic, record) in records() {
-            writer.write_record(topic, &record).expect("written");
-        }
+        records().iter().for_each(|(topic, record)| writer.write_record(topic, record).expect("written"));
         writer.finish().expect("finished");
         assert_eq!(RecordingReader::open(&path).expect("opened").count(), records().len());
         RecordingWriter::create(&path, &info()).expect("free again");

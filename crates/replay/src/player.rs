@@ -404,16 +404,25 @@ mod tests {
     use super::*;
     use blindgrasp_messages::{GraspFeature, MAX_FEATURES, TactileFrame};
     use blindgrasp_recording::{RecordingInfo, RecordingReader, RecordingWriter};
+    use tempfile::TempPath;
 
     const HAND_ID: u64 = 5;
 
     /// Whether the recording is checked before it is played, and whether its samples are kept.
     const WAYS: [(u64, usize); 3] = [(u64::MAX, usize::MAX), (u64::MAX, 0), (0, 0)];
 
-    /// Writes grasps of three frames each, a second apart, with a label before each grasp. The fifth frame was lost.
-    fn write(path: &Path, n_grasps: u64, n_cells: usize) {
+    /// A recording with what is written into it.
+    fn recording(write: impl FnOnce(&mut RecordingWriter)) -> TempPath {
+        let path = tempfile::NamedTempFile::new().expect("a file").into_temp_path();
         let info = RecordingInfo { hand: "h".into(), hand_id: HAND_ID, made_by: "a test".into(), version: "0".into() };
-        let mut writer = RecordingWriter::create(path, &info).expect("created");
+        let mut writer = RecordingWriter::create(&path, &info).expect("created");
+        write(&mut writer);
+        writer.finish().expect("finished");
+        path
+    }
+
+    /// Grasps of three frames each, a second apart, with a label before each grasp. The fifth frame was lost.
+    fn write(writer: &mut RecordingWriter, n_grasps: u64, n_cells: usize) {
         for grasp_id in 0..n_grasps {
             let header = Header { seq: grasp_id, stamp_nanos: grasp_id * 3_000_000_000, epoch: 2, ..Header::default() };
             let object = format!("object {grasp_id}");
@@ -427,7 +436,6 @@ mod tests {
                 writer.write("/tactile", &Stamped { header, message }).expect("written");
             }
         }
-        writer.finish().expect("finished");
     }
 
     fn program(path: &Path, selection: Selection, n_repetitions: u64) -> Program {
@@ -464,9 +472,7 @@ mod tests {
 
     #[test]
     fn repetitions_from_memory_are_those_from_the_file() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("grasps.mcap");
-        write(&path, 4, 2);
+        let path = recording(|writer| write(writer, 4, 2));
         let grasps = Selection { grasps: Some("0,2-3".parse().expect("grasps")), ..Selection::default() };
         for (selection, n_samples) in [(Selection::default(), 15), (grasps, 12), (from_to(3, 9), 7)] {
             let program = program(&path, selection, 3);
@@ -495,9 +501,7 @@ mod tests {
 
     #[test]
     fn a_player_that_comes_back_goes_on_in_the_middle_of_a_repetition() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("grasps.mcap");
-        write(&path, 4, 2);
+        let path = recording(|writer| write(writer, 4, 2));
         let program = program(&path, Selection::default(), 3);
         let whole = play(&mut open(&program, WAYS[0])).expect("played");
         for way in WAYS {
@@ -513,15 +517,12 @@ mod tests {
 
     #[test]
     fn topics_that_are_not_played_are_not_decoded() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("too-long.mcap");
-        let info = RecordingInfo { hand: "h".into(), hand_id: HAND_ID, made_by: "a test".into(), version: "0".into() };
-        let mut writer = RecordingWriter::create(&path, &info).expect("created");
         let header = Header::default();
         let feature = GraspFeature { values: vec![0.0; MAX_FEATURES + 1], ..GraspFeature::default() };
-        writer.write("/feature", &Stamped { header, message: feature }).expect("written");
-        writer.write("/tactile", &Stamped { header, message: TactileFrame::default() }).expect("written");
-        writer.finish().expect("finished");
+        let path = recording(|writer| {
+            writer.write("/feature", &Stamped { header, message: feature }).expect("written");
+            writer.write("/tactile", &Stamped { header, message: TactileFrame::default() }).expect("written");
+        });
         RecordingReader::open(&path).expect("opened").collect::<Result<Vec<_>, _>>().expect_err("too long");
         for way in WAYS {
             let program = program(&path, Selection::default(), 2);
@@ -535,10 +536,8 @@ mod tests {
 
     #[test]
     fn a_part_of_a_long_recording_is_played_without_reading_the_rest() {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("long.mcap");
         // 720 s in six chunks.
-        write(&path, 240, 1_024);
+        let path = recording(|writer| write(writer, 240, 1_024));
         for (from_secs, to_secs) in [(300, 330), (0, 20), (1, 50), (601, 2_000), (450, 451)] {
             let program = program(&path, from_to(from_secs, to_secs), 2);
             let whole = play(&mut open(&program, WAYS[1])).expect("played");

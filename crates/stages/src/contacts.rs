@@ -209,8 +209,15 @@ mod tests {
     use super::*;
     use std::path::Path;
 
+    /// Fingers that touch each other.
+    const TOUCHING: [f64; 7] = [0.5, 1.7, 1.7, 1.7, 0.55, 0.55, 0.55];
+
+    fn hand() -> Hand {
+        Hand::load(Path::new("barrett-bh8-280")).expect("built in")
+    }
+
     fn run(hand_id: u64, joints: &[f64], cells_newtons: &[f64]) -> (ContactSummary, Vec<Contact>) {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let hand = hand();
         let mut contacts = vec![Contact::default()];
         (contacts_from_frame(&hand, hand_id, joints, cells_newtons, &mut contacts), contacts)
     }
@@ -228,10 +235,8 @@ mod tests {
 
     #[test]
     fn bad_frames_have_a_fault_and_no_contacts() {
-        let mut nan = [1.0; 96];
-        nan[5] = f64::NAN;
-        let mut negative = [1.0; 96];
-        negative[95] = -0.1;
+        let (mut nan, mut negative) = ([1.0; 96], [1.0; 96]);
+        (nan[5], negative[95]) = (f64::NAN, -0.1);
         for (joints, cells, fault) in [
             (&[0.0; 7][..], &[0.0; 96][..], Fault::NoContact),
             (&[0.0; 7], &[1.0; 95], Fault::WrongLength),
@@ -252,7 +257,7 @@ mod tests {
 
     #[test]
     fn a_joint_that_reads_beyond_its_stop_is_at_it() {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let hand = hand();
         let stops: Vec<f64> = hand.joints.iter().map(|joint| joint.upper).collect();
         let beyond = |rad: f64| stops.iter().map(|stop| stop + rad).collect::<Vec<f64>>();
         assert_eq!(run(0, &beyond(0.09), &[1.0; 96]), run(0, &stops, &[1.0; 96]));
@@ -290,11 +295,10 @@ mod tests {
 
     #[test]
     fn a_finder_that_is_used_again_finds_the_same() {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let hand = hand();
         let mut finder = ContactFinder::default();
         let mut found = Vec::new();
-        let touching = [0.5, 1.7, 1.7, 1.7, 0.55, 0.55, 0.55];
-        for joints in [touching, [f64::NAN; 7], [0.0; 7], touching] {
+        for joints in [TOUCHING, [f64::NAN; 7], [0.0; 7], TOUCHING] {
             let summary = finder.find(&hand, 0, &joints, &[1.0; 96], &mut found);
             assert_eq!((summary, found.clone()), run(0, &joints, &[1.0; 96]));
         }
@@ -302,21 +306,10 @@ mod tests {
 
     #[test]
     fn cells_between_fingers_that_touch_are_left_out_and_counted() {
-        let joints = [0.5, 1.7, 1.7, 1.7, 0.55, 0.55, 0.55];
-        let (summary, contacts) = run(0, &joints, &[1.0; 96]);
-        assert!(summary.self_collision);
-        assert!(summary.n_self_contacts > 0, "{summary:?}");
-        assert_eq!(contacts.len() + summary.n_self_contacts as usize, 96);
-        assert_eq!(summary.fault, Fault::None);
+        let (summary, contacts) = run(0, &TOUCHING, &[1.0; 96]);
+        assert!(summary.self_collision && summary.n_self_contacts > 0, "{summary:?}");
+        assert_eq!((contacts.len() + summary.n_self_contacts as usize, summary.fault), (96, Fault::None));
         assert!(contacts.iter().filter(|contact| contact.pad == 0).count() == 24, "no finger reaches the palm's cells");
-        // Fingers so closed on nothing have nothing but each other.
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let mut between = [0.0; 96];
-        let left: Vec<usize> = contacts.iter().map(|c| c.pad as usize * 24 + c.cell as usize).collect();
-        (0..96).filter(|idx| !left.contains(idx)).for_each(|idx| between[idx] = 1.0);
-        let mut contacts = Vec::new();
-        let summary = contacts_from_frame(&hand, 0, &joints, &between, &mut contacts);
-        assert_eq!((summary.fault, contacts.len()), (Fault::NoContact, 0));
     }
 
     /// Forces of 1 N on the cells so near to a link that touches theirs.
@@ -338,17 +331,19 @@ mod tests {
 
     #[test]
     fn fingers_that_press_each_other_on_nothing_feel_no_object() {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let joints = [0.5, 1.7, 1.7, 1.7, 0.55, 0.55, 0.55];
-        let n_pressed = |within_m: f64| pressed_by_links(&hand, &joints, within_m).iter().sum::<f64>() as u32;
-        assert!(n_pressed(SELF_CONTACT_M) > 0 && n_pressed(0.012) > n_pressed(SELF_CONTACT_M), "the skin spreads it");
-        let (summary, contacts) = run(0, &joints, &pressed_by_links(&hand, &joints, 0.012));
-        assert_eq!((summary.fault, summary.n_self_contacts, contacts.len()), (Fault::NoContact, n_pressed(0.012), 0));
+        let [touched, spread] = [SELF_CONTACT_M, 0.012].map(|within_m| pressed_by_links(&hand(), &TOUCHING, within_m));
+        let [n_touched, n_spread] = [touched, spread].map(|cells| cells.iter().sum::<f64>() as u32);
+        assert!(n_touched > 0 && n_spread > n_touched, "the skin spreads it");
+        for (pressed, n_pressed) in [(touched, n_touched), (spread, n_spread)] {
+            let (summary, contacts) = run(0, &TOUCHING, &pressed);
+            let found = (summary.fault, summary.n_self_contacts, contacts.len());
+            assert_eq!(found, (Fault::NoContact, n_pressed, 0));
+        }
     }
 
     #[test]
     fn an_object_between_finger_and_palm_is_felt_by_fingers_that_touch_each_other_as_well() {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let hand = hand();
         // Fingers 2 and 3 touch; finger 1 and the palm touch nothing.
         let joints = [0.5, 1.2, 1.7, 1.7, 0.4, 0.55, 0.55];
         let pressed = pressed_by_links(&hand, &joints, 0.1);

@@ -373,41 +373,31 @@ mod tests {
     }
 
     #[test]
-    fn a_grasp_is_judged_by_those_before_it_alone() {
-        let model = DayModel {
-            method: DayMethod::Baseline(Baseline { min_grasps: 2, limit: 10.0, variances: vec![1.0] }),
-            recalibration: None,
-        };
+    fn a_grasp_is_judged_by_those_of_its_day_before_it_alone() {
+        let method = DayMethod::Baseline(Baseline { min_grasps: 2, limit: 10.0, variances: vec![1.0] });
+        let model = DayModel { method, recalibration: None };
         let mut memory = DayMemory::default();
-        let mut see = |grasp_id, day, value: f64| {
-            let place = GraspPlace { epoch: 3, grasp_id, day };
-            memory.begin(1, place, &model);
-            let before = memory.statistics.clone();
-            memory.settle(place, &[value]);
-            (before.n_grasps, before.mean)
-        };
-        assert_eq!(see(0, 5, 1.0), (0, vec![]));
-        // A second frame of the grasp changes nothing.
-        assert_eq!(see(0, 5, 9.0), (0, vec![]));
-        assert_eq!(see(1, 5, 3.0), (1, vec![1.0]));
-        assert_eq!(see(2, 5, 7.0), (2, vec![2.0]));
-        assert_eq!(see(3, 6, 7.0), (0, vec![]), "another day has no statistics yet");
-        assert_eq!(see(4, 6, 7.0), (1, vec![7.0]));
-    }
-
-    #[test]
-    fn without_a_day_each_run_of_the_source_is_one() {
-        let model = DayModel {
-            method: DayMethod::Baseline(Baseline { min_grasps: 2, limit: 10.0, variances: vec![1.0] }),
-            recalibration: None,
-        };
-        let mut memory = DayMemory::default();
-        let frames = [(1, 0, 0), (1, 0, 1), (2, 0, 0), (2, 9, 0), (3, 9, 1)];
-        for (grasp_id, (epoch, day, n_expected)) in (0..).zip(frames) {
+        for (epoch, grasp_id, day, value, n_before, mean) in [
+            (3, 0, 5, 1.0, 0, None),
+            // A second frame of the grasp changes nothing.
+            (3, 0, 5, 9.0, 0, None),
+            (3, 1, 5, 3.0, 1, Some(1.0)),
+            (3, 2, 5, 7.0, 2, Some(2.0)),
+            // Another day has no statistics yet.
+            (3, 3, 6, 7.0, 0, None),
+            (3, 4, 6, 7.0, 1, Some(7.0)),
+            // Without a day, each run of the source is one.
+            (4, 5, 0, 0.5, 0, None),
+            (4, 6, 0, 0.5, 1, Some(0.5)),
+            (5, 7, 0, 0.5, 0, None),
+            (5, 8, 9, 0.5, 0, None),
+            (6, 9, 9, 0.5, 1, Some(0.5)),
+        ] {
             let place = GraspPlace { epoch, grasp_id, day };
             memory.begin(1, place, &model);
-            assert_eq!(memory.statistics.n_grasps, n_expected, "{place:?}");
-            memory.settle(place, &[0.5]);
+            let before = &memory.statistics;
+            assert_eq!((before.n_grasps, before.mean.first().copied()), (n_before, mean), "{place:?}");
+            memory.settle(place, &[value]);
         }
     }
 

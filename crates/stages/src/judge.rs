@@ -191,6 +191,11 @@ mod tests {
         assert_eq!(judge.end(), None);
 
         judge.reset();
+        assert_eq!(judge.frame(0, &frame(Phase::Closing)), []);
+        let decision = judge.end().expect("held, as it has no decision");
+        assert_eq!((decision.grasp_id, decision.action, decision.reason), (1, Action::Hold, Reason::Missing));
+
+        judge.reset();
         let sample = |seq, phase| Stamped { header: Header { seq, ..Header::default() }, message: frame(phase) };
         assert_eq!(judge.sample(&sample(0, Phase::Closing)).decisions, []);
         let judged = judge.sample(&sample(2, Phase::Settled));
@@ -211,13 +216,5 @@ mod tests {
         let said: Vec<_> =
             decisions.iter().map(|decision| (decision.grasp_id, decision.action, decision.reason)).collect();
         assert_eq!(said, [(1, Action::Hold, Reason::NoAgreement), (2, Action::Hold, Reason::NoContact)]);
-    }
-
-    #[test]
-    fn a_grasp_without_a_decision_is_held_in_the_end() {
-        let mut judge = judge();
-        assert_eq!(judge.frame(0, &frame(Phase::Closing)), []);
-        let decision = judge.end().expect("held");
-        assert_eq!((decision.grasp_id, decision.action, decision.reason), (1, Action::Hold, Reason::Missing));
     }
 }

@@ -545,244 +545,266 @@ mod tests {
 
     const STEP_NANOS: u64 = 10_000_000;
 
-    struct Stream {
-        arbiter: LiftArbiter,
-        header: Header,
-        decisions: Vec<LiftDecision>,
-    }
-
-    fn stream() -> Stream {
-        Stream { arbiter: LiftArbiter::new(ArbiterOptions::default()), header: Header::default(), decisions: vec![] }
-    }
-
-    fn settled(probability_stable: f64) -> Prediction {
-        Prediction {
-            phase: Phase::Settled,
+    /// A prediction, as a letter of a history.
+    fn prediction(letter: char) -> Prediction {
+        let of = |phase, probability_stable: f64| Prediction {
+            phase,
             probability_stable,
             stable: probability_stable >= 0.5,
             ..Prediction::default()
+        };
+        let faulty = |phase, fault| Prediction { fault, ..of(phase, 0.1) };
+        match letter {
+            '+' | 'o' => of(Phase::Settled, 0.9),
+            '-' => of(Phase::Settled, 0.1),
+            '?' => Prediction { unsure: true, ..of(Phase::Settled, 0.4) },
+            '*' => Prediction { unsure: true, ..of(Phase::Settled, 0.9) },
+            'c' => of(Phase::Closing, 0.9),
+            'n' => faulty(Phase::Closing, Fault::NoContact),
+            '!' => faulty(Phase::Closing, Fault::InvalidValue),
+            's' => of(Phase::Squeezing, 0.9),
+            'q' => of(Phase::Squeezed, 0.9),
+            'p' => of(Phase::Squeezed, 0.1),
+            'f' => faulty(Phase::Squeezed, Fault::NoContact),
+            'l' => of(Phase::TestLifting, 0.1),
+            't' => of(Phase::TestLifted, 0.9),
+            'm' => faulty(Phase::TestLifted, Fault::MissingReading),
+            'a' => of(Phase::Lifting, 0.9),
+            'w' | 'y' => Prediction { unsure: true, ..of(Phase::Lifting, 0.4) },
+            'v' => of(Phase::Lifting, 0.1),
+            'x' => faulty(Phase::Lifting, Fault::SensorFault),
+            'e' => of(Phase::Ended, 0.9),
+            'k' => of(Phase::Kept, 0.9),
+            'd' => of(Phase::Dropped, 0.9),
+            'C' => faulty(Phase::Dropped, Fault::Changed),
+            _ => panic!("no prediction is written '{letter}'"),
         }
+    }
+
+    struct Stream {
+        arbiter: LiftArbiter,
+        header: Header,
+        grasp_id: u64,
+    }
+
+    fn stream(options: ArbiterOptions) -> Stream {
+        Stream { arbiter: LiftArbiter::new(options), header: Header::default(), grasp_id: 0 }
     }
 
     impl Stream {
-        fn push(&mut self, prediction: Prediction) -> &mut Self {
-            self.push_aged(prediction, 0)
-        }
-
-        fn push_aged(&mut self, prediction: Prediction, age_nanos: u64) -> &mut Self {
-            self.arbiter.on_prediction(&self.header, &prediction, age_nanos, &mut self.decisions);
+        fn advance(&mut self) {
             self.header.seq += 1;
             self.header.stamp_nanos += STEP_NANOS;
-            self
         }
 
-        fn end(&mut self) -> Vec<(u64, Action, Reason)> {
-            self.decisions.extend(self.arbiter.on_end());
-            self.decisions.iter().map(|decision| (decision.grasp_id, decision.action, decision.reason)).collect()
+        fn push(&mut self, prediction: Prediction, age_nanos: u64) -> Vec<LiftDecision> {
+            let mut decisions = Vec::new();
+            let prediction = Prediction { grasp_id: self.grasp_id, ..prediction };
+            self.arbiter.on_prediction(&self.header, &prediction, age_nanos, &mut decisions);
+            self.advance();
+            decisions
         }
-    }
 
-    #[test]
-    fn three_agreeing_votes_decide_once_with_the_lowest_probability() {
-        let mut s = stream();
-        for probability in [0.9, 0.8, 0.95, 0.1, 0.1, 0.1] {
-            s.push(settled(probability));
-        }
-        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
-        assert_eq!(s.decisions[0].probability_stable, 0.8);
-    }
-
-    #[test]
-    fn each_reason_not_to_lift_holds() {
-        use Action::{Hold, Lift};
-        let unsure = Prediction { unsure: true, ..settled(0.4) };
-        let fault = |fault| Prediction { fault, ..settled(0.9) };
-        let ended = Prediction { phase: Phase::Ended, ..settled(0.5) };
-        for (predictions, age_nanos, expected) in [
-            (vec![settled(0.1); 3], 0, (Hold, Reason::Unstable)),
-            (vec![unsure; 3], 0, (Hold, Reason::Unsure)),
-            (vec![settled(0.9), settled(0.1), ended], 0, (Hold, Reason::NoAgreement)),
-            (vec![settled(0.9), settled(0.1)], 0, (Hold, Reason::NoAgreement)),
-            (vec![fault(Fault::OutOfDistribution)], 0, (Hold, Reason::OutOfDistribution)),
-            (vec![settled(0.9); 3], 0, (Lift, Reason::Stable)),
-            (vec![], 0, (Hold, Reason::Missing)),
-            (vec![fault(Fault::NoContact)], 0, (Hold, Reason::NoContact)),
-            (vec![fault(Fault::SelfCollision)], 0, (Hold, Reason::SelfCollision)),
-            (vec![fault(Fault::InvalidValue)], 0, (Hold, Reason::Invalid)),
-            (vec![fault(Fault::WrongModel)], 0, (Hold, Reason::WrongModel)),
-            (vec![settled(0.1)], u64::MAX, (Hold, Reason::Stale)),
-            (vec![fault(Fault::OutOfDistribution)], u64::MAX, (Hold, Reason::OutOfDistribution)),
-        ] {
-            let mut s = stream();
-            s.push(Prediction { phase: Phase::Closing, ..settled(0.5) });
-            for prediction in &predictions {
-                s.push_aged(prediction.clone(), age_nanos);
+        /// An input, or a change of the inputs after it.
+        fn take(&mut self, letter: char) -> Vec<LiftDecision> {
+            let header = &mut self.header;
+            match letter {
+                'N' => self.grasp_id += 1,
+                'P' => self.grasp_id = self.grasp_id.saturating_sub(1),
+                'L' => header.seq += 1,
+                'R' => header.seq = header.seq.saturating_sub(1),
+                'B' => header.stamp_nanos = header.stamp_nanos.saturating_sub(2 * STEP_NANOS),
+                '=' => header.stamp_nanos = header.stamp_nanos.saturating_sub(STEP_NANOS),
+                'G' => header.stamp_nanos += 100 * STEP_NANOS,
+                'H' => header.hand_id += 1,
+                'M' => header.made_by = 1 - header.made_by,
+                'E' => *header = Header { epoch: header.epoch + 1, ..Header::default() },
+                'U' => {
+                    let mut decisions = Vec::new();
+                    self.arbiter.on_unreadable(header, self.grasp_id, &mut decisions);
+                    self.advance();
+                    return decisions;
+                }
+                'Z' => return self.arbiter.on_silence().into_iter().collect(),
+                '$' => return self.arbiter.on_end().into_iter().collect(),
+                'o' | 'y' => return self.push(prediction(letter), self.arbiter.options.max_age_nanos + 1),
+                _ => return self.push(prediction(letter), 0),
             }
-            let (action, reason) = expected;
-            assert_eq!(s.end(), [(0, action, reason)]);
+            vec![]
+        }
+
+        /// Takes a history, whose brackets hold the decisions that follow from the letter before them.
+        #[track_caller]
+        fn takes(&mut self, history: &str) {
+            let mut found = String::new();
+            let mut is_input = true;
+            for letter in history.chars() {
+                is_input |= letter == ']';
+                if is_input && letter != '[' && letter != ']' {
+                    found.push(letter);
+                    for decision in self.take(letter) {
+                        found += &format!("[{} {:?} {:?}]", decision.grasp_id, decision.action, decision.reason);
+                    }
+                }
+                is_input &= letter != '[';
+            }
+            assert_eq!(found, history);
         }
     }
 
     #[test]
-    fn a_sample_of_a_decided_grasp_amid_another_one_holds_that_one() {
-        let mut s = stream();
-        for grasp_id in [0, 0, 0, 1, 1, 0, 1, 1, 1] {
-            s.push(Prediction { grasp_id, ..settled(0.9) });
+    fn histories_are_decided_as_written() {
+        for history in [
+            "+++[0 Lift Stable]---$",
+            "c---[0 Hold Unstable]",
+            "+---[0 Hold Unstable]",
+            "c+-e[0 Hold NoAgreement]",
+            "c+-$[0 Hold NoAgreement]",
+            "++-++$[0 Hold NoAgreement]",
+            // An outcome before the decision.
+            "++k[0 Hold NoAgreement]+$",
+            "++d[0 Hold NoAgreement]+$",
+            // Unsure is a vote of its own, neither for nor against. Unsure and stable at once is no prediction.
+            "c???[0 Hold Unsure]+++$",
+            "?++?$[0 Hold NoAgreement]",
+            "?--?$[0 Hold NoAgreement]",
+            "++*[0 Hold Invalid]$",
+            // Closing frames neither vote nor decide, and votes on both sides of a movement do not add up.
+            "ccccc$[0 Hold Missing]",
+            "++n++$[0 Hold NoAgreement]",
+            // A lying sensor while closing is remembered.
+            "!+[0 Hold Invalid]++$",
+            // A grasp whose source has no more frames is decided: what is decided stays so, and a doubt is still the reason.
+            "++e[0 Hold NoAgreement]N+++[1 Lift Stable]eNe[2 Hold Missing]N!e[3 Hold Invalid]$",
+            // The next grasp ends the one before. A sample of a decided grasp amid another one holds that one.
+            "+N+[0 Hold NoAgreement]++[1 Lift Stable]P+++N+$",
+            "+++[0 Lift Stable]N++P+N+[1 Hold OutOfOrder]++$",
+            // Lost, repeated and late samples. A source counts from 0, so that a later first sample has missed the beginning.
+            "++L+[0 Hold OutOfOrder]$",
+            "++R+[0 Hold OutOfOrder]$",
+            "++B+[0 Hold OutOfOrder]$",
+            "++G+[0 Hold Stale]$",
+            "++H+[0 Hold WrongHand]$",
+            "++o[0 Hold Stale]$",
+            "co[0 Hold Stale]$",
+            "L+[0 Hold OutOfOrder]++$",
+            // Silence and unreadable samples hold their grasp once.
+            "Z+Z[0 Hold Stale]UNU[1 Hold Invalid]U$",
+            // An unreadable prediction may have been one of the next grasp, whatever grasp its head names, unless the next
+            // prediction is one of the same grasp; so may missing ones before it.
+            "+++[0 Lift Stable]LUN+[1 Hold OutOfOrder]++N+++[2 Lift Stable]U+N+++[3 Lift Stable]$",
+            // Votes of two models do not add up. A bridge that repeats its last reading under new numbers has one vote.
+            "++M++M+++[0 Lift Stable]$",
+            "+=+=+=+=+++[0 Lift Stable]$",
+            // A source that starts anew may use its numbers again, but does not finish a grasp that it had begun. A new grasp of
+            // a new epoch is trusted from its source's first sample on, and only then.
+            "+++[0 Lift Stable]E+++[0 Lift Stable]$",
+            "++E+[0 Hold OutOfOrder]$",
+            "---[0 Hold Unstable]EN+++[1 Lift Stable]$",
+            "---[0 Hold Unstable]ELLLLN+[1 Hold OutOfOrder]++$",
+        ] {
+            stream(ArbiterOptions::default()).takes(history);
         }
-        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable), (1, Action::Hold, Reason::OutOfOrder)]);
     }
 
     #[test]
-    fn a_grasp_whose_source_has_no_more_frames_is_decided() {
-        let ended = |grasp_id, probability| Prediction { grasp_id, phase: Phase::Ended, ..settled(probability) };
-        let mut s = stream();
-        s.push(settled(0.9)).push(settled(0.9)).push(ended(0, 0.9));
-        assert_eq!(s.decisions.len(), 1);
-        assert_eq!((s.decisions[0].action, s.decisions[0].reason), (Action::Hold, Reason::NoAgreement));
-        // One that is decided stays so; one without a settled frame has missed it; a doubt is still the reason.
-        let of = |grasp_id| Prediction { grasp_id, ..settled(0.9) };
-        s.push(of(1)).push(of(1)).push(of(1)).push(ended(1, 0.1)).push(ended(2, 0.9));
-        s.push(Prediction { grasp_id: 3, phase: Phase::Closing, fault: Fault::Malformed, ..Prediction::default() });
-        s.push(ended(3, 0.9));
-        assert_eq!(
-            s.end()[1..],
-            [(1, Action::Lift, Reason::Stable), (2, Action::Hold, Reason::Missing), (3, Action::Hold, Reason::Invalid)]
-        );
+    fn a_promising_grasp_is_probed_and_only_the_frames_after_it_lift() {
+        for history in [
+            // Stable and unsure both are worth a probe. The source says that it has ended before it hears of it.
+            "+?+[0 TestLift Promising]esqqqlttt[0 Lift Stable]$",
+            // A source that waits before the test lift is told to go on, once for each time that it asks.
+            "+++[0 TestLift Promising]sqqqe[0 TestLift Promising]lttt[0 Lift Stable]$",
+            // A tight hand that is not promising ends the grasp, whether the source waits or not; a faulty one at once.
+            "+++[0 TestLift Promising]sppp[0 Hold Unstable]elttt$",
+            "+++[0 TestLift Promising]sf[0 Hold NoContact]lttt$",
+            // No probe is asked for if the grasp is unstable. After the probe, `ended` ends the grasp. A hand that closes again
+            // needs another probe.
+            "---[0 Hold Unstable]$",
+            "+++[0 TestLift Promising]sqqqte[0 Hold NoAgreement]$",
+            "+++[0 TestLift Promising]sqqqcttt$[0 Hold NoAgreement]",
+            "+++[0 TestLift Promising]sqqqm[0 Hold MissingReading]$",
+        ] {
+            stream(ArbiterOptions { probe: Probe::TestLift, ..ArbiterOptions::default() }).takes(history);
+        }
+    }
+
+    #[test]
+    fn a_lift_is_watched_and_neither_lifted_again_nor_lifted_after_a_hold() {
+        let mut s = stream(ArbiterOptions::default());
+        // It has not begun to lift; then nothing was judged for the last.
+        s.takes("+++[0 Lift Stable]eae[0 GoOn Stable]we[0 GoOn NoAgreement]e[0 GoOn NoAgreement]");
+        // Two are too few, and a fault or a late frame has no vote.
+        s.takes("awwawxwyw");
+        s.takes("wv[0 Tighten Slipping]we[0 GoOn NoAgreement]");
+        s.takes("vvv[0 SetDown Slipping]aev");
+        // A robot that lifts without having been allowed to is not watched; its grasp is held.
+        s.takes("N+a[1 Hold NoAgreement]vvv");
+        // A lift that was broken off has no outcome that could be missing.
+        s.takes("N+++[2 Lift Stable]N+++[3 Lift Stable]");
+        assert_eq!(s.arbiter.state().n_unreported(), 1);
     }
 
     #[test]
     fn lifts_that_drop_more_often_than_promised_withdraw_the_promise() {
         let options = ArbiterOptions { promised_drops: 0.05, ..ArbiterOptions::default() };
-        let mut s = Stream { arbiter: LiftArbiter::new(options), ..stream() };
-        let try_grasp = |s: &mut Stream, grasp_id, phase: Option<Phase>| {
-            let of = |phase| Prediction { grasp_id, phase, ..settled(0.9) };
-            s.push(of(Phase::Settled)).push(of(Phase::Settled)).push(of(Phase::Settled));
-            phase.into_iter().for_each(|phase| _ = s.push(of(phase)));
-            s.decisions.last().map(|decision| (decision.grasp_id, decision.action, decision.reason))
-        };
+        let mut s = stream(options);
         // Two lifts are not reported, and the outcome of a grasp that was not lifted last is not counted.
-        try_grasp(&mut s, 0, None);
-        try_grasp(&mut s, 1, None);
-        s.push(Prediction { grasp_id: 0, phase: Phase::Dropped, ..settled(0.9) });
-        assert_eq!(try_grasp(&mut s, 2, Some(Phase::Kept)), Some((2, Action::Lift, Reason::Stable)));
+        s.takes("+++[0 Lift Stable]N+++[1 Lift Stable]PdNN+++[2 Lift Stable]k");
         assert_eq!((s.arbiter.state().promise().n_kept, s.arbiter.state().promise().n_dropped), (1, 0));
         assert_eq!(s.arbiter.state().n_unreported(), 2);
         // An outcome counts once, however often it comes.
-        s.push(Prediction { grasp_id: 2, phase: Phase::Dropped, ..settled(0.9) });
-        for grasp_id in 3..8 {
-            if !s.arbiter.state().promise().is_withdrawn() {
-                let lifted = Some((grasp_id, Action::Lift, Reason::Stable));
-                assert_eq!(try_grasp(&mut s, grasp_id, Some(Phase::Dropped)), lifted);
-            }
-        }
-        assert!(s.arbiter.state().promise().is_withdrawn(), "{:?}", s.arbiter.state().promise());
-        let held = Some((8, Action::Hold, Reason::PromiseWithdrawn));
-        assert_eq!(try_grasp(&mut s, 8, Some(Phase::Kept)), held);
+        s.takes("dN+++[3 Lift Stable]dN+++[4 Lift Stable]dN+++[5 Lift Stable]dN+[6 Hold PromiseWithdrawn]++k");
         // It stays withdrawn in another instance, and asks for no probe, until another share is promised.
         let mut next = LiftArbiter::new(ArbiterOptions { probe: Probe::TestLift, ..options });
         next.restore(s.arbiter.state().clone());
         s.arbiter = next;
-        assert_eq!(try_grasp(&mut s, 9, None), Some((9, Action::Hold, Reason::PromiseWithdrawn)));
+        s.takes("N+[7 Hold PromiseWithdrawn]++");
         s.arbiter.set_options(ArbiterOptions { promised_drops: 0.5, ..options });
-        assert_eq!(try_grasp(&mut s, 10, None), Some((10, Action::Lift, Reason::Stable)));
+        s.takes("N+++[8 Lift Stable]");
         // Another skin has no outcomes yet that speak for it, but a change hides no drops.
-        let mut s = Stream { arbiter: LiftArbiter::new(options), ..stream() };
+        let mut s = stream(options);
         for grasp_id in 0..5 {
-            try_grasp(&mut s, grasp_id, None);
-            let fault = Fault::Changed;
-            s.push(Prediction { grasp_id, phase: Phase::Dropped, fault, ..Prediction::default() });
-            assert_eq!(s.arbiter.state().promise().since_change(), [0, 1]);
+            "+++CN".chars().for_each(|letter| _ = s.take(letter));
+            assert_eq!(s.arbiter.state().promise().since_change(), [0, 1], "{grasp_id}");
         }
         assert!(s.arbiter.state().promise().is_withdrawn());
         // Without a promise nothing is withdrawn.
-        let mut s = stream();
-        (0..50).for_each(|grasp_id| _ = try_grasp(&mut s, grasp_id, Some(Phase::Dropped)));
-        assert_eq!(try_grasp(&mut s, 50, None), Some((50, Action::Lift, Reason::Stable)));
+        let mut s = stream(ArbiterOptions::default());
+        (0..50).for_each(|grasp_id| s.takes(&format!("+++[{grasp_id} Lift Stable]dN")));
         assert_eq!(s.arbiter.state().promise().n_dropped, 50);
     }
 
     #[test]
-    fn an_outcome_before_the_decision_holds() {
-        for phase in [Phase::Kept, Phase::Dropped] {
-            let mut s = stream();
-            s.push(settled(0.9)).push(settled(0.9)).push(Prediction { phase, ..settled(0.9) }).push(settled(0.9));
-            assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement)]);
+    fn a_decision_has_the_lowest_probability_of_its_votes() {
+        let unsure = |probability_stable| Prediction { probability_stable, ..prediction('?') };
+        let stable = |probability_stable| Prediction { probability_stable, ..prediction('+') };
+        for (votes, expected) in [([0.9, 0.8, 0.95].map(stable), 0.8), ([0.45, 0.4, 0.45].map(unsure), 0.4)] {
+            let mut s = stream(ArbiterOptions::default());
+            let decided: Vec<LiftDecision> = votes.into_iter().flat_map(|vote| s.push(vote, 0)).collect();
+            assert_eq!(decided.iter().map(|decision| decision.probability_stable).collect::<Vec<_>>(), [expected]);
         }
     }
 
     #[test]
-    fn a_change_of_mind_starts_the_count_anew() {
-        let mut s = stream();
-        for probability in [0.9, 0.9, 0.2, 0.9, 0.9] {
-            s.push(settled(probability));
-        }
-        assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement)]);
-        let mut s = stream();
-        for probability in [0.9, 0.2, 0.2, 0.2] {
-            s.push(settled(probability));
-        }
-        assert_eq!(s.end(), [(0, Action::Hold, Reason::Unstable)]);
-    }
-
-    #[test]
-    fn agreeing_that_it_cannot_be_told_holds_as_unsure() {
-        let unsure = |probability| Prediction { unsure: true, ..settled(probability) };
-        let mut s = stream();
-        s.push(unsure(0.45))
-            .push(unsure(0.4))
-            .push(unsure(0.45))
-            .push(settled(0.9))
-            .push(settled(0.9))
-            .push(settled(0.9));
-        assert_eq!(s.end(), [(0, Action::Hold, Reason::Unsure)]);
-        assert_eq!(s.decisions[0].probability_stable, 0.4);
-        // It is a vote of its own: neither for nor against.
-        for others in [[0.9, 0.9], [0.1, 0.1]] {
-            let mut s = stream();
-            s.push(unsure(0.45)).push(settled(others[0])).push(settled(others[1])).push(unsure(0.45));
-            assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement)]);
-        }
-    }
-
-    #[test]
-    fn stable_but_not_enough_for_the_arbiter_is_unsure() {
+    fn no_number_that_is_not_a_probability_lifts_nor_one_that_is_too_low_for_the_arbiter() {
         let options = ArbiterOptions { min_probability_stable: 0.95, ..ArbiterOptions::default() };
-        for (probability, expected) in
-            [(0.94, (0, Action::Hold, Reason::Unsure)), (0.95, (0, Action::Lift, Reason::Stable))]
-        {
-            let mut s = Stream { arbiter: LiftArbiter::new(options), ..stream() };
-            s.push(settled(probability)).push(settled(probability)).push(settled(probability));
-            assert_eq!(s.end(), [expected]);
+        for (probability_stable, expected) in [
+            (f64::NAN, Reason::Invalid),
+            (f64::INFINITY, Reason::Invalid),
+            (-0.1, Reason::Invalid),
+            (1.1, Reason::Invalid),
+            (0.94, Reason::Unsure),
+            (0.95, Reason::Stable),
+        ] {
+            let mut s = stream(options);
+            let vote = Prediction { probability_stable, ..prediction('+') };
+            let decided: Vec<Reason> = (0..3).flat_map(|_| s.push(vote.clone(), 0)).map(|it| it.reason).collect();
+            assert_eq!(decided, [expected], "{probability_stable}");
         }
     }
 
     #[test]
-    fn a_prediction_that_contradicts_itself_is_invalid() {
-        let mut s = stream();
-        s.push(settled(0.9)).push(settled(0.9)).push(Prediction { unsure: true, ..settled(0.9) });
-        assert_eq!(s.end(), [(0, Action::Hold, Reason::Invalid)]);
-    }
-
-    #[test]
-    fn closing_frames_neither_vote_nor_decide() {
-        let mut s = stream();
-        for _ in 0..5 {
-            s.push(Prediction { phase: Phase::Closing, ..settled(0.99) });
-        }
-        assert_eq!(s.end(), [(0, Action::Hold, Reason::Missing)]);
-    }
-
-    #[test]
-    fn votes_on_both_sides_of_a_movement_do_not_add_up() {
-        let mut s = stream();
-        s.push(settled(0.9)).push(settled(0.9));
-        s.push(Prediction { phase: Phase::Closing, fault: Fault::NoContact, ..Prediction::default() });
-        s.push(settled(0.9)).push(settled(0.9));
-        assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement)]);
-    }
-
-    #[test]
-    fn every_fault_holds_with_its_reason() {
+    fn every_fault_holds_at_once_with_its_reason_however_late_it_comes() {
         for (fault, reason) in [
             (Fault::NoContact, Reason::NoContact),
             (Fault::WrongLength, Reason::Invalid),
@@ -793,434 +815,52 @@ mod tests {
             (Fault::SelfCollision, Reason::SelfCollision),
             (Fault::OutOfDistribution, Reason::OutOfDistribution),
         ] {
-            let mut s = stream();
-            s.push(settled(0.9)).push(settled(0.9)).push(Prediction { fault, ..settled(0.9) }).push(settled(0.9));
-            assert_eq!(s.end(), [(0, Action::Hold, reason)], "{fault:?}");
-        }
-    }
-
-    #[test]
-    fn no_number_that_is_not_a_probability_lifts() {
-        for probability in [f64::NAN, f64::INFINITY, -0.1, 1.1] {
-            let mut s = stream();
-            for _ in 0..3 {
-                s.push(Prediction { stable: true, ..settled(probability) });
+            for (before, age_nanos) in [("c", 0), ("++", 0), ("c", u64::MAX)] {
+                let mut s = stream(ArbiterOptions::default());
+                s.takes(before);
+                let decided = s.push(Prediction { fault, ..prediction('+') }, age_nanos);
+                assert_eq!(
+                    decided.iter().map(|it| it.reason).collect::<Vec<_>>(),
+                    [reason],
+                    "{fault:?} after {before}"
+                );
+                s.takes("+$");
             }
-            assert_eq!(s.end(), [(0, Action::Hold, Reason::Invalid)]);
         }
+        let mut s = stream(ArbiterOptions::default());
+        for fault in [Fault::NoContact, Fault::SelfCollision, Fault::OutOfDistribution] {
+            s.push(Prediction { fault, ..prediction('c') }, 0);
+        }
+        s.takes("+++[0 Lift Stable]$");
     }
 
     #[test]
-    fn a_lying_sensor_while_closing_is_remembered_no_contact_is_not() {
-        let closing = |fault| Prediction { phase: Phase::Closing, fault, ..Prediction::default() };
-        let mut s = stream();
-        s.push(closing(Fault::InvalidValue));
-        for _ in 0..3 {
-            s.push(settled(0.9));
-        }
-        assert_eq!(s.end(), [(0, Action::Hold, Reason::Invalid)]);
-        let mut s = stream();
-        s.push(closing(Fault::NoContact)).push(closing(Fault::SelfCollision)).push(closing(Fault::OutOfDistribution));
-        for _ in 0..3 {
-            s.push(settled(0.9));
-        }
-        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
-    }
-
-    #[test]
-    fn lost_repeated_and_late_samples_hold() {
-        type Spoil = fn(&mut Header);
-        let cases: [(Spoil, Reason); 5] = [
-            (|header| header.seq += 1, Reason::OutOfOrder),
-            (|header| header.seq -= 1, Reason::OutOfOrder),
-            (|header| header.stamp_nanos -= 2 * STEP_NANOS, Reason::OutOfOrder),
-            (|header| header.stamp_nanos += 100 * STEP_NANOS, Reason::Stale),
-            (|header| header.hand_id += 1, Reason::WrongHand),
-        ];
-        for (spoil, reason) in cases {
-            let mut s = stream();
-            s.push(settled(0.9)).push(settled(0.9));
-            spoil(&mut s.header);
-            s.push(settled(0.9));
-            assert_eq!(s.end(), [(0, Action::Hold, reason)]);
-        }
-        let mut s = stream();
-        s.push(settled(0.9)).push(settled(0.9)).push_aged(settled(0.9), 200_000_001);
-        assert_eq!(s.end(), [(0, Action::Hold, Reason::Stale)]);
-        // The source counts from 0: whoever begins later has missed the grasp's beginning.
-        let mut s = stream();
-        s.header.seq = 1;
-        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
-        assert_eq!(s.end(), [(0, Action::Hold, Reason::OutOfOrder)]);
-    }
-
-    #[test]
-    fn the_next_grasp_ends_the_one_before_and_a_decided_one_stays_decided() {
-        let mut s = stream();
-        s.push(settled(0.9));
-        for grasp_id in [1, 1, 1, 0, 0, 0, 1] {
-            s.push(Prediction { grasp_id, ..settled(0.9) });
-        }
-        assert_eq!(s.end(), [(0, Action::Hold, Reason::NoAgreement), (1, Action::Lift, Reason::Stable)]);
-    }
-
-    /// Random streams of three grasps with everything that can go wrong: whatever comes, a grasp is decided once, and a
-    /// LIFT stands behind `votes` consecutive settled predictions that are stable, sure, faultless, in order and fresh, of a
-    /// grasp without any earlier fault that counts.
-    #[test]
-    fn no_stream_lifts_without_an_unbroken_row_of_votes() {
+    fn an_arbiter_replaced_at_any_point_by_one_that_reads_its_state_decides_the_same() {
         use rand::{RngExt, SeedableRng};
-        let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(7);
-        let mut n_lifts = 0;
-        for _ in 0..20_000 {
-            let mut s = stream();
-            let mut row = 0;
-            for grasp_id in 0..3 {
-                row = 0;
-                let mut is_doubtful = false;
-                for _ in 0..rng.random_range(1..8) {
-                    let is_settled = rng.random_bool(0.8);
-                    let stable = rng.random_bool(0.85);
-                    // Now and then together with stable, which no classifier says.
-                    let unsure = rng.random_bool(if stable { 0.02 } else { 0.5 });
-                    let fault = match rng.random_range(0..40) {
-                        0 => Fault::InvalidValue,
-                        1 => Fault::OutOfDistribution,
-                        2 => Fault::NoContact,
-                        _ => Fault::None,
-                    };
-                    let is_lost = rng.random_bool(0.04);
-                    let age_nanos = if rng.random_bool(0.04) { u64::MAX } else { 0 };
-                    s.header.seq += u64::from(is_lost);
-                    let counts = match fault {
-                        Fault::None => false,
-                        Fault::InvalidValue => true,
-                        _ => is_settled,
-                    };
-                    is_doubtful |= counts || is_lost || age_nanos != 0 || (stable && unsure);
-                    row = if is_settled && stable && !is_doubtful { row + 1 } else { 0 };
-                    let n_before = s.decisions.len();
-                    let probability_stable = if stable { 0.9 } else { 0.1 };
-                    let phase = if is_settled { Phase::Settled } else { Phase::Closing };
-                    let prediction = Prediction { grasp_id, phase, fault, unsure, ..settled(probability_stable) };
-                    s.push_aged(prediction, age_nanos);
-                    let lifts = |decision: &&LiftDecision| decision.action == Action::Lift;
-                    for decision in s.decisions[n_before..].iter().filter(lifts) {
-                        assert!(decision.grasp_id == grasp_id && row >= 3, "{decision:?} after a row of {row}");
-                        n_lifts += 1;
-                    }
-                }
-            }
-            let decided: Vec<u64> = s.end().iter().map(|(grasp_id, _, _)| *grasp_id).collect();
-            assert_eq!(decided, [0, 1, 2], "a last row of {row}");
-        }
-        assert!(n_lifts > 1000, "the streams lift too rarely to show anything: {n_lifts}");
-    }
-
-    /// Whatever comes, in whatever order: an arbiter that is replaced at any point, by one that knows its state from bytes,
-    /// decides as one that is not; each grasp once; and a LIFT stands behind an unbroken row of votes.
-    #[test]
-    fn an_arbiter_replaced_at_any_point_decides_the_same() {
-        use rand::{RngExt, SeedableRng};
+        let letters: Vec<char> = "++++++++++++++++++++++++++++++--?cNNNNPLRBGHMEUZo!=".chars().collect();
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(8);
         let (mut n_lifts, mut n_held, mut n_replaced) = (0, 0, 0);
         for _ in 0..10_000 {
-            let votes = rng.random_range(1..5);
-            let options = ArbiterOptions { votes, ..ArbiterOptions::default() };
-            let (mut staying, mut replaced) = (LiftArbiter::new(options), LiftArbiter::new(options));
-            let (mut decisions, mut same) = (Vec::new(), Vec::new());
-            let mut decided = std::collections::BTreeSet::new();
-            let (mut header, mut grasp_id) = (Header::default(), 0);
-            // The votes for a LIFT of one grasp right behind one another, and the last of them.
-            let mut row = 0;
-            let mut last_vote: Option<(u64, Header)> = None;
+            let options = ArbiterOptions { votes: rng.random_range(1..5), ..ArbiterOptions::default() };
+            let (mut staying, mut replaced) = (stream(options), stream(options));
+            let mut history = String::new();
             for _ in 0..rng.random_range(1..60) {
                 if rng.random_bool(0.1) {
                     let config = bincode::config::standard();
-                    let bytes = bincode::serde::encode_to_vec(replaced.state(), config).expect("encoded");
-                    replaced = LiftArbiter::new(options);
-                    replaced.restore(bincode::serde::decode_from_slice(&bytes, config).expect("decoded").0);
+                    let bytes = bincode::serde::encode_to_vec(replaced.arbiter.state(), config).expect("encoded");
+                    replaced.arbiter = LiftArbiter::new(options);
+                    replaced.arbiter.restore(bincode::serde::decode_from_slice(&bytes, config).expect("decoded").0);
                     n_replaced += 1;
                 }
-                // The next sample of the grasp or of the next one; seldom something else.
-                match rng.random_range(0..40) {
-                    0 => header.seq += 2,
-                    1 => header.seq = header.seq.saturating_sub(rng.random_range(1..4)),
-                    2 => header.stamp_nanos += 100 * STEP_NANOS,
-                    3 => header.hand_id += 1,
-                    4 => header = Header { epoch: header.epoch + 1, seq: rng.random_range(0..2), ..header },
-                    6 => header.made_by += 1,
-                    5 => grasp_id = rng.random_range(0..=grasp_id),
-                    _ => {}
-                }
-                grasp_id += u64::from(rng.random_bool(0.12));
-                let (n_before, before) = (decisions.len(), replaced.state().last.map_or(0, |last| last.epoch));
-                let age_nanos = if rng.random_bool(0.03) { options.max_age_nanos + 1 } else { 0 };
-                let fault = if rng.random_bool(0.03) { Fault::Malformed } else { Fault::None };
-                let phase = if rng.random_bool(0.9) { Phase::Settled } else { Phase::Closing };
-                let vote = settled(if rng.random_bool(0.8) { 0.9 } else { 0.1 });
-                let prediction = Prediction { grasp_id, phase, fault, ..vote };
-                let is_vote = age_nanos == 0 && fault == Fault::None && phase == Phase::Settled && prediction.stable;
-                let follows = last_vote.is_some_and(|(of, last)| {
-                    let next = Header { seq: last.seq + 1, stamp_nanos: last.stamp_nanos + STEP_NANOS, ..last };
-                    of == grasp_id && header == next
-                });
-                last_vote = is_vote.then_some((grasp_id, header));
-                row = if follows && is_vote { row + 1 } else { u32::from(is_vote) };
-                match rng.random_range(0..30) {
-                    0 => {
-                        decisions.extend(staying.on_silence());
-                        same.extend(replaced.on_silence());
-                        (row, last_vote) = (0, None);
-                    }
-                    1 => {
-                        staying.on_unreadable(&header, grasp_id, &mut decisions);
-                        replaced.on_unreadable(&header, grasp_id, &mut same);
-                        (row, last_vote) = (0, None);
-                    }
-                    _ => {
-                        staying.on_prediction(&header, &prediction, age_nanos, &mut decisions);
-                        replaced.on_prediction(&header, &prediction, age_nanos, &mut same);
-                    }
-                }
-                for decision in &decisions[n_before..] {
-                    // A source that starts anew may use its numbers again.
-                    let now = replaced.state().last.map_or(0, |last| last.epoch);
-                    let epoch = if decision.grasp_id == grasp_id { now } else { before };
-                    assert!(decided.insert((epoch, decision.grasp_id)), "decided twice: {decisions:?}");
-                }
-                header.seq += 1;
-                header.stamp_nanos += STEP_NANOS;
-                for lift in decisions[n_before..].iter().filter(|decision| decision.action == Action::Lift) {
-                    assert!(row >= votes && lift.grasp_id == grasp_id, "{lift:?} after a row of {row}");
-                    n_lifts += 1;
-                }
+                let letter = letters[rng.random_range(0..letters.len())];
+                history.push(letter);
+                let decisions = staying.take(letter);
+                assert_eq!(decisions, replaced.take(letter), "{history}");
+                n_lifts += decisions.iter().filter(|decision| decision.action == Action::Lift).count();
+                n_held += decisions.iter().filter(|decision| decision.action == Action::Hold).count();
             }
-            decisions.extend(staying.on_end());
-            same.extend(replaced.on_end());
-            assert_eq!(decisions, same);
-            n_held += decisions.iter().filter(|decision| decision.action == Action::Hold).count();
+            assert_eq!(staying.arbiter.on_end(), replaced.arbiter.on_end(), "{history}");
         }
         assert!(n_lifts > 1000 && n_held > 1000 && n_replaced > 1000, "{n_lifts} {n_held} {n_replaced}");
-    }
-
-    #[test]
-    fn silence_and_unreadable_samples_hold_their_grasp_once() {
-        let mut s = stream();
-        assert_eq!(s.arbiter.on_silence(), None);
-        s.push(settled(0.9));
-        assert_eq!(s.arbiter.on_silence().map(|decision| decision.reason), Some(Reason::Stale));
-        let mut decided = |header: &Header, grasp_id| {
-            let mut decisions = Vec::new();
-            s.arbiter.on_unreadable(header, grasp_id, &mut decisions);
-            decisions.iter().map(|decision| (decision.grasp_id, decision.reason)).collect::<Vec<_>>()
-        };
-        let next = |seq| Header { seq, ..Header::default() };
-        assert_eq!(decided(&next(1), 0), []);
-        assert_eq!(decided(&next(2), 1), [(1, Reason::Invalid)]);
-        assert_eq!(decided(&next(3), 1), []);
-    }
-
-    /// An unreadable prediction may have been one of the next grasp, whatever grasp its head names, unless the next prediction
-    /// is one of the same grasp; so may missing ones before it.
-    #[test]
-    fn an_unreadable_prediction_counts_against_the_next_grasp() {
-        let mut s = stream();
-        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
-        s.header.seq = 9;
-        s.arbiter.on_unreadable(&s.header, 0, &mut s.decisions);
-        s.header.seq += 1;
-        s.header.stamp_nanos += 7 * STEP_NANOS;
-        for grasp_id in [1, 1, 1, 2, 2, 2] {
-            s.push(Prediction { grasp_id, ..settled(0.9) });
-        }
-        s.arbiter.on_unreadable(&s.header, 2, &mut s.decisions);
-        s.header.seq += 1;
-        s.header.stamp_nanos += STEP_NANOS;
-        for grasp_id in [2, 3, 3, 3] {
-            s.push(Prediction { grasp_id, ..settled(0.9) });
-        }
-        let expected = [
-            (0, Action::Lift, Reason::Stable),
-            (1, Action::Hold, Reason::OutOfOrder),
-            (2, Action::Lift, Reason::Stable),
-            (3, Action::Lift, Reason::Stable),
-        ];
-        assert_eq!(s.end(), expected);
-    }
-
-    #[test]
-    fn votes_of_two_models_do_not_add_up() {
-        let mut s = stream();
-        for made_by in [1, 1, 2, 2, 1] {
-            s.header.made_by = made_by;
-            s.push(settled(0.9));
-        }
-        assert_eq!(s.decisions, []);
-        s.push(settled(0.9)).push(settled(0.9));
-        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
-    }
-
-    /// A bridge repeats its last reading under new numbers.
-    #[test]
-    fn a_reading_that_is_sent_again_has_one_vote() {
-        let mut s = stream();
-        for _ in 0..5 {
-            s.push(settled(0.9));
-            s.header.stamp_nanos -= STEP_NANOS;
-        }
-        assert_eq!(s.decisions, []);
-        s.header.stamp_nanos += STEP_NANOS;
-        s.push(settled(0.9)).push(settled(0.9));
-        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
-    }
-
-    /// Another machine's source starts anew while the arbiter stays: its first grasps have numbers that were decided.
-    #[test]
-    fn a_source_that_starts_anew_may_use_its_numbers_again() {
-        let mut s = stream();
-        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
-        s.header = Header { epoch: 1, ..Header::default() };
-        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
-        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable); 2]);
-    }
-
-    #[test]
-    fn a_restarted_source_does_not_finish_a_grasp_it_had_begun() {
-        let mut s = stream();
-        s.push(settled(0.9)).push(settled(0.9));
-        s.header = Header { epoch: 1, ..Header::default() };
-        s.push(settled(0.9));
-        assert_eq!(s.end(), [(0, Action::Hold, Reason::OutOfOrder)]);
-        // A new grasp of a new epoch is trusted from its source's first sample on, and only then.
-        for (seq, action) in [(0, Action::Lift), (4, Action::Hold)] {
-            let mut s = stream();
-            s.push(settled(0.1)).push(settled(0.1)).push(settled(0.1));
-            s.header = Header { epoch: 1, seq, ..Header::default() };
-            for _ in 0..3 {
-                s.push(Prediction { grasp_id: 1, ..settled(0.9) });
-            }
-            assert_eq!(s.end()[1].1, action, "first sample {seq}");
-        }
-    }
-
-    #[test]
-    fn a_promising_grasp_is_probed_and_only_the_frames_after_it_lift() {
-        let probing = || {
-            let mut s = stream();
-            s.arbiter.set_options(ArbiterOptions { probe: Probe::TestLift, ..ArbiterOptions::default() });
-            s
-        };
-        let of = |phase, probability| Prediction { phase, ..settled(probability) };
-        let mut s = probing();
-        let last_asked = |s: &mut Stream| {
-            let asked = s.decisions.drain(..).map(|decision| (decision.action, decision.reason));
-            asked.collect::<Vec<_>>()
-        };
-        // Stable and unsure both are worth a probe. The source says that it has ended before it hears of it.
-        s.push(settled(0.9)).push(Prediction { unsure: true, ..settled(0.4) }).push(settled(0.9));
-        s.push(of(Phase::Ended, 0.9));
-        assert_eq!(last_asked(&mut s), [(Action::TestLift, Reason::Promising)]);
-        let squeeze = |s: &mut Stream, probability| {
-            s.push(of(Phase::Squeezing, 0.9));
-            (0..3).for_each(|_| _ = s.push(of(Phase::Squeezed, probability)));
-        };
-        let lifted = |s: &mut Stream| {
-            s.push(of(Phase::TestLifting, 0.1));
-            (0..3).for_each(|_| _ = s.push(of(Phase::TestLifted, 0.9)));
-        };
-        squeeze(&mut s, 0.9);
-        lifted(&mut s);
-        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
-        let squeezed = |probability| {
-            let mut s = probing();
-            s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9));
-            squeeze(&mut s, probability);
-            s
-        };
-        // A source that waits before the test lift is told to go on, once for each time that it asks.
-        let mut s = squeezed(0.9);
-        s.push(of(Phase::Ended, 0.9));
-        assert_eq!(last_asked(&mut s), [(Action::TestLift, Reason::Promising); 2]);
-        lifted(&mut s);
-        assert_eq!(s.end(), [(0, Action::Lift, Reason::Stable)]);
-        // A tight hand that is not promising ends the grasp, whether the source waits or not; a faulty one at once.
-        let mut s = squeezed(0.1);
-        s.push(of(Phase::Ended, 0.1));
-        lifted(&mut s);
-        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::Unstable)]);
-        let mut s = probing();
-        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9)).push(of(Phase::Squeezing, 0.9));
-        s.push(Prediction { fault: Fault::NoContact, ..of(Phase::Squeezed, 0.0) });
-        lifted(&mut s);
-        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::NoContact)]);
-        // No probe is asked for if the grasp is unstable. After the probe, `ended` ends the grasp. A hand that closes again
-        // needs another probe.
-        let mut s = probing();
-        s.push(settled(0.1)).push(settled(0.1)).push(settled(0.1));
-        assert_eq!(s.end(), [(0, Action::Hold, Reason::Unstable)]);
-        let mut s = squeezed(0.9);
-        s.push(of(Phase::TestLifted, 0.9)).push(of(Phase::Ended, 0.9));
-        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::NoAgreement)]);
-        let mut s = squeezed(0.9);
-        s.push(of(Phase::Closing, 0.9));
-        s.push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9)).push(of(Phase::TestLifted, 0.9));
-        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::NoAgreement)]);
-        let mut s = squeezed(0.9);
-        s.push(Prediction { fault: Fault::MissingReading, ..of(Phase::TestLifted, 0.0) });
-        assert_eq!(s.end()[1..], [(0, Action::Hold, Reason::MissingReading)]);
-    }
-
-    #[test]
-    fn a_lift_is_watched_and_neither_lifted_again_nor_lifted_after_a_hold() {
-        let lifting = |probability: f64, unsure: bool| Prediction {
-            phase: Phase::Lifting,
-            unsure,
-            stable: !unsure && probability >= 0.5,
-            ..settled(probability)
-        };
-        let ended = Prediction { phase: Phase::Ended, ..settled(0.9) };
-        let said = |s: &mut Stream| -> Vec<Action> { s.decisions.drain(..).map(|decision| decision.action).collect() };
-        let mut s = stream();
-        s.push(settled(0.9)).push(settled(0.9)).push(settled(0.9)).push(ended.clone());
-        assert_eq!(said(&mut s), [Action::Lift], "it has not begun to lift");
-        s.push(lifting(0.9, false))
-            .push(ended.clone())
-            .push(lifting(0.4, true))
-            .push(ended.clone())
-            .push(ended.clone());
-        let reasons: Vec<Reason> = s.decisions.iter().map(|decision| decision.reason).collect();
-        assert_eq!(
-            reasons,
-            [Reason::Stable, Reason::NoAgreement, Reason::NoAgreement],
-            "nothing was judged for the last"
-        );
-        assert_eq!(said(&mut s), [Action::GoOn; 3]);
-        s.push(lifting(0.9, false));
-        // Two are too few, and a fault or a late frame has no vote.
-        s.push(lifting(0.4, true)).push(lifting(0.4, true)).push(lifting(0.9, false));
-        s.push(lifting(0.4, true)).push(Prediction { fault: Fault::SensorFault, ..lifting(0.0, false) });
-        s.push(lifting(0.4, true)).push_aged(lifting(0.4, true), u64::MAX).push(lifting(0.4, true));
-        assert_eq!(said(&mut s), []);
-        s.push(lifting(0.4, true)).push(lifting(0.1, false)).push(lifting(0.4, true)).push(ended.clone());
-        assert_eq!(said(&mut s), [Action::Tighten, Action::GoOn], "once");
-        s.push(lifting(0.1, false)).push(lifting(0.1, false)).push(lifting(0.0, false));
-        assert_eq!(s.decisions[0].reason, Reason::Slipping);
-        assert_eq!(said(&mut s), [Action::SetDown]);
-        s.push(lifting(0.9, false)).push(ended).push(lifting(0.1, false));
-        assert_eq!(said(&mut s), [], "that was all");
-        // A robot that lifts without having been allowed to is not watched; its grasp is held.
-        s.push(Prediction { grasp_id: 1, ..settled(0.9) }).push(Prediction { grasp_id: 1, ..lifting(0.9, false) });
-        s.push(Prediction { grasp_id: 1, ..lifting(0.1, false) })
-            .push(Prediction { grasp_id: 1, ..lifting(0.1, false) });
-        s.push(Prediction { grasp_id: 1, ..lifting(0.1, false) });
-        assert_eq!(s.decisions.iter().map(|it| (it.grasp_id, it.action)).collect::<Vec<_>>(), [(1, Action::Hold)]);
-        // A lift that was broken off has no outcome that could be missing.
-        for grasp_id in [2, 3] {
-            for _ in 0..3 {
-                s.push(Prediction { grasp_id, ..settled(0.9) });
-            }
-        }
-        assert_eq!(s.arbiter.state().n_unreported(), 1);
     }
 }

@@ -8,116 +8,13 @@ use rayon::prelude::*;
 
 const STEP_NANOS: u64 = 10_000_000;
 
-/// How an input differs from the settled, stable prediction that comes next in the same grasp.
-#[derive(Debug, Clone, Copy, PartialEq)]
-enum Step {
-    Stable,
-    Unstable,
-    Unsure,
-    Closing,
-    Ended,
-    NextGrasp,
-    NextGraspClosing,
-    FirstGraspAgain,
-    OtherModel,
-    SameTime,
-    SameTimeUnstable,
-    LaterThanMaxGap,
-    EarlierTime,
-    Gap,
-    Repeated,
-    OtherHand,
-    NewEpoch,
-    NewEpochWithoutBeginning,
-    Old,
-    Faulty,
-    Improbable,
-    Unreadable,
-    Silence,
-    CutOff,
-    Squeezed,
-    SqueezedUnstable,
-    TestLifting,
-    TestLifted,
-    TestLiftedUnstable,
-    Dropped,
-    Lifting,
-    LiftingUnsure,
-    LiftingUnstable,
-}
+/// How an input differs from the settled, stable prediction that comes next in the same grasp; [`Input::after`] says it of each
+/// letter. The inputs of histories with a probe, and of those with a lift that is watched, are fewer so that they may be longer.
+type Step = char;
 
-use Step::*;
-
-const STEPS: [Step; 25] = [
-    Stable,
-    Unstable,
-    Unsure,
-    Closing,
-    Ended,
-    NextGrasp,
-    NextGraspClosing,
-    FirstGraspAgain,
-    OtherModel,
-    SameTime,
-    SameTimeUnstable,
-    LaterThanMaxGap,
-    EarlierTime,
-    Gap,
-    Repeated,
-    OtherHand,
-    NewEpoch,
-    NewEpochWithoutBeginning,
-    Old,
-    Faulty,
-    Improbable,
-    Unreadable,
-    Silence,
-    CutOff,
-    Dropped,
-];
-
-/// The inputs of histories with a probe, fewer so that they may be longer.
-const STEPS_WITH_PROBE: [Step; 19] = [
-    Stable,
-    Unstable,
-    Unsure,
-    Closing,
-    Ended,
-    NextGrasp,
-    OtherModel,
-    SameTime,
-    Gap,
-    NewEpoch,
-    Old,
-    Faulty,
-    Silence,
-    Step::Squeezed,
-    SqueezedUnstable,
-    TestLifting,
-    TestLifted,
-    TestLiftedUnstable,
-    Dropped,
-];
-
-/// The inputs of histories with a lift that is watched.
-const STEPS_WHILE_LIFTING: [Step; 16] = [
-    Stable,
-    Ended,
-    NextGrasp,
-    OtherModel,
-    SameTimeUnstable,
-    Gap,
-    NewEpoch,
-    Old,
-    Faulty,
-    Unreadable,
-    Silence,
-    CutOff,
-    Dropped,
-    Step::Lifting,
-    LiftingUnsure,
-    LiftingUnstable,
-];
+const STEPS: &str = "+-?ceNnFM=~GBLRHEWo!iUZXd";
+const STEPS_WITH_PROBE: &str = "+-?ceNM=LEo!ZqpltTd";
+const STEPS_WHILE_LIFTING: &str = "+eNM~LEo!UZXdawv";
 
 /// An input as the arbiter gets it. A silence and a cut link have the header and the grasp of the input before them.
 #[derive(Debug, Clone)]
@@ -147,53 +44,53 @@ impl Input {
         let unstable = Prediction { stable: false, probability_stable: 0.1, ..stable };
         let mut age_nanos = options.max_age_nanos;
         let prediction = match step {
-            Unstable | SameTimeUnstable => unstable,
-            Unsure => Prediction { unsure: true, ..unstable },
-            Closing => Prediction { phase: Phase::Closing, ..stable },
-            Ended => Prediction { phase: Phase::Ended, ..stable },
-            Step::Squeezed => Prediction { phase: Phase::Squeezed, ..stable },
-            SqueezedUnstable => Prediction { phase: Phase::Squeezed, ..unstable },
-            TestLifting => Prediction { phase: Phase::TestLifting, ..stable },
-            Dropped => Prediction { phase: Phase::Dropped, ..stable },
-            Step::Lifting => Prediction { phase: Phase::Lifting, ..stable },
-            LiftingUnsure => Prediction { phase: Phase::Lifting, unsure: true, ..unstable },
-            LiftingUnstable => Prediction { phase: Phase::Lifting, ..unstable },
-            Step::TestLifted => Prediction { phase: Phase::TestLifted, ..stable },
-            TestLiftedUnstable => Prediction { phase: Phase::TestLifted, ..unstable },
-            NextGrasp => Prediction { grasp_id: grasp_id + 1, ..stable },
-            NextGraspClosing => Prediction { grasp_id: grasp_id + 1, phase: Phase::Closing, ..stable },
-            FirstGraspAgain => Prediction { grasp_id: 0, ..stable },
-            Faulty => Prediction { fault: Fault::InvalidValue, ..stable },
-            Improbable => Prediction { probability_stable: options.min_probability_stable / 2.0, ..stable },
+            '-' | '~' => unstable,
+            '?' => Prediction { unsure: true, ..unstable },
+            'c' => Prediction { phase: Phase::Closing, ..stable },
+            'e' => Prediction { phase: Phase::Ended, ..stable },
+            'q' => Prediction { phase: Phase::Squeezed, ..stable },
+            'p' => Prediction { phase: Phase::Squeezed, ..unstable },
+            'l' => Prediction { phase: Phase::TestLifting, ..stable },
+            'd' => Prediction { phase: Phase::Dropped, ..stable },
+            'a' => Prediction { phase: Phase::Lifting, ..stable },
+            'w' => Prediction { phase: Phase::Lifting, unsure: true, ..unstable },
+            'v' => Prediction { phase: Phase::Lifting, ..unstable },
+            't' => Prediction { phase: Phase::TestLifted, ..stable },
+            'T' => Prediction { phase: Phase::TestLifted, ..unstable },
+            'N' => Prediction { grasp_id: grasp_id + 1, ..stable },
+            'n' => Prediction { grasp_id: grasp_id + 1, phase: Phase::Closing, ..stable },
+            'F' => Prediction { grasp_id: 0, ..stable },
+            '!' => Prediction { fault: Fault::InvalidValue, ..stable },
+            'i' => Prediction { probability_stable: options.min_probability_stable / 2.0, ..stable },
             _ => stable,
         };
         // While the arm lifts, they say that the object leaves the hand.
         let is_lifting = last.is_some_and(|last| last.prediction.phase == Phase::Lifting);
         let prediction = match step {
-            OtherModel | SameTimeUnstable | Gap | Old | Faulty if is_lifting => {
+            'M' | '~' | 'L' | 'o' | '!' if is_lifting => {
                 Prediction { phase: Phase::Lifting, stable: false, probability_stable: 0.1, ..prediction }
             }
             _ => prediction,
         };
         match step {
-            OtherModel => header.made_by += 1,
-            SameTime | SameTimeUnstable => header.stamp_nanos = header.stamp_nanos.saturating_sub(STEP_NANOS),
-            LaterThanMaxGap => header.stamp_nanos += options.max_gap_nanos,
-            EarlierTime => header.stamp_nanos = header.stamp_nanos.saturating_sub(2 * STEP_NANOS),
-            Gap => header.seq += 1,
-            Repeated => header.seq = header.seq.saturating_sub(1),
-            OtherHand => header.hand_id += 1,
-            NewEpoch => (header.epoch, header.seq) = (header.epoch + 1, 0),
-            NewEpochWithoutBeginning => (header.epoch, header.seq) = (header.epoch + 1, header.seq.max(1)),
-            Old => age_nanos += 1,
-            Silence | CutOff => header = last.map_or_else(Header::default, |last| last.header),
+            'M' => header.made_by += 1,
+            '=' | '~' => header.stamp_nanos = header.stamp_nanos.saturating_sub(STEP_NANOS),
+            'G' => header.stamp_nanos += options.max_gap_nanos,
+            'B' => header.stamp_nanos = header.stamp_nanos.saturating_sub(2 * STEP_NANOS),
+            'L' => header.seq += 1,
+            'R' => header.seq = header.seq.saturating_sub(1),
+            'H' => header.hand_id += 1,
+            'E' => (header.epoch, header.seq) = (header.epoch + 1, 0),
+            'W' => (header.epoch, header.seq) = (header.epoch + 1, header.seq.max(1)),
+            'o' => age_nanos += 1,
+            'Z' | 'X' => header = last.map_or_else(Header::default, |last| last.header),
             _ => {}
         }
         Input { step, header, prediction, age_nanos }
     }
 
     fn is_sample(&self) -> bool {
-        !matches!(self.step, Silence | CutOff)
+        !matches!(self.step, 'Z' | 'X')
     }
 
     fn grasp(&self) -> (u64, u64) {
@@ -219,7 +116,7 @@ impl Input {
 
 fn is_plain_prediction(input: &Input, options: &ArbiterOptions) -> bool {
     input.is_sample()
-        && input.step != Unreadable
+        && input.step != 'U'
         && input.prediction.fault == Fault::None
         && input.age_nanos <= options.max_age_nanos
 }
@@ -273,7 +170,7 @@ fn may_lift(history: &[Input], decided: &[(usize, u64)], options: &ArbiterOption
                 || decided.iter().any(|(idx, id)| *idx < before.len() && *id == last.prediction.grasp_id);
             is_decided && grasp.first().is_some_and(|first| first.header.seq == 0)
         }
-        Some(previous) => previous.step != Unreadable && grasp.first().is_some_and(|first| first.follows(previous)),
+        Some(previous) => previous.step != 'U' && grasp.first().is_some_and(|first| first.follows(previous)),
     };
     let is_unbroken = grasp.windows(2).all(|pair| {
         pair[1].follows(&pair[0]) && pair[1].header.stamp_nanos - pair[0].header.stamp_nanos <= options.max_gap_nanos
@@ -341,7 +238,7 @@ fn may_react(history: &[Input], lifted: &[(usize, u64)], decision: &LiftDecision
 
 /// Each grasp that was heard of is decided once. A grasp that goes on while its source starts anew, even several times,
 /// may have one decision for these epochs.
-fn check_decisions(history: &[Input], decided: &[(usize, u64)], is_over: bool) {
+fn check_decisions(history: &[Input], decided: &[(usize, u64)]) {
     let mut n_decisions: BTreeMap<(u64, u64), usize> = BTreeMap::new();
     for input in history.iter().filter(|input| input.is_sample()) {
         n_decisions.entry(input.grasp()).or_default();
@@ -357,7 +254,7 @@ fn check_decisions(history: &[Input], decided: &[(usize, u64)], is_over: bool) {
         let earlier = (0..*epoch).rev().map_while(of_epoch);
         let shared: usize = earlier.chain((*epoch + 1..).map_while(of_epoch)).sum();
         assert!(*n <= 1, "grasp {id} of epoch {epoch} is decided {n} times: {history:?}");
-        assert!(!is_over || *n + shared > 0, "grasp {id} of epoch {epoch} is not decided: {history:?}");
+        assert!(*n + shared > 0, "grasp {id} of epoch {epoch} is not decided: {history:?}");
     }
 }
 
@@ -369,7 +266,7 @@ struct Explorer {
     asked: Vec<(usize, u64)>,
     /// Those that were answered with LIFT.
     lifted: Vec<(usize, u64)>,
-    steps: &'static [Step],
+    steps: &'static str,
     n_histories: u64,
     n_lifts: u64,
     n_reactions: u64,
@@ -383,9 +280,9 @@ impl Explorer {
         let input = Input::after(self.history.last(), step, &self.options);
         let mut decisions: Vec<LiftDecision> = Vec::new();
         match step {
-            Silence => decisions.extend(next.on_silence()),
-            CutOff => decisions.extend(next.on_cut_off()),
-            Unreadable => next.on_unreadable(&input.header, input.prediction.grasp_id, &mut decisions),
+            'Z' => decisions.extend(next.on_silence()),
+            'X' => decisions.extend(next.on_cut_off()),
+            'U' => next.on_unreadable(&input.header, input.prediction.grasp_id, &mut decisions),
             _ => next.on_prediction(&input.header, &input.prediction, input.age_nanos, &mut decisions),
         }
         let grasp_id = input.prediction.grasp_id;
@@ -431,13 +328,13 @@ impl Explorer {
             last.restore(arbiter.state().clone());
             let n_decided = self.decided.len();
             self.decided.extend(last.on_end().map(|decision| (self.history.len(), decision.grasp_id)));
-            check_decisions(&self.history, &self.decided, true);
+            check_decisions(&self.history, &self.decided);
             self.decided.truncate(n_decided);
             return;
         }
-        for step in self.steps {
+        for step in self.steps.chars() {
             let (n_decided, n_asked, n_lifted) = (self.decided.len(), self.asked.len(), self.lifted.len());
-            let next = self.step(arbiter, *step);
+            let next = self.step(arbiter, step);
             self.explore(&next, n_left - 1);
             self.history.pop();
             self.decided.truncate(n_decided);
@@ -448,9 +345,9 @@ impl Explorer {
 }
 
 /// All histories of up to `n_steps` more inputs after each of some beginnings.
-fn explore(options: ArbiterOptions, steps: &'static [Step], beginnings: &[Vec<Step>], n_steps: usize) -> u64 {
-    let jobs: Vec<(&Vec<Step>, &Step)> =
-        beginnings.iter().flat_map(|beginning| steps.iter().map(move |step| (beginning, step))).collect();
+fn explore(options: ArbiterOptions, steps: &'static str, beginnings: &[String], n_steps: usize) -> u64 {
+    let jobs: Vec<(&String, Step)> =
+        beginnings.iter().flat_map(|beginning| steps.chars().map(move |step| (beginning, step))).collect();
     let (n_histories, n_lifts, n_reactions) = jobs
         .into_par_iter()
         .map(|(beginning, first)| {
@@ -459,8 +356,8 @@ fn explore(options: ArbiterOptions, steps: &'static [Step], beginnings: &[Vec<St
             let mut explorer =
                 Explorer { options, history, decided, asked, lifted, steps, n_histories, n_lifts, n_reactions };
             let mut arbiter = LiftArbiter::new(options);
-            for step in beginning.iter().chain([first]) {
-                arbiter = explorer.step(&arbiter, *step);
+            for step in beginning.chars().chain([first]) {
+                arbiter = explorer.step(&arbiter, step);
             }
             explorer.explore(&arbiter, n_steps - 1);
             (explorer.n_histories, explorer.n_lifts, explorer.n_reactions)
@@ -478,8 +375,8 @@ fn no_history_lifts_against_the_specification_and_each_grasp_is_decided_once() {
         let (promised_drops, min_probability_stable) = (0.0, 0.6);
         let options = ArbiterOptions { votes, min_probability_stable, promised_drops, ..ArbiterOptions::default() };
         // Nothing; a grasp with one vote less than it needs; a grasp that is decided.
-        let beginnings = [0, votes as usize - 1, votes as usize].map(|n_stable| vec![Stable; n_stable]);
-        explore(options, &STEPS, &beginnings, 5);
+        let beginnings = [0, votes as usize - 1, votes as usize].map(|n_stable| "+".repeat(n_stable));
+        explore(options, STEPS, &beginnings, 5);
     }
 }
 
@@ -492,9 +389,9 @@ fn no_history_with_a_probe_lifts_before_the_probe_was_asked_for_and_felt() {
             ArbiterOptions { votes, probe, min_probability_stable, promised_drops, ..ArbiterOptions::default() };
         let n = votes as usize;
         // Nothing; a grasp of which a probe was asked for; one vote less than it needs after that.
-        let asked = vec![Unsure; n];
-        let felt = [asked.clone(), vec![TestLifting], vec![Step::TestLifted; n - 1]].concat();
-        explore(options, &STEPS_WITH_PROBE, &[vec![], asked, felt], 5);
+        let asked = "?".repeat(n);
+        let felt = format!("{asked}l{}", "t".repeat(n - 1));
+        explore(options, STEPS_WITH_PROBE, &[String::new(), asked, felt], 5);
     }
 }
 
@@ -502,9 +399,9 @@ fn no_history_with_a_probe_lifts_before_the_probe_was_asked_for_and_felt() {
 fn no_history_lifts_while_a_lift_is_watched_and_reactions_follow_votes_of_the_lift_alone() {
     for votes in [1, 2] {
         let options = ArbiterOptions { votes, promised_drops: 0.0, ..ArbiterOptions::default() };
-        let lifted = vec![Stable; votes as usize];
-        let beginnings = [lifted.clone(), [lifted, vec![LiftingUnstable; votes as usize - 1]].concat()];
-        let n_reactions = explore(options, &STEPS_WHILE_LIFTING, &beginnings, 5);
+        let lifted = "+".repeat(votes as usize);
+        let beginnings = [lifted.clone(), lifted + &"v".repeat(votes as usize - 1)];
+        let n_reactions = explore(options, STEPS_WHILE_LIFTING, &beginnings, 5);
         assert!(n_reactions > 1000, "{n_reactions} reactions show nothing");
     }
 }

@@ -14,10 +14,29 @@ fn reading(phase: Phase) -> Reading {
     Reading { joints: vec![0.5], cells_newtons: vec![0.0, 1.0], phase, ..Reading::default() }
 }
 
+fn stamped(stamp_nanos: u64) -> Reading {
+    Reading { stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) }
+}
+
+fn sent(seq: u64, stamp_nanos: u64) -> Reading {
+    Reading { seq: Some(seq), ..stamped(stamp_nanos) }
+}
+
+fn of_grasp(grasp_id: u64) -> Reading {
+    Reading { grasp_id: Some(grasp_id), ..reading(Phase::Open) }
+}
+
 fn gate() -> FrameFilter {
     let mut gate = FrameFilter::new(SHAPE, 100 * MS, 0, Place::default(), None);
     gate.began();
     gate
+}
+
+/// The gate of a process that takes over where another one stood.
+fn after(gate: &FrameFilter) -> FrameFilter {
+    let mut successor = FrameFilter::new(SHAPE, 100 * MS, 0, *gate.place(), Some(0));
+    successor.began();
+    successor
 }
 
 fn at(nanos: u64) -> Arrival {
@@ -184,26 +203,28 @@ fn the_senders_numbers_show_missed_and_reordered_frames() {
 }
 
 #[test]
-fn an_earlier_grasp_never_comes_again() {
-    let mut gate = gate();
-    let of_grasp = |grasp_id| Reading { grasp_id: Some(grasp_id), ..reading(Phase::Open) };
+fn an_earlier_grasp_never_comes_again_and_one_far_ahead_is_refused() {
+    let mut gate = self::gate();
+    assert_eq!(take(&mut gate, &of_grasp(u64::MAX), at(1)), Err(RefusalKind::Malformed));
+    assert_eq!(take(&mut gate, &of_grasp(7), at(1)), Ok((2, 7)));
+    assert_eq!(take(&mut gate, &of_grasp(1 << 60), at(1)), Err(RefusalKind::OutOfOrder));
+    assert_eq!(take(&mut gate, &of_grasp(8), at(1)), Ok((4, 8)));
+
+    let mut gate = self::gate();
     assert_eq!(take(&mut gate, &of_grasp(7), at(1)), Ok((1, 7)));
     assert_eq!(take(&mut gate, &of_grasp(6), at(1)), Err(RefusalKind::OutOfOrder));
     gate.began();
     assert_eq!(take(&mut gate, &of_grasp(6), at(10 * RESET_NANOS)), Err(RefusalKind::OutOfOrder));
-    let mut successor = FrameFilter::new(SHAPE, 100 * MS, 0, *gate.place(), Some(0));
-    successor.began();
+    let mut successor = after(&gate);
     assert_eq!(take(&mut successor, &of_grasp(6), at(1)), Err(RefusalKind::OutOfOrder));
     assert_eq!(take(&mut successor, &of_grasp(7), at(1)), Ok((2, 7)));
     // Without numbers of the sender's own, the successor goes on with a new one.
-    let mut successor = FrameFilter::new(SHAPE, 100 * MS, 0, *gate.place(), Some(0));
-    successor.began();
+    let mut successor = after(&gate);
     assert_eq!(take(&mut successor, &reading(Phase::Settled), at(1)), Ok((2, 8)));
 }
 
 #[test]
 fn a_frame_is_late_by_its_stamp_with_any_sender_clock() {
-    let stamped = |stamp_nanos| Reading { stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) };
     // A clock of another epoch, and one that is ahead.
     for offset in [0, 1_700_000_000_000_000_000] {
         let mut gate = gate();
@@ -246,7 +267,6 @@ fn frames_without_stamps_that_may_have_waited_are_late() {
 
 #[test]
 fn a_sender_that_restarts_its_count_is_accepted_after_a_while() {
-    let sent = |seq, stamp_nanos| Reading { seq: Some(seq), stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) };
     let mut gate = gate();
     for idx in 0..100 {
         assert!(take(&mut gate, &sent(1000 + idx, 900_000 * MS + idx * 10 * MS), at(idx * 10 * MS)).is_ok());
@@ -274,7 +294,6 @@ fn a_sender_that_restarts_its_count_is_accepted_after_a_while() {
 /// connection.
 #[test]
 fn a_backlog_is_never_accepted_as_fresh() {
-    let sent = |seq, stamp_nanos| Reading { seq: Some(seq), stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) };
     for stall_ms in [3_000, 11_000, 130_000] {
         for (is_copied, is_new_connection) in [(false, false), (true, false), (false, true), (true, true)] {
             let what = format!("{stall_ms} ms, copied {is_copied}, new connection {is_new_connection}");
@@ -311,18 +330,15 @@ fn a_backlog_is_never_accepted_as_fresh() {
 
 #[test]
 fn frames_kept_while_the_source_was_away_keep_their_age() {
-    let stamped = |stamp_nanos| Reading { stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) };
     let mut gate = gate();
     assert_eq!(take(&mut gate, &stamped(500 * MS), at(1000 * MS)), Ok((0, 0)));
-    let mut successor = FrameFilter::new(SHAPE, 100 * MS, 0, *gate.place(), Some(0));
-    successor.began();
+    let mut successor = after(&gate);
     assert_eq!(take(&mut successor, &stamped(600 * MS), at(3000 * MS)), Err(RefusalKind::Late));
     assert_eq!(take(&mut successor, &stamped(2510 * MS), at(3010 * MS)), Ok((3, 1)));
 }
 
 #[test]
 fn a_new_connection_has_a_new_clock_only_if_it_is_far_off_and_steady() {
-    let stamped = |stamp_nanos| Reading { stamp_nanos: Some(stamp_nanos), ..reading(Phase::Open) };
     let day = 86_400_000 * MS;
     let mut gate = gate();
     for idx in 0..100 {
@@ -340,16 +356,6 @@ fn a_new_connection_has_a_new_clock_only_if_it_is_far_off_and_steady() {
         (0..400).filter(|idx| take(&mut gate, &stamped(idx * 10 * MS), at((20_000 + idx * 10) * MS)).is_ok());
     assert_eq!(n_passed.count(), 200);
     assert_eq!(gate.counts().resets, 1);
-}
-
-#[test]
-fn a_grasp_number_far_ahead_is_refused() {
-    let mut gate = gate();
-    let of_grasp = |grasp_id| Reading { grasp_id: Some(grasp_id), ..reading(Phase::Open) };
-    assert_eq!(take(&mut gate, &of_grasp(u64::MAX), at(1)), Err(RefusalKind::Malformed));
-    assert_eq!(take(&mut gate, &of_grasp(7), at(1)), Ok((2, 7)));
-    assert_eq!(take(&mut gate, &of_grasp(1 << 60), at(1)), Err(RefusalKind::OutOfOrder));
-    assert_eq!(take(&mut gate, &of_grasp(8), at(1)), Ok((4, 8)));
 }
 
 /// A UART changes digits. One frame with a wrong number costs that frame, and the grasp that it is in, but no more.

@@ -118,15 +118,8 @@ fn surfaces_are_closed_and_face_outwards() {
         if matches!(object.shape.as_typed_shape(), TypedShape::TriMesh(_)) && mesh.triangles.len() > 6000 {
             large.push(format!("{object:?}: {} triangles", mesh.triangles.len()));
         }
-        let mut edges: HashMap<(u32, u32), i32> = HashMap::new();
-        for &[a, b, c] in &mesh.triangles {
-            for edge in [(a, b), (b, c), (c, a)] {
-                *edges.entry(edge).or_default() += 1;
-            }
-        }
-        for (&(a, b), &n) in &edges {
-            assert!(n == 1 && edges.get(&(b, a)) == Some(&1), "{object:?}: edge {a} to {b}");
-        }
+        let (_, survey) = blindgrasp_mesh::check::repair(mesh.clone());
+        assert!(survey.is_closed() && survey.warnings().is_empty(), "{object:?}: {survey:?}");
         for [a, b, c] in mesh.corners() {
             let area_mm2 = (b - a).cross(&(c - a)).norm() / 2.0 * 1e6;
             let longest_mm =

@@ -1051,50 +1051,27 @@ mod tests {
         (0..n).map(|_| std::array::from_fn(|_| radius * random.symmetric())).collect()
     }
 
-    #[track_caller]
-    fn check(points: &[[f64; DIM]], volume: f64, least_offset: f64) -> Hull {
-        let hull = convex_hull(points).expect("a hull");
-        assert!((hull.volume - volume).abs() <= 1e-12 * volume, "volume {} instead of {volume}", hull.volume);
-        let found = hull.least_offset();
-        assert!((found - least_offset).abs() <= 1e-12, "least offset {found} instead of {least_offset}");
-        assert_eq!((hull.n_retries, hull.joggle), (0, None));
-        hull
-    }
-
     #[test]
-    fn a_cube_has_twelve_planes() {
-        assert_eq!(check(&cube(), 64.0, 1.0).n_planes, 12);
-    }
-
-    #[test]
-    fn a_simplex_has_seven_facets() {
-        let mut points = unit_vectors(1.0);
-        points.push([0.0; DIM]);
-        assert_eq!(check(&points, 1.0 / 720.0, 0.0).facets.len(), 7);
-    }
-
-    #[test]
-    fn a_cross_polytope_has_64_facets() {
-        let points = [unit_vectors(1.0), unit_vectors(-1.0)].concat();
-        assert_eq!(check(&points, 64.0 / 720.0, 1.0 / 6.0_f64.sqrt()).facets.len(), 64);
-    }
-
-    #[test]
-    fn a_product_of_polygons_has_the_product_of_their_areas() {
-        // A regular octagon of radius 1 has the area 2√2; the triangle of three of a square's corners has 1.
-        assert_eq!(check(&octagons_by_triangle(0.0), 8.0, 0.0).n_planes, 8 + 8 + 3);
-    }
-
-    #[test]
-    fn the_origin_outside_is_a_negative_offset() {
+    fn hulls_by_hand() {
+        let simplex = [unit_vectors(1.0), vec![[0.0; DIM]]].concat();
+        let cross_polytope = [unit_vectors(1.0), unit_vectors(-1.0)].concat();
         let moved: Vec<_> = cube().iter().map(|point| point.map(|x| x + 3.0)).collect();
-        check(&moved, 64.0, -2.0);
-    }
-
-    #[test]
-    fn duplicates_and_points_inside_change_nothing() {
-        let points = [inside(60, 0.99), cube(), cube(), unit_vectors(1.0), vec![[0.0; DIM]; 3]].concat();
-        assert_eq!(check(&points, 64.0, 1.0).n_planes, 12);
+        let with_others = [inside(60, 0.99), cube(), cube(), unit_vectors(1.0), vec![[0.0; DIM]; 3]].concat();
+        for (name, points, volume, least_offset, n_planes) in [
+            ("a cube", cube(), 64.0, 1.0, 12),
+            ("a simplex", simplex, 1.0 / 720.0, 0.0, 7),
+            ("a cross polytope", cross_polytope, 64.0 / 720.0, 1.0 / 6.0_f64.sqrt(), 64),
+            // A regular octagon of radius 1 has the area 2√2; the triangle of three of a square's corners has 1.
+            ("a product of polygons", octagons_by_triangle(0.0), 8.0, 0.0, 8 + 8 + 3),
+            ("a cube beside the origin", moved, 64.0, -2.0, 12),
+            ("a cube with duplicates and points inside", with_others, 64.0, 1.0, 12),
+        ] {
+            let hull = convex_hull(&points).expect(name);
+            assert!((hull.volume - volume).abs() <= 1e-12 * volume, "{name}: volume {} for {volume}", hull.volume);
+            let offset = hull.least_offset();
+            assert!((offset - least_offset).abs() <= 1e-12, "{name}: least offset {offset} for {least_offset}");
+            assert_eq!((hull.n_planes, hull.n_retries, hull.joggle), (n_planes, 0, None), "{name}");
+        }
     }
 
     #[test]

@@ -408,15 +408,20 @@ impl<T> Order<T> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use blindgrasp_objects::select;
     use std::convert::Infallible;
     use std::path::Path;
 
-    fn run(options: &SimulatorOptions, n_threads: usize) -> (Vec<SimulatedGrasp>, SimulationReport) {
+    /// Grasps of the Barrett hand.
+    pub(crate) fn simulated(
+        objects: &str,
+        options: &SimulatorOptions,
+        n_threads: usize,
+    ) -> (Vec<SimulatedGrasp>, SimulationReport) {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let objects = select("train").expect("a split");
+        let objects = select(objects).expect("objects");
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().expect("threads");
         let mut grasps = Vec::new();
         let keep = |grasp: SimulatedGrasp| {
@@ -427,15 +432,24 @@ mod tests {
         (grasps, report)
     }
 
+    fn run(options: &SimulatorOptions, n_threads: usize) -> (Vec<SimulatedGrasp>, SimulationReport) {
+        simulated("train", options, n_threads)
+    }
+
+    pub(crate) fn check_same(grasps: &[SimulatedGrasp], others: &[SimulatedGrasp]) {
+        assert_eq!(grasps.len(), others.len());
+        for (a, b) in grasps.iter().zip(others) {
+            assert_eq!((&a.frames, &a.truth, &a.scene), (&b.frames, &b.truth, &b.scene));
+        }
+    }
+
     #[test]
     fn the_same_seed_gives_the_same_grasps_with_any_number_of_threads() {
         let options = SimulatorOptions { n_grasps: 40, seed: 5, ..SimulatorOptions::default() };
         let (one, report_of_one) = run(&options, 1);
         let (two, report_of_two) = run(&options, 2);
         assert_eq!(report_of_one, report_of_two);
-        for (a, b) in one.iter().zip(&two) {
-            assert_eq!((&a.frames, &a.truth, &a.scene), (&b.frames, &b.truth, &b.scene));
-        }
+        check_same(&one, &two);
         let (other, _) = run(&SimulatorOptions { seed: 6, ..options }, 2);
         assert_ne!(one[0].frames, other[0].frames);
     }
@@ -472,9 +486,7 @@ mod tests {
         };
         let simulation = Simulation { hand: &hand, objects: &objects, options: &options };
         simulation.part(&parts[1], || false, |_| {}, keep).expect("simulated");
-        for (a, b) in alone.iter().zip(&all[10..20]) {
-            assert_eq!((&a.frames, &a.truth, &a.scene), (&b.frames, &b.truth, &b.scene));
-        }
+        check_same(&alone, &all[10..20]);
     }
 
     #[test]

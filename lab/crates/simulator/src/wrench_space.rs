@@ -480,48 +480,38 @@ mod tests {
     }
 
     #[test]
-    fn the_label_alone_refuses_what_quality_refuses() {
-        let mut case = four_contacts(1.0);
-        case.contacts[1].friction = f64::NAN;
-        assert!(matches!(is_stable(&case), Err(QualityError::Contact { contact_idx: 1, field: "friction", .. })));
+    fn a_radius_too_small_is_an_error_and_not_an_unstable_grasp() {
         let case = GraspCase { max_radius_m: 1e-300, ..four_contacts(1.0) };
-        assert!(matches!(is_stable(&case), Err(QualityError::Hull { .. })));
+        for found in [quality(&case).map(|quality| quality.is_stable()), is_stable(&case)] {
+            assert!(matches!(found, Err(QualityError::Hull { source: HullError::NonFinite { .. }, .. })), "{found:?}");
+        }
         assert_eq!(is_stable(&grasp(vec![])), Ok(false));
     }
 
     #[test]
     fn bad_input_says_which_contact_and_field() {
-        let field_of = |change: fn(&mut GraspCase)| {
+        type Change = fn(&mut GraspCase);
+        let cases: [(Change, Option<usize>, &str); 9] = [
+            (|case| case.max_radius_m = 0.0, None, "max_radius_m"),
+            (|case| case.max_radius_m = f64::NAN, None, "max_radius_m"),
+            (|case| case.centre_of_mass_m[1] = f64::INFINITY, None, "centre_of_mass_m"),
+            (|case| case.contacts[2].point_m[0] = f64::NAN, Some(2), "point_m"),
+            (|case| case.contacts[1].inward_normal = [0.0, 0.0, 1.01], Some(1), "inward_normal"),
+            (|case| case.contacts[1].tangent = [f64::NAN; 3], Some(1), "tangent"),
+            (|case| case.contacts[3].tangent = case.contacts[3].inward_normal, Some(3), "tangent"),
+            (|case| case.contacts[0].friction = -0.1, Some(0), "friction"),
+            (|case| case.contacts[0].torsion_m = -0.1, Some(0), "torsion_m"),
+        ];
+        for (change, wrong_contact, wrong_field) in cases {
             let mut case = four_contacts(1.0);
             change(&mut case);
-            match quality(&case) {
+            let found = match quality(&case) {
                 Err(QualityError::Object { field, .. }) => (None, field),
                 Err(QualityError::Contact { contact_idx, field, .. }) => (Some(contact_idx), field),
-                other => panic!("{other:?}"),
-            }
-        };
-        assert_eq!(field_of(|case| case.max_radius_m = 0.0), (None, "max_radius_m"));
-        assert_eq!(field_of(|case| case.max_radius_m = f64::NAN), (None, "max_radius_m"));
-        assert_eq!(field_of(|case| case.centre_of_mass_m[1] = f64::INFINITY), (None, "centre_of_mass_m"));
-        assert_eq!(field_of(|case| case.contacts[2].point_m[0] = f64::NAN), (Some(2), "point_m"));
-        assert_eq!(field_of(|case| case.contacts[1].inward_normal = [0.0, 0.0, 1.01]), (Some(1), "inward_normal"));
-        assert_eq!(field_of(|case| case.contacts[1].tangent = [f64::NAN; 3]), (Some(1), "tangent"));
-        assert_eq!(field_of(|case| case.contacts[3].tangent = case.contacts[3].inward_normal), (Some(3), "tangent"));
-        assert_eq!(field_of(|case| case.contacts[0].friction = -0.1), (Some(0), "friction"));
-        assert_eq!(field_of(|case| case.contacts[0].torsion_m = -0.1), (Some(0), "torsion_m"));
-    }
-
-    #[test]
-    fn a_radius_too_small_is_an_error_and_not_an_unstable_grasp() {
-        let case = GraspCase { max_radius_m: 1e-300, ..four_contacts(1.0) };
-        let found = quality(&case);
-        assert!(matches!(found, Err(QualityError::Hull { source: HullError::NonFinite { .. }, .. })), "{found:?}");
-    }
-
-    #[test]
-    fn an_unknown_field_is_refused() {
-        let json = r#"{"centre_of_mass_m": [0, 0, 0], "max_radius_m": 0.05, "contacts": [], "radius": 1}"#;
-        let error = serde_json::from_str::<GraspCase>(json).expect_err("a typo");
-        assert!(error.to_string().contains("radius"), "{error}");
+                other => panic!("{wrong_field}: {other:?}"),
+            };
+            assert_eq!(found, (wrong_contact, wrong_field));
+            is_stable(&case).expect_err("refused by the label alone as well");
+        }
     }
 }

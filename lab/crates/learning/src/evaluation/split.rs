@@ -224,12 +224,8 @@ pub(super) mod tests {
         for (object, class, n) in names {
             for idx in 0..*n {
                 examples.push(Example {
-                    recording_idx: 0,
                     grasp_id: examples.len() as u64,
-                    joints: vec![],
-                    contacts: vec![],
                     stable: idx % 3 == 0,
-                    stable_by_friction: vec![],
                     object: (*object).into(),
                     class: (*class).into(),
                     ..Example::default()

@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn scale_and_offset_of_the_decision_value_change_nothing() {
+    fn scale_and_offset_of_the_decision_value_and_order_of_the_samples_change_nothing() {
         let (values, labels) = samples_of(PlattCalibration { a: -2.0, b: 0.3 });
         let reference = fit_platt(&values, &labels).unwrap();
         for (scale, offset) in [(1e-9, 0.0), (1e9, 0.0), (1.0, 1e4), (-3.0, 2.0), (1e300, 0.0), (1e-300, 0.0)] {
@@ -259,15 +259,8 @@ mod tests {
                 assert!(difference.abs() < 1e-7, "{scale} {offset}: {difference}");
             }
         }
-    }
-
-    #[test]
-    fn order_of_the_samples_changes_nothing() {
-        let (mut values, mut labels) = samples_of(PlattCalibration { a: -2.0, b: 0.3 });
-        let reference = fit_platt(&values, &labels).unwrap();
-        values.reverse();
-        labels.reverse();
-        let fitted = fit_platt(&values, &labels).unwrap();
+        let reversed: (Vec<f64>, Vec<bool>) = values.into_iter().zip(labels).rev().unzip();
+        let fitted = fit_platt(&reversed.0, &reversed.1).unwrap();
         assert!((fitted.a - reference.a).abs() < 1e-9 && (fitted.b - reference.b).abs() < 1e-9);
     }
 

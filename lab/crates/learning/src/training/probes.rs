@@ -576,14 +576,8 @@ mod tests {
                         grasps.extend((0..n_grasps).map(|_| {
                             let is_lifted = random.random::<f64>() < chance;
                             let settled = if is_lifted { 1.0 } else { random.random() };
-                            Attempted {
-                                object,
-                                fold: 0,
-                                settled,
-                                squeezed: 1.0,
-                                decided: Some(f64::from(u8::from(is_lifted))),
-                                stable: true,
-                            }
+                            let decided = Some(f64::from(u8::from(is_lifted)));
+                            Attempted { object, fold: 0, settled, squeezed: 1.0, decided, stable: true }
                         }));
                     }
                     let with = Thresholds { promising: 0.5, promising_squeezed: 0.0, lift: 0.5 };
@@ -601,15 +595,11 @@ mod tests {
 
     #[test]
     fn a_tight_grasp_that_is_not_promising_is_worth_no_test_lift() {
-        let looks = [(0.9, 0.9, true), (0.3, 0.2, false), (0.3, 0.8, false), (0.9, 0.95, true)];
-        let grasps = looks.map(|(squeezed, decided, stable)| Attempted {
-            object: 0,
-            fold: 0,
-            settled: 0.9,
-            squeezed,
-            decided: Some(decided),
-            stable,
-        });
+        let looks = [("a", 0.9, 0.9, true), ("a", 0.9, 0.2, false), ("a", 0.9, 0.8, false), ("a", 0.9, 0.95, true)];
+        let mut grasps = grasps(&looks);
+        for (grasp, squeezed) in grasps.iter_mut().zip([0.9, 0.3, 0.3, 0.9]) {
+            grasp.squeezed = squeezed;
+        }
         let policy = Policies::new(&grasps, LastLook::TestLifted, [1.0, 1.0]).cheapest(10.0).expect("a policy");
         assert_eq!((policy.promising_squeezed, policy.expected.kept), (0.9, 1.0), "{policy:?}");
     }

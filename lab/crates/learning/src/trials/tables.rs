@@ -10,7 +10,7 @@ use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use blindgrasp_stages::training_summary::Bounded;
 
 /// A run of trials and its results.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Default, Serialize)]
 pub struct TrialsReport {
     /// The command as it could be given again.
     pub command: String,
@@ -341,16 +341,11 @@ pub(super) mod tests {
             n_trials: 110,
             max_attempts: 3,
             seed: 1,
-            options: TrialOptions::default(),
             model: "models/<any>.json".into(),
             end: "finished".into(),
-            with_gate: None,
-            without_gate: None,
-            late: None,
-            n_left_out: 0,
-            effect: None,
             records_with_gate: with,
             records_without_gate: without,
+            ..TrialsReport::default()
         };
         report.count();
         report

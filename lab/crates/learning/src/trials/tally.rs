@@ -15,7 +15,7 @@ use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use blindgrasp_stages::training_summary::Promise;
 
 /// The outcome of one attempt.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct TrialRecord {
     /// Number of the trial, from 0.
     pub trial: u64,
@@ -327,15 +327,9 @@ pub(super) mod tests {
                     friction: 1.0,
                     lifted: what != '-',
                     held: what == 'h',
-                    slip_m: 0.0,
-                    turn_rad: 0.0,
                     epsilon: Some(if what == 'h' { 0.1 } else { -0.1 }),
                     volume: Some(0.2),
-                    probed: false,
-                    disturbed: false,
-                    tightened: false,
-                    set_down: false,
-                    end_secs: 0.0,
+                    ..TrialRecord::default()
                 });
             }
         }

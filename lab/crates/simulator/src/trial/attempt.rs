@@ -586,21 +586,28 @@ mod tests {
     use crate::trial::draw_start;
     use crate::trial::targets::targets_named;
 
-    /// On a post, where the hand finds room around it.
-    fn on_a_post() -> TrialOptions {
+    fn barrett() -> Hand {
+        Hand::load(std::path::Path::new("barrett-bh8-280")).expect("built in")
+    }
+
+    fn cup(friction: f64) -> LiftTarget {
+        targets_named(&format!("paper/pencil-cup@mu{friction}")).expect("a cup").remove(0)
+    }
+
+    /// A hand that has closed around a target on a post, where it finds room.
+    fn closed<'a>(hand: &'a Hand, target: &LiftTarget) -> Attempt<'a> {
         let mut options = TrialOptions::default();
         options.physics.stand_radius_m = 0.04;
-        options
+        let start = draw_start(hand, target, &options, 3, 0, 0).expect("a start");
+        let mut attempt = Attempt::begin(hand, target, &options, &start, 0).expect("an attempt");
+        while attempt.next_frame(0).is_some() {}
+        attempt
     }
 
     /// The result of lifting a cup with this friction, and the last snapshot.
     fn lifted(friction: f64) -> (LiftResult, Snapshot) {
-        let hand = Hand::load(std::path::Path::new("barrett-bh8-280")).expect("built in");
-        let targets = targets_named(&format!("paper/pencil-cup@mu{friction}")).expect("a cup");
-        let options = on_a_post();
-        let start = draw_start(&hand, &targets[0], &options, 3, 0, 0).expect("a start");
-        let mut attempt = Attempt::begin(&hand, &targets[0], &options, &start, 0).expect("an attempt");
-        while attempt.next_frame(0).is_some() {}
+        let hand = barrett();
+        let mut attempt = closed(&hand, &cup(friction));
         let mut last = attempt.snapshot();
         (attempt.lift(|snapshot| last = snapshot.clone()), last)
     }
@@ -617,15 +624,8 @@ mod tests {
 
     #[test]
     fn a_test_lift_lets_the_weight_arrive_and_the_lift_goes_on_from_there() {
-        let hand = Hand::load(std::path::Path::new("barrett-bh8-280")).expect("built in");
-        let targets = targets_named("paper/pencil-cup@mu1").expect("a cup");
-        let options = on_a_post();
-        let start = draw_start(&hand, &targets[0], &options, 3, 0, 0).expect("a start");
-        let closed = || {
-            let mut attempt = Attempt::begin(&hand, &targets[0], &options, &start, 0).expect("an attempt");
-            while attempt.next_frame(0).is_some() {}
-            attempt
-        };
+        let (hand, target) = (barrett(), cup(1.0));
+        let closed = || closed(&hand, &target);
         let mut attempt = closed();
         attempt.probe(ProbeMove::TestLift);
         let frames: Vec<TimedFrame> = std::iter::from_fn(|| attempt.next_frame(0)).collect();
@@ -639,7 +639,7 @@ mod tests {
         let last = &frames[frames.len() - 1].frame;
         let (wrench, gravity) = (last.senses.get(Sense::WristWrench), last.senses.get(Sense::Gravity));
         let borne: f64 = wrench.iter().zip(gravity).map(|(f, g)| f * g / GRAVITY).sum();
-        let weight = targets[0].mass_kg * GRAVITY;
+        let weight = target.mass_kg * GRAVITY;
         assert!((borne - weight).abs() < 0.5, "{borne} N of {weight} N");
         assert!((attempt.snapshot().palm_position_m[2] - closed().snapshot().palm_position_m[2] - 0.01).abs() < 1e-9);
         let mut highest: f64 = 0.0;

@@ -215,40 +215,25 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use crate::simulator::{SimulateError, SimulationReport, simulate_all};
+    use crate::simulator::tests::{check_same, simulated};
+    use crate::simulator::{SimulateError, simulate_all};
     use crate::wrench_space::GraspCase;
     use blindgrasp_objects::select;
     use blindgrasp_stages::hand::Hand;
     use blindgrasp_stages::label::Label;
 
-    fn simulated(options: &SimulatorOptions, n_threads: usize) -> (Vec<SimulatedGrasp>, SimulationReport) {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let objects = select("ball-01,box-03").expect("objects");
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().expect("threads");
-        let mut grasps = Vec::new();
-        let keep = |grasp: SimulatedGrasp| {
-            grasps.push(grasp);
-            Ok::<_, Infallible>(())
-        };
-        let report = pool.install(|| simulate_all(&hand, &objects, options, keep)).expect("simulated");
-        (grasps, report)
+    fn lifts(n_grasps: usize) -> SimulatorOptions {
+        SimulatorOptions { n_grasps, seed: 2, label: Label::Lift, stable_fraction: None, ..SimulatorOptions::default() }
     }
 
     #[test]
     fn lifted_grasps_are_the_same_with_any_number_of_threads_and_have_a_simulated_ones_shape() {
-        let options = SimulatorOptions {
-            n_grasps: 2,
-            seed: 2,
-            label: Label::Lift,
-            stable_fraction: None,
-            ..SimulatorOptions::default()
-        };
-        let (one, report) = simulated(&options, 1);
-        let (two, report_of_two) = simulated(&options, 2);
+        let (one, report) = simulated("ball-01,box-03", &lifts(2), 1);
+        let (two, report_of_two) = simulated("ball-01,box-03", &lifts(2), 2);
         assert_eq!(report, report_of_two);
+        check_same(&one, &two);
         assert_eq!((report.label, report.n_grasps), (Label::Lift, 2));
-        for (grasp_id, (grasp, other)) in one.iter().zip(&two).enumerate() {
-            assert_eq!((&grasp.frames, &grasp.truth, &grasp.scene), (&other.frames, &other.truth, &other.scene));
+        for (grasp_id, grasp) in one.iter().enumerate() {
             let phases: Vec<_> = grasp.frames.iter().map(|timed| timed.frame.phase).collect();
             let expected = [vec![Phase::Open; 2], vec![Phase::Closing; 6], vec![Phase::Settled; 6]].concat();
             assert_eq!(phases[..expected.len()], expected);
@@ -271,15 +256,9 @@ mod tests {
     #[test]
     fn another_time_step_of_the_lift_leaves_all_before_it_as_it_was() {
         let with = |step_secs: f64, lift_step_secs: Option<f64>| {
-            let mut options = SimulatorOptions {
-                n_grasps: 1,
-                seed: 2,
-                label: Label::Lift,
-                stable_fraction: None,
-                ..Default::default()
-            };
+            let mut options = lifts(1);
             (options.lift.step_secs, options.lift.lift_step_secs) = (step_secs, lift_step_secs);
-            let mut grasp = simulated(&options, 1).0.remove(0);
+            let mut grasp = simulated("ball-01,box-03", &options, 1).0.remove(0);
             let n_before = grasp.frames.iter().position(|timed| timed.frame.phase == Phase::Lifting).expect("it lifts");
             grasp.frames.truncate(n_before);
             grasp
@@ -306,37 +285,27 @@ mod tests {
     fn what_physics_cannot_do_is_refused() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
         let objects = select("ball-01").expect("an object");
-        let refused = |options: &SimulatorOptions| {
-            let sink = |_| Ok::<_, Infallible>(());
-            match simulate_all(&hand, &objects, options, sink) {
-                Err(SimulateError::Option(error)) => error.to_string(),
-                other => panic!("{other:?}"),
-            }
-        };
-        let mut options = SimulatorOptions { label: Label::Lift, ..SimulatorOptions::default() };
-        options.frames.period_nanos = 1;
-        assert!(refused(&options).starts_with("option frames.period_nanos is 1, expected 1e6 to 1e8"));
-        options.frames = FrameOptions::default();
-        options.protocol.back_off_m = 0.01;
-        assert!(refused(&options).starts_with("option protocol.back_off_m is 0.01, expected its default"));
-        options.protocol.back_off_m = 0.0;
-        options.planner.stand_off_m = 0.01;
-        assert!(refused(&options).starts_with("option planner.stand_off_m is 0.01, expected its default"));
-        options.planner = crate::planner::PlannerOptions::default();
-        options.thresholds.epsilon = 0.03;
-        assert!(refused(&options).starts_with("option thresholds is set, expected its default with label lift"));
-        options = SimulatorOptions { label: Label::Lift, ..SimulatorOptions::default() };
-        options.lift.mass_factor = [2.0, 0.5];
-        assert!(refused(&options).starts_with("option lift.mass_factor is [2, 0.5], expected two ascending"));
-        options.lift.mass_factor = [0.5, 2.0];
-        options.lift.test_lift_m = 0.3;
-        assert!(refused(&options).starts_with("option lift.test_lift_m is 0.3, expected more than 0"));
-        options.lift.test_lift_m = 0.005;
-        options.lift.lift_step_secs = Some(0.0);
-        assert!(refused(&options).starts_with("option lift.lift_step_secs is 0, expected more than 0"));
-        options.lift.lift_step_secs = Some(0.0025);
-        options.label = Label::WrenchSpace;
-        assert!(refused(&options).starts_with("option lift is set, expected its default without label lift"));
+        type Change = fn(&mut SimulatorOptions);
+        let cases: [(Change, &str); 8] = [
+            (|options| options.frames.period_nanos = 1, "frames.period_nanos is 1, expected 1e6 to 1e8"),
+            (|options| options.protocol.back_off_m = 0.01, "protocol.back_off_m is 0.01, expected its default"),
+            (|options| options.planner.stand_off_m = 0.01, "planner.stand_off_m is 0.01, expected its default"),
+            (|options| options.thresholds.epsilon = 0.03, "thresholds is set, expected its default with label lift"),
+            (|options| options.lift.mass_factor = [2.0, 0.5], "lift.mass_factor is [2, 0.5], expected two ascending"),
+            (|options| options.lift.test_lift_m = 0.3, "lift.test_lift_m is 0.3, expected more than 0"),
+            (|options| options.lift.lift_step_secs = Some(0.0), "lift.lift_step_secs is 0, expected more than 0"),
+            (
+                |options| (options.lift.mass_factor, options.label) = ([0.5, 2.0], Label::WrenchSpace),
+                "lift is set, expected its default without label lift",
+            ),
+        ];
+        for (change, expected) in cases {
+            let mut options = SimulatorOptions { label: Label::Lift, ..SimulatorOptions::default() };
+            change(&mut options);
+            let refused = simulate_all(&hand, &objects, &options, |_| Ok::<_, Infallible>(()));
+            let Err(SimulateError::Option(error)) = refused else { panic!("{expected}: {refused:?}") };
+            assert!(error.to_string().starts_with(&format!("option {expected}")), "{error}");
+        }
     }
 
     #[test]

@@ -578,25 +578,22 @@ mod tests {
 
     use super::*;
     use crate::trial::engine::stand_newtons;
-    use blindgrasp_objects::{Object, select};
+    use blindgrasp_objects::select;
 
-    /// Whether the environment of the tests is there, which `scripts/python-env` makes.
-    fn can_run(test: &str) -> bool {
-        let can_run = std::env::var_os(PYTHON).is_some() || Path::new(DEFAULT_PYTHON).exists();
-        if !can_run {
+    /// An object on the table, if the environment of the tests is there, which `scripts/python-env` makes.
+    fn standing(test: &str, name: &str) -> Option<Mujoco> {
+        if std::env::var_os(PYTHON).is_none() && !Path::new(DEFAULT_PYTHON).exists() {
             eprintln!("SKIPPED {test}: target/python-env is missing, scripts/python-env makes it");
+            return None;
         }
-        can_run
-    }
-
-    fn standing(object: Object, mass_kg: f64) -> (Mujoco, LiftTarget) {
-        let target = LiftTarget::new("target".into(), "target".into(), object, mass_kg, 1.0);
+        let object = select(name).expect("an object").remove(0);
+        let target = LiftTarget::new("target".into(), "target".into(), object, 0.4, 1.0);
         let stands = crate::trial::start::world_from_standing(&target, 0.3);
         // The palm is far away, and tilted.
         let palm_from_world = Isometry3::new(Vector3::new(0.1, 0.2, 1.0), Vector3::new(0.5, -0.4, 0.2));
         let options = PhysicsOptions::default();
         let engine = Mujoco::new(&target, &stands, &palm_from_world, &HandPlan::default(), &options);
-        (engine.expect("MuJoCo"), target)
+        Some(engine.expect("MuJoCo"))
     }
 
     fn run(engine: &mut Mujoco, secs: f64) {
@@ -608,13 +605,9 @@ mod tests {
 
     #[test]
     fn a_target_on_the_table_weighs_what_it_weighs_and_stays() {
-        if !can_run("mujoco::a_target_on_the_table") {
-            return;
-        }
         // Convex, and a vessel that CoACD cuts.
         for name in ["box-00", "can-00"] {
-            let object = select(name).expect("an object").remove(0);
-            let (mut engine, _) = standing(object, 0.4);
+            let Some(mut engine) = standing("mujoco::a_target_on_the_table", name) else { return };
             run(&mut engine, 0.5);
             let begin = engine.palm_from_target();
             run(&mut engine, 0.5);
@@ -627,10 +620,7 @@ mod tests {
 
     #[test]
     fn the_palm_moves_and_the_target_does_not() {
-        if !can_run("mujoco::the_palm_moves") {
-            return;
-        }
-        let (mut engine, _) = standing(select("box-00").expect("an object").remove(0), 0.4);
+        let Some(mut engine) = standing("mujoco::the_palm_moves", "box-00") else { return };
         run(&mut engine, 0.3);
         let begin = engine.palm_from_target().translation.vector;
         let velocity = Vector3::new(0.02, 0.0, 0.01);
@@ -645,10 +635,7 @@ mod tests {
 
     #[test]
     fn a_process_that_ends_is_told() {
-        if !can_run("mujoco::a_process_that_ends") {
-            return;
-        }
-        let (mut engine, _) = standing(select("box-00").expect("an object").remove(0), 0.4);
+        let Some(mut engine) = standing("mujoco::a_process_that_ends", "box-00") else { return };
         engine.process.lock().expect("a lock").as_mut().expect("a process").child.kill().expect("killed");
         engine.step();
         assert!(engine.failure().is_some_and(|reason| reason.contains("the process of MuJoCo has ended")));

@@ -503,8 +503,17 @@ mod tests {
     const OPTIONS: RobotOptions =
         RobotOptions { n_trials: 1, seed: 0, max_attempts: 2, lifts_always: false, is_watched: false };
 
-    /// Runs the robot to its end, with an action for each grasp and number of answers before. Returns its frames and its
-    /// attempts.
+    fn barrett() -> Hand {
+        Hand::load(Path::new("barrett-bh8-280")).expect("a hand")
+    }
+
+    fn robot(hand: &Hand, is_watched: bool) -> Robot<'_> {
+        let targets = targets_named("paper/pencil-cup").expect("targets");
+        Robot::new(hand, targets, TrialOptions::default(), RobotOptions { is_watched, ..OPTIONS })
+    }
+
+    /// Runs the robot to its end, with an action for each grasp and number of answers before. Returns its frames, which are
+    /// numbered, and its attempts.
     fn run(
         robot: &mut Robot<'_>,
         mut decide: impl FnMut(u64, usize) -> Action,
@@ -518,10 +527,14 @@ mod tests {
                     finished.push(over);
                     robot.conclude();
                 }
-                Doing::IsDone => return (frames, finished),
+                Doing::IsDone => break,
                 Doing::LeavesOut { .. } => panic!("it can approach"),
             }
         }
+        let first_seq = frames.first().map_or(0, |frame: &Stamped<TactileFrame>| frame.header.seq);
+        assert!((first_seq..).zip(&frames).all(|(seq, frame)| frame.header.seq == seq));
+        assert!(frames.is_sorted_by_key(|frame| frame.header.stamp_nanos));
+        (frames, finished)
     }
 
     /// Holds the first grasp, and lifts the others.
@@ -531,16 +544,11 @@ mod tests {
 
     #[test]
     fn a_robot_that_resumes_tells_the_same_again() {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
-        let robot = || {
-            let targets = targets_named("paper/pencil-cup").expect("targets");
-            Robot::new(&hand, targets, TrialOptions::default(), OPTIONS)
-        };
-        let mut first = robot();
+        let hand = barrett();
+        let mut first = robot(&hand, false);
         let (frames, finished) = run(&mut first, hold_the_first);
         let lifted: Vec<bool> = finished.iter().map(|finished| finished.outcome.lifted).collect();
         assert_eq!(lifted, [false, true]);
-        assert!(frames.iter().enumerate().all(|(seq, frame)| frame.header.seq == seq as u64));
         assert_eq!(frames.len() as u64, finished.iter().map(|finished| finished.n_frames).sum::<u64>());
 
         // The last frame of the lift says how it ended, and comes again if it alone is not known.
@@ -552,7 +560,7 @@ mod tests {
             1
         );
 
-        let mut again = robot();
+        let mut again = robot(&hand, false);
         again.resume(first.course().clone(), Some(told.header.seq - 1));
         assert_eq!(run(&mut again, hold_the_first).0.last(), Some(&told));
         again.resume(first.course().clone(), None);
@@ -565,12 +573,8 @@ mod tests {
 
     #[test]
     fn a_watched_hand_asks_while_it_lifts_reacts_and_is_felt_again() {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
-        let robot = || {
-            let targets = targets_named("paper/pencil-cup").expect("targets");
-            Robot::new(&hand, targets, TrialOptions::default(), RobotOptions { is_watched: true, ..OPTIONS })
-        };
-        let mut first = robot();
+        let hand = barrett();
+        let mut first = robot(&hand, true);
         let mut asked = Vec::new();
         // The first lift is tightened and broken off, the second one goes on.
         let (frames, finished) = run(&mut first, |grasp_id, n_before| {
@@ -587,8 +591,6 @@ mod tests {
         assert_eq!(finished[0].reactions.as_deref(), Some(&[Reaction::GoOn, Reaction::Tighten, Reaction::SetDown][..]));
         assert_eq!(finished.iter().map(|over| over.outcome.lifted).collect::<Vec<_>>(), [false, true]);
         assert!(finished[0].outcome.slip_m < DISTURBED_M, "it stands where it stood: {:?}", finished[0].outcome);
-        assert!(frames.iter().enumerate().all(|(seq, frame)| frame.header.seq == seq as u64));
-        assert!(frames.windows(2).all(|pair| pair[0].header.stamp_nanos <= pair[1].header.stamp_nanos));
         let mut phases: Vec<Phase> = frames.iter().map(|frame| frame.message.phase).collect();
         let n_lifting = phases.iter().filter(|phase| **phase == Phase::Lifting).count();
         phases.dedup();
@@ -596,19 +598,15 @@ mod tests {
         assert_eq!(n_lifting / FRAMES_PER_ASK, n_asks);
         // The first lift asked twice, and had two answers at the second time.
         assert_eq!(n_asks, asked.len() - 1 - 2);
-        let mut again = robot();
+        let mut again = robot(&hand, true);
         again.resume(first.course().clone(), None);
         assert_eq!(run(&mut again, |_, _| panic!("all is decided")), (frames, finished));
     }
 
     #[test]
     fn probes_are_made_once_and_felt_again() {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("a hand");
-        let robot = || {
-            let targets = targets_named("paper/pencil-cup").expect("targets");
-            Robot::new(&hand, targets, TrialOptions::default(), OPTIONS)
-        };
-        let mut first = robot();
+        let hand = barrett();
+        let mut first = robot(&hand, false);
         let mut asked = Vec::new();
         // The first attempt is held when it is tight. The second one makes its test lift, and a third probe is a hold.
         let (frames, finished) = run(&mut first, |grasp_id, n_before| {
@@ -617,11 +615,9 @@ mod tests {
         });
         assert_eq!(asked, [(0, 0), (0, 1), (1, 0), (1, 1), (1, 2)]);
         assert!(finished.iter().all(|finished| finished.outcome.probed && !finished.outcome.lifted));
-        assert!(frames.iter().enumerate().all(|(seq, frame)| frame.header.seq == seq as u64));
         assert!(frames.windows(2).all(|pair| pair[0].header.stamp_nanos < pair[1].header.stamp_nanos));
-        let mut again = robot();
+        let mut again = robot(&hand, false);
         again.resume(first.course().clone(), None);
-        let told_again = run(&mut again, |_, _| panic!("all is decided"));
-        assert_eq!(told_again, (frames, finished));
+        assert_eq!(run(&mut again, |_, _| panic!("all is decided")), (frames, finished));
     }
 }

@@ -232,26 +232,22 @@ mod tests {
     }
 
     #[test]
-    fn number_of_threads_changes_no_bit() {
-        let positions = cloud(3 * CHUNK * BLOCK + 17);
-        let learn = |n_threads| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().unwrap();
-            pool.install(|| learn_dictionary(&positions, &KMeansParams { n_init: 2, max_iter: 20, ..params(16) }))
-                .unwrap()
-        };
-        assert_eq!(learn(1), learn(2));
-        assert_eq!(learn(1), learn(3));
-    }
-
-    #[test]
-    fn order_of_positions_changes_no_bit() {
+    fn number_of_threads_and_order_of_positions_change_no_bit() {
         // Some coincide, so that ties are sorted too.
-        let mut positions = cloud(3 * BLOCK + 5);
+        let mut positions = cloud(3 * CHUNK * BLOCK + 17);
         positions.extend_from_within(..BLOCK);
-        let learned = learn_dictionary(&positions, &params(5)).unwrap();
-        positions.reverse();
-        positions.rotate_left(33);
-        assert_eq!(learn_dictionary(&positions, &params(5)).unwrap(), learned);
+        let mut others = positions.clone();
+        others.reverse();
+        others.rotate_left(33);
+        let learn = |positions: &[[f64; 3]], n_threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().unwrap();
+            let params = KMeansParams { n_init: 2, max_iter: 20, ..params(16) };
+            pool.install(|| learn_dictionary(positions, &params)).unwrap()
+        };
+        let learned = learn(&positions, 1);
+        for (positions, n_threads) in [(&positions, 2), (&positions, 3), (&others, 2)] {
+            assert_eq!(learn(positions, n_threads), learned, "{n_threads} threads");
+        }
     }
 
     #[test]
