@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
-use crate::common::{RECORDING, project, run, text};
+use crate::common::{RECORDING, project, report_data, run, text};
 use blindgrasp_messages::{GraspScene, LiftDecision, Prediction, Recorded, SceneContact, TactileFrame};
 use blindgrasp_recording::{Record, RecordingReader, RecordingWriter};
+use serde_json::Value;
 
 /// The first grasp of the project's recording, with a scene and with what a graph would have answered.
 fn with_scene(path: &Path) {
@@ -66,23 +67,24 @@ fn a_recording_with_a_scene_shows_the_object_and_its_contacts() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_string();
     with_scene(Path::new(&at("scene.mcap")));
-    run(&["view", &at("scene.mcap"), "--out", &at("a.svg")], 0);
-    let svg = std::fs::read_to_string(at("a.svg")).expect("written");
-    for expected in ["1 felt by cells", "1 hand on hand", "p(stable) 0.81", "hold: no agreement", "predicted"] {
-        assert!(svg.contains(expected), "{expected}");
-    }
-    assert!(!svg.contains("not drawn"), "the object is a built-in one");
-    run(&["view", &at("scene.mcap"), "--out", &at("b.svg")], 0);
-    assert_eq!(svg, std::fs::read_to_string(at("b.svg")).expect("written"), "the same bytes again");
     run(&["view", &at("scene.mcap"), "--out", &at("a.html")], 0);
     let html = std::fs::read_to_string(at("a.html")).expect("written");
-    assert!(html.starts_with("<!doctype html>") && html.contains("<table>"));
+    assert!(html.starts_with("<!doctype html>"));
+    let data = &report_data(&html)["data"];
+    let kinds = data["contacts"].as_array().expect("contacts").iter().map(|contact| &contact["kind"]);
+    assert_eq!(kinds.collect::<Vec<_>>(), ["sensed", "on-hand"]);
+    let facts = data["facts"].to_string();
+    for expected in ["[\"predicted\",\"p(stable) 0.81\"]", "[\"decided\",\"hold: no agreement\"]"] {
+        assert!(facts.contains(expected), "{expected}: {facts}");
+    }
+    let triangles = data["object"]["triangles"].as_array().map(Vec::len);
+    assert!(data["notes"] == Value::Array(vec![]) && triangles > Some(10), "the object is a built-in one");
 }
 
 #[test]
 fn any_grasp_of_a_recording_can_be_chosen() {
     let folder = tempfile::tempdir().expect("a folder");
-    let out = folder.path().join("grasp.svg");
+    let out = folder.path().join("grasp.html");
     let out = out.to_str().expect("UTF-8");
     let last = RecordingReader::open(&project().join(RECORDING))
         .expect("opened")
@@ -94,8 +96,8 @@ fn any_grasp_of_a_recording_can_be_chosen() {
         .expect("a grasp");
     let said = run(&["view", RECORDING, "--grasp", &last.to_string(), "--out", out], 0);
     assert!(text(&said.stdout).contains(&format!("grasp {last} ")), "{}", text(&said.stdout));
-    let svg = std::fs::read_to_string(out).expect("written");
-    assert!(svg.contains(&format!("grasp {last}")));
+    let title = report_data(&std::fs::read_to_string(out).expect("written"))["data"]["title"].to_string();
+    assert!(title.contains(&format!("Grasp {last} of ")), "{title}");
 }
 
 #[test]
@@ -110,73 +112,30 @@ fn drawings_that_are_impossible_are_refused() {
         }
         assert!(!stderr.contains("panicked") && output.stdout.is_empty(), "{stderr}");
     };
-    check(&["view", RECORDING, "--grasp", "99999", "--out", &at("a.svg")], 1, &["no grasp 99999", "0 to "]);
-    check(&["view", RECORDING, "--out", &at("a.png")], 1, &["a.png", ".svg", ".html"]);
-    check(&["view", RECORDING, "--out", &at("a")], 1, &[".svg", ".html"]);
+    check(&["view", RECORDING, "--grasp", "99999", "--out", &at("a.html")], 1, &["no grasp 99999", "0 to "]);
+    check(&["view", RECORDING, "--out", &at("a.png")], 1, &["a.png", "expected a name that ends in .html"]);
+    check(&["view", RECORDING, "--out", &at("a")], 1, &["ends in .html"]);
     check(&["view", RECORDING, "--out", &at("")], 1, &["is a folder"]);
-    check(&["view", RECORDING, "--out", &at("absent/a.svg")], 1, &["no such folder"]);
-    check(&["view", "absent.mcap", "--out", &at("a.svg")], 1, &["absent.mcap"]);
+    check(&["view", RECORDING, "--out", &at("absent/a.html")], 1, &["no such folder"]);
+    check(&["view", "absent.mcap", "--out", &at("a.html")], 1, &["absent.mcap"]);
     // Without --out the recording is served, if it can be.
     check(&["view", "absent.mcap"], 1, &["absent.mcap"]);
     check(&["view", RECORDING, "--grasp", "99999"], 1, &["no grasp 99999"]);
-    assert!(!Path::new(&at("a.svg")).exists());
+    assert!(!Path::new(&at("a.html")).exists());
     // A hand with another pad is not the recording's.
     let layout = std::fs::read_to_string(project().join("hands/barrett-bh8-280.yaml")).expect("readable");
     let urdf = std::fs::read_to_string(project().join("hands/barrett-bh8-280.urdf")).expect("readable");
     std::fs::write(at("barrett-bh8-280.urdf"), urdf).expect("written");
     std::fs::write(at("other.yaml"), layout.replace("at_m: [0.022, 0.0159, 0]", "at_m: [0.023, 0.0159, 0]"))
         .expect("written");
-    check(&["view", RECORDING, "--hand", &at("other.yaml"), "--out", &at("a.svg")], 1, &["was made with the hand"]);
+    check(&["view", RECORDING, "--hand", &at("other.yaml"), "--out", &at("a.html")], 1, &["was made with the hand"]);
     // A recording without frames.
     let info = RecordingReader::open(&project().join(RECORDING)).expect("opened").info().clone();
     RecordingWriter::create(Path::new(&at("empty.mcap")), &info).expect("created").finish().expect("finished");
-    check(&["view", &at("empty.mcap"), "--out", &at("a.svg")], 1, &["empty.mcap", TactileFrame::TOPIC]);
+    check(&["view", &at("empty.mcap"), "--out", &at("a.html")], 1, &["empty.mcap", TactileFrame::TOPIC]);
     check(&["simulate", "--list", "--objects", "elephant"], 1, &["elephant", "bottle"]);
     check(&["simulate", "--list", "--objects", &at("nowhere")], 1, &["nowhere"]);
-    check(&["view", RECORDING, "--objects", &at("nowhere"), "--out", &at("a.svg")], 1, &["nowhere"]);
+    check(&["view", RECORDING, "--objects", &at("nowhere"), "--out", &at("a.html")], 1, &["nowhere"]);
     std::fs::write(at("file"), "").expect("written");
     check(&["simulate", "--list", "--objects", "can-01", "--out", &at("file")], 1, &["file"]);
-}
-
-/// The frames of two grasps, each with the decision that a graph makes of it.
-#[test]
-fn grasps_are_drawn_as_a_moving_picture() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let at = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_owned();
-    let draw = |out: &str| {
-        let (model, out) = ("models/barrett-bh8-280.json", at(out));
-        run(&["view", RECORDING, "--grasp", "4,2", "--animate", model, "--out", &out], 0);
-        std::fs::read_to_string(out).expect("written")
-    };
-    let svg = draw("a.svg");
-    let frames = |id: u64| {
-        let records = RecordingReader::open(&project().join(RECORDING)).expect("a recording");
-        records.filter(
-            move |record| matches!(&record.as_ref().expect("a record").1, Record::Tactile(it) if it.message.grasp_id == id),
-        )
-    };
-    let n_frames = frames(4).count() + frames(2).count();
-    assert_eq!(svg.matches("class=\"moment\"").count(), n_frames);
-    assert_eq!(svg.matches("<image").count(), n_frames);
-    assert_eq!(svg.matches("@keyframes").count(), n_frames);
-    // As the graph of dataflow.yaml decides them.
-    let decided: Vec<&str> = ["LIFT</text>", "HOLD</text>"].into_iter().filter(|text| svg.contains(text)).collect();
-    assert_eq!(decided.len(), 2);
-    assert!(svg.find("LIFT</text>") < svg.find("HOLD</text>"));
-    assert!(svg.contains("The grasp is stable.") && svg.contains("The grasp is not stable."));
-    assert!(svg.contains("prefers-reduced-motion"));
-    assert_eq!(svg, draw("b.svg"), "the same bytes again");
-    let refused = |arguments: &[&str], exit_code: i32, expected: &str| {
-        let output = run(&[&["view", RECORDING][..], arguments].concat(), exit_code);
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert!(said.contains(expected), "{arguments:?}: {said}");
-    };
-    refused(&["--grasp", "1,2", "--out", &at("c.svg")], 2, "--grasp takes one number");
-    refused(
-        &["--animate", "models/barrett-bh8-280.json", "--out", &at("c.html")],
-        1,
-        "expected a name that ends in .svg",
-    );
-    refused(&["--animate", "models/absent.json", "--out", &at("c.svg")], 1, "absent.json");
-    refused(&["--animate", "models/barrett-bh8-280.json"], 2, "--out");
 }
