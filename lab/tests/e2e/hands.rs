@@ -394,9 +394,8 @@ fn a_hand_is_drawn_by_itself() {
     let data = &page["data"];
     assert_eq!((&data["title"], &data["is_hand_alone"]), (&"Hand parallel-gripper".into(), &true.into()));
     assert_eq!(data["facts"][2], serde_json::json!(["cells", "24"]));
-    let joint =
-        |name: &str| data["joints"].as_array().expect("joints").iter().find(|joint| joint["name"] == name).cloned();
-    let jaw = joint("jaw").expect("a joint");
+    let joints = data["joints"].as_array().expect("joints");
+    let jaw = joints.iter().find(|joint| joint["name"] == "jaw").expect("a joint");
     assert_eq!((&jaw["value"], &jaw["unit"]), (&0.01.into(), &"m".into()));
     assert!(page["drawn"]["frames"].as_array().expect("frames").len() > 1, "it closes");
     run(&["view", "allegro", "--out", utf8(&html)], 0);
