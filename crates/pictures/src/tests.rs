@@ -70,7 +70,7 @@ fn the_page_says_what_the_grasp_is_and_shows_every_contact_and_frame() {
     assert_eq!(data["title"], format!("Grasp {} of {}", grasp.grasp_id, truth.object));
     assert_eq!(data["notes"], json!([]));
     assert_eq!(page["drawn"]["frames"].as_array().map(Vec::len), Some(grasp.frames.len()));
-    assert_eq!(page["drawn"]["scale_newtons"], 5.0);
+    assert_eq!(page["drawn"]["scale_newtons"], 3.0);
     assert_eq!(data["is_closed"][data["shown"].as_u64().expect("an index") as usize], true);
     assert_eq!(data["is_closed"][0], false, "the first frame is of the open hand");
     let values: Vec<f64> = grasp.scene.expect("a scene").joints;
