@@ -27,6 +27,8 @@ const TOP: f64 = 52.0;
 const LARGEST: f64 = 13.0;
 /// Even a word that is hardly used can be seen.
 const SMALLEST: f64 = 2.5;
+/// Smaller triangles are not drawn, square pixels: those of rounded edges would make the file six times as large.
+const LEAST_AREA: f64 = 2.0;
 const UNUSED: &str = "#868e96";
 
 const STYLE: &str = "text{font-family:Inter,'Segoe UI','Helvetica Neue',Helvetica,Arial,sans-serif;fill:#52606d;\
@@ -121,7 +123,8 @@ fn draw_links(body: &mut String, view: &View, links: &[Mesh]) {
         for triangle in &link.triangles {
             let [a, b, c] = triangle.map(|idx| seen[idx as usize]);
             // The picture's y points down.
-            if (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) < 0.0 {
+            let twice_area = (b[1] - a[1]) * (c[0] - a[0]) - (b[0] - a[0]) * (c[1] - a[1]);
+            if twice_area > 2.0 * LEAST_AREA {
                 path += &format!("M{} {}L{} {}L{} {}Z", a[0], a[1], b[0], b[1], c[0], c[1]);
             }
         }
@@ -245,6 +248,7 @@ mod tests {
         let words = [word(0.0, Some(0.4)), word(0.1, Some(0.6)), word(-0.1, None)];
         let svg = dictionary_svg(&hand, &joints, &words).expect("a picture");
         assert_eq!(svg.matches("class=\"word\"").count(), 9);
+        assert!(svg.len() < 500_000, "{} bytes", svg.len());
         // The hand is behind the words.
         assert_eq!(svg.matches("<path class=\"link\"").count(), 3 * hand.links.len());
         assert!(svg.find("class=\"link\"") < svg.find("class=\"word\""));
