@@ -384,9 +384,23 @@ fn the_page_of_a_picture_draws_the_grasp() {
     browser.ask("document.getElementById('frame').dispatchEvent(new Event('input'))");
     assert_eq!(browser.ask(&format!("{n_numbers}.length")), 0);
     assert_ne!(browser.ask("JSON.stringify(blindgrasp.hand.colouredCells())"), drawn);
+    // The picture of the hand as a file: a white one would be smaller.
+    browser.ask(
+        "(window.saved = {}, HTMLAnchorElement.prototype.click = function () { saved.name = this.download; }, null)",
+    );
+    browser.ask("(URL.createObjectURL = (blob) => { Object.assign(saved, { type: blob.type, n_bytes: blob.size }); return '#'; }, null)");
+    browser.click(".save");
+    browser.wait_until("saved.name !== undefined");
+    let saved = browser.ask("saved");
+    assert!(saved["name"].as_str().is_some_and(|name| name.starts_with("grasp-") && name.ends_with(".png")), "{saved}");
+    assert!(saved["type"] == "image/png" && saved["n_bytes"].as_u64() > Some(10_000), "{saved}");
     assert_eq!(browser.ask("axe"), Value::Array(vec![]));
     assert_eq!(browser.ask("errors"), Value::Array(vec![]));
 }
+
+/// The triangles of the links, with the cells and all else that is on them.
+const N_TRIANGLES: &str = "(() => { let n = 0; blindgrasp.hand.meshes().forEach((link) => link.traverse((part) => \
+                           { n += part.geometry.index.count / 3; })); return n; })()";
 
 /// The hand by itself touches nothing: no force is written.
 #[test]
@@ -397,9 +411,12 @@ fn the_page_of_a_hand_writes_no_forces() {
     run(&["view", "barrett-bh8-280", "--out", page], 0);
     let Some(mut browser) = Browser::open(&format!("file://{page}")) else { return };
     browser.wait_until("typeof blindgrasp === 'object' && document.getElementById('when').textContent !== ''");
-    let pads = browser.ask("[...document.querySelectorAll('#pads text')].map((text) => text.textContent).join('|')");
-    let pads = pads.as_str().expect("a text");
+    let pads = browser.text("pads");
     assert!(pads.contains("24 cells") && !pads.contains(" N") && !pads.contains("1.0"), "{pads}");
+    // Needles show the normals: two triangles for each of the 96 cells, beside the two of the cell.
+    let with_needles = browser.ask(N_TRIANGLES).as_u64();
+    browser.ask("(blindgrasp.hand.build(JSON.parse(document.getElementById('report').textContent).drawn), null)");
+    assert_eq!(with_needles.map(|n| n - 2 * 96), browser.ask(N_TRIANGLES).as_u64());
     assert_eq!(browser.ask("axe"), Value::Array(vec![]));
     browser.ask("size 400 800");
     assert_eq!(browser.ask("document.documentElement.scrollWidth <= window.innerWidth"), true);
@@ -441,8 +458,7 @@ fn the_report_of_a_run_draws_the_wrong_decisions() {
     assert_eq!(browser.ask(is_drawn), true);
     browser.click(".card:last-child");
     let chosen = browser.ask("document.querySelector('.card[aria-pressed=true] b').textContent");
-    let shown = browser.ask("`Grasp ${blindgrasp.shown}`");
-    assert_eq!(chosen, shown);
+    assert_eq!(chosen, browser.ask("blindgrasp.shown"));
     assert_eq!(browser.ask("axe"), Value::Array(vec![]));
     browser.ask("dark");
     let ground = "getComputedStyle(document.querySelector('figure svg > rect')).fill";

@@ -17,7 +17,7 @@ fn the_report_of_a_run_shows_its_decisions_edges_and_mistakes() {
     let summary = &lines.last().expect("a summary")["summary"];
     let html = std::fs::read_to_string(&page).expect("a page");
     let page = report_data(&html);
-    let (data, cards) = (&page["data"], page["cards"]["frames"].as_array().expect("cards"));
+    let (data, cards) = (&page["data"], page["drawn"]["frames"].as_array().expect("cards"));
     for (name, value) in data["summary"].as_object().expect("a summary") {
         assert_eq!(*value, summary[name], "{name}");
     }

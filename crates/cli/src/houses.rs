@@ -28,7 +28,7 @@ pub const LAB: House = House {
         ("trials", "Lift objects in simulated physics, as the paper did"),
         ("model", "Describe, adapt or export a model, or rate approaches"),
         ("sensors", "Learn a healthy hand's sensors, or look for faults in recordings"),
-        ("new hand", "A hand: its URDF, a pad layout, and a picture"),
+        ("new hand", "A hand: its URDF and a pad layout"),
     ],
 };
 

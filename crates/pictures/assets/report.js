@@ -3,7 +3,7 @@ const byId = (id) => document.getElementById(id);
 // Whole numbers that a number of JavaScript cannot hold, such as seeds, stay texts.
 const read = (json) => JSON.parse(json.replace(/"(?:\\.|[^"\\])*"|-?[\d.]+(?:[eE][+-]?\d+)?/g,
   (token) => (/^-?\d{16,}$/.test(token) ? `"${token}"` : token)));
-const { kind, data, cards } = read(byId("report").textContent);
+const { kind, data, drawn } = read(byId("report").textContent);
 const main = document.querySelector("main");
 
 // --- parts of a page
@@ -253,10 +253,10 @@ const runReport = ({ summary, step, others, wrong_lifts, wrong_holds, changes, p
   pairs([...measured.filter(({ to }) => to === "run").slice(-1), ...measured.filter(({ to }) => to !== "run")].map(ageChart));
   section("Changes and messages", ...changeList(changes));
   if (problem) main.append(make("p", {}, problem));
-  if (cards) section("Wrong decisions", cardView());
+  if (drawn) section("Wrong decisions", cardView(forceScale()));
   for (const [title, { n, shown }, from] of [["Lifts of unstable grasps", wrong_lifts, 0], ["Holds of stable grasps", wrong_holds, wrong_lifts.shown]]) {
-    const own = (cards?.frames ?? []).slice(from, from + shown);
-    if (n > 0) section(title, make("p", {}, `${n} in all; the first ${own.length} are shown.`), make("div", { class: "cards" }, own.map((frame, idx) => card(frame, from + idx))));
+    const own = (drawn?.frames ?? []).slice(from, from + shown);
+    if (n > 0) section(title, make("p", {}, `${n} in all; the first ${own.length} are shown.`), cardRow(own, from, 210));
   }
 };
 const runLead = (summary) => {
@@ -305,48 +305,58 @@ const changeList = ({ lines, n_left_out, problem }) => {
     n_left_out ? caption(`${n_left_out} earlier lines are left out: see blindgrasp logs.`) : []];
 };
 
-// --- the grasps of a run: a card each, and the one that is chosen on the stage, to be turned
-const card = ({ grasp_id, lines }, idx) => make("button", { type: "button", class: "card", "data-grasp": idx, "aria-pressed": false },
-  make("canvas", { width: 280, height: 210, "aria-hidden": true }), make("b", {}, `Grasp ${grasp_id}`), lines.map((line) => make("span", {}, line)));
-const cardView = () => {
-  const bar = make("span", { class: "bar" });
-  bar.style.background = `linear-gradient(to right, ${cards.colours.map((shade) => `rgb(${shade.join(" ")})`).join(", ")})`;
+// --- a hand in three dimensions, on a canvas that can be turned
+const stageView = (label, name) => {
+  const save = make("button", { type: "button", class: "save" }, "Save picture");
+  save.addEventListener("click", () => blindgrasp.hand?.savePicture(name.toLowerCase().replace(/[^a-z0-9]+/g, "-")));
   return [
-    make("div", { class: "view" }, make("canvas", { id: "stage", tabindex: 0, role: "img", "aria-label": "The hand of the chosen grasp in three dimensions. Drag or arrow keys turn it, plus and minus zoom, Home resets the view." })),
-    make("p", { id: "chosen", class: "caption" }),
-    caption("Force of a cell: 0 ", bar, ` ${cards.scale_newtons} ${cards.cell_unit}. The axes are those of the palm.`),
-    make("p", { id: "without-webgl", class: "caption", hidden: "" }, "This browser has no WebGL: the hand cannot be drawn."),
+    make("div", { class: "view" }, make("canvas", { id: "stage", tabindex: 0, role: "img", "aria-label": `${label} Drag or arrow keys turn it, plus and minus zoom, Home resets the view.` })),
+    make("p", { id: "without-webgl", class: "caption", hidden: "" }, "This browser has no WebGL: the hand cannot be drawn."), save,
   ];
 };
-const drawCards = async () => {
-  // The modules are in the page.
+const forceScale = () => {
+  const bar = make("span", { class: "bar" });
+  bar.style.background = `linear-gradient(to right, ${drawn.colours.map((shade) => `rgb(${shade.join(" ")})`).join(", ")})`;
+  return caption("Force of a cell: 0 ", bar, ` ${drawn.scale_newtons} ${drawn.cell_unit}. The axes are those of the palm.`);
+};
+// The modules are in the page.
+const loadStage = async () => {
   const load = (id) => import(URL.createObjectURL(new Blob([byId(id).textContent], { type: "text/javascript" })));
-  const three = await load("three.js"), { colourStep, makeStage } = await load("stage.js");
-  const buttons = [...document.querySelectorAll("[data-grasp]")], stage = makeStage(three, byId("stage"));
+  return { three: await load("three.js"), ...await load("stage.js") };
+};
+
+// --- frames: a card each, and the one that is chosen on the stage
+const cardRow = (frames, from, height) => make("div", { class: "cards" }, frames.map(({ title, lines }, idx) =>
+  make("button", { type: "button", class: "card", "data-frame": from + idx, "aria-pressed": false },
+    make("canvas", { width: 280, height, "aria-hidden": true }), make("b", {}, title), lines.map((line) => make("span", {}, line)))));
+const cardView = (...captions) => [stageView("The hand of the chosen picture in three dimensions.", "hand"), make("p", { id: "chosen", class: "caption" }), captions];
+const drawCards = async () => {
+  const { three, colourStep, makeStage } = await loadStage();
+  const buttons = [...document.querySelectorAll("[data-frame]")], stage = makeStage(three, byId("stage"));
   if (!stage.renderer) byId("without-webgl").hidden = false;
   Object.assign(blindgrasp, { hand: stage, shown: null, drawn: 0 });
-  stage.build(cards);
-  const colourOf = (newtons, idx) => {
-    const step = colourStep(cards, newtons, idx, cards.scale_newtons);
-    return step < 0 ? cards.silent_colour : cards.colours[step];
-  };
+  // Trials look at the post from its side.
+  if (kind === "trials") stage.lookFrom(-0.94);
+  stage.build(drawn);
+  stage.fit(drawn.frames.map(({ links }) => links));
+  const colourOf = (newtons, idx) => drawn.colours[colourStep(drawn, newtons, idx, drawn.scale_newtons)] ?? drawn.silent_colour;
   const show = (idx) => {
-    const { grasp_id, links, cells } = cards.frames[idx];
+    const { title, links, cells } = drawn.frames[idx];
     stage.show({ links, contacts: [], gravity: null }, cells.map(colourOf));
-    blindgrasp.shown = grasp_id;
+    blindgrasp.shown = title;
   };
   let chosen = 0;
   const choose = (idx) => {
     chosen = idx;
     show(idx);
-    buttons.forEach((button) => button.setAttribute("aria-pressed", String(Number(button.dataset.grasp) === idx)));
-    byId("chosen").textContent = `Grasp ${cards.frames[idx].grasp_id}. A click on a card shows another one. Drag or arrow keys: turn. Double click: back.`;
+    buttons.forEach((button) => button.setAttribute("aria-pressed", String(Number(button.dataset.frame) === idx)));
+    byId("chosen").textContent = `${drawn.frames[idx].title}. A click on a card shows another one. Drag or arrow keys: turn. Double click: back.`;
   };
-  for (const button of buttons) button.addEventListener("click", () => choose(Number(button.dataset.grasp)));
+  for (const button of buttons) button.addEventListener("click", () => choose(Number(button.dataset.frame)));
   // One after the other, so that the page can be used meanwhile.
   for (const button of buttons) {
     await new Promise(requestAnimationFrame);
-    show(Number(button.dataset.grasp));
+    show(Number(button.dataset.frame));
     stage.drawTo(button.querySelector("canvas"));
     blindgrasp.drawn += 1;
   }
@@ -354,19 +364,24 @@ const drawCards = async () => {
 };
 
 // --- the report of trials
-const trials = ({ lead, tables, strips, size, made }) => {
+const trials = ({ lead, tables, strips, made }) => {
   begin("Lift trials", lead);
   for (const { title, head, rows } of tables) section(title, table(head, rows));
-  const [width, height] = size;
-  const strip = ({ caption, images }) => make("figure", { tabindex: 0 },
-    make("div", { class: "strip" }, images.map(([secs, src]) => make("img", { src, width, height, alt: `after ${secs.toFixed(2)} s`, title: `after ${secs.toFixed(2)} s` }))),
-    make("figcaption", { class: "caption" }, caption));
-  if (strips.length) section("Some of the trials", strips.map(strip));
+  if (strips.length) {
+    let from = 0;
+    const rows = strips.map(({ caption: text, n_moments }) => {
+      const row = make("figure", {}, cardRow(drawn.frames.slice(from, from + n_moments), from, 300), make("figcaption", { class: "caption" }, text));
+      from += n_moments;
+      return row;
+    });
+    section("Some of the trials", cardView(), rows);
+  }
   section("How this was made", facts(made));
 };
 
 // Tests read it.
 window.blindgrasp = { read, count, percent, decimals, pValue, estimate: (found) => make("p", {}, estimate(found)).textContent,
   axis, percentAxis, rangeAround, roundUp, lineChart, barChart };
-({ evaluation, run: runReport, trials })[kind](data);
-if (cards) await drawCards();
+({ evaluation, grasp: graspPage, run: runReport, trials })[kind](data);
+if (kind === "grasp") await drawGrasp();
+else if (drawn) await drawCards();

@@ -17,7 +17,7 @@ export const makeStage = (three, canvas) => {
   try {
     renderer = new WebGLRenderer({ canvas, antialias: true, alpha: true });
   } catch {
-    return { renderer: null, build() {}, show() {}, surround() {}, showWords() {}, wordCount: () => 0, lookFrom() {}, drawTo() {}, project: () => null };
+    return { renderer: null, build() {}, show() {}, fit() {}, surround() {}, showWords() {}, wordCount: () => 0, lookFrom() {}, drawTo() {}, savePicture() {}, project: () => null };
   }
   const scene = new Scene(), camera = new PerspectiveCamera(35, 1, 0.01, 10);
   camera.up.set(0, 0, 1);
@@ -50,16 +50,28 @@ export const makeStage = (three, canvas) => {
     isDue = true;
     requestAnimationFrame(render);
   }
-  // The middle and the size of the hand in its first posture, and of the object.
+  // Poses of links, as the upper three rows of their matrices; a link without one is not there.
+  function place(poses) {
+    links.forEach((link, idx) => {
+      link.visible = Boolean(poses[idx]);
+      if (!poses[idx]) return;
+      link.matrix.set(...poses[idx], 0, 0, 0, 1);
+      link.matrixWorldNeedsUpdate = true;
+    });
+  }
+  // The middle and the size of the hand in its first posture, or in these, and of the object.
   const size = { middle: new Vector3(0, 0, 0.08), radius: 0.15, isKnown: false };
-  function measure() {
+  function measure(postures) {
     const least = new Vector3(Infinity, Infinity, Infinity), most = least.clone().negate(), corner = new Vector3();
-    for (const link of object ? [...links, object] : links) {
-      const positions = link.geometry.getAttribute("position");
-      for (let k = 0; k < positions.count; k++) {
-        corner.fromBufferAttribute(positions, k).applyMatrix4(link.matrix);
-        least.min(corner);
-        most.max(corner);
+    for (const poses of postures) {
+      place(poses);
+      for (const part of object ? [...links, object] : links) {
+        const positions = part.geometry.getAttribute("position");
+        for (let k = 0; part.visible && k < positions.count; k++) {
+          corner.fromBufferAttribute(positions, k).applyMatrix4(part.matrix);
+          least.min(corner);
+          most.max(corner);
+        }
       }
     }
     size.middle.addVectors(least, most).multiplyScalar(0.5);
@@ -117,6 +129,19 @@ export const makeStage = (three, canvas) => {
     made.computeVertexNormals();
     return made;
   }
+  const shade = (bytes) => new Color(...bytes.map((part) => part / 255));
+  // Two thin triangles for each cell, which stand on it along its normal.
+  function needles(cells) {
+    const positions = cells.flatMap(({ corners_m }) => {
+      const [a, b, c, d] = [0, 3, 6, 9].map((at) => new Vector3(...corners_m.slice(at, at + 3)));
+      const middle = a.clone().add(c).multiplyScalar(0.5), along = b.sub(a).normalize(), across = d.sub(a).normalize();
+      const tip = new Vector3().crossVectors(along, across).multiplyScalar(0.006).add(middle);
+      return [along, across].flatMap((side) =>
+        [-0.0003, 0.0003].flatMap((metres) => [...side.clone().multiplyScalar(metres).add(middle)]).concat([...tip]));
+    });
+    const made = geometry(positions, [...Array(positions.length / 3).keys()]);
+    return new Mesh(made, new MeshBasicMaterial({ color: 0xc92a2a, side: DoubleSide }));
+  }
   let words = [];
   const octahedron = geometry([1, 0, 0, -1, 0, 0, 0, 1, 0, 0, -1, 0, 0, 0, 1, 0, 0, -1],
     [0, 2, 4, 2, 1, 4, 1, 3, 4, 3, 0, 4, 2, 0, 5, 1, 2, 5, 3, 1, 5, 0, 3, 5]);
@@ -150,6 +175,21 @@ export const makeStage = (three, canvas) => {
       const [left, top] = [(canvas.width - width) / 2, (canvas.height - height) / 2];
       other.getContext("2d").drawImage(canvas, left, top, width, height, 0, 0, other.width, other.height);
     },
+    // Saves the present picture as a file: PNG, on white.
+    savePicture(name) {
+      const other = document.createElement("canvas");
+      [other.width, other.height] = [canvas.width, canvas.height];
+      other.getContext("2d").fillStyle = "#ffffff";
+      other.getContext("2d").fillRect(0, 0, other.width, other.height);
+      this.drawTo(other);
+      other.toBlob((blob) => {
+        const link = document.createElement("a");
+        [link.download, link.href] = [`${name}.png`, URL.createObjectURL(blob)];
+        link.click();
+      });
+    },
+    // Looks from a distance that all of these postures can be seen from.
+    fit: measure,
     // Looks from this side of the hand.
     lookFrom(azimuth_rad) {
       side = new Vector3(Math.cos(0.35) * Math.cos(azimuth_rad), Math.cos(0.35) * Math.sin(azimuth_rad), Math.sin(0.35));
@@ -176,20 +216,21 @@ export const makeStage = (three, canvas) => {
       object?.material.dispose();
       object = null;
       if (data) {
-        const colour = new Color(...data.colour.map((part) => part / 255));
-        object = new Mesh(geometry(data.surface.positions_m, data.surface.triangles),
-          new MeshLambertMaterial({ color: colour, transparent: true, opacity: 0.45, depthWrite: false }));
+        object = new Mesh(geometry(data.positions_m, data.triangles),
+          new MeshLambertMaterial({ color: shade(data.colour), transparent: true, opacity: 0.45, depthWrite: false }));
         scene.add(object);
       }
       draw();
     },
-    build(data) {
+    // Builds a hand, if wanted with a needle for the normal of each cell.
+    build(data, hasNeedles = false) {
       scene.remove(parts);
       parts.traverse((part) => { part.geometry?.dispose(); part.material?.dispose(); });
       parts = new Group();
-      const skin = new MeshLambertMaterial({ color: new Color(...data.hand_colour.map((part) => part / 255)), flatShading: true });
+      const skin = (colour) => new MeshLambertMaterial({ color: shade(colour), flatShading: true });
+      const handSkin = skin(data.hand_colour);
       links = data.links.map((link) => {
-        const mesh = new Mesh(geometry(link.positions_m, link.triangles), skin);
+        const mesh = new Mesh(geometry(link.positions_m, link.triangles), link.colour ? skin(link.colour) : handSkin);
         mesh.matrixAutoUpdate = false;
         parts.add(mesh);
         return mesh;
@@ -201,6 +242,7 @@ export const makeStage = (three, canvas) => {
           const made = geometry(cells.flatMap((cell) => cell.corners_m), cells.flatMap((_, n) => [0, 1, 2, 0, 2, 3].map((k) => 4 * n + k)));
           made.setAttribute("color", new BufferAttribute(new Float32Array(12 * cells.length), 3));
           links[link].add(new Mesh(made, new MeshBasicMaterial({ vertexColors: true, side: DoubleSide })));
+          if (hasNeedles) links[link].add(needles(cells));
           return { idxs: cells.map((cell) => cell.idx), colours: made.getAttribute("color") };
         }).filter((pad) => pad !== null);
       scene.add(parts);
@@ -210,12 +252,8 @@ export const makeStage = (three, canvas) => {
     // Shows a frame: the poses of the links, the colours of the cells (0 to 255), contacts as point, direction, force and perhaps
     // colour, and gravity or null.
     show(frame, cellColours) {
-      frame.links.forEach((rows, idx) => {
-        if (!links[idx]) return;
-        links[idx].matrix.set(...rows, 0, 0, 0, 1);
-        links[idx].matrixWorldNeedsUpdate = true;
-      });
-      if (!size.isKnown) measure();
+      if (size.isKnown) place(frame.links);
+      else measure([frame.links]);
       const colour = new Color();
       for (const { idxs, colours } of pads) {
         idxs.forEach((cell, n) => {

@@ -24,11 +24,6 @@ pub(super) fn force_colour(share: f64) -> Rgb {
     from_oklab(std::array::from_fn(|channel| from[channel] + part * (to[channel] - from[channel])))
 }
 
-/// The lightness that people see, 0 to 1.
-pub(super) fn lightness(colour: Rgb) -> f64 {
-    oklab(colour)[0]
-}
-
 /// `#rrggbb`.
 pub(super) fn hex(colour: Rgb) -> String {
     let [red, green, blue] = bytes(colour);
@@ -38,12 +33,6 @@ pub(super) fn hex(colour: Rgb) -> String {
 /// Each channel as a byte.
 pub(super) fn bytes(colour: Rgb) -> [u8; 3] {
     colour.map(|channel| (channel.clamp(0.0, 1.0) * 255.0).round() as u8)
-}
-
-/// A surface of this colour in this much light: 1 shows the colour itself, more turns towards white.
-pub(super) fn lit(colour: Rgb, light: f64) -> Rgb {
-    let highlight = (light - 1.0).clamp(0.0, 1.0);
-    colour.map(|channel| channel * light.min(1.0) * (1.0 - highlight) + highlight)
 }
 
 /// Björn Ottosson's OKLab, in which equal steps look equal.
@@ -81,7 +70,7 @@ mod tests {
 
     #[test]
     fn the_force_scale_only_darkens() {
-        let found: Vec<f64> = (0..=100).map(|idx| lightness(force_colour(f64::from(idx) / 100.0))).collect();
+        let found: Vec<f64> = (0..=100).map(|idx| oklab(force_colour(f64::from(idx) / 100.0))[0]).collect();
         assert!(found.windows(2).all(|pair| pair[1] < pair[0]), "{found:?}");
         for (idx, stop) in FORCE_STOPS.iter().enumerate() {
             let back = force_colour(idx as f64 / 4.0);
@@ -91,8 +80,7 @@ mod tests {
 
     #[test]
     fn white_and_black_are_white_and_black() {
-        assert!((lightness([1.0; 3]) - 1.0).abs() < 1e-6 && lightness([0.0; 3]).abs() < 1e-9);
+        assert!((oklab([1.0; 3])[0] - 1.0).abs() < 1e-6 && oklab([0.0; 3])[0].abs() < 1e-9);
         assert_eq!(hex([1.0, 0.0, 0.5]), "#ff0080");
-        assert_eq!(lit([0.5, 0.5, 0.5], 2.0), [1.0; 3]);
     }
 }

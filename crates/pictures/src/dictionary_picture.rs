@@ -1,14 +1,11 @@
 //! A contact dictionary over the hand: the paper's Figure 1.
 
-use nalgebra::{Point3, Vector3};
+use nalgebra::{Point3, Rotation3, Vector3};
 
 use super::PictureError;
 use super::colour::{force_colour, hex};
-use super::grasp::{ObjectSurface, Placed, RecordedGrasp};
-use super::raster::Camera;
-use super::svg::{Anchor, Svg, px};
-use super::view::{Surfaces, draw_view};
-use blindgrasp_messages::{Header, Phase, Stamped, TactileFrame};
+use super::geometry::link_mesh;
+use blindgrasp_mesh::Mesh;
 use blindgrasp_stages::hand::Hand;
 
 /// A word of the dictionary.
@@ -30,66 +27,114 @@ const TOP: f64 = 52.0;
 const LARGEST: f64 = 13.0;
 /// Even a word that is hardly used can be seen.
 const SMALLEST: f64 = 2.5;
+/// Smaller triangles are not drawn, square pixels: those of rounded edges would make the file six times as large.
+const LEAST_AREA: f64 = 2.0;
 const UNUSED: &str = "#868e96";
 
-const STYLE: &str = ".words text{font-family:Inter,'Segoe UI','Helvetica Neue',Helvetica,Arial,sans-serif;fill:#52606d;\
-font-size:12px;font-weight:400;font-variant-numeric:tabular-nums}.words text.words-title{font-size:15px;font-weight:650;\
-fill:#1f2933}.words text.tiny{font-size:10px;paint-order:stroke;stroke:#ffffff;stroke-opacity:.8;stroke-width:3px}\
-.words .axis{stroke:#52606d;stroke-width:1.4;fill:none}.words .word{stroke:#ffffff;stroke-width:1;fill-opacity:.88}\
-.words .size{fill:#ced4da;stroke:#868e96}";
+const STYLE: &str = "text{font-family:Inter,'Segoe UI','Helvetica Neue',Helvetica,Arial,sans-serif;fill:#52606d;\
+font-size:12px;font-variant-numeric:tabular-nums}.title{font-size:15px;font-weight:650;fill:#1f2933}\
+.tiny{font-size:10px;text-anchor:middle}.axis{stroke:#52606d;stroke-width:1.4;fill:none}\
+.link{fill:#dfe3e8;stroke:#b8c0ca;stroke-width:.4;stroke-linejoin:round;fill-opacity:.75}\
+.word{stroke:#ffffff;stroke-width:1;fill-opacity:.88}.size{fill:#ced4da;stroke:#868e96}";
 
-/// The words of a dictionary over the hand in a posture, from two sides and from above the palm (SVG).
+/// The words of a dictionary over the hand in a posture, from two sides and from above the palm (SVG). The hand is drawn flat, in
+/// parallel projection.
 ///
 /// # Errors
 /// Joint angles that are not the hand's.
 pub fn dictionary_svg(hand: &Hand, joints: &[f64], words: &[DrawnWord]) -> Result<String, PictureError> {
-    let posture = RecordedGrasp {
-        grasp_id: 0,
-        frames: vec![Stamped {
-            header: Header::default(),
-            message: TactileFrame {
-                grasp_id: 0,
-                phase: Phase::Settled,
-                joints: joints.to_vec(),
-                cells_newtons: vec![0.0; hand.n_cells()],
-                ..TactileFrame::default()
-            },
-        }],
-        truth: None,
-        scene: None,
-        object: ObjectSurface::Unknown(String::new()),
-        prediction: None,
-        decision: None,
-        is_hand_alone: false,
-    };
-    let placed = Placed::new(hand, &posture)?;
-    let surfaces = Surfaces::new(&placed);
-    let mut points = surfaces.points(hand);
-    points.extend(words.iter().map(|word| Point3::from(word.position_m)));
+    let poses = hand.palm_from_links(joints).map_err(|source| PictureError::Joints { grasp_id: 0, source })?;
+    let mut links: Vec<Mesh> = hand.links.iter().map(link_mesh).collect();
+    for (link, palm_from_link) in links.iter_mut().zip(&poses) {
+        link.transform(palm_from_link);
+    }
+    let mut points: Vec<Point3<f64>> = words.iter().map(|word| word.position_m.into()).collect();
+    points.extend(links.iter().flat_map(|link| &link.vertices_m));
     let scales = Scales::of(words);
-    let mut svg = Svg::default();
-    svg.start("g", &[("class", &"words")]);
     let title = format!("The {} words of the contact dictionary over the hand", words.len());
-    svg.text([MARGIN, 32.0], Anchor::Start, "words-title", &title);
+    let mut body = format!("<text x=\"{MARGIN}\" y=\"32\" class=\"title\">{title}</text>\n");
     let views = [
         (Vector3::new(0.25, -1.0, 0.3), Vector3::z()),
         (Vector3::new(1.0, -0.25, 0.3), Vector3::z()),
         (Vector3::new(0.0, 0.0, 1.0), Vector3::y()),
     ];
     for (idx, (to_eye, up)) in views.into_iter().enumerate() {
-        let camera = Camera::new(Point3::origin(), to_eye, up, VIEW).fit(&points, 20.0);
+        let view = View::new(to_eye, up, &points);
         let left = MARGIN + idx as f64 * (VIEW[0] + 8.0);
-        draw_view(&mut svg, &placed, &surfaces, &camera, [left, TOP], VIEW)?;
-        let transform = format!("translate({} {})", px(left), px(TOP));
-        svg.start("g", &[("transform", &transform)]);
-        draw_words(&mut svg, &camera, words, &scales);
-        svg.end("g");
+        body += &format!("<g transform=\"translate({left} {TOP})\">\n");
+        draw_links(&mut body, &view, &links);
+        draw_words(&mut body, &view, words, &scales);
+        draw_axes(&mut body, &view);
+        body += "</g>\n";
     }
     let width = 2.0 * MARGIN + 3.0 * VIEW[0] + 16.0;
     let below = TOP + VIEW[1] + 26.0;
-    draw_legend(&mut svg, &scales, below);
-    svg.end("g");
-    Ok(svg.finish(width, below + 26.0, &title, STYLE))
+    draw_legend(&mut body, &scales, below);
+    let height = below + 26.0;
+    Ok(format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" width=\"{width}\" height=\"{height}\" \
+         role=\"img\">\n<title>{title}</title>\n<style>{STYLE}</style>\n\
+         <rect width=\"{width}\" height=\"{height}\" rx=\"12\" fill=\"#ffffff\"/>\n{body}</svg>\n"
+    ))
+}
+
+/// A parallel projection in which all points lie within the view.
+struct View {
+    /// The palm frame's axes in the view: x to the right, y up, z to the eye.
+    view_from_palm: Rotation3<f64>,
+    middle: Vector3<f64>,
+    pixels_per_m: f64,
+}
+
+impl View {
+    fn new(to_eye: Vector3<f64>, up: Vector3<f64>, points: &[Point3<f64>]) -> View {
+        let view_from_palm = Rotation3::face_towards(&to_eye, &up).inverse();
+        let mut least = Vector3::repeat(f64::MAX);
+        let mut most = Vector3::repeat(f64::MIN);
+        for point in points {
+            let seen = view_from_palm * point.coords;
+            least = least.inf(&seen);
+            most = most.sup(&seen);
+        }
+        let size = (most - least).add_scalar(1e-9);
+        let pixels_per_m = ((VIEW[0] - 40.0) / size.x).min((VIEW[1] - 40.0) / size.y);
+        View { view_from_palm, middle: (least + most) / 2.0, pixels_per_m }
+    }
+
+    /// A place in the view, pixels from its left and upper edge, and how near it is.
+    fn project(&self, point: &Point3<f64>) -> [f64; 3] {
+        let seen = (self.view_from_palm * point.coords - self.middle) * self.pixels_per_m;
+        [tenth(VIEW[0] / 2.0 + seen.x), tenth(VIEW[1] / 2.0 - seen.y), seen.z]
+    }
+}
+
+/// To tenths of a pixel, so that a picture's bytes do not hang on the last digits of a sine.
+fn tenth(pixels: f64) -> f64 {
+    // Adding 0 turns -0 into 0.
+    (pixels * 10.0).round() / 10.0 + 0.0
+}
+
+/// The sides of each link that face the eye; the far links first.
+fn draw_links(body: &mut String, view: &View, links: &[Mesh]) {
+    let mut drawn: Vec<(f64, String)> = Vec::new();
+    for link in links {
+        let seen: Vec<[f64; 3]> = link.vertices_m.iter().map(|vertex| view.project(vertex)).collect();
+        let mut path = String::new();
+        for triangle in &link.triangles {
+            let [a, b, c] = triangle.map(|idx| seen[idx as usize]);
+            // The picture's y points down.
+            let twice_area = (b[1] - a[1]) * (c[0] - a[0]) - (b[0] - a[0]) * (c[1] - a[1]);
+            if twice_area > 2.0 * LEAST_AREA {
+                path += &format!("M{} {}L{} {}L{} {}Z", a[0], a[1], b[0], b[1], c[0], c[1]);
+            }
+        }
+        let nearest = seen.iter().map(|vertex| vertex[2]).fold(f64::MIN, f64::max);
+        drawn.push((nearest, path));
+    }
+    drawn.sort_by(|(left, _), (right, _)| left.total_cmp(right));
+    for (_, path) in drawn {
+        *body += &format!("<path class=\"link\" d=\"{path}\"/>\n");
+    }
 }
 
 /// How shares become sizes and colours.
@@ -121,52 +166,69 @@ impl Scales {
 }
 
 /// The far ones first.
-fn draw_words(svg: &mut Svg, camera: &Camera, words: &[DrawnWord], scales: &Scales) {
-    let mut seen: Vec<_> = words.iter().map(|word| (camera.project(&Point3::from(word.position_m)), word)).collect();
-    seen.sort_by(|(left, _), (right, _)| left.nearness.total_cmp(&right.nearness));
-    for (at, word) in seen {
-        let radius = px(scales.radius(word.share_of_contacts));
+fn draw_words(body: &mut String, view: &View, words: &[DrawnWord], scales: &Scales) {
+    let mut seen: Vec<_> = words.iter().map(|word| (view.project(&word.position_m.into()), word)).collect();
+    seen.sort_by(|(left, _), (right, _)| left[2].total_cmp(&right[2]));
+    for ([x, y, _], word) in seen {
+        let radius = tenth(scales.radius(word.share_of_contacts));
         let colour = scales.colour(word.share_stable);
-        svg.element(
-            "circle",
-            &[("cx", &px(at.x)), ("cy", &px(at.y)), ("r", &radius), ("class", &"word"), ("fill", &colour)],
-        );
+        *body += &format!("<circle cx=\"{x}\" cy=\"{y}\" r=\"{radius}\" class=\"word\" fill=\"{colour}\"/>\n");
     }
 }
 
-fn draw_legend(svg: &mut Svg, scales: &Scales, y: f64) {
-    let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+/// The palm frame's axes, and a bar of 50 mm.
+fn draw_axes(body: &mut String, view: &View) {
+    let (left, y) = (34.0, VIEW[1] - 14.0);
+    for (name, axis) in [("x", Vector3::x()), ("y", Vector3::y()), ("z", Vector3::z())] {
+        let seen = view.view_from_palm * axis;
+        // An axis that points to the eye has no place for its name.
+        if seen.xy().norm() > 0.3 {
+            let [right, down] = [20.0 * seen.x, -20.0 * seen.y].map(tenth);
+            let [name_x, name_y] = [left + 1.4 * right, y - 16.5 + 1.4 * down].map(tenth);
+            *body += &format!("<path class=\"axis\" d=\"M{left} {}l{right} {down}\"/>\n", y - 20.0);
+            *body += &format!("<text x=\"{name_x}\" y=\"{name_y}\" class=\"tiny\">{name}</text>\n");
+        }
+    }
+    let length = tenth(0.05 * view.pixels_per_m);
+    let right = VIEW[0] - 14.0;
+    *body += &format!("<path class=\"axis\" d=\"M{} {}v5h{length}v-5\"/>\n", tenth(right - length), y - 5.0);
+    *body += &format!("<text x=\"{}\" y=\"{}\" class=\"tiny\">50 mm</text>\n", tenth(right - length / 2.0), y - 7.0);
+}
+
+fn draw_legend(body: &mut String, scales: &Scales, y: f64) {
     let mut x = MARGIN;
     let [least, most] = scales.stable;
     if least <= most {
-        svg.text([x, y + 4.0], Anchor::Start, "", "stable grasps among those that use the word:");
-        x += 268.0;
-        svg.text([x, y + 4.0], Anchor::Start, "", &percent(least));
-        x += 48.0;
+        *body += &legend_text(x, y, "stable grasps among those that use the word:");
+        *body += &legend_text(x + 268.0, y, &percent(least));
+        x += 316.0;
         for step in 0..40 {
             let fill = hex(force_colour((f64::from(step) + 0.5) / 40.0));
-            let left = px(x + 3.0 * f64::from(step));
-            svg.element(
-                "rect",
-                &[("x", &left), ("y", &px(y - 6.0)), ("width", &3.2), ("height", &12), ("fill", &fill)],
-            );
+            let left = x + 3.0 * f64::from(step);
+            *body += &format!("<rect x=\"{left}\" y=\"{}\" width=\"3.2\" height=\"12\" fill=\"{fill}\"/>\n", y - 6.0);
         }
-        x += 128.0;
-        svg.text([x, y + 4.0], Anchor::Start, "", &percent(most));
-        x += 90.0;
+        *body += &legend_text(x + 128.0, y, &percent(most));
+        x += 218.0;
     }
     if scales.most_used > 0.0 {
-        svg.text([x, y + 4.0], Anchor::Start, "", "share of the contacts:");
+        *body += &legend_text(x, y, "share of the contacts:");
         x += 140.0;
         for part in [0.1, 0.5, 1.0] {
             let share = part * scales.most_used;
-            let radius = scales.radius(Some(share));
-            svg.element("circle", &[("cx", &px(x + radius)), ("cy", &px(y)), ("r", &px(radius)), ("class", &"size")]);
-            x += 2.0 * radius + 6.0;
-            svg.text([x, y + 4.0], Anchor::Start, "", &percent(share));
-            x += 58.0;
+            let radius = tenth(scales.radius(Some(share)));
+            *body += &format!("<circle cx=\"{}\" cy=\"{y}\" r=\"{radius}\" class=\"size\"/>\n", tenth(x + radius));
+            *body += &legend_text(x + 2.0 * radius + 6.0, y, &percent(share));
+            x += 2.0 * radius + 64.0;
         }
     }
+}
+
+fn percent(share: f64) -> String {
+    format!("{:.1} %", 100.0 * share)
+}
+
+fn legend_text(x: f64, y: f64, text: &str) -> String {
+    format!("<text x=\"{}\" y=\"{}\">{text}</text>\n", tenth(x), y + 4.0)
 }
 
 #[cfg(test)]
@@ -186,7 +248,10 @@ mod tests {
         let words = [word(0.0, Some(0.4)), word(0.1, Some(0.6)), word(-0.1, None)];
         let svg = dictionary_svg(&hand, &joints, &words).expect("a picture");
         assert_eq!(svg.matches("class=\"word\"").count(), 9);
-        assert_eq!(svg.matches("<image").count(), 3);
+        assert!(svg.len() < 500_000, "{} bytes", svg.len());
+        // The hand is behind the words.
+        assert_eq!(svg.matches("<path class=\"link\"").count(), 3 * hand.links.len());
+        assert!(svg.find("class=\"link\"") < svg.find("class=\"word\""));
         for expected in ["The 3 words", "40.0 %", "60.0 %", UNUSED, "50 mm"] {
             assert!(svg.contains(expected), "{expected}");
         }

@@ -1,11 +1,9 @@
-//! What there is to draw, as triangles: shapes, links, cells, arrows' directions; and how round a mesh looks.
-
-use std::collections::HashMap;
+//! What there is to draw: links as triangles, cells as rectangles.
 
 use blindgrasp_mesh::Mesh;
 use blindgrasp_mesh::shape::mesh_of_shape;
 use blindgrasp_stages::hand::{Hand, Link};
-use nalgebra::{Point3, Vector3};
+use nalgebra::Point3;
 
 /// Cells are drawn so far above their pad, so that the pad's surface doesn't hide them.
 const CELL_LIFT_M: f64 = 0.0004;
@@ -42,52 +40,10 @@ pub(super) fn cells_in_link(hand: &Hand) -> Vec<[Point3<f64>; 4]> {
         .collect()
 }
 
-/// Two triangles.
-pub(super) fn quad_mesh(corners: [Point3<f64>; 4]) -> Mesh {
-    Mesh { vertices_m: corners.to_vec(), triangles: vec![[0, 1, 2], [0, 2, 3]] }
-}
-
-/// The normals with which each triangle's corners are lit: the mean of the faces around the corner that meet this one
-/// at less than `crease_rad`, by area, so that round things look round and edges stay sharp.
-pub(super) fn corner_normals(mesh: &Mesh, crease_rad: f64) -> Vec<[Vector3<f64>; 3]> {
-    // Corners are the same where they are at the same place: files often repeat them for each triangle.
-    let mut place_of: HashMap<[i64; 3], usize> = HashMap::new();
-    let places: Vec<usize> = mesh
-        .vertices_m
-        .iter()
-        .map(|vertex| {
-            let n_places = place_of.len();
-            let key = std::array::from_fn(|axis| (vertex[axis] * 1e7).round() as i64);
-            *place_of.entry(key).or_insert(n_places)
-        })
-        .collect();
-    let mut around: Vec<Vec<usize>> = vec![Vec::new(); place_of.len()];
-    let mut weighted: Vec<Vector3<f64>> = Vec::with_capacity(mesh.triangles.len());
-    for (idx, triangle) in mesh.triangles.iter().enumerate() {
-        let [a, b, c] = triangle.map(|idx| mesh.vertices_m[idx as usize]);
-        weighted.push((b - a).cross(&(c - a)));
-        triangle.iter().for_each(|vertex| around[places[*vertex as usize]].push(idx));
-    }
-    let least_cosine = crease_rad.cos();
-    mesh.triangles
-        .iter()
-        .enumerate()
-        .map(|(idx, triangle)| {
-            let own = mesh.normal(idx);
-            triangle.map(|vertex| {
-                let near = around[places[vertex as usize]]
-                    .iter()
-                    .map(|other| weighted[*other])
-                    .filter(|other| own.dot(other) > least_cosine * other.norm());
-                near.sum::<Vector3<f64>>().try_normalize(0.0).unwrap_or(own)
-            })
-        })
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nalgebra::Vector3;
     use parry3d_f64::math::Vector;
     use parry3d_f64::shape::SharedShape;
     use std::path::Path;
@@ -109,21 +65,6 @@ mod tests {
     }
 
     #[test]
-    fn a_box_has_sharp_edges_and_a_ball_has_none() {
-        let block = mesh_of_shape(&SharedShape::cuboid(0.01, 0.02, 0.03));
-        for (idx, normals) in corner_normals(&block, 0.6).into_iter().enumerate() {
-            assert!(normals.iter().all(|normal| (normal - block.normal(idx)).norm() < 1e-9));
-        }
-        let ball = mesh_of_shape(&SharedShape::ball(0.05));
-        for (corners, normals) in ball.corners().zip(corner_normals(&ball, 0.6)) {
-            for (corner, normal) in corners.iter().zip(normals) {
-                let outwards = corner.coords.normalize();
-                assert!(normal.dot(&outwards).abs() > 0.98, "{corner} {normal}");
-            }
-        }
-    }
-
-    #[test]
     fn a_cells_corners_surround_it_and_face_outwards() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
         for ((_, cell), corners) in hand.cells().zip(cells_in_link(&hand)) {
@@ -132,7 +73,8 @@ mod tests {
                 (middle - cell.position_in_link_m.coords - cell.normal_in_link.into_inner() * CELL_LIFT_M).norm()
                     < 1e-12
             );
-            assert!((quad_mesh(corners).normal(0) - cell.normal_in_link.into_inner()).norm() < 1e-9);
+            let outwards = (corners[1] - corners[0]).cross(&(corners[2] - corners[0])).normalize();
+            assert!((outwards - cell.normal_in_link.into_inner()).norm() < 1e-9);
         }
     }
 }

@@ -1,8 +1,10 @@
 //! What a picture of a grasp shows, put together from what was recorded.
 
-use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+use serde::Serialize;
 
 use super::PictureError;
+use super::scene::rounded;
 use blindgrasp_mesh::Mesh;
 use blindgrasp_messages::{GraspScene, GraspTruth, LiftDecision, Phase, Prediction, Stamped, TactileFrame};
 use blindgrasp_stages::hand::Hand;
@@ -16,7 +18,7 @@ pub enum ObjectSurface {
     Unknown(String),
 }
 
-/// A grasp of a recording: what [`grasp_svg`](super::grasp_svg) and [`grasp_html`](super::grasp_html) draw.
+/// A grasp of a recording, as [`grasp_html`](super::grasp_html) draws it.
 #[derive(Debug, Clone)]
 pub struct RecordedGrasp {
     /// Its number.
@@ -62,8 +64,9 @@ impl RecordedGrasp {
     }
 }
 
-/// What a contact is to the picture.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// What a contact is to the picture; the name is also the style's class.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
 pub(super) enum ContactKind {
     /// With the object, and cells feel it.
     Sensed,
@@ -73,28 +76,22 @@ pub(super) enum ContactKind {
     OnHand,
 }
 
-impl ContactKind {
-    /// The name in the picture, which is also the style's class.
-    pub(super) fn word(self) -> &'static str {
-        match self {
-            ContactKind::Sensed => "sensed",
-            ContactKind::Unsensed => "unsensed",
-            ContactKind::OnHand => "on-hand",
-        }
-    }
-}
+/// The note of a grasp whose recording has no scene.
+const NO_SCENE: &str =
+    "Object and contacts are not known: there is no /scene for this grasp. Shown are the active cells.";
 
 /// A contact, ready to be drawn.
-#[derive(Debug, Clone)]
+#[derive(Debug, Serialize)]
 pub(super) struct ContactMark {
-    pub(super) kind: ContactKind,
-    pub(super) link: String,
+    kind: ContactKind,
+    link: String,
     /// What the link touches: `object`, or another link.
-    pub(super) touches: String,
-    pub(super) point_in_palm_m: Point3<f64>,
-    pub(super) inward_normal_in_palm: Vector3<f64>,
-    pub(super) force_newtons: f64,
-    pub(super) felt_newtons: f64,
+    touches: String,
+    /// In the palm frame.
+    point_m: [f64; 3],
+    inward_normal: [f64; 3],
+    force_newtons: f64,
+    felt_newtons: f64,
 }
 
 /// A grasp whose parts have been checked against the hand and placed in the palm frame.
@@ -104,7 +101,6 @@ pub(super) struct Placed<'a> {
     /// The frame shown.
     pub(super) frame: &'a TactileFrame,
     pub(super) joints: &'a [f64],
-    pub(super) palm_from_links: Vec<Isometry3<f64>>,
     /// Where it is known and given.
     pub(super) object_in_palm: Option<Mesh>,
     pub(super) contacts: Vec<ContactMark>,
@@ -131,16 +127,11 @@ impl<'a> Placed<'a> {
             .ok_or(PictureError::NoFrames { grasp_id: grasp.grasp_id })?;
         // The scene's joints are what the contacts belong to; the frame's are rounded by the encoders.
         let joints = grasp.scene.as_ref().map_or(&frame.joints, |scene| &scene.joints);
-        let palm_from_links =
-            hand.palm_from_links(joints).map_err(|source| PictureError::Joints { grasp_id: grasp.grasp_id, source })?;
+        hand.palm_from_links(joints).map_err(|source| PictureError::Joints { grasp_id: grasp.grasp_id, source })?;
         let (mut notes, mut contacts, mut object_in_palm) = (Vec::new(), Vec::new(), None);
         match (&grasp.scene, &grasp.object) {
             (None, _) if grasp.is_hand_alone => {}
-            (None, _) => notes.push(
-                "Object and contacts are not known: there is no /scene for this grasp. Shown are the active \
-                 cells."
-                    .into(),
-            ),
+            (None, _) => notes.push(NO_SCENE.into()),
             (Some(scene), object) => {
                 contacts = contact_marks(hand, scene)?;
                 match object {
@@ -155,33 +146,8 @@ impl<'a> Placed<'a> {
         }
         let forces = grasp.frames.iter().flat_map(|frame| &frame.message.cells_newtons);
         let largest = forces.copied().filter(|force| force.is_finite()).fold(0.0, f64::max);
-        Ok(Placed {
-            hand,
-            grasp,
-            frame,
-            joints,
-            palm_from_links,
-            object_in_palm,
-            contacts,
-            notes,
-            scale_newtons: round_up(largest),
-        })
+        Ok(Placed { hand, grasp, frame, joints, object_in_palm, contacts, notes, scale_newtons: round_up(largest) })
     }
-
-    /// Whether a cell is active in the frame shown, and how hard it is pressed.
-    pub(super) fn active_newtons(&self, cell_idx: usize, threshold_newtons: f64) -> Option<f64> {
-        active_newtons(self.frame, cell_idx, threshold_newtons)
-    }
-
-    /// How many contacts are of this kind.
-    pub(super) fn n_contacts(&self, kind: ContactKind) -> usize {
-        self.contacts.iter().filter(|contact| contact.kind == kind).count()
-    }
-}
-
-/// A cell's reading if it is above its noise threshold.
-pub(super) fn active_newtons(frame: &TactileFrame, cell_idx: usize, threshold_newtons: f64) -> Option<f64> {
-    frame.cells_newtons.get(cell_idx).copied().filter(|newtons| *newtons > threshold_newtons)
 }
 
 fn contact_marks(hand: &Hand, scene: &GraspScene) -> Result<Vec<ContactMark>, PictureError> {
@@ -207,10 +173,10 @@ fn contact_marks(hand: &Hand, scene: &GraspScene) -> Result<Vec<ContactMark>, Pi
                 },
                 link: link_name(contact.link.into())?,
                 touches: if on_hand { link_name(contact.other_link.into())? } else { "object".into() },
-                point_in_palm_m: contact.point_m.into(),
-                inward_normal_in_palm: contact.inward_normal.into(),
-                force_newtons: contact.force_newtons,
-                felt_newtons: contact.felt_newtons,
+                point_m: contact.point_m.map(rounded),
+                inward_normal: contact.inward_normal.map(rounded),
+                force_newtons: rounded(contact.force_newtons),
+                felt_newtons: rounded(contact.felt_newtons),
             })
         })
         .collect()

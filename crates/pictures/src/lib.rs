@@ -13,54 +13,39 @@
 //! assert!(graph_mermaid(&graph).contains("contacts"));
 //! ```
 //!
-//! * [`grasp_svg`] - a grasp: the hand on the object from two sides, its contacts with their normals and forces, what
-//!   each pad feels, and what is known of the grasp. One file, no script, a light card that dark pages show as it is.
-//! * [`grasp_html`] - the same, and the grasp in three dimensions to turn by hand, with a slider over its frames. One
-//!   file that asks the network for nothing.
-//! * [`animation_svg`] - grasps as a moving picture, with the probability and the decision.
+//! * [`grasp_html`] - a grasp, or a hand by itself: in three dimensions, to turn by hand, with a slider over its frames, what
+//!   each pad feels, the contacts, and the things that are known. One file that asks the network for nothing.
 //! * [`HandScene`], [`link_poses`] - a hand for a page that draws it frame by frame, with [`STAGE_JS`] and [`THREE_JS`].
-//! * [`posed_scene_images`] - a hand and a thing on a post, moment by moment, by one camera.
 //! * [`dictionary_svg`] - a contact dictionary over the hand.
 //! * [`graph_mermaid`], [`graph_dot`] - a graph of processes.
 //! * [`report_html`] - a report as a page that draws its data by itself, with charts by [`CHART_JS`].
-//! * [`GraspCards`] - grasps that such a page draws.
+//! * [`DrawnFrames`] - grasps, or moments of a lift, that such a page draws.
 //!
-//! Surfaces are rendered here, by a small z-buffered rasteriser (no graphics card, no fonts), and embedded as PNG; what
-//! must be sharp or read (arrows, numbers, text) lies over them as vectors. The same input gives the same
+//! Hands are drawn in the browser alone, by three.js; the page saves a picture of them as PNG. The same input gives the same
 //! bytes.
 //!
 //! Not here: reading recordings or object files, which is the caller's. Links are drawn as their collision shapes, the
 //! only geometry that a hand's description here has.
 
-mod animation;
 mod colour;
 mod dictionary_picture;
+mod frames;
 mod geometry;
 mod graph;
 mod grasp;
-mod grasp_cards;
-mod grasp_picture;
-mod html;
+mod grasp_page;
 mod pads;
-mod png_image;
-mod posed_scene;
-mod raster;
 mod report;
 mod scene;
-mod svg;
-mod view;
 
 #[cfg(test)]
 mod tests;
 
-pub use animation::{AnimatedGrasp, animation_svg};
 pub use dictionary_picture::{DrawnWord, dictionary_svg};
+pub use frames::{DrawnFrames, PosedScene};
 pub use graph::{DrawnEdge, DrawnGraph, DrawnGroup, DrawnNode, graph_dot, graph_mermaid};
 pub use grasp::{ObjectSurface, RecordedGrasp};
-pub use grasp_cards::GraspCards;
-pub use grasp_picture::grasp_svg;
-pub use html::grasp_html;
-pub use posed_scene::{PosedScene, posed_scene_images};
+pub use grasp_page::grasp_html;
 pub use report::{CHART_JS, ReportKind, report_html};
 pub use scene::{HandScene, ObjectScene, STAGE_JS, THREE_JS, link_poses};
 
@@ -105,16 +90,10 @@ pub enum PictureError {
         /// How many links the hand has.
         n_links: usize,
     },
-    /// No objects.
-    #[error("no objects to draw: expected at least one")]
-    NoObjects,
     /// The page's data could not be written as JSON.
     #[error("could not write the page's data")]
     Data {
         /// The reason.
         source: serde_json::Error,
     },
-    /// The image could not be encoded.
-    #[error("could not encode an image as PNG")]
-    Png(#[from] png::EncodingError),
 }

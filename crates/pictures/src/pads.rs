@@ -1,30 +1,20 @@
-//! Pads as heat maps: each pad unrolled flat, each cell a rectangle in the colour of its force.
+//! Pads unrolled flat, so that a page can draw each cell as a rectangle in the colour of its force.
 
 use nalgebra::Vector3;
+use serde::Serialize;
 
-use super::PictureError;
-use super::colour::{SILENT_CELL, force_colour, hex, lightness};
-use super::grasp::{Placed, active_newtons};
-use super::svg::{Anchor, Svg, fit_text, px, text_width};
+use super::scene::rounded;
 use blindgrasp_messages::TactileFrame;
-use blindgrasp_stages::hand::{Cell, CellUnit, Hand, Pad};
+use blindgrasp_stages::hand::{Cell, CellUnit, Pad};
 
 /// Cells whose coordinates differ by less are in one row.
 const SAME_ROW_M: f64 = 0.0005;
-/// Room above a pad for its name and sum.
-const CAPTION_HEIGHT: f64 = 34.0;
-/// Between pads.
-const GAP: f64 = 18.0;
-/// A pad's caption needs this width, however narrow the pad.
-const LEAST_WIDTH: f64 = 74.0;
-
-/// On colours darker than this, numbers are white.
-pub(super) const DARK: f64 = 0.68;
 
 /// A pad laid flat, looked at from outside; up is away from the link's joint.
+#[derive(Serialize)]
 pub(super) struct FlatPad {
-    /// Each cell: left, top, width, height, metres.
-    cells: Vec<[f64; 4]>,
+    /// Each cell: left, top, width, height.
+    cells_m: Vec<[f64; 4]>,
     width_m: f64,
     height_m: f64,
 }
@@ -67,7 +57,8 @@ pub(super) fn flatten(pad: &Pad) -> FlatPad {
         cell[0] -= left;
         cell[1] -= top;
     }
-    FlatPad { cells, width_m, height_m }
+    let cells_m = cells.into_iter().map(|cell| cell.map(rounded)).collect();
+    FlatPad { cells_m, width_m: rounded(width_m), height_m: rounded(height_m) }
 }
 
 /// Each cell's coordinate in `direction`, measured along the surface.
@@ -91,120 +82,16 @@ fn unrolled(cells: &[Cell], direction: Vector3<f64>, normal: Vector3<f64>) -> Ve
     unrolled
 }
 
-/// Where the pads of a hand are in a panel of this width, and how large a millimetre is.
-struct Panel {
-    pads: Vec<FlatPad>,
-    /// Upper left corner of each pad's caption.
-    at: Vec<[f64; 2]>,
-    pixels_per_m: f64,
-    height: f64,
-}
-
-fn panel(hand: &Hand, width: f64, most_height: f64) -> Panel {
-    let pads: Vec<FlatPad> = hand.pads.iter().map(flatten).collect();
-    let place = |pixels_per_m: f64| {
-        let (mut at, mut x, mut y, mut row_height) = (Vec::new(), 0.0, 0.0, 0.0_f64);
-        let mut widest = 0.0_f64;
-        for pad in &pads {
-            let pad_width = (pad.width_m * pixels_per_m).max(LEAST_WIDTH);
-            if x > 0.0 && x + pad_width > width {
-                (x, y, row_height) = (0.0, y + row_height + GAP, 0.0);
-            }
-            at.push([x, y]);
-            x += pad_width + GAP;
-            widest = widest.max(x - GAP);
-            row_height = row_height.max(CAPTION_HEIGHT + pad.height_m * pixels_per_m);
-        }
-        (at, widest, y + row_height)
-    };
-    // The largest scale that fits, in steps of 2 %; 4.5 pixels a millimetre is enough for any cell's number.
-    let mut pixels_per_m = 4500.0;
-    loop {
-        let (at, widest, height) = place(pixels_per_m);
-        if (widest <= width && height <= most_height) || pixels_per_m < 100.0 {
-            return Panel { pads, at, pixels_per_m, height };
-        }
-        pixels_per_m *= 0.98;
-    }
-}
-
-/// Draws the heat maps of all pads with their scale at `[x, y]`; returns the height used.
-pub(super) fn draw_pads(
-    svg: &mut Svg,
-    placed: &Placed<'_>,
-    [x, y]: [f64; 2],
-    width: f64,
-    most_height: f64,
-) -> Result<f64, PictureError> {
-    const SCALE_HEIGHT: f64 = 44.0;
-    let hand = placed.hand;
-    let panel = panel(hand, width, most_height - SCALE_HEIGHT);
-    for (pad_idx, (pad, [left, top])) in hand.pads.iter().zip(&panel.at).enumerate() {
-        let (left, top) = (x + left, y + top);
-        let flat = &panel.pads[pad_idx];
-        let room = (flat.width_m * panel.pixels_per_m).max(LEAST_WIDTH);
-        svg.text([left, top + 11.0], Anchor::Start, "strong", &fit_text(&pad.name.replace('_', " "), 13.0, room));
-        let n_cells = pad.cells.len();
-        let sum = if placed.grasp.is_hand_alone {
-            format!("{n_cells} cells").replace("1 cells", "1 cell")
-        } else {
-            pad_summary(placed.frame, pad, hand.cell_unit)
-        };
-        // Where the numbers of newtons and cells would run into the next caption, the newtons have the room.
-        let sum = match sum.split_once(',') {
-            Some((newtons, _)) if text_width(&sum, 12.0) > room + GAP - 4.0 => newtons.into(),
-            _ => sum,
-        };
-        svg.text_with([left, top + 27.0], Anchor::Start, "note", &sum, &[("data-pad", &pad_idx)]);
-        draw_cells(svg, placed, pad, flat, [left, top + CAPTION_HEIGHT], panel.pixels_per_m);
-    }
-    if placed.grasp.is_hand_alone {
-        return Ok(panel.height);
-    }
-    draw_scale(svg, [x, y + panel.height + 16.0], width.min(230.0), placed.scale_newtons, hand.cell_unit);
-    Ok(panel.height + SCALE_HEIGHT)
-}
-
-/// Draws the cells of a pad at `[left, top]`, with their numbers where there is room.
-fn draw_cells(svg: &mut Svg, placed: &Placed<'_>, pad: &Pad, flat: &FlatPad, [left, top]: [f64; 2], pixels_per_m: f64) {
-    for (idx, (cell, [cell_x, cell_y, cell_width, cell_height])) in pad.cells.iter().zip(&flat.cells).enumerate() {
-        let cell_idx = pad.first_cell_idx + idx;
-        let corner = [left + cell_x * pixels_per_m, top + cell_y * pixels_per_m];
-        let size = [cell_width * pixels_per_m, cell_height * pixels_per_m];
-        let active = placed.active_newtons(cell_idx, cell.noise_threshold_newtons);
-        let fill = active.map_or(SILENT_CELL, |newtons| force_colour(newtons / placed.scale_newtons));
-        svg.element(
-            "rect",
-            &[
-                ("x", &px(corner[0] + 0.5)),
-                ("y", &px(corner[1] + 0.5)),
-                ("width", &px((size[0] - 1.0).max(1.0))),
-                ("height", &px((size[1] - 1.0).max(1.0))),
-                ("rx", &1.5),
-                ("fill", &hex(fill)),
-                ("class", &"cell"),
-                ("data-cell", &cell_idx),
-            ],
-        );
-        if size[0] >= 15.0 && size[1] >= 10.5 {
-            let label = match active {
-                Some(newtons) if !placed.grasp.is_hand_alone => cell_label(newtons),
-                _ => String::new(),
-            };
-            let class = if lightness(fill) < DARK { "cell-force on-dark" } else { "cell-force" };
-            let at = [corner[0] + size[0] / 2.0, corner[1] + size[1] / 2.0 + 3.2];
-            svg.text_with(at, Anchor::Middle, class, &label, &[("data-force", &cell_idx)]);
-        }
-    }
-}
-
 /// The sum of a pad's active cells, and how many they are.
 pub(super) fn pad_summary(frame: &TactileFrame, pad: &Pad, unit: CellUnit) -> String {
     let active: Vec<f64> = pad
         .cells
         .iter()
         .enumerate()
-        .filter_map(|(idx, cell)| active_newtons(frame, pad.first_cell_idx + idx, cell.noise_threshold_newtons))
+        .filter_map(|(idx, cell)| {
+            let newtons = frame.cells_newtons.get(pad.first_cell_idx + idx).copied()?;
+            (newtons > cell.noise_threshold_newtons).then_some(newtons)
+        })
         .collect();
     match active.len() {
         0 => "no contact".into(),
@@ -215,42 +102,10 @@ pub(super) fn pad_summary(frame: &TactileFrame, pad: &Pad, unit: CellUnit) -> St
     }
 }
 
-fn cell_label(newtons: f64) -> String {
-    if newtons < 9.95 { format!("{newtons:.1}") } else { format!("{newtons:.0}") }
-}
-
-/// The colours of the forces from 0 to the largest.
-fn draw_scale(svg: &mut Svg, [x, y]: [f64; 2], width: f64, largest_newtons: f64, unit: CellUnit) {
-    const N_STEPS: usize = 46;
-    let step = width / N_STEPS as f64;
-    for idx in 0..N_STEPS {
-        let fill = hex(force_colour((idx as f64 + 0.5) / N_STEPS as f64));
-        svg.element(
-            "rect",
-            &[
-                ("x", &px(x + idx as f64 * step)),
-                ("y", &px(y)),
-                // A little wider than the step: no seams.
-                ("width", &px(step + 0.5)),
-                ("height", &8),
-                ("fill", &fill),
-            ],
-        );
-    }
-    let tick = |newtons: f64| format!("{}", (newtons * 1000.0).round() / 1000.0);
-    svg.text([x, y + 23.0], Anchor::Start, "note", "0");
-    svg.text([x + width / 2.0, y + 23.0], Anchor::Middle, "note", &tick(largest_newtons / 2.0));
-    svg.text(
-        [x + width, y + 23.0],
-        Anchor::End,
-        "note",
-        &format!("{} {} a cell", tick(largest_newtons), unit.symbol()),
-    );
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use blindgrasp_stages::hand::Hand;
     use std::path::Path;
 
     #[test]
@@ -260,7 +115,7 @@ mod tests {
         // Seven cells of 10 mm at a pitch of 11 mm; four of 9.7 mm at 10.6 mm.
         assert!((palm.width_m - 0.076).abs() < 1e-9 && (palm.height_m - 0.0415).abs() < 1e-9);
         let finger = flatten(&hand.pads[1]);
-        assert!((finger.width_m - (2.0 * 0.0052 + 0.0047)).abs() < 1e-6, "{}", finger.width_m);
+        assert!((finger.width_m - (2.0 * 0.0052 + 0.0047)).abs() < 1e-5, "{}", finger.width_m);
         // The rows' distances along the profile, and half a cell at each end.
         let rows = [
             (22.25_f64, 9.5_f64),
@@ -277,6 +132,6 @@ mod tests {
         let expected_m = length_mm / 1000.0 + (ends_mm.0[0].max(ends_mm.0[1]) + ends_mm.1[0].min(ends_mm.1[1])) / 2.0;
         assert!((finger.height_m - expected_m).abs() < 1e-3, "{} {expected_m}", finger.height_m);
         // The last row is the finger's tip: at the top.
-        assert!(finger.cells[23][1] < finger.cells[0][1]);
+        assert!(finger.cells_m[23][1] < finger.cells_m[0][1]);
     }
 }

@@ -3,10 +3,11 @@
 use serde::Serialize;
 
 use super::scene::{STAGE_JS, THREE_JS};
-use super::{GraspCards, PictureError};
+use super::{DrawnFrames, PictureError};
 
 /// Charts of reports and of the page of a graph, as a module.
 pub const CHART_JS: &str = include_str!("../assets/chart.js");
+const GRASP_JS: &str = include_str!("../assets/grasp.js");
 const REPORT_JS: &str = include_str!("../assets/report.js");
 const STYLE: &str = include_str!("../assets/report.css");
 
@@ -15,6 +16,8 @@ const STYLE: &str = include_str!("../assets/report.css");
 #[serde(rename_all = "snake_case")]
 pub enum ReportKind {
     Evaluation,
+    /// One grasp, or a hand by itself.
+    Grasp,
     Run,
     Trials,
 }
@@ -23,7 +26,8 @@ pub enum ReportKind {
 struct Page<'a, T> {
     kind: ReportKind,
     data: &'a T,
-    cards: Option<&'a GraspCards>,
+    /// The hand that it shows in three dimensions.
+    drawn: Option<&'a DrawnFrames>,
 }
 
 /// The page of a report.
@@ -33,25 +37,25 @@ struct Page<'a, T> {
 pub fn report_html(
     kind: ReportKind,
     data: &impl Serialize,
-    cards: Option<&GraspCards>,
+    drawn: Option<&DrawnFrames>,
 ) -> Result<String, PictureError> {
     Ok(format!(
         include_str!("../assets/report.html"),
         style = STYLE,
-        data = json_for_page(&Page { kind, data, cards })?,
-        modules = if cards.is_some() { stage_modules() } else { String::new() },
-        script = format!("{CHART_JS}{REPORT_JS}"),
+        data = json_for_page(&Page { kind, data, drawn })?,
+        modules = if drawn.is_some() { stage_modules() } else { String::new() },
+        script = format!("{CHART_JS}{GRASP_JS}{REPORT_JS}"),
     ))
 }
 
 /// JSON that can stand in a script of a page: a name in it does not end the script.
-pub(super) fn json_for_page(data: &impl Serialize) -> Result<String, PictureError> {
+fn json_for_page(data: &impl Serialize) -> Result<String, PictureError> {
     let json = serde_json::to_string(data).map_err(|source| PictureError::Data { source })?;
     Ok(json.replace('<', "\\u003c"))
 }
 
 /// The modules of a page that shows a hand in three dimensions: its script loads them out of the page.
-pub(super) fn stage_modules() -> String {
+fn stage_modules() -> String {
     format!(
         "<script type=\"text/plain\" id=\"three.js\">{THREE_JS}</script>\n\
          <script type=\"text/plain\" id=\"stage.js\">{STAGE_JS}</script>\n"
@@ -71,7 +75,7 @@ mod tests {
         assert!(html.contains("default-src 'none'; script-src 'unsafe-inline' blob:;"));
         // Texts are set, never read as HTML.
         for reads in ["innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval("] {
-            assert!(!CHART_JS.contains(reads) && !REPORT_JS.contains(reads), "{reads}");
+            assert!([CHART_JS, GRASP_JS, REPORT_JS].iter().all(|script| !script.contains(reads)), "{reads}");
         }
     }
 }

@@ -15,12 +15,28 @@ pub const THREE_JS: &str = include_str!("../assets/three.js");
 /// Draws a [`HandScene`] with three.js, frame by frame.
 pub const STAGE_JS: &str = include_str!("../assets/stage.js");
 /// Colours of the scale of forces.
-pub(super) const N_COLOURS: usize = 64;
+const N_COLOURS: usize = 64;
 
 #[derive(Serialize)]
-struct Surface {
+pub(super) struct Surface {
     positions_m: Vec<f64>,
     triangles: Vec<u32>,
+    /// None for the hand's.
+    colour: Option<[u8; 3]>,
+}
+
+impl Surface {
+    fn new(mesh: &Mesh) -> Surface {
+        Surface {
+            positions_m: mesh.vertices_m.iter().flat_map(point).collect(),
+            triangles: mesh.triangles.iter().flatten().copied().collect(),
+            colour: None,
+        }
+    }
+
+    pub(super) fn coloured(mesh: &Mesh, colour: Rgb) -> Surface {
+        Surface { colour: Some(bytes(colour)), ..Surface::new(mesh) }
+    }
 }
 
 #[derive(Serialize)]
@@ -40,7 +56,8 @@ struct PadData {
 #[derive(Serialize)]
 pub struct HandScene {
     hand: String,
-    links: Vec<Surface>,
+    /// Those of the hand; other things may follow.
+    pub(super) links: Vec<Surface>,
     cells: Vec<CellData>,
     pads: Vec<PadData>,
     /// The names of the pads.
@@ -58,7 +75,7 @@ impl HandScene {
     pub fn new(hand: &Hand) -> HandScene {
         HandScene {
             hand: hand.name.clone(),
-            links: hand.links.iter().map(|link| surface(&link_mesh(link))).collect(),
+            links: hand.links.iter().map(|link| Surface::new(&link_mesh(link))).collect(),
             cells: cells(hand),
             pads: pads(hand),
             pad_names: hand.pads.iter().map(|pad| pad.name.clone()).collect(),
@@ -74,10 +91,8 @@ impl HandScene {
 
 /// The surface of an object in the palm frame, where the scene of a grasp has it.
 #[derive(Serialize)]
-pub struct ObjectScene {
-    surface: Surface,
-    colour: [u8; 3],
-}
+#[serde(transparent)]
+pub struct ObjectScene(Surface);
 
 impl ObjectScene {
     pub fn new(mesh: &Mesh, scene: &GraspScene) -> ObjectScene {
@@ -88,7 +103,7 @@ impl ObjectScene {
 
     /// Of a surface that is in the palm frame already.
     pub(super) fn placed(mesh: &Mesh) -> ObjectScene {
-        ObjectScene { surface: surface(mesh), colour: bytes(OBJECT) }
+        ObjectScene(Surface::coloured(mesh, OBJECT))
     }
 }
 
@@ -121,18 +136,12 @@ fn pads(hand: &Hand) -> Vec<PadData> {
     hand.pads.iter().map(|pad| PadData { first_cell: pad.first_cell_idx, n_cells: pad.cells.len() }).collect()
 }
 
-fn surface(mesh: &Mesh) -> Surface {
-    Surface {
-        positions_m: mesh.vertices_m.iter().flat_map(point).collect(),
-        triangles: mesh.triangles.iter().flatten().copied().collect(),
-    }
-}
-
 pub(super) fn point(point: &Point3<f64>) -> [f64; 3] {
     point.coords.map(rounded).into()
 }
 
-fn rows(palm_from_link: &Isometry3<f64>) -> Vec<f64> {
+/// The upper three rows of the matrix of a pose, row by row.
+pub(super) fn rows(palm_from_link: &Isometry3<f64>) -> Vec<f64> {
     let matrix = palm_from_link.to_homogeneous();
     (0..12).map(|idx| rounded(matrix[(idx / 4, idx % 4)])).collect()
 }

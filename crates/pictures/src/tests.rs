@@ -1,12 +1,13 @@
-//! Pictures of recorded grasps.
+//! Pages of recorded grasps.
 
 use std::path::Path;
 
 use parry3d_f64::shape::SharedShape;
+use serde_json::{Value, json};
 
 use super::*;
 use blindgrasp_mesh::shape::mesh_of_shape;
-use blindgrasp_messages::SceneContact;
+use blindgrasp_messages::{Phase, SceneContact};
 use blindgrasp_recording::{Record, RecordingReader};
 use blindgrasp_stages::hand::Hand;
 
@@ -34,104 +35,93 @@ fn recorded(class: &str) -> (Hand, RecordedGrasp) {
     (hand, grasp)
 }
 
-/// Fails where the text is no XML. Returns the classes of all elements.
-fn classes_of(svg: &str) -> Vec<String> {
-    let mut reader = quick_xml::Reader::from_str(svg);
-    let (mut classes, mut depth) = (Vec::new(), 0);
-    loop {
-        use quick_xml::events::Event;
-        match reader.read_event().expect("well-formed XML") {
-            event @ (Event::Start(_) | Event::Empty(_)) => {
-                depth += i32::from(matches!(event, Event::Start(_)));
-                let (Event::Start(element) | Event::Empty(element)) = event else { continue };
-                for attribute in element.attributes() {
-                    let attribute = attribute.expect("an attribute");
-                    if attribute.key.as_ref() == "class" {
-                        classes.push(attribute.value.into_owned());
-                    }
-                }
-            }
-            Event::End(_) => depth -= 1,
-            Event::Eof => break,
-            _ => {}
-        }
-    }
-    assert_eq!(depth, 0, "an element is not closed");
-    classes
-}
-
-fn n_arrows(classes: &[String], kind: &str) -> usize {
-    // One of each kind is in the legend; the others are there once a view.
-    let n = classes.iter().filter(|class| **class == format!("arrow {kind}")).count();
-    if n == 0 { 0 } else { (n - 1) / 2 }
+/// The data that the page's script draws.
+fn data_of(html: &str) -> Value {
+    let (_, json) = html.split_once("<script type=\"application/json\" id=\"report\">").expect("the data");
+    serde_json::from_str(json.split_once("</script>").expect("an end").0).expect("JSON")
 }
 
 #[test]
-fn the_picture_says_what_the_grasp_is_and_shows_every_contact() {
+fn the_page_says_what_the_grasp_is_and_shows_every_contact_and_frame() {
     let (hand, mut grasp) = recorded("can");
     let scene = grasp.scene.as_mut().expect("a scene");
     let first = scene.contacts[0].clone();
     scene.contacts.push(SceneContact { other_link: 2, felt_newtons: 1.0, ..first });
     scene.contacts.push(SceneContact { felt_newtons: 0.0, ..first.clone() });
     let contacts = scene.contacts.clone();
-    let svg = grasp_svg(&hand, &grasp).expect("a picture");
-    let classes = classes_of(&svg);
+    let html = grasp_html(&hand, &grasp).expect("a page");
+    assert_eq!(html, grasp_html(&hand, &grasp).expect("a page"), "the same bytes again");
+    let page = data_of(&html);
+    let data = &page["data"];
+    let n_found = |kind: &str| {
+        let found = data["contacts"].as_array().expect("contacts").iter();
+        found.filter(|contact| contact["kind"] == kind).count()
+    };
     let count = |of: &dyn Fn(&SceneContact) -> bool| contacts.iter().filter(|contact| of(contact)).count();
-    assert_eq!(n_arrows(&classes, "on-hand"), 1);
-    assert_eq!(n_arrows(&classes, "sensed"), count(&|c| c.other_link < 0 && c.felt_newtons > 0.05));
-    assert_eq!(n_arrows(&classes, "unsensed"), count(&|c| c.other_link < 0 && c.felt_newtons <= 0.05));
+    assert_eq!(n_found("on-hand"), 1);
+    assert_eq!(n_found("sensed"), count(&|c| c.other_link < 0 && c.felt_newtons > 0.05));
+    assert_eq!(n_found("unsensed"), count(&|c| c.other_link < 0 && c.felt_newtons <= 0.05));
     let truth = grasp.truth.clone().expect("a truth");
-    let epsilon = format!("ε {}", super::grasp_picture::number(truth.epsilon));
-    for expected in [">stable<", &epsilon, &truth.object, "class can", ">palm<", "distal 3", "5 N"] {
-        assert!(svg.contains(expected), "{expected}");
+    let fact = |name: &str| data["facts"].as_array().expect("facts").iter().find(|fact| fact[0] == name).cloned();
+    for (name, expected) in [("true label", "stable"), ("class", "can"), ("epsilon", &format!("{:.4}", truth.epsilon))]
+    {
+        assert_eq!(fact(name).expect(name)[1], expected);
     }
-    assert!(!svg.contains("not known") && !svg.contains("not drawn"));
-    assert_eq!(svg.matches("<image").count(), 2);
-    assert_eq!(svg, grasp_svg(&hand, &grasp).expect("a picture"), "the same bytes again");
+    assert_eq!(data["title"], format!("Grasp {} of {}", grasp.grasp_id, truth.object));
+    assert_eq!(data["notes"], json!([]));
+    assert_eq!(page["drawn"]["frames"].as_array().map(Vec::len), Some(grasp.frames.len()));
+    assert_eq!(page["drawn"]["scale_newtons"], 3.0);
+    assert_eq!(data["is_closed"][data["shown"].as_u64().expect("an index") as usize], true);
+    assert_eq!(data["is_closed"][0], false, "the first frame is of the open hand");
+    let values: Vec<f64> = grasp.scene.expect("a scene").joints;
+    let shown: Vec<f64> =
+        data["joints"].as_array().expect("joints").iter().filter_map(|joint| joint["value"].as_f64()).collect();
+    assert_eq!(shown, values);
 }
 
 #[test]
-fn without_a_scene_the_picture_shows_the_active_cells_and_says_so() {
+fn long_grasps_are_thinned_out_around_the_frame_shown() {
+    let (hand, mut grasp) = recorded("can");
+    grasp.frames = grasp.frames.iter().cycle().take(1000).cloned().collect();
+    let last_settled = grasp.frames.iter().rposition(|frame| frame.message.phase == Phase::Settled).expect("settled");
+    let page = data_of(&grasp_html(&hand, &grasp).expect("a page"));
+    let frames = page["drawn"]["frames"].as_array().expect("frames");
+    assert!((100..=150).contains(&frames.len()), "{}", frames.len());
+    let shown = page["data"]["shown"].as_u64().expect("an index") as usize;
+    let expected = &grasp.frames[last_settled].message.cells_newtons;
+    for (cell, newtons) in frames[shown]["cells"].as_array().expect("cells").iter().zip(expected) {
+        assert!((cell.as_f64().expect("a number") - newtons).abs() < 1e-5);
+    }
+}
+
+#[test]
+fn without_a_scene_the_page_says_so() {
     let (hand, mut grasp) = recorded("box");
     grasp.scene = None;
     grasp.truth = None;
-    let svg = grasp_svg(&hand, &grasp).expect("a picture");
-    let classes = classes_of(&svg);
-    let frame = &grasp.frames.last().expect("a frame").message;
-    let n_active = frame.cells_newtons.iter().filter(|newtons| **newtons > 0.05).count();
-    assert!(n_active > 0);
-    assert_eq!(classes.iter().filter(|class| *class == "cell-arrow").count(), 2 * n_active);
-    assert!(svg.contains("Object and contacts are not known") && svg.contains("not labelled"));
-    let html = grasp_html(&hand, &grasp).expect("a page");
-    assert!(html.contains("\"object\":null") && !html.contains("<table>"));
+    let page = data_of(&grasp_html(&hand, &grasp).expect("a page"));
+    assert_eq!((&page["data"]["object"], &page["data"]["contacts"]), (&Value::Null, &json!([])));
+    assert_eq!(page["data"]["facts"][0], json!(["true label", "not labelled"]));
+    let note = page["data"]["notes"][0].as_str().expect("a note");
+    assert!(note.starts_with("Object and contacts are not known"), "{note}");
 }
 
 #[test]
 fn an_object_that_is_not_found_is_said_and_hostile_names_are_only_text() {
     let (hand, mut grasp) = recorded("ball");
-    grasp.object = ObjectSurface::Unknown("The object 'x' is not drawn: <why> & what to do.".into());
+    let why = "The object 'x' is not drawn: <why> & what to do.";
+    grasp.object = ObjectSurface::Unknown(why.into());
     grasp.truth.as_mut().expect("a truth").object = "</script><b>\"&".into();
-    let svg = grasp_svg(&hand, &grasp).expect("a picture");
-    classes_of(&svg);
-    assert!(svg.contains("&lt;why&gt; &amp; what to do."));
     let html = grasp_html(&hand, &grasp).expect("a page");
     assert_eq!(html.matches("</script>").count(), 4, "only the page's own scripts end");
-}
-
-#[test]
-fn the_page_needs_nothing_else_and_holds_the_frames_and_contacts() {
-    let (hand, grasp) = recorded("cup");
-    let html = grasp_html(&hand, &grasp).expect("a page");
+    let page = data_of(&html);
+    assert_eq!(page["data"]["notes"], json!([why]));
+    assert!(page["data"]["title"].as_str().expect("a title").ends_with(" of </script><b>\"&"));
     // Namespaces are names, not addresses.
-    let names = ["http://www.w3.org/2000/svg", "http://www.w3.org/1999/xhtml"];
-    let addresses = names.iter().fold(html.clone(), |html, name| html.replace(name, ""));
+    let addresses = html.replace("http://www.w3.org/2000/svg", "").replace("http://www.w3.org/1999/xhtml", "");
     for loads in ["http:", "https:", "src=", "@import", "url("] {
         assert!(!addresses.contains(loads), "{loads}");
     }
-    assert_eq!(html.matches("\"phase\"").count(), grasp.frames.len());
-    let n_contacts = grasp.scene.as_ref().expect("a scene").contacts.len();
-    assert_eq!(html.matches("<span class=\"badge\">").count(), n_contacts);
-    assert_eq!(html, grasp_html(&hand, &grasp).expect("a page"), "the same bytes again");
 }
 
 #[test]
@@ -140,7 +130,7 @@ fn frames_and_contacts_of_another_hand_are_refused() {
     let refused = |change: &dyn Fn(&mut RecordedGrasp), expected: &str| {
         let mut changed = grasp.clone();
         change(&mut changed);
-        let error = anyhow::Error::from(grasp_svg(&hand, &changed).expect_err("not the hand's"));
+        let error = anyhow::Error::from(grasp_html(&hand, &changed).expect_err("not the hand's"));
         assert!(format!("{error:#}").contains(expected), "{error:#}");
     };
     refused(&|grasp| grasp.frames[3].message.cells_newtons.truncate(95), "frame 3: 95 cells, the hand has 96");
@@ -157,12 +147,12 @@ fn frames_and_contacts_of_another_hand_are_refused() {
 fn cards_hold_a_frame_each_and_hostile_names_are_only_text() {
     let (hand, mut grasp) = recorded("can");
     grasp.truth.as_mut().expect("a truth").object = "</script><b>\"&".into();
-    let cards = GraspCards::new(&hand, [&grasp, &grasp]).expect("cards");
+    let cards = DrawnFrames::of_grasps(&hand, &[&grasp, &grasp]).expect("cards");
     let html = report_html(ReportKind::Run, &(), Some(&cards)).expect("a page");
-    assert_eq!(html.matches("\"grasp_id\"").count(), 2);
+    assert_eq!(html.matches("\"lines\"").count(), 2);
     assert!(html.contains("known to be stable; object \\u003c/script>\\u003cb>"), "{}", &html[..2000]);
     assert_eq!(html.matches("</script>").count(), 4, "only the page's own scripts end");
     let (_, mut other) = recorded("can");
     other.frames[0].message.cells_newtons.pop();
-    assert!(GraspCards::new(&hand, [&other]).is_err(), "a frame of another hand");
+    assert!(DrawnFrames::of_grasps(&hand, &[&other]).is_err(), "a frame of another hand");
 }

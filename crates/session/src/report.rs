@@ -10,7 +10,7 @@ use blindgrasp_graph::log::{LogFolder, LogTail};
 use blindgrasp_graph::run::{RunSummary, SeenDecision};
 use blindgrasp_messages::{Action, GraspTruth, LiftDecision, Phase, Record, Stamped, TactileFrame};
 use blindgrasp_operator::wiring::LogLevel;
-use blindgrasp_pictures::{GraspCards, ObjectSurface, RecordedGrasp, ReportKind, report_html};
+use blindgrasp_pictures::{DrawnFrames, ObjectSurface, RecordedGrasp, ReportKind, report_html};
 use blindgrasp_stages::hand::Hand;
 use serde::Serialize;
 
@@ -236,10 +236,11 @@ impl RunReport {
             problem: None,
         };
         let mut cards = None;
+        let wrong: Vec<_> = self.wrong_lifts.pictures.iter().chain(&self.wrong_holds.pictures).collect();
         if let Some(hand) = &self.hand
-            && self.wrong_lifts.pictures.len() + self.wrong_holds.pictures.len() > 0
+            && !wrong.is_empty()
         {
-            match GraspCards::new(hand, self.wrong_lifts.pictures.iter().chain(&self.wrong_holds.pictures)) {
+            match DrawnFrames::of_grasps(hand, &wrong) {
                 Ok(made) => cards = Some(made),
                 Err(error) => page.problem = Some(error.to_string()),
             }

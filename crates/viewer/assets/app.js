@@ -15,6 +15,7 @@ const shown = (window.blindgrasp = { server: null, scene: null, model: null, fra
 const hand = makeStage(three, byId("stage"));
 if (!hand.renderer) byId("without-webgl").hidden = false;
 shown.hand = hand;
+byId("save").addEventListener("click", () => hand.savePicture("hand"));
 
 // --- a frame
 const isActive = (newtons, idx) => newtons !== null && newtons > shown.scene.cells[idx].threshold_newtons;

@@ -10,67 +10,22 @@ use super::super::{Outcome, check_output, print_line, write_out};
 use super::GraspArguments;
 use blindgrasp_cli::houses::LAB;
 use blindgrasp_grasps::dataset::hand_of;
-use blindgrasp_grasps::decide::decide_alone;
 use blindgrasp_mesh::Mesh;
-use blindgrasp_messages::{Fault, Phase};
+use blindgrasp_messages::Phase;
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_pictures::{AnimatedGrasp, ObjectSurface, RecordedGrasp, animation_svg, grasp_html, grasp_svg};
+use blindgrasp_pictures::{ObjectSurface, RecordedGrasp, grasp_html};
 use blindgrasp_recording::{Record, RecordingReader};
 use blindgrasp_stages::{Hand, Judge, Model};
 
-/// The kind of picture, by the file's extension.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Format {
-    Svg,
-    Html,
-}
-
 pub(super) fn draw(recording: &Path, out: &Path, arguments: &GraspArguments) -> anyhow::Result<Outcome> {
     check_output(out, &[recording.to_owned()])?;
-    let format = format_of(out)?;
+    check_html(out)?;
     let hand = hand_of(recording, arguments.hand.as_deref())?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
-    let mut grasp = read_grasp(recording, arguments.grasp.first().copied())?;
+    let mut grasp = read_grasp(recording, arguments.grasp)?;
     grasp.object = surface(&grasp, arguments.objects.as_deref())?;
-    let picture = match format {
-        Format::Svg => grasp_svg(&hand, &grasp)?,
-        Format::Html => grasp_html(&hand, &grasp)?,
-    };
-    write_out(out, &picture)?;
+    write_out(out, &grasp_html(&hand, &grasp)?)?;
     print_line(&format!("grasp {} drawn to {}", grasp.grasp_id, out.display()))?;
-    Ok(Outcome::Done)
-}
-
-/// Draws grasps as a moving picture, as this model decides them.
-pub(super) fn animate(recording: &Path, out: &Path, arguments: &GraspArguments) -> anyhow::Result<Outcome> {
-    check_output(out, &[recording.to_owned()])?;
-    if format_of(out)? != Format::Svg {
-        bail!("{}: expected a name that ends in .svg: a moving picture is an SVG", out.display());
-    }
-    let hand = hand_of(recording, arguments.hand.as_deref())?;
-    hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
-    let path = arguments.animate.as_deref().unwrap_or(Path::new(""));
-    let mut judge = judge_of(path, &hand)?;
-    let wanted = arguments.grasp.iter().map(|id| Some(*id));
-    let wanted: Vec<_> = if arguments.grasp.is_empty() { vec![None] } else { wanted.collect() };
-    let mut animated = Vec::new();
-    for id in wanted {
-        let mut grasp = read_grasp(recording, id)?;
-        grasp.object = surface(&grasp, arguments.objects.as_deref())?;
-        let alone = decide_alone(&mut judge, &grasp.frames);
-        grasp.decision = alone.decision;
-        let probabilities =
-            alone.predictions.iter().map(|it| (it.fault == Fault::None).then_some(it.probability_stable));
-        animated.push(AnimatedGrasp {
-            probabilities: probabilities.collect(),
-            decided_at: alone.decided_at,
-            threshold: judge.model().classifier.threshold_probability,
-            grasp,
-        });
-    }
-    let picture = animation_svg(&hand, &animated)?;
-    write_out(out, &picture)?;
-    print_line(&format!("{} grasps drawn to {}", animated.len(), out.display()))?;
     Ok(Outcome::Done)
 }
 
@@ -80,14 +35,13 @@ pub(super) fn judge_of(model: &Path, hand: &Hand) -> anyhow::Result<Judge> {
     judge.with_context(|| model.display().to_string())
 }
 
-pub(super) fn format_of(out: &Path) -> anyhow::Result<Format> {
-    match out.extension().and_then(|extension| extension.to_str()).map(str::to_lowercase).as_deref() {
-        Some("svg") => Ok(Format::Svg),
-        Some("html" | "htm") => Ok(Format::Html),
-        _ => {
-            bail!("{}: expected a name that ends in .svg (a picture) or .html (one that can be turned)", out.display())
-        }
+/// Refuses a file that is no page.
+pub(super) fn check_html(out: &Path) -> anyhow::Result<()> {
+    let extension = out.extension().and_then(OsStr::to_str).unwrap_or_default();
+    if !["html", "htm"].contains(&extension.to_lowercase().as_str()) {
+        bail!("{}: expected a name that ends in .html: the page saves a picture (PNG)", out.display());
     }
+    Ok(())
 }
 
 /// All that a recording says of a grasp, but for the object's surface.

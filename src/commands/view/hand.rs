@@ -3,13 +3,13 @@
 use std::path::Path;
 
 use super::super::{Outcome, check_output, print_line, write_out};
-use super::grasp::{Format, format_of};
+use super::grasp::check_html;
 use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_pictures::{RecordedGrasp, grasp_html, grasp_svg};
+use blindgrasp_pictures::{RecordedGrasp, grasp_html};
 use blindgrasp_stages::hand::Hand;
 
-/// Postures in the page, from the open hand to the closed one.
+/// Postures on the page, from the open hand to the closed one.
 const N_POSTURES: usize = 60;
 
 /// Whether the argument is a pad layout or the name of a built-in hand.
@@ -21,23 +21,17 @@ pub(super) fn is_hand(path: &Path) -> bool {
     text.lines().any(|line| line.starts_with("format: blindgrasp-hand"))
 }
 
-/// Draws the hand in a posture. The page also shows how it closes.
+/// Draws the hand in a posture, and how it closes from there.
 pub(super) fn draw(path: &Path, out: &Path, joints: &[(String, f64)]) -> anyhow::Result<Outcome> {
     check_output(out, &[path.to_owned()])?;
-    let format = format_of(out)?;
+    check_html(out)?;
     let hand = Hand::load(path)?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let posture = hand.posture(joints.iter().map(|(name, value)| (name.as_str(), *value)))?;
-    let picture = match format {
-        Format::Svg => grasp_svg(&hand, &RecordedGrasp::hand_alone(&hand, &[posture]))?,
-        Format::Html => {
-            let mut postures = hand.closing_postures(&posture, N_POSTURES);
-            // Links that touch in the given posture leave nothing to close.
-            postures.truncate(n_apart(&hand, &postures)?.max(1));
-            grasp_html(&hand, &RecordedGrasp::hand_alone(&hand, &postures))?
-        }
-    };
-    write_out(out, &picture)?;
+    let mut postures = hand.closing_postures(&posture, N_POSTURES);
+    // Links that touch in the given posture leave nothing to close.
+    postures.truncate(n_apart(&hand, &postures)?.max(1));
+    write_out(out, &grasp_html(&hand, &RecordedGrasp::hand_alone(&hand, &postures))?)?;
     print_line(&format!("hand {} drawn to {}", hand.name, out.display()))?;
     Ok(Outcome::Done)
 }

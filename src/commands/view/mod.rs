@@ -35,7 +35,7 @@ pub(super) struct Arguments {
     /// of a built-in one
     #[arg(default_value = "dataflow.yaml")]
     file: PathBuf,
-    /// Write to this file: .svg, .mmd or .dot for a graph, .svg or .html for a grasp or a hand
+    /// Write to this file: .svg, .mmd or .dot for a graph, .html for a grasp or a hand
     #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Port of the page of a running graph or a recording, on 127.0.0.1 [default: any free one]
@@ -111,18 +111,15 @@ struct GraphArguments {
 #[derive(Debug, Args)]
 #[command(next_help_heading = "A recorded grasp")]
 struct GraspArguments {
-    /// Number of the grasp [default: the recording's first]; several with --animate
-    #[arg(long, value_delimiter = ',')]
-    grasp: Vec<u64>,
+    /// Number of the grasp [default: the recording's first]
+    #[arg(long)]
+    grasp: Option<u64>,
     /// Pad layout of the hand [default: the built-in hand that the recording names]
     #[arg(long)]
     hand: Option<PathBuf>,
     /// Folder of the objects' meshes [default: the built-in objects]
     #[arg(long)]
     objects: Option<PathBuf>,
-    /// Draw the grasps as a moving picture (.svg), decided by this model
-    #[arg(long, value_name = "MODEL", requires = "out")]
-    animate: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]
@@ -168,10 +165,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     if hand::is_hand(&arguments.file) {
         let Some(out) = &arguments.out else {
-            refuse("--out is missing: name the picture of the hand, .svg or .html");
+            refuse("--out is missing: name the page of the hand, .html");
         };
-        if !grasp.grasp.is_empty() || grasp.animate.is_some() {
-            refuse("--grasp and --animate are for recordings: name an .mcap file");
+        if grasp.grasp.is_some() {
+            refuse("--grasp is for recordings: name an .mcap file");
         }
         return hand::draw(&arguments.file, out, &arguments.alone.joints);
     }
@@ -179,19 +176,15 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         refuse("--joints is for hands: name a pad layout (.yaml) or a built-in hand");
     }
     if is_dataflow(&arguments.file) {
-        if !grasp.grasp.is_empty() || grasp.hand.is_some() || grasp.objects.is_some() || grasp.animate.is_some() {
-            refuse("--grasp, --hand, --objects and --animate are for recordings: name an .mcap file");
+        if grasp.grasp.is_some() || grasp.hand.is_some() || grasp.objects.is_some() {
+            refuse("--grasp, --hand and --objects are for recordings: name an .mcap file");
         }
         return graph::draw_file(&arguments.file, arguments.out.as_deref(), graph);
     }
     if !graph.overrides.is_empty() || graph.machine.is_some() || graph.format.is_some() || graph.json {
         refuse("--set, --machine, --format and --json are for graphs: name a dataflow file (.yaml)");
     }
-    if grasp.grasp.len() > 1 && grasp.animate.is_none() {
-        refuse("--grasp takes one number, or several with --animate");
-    }
     match &arguments.out {
-        Some(out) if grasp.animate.is_some() => grasp::animate(&arguments.file, out, grasp),
         Some(out) => grasp::draw(&arguments.file, out, grasp),
         None => recorded::show(&arguments.file, port, grasp, shadow),
     }

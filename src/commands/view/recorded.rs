@@ -65,9 +65,9 @@ pub(super) fn show(
     if list.is_empty() {
         bail!("{} holds no frames on /tactile: there is no grasp to show", recording.display());
     }
-    let first = match arguments.grasp.first() {
+    let first = match arguments.grasp {
         None => 0,
-        Some(id) => list.keys().position(|known| known == id).ok_or_else(|| {
+        Some(id) => list.keys().position(|known| *known == id).ok_or_else(|| {
             anyhow::anyhow!("{} has no grasp {id}: it has {} grasps", recording.display(), list.len())
         })?,
     };

@@ -11,7 +11,6 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_pictures::{RecordedGrasp, grasp_svg};
 use blindgrasp_stages::hand::{BareHand, Cell, Hand, find_mesh, part_below, read_urdf, with_meshes_renamed};
 use clap::Args;
 use nalgebra::{Unit, Vector3};
@@ -24,10 +23,10 @@ use blindgrasp_cli::{check_free, in_shell, joint};
 use super::{Outcome, print_line, print_text};
 use draft::Draft;
 
-/// A hand: its URDF, a pad layout, and a picture.
+/// A hand: its URDF and a pad layout.
 ///
-/// The folder gets the URDF (expanded, if it is a xacro file, and with the collision meshes beside it), the pad layout and a
-/// picture of the hand. Without --cells and --grid, the links and joints are listed and nothing is made.
+/// The folder gets the URDF (expanded, if it is a xacro file, and with the collision meshes beside it), the pad
+/// layout. Without --cells and --grid, the links and joints are listed and nothing is made.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                   blindgrasp new hand my_gripper --urdf gripper.urdf\n  \
@@ -163,7 +162,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let layout_path = folder.join(format!("{name}.yaml"));
     let shown = in_shell(&layout_path.display().to_string());
     print_text(&format!(
-        "\n{}: {} pads, {} cells; picture: {name}.svg\nnext:\n  blindgrasp view {shown} --out hand.html      turn it, close it\n  \
+        "\n{}: {} pads, {} cells\nnext:\n  blindgrasp view {shown} --out hand.html      look at it, turn it, close it\n  \
          blindgrasp simulate --hand {shown} --label lift --protocol planned --stable-fraction natural --objects train \
          --grasps 600 --out lifts.mcap\n  \
          blindgrasp train lifts.mcap --hand {shown} --drop-secs 120 --out model.json",
@@ -213,7 +212,6 @@ fn write_folder(
     write("urdf", urdf)?;
     let hand = Hand::load(&write("yaml", layout)?)?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
-    write("svg", &grasp_svg(&hand, &RecordedGrasp::hand_alone(&hand, &[hand.open_joints_rad()]))?)?;
     Ok(hand)
 }
 

@@ -163,7 +163,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     report.count();
     if let Some(path) = &arguments.report {
         let strips = strips(&setup, &targets, &report, &n_stops);
-        write_report(path, &trials_page(&report, &strips)?)?;
+        write_report(path, &trials_page(&setup.hand, &report, &strips)?)?;
     }
     print_report(arguments, &report)?;
     let late = report.late.and_then(|late| late.advice());
@@ -258,7 +258,7 @@ fn run_way(
     }))
 }
 
-/// Pictures of some trials, as many as are made before Ctrl-C. Attempts that cannot be drawn are reported and left out.
+/// Pictures of some trials, as many as are made before Ctrl-C. Attempts that cannot be simulated are reported and left out.
 fn strips(setup: &Setup, targets: &[LiftTarget], report: &TrialsReport, n_stops: &AtomicUsize) -> Vec<Strip> {
     let mut telling = telling_records(report);
     telling.truncate(MAX_STRIPS);

@@ -7,37 +7,31 @@ use serde::Serialize;
 
 use super::tables::{Table, TrialsReport, tables};
 use super::tally::TrialRecord;
-use blindgrasp_pictures::{PictureError, PosedScene, ReportKind, posed_scene_images, report_html};
+use blindgrasp_mesh::Mesh;
+use blindgrasp_pictures::{DrawnFrames, PictureError, PosedScene, ReportKind, report_html};
 use blindgrasp_simulator::trial::{
     Attempt, LiftTarget, ProbeMove, Snapshot, TrialError, TrialOptions, choose_start, sensor_seed,
 };
 use blindgrasp_stages::approach::ApproachPrior;
 use blindgrasp_stages::hand::Hand;
 
-/// Images of a lift: from when it begins to its end.
+/// Moments of a lift that are drawn: from when it begins to its end.
 const N_MOMENTS: usize = 4;
 /// A target that has gone so far in the hand has left it.
 const DROPPED_M: f64 = 0.09;
-/// Pixels.
-const IMAGE: [usize; 2] = [220, 250];
 
-/// A lift, or a grasp that was not lifted, as a strip of images.
-#[derive(Debug, Clone, Serialize)]
+/// A lift, or a grasp that was not lifted, as a strip of pictures. The page draws them.
+#[derive(Debug, Clone)]
 pub struct Strip {
-    pub caption: String,
-    /// Each with its time, seconds since the attempt began.
-    images: Vec<(f64, String)>,
+    caption: String,
+    thing: Mesh,
+    moments: Vec<PosedScene>,
 }
 
-/// Why there is no picture of an attempt.
-#[derive(Debug, thiserror::Error)]
-pub enum StripError {
-    /// It cannot be simulated.
-    #[error(transparent)]
-    Trial(#[from] TrialError),
-    /// It cannot be drawn.
-    #[error(transparent)]
-    Picture(#[from] PictureError),
+#[derive(Serialize)]
+struct ShownStrip<'a> {
+    caption: &'a str,
+    n_moments: usize,
 }
 
 /// The data of the page.
@@ -45,25 +39,22 @@ pub enum StripError {
 struct TrialsPage<'a> {
     lead: String,
     tables: Vec<Table>,
-    strips: &'a [Strip],
-    /// Of an image, pixels.
-    size: [usize; 2],
+    strips: Vec<ShownStrip<'a>>,
     /// How this was made: names and values.
     made: [(&'static str, &'a str); 6],
 }
 
-/// The page.
+/// The page, with strips of this hand.
 ///
 /// # Errors
-/// The data cannot be written as JSON.
-pub fn trials_page(report: &TrialsReport, strips: &[Strip]) -> Result<String, PictureError> {
+/// Joints that are not this hand's, or data that cannot be written as JSON.
+pub fn trials_page(hand: &Hand, report: &TrialsReport, strips: &[Strip]) -> Result<String, PictureError> {
     let TrialsReport { n_trials, max_attempts, seed, .. } = report;
     let trials = format!("{n_trials}, {max_attempts} attempts each at most, seed {seed}");
     let page = TrialsPage {
         lead: lead(report),
         tables: tables(report),
-        strips,
-        size: IMAGE,
+        strips: strips.iter().map(|it| ShownStrip { caption: &it.caption, n_moments: it.moments.len() }).collect(),
         made: [
             ("command", &report.command),
             ("objects", &report.objects),
@@ -73,7 +64,12 @@ pub fn trials_page(report: &TrialsReport, strips: &[Strip]) -> Result<String, Pi
             ("assumed", "the objects' sizes and their friction; the paper's masses"),
         ],
     };
-    report_html(ReportKind::Trials, &page, None)
+    if strips.is_empty() {
+        return report_html(ReportKind::Trials, &page, None);
+    }
+    let stand_radius_m = report.options.physics.stand_radius_m.min(DRAWN_STAND_M);
+    let scenes: Vec<_> = strips.iter().map(|strip| (&strip.thing, &strip.moments[..])).collect();
+    report_html(ReportKind::Trials, &page, Some(&DrawnFrames::of_scenes(hand, stand_radius_m, &scenes)?))
 }
 
 /// Of each group, with the gate (or without, if there was none), the first grasp that held, the first that was dropped
@@ -108,17 +104,17 @@ pub struct Made<'a> {
     pub probe: Option<ProbeMove>,
 }
 
-/// Simulates an attempt again and draws its lift, or the settled grasp if it was not lifted.
+/// Simulates an attempt again, for pictures of its lift, or of the settled grasp if it was not lifted.
 ///
 /// # Errors
-/// It cannot be simulated or drawn.
+/// It cannot be simulated.
 pub fn strip(
     hand: &Hand,
     target: &LiftTarget,
     made: Made<'_>,
     seed: u64,
     record: &TrialRecord,
-) -> Result<Strip, StripError> {
+) -> Result<Strip, TrialError> {
     let Made { options, prior, probe } = made;
     let start = choose_start(hand, target, options, prior, seed, record.trial, record.attempt)?;
     let mut attempt = Attempt::begin(hand, target, options, &start, sensor_seed(seed, record.trial, record.attempt))?;
@@ -141,11 +137,8 @@ pub fn strip(
     }
     let moments =
         if record.lifted && !record.held { moments_of_a_drop(&snapshots) } else { moments_of_a_lift(&snapshots) };
-    let scenes: Vec<PosedScene> = moments.iter().map(|snapshot| scene(snapshot)).collect();
-    let stand_radius_m = options.physics.stand_radius_m.min(DRAWN_STAND_M);
-    let images = posed_scene_images(hand, &target.object.to_mesh(), stand_radius_m, &scenes, IMAGE)?;
-    let secs = moments.iter().map(|snapshot| snapshot.elapsed_nanos as f64 / 1e9);
-    Ok(Strip { caption: caption(record), images: secs.zip(images).collect() })
+    let moments = moments.into_iter().map(scene).collect();
+    Ok(Strip { caption: caption(record), thing: target.object.to_mesh(), moments })
 }
 
 /// Closer together at the beginning, where the target rises; later it is still.
@@ -191,6 +184,7 @@ fn scene(snapshot: &Snapshot) -> PosedScene {
         Isometry3::from_parts(position_m.into(), UnitQuaternion::from_quaternion(Quaternion::from(xyzw)))
     };
     PosedScene {
+        secs: snapshot.elapsed_nanos as f64 / 1e9,
         world_from_palm: pose(snapshot.palm_position_m, snapshot.palm_rotation_xyzw),
         joints: snapshot.joints.clone(),
         world_from_thing: pose(snapshot.target_position_m, snapshot.target_rotation_xyzw),
@@ -254,7 +248,7 @@ mod tests {
                 strip(&hand, target, made, 1, record).expect("a strip")
             })
             .collect();
-        let page = trials_page(&report, &strips).expect("a page");
+        let page = trials_page(&hand, &report, &strips).expect("a page");
         for expected in [
             "2 of 3 lifts kept (8 attempts, 1 of 4 trials given up)",
             "Of 2 drops, 2 were avoided.",
@@ -262,11 +256,11 @@ mod tests {
             "Table IV: the mug by mass",
             "decorative rock: held (trial 3, attempt 0; epsilon -0.100)",
             "models/\\u003cany>.json",
-            "\"data:image/png;base64,",
+            "\"title\":\"After ",
         ] {
             assert!(page.contains(expected), "no '{expected}'");
         }
-        assert!(!page.contains("https:") && page.matches("<script").count() == 2);
-        assert!(page.len() < 500_000, "{}", page.len());
+        assert!(!page.contains("https:") && page.matches("<script").count() == 4);
+        assert!(page.len() < 3_000_000, "{}", page.len());
     }
 }
