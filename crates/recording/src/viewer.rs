@@ -129,13 +129,11 @@ impl StandardHeader {
     }
 }
 
-/// A frame's joint angles, radians, under the hand's names; neither velocities nor efforts.
-pub(super) fn joint_state(
-    header: &Header,
-    names: &[String],
-    frame: &TactileFrame,
-    data: &mut Vec<u8>,
-) -> Result<(), String> {
+/// A frame's joint angles, radians, under the hand's names, as `sensor_msgs/msg/JointState`; neither velocities nor efforts.
+///
+/// # Errors
+/// As [`encode`]; or there is another number of names.
+pub fn joint_state(header: &Header, names: &[String], frame: &TactileFrame, data: &mut Vec<u8>) -> Result<(), String> {
     if names.len() != frame.joints.len() {
         return Err(format!("{} joint values, the hand has {}", frame.joints.len(), names.len()));
     }
@@ -143,13 +141,19 @@ pub(super) fn joint_state(
     encode(&JointState { header, name: names, position: &frame.joints, velocity: &[], effort: &[] }, data)
 }
 
-/// A sample's contacts: palm frame, metres, and the force of each in newtons.
-pub(super) fn contact_points(header: &Header, contacts: &ContactSet, data: &mut Vec<u8>) -> Result<(), String> {
+/// A sample's contacts, as [`force_points`].
+///
+/// # Errors
+/// As [`encode`].
+pub fn contact_points(header: &Header, contacts: &ContactSet, data: &mut Vec<u8>) -> Result<(), String> {
     force_points(header, contacts.contacts.iter().map(|contact| (contact.position_m, contact.force_newtons)), data)
 }
 
-/// Points in the palm frame, metres, each with a force, newtons.
-pub(super) fn force_points(
+/// Points in the palm frame, metres, each with a force, newtons, as `sensor_msgs/msg/PointCloud2` with `x`, `y`, `z`, `force`.
+///
+/// # Errors
+/// As [`encode`].
+pub fn force_points(
     header: &Header,
     points: impl ExactSizeIterator<Item = ([f64; 3], f64)>,
     data: &mut Vec<u8>,

@@ -18,13 +18,12 @@ use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_graph::run::{RunSummary, observed_topics};
 use blindgrasp_messages::{LiftDecision, Recorded};
 use blindgrasp_operator::wiring::Clock;
-use blindgrasp_recording::RecordingReader;
+use blindgrasp_recording::{LiveOptions, RecordingReader};
 use blindgrasp_replay::checks::{ChangedDecision, Check, Decisions, EdgesInQuestion, describe_changes};
 use blindgrasp_replay::comparison::{ComparedEdge, Coverage, compare_edge};
 use blindgrasp_replay::expectations::{self, Expectations};
 use blindgrasp_replay::selection::Selection;
 use blindgrasp_replay::update::update;
-use blindgrasp_session::recorder::RecordOptions;
 use blindgrasp_session::run::Session;
 
 /// The options that all recordings have in common.
@@ -175,7 +174,7 @@ impl Runner<'_> {
             },
             clock: Clock::Recording,
             record: Some(found.to_path_buf()),
-            record_options: RecordOptions { overwrite: true, ..RecordOptions::default() },
+            record_options: LiveOptions { overwrite: true, ..LiveOptions::default() },
             is_quiet: true,
             ..Session::default()
         };
