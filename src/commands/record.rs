@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use clap::Args;
-use serde::{Serialize, Serializer};
+use serde::Serialize;
 use serde_json::json;
 
 use super::elsewhere::{MachineArgument, is_over_ssh};
@@ -81,15 +81,8 @@ struct RecordSummary {
     edges: Vec<SpanOfEdge>,
     /// Missing samples of all edges together.
     missing: u64,
-    #[serde(flatten, serialize_with = "with_names_as_text")]
+    #[serde(flatten)]
     recorded: Recorded,
-}
-
-/// JSON has no place for names of files that are not UTF-8.
-fn with_names_as_text<S: Serializer>(recorded: &Recorded, serializer: S) -> Result<S::Ok, S::Error> {
-    let Recorded { files, samples, n_not_recorded, error } = recorded;
-    let files: Vec<_> = files.iter().map(|file| file.to_string_lossy()).collect();
-    json!({"files": files, "samples": samples, "n_not_recorded": n_not_recorded, "error": error}).serialize(serializer)
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {

@@ -24,12 +24,13 @@ pub(super) const CONTACT_POINTS: StandardType =
 /// The topics of live recordings that are there for viewers. Their content follows from our own topics.
 pub const TOPICS_FOR_VIEWERS: [&str; 2] = [JOINT_STATES.topic, CONTACT_POINTS.topic];
 
-const JOINT_STATE: &str = "\
-std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
+/// A definition whose own lines begin with a header.
+macro_rules! with_header {
+    ($own:literal) => {
+        concat!(
+            "std_msgs/Header header\n",
+            $own,
+            "\
 ================================================================================
 MSG: std_msgs/Header
 builtin_interfaces/Time stamp
@@ -38,10 +39,22 @@ string frame_id
 MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec
-";
+"
+        )
+    };
+}
 
-const POINT_CLOUD: &str = "\
-std_msgs/Header header
+const JOINT_STATE: &str = with_header!(
+    "\
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+"
+);
+
+const POINT_CLOUD: &str = with_header!(
+    "\
 uint32 height
 uint32 width
 PointField[] fields
@@ -64,15 +77,8 @@ string name
 uint32 offset
 uint8 datatype
 uint32 count
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-";
+"
+);
 
 const FLOAT32: u8 = 7;
 const FIELDS: [&str; 4] = ["x", "y", "z", "force"];

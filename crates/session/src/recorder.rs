@@ -9,7 +9,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -33,6 +33,7 @@ pub fn check_recording(path: &Path, options: &LiveOptions) -> anyhow::Result<()>
 
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Recorded {
+    #[serde(serialize_with = "as_text")]
     pub files: Vec<PathBuf>,
     /// Samples in the files, by topic.
     pub samples: BTreeMap<String, u64>,
@@ -40,6 +41,11 @@ pub struct Recorded {
     pub n_not_recorded: u64,
     /// The error that ended it early.
     pub error: Option<String>,
+}
+
+/// JSON has no place for names of files that are not UTF-8.
+fn as_text<S: Serializer>(files: &[PathBuf], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(files.iter().map(|file| file.to_string_lossy()))
 }
 
 impl Recorded {
@@ -56,7 +62,7 @@ impl Recorded {
 /// An open recording. A recorder that is dropped completes it, or removes it if it is empty.
 pub struct Recorder {
     shared: Arc<Shared>,
-    topics: Vec<String>,
+    topics: Vec<Arc<str>>,
     thread: Option<JoinHandle<Recorded>>,
     /// The disk is stuck: samples are left out until half of the queue is free.
     is_stuck: bool,
@@ -75,9 +81,7 @@ struct Shared {
 
 #[derive(Default)]
 struct Queue {
-    waiting: VecDeque<(usize, Record)>,
-    /// Topics by index, in the order of their first samples.
-    topics: Vec<String>,
+    waiting: VecDeque<(Arc<str>, Record)>,
     /// How the recording ends, once it does.
     ending: Option<Ending>,
 }
@@ -99,13 +103,14 @@ impl Recorder {
 
     /// Queues a sample. Waits only for a slow disk.
     pub fn push(&mut self, topic: &str, record: Record) {
-        let known = self.topics.iter().position(|known| known == topic);
+        let topic = match self.topics.iter().find(|known| known.as_ref() == topic) {
+            Some(known) => Arc::clone(known),
+            None => {
+                self.topics.push(topic.into());
+                topic.into()
+            }
+        };
         let mut queue = self.shared.lock();
-        let topic_idx = known.unwrap_or_else(|| {
-            self.topics.push(topic.into());
-            queue.topics.push(topic.into());
-            self.topics.len() - 1
-        });
         self.is_stuck &= queue.waiting.len() > MAX_WAITING / 2;
         while queue.waiting.len() >= MAX_WAITING && !self.is_stuck {
             let waited;
@@ -119,7 +124,7 @@ impl Recorder {
             self.n_left_out += 1;
             return;
         }
-        queue.waiting.push_back((topic_idx, record));
+        queue.waiting.push_back((topic, record));
         if queue.waiting.len() == WAKE_AT {
             self.shared.come.notify_one();
         }
@@ -164,20 +169,17 @@ impl Shared {
 fn write(mut live: LiveRecorder, shared: &Shared) -> Recorded {
     let mut recorded = Recorded::default();
     let mut batch = VecDeque::new();
-    let mut topics: Vec<String> = Vec::new();
     let ending = loop {
         let mut queue = shared.lock();
         if queue.waiting.len() < WAKE_AT && queue.ending.is_none() {
             (queue, _) = shared.come.wait_timeout(queue, POLL).unwrap_or_else(PoisonError::into_inner);
         }
         std::mem::swap(&mut queue.waiting, &mut batch);
-        let new = topics.len()..;
-        topics.extend_from_slice(&queue.topics[new]);
         let ending = queue.ending;
         drop(queue);
         shared.gone.notify_one();
-        for (topic_idx, record) in batch.drain(..) {
-            let written = live.write(&topics[topic_idx], &record);
+        for (topic, record) in batch.drain(..) {
+            let written = live.write(&topic, &record);
             keep(shared, &mut recorded, written);
         }
         let ticked = live.tick();

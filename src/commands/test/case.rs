@@ -19,7 +19,7 @@ use blindgrasp_graph::run::{RunSummary, observed_topics};
 use blindgrasp_messages::{LiftDecision, Recorded};
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_recording::{LiveOptions, RecordingReader};
-use blindgrasp_replay::checks::{ChangedDecision, Check, Decisions, EdgesInQuestion, describe_changes};
+use blindgrasp_replay::checks::{self, ChangedDecision, Check, Decisions, describe_changes};
 use blindgrasp_replay::comparison::{ComparedEdge, Coverage, compare_edge};
 use blindgrasp_replay::expectations::{self, Expectations};
 use blindgrasp_replay::selection::Selection;
@@ -209,12 +209,6 @@ fn edges_to_compare(
 ) -> anyhow::Result<(Vec<ComparedEdge>, Vec<Check>)> {
     let (recorded, found) = (RecordingReader::open(recording)?, RecordingReader::open(found)?);
     let topics = observed_topics(graph, true);
-    let edges = EdgesInQuestion {
-        fed: &fed.edges,
-        topics_of_graph: topics.values().map(String::as_str).collect(),
-        recorded: recorded.topics(),
-        found: found.topics(),
-        is_update,
-    };
-    Ok(edges.to_compare(expected)?)
+    let topics = topics.values().map(String::as_str).collect();
+    Ok(checks::edges_to_compare(&fed.edges, &topics, recorded.topics(), found.topics(), expected, is_update)?)
 }

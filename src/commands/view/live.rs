@@ -442,11 +442,10 @@ impl Latest {
 
 /// Numbers are texts: JavaScript has no integers beyond 2^53.
 fn decision_event(decided: &Decided, truths: &BTreeMap<GraspKey, bool>) -> Value {
-    let Decided { key, decision, .. } = decided;
-    json!({
-        "epoch": key.0.to_string(), "grasp_id": decision.grasp_id.to_string(), "action": decision.action,
-        "reason": decision.reason, "probability_stable": decision.probability_stable, "truth": truths.get(key),
-    })
+    let mut event = shadow_event(&decided.decision);
+    event["epoch"] = decided.key.0.to_string().into();
+    event["truth"] = json!(truths.get(&decided.key));
+    event
 }
 
 /// The decision of the model beside.

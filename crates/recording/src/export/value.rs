@@ -196,32 +196,24 @@ impl Serializer for ToValue {
     }
 }
 
-impl SerializeSeq for Items {
-    type Ok = Value;
-    type Error = ValueError;
+macro_rules! as_items {
+    ($($trait:ident)+) => {$(
+        impl $trait for Items {
+            type Ok = Value;
+            type Error = ValueError;
 
-    fn serialize_element<T: Serialize + ?Sized>(&mut self, item: &T) -> Result<(), ValueError> {
-        self.0.push(item.serialize(ToValue)?);
-        Ok(())
-    }
+            fn serialize_element<T: Serialize + ?Sized>(&mut self, item: &T) -> Result<(), ValueError> {
+                self.0.push(item.serialize(ToValue)?);
+                Ok(())
+            }
 
-    fn end(self) -> Result<Value, ValueError> {
-        Ok(Value::List(self.0))
-    }
+            fn end(self) -> Result<Value, ValueError> {
+                Ok(Value::List(self.0))
+            }
+        }
+    )+};
 }
-
-impl SerializeTuple for Items {
-    type Ok = Value;
-    type Error = ValueError;
-
-    fn serialize_element<T: Serialize + ?Sized>(&mut self, item: &T) -> Result<(), ValueError> {
-        SerializeSeq::serialize_element(self, item)
-    }
-
-    fn end(self) -> Result<Value, ValueError> {
-        SerializeSeq::end(self)
-    }
-}
+as_items!(SerializeSeq SerializeTuple);
 
 impl SerializeStruct for Fields {
     type Ok = Value;
