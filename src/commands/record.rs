@@ -19,7 +19,7 @@ use blindgrasp_graph::control::Attachment;
 use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_operator::cursors::SharedCursors;
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_session::of_graph::of_graph;
+use blindgrasp_session::of_graph::{nodes, of_graph};
 use blindgrasp_session::recorder::{Recorded, Recorder, check_recording};
 use blindgrasp_session::span::{EdgeSpan, Span, SpanOfEdge};
 
@@ -133,8 +133,7 @@ fn attach(
         bail!("graph '{}' has no edge that can be recorded", connection.graph());
     }
     // The files that the graph reads, its recording, hand or model, must not be written over.
-    let nodes = attachment.graph["nodes"].as_array().into_iter().flatten();
-    let params = nodes.filter_map(|node| node["params"].as_object());
+    let params = nodes(&attachment.graph).filter_map(|node| node["params"].as_object());
     let inputs: Vec<PathBuf> =
         params.flat_map(|params| params.values()).filter_map(|value| value.as_str()).map(PathBuf::from).collect();
     check_output(out, &inputs)?;

@@ -210,16 +210,15 @@ impl LiveRecorder {
             message: format!("{topic}, seq {}: {error}", header.seq),
         };
         with_sample!(record, sample => encode(sample, &mut self.data)).map_err(|error| invalid(&self.path, error))?;
+        let mut is_late = false;
         if self.options.is_split() {
             self.close_previous(false)?;
             self.split_before(record)?;
-        }
-        let is_late = self.previous.as_mut().is_some_and(|previous| previous.is_late(topic, record));
-        if self.options.is_split() {
+            is_late = self.previous.as_mut().is_some_and(|previous| previous.is_late(topic, record));
             self.recent.add(key_of(record));
         }
-        let (part, previous) = (&mut self.current, &mut self.previous);
-        let part = if is_late { previous.as_mut().map(|previous| &mut previous.part) } else { part.as_mut() };
+        let previous = self.previous.as_mut().map(|previous| &mut previous.part);
+        let part = if is_late { previous } else { self.current.as_mut() };
         let Some(part) = part else { return Ok(()) };
         let mut written = with_sample!(record, sample => part.file.write(topic, sample, &self.data));
         let is_taken = written.is_ok();

@@ -81,7 +81,8 @@ fn models(graph: &Value) -> Value {
     Value::Object(param(graph, "model").map(model).collect::<Map<_, _>>())
 }
 
-fn nodes(graph: &Value) -> impl Iterator<Item = &Value> {
+/// The nodes of a graph.
+pub fn nodes(graph: &Value) -> impl Iterator<Item = &Value> {
     graph["nodes"].as_array().into_iter().flatten()
 }
 

@@ -19,7 +19,7 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_recording::{LiveOptions, RecordingInfo};
 use blindgrasp_session::flight::{Excerpt, FlightRecorder, SharedRecorder};
-use blindgrasp_session::of_graph::of_graph;
+use blindgrasp_session::of_graph::{nodes, of_graph};
 
 /// The reason in the names of files that somebody asked for.
 const ASKED: &str = "asked";
@@ -169,19 +169,21 @@ impl Keeping<'_> {
 
 /// The nodes that send frames and read none.
 fn n_sources_of_frames(graph: &Value) -> usize {
-    let nodes = list(&graph["nodes"]);
-    let frames: BTreeSet<String> = nodes.iter().flat_map(ports_of_frames).collect();
-    let senders = nodes.iter().filter(|node| !ports_of_frames(node).is_empty());
-    senders.filter(|node| !list(&node["inputs"]).iter().any(|input| frames.contains(word(&input["from"])))).count()
-}
-
-fn ports_of_frames(node: &Value) -> Vec<String> {
-    let ports = list(&node["outputs"]).iter().filter(|port| port["type"] == TactileFrame::TYPE_NAME);
-    ports.map(|port| format!("{}/{}", word(&node["id"]), word(&port["port"]))).collect()
-}
-
-fn list(value: &Value) -> &[Value] {
-    value.as_array().map_or(&[], Vec::as_slice)
+    let (mut senders, mut frames) = (Vec::new(), BTreeSet::new());
+    for node in nodes(graph) {
+        for port in node["outputs"].as_array().into_iter().flatten() {
+            if port["type"] == TactileFrame::TYPE_NAME {
+                senders.push(node);
+                frames.insert(format!("{}/{}", word(&node["id"]), word(&port["port"])));
+            }
+        }
+    }
+    senders.dedup();
+    senders.retain(|node| {
+        let mut inputs = node["inputs"].as_array().into_iter().flatten();
+        !inputs.any(|input| frames.contains(word(&input["from"])))
+    });
+    senders.len()
 }
 
 fn word(value: &Value) -> &str {
