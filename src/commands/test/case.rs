@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::json;
@@ -133,19 +133,19 @@ impl Runner<'_> {
         fitting(&file, overrides, dataflow::Scope::Everything, OnMisfit::Warn)
     }
 
-    /// As [`Runner::replay`]; lost samples are an error.
-    pub(super) fn replay_whole(
+    /// The decisions of a replay. Lost samples are an error.
+    pub(super) fn decide(
         &self,
         recording: &Path,
         graph: &Graph,
         overrides: &[Override],
-        found: &Path,
-    ) -> anyhow::Result<Fed> {
-        let (fed, summary) = self.replay(recording, graph, overrides, found)?;
+    ) -> anyhow::Result<(Fed, Decisions)> {
+        let (shown, found) = (recording.display().to_string(), self.scratch.path(recording));
+        let (fed, summary) = self.replay(recording, graph, overrides, &found).context(shown.clone())?;
         if summary.samples_lost + summary.samples_dropped > 0 || summary.edges_unknown > 0 {
-            bail!("the replay lost samples, so its decisions say nothing: run the command again");
+            bail!("{shown}: the replay lost samples, so its decisions say nothing: run the command again");
         }
-        Ok(fed)
+        Ok((fed, Decisions::read(&found)?))
     }
 
     /// Plays a recording as fast as the graph takes it, and records every edge to `found`.

@@ -28,13 +28,12 @@ pub(super) fn run(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) ->
             print_diagnostic(&format!("{}: left out: it is of another hand than graph '{}'", shown, graph.name));
             continue;
         }
-        let found = runner.scratch.path(recording);
-        let fed = runner.replay_whole(recording, &graph, runner.overrides, &found).with_context(|| shown.clone())?;
+        let (fed, whole) = runner.decide(recording, &graph, runner.overrides)?;
         n_replayed += 1;
         if fed.replaced.played_port != "tactile" {
             bail!("{}: --faults are of frames, and the recording plays {}", shown, fed.topic);
         }
-        let whole = Decisions::read(&found)?;
+        let found = runner.scratch.path(recording);
         let pad_of_cell: Vec<usize> = hand.cells().map(|(pad_idx, _)| pad_idx).collect();
         let mut table = TextTable::new(["fault", "held -> lifted", "lifted -> held"], 1);
         let mut told = Vec::new();
