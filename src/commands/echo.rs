@@ -10,9 +10,8 @@ use clap::Args;
 use super::elsewhere::MachineArgument;
 use super::export::json_line;
 use super::{Outcome, completions, secs_in, stop_signal};
-use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_observe};
-use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
-use blindgrasp_graph::control::{Attachment, Reply, Request};
+use blindgrasp_graph::client::observer::{Observer, Sink};
+use blindgrasp_graph::client::{Connection, Heard, pick_graph};
 use blindgrasp_messages::Record;
 use blindgrasp_operator::diagnostics::{LinePrinter, print_diagnostic};
 
@@ -72,19 +71,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let stop: Arc<AtomicBool> = stop_signal()?;
     let graph = pick_graph(arguments.graph.as_deref())?;
     let mut connection = Connection::open(&graph)?;
-    let attachment = match connection
-        .ask(&Request::Attach { ports: arguments.edges.clone(), is_flight_recorder: false }, ANSWER_LIMIT)?
-    {
-        Reply::Attached(attachment) => attachment,
-        other => return Err(connection.unexpected(&other).into()),
-    };
-    let Attachment { domain, edges, .. } = attachment;
-    let edges = edges.into_iter().filter(|edge| can_observe(&edge.input.service.type_name));
-    let edges = edges.map(|edge| ObservedEdge { topic: edge.topic, input: edge.input, is_prompt: false }).collect();
+    let attachment = connection.attach(&arguments.edges, false)?;
     let n_left = Arc::new(AtomicU64::new(arguments.samples.unwrap_or(u64::MAX)));
     let printer = LinePrinter::new(std::io::stdout(), MAX_UNREAD_LINES);
     let echo = Echo { printer, n_left: Arc::clone(&n_left) };
-    let observer = Observer::start_attached(&domain, edges, echo).context("cannot read the graph's edges")?;
+    let observer = Observer::start_attached(&attachment.domain, attachment.observed(), echo);
+    let observer = observer.context("cannot read the graph's edges")?;
     let end = arguments.for_secs.map(|secs| Instant::now() + Duration::from_secs_f64(secs));
     let is_over = loop {
         let is_enough = n_left.load(Ordering::Relaxed) == 0;
@@ -92,11 +84,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         if is_enough || is_interrupted || observer.has_failed() {
             break false;
         }
-        match connection.receive_within(POLL) {
-            Ok(None) => {}
-            Ok(Some(Reply::Drained)) | Err(ClientError::Ended { .. }) => break true,
-            Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
-            Err(error) => return Err(error.into()),
+        if let Heard::Ended(_) = connection.hear(POLL)? {
+            break true;
         }
     };
     if is_over && arguments.samples.is_some() {

@@ -1,27 +1,26 @@
 //! `blindgrasp record`: records a graph that runs, from a process of its own.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use clap::Args;
-use serde::{Serialize, Serializer};
+use serde::Serialize;
 use serde_json::json;
 
 use super::elsewhere::{MachineArgument, is_over_ssh};
 use super::recording_arguments::RecordingArguments;
 use super::text_table::TextTable;
 use super::{Outcome, check_output, completions, print_line, secs_in, stop_signal};
-use blindgrasp_graph::client::observer::{ObservedEdge, Observer, can_observe};
-use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
-use blindgrasp_graph::control::{AttachedEdge, Attachment, Reply, Request};
-use blindgrasp_graph::recorded_graph::{Beginning, Ending};
+use blindgrasp_graph::client::observer::{Observer, Sink, can_observe};
+use blindgrasp_graph::client::{Connection, Heard, pick_graph};
+use blindgrasp_graph::control::Attachment;
+use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_operator::cursors::SharedCursors;
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_session::of_graph::of_graph;
-use blindgrasp_session::recorder::{Recorded, Recorder};
+use blindgrasp_session::of_graph::{nodes, of_graph};
+use blindgrasp_session::recorder::{Recorded, Recorder, check_recording};
 use blindgrasp_session::span::{EdgeSpan, Span, SpanOfEdge};
 
 mod keep;
@@ -77,21 +76,13 @@ pub(super) struct Arguments {
 #[derive(Debug, Serialize)]
 struct RecordSummary {
     graph: String,
-    /// `graph` if it ended, else `detached`.
-    ended: &'static str,
+    ended: Ending,
     secs: f64,
     edges: Vec<SpanOfEdge>,
     /// Missing samples of all edges together.
     missing: u64,
-    #[serde(flatten, serialize_with = "with_names_as_text")]
+    #[serde(flatten)]
     recorded: Recorded,
-}
-
-/// JSON has no place for names of files that are not UTF-8.
-fn with_names_as_text<S: Serializer>(recorded: &Recorded, serializer: S) -> Result<S::Ok, S::Error> {
-    let Recorded { files, samples, n_not_recorded, error } = recorded;
-    let files: Vec<_> = files.iter().map(|file| file.to_string_lossy()).collect();
-    json!({"files": files, "samples": samples, "n_not_recorded": n_not_recorded, "error": error}).serialize(serializer)
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
@@ -106,7 +97,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         return keep::keep(arguments, out, Duration::from_secs_f64(secs));
     }
     check_output(out, &[])?;
-    arguments.recording.options().check(out)?;
+    check_recording(out, &arguments.recording.options())?;
     if let Some(destination) = arguments.machine.destination()? {
         return over_ssh::record_there(arguments, &destination);
     }
@@ -122,13 +113,6 @@ impl Arguments {
     }
 }
 
-/// Records a graph of this machine to `out`.
-fn record(arguments: &Arguments, out: &Path) -> anyhow::Result<RecordSummary> {
-    let stop = stop_signal()?;
-    let connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
-    record_from(arguments, out, connection, &|| stop.load(Ordering::Relaxed))
-}
-
 /// Attaches to the edges of a graph that can be recorded. `out` must be no file that the graph reads.
 fn attach(
     connection: &mut Connection,
@@ -136,55 +120,72 @@ fn attach(
     out: &Path,
     is_flight_recorder: bool,
 ) -> anyhow::Result<Attachment> {
-    let request = Request::Attach { ports: ports.to_vec(), is_flight_recorder };
-    let attachment = match connection.ask(&request, ANSWER_LIMIT)? {
-        Reply::Attached(attachment) => attachment,
-        other => return Err(connection.unexpected(&other).into()),
-    };
-    let (edges, others): (Vec<AttachedEdge>, _) =
-        attachment.edges.into_iter().partition(|edge| can_observe(&edge.input.service.type_name));
-    for edge in others {
-        print_diagnostic(&format!(
-            "blindgrasp: {} is not recorded: its type {} is unknown",
-            edge.port, edge.input.service.type_name
-        ));
-    }
-    if edges.is_empty() {
+    let mut attachment = connection.attach(ports, is_flight_recorder)?;
+    attachment.edges.retain(|edge| {
+        let type_name = &edge.input.service.type_name;
+        let is_known = can_observe(type_name);
+        if !is_known {
+            print_diagnostic(&format!("blindgrasp: {} is not recorded: its type {type_name} is unknown", edge.port));
+        }
+        is_known
+    });
+    if attachment.edges.is_empty() {
         bail!("graph '{}' has no edge that can be recorded", connection.graph());
     }
     // The files that the graph reads, its recording, hand or model, must not be written over.
-    let nodes = attachment.graph["nodes"].as_array().into_iter().flatten();
-    let params = nodes.filter_map(|node| node["params"].as_object());
+    let params = nodes(&attachment.graph).filter_map(|node| node["params"].as_object());
     let inputs: Vec<PathBuf> =
         params.flat_map(|params| params.values()).filter_map(|value| value.as_str()).map(PathBuf::from).collect();
     check_output(out, &inputs)?;
-    Ok(Attachment { edges, ..attachment })
+    Ok(attachment)
 }
 
-fn observed(edges: &[AttachedEdge]) -> Vec<ObservedEdge> {
-    let observed = edges.iter().map(|edge| ObservedEdge {
-        topic: edge.topic.clone(),
-        input: edge.input.clone(),
-        is_prompt: false,
-    });
-    observed.collect()
+/// Waits until the graph, the observer or the command ends. Before each wait, `look` hears whether somebody has asked for the kept
+/// samples, and says whether the command ends.
+fn follow<S: Sink>(
+    connection: &mut Connection,
+    observer: &Observer<S>,
+    end: Option<Instant>,
+    look: &mut dyn FnMut(bool) -> anyhow::Result<bool>,
+) -> anyhow::Result<Ending> {
+    let mut is_asked = false;
+    loop {
+        let left = end.map_or(POLL, |end| end.saturating_duration_since(Instant::now()).min(POLL));
+        if look(is_asked)? || left.is_zero() {
+            return Ok(Ending::Detached);
+        }
+        let heard = connection.hear(left)?;
+        is_asked = heard == Heard::Keep;
+        match heard {
+            Heard::Nothing if observer.has_failed() => return Ok(Ending::Broken),
+            Heard::Nothing | Heard::Keep => {}
+            Heard::Ended(ending) => return Ok(ending),
+        }
+    }
 }
 
-fn record_from(
-    arguments: &Arguments,
-    out: &Path,
-    mut connection: Connection,
-    is_interrupted: &dyn Fn() -> bool,
-) -> anyhow::Result<RecordSummary> {
-    let Attachment { domain, edges, graph, is_at_start } = attach(&mut connection, &arguments.edges, out, false)?;
-    let beginning = if is_at_start { Beginning::Start } else { Beginning::Attached };
-    let about = of_graph(&graph, beginning)?;
-    let recorder = Recorder::create(out, about, &arguments.recording.options())?;
+/// The end of the graph, for a person.
+fn how(ending: Ending) -> &'static str {
+    match ending {
+        Ending::Graph => "the graph has ended",
+        Ending::Broken => "the graph broke off",
+        Ending::Detached => "the graph goes on",
+    }
+}
+
+/// Records a graph of this machine to `out`.
+fn record(arguments: &Arguments, out: &Path) -> anyhow::Result<RecordSummary> {
+    let stop = stop_signal()?;
+    let mut connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
+    let attachment = attach(&mut connection, &arguments.edges, out, false)?;
+    let Attachment { domain, edges, graph, is_at_start } = &attachment;
+    let (info, options) = of_graph(graph, *is_at_start, arguments.recording.options())?;
+    let recorder = Recorder::create(out, &info, options)?;
+    let has_failed = recorder.has_failed();
     let cursors = SharedCursors::open(&domain.cursors())?;
-    let observed = observed(&edges);
-    let failed = Arc::new(AtomicBool::new(false));
-    let span = Span::new(cursors, edges.iter().map(EdgeSpan::of).collect(), recorder, Arc::clone(&failed));
-    let observer = Observer::start_attached(&domain, observed, span).context("cannot read the graph's edges")?;
+    let span = Span::new(cursors, edges.iter().map(EdgeSpan::of).collect(), recorder);
+    let observer = Observer::start_attached(domain, attachment.observed(), span);
+    let observer = observer.context("cannot read the graph's edges")?;
     let start = Instant::now();
     print_diagnostic(&format!(
         "recording {} edges of graph '{}' to {}; Ctrl-C ends the recording",
@@ -193,20 +194,9 @@ fn record_from(
         out.display()
     ));
     let end = arguments.for_secs.map(|secs| start + Duration::from_secs_f64(secs));
-    let ending = loop {
-        if is_interrupted() || failed.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end) {
-            break Ending::Detached;
-        }
-        let left = end.map_or(POLL, |end| end.saturating_duration_since(Instant::now()).min(POLL));
-        match connection.receive_within(left) {
-            Ok(None) if observer.has_failed() => break Ending::Detached,
-            Ok(None) => {}
-            Ok(Some(Reply::Drained)) => break Ending::Graph,
-            Err(ClientError::Ended { .. }) => break Ending::Broken,
-            Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
-            Err(error) => return Err(error.into()),
-        }
-    };
+    let ending = follow(&mut connection, &observer, end, &mut |_is_asked| {
+        Ok(stop.load(Ordering::Relaxed) || has_failed.load(Ordering::Relaxed))
+    })?;
     let finished = if ending == Ending::Detached { observer.leave() } else { observer.finish() };
     let graph = connection.graph().to_string();
     // A graph that ends waits for the end of the connection, not for the disk.
@@ -214,7 +204,7 @@ fn record_from(
     let secs = start.elapsed().as_secs_f64();
     let (edges, recorded) = finished.context("cannot read the graph's edges any more")?.0.finish(ending);
     let missing = edges.iter().map(|edge| edge.missing).sum();
-    Ok(RecordSummary { graph, ended: ending.word(), secs, edges, missing, recorded })
+    Ok(RecordSummary { graph, ended: ending, secs, edges, missing, recorded })
 }
 
 impl RecordSummary {
@@ -237,11 +227,7 @@ fn table(summary: &RecordSummary) -> Vec<String> {
         let [first, last] = [edge.first, edge.last].map(|seq| seq.map_or("-".to_string(), |seq| seq.to_string()));
         edges.row([edge.topic.clone(), samples, first, last, missing]);
     }
-    let how = match summary.ended {
-        "graph" => "the graph has ended",
-        "broken" => "the graph broke off",
-        _ => "the graph goes on",
-    };
+    let how = how(summary.ended);
     let files: Vec<String> = summary.recorded.files.iter().map(|file| file.display().to_string()).collect();
     let tail = format!("{:.1} s of graph '{}' recorded, {how}: {}", summary.secs, summary.graph, files.join(", "));
     let lost = summary.recorded.n_not_recorded;

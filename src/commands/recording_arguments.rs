@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clap::Args;
 
-use blindgrasp_session::recorder::RecordOptions;
+use blindgrasp_recording::LiveOptions;
 
 #[derive(Debug, Clone, Args)]
 #[command(next_help_heading = "Recording")]
@@ -23,9 +23,9 @@ pub(super) struct RecordingArguments {
 }
 
 impl RecordingArguments {
-    pub(super) fn options(&self) -> RecordOptions {
+    pub(super) fn options(&self) -> LiveOptions {
         let RecordingArguments { rotate_size, rotate_every, overwrite } = *self;
-        RecordOptions { rotate_size, rotate_every, overwrite }
+        LiveOptions { rotate_bytes: rotate_size, rotate_after: rotate_every, overwrite, ..LiveOptions::default() }
     }
 }
 

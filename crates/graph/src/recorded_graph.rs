@@ -1,23 +1,13 @@
-//! The facts about a graph that its recording holds, and how a recording begins and ends.
+//! The facts about a graph that its recording holds, and how a recording ends.
 
-use std::collections::BTreeMap;
-
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use serde_json::json;
 
 use crate::dataflow::Node;
 
-/// When a recording began.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Beginning {
-    /// Before the graph had sent a sample.
-    Start,
-    /// While the graph ran.
-    Attached,
-}
-
 /// How a recording ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Ending {
     /// With the graph.
     Graph,
@@ -36,20 +26,6 @@ impl Ending {
             Ending::Broken => "broken",
         }
     }
-}
-
-/// The facts about a graph that its recording holds.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct RecordedGraph {
-    /// The hand's name; `unknown` if no node has a hand.
-    pub hand: String,
-    /// The hand's identity; 0 if unknown.
-    pub hand_id: u64,
-    pub made_by: String,
-    /// The joint names of the hand; empty if it is not known.
-    pub joint_names: Vec<String>,
-    /// MCAP's metadata, by name, then by key.
-    pub metadata: BTreeMap<String, BTreeMap<String, String>>,
 }
 
 /// A graph as it runs, for the metadata of a recording: its nodes with programs, arguments, parameters and inputs.

@@ -118,6 +118,11 @@ impl Channels {
         self.schemas.get(&channel.schema_id)
     }
 
+    /// The name of a channel's schema; empty without one.
+    pub(super) fn schema_name(&self, known: &KnownChannel) -> String {
+        self.schema(&known.channel).map_or(String::new(), |schema| schema.name.clone())
+    }
+
     /// How a channel's type differs from ours, if one does.
     pub(super) fn other_version(&self) -> Option<&str> {
         self.iter().find_map(|known| known.other_version.as_deref())

@@ -52,9 +52,8 @@ impl RecordingIndex {
         for known in summary.channels.iter() {
             let counts = statistics.map(|statistics| &statistics.channel_message_counts);
             let n_messages = counts.map(|counts| counts.get(&known.channel.id).copied().unwrap_or(0));
-            let schema = summary.channels.schema(&known.channel).map_or(String::new(), |schema| schema.name.clone());
             let topic = topics.entry(known.channel.topic.clone()).or_insert(IndexedTopic {
-                schema,
+                schema: summary.channels.schema_name(known),
                 n_messages: Some(0),
                 is_ours: known.ours.is_some(),
             });

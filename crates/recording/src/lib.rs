@@ -18,7 +18,6 @@
 //! Not here: what the messages mean. A recording that was cut off or damaged is an error that names the file, never a
 //! shorter recording; [`repair()`] makes a recording of the whole samples in it.
 
-pub mod cdr;
 mod channels;
 mod chosen;
 pub mod export;
@@ -39,6 +38,12 @@ mod writer;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+
+/// Messages as CDR, for topics of ROS 2: little-endian, behind the four bytes of its encapsulation.
+pub mod cdr {
+    pub use super::types::{decode, encode};
+    pub use super::viewer::{contact_points, force_points, joint_state};
+}
 
 pub use blindgrasp_messages::Record;
 pub use chosen::{Choice, ChosenSamples, RawSample, Reach};

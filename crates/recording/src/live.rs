@@ -32,6 +32,13 @@ pub struct LiveOptions {
     pub metadata: BTreeMap<String, BTreeMap<String, String>>,
 }
 
+impl LiveOptions {
+    /// Whether the recording may become several files.
+    pub fn is_split(&self) -> bool {
+        self.rotate_bytes.is_some() || self.rotate_after.is_some()
+    }
+}
+
 /// The outcome of a recording.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct LiveSummary {
@@ -89,9 +96,12 @@ struct Previous {
 }
 
 /// Why the recording has ended.
-enum Ended {
-    Full { path: PathBuf, n_samples: u64, reason: String },
-    Broken { path: PathBuf, message: String },
+#[derive(Clone)]
+struct Ended {
+    path: PathBuf,
+    reason: String,
+    /// The samples of a recording that is complete up to a full disk; `None` of one that could not be written.
+    n_samples: Option<u64>,
 }
 
 impl LiveRecorder {
@@ -122,7 +132,7 @@ impl LiveRecorder {
             is_last_taken: false,
             data: Vec::new(),
         };
-        if recorder.is_split() {
+        if recorder.options.is_split() {
             recorder.clear_old_parts()?;
         }
         recorder.current = Some(recorder.begin_part()?);
@@ -157,8 +167,7 @@ impl LiveRecorder {
         self.close_previous(false)?;
         for part in self.previous.as_mut().map(|previous| &mut previous.part).into_iter().chain(&mut self.current) {
             if let Err(error) = part.file.tick() {
-                let path = part.file.path().to_path_buf();
-                return Err(self.end(path, WriteFailure::Broken(error)));
+                return Err(self.end(error.into()));
             }
         }
         Ok(())
@@ -178,13 +187,13 @@ impl LiveRecorder {
         if self.ended.is_none() {
             self.close_previous(true)?;
             if let Some(part) = self.current.take()
-                && let Err(failure) = self.complete(part, true)
+                && let Err(error) = self.complete(part, true)
             {
-                return Err(self.end(failure.0, WriteFailure::Broken(failure.1)));
+                return Err(self.end(error.into()));
             }
         }
         match &self.ended {
-            Some(ended @ Ended::Broken { .. }) => Err(ended.error()),
+            Some(ended) if ended.n_samples.is_none() => Err(ended.error()),
             _ => Ok(std::mem::take(&mut self.summary)),
         }
     }
@@ -201,21 +210,20 @@ impl LiveRecorder {
             message: format!("{topic}, seq {}: {error}", header.seq),
         };
         with_sample!(record, sample => encode(sample, &mut self.data)).map_err(|error| invalid(&self.path, error))?;
-        if self.is_split() {
+        let mut is_late = false;
+        if self.options.is_split() {
             self.close_previous(false)?;
             self.split_before(record)?;
-        }
-        let is_late = self.previous.as_mut().is_some_and(|previous| previous.is_late(topic, record));
-        if self.is_split() {
+            is_late = self.previous.as_mut().is_some_and(|previous| previous.is_late(topic, record));
             self.recent.add(key_of(record));
         }
-        let (part, previous) = (&mut self.current, &mut self.previous);
-        let part = if is_late { previous.as_mut().map(|previous| &mut previous.part) } else { part.as_mut() };
+        let previous = self.previous.as_mut().map(|previous| &mut previous.part);
+        let part = if is_late { previous } else { self.current.as_mut() };
         let Some(part) = part else { return Ok(()) };
         let mut written = with_sample!(record, sample => part.file.write(topic, sample, &self.data));
         let is_taken = written.is_ok();
         if is_taken {
-            let (at, names) = ((header.seq, header.stamp_nanos), &self.options.joint_names);
+            let names = &self.options.joint_names;
             written = match record {
                 Record::Tactile(sample)
                     if !names.is_empty()
@@ -224,28 +232,19 @@ impl LiveRecorder {
                 {
                     joint_state(&header, names, &sample.message, &mut self.data)
                         .map_err(|error| invalid(&self.path, error))?;
-                    part.file.write_standard(&mut part.joint_channel, &JOINT_STATES, at, &self.data)
+                    part.file.write_standard(&mut part.joint_channel, &JOINT_STATES, &header, &self.data)
                 }
                 Record::Contacts(sample) if is_first(&mut self.contact_topic, topic) => {
                     contact_points(&header, &sample.message, &mut self.data)
                         .map_err(|error| invalid(&self.path, error))?;
-                    part.file.write_standard(&mut part.contact_channel, &CONTACT_POINTS, at, &self.data)
+                    part.file.write_standard(&mut part.contact_channel, &CONTACT_POINTS, &header, &self.data)
                 }
                 _ => Ok(()),
             };
         }
-        match written {
-            Ok(()) => Ok(()),
-            Err(failure) => {
-                let path = part.file.path().to_path_buf();
-                self.is_last_taken = is_taken;
-                Err(self.end(path, failure))
-            }
-        }
-    }
-
-    fn is_split(&self) -> bool {
-        self.options.rotate_bytes.is_some() || self.options.rotate_after.is_some()
+        let Err(failure) = written else { return Ok(()) };
+        self.is_last_taken = is_taken;
+        Err(self.end(failure))
     }
 
     /// Begins the next file if this sample is to be its first.
@@ -266,13 +265,10 @@ impl LiveRecorder {
         };
         let next = match self.begin_part() {
             Ok(next) => next,
-            Err(RecordingError::Io { path, source }) if is_full(&source) => {
-                return Err(self.end(path, WriteFailure::Full(source)));
+            Err(RecordingError::Io { source, .. }) if is_full(&source) => {
+                return Err(self.end(WriteFailure::Full(source)));
             }
-            Err(error) => {
-                let path = self.part_path(self.n_parts);
-                return Err(self.end(path, WriteFailure::Broken(error)));
-            }
+            Err(error) => return Err(self.end(error.into())),
         };
         self.previous = self.current.replace(next).map(|part| Previous {
             part,
@@ -284,11 +280,11 @@ impl LiveRecorder {
     }
 
     fn begin_part(&mut self) -> Result<Part, RecordingError> {
-        let path = if self.is_split() { self.part_path(self.n_parts) } else { self.path.clone() };
+        let path = if self.options.is_split() { self.part_path(self.n_parts) } else { self.path.clone() };
         let part = BTreeMap::from([("number".to_string(), self.n_parts.to_string())]);
         let mut metadata: Vec<(&str, &BTreeMap<String, String>)> = vec![(METADATA_NAME, &self.info)];
         metadata.extend(self.options.metadata.iter().map(|(name, metadata)| (name.as_str(), metadata)));
-        if self.is_split() {
+        if self.options.is_split() {
             metadata.push((PART_METADATA_NAME, &part));
         }
         let file = LiveFile::create(&path, self.options.overwrite, &metadata)?;
@@ -323,42 +319,40 @@ impl LiveRecorder {
                 || previous.part.file.topics().all(|(topic, _)| previous.passed.contains(topic))
         };
         match self.previous.take_if(|previous| is_done(previous)) {
-            Some(previous) => {
-                self.complete(previous.part, false).map_err(|(path, error)| self.end(path, WriteFailure::Broken(error)))
-            }
+            Some(previous) => self.complete(previous.part, false).map_err(|error| self.end(error.into())),
             None => Ok(()),
         }
     }
 
-    fn complete(&mut self, mut part: Part, is_last: bool) -> Result<(), (PathBuf, RecordingError)> {
+    fn complete(&mut self, mut part: Part, is_last: bool) -> Result<(), RecordingError> {
         let path = part.file.path().to_path_buf();
         if let Some(ending) = self.ending
             && is_last
         {
             let metadata = BTreeMap::from([("ended".to_string(), ending.to_string())]);
-            part.file.write_metadata(END_METADATA_NAME, &metadata).map_err(|error| (path.clone(), error))?;
+            part.file.write_metadata(END_METADATA_NAME, &metadata)?;
         }
         self.summary.files.push(path.clone());
         for (topic, n_samples) in part.file.topics() {
             *self.summary.n_samples.entry(topic.into()).or_default() += n_samples;
         }
-        part.file.finish(is_last).map_err(|error| (path.clone(), error))?;
+        part.file.finish(is_last)?;
         self.summary.n_bytes += std::fs::metadata(&path).map_or(0, |found| found.len());
         Ok(())
     }
 
     /// Ends the recording and completes the files that can be completed.
-    fn end(&mut self, at: PathBuf, failure: WriteFailure) -> RecordingError {
+    fn end(&mut self, failure: WriteFailure) -> RecordingError {
         let mut n_samples = 0;
         let mut ended = match failure {
             WriteFailure::Full(error) => {
                 self.ending = Some("disk_full");
-                Ended::Full { path: at, n_samples: 0, reason: error.to_string() }
+                Ended { path: self.path.clone(), reason: error.to_string(), n_samples: Some(0) }
             }
-            WriteFailure::Broken(error) => Ended::Broken { path: at, message: reason(error) },
+            WriteFailure::Broken(error) => Ended::broken(error),
         };
         for part in self.previous.take().map(|previous| previous.part).into_iter().chain(self.current.take()) {
-            if matches!(&ended, Ended::Broken { path, .. } if path == part.file.path()) {
+            if ended.n_samples.is_none() && ended.path == part.file.path() {
                 self.summary.files.push(part.file.path().to_path_buf());
                 // Some of these samples may lie in the file, where a repair finds them.
                 self.summary.n_refused += part.file.n_samples();
@@ -366,16 +360,13 @@ impl LiveRecorder {
                 continue;
             }
             n_samples += part.file.n_samples();
-            if let Err((path, error)) = self.complete(part, true) {
-                ended = Ended::Broken { path, message: reason(error) };
+            if let Err(error) = self.complete(part, true) {
+                ended = Ended::broken(error);
             }
         }
-        if let Ended::Full { n_samples: found, path, .. } = &mut ended {
-            *found = n_samples;
+        if let (Some(found), Some(last)) = (&mut ended.n_samples, self.summary.files.last()) {
             // The next file may not have begun.
-            if let Some(last) = self.summary.files.last() {
-                *path = last.clone();
-            }
+            (*found, ended.path) = (n_samples, last.clone());
         }
         self.ended.insert(ended).error()
     }
@@ -404,12 +395,20 @@ impl Previous {
 }
 
 impl Ended {
+    fn broken(error: RecordingError) -> Ended {
+        let (path, reason) = match error {
+            RecordingError::Io { path, source } => (path, format!("could not be written: {source}")),
+            RecordingError::Invalid { path, message } | RecordingError::Damaged { path, message } => (path, message),
+            RecordingError::Full { path, reason, .. } => (path, reason),
+        };
+        Ended { path, reason, n_samples: None }
+    }
+
     fn error(&self) -> RecordingError {
-        match self {
-            Ended::Full { path, n_samples, reason } => {
-                RecordingError::Full { path: path.clone(), n_samples: *n_samples, reason: reason.clone() }
-            }
-            Ended::Broken { path, message } => RecordingError::Damaged { path: path.clone(), message: message.clone() },
+        let Ended { path, reason, n_samples } = self.clone();
+        match n_samples {
+            Some(n_samples) => RecordingError::Full { path, n_samples, reason },
+            None => RecordingError::Damaged { path, message: reason },
         }
     }
 }
@@ -421,14 +420,6 @@ fn is_first(first: &mut Option<String>, topic: &str) -> bool {
 fn is_full(error: &std::io::Error) -> bool {
     use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
     matches!(error.kind(), StorageFull | QuotaExceeded | FileTooLarge)
-}
-
-fn reason(error: RecordingError) -> String {
-    match error {
-        RecordingError::Io { source, .. } => format!("could not be written: {source}"),
-        RecordingError::Invalid { message, .. } | RecordingError::Damaged { message, .. } => message,
-        error @ RecordingError::Full { .. } => error.to_string(),
-    }
 }
 
 /// Whether the file `name` beside a recording would be one of its parts.

@@ -7,16 +7,15 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use blindgrasp_messages::files::private_file;
-use blindgrasp_messages::{Recorded, Stamped};
+use blindgrasp_messages::{Header, Recorded, Stamped};
 use mcap::Writer;
-use mcap::records::{MessageHeader, Metadata};
+use mcap::records::Metadata;
 use rustix::fs::FallocateFlags;
 use rustix::io::Errno;
 
 use super::RecordingError;
-use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING};
 use super::viewer::StandardType;
-use super::writer::{lock, write_error, write_options};
+use super::writer::{add_channel, append, lock, write_error, write_options};
 
 /// A chunk is closed at this many bytes before compression: little is lost with a killed process, and zstd still
 /// compresses well.
@@ -174,7 +173,7 @@ impl LiveFile {
                 id
             }
         };
-        self.append(id, (sample.header.seq, sample.header.stamp_nanos), data)?;
+        self.append(id, &sample.header, data)?;
         if let Some(channel) = self.channels.get_mut(topic) {
             channel.n_samples += 1;
         }
@@ -186,7 +185,7 @@ impl LiveFile {
         &mut self,
         id: &mut Option<u16>,
         standard: &StandardType,
-        (sequence, stamp_nanos): (u64, u64),
+        header: &Header,
         data: &[u8],
     ) -> Result<(), WriteFailure> {
         self.make_room(standard.topic, id.is_none().then_some(standard.definition), data)?;
@@ -197,7 +196,7 @@ impl LiveFile {
                 *id.insert(self.add_channel(standard.topic, standard.schema, standard.definition)?)
             }
         };
-        self.append(id, (sequence, stamp_nanos), data)
+        self.append(id, header, data)
     }
 
     /// Closes the open chunk if it is old enough.
@@ -253,17 +252,11 @@ impl LiveFile {
     }
 
     fn add_channel(&mut self, topic: &str, schema: &str, definition: &str) -> Result<u16, RecordingError> {
-        self.writer
-            .add_schema(schema, SCHEMA_ENCODING, definition.as_bytes())
-            .and_then(|schema_id| self.writer.add_channel(schema_id, topic, MESSAGE_ENCODING, &BTreeMap::new()))
-            .map_err(|error| write_error(&self.path, error))
+        add_channel(&mut self.writer, topic, schema, definition).map_err(|error| write_error(&self.path, error))
     }
 
-    fn append(&mut self, channel_id: u16, (seq, stamp_nanos): (u64, u64), data: &[u8]) -> Result<(), WriteFailure> {
-        // MCAP's sequence has 32 bits; the header inside the message has them all.
-        let header =
-            MessageHeader { channel_id, sequence: seq as u32, log_time: stamp_nanos, publish_time: stamp_nanos };
-        self.writer.write_to_known_channel(&header, data).map_err(|error| write_error(&self.path, error).into())
+    fn append(&mut self, channel_id: u16, header: &Header, data: &[u8]) -> Result<(), WriteFailure> {
+        append(&mut self.writer, channel_id, header, data).map_err(|error| write_error(&self.path, error).into())
     }
 
     fn end_chunk(&mut self) -> Result<(), RecordingError> {

@@ -5,7 +5,7 @@ use std::fmt;
 
 use serde::Serialize;
 
-use blindgrasp_messages::{Record, Recorded, TactileFrame};
+use blindgrasp_messages::{Header, Record, Recorded, TactileFrame};
 
 /// The most gaps that are remembered per topic and epoch, to recognise numbers that come late.
 const MAX_GAPS: usize = 4096;
@@ -57,7 +57,7 @@ struct Topic {
     /// The epoch of the last sample.
     epoch: Option<u64>,
     epochs: BTreeMap<u64, Epoch>,
-    found: BTreeMap<Oddity, Found>,
+    found: BTreeMap<Oddity, Problem>,
 }
 
 #[derive(Debug, Clone)]
@@ -69,24 +69,15 @@ struct Epoch {
     gaps: BTreeMap<u64, u64>,
 }
 
-#[derive(Debug, Clone)]
-struct Found {
-    n_samples: u64,
-    first_seq: u64,
-    epoch: u64,
-}
-
 impl Problems {
     pub fn add(&mut self, topic: &str, record: &Record) {
         self.has_tactile |= matches!(record, Record::Tactile(_));
         let header = record.header();
-        match self.topics.get_mut(topic) {
-            Some(known) => known.add(header.epoch, header.seq, header.stamp_nanos),
-            None => {
-                let mut new = Topic { first_seq: header.seq, ..Topic::default() };
-                new.add(header.epoch, header.seq, header.stamp_nanos);
-                self.topics.insert(topic.into(), new);
-            }
+        if !self.topics.contains_key(topic) {
+            self.topics.insert(topic.into(), Topic { first_seq: header.seq, ..Topic::default() });
+        }
+        if let Some(known) = self.topics.get_mut(topic) {
+            known.add(topic, header);
         }
     }
 
@@ -105,18 +96,18 @@ impl Problems {
             });
         }
         for (name, topic) in &self.topics {
-            problems.extend(topic.missing().map(|found| found.problem(Oddity::MissingNumbers, name)));
-            problems.extend(topic.found.iter().map(|(oddity, found)| found.problem(*oddity, name)));
+            problems.extend(topic.missing(name));
+            problems.extend(topic.found.values().cloned());
         }
         problems
     }
 }
 
 impl Topic {
-    fn add(&mut self, epoch: u64, seq: u64, stamp_nanos: u64) {
+    fn add(&mut self, topic: &str, &Header { epoch, seq, stamp_nanos, .. }: &Header) {
         self.n_samples += 1;
         if self.epoch.is_some_and(|last| last != epoch) && self.epochs.contains_key(&epoch) {
-            self.note(Oddity::EpochComesBack, epoch, seq);
+            self.note(Oddity::EpochComesBack, topic, epoch, seq);
         }
         self.epoch = Some(epoch);
         let Some(known) = self.epochs.get_mut(&epoch) else {
@@ -149,21 +140,22 @@ impl Topic {
             odd.insert(if is_again { Oddity::RepeatedNumbers } else { Oddity::NumbersGoBack });
         }
         for oddity in odd {
-            self.note(oddity, epoch, seq);
+            self.note(oddity, topic, epoch, seq);
         }
     }
 
-    fn note(&mut self, oddity: Oddity, epoch: u64, seq: u64) {
-        let found = self.found.entry(oddity).or_insert(Found { n_samples: 0, first_seq: seq, epoch });
-        found.n_samples += 1;
+    fn note(&mut self, oddity: Oddity, topic: &str, epoch: u64, first_seq: u64) {
+        let problem = Problem { oddity, topic: topic.into(), n_samples: 0, first_seq, epoch };
+        self.found.entry(oddity).or_insert(problem).n_samples += 1;
     }
 
-    fn missing(&self) -> Option<Found> {
+    fn missing(&self, topic: &str) -> Option<Problem> {
         let gaps = || self.epochs.iter().flat_map(|(epoch, found)| found.gaps.iter().map(move |gap| (epoch, gap)));
         let (epoch, (first, _)) = gaps().next()?;
         let n_samples =
             gaps().fold(0_u64, |sum, (_, (first, last))| sum.saturating_add(last - first).saturating_add(1));
-        Some(Found { n_samples, first_seq: *first, epoch: *epoch })
+        let oddity = Oddity::MissingNumbers;
+        Some(Problem { oddity, topic: topic.into(), n_samples, first_seq: *first, epoch: *epoch })
     }
 }
 
@@ -184,12 +176,6 @@ impl Epoch {
             self.gaps.insert(seq + 1, last);
         }
         true
-    }
-}
-
-impl Found {
-    fn problem(&self, oddity: Oddity, topic: &str) -> Problem {
-        Problem { oddity, topic: topic.into(), n_samples: self.n_samples, first_seq: self.first_seq, epoch: self.epoch }
     }
 }
 
@@ -218,7 +204,7 @@ impl fmt::Display for Problem {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use blindgrasp_messages::{Header, Prediction, Stamped};
+    use blindgrasp_messages::{Prediction, Stamped};
 
     fn found(samples: &[(u64, u64, u64)]) -> Vec<(Oddity, u64, u64, u64)> {
         let mut problems = Problems::default();

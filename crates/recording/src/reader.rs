@@ -42,12 +42,6 @@ pub struct RecordingReader {
 /// A message's topic, its number in MCAP's header, its type and its data.
 type OurMessage<'a> = (&'a str, u32, &'static OurType, &'a [u8]);
 
-/// Why a message is refused.
-enum Refusal {
-    Damaged(String),
-    OtherVersion(String),
-}
-
 impl RecordingReader {
     /// Opens a recording and reads its summary.
     ///
@@ -118,38 +112,35 @@ impl RecordingReader {
         &mut self,
         mut take: impl FnMut(OurMessage<'_>) -> Option<Result<T, String>>,
     ) -> Result<Option<T>, RecordingError> {
-        let RecordingReader { reader, input, growth, channels, n_read, is_past_data, .. } = self;
+        let RecordingReader { path, info, reader, input, growth, channels, n_read, is_past_data, .. } = self;
+        let damaged = |message: String| RecordingError::Damaged { path: path.clone(), message };
+        let invalid = |message: String| RecordingError::Invalid { path: path.clone(), message };
         let found = read_records(reader, input, growth, |opcode, data| match opcode {
-            op::MESSAGE if *is_past_data => {
-                Some(Err(Refusal::Damaged("a sample lies behind the end of its data".into())))
-            }
+            op::MESSAGE if *is_past_data => Some(Err(damaged("a sample lies behind the end of its data".into()))),
             op::MESSAGE => {
                 *n_read += 1;
                 let taken = our_message(channels, data).and_then(|message| match message {
                     Ok(message) => take(message),
                     Err(what) => Some(Err(what)),
                 });
-                taken.map(|taken| taken.map_err(Refusal::Damaged))
+                taken.map(|taken| taken.map_err(damaged))
             }
             op::DATA_END => {
                 *is_past_data = true;
                 None
             }
             _ => match channels.add(opcode, data) {
-                Ok(()) => channels.other_version().map(|difference| Err(Refusal::OtherVersion(difference.into()))),
-                Err(message) => Some(Err(Refusal::Damaged(message))),
+                Ok(()) => {
+                    channels.other_version().map(|difference| Err(invalid(summary::other_version(difference, info))))
+                }
+                Err(message) => Some(Err(damaged(message))),
             },
         });
-        let invalid = |message| RecordingError::Invalid { path: self.path.clone(), message };
         match found {
-            Ok(Some(Ok(sample))) => Ok(Some(sample)),
-            Ok(Some(Err(Refusal::Damaged(message)))) => Err(self.damaged(message)),
-            Ok(Some(Err(Refusal::OtherVersion(difference)))) => {
-                Err(invalid(summary::other_version(&difference, &self.info)))
-            }
+            Ok(Some(taken)) => taken.map(Some),
             Ok(None) => match self.n_expected {
-                Some(expected) if expected != self.n_read && !self.input.has_skipped => {
-                    Err(self.damaged(format!("it holds {} samples, its statistics say {expected}", self.n_read)))
+                Some(expected) if expected != *n_read && !input.has_skipped => {
+                    Err(damaged(format!("it holds {n_read} samples, its statistics say {expected}")))
                 }
                 _ => Ok(None),
             },
@@ -158,7 +149,7 @@ impl RecordingReader {
             }
             Err(error) => {
                 let cause = with_cause(&error);
-                Err(self.damaged(format!("cut off or damaged after {} samples: {cause}", self.n_read)))
+                Err(damaged(format!("cut off or damaged after {n_read} samples: {cause}")))
             }
         }
     }

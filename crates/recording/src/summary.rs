@@ -39,10 +39,7 @@ impl FileSummary {
         // Without statistics, a named topic may be empty.
         let has_samples = |id: &u16| counts.is_none_or(|counts| counts.get(id).is_some_and(|n| *n > 0));
         let channels = self.channels.iter().filter(|known| has_samples(&known.channel.id));
-        let schema = |known: &super::channels::KnownChannel| {
-            self.channels.schema(&known.channel).map_or(String::new(), |schema| schema.name.clone())
-        };
-        channels.map(|known| (known.channel.topic.clone(), schema(known))).collect()
+        channels.map(|known| (known.channel.topic.clone(), self.channels.schema_name(known))).collect()
     }
 }
 
@@ -64,29 +61,17 @@ pub(super) fn open(path: &Path) -> Result<(File, FileSummary), RecordingError> {
         let found = metadata_in_data(&mut file, n_file_bytes);
         raw.metadata_in_data = found.map_err(|message| damaged(format!("its metadata: {message}")))?;
     }
-    let mut info = None;
     let mut metadata = BTreeMap::new();
     for index in &raw.metadata {
         let found = read_metadata(&mut file, index, n_file_bytes)
             .map_err(|message| damaged(format!("its '{}' metadata: {message}", index.name)))?;
-        if index.name == METADATA_NAME {
-            let found = info_from_metadata(found);
-            info = Some(found.map_err(|message| invalid(format!("its '{METADATA_NAME}' metadata: {message}")))?);
-        } else {
-            metadata.insert(index.name.clone(), found);
-        }
+        metadata.insert(index.name.clone(), found);
     }
-    for (name, found) in raw.metadata_in_data {
-        if name == METADATA_NAME {
-            let found = info_from_metadata(found);
-            info = Some(found.map_err(|message| invalid(format!("its '{METADATA_NAME}' metadata: {message}")))?);
-        } else {
-            metadata.insert(name, found);
-        }
-    }
+    metadata.extend(raw.metadata_in_data);
     // Other MCAP tools copy samples without metadata. The samples still say which hand they are of.
-    let info = match info {
-        Some(info) => info,
+    let info = match metadata.remove(METADATA_NAME) {
+        Some(found) => info_from_metadata(found)
+            .map_err(|message| invalid(format!("its '{METADATA_NAME}' metadata: {message}")))?,
         None if is_ours => unknown_info(),
         None => {
             let message = format!(
@@ -129,6 +114,7 @@ pub(super) fn is_being_written(file: &File) -> bool {
 }
 
 /// A summary as it stands in the file.
+#[derive(Default)]
 pub(super) struct RawSummary {
     pub(super) channels: Channels,
     pub(super) statistics: Option<Statistics>,
@@ -136,18 +122,6 @@ pub(super) struct RawSummary {
     metadata: Vec<MetadataIndex>,
     /// By name: of a file whose index does not name them.
     metadata_in_data: BTreeMap<String, BTreeMap<String, String>>,
-}
-
-impl RawSummary {
-    fn empty() -> RawSummary {
-        RawSummary {
-            channels: Channels::default(),
-            statistics: None,
-            chunks: Vec::new(),
-            metadata: Vec::new(),
-            metadata_in_data: BTreeMap::new(),
-        }
-    }
 }
 
 /// The summary of a file that has none but is whole otherwise, as some programs write it. All of the file is read.
@@ -159,7 +133,7 @@ fn summary_of_data(file: &mut File) -> Result<RawSummary, String> {
         .with_record_length_limit(MAX_RECORD_BYTES);
     let mut reader = LinearReader::new_with_options(options);
     let mut input = std::io::BufReader::new(file);
-    let mut summary = RawSummary::empty();
+    let mut summary = RawSummary::default();
     let refused = read_records(&mut reader, &mut input, &mut Growth::default(), |opcode, data| match opcode {
         op::SCHEMA | op::CHANNEL => summary.channels.add(opcode, data).err(),
         op::METADATA => match parse_record(opcode, data) {
@@ -205,7 +179,7 @@ pub(super) fn raw_summary(file: &mut File, n_file_bytes: u64) -> Result<RawSumma
             .with_record_length_limit(longest_record(n_file_bytes)),
     );
     let mut input = std::io::BufReader::new(file);
-    let mut summary = RawSummary::empty();
+    let mut summary = RawSummary::default();
     let mut is_first = true;
     let refused = read_records(&mut reader, &mut input, &mut Growth::default(), |opcode, data| {
         if std::mem::take(&mut is_first) && opcode != op::DATA_END {

@@ -67,7 +67,10 @@ fn ours<M: Recorded>() -> Vec<OurType> {
 }
 
 /// Puts a message, or anything else, into `data` as CDR, in place of what was there.
-pub(super) fn encode(value: &impl Serialize, data: &mut Vec<u8>) -> Result<(), String> {
+///
+/// # Errors
+/// A value that CDR does not have.
+pub fn encode(value: &impl Serialize, data: &mut Vec<u8>) -> Result<(), String> {
     data.clear();
     data.extend(CDR_LITTLE_ENDIAN);
     to_writer::<_, byteorder::LittleEndian, _>(data, value).map_err(|error| error.to_string())
@@ -77,7 +80,11 @@ fn body(data: &[u8]) -> Result<&[u8], String> {
     data.strip_prefix(&CDR_LITTLE_ENDIAN[..]).ok_or_else(|| "expected little-endian CDR".into())
 }
 
-pub(super) fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
+/// Reads a message of the package `blindgrasp_msgs`.
+///
+/// # Errors
+/// Why it is no such message, for a person.
+pub fn decode<M: Recorded>(data: &[u8]) -> Result<Stamped<M>, String> {
     let body = body(data)?;
     let (sample, n_bytes) = from_bytes::<Stamped<M>, byteorder::LittleEndian>(body)
         .map_err(|error| format!("not a {}: {error}", M::TYPE_NAME))?;

@@ -24,12 +24,13 @@ pub(super) const CONTACT_POINTS: StandardType =
 /// The topics of live recordings that are there for viewers. Their content follows from our own topics.
 pub const TOPICS_FOR_VIEWERS: [&str; 2] = [JOINT_STATES.topic, CONTACT_POINTS.topic];
 
-const JOINT_STATE: &str = "\
-std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
+/// A definition whose own lines begin with a header.
+macro_rules! with_header {
+    ($own:literal) => {
+        concat!(
+            "std_msgs/Header header\n",
+            $own,
+            "\
 ================================================================================
 MSG: std_msgs/Header
 builtin_interfaces/Time stamp
@@ -38,10 +39,22 @@ string frame_id
 MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec
-";
+"
+        )
+    };
+}
 
-const POINT_CLOUD: &str = "\
-std_msgs/Header header
+const JOINT_STATE: &str = with_header!(
+    "\
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+"
+);
+
+const POINT_CLOUD: &str = with_header!(
+    "\
 uint32 height
 uint32 width
 PointField[] fields
@@ -64,15 +77,8 @@ string name
 uint32 offset
 uint8 datatype
 uint32 count
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-";
+"
+);
 
 const FLOAT32: u8 = 7;
 const FIELDS: [&str; 4] = ["x", "y", "z", "force"];
@@ -129,13 +135,11 @@ impl StandardHeader {
     }
 }
 
-/// A frame's joint angles, radians, under the hand's names; neither velocities nor efforts.
-pub(super) fn joint_state(
-    header: &Header,
-    names: &[String],
-    frame: &TactileFrame,
-    data: &mut Vec<u8>,
-) -> Result<(), String> {
+/// A frame's joint angles, radians, under the hand's names, as `sensor_msgs/msg/JointState`; neither velocities nor efforts.
+///
+/// # Errors
+/// As [`encode`]; or there is another number of names.
+pub fn joint_state(header: &Header, names: &[String], frame: &TactileFrame, data: &mut Vec<u8>) -> Result<(), String> {
     if names.len() != frame.joints.len() {
         return Err(format!("{} joint values, the hand has {}", frame.joints.len(), names.len()));
     }
@@ -143,13 +147,19 @@ pub(super) fn joint_state(
     encode(&JointState { header, name: names, position: &frame.joints, velocity: &[], effort: &[] }, data)
 }
 
-/// A sample's contacts: palm frame, metres, and the force of each in newtons.
-pub(super) fn contact_points(header: &Header, contacts: &ContactSet, data: &mut Vec<u8>) -> Result<(), String> {
+/// A sample's contacts, as [`force_points`].
+///
+/// # Errors
+/// As [`encode`].
+pub fn contact_points(header: &Header, contacts: &ContactSet, data: &mut Vec<u8>) -> Result<(), String> {
     force_points(header, contacts.contacts.iter().map(|contact| (contact.position_m, contact.force_newtons)), data)
 }
 
-/// Points in the palm frame, metres, each with a force, newtons.
-pub(super) fn force_points(
+/// Points in the palm frame, metres, each with a force, newtons, as `sensor_msgs/msg/PointCloud2` with `x`, `y`, `z`, `force`.
+///
+/// # Errors
+/// As [`encode`].
+pub fn force_points(
     header: &Header,
     points: impl ExactSizeIterator<Item = ([f64; 3], f64)>,
     data: &mut Vec<u8>,

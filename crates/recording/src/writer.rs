@@ -10,7 +10,7 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::{Compression, WriteOptions, Writer};
 
 use blindgrasp_messages::files::{keep_mode, partial_path, private_file};
-use blindgrasp_messages::{Record, Recorded, Stamped, with_sample};
+use blindgrasp_messages::{Header, Record, Recorded, Stamped, with_sample};
 
 use super::source::with_cause;
 use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING, encode};
@@ -107,22 +107,37 @@ impl RecordingWriter {
             return Ok(());
         };
         if !self.channels.contains_key(topic) {
-            let schema_id = writer.add_schema(M::SCHEMA, SCHEMA_ENCODING, M::definition().as_bytes())?;
-            let id = writer.add_channel(schema_id, topic, MESSAGE_ENCODING, &BTreeMap::new())?;
+            let id = add_channel(writer, topic, M::SCHEMA, &M::definition())?;
             self.channels.insert(topic.into(), WrittenChannel { id, n_samples: 0 });
         }
         let Some(channel) = self.channels.get_mut(topic) else { return Ok(()) };
-        let header = MessageHeader {
-            channel_id: channel.id,
-            // MCAP's sequence has 32 bits; the header inside the message has them all.
-            sequence: sample.header.seq as u32,
-            log_time: sample.header.stamp_nanos,
-            publish_time: sample.header.stamp_nanos,
-        };
-        writer.write_to_known_channel(&header, &self.data)?;
+        append(writer, channel.id, &sample.header, &self.data)?;
         channel.n_samples += 1;
         Ok(())
     }
+}
+
+/// Declares a topic and the type of its messages.
+pub(super) fn add_channel(
+    writer: &mut Writer<BufWriter<File>>,
+    topic: &str,
+    schema: &str,
+    definition: &str,
+) -> mcap::McapResult<u16> {
+    let schema_id = writer.add_schema(schema, SCHEMA_ENCODING, definition.as_bytes())?;
+    writer.add_channel(schema_id, topic, MESSAGE_ENCODING, &BTreeMap::new())
+}
+
+/// Appends a message of the sample with this header.
+pub(super) fn append(
+    writer: &mut Writer<BufWriter<File>>,
+    channel_id: u16,
+    &Header { seq, stamp_nanos, .. }: &Header,
+    data: &[u8],
+) -> mcap::McapResult<()> {
+    // MCAP's sequence has 32 bits; the header inside the message has them all.
+    let header = MessageHeader { channel_id, sequence: seq as u32, log_time: stamp_nanos, publish_time: stamp_nanos };
+    writer.write_to_known_channel(&header, data)
 }
 
 impl Drop for RecordingWriter {

@@ -32,20 +32,6 @@ pub struct UnknownTopic {
     topics: Vec<String>,
 }
 
-/// The edges of a graph and of the replay of a recording in it, by topic.
-pub struct EdgesInQuestion<'a> {
-    /// The edges of the replay.
-    pub fed: &'a [FedEdge],
-    /// The topics of the whole graph.
-    pub topics_of_graph: BTreeSet<&'a str>,
-    /// The topics of the recording, with their types.
-    pub recorded: &'a BTreeMap<String, String>,
-    /// The topics of the replay's recording, with their types.
-    pub found: &'a BTreeMap<String, String>,
-    /// Whether the recording is updated: missing edges pass.
-    pub is_update: bool,
-}
-
 /// The decisions and labels of a replay, by grasp.
 #[derive(Default)]
 pub struct Decisions {
@@ -143,54 +129,61 @@ impl Check {
     }
 }
 
-impl EdgesInQuestion<'_> {
-    /// Returns the edges to compare, in the graph's order, and a check for each edge that only one side has.
-    ///
-    /// # Errors
-    /// [`UnknownTopic`].
-    pub fn to_compare(&self, expected: &Expectations) -> Result<(Vec<ComparedEdge>, Vec<Check>), UnknownTopic> {
-        let (mut compared, mut checks) = (Vec::new(), Vec::new());
-        if let Some(topic) = expected.tolerances.keys().find(|topic| !self.has(topic)) {
-            let topics = self.topics_of_graph.iter().map(ToString::to_string).collect();
-            return Err(UnknownTopic { topic: topic.clone(), topics });
+/// Returns the edges of a replay to compare, in the graph's order, and a check for each edge that only one side has.
+///
+/// * `fed` - the edges of the replay. `topics_of_graph` - the topics of the whole graph.
+/// * `recorded`, `found` - the topics of the recording and of the replay's recording, with their types.
+/// * `is_update` - the recording is updated: missing edges pass.
+///
+/// # Errors
+/// [`UnknownTopic`].
+pub fn edges_to_compare(
+    fed: &[FedEdge],
+    topics_of_graph: &BTreeSet<&str>,
+    recorded: &BTreeMap<String, String>,
+    found: &BTreeMap<String, String>,
+    expected: &Expectations,
+    is_update: bool,
+) -> Result<(Vec<ComparedEdge>, Vec<Check>), UnknownTopic> {
+    let (mut compared, mut checks) = (Vec::new(), Vec::new());
+    let has = |topic: &str| topics_of_graph.contains(topic) || fed.iter().any(|edge| edge.recorded_topic == topic);
+    if let Some(topic) = expected.tolerances.keys().find(|topic| !has(topic)) {
+        let topics = topics_of_graph.iter().map(ToString::to_string).collect();
+        return Err(UnknownTopic { topic: topic.clone(), topics });
+    }
+    let is_recorded = |edge: &FedEdge| recorded.contains_key(&edge.recorded_topic);
+    if !is_update {
+        if !fed.iter().any(|edge| edge.origin == Origin::Stage && is_recorded(edge)) {
+            // The recording holds no output of a stage: there is nothing to compare.
+            return Ok((compared, checks));
         }
-        let is_recorded = |edge: &FedEdge| self.recorded.contains_key(&edge.recorded_topic);
-        if !self.is_update {
-            if !self.fed.iter().any(|edge| edge.origin == Origin::Stage && is_recorded(edge)) {
-                // The recording holds no output of a stage: there is nothing to compare.
-                return Ok((compared, checks));
-            }
-            let of_sources = [GraspScene::TOPIC, GraspTruth::TOPIC, LiftOutcome::TOPIC];
-            let is_known = |topic: &str| of_sources.contains(&topic) || self.has(topic);
-            let ours = self.recorded.iter().filter(|(_, schema)| schema.starts_with("blindgrasp_msgs/"));
-            for (topic, _) in ours.filter(|(topic, _)| !is_known(topic)) {
+        let of_sources = [GraspScene::TOPIC, GraspTruth::TOPIC, LiftOutcome::TOPIC];
+        for (topic, schema) in recorded {
+            let is_ours = schema.starts_with("blindgrasp_msgs/");
+            if is_ours && !of_sources.contains(&topic.as_str()) && !has(topic) {
                 checks.push(Check::new(topic, false, "recorded, but the graph has no such edge".into()));
             }
         }
-        for edge in self.fed {
-            let topic = &edge.recorded_topic;
-            if is_recorded(edge) {
-                compared.push(ComparedEdge {
-                    recorded_topic: topic.clone(),
-                    found_topic: edge.found_topic.clone(),
-                    tolerance: expected.tolerances.get(topic).copied().unwrap_or_default(),
-                    is_played: edge.origin != Origin::Stage,
-                });
-            } else if self.found.contains_key(&edge.found_topic) {
-                let text = if self.is_update {
-                    "was not recorded"
-                } else {
-                    "the graph has this edge, but the recording does not: record it again, or --update"
-                };
-                checks.push(Check::new(topic, self.is_update, text.into()));
-            }
+    }
+    for edge in fed {
+        let topic = &edge.recorded_topic;
+        if is_recorded(edge) {
+            compared.push(ComparedEdge {
+                recorded_topic: topic.clone(),
+                found_topic: edge.found_topic.clone(),
+                tolerance: expected.tolerances.get(topic).copied().unwrap_or_default(),
+                is_played: edge.origin != Origin::Stage,
+            });
+        } else if found.contains_key(&edge.found_topic) {
+            let text = if is_update {
+                "was not recorded"
+            } else {
+                "the graph has this edge, but the recording does not: record it again, or --update"
+            };
+            checks.push(Check::new(topic, is_update, text.into()));
         }
-        Ok((compared, checks))
     }
-
-    fn has(&self, topic: &str) -> bool {
-        self.topics_of_graph.contains(topic) || self.fed.iter().any(|edge| edge.recorded_topic == topic)
-    }
+    Ok((compared, checks))
 }
 
 impl Decisions {

@@ -9,14 +9,14 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::played::played;
-use blindgrasp_messages::{Header, Recorded};
+use super::played::is_played;
+use blindgrasp_messages::{Header, with_sample};
+use blindgrasp_recording::cdr;
 use blindgrasp_recording::export::{Value, ValueError, leaves};
 use blindgrasp_recording::{ChosenSamples, Reach, Record, RecordingError, RecordingReader};
 
 /// A sample counts as re-ordered if it is at most so many samples away in the other recording.
 const WINDOW: usize = 512;
-const FORMAT: bincode::config::Configuration = bincode::config::standard();
 
 /// The allowed difference of floats: `absolute + relative * |recorded value|`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
@@ -106,7 +106,7 @@ pub enum CompareError {
     #[error(transparent)]
     Value(#[from] ValueError),
     #[error("a message cannot be encoded: {0}")]
-    Encode(#[from] bincode::error::EncodeError),
+    Encode(String),
     #[error("recording {path}: it holds no {topic}")]
     NoSource { path: String, topic: String },
 }
@@ -155,16 +155,15 @@ impl Coverage {
         let mut ends: Option<(Header, u64, u64)> = None;
         for record in reader {
             let (topic, record) = record?;
-            if topic == source_topic
-                && let Some((grasp_id, _)) = played(&record)
-            {
+            if topic == source_topic && is_played(&record) {
+                let grasp_id = record.grasp_id();
                 let (header, first, _) = ends.unwrap_or((*record.header(), grasp_id, grasp_id));
                 ends = Some((header, first, grasp_id));
             }
         }
-        let no_source =
-            || CompareError::NoSource { path: recording.display().to_string(), topic: source_topic.to_string() };
-        let (first, first_grasp_id, last_grasp_id) = ends.ok_or_else(no_source)?;
+        let Some((first, first_grasp_id, last_grasp_id)) = ends else {
+            return Err(CompareError::NoSource { path: recording.display().to_string(), topic: source_topic.into() });
+        };
         let is_attached = is_attached || first.seq != 0;
         Ok(Coverage { first, first_grasp_id, last_grasp_id, hand_id, is_attached, is_detached, is_cut_off })
     }
@@ -190,8 +189,13 @@ impl Coverage {
 
     /// The number in the replay of a recorded sample; `None` if it comes before the first played sample.
     fn found_seq(&self, recorded: &Header) -> Option<u64> {
-        if recorded.epoch == self.first.epoch { recorded.seq.checked_sub(self.first.seq) } else { Some(recorded.seq) }
+        since(&self.first, recorded)
     }
+}
+
+/// The number of a sample, counted from the first one; numbers of another epoch stay.
+fn since(first: &Header, header: &Header) -> Option<u64> {
+    if header.epoch == first.epoch { header.seq.checked_sub(first.seq) } else { Some(header.seq) }
 }
 
 /// Compares an edge of a recording with the same edge of its replay.
@@ -204,14 +208,13 @@ pub fn compare_edge(
     edge: &ComparedEdge,
     coverage: &Coverage,
 ) -> Result<EdgeComparison, CompareError> {
-    let comparison = EdgeComparison { topic: edge.recorded_topic.clone(), ..EdgeComparison::default() };
     let mut sides = Sides {
         recorded: Side::open(recording, &edge.recorded_topic)?,
         found: Side::open(replay, &edge.found_topic)?,
-        tolerance: edge.tolerance,
+        edge,
         coverage,
-        is_played: edge.is_played,
-        comparison,
+        first_own: None,
+        comparison: EdgeComparison { topic: edge.recorded_topic.clone(), ..EdgeComparison::default() },
     };
     sides.compare()?;
     sides.comparison.n_grasps = sides.comparison.grasps.len();
@@ -222,24 +225,21 @@ pub fn compare_edge(
 struct Side {
     samples: ChosenSamples,
     window: VecDeque<Sample>,
-    /// The first sample of an edge with numbers of its own, such as labels.
-    first_own: Option<Header>,
 }
 
 struct Sample {
     /// The header with the number of the replay.
     header: Header,
     record: Record,
-    grasp_id: u64,
 }
 
 struct Sides<'a> {
     recorded: Side,
     found: Side,
-    tolerance: Tolerance,
+    edge: &'a ComparedEdge,
     coverage: &'a Coverage,
-    /// Whether the edge is played from the recording.
-    is_played: bool,
+    /// The first recorded sample of an edge with numbers of its own, such as labels.
+    first_own: Option<Header>,
     comparison: EdgeComparison,
 }
 
@@ -247,18 +247,16 @@ impl Side {
     fn open(path: &Path, topic: &str) -> Result<Side, RecordingError> {
         let topic = topic.to_owned();
         let samples = ChosenSamples::open(path, Box::new(move |found, _| found == topic), Reach::Whole)?;
-        Ok(Side { samples, window: VecDeque::new(), first_own: None })
+        Ok(Side { samples, window: VecDeque::new() })
     }
 
+    /// The next sample, while the window has room.
     fn read(&mut self) -> Result<Option<Record>, RecordingError> {
+        if self.window.len() >= WINDOW {
+            return Ok(None);
+        }
         let sample = self.samples.advance()?;
         sample.map(|sample| self.samples.decode(&sample)).transpose()
-    }
-
-    /// The number of a sample of an edge with numbers of its own, counted from its first sample.
-    fn since_first(&mut self, header: &Header) -> Option<u64> {
-        let first = *self.first_own.get_or_insert(*header);
-        if header.epoch == first.epoch { header.seq.checked_sub(first.seq) } else { Some(header.seq) }
     }
 
     fn position(&self, sample: &Sample) -> Option<usize> {
@@ -280,34 +278,35 @@ impl Sides<'_> {
                 break;
             };
             if recorded.is_named_as(found) {
-                self.compare_at(0, 0)?;
+                let what = first_difference(recorded, found, self.edge.tolerance)?;
+                if let (Some(recorded), Some(what)) = (self.recorded.window.pop_front(), what) {
+                    self.add(&recorded.record, recorded.record.header().seq, what);
+                }
+                self.found.window.pop_front();
                 continue;
             }
             match (self.found.position(recorded), self.recorded.position(found)) {
                 // Both samples are in both recordings, at other places.
                 (Some(found_idx), Some(_)) => {
-                    let (grasp_id, seq) = (recorded.grasp_id, recorded.record.header().seq);
-                    self.add(grasp_id, seq, What::Reordered);
                     // The place of the sample is a difference already: its values are not compared.
-                    self.recorded.window.pop_front();
                     self.found.window.remove(found_idx);
+                    self.pop_recorded(What::Reordered);
                 }
                 (Some(_), None) => self.pop_found(),
-                (None, Some(_)) => self.pop_recorded(),
+                (None, Some(_)) => self.pop_recorded(What::Missing),
                 (None, None) => {
-                    self.pop_recorded();
+                    self.pop_recorded(What::Missing);
                     self.pop_found();
                 }
             }
         }
         while !self.recorded.window.is_empty() {
-            self.pop_recorded();
+            self.pop_recorded(What::Missing);
             self.fill()?;
         }
         while let Some(sample) = self.found.window.front() {
-            let is_said_once = sample.record.is_said_once();
             // Samples after the end of the recording, or that depend on them, cannot be compared.
-            let is_of_the_end = is_said_once && sample.grasp_id == self.coverage.last_grasp_id;
+            let is_of_the_end = sample.record.is_said_once() && sample.record.grasp_id() == self.coverage.last_grasp_id;
             if self.coverage.is_cut_off || (self.coverage.is_detached && is_of_the_end) {
                 self.comparison.n_not_compared += 1;
                 self.found.window.pop_front();
@@ -321,72 +320,57 @@ impl Sides<'_> {
 
     /// Fills both windows.
     fn fill(&mut self) -> Result<(), CompareError> {
-        while self.recorded.window.len() < WINDOW
-            && let Some(record) = self.recorded.read()?
-        {
-            let grasp_id = grasp_id(&record);
-            if self.is_uncovered(&record, grasp_id) {
-                self.comparison.n_not_compared += 1;
-                continue;
-            }
-            let mut header = *record.header();
-            let seq = match record {
-                Record::Truth(_) | Record::Outcome(_) => self.recorded.since_first(&header),
-                // Their numbers began before the recording; there is one for each grasp.
-                _ if record.is_said_once() && self.coverage.is_attached => Some(grasp_id),
-                _ if record.is_said_once() => Some(header.seq),
-                _ => self.coverage.found_seq(&header),
-            };
-            let Some(seq) = seq else {
+        while let Some(record) = self.recorded.read()? {
+            let Some(seq) = self.number_in_replay(&record) else {
                 self.comparison.n_not_compared += 1;
                 continue;
             };
-            header.seq = seq;
-            if header.hand_id == 0 && self.is_played {
+            let mut header = Header { seq, ..*record.header() };
+            if header.hand_id == 0 && self.edge.is_played {
                 // The player takes the hand from the recording's metadata.
                 header.hand_id = self.coverage.hand_id;
             }
             self.comparison.n_recorded += 1;
-            self.recorded.window.push_back(Sample { header, record, grasp_id });
+            self.recorded.window.push_back(Sample { header, record });
         }
-        while self.found.window.len() < WINDOW
-            && let Some(record) = self.found.read()?
-        {
-            let grasp_id = grasp_id(&record);
-            if self.is_uncovered(&record, grasp_id) {
+        while let Some(record) = self.found.read()? {
+            if self.is_uncovered(&record) {
                 self.comparison.n_not_compared += 1;
                 continue;
             }
             let mut header = *record.header();
             if self.coverage.is_attached && record.is_said_once() {
-                header.seq = grasp_id;
+                header.seq = record.grasp_id();
             }
             self.comparison.n_found += 1;
-            self.found.window.push_back(Sample { header, record, grasp_id });
+            self.found.window.push_back(Sample { header, record });
         }
         Ok(())
+    }
+
+    /// The number in the replay of a recorded sample; `None` if it cannot be compared.
+    fn number_in_replay(&mut self, record: &Record) -> Option<u64> {
+        let header = record.header();
+        if self.is_uncovered(record) {
+            return None;
+        }
+        match record {
+            Record::Truth(_) | Record::Outcome(_) => since(self.first_own.get_or_insert(*header), header),
+            // Their numbers began before the recording; there is one for each grasp.
+            _ if record.is_said_once() && self.coverage.is_attached => Some(record.grasp_id()),
+            _ if record.is_said_once() => Some(header.seq),
+            _ => self.coverage.found_seq(header),
+        }
     }
 
     /// The decision about the grasp in which the recording begins depends on frames that were not recorded.
-    fn is_uncovered(&self, record: &Record, grasp_id: u64) -> bool {
-        record.is_said_once() && !self.coverage.covers_decision(grasp_id)
+    fn is_uncovered(&self, record: &Record) -> bool {
+        record.is_said_once() && !self.coverage.covers_decision(record.grasp_id())
     }
 
-    fn compare_at(&mut self, recorded_idx: usize, found_idx: usize) -> Result<(), CompareError> {
-        let (Some(recorded), Some(found)) =
-            (self.recorded.window.remove(recorded_idx), self.found.window.remove(found_idx))
-        else {
-            return Ok(());
-        };
-        if let Some(what) = first_difference(&recorded, &found, self.tolerance)? {
-            self.add(recorded.grasp_id, recorded.record.header().seq, what);
-        }
-        Ok(())
-    }
-
-    fn pop_recorded(&mut self) {
+    fn pop_recorded(&mut self, what: What) {
         if let Some(sample) = self.recorded.window.pop_front() {
-            self.add(sample.grasp_id, sample.record.header().seq, What::Missing);
+            self.add(&sample.record, sample.record.header().seq, what);
         }
     }
 
@@ -396,11 +380,12 @@ impl Sides<'_> {
                 Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) => sample.record.header().seq,
                 _ => self.coverage.recorded_seq(&sample.header),
             };
-            self.add(sample.grasp_id, seq, What::Extra);
+            self.add(&sample.record, seq, What::Extra);
         }
     }
 
-    fn add(&mut self, grasp_id: u64, seq: u64, what: What) {
+    fn add(&mut self, record: &Record, seq: u64, what: What) {
+        let grasp_id = record.grasp_id();
         self.comparison.n_differing += 1;
         self.comparison.grasps.insert(grasp_id);
         self.comparison.first.get_or_insert(Difference { grasp_id, seq, what });
@@ -462,27 +447,7 @@ fn are_equal(expected: &Value, found: &Value, tolerance: Tolerance) -> bool {
 
 /// The bytes of the message: messages with the same bytes are the same in every bit.
 fn encoded(record: &Record) -> Result<Vec<u8>, CompareError> {
-    fn encode<M: Recorded>(message: &M) -> Result<Vec<u8>, bincode::error::EncodeError> {
-        bincode::serde::encode_to_vec(message, FORMAT)
-    }
-    Ok(match record {
-        Record::Tactile(sample) => encode(&sample.message),
-        Record::Contacts(sample) => encode(&sample.message),
-        Record::Feature(sample) => encode(&sample.message),
-        Record::Prediction(sample) => encode(&sample.message),
-        Record::Decision(sample) => encode(&sample.message),
-        Record::Truth(sample) => encode(&sample.message),
-        Record::Outcome(sample) => encode(&sample.message),
-        Record::Scene(sample) => encode(&sample.message),
-    }?)
-}
-
-fn grasp_id(record: &Record) -> u64 {
-    match record {
-        Record::Decision(sample) => sample.message.grasp_id,
-        Record::Truth(sample) => sample.message.grasp_id,
-        Record::Outcome(sample) => sample.message.grasp_id,
-        Record::Scene(sample) => sample.message.grasp_id,
-        record => played(record).map_or(0, |(grasp_id, _)| grasp_id),
-    }
+    let mut data = Vec::new();
+    with_sample!(record, sample => cdr::encode(&sample.message, &mut data)).map_err(CompareError::Encode)?;
+    Ok(data)
 }

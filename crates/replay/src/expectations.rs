@@ -19,6 +19,7 @@ use serde::Deserialize;
 use super::comparison::Tolerance;
 use blindgrasp_messages::files::read_regular;
 use blindgrasp_messages::{Action, Reason};
+use blindgrasp_operator::text::did_you_mean;
 
 /// The keys of an expectations file.
 const KEYS: [&str; 7] =
@@ -180,8 +181,8 @@ fn decision(text: &str) -> Result<(Action, Option<Reason>), String> {
 fn reason_named(word: &str) -> Result<Reason, String> {
     let words = || Reason::ALL.iter().map(|reason| reason.as_str());
     let known = Reason::ALL.iter().find(|reason| reason.as_str() == word);
-    known.copied().ok_or_else(|| match similar(word, words()) {
-        Some(similar) => format!("unknown reason '{word}'; did you mean '{similar}'?"),
+    known.copied().ok_or_else(|| match did_you_mean(word, words()) {
+        Some(hint) => format!("unknown reason '{word}'; {hint}"),
         None => format!("unknown reason '{word}'; reasons: {}", words().collect::<Vec<_>>().join(", ")),
     })
 }
@@ -189,17 +190,12 @@ fn reason_named(word: &str) -> Result<Reason, String> {
 /// The text of a parser's error, with the known key that is most like an unknown one.
 fn with_suggestion(error: &str) -> String {
     let unknown = error.split_once("unknown field `").and_then(|(_, rest)| rest.split_once('`'));
-    let suggestion = unknown.and_then(|(key, _)| similar(key, KEYS.into_iter().chain(["absolute", "relative"])));
+    let hint = unknown.and_then(|(key, _)| did_you_mean(key, KEYS.into_iter().chain(["absolute", "relative"])));
     let error = error.replace("unknown field `", "unknown key `");
-    match suggestion {
-        Some(suggestion) => format!("{error}; did you mean '{suggestion}'?"),
+    match hint {
+        Some(hint) => format!("{error}; {hint}"),
         None => error,
     }
-}
-
-fn similar<'a>(wrong: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
-    let distances = known.map(|name| (strsim::osa_distance(wrong, name), name));
-    distances.filter(|(distance, _)| *distance <= (wrong.len() / 3).clamp(1, 3)).min().map(|(_, name)| name)
 }
 
 #[cfg(test)]

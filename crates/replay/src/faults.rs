@@ -33,32 +33,18 @@ pub enum InjectedFault {
 }
 
 impl InjectedFault {
-    pub const ALL: [InjectedFault; 9] = [
-        InjectedFault::LostFrame,
-        InjectedFault::DropOuts,
-        InjectedFault::DoubledFrame,
-        InjectedFault::LateFrame,
-        InjectedFault::SilentFrame,
-        InjectedFault::NanReading,
-        InjectedFault::DeadCell,
-        InjectedFault::StuckCell,
-        InjectedFault::DeadPad,
+    /// All faults, each with its words for a person.
+    pub const ALL: [(InjectedFault, &str); 9] = [
+        (InjectedFault::LostFrame, "the second settled frame is lost"),
+        (InjectedFault::DropOuts, "every third frame is lost"),
+        (InjectedFault::DoubledFrame, "the first settled frame comes twice"),
+        (InjectedFault::LateFrame, "the first settled frame comes after the second"),
+        (InjectedFault::SilentFrame, "all cells read 0 in the second settled frame"),
+        (InjectedFault::NanReading, "a cell reads NaN in the second settled frame"),
+        (InjectedFault::DeadCell, "the most loaded cell reads 0"),
+        (InjectedFault::StuckCell, "the most loaded cell is stuck"),
+        (InjectedFault::DeadPad, "the most loaded pad reads 0"),
     ];
-
-    /// What happens, for a person to read.
-    pub fn describe(self) -> &'static str {
-        match self {
-            InjectedFault::LostFrame => "the second settled frame is lost",
-            InjectedFault::DropOuts => "every third frame is lost",
-            InjectedFault::DoubledFrame => "the first settled frame comes twice",
-            InjectedFault::LateFrame => "the first settled frame comes after the second",
-            InjectedFault::SilentFrame => "all cells read 0 in the second settled frame",
-            InjectedFault::NanReading => "a cell reads NaN in the second settled frame",
-            InjectedFault::DeadCell => "the most loaded cell reads 0",
-            InjectedFault::StuckCell => "the most loaded cell is stuck",
-            InjectedFault::DeadPad => "the most loaded pad reads 0",
-        }
-    }
 
     /// Puts the fault into the frames of a grasp. `pad_of_cell` has the index of each cell's pad.
     pub fn apply(self, frames: &mut Vec<Stamped<TactileFrame>>, pad_of_cell: &[usize]) {
@@ -191,7 +177,7 @@ mod tests {
 
     #[test]
     fn a_grasp_that_never_settles_stays_as_it_is() {
-        for fault in InjectedFault::ALL {
+        for (fault, _) in InjectedFault::ALL {
             let mut frames: Vec<_> = grasp().into_iter().take(2).collect();
             fault.apply(&mut frames, &[0, 0, 1, 1]);
             assert_eq!(frames.len(), 2, "{fault:?}");

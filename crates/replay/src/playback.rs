@@ -4,7 +4,7 @@ use std::marker::PhantomData;
 use std::path::{Path, PathBuf};
 
 use super::played::Played;
-use super::selection::{Selection, SelectionError, Selector};
+use super::selection::{Selection, Selector};
 use blindgrasp_messages::{GraspTruth, Recorded, Stamped};
 use blindgrasp_recording::{ChosenSamples, RawSample, Reach, Record, RecordingError, RecordingInfo};
 
@@ -15,8 +15,6 @@ const LATE_NANOS: u64 = 60_000_000_000;
 pub enum PlaybackError {
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    #[error("recording {}: {source}", path.display())]
-    Selection { path: PathBuf, source: SelectionError },
     /// The recording does not fit its metadata, or the caller's selection.
     #[error("recording {}: {message}", path.display())]
     Unfit { path: PathBuf, message: String },
@@ -102,7 +100,7 @@ impl<M: Played> Playback<M> {
     }
 
     fn advance(&mut self) -> Result<Option<Next>, PlaybackError> {
-        if let Some(truth) = self.selector.next_truth().map_err(|source| self.mixed(source))? {
+        if let Some(truth) = self.selector.next_truth().map_err(|error| self.unfit(error.to_string()))? {
             return Ok(Some(Next::Truth(truth)));
         }
         if let Some(frame) = self.held.take() {
@@ -155,7 +153,7 @@ impl<M: Played> Playback<M> {
         seen.least_grasp_id = seen.least_grasp_id.min(grasp_id);
         seen.greatest_grasp_id = seen.greatest_grasp_id.max(grasp_id);
         let since_first_nanos = header.stamp_nanos.saturating_sub(seen.first_stamp_nanos);
-        if let Some(seq) = self.selector.frame(&header, grasp_id).map_err(|source| self.mixed(source))? {
+        if let Some(seq) = self.selector.frame(&header, grasp_id).map_err(|error| self.unfit(error.to_string()))? {
             self.n_selected += 1;
             sample.header.seq = seq;
             self.held = Some(sample);
@@ -178,10 +176,6 @@ impl<M: Played> Playback<M> {
             (None, Some(topic)) => format!("it holds no {topic} to replay"),
             (None, None) => format!("it holds no {} to replay", M::TOPIC),
         })
-    }
-
-    fn mixed(&self, source: SelectionError) -> PlaybackError {
-        PlaybackError::Selection { path: self.path.clone(), source }
     }
 
     fn unfit(&self, message: String) -> PlaybackError {

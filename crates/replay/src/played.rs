@@ -49,13 +49,7 @@ pub const PLAYED: [(&str, &str); 4] = [
     (Prediction::PORT, Prediction::TYPE_NAME),
 ];
 
-/// Grasp and type of a record, if it can be played.
-pub fn played(record: &Record) -> Option<(u64, &'static str)> {
-    match record {
-        Record::Tactile(sample) => Some((sample.message.grasp_id, TactileFrame::TYPE_NAME)),
-        Record::Contacts(sample) => Some((sample.message.grasp_id, ContactSet::TYPE_NAME)),
-        Record::Feature(sample) => Some((sample.message.grasp_id, GraspFeature::TYPE_NAME)),
-        Record::Prediction(sample) => Some((sample.message.grasp_id, Prediction::TYPE_NAME)),
-        Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Scene(_) => None,
-    }
+/// Whether a record can be played.
+pub fn is_played(record: &Record) -> bool {
+    PLAYED.iter().any(|(_, type_name)| *type_name == record.type_name())
 }

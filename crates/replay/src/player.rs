@@ -13,7 +13,7 @@ use super::playback::{Next, Playback, PlaybackError};
 use super::played::Played;
 use super::samples::{Sample, Samples};
 use super::selection::Selection;
-use blindgrasp_messages::{GraspTruth, GraspTruthHead, Header, Message, Stamped};
+use blindgrasp_messages::{GraspTruthHead, Header, Message};
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::port::sample_id;
 use blindgrasp_recording::{Reach, RecordingIndex};
@@ -65,10 +65,12 @@ pub struct Player<M: Played> {
     samples: Samples<M>,
     /// The repetition that is under way; `None` between repetitions.
     under_way: Option<UnderWay<M>>,
-    current: Current<M>,
+    /// The sample to be sent; its items lie in `samples`.
+    current: Option<Sample<M>>,
     repetition: u64,
     /// What the repetition under way has had so far.
     so_far: Extent,
+    /// Frames so far, those included that the readers have.
     n_frames: u64,
     frames: Resume,
     truths: Resume,
@@ -79,14 +81,6 @@ enum UnderWay<M> {
     /// The index of the next one among the kept samples.
     Kept(usize),
     Read(Box<Playback<M>>),
-}
-
-/// The sample to be sent; its items lie in the player's samples.
-enum Current<M: Played> {
-    Frame { head: M::Head, items: Range<usize>, n_before: u64 },
-    Truth { head: GraspTruthHead, items: Range<usize> },
-    Nothing,
-    End,
 }
 
 impl<M: Played> Player<M> {
@@ -108,7 +102,7 @@ impl<M: Played> Player<M> {
             is_kept: false,
             samples: Samples::default(),
             under_way: None,
-            current: Current::Nothing,
+            current: None,
             repetition: 0,
             so_far: Extent::default(),
             n_frames: 0,
@@ -143,7 +137,7 @@ impl<M: Played> Player<M> {
         go_on: &mut dyn FnMut() -> bool,
     ) -> Result<bool, PlaybackError> {
         (self.frames, self.truths) = (Resume { after: frame }, Resume { after: truth });
-        self.under_way = None;
+        (self.under_way, self.current) = (None, None);
         if self.program.n_repetitions > 1 && self.extent.is_none() && frame.is_some() {
             // The readers can be in any repetition.
             self.extent = self.read_through(go_on)?;
@@ -165,12 +159,10 @@ impl<M: Played> Player<M> {
     /// # Errors
     /// The recording cannot be read.
     pub fn advance(&mut self) -> Result<(), PlaybackError> {
+        self.current = None;
         let mut under_way = match self.under_way.take() {
             Some(under_way) => under_way,
-            None if self.repetition >= self.program.n_repetitions => {
-                self.current = Current::End;
-                return Ok(());
-            }
+            None if self.repetition >= self.program.n_repetitions => return Ok(()),
             None => {
                 self.so_far = Extent::default();
                 if self.is_kept {
@@ -180,7 +172,6 @@ impl<M: Played> Player<M> {
                 }
             }
         };
-        self.current = Current::Nothing;
         let is_over = match &mut under_way {
             UnderWay::Kept(next) => {
                 *next += 1;
@@ -200,12 +191,14 @@ impl<M: Played> Player<M> {
     /// The sample to be sent now, until [`Player::advance`] is called again.
     pub fn current(&self) -> Playing<'_, M> {
         match &self.current {
-            Current::Frame { head, items, n_before } => {
-                Playing::Frame { head: *head, items: &self.samples.items[items.clone()], n_before: *n_before }
+            Some(Sample::Frame(head, items)) => {
+                Playing::Frame { head: *head, items: &self.samples.items[items.clone()], n_before: self.n_frames - 1 }
             }
-            Current::Truth { head, items } => Playing::Truth { head: *head, items: &self.samples.names[items.clone()] },
-            Current::Nothing => Playing::Nothing,
-            Current::End => Playing::End,
+            Some(Sample::Truth(head, items)) => {
+                Playing::Truth { head: *head, items: &self.samples.names[items.clone()] }
+            }
+            None if self.under_way.is_none() && self.repetition >= self.program.n_repetitions => Playing::End,
+            None => Playing::Nothing,
         }
     }
 
@@ -213,8 +206,8 @@ impl<M: Played> Player<M> {
     fn take_kept(&mut self, idx: usize) -> bool {
         match self.samples.all.get(idx).cloned() {
             Some(Sample::Frame(head, items)) => {
-                if let Some((header, n_before)) = self.next_frame(M::header(&head)) {
-                    self.set_frame(head, items, header, n_before);
+                if let Some(header) = self.next_frame(M::header(&head)) {
+                    self.set_frame(head, items, header);
                 }
             }
             Some(Sample::Truth(head, items)) => self.set_truth(head, items),
@@ -225,48 +218,46 @@ impl<M: Played> Player<M> {
 
     /// Goes to the next sample in the file, and returns whether there is none.
     fn take_read(&mut self, playback: &mut Playback<M>) -> Result<bool, PlaybackError> {
-        match playback.next().transpose()? {
-            Some(Next::Frame(frame)) => {
-                self.so_far.add_frame(&frame.header, frame.grasp_id);
+        let Some(next) = playback.next().transpose()? else { return Ok(true) };
+        self.so_far.add(&next);
+        match next {
+            Next::Frame(frame) => {
                 // Frames that the readers have are not decoded.
-                if let Some((header, n_before)) = self.next_frame(&frame.header) {
+                if let Some(header) = self.next_frame(&frame.header) {
                     self.samples.clear();
                     let (head, items) = self.samples.add_frame(&playback.decode(&frame)?);
-                    self.set_frame(head, items, header, n_before);
+                    self.set_frame(head, items, header);
                 }
             }
-            Some(Next::Truth(truth)) => {
-                self.so_far.add_truth(&truth);
+            Next::Truth(truth) => {
                 self.samples.clear();
                 let (head, items) = self.samples.add_truth(&truth);
                 self.set_truth(head, items);
             }
-            Some(Next::Nothing) => {}
-            None => return Ok(true),
+            Next::Nothing => {}
         }
         Ok(false)
     }
 
-    /// Counts a frame. Returns the header as it goes out and the number of frames before it, unless the readers have it.
-    fn next_frame(&mut self, recorded: &Header) -> Option<(Header, u64)> {
+    /// Counts a frame. Returns the header as it goes out, unless the readers have the frame.
+    fn next_frame(&mut self, recorded: &Header) -> Option<Header> {
         let header = self.shifted(recorded, |extent| extent.n_frame_numbers);
-        let n_before = self.n_frames;
         self.n_frames += 1;
-        (!self.frames.has(&header)).then_some((header, n_before))
+        if self.frames.has(&header) { None } else { Some(header) }
     }
 
-    fn set_frame(&mut self, mut head: M::Head, items: Range<usize>, header: Header, n_before: u64) {
+    fn set_frame(&mut self, mut head: M::Head, items: Range<usize>, header: Header) {
         let grasp_id = M::grasp_id_mut(&mut head);
         *grasp_id = self.shifted_grasp_id(*grasp_id);
         *M::header_mut(&mut head) = header;
-        self.current = Current::Frame { head, items, n_before };
+        self.current = Some(Sample::Frame(head, items));
     }
 
     fn set_truth(&mut self, head: GraspTruthHead, items: Range<usize>) {
         let header = self.shifted(&head.header, |extent| extent.n_truth_numbers);
         if !self.truths.has(&header) {
             let grasp_id = self.shifted_grasp_id(head.grasp_id);
-            self.current = Current::Truth { head: GraspTruthHead { header, grasp_id, ..head }, items };
+            self.current = Some(Sample::Truth(GraspTruthHead { header, grasp_id, ..head }, items));
         }
     }
 
@@ -293,16 +284,14 @@ impl<M: Played> Player<M> {
         let mut extent = Extent::default();
         (self.is_kept, self.max_items) = (true, 0);
         while let Some(next) = playback.next() {
-            match next? {
+            let next = next?;
+            extent.add(&next);
+            match next {
                 Next::Frame(frame) => {
-                    extent.add_frame(&frame.header, frame.grasp_id);
                     let (_, items) = self.samples.add_frame(&playback.decode(&frame)?);
                     self.max_items = self.max_items.max(items.len());
                 }
-                Next::Truth(truth) => {
-                    extent.add_truth(&truth);
-                    self.samples.add_truth(&truth);
-                }
+                Next::Truth(truth) => drop(self.samples.add_truth(&truth)),
                 Next::Nothing => {}
             }
             self.is_kept &= self.samples.n_bytes() <= max_kept_bytes;
@@ -319,11 +308,7 @@ impl<M: Played> Player<M> {
     fn read_through(&self, go_on: &mut dyn FnMut() -> bool) -> Result<Option<Extent>, PlaybackError> {
         let mut extent = Extent::default();
         for next in self.program.open::<M>(Reach::ByIndex)? {
-            match next? {
-                Next::Frame(frame) => extent.add_frame(&frame.header, frame.grasp_id),
-                Next::Truth(truth) => extent.add_truth(&truth),
-                Next::Nothing => {}
-            }
+            extent.add(&next?);
             if !go_on() {
                 return Ok(None);
             }
@@ -377,18 +362,24 @@ struct Extent {
 }
 
 impl Extent {
-    fn add_frame(&mut self, header: &Header, grasp_id: u64) {
-        let Header { seq, stamp_nanos, .. } = *header;
-        self.n_frames += 1;
-        self.n_frame_numbers = self.n_frame_numbers.max(seq.saturating_add(1));
+    fn add(&mut self, next: &Next) {
+        let grasp_id = match next {
+            Next::Frame(frame) => {
+                let Header { seq, stamp_nanos, .. } = frame.header;
+                self.n_frames += 1;
+                self.n_frame_numbers = self.n_frame_numbers.max(seq.saturating_add(1));
+                let (first, last, step) = self.stamps.unwrap_or((stamp_nanos, stamp_nanos, 0));
+                let step = if step == 0 { stamp_nanos.saturating_sub(last) } else { step };
+                self.stamps = Some((first, stamp_nanos, step));
+                frame.grasp_id
+            }
+            Next::Truth(truth) => {
+                self.n_truth_numbers = self.n_truth_numbers.max(truth.header.seq.saturating_add(1));
+                truth.message.grasp_id
+            }
+            Next::Nothing => return,
+        };
         self.n_grasp_ids = self.n_grasp_ids.max(grasp_id.saturating_add(1));
-        let (first, last, step) = self.stamps.unwrap_or((stamp_nanos, stamp_nanos, 0));
-        self.stamps = Some((first, stamp_nanos, if step == 0 { stamp_nanos.saturating_sub(last) } else { step }));
-    }
-
-    fn add_truth(&mut self, truth: &Stamped<GraspTruth>) {
-        self.n_truth_numbers = self.n_truth_numbers.max(truth.header.seq.saturating_add(1));
-        self.n_grasp_ids = self.n_grasp_ids.max(truth.message.grasp_id.saturating_add(1));
     }
 
     /// From the first frame to the time at which the first frame of the next repetition is due.
@@ -402,7 +393,7 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use blindgrasp_messages::{GraspFeature, MAX_FEATURES, TactileFrame};
+    use blindgrasp_messages::{GraspFeature, GraspTruth, MAX_FEATURES, Stamped, TactileFrame};
     use blindgrasp_recording::{RecordingInfo, RecordingReader, RecordingWriter};
     use tempfile::TempPath;
 

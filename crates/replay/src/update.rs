@@ -5,8 +5,9 @@ use std::iter::Peekable;
 use std::path::Path;
 
 use super::comparison::Coverage;
-use super::played::played;
+use super::played::is_played;
 use super::rewrite::{FedEdge, Origin};
+use blindgrasp_messages::with_sample;
 use blindgrasp_recording::{Record, RecordingError, RecordingReader, RecordingWriter, TOPICS_FOR_VIEWERS};
 
 /// Why a recording cannot be updated.
@@ -62,7 +63,7 @@ pub fn update(
         if replaced.contains(topic.as_str()) {
             continue;
         }
-        if topic == played_topic && played(&record).is_some() {
+        if topic == played_topic && is_played(&record) {
             copy(&mut new_samples, &mut writer, Some(record.header().stamp_nanos))?;
         }
         writer.write_record(&topic, &record)?;
@@ -91,16 +92,9 @@ fn copy(
 
 /// A stage's answer takes the recorded number of the sample that it answers.
 fn with_recorded_number(mut record: Record, coverage: &Coverage) -> Record {
-    let header = match &mut record {
-        Record::Tactile(sample) => &mut sample.header,
-        Record::Contacts(sample) => &mut sample.header,
-        Record::Feature(sample) => &mut sample.header,
-        Record::Prediction(sample) => &mut sample.header,
-        // These messages have numbers of their own.
-        Record::Decision(_) | Record::Truth(_) | Record::Outcome(_) | Record::Scene(_) => {
-            return record;
-        }
-    };
-    header.seq = coverage.recorded_seq(header);
+    // The other messages have numbers of their own.
+    if is_played(&record) {
+        with_sample!(&mut record, sample => sample.header.seq = coverage.recorded_seq(&sample.header));
+    }
     record
 }

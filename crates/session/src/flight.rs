@@ -13,7 +13,7 @@ use serde::Serialize;
 
 use blindgrasp_graph::client::observer::{Sink, bears_source_number};
 use blindgrasp_graph::control::AttachedEdge;
-use blindgrasp_graph::recorded_graph::{Ending, RecordedGraph};
+use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_messages::{Action, Phase, Reason, Record};
 use blindgrasp_recording::{LiveOptions, LiveRecorder, RecordingError, RecordingInfo};
 
@@ -72,20 +72,10 @@ pub struct FlightRecorder {
     later: Option<Trigger>,
 }
 
-/// The samples for a file.
+/// The samples for a file, and the facts about it.
+#[derive(Serialize)]
 pub struct Excerpt {
-    why: Vec<String>,
-    samples: Vec<(String, Arc<Record>)>,
-    ending: Ending,
-    n_frames: usize,
-    n_grasps: usize,
-    missing: u64,
-    secs: f64,
-}
-
-/// A file that was written.
-#[derive(Debug, Serialize)]
-pub struct WrittenExcerpt {
+    /// Empty until it is written.
     pub file: PathBuf,
     pub why: Vec<String>,
     pub frames: usize,
@@ -93,6 +83,10 @@ pub struct WrittenExcerpt {
     pub secs: f64,
     /// Samples that edges lack of the frames in the file.
     pub missing: u64,
+    #[serde(skip)]
+    samples: Vec<(String, Arc<Record>)>,
+    #[serde(skip)]
+    ending: Ending,
 }
 
 impl FlightRecorder {
@@ -214,6 +208,16 @@ impl FlightRecorder {
     fn excerpt(&mut self, until_nanos: u64) -> Option<Excerpt> {
         let Trigger { why, since_nanos, .. } = self.trigger.take()?;
         self.trigger = self.later.take();
+        let mut excerpt = Excerpt {
+            file: PathBuf::new(),
+            why,
+            frames: 0,
+            grasps: 0,
+            secs: 0.0,
+            missing: 0,
+            samples: Vec::new(),
+            ending: Ending::Detached,
+        };
         let held = || self.samples.iter().filter(|kept| kept.edge_idx == self.leader_idx);
         // From the first whole grasp on, unless that began after the moment that is to be kept.
         let has_whole = held().any(|kept| kept.begins_grasp && kept.received_nanos <= since_nanos);
@@ -221,50 +225,42 @@ impl FlightRecorder {
             .skip_while(|kept| has_whole && !kept.begins_grasp)
             .take_while(|kept| kept.received_nanos <= until_nanos)
             .collect();
-        let (Some(first), Some(last_kept)) = (frames.first(), frames.last()) else {
-            return Some(Excerpt { why, ..Excerpt::EMPTY });
-        };
+        let (Some(first), Some(last)) = (frames.first(), frames.last()) else { return Some(excerpt) };
         let from_nanos = first.received_nanos.saturating_sub(BEFORE_GRASP_NANOS);
         let ids: HashSet<(u64, u64)> = frames.iter().map(|kept| id(&kept.record)).collect();
         let grasps: HashSet<u64> = frames.iter().map(|kept| kept.record.grasp_id()).collect();
-        let last_frame = last_kept.record.header();
-        let belongs = |kept: &&Kept| {
-            let header = kept.record.header();
-            kept.received_nanos >= from_nanos
-                && if self.edges[kept.edge_idx].is_numbered {
-                    ids.contains(&id(&kept.record))
-                } else {
-                    // An answer to a later frame is after the end.
-                    grasps.contains(&kept.record.grasp_id()) && header.stamp_nanos <= last_frame.stamp_nanos
-                }
-        };
-        let samples = self.samples.iter().filter(belongs);
-        let samples = samples.map(|kept| (self.edges[kept.edge_idx].topic.clone(), Arc::clone(&kept.record)));
-        let last = (last_frame.epoch, last_frame.seq);
-        // Numbers that no frame has: the recorder was too slow, or the source had a gap.
-        let gap = |pair: &[&Kept]| {
-            let (before, after) = (pair[0].record.header(), pair[1].record.header());
-            let next = before.seq.saturating_add(1);
-            if before.epoch == after.epoch { after.seq.saturating_sub(next) } else { 0 }
-        };
-        let n_gaps: u64 = frames.windows(2).map(gap).sum();
-        let (mut missing, mut is_whole) = (0, true);
-        for edge_idx in (0..self.edges.len()).filter(|idx| self.edges[*idx].is_numbered) {
-            let of_edge = self.samples.iter().filter(|kept| kept.edge_idx == edge_idx).map(|kept| id(&kept.record));
-            let found: HashSet<(u64, u64)> = of_edge.filter(|id| ids.contains(id)).collect();
-            missing += (ids.len() - found.len()) as u64 + n_gaps;
-            is_whole &= found.contains(&last);
+        let mut found = vec![HashSet::new(); self.edges.len()];
+        for kept in self.samples.iter().filter(|kept| kept.received_nanos >= from_nanos) {
+            let (edge, header) = (&self.edges[kept.edge_idx], kept.record.header());
+            let belongs = if edge.is_numbered {
+                ids.contains(&id(&kept.record))
+            } else {
+                // An answer to a later frame is after the end.
+                grasps.contains(&kept.record.grasp_id()) && header.stamp_nanos <= last.record.header().stamp_nanos
+            };
+            if belongs {
+                found[kept.edge_idx].insert(id(&kept.record));
+                excerpt.samples.push((edge.topic.clone(), Arc::clone(&kept.record)));
+            }
         }
-        Some(Excerpt {
-            why,
-            samples: samples.collect(),
+        // Numbers that no frame has: the recorder was too slow, or the source had a gap.
+        let mut n_gaps = 0;
+        for pair in frames.windows(2) {
+            let (before, after) = (pair[0].record.header(), pair[1].record.header());
+            if before.epoch == after.epoch {
+                n_gaps += after.seq.saturating_sub(before.seq.saturating_add(1));
+            }
+        }
+        for (_, found) in self.edges.iter().zip(&found).filter(|(edge, _)| edge.is_numbered) {
+            excerpt.missing += (ids.len() - found.len()) as u64 + n_gaps;
             // An edge that lacks the end, because its node does not answer, is compared up to where it ends.
-            ending: if is_whole { Ending::Detached } else { Ending::Broken },
-            n_frames: frames.len(),
-            n_grasps: grasps.len(),
-            missing,
-            secs: (last_kept.received_nanos - first.received_nanos) as f64 / 1e9,
-        })
+            if !found.contains(&id(&last.record)) {
+                excerpt.ending = Ending::Broken;
+            }
+        }
+        (excerpt.frames, excerpt.grasps) = (frames.len(), grasps.len());
+        excerpt.secs = (last.received_nanos - first.received_nanos) as f64 / 1e9;
+        Some(excerpt)
     }
 
     /// When the time to keep begins, which ends now or when a file was asked for.
@@ -292,46 +288,23 @@ impl FlightRecorder {
 }
 
 impl Excerpt {
-    /// No frame has come yet.
-    const EMPTY: Excerpt = Excerpt {
-        why: Vec::new(),
-        samples: Vec::new(),
-        ending: Ending::Detached,
-        n_frames: 0,
-        n_grasps: 0,
-        missing: 0,
-        secs: 0.0,
-    };
-
+    /// Whether no frame has come yet.
     pub fn is_empty(&self) -> bool {
-        self.n_frames == 0
+        self.frames == 0
     }
 
     /// Writes `STEM-TIME-WHY.mcap` beside `out`.
     ///
     /// # Errors
     /// The file cannot be written.
-    pub fn write(self, out: &Path, graph: &RecordedGraph) -> Result<WrittenExcerpt, RecordingError> {
-        let file = path_for(out, &self.why);
-        let info = RecordingInfo {
-            hand: graph.hand.clone(),
-            hand_id: graph.hand_id,
-            made_by: graph.made_by.clone(),
-            version: env!("CARGO_PKG_VERSION").into(),
-        };
-        let options = LiveOptions {
-            joint_names: graph.joint_names.clone(),
-            metadata: graph.metadata.clone(),
-            ..LiveOptions::default()
-        };
-        let mut live = LiveRecorder::create(&file, &info, options)?;
+    pub fn write(&mut self, out: &Path, info: &RecordingInfo, options: &LiveOptions) -> Result<(), RecordingError> {
+        self.file = path_for(out, &self.why);
+        let mut live = LiveRecorder::create(&self.file, info, options.clone())?;
         for (topic, record) in &self.samples {
             live.write(topic, record)?;
         }
         live.set_ending(self.ending.word());
-        live.finish()?;
-        let Excerpt { why, n_frames, n_grasps, secs, missing, .. } = self;
-        Ok(WrittenExcerpt { file, why, frames: n_frames, grasps: n_grasps, secs, missing })
+        live.finish().map(drop)
     }
 }
 
@@ -431,7 +404,7 @@ mod tests {
         // The last grasp that began before 50 s - 9 s did so at 40 s.
         assert_eq!(seqs(&excerpt, "/tactile"), (40..=70).collect::<Vec<_>>());
         assert_eq!(seqs(&excerpt, "/prediction"), (40..=70).collect::<Vec<_>>());
-        assert_eq!((excerpt.missing, excerpt.n_grasps, excerpt.ending), (0, 8, Ending::Detached));
+        assert_eq!((excerpt.missing, excerpt.grasps, excerpt.ending), (0, 8, Ending::Detached));
         assert!(recorder.excerpt_when_due(99 * SEC).is_none(), "a file is written once");
         feed(&mut recorder, 80..200);
         assert!(recorder.samples.len() < 40, "older samples are forgotten");

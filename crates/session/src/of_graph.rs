@@ -6,10 +6,9 @@ use std::time::SystemTime;
 
 use serde_json::{Map, Value, json};
 
-use blindgrasp_graph::recorded_graph::{Beginning, RecordedGraph};
 use blindgrasp_grasps::dataset::{TRUTH_METADATA, label_of};
 use blindgrasp_messages::{LiftOutcome, Recorded};
-use blindgrasp_recording::RecordingReader;
+use blindgrasp_recording::{LiveOptions, RecordingInfo, RecordingReader};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
@@ -18,17 +17,19 @@ use blindgrasp_stages::model::Model;
 const GRAPH_METADATA: &str = "graph";
 
 /// What is to be recorded of a graph, as [`describe_graph`](blindgrasp_graph::recorded_graph::describe_graph) describes it. The hand
-/// is the one that a node has as its parameter `hand`.
+/// is the one that a node has as its parameter `hand`. `is_at_start` says that the graph has sent no sample yet. The options get
+/// the joints of the hand and the metadata.
 ///
 /// # Errors
 /// The hand cannot be read.
-pub fn of_graph(graph: &Value, beginning: Beginning) -> anyhow::Result<RecordedGraph> {
+pub fn of_graph(
+    graph: &Value,
+    is_at_start: bool,
+    options: LiveOptions,
+) -> anyhow::Result<(RecordingInfo, LiveOptions)> {
     let name = graph["name"].as_str().unwrap_or_default();
     let hand = param(graph, "hand").next().map(|(_, path)| Hand::load(Path::new(path))).transpose()?;
-    let began = match beginning {
-        Beginning::Start => "start",
-        Beginning::Attached => "attached",
-    };
+    let began = if is_at_start { "start" } else { "attached" };
     let versions = nodes(graph).filter_map(|node| Some((node["id"].as_str()?.to_string(), node["version"].clone())));
     let about = BTreeMap::from([
         ("name".into(), name.into()),
@@ -43,13 +44,14 @@ pub fn of_graph(graph: &Value, beginning: Beginning) -> anyhow::Result<RecordedG
     if let Some(label) = label(graph) {
         metadata.insert(TRUTH_METADATA.into(), BTreeMap::from([("label".into(), label.word().into())]));
     }
-    Ok(RecordedGraph {
+    let info = RecordingInfo {
         hand: hand.as_ref().map_or("unknown".into(), |hand| hand.name.clone()),
         hand_id: hand.as_ref().map_or(0, Hand::id),
         made_by: format!("graph {name}"),
-        joint_names: hand.map_or_else(Vec::new, |hand| hand.joints.into_iter().map(|joint| joint.name).collect()),
-        metadata,
-    })
+        version: env!("CARGO_PKG_VERSION").into(),
+    };
+    let joint_names = hand.map_or_else(Vec::new, |hand| hand.joints.into_iter().map(|joint| joint.name).collect());
+    Ok((info, LiveOptions { joint_names, metadata, ..options }))
 }
 
 /// What stable means in the truth that a graph tells: a lift's where a node says what became of lifts, and otherwise what
@@ -79,7 +81,8 @@ fn models(graph: &Value) -> Value {
     Value::Object(param(graph, "model").map(model).collect::<Map<_, _>>())
 }
 
-fn nodes(graph: &Value) -> impl Iterator<Item = &Value> {
+/// The nodes of a graph.
+pub fn nodes(graph: &Value) -> impl Iterator<Item = &Value> {
     graph["nodes"].as_array().into_iter().flatten()
 }
 

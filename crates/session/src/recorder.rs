@@ -4,13 +4,14 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
-use blindgrasp_graph::recorded_graph::{Ending, RecordedGraph};
+use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::{LiveOptions, LiveRecorder, Record, RecordingError, RecordingInfo};
 
@@ -22,30 +23,17 @@ const POLL: Duration = Duration::from_millis(20);
 /// The graph waits this long for a stuck disk before samples are left out.
 const PATIENCE: Duration = Duration::from_secs(1);
 
-/// How a recording is divided into files.
-#[derive(Debug, Clone, Default)]
-pub struct RecordOptions {
-    /// Another file is begun at this size (bytes), between grasps.
-    pub rotate_size: Option<u64>,
-    /// Another file is begun after this time, between grasps.
-    pub rotate_every: Option<Duration>,
-    /// Existing files are replaced.
-    pub overwrite: bool,
-}
-
-impl RecordOptions {
-    /// Refuses to replace an existing file; parts of a split recording are checked when they begin.
-    pub fn check(&self, path: &Path) -> anyhow::Result<()> {
-        let is_split = self.rotate_size.is_some() || self.rotate_every.is_some();
-        if !self.overwrite && !is_split && path.exists() {
-            anyhow::bail!("{}: the file exists; choose another name, or replace it with --overwrite", path.display());
-        }
-        Ok(())
+/// Refuses to replace an existing file; parts of a split recording are checked when they begin.
+pub fn check_recording(path: &Path, options: &LiveOptions) -> anyhow::Result<()> {
+    if !options.overwrite && !options.is_split() && path.exists() {
+        anyhow::bail!("{}: the file exists; choose another name, or replace it with --overwrite", path.display());
     }
+    Ok(())
 }
 
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Recorded {
+    #[serde(serialize_with = "as_text")]
     pub files: Vec<PathBuf>,
     /// Samples in the files, by topic.
     pub samples: BTreeMap<String, u64>,
@@ -53,6 +41,11 @@ pub struct Recorded {
     pub n_not_recorded: u64,
     /// The error that ended it early.
     pub error: Option<String>,
+}
+
+/// JSON has no place for names of files that are not UTF-8.
+fn as_text<S: Serializer>(files: &[PathBuf], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(files.iter().map(|file| file.to_string_lossy()))
 }
 
 impl Recorded {
@@ -69,9 +62,8 @@ impl Recorded {
 /// An open recording. A recorder that is dropped completes it, or removes it if it is empty.
 pub struct Recorder {
     shared: Arc<Shared>,
-    topics: Vec<String>,
+    topics: Vec<Arc<str>>,
     thread: Option<JoinHandle<Recorded>>,
-    patience: Duration,
     /// The disk is stuck: samples are left out until half of the queue is free.
     is_stuck: bool,
     n_left_out: u64,
@@ -84,16 +76,14 @@ struct Shared {
     come: Condvar,
     /// The queue has room.
     gone: Condvar,
+    has_failed: Arc<AtomicBool>,
 }
 
 #[derive(Default)]
 struct Queue {
-    waiting: VecDeque<(usize, Record)>,
-    /// Topics by index, in the order of their first samples.
-    topics: Vec<String>,
+    waiting: VecDeque<(Arc<str>, Record)>,
     /// How the recording ends, once it does.
     ending: Option<Ending>,
-    has_failed: bool,
 }
 
 impl Recorder {
@@ -101,50 +91,30 @@ impl Recorder {
     ///
     /// # Errors
     /// The file cannot be written, or is there already.
-    pub fn create(path: &Path, graph: RecordedGraph, options: &RecordOptions) -> Result<Recorder, RecordingError> {
-        let info = RecordingInfo {
-            hand: graph.hand,
-            hand_id: graph.hand_id,
-            made_by: graph.made_by,
-            version: env!("CARGO_PKG_VERSION").into(),
-        };
-        let options = LiveOptions {
-            overwrite: options.overwrite,
-            rotate_bytes: options.rotate_size,
-            rotate_after: options.rotate_every,
-            joint_names: graph.joint_names,
-            metadata: graph.metadata,
-        };
-        let live = LiveRecorder::create(path, &info, options)?;
+    pub fn create(path: &Path, info: &RecordingInfo, options: LiveOptions) -> Result<Recorder, RecordingError> {
+        let live = LiveRecorder::create(path, info, options)?;
         let shared = Arc::new(Shared::default());
         let thread = std::thread::spawn({
             let shared = Arc::clone(&shared);
             move || write(live, &shared)
         });
-        Ok(Recorder {
-            shared,
-            topics: Vec::new(),
-            thread: Some(thread),
-            patience: PATIENCE,
-            is_stuck: false,
-            n_left_out: 0,
-        })
+        Ok(Recorder { shared, topics: Vec::new(), thread: Some(thread), is_stuck: false, n_left_out: 0 })
     }
 
     /// Queues a sample. Waits only for a slow disk.
     pub fn push(&mut self, topic: &str, record: Record) {
-        let known = self.topics.iter().position(|known| known == topic);
+        let topic = match self.topics.iter().find(|known| known.as_ref() == topic) {
+            Some(known) => Arc::clone(known),
+            None => {
+                self.topics.push(topic.into());
+                topic.into()
+            }
+        };
         let mut queue = self.shared.lock();
-        let topic_idx = known.unwrap_or_else(|| {
-            self.topics.push(topic.into());
-            queue.topics.push(topic.into());
-            self.topics.len() - 1
-        });
         self.is_stuck &= queue.waiting.len() > MAX_WAITING / 2;
         while queue.waiting.len() >= MAX_WAITING && !self.is_stuck {
             let waited;
-            (queue, waited) =
-                self.shared.gone.wait_timeout(queue, self.patience).unwrap_or_else(PoisonError::into_inner);
+            (queue, waited) = self.shared.gone.wait_timeout(queue, PATIENCE).unwrap_or_else(PoisonError::into_inner);
             self.is_stuck = waited.timed_out();
             if self.is_stuck {
                 print_diagnostic("blindgrasp: the disk is stuck: samples are not recorded until it takes data again");
@@ -154,15 +124,15 @@ impl Recorder {
             self.n_left_out += 1;
             return;
         }
-        queue.waiting.push_back((topic_idx, record));
+        queue.waiting.push_back((topic, record));
         if queue.waiting.len() == WAKE_AT {
             self.shared.come.notify_one();
         }
     }
 
-    /// Whether the recording has ended early.
-    pub fn has_failed(&self) -> bool {
-        self.shared.lock().has_failed
+    /// Set once the recording has ended early.
+    pub fn has_failed(&self) -> Arc<AtomicBool> {
+        Arc::clone(&self.shared.has_failed)
     }
 
     /// Writes what is left and completes the recording.
@@ -175,9 +145,10 @@ impl Recorder {
     fn end(&mut self, ending: Ending) -> Recorded {
         self.shared.lock().ending = Some(ending);
         self.shared.come.notify_one();
-        let recorded = self.thread.take().map(JoinHandle::join);
-        let lost = || Recorded { error: Some("the thread that records panicked".into()), ..Recorded::default() };
-        recorded.and_then(Result::ok).unwrap_or_else(lost)
+        match self.thread.take().map(JoinHandle::join) {
+            Some(Ok(recorded)) => recorded,
+            _ => Recorded { error: Some("the thread that records panicked".into()), ..Recorded::default() },
+        }
     }
 }
 
@@ -198,20 +169,17 @@ impl Shared {
 fn write(mut live: LiveRecorder, shared: &Shared) -> Recorded {
     let mut recorded = Recorded::default();
     let mut batch = VecDeque::new();
-    let mut topics: Vec<String> = Vec::new();
     let ending = loop {
         let mut queue = shared.lock();
         if queue.waiting.len() < WAKE_AT && queue.ending.is_none() {
             (queue, _) = shared.come.wait_timeout(queue, POLL).unwrap_or_else(PoisonError::into_inner);
         }
         std::mem::swap(&mut queue.waiting, &mut batch);
-        let new = topics.len()..;
-        topics.extend_from_slice(&queue.topics[new]);
         let ending = queue.ending;
         drop(queue);
         shared.gone.notify_one();
-        for (topic_idx, record) in batch.drain(..) {
-            let written = live.write(&topics[topic_idx], &record);
+        for (topic, record) in batch.drain(..) {
+            let written = live.write(&topic, &record);
             keep(shared, &mut recorded, written);
         }
         let ticked = live.tick();
@@ -221,21 +189,15 @@ fn write(mut live: LiveRecorder, shared: &Shared) -> Recorded {
         }
     };
     live.set_ending(ending.word());
-    match live.finish() {
-        Ok(summary) => {
-            recorded.files = summary.files;
-            recorded.samples = summary.n_samples;
-            recorded.n_not_recorded = summary.n_refused;
-        }
+    let summary = match live.finish() {
+        Ok(summary) => summary,
         Err(error) => {
-            let summary = live.summary();
-            recorded.files.clone_from(&summary.files);
-            recorded.samples.clone_from(&summary.n_samples);
-            recorded.n_not_recorded = summary.n_refused;
             keep(shared, &mut recorded, Err(error));
+            live.summary().clone()
         }
-    }
-    recorded
+    };
+    let (files, samples, n_not_recorded) = (summary.files, summary.n_samples, summary.n_refused);
+    Recorded { files, samples, n_not_recorded, error: recorded.error }
 }
 
 /// Prints and keeps the first error.
@@ -246,6 +208,6 @@ fn keep(shared: &Shared, recorded: &mut Recorded, outcome: Result<(), RecordingE
         let text = format!("{:#}", anyhow::Error::from(error));
         print_diagnostic(&format!("blindgrasp: recording has ended, the graph goes on: {text}"));
         recorded.error = Some(text);
-        shared.lock().has_failed = true;
+        shared.has_failed.store(true, Ordering::Relaxed);
     }
 }

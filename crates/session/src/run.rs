@@ -11,17 +11,17 @@ use serde_json::json;
 use crate::console::Console;
 use crate::of_graph::of_graph;
 use crate::output::{check_new, check_output, check_page};
-use crate::recorder::{RecordOptions, Recorded, Recorder};
+use crate::recorder::{Recorded, Recorder, check_recording};
 use crate::report::RunReport;
 use crate::table::table;
 use blindgrasp_graph::client::metrics;
 use blindgrasp_graph::dataflow::Graph;
 use blindgrasp_graph::launcher::LaunchOptions;
-use blindgrasp_graph::recorded_graph::{Beginning, Ending};
+use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_graph::run::{self, Run, RunOptions};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Clock;
-use blindgrasp_recording::Record;
+use blindgrasp_recording::{LiveOptions, Record};
 use blindgrasp_stages::hand::Hand;
 
 /// Receives every sample of a run: its topic and content, and the time of its receipt (CLOCK_BOOTTIME).
@@ -34,7 +34,7 @@ pub struct Session {
     pub clock: Clock,
     /// Every edge is recorded to this file.
     pub record: Option<PathBuf>,
-    pub record_options: RecordOptions,
+    pub record_options: LiveOptions,
     /// Prometheus is answered on this port.
     pub metrics: Option<u16>,
     /// The report is written to this file (HTML) at the end.
@@ -84,8 +84,8 @@ impl Session {
         let run = Run::prepare(graph, name, options)?;
         let recorder = match &self.record {
             Some(path) => {
-                let about = of_graph(&run.description(), Beginning::Start)?;
-                Some(Recorder::create(path, about, &self.record_options)?)
+                let (info, options) = of_graph(&run.description(), true, self.record_options)?;
+                Some(Recorder::create(path, &info, options)?)
             }
             None => None,
         };
@@ -139,7 +139,7 @@ impl Session {
         let inputs: Vec<PathBuf> = params.filter_map(|param| Some(PathBuf::from(param.as_str()?))).collect();
         if let Some(path) = &self.record {
             check_output(path, &inputs)?;
-            self.record_options.check(path)?;
+            check_recording(path, &self.record_options)?;
         }
         if let Some(path) = &self.report {
             check_page(path, &inputs)?;

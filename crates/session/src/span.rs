@@ -5,9 +5,6 @@
 //! recording if its frame does, and all truths after the beginning do. At the end, edges that are behind are read until
 //! they reach the furthest edge.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-
 use serde::Serialize;
 
 use crate::recorder::{Recorded, Recorder};
@@ -62,8 +59,6 @@ pub struct Span {
     cursors: SharedCursors,
     edges: Vec<EdgeSpan>,
     recorder: Recorder,
-    /// Set when the recording has failed.
-    failed: Arc<AtomicBool>,
     /// The furthest sample before the recording; `None` if there was none.
     before: Option<SampleId>,
     /// When the first recorded frame was taken, by the source's clock.
@@ -152,12 +147,11 @@ impl EdgeSpan {
 }
 
 impl Span {
-    pub fn new(cursors: SharedCursors, edges: Vec<EdgeSpan>, recorder: Recorder, failed: Arc<AtomicBool>) -> Self {
+    pub fn new(cursors: SharedCursors, edges: Vec<EdgeSpan>, recorder: Recorder) -> Self {
         Span {
             cursors,
             edges,
             recorder,
-            failed,
             before: None,
             first_stamp_nanos: None,
             end: None,
@@ -233,9 +227,6 @@ impl Sink for Span {
         }
         edge.count(sample_id(&header), self.before);
         self.recorder.push(topic, record);
-        if self.recorder.has_failed() {
-            self.failed.store(true, Ordering::Relaxed);
-        }
         Ok(())
     }
 

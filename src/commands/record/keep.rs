@@ -9,16 +9,17 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, bail};
 use serde_json::{Value, json};
 
-use super::{Arguments, Outcome, POLL, attach, observed, print_line, stop_signal};
+use super::{Arguments, Outcome, attach, follow, how, print_line, stop_signal};
 use blindgrasp_graph::client::observer::Observer;
-use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
-use blindgrasp_graph::control::{Attachment, Reply, Request};
-use blindgrasp_graph::recorded_graph::{Beginning, Ending, RecordedGraph};
+use blindgrasp_graph::client::{ANSWER_LIMIT, Connection, Heard, pick_graph};
+use blindgrasp_graph::control::{Reply, Request};
+use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_messages::{Recorded as _, TactileFrame};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_recording::{LiveOptions, RecordingInfo};
 use blindgrasp_session::flight::{Excerpt, FlightRecorder, SharedRecorder};
-use blindgrasp_session::of_graph::of_graph;
+use blindgrasp_session::of_graph::{nodes, of_graph};
 
 /// The reason in the names of files that somebody asked for.
 const ASKED: &str = "asked";
@@ -52,44 +53,42 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
     signal_hook::flag::register(signal_hook::consts::SIGUSR1, Arc::clone(&asked))
         .context("cannot listen for SIGUSR1")?;
     let mut connection = Connection::open(&pick_graph(arguments.graph.as_deref())?)?;
-    let Attachment { domain, edges, graph, .. } = attach(&mut connection, &[], out, true)?;
-    if n_sources_of_frames(&graph) > 1 {
+    let attachment = attach(&mut connection, &[], out, true)?;
+    if n_sources_of_frames(&attachment.graph) > 1 {
         bail!(
             "graph '{}' has several sources of frames, and --keep is for one: use blindgrasp record without --keep",
             connection.graph()
         );
     }
-    let about = of_graph(&graph, Beginning::Attached)?;
-    let recorder = FlightRecorder::new(&edges, kept, Duration::from_secs_f64(arguments.after));
+    let (info, options) = of_graph(&attachment.graph, false, LiveOptions::default())?;
+    let recorder = FlightRecorder::new(&attachment.edges, kept, Duration::from_secs_f64(arguments.after));
     let Some(recorder) = recorder.map(SharedRecorder::new) else {
         bail!("graph '{}' has no edge with frames to keep", connection.graph());
     };
-    let observer = Observer::start_attached(&domain, observed(&edges), recorder.clone());
+    let observer = Observer::start_attached(&attachment.domain, attachment.observed(), recorder.clone());
     let observer = observer.context("cannot read the graph's edges")?;
-    let start = Instant::now();
+    let end = arguments.for_secs.map(|secs| Instant::now() + Duration::from_secs_f64(secs));
     print_diagnostic(&format!(
         "keeping the last {} s of graph '{}'; Ctrl-C ends it",
         kept.as_secs_f64(),
         connection.graph()
     ));
-    let end = arguments.for_secs.map(|secs| start + Duration::from_secs_f64(secs));
-    let mut keeping = Keeping { recorder, stop, asked, end, out, about, is_json: arguments.json, has_loss: false };
-    let ending = keeping.follow(&mut connection, &observer)?;
+    let is_json = arguments.json;
+    let mut keeping = Keeping { recorder, asked, out, info, options, is_json, has_loss: false, is_full: false };
+    let ending = follow(&mut connection, &observer, end, &mut |is_asked| {
+        keeping.look(is_asked)?;
+        Ok(stop.load(Ordering::Relaxed))
+    })?;
     let finished = if ending == Ending::Detached { observer.leave() } else { observer.finish() };
     let graph = connection.graph().to_string();
     // Somebody may have asked since the last look.
-    while let Ok(Some(Reply::Keep)) = connection.receive_within(Duration::ZERO) {
+    while let Ok(Heard::Keep) = connection.hear(Duration::ZERO) {
         keeping.asked.store(true, Ordering::Relaxed);
     }
     drop(connection);
     keeping.finish(ending)?;
     finished.context("cannot read the graph's edges any more")?;
-    let how = match ending {
-        Ending::Graph => "the graph has ended",
-        Ending::Broken => "the graph broke off",
-        Ending::Detached => "the graph goes on",
-    };
-    print_diagnostic(&format!("graph '{graph}' is kept no longer: {how}"));
+    print_diagnostic(&format!("graph '{graph}' is kept no longer: {}", how(ending)));
     Ok(Outcome::of(keeping.has_loss))
 }
 
@@ -97,45 +96,30 @@ pub(super) fn keep(arguments: &Arguments, out: &Path, kept: Duration) -> anyhow:
 struct Keeping<'a> {
     recorder: SharedRecorder,
     out: &'a Path,
-    about: RecordedGraph,
+    info: RecordingInfo,
+    options: LiveOptions,
     is_json: bool,
     has_loss: bool,
-    stop: Arc<AtomicBool>,
+    is_full: bool,
     asked: Arc<AtomicBool>,
-    /// When it ends, if not earlier.
-    end: Option<Instant>,
 }
 
 impl Keeping<'_> {
-    /// Writes the files that are asked for until the graph or the command ends.
-    fn follow(&mut self, connection: &mut Connection, observer: &Observer<SharedRecorder>) -> anyhow::Result<Ending> {
-        let mut is_full = false;
-        loop {
-            if self.stop.load(Ordering::Relaxed) || self.end.is_some_and(|end| Instant::now() >= end) {
-                return Ok(Ending::Detached);
-            }
-            if self.asked.swap(false, Ordering::Relaxed) {
-                self.ask(ASKED);
-            }
-            if let Some(excerpt) = self.recorder.with(|recorder| recorder.excerpt_when_due(monotonic_nanos())) {
-                self.write(excerpt)?;
-            }
-            if !is_full && self.recorder.with(|recorder| recorder.is_full()) {
-                is_full = true;
-                print_diagnostic(
-                    "blindgrasp: --keep holds 512 MiB, which is less than that time: older samples are forgotten",
-                );
-            }
-            match connection.receive_within(POLL) {
-                Ok(None) if observer.has_failed() => return Ok(Ending::Broken),
-                Ok(None) => {}
-                Ok(Some(Reply::Keep)) => self.ask(ASKED),
-                Ok(Some(Reply::Drained)) => return Ok(Ending::Graph),
-                Err(ClientError::Ended { .. }) => return Ok(Ending::Broken),
-                Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
-                Err(error) => return Err(error.into()),
-            }
+    /// Writes the file that is asked for, once it is due.
+    fn look(&mut self, is_asked: bool) -> anyhow::Result<()> {
+        if self.asked.swap(false, Ordering::Relaxed) || is_asked {
+            self.ask(ASKED);
         }
+        if let Some(excerpt) = self.recorder.with(|recorder| recorder.excerpt_when_due(monotonic_nanos())) {
+            self.write(excerpt)?;
+        }
+        if !self.is_full && self.recorder.with(|recorder| recorder.is_full()) {
+            self.is_full = true;
+            print_diagnostic(
+                "blindgrasp: --keep holds 512 MiB, which is less than that time: older samples are forgotten",
+            );
+        }
+        Ok(())
     }
 
     fn ask(&self, why: &str) {
@@ -159,37 +143,25 @@ impl Keeping<'_> {
         Ok(())
     }
 
-    fn write(&mut self, excerpt: Excerpt) -> anyhow::Result<()> {
+    fn write(&mut self, mut excerpt: Excerpt) -> anyhow::Result<()> {
         if excerpt.is_empty() {
             self.has_loss = true;
             print_diagnostic("blindgrasp: nothing is written: no frame has come yet");
             return Ok(());
         }
-        let written = match excerpt.write(self.out, &self.about) {
-            Ok(written) => written,
-            Err(error) => {
-                // The next file may be written: the disk may have room again.
-                self.has_loss = true;
-                print_diagnostic(&format!("blindgrasp: the kept samples are not written: {error}"));
-                return Ok(());
-            }
-        };
-        self.has_loss |= written.missing > 0;
+        if let Err(error) = excerpt.write(self.out, &self.info, &self.options) {
+            // The next file may be written: the disk may have room again.
+            self.has_loss = true;
+            print_diagnostic(&format!("blindgrasp: the kept samples are not written: {error}"));
+            return Ok(());
+        }
+        self.has_loss |= excerpt.missing > 0;
         let line = if self.is_json {
-            json!(written).to_string()
+            json!(excerpt).to_string()
         } else {
-            let missing = match written.missing {
-                0 => String::new(),
-                missing => format!(", {missing} samples are missing"),
-            };
-            format!(
-                "{} ({}): {:.1} s, {} grasps, {} frames{missing}",
-                written.file.display(),
-                written.why.join(", "),
-                written.secs,
-                written.grasps,
-                written.frames
-            )
+            let Excerpt { file, why, frames, grasps, secs, missing, .. } = &excerpt;
+            let missing = if *missing > 0 { format!(", {missing} samples are missing") } else { String::new() };
+            format!("{} ({}): {secs:.1} s, {grasps} grasps, {frames} frames{missing}", file.display(), why.join(", "))
         };
         Ok(print_line(&line)?)
     }
@@ -197,19 +169,21 @@ impl Keeping<'_> {
 
 /// The nodes that send frames and read none.
 fn n_sources_of_frames(graph: &Value) -> usize {
-    let nodes = list(&graph["nodes"]);
-    let frames: BTreeSet<String> = nodes.iter().flat_map(ports_of_frames).collect();
-    let senders = nodes.iter().filter(|node| !ports_of_frames(node).is_empty());
-    senders.filter(|node| !list(&node["inputs"]).iter().any(|input| frames.contains(word(&input["from"])))).count()
-}
-
-fn ports_of_frames(node: &Value) -> Vec<String> {
-    let ports = list(&node["outputs"]).iter().filter(|port| port["type"] == TactileFrame::TYPE_NAME);
-    ports.map(|port| format!("{}/{}", word(&node["id"]), word(&port["port"]))).collect()
-}
-
-fn list(value: &Value) -> &[Value] {
-    value.as_array().map_or(&[], Vec::as_slice)
+    let (mut senders, mut frames) = (Vec::new(), BTreeSet::new());
+    for node in nodes(graph) {
+        for port in node["outputs"].as_array().into_iter().flatten() {
+            if port["type"] == TactileFrame::TYPE_NAME {
+                senders.push(node);
+                frames.insert(format!("{}/{}", word(&node["id"]), word(&port["port"])));
+            }
+        }
+    }
+    senders.dedup();
+    senders.retain(|node| {
+        let mut inputs = node["inputs"].as_array().into_iter().flatten();
+        !inputs.any(|input| frames.contains(word(&input["from"])))
+    });
+    senders.len()
 }
 
 fn word(value: &Value) -> &str {

@@ -88,10 +88,7 @@ pub(super) fn record_for_caller(arguments: &Arguments) -> anyhow::Result<Outcome
 
 fn record_and_send(arguments: &Arguments, folder: &Path, name: &str) -> anyhow::Result<Outcome> {
     print_line(&serde_json::to_string(&Begun { folder: folder.to_owned() })?)?;
-    send(arguments, record(arguments, &folder.join(name))?)
-}
-
-fn send(arguments: &Arguments, mut summary: super::RecordSummary) -> anyhow::Result<Outcome> {
+    let mut summary = record(arguments, &folder.join(name))?;
     let mut files = Vec::new();
     let mut opened = Vec::new();
     for path in &mut summary.recorded.files {

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU32, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::json;
@@ -18,13 +18,12 @@ use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_graph::run::{RunSummary, observed_topics};
 use blindgrasp_messages::{LiftDecision, Recorded};
 use blindgrasp_operator::wiring::Clock;
-use blindgrasp_recording::RecordingReader;
-use blindgrasp_replay::checks::{ChangedDecision, Check, Decisions, EdgesInQuestion, describe_changes};
+use blindgrasp_recording::{LiveOptions, RecordingReader};
+use blindgrasp_replay::checks::{self, ChangedDecision, Check, Decisions, describe_changes};
 use blindgrasp_replay::comparison::{ComparedEdge, Coverage, compare_edge};
 use blindgrasp_replay::expectations::{self, Expectations};
 use blindgrasp_replay::selection::Selection;
 use blindgrasp_replay::update::update;
-use blindgrasp_session::recorder::RecordOptions;
 use blindgrasp_session::run::Session;
 
 /// The options that all recordings have in common.
@@ -134,19 +133,19 @@ impl Runner<'_> {
         fitting(&file, overrides, dataflow::Scope::Everything, OnMisfit::Warn)
     }
 
-    /// As [`Runner::replay`]; lost samples are an error.
-    pub(super) fn replay_whole(
+    /// The decisions of a replay. Lost samples are an error.
+    pub(super) fn decide(
         &self,
         recording: &Path,
         graph: &Graph,
         overrides: &[Override],
-        found: &Path,
-    ) -> anyhow::Result<Fed> {
-        let (fed, summary) = self.replay(recording, graph, overrides, found)?;
+    ) -> anyhow::Result<(Fed, Decisions)> {
+        let (shown, found) = (recording.display().to_string(), self.scratch.path(recording));
+        let (fed, summary) = self.replay(recording, graph, overrides, &found).context(shown.clone())?;
         if summary.samples_lost + summary.samples_dropped > 0 || summary.edges_unknown > 0 {
-            bail!("the replay lost samples, so its decisions say nothing: run the command again");
+            bail!("{shown}: the replay lost samples, so its decisions say nothing: run the command again");
         }
-        Ok(fed)
+        Ok((fed, Decisions::read(&found)?))
     }
 
     /// Plays a recording as fast as the graph takes it, and records every edge to `found`.
@@ -175,7 +174,7 @@ impl Runner<'_> {
             },
             clock: Clock::Recording,
             record: Some(found.to_path_buf()),
-            record_options: RecordOptions { overwrite: true, ..RecordOptions::default() },
+            record_options: LiveOptions { overwrite: true, ..LiveOptions::default() },
             is_quiet: true,
             ..Session::default()
         };
@@ -210,12 +209,6 @@ fn edges_to_compare(
 ) -> anyhow::Result<(Vec<ComparedEdge>, Vec<Check>)> {
     let (recorded, found) = (RecordingReader::open(recording)?, RecordingReader::open(found)?);
     let topics = observed_topics(graph, true);
-    let edges = EdgesInQuestion {
-        fed: &fed.edges,
-        topics_of_graph: topics.values().map(String::as_str).collect(),
-        recorded: recorded.topics(),
-        found: found.topics(),
-        is_update,
-    };
-    Ok(edges.to_compare(expected)?)
+    let topics = topics.values().map(String::as_str).collect();
+    Ok(checks::edges_to_compare(&fed.edges, &topics, recorded.topics(), found.topics(), expected, is_update)?)
 }

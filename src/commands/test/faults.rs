@@ -28,27 +28,26 @@ pub(super) fn run(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) ->
             print_diagnostic(&format!("{}: left out: it is of another hand than graph '{}'", shown, graph.name));
             continue;
         }
-        let found = runner.scratch.path(recording);
-        let fed = runner.replay_whole(recording, &graph, runner.overrides, &found).with_context(|| shown.clone())?;
+        let (fed, whole) = runner.decide(recording, &graph, runner.overrides)?;
         n_replayed += 1;
         if fed.replaced.played_port != "tactile" {
             bail!("{}: --faults are of frames, and the recording plays {}", shown, fed.topic);
         }
-        let whole = Decisions::read(&found)?;
+        let found = runner.scratch.path(recording);
         let pad_of_cell: Vec<usize> = hand.cells().map(|(pad_idx, _)| pad_idx).collect();
         let mut table = TextTable::new(["fault", "held -> lifted", "lifted -> held"], 1);
         let mut told = Vec::new();
-        for fault in InjectedFault::ALL {
+        for (fault, words) in InjectedFault::ALL {
             let faulty = runner.scratch.path(Path::new(&format!(".{}-with-fault.mcap", std::process::id())));
             write_with_fault(recording, &fed.topic, fault, &pad_of_cell, &faulty).with_context(|| shown.clone())?;
             // A doubled frame is dropped on the way, which counts as a loss.
             let replayed = runner.replay(&faulty, &graph, runner.overrides, &found);
-            replayed.with_context(|| format!("{} with a fault: {}", shown, fault.describe()))?;
+            replayed.with_context(|| format!("{shown} with a fault: {words}"))?;
             let changed = Decisions::read(&found)?.changed_since(&whole);
             let (lifted, held): (Vec<_>, Vec<_>) = changed.iter().partition(|changed| changed.is_lifted_now());
             n_lifted_now += lifted.len();
-            table.row([fault.describe().into(), lifted.len().to_string(), held.len().to_string()]);
-            told.extend(lifted.into_iter().map(|changed: &ChangedDecision| format!("{}: {changed}", fault.describe())));
+            table.row([words.into(), lifted.len().to_string(), held.len().to_string()]);
+            told.extend(lifted.into_iter().map(|changed: &ChangedDecision| format!("{words}: {changed}")));
             all.push(json!({"recording": &shown, "fault": fault, "changed_actions": changed}));
         }
         if !is_json {

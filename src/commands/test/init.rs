@@ -36,12 +36,9 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
     }
     let mut written = Vec::new();
     for recording in recordings {
-        let found = runner.scratch.path(recording);
         // The recording's own dataflow file is not known yet: all are replayed with the one of the command.
         let graph = runner.graph(&Expectations::default(), runner.overrides)?;
-        let replayed = runner.replay_whole(recording, &graph, runner.overrides, &found);
-        replayed.with_context(|| recording.display().to_string())?;
-        let decisions = Decisions::read(&found)?;
+        let (_fed, decisions) = runner.decide(recording, &graph, runner.overrides)?;
         let mut expected = decisions.to_expectations();
         expected.dataflow = other_dataflow(runner.dataflow, recording)?;
         let remarks: BTreeMap<u64, String> =

@@ -2,7 +2,6 @@
 
 use std::path::PathBuf;
 
-use anyhow::Context;
 use serde_json::json;
 
 use super::Outcome;
@@ -40,11 +39,8 @@ impl Sweep {
             let (mut tally, mut n_changed) = (Tally::default(), Some(0));
             for recording in recordings {
                 let expected = Expectations::of(recording)?.unwrap_or_default();
-                let found = runner.scratch.path(recording);
                 let graph = runner.graph(&expected, &overrides)?;
-                let replayed = runner.replay_whole(recording, &graph, &overrides, &found);
-                let fed = replayed.with_context(|| recording.display().to_string())?;
-                let decisions = Decisions::read(&found)?;
+                let (fed, decisions) = runner.decide(recording, &graph, &overrides)?;
                 tally.add(decisions.tally());
                 let before = Decisions::read(recording)?;
                 let coverage = Coverage::of(recording, &fed.topic)?;

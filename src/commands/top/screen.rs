@@ -177,11 +177,15 @@ fn link_line(link: &LinkStatus) -> Line<'static> {
 }
 
 fn column(title: &'static str, expendable: u8) -> Column {
-    Column { title, expendable, is_left: false }
+    Column { title, expendable, is_left: false, is_rare: false }
 }
 
 fn left(title: &'static str, expendable: u8) -> Column {
-    Column { title, expendable, is_left: true }
+    Column { is_left: true, ..column(title, expendable) }
+}
+
+fn rare(column: Column) -> Column {
+    Column { is_rare: true, ..column }
 }
 
 fn node_table(measured: &Measured, width: u16) -> (Line<'static>, Vec<Line<'static>>) {
@@ -194,12 +198,10 @@ fn node_table(measured: &Measured, width: u16) -> (Line<'static>, Vec<Line<'stat
         column("RESTARTS", 3),
         column("SWAPS", 7),
         column("HEARTBEAT", 6),
-        left("COUNTS", 8),
+        rare(left("COUNTS", 8)),
     ];
     let rows: Vec<Vec<Cell>> = measured.nodes.iter().map(node_row).collect();
-    let has_counts = measured.nodes.iter().any(|node| !node.counts.is_empty());
-    let n_columns = if has_counts { columns.len() } else { columns.len() - 1 };
-    table(&columns[..n_columns], &rows, width.into())
+    table(&columns, &rows, width.into())
 }
 
 fn node_row(node: &MeasuredNode) -> Vec<Cell> {
@@ -236,27 +238,11 @@ fn edge_table(measured: &Measured, width: u16) -> (Line<'static>, Vec<Line<'stat
         column("QUEUE", 6),
         column("DROP", 3),
         column("MISS", 4),
-        column("LATE", 7),
-        column("REPEATED", 9),
-        column("BLOCKED", 10),
+        rare(column("LATE", 7)),
+        rare(column("REPEATED", 9)),
+        rare(column("BLOCKED", 10)),
     ];
-    // These are rare: a column of zeros would take a name's place.
-    let kept = (0..columns.len()).filter(|&idx| match columns[idx].title {
-        "LATE" => measured.edges.iter().any(|edge| edge.late > 0),
-        "REPEATED" => measured.edges.iter().any(|edge| edge.repeated > 0),
-        "BLOCKED" => measured.edges.iter().any(|edge| edge.blocked_nanos > 0),
-        _ => true,
-    });
-    let kept: Vec<usize> = kept.collect();
-    let rows: Vec<Vec<Cell>> = measured
-        .edges
-        .iter()
-        .map(|edge| {
-            let row = edge_row(edge);
-            kept.iter().map(|&idx| row[idx].clone()).collect()
-        })
-        .collect();
-    let columns: Vec<Column> = kept.iter().map(|&idx| columns[idx]).collect();
+    let rows: Vec<Vec<Cell>> = measured.edges.iter().map(edge_row).collect();
     table(&columns, &rows, width.into())
 }
 

@@ -10,7 +10,12 @@ pub(super) struct Column {
     /// The greater, the sooner it goes when there is no room; the first column stays.
     pub(super) expendable: u8,
     pub(super) is_left: bool,
+    /// It is left out where all its cells are [`NOTHING`]: it would take a name's place.
+    pub(super) is_rare: bool,
 }
+
+/// Cells without a count or a time.
+const NOTHING: [&str; 3] = ["", "0", "0.0µs"];
 
 /// What stands in a column.
 #[derive(Debug, Clone, PartialEq)]
@@ -45,6 +50,7 @@ pub(super) fn table(columns: &[Column], rows: &[Vec<Cell>], width: usize) -> (Li
         })
         .collect();
     let mut kept: Vec<usize> = (0..columns.len()).collect();
+    kept.retain(|&idx| !columns[idx].is_rare || rows.iter().any(|row| !NOTHING.contains(&row[idx].text.as_str())));
     let needed = |kept: &[usize], first: usize| first + kept.iter().skip(1).map(|&idx| GAP + full[idx]).sum::<usize>();
     while let Some(least) = kept.iter().skip(1).copied().max_by_key(|&idx| columns[idx].expendable) {
         let is_luxury = columns[least].expendable >= LUXURY;
@@ -102,9 +108,9 @@ mod tests {
     use super::*;
 
     const COLUMNS: [Column; 3] = [
-        Column { title: "NODE", expendable: 0, is_left: true },
-        Column { title: "PID", expendable: 2, is_left: false },
-        Column { title: "STATE", expendable: 1, is_left: true },
+        Column { title: "NODE", expendable: 0, is_left: true, is_rare: false },
+        Column { title: "PID", expendable: 2, is_left: false, is_rare: false },
+        Column { title: "STATE", expendable: 1, is_left: true, is_rare: false },
     ];
 
     fn drawn(width: usize) -> Vec<String> {

@@ -152,41 +152,38 @@ fn file_picture(graph: &Graph) -> Picture {
         heartbeat_millis: Some(node.heartbeat_millis),
         running: None,
     });
-    let inputs = graph.nodes.iter().flat_map(|node| node.inputs.iter().map(move |input| (node, input)));
-    let edges = inputs.map(|(node, input)| {
-        let drawn = file_edge(
-            (&input.from_node, &input.from_port),
-            (&node.id, Some(&input.port)),
-            &input.type_name,
-            input.edge,
-        );
-        PictureEdge { feedback: input.feedback, ..drawn }
-    });
+    let mut edges = Vec::new();
+    let inputs = graph.nodes.iter().flat_map(|node| &node.inputs);
     // In the same order.
-    let edges = edges.zip(graph.edges()).map(|(drawn, edge)| {
-        let crossing = graph.crossing(&edge).map(|(from, to)| [from.to_owned(), to.to_owned()]);
-        PictureEdge { crossing, ..drawn }
-    });
-    // What the launching command always reads.
-    let outputs = graph.nodes.iter().flat_map(|node| node.outputs().iter().map(move |output| (node, output)));
-    let read = outputs.filter(|(_, output)| is_needed(&output.type_name)).map(|(node, output)| {
-        file_edge((&node.id, &output.name), (RUN, None), &output.type_name, EdgeOptions::default())
-    });
-    Picture {
-        graph: graph.name.clone(),
-        machines: graph.machines.clone(),
-        nodes: nodes.collect(),
-        edges: edges.chain(read).collect(),
+    for (input, edge) in inputs.zip(graph.edges()) {
+        let from = (edge.from_node, edge.from_port);
+        let mut drawn = file_edge(from, (edge.to_node, Some(edge.to_port)), Some(edge.type_name), input.edge);
+        drawn.feedback = input.feedback;
+        drawn.crossing = graph.crossing(&edge).map(|(from, to)| [from.to_owned(), to.to_owned()]);
+        edges.push(drawn);
     }
+    // The launching command always reads these.
+    for node in &graph.nodes {
+        for output in node.outputs().iter().filter(|output| is_needed(&output.type_name)) {
+            let (from, type_name) = ((node.id.as_str(), output.name.as_str()), Some(output.type_name.as_str()));
+            edges.push(file_edge(from, (RUN, None), type_name, EdgeOptions::default()));
+        }
+    }
+    Picture { graph: graph.name.clone(), machines: graph.machines.clone(), nodes: nodes.collect(), edges }
 }
 
-fn file_edge(from: (&str, &str), to: (&str, Option<&str>), type_name: &str, options: EdgeOptions) -> PictureEdge {
+fn file_edge(
+    from: (&str, &str),
+    to: (&str, Option<&str>),
+    type_name: Option<&str>,
+    options: EdgeOptions,
+) -> PictureEdge {
     PictureEdge {
         from_node: from.0.into(),
         from_port: from.1.into(),
         to_node: to.0.into(),
         to_port: to.1.map(String::from),
-        type_name: Some(type_name.into()),
+        type_name: type_name.map(String::from),
         policy: options.policy,
         capacity: options.capacity,
         deadline_millis: options.deadline_millis,
@@ -216,7 +213,8 @@ fn measured_picture(measured: Measured, file: Option<Picture>) -> Picture {
         PictureNode { id: node.node.clone(), running: Some(node), ..known }
     });
     let nodes = nodes.collect();
-    let edges = measured.edges.into_iter().map(|edge| {
+    let mut edges = Vec::new();
+    for edge in measured.edges {
         let (from_node, from_port) = edge.from.split_once('/').unwrap_or((&edge.from, ""));
         let (to_node, to_port) =
             edge.to.split_once('/').map_or((edge.to.as_str(), None), |(node, port)| (node, Some(port)));
@@ -224,22 +222,14 @@ fn measured_picture(measured: Measured, file: Option<Picture>) -> Picture {
             (known.from_node.as_str(), known.from_port.as_str()) == (from_node, from_port)
                 && (known.to_node.as_str(), known.to_port.as_deref()) == (to_node, to_port)
         });
-        let known = known.map(|idx| file_edges.swap_remove(idx));
-        PictureEdge {
-            from_node: from_node.into(),
-            from_port: from_port.into(),
-            to_node: to_node.into(),
-            to_port: to_port.map(String::from),
-            policy: edge.policy,
-            capacity: edge.capacity,
-            deadline_millis: known.as_ref().and_then(|known| known.deadline_millis),
-            type_name: known.as_ref().and_then(|known| known.type_name.clone()),
-            feedback: known.as_ref().is_some_and(|known| known.feedback),
-            crossing: known.and_then(|known| known.crossing),
-            running: Some(edge.clone()),
-        }
-    });
-    Picture { graph: measured.graph, machines, nodes, edges: edges.collect() }
+        let mut drawn = match known {
+            Some(idx) => file_edges.swap_remove(idx),
+            None => file_edge((from_node, from_port), (to_node, to_port), None, EdgeOptions::default()),
+        };
+        (drawn.policy, drawn.capacity, drawn.running) = (edge.policy, edge.capacity, Some(edge));
+        edges.push(drawn);
+    }
+    Picture { graph: measured.graph, machines, nodes, edges }
 }
 
 fn drawn(picture: &Picture) -> DrawnGraph {

@@ -9,11 +9,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use blindgrasp_graph::client::activity::{Look, Window, measure};
-use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_observe};
+use blindgrasp_graph::client::observer::{Observer, Sink};
 use blindgrasp_graph::client::poller::Poller;
 use blindgrasp_graph::client::words::warnings;
-use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection};
-use blindgrasp_graph::control::{Attachment, Reply, Request};
+use blindgrasp_graph::client::{Connection, Heard};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_messages::{
     Action, ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Record, Sense, TactileFrame,
@@ -105,13 +104,8 @@ pub(super) fn show(
 
 /// Feeds the page until the graph ends, which is an error, or the command is interrupted.
 fn watch(mut connection: Connection, viewer: &Viewer, shadow: Option<&Path>, stop: &AtomicBool) -> anyhow::Result<()> {
-    let attachment =
-        match connection.ask(&Request::Attach { ports: Vec::new(), is_flight_recorder: false }, ANSWER_LIMIT)? {
-            Reply::Attached(attachment) => attachment,
-            other => return Err(connection.unexpected(&other).into()),
-        };
-    let Attachment { domain, edges, graph, .. } = attachment;
-    let hand = hand_of(&graph);
+    let attachment = connection.attach(&[], false)?;
+    let hand = hand_of(&attachment.graph);
     let (mut poller, before) = Poller::connect(connection.graph())?;
     let first = graph_event(&before, None)?;
     // The decision and the hand of an earlier run are not shown any more.
@@ -123,13 +117,12 @@ fn watch(mut connection: Connection, viewer: &Viewer, shadow: Option<&Path>, sto
         (None, _) => None,
     };
     viewer.forget("shadow");
-    let streams = viewer.foxglove_address().map(|_| Streams::begin(viewer, &edges, hand.as_ref()));
-    let edges = edges.into_iter().filter(|edge| can_observe(&edge.input.service.type_name));
-    let edges = edges.map(|edge| ObservedEdge { topic: edge.topic, input: edge.input, is_prompt: false }).collect();
+    let streams = viewer.foxglove_address().map(|_| Streams::begin(viewer, &attachment.edges, hand.as_ref()));
     let latest = Arc::new(Mutex::new(Latest::default()));
     let hand_id = hand.as_ref().map(Hand::id);
     let reader = Reader { latest: Arc::clone(&latest), hand_id, streams, shadow, epochs: RandomState::new() };
-    let observer = Observer::start_attached(&domain, edges, reader).context("cannot read the graph's edges")?;
+    let observer = Observer::start_attached(&attachment.domain, attachment.observed(), reader);
+    let observer = observer.context("cannot read the graph's edges")?;
     viewer.forget("ended");
     viewer.keep("graph", &first);
     let (model, log) = (ShownModel::default(), ShownLog::open(&before.status.log_folder));
@@ -169,12 +162,10 @@ impl GraphPage<'_> {
         let mut frame_due = Instant::now();
         let mut graph_due = Instant::now() + GRAPH_PAUSE;
         while !stop.load(Ordering::Relaxed) {
-            match connection.receive_within(POLL) {
-                Ok(None) if observer.has_failed() => bail!("the graph cannot be read any more"),
-                Ok(None) => {}
-                Ok(Some(Reply::Drained)) | Err(ClientError::Ended { .. }) => return Ok(true),
-                Ok(Some(other)) => return Err(connection.unexpected(&other).into()),
-                Err(error) => return Err(error.into()),
+            match connection.hear(POLL)? {
+                Heard::Ended(_) => return Ok(true),
+                _ if observer.has_failed() => bail!("the graph cannot be read any more"),
+                _ => {}
             }
             self.show_decision();
             if Instant::now() >= frame_due {
@@ -451,11 +442,10 @@ impl Latest {
 
 /// Numbers are texts: JavaScript has no integers beyond 2^53.
 fn decision_event(decided: &Decided, truths: &BTreeMap<GraspKey, bool>) -> Value {
-    let Decided { key, decision, .. } = decided;
-    json!({
-        "epoch": key.0.to_string(), "grasp_id": decision.grasp_id.to_string(), "action": decision.action,
-        "reason": decision.reason, "probability_stable": decision.probability_stable, "truth": truths.get(key),
-    })
+    let mut event = shadow_event(&decided.decision);
+    event["epoch"] = decided.key.0.to_string().into();
+    event["truth"] = json!(truths.get(&decided.key));
+    event
 }
 
 /// The decision of the model beside.

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use prometheus_client::collector::Collector;
-use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric, MetricEncoder, NoLabelSet};
+use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric, NoLabelSet};
 use prometheus_client::metrics::MetricType;
 use prometheus_client::metrics::counter::ConstCounter;
 use prometheus_client::metrics::gauge::ConstGauge;
@@ -21,7 +21,7 @@ use crate::client;
 use crate::client::usage::{ProcessUsage, usage};
 use crate::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus};
 use blindgrasp_operator::ages::Ages;
-use blindgrasp_operator::link_status::{ChannelStatus, LinkStatus, PeerState, PeerStatus};
+use blindgrasp_operator::link_status::{ChannelStatus, LinkStatus, PeerState};
 
 /// A client must send its request, and then read the answer, within this time each.
 const CLIENT_LIMIT: Duration = Duration::from_millis(500);
@@ -145,10 +145,6 @@ fn head_of_request(mut client: &TcpStream) -> String {
     String::from_utf8_lossy(&head).into_owned()
 }
 
-fn machine_labels<'a>(graph: &'a str, peer: &'a PeerStatus) -> Labels<'a> {
-    vec![("graph", graph), ("machine", peer.machine.as_str())]
-}
-
 #[derive(Debug)]
 struct Figures {
     status: GraphStatus,
@@ -162,28 +158,22 @@ type ChannelCount = fn(&ChannelStatus) -> u64;
 
 impl Collector for Figures {
     fn encode(&self, mut encoder: DescriptorEncoder) -> fmt::Result {
-        let graph = self.status.graph.as_str();
-        let state = self.status.state;
-        gauge(&mut encoder, "up", "1 if the graph runs and no operator was given up", None, |figure| {
-            figure(vec![("graph", graph)], f64::from(u8::from(state == GraphState::Running)))
-        })?;
-        gauge(&mut encoder, "uptime", "How long the graph has been running", Some(Unit::Seconds), |figure| {
-            figure(vec![("graph", graph)], self.status.uptime_secs)
-        })?;
-        self.nodes(&mut encoder)?;
-        self.edges(&mut encoder)?;
+        let encoder = &mut encoder;
+        let (of_graph, decisions) = (("graph", self.status.graph.as_str()), &self.status.decisions);
+        let is_up = flag(self.status.state == GraphState::Running);
+        gauge(encoder, "up", "1 if the graph runs and no operator was given up", None, [(vec![of_graph], is_up)])?;
+        let uptime = [(vec![of_graph], self.status.uptime_secs)];
+        gauge(encoder, "uptime", "How long the graph has been running", Some(Unit::Seconds), uptime)?;
+        self.nodes(encoder)?;
+        self.edges(encoder)?;
         if let Some(link) = &self.status.link {
-            self.link(link, &mut encoder)?;
+            self.link(link, encoder)?;
         }
-        let decisions = &self.status.decisions;
-        counter(&mut encoder, "decisions", "Grasps decided", |figure| {
-            figure(vec![("graph", graph), ("action", "lift")], decisions.n_lift)?;
-            figure(vec![("graph", graph), ("action", "hold")], decisions.n_hold)
-        })?;
+        let decided = [("lift", decisions.n_lift), ("hold", decisions.n_hold)];
+        let decided = decided.map(|(action, n)| (vec![of_graph, ("action", action)], n));
+        counter(encoder, "decisions", "Grasps decided", decided)?;
         let help = "Grasps lifted that were unstable, where the source knows the truth";
-        counter(&mut encoder, "false_positives", help, |figure| {
-            figure(vec![("graph", graph)], decisions.n_false_positives)
-        })
+        counter(encoder, "false_positives", help, [(vec![of_graph], decisions.n_false_positives)])
     }
 }
 
@@ -191,75 +181,59 @@ impl Figures {
     fn nodes(&self, encoder: &mut DescriptorEncoder) -> fmt::Result {
         let nodes = || self.status.nodes.iter().map(|node| (self.node_labels(node), node));
         let used = || nodes().zip(&self.usages).filter_map(|((labels, _), usage)| Some((labels, (*usage)?)));
-        gauge(encoder, "node_up", "1 if the node answers samples, or has done its work", None, |figure| {
-            nodes().try_for_each(|(labels, node)| {
-                let is_up = matches!(node.state, NodeState::Running | NodeState::Done);
-                figure(labels, f64::from(u8::from(is_up)))
-            })
-        })?;
-        counter(encoder, "node_restarts", "Times that the node was started again after a failure", |figure| {
-            nodes().try_for_each(|(labels, node)| figure(labels, node.n_restarts.into()))
-        })?;
-        counter(encoder, "node_swaps", "Times that the node was swapped", |figure| {
-            nodes().try_for_each(|(labels, node)| figure(labels, node.n_swaps.into()))
-        })?;
-        gauge(encoder, "node_heartbeat_age", "Since the last heartbeat", Some(Unit::Seconds), |figure| {
-            nodes().try_for_each(|(labels, node)| match node.heartbeat_age_millis {
-                Some(millis) => figure(labels, millis as f64 / 1e3),
-                None => Ok(()),
-            })
-        })?;
+        let up =
+            nodes().map(|(labels, node)| (labels, flag(matches!(node.state, NodeState::Running | NodeState::Done))));
+        gauge(encoder, "node_up", "1 if the node answers samples, or has done its work", None, up)?;
+        let restarts = nodes().map(|(labels, node)| (labels, node.n_restarts.into()));
+        counter(encoder, "node_restarts", "Times that the node was started again after a failure", restarts)?;
+        let swaps = nodes().map(|(labels, node)| (labels, node.n_swaps.into()));
+        counter(encoder, "node_swaps", "Times that the node was swapped", swaps)?;
+        let ages = nodes().filter_map(|(labels, node)| Some((labels, node.heartbeat_age_millis? as f64 / 1e3)));
+        gauge(encoder, "node_heartbeat_age", "Since the last heartbeat", Some(Unit::Seconds), ages)?;
         // It begins at 0 with each process, as Prometheus expects of a counter.
         let help = "Processor time of the node's active process";
         let mut metric = encoder.encode_descriptor("node_cpu", help, Some(&Unit::Seconds), MetricType::Counter)?;
-        used()
-            .try_for_each(|(labels, usage)| ConstCounter::new(usage.cpu_secs).encode(metric.encode_family(&labels)?))?;
+        for (labels, usage) in used() {
+            ConstCounter::new(usage.cpu_secs).encode(metric.encode_family(&labels)?)?;
+        }
         let help = "Memory of the node's active process, shared memory included";
-        gauge(encoder, "node_resident_memory", help, Some(Unit::Bytes), |figure| {
-            used().try_for_each(|(labels, usage)| figure(labels, usage.resident_bytes as f64))
-        })?;
-        counter(encoder, "node_events", "Other counts of the node, by kind", |figure| {
-            nodes().try_for_each(|(labels, node)| {
-                node.counts.iter().try_for_each(|(kind, count)| {
-                    figure(labels.iter().copied().chain([("kind", kind.as_str())]).collect(), *count)
-                })
-            })
-        })
+        let memory = used().map(|(labels, usage)| (labels, usage.resident_bytes as f64));
+        gauge(encoder, "node_resident_memory", help, Some(Unit::Bytes), memory)?;
+        let mut events = Vec::new();
+        for (labels, node) in nodes() {
+            for (kind, count) in &node.counts {
+                events.push(([&labels[..], &[("kind", kind.as_str())]].concat(), *count));
+            }
+        }
+        counter(encoder, "node_events", "Other counts of the node, by kind", events)
     }
 
     fn link(&self, link: &LinkStatus, encoder: &mut DescriptorEncoder) -> fmt::Result {
-        let graph = self.status.graph.as_str();
-        gauge(encoder, "machine_up", "1 if the other machine is linked", None, |figure| {
-            link.peers.iter().try_for_each(|peer| {
-                figure(machine_labels(graph, peer), f64::from(u8::from(peer.state == PeerState::Up)))
-            })
-        })?;
-        gauge(encoder, "machine_round_trip", "To the other machine and back, median", Some(Unit::Seconds), |figure| {
-            link.peers.iter().try_for_each(|peer| match peer.round_trip_nanos {
-                Some(nanos) => figure(machine_labels(graph, peer), nanos as f64 / 1e9),
-                None => Ok(()),
-            })
-        })?;
-        let channels = || link.peers.iter().flat_map(|peer| peer.channels.iter().map(move |channel| (peer, channel)));
+        let of_graph = ("graph", self.status.graph.as_str());
+        let peers = || link.peers.iter().map(|peer| (vec![of_graph, ("machine", peer.machine.as_str())], peer));
+        let up = peers().map(|(labels, peer)| (labels, flag(peer.state == PeerState::Up)));
+        gauge(encoder, "machine_up", "1 if the other machine is linked", None, up)?;
+        let round_trips = peers().filter_map(|(labels, peer)| Some((labels, peer.round_trip_nanos? as f64 / 1e9)));
+        let help = "To the other machine and back, median";
+        gauge(encoder, "machine_round_trip", help, Some(Unit::Seconds), round_trips)?;
         let counts: [(&str, &str, ChannelCount); 3] = [
             ("channel_samples", "Samples that went to or came from the other machine, each once", |c| c.n_samples),
             ("channel_repeated", "Samples that went or came again", |c| c.n_repeated),
             ("channel_lost", "Samples given up for the other machine", |c| c.n_lost),
         ];
         for (name, help, count) in counts {
-            counter(encoder, name, help, |figure| {
-                channels().try_for_each(|(peer, channel)| {
+            let mut channels = Vec::new();
+            for (labels, peer) in peers() {
+                for channel in &peer.channels {
                     let direction = if channel.is_sent { "to" } else { "from" };
                     let of_channel = [("port", channel.port.as_str()), ("direction", direction)];
-                    figure(machine_labels(graph, peer).into_iter().chain(of_channel).collect(), count(channel))
-                })
-            })?;
+                    channels.push(([&labels[..], &of_channel].concat(), count(channel)));
+                }
+            }
+            counter(encoder, name, help, channels)?;
         }
-        counter(encoder, "link_rejected", "Messages of other machines dropped unread, by why", |figure| {
-            link.rejected
-                .iter()
-                .try_for_each(|(why, count)| figure(vec![("graph", graph), ("why", why.as_str())], *count))
-        })
+        let rejected = link.rejected.iter().map(|(why, count)| (vec![of_graph, ("why", why.as_str())], *count));
+        counter(encoder, "link_rejected", "Messages of other machines dropped unread, by why", rejected)
     }
 
     fn edges(&self, encoder: &mut DescriptorEncoder) -> fmt::Result {
@@ -274,20 +248,20 @@ impl Figures {
             ("edge_blocked_nanoseconds", "How long the writer has waited for its readers", |edge| edge.blocked_nanos),
         ];
         for (name, help, count) in counts {
-            counter(encoder, name, help, |figure| edges().try_for_each(|(labels, edge)| figure(labels, count(edge))))?;
+            counter(encoder, name, help, edges().map(|(labels, edge)| (labels, count(edge))))?;
         }
         // Not a counter: while samples are on their way it is not known.
         let help = "Samples dropped for newer ones on a latest edge, lost on a lossless one";
-        gauge(encoder, "edge_dropped", help, None, |figure| {
-            edges().try_for_each(|(labels, edge)| figure(labels, edge.dropped as f64))
-        })?;
+        let dropped = edges().map(|(labels, edge)| (labels, edge.dropped as f64));
+        gauge(encoder, "edge_dropped", help, None, dropped)?;
         let help = "Age of samples on arrival since their source published them";
         let mut metric = encoder.encode_descriptor("edge_age", help, Some(&Unit::Seconds), MetricType::Histogram)?;
-        edges().try_for_each(|(labels, edge)| {
+        for (labels, edge) in edges() {
             let (sum_secs, buckets) = age_buckets(&edge.ages);
             let mut metric = metric.encode_family(&labels)?;
-            metric.encode_histogram::<NoLabelSet>(sum_secs, edge.ages.n_samples(), &buckets, None)
-        })
+            metric.encode_histogram::<NoLabelSet>(sum_secs, edge.ages.n_samples(), &buckets, None)?;
+        }
+        Ok(())
     }
 
     fn node_labels<'a>(&'a self, node: &'a NodeStatus) -> Labels<'a> {
@@ -320,10 +294,13 @@ fn counter<'a>(
     encoder: &mut DescriptorEncoder,
     name: &str,
     help: &str,
-    figures: impl FnOnce(&mut dyn FnMut(Labels<'a>, u64) -> fmt::Result) -> fmt::Result,
+    figures: impl IntoIterator<Item = (Labels<'a>, u64)>,
 ) -> fmt::Result {
     let mut metric = encoder.encode_descriptor(name, help, None, MetricType::Counter)?;
-    figures(&mut |labels, count| ConstCounter::new(count).encode(family(&mut metric, &labels)?))
+    for (labels, count) in figures {
+        ConstCounter::new(count).encode(metric.encode_family(&labels)?)?;
+    }
+    Ok(())
 }
 
 fn gauge<'a>(
@@ -331,14 +308,18 @@ fn gauge<'a>(
     name: &str,
     help: &str,
     unit: Option<Unit>,
-    figures: impl FnOnce(&mut dyn FnMut(Labels<'a>, f64) -> fmt::Result) -> fmt::Result,
+    figures: impl IntoIterator<Item = (Labels<'a>, f64)>,
 ) -> fmt::Result {
     let mut metric = encoder.encode_descriptor(name, help, unit.as_ref(), MetricType::Gauge)?;
-    figures(&mut |labels, value| ConstGauge::new(value).encode(family(&mut metric, &labels)?))
+    for (labels, value) in figures {
+        ConstGauge::new(value).encode(metric.encode_family(&labels)?)?;
+    }
+    Ok(())
 }
 
-fn family<'s>(metric: &'s mut MetricEncoder<'_>, labels: &'s Labels<'_>) -> Result<MetricEncoder<'s>, fmt::Error> {
-    metric.encode_family(labels)
+/// 1 stands for yes.
+fn flag(is_so: bool) -> f64 {
+    f64::from(u8::from(is_so))
 }
 
 #[cfg(test)]

@@ -14,7 +14,9 @@ use std::time::{Duration, Instant};
 
 use rustix::io::Errno;
 
-use crate::control::{GraphStatus, Reply, Request};
+use self::observer::{ObservedEdge, can_observe};
+use crate::control::{Attachment, GraphStatus, Reply, Request};
+use crate::recorded_graph::Ending;
 use blindgrasp_operator::control_socket;
 use blindgrasp_operator::peer::peer_of;
 use blindgrasp_operator::text::is_name;
@@ -81,6 +83,26 @@ pub struct Connection {
     received: Vec<u8>,
     /// So many of the received bytes hold no end of a line.
     n_searched: usize,
+}
+
+/// The news of a graph for an attached client.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Heard {
+    Nothing,
+    /// Somebody asks the flight recorders for a file.
+    Keep,
+    /// The graph has ended: whole, or [`Ending::Broken`].
+    Ended(Ending),
+}
+
+impl Attachment {
+    /// The edges of known types, for an observer that they do not wake.
+    pub fn observed(&self) -> Vec<ObservedEdge> {
+        let known = self.edges.iter().filter(|edge| can_observe(&edge.input.service.type_name));
+        let observed =
+            known.map(|edge| ObservedEdge { topic: edge.topic.clone(), input: edge.input.clone(), is_prompt: false });
+        observed.collect()
+    }
 }
 
 /// This user's running graphs, by name, whether or not they answer.
@@ -243,6 +265,32 @@ impl Connection {
     pub fn ask(&mut self, request: &Request, limit: Duration) -> Result<Reply, ClientError> {
         self.send(request)?;
         self.receive(limit, &|| false)
+    }
+
+    /// Attaches to these outputs, or to all if none is named.
+    ///
+    /// # Errors
+    /// See [`receive`](Self::receive).
+    pub fn attach(&mut self, ports: &[String], is_flight_recorder: bool) -> Result<Attachment, ClientError> {
+        match self.ask(&Request::Attach { ports: ports.to_vec(), is_flight_recorder }, ANSWER_LIMIT)? {
+            Reply::Attached(attachment) => Ok(attachment),
+            other => Err(self.unexpected(&other)),
+        }
+    }
+
+    /// The next news for an attached client, if it comes within `limit`.
+    ///
+    /// # Errors
+    /// The connection failed, or the answer is no news.
+    pub fn hear(&mut self, limit: Duration) -> Result<Heard, ClientError> {
+        match self.receive_within(limit) {
+            Ok(None) => Ok(Heard::Nothing),
+            Ok(Some(Reply::Keep)) => Ok(Heard::Keep),
+            Ok(Some(Reply::Drained)) => Ok(Heard::Ended(Ending::Graph)),
+            Ok(Some(other)) => Err(self.unexpected(&other)),
+            Err(ClientError::Ended { .. }) => Ok(Heard::Ended(Ending::Broken)),
+            Err(error) => Err(error),
+        }
     }
 
     /// Waits until the graph has ended: its name is free, or another launcher has it.

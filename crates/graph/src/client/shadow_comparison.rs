@@ -263,22 +263,22 @@ impl PromotionLimits {
 
     /// The limits that a report does not keep, in words.
     fn broken_by(&self, report: &ComparisonReport) -> Vec<String> {
-        let mut broken = Vec::new();
-        let mut check =
-            |name: &str, found: Option<f64>, bound: &str, limit: Option<f64>, is_kept: fn(f64, f64) -> bool| {
-                let Some(limit) = limit else { return };
-                match found {
-                    Some(found) if is_kept(found, limit) => {}
-                    Some(found) => broken.push(format!("{name} is {found}, expected {bound} {limit}")),
-                    None => broken.push(format!("{name} is unknown, expected {bound} {limit}")),
-                }
-            };
-        let at_most = |found: f64, limit: f64| found <= limit;
-        check("agreement", report.agreement, "at least", self.min_agreement, |found, limit| found >= limit);
         let n_disagreements = Some(report.disagreements.len() as f64);
-        check("disagreements", n_disagreements, "at most", self.max_disagreements.map(|n| n as f64), at_most);
         let latency = report.shadow_latency.map(|latency| latency.p99_micros);
-        check("latency_p99_us", latency, "at most", self.max_latency_p99_micros, at_most);
+        let checks = [
+            ("agreement", report.agreement, "at least", self.min_agreement),
+            ("disagreements", n_disagreements, "at most", self.max_disagreements.map(|n| n as f64)),
+            ("latency_p99_us", latency, "at most", self.max_latency_p99_micros),
+        ];
+        let mut broken = Vec::new();
+        for (name, found, bound, limit) in checks {
+            let Some(limit) = limit else { continue };
+            let is_kept = |found: f64| if bound == "at least" { found >= limit } else { found <= limit };
+            if !found.is_some_and(is_kept) {
+                let found = found.map_or("unknown".into(), |found| found.to_string());
+                broken.push(format!("{name} is {found}, expected {bound} {limit}"));
+            }
+        }
         broken
     }
 }

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::path::Path;
 
 use super::ExportError;
-use super::value::{Row, Value, row, type_name};
+use super::value::{Row, Value, row};
 use crate::RecordingReader;
 
 /// The columns of a topic's table.
@@ -43,7 +43,7 @@ pub fn table_shapes(path: &Path, wanted: &[String]) -> Result<BTreeMap<String, T
             found.entry(topic).or_default();
             continue;
         }
-        let (type_name, row) = (type_name(&record), row(&record)?);
+        let (type_name, row) = (record.type_name(), row(&record)?);
         match found.entry(topic.clone()).or_default() {
             Some(shape) if shape.type_name != type_name => {
                 let (path, first) = (path.into(), shape.type_name);

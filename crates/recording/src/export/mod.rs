@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use crate::RecordingError;
 
 pub use csv_table::{CsvTable, TableShape, table_shapes};
-pub use value::{Row, Value, ValueError, leaves, row, type_name};
+pub use value::{Row, Value, ValueError, leaves, row};
 
 /// Why a recording could not become tables.
 #[derive(Debug, thiserror::Error)]

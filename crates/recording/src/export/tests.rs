@@ -61,7 +61,7 @@ fn every_type_has_its_fields_as_columns() {
     for (_, record) in records() {
         let found = row(&record).expect("a row");
         let names: Vec<_> = found.iter().map(|(name, _)| *name).collect();
-        assert_eq!(names[..4], ["seq", "stamp_nanos", "epoch", "hand_id"], "{}", type_name(&record));
+        assert_eq!(names[..4], ["seq", "stamp_nanos", "epoch", "hand_id"], "{}", record.type_name());
         assert_eq!(names.iter().collect::<BTreeSet<_>>().len(), names.len(), "{names:?}");
         // JSON has the same fields.
         let json = record.to_json().expect("JSON");

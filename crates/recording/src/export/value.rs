@@ -6,7 +6,7 @@ use serde::ser::{Impossible, SerializeSeq, SerializeStruct, SerializeTuple};
 use serde::{Serialize, Serializer};
 
 use crate::Record;
-use blindgrasp_messages::{Recorded, Stamped};
+use blindgrasp_messages::with_sample;
 
 /// A value in a message. As JSON it is what the message is as JSON, in the message's order.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -53,21 +53,6 @@ impl fmt::Display for Value {
     }
 }
 
-macro_rules! of_any_type {
-    ($record:expr, $function:ident) => {
-        match $record {
-            Record::Tactile(sample) => $function(sample),
-            Record::Contacts(sample) => $function(sample),
-            Record::Feature(sample) => $function(sample),
-            Record::Prediction(sample) => $function(sample),
-            Record::Decision(sample) => $function(sample),
-            Record::Truth(sample) => $function(sample),
-            Record::Outcome(sample) => $function(sample),
-            Record::Scene(sample) => $function(sample),
-        }
-    };
-}
-
 /// A sample as a row of a table: the header's fields, then the message's.
 ///
 /// # Errors
@@ -105,22 +90,11 @@ pub fn leaves(record: &Record) -> Result<Vec<(String, Value)>, ValueError> {
     Ok(found)
 }
 
-/// The type of a sample's message, [`Recorded::TYPE_NAME`].
-pub fn type_name(record: &Record) -> &'static str {
-    fn name<M: Recorded>(_: &Stamped<M>) -> &'static str {
-        M::TYPE_NAME
-    }
-    of_any_type!(record, name)
-}
-
 fn message_fields(record: &Record) -> Result<Row, ValueError> {
-    fn fields<M: Recorded>(sample: &Stamped<M>) -> Result<Row, ValueError> {
-        match sample.message.serialize(ToValue)? {
-            Value::Struct(fields) => Ok(fields),
-            other => Err(ValueError(format!("no fields, but {other}"))),
-        }
+    match with_sample!(record, sample => sample.message.serialize(ToValue))? {
+        Value::Struct(fields) => Ok(fields),
+        other => Err(ValueError(format!("no fields, but {other}"))),
     }
-    of_any_type!(record, fields)
 }
 
 fn as_map<S: Serializer>(fields: &Row, serializer: S) -> Result<S::Ok, S::Error> {
@@ -222,32 +196,24 @@ impl Serializer for ToValue {
     }
 }
 
-impl SerializeSeq for Items {
-    type Ok = Value;
-    type Error = ValueError;
+macro_rules! as_items {
+    ($($trait:ident)+) => {$(
+        impl $trait for Items {
+            type Ok = Value;
+            type Error = ValueError;
 
-    fn serialize_element<T: Serialize + ?Sized>(&mut self, item: &T) -> Result<(), ValueError> {
-        self.0.push(item.serialize(ToValue)?);
-        Ok(())
-    }
+            fn serialize_element<T: Serialize + ?Sized>(&mut self, item: &T) -> Result<(), ValueError> {
+                self.0.push(item.serialize(ToValue)?);
+                Ok(())
+            }
 
-    fn end(self) -> Result<Value, ValueError> {
-        Ok(Value::List(self.0))
-    }
+            fn end(self) -> Result<Value, ValueError> {
+                Ok(Value::List(self.0))
+            }
+        }
+    )+};
 }
-
-impl SerializeTuple for Items {
-    type Ok = Value;
-    type Error = ValueError;
-
-    fn serialize_element<T: Serialize + ?Sized>(&mut self, item: &T) -> Result<(), ValueError> {
-        SerializeSeq::serialize_element(self, item)
-    }
-
-    fn end(self) -> Result<Value, ValueError> {
-        SerializeSeq::end(self)
-    }
-}
+as_items!(SerializeSeq SerializeTuple);
 
 impl SerializeStruct for Fields {
     type Ok = Value;

@@ -21,7 +21,7 @@ use blindgrasp_learning::trials::late_decisions::LateDecisions;
 use blindgrasp_learning::trials::page::{Made, Strip, strip, telling_records, trials_page};
 use blindgrasp_learning::trials::tables::{Table, TrialsReport, tables};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_session::recorder::RecordOptions;
+use blindgrasp_recording::LiveOptions;
 use blindgrasp_session::run::Session;
 use blindgrasp_simulator::trial::targets::{check_approaches, targets_and_warnings};
 use blindgrasp_simulator::trial::{LiftTarget, PhysicsEngine, TrialOptions};
@@ -236,7 +236,7 @@ fn run_way(
     let session = Session {
         launch: LaunchOptions { startup_limit: Duration::from_secs(60), ..LaunchOptions::default() },
         record: arguments.record.clone(),
-        record_options: RecordOptions { overwrite: arguments.overwrite, ..RecordOptions::default() },
+        record_options: LiveOptions { overwrite: arguments.overwrite, ..LiveOptions::default() },
         is_quiet: true,
         tap: Some(watch.tap()),
         ..Session::default()
