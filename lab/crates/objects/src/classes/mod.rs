@@ -11,7 +11,6 @@ mod tableware;
 mod tools;
 
 use nalgebra::Point3;
-use parry3d_f64::shape::SharedShape;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -21,18 +20,10 @@ use crate::solid::{Assembly, Solid};
 
 pub(super) use tableware::loop_handle;
 
-/// The object that a class makes.
-pub(super) enum Made {
-    /// A surface put together from parts.
-    Assembled(Assembly),
-    /// One of parry's shapes.
-    Exact { shape: SharedShape, density_kg_per_m3: f64 },
-}
-
 /// A class.
 pub(super) struct Class {
     pub(super) name: &'static str,
-    pub(super) make: fn(&mut Draw) -> Made,
+    pub(super) make: fn(&mut Draw, &mut Assembly),
 }
 
 /// All classes, in the catalogue's order.
