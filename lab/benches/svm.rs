@@ -9,7 +9,6 @@ use std::path::Path;
 use std::time::Instant;
 
 use blindgrasp_grasps::dataset::{hand_of, read_grasps};
-use blindgrasp_learning::learners::libsvm_format::write_libsvm;
 use blindgrasp_learning::learners::svm::train_svm;
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::svm::{PreparedSvm, RbfSvm, SvmParams};
@@ -103,7 +102,7 @@ fn time_training(problem: &str, params: &SvmParams, out: &str) -> Result<(), Fai
     let start = Instant::now();
     let (svm, report) = train_svm(&problem.features, problem.n_features, &problem.labels, params)?;
     let secs = start.elapsed().as_secs_f64();
-    std::fs::write(out, write_libsvm(&svm, None))?;
+    std::fs::write(out, write_libsvm(&svm))?;
     std::fs::write(Path::new(out).with_extension("json"), serde_json::to_string(&svm)?)?;
     println!(
         "{}",
@@ -133,4 +132,35 @@ fn time_prediction(model: &str, problem: &str) -> Result<(), Failure> {
     let secs = start.elapsed().as_secs_f64() / samples.len() as f64;
     println!("{}", json!({ "secs": secs, "n_support_vectors": svm.n_support_vectors(), "decision_values": values }));
     Ok(())
+}
+
+/// Writes a machine as LIBSVM's model file. Labels are 1 (stable) and -1; the support vectors of
+/// label 1 come first, as LIBSVM wants, each class in the order of `svm`.
+fn write_libsvm(svm: &RbfSvm) -> String {
+    let support = || svm.dual_coefficients.iter().zip(svm.support_vectors.chunks_exact(svm.n_features.max(1)));
+    let n_stable = svm.dual_coefficients.iter().filter(|coefficient| **coefficient > 0.0).count();
+    let n_unstable = svm.n_support_vectors() - n_stable;
+    let mut text = format!(
+        "svm_type c_svc\nkernel_type rbf\ngamma {}\nnr_class 2\ntotal_sv {}\nrho {}\nlabel 1 -1\n",
+        number(svm.gamma),
+        svm.n_support_vectors(),
+        number(svm.rho)
+    );
+    text += &format!("nr_sv {n_stable} {n_unstable}\nSV\n");
+    for of_stable in [true, false] {
+        for (coefficient, vector) in support().filter(|(coefficient, _)| (**coefficient > 0.0) == of_stable) {
+            text += &number(*coefficient);
+            for (idx, value) in vector.iter().enumerate().filter(|(_, value)| **value != 0.0) {
+                // Writing to a String cannot fail.
+                let _ = write!(text, " {}:{}", idx + 1, number(*value));
+            }
+            text += " \n";
+        }
+    }
+    text
+}
+
+/// The shortest decimals that are read back as the same number, with an exponent where plain digits would be many.
+fn number(value: f64) -> String {
+    format!("{value:?}")
 }

@@ -13,7 +13,7 @@ use serde::Serialize;
 
 use super::object_list::list;
 use super::trials::physics;
-use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text};
+use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text, word};
 use blindgrasp_grasps::dataset::REPORT_METADATA;
 use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::read_regular;
@@ -68,7 +68,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "EPSILON,VOLUME", value_parser = thresholds)]
     thresholds: Option<Thresholds>,
     /// Approach of the palm: blind, from anywhere; planned, by a planner that knows the object [default: blind].
-    #[arg(long, value_parser = approach)]
+    #[arg(long, value_parser = |text: &str| word::<Approach>(text, "blind or planned"))]
     protocol: Option<Approach>,
     /// Share of stable grasps to keep (0 to 1), or natural to keep the natural share [default: 0.48, the paper's].
     #[arg(long, value_parser = stable_fraction)]
@@ -406,14 +406,6 @@ impl<'a> AllOptions<'a> {
             thresholds: options.thresholds.is_default().then_some(options.thresholds),
             options,
         }
-    }
-}
-
-fn approach(text: &str) -> Result<Approach, String> {
-    match text {
-        "blind" => Ok(Approach::Blind),
-        "planned" => Ok(Approach::Planned),
-        _ => Err("expected blind or planned".into()),
     }
 }
 

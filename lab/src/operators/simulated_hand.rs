@@ -16,6 +16,7 @@ use anyhow::{Context, bail};
 use blindgrasp_messages::{
     Action, GraspTruth, Header, LiftDecision, LiftOutcome, MAX_NAME_BYTES, Message, Recorded, TactileFrame,
 };
+use blindgrasp_objects::Object;
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, TICK, parse_params};
@@ -131,8 +132,9 @@ fn setup(params: &Params) -> anyhow::Result<TrialParts> {
     }
     for thing in &mut things {
         thing.friction = params.friction.unwrap_or(thing.friction);
-        let names = LiftOutcome { thing: thing.name.clone(), group: thing.group.clone(), ..LiftOutcome::default() };
-        names.check().with_context(|| format!("things: '{}'", thing.name))?;
+        let Object { name, class, .. } = &thing.object;
+        let names = LiftOutcome { thing: name.clone(), group: class.clone(), ..LiftOutcome::default() };
+        names.check().with_context(|| format!("things: '{name}'"))?;
     }
     let mut trial_options =
         params.options.as_deref().map_or_else(|| Ok(TrialOptions::default()), TrialOptions::load)?;

@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use self::setup::Setup;
 use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
-use super::{Outcome, check_page, completions, print_line, print_text, stop_requests, write_report};
+use super::{Outcome, check_page, completions, print_line, print_text, stop_requests, word, write_report};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_learning::trials::late_decisions::LateDecisions;
@@ -107,11 +107,7 @@ enum LiftPolicy {
 }
 
 pub(super) fn physics(text: &str) -> Result<PhysicsEngine, String> {
-    match text {
-        "rapier" => Ok(PhysicsEngine::Rapier),
-        "mujoco" => Ok(PhysicsEngine::Mujoco),
-        _ => Err("expected rapier or mujoco".into()),
-    }
+    word(text, "rapier or mujoco")
 }
 
 /// One way to make the trials.
@@ -268,7 +264,7 @@ fn strips(setup: &Setup, targets: &[LiftTarget], report: &TrialsReport, n_stops:
             if n_stops.load(Ordering::Relaxed) > 0 {
                 return Ok(None);
             }
-            let target = targets.iter().find(|target| target.name == record.thing).context("no such object")?;
+            let target = targets.iter().find(|target| target.object.name == record.thing).context("no such object")?;
             let made = Made { options: &report.options, prior: setup.prior.as_ref(), probe: setup.probe };
             Ok(Some(strip(&setup.hand, target, made, report.seed, record)?))
         })

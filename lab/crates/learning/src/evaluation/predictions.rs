@@ -345,7 +345,7 @@ impl PredictionColumns {
         let grasp_id = whole_number("grasp_id", self.grasp_id)?;
         let place = match self.recording {
             Some(idx) => grasps.of_recording(&record[idx], grasp_id)?,
-            None => grasps.of_any_recording(grasp_id)?,
+            None => grasps.of_only_recording(grasp_id)?,
         };
         let probability = &record[self.probability_stable];
         // NaN is in no range.
@@ -413,19 +413,14 @@ impl KnownGrasps<'_> {
         }
     }
 
-    /// A grasp of the only recording that has one with this number.
-    fn of_any_recording(&self, grasp_id: u64) -> Result<GraspInRecording, String> {
-        let has_it = |idx: &usize| self.grasps.contains(&(*idx, grasp_id));
-        let having: Vec<usize> = (0..self.recordings.len()).filter(has_it).collect();
-        match having[..] {
-            [idx] => Ok((idx, grasp_id)),
-            [] if self.recordings.len() == 1 => Err(self.no_such_grasp(0, grasp_id)),
-            [] => Err(format!("none of the {} recordings has a grasp {grasp_id}", self.recordings.len())),
-            [first, second, ..] => Err(format!(
-                "grasp {grasp_id} is in {} and in {}: expected a column 'recording'",
-                self.name(first),
-                self.name(second)
-            )),
+    /// A grasp of the only recording.
+    fn of_only_recording(&self, grasp_id: u64) -> Result<GraspInRecording, String> {
+        match self.recordings {
+            [_] if self.grasps.contains(&(0, grasp_id)) => Ok((0, grasp_id)),
+            [_] => Err(self.no_such_grasp(0, grasp_id)),
+            several => {
+                Err(format!("grasp {grasp_id} of one of {} recordings: expected a column 'recording'", several.len()))
+            }
         }
     }
 }
@@ -537,12 +532,11 @@ mod tests {
             ),
             (
                 "grasp_id,probability_stable\n0,0.5\n2,0.5\n".into(),
-                "line 3: grasp 2 is in a.mcap and in b.mcap: expected a column",
+                "line 2: grasp 0 of one of 2 recordings: expected a column 'recording'",
             ),
-            ("grasp_id,probability_stable\n9,0.5\n".into(), "line 2: none of the 2 recordings has a grasp 9"),
             ("model,grasp_id,probability_stable\na/b,0,0.5\n".into(), "line 2: column 'model': expected a name"),
             (
-                "fold,grasp_id,probability_stable\nx,0,0.5\n".into(),
+                "fold,recording,grasp_id,probability_stable\nx,a.mcap,0,0.5\n".into(),
                 "line 2: column 'fold': expected a whole number, found 'x'",
             ),
         ] {
@@ -551,8 +545,8 @@ mod tests {
         }
         let error = read_table(b"grasp_id,probability_stable\n\xff,0.5\n").expect_err("no UTF-8");
         assert!(error.contains("line 2: field 1: expected UTF-8"), "{error}");
-        let many: String = (0..17).map(|idx| format!("m{idx},0,0.5\n")).collect();
-        let error = read_table(format!("model,grasp_id,probability_stable\n{many}")).expect_err("too many");
+        let many: String = (0..17).map(|idx| format!("m{idx},a.mcap,0,0.5\n")).collect();
+        let error = read_table(format!("model,recording,grasp_id,probability_stable\n{many}")).expect_err("too many");
         assert!(error.contains("line 18") && error.contains("at most 16 models"), "{error}");
     }
 

@@ -10,7 +10,7 @@ use std::path::PathBuf;
 
 use nalgebra::{DMatrix, DVector};
 
-use super::{Example, Examples, Relabelling, TrainingError, composed, file_name, folds_by_object};
+use super::{Example, Examples, TrainingError, composed, file_name, folds_by_object};
 use crate::learners::decision_values;
 use crate::learners::training_range::learn_training_range;
 use crate::promise::{ObjectTrials, promise};
@@ -44,7 +44,7 @@ const FEWEST_FOR_LIMITS: usize = 30;
 /// # Errors
 /// Recordings that cannot be used, that the model was trained on, or with too few labelled grasps.
 pub fn adapt(hand: &Hand, model: &Model, recordings: &[PathBuf]) -> Result<Model, TrainingError> {
-    adapt_on(hand, model, &Examples::read(hand, recordings, &Relabelling::default(), |_, _| {})?, recordings)
+    adapt_on(hand, model, &Examples::read(hand, recordings, |_, _| {})?, recordings)
 }
 
 /// Corrects a model by examples. `recordings` names the files that they are from; it is empty for examples out of memory.

@@ -8,7 +8,6 @@ mod adaptation;
 mod approach;
 mod day;
 mod examples;
-mod friction;
 mod probes;
 mod thresholds;
 
@@ -18,7 +17,7 @@ use std::path::{Path, PathBuf};
 pub use adaptation::{adapt, adapt_on};
 pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 pub use blindgrasp_stages::training_summary::{PolicySummary, TrainingSummary};
-pub use examples::{Example, Examples, Relabelling, Signals, UnfeltGrasp};
+pub use examples::{Example, Examples, Signals, UnfeltGrasp};
 pub(crate) use probes::composed;
 pub use thresholds::Aim;
 
@@ -53,39 +52,21 @@ pub struct TrainingOptions {
     pub threshold_probability: f64,
     /// What the thresholds of all stages are chosen for, in place of that probability.
     pub aim: Option<Aim>,
-    /// Friction coefficients, equally probable, for which the grasps are labelled again from their scenes. The target
-    /// is then the probability that a grasp is stable. Empty: the recordings' own labels.
-    pub frictions: Vec<f64>,
-    /// Whether grasps are labelled by epsilon and volume, whatever the recordings say.
-    pub by_wrench_space: bool,
     /// Seeds K-means and boosting.
     pub seed: u64,
 }
 
 impl Default for TrainingOptions {
     fn default() -> Self {
-        TrainingOptions {
-            recipe: Recipe::default(),
-            n_folds: 5,
-            threshold_probability: 0.5,
-            aim: None,
-            frictions: Vec::new(),
-            by_wrench_space: false,
-            seed: 1,
-        }
+        TrainingOptions { recipe: Recipe::default(), n_folds: 5, threshold_probability: 0.5, aim: None, seed: 1 }
     }
 }
 
 impl TrainingOptions {
-    /// The label to learn.
-    pub fn relabelling(&self) -> Relabelling {
-        Relabelling { frictions: self.frictions.clone(), by_wrench_space: self.by_wrench_space }
-    }
-
     /// Refuses options that no training takes, before recordings are read.
     ///
     /// # Errors
-    /// Too many words, a threshold that is no probability, or frictions for a learner without probabilities.
+    /// Too many words, or a threshold that is no probability.
     pub fn check(&self) -> Result<(), TrainingError> {
         let recipe = &self.recipe;
         if recipe.n_words > MAX_FEATURES {
@@ -94,12 +75,6 @@ impl TrainingOptions {
         let threshold = self.threshold_probability;
         if !(threshold > 0.0 && threshold <= 1.0) {
             return Err(TrainingError::Data(format!("the threshold is {threshold}, expected more than 0, at most 1")));
-        }
-        if !self.frictions.is_empty() && !matches!(recipe.learner, Learner::Boosting(_)) {
-            return Err(TrainingError::Data(format!(
-                "several frictions need a learner of probabilities, and the recipe {} has an SVM: use the recipe boosted",
-                recipe.name
-            )));
         }
         Ok(())
     }
@@ -152,7 +127,7 @@ pub fn train(
 ) -> Result<Model, TrainingError> {
     options.check()?;
     let recipe = &options.recipe;
-    check_examples(read, recordings, &options.frictions)?;
+    check_examples(read, recordings)?;
     let examples: Vec<&Example> = read.examples.iter().collect();
     let folds = folds_by_object(&examples, options.n_folds)?;
     let judged = judge_out_of_fold(hand, &examples, &folds, options, &mut progress)?;
@@ -182,7 +157,7 @@ pub fn train(
     let mut probes = learn_probes(hand, &fitted.features, &examples, &folds, options, &mut progress)?;
     if let Some(aim) = options.aim {
         progress("choosing thresholds for trials");
-        let of_lifts = !options.by_wrench_space && !read.labels.contains_key(&Label::WrenchSpace);
+        let of_lifts = !read.labels.contains_key(&Label::WrenchSpace);
         let promises = of_lifts && !recipe.day_baseline;
         training.policies = choose_thresholds(aim, promises, &judged, &mut classifier, &mut probes, &mut progress)?;
     }
@@ -275,13 +250,9 @@ fn summary(
         policies: Vec::new(),
         recordings: recordings.iter().map(|path| file_name(path)).collect(),
         made_by: read.made_by.clone(),
-        labels: if options.by_wrench_space || read.labels.contains_key(&Label::Lift) {
-            read.labels.clone()
-        } else {
-            BTreeMap::new()
-        },
+        labels: if read.labels.contains_key(&Label::Lift) { read.labels.clone() } else { BTreeMap::new() },
         recipe: options.recipe.clone(),
-        frictions: options.frictions.clone(),
+        frictions: Vec::new(),
         n_grasps: examples.len(),
         n_stable: examples.iter().filter(|example| example.stable).count(),
         n_objects: examples.iter().map(|example| &example.object).collect::<BTreeSet<_>>().len(),
@@ -324,12 +295,12 @@ impl CrossValidated {
         calibration: &PlattCalibration,
         threshold_probability: f64,
     ) -> Result<CrossValidated, TrainingError> {
-        let (probabilities, outcomes) = by_outcome(&judged.examples, &out_of_fold_probabilities(judged)?);
+        let probabilities = out_of_fold_probabilities(judged)?;
+        let outcomes = labels(&judged.examples);
         let reliability = reliability(&probabilities, &outcomes, N_RELIABILITY_BINS);
         check_skill(calibration, &outcomes, reliability.brier)?;
-        let (values, _) = by_outcome(&judged.examples, &judged.decision_values);
         let (mut n_right, mut n_false_positives) = (0, 0);
-        for (value, stable) in values.iter().zip(&outcomes) {
+        for (value, stable) in judged.decision_values.iter().zip(&outcomes) {
             let called_stable = calibration.probability(*value) >= threshold_probability;
             n_right += usize::from(called_stable == *stable);
             n_false_positives += usize::from(called_stable && !stable);
@@ -343,22 +314,13 @@ impl CrossValidated {
     }
 }
 
-/// Each example's number, once for each of its outcomes, and the outcomes.
-fn by_outcome(examples: &[&Example], numbers: &[f64]) -> (Vec<f64>, Vec<bool>) {
-    let (mut repeated, mut outcomes) = (Vec::new(), Vec::new());
-    for (example, number) in examples.iter().zip(numbers) {
-        for outcome in example.outcomes() {
-            repeated.push(*number);
-            outcomes.push(*outcome);
-        }
-    }
-    (repeated, outcomes)
+fn labels(examples: &[&Example]) -> Vec<bool> {
+    examples.iter().map(|example| example.stable).collect()
 }
 
-/// Platt's calibration. An example with labels for several frictions counts once for each.
+/// Platt's calibration.
 fn calibrate(examples: &[&Example], decision_values: &[f64]) -> Result<PlattCalibration, PlattError> {
-    let (values, outcomes) = by_outcome(examples, decision_values);
-    fit_platt(&values, &outcomes)
+    fit_platt(decision_values, &labels(examples))
 }
 
 /// Refuses a model that is no better than a guess, because it would lift all grasps or none.
@@ -404,7 +366,7 @@ fn readings<'a>(examples: &[&'a Example]) -> Vec<FeltReading<'a>> {
 }
 
 /// Refuses examples without grasps or of one class only.
-fn check_examples(read: &Examples, recordings: &[PathBuf], frictions: &[f64]) -> Result<(), TrainingError> {
+fn check_examples(read: &Examples, recordings: &[PathBuf]) -> Result<(), TrainingError> {
     let (n, n_excluded) = (read.examples.len(), &read.n_excluded);
     let n_stable = read.examples.iter().filter(|example| example.stable).count();
     if n == 0 {
@@ -417,14 +379,6 @@ fn check_examples(read: &Examples, recordings: &[PathBuf], frictions: &[f64]) ->
     if n_stable == 0 || n_stable == n {
         return Err(TrainingError::Data(format!(
             "{n_stable} of {n} grasps with contact are stable: expected some of each (left out: {n_excluded:?})"
-        )));
-    }
-    let none = read.examples.iter().all(|example| example.target() <= 0.0);
-    if none || read.examples.iter().all(|example| example.target() >= 1.0) {
-        let which = if none { "no grasp is stable for any" } else { "every grasp is stable for each" };
-        return Err(TrainingError::Data(format!(
-            "{which} of the frictions {:?}: expected some of which only a part is stable",
-            frictions
         )));
     }
     Ok(())
@@ -486,7 +440,7 @@ struct Prepared {
     /// The feature of each example, row after row.
     rows: Vec<f64>,
     labels: Vec<bool>,
-    /// [`Example::target`] of each example, which boosting learns.
+    /// The labels as 0 and 1, which boosting learns.
     targets: Vec<f64>,
     day_variances: Vec<f64>,
 }
@@ -514,8 +468,8 @@ fn prepare(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Re
         scaling.apply(&mut rows);
         features.scaling = Some(scaling);
     }
-    let labels = examples.iter().map(|example| example.stable).collect();
-    let targets = examples.iter().map(|example| example.target()).collect();
+    let labels = labels(examples);
+    let targets = labels.iter().map(|stable| f64::from(u8::from(*stable))).collect();
     Ok(Prepared { features, inertia: k_means.inertia, rows, labels, targets, day_variances })
 }
 
@@ -545,7 +499,7 @@ fn fit_trees(
             && held_out != Some(*fold)
         {
             values.extend_from_slice(row);
-            targets.push(example.target());
+            targets.push(f64::from(u8::from(example.stable)));
         }
     }
     train_boosted(&values, n_values, &targets, params, seed)

@@ -590,7 +590,7 @@ mod tests {
     }
 
     fn standing(object: Object, mass_kg: f64) -> (Mujoco, LiftTarget) {
-        let target = LiftTarget::new("target".into(), "target".into(), object, mass_kg, 1.0);
+        let target = LiftTarget::new(Object { mass_kg, ..object }, 1.0);
         let stands = crate::trial::start::world_from_standing(&target, 0.3);
         // The palm is far away, and tilted.
         let palm_from_world = Isometry3::new(Vector3::new(0.1, 0.2, 1.0), Vector3::new(0.5, -0.4, 0.2));
