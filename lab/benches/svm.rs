@@ -2,7 +2,8 @@
 //!
 //! `cargo bench -p blindgrasp-lab --bench svm -- features RECORDING MODEL N OUT` writes the features of N grasps, by the model's
 //! dictionary, as LIBSVM's problem file; `-- train PROBLEM C GAMMA TOLERANCE OUT` trains on one and writes LIBSVM's
-//! model file, and beside it the machine as blindgrasp's JSON; `-- predict JSON PROBLEM` times single decision values. Results are lines of JSON on stdout.
+//! model file, and beside it the machine as blindgrasp's JSON; `-- predict JSON PROBLEM` times single decision values; `-- export MODEL OUT` writes
+//! a model's machine and calibration as LIBSVM's model file. Results are lines of JSON on stdout.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -11,6 +12,8 @@ use std::time::Instant;
 use blindgrasp_grasps::dataset::{hand_of, read_grasps};
 use blindgrasp_learning::learners::svm::train_svm;
 use blindgrasp_messages::Phase;
+use blindgrasp_stages::classifier::Predictor;
+use blindgrasp_stages::classifier::calibration::PlattCalibration;
 use blindgrasp_stages::classifier::svm::{PreparedSvm, RbfSvm, SvmParams};
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::encoder::FeltReading;
@@ -36,6 +39,7 @@ fn main() -> Result<(), Failure> {
             };
             time_training(problem, &params, out)
         }
+        ["export", model, out] => export(model, out),
         ["predict", model, problem] => time_prediction(model, problem),
         [] => {
             eprintln!("run by scripts/benchsuite svm");
@@ -102,7 +106,7 @@ fn time_training(problem: &str, params: &SvmParams, out: &str) -> Result<(), Fai
     let start = Instant::now();
     let (svm, report) = train_svm(&problem.features, problem.n_features, &problem.labels, params)?;
     let secs = start.elapsed().as_secs_f64();
-    std::fs::write(out, write_libsvm(&svm))?;
+    std::fs::write(out, write_libsvm(&svm, None))?;
     std::fs::write(Path::new(out).with_extension("json"), serde_json::to_string(&svm)?)?;
     println!(
         "{}",
@@ -134,9 +138,17 @@ fn time_prediction(model: &str, problem: &str) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Writes a machine as LIBSVM's model file. Labels are 1 (stable) and -1; the support vectors of
+fn export(model: &str, out: &str) -> Result<(), Failure> {
+    let classifier = Model::load(Path::new(model))?.classifier;
+    let Predictor::Svm(svm) = &classifier.predictor else { return Err("expected a model with an SVM".into()) };
+    std::fs::write(out, write_libsvm(svm, Some(&classifier.calibration)))?;
+    println!("{}", json!({ "n_support_vectors": svm.n_support_vectors() }));
+    Ok(())
+}
+
+/// Writes a machine and its calibration as LIBSVM's model file. Labels are 1 (stable) and -1; the support vectors of
 /// label 1 come first, as LIBSVM wants, each class in the order of `svm`.
-fn write_libsvm(svm: &RbfSvm) -> String {
+fn write_libsvm(svm: &RbfSvm, calibration: Option<&PlattCalibration>) -> String {
     let support = || svm.dual_coefficients.iter().zip(svm.support_vectors.chunks_exact(svm.n_features.max(1)));
     let n_stable = svm.dual_coefficients.iter().filter(|coefficient| **coefficient > 0.0).count();
     let n_unstable = svm.n_support_vectors() - n_stable;
@@ -146,6 +158,9 @@ fn write_libsvm(svm: &RbfSvm) -> String {
         svm.n_support_vectors(),
         number(svm.rho)
     );
+    if let Some(calibration) = calibration {
+        text += &format!("probA {}\nprobB {}\n", number(calibration.a), number(calibration.b));
+    }
     text += &format!("nr_sv {n_stable} {n_unstable}\nSV\n");
     for of_stable in [true, false] {
         for (coefficient, vector) in support().filter(|(coefficient, _)| (**coefficient > 0.0) == of_stable) {
