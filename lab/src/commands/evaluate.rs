@@ -20,6 +20,7 @@ use blindgrasp_learning::evaluation::report::{
 use blindgrasp_learning::evaluation::split::{Split, split_into_folds};
 use blindgrasp_learning::evaluation::statistics::Estimate;
 use blindgrasp_learning::evaluation::{Evaluated, Score, Trained, evaluate};
+use blindgrasp_learning::file_name;
 use blindgrasp_learning::training::{Example, Examples};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
@@ -276,10 +277,6 @@ pub(super) fn command_line() -> String {
         |argument: String| if plain(&argument) { argument } else { format!("'{}'", argument.replace('\'', r"'\''")) };
     let arguments = std::env::args_os().skip(1).map(|argument| quoted(argument.to_string_lossy().into_owned()));
     std::iter::once("blindgrasp".to_string()).chain(arguments).collect::<Vec<_>>().join(" ")
-}
-
-fn file_name(path: &Path) -> String {
-    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
 /// Prints the definition of stable in the recordings, unless it is the wrench space's in all.

@@ -57,9 +57,6 @@ pub(super) struct Arguments {
     /// The SVM's kernel width.
     #[arg(long, value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
     gamma: Option<f64>,
-    /// The SVM's stopping tolerance.
-    #[arg(long, value_parser = |text: &str| number_in(text, 1e-12..=1.0))]
-    tolerance: Option<f64>,
     #[command(flatten)]
     thresholds: ThresholdArguments,
     /// The seed of K-means and boosting.
@@ -245,10 +242,9 @@ fn recipe(arguments: &Arguments) -> anyhow::Result<Recipe> {
         Learner::Svm(params) | Learner::Blend(BlendParams { svm: params, .. }) => {
             params.c = arguments.c.unwrap_or(params.c);
             params.gamma = arguments.gamma.unwrap_or(params.gamma);
-            params.tolerance = arguments.tolerance.unwrap_or(params.tolerance);
         }
         Learner::Boosting(_) => {
-            let given = [("--c", arguments.c), ("--gamma", arguments.gamma), ("--tolerance", arguments.tolerance)];
+            let given = [("--c", arguments.c), ("--gamma", arguments.gamma)];
             if let Some((name, _)) = given.iter().find(|(_, value)| value.is_some()) {
                 anyhow::bail!("{name} is the SVM's: the recipe {} has none; name another with --recipe", recipe.name);
             }

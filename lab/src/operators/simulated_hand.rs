@@ -49,7 +49,6 @@ struct Params {
     attempts: u32,
     watch: String,
     decision_timeout_s: f64,
-    friction: Option<f64>,
     options: Option<PathBuf>,
     physics: Option<PhysicsEngine>,
     model: Option<PathBuf>,
@@ -65,7 +64,7 @@ struct TrialParts {
 
 pub(crate) fn describe() -> OperatorDescription {
     let whole = |min: i64, max: i64| ParamKind::Integer { min: Some(min), max: Some(max) };
-    let number = |max: f64| ParamKind::Number { above: Some(0.0), min: None, max: Some(max), words: vec![] };
+    let seconds = ParamKind::Number { above: Some(0.0), min: None, max: Some(3600.0), words: vec![] };
     let gate = ParamKind::Choice { values: vec!["on".into(), "off".into()] };
     OperatorDescription::new("simulated_hand", "Tries to lift things in simulated physics")
         .feedback_input("decision", LiftDecision::TYPE_NAME, "Whether to lift what the hand holds")
@@ -96,11 +95,10 @@ pub(crate) fn describe() -> OperatorDescription {
         )
         .param(
             "decision_timeout_s",
-            number(3600.0),
+            seconds,
             Some(30.0.into()),
             "A grasp whose decision is later is not lifted",
         )
-        .optional_param("friction", number(10.0), "Friction of all things on the hand instead of their own")
         .optional_param(
             "options",
             ParamKind::Path { must_exist: true },
@@ -126,12 +124,11 @@ pub(crate) fn check(node: &FileNode) -> anyhow::Result<()> {
 /// The hand, the things, the options of trials and the approaches that a model prefers.
 fn setup(params: &Params) -> anyhow::Result<TrialParts> {
     let hand = Hand::load(params.hand.as_deref().unwrap_or(Path::new(DEFAULT_HAND)))?;
-    let mut things = targets_named(&params.things)?;
+    let things = targets_named(&params.things)?;
     if things.is_empty() {
         bail!("things is '{}': expected at least one thing", params.things);
     }
-    for thing in &mut things {
-        thing.friction = params.friction.unwrap_or(thing.friction);
+    for thing in &things {
         let Object { name, class, .. } = &thing.object;
         let names = LiftOutcome { thing: name.clone(), group: class.clone(), ..LiftOutcome::default() };
         names.check().with_context(|| format!("things: '{name}'"))?;

@@ -8,6 +8,7 @@ use std::path::PathBuf;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use crate::file_name;
 use crate::learners::booster::train_boosted;
 use blindgrasp_grasps::dataset::{DatasetError, read_grasps};
 use blindgrasp_messages::{Contact, Fault, Phase, TactileFrame};
@@ -262,10 +263,7 @@ pub fn learn(
         format: FORMAT.into(),
         hand: ModelHand { name: hand.name.clone(), id: hand.id() },
         n_grasps: settled.len(),
-        recordings: recordings
-            .iter()
-            .map(|path| path.file_name().unwrap_or_default().to_string_lossy().into())
-            .collect(),
+        recordings: recordings.iter().map(|path| file_name(path)).collect(),
         flicker: flicker(hand, grasps),
         detectors,
     })

@@ -125,12 +125,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         return Ok(Outcome::Done);
     }
     check_arguments(arguments)?;
-    let (mut targets, warnings) = targets_and_warnings(&arguments.objects)?;
+    let (targets, warnings) = targets_and_warnings(&arguments.objects)?;
     warnings.iter().for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
     let setup = Setup::new(arguments)?;
-    if let Some(friction) = setup.friction {
-        targets.iter_mut().for_each(|target| target.friction = friction);
-    }
     let left_out = check_approaches(&setup.hand, &targets, &setup.options, arguments.seed, arguments.trials)?;
     if !left_out.is_empty() {
         print_diagnostic(&format!(

@@ -5,21 +5,18 @@
 //! grasps that it predicts cannot be found out here.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use super::decisions::{JudgedGrasp, JudgedRecipe};
+use crate::file_name;
 use crate::import::columns::shortened;
 use crate::import::lines::{Lines, RowLimit};
-use crate::import::{BYTE_ORDER_MARK, bad_row, found};
+use crate::import::{BYTE_ORDER_MARK, bad_row, found, read as read_bytes};
 use crate::training::{Example, Examples};
 use blindgrasp_messages::MAX_NAME_BYTES;
-use blindgrasp_messages::files::open_regular;
 
 /// The most models of a table: more would be a number or a path in the column of models.
 const MAX_MODELS: usize = 16;
-/// The size limit of a table: tens of millions of predictions.
-const MAX_BYTES: u64 = 1 << 30;
 /// The most grasps that an error lists.
 const MAX_SHOWN_GRASPS: usize = 8;
 
@@ -29,7 +26,7 @@ type GraspInRecording = (usize, u64);
 /// Models with a prediction for each grasp that is judged.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct OutsidePredictions {
-    path: PathBuf,
+    pub path: PathBuf,
     /// In the order in which the table has them.
     pub models: Vec<OutsideModel>,
     /// The models lift from this probability on.
@@ -80,7 +77,7 @@ impl OutsidePredictions {
         if read.examples.is_empty() {
             return Err(PredictionsError::NoGrasps);
         }
-        let bytes = read_bytes(path)?;
+        let bytes = read_bytes(path).map_err(|source| PredictionsError::Read { path: path.into(), source })?;
         let text = bytes.strip_prefix(BYTE_ORDER_MARK).unwrap_or(&bytes);
         let grasps = KnownGrasps { recordings, grasps: &read.grasps };
         let default_name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
@@ -138,11 +135,6 @@ impl OutsidePredictions {
             ))),
             None => Ok(()),
         }
-    }
-
-    /// The name of the table.
-    pub fn file_name(&self) -> String {
-        self.path.file_name().unwrap_or_default().to_string_lossy().into_owned()
     }
 
     fn refused(&self, message: String) -> PredictionsError {
@@ -217,18 +209,6 @@ pub fn predictions_csv(judges: &[JudgedRecipe], recordings: &[PathBuf]) -> Resul
 
 fn key_of(example: &Example) -> GraspInRecording {
     (example.recording_idx, example.grasp_id)
-}
-
-fn read_bytes(path: &Path) -> Result<Vec<u8>, PredictionsError> {
-    let mut bytes = Vec::new();
-    open_regular(path)
-        .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
-        .map_err(|source| PredictionsError::Read { path: path.into(), source })?;
-    if bytes.len() as u64 > MAX_BYTES {
-        let message = "more than 1 GiB: expected a table (CSV) with a row for each grasp".into();
-        return Err(PredictionsError::Table { path: path.into(), message });
-    }
-    Ok(bytes)
 }
 
 /// Errors do not name the file.
@@ -369,8 +349,7 @@ struct KnownGrasps<'a> {
 impl KnownGrasps<'_> {
     /// The file name of a recording.
     fn name(&self, recording_idx: usize) -> String {
-        let path = &self.recordings[recording_idx];
-        path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+        file_name(&self.recordings[recording_idx])
     }
 
     /// A grasp of the recording with this path, or of the only one with this file name.

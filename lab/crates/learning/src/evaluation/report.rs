@@ -12,6 +12,7 @@ use super::predictions::{OutsideModel, OutsidePredictions};
 use super::split::Split;
 use super::statistics::{Estimate, N_RESAMPLES};
 use super::{Evaluated, Evaluation, Trained};
+use crate::file_name;
 use crate::training::{Example, Examples};
 use blindgrasp_messages::Fault;
 use blindgrasp_pictures::DrawnWord;
@@ -232,12 +233,12 @@ pub fn report_on_predictions(origin: Origin, read: &Examples, outside: &OutsideP
 /// The labelled grasps without a decision: the examples, then those that no cell feels.
 fn undecided(read: &Examples) -> Vec<JudgedGrasp> {
     let mut grasps: Vec<JudgedGrasp> = read.examples.iter().map(of_example).collect();
-    grasps.extend(read.unfelt.iter().map(|grasp| JudgedGrasp {
-        recording_idx: grasp.recording_idx,
-        grasp_id: grasp.grasp_id,
-        object: grasp.object.clone(),
-        class: grasp.class.clone(),
-        stable: grasp.stable,
+    grasps.extend(read.unfelt.iter().map(|(recording_idx, truth)| JudgedGrasp {
+        recording_idx: *recording_idx,
+        grasp_id: truth.grasp_id,
+        object: truth.object.clone(),
+        class: truth.class.clone(),
+        stable: truth.stable,
         ..JudgedGrasp::default()
     }));
     grasps
@@ -285,7 +286,7 @@ fn outside_judges(
     let threshold = outside.threshold_probability;
     let judge = |model: &OutsideModel| {
         let decided = grasps.iter().map(|grasp| decide(grasp, model.probability(grasp), threshold)).collect();
-        let about = format!("predictions of {}", outside.file_name());
+        let about = format!("predictions of {}", file_name(&outside.path));
         JudgedRecipe::new(&model.name, about, threshold, decided, unit, seed)
     };
     outside.models.iter().map(judge).collect()
@@ -338,7 +339,7 @@ fn made(
         version: env!("CARGO_PKG_VERSION").into(),
         hand: origin.hand,
         recordings: origin.recordings,
-        predictions: outside.map(OutsidePredictions::file_name),
+        predictions: outside.map(|outside| file_name(&outside.path)),
         made_by: makers,
         labels: read.labels.clone(),
         split: options.map(|options| SplitMade {

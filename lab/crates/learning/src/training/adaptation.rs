@@ -10,7 +10,8 @@ use std::path::PathBuf;
 
 use nalgebra::{DMatrix, DVector};
 
-use super::{Example, Examples, TrainingError, composed, file_name, folds_by_object};
+use super::{Example, Examples, LOOKS, TrainingError, folds_by_object, values_at};
+use crate::file_name;
 use crate::learners::decision_values;
 use crate::learners::training_range::learn_training_range;
 use crate::promise::{ObjectTrials, promise};
@@ -137,12 +138,9 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
     Ok(adapted)
 }
 
-/// The looks, from the last on.
-const LOOKS: [Phase; 3] = [Phase::TestLifted, Phase::Squeezed, Phase::Settled];
-
 /// The last look that lifts and that a grasp has, and its classifier.
 fn deciding_look<'a>(model: &'a Model, examples: &[Example]) -> Option<(Phase, &'a Classifier)> {
-    for look in LOOKS {
+    for look in LOOKS.into_iter().rev() {
         if let Some(classifier) = model.look(look)
             && classifier.threshold_probability < 1.0
             && examples.iter().any(|example| felt(look, example).is_some())
@@ -157,7 +155,7 @@ fn deciding_look<'a>(model: &'a Model, examples: &[Example]) -> Option<(Phase, &
 fn judged_lifts<'a>(look: Phase, model: &Model, examples: &'a [Example]) -> Vec<JudgedLift<'a>> {
     let mut lifts = Vec::new();
     for example in examples {
-        let mut earlier = LOOKS.into_iter().skip_while(|other| *other != look).skip(1);
+        let mut earlier = LOOKS.into_iter().take_while(|other| *other != look);
         if !earlier.any(|earlier| is_unstable(model, earlier, example))
             && let Some(log_odds) = log_odds(model, look, example)
         {
@@ -287,14 +285,7 @@ fn felt(look: Phase, example: &Example) -> Option<FeltReading<'_>> {
 /// The model's log-odds of an example at a look; `None` if it has no feature there.
 fn log_odds(model: &Model, look: Phase, example: &Example) -> Option<f64> {
     let classifier = model.look(look)?;
-    let values = if look == Phase::Settled {
-        let mut values = Vec::new();
-        model.features.extract(&example.reading(), &mut values).ok()?;
-        values
-    } else {
-        composed(&model.features, look, example)?
-    };
-    Some(classifier.log_odds(classifier.predictor.decision_value(&values).ok()?))
+    Some(classifier.log_odds(classifier.predictor.decision_value(&values_at(model, look, example)?).ok()?))
 }
 
 /// Widens the limits that own grasps violate, of every look, so that they hold the own grasps. Returns how many grasps a limit

@@ -77,18 +77,6 @@ impl FeltGrasp {
     }
 }
 
-/// A labelled grasp that no cell feels.
-#[derive(Debug, Clone, PartialEq)]
-pub struct UnfeltGrasp {
-    /// Index of its recording in the list it was read from.
-    pub recording_idx: usize,
-    /// Its number in that recording.
-    pub grasp_id: u64,
-    pub object: String,
-    pub class: String,
-    pub stable: bool,
-}
-
 /// The grasps of recordings to learn from, and the number of those left out.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Examples {
@@ -96,8 +84,8 @@ pub struct Examples {
     pub examples: Vec<Example>,
     /// Grasps left out, by reason.
     pub n_excluded: BTreeMap<String, usize>,
-    /// Labelled grasps that no cell feels. They are always held.
-    pub unfelt: Vec<UnfeltGrasp>,
+    /// Labelled grasps that no cell feels, each with the index of its recording. They are always held.
+    pub unfelt: Vec<(usize, GraspTruth)>,
     /// All grasps, those left out as well: the index of the recording and the number in it.
     pub grasps: BTreeSet<(usize, u64)>,
     /// The program and options that made each recording, from its metadata.
@@ -205,8 +193,7 @@ impl Examples {
                     // Two grasps of one recording may have equal readings. In two recordings it is the same grasp.
                     let first = seen.entry(settled.reading_id).or_insert((recording_idx, truth.stable)).0;
                     if settled.fault == Fault::NoContact && first == recording_idx {
-                        let GraspTruth { object, class, stable, .. } = truth;
-                        self.unfelt.push(UnfeltGrasp { recording_idx, grasp_id, object, class, stable });
+                        self.unfelt.push((recording_idx, truth));
                     }
                 }
             }

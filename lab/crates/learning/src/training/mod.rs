@@ -12,17 +12,18 @@ mod probes;
 mod thresholds;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 pub use adaptation::{adapt, adapt_on};
 pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 pub use blindgrasp_stages::training_summary::{PolicySummary, TrainingSummary};
-pub use examples::{Example, Examples, Signals, UnfeltGrasp};
-pub(crate) use probes::composed;
+pub use examples::{Example, Examples, Signals};
+pub(crate) use probes::{LOOKS, values_at};
 pub use thresholds::Aim;
 
 use crate::evaluation::reliability::{N_RELIABILITY_BINS, reliability};
 use crate::evaluation::split::Split;
+use crate::file_name;
 use crate::learners::booster::train_boosted;
 use crate::learners::decision_values;
 use crate::learners::k_means::{DictionaryError, KMeansParams, learn_dictionary};
@@ -547,10 +548,6 @@ pub fn cross_validate(
 /// The examples of these indices.
 pub(crate) fn picked<'a>(examples: &[&'a Example], idxs: &[usize]) -> Vec<&'a Example> {
     idxs.iter().map(|idx| examples[*idx]).collect()
-}
-
-fn file_name(path: &Path) -> String {
-    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
 #[cfg(test)]

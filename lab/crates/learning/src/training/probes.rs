@@ -19,6 +19,7 @@ use blindgrasp_stages::classifier::boosting::BoostingParams;
 use blindgrasp_stages::classifier::{Classifier, Predictor};
 use blindgrasp_stages::encoder::{Block, FeatureExtractor, FeltReading};
 use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::model::Model;
 use blindgrasp_stages::own_lifts::{ATTEMPT_SECS, LIFT_SECS, SQUEEZE_SECS, TEST_LIFT_SECS};
 use blindgrasp_stages::probe::{GraspHistory, ProbeModel, n_values, signals};
 use blindgrasp_stages::recipe::Recipe;
@@ -148,7 +149,7 @@ fn felt(phase: Phase, example: &Example) -> Option<&Felt> {
 }
 
 /// The values from which a probe is judged; `None` if a reading has no feature.
-pub(crate) fn composed(features: &FeatureExtractor, phase: Phase, example: &Example) -> Option<Vec<f64>> {
+fn composed(features: &FeatureExtractor, phase: Phase, example: &Example) -> Option<Vec<f64>> {
     let followed = signals(features);
     let [squeezing, test_lifting] = &example.moving;
     let mut history = GraspHistory::default();
@@ -168,6 +169,14 @@ pub(crate) fn composed(features: &FeatureExtractor, phase: Phase, example: &Exam
     let mut composed = Vec::new();
     history.compose(phase, &now, &followed, &mut composed).ok()?;
     Some(composed)
+}
+
+/// The values from which a model judges a grasp at a look; `None` if it has no feature there.
+pub(crate) fn values_at(model: &Model, look: Phase, example: &Example) -> Option<Vec<f64>> {
+    match look {
+        Phase::Settled => extracted(&model.features, &example.reading()).ok(),
+        _ => composed(&model.features, look, example),
+    }
 }
 
 fn extracted(features: &FeatureExtractor, reading: &FeltReading<'_>) -> Result<Vec<f64>, Fault> {
@@ -247,7 +256,7 @@ pub(super) struct Attempted {
 }
 
 /// The looks that may decide.
-pub(super) const LOOKS: [Phase; 3] = [Phase::Settled, Phase::Squeezed, Phase::TestLifted];
+pub(crate) const LOOKS: [Phase; 3] = [Phase::Settled, Phase::Squeezed, Phase::TestLifted];
 
 /// Takes the place of a probability where a look has no feature: only a threshold that gives up no grasp lets it go on.
 pub(super) const NO_FEATURE: f64 = -1.0;
