@@ -35,7 +35,8 @@ use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 use serde::{Deserialize, Serialize};
 
-const DEFAULT_HAND: &str = "barrett-bh8-280";
+/// The hand of a node that names none.
+pub(crate) const DEFAULT_HAND: &str = "barrett-bh8-280";
 /// The most attempts that are kept because they may be unread; that many fit into a node's state.
 const MAX_UNREAD: usize = 96;
 

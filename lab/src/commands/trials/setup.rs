@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 
 use super::{Arguments, Way, physics};
+use crate::operators::simulated_hand::DEFAULT_HAND;
 use blindgrasp_cli::graph_file::{OnMisfit, checked, fitting};
 use blindgrasp_graph::dataflow::{self, DataflowFile, Graph, Node, Override, Scope};
 use blindgrasp_messages::{LiftOutcome, Recorded};
@@ -17,9 +18,6 @@ use blindgrasp_stages::model::Model;
 const SOURCE: &str = "simulated_hand";
 /// While the hand waits for a decision nothing moves, and a simulation on a busy machine may take its time.
 const LEAST_MAX_AGE_MS: f64 = 5000.0;
-
-/// The hand of a node that names none.
-const DEFAULT_HAND: &str = "barrett-bh8-280";
 
 /// A dataflow file and what it is run with.
 pub(super) struct Setup {
