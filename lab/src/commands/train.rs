@@ -101,7 +101,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         threshold_probability: arguments.thresholds.threshold_probability,
         aim: arguments.thresholds.aim(),
         seed: arguments.seed,
-        ..TrainingOptions::default()
     };
     options.check()?;
     let progress = |what: &str| print_diagnostic(&format!("{what} …"));

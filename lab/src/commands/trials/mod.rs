@@ -190,13 +190,7 @@ fn empty_report(arguments: &Arguments, setup: &Setup) -> TrialsReport {
         options: setup.options.clone(),
         model: setup.model.clone(),
         end: "finished".into(),
-        with_gate: None,
-        without_gate: None,
-        late: None,
-        n_left_out: 0,
-        effect: None,
-        records_with_gate: Vec::new(),
-        records_without_gate: Vec::new(),
+        ..TrialsReport::default()
     }
 }
 

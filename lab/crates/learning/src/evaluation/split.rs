@@ -32,12 +32,6 @@ pub enum SplitError {
         split.words()
     )]
     TooFewGroups { split: Split, n_groups: usize, n_folds: usize },
-    /// An object of two classes cannot be left out with either.
-    #[error(
-        "object '{object}' is of class '{first}' in one grasp and of '{second}' in another: name the objects apart, or \
-         give the recordings one at a time"
-    )]
-    TwoClasses { object: String, first: String, second: String },
     /// Nothing can be learned from grasps that are all alike.
     #[error(
         "without fold {} of {n_folds}, only {} grasps are left to train on ({n_grasps}): expected {}; ask for more folds, or \
@@ -96,10 +90,11 @@ impl Split {
     }
 }
 
-/// The fold of each example, from 0. Folds are of about equal size; the same seed gives the same folds.
+/// The fold of each example, from 0. Folds are of about equal size; the same seed gives the same folds. Each object has one
+/// class: [`Examples`](crate::training::Examples) refuse others.
 ///
 /// # Errors
-/// There are too few grasps, objects or classes, an object has two classes, or without a fold all grasps are alike.
+/// There are too few grasps, objects or classes, or without a fold all grasps are alike.
 pub fn split_into_folds(
     split: Split,
     examples: &[&Example],
@@ -109,7 +104,6 @@ pub fn split_into_folds(
     if n_folds < 2 {
         return Err(SplitError::TooFewFolds(n_folds));
     }
-    check_classes(examples)?;
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let folds = match split {
         Split::Grasp => stratified_folds(examples, n_folds, &mut random)?,
@@ -131,22 +125,6 @@ fn shuffle<T>(items: &mut [T], random: &mut ChaCha8Rng) {
     for idx in (1..items.len()).rev() {
         items.swap(idx, random.random_range(0..=idx));
     }
-}
-
-/// A class named two ways for one object would let a class leak into its own test.
-fn check_classes(examples: &[&Example]) -> Result<(), SplitError> {
-    let mut class_of: BTreeMap<&str, &str> = BTreeMap::new();
-    for example in examples {
-        let first = *class_of.entry(&example.object).or_insert(&example.class);
-        if first != example.class {
-            return Err(SplitError::TwoClasses {
-                object: example.object.clone(),
-                first: first.into(),
-                second: example.class.clone(),
-            });
-        }
-    }
-    Ok(())
 }
 
 /// Deals stable and then unstable grasps to the folds in turn, each in a random order.
@@ -261,8 +239,6 @@ pub(super) mod tests {
         assert!(refused(&NAMES, Split::Class, 4).starts_with("3 classes for 4 folds"));
         assert!(refused(&NAMES, Split::Grasp, 1).starts_with("expected at least 2 folds"));
         assert!(refused(&NAMES, Split::Grasp, 100).starts_with("75 grasps for 100 folds"));
-        let two = [("a", "x", 3), ("a", "y", 3), ("b", "y", 3)];
-        assert!(refused(&two, Split::Grasp, 2).contains("'a' is of class 'x'"));
         // Object b has one grasp, a stable one.
         let error = refused(&[("a", "x", 9), ("b", "x", 1)], Split::Object, 2);
         let expected = "only stable grasps are left to train on (1): expected stable grasps of at least 2 objects";

@@ -43,12 +43,13 @@ use blindgrasp_stages::model::{FORMAT, Model, ModelHand};
 use probes::LearnedProbes;
 use thresholds::choose_thresholds;
 
+/// Folds, grouped by object, for calibration and cross-validated figures.
+const N_FOLDS: usize = 5;
+
 /// How a model is trained.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingOptions {
     pub recipe: Recipe,
-    /// Folds, grouped by object, for calibration and cross-validated figures.
-    pub n_folds: usize,
     /// A grasp counts as stable from this probability on, and as unstable below 1 minus it; between them it is unsure.
     pub threshold_probability: f64,
     /// What the thresholds of all stages are chosen for, in place of that probability.
@@ -59,7 +60,7 @@ pub struct TrainingOptions {
 
 impl Default for TrainingOptions {
     fn default() -> Self {
-        TrainingOptions { recipe: Recipe::default(), n_folds: 5, threshold_probability: 0.5, aim: None, seed: 1 }
+        TrainingOptions { recipe: Recipe::default(), threshold_probability: 0.5, aim: None, seed: 1 }
     }
 }
 
@@ -130,7 +131,7 @@ pub fn train(
     let recipe = &options.recipe;
     check_examples(read, recordings)?;
     let examples: Vec<&Example> = read.examples.iter().collect();
-    let folds = folds_by_object(&examples, options.n_folds)?;
+    let folds = folds_by_object(&examples, N_FOLDS)?;
     let judged = judge_out_of_fold(hand, &examples, &folds, options, &mut progress)?;
     let calibration = calibrate(&judged.examples, &judged.decision_values)?;
     progress("training on all grasps");
@@ -185,8 +186,8 @@ fn judge_out_of_fold<'a>(
     options: &TrainingOptions,
     progress: &mut impl FnMut(&str),
 ) -> Result<OutOfFold<'a>, TrainingError> {
-    let TrainingOptions { recipe, n_folds, seed, .. } = options;
-    let cross_validating = |fold: usize| progress(&format!("cross-validating, fold {} of {n_folds}", fold + 1));
+    let TrainingOptions { recipe, seed, .. } = options;
+    let cross_validating = |fold: usize| progress(&format!("cross-validating, fold {} of {N_FOLDS}", fold + 1));
     if recipe.day_baseline {
         return day::cross_validate(hand, recipe, examples, folds, *seed, cross_validating);
     }
@@ -262,7 +263,7 @@ fn summary(
         inertia: fitted.inertia,
         n_iterations: fitted.n_iterations,
         converged: fitted.converged,
-        n_folds: options.n_folds,
+        n_folds: N_FOLDS,
         cross_validated_accuracy: validated.accuracy,
         cross_validated_false_positive_share: validated.false_positive_share,
         cross_validated_brier: validated.brier,
@@ -388,8 +389,8 @@ fn check_examples(read: &Examples, recordings: &[PathBuf]) -> Result<(), Trainin
 /// The fold of each example. All grasps of an object are in one fold.
 ///
 /// # Errors
-/// Fewer than two folds, or fewer objects than folds.
-pub fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usize>, TrainingError> {
+/// Fewer objects than folds, or than two.
+fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usize>, TrainingError> {
     let objects: BTreeSet<&str> = examples.iter().map(|example| example.object.as_str()).collect();
     let n_needed = n_folds.max(2);
     if objects.len() < n_needed {
@@ -398,9 +399,6 @@ pub fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usiz
              and unstable grasps of several; record more objects, or say which grasps are of which object",
             Split::Object.counted(objects.len())
         )));
-    }
-    if n_folds < 2 {
-        return Err(TrainingError::Data(format!("expected at least 2 folds, found {n_folds}")));
     }
     let fold_of: BTreeMap<&str, usize> =
         objects.iter().enumerate().map(|(idx, object)| (*object, idx % n_folds)).collect();
@@ -579,7 +577,6 @@ mod tests {
         assert!(refused(1, 5).starts_with("grasps with contact of 1 object: expected at least 5 objects"));
         assert!(refused(2, 5).starts_with("grasps with contact of 2 objects: expected at least 5 objects"));
         assert!(refused(1, 1).contains("expected at least 2 objects"));
-        assert!(refused(2, 1).contains("expected at least 2 folds"));
         assert_eq!(folds(2, 2).expect("folds"), [0, 1]);
     }
 }

@@ -76,7 +76,7 @@ impl LearnedProbes {
 
 /// The number of grasps without a frame of this phase.
 pub(super) fn n_without(phase: Phase, examples: &[&Example]) -> usize {
-    examples.iter().filter(|example| felt(phase, example).is_none()).count()
+    examples.iter().filter(|example| reading_at(phase, example).is_none()).count()
 }
 
 /// Learns to judge the frames of a phase, which all grasps have; `None` if the frames of objects not seen say nothing of the
@@ -123,8 +123,8 @@ pub(super) fn learn(
     for (idx, probability) in kept_idxs.iter().zip(&judged) {
         probabilities[*idx] = Some(*probability);
     }
-    let felt = kept.examples.iter().filter_map(|example| felt(phase, example));
-    let readings: Vec<FeltReading<'_>> = felt.map(Felt::reading).collect();
+    let readings: Vec<FeltReading<'_>> =
+        kept.examples.iter().filter_map(|example| reading_at(phase, example)).collect();
     let trees = fit_trees(&rows, n_values, examples, folds, None, &PARAMS, seed)?;
     let probe = ProbeModel {
         classifier: Classifier {
@@ -144,8 +144,13 @@ fn composed_rows(features: &FeatureExtractor, phase: Phase, examples: &[&Example
     examples.par_iter().map(|example| composed(features, phase, example)).collect()
 }
 
-fn felt(phase: Phase, example: &Example) -> Option<&Felt> {
-    if phase == Phase::Squeezed { example.squeezed.as_ref() } else { example.test_lifted.as_ref() }
+/// The frame of a look, as it was felt.
+pub(super) fn reading_at(look: Phase, example: &Example) -> Option<FeltReading<'_>> {
+    match look {
+        Phase::Settled => Some(example.reading()),
+        Phase::Squeezed => example.squeezed.as_ref().map(Felt::reading),
+        _ => example.test_lifted.as_ref().map(Felt::reading),
+    }
 }
 
 /// The values from which a probe is judged; `None` if a reading has no feature.
@@ -161,11 +166,11 @@ fn composed(features: &FeatureExtractor, phase: Phase, example: &Example) -> Opt
     );
     add_moves(&mut history, Phase::Squeezing, squeezing, features, &followed);
     if phase == Phase::TestLifted {
-        let squeezed = extracted(features, &example.squeezed.as_ref()?.reading());
+        let squeezed = extracted(features, &reading_at(Phase::Squeezed, example)?);
         history.add((0, 0), Phase::Squeezed, squeezed.as_deref().map_err(|fault| *fault), &followed);
         add_moves(&mut history, Phase::TestLifting, test_lifting, features, &followed);
     }
-    let now = extracted(features, &felt(phase, example)?.reading()).ok()?;
+    let now = extracted(features, &reading_at(phase, example)?).ok()?;
     let mut composed = Vec::new();
     history.compose(phase, &now, &followed, &mut composed).ok()?;
     Some(composed)
