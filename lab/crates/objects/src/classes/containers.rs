@@ -5,7 +5,7 @@ use parry3d_f64::shape::SharedShape;
 
 use super::super::outline::{closed_fillet, ellipse, fillet, rounded_rectangle, spline, superellipse};
 use super::super::solid::{Assembly, Solid};
-use super::{Draw, capped, radius_at};
+use super::{Draw, capped, radius_at, spline_from_axis};
 
 /// A filled bottle or can, packaging included.
 const FILLED: f64 = 970.0;
@@ -287,8 +287,7 @@ pub(super) fn vase(draw: &mut Draw, made: &mut Assembly) {
     let outer = match draw.kind(4) {
         0 => {
             let neck = draw.between(0.34, 0.5) * r;
-            let mut line = vec![[0.0, 0.0]];
-            line.extend(spline(&[
+            spline_from_axis(&[
                 [0.60 * r, 0.0],
                 [0.93 * r, 0.16 * h],
                 [r, 0.34 * h],
@@ -296,13 +295,11 @@ pub(super) fn vase(draw: &mut Draw, made: &mut Assembly) {
                 [neck, 0.76 * h],
                 [neck, 0.88 * h],
                 [1.35 * neck, h],
-            ]));
-            line
+            ])
         }
         1 => {
             let neck = draw.between(0.46, 0.58) * r;
-            let mut line = vec![[0.0, 0.0]];
-            line.extend(spline(&[
+            spline_from_axis(&[
                 [0.46 * r, 0.0],
                 [0.62 * r, 0.16 * h],
                 [0.96 * r, 0.42 * h],
@@ -310,20 +307,17 @@ pub(super) fn vase(draw: &mut Draw, made: &mut Assembly) {
                 [neck, 0.78 * h],
                 [0.95 * neck, 0.90 * h],
                 [1.3 * neck, h],
-            ]));
-            line
+            ])
         }
         2 => {
             let waist = draw.between(0.55, 0.75) * r;
-            let mut line = vec![[0.0, 0.0]];
-            line.extend(spline(&[
+            spline_from_axis(&[
                 [0.80 * r, 0.0],
                 [0.74 * r, 0.12 * h],
                 [waist, 0.42 * h],
                 [0.86 * r, 0.78 * h],
                 [1.12 * r, h],
-            ]));
-            line
+            ])
         }
         _ => {
             let top = draw.between(0.6, 0.85) * r;

@@ -15,7 +15,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::N_PER_CLASS;
-use crate::outline::{Point, n_around, subdivide, superellipse};
+use crate::outline::{Point, n_around, spline, subdivide, superellipse};
 use crate::solid::{Assembly, Solid};
 
 pub(super) use tableware::loop_handle;
@@ -94,6 +94,11 @@ fn radius_at(profile: &[Point], z_mm: f64) -> f64 {
             pair[0][0] + along * (pair[1][0] - pair[0][0])
         },
     )
+}
+
+/// A smooth line that begins on the axis, on the ground.
+fn spline_from_axis(knots: &[Point]) -> Vec<Point> {
+    [vec![[0.0, 0.0]], spline(knots)].concat()
 }
 
 /// The last line, closed onto the axis at both ends with flat faces: a profile for a lathe.

@@ -4,7 +4,7 @@ use nalgebra::{Point3, Vector3};
 
 use super::super::outline::{Point, ellipse, fillet, half_ellipse, simplify, spline, squared, subdivide, superellipse};
 use super::super::solid::{Assembly, Solid};
-use super::{Draw, capped, radius_at};
+use super::{Draw, capped, radius_at, spline_from_axis};
 
 const CERAMIC: f64 = 2300.0;
 const GLASS: f64 = 2500.0;
@@ -145,17 +145,16 @@ pub(super) fn teapot(draw: &mut Draw, made: &mut Assembly) {
             let r = draw.between(46.0, 59.0);
             let h = r * draw.between(1.45, 1.75);
             let opening = r * 0.5;
-            let mut body = vec![[0.0, 0.0]];
-            body.extend(spline(&[
+            let body = spline_from_axis(&[
                 [0.62 * r, 0.0],
                 [0.95 * r, 0.24 * h],
                 [r, 0.48 * h],
                 [0.84 * r, 0.78 * h],
                 [opening, h],
-            ]));
+            ]);
             made.add(&Solid::lathe(&capped(body.clone())), POT);
             made.add(&Solid::lathe(&lid(opening + 2.0, h - 2.0, 0.30 * r)), CERAMIC);
-            let ends = [[radius_at(&body, 0.80 * h) - 4.0, 0.80 * h], [radius_at(&body, 0.28 * h) - 4.0, 0.28 * h]];
+            let ends = [0.80 * h, 0.28 * h].map(|z| [radius_at(&body, z) - 4.0, z]);
             made.add(&loop_handle(ends, draw.between(40.0, 48.0), 2.3, [4.5, 7.0]), CERAMIC);
             let path = spline(&[
                 [-radius_at(&body, 0.36 * h) + 12.0, 0.36 * h],
@@ -178,7 +177,7 @@ pub(super) fn teapot(draw: &mut Draw, made: &mut Assembly) {
             ]);
             made.add(&Solid::lathe(&body), POT);
             made.add(&Solid::lathe(&lid(opening + 2.0, h - 2.0, 0.4 * r)), CERAMIC);
-            let ends = [[radius_at(&body, 0.88 * h) - 4.0, 0.88 * h], [radius_at(&body, 0.30 * h) - 4.0, 0.30 * h]];
+            let ends = [0.88 * h, 0.30 * h].map(|z| [radius_at(&body, z) - 4.0, z]);
             made.add(&loop_handle(ends, draw.between(40.0, 50.0), 3.0, [5.0, 7.5]), CERAMIC);
             let path = spline(&[
                 [-radius_at(&body, 0.48 * h) + 12.0, 0.48 * h],
@@ -193,14 +192,13 @@ pub(super) fn teapot(draw: &mut Draw, made: &mut Assembly) {
             let h = draw.between(120.0, 180.0);
             let wall = draw.between(4.0, 5.0);
             let neck = r * draw.between(0.66, 0.78);
-            let mut outer = vec![[0.0, 0.0]];
-            outer.extend(spline(&[
+            let mut outer = spline_from_axis(&[
                 [0.72 * r, 0.0],
                 [0.97 * r, 0.18 * h],
                 [r, 0.36 * h],
                 [neck, 0.80 * h],
                 [neck * 1.12, h],
-            ]));
+            ]);
             let smooth = outer.iter().position(|point| point[1] > 0.72 * h).unwrap_or(0);
             let upper = subdivide(&outer[smooth..], 5.0);
             outer.truncate(smooth);
@@ -212,10 +210,7 @@ pub(super) fn teapot(draw: &mut Draw, made: &mut Assembly) {
                 Point3::new(point.x - 11.0 * upper * forward, point.y, point.z + 4.0 * upper * forward)
             };
             made.add(&Solid::vessel(&outer, 0.0, wall, wall + 1.5).mapped(lip), CERAMIC);
-            let ends = [
-                [radius_at(&outer, 0.86 * h) - 0.5 * wall, 0.86 * h],
-                [radius_at(&outer, 0.28 * h) - 0.5 * wall, 0.28 * h],
-            ];
+            let ends = [0.86 * h, 0.28 * h].map(|z| [radius_at(&outer, z) - 0.5 * wall, z]);
             made.add(&loop_handle(ends, draw.between(36.0, 46.0), 2.6, [4.5, 7.5]), CERAMIC);
         }
     }
