@@ -6,7 +6,7 @@ decision values (to 1e-6) and probabilities with what LIBSVM and scikit-learn ma
 
 import json
 
-from . import figures, programs
+from . import figures
 from . import libsvm_peer as libsvm
 from .options import Option
 
@@ -32,7 +32,7 @@ def measure(options):
 
     model = libsvm.paper_model()
     exported = libsvm.FOLDER / "exported.model"
-    programs.blindgrasp("model", "export", model, "--overwrite", "--out", exported)
+    libsvm.ours("export", model, exported)
     machine = json.loads(model.read_text())["classifier"]["predictor"]["svm"]
     exported.with_suffix(".json").write_text(json.dumps(machine))
     compare_values(check, "a model by the paper's recipe", exported, problem)

@@ -11,7 +11,7 @@ use std::time::Instant;
 use blindgrasp_objects::select;
 use blindgrasp_simulator::hull::{Hull, HullError, convex_hull};
 use blindgrasp_simulator::simulator::{SimulatorOptions, simulate_all};
-use blindgrasp_simulator::wrench_space::{GraspCase, is_stable, quality, wrenches};
+use blindgrasp_simulator::wrench_space::{GraspCase, wrenches};
 use blindgrasp_stages::hand::Hand;
 use serde_json::{Value, json};
 
@@ -74,7 +74,6 @@ fn least_seconds_of<T>(run: impl Fn() -> T) -> (f64, T) {
 
 fn report(cases: &[GraspCase], as_json: bool) -> Result<(), Box<dyn std::error::Error>> {
     let mut hull_ms = Vec::new();
-    let mut label_ms = [Vec::new(), Vec::new(), Vec::new()];
     let (mut n_facets, mut n_flat, mut n_failed, mut n_retries) = (0, 0, 0, 0);
     for case in cases {
         let points = wrenches(case);
@@ -88,19 +87,7 @@ fn report(cases: &[GraspCase], as_json: bool) -> Result<(), Box<dyn std::error::
             Err(HullError::NotFullDimensional { .. }) => n_flat += 1,
             Err(_) => n_failed += 1,
         }
-        let (seconds, stable) = least_seconds_of(|| is_stable(case));
-        let (stable, quality) = (stable?, quality(case)?);
-        if stable != quality.is_stable() {
-            return Err(format!("is_stable says {stable} of a grasp with {quality:?}").into());
-        }
-        let kind = match (stable, quality.force_closure) {
-            (true, _) => 0,
-            (false, true) => 1,
-            (false, false) => 2,
-        };
-        label_ms[kind].push(1e3 * seconds);
     }
-    let [stable, weak, outside] = label_ms.map(|ms| summary(&ms));
     let all = json!({
         "machine": machine(),
         "n_grasps": cases.len(),
@@ -110,7 +97,6 @@ fn report(cases: &[GraspCase], as_json: bool) -> Result<(), Box<dyn std::error::
         "n_hulls_with_retries": n_retries,
         "mean_facets": n_facets as f64 / hull_ms.len().max(1) as f64,
         "hull_ms": summary(&hull_ms),
-        "is_stable_ms": {"stable": stable, "force_closure_but_unstable": weak, "no_force_closure": outside},
     });
     println!("{}", if as_json { serde_json::to_string(&all)? } else { serde_json::to_string_pretty(&all)? });
     Ok(())

@@ -2,16 +2,18 @@
 //!
 //! `cargo bench -p blindgrasp-lab --bench svm -- features RECORDING MODEL N OUT` writes the features of N grasps, by the model's
 //! dictionary, as LIBSVM's problem file; `-- train PROBLEM C GAMMA TOLERANCE OUT` trains on one and writes LIBSVM's
-//! model file, and beside it the machine as blindgrasp's JSON; `-- predict JSON PROBLEM` times single decision values. Results are lines of JSON on stdout.
+//! model file, and beside it the machine as blindgrasp's JSON; `-- predict JSON PROBLEM` times single decision values; `-- export MODEL OUT` writes
+//! a model's machine and calibration as LIBSVM's model file. Results are lines of JSON on stdout.
 
 use std::fmt::Write;
 use std::path::Path;
 use std::time::Instant;
 
 use blindgrasp_grasps::dataset::{hand_of, read_grasps};
-use blindgrasp_learning::learners::libsvm_format::write_libsvm;
 use blindgrasp_learning::learners::svm::train_svm;
 use blindgrasp_messages::Phase;
+use blindgrasp_stages::classifier::Predictor;
+use blindgrasp_stages::classifier::calibration::PlattCalibration;
 use blindgrasp_stages::classifier::svm::{PreparedSvm, RbfSvm, SvmParams};
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::encoder::FeltReading;
@@ -37,6 +39,7 @@ fn main() -> Result<(), Failure> {
             };
             time_training(problem, &params, out)
         }
+        ["export", model, out] => export(model, out),
         ["predict", model, problem] => time_prediction(model, problem),
         [] => {
             eprintln!("run by scripts/benchsuite svm");
@@ -133,4 +136,46 @@ fn time_prediction(model: &str, problem: &str) -> Result<(), Failure> {
     let secs = start.elapsed().as_secs_f64() / samples.len() as f64;
     println!("{}", json!({ "secs": secs, "n_support_vectors": svm.n_support_vectors(), "decision_values": values }));
     Ok(())
+}
+
+fn export(model: &str, out: &str) -> Result<(), Failure> {
+    let classifier = Model::load(Path::new(model))?.classifier;
+    let Predictor::Svm(svm) = &classifier.predictor else { return Err("expected a model with an SVM".into()) };
+    std::fs::write(out, write_libsvm(svm, Some(&classifier.calibration)))?;
+    println!("{}", json!({ "n_support_vectors": svm.n_support_vectors() }));
+    Ok(())
+}
+
+/// Writes a machine and its calibration as LIBSVM's model file. Labels are 1 (stable) and -1; the support vectors of
+/// label 1 come first, as LIBSVM wants, each class in the order of `svm`.
+fn write_libsvm(svm: &RbfSvm, calibration: Option<&PlattCalibration>) -> String {
+    let support = || svm.dual_coefficients.iter().zip(svm.support_vectors.chunks_exact(svm.n_features.max(1)));
+    let n_stable = svm.dual_coefficients.iter().filter(|coefficient| **coefficient > 0.0).count();
+    let n_unstable = svm.n_support_vectors() - n_stable;
+    let mut text = format!(
+        "svm_type c_svc\nkernel_type rbf\ngamma {}\nnr_class 2\ntotal_sv {}\nrho {}\nlabel 1 -1\n",
+        number(svm.gamma),
+        svm.n_support_vectors(),
+        number(svm.rho)
+    );
+    if let Some(calibration) = calibration {
+        text += &format!("probA {}\nprobB {}\n", number(calibration.a), number(calibration.b));
+    }
+    text += &format!("nr_sv {n_stable} {n_unstable}\nSV\n");
+    for of_stable in [true, false] {
+        for (coefficient, vector) in support().filter(|(coefficient, _)| (**coefficient > 0.0) == of_stable) {
+            text += &number(*coefficient);
+            for (idx, value) in vector.iter().enumerate().filter(|(_, value)| **value != 0.0) {
+                // Writing to a String cannot fail.
+                let _ = write!(text, " {}:{}", idx + 1, number(*value));
+            }
+            text += " \n";
+        }
+    }
+    text
+}
+
+/// The shortest decimals that are read back as the same number, with an exponent where plain digits would be many.
+fn number(value: f64) -> String {
+    format!("{value:?}")
 }

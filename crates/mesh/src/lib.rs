@@ -23,7 +23,6 @@
 
 pub mod check;
 mod error;
-mod format;
 pub mod mass;
 mod obj;
 mod off;

@@ -8,7 +8,6 @@ use std::path::Path;
 
 use nalgebra::Point3;
 
-use crate::format::Format;
 use crate::{Mesh, MeshError, obj, off, ply, scene, stl};
 
 /// Greatest size of a mesh file: scans of a million triangles take 50 to 100 MiB.
@@ -25,7 +24,7 @@ pub fn read_mesh(path: &Path, scale: f64) -> Result<Mesh, MeshError> {
     if !(scale.is_finite() && scale > 0.0) {
         return Err(MeshError::Scale { found: scale });
     }
-    let format = Format::of(path)?;
+    let Some(parse) = parser_of(path) else { return Err(MeshError::UnknownFormat { path: path.into() }) };
     let bytes = read_file(path).map_err(|source| MeshError::Read { path: path.into(), source })?;
     if bytes.is_empty() {
         return Err(MeshError::Empty { path: path.into() });
@@ -33,15 +32,7 @@ pub fn read_mesh(path: &Path, scale: f64) -> Result<Mesh, MeshError> {
     if bytes.starts_with(b"version https://git-lfs.github.com/spec/") {
         return Err(MeshError::GitLfsPointer { path: path.into() });
     }
-    let parsed = match format {
-        Format::Off => off::parse(&bytes),
-        Format::Obj => obj::parse(&bytes),
-        Format::Stl => stl::parse(&bytes),
-        Format::Ply => ply::parse(&bytes),
-        Format::Dae => scene::parse_dae(&bytes),
-        Format::Glb => scene::parse_glb(&bytes),
-    };
-    let mesh = parsed.and_then(|soup| soup.into_mesh(scale)).map_err(|Problem { line, expected, found }| {
+    let mesh = parse(&bytes).and_then(|soup| soup.into_mesh(scale)).map_err(|Problem { line, expected, found }| {
         MeshError::Malformed { path: path.into(), line, expected, found }
     })?;
     if mesh.triangles.is_empty() {
@@ -52,7 +43,21 @@ pub fn read_mesh(path: &Path, scale: f64) -> Result<Mesh, MeshError> {
 
 /// Whether a file's extension is that of a format that can be read.
 pub fn is_mesh_file(path: &Path) -> bool {
-    Format::of(path).is_ok()
+    parser_of(path).is_some()
+}
+
+/// The parser of the format that a file's extension says, in upper or lower case.
+fn parser_of(path: &Path) -> Option<fn(&[u8]) -> Result<Soup, Problem>> {
+    let extension = path.extension()?.to_string_lossy().to_ascii_lowercase();
+    Some(match extension.as_str() {
+        "off" => off::parse,
+        "obj" => obj::parse,
+        "stl" => stl::parse,
+        "ply" => ply::parse,
+        "dae" => scene::parse_dae,
+        "glb" => scene::parse_glb,
+        _ => return None,
+    })
 }
 
 /// Refuses pipes and devices, which may never end, and files that would take all memory.

@@ -93,11 +93,7 @@ const evaluation = (report) => {
     `Positive is stable. Deciding always the same would be right for ${first?.judged.majority == null ? "none" : percent(first.judged.majority)}. Intervals are ${made.intervals}.`));
   if (report.looks?.length) section("By stage", stages(report.looks));
   if (report.comparisons.length) section("Compared with each other", comparisons(report));
-  if (report.repeats.length) section("The same with other folds", repeats(report));
-  pairs([roc(judges), precisionRecall(judges), reliability(judges), thresholds(judges), ...learningCurves(report)]);
-  const problems = report.learning_curve.filter(({ problem }) => problem)
-    .map(({ recipe, share, problem }) => `${recipe} at ${(100 * share).toFixed(0)} %: ${problem}`);
-  if (problems.length) main.append(make("p", { class: "aside" }, `Too little to learn from: ${problems.join("; ")}.`));
+  pairs([roc(judges), precisionRecall(judges), reliability(judges), thresholds(judges)]);
   const highest = roundUp(Math.max(0, ...judges.flatMap(({ by_class }) => by_class.map(({ error_share }) => error_share))));
   main.append(...judges.map((judge) => figure(errorsByClass(judge, highest))));
   if (report.figure_1) {
@@ -157,23 +153,13 @@ const comparisons = ({ comparisons, made }) => [
     })),
   caption(`The same grasps${made.split ? ", the same folds" : ""}. Fewer errors: by which share of the second one’s errors the first one’s are fewer. Only one right: grasps that only the first, and only the second, decides rightly; McNemar’s exact test on them takes grasps as independent, the intervals do not. The last columns compare false positives where both lift as many of the stable grasps, at the recall that the second has at its threshold.`),
 ];
-const repeats = ({ judges, repeats, repeated_comparisons }) => {
-  const share = (of) => (of === undefined ? "–" : percent(of)), names = judges.map(({ name }) => name);
-  const rows = repeats.map(({ seed, accuracy, false_positive_share }, idx) => [String(seed),
-    ...names.map((name) => `${share(accuracy[name])}, ${share(false_positive_share[name])}`),
-    ...repeated_comparisons.map((pair) => share(pair.relative_error_reduction[idx]))]);
-  rows.push(["mean (range)", ...names.map(() => ""),
-    ...repeated_comparisons.map(({ mean, least, greatest }) => [percent(mean), " ", small(`(${number(least)} to ${number(greatest)})`)])]);
-  return table(["seed", ...names.map((name) => `${name}\naccuracy, false positives`),
-    ...repeated_comparisons.map(({ first, second }) => `fewer errors,\n${first} against ${second}`)], rows, { isOwn: (idx) => idx === repeats.length });
-};
 const howMade = (report) => {
-  const { made, data } = report, { split } = made, n = report.repeats.length;
+  const { made, data } = report, { split } = made;
   const listed = (counts, word) => Object.entries(counts).map(([name, n]) => `${n}${word} ${spoken(name)}`).join(", ");
   const names = made.recordings, makers = Object.entries(made.made_by).map(([maker, n], idx) => [idx ? make("br") : [], `${n} by `, make("code", {}, maker)]);
   return [
     ["command", make("code", {}, made.command)], ["version", `blindgrasp ${made.version}`], ["hand", made.hand],
-    ...(split ? [["split", `by ${split.by}, ${split.n_folds} folds, seed ${split.seed}${n > 1 ? `, ${n} times, each with the next seed` : ""}. Dictionary, scaling and classifier of a recipe are learned from the other folds alone; the calibration, too, on decision values out of ${split.n_calibration_folds} inner folds, split alike.`]] : []),
+    ...(split ? [["split", `by ${split.by}, ${split.n_folds} folds, seed ${split.seed}. Dictionary, scaling and classifier of a recipe are learned from the other folds alone; the calibration, too, on decision values out of ${split.n_calibration_folds} inner folds, split alike.`]] : []),
     ...(made.predictions ? [["predictions", `${made.predictions}, taken as they are: the outside model must have made each one without having seen the grasp`]] : []),
     ["grasps", `${count(data.n_grasps)} with a label, of ${count(data.n_objects)} objects in ${count(data.n_classes)} classes; ${count(data.n_judged)} judged, ${count(data.n_held_unjudged)} held without a judgement`],
     ["left out", listed(data.n_excluded, " with") || "none"],
@@ -212,23 +198,6 @@ const thresholds = (judges) => curves("What another threshold would do", "lift f
     { name: `${name}, lifted`, colour: seriesColour(idx), points: curve.map((point) => [point.threshold, point.false_positive_rate]) },
     { name: `${name}, held`, colour: seriesColour(idx), isDashed: true, points: curve.map((point) => [point.threshold, 1 - point.recall]) },
   ]));
-// Errors, and false positives, over the grasps learned from.
-const learningCurves = ({ judges, learning_curve }) => {
-  const errors = ({ accuracy }) => accuracy && { value: 1 - accuracy.value, interval: accuracy.interval && { low: 1 - accuracy.interval.high, high: 1 - accuracy.interval.low } };
-  const curve = (what, of) => {
-    const series = judges.map(({ name }, idx) => {
-      const points = learning_curve.filter((point) => point.recipe === name && of(point)).map((point) => ({ n: point.n_grasps, ...of(point) }));
-      return { name, colour: seriesColour(idx), mark: idx, points: points.map(({ n, value }) => [n, value]), marks: points.map(({ n, value }) => [n, value, 4]),
-        intervals: points.filter(({ interval }) => interval).map(({ n, interval }) => [n, interval.low, interval.high]) };
-    });
-    const most = roundUp(Math.max(0, ...learning_curve.map(({ n_grasps }) => n_grasps)));
-    const highest = roundUp(Math.max(0, ...series.flatMap(({ points, intervals }) => [...points.map(([, y]) => y), ...intervals.map(([, , high]) => high)])));
-    const n_judged = Math.max(...learning_curve.map(({ n_judged }) => n_judged));
-    return lineChart({ title: `Learning curve: ${what} among ${count(n_judged)} grasps of the first fold`, ...HALF,
-      x: axis("grasps learned from", 0, most), y: percentAxis(`${what} (%)`, highest), series }).svg;
-  };
-  return learning_curve.length ? [curve("errors", errors), curve("false positives", (point) => point.false_positive_share)] : [];
-};
 const errorsByClass = ({ name, by_class }, highest) => barChart({
   title: `Figure 2: errors and false positives by class, ${name}`, width: 1152, height: 330, y: percentAxis("share of the class’s grasps (%)", highest),
   groups: by_class.map((of) => of.class),

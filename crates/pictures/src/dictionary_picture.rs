@@ -1,6 +1,7 @@
 //! A contact dictionary over the hand: the paper's Figure 1.
 
 use nalgebra::{Point3, Rotation3, Vector3};
+use serde::Serialize;
 
 use super::PictureError;
 use super::colour::{force_colour, hex};
@@ -9,13 +10,13 @@ use blindgrasp_mesh::Mesh;
 use blindgrasp_stages::hand::Hand;
 
 /// A word of the dictionary.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct DrawnWord {
     /// Its place, metres in the palm frame.
     pub position_m: [f64; 3],
-    /// How often it is used, for its size; none = all alike.
+    /// The share of all contacts that are nearest to it, for its size; none = all alike.
     pub share_of_contacts: Option<f64>,
-    /// For its colour; none = grey.
+    /// The share of these contacts that are of stable grasps, for its colour; none = grey.
     pub share_stable: Option<f64>,
 }
 

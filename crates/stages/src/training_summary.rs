@@ -22,7 +22,7 @@ pub struct TrainingSummary {
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub labels: BTreeMap<Label, usize>,
     pub recipe: Recipe,
-    /// Friction coefficients for which the grasps were labelled again. Empty: the recordings' own labels.
+    /// Friction coefficients for which an earlier version labelled the grasps again. Empty: the recordings' own labels.
     pub frictions: Vec<f64>,
     pub n_grasps: usize,
     /// Stable grasps among them.

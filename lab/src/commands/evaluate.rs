@@ -6,11 +6,13 @@ use anyhow::{Context, bail};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{Outcome, check_output, check_page, number_in, percent, print_line, print_text, write_out, write_report};
+use super::{
+    Outcome, check_output, check_page, number_in, percent, print_line, print_text, word, write_out, write_report,
+};
 use blindgrasp_grasps::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::looks::{Look, looks};
-use blindgrasp_learning::evaluation::page::{FIGURE_1_FILE, figure_1, report_page, tables};
+use blindgrasp_learning::evaluation::page::{FIGURE_1_FILE, figure_1, report_page};
 use blindgrasp_learning::evaluation::predictions::{OutsidePredictions, predictions_csv};
 use blindgrasp_learning::evaluation::report::{
     Origin, Report, THRESHOLD_PROBABILITY, report_on_model, report_on_predictions, report_on_recipes,
@@ -18,7 +20,8 @@ use blindgrasp_learning::evaluation::report::{
 use blindgrasp_learning::evaluation::split::{Split, split_into_folds};
 use blindgrasp_learning::evaluation::statistics::Estimate;
 use blindgrasp_learning::evaluation::{Evaluated, Score, Trained, evaluate};
-use blindgrasp_learning::training::{Example, Examples, Relabelling};
+use blindgrasp_learning::file_name;
+use blindgrasp_learning::training::{Example, Examples};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::hand::Hand;
@@ -48,7 +51,7 @@ pub(super) struct Arguments {
     #[arg(required = true, value_name = "[MODEL] RECORDING")]
     inputs: Vec<PathBuf>,
     /// The probe after which the model's arbiter decides: none, squeeze or test_lift; the recordings need its frames.
-    #[arg(long, default_value = "none", value_parser = probe, conflicts_with = "split")]
+    #[arg(long, default_value = "none", value_parser = |text: &str| word::<Probe>(text, "none, squeeze or test_lift"), conflicts_with = "split")]
     probe: Probe,
     /// Train recipes on a part of the grasps and judge the rest, by folds that share no grasp, object or class.
     #[arg(long, value_parser = ["grasp", "object", "class"])]
@@ -62,15 +65,9 @@ pub(super) struct Arguments {
     /// The seed of folds, K-means and boosting.
     #[arg(long, default_value_t = 1, requires = "split")]
     seed: u64,
-    /// The number of repeats, each with other folds.
-    #[arg(long, default_value_t = 1, requires = "split", value_parser = clap::value_parser!(u64).range(1..=100))]
-    repeats: u64,
-    /// Also learn from 10, 20, 40 and 70 % of the training objects.
-    #[arg(long, requires = "split")]
-    learning_curve: bool,
     /// Judge what other models say of these grasps (CSV): the columns grasp_id and probability_stable, for several recordings
     /// also recording, for several models also model.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["repeats", "learning_curve"])]
+    #[arg(long, value_name = "FILE")]
     predictions: Option<PathBuf>,
     /// The models of --predictions lift from this probability on.
     #[arg(long, value_name = "PROBABILITY", requires = "predictions", default_value_t = THRESHOLD_PROBABILITY,
@@ -79,8 +76,8 @@ pub(super) struct Arguments {
     /// Write a report with tables and pictures (HTML).
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
-    /// Write to this folder: the points of the curves (roc.csv, pr.csv, reliability.csv), the probability and fold of each grasp
-    /// (predictions.csv), Table I and Figure 2 (CSV), and Figure 1 (SVG). The page of --report saves its charts as SVG.
+    /// Write to this folder: the probability and fold of each grasp (predictions.csv), and Figure 1 (SVG). The page of --report
+    /// saves its charts as SVG.
     #[arg(long, value_name = "FOLDER")]
     figures: Option<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
@@ -142,10 +139,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
 }
 
-fn probe(text: &str) -> Result<Probe, String> {
-    serde_json::from_value(text.into()).map_err(|_| "expected none, squeeze or test_lift".into())
-}
-
 /// The inputs that models and recipes have in common.
 struct Job<'a> {
     arguments: &'a Arguments,
@@ -169,7 +162,7 @@ impl Job<'_> {
         if is_table && !is_asked_for_more && !has_probes {
             return Ok(Outcome::Done);
         }
-        let mut read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
+        let mut read = Examples::read(self.hand, self.recordings, |_, _| {})?;
         if let Some(trained_on) = &model.training.trained_on {
             read.examples.retain(|example| !trained_on.grasps.contains(&example.reading_id));
         }
@@ -185,7 +178,7 @@ impl Job<'_> {
     }
 
     fn predictions(self) -> anyhow::Result<Outcome> {
-        let read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
+        let read = Examples::read(self.hand, self.recordings, |_, _| {})?;
         let outside = self.outside(&read, &[])?.context("expected predictions")?;
         let report = report_on_predictions(self.origin.clone(), &read, &outside);
         if !self.arguments.json {
@@ -220,15 +213,9 @@ impl Job<'_> {
             }
             recipes.push(recipe);
         }
-        let options = HeldOutOptions {
-            split,
-            n_folds: usize::try_from(arguments.folds)?,
-            recipes,
-            seed: arguments.seed,
-            n_repeats: usize::try_from(arguments.repeats)?,
-            learning_curve: arguments.learning_curve,
-        };
-        let read = Examples::read(self.hand, self.recordings, &Relabelling::default(), |_, _| {})?;
+        let options =
+            HeldOutOptions { split, n_folds: usize::try_from(arguments.folds)?, recipes, seed: arguments.seed };
+        let read = Examples::read(self.hand, self.recordings, |_, _| {})?;
         let examples: Vec<&Example> = read.examples.iter().collect();
         let outside = self.outside(&read, &arguments.recipe)?;
         if let Some(outside) = &outside {
@@ -263,9 +250,6 @@ impl Job<'_> {
         }
         if let Some(folder) = &self.arguments.figures {
             std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
-            for (name, text) in tables(report)? {
-                write_out(&folder.join(name), &text)?;
-            }
             if let Some(picture) = figure_1(self.hand, report)? {
                 write_out(&folder.join(FIGURE_1_FILE), &picture)?;
             }
@@ -293,10 +277,6 @@ pub(super) fn command_line() -> String {
         |argument: String| if plain(&argument) { argument } else { format!("'{}'", argument.replace('\'', r"'\''")) };
     let arguments = std::env::args_os().skip(1).map(|argument| quoted(argument.to_string_lossy().into_owned()));
     std::iter::once("blindgrasp".to_string()).chain(arguments).collect::<Vec<_>>().join(" ")
-}
-
-fn file_name(path: &Path) -> String {
-    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
 /// Prints the definition of stable in the recordings, unless it is the wrench space's in all.
@@ -404,17 +384,6 @@ fn print_judges(report: &Report) -> anyhow::Result<()> {
             with_interval(pair.relative_error_reduction),
             with_interval(pair.at_equal_recall.as_ref().and_then(|equal| equal.relative_reduction)),
             pair.mcnemar_p,
-        ))?;
-    }
-    for pair in &report.repeated_comparisons {
-        print_line(&format!(
-            "{} against {}, {} repeats: {} fewer errors in the mean (least {}, greatest {})",
-            pair.first,
-            pair.second,
-            pair.relative_error_reduction.len(),
-            percent(Some(pair.mean)),
-            percent(Some(pair.least)),
-            percent(Some(pair.greatest)),
         ))?;
     }
     let data = &report.data;

@@ -7,6 +7,7 @@ use clap::{ArgGroup, Args};
 use super::{Outcome, check_new, completions, percent, print_line, print_text};
 use blindgrasp_cli::frame_lines::{FrameLines, read_frames};
 use blindgrasp_cli::joint;
+use blindgrasp_learning::file_name;
 use blindgrasp_learning::import::{Day, ImportOptions, ImportReport, Joints, import_frames, import_table};
 use blindgrasp_stages::hand::Hand;
 
@@ -127,7 +128,7 @@ fn import_lines(arguments: &Arguments, hand: &Hand) -> anyhow::Result<Outcome> {
     let inputs: &[PathBuf] = if arguments.table.is_file() { std::slice::from_ref(&arguments.table) } else { &[] };
     check_new(&arguments.out, inputs, arguments.overwrite)?;
     let FrameLines { frames, truths, headers_of_truths } = read_frames(&arguments.table, hand)?;
-    let name = arguments.table.file_name().unwrap_or(arguments.table.as_os_str()).to_string_lossy();
+    let name = file_name(&arguments.table);
     let report = import_frames(&name, hand, &frames, (&truths, &headers_of_truths), &arguments.out)?;
     if arguments.json {
         print_text(&serde_json::to_string_pretty(&report)?)?;

@@ -25,6 +25,11 @@ blindgrasp_cli::program! {
     operators crate::operators::SHIPPED; others &[]
 }
 
+/// The value that a word of an argument stands for.
+fn word<T: serde::de::DeserializeOwned>(text: &str, expected: &str) -> Result<T, String> {
+    serde_json::from_value(text.into()).map_err(|_| format!("expected {expected}"))
+}
+
 #[cfg(test)]
 mod tests {
     use std::ffi::OsString;

@@ -7,9 +7,8 @@ use clap::{Args, Subcommand};
 use serde_json::json;
 
 use super::train::{probe_lines, threshold_line};
-use super::{Outcome, check_new, check_output, completions, percent, print_line, print_text, write_out};
+use super::{Outcome, check_new, completions, percent, print_line, print_text};
 use blindgrasp_grasps::dataset::{hand_of, label_line};
-use blindgrasp_learning::learners::libsvm_format::write_libsvm;
 use blindgrasp_learning::training::adapt;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::boosting::BoostedTrees;
@@ -22,7 +21,7 @@ use blindgrasp_stages::own_lifts::Correction;
 use blindgrasp_stages::probe::ProbeModel;
 use blindgrasp_stages::training_summary::OwnLiftsSummary;
 
-/// Describe, adapt or export a model, or rate approaches
+/// Describe or adapt a model, or rate approaches
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(subcommand)]
@@ -32,26 +31,8 @@ pub(super) struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     Show(ShowArguments),
-    Export(ExportArguments),
     Adapt(AdaptArguments),
     Approaches(super::approaches::Arguments),
-}
-
-/// Write a model's SVM and calibration for LIBSVM (svm-predict).
-///
-/// Labels are 1 (stable) and -1. Decision values and probabilities are the same there; dictionary, hand and threshold
-/// have no place in the file.
-#[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp model export paper.json --out svm.model")]
-struct ExportArguments {
-    /// The model.
-    model: PathBuf,
-    /// Where to write it.
-    #[arg(short, long)]
-    out: PathBuf,
-    /// Replace a file of this name
-    #[arg(long)]
-    overwrite: bool,
 }
 
 /// Correct a model by the robot's own outcomes: lifts, or labelled grasps of one day.
@@ -96,33 +77,9 @@ struct ShowArguments {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     match &arguments.command {
         Command::Show(arguments) => show(arguments),
-        Command::Export(arguments) => export(arguments),
         Command::Adapt(arguments) => adapt_model(arguments),
         Command::Approaches(arguments) => super::approaches::run(arguments),
     }
-}
-
-fn export(arguments: &ExportArguments) -> anyhow::Result<Outcome> {
-    let inputs = std::slice::from_ref(&arguments.model);
-    // A pipe or a device is written to.
-    if arguments.out.is_file() {
-        check_new(&arguments.out, inputs, arguments.overwrite)?
-    } else {
-        check_output(&arguments.out, inputs)?
-    }
-    let Model { classifier, training, .. } = Model::load(&arguments.model)?;
-    let Predictor::Svm(svm) = &classifier.predictor else {
-        anyhow::bail!(
-            "{} has no SVM but {} (recipe {}): LIBSVM can take models of the recipes with an SVM (blindgrasp train \
-             --recipe paper)",
-            arguments.model.display(),
-            classifier.predictor.summary(),
-            training.recipe.name
-        );
-    };
-    write_out(&arguments.out, &write_libsvm(svm, Some(&classifier.calibration)))?;
-    print_line(&format!("{}: {} support vectors", arguments.out.display(), svm.n_support_vectors()))?;
-    Ok(Outcome::Done)
 }
 
 fn adapt_model(arguments: &AdaptArguments) -> anyhow::Result<Outcome> {

@@ -45,8 +45,7 @@ pub(super) fn list(objects: &str, folder: Option<&Path>, as_json: bool) -> anyho
 
 /// The objects of the paper's lift trials, by their names there.
 fn paper_objects(text: &str) -> anyhow::Result<Vec<Object>> {
-    let targets = targets_named(text)?;
-    Ok(targets.into_iter().map(|target| Object { name: target.name, ..target.object }).collect())
+    Ok(targets_named(text)?.into_iter().map(|target| target.object).collect())
 }
 
 fn row(object: &Object) -> Row<'_> {

@@ -13,10 +13,8 @@ use serde::Serialize;
 
 use super::object_list::list;
 use super::trials::physics;
-use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text};
+use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text, word};
 use blindgrasp_grasps::dataset::REPORT_METADATA;
-use blindgrasp_messages::file_kind::FileKind;
-use blindgrasp_messages::files::read_regular;
 use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
 use blindgrasp_objects::{objects_id, objects_named};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -25,7 +23,7 @@ use blindgrasp_simulator::candidate::SimulatedGrasp;
 use blindgrasp_simulator::options::{SimulatorOptions, Thresholds, check_hand};
 use blindgrasp_simulator::protocol::Approach;
 use blindgrasp_simulator::simulator::{Part, SimulateError, Simulation, SimulationReport};
-use blindgrasp_simulator::trial::PhysicsEngine;
+use blindgrasp_simulator::trial::{PhysicsEngine, read_options};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 
@@ -68,7 +66,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "EPSILON,VOLUME", value_parser = thresholds)]
     thresholds: Option<Thresholds>,
     /// Approach of the palm: blind, from anywhere; planned, by a planner that knows the object [default: blind].
-    #[arg(long, value_parser = approach)]
+    #[arg(long, value_parser = |text: &str| word::<Approach>(text, "blind or planned"))]
     protocol: Option<Approach>,
     /// Share of stable grasps to keep (0 to 1), or natural to keep the natural share [default: 0.48, the paper's].
     #[arg(long, value_parser = stable_fraction)]
@@ -93,7 +91,7 @@ pub(super) struct Arguments {
     overwrite: bool,
     /// Make only the parts of shard I of N (0/N to N-1/N) of a folder; all shards together complete it.
     #[arg(long, value_parser = shard, value_name = "I/N")]
-    shard: Option<Shard>,
+    shard: Option<(usize, usize)>,
     /// Print the report as JSON.
     #[arg(long)]
     json: bool,
@@ -225,7 +223,7 @@ impl Job<'_> {
     fn to_folder(&self, out: &Path, arguments: &Arguments) -> anyhow::Result<Option<SimulationReport>> {
         let Simulation { hand, objects, options } = self.simulation;
         let parts: Vec<Part> = options.parts().collect();
-        let Shard { idx, n } = arguments.shard.unwrap_or(Shard { idx: 0, n: 1 });
+        let (idx, n) = arguments.shard.unwrap_or((0, 1));
         let objects = (arguments.objects.as_str(), objects_id(objects));
         let options = serde_json::to_value(options)?;
         Manifest::new((&hand.name, hand.description_id()), objects, options, parts.len()).claim(out)?;
@@ -341,13 +339,7 @@ fn report_of(recording: &Path) -> anyhow::Result<SimulationReport> {
 
 fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {
     let mut options = match &arguments.options {
-        Some(path) => {
-            if let Some(kind) = FileKind::at(path).filter(|kind| !matches!(kind, FileKind::Empty | FileKind::Json)) {
-                bail!("options {}: expected YAML as of --print-options, found {}", path.display(), kind.description());
-            }
-            let text = read_regular(path).with_context(|| format!("options {}", path.display()))?;
-            serde_saphyr::from_str(&text).with_context(|| format!("options {}", path.display()))?
-        }
+        Some(path) => read_options(path)?,
         None => SimulatorOptions::default(),
     };
     options.n_grasps = arguments.grasps.unwrap_or(options.n_grasps);
@@ -409,24 +401,11 @@ impl<'a> AllOptions<'a> {
     }
 }
 
-fn approach(text: &str) -> Result<Approach, String> {
-    match text {
-        "blind" => Ok(Approach::Blind),
-        "planned" => Ok(Approach::Planned),
-        _ => Err("expected blind or planned".into()),
-    }
-}
-
-#[derive(Debug, Clone, Copy)]
-struct Shard {
-    idx: usize,
-    n: usize,
-}
-
-fn shard(text: &str) -> Result<Shard, String> {
+/// The index of a shard, and the number of shards.
+fn shard(text: &str) -> Result<(usize, usize), String> {
     let numbers = text.split_once('/').and_then(|(idx, n)| Some((idx.parse().ok()?, n.parse().ok()?)));
     match numbers {
-        Some((idx, n)) if idx < n => Ok(Shard { idx, n }),
+        Some((idx, n)) if idx < n => Ok((idx, n)),
         _ => Err("expected I/N with I from 0 to N-1, such as 3/16".into()),
     }
 }

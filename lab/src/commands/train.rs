@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use anyhow::Context;
-use clap::{Args, ValueEnum};
+use clap::Args;
 
 use super::evaluate::print_label;
 use super::{Outcome, check_new, completions, number_in, percent, print_line};
@@ -57,29 +57,11 @@ pub(super) struct Arguments {
     /// The SVM's kernel width.
     #[arg(long, value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
     gamma: Option<f64>,
-    /// The SVM's stopping tolerance.
-    #[arg(long, value_parser = |text: &str| number_in(text, 1e-12..=1.0))]
-    tolerance: Option<f64>,
-    /// Learn the probability of being stable over these friction coefficients, each as probable as the others: the
-    /// recordings' scenes say what each grasp would have been. For a recipe of boosted trees.
-    #[arg(long, value_delimiter = ',', value_parser = |text: &str| number_in(text, 0.01..=10.0))]
-    frictions: Vec<f64>,
-    /// The definition of stable: recorded, the recordings' labels; wrench-space, epsilon > 0.07 and volume > 0.1, also for
-    /// grasps that were labelled by a lift.
-    #[arg(long, default_value = "recorded", conflicts_with = "frictions")]
-    label: TrainingLabel,
     #[command(flatten)]
     thresholds: ThresholdArguments,
     /// The seed of K-means and boosting.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
     seed: u64,
-}
-
-/// The definition of stable.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum TrainingLabel {
-    Recorded,
-    WrenchSpace,
 }
 
 /// The probabilities from which a grasp counts as stable: one that is given, or those that are chosen.
@@ -118,14 +100,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         recipe: recipe(arguments)?,
         threshold_probability: arguments.thresholds.threshold_probability,
         aim: arguments.thresholds.aim(),
-        frictions: arguments.frictions.clone(),
-        by_wrench_space: arguments.label == TrainingLabel::WrenchSpace,
         seed: arguments.seed,
-        ..TrainingOptions::default()
     };
     options.check()?;
     let progress = |what: &str| print_diagnostic(&format!("{what} …"));
-    let examples = Examples::read(&hand, &recordings, &options.relabelling(), |n_read, n| {
+    let examples = Examples::read(&hand, &recordings, |n_read, n| {
         progress(&format!("read recording {n_read} of {n}"));
     })?;
     let model = train(&hand, &examples, &recordings, &options, progress)?;
@@ -146,11 +125,7 @@ fn report(model: &Model, recordings: &[PathBuf], arguments: &Arguments) -> anyho
         training.recipe.name,
         model.classifier.predictor.summary(),
     ))?;
-    if arguments.label == TrainingLabel::WrenchSpace {
-        print_line("stable: epsilon > 0.07 and volume > 0.1, whatever the recordings say")?
-    } else {
-        print_label(recordings)?
-    }
+    print_label(recordings)?;
     let (n_words, n_asked) = (model.features.dictionary.len(), training.recipe.n_words);
     if n_words < n_asked {
         print_diagnostic(&format!(
@@ -266,10 +241,9 @@ fn recipe(arguments: &Arguments) -> anyhow::Result<Recipe> {
         Learner::Svm(params) | Learner::Blend(BlendParams { svm: params, .. }) => {
             params.c = arguments.c.unwrap_or(params.c);
             params.gamma = arguments.gamma.unwrap_or(params.gamma);
-            params.tolerance = arguments.tolerance.unwrap_or(params.tolerance);
         }
         Learner::Boosting(_) => {
-            let given = [("--c", arguments.c), ("--gamma", arguments.gamma), ("--tolerance", arguments.tolerance)];
+            let given = [("--c", arguments.c), ("--gamma", arguments.gamma)];
             if let Some((name, _)) = given.iter().find(|(_, value)| value.is_some()) {
                 anyhow::bail!("{name} is the SVM's: the recipe {} has none; name another with --recipe", recipe.name);
             }

@@ -1,6 +1,6 @@
 //! The operators of the lab.
 
-mod simulated_hand;
+pub(crate) mod simulated_hand;
 
 use blindgrasp_operators::Shipped;
 

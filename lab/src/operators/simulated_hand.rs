@@ -16,6 +16,7 @@ use anyhow::{Context, bail};
 use blindgrasp_messages::{
     Action, GraspTruth, Header, LiftDecision, LiftOutcome, MAX_NAME_BYTES, Message, Recorded, TactileFrame,
 };
+use blindgrasp_objects::Object;
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, TICK, parse_params};
@@ -34,7 +35,8 @@ use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
 use serde::{Deserialize, Serialize};
 
-const DEFAULT_HAND: &str = "barrett-bh8-280";
+/// The hand of a node that names none.
+pub(crate) const DEFAULT_HAND: &str = "barrett-bh8-280";
 /// The most attempts that are kept because they may be unread; that many fit into a node's state.
 const MAX_UNREAD: usize = 96;
 
@@ -48,7 +50,6 @@ struct Params {
     attempts: u32,
     watch: String,
     decision_timeout_s: f64,
-    friction: Option<f64>,
     options: Option<PathBuf>,
     physics: Option<PhysicsEngine>,
     model: Option<PathBuf>,
@@ -64,7 +65,7 @@ struct TrialParts {
 
 pub(crate) fn describe() -> OperatorDescription {
     let whole = |min: i64, max: i64| ParamKind::Integer { min: Some(min), max: Some(max) };
-    let number = |max: f64| ParamKind::Number { above: Some(0.0), min: None, max: Some(max), words: vec![] };
+    let seconds = ParamKind::Number { above: Some(0.0), min: None, max: Some(3600.0), words: vec![] };
     let gate = ParamKind::Choice { values: vec!["on".into(), "off".into()] };
     OperatorDescription::new("simulated_hand", "Tries to lift things in simulated physics")
         .feedback_input("decision", LiftDecision::TYPE_NAME, "Whether to lift what the hand holds")
@@ -95,11 +96,10 @@ pub(crate) fn describe() -> OperatorDescription {
         )
         .param(
             "decision_timeout_s",
-            number(3600.0),
+            seconds,
             Some(30.0.into()),
             "A grasp whose decision is later is not lifted",
         )
-        .optional_param("friction", number(10.0), "Friction of all things on the hand instead of their own")
         .optional_param(
             "options",
             ParamKind::Path { must_exist: true },
@@ -125,14 +125,14 @@ pub(crate) fn check(node: &FileNode) -> anyhow::Result<()> {
 /// The hand, the things, the options of trials and the approaches that a model prefers.
 fn setup(params: &Params) -> anyhow::Result<TrialParts> {
     let hand = Hand::load(params.hand.as_deref().unwrap_or(Path::new(DEFAULT_HAND)))?;
-    let mut things = targets_named(&params.things)?;
+    let things = targets_named(&params.things)?;
     if things.is_empty() {
         bail!("things is '{}': expected at least one thing", params.things);
     }
-    for thing in &mut things {
-        thing.friction = params.friction.unwrap_or(thing.friction);
-        let names = LiftOutcome { thing: thing.name.clone(), group: thing.group.clone(), ..LiftOutcome::default() };
-        names.check().with_context(|| format!("things: '{}'", thing.name))?;
+    for thing in &things {
+        let Object { name, class, .. } = &thing.object;
+        let names = LiftOutcome { thing: name.clone(), group: class.clone(), ..LiftOutcome::default() };
+        names.check().with_context(|| format!("things: '{name}'"))?;
     }
     let mut trial_options =
         params.options.as_deref().map_or_else(|| Ok(TrialOptions::default()), TrialOptions::load)?;

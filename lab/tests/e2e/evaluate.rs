@@ -93,7 +93,7 @@ fn a_report_is_self_contained_and_the_json_has_every_number_of_its_tables() {
     let path = folder.path().join("report.html");
     let mut arguments = SPLIT.to_vec();
     let name = path.to_str().expect("UTF-8");
-    arguments.extend(["--report", name, "--repeats", "2", "--learning-curve"]);
+    arguments.extend(["--report", name]);
     let report = json_of(&arguments);
     let page = std::fs::read_to_string(&path).expect("the report");
     assert_self_contained(&page);
@@ -102,16 +102,6 @@ fn a_report_is_self_contained_and_the_json_has_every_number_of_its_tables() {
     for (name, value) in report.as_object().expect("a report") {
         assert_eq!(data["data"][name], *value, "{name}");
     }
-
-    assert_eq!(report["repeats"].as_array().map(Vec::len), Some(2));
-    let curve = report["learning_curve"].as_array().expect("a curve");
-    assert_eq!(curve.len(), 10, "five shares, two recipes");
-    assert!(
-        curve
-            .windows(2)
-            .filter(|pair| pair[0]["recipe"] == pair[1]["recipe"])
-            .all(|pair| { number(&pair[0]["n_grasps"]) < number(&pair[1]["n_grasps"]) })
-    );
 
     let mut found = Vec::new();
     numbers(&report, &mut found);
@@ -140,8 +130,8 @@ fn a_report_is_self_contained_and_the_json_has_every_number_of_its_tables() {
             }
         }
     }
-    assert!(n_checked > 150, "{n_checked}");
-    for expected in ["24,640", "81.0 %", "Receiver operating", "Figure 2: errors", "Learning curve", "mean (range)"] {
+    assert!(n_checked > 100, "{n_checked}");
+    for expected in ["24,640", "81.0 %", "Receiver operating", "Figure 2: errors"] {
         assert!(shown.contains(expected), "{expected}");
     }
     assert!(page.contains("8 words"), "the dictionary is in the page");
@@ -188,12 +178,10 @@ fn a_model_of_lifts_is_shown_at_each_stage() {
 }
 
 #[test]
-fn judged_grasps_have_their_own_objects_and_repeats_have_a_least_and_a_greatest_value() {
-    let arguments = [&SPLIT[..SPLIT.len() - 1], &["--repeats", "2"]].concat();
-    let printed = text(&run(&arguments, 0).stdout);
+fn judged_grasps_have_their_own_objects() {
+    let printed = text(&run(&SPLIT[..SPLIT.len() - 1], 0).stdout);
     // 240 grasps of 151 objects have a label.
     assert!(printed.contains("judged: 203 grasps of 132 objects; held without a judgement: 37,"), "{printed}");
-    assert!(printed.contains("fewer errors in the mean (least ") && printed.contains(" %, greatest "), "{printed}");
 }
 
 /// The functions of the page's script, in a browser: numbers, axes, charts, and charts as files.
@@ -277,35 +265,16 @@ fn figures(folder: &Path) -> Value {
 }
 
 #[test]
-fn figures_are_tables_of_the_points_that_the_page_shows() {
+fn figures_have_the_fold_and_the_probability_of_each_grasp() {
     let folder = tempfile::tempdir().expect("a folder");
     let folder = folder.path().join("figures");
     let report = figures(&folder);
-    let mut names: Vec<String> = std::fs::read_dir(&folder)
-        .expect("figures")
-        .map(|entry| entry.expect("an entry").file_name().into_string().expect("UTF-8"))
-        .collect();
-    names.sort();
-    let expected =
-        ["figure-1.svg", "figure-2.csv", "pr.csv", "predictions.csv", "reliability.csv", "roc.csv", "table-1.csv"];
-    assert_eq!(names, expected);
-    for name in ["roc", "pr", "reliability", "figure-2"] {
-        let points = rows(&folder.join(format!("{name}.csv")));
-        let models: BTreeSet<&str> = points.iter().map(|row| row["model"].as_str()).collect();
-        assert_eq!(models, BTreeSet::from(["boosted", "paper"]), "{name}");
-    }
+    assert!(folder.join("figure-1.svg").is_file());
     let of = |name: &str, model: &str| {
         rows(&folder.join(name)).into_iter().filter(|row| row["model"] == model).collect::<Vec<_>>()
     };
     for judge in report["judges"].as_array().expect("judges") {
         let model = judge["name"].as_str().expect("a name");
-        let roc = of("roc.csv", model);
-        let ends = [roc.first(), roc.last()].map(|row| row.map(|row| (&*row["false_positive_rate"], &*row["recall"])));
-        assert_eq!(ends, [Some(("0", "0")), Some(("1", "1"))]);
-        assert_eq!(of("pr.csv", model).last().map(|row| row["recall"].clone()).as_deref(), Some("1"));
-        let n_in_bins: f64 =
-            of("reliability.csv", model).iter().map(|bin| bin["n_grasps"].parse::<f64>().expect("a number")).sum();
-        assert_eq!(n_in_bins, number(&report["data"]["n_judged"]));
         let grasps = of("predictions.csv", model);
         assert_eq!(grasps.len() as f64, number(&report["data"]["n_judged"]));
         let mut fold_of: BTreeMap<&str, &str> = BTreeMap::new();
@@ -520,7 +489,6 @@ fn arguments_that_do_not_fit_are_refused_with_a_way_out() {
         (vec![RECORDING, "--predictions", "absent.csv"], 1, "absent.csv"),
         (vec![RECORDING, "--threshold", "0.5"], 2, "--predictions"),
         (vec![RECORDING, "--predictions", "absent.csv", "--threshold", "1.5"], 2, "a number from"),
-        (vec![RECORDING, "--predictions", "absent.csv", "--split", "object", "--repeats", "2"], 2, "--repeats"),
         (vec![RECORDING, "--folds", "5"], 2, "--split"),
         (vec![RECORDING, "--split", "hand"], 2, "grasp, object, class"),
         (vec![RECORDING, "--split", "object", "--folds", "1"], 2, "2..=1000"),

@@ -6,7 +6,7 @@ use std::process::Stdio;
 use crate::common::{blindgrasp, json_lines, run, text};
 use blindgrasp_objects::select;
 use blindgrasp_simulator::simulator::{SimulatorOptions, simulate_all};
-use blindgrasp_simulator::wrench_space::{GraspCase, is_stable, quality};
+use blindgrasp_simulator::wrench_space::{GraspCase, quality};
 use blindgrasp_stages::hand::Hand;
 use serde_json::{Value, json};
 
@@ -122,7 +122,7 @@ fn files_without_a_case_say_why() {
 }
 
 #[test]
-fn the_label_alone_is_the_simulators_label() {
+fn the_quality_of_a_scene_is_the_simulators_label() {
     let hand = Hand::load("barrett-bh8-280".as_ref()).expect("built in");
     let objects = select("all").expect("built in");
     let options = SimulatorOptions { n_grasps: 100, seed: 4, ..Default::default() };
@@ -130,7 +130,6 @@ fn the_label_alone_is_the_simulators_label() {
     let sink = |grasp: blindgrasp_simulator::candidate::SimulatedGrasp| {
         let case = GraspCase::from(&grasp.scene);
         assert_eq!(quality(&case).expect("a quality").is_stable(), grasp.truth.stable);
-        assert_eq!(is_stable(&case), Ok(grasp.truth.stable), "{case:?}");
         n_stable += usize::from(grasp.truth.stable);
         Ok::<(), std::convert::Infallible>(())
     };

@@ -28,11 +28,6 @@ fn tables_and_figures_are_made_once_and_an_interrupted_run_goes_on() {
     assert_eq!(tables.matches("; 150: ").count(), 9, "{tables}");
     let svg = std::fs::read_to_string(folder.join("figures/figure-1.svg")).expect("a figure");
     assert!(svg.starts_with("<svg ") && svg.trim_end().ends_with("</svg>"), "{svg}");
-    let scores = std::fs::read_to_string(folder.join("figures/figure-2.csv")).expect("points");
-    assert!(["paper", "boosted"].iter().all(|recipe| scores.contains(recipe)), "{scores}");
-    let table = std::fs::read_to_string(folder.join("figures/table-1.csv")).expect("a table");
-    assert!(table.contains("true,Test,12320,5914,6406,0.81,0.086"), "{table}");
-
     // As if it had been interrupted in one step: that one is done again, with the same result.
     let step = folder.join("by-object.json");
     let judges =

@@ -183,12 +183,6 @@ fn recordings_of_lifts_are_named_as_such_by_every_command() {
 
     let printed = text(&run(&["evaluate", MODEL, &out], 0).stdout);
     assert!(printed.contains("label: lift (stable: kept"), "{printed}");
-    let model = folder.path().join("model.json");
-    let frictions = ["train", &out, "--frictions", "0.5,1", "--out", model.to_str().expect("UTF-8")];
-    fails(&frictions, "its truth is that of lifts");
-    let by_wrench_space = ["train", &out, "--label", "wrench-space", "--frictions", "1", "--out", "x.json"];
-    let refused = run(&by_wrench_space, 2);
-    assert!(text(&refused.stderr).contains("cannot be used with"), "{}", text(&refused.stderr));
 }
 
 #[test]

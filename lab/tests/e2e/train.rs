@@ -1,9 +1,9 @@
-//! Training by command: recipes, repeated readings, several frictions.
+//! Training by command: recipes, repeated readings.
 
 use std::path::Path;
 use std::process::{Command, Output};
 
-use crate::common::{MODEL, RECORDING, blindgrasp, example, json_of, paper_model, project, run, text};
+use crate::common::{MODEL, RECORDING, blindgrasp, example, json_of, project, run, text};
 use crate::import::pincer;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -42,9 +42,6 @@ fn every_recipe_makes_a_model_that_says_how_it_was_made() {
         &run(&["train", RECORDING, "--c", "3", "--overwrite", "--out", boosted.to_str().expect("UTF-8")], 1).stderr,
     );
     assert!(errors.contains("--c is the SVM's"), "{errors}");
-    let exported = ["model", "export", boosted.to_str().expect("UTF-8"), "--out", "never"];
-    let errors = text(&run(&exported, 1).stderr);
-    assert!(errors.contains("has no SVM"), "{errors}");
 }
 
 #[test]
@@ -59,36 +56,6 @@ fn equal_readings_count_once() {
     assert_eq!(n_grasps(&once), n_grasps(&twice));
     let n = n_grasps(&once).expect("a number of grasps");
     assert!(twice.contains(&format!("left out: {n} with the reading of another grasp")), "{twice}");
-}
-
-#[test]
-fn several_frictions_give_a_probability_over_them() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let judged = folder.path().join("judged.mcap");
-    let judged = judged.to_str().expect("UTF-8");
-    run(&["simulate", "--objects", "held-out", "--grasps", "200", "--seed", "6", "--out", judged], 0);
-    let model = |name: &str, more: &[&str]| {
-        let out = folder.path().join(name);
-        let out = out.to_str().expect("UTF-8");
-        run(&[&["train", RECORDING, "--overwrite", "--out", out], more].concat(), 0);
-        let evaluation = json_of(&["evaluate", out, judged, "--json"]);
-        evaluation["score"]["n_lift"].as_u64().expect("a count")
-    };
-    // Smooth objects slip, and rough ones do not: with more friction, more grasps are lifted.
-    let lifts = [&["--frictions", "0.5,1.0"][..], &[], &["--frictions", "1.0,3.0"]]
-        .iter()
-        .enumerate()
-        .map(|(idx, more)| model(&format!("{idx}.json"), more))
-        .collect::<Vec<_>>();
-    assert!(lifts[0] < lifts[1] && lifts[1] < lifts[2], "{lifts:?}");
-    let out = folder.path().join("never.json");
-    let errors =
-        text(&run(&["train", RECORDING, "--frictions", "0.2,0.3", "--out", out.to_str().expect("UTF-8")], 1).stderr);
-    assert!(errors.contains("no grasp is stable for any of the frictions [0.2, 0.3]"), "{errors}");
-    let refused = ["train", RECORDING, "--recipe", "paper", "--frictions", "0.5,1", "--out"];
-    let output = blindgrasp().args(refused).arg(&out).output().expect("started");
-    assert!(text(&output.stderr).contains("use the recipe boosted"), "{output:?}");
-    assert!(!out.exists());
 }
 
 #[test]
@@ -262,20 +229,6 @@ fn a_look_that_cannot_keep_the_promise_never_lifts() {
     let judged = run(&["evaluate", &model, &new, "--hand", &hand, "--json"], 0);
     let score = &serde_json::from_slice::<Value>(&judged.stdout).expect("JSON")["score"];
     assert_eq!((&score["n_lift"], &score["n_grasps"]), (&json!(0), &json!(2000)), "{score}");
-}
-
-#[test]
-fn an_svm_is_written_for_libsvm_and_trees_are_not() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let out = folder.path().join("svm.model");
-    let out = out.to_str().expect("UTF-8");
-    let said = text(&run(&["model", "export", paper_model().to_str().expect("UTF-8"), "--out", out], 0).stdout);
-    let file = std::fs::read_to_string(out).expect("written");
-    let (header, vectors) = file.split_once("SV\n").expect("support vectors");
-    assert!(header.starts_with("svm_type c_svc\nkernel_type rbf\n") && header.contains("\nprobA -"), "{header}");
-    assert!(said.contains(&format!(": {} support vectors", vectors.lines().count())), "{said}");
-    let refused = text(&run(&["model", "export", MODEL, "--overwrite", "--out", out], 1).stderr);
-    assert!(refused.contains("has no SVM") && refused.contains("--recipe paper"), "{refused}");
 }
 
 #[test]

@@ -25,3 +25,8 @@ pub mod promise;
 pub mod sensors;
 pub mod training;
 pub mod trials;
+
+/// The name of a file, for people.
+pub fn file_name(path: &std::path::Path) -> String {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}

@@ -8,9 +8,11 @@ use std::path::PathBuf;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use crate::file_name;
 use crate::learners::booster::train_boosted;
 use blindgrasp_grasps::dataset::{DatasetError, read_grasps};
 use blindgrasp_messages::{Contact, Fault, Phase, TactileFrame};
+use blindgrasp_simulator::tactile_sensor::gaussian;
 use blindgrasp_stages::classifier::boosting::{BoostedTrees, BoostingError, BoostingParams};
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::day::GraspPlace;
@@ -129,7 +131,9 @@ pub fn damaged(
             Damage::Gain { pad, factor } => cells[cells_of(pad)].iter_mut().for_each(|force| *force *= factor),
             Damage::Offset { pad, newtons } => cells[cells_of(pad)].iter_mut().for_each(|force| *force += newtons),
             Damage::Noise { pad, newtons } => {
-                cells[cells_of(pad)].iter_mut().for_each(|force| *force = (*force + newtons * normal(random)).max(0.0));
+                cells[cells_of(pad)]
+                    .iter_mut()
+                    .for_each(|force| *force = (*force + newtons * gaussian(random)).max(0.0));
             }
             Damage::Encoder { joint, radians } => frame.joints[joint] += radians,
             Damage::Exchanged { pads: [a, b] } => cells_of(a).zip(cells_of(b)).for_each(|(a, b)| cells.swap(a, b)),
@@ -144,12 +148,6 @@ pub fn damaged(
         }
     }
     grasp
-}
-
-/// A standard normal number (Box & Muller).
-fn normal(random: &mut impl Rng) -> f64 {
-    let (u, v): (f64, f64) = (1.0 - random.random::<f64>(), random.random());
-    (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
 }
 
 /// The grasp's values for detectors, if it settles.
@@ -262,10 +260,7 @@ pub fn learn(
         format: FORMAT.into(),
         hand: ModelHand { name: hand.name.clone(), id: hand.id() },
         n_grasps: settled.len(),
-        recordings: recordings
-            .iter()
-            .map(|path| path.file_name().unwrap_or_default().to_string_lossy().into())
-            .collect(),
+        recordings: recordings.iter().map(|path| file_name(path)).collect(),
         flicker: flicker(hand, grasps),
         detectors,
     })

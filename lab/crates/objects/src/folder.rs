@@ -3,13 +3,12 @@
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Component, Path, PathBuf};
 
+use crate::HELD_OUT_EVERY;
 use blindgrasp_mesh::read::is_mesh_file;
 use blindgrasp_messages::MAX_NAME_BYTES;
 
 /// The catalogue's name within the folder.
 pub const CATALOGUE_FILE: &str = "catalogue.csv";
-/// Without a `split` column, one mesh is held out of so many of a class.
-pub const HELD_OUT_EVERY: usize = 3;
 
 /// The class of a mesh that lies in no class's folder.
 const DEFAULT_CLASS: &str = "mesh";
@@ -113,7 +112,7 @@ impl Row {
     }
 }
 
-fn listed(problems: &[String]) -> String {
+pub(crate) fn listed(problems: &[String]) -> String {
     let shown: String = problems.iter().take(MAX_SHOWN).map(|problem| format!("\n  {problem}")).collect();
     match problems.len().saturating_sub(MAX_SHOWN) {
         0 => shown,

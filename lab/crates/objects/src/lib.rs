@@ -32,7 +32,8 @@ use rayon::prelude::*;
 use blindgrasp_mesh::mass::{SolidProperties, solid_properties};
 use blindgrasp_mesh::shape::mesh_of_shape;
 use blindgrasp_mesh::{Mesh, MeshError};
-use classes::{CLASSES, Class, Draw, Made};
+use classes::{CLASSES, Class, Draw};
+use solid::Assembly;
 
 pub use named::{MeshObjectError, NamedError, find_mesh, object_of_mesh, objects_id, objects_named};
 pub use paper::PaperShape;
@@ -140,19 +141,17 @@ impl ObjectSpec {
     /// # Errors
     /// A mesh that cannot be an object, of which the catalogue has none.
     pub fn build(&self) -> Result<Object, ObjectError> {
-        let class = self.class.name.to_owned();
-        match (self.class.make)(&mut Draw::new(self.class.name, self.idx)) {
-            Made::Assembled(made) => {
-                let (name, mass_kg) = (self.name(), made.mass_kg);
-                let refused = |error: MeshError| ObjectError::Mesh { name: self.name(), reason: error.to_string() };
-                let mesh = made.standing();
-                let properties = solid_properties(&mesh).map_err(refused)?;
-                Object::from_mesh(name, class, &mesh, &properties, mass_kg, self.held_out())
-            }
-            Made::Exact { shape, density_kg_per_m3 } => {
-                Ok(Object::new(self.name(), class, shape, density_kg_per_m3, self.held_out()))
-            }
+        let (name, class) = (self.name(), self.class.name.to_owned());
+        let mut made = Assembly::default();
+        (self.class.make)(&mut Draw::new(self.class.name, self.idx), &mut made);
+        if let Some((shape, density_kg_per_m3)) = made.exact {
+            return Ok(Object::new(name, class, shape, density_kg_per_m3, self.held_out()));
         }
+        let mass_kg = made.mass_kg;
+        let mesh = made.standing();
+        let refused = |error: MeshError| ObjectError::Mesh { name: self.name(), reason: error.to_string() };
+        let properties = solid_properties(&mesh).map_err(refused)?;
+        Object::from_mesh(name, class, &mesh, &properties, mass_kg, self.held_out())
     }
 }
 
@@ -174,14 +173,6 @@ pub fn catalogue_specs() -> impl Iterator<Item = ObjectSpec> {
     CLASSES.iter().flat_map(|class| (0..N_PER_CLASS).map(move |idx| ObjectSpec { class, idx }))
 }
 
-/// All built-in objects, class by class.
-///
-/// # Errors
-/// A mesh that cannot be an object, of which the catalogue has none.
-pub fn catalogue() -> Result<Vec<Object>, ObjectError> {
-    catalogue_specs().collect::<Vec<_>>().par_iter().map(ObjectSpec::build).collect()
-}
-
 /// The objects that `text` names: `train`, `held-out`, `all` (also `builtin`), or classes and objects separated by
 /// commas. Builds no others.
 ///
@@ -191,11 +182,8 @@ pub fn select(text: &str) -> Result<Vec<Object>, SelectionError> {
     Ok(select_specs(text)?.par_iter().map(ObjectSpec::build).collect::<Result<_, _>>()?)
 }
 
-/// As [`select`], without building the objects; in the catalogue's order.
-///
-/// # Errors
-/// A name that is neither.
-pub fn select_specs(text: &str) -> Result<Vec<ObjectSpec>, SelectionError> {
+/// In the catalogue's order.
+fn select_specs(text: &str) -> Result<Vec<ObjectSpec>, SelectionError> {
     const SPLITS: [&str; 4] = ["train", "held-out", "all", "builtin"];
     let all: Vec<(String, ObjectSpec)> = catalogue_specs().map(|spec| (spec.name(), spec)).collect();
     let wanted: Vec<&str> = text.split(',').map(str::trim).collect();

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 
 use super::{Object, ObjectError, SelectionError, select};
-use crate::folder::{FolderError, MeshEntry, read_folder};
+use crate::folder::{FolderError, MeshEntry, listed, read_folder};
 use blindgrasp_mesh::check::{check_size, repair};
 use blindgrasp_mesh::mass::solid_properties;
 use blindgrasp_mesh::read::read_mesh;
@@ -14,8 +14,6 @@ use blindgrasp_mesh::{Mesh, MeshError};
 
 /// Density of a mesh without known mass or density. 500 kg/m³: assumed, a light wood.
 const DENSITY_KG_PER_M3: f64 = 500.0;
-/// Most unusable meshes that an error shows.
-const MAX_SHOWN: usize = 10;
 
 /// Why there are no such objects.
 #[derive(Debug, thiserror::Error)]
@@ -28,7 +26,7 @@ pub enum NamedError {
     #[error(transparent)]
     Mesh(#[from] MeshObjectError),
     /// Meshes that cannot be objects. Each problem names its file.
-    #[error("{}: {} of {n_meshes} meshes cannot be used:\n  {}", folder.display(), problems.len(), shown(problems))]
+    #[error("{}: {} of {n_meshes} meshes cannot be used:{}", folder.display(), problems.len(), listed(problems))]
     Meshes { folder: PathBuf, n_meshes: usize, problems: Vec<String> },
 }
 
@@ -132,12 +130,4 @@ pub fn objects_id(objects: &[Object]) -> u64 {
     let mut first = [0; 8];
     first.copy_from_slice(&digest[..8]);
     u64::from_le_bytes(first)
-}
-
-fn shown(problems: &[String]) -> String {
-    let mut shown: Vec<String> = problems.iter().take(MAX_SHOWN).cloned().collect();
-    if problems.len() > MAX_SHOWN {
-        shown.push(format!("and {} more", problems.len() - MAX_SHOWN));
-    }
-    shown.join("\n  ")
 }

@@ -4,6 +4,7 @@
 //! nothing is cut away where one enters another.
 
 use nalgebra::{Point3, Rotation3, Unit, Vector3};
+use parry3d_f64::shape::SharedShape;
 
 use crate::outline::{Point, n_around, offset};
 use blindgrasp_mesh::Mesh;
@@ -19,12 +20,14 @@ pub(super) struct Solid {
 }
 
 /// Solids put together, and their mass.
-#[derive(Debug, Default)]
+#[derive(Default)]
 pub(super) struct Assembly {
     /// All solids so far, metres.
     mesh: Mesh,
     /// The sum of their masses; where they overlap, both count.
     pub(super) mass_kg: f64,
+    /// One of parry's shapes and its density, in the place of solids.
+    pub(super) exact: Option<(SharedShape, f64)>,
 }
 
 impl Assembly {

@@ -6,7 +6,7 @@ use super::*;
 use parry3d_f64::shape::TypedShape;
 
 fn all() -> Vec<(Object, Mesh)> {
-    let objects = catalogue().expect("the catalogue builds");
+    let objects = select("all").expect("the catalogue builds");
     objects.into_iter().map(|object| (object.to_mesh(), object)).map(|(mesh, object)| (object, mesh)).collect()
 }
 

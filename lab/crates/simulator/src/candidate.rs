@@ -291,7 +291,7 @@ mod tests {
         n: u64,
     ) -> Vec<(Object, Start, Exploration, Vec<SimulatedContact>)> {
         let mechanism = Mechanism::new(hand);
-        let objects = blindgrasp_objects::catalogue().expect("built in");
+        let objects = blindgrasp_objects::select("all").expect("built in");
         (0..n)
             .filter_map(|idx| {
                 let mut rng = candidate_rng(7, idx, 0);

@@ -109,7 +109,7 @@ pub const FLAT_TOLERANCE: f64 = 1e-8;
 /// above the noise of degenerate input, far below any feature that is meant. It breaks on input with features of just
 /// that size (contacts that nearly coincide). A finer tolerance then sees them as features, a coarser one sees past
 /// them; what is left between 1e-9 and 1e-7 the coarsest settle.
-pub(super) const TOLERANCES: [f64; 7] = [
+const TOLERANCES: [f64; 7] = [
     ROUNDING * 512.0,
     ROUNDING * 32.0,
     ROUNDING * 8e3,
@@ -126,10 +126,6 @@ const ROUNDING: f64 = 20.0 * f64::EPSILON;
 /// than rounding: a sliver of its height must still determine a plane (1e-15 / 1e-7 = 1e-8).
 const JOGGLES: [f64; 3] = [1e-8, 1e-7, 1e-6];
 
-/// No hull's [`Hull::uncertainty`] is larger than this times the largest absolute coordinate: √6 times the largest joggle,
-/// and a little.
-pub(super) const MAX_UNCERTAINTY: f64 = 3e-6;
-
 /// Largest coordinate: the sixth power of twice it, times any number of facets, is finite.
 const LIMIT: f64 = 1e45;
 
@@ -141,7 +137,7 @@ const WORD_SEED: u64 = 0x776f_7264;
 
 /// A finished hull may miss the tolerance by this factor: a point is dropped against planes whose successors, through
 /// vertices that were themselves on a plane only within the tolerance, need not be the same to the last bit.
-pub(super) const CHECK_SLACK: f64 = 4.0;
+const CHECK_SLACK: f64 = 4.0;
 
 /// A blended plane may miss its simplex' vertices by this share of the tolerance: errors add up from blend to blend.
 const BLEND_TOLERANCE: f64 = 1.0 / 16.0;
@@ -168,11 +164,6 @@ thread_local! {
     static SURFACE: RefCell<Surface> = RefCell::default();
 }
 
-/// Lends this thread's surface.
-pub(super) fn with_surface<T>(use_it: impl FnOnce(&mut Surface) -> T) -> T {
-    SURFACE.with_borrow_mut(use_it)
-}
-
 /// Tries the tolerances on the points as they are, then joggles.
 fn first_unbroken(points: &[[f64; DIM]], tolerances: &[f64]) -> Result<Hull, HullError> {
     let scale = largest_coordinate(points)?;
@@ -181,7 +172,7 @@ fn first_unbroken(points: &[[f64; DIM]], tolerances: &[f64]) -> Result<Hull, Hul
     }
     let corners = initial_simplex(points, FLAT_TOLERANCE * scale)?;
     let build = |points: &[[f64; DIM]], relative_tolerance: f64, blends: bool| {
-        with_surface(|surface| surface.build(points, &corners, relative_tolerance * scale, blends))
+        SURFACE.with_borrow_mut(|surface| surface.build(points, &corners, relative_tolerance * scale, blends))
     };
     let mut n_retries = 0;
     let mut reason = "";
@@ -211,14 +202,14 @@ fn first_unbroken(points: &[[f64; DIM]], tolerances: &[f64]) -> Result<Hull, Hul
 
 /// Tolerances in turn, and whether planes are blended. Blending is a matter of speed: before the tolerance is blamed, it
 /// is tried without.
-pub(super) fn attempts(tolerances: &[f64]) -> impl Iterator<Item = (f64, bool)> {
+fn attempts(tolerances: &[f64]) -> impl Iterator<Item = (f64, bool)> {
     let blended = tolerances.iter().take(1).map(|tolerance| (*tolerance, true));
     blended.chain(tolerances.iter().map(|tolerance| (*tolerance, false)))
 }
 
 /// Why an attempt broke.
 #[derive(Debug)]
-pub(super) struct Broken(pub(super) &'static str);
+struct Broken(&'static str);
 
 /// No simplex, no point.
 const NONE: u32 = u32::MAX;
@@ -270,7 +261,7 @@ struct HorizonRidge {
 
 /// The hull so far. Its memory is used again for the next hull.
 #[derive(Default)]
-pub(super) struct Surface {
+struct Surface {
     points: Vec<[f64; DIM]>,
     tolerance: f64,
     blends: bool,
@@ -300,40 +291,6 @@ impl Surface {
         tolerance: f64,
         blends: bool,
     ) -> Result<Hull, Broken> {
-        self.enclose(points, corners, tolerance, blends)?;
-        self.check()?;
-        self.finish()
-    }
-
-    /// Goes on from points of the hull to the hull of all, furthest point first; `pause` is asked after each and may end it.
-    pub(super) fn complete(
-        &mut self,
-        points: &[[f64; DIM]],
-        mut pause: impl FnMut(&Self) -> Result<bool, Broken>,
-    ) -> Result<(), Broken> {
-        let alive: Vec<u32> = (0..self.planes.len() as u32).filter(|idx| self.planes[*idx as usize].alive).collect();
-        for point in points {
-            self.push(*point);
-            let outsider = self.outside_of(self.points.len() as u32 - 1, &alive);
-            self.outsiders.extend(outsider);
-        }
-        while let Some(outsider) = self.take_furthest() {
-            self.insert(outsider)?;
-            if pause(self)? {
-                return Ok(());
-            }
-        }
-        Ok(())
-    }
-
-    /// Starts anew with the hull of these points.
-    pub(super) fn enclose(
-        &mut self,
-        points: &[[f64; DIM]],
-        corners: &[u32; DIM + 1],
-        tolerance: f64,
-        blends: bool,
-    ) -> Result<(), Broken> {
         self.clear();
         points.iter().for_each(|point| self.push(*point));
         (self.tolerance, self.blends) = (tolerance, blends);
@@ -341,30 +298,8 @@ impl Surface {
         while let Some(outsider) = self.take_furthest() {
             self.insert(outsider)?;
         }
-        Ok(())
-    }
-
-    /// Adds a point that is outside the facet [`Surface::nearest_facet`] by more than the tolerance.
-    pub(super) fn extend(&mut self, point: [f64; DIM], plane: u32) -> Result<(), Broken> {
-        self.push(point);
-        let distance = self.planes[plane as usize].distance_to(&point);
-        self.insert(Outsider { point: self.points.len() as u32 - 1, plane, distance })
-    }
-
-    /// The plane with the least offset, its normal and its offset.
-    pub(super) fn nearest_facet(&self) -> (u32, [f64; DIM], f64) {
-        let mut nearest = (NONE, [0.0; DIM], f64::INFINITY);
-        for (idx, plane) in self.planes.iter().enumerate() {
-            if plane.alive && plane.offset < nearest.2 {
-                nearest = (idx as u32, plane.normal, plane.offset);
-            }
-        }
-        nearest
-    }
-
-    /// How many points were added to the first simplex.
-    pub(super) fn n_insertions(&self) -> u32 {
-        self.n_insertions
+        self.check()?;
+        self.finish()
     }
 
     fn push(&mut self, point: [f64; DIM]) {
@@ -663,14 +598,9 @@ impl Surface {
     }
 
     /// Every point below every plane, every vertex on its plane.
-    pub(super) fn check(&self) -> Result<(), Broken> {
-        self.check_against(&self.points)
-    }
-
-    /// All these points below every plane, every vertex on its plane.
-    fn check_against(&self, points: &[[f64; DIM]]) -> Result<(), Broken> {
+    fn check(&self) -> Result<(), Broken> {
         let limit = CHECK_SLACK * self.tolerance;
-        let blocks = blocks(points);
+        let blocks = blocks(&self.points);
         for plane in self.planes.iter().filter(|plane| plane.alive) {
             if greatest(&blocks, &plane.normal) - plane.offset > limit {
                 return Err(Broken("a point outside the finished hull"));
@@ -683,21 +613,6 @@ impl Surface {
             }
         }
         Ok(())
-    }
-
-    /// The volume so far, from a surface that passes the checks as the hull of its vertices.
-    pub(super) fn checked_volume(&self) -> Result<f64, Broken> {
-        let mut vertices: Vec<u32> = self
-            .simplices
-            .iter()
-            .filter(|simplex| simplex.seen_at != NONE)
-            .flat_map(|simplex| simplex.vertices)
-            .collect();
-        vertices.sort_unstable();
-        vertices.dedup();
-        let vertices: Vec<[f64; DIM]> = vertices.iter().map(|idx| self.points[*idx as usize]).collect();
-        self.check_against(&vertices)?;
-        Ok(self.finish()?.volume)
     }
 
     /// Sums the cones from the interior point and lists the facets.
@@ -803,10 +718,10 @@ impl Table {
 }
 
 /// Steele, Lea & Flood's SplitMix64.
-pub(super) struct SplitMix64(pub(super) u64);
+struct SplitMix64(u64);
 
 impl SplitMix64 {
-    pub(super) fn next(&mut self) -> u64 {
+    fn next(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
         z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -815,12 +730,12 @@ impl SplitMix64 {
     }
 
     /// Uniform in -1..1.
-    pub(super) fn symmetric(&mut self) -> f64 {
+    fn symmetric(&mut self) -> f64 {
         (self.next() >> 11) as f64 / (1_u64 << 52) as f64 - 1.0
     }
 }
 
-pub(super) fn largest_coordinate(points: &[[f64; DIM]]) -> Result<f64, HullError> {
+fn largest_coordinate(points: &[[f64; DIM]]) -> Result<f64, HullError> {
     let mut largest = 0.0_f64;
     for (point_idx, point) in points.iter().enumerate() {
         for (axis, &value) in point.iter().enumerate() {
@@ -834,7 +749,7 @@ pub(super) fn largest_coordinate(points: &[[f64; DIM]]) -> Result<f64, HullError
 }
 
 /// Seven points far apart: each in turn is the furthest from the flat through those before it.
-pub(super) fn initial_simplex(points: &[[f64; DIM]], flat_tolerance: f64) -> Result<[u32; DIM + 1], HullError> {
+fn initial_simplex(points: &[[f64; DIM]], flat_tolerance: f64) -> Result<[u32; DIM + 1], HullError> {
     let first = (0..points.len()).fold(0, |least, idx| if points[idx][0] < points[least][0] { idx } else { least });
     let mut corners = [first as u32; DIM + 1];
     // The part of each point that is perpendicular to the flat so far.
@@ -1012,7 +927,7 @@ fn minors(a: &[[f64; LANES]; DIM], b: &[[f64; LANES]; DIM], c: &[[f64; LANES]; D
     minors
 }
 
-pub(super) fn dot(a: &[f64; DIM], b: &[f64; DIM]) -> f64 {
+fn dot(a: &[f64; DIM], b: &[f64; DIM]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
 }
 

@@ -24,7 +24,7 @@
 //! part and keeps those that fill the asked-for numbers of stable and unstable grasps; [`options`] has its options. With
 //! the label `lift`, the physics of [`crate::trial`] replace the steps between the object and the label.
 //!
-//! [`inner_ball`] proves most stable and unstable grasps without a hull. [`case_file`] reads grasps of users.
+//! [`case_file`] reads grasps of users.
 //!
 //! Without physics this is a geometric simulator: the object does not move, nothing has mass or speed while the fingers
 //! close, and links are rigid but for the contact patch.
@@ -34,7 +34,6 @@ pub mod case_file;
 pub mod contact_points;
 pub mod distance;
 pub mod hull;
-pub mod inner_ball;
 pub mod loaded_contacts;
 pub mod mechanism;
 pub(crate) mod option_check;

@@ -156,15 +156,12 @@ pub enum SimulateError<E> {
     #[error(transparent)]
     Candidate(#[from] CandidateError),
     #[error(
-        "gave up after {n_candidates} candidates with {n_grasps} of {n_wanted} grasps: {:.1} % of the candidates are \
+        "gave up after {} candidates with {} of {n_wanted} grasps: {:.1} % of the candidates are \
          stable by nature; ask for a stable fraction nearer to that, or for other objects",
-        natural_stable_rate * 100.0
+        done.n_candidates, done.n_grasps, done.natural_stable_rate() * 100.0
     )]
     GaveUp {
-        n_candidates: usize,
-        n_grasps: usize,
         n_wanted: usize,
-        natural_stable_rate: f64,
         /// Of the grasps that the sink has got.
         done: Box<SimulationReport>,
     },
@@ -289,9 +286,7 @@ impl<'a> PartRun<'a> {
         let SimulationReport { n_candidates, n_grasps, .. } = self.report;
         let n_wanted = self.part.n_grasps;
         if n_candidates >= n_wanted.saturating_mul(options.max_candidates_per_grasp).saturating_add(1000) {
-            let natural_stable_rate = self.report.natural_stable_rate();
-            let done = Box::new(self.report.clone());
-            return Err(SimulateError::GaveUp { n_candidates, n_grasps, n_wanted, natural_stable_rate, done });
+            return Err(SimulateError::GaveUp { n_wanted, done: Box::new(self.report.clone()) });
         }
         let (n_missing, n_threads) = (n_wanted - n_grasps, rayon::current_num_threads());
         let n_batch = match options.label {
@@ -540,6 +535,6 @@ pub(crate) mod tests {
         options = SimulatorOptions { friction: 0.01, ..Default::default() };
         options.max_candidates_per_grasp = 0;
         let gave_up = simulate(&objects, &options);
-        assert!(matches!(gave_up, Err(SimulateError::GaveUp { n_grasps: 0, .. })));
+        assert!(matches!(gave_up, Err(SimulateError::GaveUp { done, .. }) if done.n_grasps == 0));
     }
 }

@@ -284,7 +284,7 @@ pub(crate) fn read_torques(torques: &[f64], options: &SensorOptions, rng: &mut i
 }
 
 /// Standard normal (Box & Muller).
-fn gaussian(rng: &mut (impl rand::Rng + ?Sized)) -> f64 {
+pub fn gaussian(rng: &mut (impl rand::Rng + ?Sized)) -> f64 {
     let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
     radius * (std::f64::consts::TAU * rng.random::<f64>()).cos()
 }

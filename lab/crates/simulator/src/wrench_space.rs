@@ -12,7 +12,6 @@ use thiserror::Error;
 use blindgrasp_messages::GraspScene;
 
 use super::hull::{DIM, HullError, convex_hull};
-use super::inner_ball::exceeds;
 
 /// A grasp is stable only if its epsilon is greater than this (Dang & Allen, section IV).
 pub const STABLE_EPSILON: f64 = 0.07;
@@ -151,34 +150,12 @@ pub fn wrenches(case: &GraspCase) -> Vec<[f64; DIM]> {
 /// A value that a grasp cannot have, with its contact and field; or a hull that failed for another reason than flatness.
 pub fn quality(case: &GraspCase) -> Result<Quality, QualityError> {
     check(case)?;
-    quality_of(&wrenches(case), case.contacts.len())
-}
-
-/// Whether a grasp is stable: the same answer as [`quality`]'s [`Quality::is_stable`], at a small part of the cost.
-///
-/// A part of the wrenches usually proves the answer ([`exceeds`]); the hull decides the grasps that are too near to the
-/// thresholds for that. A proof also settles a grasp whose hull would have failed.
-///
-/// # Errors
-/// The same as [`quality`]'s.
-pub fn is_stable(case: &GraspCase) -> Result<bool, QualityError> {
-    check(case)?;
-    if case.contacts.len() < 2 {
-        return Ok(false);
-    }
     let wrenches = wrenches(case);
-    match exceeds(&wrenches, STABLE_EPSILON, STABLE_VOLUME) {
-        Some(is_stable) => Ok(is_stable),
-        None => Ok(quality_of(&wrenches, case.contacts.len())?.is_stable()),
-    }
-}
-
-fn quality_of(wrenches: &[[f64; DIM]], n_contacts: usize) -> Result<Quality, QualityError> {
     let n_wrenches = wrenches.len();
-    if n_contacts < 2 {
+    if case.contacts.len() < 2 {
         return Ok(Quality::flat(n_wrenches));
     }
-    let hull = match convex_hull(wrenches) {
+    let hull = match convex_hull(&wrenches) {
         Ok(hull) => hull,
         Err(HullError::NotFullDimensional { .. }) => return Ok(Quality::flat(n_wrenches)),
         Err(source) => return Err(QualityError::Hull { n_wrenches, source }),
@@ -279,7 +256,6 @@ fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::hull::SplitMix64;
 
     /// A contact on an object, its tangent along the axis the normal is least along.
     fn contact(point_m: [f64; 3], direction: [f64; 3], friction: f64, torsion_m: f64) -> GraspContact {
@@ -434,60 +410,6 @@ mod tests {
         assert!(!of(-1.0, 0.2));
     }
 
-    /// Contacts at random places, whose normals look more or less to the centre.
-    fn random_grasp(random: &mut SplitMix64) -> GraspCase {
-        let n_contacts = random.next() % 8;
-        let friction = [0.1, 0.3, 0.6, 1.0, 1.0][(random.next() % 5) as usize];
-        let contacts = (0..n_contacts).map(|_| {
-            let point_m: [f64; 3] = std::array::from_fn(|_| 0.05 * random.symmetric());
-            let direction = point_m.map(|x| -x + 0.02 * random.symmetric());
-            let torsion_m = if random.next().is_multiple_of(2) { 0.0 } else { 0.01 * random.symmetric().abs() };
-            contact(point_m, direction, friction, torsion_m)
-        });
-        grasp(contacts.collect())
-    }
-
-    #[test]
-    fn the_label_alone_is_the_same_label() {
-        let mut random = SplitMix64(1);
-        let mut n_stable = 0;
-        for idx in 0..3000 {
-            let mut case = random_grasp(&mut random);
-            if idx % 10 == 0 {
-                case.contacts.extend(case.contacts.clone());
-            }
-            let stable = quality(&case).expect("a quality").is_stable();
-            assert_eq!(is_stable(&case), Ok(stable), "{case:?}");
-            n_stable += usize::from(stable);
-        }
-        assert!((300..2700).contains(&n_stable), "{n_stable}");
-    }
-
-    #[test]
-    fn the_label_alone_is_the_same_label_near_the_threshold() {
-        let base = four_contacts(1.0);
-        let epsilon = quality(&base).expect("a quality").epsilon;
-        // Epsilon follows the torques' scale continuously: look for where it crosses the threshold.
-        let scaled = |factor: f64| GraspCase { max_radius_m: base.max_radius_m * factor, ..base.clone() };
-        assert!(epsilon > STABLE_EPSILON);
-        let (mut small, mut large) = (1.0, 64.0);
-        for _ in 0..50 {
-            let middle = 0.5 * (small + large);
-            let found = quality(&scaled(middle)).expect("a quality");
-            assert_eq!(is_stable(&scaled(middle)), Ok(found.is_stable()), "{found:?}");
-            if found.is_stable() { small = middle } else { large = middle }
-        }
-    }
-
-    #[test]
-    fn a_radius_too_small_is_an_error_and_not_an_unstable_grasp() {
-        let case = GraspCase { max_radius_m: 1e-300, ..four_contacts(1.0) };
-        for found in [quality(&case).map(|quality| quality.is_stable()), is_stable(&case)] {
-            assert!(matches!(found, Err(QualityError::Hull { source: HullError::NonFinite { .. }, .. })), "{found:?}");
-        }
-        assert_eq!(is_stable(&grasp(vec![])), Ok(false));
-    }
-
     #[test]
     fn bad_input_says_which_contact_and_field() {
         type Change = fn(&mut GraspCase);
@@ -511,7 +433,6 @@ mod tests {
                 other => panic!("{wrong_field}: {other:?}"),
             };
             assert_eq!(found, (wrong_contact, wrong_field));
-            is_stable(&case).expect_err("refused by the label alone as well");
         }
     }
 }

@@ -14,7 +14,7 @@ use rayon::prelude::*;
 use self::setup::Setup;
 use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
-use super::{Outcome, check_page, completions, print_line, print_text, stop_requests, write_report};
+use super::{Outcome, check_page, completions, print_line, print_text, stop_requests, word, write_report};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_learning::trials::late_decisions::LateDecisions;
@@ -107,11 +107,7 @@ enum LiftPolicy {
 }
 
 pub(super) fn physics(text: &str) -> Result<PhysicsEngine, String> {
-    match text {
-        "rapier" => Ok(PhysicsEngine::Rapier),
-        "mujoco" => Ok(PhysicsEngine::Mujoco),
-        _ => Err("expected rapier or mujoco".into()),
-    }
+    word(text, "rapier or mujoco")
 }
 
 /// One way to make the trials.
@@ -129,12 +125,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         return Ok(Outcome::Done);
     }
     check_arguments(arguments)?;
-    let (mut targets, warnings) = targets_and_warnings(&arguments.objects)?;
+    let (targets, warnings) = targets_and_warnings(&arguments.objects)?;
     warnings.iter().for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
     let setup = Setup::new(arguments)?;
-    if let Some(friction) = setup.friction {
-        targets.iter_mut().for_each(|target| target.friction = friction);
-    }
     let left_out = check_approaches(&setup.hand, &targets, &setup.options, arguments.seed, arguments.trials)?;
     if !left_out.is_empty() {
         print_diagnostic(&format!(
@@ -197,13 +190,7 @@ fn empty_report(arguments: &Arguments, setup: &Setup) -> TrialsReport {
         options: setup.options.clone(),
         model: setup.model.clone(),
         end: "finished".into(),
-        with_gate: None,
-        without_gate: None,
-        late: None,
-        n_left_out: 0,
-        effect: None,
-        records_with_gate: Vec::new(),
-        records_without_gate: Vec::new(),
+        ..TrialsReport::default()
     }
 }
 
@@ -268,7 +255,7 @@ fn strips(setup: &Setup, targets: &[LiftTarget], report: &TrialsReport, n_stops:
             if n_stops.load(Ordering::Relaxed) > 0 {
                 return Ok(None);
             }
-            let target = targets.iter().find(|target| target.name == record.thing).context("no such object")?;
+            let target = targets.iter().find(|target| target.object.name == record.thing).context("no such object")?;
             let made = Made { options: &report.options, prior: setup.prior.as_ref(), probe: setup.probe };
             Ok(Some(strip(&setup.hand, target, made, report.seed, record)?))
         })

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 
 use super::{Arguments, Way, physics};
+use crate::operators::simulated_hand::DEFAULT_HAND;
 use blindgrasp_cli::graph_file::{OnMisfit, checked, fitting};
 use blindgrasp_graph::dataflow::{self, DataflowFile, Graph, Node, Override, Scope};
 use blindgrasp_messages::{LiftOutcome, Recorded};
@@ -18,9 +19,6 @@ const SOURCE: &str = "simulated_hand";
 /// While the hand waits for a decision nothing moves, and a simulation on a busy machine may take its time.
 const LEAST_MAX_AGE_MS: f64 = 5000.0;
 
-/// The hand of a node that names none.
-const DEFAULT_HAND: &str = "barrett-bh8-280";
-
 /// A dataflow file and what it is run with.
 pub(super) struct Setup {
     file: DataflowFile,
@@ -29,8 +27,6 @@ pub(super) struct Setup {
     pub(super) node: String,
     /// The hand of the node that lifts.
     pub(super) hand: Hand,
-    /// The friction that the node gives to all objects, if any.
-    pub(super) friction: Option<f64>,
     pub(super) options: TrialOptions,
     /// File name of the model.
     pub(super) model: String,
@@ -80,7 +76,6 @@ impl Setup {
         let options = trial_options(arguments, node, &mut overrides)?;
         let hand = node.params.get("hand").and_then(|hand| hand.as_str()).unwrap_or(DEFAULT_HAND);
         let hand = Hand::load(Path::new(hand))?;
-        let friction = node.params.get("friction").and_then(|friction| friction.as_f64());
         let prior = approach_prior(arguments, node);
         let probe = match text_param(&graph, "probe").as_deref() {
             Some("squeeze") => Some(ProbeMove::Squeeze),
@@ -96,7 +91,7 @@ impl Setup {
             overrides.push(set(&node.id, "watch", "on".into()));
         }
         let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());
-        Ok(Setup { node: node.id.clone(), file, overrides, hand, friction, options, model, prior, probe })
+        Ok(Setup { node: node.id.clone(), file, overrides, hand, options, model, prior, probe })
     }
 
     /// The checked graph of a way.

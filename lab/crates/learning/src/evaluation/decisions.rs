@@ -9,7 +9,7 @@ use super::reliability::{N_RELIABILITY_BINS, Reliability, reliability};
 use super::statistics::{Estimate, Interval, bootstrap, wilson_interval};
 
 /// A labelled grasp and the decision on it.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct JudgedGrasp {
     /// Index of its recording in the list of recordings.
     pub recording_idx: usize,

@@ -5,21 +5,18 @@
 //! grasps that it predicts cannot be found out here.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use super::decisions::{JudgedGrasp, JudgedRecipe};
+use crate::file_name;
 use crate::import::columns::shortened;
 use crate::import::lines::{Lines, RowLimit};
-use crate::import::{BYTE_ORDER_MARK, bad_row, found};
+use crate::import::{BYTE_ORDER_MARK, bad_row, found, read as read_bytes};
 use crate::training::{Example, Examples};
 use blindgrasp_messages::MAX_NAME_BYTES;
-use blindgrasp_messages::files::open_regular;
 
 /// The most models of a table: more would be a number or a path in the column of models.
 const MAX_MODELS: usize = 16;
-/// The size limit of a table: tens of millions of predictions.
-const MAX_BYTES: u64 = 1 << 30;
 /// The most grasps that an error lists.
 const MAX_SHOWN_GRASPS: usize = 8;
 
@@ -29,7 +26,7 @@ type GraspInRecording = (usize, u64);
 /// Models with a prediction for each grasp that is judged.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct OutsidePredictions {
-    path: PathBuf,
+    pub path: PathBuf,
     /// In the order in which the table has them.
     pub models: Vec<OutsideModel>,
     /// The models lift from this probability on.
@@ -80,7 +77,7 @@ impl OutsidePredictions {
         if read.examples.is_empty() {
             return Err(PredictionsError::NoGrasps);
         }
-        let bytes = read_bytes(path)?;
+        let bytes = read_bytes(path).map_err(|source| PredictionsError::Read { path: path.into(), source })?;
         let text = bytes.strip_prefix(BYTE_ORDER_MARK).unwrap_or(&bytes);
         let grasps = KnownGrasps { recordings, grasps: &read.grasps };
         let default_name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
@@ -138,11 +135,6 @@ impl OutsidePredictions {
             ))),
             None => Ok(()),
         }
-    }
-
-    /// The name of the table.
-    pub fn file_name(&self) -> String {
-        self.path.file_name().unwrap_or_default().to_string_lossy().into_owned()
     }
 
     fn refused(&self, message: String) -> PredictionsError {
@@ -217,18 +209,6 @@ pub fn predictions_csv(judges: &[JudgedRecipe], recordings: &[PathBuf]) -> Resul
 
 fn key_of(example: &Example) -> GraspInRecording {
     (example.recording_idx, example.grasp_id)
-}
-
-fn read_bytes(path: &Path) -> Result<Vec<u8>, PredictionsError> {
-    let mut bytes = Vec::new();
-    open_regular(path)
-        .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
-        .map_err(|source| PredictionsError::Read { path: path.into(), source })?;
-    if bytes.len() as u64 > MAX_BYTES {
-        let message = "more than 1 GiB: expected a table (CSV) with a row for each grasp".into();
-        return Err(PredictionsError::Table { path: path.into(), message });
-    }
-    Ok(bytes)
 }
 
 /// Errors do not name the file.
@@ -345,7 +325,7 @@ impl PredictionColumns {
         let grasp_id = whole_number("grasp_id", self.grasp_id)?;
         let place = match self.recording {
             Some(idx) => grasps.of_recording(&record[idx], grasp_id)?,
-            None => grasps.of_any_recording(grasp_id)?,
+            None => grasps.of_only_recording(grasp_id)?,
         };
         let probability = &record[self.probability_stable];
         // NaN is in no range.
@@ -369,8 +349,7 @@ struct KnownGrasps<'a> {
 impl KnownGrasps<'_> {
     /// The file name of a recording.
     fn name(&self, recording_idx: usize) -> String {
-        let path = &self.recordings[recording_idx];
-        path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+        file_name(&self.recordings[recording_idx])
     }
 
     /// A grasp of the recording with this path, or of the only one with this file name.
@@ -413,19 +392,14 @@ impl KnownGrasps<'_> {
         }
     }
 
-    /// A grasp of the only recording that has one with this number.
-    fn of_any_recording(&self, grasp_id: u64) -> Result<GraspInRecording, String> {
-        let has_it = |idx: &usize| self.grasps.contains(&(*idx, grasp_id));
-        let having: Vec<usize> = (0..self.recordings.len()).filter(has_it).collect();
-        match having[..] {
-            [idx] => Ok((idx, grasp_id)),
-            [] if self.recordings.len() == 1 => Err(self.no_such_grasp(0, grasp_id)),
-            [] => Err(format!("none of the {} recordings has a grasp {grasp_id}", self.recordings.len())),
-            [first, second, ..] => Err(format!(
-                "grasp {grasp_id} is in {} and in {}: expected a column 'recording'",
-                self.name(first),
-                self.name(second)
-            )),
+    /// A grasp of the only recording.
+    fn of_only_recording(&self, grasp_id: u64) -> Result<GraspInRecording, String> {
+        match self.recordings {
+            [_] if self.grasps.contains(&(0, grasp_id)) => Ok((0, grasp_id)),
+            [_] => Err(self.no_such_grasp(0, grasp_id)),
+            several => {
+                Err(format!("grasp {grasp_id} of one of {} recordings: expected a column 'recording'", several.len()))
+            }
         }
     }
 }
@@ -537,12 +511,11 @@ mod tests {
             ),
             (
                 "grasp_id,probability_stable\n0,0.5\n2,0.5\n".into(),
-                "line 3: grasp 2 is in a.mcap and in b.mcap: expected a column",
+                "line 2: grasp 0 of one of 2 recordings: expected a column 'recording'",
             ),
-            ("grasp_id,probability_stable\n9,0.5\n".into(), "line 2: none of the 2 recordings has a grasp 9"),
             ("model,grasp_id,probability_stable\na/b,0,0.5\n".into(), "line 2: column 'model': expected a name"),
             (
-                "fold,grasp_id,probability_stable\nx,0,0.5\n".into(),
+                "fold,recording,grasp_id,probability_stable\nx,a.mcap,0,0.5\n".into(),
                 "line 2: column 'fold': expected a whole number, found 'x'",
             ),
         ] {
@@ -551,8 +524,8 @@ mod tests {
         }
         let error = read_table(b"grasp_id,probability_stable\n\xff,0.5\n").expect_err("no UTF-8");
         assert!(error.contains("line 2: field 1: expected UTF-8"), "{error}");
-        let many: String = (0..17).map(|idx| format!("m{idx},0,0.5\n")).collect();
-        let error = read_table(format!("model,grasp_id,probability_stable\n{many}")).expect_err("too many");
+        let many: String = (0..17).map(|idx| format!("m{idx},a.mcap,0,0.5\n")).collect();
+        let error = read_table(format!("model,recording,grasp_id,probability_stable\n{many}")).expect_err("too many");
         assert!(error.contains("line 18") && error.contains("at most 16 models"), "{error}");
     }
 

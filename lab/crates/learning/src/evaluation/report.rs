@@ -5,15 +5,17 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::Serialize;
 
 use super::comparison::{Comparison, compare};
-use super::cross_validation::{HeldOut, HeldOutOptions, N_INNER_FOLDS, Word, used_words};
-use super::decisions::{JudgedGrasp, JudgedRecipe, Unit, measure};
+use super::cross_validation::{HeldOut, HeldOutOptions, N_INNER_FOLDS, used_words};
+use super::decisions::{JudgedGrasp, JudgedRecipe, Unit};
 use super::looks::{Look, looks};
 use super::predictions::{OutsideModel, OutsidePredictions};
 use super::split::Split;
 use super::statistics::{Estimate, N_RESAMPLES};
 use super::{Evaluated, Evaluation, Trained};
+use crate::file_name;
 use crate::training::{Example, Examples};
 use blindgrasp_messages::Fault;
+use blindgrasp_pictures::DrawnWord;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
@@ -37,12 +39,6 @@ pub struct Report {
     pub judges: Vec<JudgedRecipe>,
     /// Each pair of judges.
     pub comparisons: Vec<Comparison>,
-    /// The same with other folds, if repeats were asked for. All other figures are of the first repeat.
-    pub repeats: Vec<RepeatSummary>,
-    /// Each pair of recipes over all repeats.
-    pub repeated_comparisons: Vec<RepeatedComparison>,
-    /// Recipes that learned from growing parts of the grasps, if that was asked for.
-    pub learning_curve: Vec<LearningPoint>,
     /// The contact dictionary (the paper's Figure 1).
     pub dictionary: DictionaryUse,
 }
@@ -112,43 +108,6 @@ pub struct TableRow {
     pub false_positive_share: Option<Estimate>,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct RepeatSummary {
-    /// The seed of its folds.
-    pub seed: u64,
-    /// For each recipe, its accuracy over the judged grasps.
-    pub accuracy: BTreeMap<String, f64>,
-    /// For each recipe, its false positives among the judged grasps.
-    pub false_positive_share: BTreeMap<String, f64>,
-}
-
-/// A pair of recipes over all repeats.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct RepeatedComparison {
-    pub first: String,
-    pub second: String,
-    /// For each repeat, 1 - errors of the first / errors of the second.
-    pub relative_error_reduction: Vec<f64>,
-    pub mean: f64,
-    pub least: f64,
-    pub greatest: f64,
-}
-
-/// A recipe that learned from a part of the training data.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct LearningPoint {
-    pub recipe: String,
-    /// The share of the training objects (grasps, for a split by grasp).
-    pub share: f64,
-    pub n_objects: usize,
-    pub n_grasps: usize,
-    pub n_judged: usize,
-    pub accuracy: Option<Estimate>,
-    pub false_positive_share: Option<Estimate>,
-    /// Why this part was too small to learn from, if it was.
-    pub problem: Option<String>,
-}
-
 /// A contact dictionary and the use of its words.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct DictionaryUse {
@@ -156,7 +115,7 @@ pub struct DictionaryUse {
     pub from: String,
     /// The posture of the drawn hand: the median of each joint over the grasps, radians.
     pub joints: Vec<f64>,
-    pub words: Vec<Word>,
+    pub words: Vec<DrawnWord>,
 }
 
 /// The part of [`Made`] that the caller knows.
@@ -181,27 +140,16 @@ pub fn report_on_recipes(
     outside: Option<&OutsidePredictions>,
 ) -> Report {
     let unit = if options.split == Split::Grasp { Unit::Grasp } else { Unit::Object };
-    let names: Vec<&str> = options.recipes.iter().map(|recipe| recipe.name.as_str()).collect();
     let undecided = undecided(read);
-    // The decisions of each repeat and recipe; the judged grasps come first.
-    let decided: Vec<Vec<Vec<JudgedGrasp>>> = held_out
-        .repeats
-        .iter()
-        .map(|repeat| {
-            let of_recipe = |probabilities: &Vec<f64>| decided(&undecided, probabilities, &repeat.folds);
-            repeat.probabilities.iter().map(of_recipe).collect()
-        })
-        .collect();
-    let main = decided.first().map_or(&[][..], Vec::as_slice);
+    // The decisions of each recipe; the judged grasps come first.
+    let main: Vec<Vec<JudgedGrasp>> =
+        held_out.probabilities.iter().map(|of_recipe| decided(&undecided, of_recipe, &held_out.folds)).collect();
     let any = main.first().map_or(&[][..], Vec::as_slice);
     let judge = |(recipe, decided): (&Recipe, &Vec<JudgedGrasp>)| {
         JudgedRecipe::new(&recipe.name, about(recipe), THRESHOLD_PROBABILITY, decided.clone(), unit, options.seed)
     };
     let mut judges = outside_judges(outside, any, unit, options.seed);
-    judges.extend(options.recipes.iter().zip(main).map(judge));
-    let paired = |of: &[Vec<JudgedGrasp>], (first, second): (usize, usize)| {
-        compare([(names[first], &of[first]), (names[second], &of[second])], unit, options.seed)
-    };
+    judges.extend(options.recipes.iter().zip(&main).map(judge));
     let n_examples = read.examples.len() as f64;
     let n_stable = read.examples.iter().filter(|example| example.stable).count() as f64;
     let in_training = 1.0 - 1.0 / options.n_folds as f64;
@@ -215,16 +163,9 @@ pub fn report_on_recipes(
         data: data(any, read.n_excluded.clone()),
         table_1: table_1(Some(training), &judges),
         comparisons: comparisons(&judges, unit, options.seed),
-        repeats: repeats(held_out, &names, &decided),
-        repeated_comparisons: if decided.len() > 1 {
-            pairs(names.len()).map(|pair| repeated(decided.iter().map(|of| paired(of, pair)).collect())).collect()
-        } else {
-            Vec::new()
-        },
-        learning_curve: learning_curve(&names, held_out, read, options, unit),
         judges,
         dictionary: DictionaryUse {
-            from: format!("what recipe {} learned from all folds but the first", names[0]),
+            from: format!("what recipe {} learned from all folds but the first", options.recipes[0].name),
             joints: median_joints(&read.examples),
             words: held_out.words.clone(),
         },
@@ -261,9 +202,6 @@ pub fn report_on_model(
         table_1: table_1(Some(learned_from), &judges),
         comparisons: comparisons(&judges, unit, training.seed),
         judges,
-        repeats: Vec::new(),
-        repeated_comparisons: Vec::new(),
-        learning_curve: Vec::new(),
         dictionary: DictionaryUse {
             from: format!("the model's, and the contacts of these recordings ({name})"),
             joints: median_joints(&read.examples),
@@ -288,9 +226,6 @@ pub fn report_on_predictions(origin: Origin, read: &Examples, outside: &OutsideP
         table_1: table_1(None, &judges),
         comparisons: comparisons(&judges, unit, INTERVAL_SEED),
         judges,
-        repeats: Vec::new(),
-        repeated_comparisons: Vec::new(),
-        learning_curve: Vec::new(),
         dictionary: DictionaryUse { from: String::new(), joints: Vec::new(), words: Vec::new() },
     }
 }
@@ -298,16 +233,13 @@ pub fn report_on_predictions(origin: Origin, read: &Examples, outside: &OutsideP
 /// The labelled grasps without a decision: the examples, then those that no cell feels.
 fn undecided(read: &Examples) -> Vec<JudgedGrasp> {
     let mut grasps: Vec<JudgedGrasp> = read.examples.iter().map(of_example).collect();
-    grasps.extend(read.unfelt.iter().map(|grasp| JudgedGrasp {
-        recording_idx: grasp.recording_idx,
-        grasp_id: grasp.grasp_id,
-        fold: None,
-        object: grasp.object.clone(),
-        class: grasp.class.clone(),
-        stable: grasp.stable,
-        lifted: false,
-        judged: false,
-        probability: None,
+    grasps.extend(read.unfelt.iter().map(|(recording_idx, truth)| JudgedGrasp {
+        recording_idx: *recording_idx,
+        grasp_id: truth.grasp_id,
+        object: truth.object.clone(),
+        class: truth.class.clone(),
+        stable: truth.stable,
+        ..JudgedGrasp::default()
     }));
     grasps
 }
@@ -316,13 +248,10 @@ fn of_example(example: &Example) -> JudgedGrasp {
     JudgedGrasp {
         recording_idx: example.recording_idx,
         grasp_id: example.grasp_id,
-        fold: None,
         object: example.object.clone(),
         class: example.class.clone(),
         stable: example.stable,
-        lifted: false,
-        judged: false,
-        probability: None,
+        ..JudgedGrasp::default()
     }
 }
 
@@ -357,7 +286,7 @@ fn outside_judges(
     let threshold = outside.threshold_probability;
     let judge = |model: &OutsideModel| {
         let decided = grasps.iter().map(|grasp| decide(grasp, model.probability(grasp), threshold)).collect();
-        let about = format!("predictions of {}", outside.file_name());
+        let about = format!("predictions of {}", file_name(&outside.path));
         JudgedRecipe::new(&model.name, about, threshold, decided, unit, seed)
     };
     outside.models.iter().map(judge).collect()
@@ -410,7 +339,7 @@ fn made(
         version: env!("CARGO_PKG_VERSION").into(),
         hand: origin.hand,
         recordings: origin.recordings,
-        predictions: outside.map(OutsidePredictions::file_name),
+        predictions: outside.map(|outside| file_name(&outside.path)),
         made_by: makers,
         labels: read.labels.clone(),
         split: options.map(|options| SplitMade {
@@ -479,72 +408,6 @@ fn table_1(training: Option<TableRow>, judges: &[JudgedRecipe]) -> Vec<TableRow>
         }
     }
     rows
-}
-
-fn repeats(held_out: &HeldOut, names: &[&str], decided: &[Vec<Vec<JudgedGrasp>>]) -> Vec<RepeatSummary> {
-    use super::measures::{Counts, Share};
-    if decided.len() < 2 {
-        return Vec::new();
-    }
-    let of_recipes = |of: &[Vec<JudgedGrasp>], share: Share| -> BTreeMap<String, f64> {
-        let of_recipe = |(name, decided): (&&str, &Vec<JudgedGrasp>)| {
-            let judged = decided.iter().filter(|grasp| grasp.judged);
-            let counts = Counts::of(judged.map(|grasp| (grasp.lifted, grasp.stable)));
-            Some(((*name).to_string(), counts.share(share)?))
-        };
-        names.iter().zip(of).filter_map(of_recipe).collect()
-    };
-    held_out
-        .repeats
-        .iter()
-        .zip(decided)
-        .map(|(repeat, of)| RepeatSummary {
-            seed: repeat.seed,
-            accuracy: of_recipes(of, Share::Accuracy),
-            false_positive_share: of_recipes(of, Share::FalsePositiveShare),
-        })
-        .collect()
-}
-
-fn repeated(of_repeats: Vec<Comparison>) -> RepeatedComparison {
-    let reductions: Vec<f64> =
-        of_repeats.iter().filter_map(|comparison| Some(comparison.relative_error_reduction?.value)).collect();
-    let name = |of: fn(&Comparison) -> &String| of_repeats.first().map(of).cloned().unwrap_or_default();
-    RepeatedComparison {
-        first: name(|comparison| &comparison.first),
-        second: name(|comparison| &comparison.second),
-        mean: reductions.iter().sum::<f64>() / reductions.len().max(1) as f64,
-        least: reductions.iter().copied().reduce(f64::min).unwrap_or(0.0),
-        greatest: reductions.iter().copied().reduce(f64::max).unwrap_or(0.0),
-        relative_error_reduction: reductions,
-    }
-}
-
-fn learning_curve(
-    names: &[&str],
-    held_out: &HeldOut,
-    read: &Examples,
-    options: &HeldOutOptions,
-    unit: Unit,
-) -> Vec<LearningPoint> {
-    let point = |step: &super::cross_validation::LearningStep| {
-        let decide = |(idx, probability): &(usize, f64)| {
-            decide(&of_example(&read.examples[*idx]), Some(*probability), THRESHOLD_PROBABILITY)
-        };
-        let decided: Vec<JudgedGrasp> = step.judged.iter().flatten().map(decide).collect();
-        let measures = measure(&decided.iter().collect::<Vec<_>>(), unit, options.seed);
-        LearningPoint {
-            recipe: names[step.recipe_idx].into(),
-            share: step.share,
-            n_objects: step.n_objects,
-            n_grasps: step.n_grasps,
-            n_judged: measures.n_grasps,
-            accuracy: measures.accuracy,
-            false_positive_share: measures.false_positive_share,
-            problem: step.judged.as_ref().err().cloned(),
-        }
-    };
-    held_out.learning_curve.iter().map(point).collect()
 }
 
 /// The median of each joint; empty without examples.

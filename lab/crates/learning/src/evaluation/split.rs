@@ -32,15 +32,6 @@ pub enum SplitError {
         split.words()
     )]
     TooFewGroups { split: Split, n_groups: usize, n_folds: usize },
-    /// An object of two classes cannot be left out with either.
-    #[error(
-        "object '{object}' is of class '{first}' in one grasp and of '{second}' in another: name the objects apart, or \
-         give the recordings one at a time"
-    )]
-    TwoClasses { object: String, first: String, second: String },
-    /// Training would have seen the grasps that it judges. This must never happen.
-    #[error("{what} '{group}' is in the folds {} and {}: it would be judged by a classifier that has seen it", first + 1, second + 1)]
-    Leak { what: &'static str, group: String, first: usize, second: usize },
     /// Nothing can be learned from grasps that are all alike.
     #[error(
         "without fold {} of {n_folds}, only {} grasps are left to train on ({n_grasps}): expected {}; ask for more folds, or \
@@ -99,10 +90,11 @@ impl Split {
     }
 }
 
-/// The fold of each example, from 0. Folds are of about equal size; the same seed gives the same folds.
+/// The fold of each example, from 0. Folds are of about equal size; the same seed gives the same folds. Each object has one
+/// class: [`Examples`](crate::training::Examples) refuse others.
 ///
 /// # Errors
-/// There are too few grasps, objects or classes, an object has two classes, or without a fold all grasps are alike.
+/// There are too few grasps, objects or classes, or without a fold all grasps are alike.
 pub fn split_into_folds(
     split: Split,
     examples: &[&Example],
@@ -112,13 +104,11 @@ pub fn split_into_folds(
     if n_folds < 2 {
         return Err(SplitError::TooFewFolds(n_folds));
     }
-    check_classes(examples)?;
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let folds = match split {
         Split::Grasp => stratified_folds(examples, n_folds, &mut random)?,
         Split::Object | Split::Class => grouped_folds(split, examples, n_folds, &mut random)?,
     };
-    check_disjoint(split, examples, &folds)?;
     for fold in 0..n_folds {
         let mut labels = examples.iter().zip(&folds).filter(|(_, of)| **of != fold).map(|(example, _)| example.stable);
         let Some(first) = labels.next() else { continue };
@@ -130,44 +120,11 @@ pub fn split_into_folds(
     Ok(folds)
 }
 
-/// Checks that no two folds have an object (or a class) in common. Folds of [`split_into_folds`] never have; evaluation
-/// checks it again, because every figure depends on it.
-///
-/// # Errors
-/// [`SplitError::Leak`].
-pub fn check_disjoint(split: Split, examples: &[&Example], folds: &[usize]) -> Result<(), SplitError> {
-    let mut fold_of: BTreeMap<&str, usize> = BTreeMap::new();
-    for (example, fold) in examples.iter().zip(folds) {
-        let Some(group) = split.group_of(example) else { continue };
-        let first = *fold_of.entry(group).or_insert(*fold);
-        if first != *fold {
-            return Err(SplitError::Leak { what: split.word(), group: group.into(), first, second: *fold });
-        }
-    }
-    Ok(())
-}
-
 /// Puts items in a random order.
-pub(super) fn shuffle<T>(items: &mut [T], random: &mut ChaCha8Rng) {
+fn shuffle<T>(items: &mut [T], random: &mut ChaCha8Rng) {
     for idx in (1..items.len()).rev() {
         items.swap(idx, random.random_range(0..=idx));
     }
-}
-
-/// A class named two ways for one object would let a class leak into its own test.
-fn check_classes(examples: &[&Example]) -> Result<(), SplitError> {
-    let mut class_of: BTreeMap<&str, &str> = BTreeMap::new();
-    for example in examples {
-        let first = *class_of.entry(&example.object).or_insert(&example.class);
-        if first != example.class {
-            return Err(SplitError::TwoClasses {
-                object: example.object.clone(),
-                first: first.into(),
-                second: example.class.clone(),
-            });
-        }
-    }
-    Ok(())
 }
 
 /// Deals stable and then unstable grasps to the folds in turn, each in a random order.
@@ -250,7 +207,12 @@ pub(super) mod tests {
                 (0..n_folds).map(|fold| folds.iter().filter(|of| **of == fold).count()).collect();
             sizes.sort_unstable();
             assert_eq!(sizes, expected, "{split:?}");
-            check_disjoint(split, &all, &folds).expect("no leak");
+            let mut fold_of = BTreeMap::new();
+            for (example, fold) in all.iter().zip(&folds) {
+                if let Some(group) = split.group_of(example) {
+                    assert_eq!(fold_of.entry(group).or_insert(*fold), fold, "{group} is in two folds");
+                }
+            }
             assert_eq!(folds, split_into_folds(split, &all, n_folds, 7).expect("folds"), "the same seed");
         }
         let stable_in = |fold: usize, folds: &[usize]| {
@@ -264,17 +226,6 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_group_on_both_sides_is_refused() {
-        let all = examples(&NAMES);
-        let all: Vec<&Example> = all.iter().collect();
-        let mut folds = split_into_folds(Split::Object, &all, 3, 1).expect("folds");
-        folds[0] = (folds[0] + 1) % 3;
-        let error = check_disjoint(Split::Object, &all, &folds).expect_err("a leak").to_string();
-        assert!(error.contains("object 'a'"), "{error}");
-        check_disjoint(Split::Grasp, &all, &folds).expect("grasps may");
-    }
-
-    #[test]
     fn what_cannot_be_split_is_refused() {
         let refused = |names: &[(&str, &str, usize)], split, n_folds| {
             let all = examples(names);
@@ -285,8 +236,6 @@ pub(super) mod tests {
         assert!(refused(&NAMES, Split::Class, 4).starts_with("3 classes for 4 folds"));
         assert!(refused(&NAMES, Split::Grasp, 1).starts_with("expected at least 2 folds"));
         assert!(refused(&NAMES, Split::Grasp, 100).starts_with("75 grasps for 100 folds"));
-        let two = [("a", "x", 3), ("a", "y", 3), ("b", "y", 3)];
-        assert!(refused(&two, Split::Grasp, 2).contains("'a' is of class 'x'"));
         // Object b has one grasp, a stable one.
         let error = refused(&[("a", "x", 9), ("b", "x", 1)], Split::Object, 2);
         let expected = "only stable grasps are left to train on (1): expected stable grasps of at least 2 objects";

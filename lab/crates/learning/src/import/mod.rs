@@ -20,6 +20,7 @@ pub use self::frames::{FramesReport, import_frames};
 use self::columns::{Columns, in_one_line, shortened};
 use self::grasps::{Grasps, TableGrasp, TableReading};
 use self::lines::{Lines, RowLimit};
+use crate::file_name;
 use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::open_regular;
 use blindgrasp_messages::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Recorded, Stamped, TactileFrame};
@@ -176,7 +177,7 @@ pub fn import_table(
 ) -> Result<ImportReport, ImportError> {
     let refused = |message: String| ImportError::Table { path: table.into(), message };
     require_forces(hand).map_err(refused)?;
-    let bytes = read(table)?;
+    let bytes = read(table).map_err(|source| ImportError::Read { path: table.into(), source })?;
     if let Some(kind) = FileKind::of(&bytes).filter(|kind| !matches!(kind, FileKind::Table | FileKind::Empty)) {
         return Err(refused(format!("expected a table (CSV), found {}", kind.description())));
     }
@@ -425,7 +426,7 @@ struct GraspWriter {
 
 impl GraspWriter {
     fn create(table: &Path, hand: &Hand, options: &ImportOptions, out: &Path) -> Result<Self, ImportError> {
-        let name = table.file_name().unwrap_or(table.as_os_str()).to_string_lossy();
+        let name = file_name(table);
         let how = serde_json::to_string(options)
             .map_err(|error| ImportError::Read { path: table.into(), source: error.into() })?;
         let info = RecordingInfo {
@@ -504,14 +505,12 @@ pub(crate) fn found(field: &str) -> String {
     if field.is_empty() { "nothing".into() } else { format!("'{}'", shortened(field)) }
 }
 
-fn read(table: &Path) -> Result<Vec<u8>, ImportError> {
+/// The bytes of a table, of at most [`MAX_BYTES`].
+pub(crate) fn read(table: &Path) -> std::io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
-    open_regular(table)
-        .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes))
-        .map_err(|source| ImportError::Read { path: table.into(), source })?;
+    open_regular(table)?.take(MAX_BYTES + 1).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > MAX_BYTES {
-        let message = "more than 1 GiB: expected a table (CSV); split it, and import part by part".into();
-        return Err(ImportError::Table { path: table.into(), message });
+        return Err(std::io::Error::other("more than 1 GiB: expected a table (CSV); split it"));
     }
     Ok(bytes)
 }

@@ -6,7 +6,6 @@
 
 pub mod booster;
 pub mod k_means;
-pub mod libsvm_format;
 pub mod platt;
 pub mod svm;
 pub mod training_range;

@@ -10,14 +10,6 @@ use thiserror::Error;
 /// Why a calibration could not be fitted.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum PlattError {
-    /// Decision values and labels differ in number.
-    #[error("{n_decision_values} decision values but {n_labels} labels: pass one label for each decision value")]
-    LengthMismatch {
-        /// Number of decision values.
-        n_decision_values: usize,
-        /// Number of labels.
-        n_labels: usize,
-    },
     /// A class has no sample, so nothing says where the classes meet.
     #[error("calibration needs samples of both classes, found {n_positive} positive and {n_negative} negative")]
     OneClass {
@@ -56,12 +48,9 @@ pub enum PlattError {
 /// values separate the classes perfectly.
 ///
 /// # Errors
-/// When the lengths differ, a class is missing, a decision value is not finite, or the fit itself
+/// When a class is missing, a decision value is not finite, or the fit itself
 /// fails.
 pub fn fit_platt(decision_values: &[f64], labels: &[bool]) -> Result<PlattCalibration, PlattError> {
-    if decision_values.len() != labels.len() {
-        return Err(PlattError::LengthMismatch { n_decision_values: decision_values.len(), n_labels: labels.len() });
-    }
     let n_positive = labels.iter().filter(|&&positive| positive).count();
     let n_negative = labels.len() - n_positive;
     if n_positive == 0 || n_negative == 0 {
@@ -288,10 +277,6 @@ mod tests {
 
     #[test]
     fn errors_say_what_is_wrong() {
-        assert_eq!(
-            fit_platt(&[1.0], &[true, false]),
-            Err(PlattError::LengthMismatch { n_decision_values: 1, n_labels: 2 })
-        );
         assert_eq!(fit_platt(&[], &[]), Err(PlattError::OneClass { n_positive: 0, n_negative: 0 }));
         assert_eq!(fit_platt(&[1.0, 2.0], &[true; 2]), Err(PlattError::OneClass { n_positive: 2, n_negative: 0 }));
         assert_eq!(

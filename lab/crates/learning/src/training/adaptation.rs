@@ -10,11 +10,12 @@ use std::path::PathBuf;
 
 use nalgebra::{DMatrix, DVector};
 
-use super::{Example, Examples, Relabelling, TrainingError, composed, file_name, folds_by_object};
+use super::probes::reading_at;
+use super::{Example, Examples, LOOKS, N_FOLDS, TrainingError, folds_by_object, values_at};
+use crate::file_name;
 use crate::learners::decision_values;
 use crate::learners::training_range::learn_training_range;
 use crate::promise::{ObjectTrials, promise};
-use blindgrasp_grasps::reading::Felt;
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::Classifier;
 use blindgrasp_stages::day::{DayMethod, DayModel, DayStatistics, LabelledGrasp, Recalibration, covariance};
@@ -30,8 +31,6 @@ use blindgrasp_stages::training_summary::{OwnLiftsSummary, Promise};
 
 /// The fewest labelled grasps of a day.
 const MIN_LABELLED: usize = 20;
-/// Folds of objects, or as many as there are objects.
-const N_FOLDS: usize = 5;
 /// From this share of own grasps outside the limits on, the robot is unlike those that the model learned from, and the limits are
 /// widened. A few grasps outside are as expected.
 const UNLIKE_SHARE: f64 = 0.1;
@@ -44,7 +43,7 @@ const FEWEST_FOR_LIMITS: usize = 30;
 /// # Errors
 /// Recordings that cannot be used, that the model was trained on, or with too few labelled grasps.
 pub fn adapt(hand: &Hand, model: &Model, recordings: &[PathBuf]) -> Result<Model, TrainingError> {
-    adapt_on(hand, model, &Examples::read(hand, recordings, &Relabelling::default(), |_, _| {})?, recordings)
+    adapt_on(hand, model, &Examples::read(hand, recordings, |_, _| {})?, recordings)
 }
 
 /// Corrects a model by examples. `recordings` names the files that they are from; it is empty for examples out of memory.
@@ -137,15 +136,12 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
     Ok(adapted)
 }
 
-/// The looks, from the last on.
-const LOOKS: [Phase; 3] = [Phase::TestLifted, Phase::Squeezed, Phase::Settled];
-
 /// The last look that lifts and that a grasp has, and its classifier.
 fn deciding_look<'a>(model: &'a Model, examples: &[Example]) -> Option<(Phase, &'a Classifier)> {
-    for look in LOOKS {
+    for look in LOOKS.into_iter().rev() {
         if let Some(classifier) = model.look(look)
             && classifier.threshold_probability < 1.0
-            && examples.iter().any(|example| felt(look, example).is_some())
+            && examples.iter().any(|example| reading_at(look, example).is_some())
         {
             return Some((look, classifier));
         }
@@ -157,7 +153,7 @@ fn deciding_look<'a>(model: &'a Model, examples: &[Example]) -> Option<(Phase, &
 fn judged_lifts<'a>(look: Phase, model: &Model, examples: &'a [Example]) -> Vec<JudgedLift<'a>> {
     let mut lifts = Vec::new();
     for example in examples {
-        let mut earlier = LOOKS.into_iter().skip_while(|other| *other != look).skip(1);
+        let mut earlier = LOOKS.into_iter().take_while(|other| *other != look);
         if !earlier.any(|earlier| is_unstable(model, earlier, example))
             && let Some(log_odds) = log_odds(model, look, example)
         {
@@ -275,26 +271,10 @@ fn is_unstable(model: &Model, look: Phase, example: &Example) -> bool {
     judged.is_some_and(|(classifier, log_odds)| probability(log_odds) < classifier.unsure_from_probability)
 }
 
-/// The frame of a look, as it was felt.
-fn felt(look: Phase, example: &Example) -> Option<FeltReading<'_>> {
-    match look {
-        Phase::Settled => Some(example.reading()),
-        Phase::Squeezed => example.squeezed.as_ref().map(Felt::reading),
-        _ => example.test_lifted.as_ref().map(Felt::reading),
-    }
-}
-
 /// The model's log-odds of an example at a look; `None` if it has no feature there.
 fn log_odds(model: &Model, look: Phase, example: &Example) -> Option<f64> {
     let classifier = model.look(look)?;
-    let values = if look == Phase::Settled {
-        let mut values = Vec::new();
-        model.features.extract(&example.reading(), &mut values).ok()?;
-        values
-    } else {
-        composed(&model.features, look, example)?
-    };
-    Some(classifier.log_odds(classifier.predictor.decision_value(&values).ok()?))
+    Some(classifier.log_odds(classifier.predictor.decision_value(&values_at(model, look, example)?).ok()?))
 }
 
 /// Widens the limits that own grasps violate, of every look, so that they hold the own grasps. Returns how many grasps a limit
@@ -313,7 +293,7 @@ fn widen(hand: &Hand, model: &mut Model, examples: &[&Example]) -> Result<usize,
         let mut own = Vec::new();
         for (idx, (example, fold)) in examples.iter().zip(&folds).enumerate() {
             // A hand that feels nothing is held for that, and not by a limit.
-            if let Some(reading) = felt(look, example)
+            if let Some(reading) = reading_at(look, example)
                 && features.extract(&reading, &mut values).is_ok()
             {
                 own.push((idx, reading, *fold));

@@ -4,12 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use super::TrainingError;
-use super::friction::{Judged, stable_by_friction};
 use blindgrasp_grasps::dataset::{DatasetError, Grasp, check_once, label_of, read_grasps};
 use blindgrasp_grasps::reading::{Felt, SeenReadings, Settled, check_classes, note_reading};
 use blindgrasp_messages::{Contact, Fault, GraspTruth, OwnedSenses, Phase, Stamped, TactileFrame};
 use blindgrasp_recording::RecordingReader;
-use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use blindgrasp_stages::encoder::{FeltReading, wrist_values};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
@@ -37,8 +35,6 @@ pub struct Example {
     pub moving: [Vec<Signals>; 2],
     /// Whether the grasp was stable.
     pub stable: bool,
-    /// Whether the grasp is stable for each friction coefficient. Empty if none were given.
-    pub stable_by_friction: Vec<bool>,
     /// The object's name. Splits by object keep its grasps together.
     pub object: String,
     pub class: String,
@@ -81,18 +77,6 @@ impl FeltGrasp {
     }
 }
 
-/// A labelled grasp that no cell feels.
-#[derive(Debug, Clone, PartialEq)]
-pub struct UnfeltGrasp {
-    /// Index of its recording in the list it was read from.
-    pub recording_idx: usize,
-    /// Its number in that recording.
-    pub grasp_id: u64,
-    pub object: String,
-    pub class: String,
-    pub stable: bool,
-}
-
 /// The grasps of recordings to learn from, and the number of those left out.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Examples {
@@ -100,8 +84,8 @@ pub struct Examples {
     pub examples: Vec<Example>,
     /// Grasps left out, by reason.
     pub n_excluded: BTreeMap<String, usize>,
-    /// Labelled grasps that no cell feels. They are always held.
-    pub unfelt: Vec<UnfeltGrasp>,
+    /// Labelled grasps that no cell feels, each with the index of its recording. They are always held.
+    pub unfelt: Vec<(usize, GraspTruth)>,
     /// All grasps, those left out as well: the index of the recording and the number in it.
     pub grasps: BTreeSet<(usize, u64)>,
     /// The program and options that made each recording, from its metadata.
@@ -110,33 +94,22 @@ pub struct Examples {
     pub labels: BTreeMap<Label, usize>,
 }
 
-/// The label to learn, if it is not the recordings' own.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Relabelling {
-    /// Friction coefficients for which each grasp is labelled again from its scene. Empty: none.
-    pub frictions: Vec<f64>,
-    /// Whether the label is the paper's, by epsilon and volume, also for recordings of lifts.
-    pub by_wrench_space: bool,
-}
-
 impl Examples {
     /// Reads recordings. A grasp whose reading equals that of an earlier one is left out as a duplicate. `progress`
     /// gets the number of recordings read and their total after each one.
     ///
     /// # Errors
-    /// A recording that cannot be used or is given twice, a label from a lift where other frictions are asked for, or
-    /// an object of two classes.
+    /// A recording that cannot be used or is given twice, or an object of two classes.
     pub fn read(
         hand: &Hand,
         recordings: &[PathBuf],
-        relabelling: &Relabelling,
         mut progress: impl FnMut(usize, usize),
     ) -> Result<Examples, TrainingError> {
         check_once(recordings)?;
         let mut read = Examples::default();
         let mut seen = SeenReadings::new();
         for (recording_idx, path) in recordings.iter().enumerate() {
-            read.add(hand, path, recording_idx, relabelling, &mut seen)?;
+            read.add(hand, path, recording_idx, &mut seen)?;
             progress(recording_idx + 1, recordings.len());
         }
         read.check_classes()?;
@@ -148,29 +121,15 @@ impl Examples {
         hand: &Hand,
         path: &Path,
         recording_idx: usize,
-        relabelling: &Relabelling,
         seen: &mut SeenReadings,
     ) -> Result<(), TrainingError> {
-        let Relabelling { frictions, by_wrench_space } = relabelling;
         let reader = RecordingReader::open(path).map_err(DatasetError::from)?;
-        let label = label_of(path, &reader)?;
-        if label == Some(Label::Lift) && !frictions.is_empty() {
-            return Err(TrainingError::Data(format!(
-                "{}: its truth is that of lifts in physics, which other frictions cannot be judged by: leave the frictions \
-                 out, or simulate with --label wrench-space",
-                path.display()
-            )));
-        }
-        if let Some(label) = if *by_wrench_space { Some(Label::WrenchSpace) } else { label } {
+        if let Some(label) = label_of(path, &reader)? {
             *self.labels.entry(label).or_default() += 1;
         }
         self.made_by.push(reader.info().made_by.clone());
-        let mut by_friction = match &frictions[..] {
-            [] => None,
-            _ => Some(stable_by_friction(path, frictions).map_err(DatasetError::from)?),
-        };
         let grasps = read_grasps(path, hand, |_, frames| FeltGrasp::of(hand, &frames))?;
-        self.add_grasps(grasps, recording_idx, *by_wrench_space, by_friction.as_mut(), seen);
+        self.add_grasps(grasps, recording_idx, seen);
         Ok(())
     }
 
@@ -189,7 +148,7 @@ impl Examples {
             truth: Some(truth),
         });
         let mut examples = Examples::default();
-        examples.add_grasps(felt, 0, false, None, &mut SeenReadings::new());
+        examples.add_grasps(felt, 0, &mut SeenReadings::new());
         examples.check_classes()?;
         Ok(examples)
     }
@@ -198,36 +157,21 @@ impl Examples {
         &mut self,
         grasps: impl IntoIterator<Item = Grasp<Option<FeltGrasp>>>,
         recording_idx: usize,
-        by_wrench_space: bool,
-        mut by_friction: Option<&mut BTreeMap<u64, Judged>>,
         seen: &mut SeenReadings,
     ) {
         let mut exclude = |reason: &str| *self.n_excluded.entry(reason.into()).or_default() += 1;
         for grasp in grasps {
             let grasp_id = grasp.grasp_id;
             self.grasps.insert((recording_idx, grasp_id));
-            let mut truth = grasp.truth;
-            if let Some(truth) = truth.as_mut()
-                && by_wrench_space
-            {
-                if truth.epsilon.is_nan() || truth.volume.is_nan() {
-                    exclude("no epsilon and volume in its truth");
-                    continue;
-                }
-                truth.stable = truth.epsilon > STABLE_EPSILON && truth.volume > STABLE_VOLUME;
-            }
-            match (grasp.value, truth) {
+            match (grasp.value, grasp.truth) {
                 (_, None) => exclude("no truth"),
                 (None, _) => exclude("no settled frame"),
                 (Some(FeltGrasp { settled, squeezed, test_lifted, moving }), Some(truth))
                     if settled.fault == Fault::None =>
                 {
-                    let outcomes = friction_outcomes(by_friction.as_deref_mut(), grasp_id).and_then(|outcomes| {
-                        note_reading(seen, settled.reading_id, recording_idx, truth.stable).map(|()| outcomes)
-                    });
-                    match outcomes {
+                    match note_reading(seen, settled.reading_id, recording_idx, truth.stable) {
                         Err(reason) => exclude(reason),
-                        Ok(stable_by_friction) => self.examples.push(Example {
+                        Ok(()) => self.examples.push(Example {
                             recording_idx,
                             grasp_id,
                             reading_id: settled.reading_id,
@@ -239,7 +183,6 @@ impl Examples {
                             test_lifted,
                             moving,
                             stable: truth.stable,
-                            stable_by_friction,
                             object: truth.object,
                             class: truth.class,
                         }),
@@ -250,8 +193,7 @@ impl Examples {
                     // Two grasps of one recording may have equal readings. In two recordings it is the same grasp.
                     let first = seen.entry(settled.reading_id).or_insert((recording_idx, truth.stable)).0;
                     if settled.fault == Fault::NoContact && first == recording_idx {
-                        let GraspTruth { object, class, stable, .. } = truth;
-                        self.unfelt.push(UnfeltGrasp { recording_idx, grasp_id, object, class, stable });
+                        self.unfelt.push((recording_idx, truth));
                     }
                 }
             }
@@ -277,34 +219,6 @@ impl Example {
     pub fn reading(&self) -> FeltReading<'_> {
         FeltReading { joints: &self.joints, contacts: &self.contacts, senses: self.senses.view() }
     }
-
-    /// Whether the grasp is stable, for each friction coefficient if there are several.
-    pub fn outcomes(&self) -> &[bool] {
-        match &self.stable_by_friction[..] {
-            [] => std::slice::from_ref(&self.stable),
-            by_friction => by_friction,
-        }
-    }
-
-    /// The probability that the grasp is stable: 0 or 1, or the share of the friction coefficients for which it is
-    /// stable.
-    pub fn target(&self) -> f64 {
-        let outcomes = self.outcomes();
-        outcomes.iter().filter(|stable| **stable).count() as f64 / outcomes.len() as f64
-    }
-}
-
-/// Whether a grasp is stable for each friction, empty without frictions; or the reason why it is left out.
-fn friction_outcomes(
-    by_friction: Option<&mut BTreeMap<u64, Judged>>,
-    grasp_id: u64,
-) -> Result<Vec<bool>, &'static str> {
-    match by_friction.map(|judged| judged.remove(&grasp_id)) {
-        None => Ok(Vec::new()),
-        Some(Some(Ok(stable))) => Ok(stable),
-        Some(Some(Err(_))) => Err("no quality for other frictions"),
-        Some(None) => Err("no scene to judge other frictions by"),
-    }
 }
 
 #[cfg(test)]
@@ -318,21 +232,8 @@ mod tests {
         let grasps = read_grasps(&path, &hand, |_, frames| frames).expect("readable");
         let labelled = grasps.into_iter().filter_map(|grasp| Some((grasp.value, grasp.truth?)));
         let of_memory = Examples::of_grasps(&hand, labelled).expect("examples");
-        let of_file = Examples::read(&hand, &[path], &Relabelling::default(), |_, _| {}).expect("readable");
+        let of_file = Examples::read(&hand, &[path], |_, _| {}).expect("readable");
         assert_eq!(of_memory.examples, of_file.examples);
         assert_eq!((&of_memory.unfelt, &of_memory.n_excluded), (&of_file.unfelt, &of_file.n_excluded));
-    }
-
-    #[test]
-    fn the_paper_label_of_recordings_that_have_it_is_their_own() {
-        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let by_wrench_space = Relabelling { by_wrench_space: true, ..Relabelling::default() };
-        let read = |name: &str, relabelling: &Relabelling| {
-            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../recordings").join(name);
-            Examples::read(&hand, &[path], relabelling, |_, _| {}).expect("readable")
-        };
-        let (own, again) = (read("held-out.mcap", &Relabelling::default()), read("held-out.mcap", &by_wrench_space));
-        assert_eq!(own.examples, again.examples);
-        assert_eq!(again.labels, BTreeMap::from([(Label::WrenchSpace, 1)]));
     }
 }

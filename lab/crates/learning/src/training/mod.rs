@@ -8,22 +8,22 @@ mod adaptation;
 mod approach;
 mod day;
 mod examples;
-mod friction;
 mod probes;
 mod thresholds;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 pub use adaptation::{adapt, adapt_on};
 pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 pub use blindgrasp_stages::training_summary::{PolicySummary, TrainingSummary};
-pub use examples::{Example, Examples, Relabelling, Signals, UnfeltGrasp};
-pub(crate) use probes::composed;
+pub use examples::{Example, Examples, Signals};
+pub(crate) use probes::{LOOKS, values_at};
 pub use thresholds::Aim;
 
 use crate::evaluation::reliability::{N_RELIABILITY_BINS, reliability};
 use crate::evaluation::split::Split;
+use crate::file_name;
 use crate::learners::booster::train_boosted;
 use crate::learners::decision_values;
 use crate::learners::k_means::{DictionaryError, KMeansParams, learn_dictionary};
@@ -43,49 +43,32 @@ use blindgrasp_stages::model::{FORMAT, Model, ModelHand};
 use probes::LearnedProbes;
 use thresholds::choose_thresholds;
 
+/// Folds, grouped by object, for calibration and cross-validated figures.
+const N_FOLDS: usize = 5;
+
 /// How a model is trained.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingOptions {
     pub recipe: Recipe,
-    /// Folds, grouped by object, for calibration and cross-validated figures.
-    pub n_folds: usize,
     /// A grasp counts as stable from this probability on, and as unstable below 1 minus it; between them it is unsure.
     pub threshold_probability: f64,
     /// What the thresholds of all stages are chosen for, in place of that probability.
     pub aim: Option<Aim>,
-    /// Friction coefficients, equally probable, for which the grasps are labelled again from their scenes. The target
-    /// is then the probability that a grasp is stable. Empty: the recordings' own labels.
-    pub frictions: Vec<f64>,
-    /// Whether grasps are labelled by epsilon and volume, whatever the recordings say.
-    pub by_wrench_space: bool,
     /// Seeds K-means and boosting.
     pub seed: u64,
 }
 
 impl Default for TrainingOptions {
     fn default() -> Self {
-        TrainingOptions {
-            recipe: Recipe::default(),
-            n_folds: 5,
-            threshold_probability: 0.5,
-            aim: None,
-            frictions: Vec::new(),
-            by_wrench_space: false,
-            seed: 1,
-        }
+        TrainingOptions { recipe: Recipe::default(), threshold_probability: 0.5, aim: None, seed: 1 }
     }
 }
 
 impl TrainingOptions {
-    /// The label to learn.
-    pub fn relabelling(&self) -> Relabelling {
-        Relabelling { frictions: self.frictions.clone(), by_wrench_space: self.by_wrench_space }
-    }
-
     /// Refuses options that no training takes, before recordings are read.
     ///
     /// # Errors
-    /// Too many words, a threshold that is no probability, or frictions for a learner without probabilities.
+    /// Too many words, or a threshold that is no probability.
     pub fn check(&self) -> Result<(), TrainingError> {
         let recipe = &self.recipe;
         if recipe.n_words > MAX_FEATURES {
@@ -94,12 +77,6 @@ impl TrainingOptions {
         let threshold = self.threshold_probability;
         if !(threshold > 0.0 && threshold <= 1.0) {
             return Err(TrainingError::Data(format!("the threshold is {threshold}, expected more than 0, at most 1")));
-        }
-        if !self.frictions.is_empty() && !matches!(recipe.learner, Learner::Boosting(_)) {
-            return Err(TrainingError::Data(format!(
-                "several frictions need a learner of probabilities, and the recipe {} has an SVM: use the recipe boosted",
-                recipe.name
-            )));
         }
         Ok(())
     }
@@ -152,9 +129,9 @@ pub fn train(
 ) -> Result<Model, TrainingError> {
     options.check()?;
     let recipe = &options.recipe;
-    check_examples(read, recordings, &options.frictions)?;
+    check_examples(read, recordings)?;
     let examples: Vec<&Example> = read.examples.iter().collect();
-    let folds = folds_by_object(&examples, options.n_folds)?;
+    let folds = folds_by_object(&examples, N_FOLDS)?;
     let judged = judge_out_of_fold(hand, &examples, &folds, options, &mut progress)?;
     let calibration = calibrate(&judged.examples, &judged.decision_values)?;
     progress("training on all grasps");
@@ -182,7 +159,7 @@ pub fn train(
     let mut probes = learn_probes(hand, &fitted.features, &examples, &folds, options, &mut progress)?;
     if let Some(aim) = options.aim {
         progress("choosing thresholds for trials");
-        let of_lifts = !options.by_wrench_space && !read.labels.contains_key(&Label::WrenchSpace);
+        let of_lifts = !read.labels.contains_key(&Label::WrenchSpace);
         let promises = of_lifts && !recipe.day_baseline;
         training.policies = choose_thresholds(aim, promises, &judged, &mut classifier, &mut probes, &mut progress)?;
     }
@@ -209,8 +186,8 @@ fn judge_out_of_fold<'a>(
     options: &TrainingOptions,
     progress: &mut impl FnMut(&str),
 ) -> Result<OutOfFold<'a>, TrainingError> {
-    let TrainingOptions { recipe, n_folds, seed, .. } = options;
-    let cross_validating = |fold: usize| progress(&format!("cross-validating, fold {} of {n_folds}", fold + 1));
+    let TrainingOptions { recipe, seed, .. } = options;
+    let cross_validating = |fold: usize| progress(&format!("cross-validating, fold {} of {N_FOLDS}", fold + 1));
     if recipe.day_baseline {
         return day::cross_validate(hand, recipe, examples, folds, *seed, cross_validating);
     }
@@ -275,13 +252,9 @@ fn summary(
         policies: Vec::new(),
         recordings: recordings.iter().map(|path| file_name(path)).collect(),
         made_by: read.made_by.clone(),
-        labels: if options.by_wrench_space || read.labels.contains_key(&Label::Lift) {
-            read.labels.clone()
-        } else {
-            BTreeMap::new()
-        },
+        labels: if read.labels.contains_key(&Label::Lift) { read.labels.clone() } else { BTreeMap::new() },
         recipe: options.recipe.clone(),
-        frictions: options.frictions.clone(),
+        frictions: Vec::new(),
         n_grasps: examples.len(),
         n_stable: examples.iter().filter(|example| example.stable).count(),
         n_objects: examples.iter().map(|example| &example.object).collect::<BTreeSet<_>>().len(),
@@ -290,7 +263,7 @@ fn summary(
         inertia: fitted.inertia,
         n_iterations: fitted.n_iterations,
         converged: fitted.converged,
-        n_folds: options.n_folds,
+        n_folds: N_FOLDS,
         cross_validated_accuracy: validated.accuracy,
         cross_validated_false_positive_share: validated.false_positive_share,
         cross_validated_brier: validated.brier,
@@ -324,12 +297,12 @@ impl CrossValidated {
         calibration: &PlattCalibration,
         threshold_probability: f64,
     ) -> Result<CrossValidated, TrainingError> {
-        let (probabilities, outcomes) = by_outcome(&judged.examples, &out_of_fold_probabilities(judged)?);
+        let probabilities = out_of_fold_probabilities(judged)?;
+        let outcomes = labels(&judged.examples);
         let reliability = reliability(&probabilities, &outcomes, N_RELIABILITY_BINS);
         check_skill(calibration, &outcomes, reliability.brier)?;
-        let (values, _) = by_outcome(&judged.examples, &judged.decision_values);
         let (mut n_right, mut n_false_positives) = (0, 0);
-        for (value, stable) in values.iter().zip(&outcomes) {
+        for (value, stable) in judged.decision_values.iter().zip(&outcomes) {
             let called_stable = calibration.probability(*value) >= threshold_probability;
             n_right += usize::from(called_stable == *stable);
             n_false_positives += usize::from(called_stable && !stable);
@@ -343,22 +316,13 @@ impl CrossValidated {
     }
 }
 
-/// Each example's number, once for each of its outcomes, and the outcomes.
-fn by_outcome(examples: &[&Example], numbers: &[f64]) -> (Vec<f64>, Vec<bool>) {
-    let (mut repeated, mut outcomes) = (Vec::new(), Vec::new());
-    for (example, number) in examples.iter().zip(numbers) {
-        for outcome in example.outcomes() {
-            repeated.push(*number);
-            outcomes.push(*outcome);
-        }
-    }
-    (repeated, outcomes)
+fn labels(examples: &[&Example]) -> Vec<bool> {
+    examples.iter().map(|example| example.stable).collect()
 }
 
-/// Platt's calibration. An example with labels for several frictions counts once for each.
+/// Platt's calibration.
 fn calibrate(examples: &[&Example], decision_values: &[f64]) -> Result<PlattCalibration, PlattError> {
-    let (values, outcomes) = by_outcome(examples, decision_values);
-    fit_platt(&values, &outcomes)
+    fit_platt(decision_values, &labels(examples))
 }
 
 /// Refuses a model that is no better than a guess, because it would lift all grasps or none.
@@ -404,7 +368,7 @@ fn readings<'a>(examples: &[&'a Example]) -> Vec<FeltReading<'a>> {
 }
 
 /// Refuses examples without grasps or of one class only.
-fn check_examples(read: &Examples, recordings: &[PathBuf], frictions: &[f64]) -> Result<(), TrainingError> {
+fn check_examples(read: &Examples, recordings: &[PathBuf]) -> Result<(), TrainingError> {
     let (n, n_excluded) = (read.examples.len(), &read.n_excluded);
     let n_stable = read.examples.iter().filter(|example| example.stable).count();
     if n == 0 {
@@ -419,22 +383,14 @@ fn check_examples(read: &Examples, recordings: &[PathBuf], frictions: &[f64]) ->
             "{n_stable} of {n} grasps with contact are stable: expected some of each (left out: {n_excluded:?})"
         )));
     }
-    let none = read.examples.iter().all(|example| example.target() <= 0.0);
-    if none || read.examples.iter().all(|example| example.target() >= 1.0) {
-        let which = if none { "no grasp is stable for any" } else { "every grasp is stable for each" };
-        return Err(TrainingError::Data(format!(
-            "{which} of the frictions {:?}: expected some of which only a part is stable",
-            frictions
-        )));
-    }
     Ok(())
 }
 
 /// The fold of each example. All grasps of an object are in one fold.
 ///
 /// # Errors
-/// Fewer than two folds, or fewer objects than folds.
-pub fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usize>, TrainingError> {
+/// Fewer objects than folds, or than two.
+fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usize>, TrainingError> {
     let objects: BTreeSet<&str> = examples.iter().map(|example| example.object.as_str()).collect();
     let n_needed = n_folds.max(2);
     if objects.len() < n_needed {
@@ -443,9 +399,6 @@ pub fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usiz
              and unstable grasps of several; record more objects, or say which grasps are of which object",
             Split::Object.counted(objects.len())
         )));
-    }
-    if n_folds < 2 {
-        return Err(TrainingError::Data(format!("expected at least 2 folds, found {n_folds}")));
     }
     let fold_of: BTreeMap<&str, usize> =
         objects.iter().enumerate().map(|(idx, object)| (*object, idx % n_folds)).collect();
@@ -486,7 +439,7 @@ struct Prepared {
     /// The feature of each example, row after row.
     rows: Vec<f64>,
     labels: Vec<bool>,
-    /// [`Example::target`] of each example, which boosting learns.
+    /// The labels as 0 and 1, which boosting learns.
     targets: Vec<f64>,
     day_variances: Vec<f64>,
 }
@@ -514,8 +467,8 @@ fn prepare(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Re
         scaling.apply(&mut rows);
         features.scaling = Some(scaling);
     }
-    let labels = examples.iter().map(|example| example.stable).collect();
-    let targets = examples.iter().map(|example| example.target()).collect();
+    let labels = labels(examples);
+    let targets = labels.iter().map(|stable| f64::from(u8::from(*stable))).collect();
     Ok(Prepared { features, inertia: k_means.inertia, rows, labels, targets, day_variances })
 }
 
@@ -545,7 +498,7 @@ fn fit_trees(
             && held_out != Some(*fold)
         {
             values.extend_from_slice(row);
-            targets.push(example.target());
+            targets.push(f64::from(u8::from(example.stable)));
         }
     }
     train_boosted(&values, n_values, &targets, params, seed)
@@ -595,10 +548,6 @@ pub(crate) fn picked<'a>(examples: &[&'a Example], idxs: &[usize]) -> Vec<&'a Ex
     idxs.iter().map(|idx| examples[*idx]).collect()
 }
 
-fn file_name(path: &Path) -> String {
-    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -628,7 +577,6 @@ mod tests {
         assert!(refused(1, 5).starts_with("grasps with contact of 1 object: expected at least 5 objects"));
         assert!(refused(2, 5).starts_with("grasps with contact of 2 objects: expected at least 5 objects"));
         assert!(refused(1, 1).contains("expected at least 2 objects"));
-        assert!(refused(2, 1).contains("expected at least 2 folds"));
         assert_eq!(folds(2, 2).expect("folds"), [0, 1]);
     }
 }

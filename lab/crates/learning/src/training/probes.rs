@@ -19,6 +19,7 @@ use blindgrasp_stages::classifier::boosting::BoostingParams;
 use blindgrasp_stages::classifier::{Classifier, Predictor};
 use blindgrasp_stages::encoder::{Block, FeatureExtractor, FeltReading};
 use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::model::Model;
 use blindgrasp_stages::own_lifts::{ATTEMPT_SECS, LIFT_SECS, SQUEEZE_SECS, TEST_LIFT_SECS};
 use blindgrasp_stages::probe::{GraspHistory, ProbeModel, n_values, signals};
 use blindgrasp_stages::recipe::Recipe;
@@ -64,18 +65,18 @@ pub(super) struct LearnedProbes {
 
 impl LearnedProbes {
     /// The probe that this look comes after.
-    pub(super) fn after(&mut self, look: LastLook) -> Option<&mut LearnedProbe> {
+    pub(super) fn after(&mut self, look: Phase) -> Option<&mut LearnedProbe> {
         match look {
-            LastLook::Settled => None,
-            LastLook::Squeezed => self.squeezed.as_mut(),
-            LastLook::TestLifted => self.test_lifted.as_mut(),
+            Phase::Squeezed => self.squeezed.as_mut(),
+            Phase::TestLifted => self.test_lifted.as_mut(),
+            _ => None,
         }
     }
 }
 
 /// The number of grasps without a frame of this phase.
 pub(super) fn n_without(phase: Phase, examples: &[&Example]) -> usize {
-    examples.iter().filter(|example| felt(phase, example).is_none()).count()
+    examples.iter().filter(|example| reading_at(phase, example).is_none()).count()
 }
 
 /// Learns to judge the frames of a phase, which all grasps have; `None` if the frames of objects not seen say nothing of the
@@ -122,8 +123,8 @@ pub(super) fn learn(
     for (idx, probability) in kept_idxs.iter().zip(&judged) {
         probabilities[*idx] = Some(*probability);
     }
-    let felt = kept.examples.iter().filter_map(|example| felt(phase, example));
-    let readings: Vec<FeltReading<'_>> = felt.map(Felt::reading).collect();
+    let readings: Vec<FeltReading<'_>> =
+        kept.examples.iter().filter_map(|example| reading_at(phase, example)).collect();
     let trees = fit_trees(&rows, n_values, examples, folds, None, &PARAMS, seed)?;
     let probe = ProbeModel {
         classifier: Classifier {
@@ -143,12 +144,17 @@ fn composed_rows(features: &FeatureExtractor, phase: Phase, examples: &[&Example
     examples.par_iter().map(|example| composed(features, phase, example)).collect()
 }
 
-fn felt(phase: Phase, example: &Example) -> Option<&Felt> {
-    if phase == Phase::Squeezed { example.squeezed.as_ref() } else { example.test_lifted.as_ref() }
+/// The frame of a look, as it was felt.
+pub(super) fn reading_at(look: Phase, example: &Example) -> Option<FeltReading<'_>> {
+    match look {
+        Phase::Settled => Some(example.reading()),
+        Phase::Squeezed => example.squeezed.as_ref().map(Felt::reading),
+        _ => example.test_lifted.as_ref().map(Felt::reading),
+    }
 }
 
 /// The values from which a probe is judged; `None` if a reading has no feature.
-pub(crate) fn composed(features: &FeatureExtractor, phase: Phase, example: &Example) -> Option<Vec<f64>> {
+fn composed(features: &FeatureExtractor, phase: Phase, example: &Example) -> Option<Vec<f64>> {
     let followed = signals(features);
     let [squeezing, test_lifting] = &example.moving;
     let mut history = GraspHistory::default();
@@ -160,14 +166,22 @@ pub(crate) fn composed(features: &FeatureExtractor, phase: Phase, example: &Exam
     );
     add_moves(&mut history, Phase::Squeezing, squeezing, features, &followed);
     if phase == Phase::TestLifted {
-        let squeezed = extracted(features, &example.squeezed.as_ref()?.reading());
+        let squeezed = extracted(features, &reading_at(Phase::Squeezed, example)?);
         history.add((0, 0), Phase::Squeezed, squeezed.as_deref().map_err(|fault| *fault), &followed);
         add_moves(&mut history, Phase::TestLifting, test_lifting, features, &followed);
     }
-    let now = extracted(features, &felt(phase, example)?.reading()).ok()?;
+    let now = extracted(features, &reading_at(phase, example)?).ok()?;
     let mut composed = Vec::new();
     history.compose(phase, &now, &followed, &mut composed).ok()?;
     Some(composed)
+}
+
+/// The values from which a model judges a grasp at a look; `None` if it has no feature there.
+pub(crate) fn values_at(model: &Model, look: Phase, example: &Example) -> Option<Vec<f64>> {
+    match look {
+        Phase::Settled => extracted(&model.features, &example.reading()).ok(),
+        _ => composed(&model.features, look, example),
+    }
 }
 
 fn extracted(features: &FeatureExtractor, reading: &FeltReading<'_>) -> Result<Vec<f64>, Fault> {
@@ -195,15 +209,21 @@ fn add_moves(
     }
 }
 
-/// The thresholds of a policy, and what to expect of it.
+/// The thresholds of the looks at a grasp.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Policy {
+pub(super) struct Thresholds {
     /// A settled grasp below this is given up.
     pub(super) promising: f64,
     /// A tight grasp below this is given up before the test lift. 0 without a test lift.
     pub(super) promising_squeezed: f64,
     /// From here on the grasp is lifted.
     pub(super) lift: f64,
+}
+
+/// The thresholds of a policy, and what to expect of it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Policy {
+    pub(super) thresholds: Thresholds,
     pub(super) expected: Expected,
 }
 
@@ -240,25 +260,8 @@ pub(super) struct Attempted {
     pub(super) stable: bool,
 }
 
-/// The look that decides.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum LastLook {
-    Settled,
-    Squeezed,
-    TestLifted,
-}
-
-impl LastLook {
-    pub(super) const ALL: [LastLook; 3] = [LastLook::Settled, LastLook::Squeezed, LastLook::TestLifted];
-
-    pub(super) fn as_str(self) -> &'static str {
-        match self {
-            LastLook::Settled => "settled",
-            LastLook::Squeezed => "squeezed",
-            LastLook::TestLifted => "test_lifted",
-        }
-    }
-}
+/// The looks that may decide.
+pub(crate) const LOOKS: [Phase; 3] = [Phase::Settled, Phase::Squeezed, Phase::TestLifted];
 
 /// Takes the place of a probability where a look has no feature: only a threshold that gives up no grasp lets it go on.
 pub(super) const NO_FEATURE: f64 = -1.0;
@@ -275,7 +278,7 @@ pub(super) struct Policies {
 impl Policies {
     /// Without a probe, `decided` is `settled`, and no grasp is given up before. With one, no grasp is given up from
     /// the first of `stable_from` on when it has settled, and from the second on when it is tight: it counts as stable there.
-    pub(super) fn new(grasps: &[Attempted], last: LastLook, stable_from: [f64; 2]) -> Policies {
+    pub(super) fn new(grasps: &[Attempted], last: Phase, stable_from: [f64; 2]) -> Policies {
         let all = Thresholds { promising: 0.0, promising_squeezed: 0.0, lift: 0.0 };
         let mut n_grasps: Vec<u32> = counts(grasps, all).iter().map(|count| count.n as u32).collect();
         n_grasps.sort_unstable();
@@ -300,7 +303,7 @@ impl Policies {
     pub(super) fn promise(&self, drop_secs: f64) -> Option<Promise> {
         let mut tried = Vec::new();
         for (grasps, policies) in &self.folds {
-            let counts = counts(grasps, cheapest(policies, drop_secs)?.thresholds());
+            let counts = counts(grasps, cheapest(policies, drop_secs)?.thresholds);
             tried.extend(counts.iter().map(|count| count.trials(self.n_attempts)));
         }
         Some(Promise { n_attempts: Some(self.n_attempts), ..promise(&tried)? })
@@ -315,31 +318,16 @@ fn cheapest(policies: &[Policy], drop_secs: f64) -> Option<Policy> {
     equal.max_by(|a, b| a.expected.kept.total_cmp(&b.expected.kept).then(cost(b).total_cmp(&cost(a))))
 }
 
-/// The thresholds of the looks at a grasp.
-#[derive(Debug, Clone, Copy)]
-struct Thresholds {
-    promising: f64,
-    promising_squeezed: f64,
-    lift: f64,
-}
-
-impl Policy {
-    fn thresholds(&self) -> Thresholds {
-        let Policy { promising, promising_squeezed, lift, .. } = *self;
-        Thresholds { promising, promising_squeezed, lift }
-    }
-}
-
 /// The policies among which one is chosen: quantiles of the probabilities as thresholds. All grasps from
 /// `stable_from` on go on, settled and tight.
-fn policies(grasps: &[Attempted], last: LastLook, [settled_from, squeezed_from]: [f64; 2]) -> Vec<Policy> {
+fn policies(grasps: &[Attempted], last: Phase, [settled_from, squeezed_from]: [f64; 2]) -> Vec<Policy> {
     let stable = || grasps.iter().filter(|grasp| grasp.stable);
     let settled = stable().map(|grasp| grasp.settled.min(settled_from)).collect();
     let squeezed = stable().map(|grasp| grasp.squeezed.min(squeezed_from)).collect();
     let (promising, promising_squeezed, n_lifts) = match last {
-        LastLook::Settled => (vec![0.0], vec![0.0], 400),
-        LastLook::Squeezed => (quantiles(settled, 20), vec![0.0], 400),
-        LastLook::TestLifted => (quantiles(settled, 16), quantiles(squeezed, 12), 200),
+        Phase::TestLifted => (quantiles(settled, 16), quantiles(squeezed, 12), 200),
+        Phase::Squeezed => (quantiles(settled, 20), vec![0.0], 400),
+        _ => (vec![0.0], vec![0.0], 400),
     };
     let mut candidates = Vec::new();
     let lifts = quantiles(grasps.iter().filter_map(|grasp| grasp.decided).collect(), n_lifts);
@@ -348,13 +336,8 @@ fn policies(grasps: &[Attempted], last: LastLook, [settled_from, squeezed_from]:
             candidates.extend(lifts.iter().map(|&lift| Thresholds { promising, promising_squeezed, lift }));
         }
     }
-    candidates
-        .par_iter()
-        .filter_map(|thresholds| {
-            let Thresholds { promising, promising_squeezed, lift } = *thresholds;
-            Some(Policy { promising, promising_squeezed, lift, expected: expect(grasps, *thresholds, last)? })
-        })
-        .collect()
+    let policy = |thresholds| Some(Policy { thresholds, expected: expect(grasps, thresholds, last)? });
+    candidates.into_par_iter().filter_map(policy).collect()
 }
 
 /// At most `n` of the values, evenly spread among all different ones, in ascending order.
@@ -466,7 +449,7 @@ fn trial(count: &Count, chances: &Chances) -> (f64, f64) {
 }
 
 /// What thresholds lead to in trials of objects like these; each object weighs the same. `None` if nothing is lifted.
-fn expect(grasps: &[Attempted], thresholds: Thresholds, last: LastLook) -> Option<Expected> {
+fn expect(grasps: &[Attempted], thresholds: Thresholds, last: Phase) -> Option<Expected> {
     let objects = counts(grasps, thresholds);
     let chances = Chances::of(&objects);
     let (mut lifted, mut attempts, mut secs) = (0.0, 0.0, 0.0);
@@ -482,11 +465,9 @@ fn expect(grasps: &[Attempted], thresholds: Thresholds, last: LastLook) -> Optio
         // The attempts before a lift are a random part of the grasps that are not lifted.
         let n_of = |part: f64| ends + (n_attempts - ends) * (part - count.lifted) / (count.n - count.lifted).max(1.0);
         let probe_secs = match last {
-            LastLook::Settled => 0.0,
-            LastLook::Squeezed => n_of(count.promising) * SQUEEZE_SECS,
-            LastLook::TestLifted => {
-                n_of(count.promising) * SQUEEZE_SECS + n_of(count.promising_squeezed) * TEST_LIFT_SECS
-            }
+            Phase::TestLifted => n_of(count.promising) * SQUEEZE_SECS + n_of(count.promising_squeezed) * TEST_LIFT_SECS,
+            Phase::Squeezed => n_of(count.promising) * SQUEEZE_SECS,
+            _ => 0.0,
         };
         secs += n_attempts * ATTEMPT_SECS + probe_secs + ends * LIFT_SECS;
     }
@@ -532,25 +513,26 @@ mod tests {
             ("b", 0.9, 0.2, false),
         ]);
         let with = |lift: f64| Thresholds { promising: 0.5, promising_squeezed: 0.0, lift };
-        let expected = expect(&grasps, with(0.5), LastLook::TestLifted).expect("lifts");
+        let expected = expect(&grasps, with(0.5), Phase::TestLifted).expect("lifts");
         // In random order, the lift is number 1.5 and 2.5 in the mean. A probe comes before each lift, and in all grasps of b.
         let secs = (1.5 + 2.5) * ATTEMPT_SECS + (1.0 + 2.5) * (SQUEEZE_SECS + TEST_LIFT_SECS) + 2.0 * LIFT_SECS;
         assert_eq!((expected.kept, expected.attempts_per_lift, expected.given_up), (0.5, 2.0, 0.0));
         assert!((expected.secs_per_kept - secs).abs() < 1e-12, "{expected:?}");
         // A higher threshold lifts none of b's grasps, and keeps each object that it lifts. As both shares of lifts, 1/2 and 0,
         // vary less than chance makes them, b has the mean of the two from its fifth attempt on.
-        let strict = expect(&grasps, with(0.85), LastLook::TestLifted).expect("lifts");
+        let strict = expect(&grasps, with(0.85), Phase::TestLifted).expect("lifts");
         assert_eq!(strict.kept, 1.0);
         assert!((strict.given_up - 0.75_f64.powi(16) / 2.0).abs() < 1e-12, "{strict:?}");
-        assert_eq!(expect(&grasps, with(1.0), LastLook::TestLifted), None);
+        assert_eq!(expect(&grasps, with(1.0), Phase::TestLifted), None);
     }
 
     #[test]
     fn drops_that_cost_more_are_worth_more_attempts() {
         let grasps =
             grasps(&[("a", 0.9, 0.9, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, false)]);
-        let policies = Policies::new(&grasps, LastLook::Squeezed, [1.0, 1.0]);
-        let chosen = |drop_secs| policies.cheapest(drop_secs).map(|policy| (policy.lift, policy.expected.kept));
+        let policies = Policies::new(&grasps, Phase::Squeezed, [1.0, 1.0]);
+        let chosen =
+            |drop_secs| policies.cheapest(drop_secs).map(|policy| (policy.thresholds.lift, policy.expected.kept));
         assert_eq!((chosen(0.0), chosen(1000.0)), (Some((0.3, 0.75)), Some((0.9, 1.0))));
     }
 
@@ -581,7 +563,7 @@ mod tests {
                         }));
                     }
                     let with = Thresholds { promising: 0.5, promising_squeezed: 0.0, lift: 0.5 };
-                    let expected = expect(&grasps, with, LastLook::Squeezed).expect("lifts");
+                    let expected = expect(&grasps, with, Phase::Squeezed).expect("lifts");
                     of_given_up += expected.given_up / f64::from(n_runs);
                     of_attempts += expected.attempts_per_lift / f64::from(n_runs);
                     of_secs += expected.secs_per_kept / f64::from(n_runs);
@@ -600,18 +582,18 @@ mod tests {
         for (grasp, squeezed) in grasps.iter_mut().zip([0.9, 0.3, 0.3, 0.9]) {
             grasp.squeezed = squeezed;
         }
-        let policy = Policies::new(&grasps, LastLook::TestLifted, [1.0, 1.0]).cheapest(10.0).expect("a policy");
-        assert_eq!((policy.promising_squeezed, policy.expected.kept), (0.9, 1.0), "{policy:?}");
+        let policy = Policies::new(&grasps, Phase::TestLifted, [1.0, 1.0]).cheapest(10.0).expect("a policy");
+        assert_eq!((policy.thresholds.promising_squeezed, policy.expected.kept), (0.9, 1.0), "{policy:?}");
     }
 
     #[test]
     fn grasps_that_count_as_stable_are_probed() {
         let grasps =
             grasps(&[("a", 0.9, 0.9, true), ("a", 0.7, 0.1, false), ("b", 0.9, 0.9, true), ("b", 0.6, 0.1, false)]);
-        let free = Policies::new(&grasps, LastLook::Squeezed, [1.0, 1.0]).cheapest(0.0).expect("a policy");
-        assert_eq!(free.promising, 0.9, "the others are not worth a probe");
+        let free = Policies::new(&grasps, Phase::Squeezed, [1.0, 1.0]).cheapest(0.0).expect("a policy");
+        assert_eq!(free.thresholds.promising, 0.9, "the others are not worth a probe");
         assert_eq!(
-            Policies::new(&grasps, LastLook::Squeezed, [0.65, 1.0]).cheapest(0.0).expect("a policy").promising,
+            Policies::new(&grasps, Phase::Squeezed, [0.65, 1.0]).cheapest(0.0).expect("a policy").thresholds.promising,
             0.65
         );
     }
@@ -639,7 +621,7 @@ mod tests {
             ("b", 0.9, 0.9, true),
             ("b", 0.9, 0.3, false),
         ]);
-        let policies = Policies::new(&grasps, LastLook::Settled, [1.0, 1.0]);
+        let policies = Policies::new(&grasps, Phase::Settled, [1.0, 1.0]);
         let found = policies.promise(1000.0).expect("lifts");
         // b with the threshold 0.3: a lift of three is dropped. a with 0.9 or more drops none.
         let dropped = (1.0 / 3.0) / 2.0;

@@ -2,9 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::probes::{Attempted, LastLook, LearnedProbes, NO_FEATURE, Policies, Policy};
+use super::probes::{Attempted, LOOKS, LearnedProbes, NO_FEATURE, Policies, Policy};
 use super::{OutOfFold, TrainingError, out_of_fold_probabilities};
 use crate::evaluation::measures::{area_under_roc, curve};
+use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::Classifier;
 use blindgrasp_stages::training_summary::{Bounded, PolicySummary, Promise};
 
@@ -26,7 +27,7 @@ const NEVER: f64 = 1.0;
 
 /// A look's policy with the price of a drop that it was chosen for, and its promise.
 struct Chosen {
-    look: LastLook,
+    look: Phase,
     policy: Policy,
     drop_secs: f64,
     promise: Option<Promise>,
@@ -34,7 +35,7 @@ struct Chosen {
 
 impl Aim {
     /// Chooses the policy of a look. The error is the reason why the look has none.
-    fn choose(self, policies: &Policies, look: LastLook) -> Result<Chosen, String> {
+    fn choose(self, policies: &Policies, look: Phase) -> Result<Chosen, String> {
         let max_drops = match self {
             Aim::MaxDrops(max_drops) => max_drops,
             Aim::DropSecs(drop_secs) => {
@@ -104,7 +105,7 @@ pub(super) fn choose_thresholds(
     if matches!(aim, Aim::MaxDrops(_)) && !promises {
         return Err(TrainingError::Data(
             "a share of drops can be promised for lifts alone: expected recordings of lifts (simulate --label lift, import), without \
-             --label wrench-space and without --day-baseline"
+             --day-baseline"
                 .into(),
         ));
     }
@@ -116,11 +117,11 @@ pub(super) fn choose_thresholds(
     classifier.threshold_probability = NEVER;
     let stable: Vec<bool> = judged.examples.iter().map(|example| example.stable).collect();
     let settled_roc_area = area_under_roc(&curve(&settled, &stable)).unwrap_or(0.5);
-    let has_test_lift = chosen_looks.iter().any(|chosen| chosen.look == LastLook::TestLifted);
+    let has_test_lift = chosen_looks.iter().any(|chosen| chosen.look == Phase::TestLifted);
     let (mut summaries, mut unsure_from) = (Vec::new(), NEVER);
     for mut chosen in chosen_looks {
-        let policy = chosen.policy;
-        let is_before_test_lift = chosen.look == LastLook::Squeezed && has_test_lift;
+        let policy = chosen.policy.thresholds;
+        let is_before_test_lift = chosen.look == Phase::Squeezed && has_test_lift;
         // Without a promise a look does not lift, if one was asked for, and that of this look was for another choice of
         // the grasps to probe.
         if is_before_test_lift && matches!(aim, Aim::MaxDrops(_)) {
@@ -139,7 +140,7 @@ pub(super) fn choose_thresholds(
             classifier.threshold_probability = policy.lift;
             unsure_from = policy.lift;
         }
-        if chosen.look == LastLook::TestLifted
+        if chosen.look == Phase::TestLifted
             && let Some(squeezed) = &mut probes.squeezed
         {
             squeezed.probe.classifier.unsure_from_probability = policy.promising_squeezed.max(0.0);
@@ -162,15 +163,15 @@ fn choose_looks(
 ) -> (Vec<Chosen>, Vec<String>) {
     let (mut chosen_looks, mut refusals) = (Vec::new(), Vec::new());
     let mut stable_from = [NEVER; 2];
-    for look in LastLook::ALL {
-        if look != LastLook::Settled && probes.after(look).is_none() {
+    for look in LOOKS {
+        if look != Phase::Settled && probes.after(look).is_none() {
             continue;
         }
         match aim.choose(&Policies::new(&attempts(judged, settled, probes, look), look, stable_from), look) {
             Ok(chosen) => {
                 match (look, aim) {
-                    (LastLook::Settled, _) => stable_from[0] = chosen.policy.lift,
-                    (LastLook::Squeezed, Aim::DropSecs(_)) => stable_from[1] = chosen.policy.lift,
+                    (Phase::Settled, _) => stable_from[0] = chosen.policy.thresholds.lift,
+                    (Phase::Squeezed, Aim::DropSecs(_)) => stable_from[1] = chosen.policy.thresholds.lift,
                     // With a promise, a tight hand is not lifted before its test lift, so that no threshold of its own lets
                     // it go on.
                     _ => {}
@@ -184,7 +185,7 @@ fn choose_looks(
 }
 
 /// The grasps as attempts that a look decides.
-fn attempts(judged: &OutOfFold<'_>, settled: &[f64], probes: &LearnedProbes, look: LastLook) -> Vec<Attempted> {
+fn attempts(judged: &OutOfFold<'_>, settled: &[f64], probes: &LearnedProbes, look: Phase) -> Vec<Attempted> {
     let names: BTreeSet<&String> = judged.examples.iter().map(|example| &example.object).collect();
     let objects: BTreeMap<&String, usize> = names.into_iter().zip(0..).collect();
     let mut attempts = Vec::new();
@@ -196,11 +197,11 @@ fn attempts(judged: &OutOfFold<'_>, settled: &[f64], probes: &LearnedProbes, loo
             fold: judged.folds[idx],
             settled: settled[idx],
             // A tight hand that feels nothing is given up.
-            squeezed: if look == LastLook::TestLifted { squeezed.unwrap_or(NO_FEATURE) } else { 1.0 },
+            squeezed: if look == Phase::TestLifted { squeezed.unwrap_or(NO_FEATURE) } else { 1.0 },
             decided: match look {
-                LastLook::Settled => Some(settled[idx]),
-                LastLook::Squeezed => squeezed,
-                LastLook::TestLifted => test_lifted,
+                Phase::Squeezed => squeezed,
+                Phase::TestLifted => test_lifted,
+                _ => Some(settled[idx]),
             },
             stable: example.stable,
         });

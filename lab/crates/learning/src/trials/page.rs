@@ -243,7 +243,7 @@ mod tests {
         let strips: Vec<Strip> = telling
             .iter()
             .map(|record| {
-                let target = targets.iter().find(|target| target.name == record.thing).expect("a thing");
+                let target = targets.iter().find(|target| target.object.name == record.thing).expect("a thing");
                 let made = Made { options: &TrialOptions::default(), prior: None, probe: None };
                 strip(&hand, target, made, 1, record).expect("a strip")
             })

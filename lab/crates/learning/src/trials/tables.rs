@@ -6,6 +6,7 @@ use super::late_decisions::LateDecisions;
 use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
 use crate::evaluation::statistics::Estimate;
 use blindgrasp_simulator::trial::TrialOptions;
+use blindgrasp_simulator::trial::targets::{N_PAPER_TRIALS_EACH, held_in_paper};
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use blindgrasp_stages::training_summary::Bounded;
 
@@ -103,8 +104,13 @@ impl Table {
 pub fn tables(report: &TrialsReport) -> Vec<Table> {
     let tables = [
         Some(table_2(report)),
-        table_3(report),
-        table_4(report),
+        by_mass(
+            report,
+            "Table III: the canteen by surface and mass",
+            &["0.50 kg", "0.75 kg"],
+            &["canteen without cover", "canteen with cover"],
+        ),
+        by_mass(report, "Table IV: the mug by mass", &["0.43 kg", "0.68 kg", "0.93 kg"], &["mug"]),
         Some(attempts(report)),
         Some(cost(report)),
         promises(report),
@@ -139,49 +145,29 @@ fn table_2(report: &TrialsReport) -> Table {
     Table { title: "Table II: lifts that kept the object (95 % interval)".into(), head, rows }
 }
 
-/// The canteen: two surfaces, two masses.
-fn table_3(report: &TrialsReport) -> Option<Table> {
-    const CELLS: [(&str, [&str; 2]); 2] = [
-        ("canteen without cover", ["canteen without cover, 0.50 kg", "canteen without cover, 0.75 kg"]),
-        ("canteen with cover", ["canteen with cover, 0.50 kg", "canteen with cover, 0.75 kg"]),
-    ];
-    by_thing(report, "Table III: the canteen by surface and mass", &["0.50 kg", "0.75 kg"], &CELLS)
-}
-
-/// The mug: three masses.
-fn table_4(report: &TrialsReport) -> Option<Table> {
-    const CELLS: [(&str, [&str; 3]); 1] = [("mug", ["mug, 0.43 kg", "mug, 0.68 kg", "mug, 0.93 kg"])];
-    by_thing(report, "Table IV: the mug by mass", &["0.43 kg", "0.68 kg", "0.93 kg"], &CELLS)
-}
-
-/// A line for each row and way, a column for each thing, and the paper's figures.
-fn by_thing<const N: usize>(
-    report: &TrialsReport,
-    title: &str,
-    columns: &[&str; N],
-    cells: &[(&str, [&str; N])],
-) -> Option<Table> {
+/// A line for each object and way, a column for each mass, and the paper's figures.
+fn by_mass(report: &TrialsReport, title: &str, masses: &[&str], names: &[&str]) -> Option<Table> {
     let mut rows = Vec::new();
-    for (name, things) in cells {
+    for name in names {
+        let things: Vec<String> = masses.iter().map(|mass| format!("{name}, {mass}")).collect();
         let n_before = rows.len();
         for (way, tallies) in report.ways() {
-            let find = |thing: &str| tallies.things.iter().find(|tally| tally.name == thing);
+            let find = |thing: &String| tallies.things.iter().find(|tally| tally.name == *thing);
             if things.iter().any(|thing| find(thing).is_some()) {
                 let found = things.iter().map(|thing| find(thing).map_or("-".into(), held));
                 rows.push([format!("{name}, {way}")].into_iter().chain(found).collect::<Vec<_>>());
             }
         }
         if rows.len() > n_before {
-            let in_paper = things.iter().map(|thing| blindgrasp_simulator::trial::targets::held_in_paper(thing));
-            let found = in_paper.map(|n_held| {
-                n_held.map_or("-".into(), |n_held| {
-                    part_of_whole([n_held, blindgrasp_simulator::trial::targets::N_PAPER_TRIALS_EACH])
-                })
-            });
-            rows.push([format!("{name}, paper")].into_iter().chain(found).collect());
+            let mut row = vec![format!("{name}, paper")];
+            for thing in &things {
+                let n_held = held_in_paper(thing);
+                row.push(n_held.map_or("-".into(), |n_held| part_of_whole([n_held, N_PAPER_TRIALS_EACH])));
+            }
+            rows.push(row);
         }
     }
-    let head = std::iter::once("object").chain(columns.iter().copied()).map(String::from).collect();
+    let head = std::iter::once("object").chain(masses.iter().copied()).map(String::from).collect();
     (!rows.is_empty()).then(|| Table { title: title.into(), head, rows })
 }
 

@@ -5,7 +5,7 @@ use parry3d_f64::shape::SharedShape;
 
 use super::super::outline::{closed_fillet, ellipse, fillet, rounded_rectangle, spline, superellipse};
 use super::super::solid::{Assembly, Solid};
-use super::{Draw, Made, capped, radius_at};
+use super::{Draw, capped, radius_at, spline_from_axis};
 
 /// A filled bottle or can, packaging included.
 const FILLED: f64 = 970.0;
@@ -15,16 +15,14 @@ const PACKAGE: f64 = 350.0;
 const LID: f64 = 500.0;
 
 /// Water, wine, beer, shampoo and spray bottles, filled and closed.
-pub(super) fn bottle(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn bottle(draw: &mut Draw, made: &mut Assembly) {
     match draw.kind(5) {
-        0 => drinks_bottle(draw, &mut made),
-        1 => wine_bottle(draw, &mut made),
-        2 => beer_bottle(draw, &mut made),
-        3 => shampoo_bottle(draw, &mut made),
-        _ => spray_bottle(draw, &mut made),
+        0 => drinks_bottle(draw, made),
+        1 => wine_bottle(draw, made),
+        2 => beer_bottle(draw, made),
+        3 => shampoo_bottle(draw, made),
+        _ => spray_bottle(draw, made),
     }
-    Made::Assembled(made)
 }
 
 /// A 0.5 to 1 l PET bottle with a grip.
@@ -164,8 +162,7 @@ fn spray_bottle(draw: &mut Draw, made: &mut Assembly) {
 }
 
 /// Drinks cans, food tins, flat tins and aerosols.
-pub(super) fn can(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn can(draw: &mut Draw, made: &mut Assembly) {
     match draw.kind(4) {
         0 => {
             // 250 ml slim to 500 ml.
@@ -212,12 +209,10 @@ pub(super) fn can(draw: &mut Draw) -> Made {
             made.add(&Solid::lathe(&cap), 200.0);
         }
     }
-    Made::Assembled(made)
 }
 
 /// Jam jars, spice jars, square honey jars, all with lids, and open preserving jars.
-pub(super) fn jar(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn jar(draw: &mut Draw, made: &mut Assembly) {
     match draw.kind(4) {
         0 => {
             let r = draw.between(32.0, 46.0);
@@ -267,11 +262,10 @@ pub(super) fn jar(draw: &mut Draw) -> Made {
             made.add(&bead(h - 11.0), 2500.0);
         }
     }
-    Made::Assembled(made)
 }
 
 /// Flat and tall boxes and cubes, and gable-top cartons.
-pub(super) fn carton(draw: &mut Draw) -> Made {
+pub(super) fn carton(draw: &mut Draw, made: &mut Assembly) {
     let size_mm = match draw.kind(4) {
         0 => [draw.between(110.0, 190.0), draw.between(28.0, 50.0), draw.between(80.0, 130.0)],
         1 => [draw.between(60.0, 130.0), draw.between(35.0, 65.0), draw.between(140.0, 220.0)],
@@ -279,23 +273,21 @@ pub(super) fn carton(draw: &mut Draw) -> Made {
             let side = draw.between(45.0, 105.0);
             [side, side * draw.between(0.93, 1.0), side * draw.between(0.9, 1.1)]
         }
-        _ => return gable_top(draw),
+        _ => return gable_top(draw, made),
     };
     let [x, y, z] = size_mm.map(|side| side / 2000.0);
-    Made::Exact { shape: SharedShape::cuboid(x, y, z), density_kg_per_m3: PACKAGE }
+    made.exact = Some((SharedShape::cuboid(x, y, z), PACKAGE));
 }
 
 /// Bulbs, amphorae with handles, flared and slender vases; hollow.
-pub(super) fn vase(draw: &mut Draw) -> Made {
+pub(super) fn vase(draw: &mut Draw, made: &mut Assembly) {
     let h = draw.between(140.0, 290.0) * if draw.kind(4) == 1 { 0.68 } else { 1.0 };
     let r = draw.between(0.19, 0.26) * h;
     let wall = draw.between(4.0, 6.0);
-    let mut made = Assembly::default();
     let outer = match draw.kind(4) {
         0 => {
             let neck = draw.between(0.34, 0.5) * r;
-            let mut line = vec![[0.0, 0.0]];
-            line.extend(spline(&[
+            spline_from_axis(&[
                 [0.60 * r, 0.0],
                 [0.93 * r, 0.16 * h],
                 [r, 0.34 * h],
@@ -303,13 +295,11 @@ pub(super) fn vase(draw: &mut Draw) -> Made {
                 [neck, 0.76 * h],
                 [neck, 0.88 * h],
                 [1.35 * neck, h],
-            ]));
-            line
+            ])
         }
         1 => {
             let neck = draw.between(0.46, 0.58) * r;
-            let mut line = vec![[0.0, 0.0]];
-            line.extend(spline(&[
+            spline_from_axis(&[
                 [0.46 * r, 0.0],
                 [0.62 * r, 0.16 * h],
                 [0.96 * r, 0.42 * h],
@@ -317,20 +307,17 @@ pub(super) fn vase(draw: &mut Draw) -> Made {
                 [neck, 0.78 * h],
                 [0.95 * neck, 0.90 * h],
                 [1.3 * neck, h],
-            ]));
-            line
+            ])
         }
         2 => {
             let waist = draw.between(0.55, 0.75) * r;
-            let mut line = vec![[0.0, 0.0]];
-            line.extend(spline(&[
+            spline_from_axis(&[
                 [0.80 * r, 0.0],
                 [0.74 * r, 0.12 * h],
                 [waist, 0.42 * h],
                 [0.86 * r, 0.78 * h],
                 [1.12 * r, h],
-            ]));
-            line
+            ])
         }
         _ => {
             let top = draw.between(0.6, 0.85) * r;
@@ -357,15 +344,13 @@ pub(super) fn vase(draw: &mut Draw) -> Made {
             );
         }
     }
-    Made::Assembled(made)
 }
 
 /// A milk carton, its ridge along x.
-fn gable_top(draw: &mut Draw) -> Made {
+fn gable_top(draw: &mut Draw, made: &mut Assembly) {
     let (w, d) = (draw.between(58.0, 95.0), draw.between(58.0, 92.0));
     let (h, roof) = (draw.between(95.0, 195.0), draw.between(22.0, 34.0));
     let rectangle = |width: f64, depth: f64| rounded_rectangle([width, depth], 0.0);
-    let mut made = Assembly::default();
     let sections = [(0.0, rectangle(w, d)), (h, rectangle(w, d)), (h + roof, rectangle(w, 4.0))];
     made.add(&Solid::stack(&sections), 900.0);
     let fin = [(h + roof - 2.0, rectangle(w - 1.2, 3.0)), (h + roof + 14.0, rectangle(w - 1.2, 2.6))];
@@ -376,7 +361,6 @@ fn gable_top(draw: &mut Draw) -> Made {
         let side = std::f64::consts::FRAC_PI_2 - lean_rad;
         made.add(&spout.turned([1.0, 0.0, 0.0], side).moved([0.0, -d / 4.0 - 1.0, h + roof / 2.0]), LID);
     }
-    Made::Assembled(made)
 }
 
 /// A screw cap from one height to another.

@@ -7,7 +7,7 @@ use parry3d_f64::shape::SharedShape;
 
 use super::super::outline::{Point, closed_fillet, ellipse, fillet, half_ellipse, spline, superellipse};
 use super::super::solid::{Assembly, Solid};
-use super::{Draw, Made, bar, capped};
+use super::{Draw, bar, capped};
 
 const PAPER: f64 = 750.0;
 /// A battery, a board, a case.
@@ -16,15 +16,15 @@ const REMOTE: f64 = 750.0;
 const RUBBER: f64 = 1100.0;
 
 /// Paperbacks (exact blocks) and bound books with boards and a round spine.
-pub(super) fn book(draw: &mut Draw) -> Made {
+pub(super) fn book(draw: &mut Draw, made: &mut Assembly) {
     let height = draw.between(160.0, 225.0);
     let width = height * draw.between(0.62, 0.70);
     let thick = draw.between(10.0, 42.0);
     if draw.kind(2) == 0 {
         let shape = SharedShape::cuboid(width / 2000.0, thick / 2000.0, height / 2000.0);
-        return Made::Exact { shape, density_kg_per_m3: PAPER };
+        made.exact = Some((shape, PAPER));
+        return;
     }
-    let mut made = Assembly::default();
     let half = thick / 2.0;
     let board = 2.6;
     let bulge = 0.22 * thick;
@@ -48,12 +48,10 @@ pub(super) fn book(draw: &mut Draw) -> Made {
     outline.push([front, half]);
     let cover = Solid::plate(&outline, height, 0.0).turned([1.0, 0.0, 0.0], FRAC_PI_2);
     made.add(&cover.moved([0.0, 0.0, height / 2.0]), 850.0);
-    Made::Assembled(made)
 }
 
 /// Smartphones (their backs, with the camera, towards -y), phones with keys and cordless handsets.
-pub(super) fn phone(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn phone(draw: &mut Draw, made: &mut Assembly) {
     match draw.kind(3) {
         0 => {
             let (width, height, thick) =
@@ -76,14 +74,9 @@ pub(super) fn phone(draw: &mut Draw) -> Made {
             made.add(&Solid::block([width, thick, height], draw.between(9.0, 18.0), draw.between(3.0, 4.5)), 1250.0);
             let screen = Solid::block([width - 13.0, 2.0, 0.33 * height], 2.0, 0.5);
             made.add(&screen.moved([0.0, -thick / 2.0, 0.56 * height]), DEVICE);
-            keys(
-                &mut made,
-                [3, 4],
-                [width * 0.27, 0.098 * height],
-                [width * 0.20, 0.06 * height],
-                0.12 * height,
-                |_| -thick / 2.0,
-            );
+            keys(made, [3, 4], [width * 0.27, 0.098 * height], [width * 0.20, 0.06 * height], 0.12 * height, |_| {
+                -thick / 2.0
+            });
         }
         _ => {
             let (width, height, thick) =
@@ -106,14 +99,7 @@ pub(super) fn phone(draw: &mut Draw) -> Made {
                 650.0,
             );
             let face = |z: f64| -thick / 2.0 - bent(z);
-            keys(
-                &mut made,
-                [3, 4],
-                [width * 0.26, 0.085 * height],
-                [width * 0.19, 0.052 * height],
-                0.20 * height,
-                face,
-            );
+            keys(made, [3, 4], [width * 0.26, 0.085 * height], [width * 0.19, 0.052 * height], 0.20 * height, face);
             let screen = Solid::block([width * 0.62, 2.4, 0.17 * height], 3.0, 0.6);
             made.add(&screen.moved([0.0, face(0.67 * height) + 0.3, 0.58 * height]), DEVICE);
             let aerial = fillet(&[
@@ -125,26 +111,19 @@ pub(super) fn phone(draw: &mut Draw) -> Made {
             made.add(&Solid::lathe(&aerial).moved([0.27 * width, -bent(height) + 3.0, 0.0]), RUBBER);
         }
     }
-    Made::Assembled(made)
 }
 
 /// Plain, waisted and small remote controls.
-pub(super) fn remote(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn remote(draw: &mut Draw, made: &mut Assembly) {
     match draw.kind(3) {
         0 => {
             let (width, height, thick) =
                 (draw.between(42.0, 56.0), draw.between(150.0, 220.0), draw.between(16.0, 23.0));
             made.add(&Solid::block([width, thick, height], draw.between(5.0, 10.0), 3.5), REMOTE);
-            keys(
-                &mut made,
-                [3, 5],
-                [width * 0.28, 0.075 * height],
-                [width * 0.19, 0.045 * height],
-                0.42 * height,
-                |_| -thick / 2.0,
-            );
-            ring_key(&mut made, 0.35 * width, -thick / 2.0, 0.24 * height);
+            keys(made, [3, 5], [width * 0.28, 0.075 * height], [width * 0.19, 0.045 * height], 0.42 * height, |_| {
+                -thick / 2.0
+            });
+            ring_key(made, 0.35 * width, -thick / 2.0, 0.24 * height);
         }
         1 => {
             let (width, height, thick) =
@@ -161,34 +140,27 @@ pub(super) fn remote(draw: &mut Draw) -> Made {
             ]);
             let round = |_: f64, half_width: f64| [thick / 2.0 * (half_width / (0.4 * width)).min(1.0).sqrt(), 0.0];
             made.add(&bar(&half, 3.2, round), REMOTE);
-            keys(
-                &mut made,
-                [3, 4],
-                [width * 0.24, 0.065 * height],
-                [width * 0.16, 0.04 * height],
-                0.16 * height,
-                |_| -thick / 2.0,
-            );
-            ring_key(&mut made, 0.30 * width, -thick / 2.0, 0.66 * height);
+            keys(made, [3, 4], [width * 0.24, 0.065 * height], [width * 0.16, 0.04 * height], 0.16 * height, |_| {
+                -thick / 2.0
+            });
+            ring_key(made, 0.30 * width, -thick / 2.0, 0.66 * height);
         }
         _ => {
             let (width, height, thick) =
                 (draw.between(32.0, 42.0), draw.between(118.0, 150.0), draw.between(12.0, 19.0));
             made.add(&Solid::block([width, thick, height], width * 0.46, thick * 0.36), REMOTE);
-            ring_key(&mut made, 0.32 * width, -thick / 2.0, 0.74 * height);
-            keys(&mut made, [2, 3], [width * 0.42, 0.12 * height], [width * 0.26, width * 0.26], 0.20 * height, |_| {
+            ring_key(made, 0.32 * width, -thick / 2.0, 0.74 * height);
+            keys(made, [2, 3], [width * 0.42, 0.12 * height], [width * 0.26, width * 0.26], 0.20 * height, |_| {
                 -thick / 2.0
             });
         }
     }
-    Made::Assembled(made)
 }
 
 /// Hard clamshells, slim boxes and round tubes for glasses, lying along x.
-pub(super) fn glasses_case(draw: &mut Draw) -> Made {
+pub(super) fn glasses_case(draw: &mut Draw, made: &mut Assembly) {
     /// Mostly air.
     const CASE: f64 = 280.0;
-    let mut made = Assembly::default();
     let length = draw.between(150.0, 172.0);
     match draw.kind(3) {
         0 => {
@@ -241,15 +213,13 @@ pub(super) fn glasses_case(draw: &mut Draw) -> Made {
             made.add(&clasp.moved([0.0, -depth / 2.0, 0.30 * height]), 900.0);
         }
     }
-    Made::Assembled(made)
 }
 
 /// Table lamps: a slim stem, a ceramic body or a dome for a shade. Shades are hollow.
-pub(super) fn lamp(draw: &mut Draw) -> Made {
+pub(super) fn lamp(draw: &mut Draw, made: &mut Assembly) {
     /// Wood and metal, weighted.
     const FOOT: f64 = 1500.0;
     const SHADE: f64 = 500.0;
-    let mut made = Assembly::default();
     let height = draw.between(250.0, 375.0);
     let foot = draw.between(39.0, 50.0);
     let kind = draw.kind(3);
@@ -300,7 +270,7 @@ pub(super) fn lamp(draw: &mut Draw) -> Made {
         made.add(&shell.mapped(|point| Point3::new(point.x, point.y, height - point.z)), SHADE * 2.0);
         let carrier = [[0.0, stem_top - 2.0], [5.0, stem_top - 2.0], [5.0, height - 1.5], [0.0, height - 1.5]];
         made.add(&Solid::lathe(&carrier), FOOT);
-        return Made::Assembled(made);
+        return;
     }
     let low = draw.between(72.0, 98.0);
     let high = low * draw.between(0.55, 0.9);
@@ -326,7 +296,6 @@ pub(super) fn lamp(draw: &mut Draw) -> Made {
         let rod = Solid::sweep(&path, Vector3::y(), [0.0; 2], |_| ellipse([1.2, 1.2]));
         made.add(&rod.turned([0.0, 0.0, 1.0], angle), FOOT);
     }
-    Made::Assembled(made)
 }
 
 /// Keys in columns and rows on a front, from a height upwards.

@@ -7,7 +7,7 @@ use parry3d_f64::shape::SharedShape;
 
 use super::super::outline::{Point, closed_fillet, ellipse, fillet, half_ellipse, simplify, spline};
 use super::super::solid::{Assembly, Solid};
-use super::{Draw, Made};
+use super::Draw;
 
 const FLESH: f64 = 920.0;
 const WOOD: f64 = 650.0;
@@ -15,12 +15,12 @@ const WOOD: f64 = 650.0;
 const HOLLOW: f64 = 300.0;
 
 /// Round balls from table tennis to handball (exact), and rugby balls for children.
-pub(super) fn ball(draw: &mut Draw) -> Made {
+pub(super) fn ball(draw: &mut Draw, made: &mut Assembly) {
     let diameter = draw.between(38.0, 130.0);
     if draw.kind(5) < 4 {
         // Light when large, as balls are.
-        let density_kg_per_m3 = 700.0 - 4.0 * diameter;
-        return Made::Exact { shape: SharedShape::ball(diameter / 2000.0), density_kg_per_m3 };
+        made.exact = Some((SharedShape::ball(diameter / 2000.0), 700.0 - 4.0 * diameter));
+        return;
     }
     let half = draw.between(70.0, 105.0);
     let r = half * draw.between(0.56, 0.66);
@@ -31,25 +31,21 @@ pub(super) fn ball(draw: &mut Draw) -> Made {
             [if idx % 256 == 0 { 0.0 } else { r * cos.max(0.0).powf(1.12) }, half * (1.0 + sin)]
         })
         .collect();
-    let mut made = Assembly::default();
     made.add(&Solid::lathe(&simplify(&meridian)), 180.0);
-    Made::Assembled(made)
 }
 
 /// Apples and pears with their dimples and stalks, bananas, lemons and oranges.
-pub(super) fn fruit(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn fruit(draw: &mut Draw, made: &mut Assembly) {
     let r = draw.between(31.0, 43.0);
     // No fruit is quite round.
     let scale = [draw.between(0.96, 1.0), draw.between(0.96, 1.0)];
     match draw.kind(5) {
-        0 => apple(draw, &mut made, r, scale),
-        1 => banana(draw, &mut made),
-        2 => pear(draw, &mut made, r, scale),
-        3 => lemon(draw, &mut made, r, scale),
-        _ => orange(draw, &mut made, r, scale),
+        0 => apple(draw, made, r, scale),
+        1 => banana(draw, made),
+        2 => pear(draw, made, r, scale),
+        3 => lemon(draw, made, r, scale),
+        _ => orange(draw, made, r, scale),
     }
-    Made::Assembled(made)
 }
 
 /// A slightly bent stalk from one height to another.
@@ -154,16 +150,14 @@ fn orange(draw: &mut Draw, made: &mut Assembly, r: f64, scale: [f64; 2]) {
 }
 
 /// Bath ducks, cars, robots, ring towers and rockets, their faces towards -y.
-pub(super) fn toy(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn toy(draw: &mut Draw, made: &mut Assembly) {
     match draw.kind(5) {
-        0 => duck(draw, &mut made),
-        1 => car(draw, &mut made),
-        2 => robot(draw, &mut made),
-        3 => ring_tower(draw, &mut made),
-        _ => rocket(draw, &mut made),
+        0 => duck(draw, made),
+        1 => car(draw, made),
+        2 => robot(draw, made),
+        3 => ring_tower(draw, made),
+        _ => rocket(draw, made),
     }
-    Made::Assembled(made)
 }
 
 fn duck(draw: &mut Draw, made: &mut Assembly) {

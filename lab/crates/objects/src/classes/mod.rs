@@ -11,28 +11,19 @@ mod tableware;
 mod tools;
 
 use nalgebra::Point3;
-use parry3d_f64::shape::SharedShape;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::N_PER_CLASS;
-use crate::outline::{Point, n_around, subdivide, superellipse};
+use crate::outline::{Point, n_around, spline, subdivide, superellipse};
 use crate::solid::{Assembly, Solid};
 
 pub(super) use tableware::loop_handle;
 
-/// The object that a class makes.
-pub(super) enum Made {
-    /// A surface put together from parts.
-    Assembled(Assembly),
-    /// One of parry's shapes.
-    Exact { shape: SharedShape, density_kg_per_m3: f64 },
-}
-
 /// A class.
 pub(super) struct Class {
     pub(super) name: &'static str,
-    pub(super) make: fn(&mut Draw) -> Made,
+    pub(super) make: fn(&mut Draw, &mut Assembly),
 }
 
 /// All classes, in the catalogue's order.
@@ -103,6 +94,11 @@ fn radius_at(profile: &[Point], z_mm: f64) -> f64 {
             pair[0][0] + along * (pair[1][0] - pair[0][0])
         },
     )
+}
+
+/// A smooth line that begins on the axis, on the ground.
+fn spline_from_axis(knots: &[Point]) -> Vec<Point> {
+    [vec![[0.0, 0.0]], spline(knots)].concat()
 }
 
 /// The last line, closed onto the axis at both ends with flat faces: a profile for a lathe.

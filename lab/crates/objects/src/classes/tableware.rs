@@ -4,7 +4,7 @@ use nalgebra::{Point3, Vector3};
 
 use super::super::outline::{Point, ellipse, fillet, half_ellipse, simplify, spline, squared, subdivide, superellipse};
 use super::super::solid::{Assembly, Solid};
-use super::{Draw, Made, capped, radius_at};
+use super::{Draw, capped, radius_at, spline_from_axis};
 
 const CERAMIC: f64 = 2300.0;
 const GLASS: f64 = 2500.0;
@@ -13,7 +13,7 @@ const STEEL: f64 = 7800.0;
 const WOOD: f64 = 700.0;
 
 /// Straight, tapered and bellied mugs with a handle that fingers go through.
-pub(super) fn mug(draw: &mut Draw) -> Made {
+pub(super) fn mug(draw: &mut Draw, made: &mut Assembly) {
     let r = draw.between(36.0, 47.0);
     let h = draw.between(82.0, 114.0);
     let wall = draw.between(3.8, 5.0);
@@ -28,7 +28,6 @@ pub(super) fn mug(draw: &mut Draw) -> Made {
             [r * 0.9, h, 0.0],
         ]),
     };
-    let mut made = Assembly::default();
     made.add(&Solid::vessel(&outer, 0.0, wall, wall + 1.5), CERAMIC);
     let high = h * draw.between(0.80, 0.86);
     let low = h * draw.between(0.17, 0.25);
@@ -37,12 +36,10 @@ pub(super) fn mug(draw: &mut Draw) -> Made {
     let section = [draw.between(3.6, 4.6), draw.between(5.5, 8.0)];
     let ends = [high, low].map(|z| [radius_at(&outer, z) - 0.6 * wall, z]);
     made.add(&loop_handle(ends, reach, squareness, section), CERAMIC);
-    Made::Assembled(made)
 }
 
 /// Tumblers, paper cups, tea bowls and wine glasses.
-pub(super) fn cup(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn cup(draw: &mut Draw, made: &mut Assembly) {
     match draw.kind(4) {
         0 => {
             let r = draw.between(31.0, 43.0);
@@ -109,14 +106,12 @@ pub(super) fn cup(draw: &mut Draw) -> Made {
             made.add(&Solid::vessel(&outer, 0.0, 1.6, stem_top + 5.0), GLASS);
         }
     }
-    Made::Assembled(made)
 }
 
 /// Soup bowls with a foot, deep mixing bowls, flared bowls.
-pub(super) fn bowl(draw: &mut Draw) -> Made {
+pub(super) fn bowl(draw: &mut Draw, made: &mut Assembly) {
     let r = draw.between(55.0, 81.0);
     let wall = draw.between(3.5, 5.0);
-    let mut made = Assembly::default();
     match draw.kind(3) {
         0 => {
             let h = r * draw.between(0.62, 0.85);
@@ -139,30 +134,27 @@ pub(super) fn bowl(draw: &mut Draw) -> Made {
             made.add(&Solid::vessel(&outer, 0.0, wall, wall + 0.5), WOOD);
         }
     }
-    Made::Assembled(made)
 }
 
 /// Round teapots, tall coffee pots (both with their lids on) and open milk jugs.
-pub(super) fn teapot(draw: &mut Draw) -> Made {
+pub(super) fn teapot(draw: &mut Draw, made: &mut Assembly) {
     /// Full of tea to half its height.
     const POT: f64 = 700.0;
-    let mut made = Assembly::default();
     match draw.kind(3) {
         0 => {
             let r = draw.between(46.0, 59.0);
             let h = r * draw.between(1.45, 1.75);
             let opening = r * 0.5;
-            let mut body = vec![[0.0, 0.0]];
-            body.extend(spline(&[
+            let body = spline_from_axis(&[
                 [0.62 * r, 0.0],
                 [0.95 * r, 0.24 * h],
                 [r, 0.48 * h],
                 [0.84 * r, 0.78 * h],
                 [opening, h],
-            ]));
+            ]);
             made.add(&Solid::lathe(&capped(body.clone())), POT);
             made.add(&Solid::lathe(&lid(opening + 2.0, h - 2.0, 0.30 * r)), CERAMIC);
-            let ends = [[radius_at(&body, 0.80 * h) - 4.0, 0.80 * h], [radius_at(&body, 0.28 * h) - 4.0, 0.28 * h]];
+            let ends = [0.80 * h, 0.28 * h].map(|z| [radius_at(&body, z) - 4.0, z]);
             made.add(&loop_handle(ends, draw.between(40.0, 48.0), 2.3, [4.5, 7.0]), CERAMIC);
             let path = spline(&[
                 [-radius_at(&body, 0.36 * h) + 12.0, 0.36 * h],
@@ -185,7 +177,7 @@ pub(super) fn teapot(draw: &mut Draw) -> Made {
             ]);
             made.add(&Solid::lathe(&body), POT);
             made.add(&Solid::lathe(&lid(opening + 2.0, h - 2.0, 0.4 * r)), CERAMIC);
-            let ends = [[radius_at(&body, 0.88 * h) - 4.0, 0.88 * h], [radius_at(&body, 0.30 * h) - 4.0, 0.30 * h]];
+            let ends = [0.88 * h, 0.30 * h].map(|z| [radius_at(&body, z) - 4.0, z]);
             made.add(&loop_handle(ends, draw.between(40.0, 50.0), 3.0, [5.0, 7.5]), CERAMIC);
             let path = spline(&[
                 [-radius_at(&body, 0.48 * h) + 12.0, 0.48 * h],
@@ -200,14 +192,13 @@ pub(super) fn teapot(draw: &mut Draw) -> Made {
             let h = draw.between(120.0, 180.0);
             let wall = draw.between(4.0, 5.0);
             let neck = r * draw.between(0.66, 0.78);
-            let mut outer = vec![[0.0, 0.0]];
-            outer.extend(spline(&[
+            let mut outer = spline_from_axis(&[
                 [0.72 * r, 0.0],
                 [0.97 * r, 0.18 * h],
                 [r, 0.36 * h],
                 [neck, 0.80 * h],
                 [neck * 1.12, h],
-            ]));
+            ]);
             let smooth = outer.iter().position(|point| point[1] > 0.72 * h).unwrap_or(0);
             let upper = subdivide(&outer[smooth..], 5.0);
             outer.truncate(smooth);
@@ -219,18 +210,14 @@ pub(super) fn teapot(draw: &mut Draw) -> Made {
                 Point3::new(point.x - 11.0 * upper * forward, point.y, point.z + 4.0 * upper * forward)
             };
             made.add(&Solid::vessel(&outer, 0.0, wall, wall + 1.5).mapped(lip), CERAMIC);
-            let ends = [
-                [radius_at(&outer, 0.86 * h) - 0.5 * wall, 0.86 * h],
-                [radius_at(&outer, 0.28 * h) - 0.5 * wall, 0.28 * h],
-            ];
+            let ends = [0.86 * h, 0.28 * h].map(|z| [radius_at(&outer, z) - 0.5 * wall, z]);
             made.add(&loop_handle(ends, draw.between(36.0, 46.0), 2.6, [4.5, 7.5]), CERAMIC);
         }
     }
-    Made::Assembled(made)
 }
 
 /// Table, tea, wooden and serving spoons, the bowl up.
-pub(super) fn spoon(draw: &mut Draw) -> Made {
+pub(super) fn spoon(draw: &mut Draw, made: &mut Assembly) {
     let kind = draw.kind(3);
     // Length, half width and depth of the bowl; thickness of the metal; half width and half thickness of the handle.
     let (length, half_bowl, depth, thick, grip, density) = match kind {
@@ -304,14 +291,11 @@ pub(super) fn spoon(draw: &mut Draw) -> Made {
             (0..=n_across).map(|idx| side(idx, true)).chain((0..=n_across).rev().map(|idx| side(idx, false))).collect()
         })
         .collect();
-    let mut made = Assembly::default();
     made.add(&Solid::loft(&rings), density);
-    Made::Assembled(made)
 }
 
 /// Table, kitchen and chef's knives, the point up.
-pub(super) fn knife(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn knife(draw: &mut Draw, made: &mut Assembly) {
     // Half thickness of the spine, and where spine and edge are (x) at heights above the bolster.
     let blade = |handle: f64, half_thick: f64, spine: Vec<Point>, edge: Vec<Point>| {
         let x_at = |line: &[Point], z: f64| {
@@ -387,7 +371,6 @@ pub(super) fn knife(draw: &mut Draw) -> Made {
             made.add(&blade(handle, 1.0, spine, edge), STEEL);
         }
     }
-    Made::Assembled(made)
 }
 
 /// A handle on the side of +x between two ends (x and z, the higher one first), superelliptic, of elliptic section.

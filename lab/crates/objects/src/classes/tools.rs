@@ -6,7 +6,7 @@ use nalgebra::{Point3, Vector3};
 
 use super::super::outline::{Point, closed_fillet, ellipse, fillet, half_ellipse, n_around, spline, superellipse};
 use super::super::solid::{Assembly, Solid};
-use super::{Draw, Made, bar, capped};
+use super::{Draw, bar, capped};
 
 const STEEL: f64 = 7800.0;
 const WOOD: f64 = 700.0;
@@ -16,15 +16,13 @@ const RUBBER: f64 = 1200.0;
 const BRISTLES: f64 = 350.0;
 
 /// Hair brushes, dish brushes, paint brushes and tooth brushes.
-pub(super) fn brush(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn brush(draw: &mut Draw, made: &mut Assembly) {
     match draw.kind(4) {
-        0 => hair_brush(draw, &mut made),
-        1 => dish_brush(draw, &mut made),
-        2 => paint_brush(draw, &mut made),
-        _ => tooth_brush(draw, &mut made),
+        0 => hair_brush(draw, made),
+        1 => dish_brush(draw, made),
+        2 => paint_brush(draw, made),
+        _ => tooth_brush(draw, made),
     }
-    Made::Assembled(made)
 }
 
 fn hair_brush(draw: &mut Draw, made: &mut Assembly) {
@@ -143,8 +141,7 @@ fn tooth_brush(draw: &mut Draw, made: &mut Assembly) {
 }
 
 /// Claw hammers, rubber mallets and ball-peen hammers, the face towards +x.
-pub(super) fn hammer(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn hammer(draw: &mut Draw, made: &mut Assembly) {
     let length = draw.between(250.0, 345.0);
     let grip = [draw.between(13.0, 17.0), draw.between(10.0, 13.0)];
     let points: Vec<_> =
@@ -216,12 +213,10 @@ pub(super) fn hammer(draw: &mut Draw) -> Made {
             made.add(&along_x(Solid::lathe(&head), length - 8.0), STEEL);
         }
     }
-    Made::Assembled(made)
 }
 
 /// Combination pliers, needle-nose pliers and side cutters, a little open.
-pub(super) fn pliers(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn pliers(draw: &mut Draw, made: &mut Assembly) {
     let handle = draw.between(100.0, 130.0);
     let spread = draw.between(21.0, 28.0);
     // Jaw length, half width at the joint and at the tip, half depth at the joint and at the tip.
@@ -278,12 +273,10 @@ pub(super) fn pliers(draw: &mut Draw) -> Made {
         [0.0, deep + 1.2, 0.0],
     ]));
     made.add(&rivet.turned([1.0, 0.0, 0.0], FRAC_PI_2).moved([0.0, 0.0, handle + 6.0]), STEEL);
-    Made::Assembled(made)
 }
 
 /// Slotted, cross-head and stubby screwdrivers with fluted handles.
-pub(super) fn screwdriver(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn screwdriver(draw: &mut Draw, made: &mut Assembly) {
     let kind = draw.kind(3);
     let r = draw.between(11.5, 17.5);
     let handle = if kind == 2 { draw.between(52.0, 66.0) } else { draw.between(85.0, 118.0) };
@@ -335,12 +328,10 @@ pub(super) fn screwdriver(draw: &mut Draw) -> Made {
         ];
         made.add(&Solid::stack(&sections), STEEL);
     }
-    Made::Assembled(made)
 }
 
 /// Long torches, pocket torches and hand lanterns, the light up.
-pub(super) fn flashlight(draw: &mut Draw) -> Made {
-    let mut made = Assembly::default();
+pub(super) fn flashlight(draw: &mut Draw, made: &mut Assembly) {
     match draw.kind(3) {
         0 => {
             let r = draw.between(13.0, 19.5);
@@ -417,7 +408,6 @@ pub(super) fn flashlight(draw: &mut Draw) -> Made {
             made.add(&Solid::sweep(&points, Vector3::y(), [0.0; 2], |_| superellipse([6.5, 10.0], 2.6, 32)), 700.0);
         }
     }
-    Made::Assembled(made)
 }
 
 /// A push button on the front of a round body.

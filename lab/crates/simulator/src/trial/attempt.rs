@@ -152,7 +152,7 @@ impl<'a> Attempt<'a> {
         check_hand(hand).map_err(|error| TrialError::hand(hand, error))?;
         let mechanism = Mechanism::new(hand);
         let Some(touch) = first_touch(&mechanism, target, start)? else {
-            return Err(TrialError::NoApproach { target: target.name.clone(), n_draws: 1 });
+            return Err(TrialError::NoApproach { target: target.object.name.clone(), n_draws: 1 });
         };
         let stand_off = Isometry3::translation(0.0, 0.0, options.protocol.stand_off_m);
         let palm_from_world = stand_off * touch.palm_from_world;
@@ -235,7 +235,7 @@ impl<'a> Attempt<'a> {
             torques: self.body.torques(&*self.engine),
             touches: self.engine.touches(),
             palm_from_target: self.engine.palm_from_target(),
-            load_on_wrist: load_on_wrist(&*self.engine, self.target.mass_kg, &centre, &acceleration),
+            load_on_wrist: load_on_wrist(&*self.engine, self.target.object.mass_kg, &centre, &acceleration),
         })
     }
 
@@ -639,7 +639,7 @@ mod tests {
         let last = &frames[frames.len() - 1].frame;
         let (wrench, gravity) = (last.senses.get(Sense::WristWrench), last.senses.get(Sense::Gravity));
         let borne: f64 = wrench.iter().zip(gravity).map(|(f, g)| f * g / GRAVITY).sum();
-        let weight = target.mass_kg * GRAVITY;
+        let weight = target.object.mass_kg * GRAVITY;
         assert!((borne - weight).abs() < 0.5, "{borne} N of {weight} N");
         assert!((attempt.snapshot().palm_position_m[2] - closed().snapshot().palm_position_m[2] - 0.01).abs() < 1e-9);
         let mut highest: f64 = 0.0;

@@ -547,7 +547,7 @@ mod tests {
     ) {
         let (mechanism, options) = (Mechanism::new(hand), PhysicsOptions::default());
         let object = Object::new("ball".into(), "ball".into(), SharedShape::ball(radius_m), 1000.0, false);
-        let target = LiftTarget::new("ball".into(), "ball".into(), object, mass_kg, 1.0);
+        let target = LiftTarget::new(Object { mass_kg, ..object }, 1.0);
         // The stand is far away.
         let palm_from_world = Isometry3::translation(0.0, 0.0, -5.0);
         let world_from_target = Isometry3::translation(x, y, 5.0 + z);

@@ -81,8 +81,8 @@ pub(crate) fn try_candidate(
         epsilon: quality.epsilon,
         volume: quality.volume,
         stable: is_stable,
-        object: target.name,
-        class: target.group,
+        object: target.object.name,
+        class: target.object.class,
         ..GraspTruth::default()
     };
     let grasp = SimulatedGrasp { frames, truth, scene };
@@ -117,8 +117,7 @@ fn varied(object: &Object, options: &SimulatorOptions, rng: &mut impl rand::Rng)
     if shift.norm() <= *centre_shift_m {
         object.centre_of_mass_m += shift;
     }
-    let (name, class, mass_kg) = (object.name.clone(), object.class.clone(), object.mass_kg);
-    LiftTarget::new(name, class, object, mass_kg, friction)
+    LiftTarget::new(object, friction)
 }
 
 fn between([low, high]: [f64; 2], rng: &mut impl rand::Rng) -> f64 {
@@ -187,7 +186,7 @@ fn scene(attempt: &Attempt<'_>, target: &LiftTarget, candidate: u64, contacts: &
         object_rotation_xyzw: palm_from_object.rotation.coords.into(),
         centre_of_mass_m: (palm_from_object * target.object.centre_of_mass_m).into(),
         max_radius_m: target.object.max_radius_m,
-        mass_kg: target.mass_kg,
+        mass_kg: target.object.mass_kg,
         friction: target.friction,
         joints: attempt.joints(),
         self_collision: contacts.iter().any(|contact| contact.point.other.is_some()),

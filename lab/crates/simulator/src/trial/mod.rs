@@ -34,20 +34,13 @@ use blindgrasp_objects::Object;
 pub use attempt::{Attempt, ProbeMove, Reaction};
 pub use mujoco::python_path;
 pub(crate) use options::check_planner;
-pub use options::{MujocoOptions, PhysicsEngine, PhysicsOptions, TrialOptions, TrialProtocol};
+pub use options::{MujocoOptions, PhysicsEngine, PhysicsOptions, TrialOptions, TrialProtocol, read_options};
 pub use start::{choose_start, draw_start, sensor_seed};
 
-/// An object to lift.
+/// An object to lift. Its name and class are those in tables, e.g. `canteen with cover, 0.50 kg` and `canteen`.
 #[derive(Debug, Clone)]
 pub struct LiftTarget {
-    /// Name in tables, e.g. `canteen with cover, 0.50 kg`.
-    pub name: String,
-    /// Group in tables, e.g. `canteen`.
-    pub group: String,
-    /// Shape and centre of mass.
     pub object: Object,
-    /// Mass, which replaces the object's own.
-    pub mass_kg: f64,
     /// Coulomb friction of the surface on the hand's rubber.
     pub friction: f64,
     /// The convex hull, on which the target stands and of which its inertia is.
@@ -57,12 +50,12 @@ pub struct LiftTarget {
 }
 
 impl LiftTarget {
-    /// A target of `mass_kg` with `friction`. It stands as it is built if it does not topple easily, and otherwise on the
-    /// side on which it stands best: a spoon lies.
-    pub fn new(name: String, group: String, object: Object, mass_kg: f64, friction: f64) -> LiftTarget {
+    /// It stands as it is built if it does not topple easily, and otherwise on the side on which it stands best: a spoon
+    /// lies.
+    pub fn new(object: Object, friction: f64) -> LiftTarget {
         let hull = rest::hull(&object);
         let rest = rest::rest_rotation(&hull, &object.centre_of_mass_m);
-        LiftTarget { name, group, object, mass_kg, friction, hull, rest }
+        LiftTarget { object, friction, hull, rest }
     }
 }
 

@@ -578,7 +578,7 @@ mod tests {
 
     use super::*;
     use crate::trial::engine::stand_newtons;
-    use blindgrasp_objects::select;
+    use blindgrasp_objects::{Object, select};
 
     /// An object on the table, if the environment of the tests is there, which `scripts/python-env` makes.
     fn standing(test: &str, name: &str) -> Option<Mujoco> {
@@ -587,7 +587,7 @@ mod tests {
             return None;
         }
         let object = select(name).expect("an object").remove(0);
-        let target = LiftTarget::new("target".into(), "target".into(), object, 0.4, 1.0);
+        let target = LiftTarget::new(Object { mass_kg: 0.4, ..object }, 1.0);
         let stands = crate::trial::start::world_from_standing(&target, 0.3);
         // The palm is far away, and tilted.
         let palm_from_world = Isometry3::new(Vector3::new(0.1, 0.2, 1.0), Vector3::new(0.5, -0.4, 0.2));

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use super::TrialError;
@@ -239,14 +240,11 @@ impl TrialOptions {
     /// # Errors
     /// A file that cannot be read, an unknown option, or a value that cannot be used; with the file's name.
     pub fn load(path: &Path) -> Result<TrialOptions, TrialError> {
-        let refuse = |reason: String| TrialError::OptionsFile { path: path.into(), reason };
-        if let Some(kind) = FileKind::at(path).filter(|kind| !matches!(kind, FileKind::Empty | FileKind::Json)) {
-            return Err(refuse(format!("expected YAML as of --print-options, found {}", kind.description())));
+        let options: TrialOptions = read_options(path)?;
+        match options.check() {
+            Ok(()) => Ok(options),
+            Err(error) => Err(TrialError::OptionsFile { path: path.into(), reason: error.to_string() }),
         }
-        let text = read_regular(path).map_err(|error| refuse(error.to_string()))?;
-        let options: TrialOptions = serde_saphyr::from_str(&text).map_err(|error| refuse(error.to_string()))?;
-        options.check().map_err(|error| refuse(error.to_string()))?;
-        Ok(options)
     }
 
     /// Checks all options.
@@ -260,6 +258,19 @@ impl TrialOptions {
         self.physics.check()?;
         self.sensor.check()
     }
+}
+
+/// Reads options, which it does not check, from a YAML or JSON file. Options that it leaves out have their defaults.
+///
+/// # Errors
+/// A file that cannot be read, or an unknown option; with the file's name.
+pub fn read_options<T: DeserializeOwned>(path: &Path) -> Result<T, TrialError> {
+    let refuse = |reason: String| TrialError::OptionsFile { path: path.into(), reason };
+    if let Some(kind) = FileKind::at(path).filter(|kind| !matches!(kind, FileKind::Empty | FileKind::Json)) {
+        return Err(refuse(format!("expected YAML as of --print-options, found {}", kind.description())));
+    }
+    let text = read_regular(path).map_err(|error| refuse(error.to_string()))?;
+    serde_saphyr::from_str(&text).map_err(|error| refuse(error.to_string()))
 }
 
 /// Refuses the planner's option that lifts do not have.

@@ -317,7 +317,7 @@ impl<'a> Robot<'a> {
                 }
                 let Some(last) = grasp.last.clone() else {
                     let reason = format!("grasp {} has no frames", grasp.place.grasp_id);
-                    return Err(TrialError::Target { name: grasp.target.name.clone(), reason });
+                    return Err(TrialError::Target { name: grasp.target.object.name.clone(), reason });
                 };
                 (TactileFrame { phase: Phase::Ended, ..last }, true)
             }
@@ -436,10 +436,10 @@ impl<'a> Robot<'a> {
             turn_rad: lift.map_or(turned_rad, |lift| lift.turn_rad),
             epsilon,
             volume,
-            mass_kg: target.mass_kg,
+            mass_kg: target.object.mass_kg,
             friction: target.friction,
-            thing: target.name,
-            group: target.group,
+            thing: target.object.name,
+            group: target.object.class,
             probed: !probes.is_empty(),
             disturbed,
         };

@@ -74,7 +74,7 @@ pub fn draw_start(
             return Ok(start);
         }
     }
-    Err(TrialError::NoApproach { target: target.name.clone(), n_draws: MOST_DRAWS })
+    Err(TrialError::NoApproach { target: target.object.name.clone(), n_draws: MOST_DRAWS })
 }
 
 /// The planned approach of least energy of those that come from above and pass the stand. The planner's energy is that of
@@ -123,7 +123,7 @@ fn plan(
     }
     match best {
         Some((_, start)) => Ok(start),
-        None => Err(TrialError::NoApproach { target: target.name.clone(), n_draws: MOST_DRAWS }),
+        None => Err(TrialError::NoApproach { target: target.object.name.clone(), n_draws: MOST_DRAWS }),
     }
 }
 

@@ -74,11 +74,12 @@ pub fn targets_and_warnings(text: &str) -> Result<(Vec<LiftTarget>, Vec<String>)
             None => others(name)?,
         };
         for target in &mut named {
-            target.mass_kg = mass_kg.unwrap_or(target.mass_kg);
-            target.friction = friction.unwrap_or(target.friction);
+            let object = &mut target.object;
+            object.mass_kg = mass_kg.unwrap_or(object.mass_kg);
             if name != entry {
-                target.name = format!("{}{}", target.name, &entry[name.len()..]);
+                object.name.push_str(&entry[name.len()..]);
             }
+            target.friction = friction.unwrap_or(target.friction);
         }
         targets.extend(named);
         warnings.extend(said);
@@ -182,11 +183,9 @@ fn paper_targets(name: &str) -> Result<Option<Vec<LiftTarget>>, TrialError> {
     }
     let mut targets = Vec::with_capacity(wanted.len());
     for &(of_paper, shape, mass_kg, friction, _) in wanted {
-        let object = match shape.object(mass_kg) {
-            Ok(object) => object,
-            Err(error) => return Err(TrialError::Target { name: name.into(), reason: error.to_string() }),
-        };
-        targets.push(LiftTarget::new(of_paper.into(), shape.name().into(), object, mass_kg, friction));
+        let made = shape.object(mass_kg);
+        let object = made.map_err(|error| TrialError::Target { name: name.into(), reason: error.to_string() })?;
+        targets.push(LiftTarget::new(Object { name: of_paper.into(), ..object }, friction));
     }
     Ok(Some(targets))
 }
@@ -202,16 +201,12 @@ fn others(name: &str) -> Result<(Vec<LiftTarget>, Vec<String>), TrialError> {
         },
         error => TrialError::Mesh { path: name.into(), reason: error.to_string() },
     })?;
-    let targets = objects.into_iter().map(|object| {
-        let Object { name, class, mass_kg, .. } = &object;
-        let (name, group, mass_kg) = (name.clone(), class.clone(), *mass_kg);
-        LiftTarget::new(name, group, object, mass_kg, DEFAULT_FRICTION)
-    });
-    let mut targets: Vec<LiftTarget> = targets.collect();
+    let mut targets: Vec<LiftTarget> =
+        objects.into_iter().map(|object| LiftTarget::new(object, DEFAULT_FRICTION)).collect();
     // Groups take turns, so that any number of trials reaches all of them.
     let mut n_of_group: BTreeMap<String, usize> = BTreeMap::new();
     targets.sort_by_cached_key(|target| {
-        let n = n_of_group.entry(target.group.clone()).or_default();
+        let n = n_of_group.entry(target.object.class.clone()).or_default();
         *n += 1;
         *n
     });
@@ -230,16 +225,18 @@ mod tests {
         let mut n_by_target: BTreeMap<&str, u64> = BTreeMap::new();
         for trial in 0..110 {
             let target = target_of_trial(&targets, trial).expect("a target");
-            *n_by_group.entry(&target.group).or_default() += 1;
-            *n_by_target.entry(&target.name).or_default() += 1;
+            *n_by_group.entry(&target.object.class).or_default() += 1;
+            *n_by_target.entry(&target.object.name).or_default() += 1;
         }
         let table_2 =
             [("candle-box", 10), ("canteen", 40), ("mug", 30), ("pencil-cup", 10), ("rock", 10), ("wipe-box", 10)];
         assert_eq!(n_by_group.into_iter().collect::<Vec<_>>(), table_2);
         assert_eq!(n_by_target.len(), 11);
         assert!(n_by_target.values().all(|n| *n == 10));
-        let names: std::collections::BTreeSet<&str> =
-            (40..51).filter_map(|trial| target_of_trial(&targets, trial)).map(|target| target.name.as_str()).collect();
+        let names: std::collections::BTreeSet<&str> = (40..51)
+            .filter_map(|trial| target_of_trial(&targets, trial))
+            .map(|target| target.object.name.as_str())
+            .collect();
         assert_eq!(names.len(), 11);
         assert!(target_of_trial(&[], 0).is_none());
     }
@@ -248,7 +245,7 @@ mod tests {
     fn what_the_paper_held_adds_up_to_its_table_2() {
         let held = |group: &str| -> usize {
             let targets = targets_named(group).expect("the paper's");
-            targets.iter().filter_map(|target| held_in_paper(&target.name)).sum()
+            targets.iter().filter_map(|target| held_in_paper(&target.object.name)).sum()
         };
         let groups = ["mug", "wipe-box", "pencil-cup", "candle-box", "rock", "canteen"];
         assert_eq!(groups.map(|group| held(&format!("paper/{group}"))), [28, 9, 9, 9, 6, 32]);
@@ -257,12 +254,12 @@ mod tests {
     }
 
     #[test]
-    fn the_papers_masses_are_the_objects_own_and_no_two_names_are_alike() {
+    fn no_two_names_of_the_papers_targets_are_alike() {
         let targets = targets_named("paper").expect("the paper's");
         for target in &targets {
-            assert_eq!(target.mass_kg, target.object.mass_kg, "{}", target.name);
-            assert!(target.name.len() <= 64);
-            assert_eq!(targets.iter().filter(|other| other.name == target.name).count(), 1);
+            let name = &target.object.name;
+            assert!(name.len() <= 64);
+            assert_eq!(targets.iter().filter(|other| other.object.name == *name).count(), 1);
         }
         let canteens = targets_named("paper/canteen").expect("canteens");
         assert_eq!(canteens.iter().map(|target| target.friction).collect::<Vec<_>>(), [0.9, 0.4, 0.9, 0.4]);
@@ -280,19 +277,23 @@ mod tests {
             let least = corners.iter().copied().fold(f64::INFINITY, f64::min);
             let most = corners.iter().copied().fold(0.0, f64::max);
             // A ball's mesh is a little smaller than the ball.
-            assert!(least.abs() < 1e-3, "{}: {least}", target.name);
+            assert!(least.abs() < 1e-3, "{}: {least}", target.object.name);
             let centre = world_from_target * target.object.centre_of_mass_m;
-            assert!((0.0..most).contains(&centre.z) && centre.coords.xy().norm() < 1e-9, "{}: {centre}", target.name);
-            assert!(target.friction == DEFAULT_FRICTION || target.group == "rock");
+            assert!(
+                (0.0..most).contains(&centre.z) && centre.coords.xy().norm() < 1e-9,
+                "{}: {centre}",
+                target.object.name
+            );
+            assert!(target.friction == DEFAULT_FRICTION || target.object.class == "rock");
         }
     }
 
     #[test]
     fn an_entry_can_have_another_mass_and_friction() {
         let targets = targets_named("box-02@0.3kg@mu0.5,box-02").expect("targets");
-        assert_eq!([targets[0].mass_kg, targets[0].friction], [0.3, 0.5]);
-        assert_eq!(targets[0].name, "box-02@0.3kg@mu0.5");
-        assert_eq!(targets[1].mass_kg, targets[1].object.mass_kg);
+        assert_eq!([targets[0].object.mass_kg, targets[0].friction], [0.3, 0.5]);
+        assert_eq!(targets[0].object.name, "box-02@0.3kg@mu0.5");
+        assert_ne!(targets[1].object.mass_kg, 0.3);
         let entry = Entry::parse("odd@name.off@mu0.2").expect("an entry");
         assert_eq!(entry, Entry { name: "odd@name.off", mass_kg: None, friction: Some(0.2) });
         for (text, expected) in

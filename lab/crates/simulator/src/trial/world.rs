@@ -392,8 +392,8 @@ impl LiftTarget {
     /// Mass, centre and inertia: the inertia that of the convex hull, scaled to the mass.
     pub(super) fn mass_properties(&self, centre: Vector) -> MassProperties {
         let hull = self.hull.mass_properties(1.0);
-        let inertia = hull.reconstruct_inertia_matrix() * (self.mass_kg / hull.mass());
-        MassProperties::with_inertia_matrix(centre, self.mass_kg, inertia)
+        let inertia = hull.reconstruct_inertia_matrix() * (self.object.mass_kg / hull.mass());
+        MassProperties::with_inertia_matrix(centre, self.object.mass_kg, inertia)
     }
 }
 
@@ -428,7 +428,8 @@ mod tests {
             let (vertices, indices) = object.shape.as_cuboid().expect("a box").to_trimesh();
             object.shape = SharedShape::trimesh(vertices, indices).expect("a mesh");
         }
-        LiftTarget::new("cube".into(), "cube".into(), object, MASS_KG, friction)
+        object.mass_kg = MASS_KG;
+        LiftTarget::new(object, friction)
     }
 
     fn standing(target: &LiftTarget, options: &PhysicsOptions) -> World {

@@ -56,13 +56,6 @@ pub struct KMeans {
 /// Why no dictionary could be learned.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum DictionaryError {
-    #[error("n_clusters is 0: ask for at least one word")]
-    NoClusters,
-    #[error("n_init is 0: ask for at least one restart")]
-    NoRestarts,
-    /// The tolerance is negative or not a number.
-    #[error("tolerance is {tolerance}: it must be finite and at least 0")]
-    Tolerance { tolerance: f64 },
     /// A position is NaN, infinite or absurdly far from the palm.
     #[error("position {index} is {position_m:?} m: every coordinate must be finite and within ±{MAX_COORDINATE_M} m")]
     InvalidPosition {
@@ -85,18 +78,8 @@ pub enum DictionaryError {
 /// Takes some 34 bytes of memory per position beside `positions_m`.
 ///
 /// # Errors
-/// When a parameter is out of range, a position is not finite, or fewer positions are distinct than
-/// clusters asked for.
+/// When a position is not finite, or fewer positions are distinct than clusters asked for.
 pub fn learn_dictionary(positions_m: &[[f64; 3]], params: &KMeansParams) -> Result<KMeans, DictionaryError> {
-    if params.n_clusters == 0 {
-        return Err(DictionaryError::NoClusters);
-    }
-    if params.n_init == 0 {
-        return Err(DictionaryError::NoRestarts);
-    }
-    if !params.tolerance.is_finite() || params.tolerance < 0.0 {
-        return Err(DictionaryError::Tolerance { tolerance: params.tolerance });
-    }
     let in_range = |x: &f64| x.abs() <= MAX_COORDINATE_M;
     if let Some((index, &position_m)) = positions_m.iter().enumerate().find(|(_, p)| !p.iter().all(in_range)) {
         return Err(DictionaryError::InvalidPosition { index, position_m });
@@ -104,18 +87,19 @@ pub fn learn_dictionary(positions_m: &[[f64; 3]], params: &KMeansParams) -> Resu
 
     let blocks = blocks_of(positions_m);
     let max_squared_shift = params.tolerance * mean_variance(&blocks);
-    let mut best: Option<KMeans> = None;
-    for restart in 0..params.n_init {
+    let restart = |stream: usize| {
         let mut rng = ChaCha8Rng::seed_from_u64(params.seed);
-        rng.set_stream(restart as u64);
+        rng.set_stream(stream as u64);
         let seeds = seed_words(&blocks, params.n_clusters, &mut rng)?;
-        let learned = lloyd(&blocks, seeds, params.max_iter, max_squared_shift);
-        if best.as_ref().is_none_or(|best| learned.inertia < best.inertia) {
-            best = Some(learned);
+        Ok(lloyd(&blocks, seeds, params.max_iter, max_squared_shift))
+    };
+    let mut best = restart(0)?;
+    for stream in 1..params.n_init {
+        let learned = restart(stream)?;
+        if learned.inertia < best.inertia {
+            best = learned;
         }
     }
-    // `n_init` is at least 1, so there is a best one.
-    let mut best = best.ok_or(DictionaryError::NoRestarts)?;
     best.dictionary.words_m.sort_by(|left, right| {
         left.iter()
             .zip(right)
@@ -343,11 +327,6 @@ mod tests {
     #[test]
     fn errors_say_what_is_wrong() {
         let positions = [[0.0; 3], [0.1, 0.0, f64::NAN], [2e3, 0.0, 0.0]];
-        assert_eq!(learn_dictionary(&positions, &params(0)), Err(DictionaryError::NoClusters));
-        assert_eq!(
-            learn_dictionary(&positions, &KMeansParams { n_init: 0, ..params(1) }),
-            Err(DictionaryError::NoRestarts)
-        );
         assert!(matches!(
             learn_dictionary(&positions, &params(1)),
             Err(DictionaryError::InvalidPosition { index: 1, .. })
@@ -356,10 +335,6 @@ mod tests {
             learn_dictionary(&positions[2..], &params(1)),
             Err(DictionaryError::InvalidPosition { index: 0, .. })
         ));
-        for tolerance in [-1.0, f64::NAN, f64::INFINITY] {
-            let result = learn_dictionary(&positions[..1], &KMeansParams { tolerance, ..params(1) });
-            assert!(matches!(result, Err(DictionaryError::Tolerance { .. })), "{tolerance}");
-        }
         assert_eq!(
             learn_dictionary(&[], &params(1)),
             Err(DictionaryError::TooFewDistinct { n_distinct: 0, n_clusters: 1 })
