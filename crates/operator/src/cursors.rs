@@ -72,8 +72,8 @@ unsafe impl Send for SharedCursors {}
 // SAFETY: as above.
 unsafe impl Sync for SharedCursors {}
 
-/// The number of a sample in a stream.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+/// The number of a sample in a stream. Two of them have no order: see [`Written`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct SampleId {
     /// The generation of the source.
     pub epoch: u64,

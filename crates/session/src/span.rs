@@ -246,7 +246,7 @@ impl Sink for Span {
         let numbered = || self.edges.iter().filter(|edge| edge.is_numbered).filter_map(|edge| edge.place);
         // The edges are in the graph's order: the first is in the latest epoch.
         let epoch = numbered().next().map(|first| first.epoch);
-        self.before = numbered().filter(|place| Some(place.epoch) == epoch).max();
+        self.before = numbered().filter(|place| Some(place.epoch) == epoch).max_by_key(|place| place.seq);
     }
 
     fn leave(&mut self) {

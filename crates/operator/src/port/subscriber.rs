@@ -179,7 +179,7 @@ impl UntypedSubscriber {
     }
 
     /// How far its writer has come; `None` for a reader that only reads along.
-    fn writer(&self) -> Option<Written> {
+    pub fn writer(&self) -> Option<Written> {
         self.cursors.as_ref().and_then(|(cursors, _)| cursors.output(self.writer_slot).written())
     }
 

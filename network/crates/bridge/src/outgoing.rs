@@ -17,13 +17,14 @@
 //! process that takes over gets them back ([`Outgoing::restore`]).
 //!
 //! A position in the stream counts the samples in the order in which they were pushed. Keys order samples only within
-//! an epoch: a recording that is played has its recorded epochs, and a machine's clock may have been set back.
+//! an epoch; the order of epochs is that in which the writer began them ([`Written`]).
 
 use std::collections::VecDeque;
 
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::ChannelStatus;
 use blindgrasp_operator::wiring::EdgePolicy;
+use blindgrasp_operator::written::Written;
 
 /// A sample that is not acknowledged is repeated after the first pause. Each further pause is twice as long.
 const FIRST_PROBE_NANOS: u64 = 250_000_000;
@@ -66,8 +67,8 @@ impl KeptSample {
 #[derive(Debug, Clone)]
 pub struct Outgoing {
     options: OutgoingOptions,
-    /// The last sample that an earlier process had committed.
-    begun_after: Option<SampleId>,
+    /// How far the writer has come.
+    written: Option<Written>,
     /// In the order in which the samples were pushed.
     kept: VecDeque<Kept>,
     /// The position of the first kept sample.
@@ -153,12 +154,13 @@ struct End {
 }
 
 impl Outgoing {
-    /// A channel whose reader has committed `begun_after` on the cursors: `None` in a graph that has just started.
-    pub fn new(options: OutgoingOptions, begun_after: Option<SampleId>) -> Self {
+    /// A channel whose reader has committed `begun_after` on the cursors, `None` in a graph that has just started, and whose
+    /// writer has come to `written`.
+    pub fn new(options: OutgoingOptions, begun_after: Option<SampleId>, written: Option<Written>) -> Self {
         let window = options.window.max(1);
         Outgoing {
             options: OutgoingOptions { window, buffer: options.buffer.max(window), ..options },
-            begun_after,
+            written,
             kept: VecDeque::new(),
             first: 0,
             cursor: 0,
@@ -187,7 +189,7 @@ impl Outgoing {
     /// the last committed sample were not committed any more: the writer sends them again.
     pub fn restore(&mut self, mut saved: Vec<KeptSample>, n_lost: u64) {
         let n_committed =
-            saved.iter().rposition(|sample| Some(sample.key) == self.begun_after).map_or(0, |idx| idx + 1);
+            saved.iter().rposition(|sample| Some(sample.key) == self.committed_key).map_or(0, |idx| idx + 1);
         saved.truncate(n_committed);
         self.n_lost = n_lost;
         if saved.is_empty() {
@@ -255,6 +257,7 @@ impl Outgoing {
             self.give_up_first();
         }
         self.kept.push_back(Kept { key, message, origin_nanos, pushed_nanos: now_nanos, sent: None });
+        self.written = Written::with(self.written, key).or(self.written);
         if let Some(had) = self.skip {
             if self.is_before_or_at(&key, &had) {
                 self.cursor = self.end_position();
@@ -522,12 +525,10 @@ impl Outgoing {
     }
 
     fn is_before_or_at(&self, kept: &SampleId, key: &SampleId) -> bool {
-        let is_over = self.last_removed.is_some_and(|removed| removed.epoch == key.epoch);
         if kept.epoch == key.epoch {
-            kept.seq <= key.seq
-        } else {
-            self.begun_after.is_some() && !is_over && kept.epoch < key.epoch
+            return kept.seq <= key.seq;
         }
+        self.written.is_some_and(|written| written.is_past(*key, *kept))
     }
 
     /// The receiver has the samples up to `after`. Of the samples that were sent and are no longer kept, those behind

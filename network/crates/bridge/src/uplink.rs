@@ -76,7 +76,7 @@ impl Uplink {
             buffer: config.buffer,
             stall_limit_nanos: deadlines_nanos.min(LONGEST_STALL_NANOS),
         };
-        let mut outgoing = Outgoing::new(options, last);
+        let mut outgoing = Outgoing::new(options, last, subscriber.writer());
         outgoing.restore(saved.samples, saved.n_lost);
         // Samples that were saved and not committed come again, and must not be there twice.
         spool.replace(outgoing.committed(), saved.n_lost).with_context(|| path.display().to_string())?;

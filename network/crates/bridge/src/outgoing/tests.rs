@@ -9,7 +9,7 @@ fn key(seq: u64) -> SampleId {
 }
 
 fn outgoing(policy: EdgePolicy, window: usize, capacity: usize, buffer: usize) -> Outgoing {
-    Outgoing::new(OutgoingOptions { policy, window, capacity, buffer, stall_limit_nanos: STALL_LIMIT }, None)
+    Outgoing::new(OutgoingOptions { policy, window, capacity, buffer, stall_limit_nanos: STALL_LIMIT }, None, None)
 }
 
 fn push(outgoing: &mut Outgoing, seqs: std::ops::Range<u64>) {
@@ -87,7 +87,7 @@ fn a_receiver_may_have_samples_that_are_no_longer_kept_or_not_yet_pushed() {
         buffer: 100,
         stall_limit_nanos: STALL_LIMIT,
     };
-    let mut outgoing = Outgoing::new(options, Some(key(1)));
+    let mut outgoing = Outgoing::new(options, Some(key(1)), Written::with(None, key(4)));
     outgoing.on_resume(1, Some(key(4)));
     push(&mut outgoing, 2..7);
     assert_eq!(sent(&mut outgoing, 0), [5, 6]);
@@ -322,7 +322,7 @@ fn a_process_that_takes_over_goes_on_with_what_was_saved() {
         (4..8, 3, Some(3), vec![4, 5, 6, 7, 8, 9]),
         (4..6, 7, Some(7), vec![8, 9]),
     ] {
-        let mut outgoing = Outgoing::new(options, Some(key(committed)));
+        let mut outgoing = Outgoing::new(options, Some(key(committed)), Written::with(None, key(8)));
         outgoing.restore(saved.clone().map(kept).collect(), 0);
         assert_eq!(outgoing.commit_point(), Some(key(committed)));
         push(&mut outgoing, committed + 1..10);
