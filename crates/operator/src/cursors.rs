@@ -416,6 +416,12 @@ impl OutputSlot {
         self.record()[3]
     }
 
+    /// The last sample that was sent, and the number of samples up to it.
+    pub(crate) fn sent(&self) -> (Option<SampleId>, u64) {
+        let record = self.record();
+        (from_words(record[0], record[1]), record[3])
+    }
+
     /// The time for which the writer has waited for readers.
     pub fn blocked_nanos(&self) -> u64 {
         self.record()[4]

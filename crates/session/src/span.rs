@@ -18,6 +18,7 @@ use blindgrasp_messages::{Header, LiftDecision, Recorded as _};
 use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::port::sample_id;
+use blindgrasp_operator::written::Written;
 use blindgrasp_recording::Record;
 
 /// The first gaps of an edge are printed one by one.
@@ -29,7 +30,7 @@ pub struct SpanOfEdge {
     pub samples: u64,
     pub first: Option<u64>,
     pub last: Option<u64>,
-    /// Missing numbers between the first and the last.
+    /// Missing numbers between the first and the last, or samples that were sent and have not come, if there are more of them.
     pub missing: u64,
 }
 
@@ -54,6 +55,8 @@ pub struct EdgeSpan {
     n_samples: u64,
     n_missing: u64,
     n_gaps: u64,
+    /// See [`Sink::lacks`].
+    n_lost: u64,
 }
 
 /// The part of the stream that is recorded.
@@ -93,6 +96,7 @@ impl EdgeSpan {
             n_samples: 0,
             n_missing: 0,
             n_gaps: 0,
+            n_lost: 0,
         }
     }
 
@@ -128,26 +132,25 @@ impl EdgeSpan {
         self.n_samples += 1;
     }
 
-    /// Whether the edge has come as far as the end.
-    fn has_reached(&mut self, end: &SampleId, cursors: &SharedCursors) -> bool {
-        let is_at = |seen: &Option<SampleId>, end: &SampleId| {
-            seen.is_some_and(|seen| seen.epoch != end.epoch || seen.seq >= end.seq)
-        };
+    /// Whether the edge has come as far as the end. The source has come to `source`.
+    fn has_reached(&mut self, end: SampleId, source: &Written, cursors: &SharedCursors) -> bool {
         if self.is_numbered {
-            return is_at(&self.seen, end);
+            return self.seen.is_some_and(|seen| source.is_past(seen, end));
         }
         if !self.is_said_once {
             return true;
         }
+        let writer = cursors.output(self.writer_slot);
         if self.until.is_none() {
             // Its answered samples are read before its sent samples, which then include the answers.
-            let has_answered = self.answered_slots.iter().all(|slot| is_at(&cursors.input(*slot).key(), end));
-            if !has_answered {
+            let answered = |slot: &usize| cursors.input(*slot).key().is_some_and(|key| source.is_past(key, end));
+            if !self.answered_slots.iter().all(answered) {
                 return false;
             }
-            self.until = Some(cursors.output(self.writer_slot).key());
+            self.until = Some(writer.key());
         }
-        self.until.flatten().is_none_or(|until| is_at(&self.seen.or(self.place), &until))
+        let (Some(until), Some(written)) = (self.until.flatten(), writer.written()) else { return true };
+        self.seen.or(self.place).is_some_and(|seen| written.is_past(seen, until))
     }
 }
 
@@ -181,7 +184,7 @@ impl Span {
             samples: edge.n_samples,
             first: edge.first,
             last: edge.last.map(|last| last.seq),
-            missing: edge.n_missing,
+            missing: edge.n_missing.max(edge.n_lost),
         });
         (edges.collect(), self.recorder.finish(ending))
     }
@@ -239,6 +242,12 @@ impl Sink for Span {
         Ok(())
     }
 
+    fn lacks(&mut self, topic: &str, n_lost: u64) {
+        if let Some(edge) = self.edges.iter_mut().find(|edge| edge.topic == topic) {
+            edge.n_lost = n_lost;
+        }
+    }
+
     fn begin(&mut self, places: &[Option<SampleId>]) {
         for (edge, place) in self.edges.iter_mut().zip(places) {
             edge.place = *place;
@@ -256,7 +265,10 @@ impl Sink for Span {
 
     fn has_enough(&mut self) -> bool {
         let Some((end, _)) = self.end else { return true };
-        self.edges.iter_mut().all(|edge| edge.has_reached(&end, &self.cursors))
+        // The edges are in the graph's order: the first has the source's samples before all others.
+        let first = self.edges.iter().find(|edge| edge.is_numbered);
+        let Some(source) = first.and_then(|edge| self.cursors.output(edge.writer_slot).written()) else { return true };
+        self.edges.iter_mut().all(|edge| edge.has_reached(end, &source, &self.cursors))
     }
 }
 
@@ -284,6 +296,7 @@ mod tests {
             n_samples: 0,
             n_missing: 0,
             n_gaps: 0,
+            n_lost: 0,
         }
     }
 
@@ -302,6 +315,25 @@ mod tests {
         assert!(!in_the_old.is_before(&key(5, 101), before));
         // Nothing had been sent.
         assert!(!edge(true, None).is_before(&key(5, 0), None));
+    }
+
+    /// The end of the recording is in an epoch that this edge has not come to.
+    #[test]
+    fn an_edge_in_an_earlier_epoch_has_not_reached_the_end() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let cursors = SharedCursors::create(&folder.path().join("cursors"), 1, 0).expect("made");
+        let source = Written { last: key(3, 1), first_seq: 0, before: Some(key(9, 4)) };
+        let mut edge = edge(true, None);
+        let ends = [key(9, 3), key(3, 0)];
+        for (seen, has_reached) in [
+            (key(5, 7), [false, false]),
+            (key(9, 2), [false, false]),
+            (key(9, 4), [true, false]),
+            (key(3, 0), [true, true]),
+        ] {
+            edge.seen = Some(seen);
+            assert_eq!(ends.map(|end| edge.has_reached(end, &source, &cursors)), has_reached, "{seen:?}");
+        }
     }
 
     #[test]
