@@ -116,16 +116,6 @@ struct World {
     has_faults: bool,
 }
 
-/// The committed samples that are not answered, as a file holds them.
-fn saved(sender: &Outgoing) -> Vec<KeptSample> {
-    let kept = |(key, origin_nanos, message): (SampleId, u64, &[u8])| KeptSample {
-        key,
-        origin_nanos,
-        message: message.into(),
-    };
-    sender.committed().map(kept).collect()
-}
-
 const SENDER: usize = 0;
 const RECEIVER: usize = 1;
 
@@ -187,12 +177,12 @@ impl World {
     fn commit_point(&mut self) -> Option<SampleId> {
         let now_nanos = self.now_nanos();
         if self.ends[SENDER].is_alive {
-            while let Some((key, origin_nanos, message)) = self.sender.next_to_save(now_nanos) {
-                self.spool.0.push(KeptSample { key, origin_nanos, message: message.into() });
+            while let Some(sample) = self.sender.next_to_save(now_nanos) {
+                self.spool.0.push(sample.clone());
                 self.sender.saved();
             }
             if self.happens(0.05) {
-                self.spool.0 = saved(&self.sender);
+                self.spool.0 = self.sender.committed().cloned().collect();
             }
             self.spool.1 = self.sender.n_lost_to_save();
             // It may be killed between the two.
@@ -232,7 +222,7 @@ impl World {
             let written = self.written.iter().fold(None, |written, key| Written::with(written, *key));
             self.sender = Outgoing::new(self.setting.options, begun_after, written);
             self.sender.restore(std::mem::take(&mut self.spool.0), self.spool.1);
-            self.spool.0 = saved(&self.sender);
+            self.spool.0 = self.sender.committed().cloned().collect();
             self.n_taken = self.place_of(begun_after);
         }
         if !self.ends[RECEIVER].is_alive && now_millis >= self.ends[RECEIVER].back_at_millis {

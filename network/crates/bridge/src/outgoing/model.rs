@@ -35,16 +35,6 @@ fn last_of(n: usize) -> Option<SampleId> {
     Some(KEYS[n.checked_sub(1)?])
 }
 
-/// The content of the file without samples that are needed no more.
-fn saved(sender: &Outgoing) -> Vec<KeptSample> {
-    let kept = |(key, origin_nanos, message): (SampleId, u64, &[u8])| KeptSample {
-        key,
-        origin_nanos,
-        message: message.into(),
-    };
-    sender.committed().map(kept).collect()
-}
-
 #[derive(Debug, Clone)]
 struct State {
     n_written: usize,
@@ -127,9 +117,9 @@ impl State {
                 next.n_read += 1;
             }
             Step::Save => {
-                let (key, origin_nanos, message) = self.sender.next_to_save(NOW_NANOS)?;
+                let sample = self.sender.next_to_save(NOW_NANOS)?;
                 if saves {
-                    next.spool.push(KeptSample { key, origin_nanos, message: message.into() });
+                    next.spool.push(sample.clone());
                 }
                 next.sender.saved();
             }
@@ -144,7 +134,7 @@ impl State {
                 if kept.len() >= self.spool.len() {
                     return None;
                 }
-                next.spool = saved(&self.sender);
+                next.spool = self.sender.committed().cloned().collect();
             }
             Step::Kill => {
                 if self.n_kills == 2 {
@@ -154,7 +144,7 @@ impl State {
                 let written = KEYS[..self.n_written].iter().fold(None, |written, key| Written::with(written, *key));
                 next.sender = Outgoing::new(OPTIONS, self.committed, written);
                 next.sender.restore(self.spool.clone(), 0);
-                next.spool = saved(&next.sender);
+                next.spool = next.sender.committed().cloned().collect();
                 next.n_read = n_committed;
             }
             Step::Resume => {
