@@ -132,6 +132,10 @@ impl EdgeSpan {
         self.n_samples += 1;
     }
 
+    fn missing(&self) -> u64 {
+        self.n_missing.max(self.n_lost)
+    }
+
     /// Whether the edge has come as far as the end. The source has come to `source`.
     fn has_reached(&mut self, end: SampleId, source: &Written, cursors: &SharedCursors) -> bool {
         if self.is_numbered {
@@ -180,11 +184,11 @@ impl Span {
             }
         }
         let edges = self.edges.into_iter().map(|edge| SpanOfEdge {
+            missing: edge.missing(),
             topic: edge.topic,
             samples: edge.n_samples,
             first: edge.first,
             last: edge.last.map(|last| last.seq),
-            missing: edge.n_missing.max(edge.n_lost),
         });
         (edges.collect(), self.recorder.finish(ending))
     }
@@ -345,7 +349,10 @@ mod tests {
         }
         numbered.count(key(6, 4), before);
         numbered.count(key(6, 3), before);
-        assert_eq!((numbered.n_samples, numbered.n_missing, numbered.n_gaps), (5, 1 + 3, 2));
+        assert_eq!((numbered.n_samples, numbered.missing(), numbered.n_gaps), (5, 1 + 3, 2));
+        // With a whole epoch that leaves no gap.
+        numbered.n_lost = 9;
+        assert_eq!(numbered.missing(), 9);
         assert_eq!((numbered.first, numbered.last), (Some(102), Some(key(6, 3))));
         // Decisions have numbers of their own: the first is the first.
         let mut decisions = edge(false, Some(key(5, 7)));

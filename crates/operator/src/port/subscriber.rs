@@ -347,11 +347,7 @@ impl UntypedSubscriber {
     /// How many samples were sent since it began and have not come; 0 while some that were sent are not answered.
     pub fn n_lost(&self) -> u64 {
         let Some((cursors, slot)) = &self.cursors else { return 0 };
-        let (sent, n_sent) = cursors.output(self.writer_slot).sent();
-        if cursors.input(*slot).key() != sent {
-            return 0;
-        }
-        (n_sent - self.n_sent_before).saturating_sub(self.counts().n_received)
+        cursors.output(self.writer_slot).n_lost(cursors.input(*slot), self.n_sent_before)
     }
 
     /// Marks all samples up to this one as answered: its writer may overwrite them, and an instance that takes over goes on
