@@ -10,7 +10,7 @@ use blindgrasp_bridge::identity::Identity;
 use blindgrasp_bridge::keys::{KeyRequest, make};
 use blindgrasp_bridge::protection::Protection;
 use blindgrasp_bridge::wire::{Body, Frame, Hello};
-use blindgrasp_graph::link::config::{Endpoints, KeyKind, LinkConfig, key_files};
+use blindgrasp_graph::link::config::{KeyKind, LinkConfig, key_files};
 use time::OffsetDateTime;
 
 /// The least of these times counts; the rest is other programs'.
@@ -34,27 +34,16 @@ fn main() -> anyhow::Result<()> {
     let request = KeyRequest {
         folder: folder.path().into(),
         machines: machines.map(Into::into).into(),
-        namespace: None,
-        router: false,
         days: 90,
-        renew: false,
+        ..KeyRequest::default()
     };
     make(&request, OffsetDateTime::now_utc())?;
     let protection = |machine: &str, peer: &str| -> anyhow::Result<Protection> {
         let config = LinkConfig {
             graph: "g".into(),
-            namespace: None,
             machine: machine.into(),
-            run: 1,
-            fingerprint: 0,
-            peers: Vec::new(),
-            exports: Vec::new(),
-            imports: Vec::new(),
-            endpoints: Endpoints::default(),
             keys: Some(key_files(folder.path(), machine)),
-            insecure: false,
-            deadline_millis: 200,
-            buffer: 8,
+            ..LinkConfig::default()
         };
         let identity = Identity::load(&config, OffsetDateTime::now_utc())?.map(Arc::new);
         let agreement = Agreement::new(&config.key_prefix(), machine, peer, 1)?;
@@ -82,10 +71,8 @@ fn hello() -> Hello {
         heard_key: Some([7; 32]),
         fingerprint: 1,
         run: 1,
-        is_cut_off: false,
-        lacks_request: false,
-        exports: Vec::new(),
         is_ready: true,
+        ..Hello::default()
     }
 }
 

@@ -3,6 +3,8 @@
 //! It decides on the places of readers that the [cursors](crate::cursors) show, and does no I/O: the publishers of all
 //! operators and the search through all histories (`recovery_model.rs`) call the same code.
 
+use std::collections::VecDeque;
+
 use crate::cursors::{SampleId, SharedCursors};
 use crate::wiring::{ConsumerWiring, ReaderWiring};
 use crate::written::Written;
@@ -41,6 +43,9 @@ pub(crate) struct Credit {
     own_first: Option<SampleId>,
     /// Its last sample, without those whose number was not above the ones before: a recording may have such.
     own_last: Option<SampleId>,
+    /// Its last samples, as many as an attached reader may leave unanswered.
+    newest: VecDeque<SampleId>,
+    n_newest: usize,
 }
 
 /// A reader whose unanswered samples the publisher must be able to send again.
@@ -71,7 +76,7 @@ enum Limit {
 }
 
 /// The sample that is to be sent, for [`Reader::has_room`].
-struct Next {
+struct Next<'a> {
     /// Of a repeated sample, the number behind the last one that was sent.
     key: SampleId,
     is_repeat: bool,
@@ -80,6 +85,8 @@ struct Next {
     own_first: u64,
     /// Whether samples of earlier publishers can be sent again.
     is_repeatable: bool,
+    /// See [`Credit::newest`].
+    newest: &'a VecDeque<SampleId>,
 }
 
 impl Reader {
@@ -109,7 +116,7 @@ impl Reader {
         }
     }
 
-    fn has_room(&mut self, places: &impl Places, next: &Next) -> bool {
+    fn has_room(&mut self, places: &impl Places, next: &Next<'_>) -> bool {
         if next.is_repeat || !(self.key.is_some() && self.is_near(next)) {
             self.key = places.answered(self.slot);
             let n_repeated = places.n_repeated(self.slot);
@@ -122,7 +129,7 @@ impl Reader {
         self.behind.iter_mut().all(|reader| reader.has_room(places, next)) || places.is_given_up(self.slot)
     }
 
-    fn is_near(&self, next: &Next) -> bool {
+    fn is_near(&self, next: &Next<'_>) -> bool {
         let Some(written) = &next.written else { return true };
         let (Limit::Queue(limit) | Limit::History(limit)) = self.limit;
         let limit = limit.saturating_sub(self.n_repeats);
@@ -130,12 +137,17 @@ impl Reader {
         if self.key == Some(written.last) {
             return limit > 0;
         }
-        // A new epoch begins when every reader has answered the one before.
-        if next.key.epoch != written.last.epoch {
+        let is_within_epoch = self.key.filter(|key| written.is_current(*key));
+        let begins_epoch = next.key.epoch != written.last.epoch;
+        if self.is_attached() && (begins_epoch || is_within_epoch.is_none()) {
+            let n_answered = next.newest.iter().rposition(|sent| Some(*sent) == self.key).map_or(0, |idx| idx + 1);
+            return ((next.newest.len() - n_answered) as u64) < limit;
+        }
+        // A new epoch begins when every reader that is not attached has answered the one before.
+        if begins_epoch {
             return false;
         }
         // It had answered the epoch before, or it has just come.
-        let is_within_epoch = self.key.filter(|key| written.is_current(*key));
         let first_unanswered = is_within_epoch.map_or(written.first_seq, |key| key.seq + 1);
         let first_unanswered = match self.limit {
             Limit::History(_) if next.is_repeatable => first_unanswered,
@@ -151,6 +163,13 @@ impl Reader {
             return None;
         }
         let mut least = places.answered(self.slot);
+        // No writer goes back to an earlier epoch for an attached reader.
+        if self.is_attached()
+            && let Some(written) = written
+            && !least.is_some_and(|key| written.is_current(key))
+        {
+            least = written.before;
+        }
         for reader in &self.behind {
             if let Some(key) = reader.least(places, written) {
                 least = written.and_then(|written| written.behind(least, key));
@@ -164,6 +183,10 @@ impl Reader {
         self.behind.iter_mut().for_each(Reader::has_been_sent_a_repeat);
     }
 
+    fn is_attached(&self) -> bool {
+        !self.attached_slots.is_empty()
+    }
+
     pub(crate) fn is_among(&self, slots: &[usize]) -> bool {
         slots.contains(&self.slot) || self.behind.iter().any(|reader| reader.is_among(slots))
     }
@@ -172,8 +195,11 @@ impl Reader {
 impl Credit {
     /// The credit of a publisher whose wiring names these readers and so many samples that it keeps.
     pub(crate) fn new(consumers: &[ConsumerWiring], history: usize) -> Credit {
+        let attached = consumers.iter().filter(|reader| !reader.attached_slots.is_empty());
+        let n_newest = attached.map(|reader| reader.capacity).max().unwrap_or(0);
         let readers = consumers.iter().map(|reader| Reader::of_port(reader, history)).collect();
-        Credit { readers, begun_after: None, own_first: None, own_last: None }
+        let newest = VecDeque::with_capacity(n_newest);
+        Credit { readers, begun_after: None, own_first: None, own_last: None, newest, n_newest }
     }
 
     /// The first reader that has no room for a sample, if there is one.
@@ -187,7 +213,8 @@ impl Credit {
         let is_repeat = self.is_repeat(key);
         let last = if is_repeat { self.own_last } else { None };
         let key = last.map_or(key, |last| SampleId { seq: last.seq + 1, ..last });
-        let next = Next { key, is_repeat, written, own_first, is_repeatable: self.begun_after.is_some() };
+        let (is_repeatable, newest) = (self.begun_after.is_some(), &self.newest);
+        let next = Next { key, is_repeat, written, own_first, is_repeatable, newest };
         self.readers.iter_mut().find_map(|reader| (!reader.has_room(places, &next)).then_some(&*reader))
     }
 
@@ -210,6 +237,10 @@ impl Credit {
         }
         self.own_first = self.own_first.filter(|first| first.epoch == key.epoch).or(Some(key));
         self.own_last = Some(key);
+        self.newest.push_back(key);
+        if self.newest.len() > self.n_newest {
+            self.newest.pop_front();
+        }
     }
 
     /// Whether a number is not above the last one of this publisher.
@@ -329,33 +360,54 @@ mod tests {
         }
     }
 
+    /// A reader in the first slot.
+    fn reader(attached_slots: Vec<usize>) -> ConsumerWiring {
+        ConsumerWiring { slot: 0, capacity: 4, attached_slots, attached_limit_millis: 0, behind: vec![] }
+    }
+
+    /// So many of the samples can be sent until the reader has no room.
+    fn n_sent(credit: &mut Credit, written: &mut Option<Written>, keys: &[SampleId], place: &Place) -> usize {
+        let is_sent = |key: &&SampleId| {
+            let has_room = credit.first_without_room(place, *written, **key).is_none();
+            if has_room {
+                *written = Written::with(*written, **key).or(*written);
+                credit.has_sent(**key);
+            }
+            has_room
+        };
+        keys.iter().take_while(is_sent).count()
+    }
+
+    /// An observer that stands still while epochs change was given up with most of its places free.
+    #[test]
+    fn an_attached_reader_has_room_for_its_places_whatever_the_epochs() {
+        let id = |epoch, seq| SampleId { epoch, seq };
+        let keys = [id(9, 0), id(2, 0), id(5, 0), id(5, 1), id(1, 0), id(1, 1), id(1, 2)];
+        let (mut credit, mut written) = (Credit::new(&[reader(vec![])], 4), None);
+        assert_eq!(n_sent(&mut credit, &mut written, &keys, &Place(None, 0)), 1, "another reader is waited for");
+        let (mut credit, mut written) = (Credit::new(&[reader(vec![0])], 4), None);
+        assert_eq!(n_sent(&mut credit, &mut written, &keys, &Place(None, 0)), 4);
+        assert_eq!(n_sent(&mut credit, &mut written, &keys[4..], &Place(Some(id(2, 0)), 0)), 2);
+        assert_eq!(n_sent(&mut credit, &mut written, &keys[6..], &Place(Some(id(2, 0)), 0)), 0);
+        assert_eq!(n_sent(&mut credit, &mut written, &keys[6..], &Place(Some(id(5, 0)), 0)), 1);
+        // An instance that takes over goes back to no epoch that is over: its writer cannot send that again.
+        assert_eq!(credit.answered_by_readers(&Place(Some(id(9, 0)), 0), written), Some(id(5, 1)));
+        assert_eq!(credit.answered_by_readers(&Place(Some(id(1, 0)), 0), written), Some(id(1, 0)));
+    }
+
     #[test]
     fn repeated_samples_take_places_in_the_queue_until_they_are_answered() {
-        let id = |seq| SampleId { epoch: 7, seq };
-        let reader =
-            ConsumerWiring { slot: 0, capacity: 4, attached_slots: vec![], attached_limit_millis: 0, behind: vec![] };
-        let mut credit = Credit::new(&[reader], 4);
-        let mut written = None;
-        // So many can be sent until the reader has no room.
-        let mut send = |numbers: &[u64], place: &Place| {
-            let sent = numbers.iter().take_while(|seq| {
-                let key = id(**seq);
-                let has_room = credit.first_without_room(place, written, key).is_none();
-                if has_room {
-                    written = Written::with(written, key).or(written);
-                    credit.has_sent(key);
-                }
-                has_room
-            });
-            sent.count()
-        };
+        let ids = |seqs: &[u64]| seqs.iter().map(|seq| SampleId { epoch: 7, seq: *seq }).collect::<Vec<_>>();
+        let place = |seq, n_repeated| Place(Some(SampleId { epoch: 7, seq }), n_repeated);
+        let (mut credit, mut written) = (Credit::new(&[reader(vec![])], 4), None);
+        let mut send = |seqs: &[u64], place: Place| n_sent(&mut credit, &mut written, &ids(seqs), &place);
         // The reader has counted repeated samples of an earlier writer.
-        assert_eq!(send(&[0, 1, 1, 0, 2, 2], &Place(None, 10)), 4);
+        assert_eq!(send(&[0, 1, 1, 0, 2, 2], Place(None, 10)), 4);
         // It has answered 0 and 1 and one of the two repeated ones; then all but the repeated ones.
-        assert_eq!(send(&[2, 3, 3, 4], &Place(Some(id(1)), 11)), 3);
-        assert_eq!(send(&[3, 3, 3, 3], &Place(Some(id(3)), 11)), 2);
-        assert_eq!(send(&[3, 4, 4, 4, 4], &Place(Some(id(3)), 13)), 2);
+        assert_eq!(send(&[2, 3, 3, 4], place(1, 11)), 3);
+        assert_eq!(send(&[3, 3, 3, 3], place(3, 11)), 2);
+        assert_eq!(send(&[3, 4, 4, 4, 4], place(3, 13)), 2);
         // It has answered all.
-        assert_eq!(send(&[5, 6, 7, 8, 9], &Place(Some(id(4)), 16)), 4);
+        assert_eq!(send(&[5, 6, 7, 8, 9], place(4, 16)), 4);
     }
 }

@@ -72,8 +72,8 @@ unsafe impl Send for SharedCursors {}
 // SAFETY: as above.
 unsafe impl Sync for SharedCursors {}
 
-/// The number of a sample in a stream.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+/// The number of a sample in a stream. Two of them have no order: see [`Written`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct SampleId {
     /// The generation of the source.
     pub epoch: u64,
@@ -416,6 +416,21 @@ impl OutputSlot {
         self.record()[3]
     }
 
+    /// The last sample that was sent, and the number of samples up to it.
+    pub(crate) fn sent(&self) -> (Option<SampleId>, u64) {
+        let record = self.record();
+        (from_words(record[0], record[1]), record[3])
+    }
+
+    /// How many of the samples after the first `n_before` a reader lacks; 0 while it has not answered the last one.
+    pub(crate) fn n_lost(&self, reader: &InputSlot, n_before: u64) -> u64 {
+        let (last, n_sent) = self.sent();
+        if reader.key() != last {
+            return 0;
+        }
+        (n_sent - n_before).saturating_sub(reader.counts().n_received)
+    }
+
     /// The time for which the writer has waited for readers.
     pub fn blocked_nanos(&self) -> u64 {
         self.record()[4]
@@ -501,6 +516,21 @@ mod tests {
     fn cursors(folder: &tempfile::TempDir) -> (SharedCursors, std::path::PathBuf) {
         let path = folder.path().join("cursors");
         (SharedCursors::create(&path, 3, 2).expect("a file of cursors"), path)
+    }
+
+    #[test]
+    fn a_whole_epoch_that_a_reader_lacks_is_counted() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let cursors = SharedCursors::create(&folder.path().join("cursors"), 2, 0).expect("made");
+        let (writer, reader) = (cursors.output(0), cursors.input(1));
+        for (epoch, seq) in [(9, 0), (9, 1), (2, 0), (2, 1), (5, 0)] {
+            writer.commit(SampleId { epoch, seq });
+        }
+        // It has begun after the first sample, and received two: 9.1 and 5.0.
+        reader.place_at(Some(SampleId { epoch: 9, seq: 1 }), &InputCounts { n_received: 1, ..InputCounts::default() });
+        assert_eq!(writer.n_lost(reader, 1), 0, "it has not read all");
+        reader.place_at(Some(SampleId { epoch: 5, seq: 0 }), &InputCounts { n_received: 2, ..InputCounts::default() });
+        assert_eq!(writer.n_lost(reader, 1), 2);
     }
 
     #[test]

@@ -304,7 +304,7 @@ impl Search {
     fn push(&self, world: &mut World, node: usize, sample: Sample) {
         if node == STATEFUL && !world.decided.contains(&sample) {
             world.decided.push(sample);
-            world.decided.sort_by_key(|sample| (sample.key, sample.decided_by));
+            world.decided.sort_by_key(|sample| (sample.key.epoch, sample.key.seq, sample.decided_by));
         }
         let Some(process) = &mut world.nodes[node].active else { return };
         process.history.push_back(sample);

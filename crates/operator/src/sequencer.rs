@@ -134,8 +134,9 @@ impl<T> Sequencer<T> {
         self.counts.n_late += 1;
     }
 
-    /// The place of a sample, whose writer has come to `written`; `None` if its epoch is over and this reader has left it.
-    fn place(&mut self, key: SampleId, written: Option<&Written>) -> Option<Place> {
+    /// The place of a sample, whose writer has come to `written`; `None` if its epoch is over and this reader has left it. It has
+    /// not left an epoch whose sample `goes_on` after the last one from the same publisher.
+    fn place(&mut self, key: SampleId, written: Option<&Written>, goes_on: bool) -> Option<Place> {
         let current = written.filter(|written| written.is_current(key));
         let known = self.epochs.iter().rposition(|epoch| epoch.value == key.epoch);
         let first_seq = current.map(|written| written.first_seq);
@@ -150,7 +151,7 @@ impl<T> Sequencer<T> {
         // A writer keeps samples of epochs that its readers have left. Where readers are not waited for, it may have begun
         // several since.
         let is_over = current.is_none() && written.is_some() && self.may_hold && !self.epochs.is_empty();
-        if is_over {
+        if is_over && !goes_on {
             return None;
         }
         let generation = self.epochs.back().map_or(0, |epoch| epoch.generation + 1);
@@ -181,7 +182,8 @@ impl<T> Sequencer<T> {
         has_other_publishers: impl FnOnce() -> bool,
         now: impl FnOnce() -> Instant,
     ) -> Placing<T> {
-        let Some(place) = self.place(key, written) else { return Placing::Drop };
+        let goes_on = self.publishers.iter().any(|(id, last)| *id == publisher && Some(*last) >= self.last);
+        let Some(place) = self.place(key, written, goes_on) else { return Placing::Drop };
         let known = self.publishers.iter_mut().find(|(id, _)| *id == publisher);
         let is_first_of_publisher = known.is_none();
         match known {
@@ -266,7 +268,7 @@ impl<T> Sequencer<T> {
         // Those that an earlier instance has counted are answered again, if its answers were not received.
         let last = self.last;
         for (key, sample) in held {
-            let Some(place) = self.place(key, written) else { continue };
+            let Some(place) = self.place(key, written, false) else { continue };
             if last.is_none_or(|last| place > last) {
                 self.held.insert(place, sample);
             }
@@ -589,6 +591,21 @@ mod tests {
         }
         assert_eq!(delivered, [key(2, 1), key(9, 4), key(9, 5)]);
         assert_eq!(sequencer.counts(), InputCounts { n_received: 3, ..InputCounts::default() });
+    }
+
+    /// The writer does not wait for an attached reader to begin an epoch.
+    #[test]
+    fn epochs_that_are_over_are_taken_from_the_publisher_that_goes_on_to_them() {
+        let key = |epoch, seq| SampleId { epoch, seq };
+        let written = Written { last: key(3, 0), first_seq: 0, before: Some(key(8, 1)) };
+        let mut sequencer = Sequencer::resume(Some(key(5, 0)), Some(key(5, 0)), InputCounts::default());
+        let mut push = |key, publisher| sequencer.push(key, key, publisher, Some(&written), || true, Instant::now);
+        for key in [key(5, 1), key(2, 0), key(2, 1), key(8, 0), key(8, 1)] {
+            assert_eq!(push(key, 1), Placing::Deliver(key));
+        }
+        assert_eq!(push(key(7, 0), 2), Placing::Drop, "another publisher has kept it");
+        assert_eq!(push(key(3, 0), 1), Placing::Deliver(key(3, 0)));
+        assert_eq!(sequencer.counts(), InputCounts { n_received: 6, ..InputCounts::default() });
     }
 
     #[test]

@@ -461,10 +461,11 @@ pub struct InputCounts {
     pub n_late: u64,
 }
 /// Who gives way when the reader of an edge is behind.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EdgePolicy {
     /// The writer waits, for a bounded time.
+    #[default]
     Lossless,
     /// The oldest samples are dropped and counted; the newest are kept.
     Latest,

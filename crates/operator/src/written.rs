@@ -2,8 +2,8 @@
 //!
 //! Numbers order samples only within an epoch, and the value of an epoch says nothing: a recording that is played has its
 //! recorded epochs, in any order, and may come back to one of them. So the order of epochs is the order in which the writer
-//! began them. A writer begins an epoch only once all its readers have answered the one before, so that a reader that is
-//! waited for is in one of these two.
+//! began them. A writer begins an epoch only once all its readers, except attached ones, have answered the one before, so
+//! that they are in one of these two.
 
 use serde::{Deserialize, Serialize};
 

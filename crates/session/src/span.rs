@@ -15,6 +15,7 @@ use blindgrasp_messages::{Header, LiftDecision, Recorded as _};
 use blindgrasp_operator::cursors::{SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::port::sample_id;
+use blindgrasp_operator::written::Written;
 use blindgrasp_recording::Record;
 
 /// The first gaps of an edge are printed one by one.
@@ -26,7 +27,7 @@ pub struct SpanOfEdge {
     pub samples: u64,
     pub first: Option<u64>,
     pub last: Option<u64>,
-    /// Missing numbers between the first and the last.
+    /// Missing numbers between the first and the last, or samples that were sent and have not come, if there are more of them.
     pub missing: u64,
 }
 
@@ -51,6 +52,8 @@ pub struct EdgeSpan {
     n_samples: u64,
     n_missing: u64,
     n_gaps: u64,
+    /// See [`Sink::lacks`].
+    n_lost: u64,
 }
 
 /// The part of the stream that is recorded.
@@ -88,6 +91,7 @@ impl EdgeSpan {
             n_samples: 0,
             n_missing: 0,
             n_gaps: 0,
+            n_lost: 0,
         }
     }
 
@@ -123,26 +127,29 @@ impl EdgeSpan {
         self.n_samples += 1;
     }
 
-    /// Whether the edge has come as far as the end.
-    fn has_reached(&mut self, end: &SampleId, cursors: &SharedCursors) -> bool {
-        let is_at = |seen: &Option<SampleId>, end: &SampleId| {
-            seen.is_some_and(|seen| seen.epoch != end.epoch || seen.seq >= end.seq)
-        };
+    fn missing(&self) -> u64 {
+        self.n_missing.max(self.n_lost)
+    }
+
+    /// Whether the edge has come as far as the end. The source has come to `source`.
+    fn has_reached(&mut self, end: SampleId, source: &Written, cursors: &SharedCursors) -> bool {
         if self.is_numbered {
-            return is_at(&self.seen, end);
+            return self.seen.is_some_and(|seen| source.is_past(seen, end));
         }
         if !self.is_said_once {
             return true;
         }
+        let writer = cursors.output(self.writer_slot);
         if self.until.is_none() {
             // Its answered samples are read before its sent samples, which then include the answers.
-            let has_answered = self.answered_slots.iter().all(|slot| is_at(&cursors.input(*slot).key(), end));
-            if !has_answered {
+            let answered = |slot: &usize| cursors.input(*slot).key().is_some_and(|key| source.is_past(key, end));
+            if !self.answered_slots.iter().all(answered) {
                 return false;
             }
-            self.until = Some(cursors.output(self.writer_slot).key());
+            self.until = Some(writer.key());
         }
-        self.until.flatten().is_none_or(|until| is_at(&self.seen.or(self.place), &until))
+        let (Some(until), Some(written)) = (self.until.flatten(), writer.written()) else { return true };
+        self.seen.or(self.place).is_some_and(|seen| written.is_past(seen, until))
     }
 }
 
@@ -171,11 +178,11 @@ impl Span {
             }
         }
         let edges = self.edges.into_iter().map(|edge| SpanOfEdge {
+            missing: edge.missing(),
             topic: edge.topic,
             samples: edge.n_samples,
             first: edge.first,
             last: edge.last.map(|last| last.seq),
-            missing: edge.n_missing,
         });
         (edges.collect(), self.recorder.finish(ending))
     }
@@ -230,6 +237,12 @@ impl Sink for Span {
         Ok(())
     }
 
+    fn lacks(&mut self, topic: &str, n_lost: u64) {
+        if let Some(edge) = self.edges.iter_mut().find(|edge| edge.topic == topic) {
+            edge.n_lost = n_lost;
+        }
+    }
+
     fn begin(&mut self, places: &[Option<SampleId>]) {
         for (edge, place) in self.edges.iter_mut().zip(places) {
             edge.place = *place;
@@ -237,7 +250,7 @@ impl Sink for Span {
         let numbered = || self.edges.iter().filter(|edge| edge.is_numbered).filter_map(|edge| edge.place);
         // The edges are in the graph's order: the first is in the latest epoch.
         let epoch = numbered().next().map(|first| first.epoch);
-        self.before = numbered().filter(|place| Some(place.epoch) == epoch).max();
+        self.before = numbered().filter(|place| Some(place.epoch) == epoch).max_by_key(|place| place.seq);
     }
 
     fn leave(&mut self) {
@@ -247,7 +260,10 @@ impl Sink for Span {
 
     fn has_enough(&mut self) -> bool {
         let Some((end, _)) = self.end else { return true };
-        self.edges.iter_mut().all(|edge| edge.has_reached(&end, &self.cursors))
+        // The edges are in the graph's order: the first has the source's samples before all others.
+        let first = self.edges.iter().find(|edge| edge.is_numbered);
+        let Some(source) = first.and_then(|edge| self.cursors.output(edge.writer_slot).written()) else { return true };
+        self.edges.iter_mut().all(|edge| edge.has_reached(end, &source, &self.cursors))
     }
 }
 
@@ -275,6 +291,7 @@ mod tests {
             n_samples: 0,
             n_missing: 0,
             n_gaps: 0,
+            n_lost: 0,
         }
     }
 
@@ -295,6 +312,25 @@ mod tests {
         assert!(!edge(true, None).is_before(&key(5, 0), None));
     }
 
+    /// The end of the recording is in an epoch that this edge has not come to.
+    #[test]
+    fn an_edge_in_an_earlier_epoch_has_not_reached_the_end() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let cursors = SharedCursors::create(&folder.path().join("cursors"), 1, 0).expect("made");
+        let source = Written { last: key(3, 1), first_seq: 0, before: Some(key(9, 4)) };
+        let mut edge = edge(true, None);
+        let ends = [key(9, 3), key(3, 0)];
+        for (seen, has_reached) in [
+            (key(5, 7), [false, false]),
+            (key(9, 2), [false, false]),
+            (key(9, 4), [true, false]),
+            (key(3, 0), [true, true]),
+        ] {
+            edge.seen = Some(seen);
+            assert_eq!(ends.map(|end| edge.has_reached(end, &source, &cursors)), has_reached, "{seen:?}");
+        }
+    }
+
     #[test]
     fn gaps_are_counted_from_the_beginning_on_and_not_across_epochs() {
         let before = Some(key(5, 100));
@@ -304,7 +340,10 @@ mod tests {
         }
         numbered.count(key(6, 4), before);
         numbered.count(key(6, 3), before);
-        assert_eq!((numbered.n_samples, numbered.n_missing, numbered.n_gaps), (5, 1 + 3, 2));
+        assert_eq!((numbered.n_samples, numbered.missing(), numbered.n_gaps), (5, 1 + 3, 2));
+        // With a whole epoch that leaves no gap.
+        numbered.n_lost = 9;
+        assert_eq!(numbered.missing(), 9);
         assert_eq!((numbered.first, numbered.last), (Some(102), Some(key(6, 3))));
         // Decisions have numbers of their own: the first is the first.
         let mut decisions = edge(false, Some(key(5, 7)));

@@ -39,10 +39,8 @@ fn request(folder: &Path, machines: &[&str]) -> KeyRequest {
     KeyRequest {
         folder: folder.into(),
         machines: machines.iter().map(ToString::to_string).collect(),
-        namespace: None,
-        router: false,
         days: 90,
-        renew: false,
+        ..KeyRequest::default()
     }
 }
 
@@ -57,21 +55,17 @@ pub(crate) fn config(machine: &str, endpoints: Endpoints, keys: Option<&Path>) -
     LinkConfig {
         run: 1,
         graph: "grasp_gate".into(),
-        namespace: None,
         machine: machine.into(),
-        fingerprint: 0,
         peers: ["robot", "brain", "laptop"]
             .iter()
             .filter(|other| **other != machine)
             .map(ToString::to_string)
             .collect(),
-        exports: Vec::new(),
-        imports: Vec::new(),
         endpoints,
         keys: keys.map(|folder| key_files(folder, machine)),
-        insecure: false,
         deadline_millis: 200,
         buffer: 8,
+        ..LinkConfig::default()
     }
 }
 

@@ -6,12 +6,13 @@ use std::cell::Cell;
 
 use blindgrasp_bridge::sample;
 use blindgrasp_bridge::wire::{
-    Body, ExportedChannel, Frame, Hello, MAX_FRAME_BYTES, SampleFrame, WireError, WireKey, encode_refusal,
+    Body, ExportedChannel, Frame, Hello, MAX_FRAME_BYTES, SampleFrame, WireError, encode_refusal,
 };
 use blindgrasp_messages::{
     Contact, ContactSet, GraspFeature, GraspTruth, Header, LiftDecision, LiftOutcome, Message, Prediction, Recorded,
     TactileFrame, WithMessage, with_message,
 };
+use blindgrasp_operator::cursors::SampleId;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -100,7 +101,7 @@ fn samples(rng: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
 }
 
 fn frame(rng: &mut ChaCha8Rng, message: &[u8]) -> Vec<u8> {
-    let key = rng.random_bool(0.5).then(|| WireKey { epoch: rng.next_u64(), seq: rng.next_u64() });
+    let key = rng.random_bool(0.5).then(|| SampleId { epoch: rng.next_u64(), seq: rng.next_u64() });
     let number = rng.next_u64() >> rng.random_range(0..64);
     let (channel, run) = (rng.random_range(0..4), rng.next_u32());
     let body = match rng.random_range(0..8) {
@@ -113,13 +114,10 @@ fn frame(rng: &mut ChaCha8Rng, message: &[u8]) -> Vec<u8> {
                 machine,
                 heard: Some(number),
                 key: Some([7; 32]),
-                heard_key: None,
                 fingerprint: 7,
                 exports,
                 is_ready: true,
-                is_cut_off: false,
-                lacks_request: false,
-                run: 0,
+                ..Hello::default()
             })
         }
         1 => Body::Pong { sent_nanos: number, received_nanos: number, answered_nanos: 3 },

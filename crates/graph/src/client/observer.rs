@@ -68,6 +68,10 @@ pub trait Sink: Send + 'static {
     /// An attached observer has begun: the last earlier sample of each edge, in the order of the edges.
     fn begin(&mut self, _places: &[Option<SampleId>]) {}
 
+    /// So many samples of an edge were sent since the observer has begun, and have not come: a whole epoch leaves no gap in the
+    /// numbers.
+    fn lacks(&mut self, _topic: &str, _n_lost: u64) {}
+
     /// The observer is about to leave a graph that goes on.
     fn leave(&mut self) {}
 
@@ -326,9 +330,13 @@ fn hand_on(round: Round, ports: &Ports, sink: &mut impl Sink) -> anyhow::Result<
     for (idx, record, received_nanos) in round.records {
         sink.take(&ports[idx].0, record, received_nanos)?;
     }
-    for ((_, port), header) in ports.iter().zip(round.furthest) {
+    for ((topic, port), header) in ports.iter().zip(round.furthest) {
         if let Some(header) = header {
             port.commit(&header);
+        }
+        let n_lost = port.n_lost();
+        if n_lost > 0 {
+            sink.lacks(topic, n_lost);
         }
     }
     Ok(round.n_most)
@@ -448,6 +456,7 @@ trait AnySubscriber {
     fn give_up(&self, is_given_up: bool);
     fn is_given_up(&self) -> bool;
     fn is_caught_up(&self) -> bool;
+    fn n_lost(&self) -> u64;
     fn counts(&self) -> InputCounts;
 }
 
@@ -491,6 +500,10 @@ impl<M: Message> AnySubscriber for Typed<M> {
 
     fn is_caught_up(&self) -> bool {
         self.subscriber.is_caught_up()
+    }
+
+    fn n_lost(&self) -> u64 {
+        self.subscriber.n_lost()
     }
 
     fn counts(&self) -> InputCounts {

@@ -12,7 +12,7 @@ pub const REVOKED_FILE: &str = "crl.pem";
 /// The common name in the certificate of a Zenoh router. No machine can have this name.
 pub const ROUTER_COMMON_NAME: &str = "@router";
 
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct LinkConfig {
     /// The graph's name in its file.
     pub graph: String,

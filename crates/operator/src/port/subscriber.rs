@@ -108,6 +108,8 @@ pub struct UntypedSubscriber {
     /// Samples that were taken and not answered, the first one first.
     put_back: VecDeque<UntypedSample>,
     sequencer: Sequencer<UntypedSample>,
+    /// The number of samples that its writer had sent before an attached reader began.
+    n_sent_before: u64,
 }
 
 impl UntypedSubscriber {
@@ -142,6 +144,7 @@ impl UntypedSubscriber {
             may_hold: wiring.policy == EdgePolicy::Lossless,
             put_back: VecDeque::new(),
             sequencer: Sequencer::onlooker(),
+            n_sent_before: 0,
         };
         subscriber.begin_with(Sequencer::onlooker());
         Ok(subscriber)
@@ -179,7 +182,7 @@ impl UntypedSubscriber {
     }
 
     /// How far its writer has come; `None` for a reader that only reads along.
-    fn writer(&self) -> Option<Written> {
+    pub fn writer(&self) -> Option<Written> {
         self.cursors.as_ref().and_then(|(cursors, _)| cursors.output(self.writer_slot).written())
     }
 
@@ -334,10 +337,17 @@ impl UntypedSubscriber {
     /// before it.
     pub fn begin_here(&mut self) -> Option<SampleId> {
         let (cursors, slot) = self.cursors.as_ref()?;
-        let last = cursors.output(self.writer_slot).key();
+        let (last, n_sent) = cursors.output(self.writer_slot).sent();
+        self.n_sent_before = n_sent;
         cursors.input(*slot).begin_after(last);
         self.begin_with(Sequencer::resume(last, last, InputCounts::default()));
         last
+    }
+
+    /// How many samples were sent since it began and have not come; 0 while some that were sent are not answered.
+    pub fn n_lost(&self) -> u64 {
+        let Some((cursors, slot)) = &self.cursors else { return 0 };
+        cursors.output(self.writer_slot).n_lost(cursors.input(*slot), self.n_sent_before)
     }
 
     /// Marks all samples up to this one as answered: its writer may overwrite them, and an instance that takes over goes on

@@ -6,7 +6,7 @@
 //!
 //! All times are nanoseconds of CLOCK_BOOTTIME, whose zero differs from machine to machine.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{HashMap, VecDeque};
 
 use blindgrasp_operator::cursors::SampleId;
 
@@ -125,7 +125,7 @@ pub fn origin_of_answer(key: &SampleId, sent: &Origins, on_arrival: impl FnOnce(
 /// ([`bears_source_number`](blindgrasp_graph::client::observer::bears_source_number)).
 #[derive(Debug, Clone)]
 pub struct Origins {
-    nanos_by_key: BTreeMap<SampleId, u64>,
+    nanos_by_key: HashMap<SampleId, u64>,
     keys: VecDeque<SampleId>,
     capacity: usize,
     /// The last samples that an earlier process of this link has sent, of each port.
@@ -135,7 +135,7 @@ pub struct Origins {
 impl Origins {
     /// Keeps the last `capacity` samples.
     pub fn new(capacity: usize) -> Self {
-        Origins { nanos_by_key: BTreeMap::new(), keys: VecDeque::new(), capacity: capacity.max(1), before: Vec::new() }
+        Origins { nanos_by_key: HashMap::new(), keys: VecDeque::new(), capacity: capacity.max(1), before: Vec::new() }
     }
 
     /// Remembers a sample that is sent. It is ignored if `origin_nanos` is 0 (unknown). Of several samples with one key

@@ -12,7 +12,7 @@ use blindgrasp_messages::{Message, Stamped};
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
-use blindgrasp_operator::port::{Publisher, Sent, sample_id};
+use blindgrasp_operator::port::{Publisher, Sent, UntypedPublisher, sample_id};
 
 /// Maximum number of samples that wait for readers: twice the number that a sender has on their way.
 const MAX_QUEUE: usize = 2 * super::uplink::WINDOW;
@@ -60,17 +60,8 @@ pub(super) trait Writer {
     /// The port fails.
     fn flush(&mut self) -> anyhow::Result<bool>;
     fn n_waiting(&self) -> usize;
-    /// The last sample that all readers here have answered.
-    fn answered(&self) -> Option<SampleId>;
-    /// The last sample that was published here.
-    fn published(&self) -> Option<SampleId>;
-    /// Tells readers whether samples can arrive.
-    fn set_cut_off(&self, is_cut_off: bool);
-    /// Connects to readers that are new.
-    ///
-    /// # Errors
-    /// The port fails.
-    fn look_for_readers(&mut self) -> anyhow::Result<()>;
+    fn port(&self) -> &UntypedPublisher;
+    fn port_mut(&mut self) -> &mut UntypedPublisher;
 }
 
 impl Downlink {
@@ -133,7 +124,7 @@ impl Downlink {
     pub(super) fn begin_anew(&mut self) {
         if self.channel.is_from_source {
             self.incoming.begin_anew();
-            self.before = self.writer.published();
+            self.before = self.writer.port().last();
         }
     }
 
@@ -148,12 +139,13 @@ impl Downlink {
 
     /// The last sample that all readers here have answered.
     pub(super) fn answered(&self) -> Option<SampleId> {
-        let published = self.writer.published();
+        let port = self.writer.port();
+        let published = port.last();
         // Answers to an earlier run of the sender do not count for this run.
         if self.is_closed || (self.before.is_some() && self.before == published) {
             return None;
         }
-        let answered = self.writer.answered();
+        let answered = if port.has_readers() { port.answered_by_readers() } else { published };
         // No reader will answer a sample that cannot be decoded.
         let is_at_rest = self.writer.n_waiting() == 0 && answered == published;
         if is_at_rest && self.unreadable.is_some() { self.unreadable } else { answered }
@@ -202,19 +194,11 @@ impl<M: Message> Writer for Queue<M> {
         self.waiting.len()
     }
 
-    fn answered(&self) -> Option<SampleId> {
-        if self.publisher.has_readers() { self.publisher.answered_by_readers() } else { self.publisher.last() }
+    fn port(&self) -> &UntypedPublisher {
+        &self.publisher
     }
 
-    fn published(&self) -> Option<SampleId> {
-        self.publisher.last()
-    }
-
-    fn set_cut_off(&self, is_cut_off: bool) {
-        self.publisher.set_cut_off(is_cut_off);
-    }
-
-    fn look_for_readers(&mut self) -> anyhow::Result<()> {
-        Ok(self.publisher.look_for_readers()?)
+    fn port_mut(&mut self) -> &mut UntypedPublisher {
+        &mut self.publisher
     }
 }

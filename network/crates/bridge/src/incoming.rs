@@ -14,7 +14,7 @@ const ACK_PAUSE_NANOS: u64 = 2_000_000;
 const ACK_REPEAT_NANOS: u64 = 100_000_000;
 
 /// The receiving end of a channel.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Incoming {
     policy: EdgePolicy,
     run: u32,
@@ -73,15 +73,8 @@ impl Incoming {
             policy,
             // Half of the range is left to count upwards.
             run: (instance as u32) >> 1,
-            asking: None,
-            expected: 0,
             last: after,
-            has_ended: false,
-            last_ack: None,
-            n_samples: 0,
-            n_repeated: 0,
-            n_lost: 0,
-            n_stale: 0,
+            ..Incoming::default()
         }
     }
 

@@ -31,7 +31,7 @@ const OPEN: u32 = 0o644;
 const SECRET: u32 = 0o600;
 
 /// The certificates to make.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct KeyRequest {
     pub folder: PathBuf,
     /// The machines' names.

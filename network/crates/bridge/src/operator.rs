@@ -14,6 +14,7 @@ use time::OffsetDateTime;
 use super::clock::{Origins, Passage, origin_of_answer, origin_on_arrival};
 use super::downlink::{Accepted, Downlink};
 use super::identity::Identity;
+use super::incoming::Progress;
 use super::peer::{Change, Own, Rejection};
 use super::peer_connection::PeerConnection;
 use super::protection::Opened;
@@ -170,7 +171,7 @@ impl<'a> Link<'a> {
 
     fn look_for_readers(&mut self) -> anyhow::Result<()> {
         let mut downlinks = self.connections.iter_mut().flat_map(|connection| &mut connection.downlinks);
-        downlinks.try_for_each(|downlink| downlink.writer.look_for_readers())
+        downlinks.try_for_each(|downlink| Ok(downlink.writer.port_mut().look_for_readers()?))
     }
 
     /// Connects to Zenoh when the session has been opened.
@@ -379,7 +380,7 @@ impl<'a> Link<'a> {
             }
             Body::Resume { channel, run, after } => {
                 if let Some(uplink) = connection.uplinks.get_mut(usize::from(channel)) {
-                    uplink.outgoing.on_resume(run, after.map(SampleId::from));
+                    uplink.outgoing.on_resume(run, after);
                 }
                 if connection.uplinks.iter().all(|uplink| uplink.outgoing.has_request()) {
                     connection.peer.on_requests();
@@ -388,7 +389,7 @@ impl<'a> Link<'a> {
             Body::Sample(frame) => self.on_sample(idx, &frame, now_nanos)?,
             Body::Ack { channel, run, n_received, answered } => {
                 if let Some(uplink) = connection.uplinks.get_mut(usize::from(channel)) {
-                    uplink.outgoing.on_ack(run, n_received, answered.map(SampleId::from), now_nanos);
+                    uplink.outgoing.on_ack(run, n_received, answered, now_nanos);
                     uplink.commit();
                 }
             }
@@ -532,7 +533,7 @@ impl<'a> Link<'a> {
         for downlink in &connection.downlinks {
             // At the end of a graph the other machines leave first; these readers are not cut off.
             let has_ended = is_ending && self.ended_ports.contains(&downlink.channel.port);
-            downlink.writer.set_cut_off(is_cut_off && !has_ended);
+            downlink.writer.port().set_cut_off(is_cut_off && !has_ended);
         }
     }
 
@@ -565,7 +566,7 @@ impl<'a> Link<'a> {
             }
             let outgoing = &mut self.connections[idx].uplinks[channel_idx].outgoing;
             if is_up && let Some((run, last)) = outgoing.end_to_send(monotonic_nanos()) {
-                self.say(idx, KeyKind::Link, Body::End { channel, run, last: last.map(Into::into) })?;
+                self.say(idx, KeyKind::Link, Body::End { channel, run, last })?;
             }
         }
         Ok(is_busy)
@@ -589,13 +590,12 @@ impl<'a> Link<'a> {
             downlink.writer.flush()?;
             let answered = downlink.answered();
             if is_up && let Some(progress) = downlink.incoming.ack_to_send(answered, now_nanos) {
-                let answered = progress.answered.map(Into::into);
-                let (run, n_received) = (progress.run, progress.n_received);
+                let Progress { run, n_received, answered } = progress;
                 self.say(idx, KeyKind::Link, Body::Ack { channel, run, n_received, answered })?;
             }
             let incoming = &mut self.connections[idx].downlinks[channel_idx].incoming;
             if is_up && let Some((run, after)) = incoming.resume_to_send(now_nanos) {
-                self.say(idx, KeyKind::Link, Body::Resume { channel, run, after: after.map(Into::into) })?;
+                self.say(idx, KeyKind::Link, Body::Resume { channel, run, after })?;
             }
         }
         Ok(())

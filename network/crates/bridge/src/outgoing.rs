@@ -17,13 +17,16 @@
 //! process that takes over gets them back ([`Outgoing::restore`]).
 //!
 //! A position in the stream counts the samples in the order in which they were pushed. Keys order samples only within
-//! an epoch: a recording that is played has its recorded epochs, and a machine's clock may have been set back.
+//! an epoch; the order of epochs is that in which the writer began them ([`Written`]).
 
 use std::collections::VecDeque;
+
+use serde::{Deserialize, Serialize};
 
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::link_status::ChannelStatus;
 use blindgrasp_operator::wiring::EdgePolicy;
+use blindgrasp_operator::written::Written;
 
 /// A sample that is not acknowledged is repeated after the first pause. Each further pause is twice as long.
 const FIRST_PROBE_NANOS: u64 = 250_000_000;
@@ -34,7 +37,7 @@ const END_PAUSE_NANOS: u64 = 100_000_000;
 /// have answered the old one, and it must not wait for a machine that is away.
 const COMMIT_AFTER_NANOS: u64 = 50_000_000;
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct OutgoingOptions {
     pub policy: EdgePolicy,
     /// Maximum number of samples that are on their way or unanswered, at least 1.
@@ -48,7 +51,7 @@ pub struct OutgoingOptions {
 }
 
 /// A sample as it is saved for a process that takes over.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct KeptSample {
     pub key: SampleId,
     pub origin_nanos: u64,
@@ -56,18 +59,12 @@ pub struct KeptSample {
     pub message: Vec<u8>,
 }
 
-impl KeptSample {
-    pub fn as_parts(&self) -> (SampleId, u64, &[u8]) {
-        (self.key, self.origin_nanos, &self.message)
-    }
-}
-
 /// The sending end of a channel.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Outgoing {
     options: OutgoingOptions,
-    /// The last sample that an earlier process had committed.
-    begun_after: Option<SampleId>,
+    /// How far the writer has come.
+    written: Option<Written>,
     /// In the order in which the samples were pushed.
     kept: VecDeque<Kept>,
     /// The position of the first kept sample.
@@ -120,9 +117,7 @@ pub struct Next<'a> {
 
 #[derive(Debug, Clone)]
 struct Kept {
-    key: SampleId,
-    message: Vec<u8>,
-    origin_nanos: u64,
+    sample: KeptSample,
     pushed_nanos: u64,
     sent: Option<Sent>,
 }
@@ -153,33 +148,17 @@ struct End {
 }
 
 impl Outgoing {
-    /// A channel whose reader has committed `begun_after` on the cursors: `None` in a graph that has just started.
-    pub fn new(options: OutgoingOptions, begun_after: Option<SampleId>) -> Self {
+    /// A channel whose reader has committed `begun_after` on the cursors, `None` in a graph that has just started, and whose
+    /// writer has come to `written`.
+    pub fn new(options: OutgoingOptions, begun_after: Option<SampleId>, written: Option<Written>) -> Self {
         let window = options.window.max(1);
         Outgoing {
             options: OutgoingOptions { window, buffer: options.buffer.max(window), ..options },
-            begun_after,
-            kept: VecDeque::new(),
-            first: 0,
-            cursor: 0,
-            reached: 0,
-            committed: 0,
+            written,
             committed_key: begun_after,
             last_removed: begun_after,
-            skip: None,
-            unsettled: VecDeque::new(),
-            run: None,
             is_catching_up: true,
-            last_answered: None,
-            full_since_nanos: None,
-            is_stalled: false,
-            is_on_trial: false,
-            blocked_since_nanos: None,
-            end: None,
-            n_samples: 0,
-            n_repeated: 0,
-            n_lost: 0,
-            blocked_nanos: 0,
+            ..Outgoing::default()
         }
     }
 
@@ -187,20 +166,13 @@ impl Outgoing {
     /// the last committed sample were not committed any more: the writer sends them again.
     pub fn restore(&mut self, mut saved: Vec<KeptSample>, n_lost: u64) {
         let n_committed =
-            saved.iter().rposition(|sample| Some(sample.key) == self.begun_after).map_or(0, |idx| idx + 1);
+            saved.iter().rposition(|sample| Some(sample.key) == self.committed_key).map_or(0, |idx| idx + 1);
         saved.truncate(n_committed);
         self.n_lost = n_lost;
         if saved.is_empty() {
             return;
         }
-        let kept = saved.into_iter().map(|KeptSample { key, origin_nanos, message }| Kept {
-            key,
-            message,
-            origin_nanos,
-            pushed_nanos: 0,
-            sent: None,
-        });
-        self.kept = kept.collect();
+        self.kept = saved.into_iter().map(|sample| Kept { sample, pushed_nanos: 0, sent: None }).collect();
         self.committed = self.end_position();
         // The sample before them is not known.
         self.last_removed = None;
@@ -254,7 +226,9 @@ impl Outgoing {
         while self.kept.len() > most_before {
             self.give_up_first();
         }
-        self.kept.push_back(Kept { key, message, origin_nanos, pushed_nanos: now_nanos, sent: None });
+        let sample = KeptSample { key, origin_nanos, message };
+        self.kept.push_back(Kept { sample, pushed_nanos: now_nanos, sent: None });
+        self.written = Written::with(self.written, key).or(self.written);
         if let Some(had) = self.skip {
             if self.is_before_or_at(&key, &had) {
                 self.cursor = self.end_position();
@@ -274,7 +248,7 @@ impl Outgoing {
         self.cursor = after.map_or(self.first, |key| self.position_after(&key));
         self.reached = self.reached.max(self.cursor);
         let is_known =
-            |key: &SampleId| self.last_removed == Some(*key) || self.kept.iter().any(|kept| kept.key == *key);
+            |key: &SampleId| self.last_removed == Some(*key) || self.kept.iter().any(|kept| kept.sample.key == *key);
         self.skip = after.filter(|key| self.cursor == self.end_position() && !is_known(key));
         self.run = Some(Run {
             number: run,
@@ -330,8 +304,8 @@ impl Outgoing {
         } else {
             self.n_samples += 1;
         }
-        let Kept { key, origin_nanos, .. } = *kept;
-        Some(Next { run: sent.run, index, key, message: &kept.message, origin_nanos, is_repeat })
+        let KeptSample { key, origin_nanos, message } = &kept.sample;
+        Some(Next { run: sent.run, index, key: *key, message, origin_nanos: *origin_nanos, is_repeat })
     }
 
     /// The receiver has `n_received` samples of a request, and its readers have answered all samples up to `answered`.
@@ -352,7 +326,7 @@ impl Outgoing {
         if self.last_answered.replace(key) != Some(key) {
             (self.full_since_nanos, self.is_stalled) = (None, false);
         }
-        let exactly = self.kept.iter().position(|kept| kept.key == key);
+        let exactly = self.kept.iter().position(|kept| kept.sample.key == key);
         let position = match exactly {
             Some(idx) => self.first + idx as u64 + 1,
             None => self.position_after(&key),
@@ -367,34 +341,34 @@ impl Outgoing {
 
     /// The next sample that must be saved outside of this process, because the writer must not wait for its answer: call
     /// [`Outgoing::saved`] once that is done, and this until it returns `None`.
-    pub fn next_to_save(&self, now_nanos: u64) -> Option<(SampleId, u64, &[u8])> {
+    pub fn next_to_save(&self, now_nanos: u64) -> Option<&KeptSample> {
         if self.options.policy != EdgePolicy::Lossless {
             return None;
         }
-        let newest = self.kept.back()?.key;
+        let newest = self.kept.back()?.sample.key;
         let kept = self.kept.get((self.committed - self.first) as usize)?;
         let capacity = self.options.capacity as u64;
         let most = capacity - (capacity / 4).max(1).min(capacity);
         // The writer's limit is a difference of sequence numbers, not a number of samples.
-        let is_far = newest.epoch == kept.key.epoch && newest.seq.saturating_sub(kept.key.seq) >= most;
+        let key = kept.sample.key;
+        let is_far = newest.epoch == key.epoch && newest.seq.saturating_sub(key.seq) >= most;
         let is_many = self.end_position() - self.committed > most;
         let is_cut_off_long = (self.run.is_none() || self.is_on_trial)
             && now_nanos.saturating_sub(kept.pushed_nanos) >= COMMIT_AFTER_NANOS;
-        (is_far || is_many || is_cut_off_long).then_some((kept.key, kept.origin_nanos, &kept.message))
+        (is_far || is_many || is_cut_off_long).then_some(&kept.sample)
     }
 
     /// The sample of [`Outgoing::next_to_save`] is saved: it may be committed.
     pub fn saved(&mut self) {
         if let Some(kept) = self.kept.get((self.committed - self.first) as usize) {
-            self.committed_key = Some(kept.key);
+            self.committed_key = Some(kept.sample.key);
             self.committed += 1;
         }
     }
 
     /// The samples that are committed and not answered. A process that takes over needs them.
-    pub fn committed(&self) -> impl ExactSizeIterator<Item = (SampleId, u64, &[u8])> {
-        let n_committed = (self.committed - self.first) as usize;
-        self.kept.iter().take(n_committed).map(|kept| (kept.key, kept.origin_nanos, kept.message.as_slice()))
+    pub fn committed(&self) -> impl ExactSizeIterator<Item = &KeptSample> {
+        self.kept.iter().take((self.committed - self.first) as usize).map(|kept| &kept.sample)
     }
 
     /// The last sample that may be committed on this machine's cursors, so that the local writer goes on.
@@ -486,10 +460,10 @@ impl Outgoing {
         self.first += 1;
         self.cursor = self.cursor.max(self.first);
         self.reached = self.reached.max(self.first);
-        self.last_removed = Some(removed.key);
+        self.last_removed = Some(removed.sample.key);
         if self.committed < self.first {
             self.committed = self.first;
-            self.committed_key = Some(removed.key);
+            self.committed_key = Some(removed.sample.key);
         }
         Some(removed)
     }
@@ -500,7 +474,7 @@ impl Outgoing {
         let may_be_had = self.first < if self.run.is_some() { self.cursor } else { self.reached };
         match self.remove_first() {
             Some(_) if !may_be_had => self.n_lost += 1,
-            Some(Kept { sent: Some(sent), key, .. }) => self.unsettled.push_back((sent, key)),
+            Some(Kept { sent: Some(sent), sample, .. }) => self.unsettled.push_back((sent, sample.key)),
             _ => {}
         }
         // A receiver that says nothing for ever must not fill the memory.
@@ -514,27 +488,25 @@ impl Outgoing {
     /// belongs to an earlier run of this machine's part of the graph; then the receiver lacks all kept samples. But a
     /// process that took over from another one may not have reached the position of that one yet.
     fn position_after(&self, key: &SampleId) -> u64 {
-        let found = self.kept.iter().rposition(|kept| kept.key == *key);
-        match found.or_else(|| self.kept.iter().rposition(|kept| self.is_before_or_at(&kept.key, key))) {
+        let found = self.kept.iter().rposition(|kept| kept.sample.key == *key);
+        match found.or_else(|| self.kept.iter().rposition(|kept| self.is_before_or_at(&kept.sample.key, key))) {
             Some(idx) => self.first + idx as u64 + 1,
             None => self.first,
         }
     }
 
     fn is_before_or_at(&self, kept: &SampleId, key: &SampleId) -> bool {
-        let is_over = self.last_removed.is_some_and(|removed| removed.epoch == key.epoch);
         if kept.epoch == key.epoch {
-            kept.seq <= key.seq
-        } else {
-            self.begun_after.is_some() && !is_over && kept.epoch < key.epoch
+            return kept.seq <= key.seq;
         }
+        self.written.is_some_and(|written| written.is_past(*key, *kept))
     }
 
     /// The receiver has the samples up to `after`. Of the samples that were sent and are no longer kept, those behind
     /// it are lost. A sample that is unknown here is older than all of them.
     fn settle(&mut self, after: Option<SampleId>) {
         let n_lost = match after {
-            Some(key) if self.kept.iter().any(|kept| kept.key == key) => 0,
+            Some(key) if self.kept.iter().any(|kept| kept.sample.key == key) => 0,
             _ => {
                 let last_had = self.unsettled.iter().rposition(|(_, unsettled)| Some(*unsettled) == after);
                 self.unsettled.len() - last_had.map_or(0, |idx| idx + 1)

@@ -42,7 +42,7 @@ pub struct Own {
 }
 
 /// Another machine as seen by this link.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Peer {
     /// Its name.
     pub machine: String,
@@ -126,35 +126,7 @@ impl Peer {
         deadline_nanos: u64,
         agreement: Option<Agreement>,
     ) -> Peer {
-        Peer {
-            machine,
-            clock: ClockOffset::default(),
-            version: None,
-            state: PeerState::Waiting,
-            reason: None,
-            n_times_up: 0,
-            bytes: [0; 2],
-            echo_nanos: 0,
-            last_heard_nanos: None,
-            exports,
-            imports,
-            deadline_nanos,
-            instance: None,
-            candidate: None,
-            candidate_key: None,
-            agreement,
-            proved_nanos: 0,
-            run: None,
-            is_ready: false,
-            heard: [0; 2],
-            said: [0; 2],
-            past: VecDeque::new(),
-            last_hello_nanos: None,
-            last_ping_nanos: None,
-            lacks_request: false,
-            n_pongs: 0,
-            last_pong_nanos: 0,
-        }
+        Peer { machine, exports, imports, deadline_nanos, agreement, ..Peer::default() }
     }
 
     /// Whether it is up and its operators are ready.

@@ -210,7 +210,7 @@ impl PeerConnection {
     /// Whether readers here have not answered all published samples. Answers do not wake the link, so that it must
     /// poll.
     pub(super) fn awaits_answers(&self) -> bool {
-        self.downlinks.iter().any(|downlink| downlink.writer.published() != downlink.answered())
+        self.downlinks.iter().any(|downlink| downlink.writer.port().last() != downlink.answered())
     }
 
     /// Whether it is up and answers nothing on some channel, so that it counts as cut off.

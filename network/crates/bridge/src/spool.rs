@@ -2,21 +2,28 @@
 //! killed and started again finds them there. The file ends with the graph. A link follows no link of the file system: it has
 //! no sandbox, and could be led anywhere.
 
+use std::borrow::Cow;
 use std::fs::{File, OpenOptions};
-use std::io::{ErrorKind, Read, Result, Write};
+use std::io::{Error, ErrorKind, Read, Result, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-use blindgrasp_operator::cursors::SampleId;
+use bincode::config::Configuration;
 use rustix::fs::OFlags;
+use serde::{Deserialize, Serialize};
 
 use super::outgoing::KeptSample;
 
 /// The file is written anew when it is longer than this, and longer than twice the samples in it that are still kept.
 const SLACK_BYTES: u64 = 1 << 20;
-/// The kinds of records: a sample, and the number of samples that were lost so far.
-const SAMPLE: u8 = 0;
-const LOST: u8 = 1;
+const FORMAT: Configuration = bincode::config::standard();
+
+#[derive(Serialize, Deserialize)]
+enum Record<'a> {
+    Sample(Cow<'a, KeptSample>),
+    /// The number of samples that were lost so far.
+    Lost(u64),
+}
 
 #[derive(Debug)]
 pub(super) struct Spool {
@@ -48,7 +55,7 @@ impl Spool {
         let (saved, n_bytes) = (read(&bytes), bytes.len() as u64);
         let mut spool = Spool { path: path.into(), file, n_bytes, most_bytes: 0, n_lost: saved.n_lost };
         // The end of the file may be half of a record.
-        spool.replace(saved.samples.iter().map(KeptSample::as_parts), saved.n_lost)?;
+        spool.replace(saved.samples.iter(), saved.n_lost)?;
         Ok((spool, saved))
     }
 
@@ -56,10 +63,8 @@ impl Spool {
     ///
     /// # Errors
     /// The file cannot be written.
-    pub(super) fn save(&mut self, (key, origin_nanos, message): (SampleId, u64, &[u8])) -> Result<()> {
-        let mut record = Vec::with_capacity(32 + message.len());
-        push_sample(&mut record, key, origin_nanos, message);
-        self.append(&record)
+    pub(super) fn save(&mut self, sample: &KeptSample) -> Result<()> {
+        self.append(&Record::Sample(Cow::Borrowed(sample)))
     }
 
     /// Saves the number of lost samples, if it is another one.
@@ -70,9 +75,7 @@ impl Spool {
         if n_lost == self.n_lost {
             return Ok(());
         }
-        let mut record = Vec::new();
-        push_lost(&mut record, n_lost);
-        self.append(&record)?;
+        self.append(&Record::Lost(n_lost))?;
         self.n_lost = n_lost;
         Ok(())
     }
@@ -86,14 +89,12 @@ impl Spool {
     ///
     /// # Errors
     /// The file cannot be written.
-    pub(super) fn replace<'a>(
-        &mut self,
-        samples: impl Iterator<Item = (SampleId, u64, &'a [u8])>,
-        n_lost: u64,
-    ) -> Result<()> {
+    pub(super) fn replace<'a>(&mut self, samples: impl Iterator<Item = &'a KeptSample>, n_lost: u64) -> Result<()> {
         let mut bytes = Vec::new();
-        push_lost(&mut bytes, n_lost);
-        samples.for_each(|(key, origin_nanos, message)| push_sample(&mut bytes, key, origin_nanos, message));
+        push(&mut bytes, &Record::Lost(n_lost))?;
+        for sample in samples {
+            push(&mut bytes, &Record::Sample(Cow::Borrowed(sample)))?;
+        }
         let partial = self.path.with_extension("partial");
         // A link that was killed may have left one.
         match std::fs::remove_file(&partial) {
@@ -109,54 +110,37 @@ impl Spool {
         Ok(())
     }
 
-    fn append(&mut self, record: &[u8]) -> Result<()> {
-        self.file.write_all(record)?;
-        self.n_bytes += record.len() as u64;
+    fn append(&mut self, record: &Record<'_>) -> Result<()> {
+        let mut bytes = Vec::new();
+        push(&mut bytes, record)?;
+        self.file.write_all(&bytes)?;
+        self.n_bytes += bytes.len() as u64;
         Ok(())
     }
 }
 
-fn push_sample(bytes: &mut Vec<u8>, key: SampleId, origin_nanos: u64, message: &[u8]) {
-    bytes.push(SAMPLE);
-    bytes.extend((message.len() as u64).to_le_bytes());
-    [key.epoch, key.seq, origin_nanos].iter().for_each(|number| bytes.extend(number.to_le_bytes()));
-    bytes.extend(message);
-}
-
-fn push_lost(bytes: &mut Vec<u8>, n_lost: u64) {
-    bytes.push(LOST);
-    bytes.extend(n_lost.to_le_bytes());
+fn push(bytes: &mut Vec<u8>, record: &Record<'_>) -> Result<()> {
+    bincode::serde::encode_into_std_write(record, bytes, FORMAT).map_err(Error::other)?;
+    Ok(())
 }
 
 /// The records up to the first that is not complete.
 fn read(mut bytes: &[u8]) -> Saved {
     let mut saved = Saved::default();
-    while next_record(&mut bytes, &mut saved).is_some() {}
-    saved
-}
-
-/// Takes a record from the front; `None` if there is no complete one.
-fn next_record(bytes: &mut &[u8], saved: &mut Saved) -> Option<()> {
-    let kind = bytes.split_off_first()?;
-    match *kind {
-        SAMPLE => {
-            let length = usize::try_from(number(bytes)?).ok()?;
-            let (epoch, seq, origin_nanos) = (number(bytes)?, number(bytes)?, number(bytes)?);
-            let message = bytes.split_off(..length)?.to_vec();
-            saved.samples.push(KeptSample { key: SampleId { epoch, seq }, origin_nanos, message });
+    while let Ok((record, n_bytes)) = bincode::serde::decode_from_slice(bytes, FORMAT) {
+        match record {
+            Record::Sample(sample) => saved.samples.push(sample.into_owned()),
+            Record::Lost(n_lost) => saved.n_lost = n_lost,
         }
-        LOST => saved.n_lost = number(bytes)?,
-        _ => return None,
+        bytes = &bytes[n_bytes..];
     }
-    Some(())
-}
-
-fn number(bytes: &mut &[u8]) -> Option<u64> {
-    Some(u64::from_le_bytes(bytes.split_off(..8)?.try_into().ok()?))
+    saved
 }
 
 #[cfg(test)]
 mod tests {
+    use blindgrasp_operator::cursors::SampleId;
+
     use super::*;
 
     fn sample(seq: u64) -> KeptSample {
@@ -171,7 +155,7 @@ mod tests {
         assert_eq!(saved, Saved::default());
         let samples: Vec<KeptSample> = (0..5).map(sample).collect();
         for sample in &samples {
-            spool.save(sample.as_parts()).expect("saved");
+            spool.save(sample).expect("saved");
         }
         spool.save_lost(7).expect("saved");
         // It is killed while it writes.
@@ -183,7 +167,7 @@ mod tests {
         let (mut spool, found) = Spool::open(&path).expect("opened");
         assert_eq!(found, Saved { samples: samples.clone(), n_lost: 7 });
         // It goes on behind them.
-        spool.save(sample(5).as_parts()).expect("saved");
+        spool.save(&sample(5)).expect("saved");
         assert_eq!(Spool::open(&path).expect("opened").1.samples, (0..6).map(sample).collect::<Vec<_>>());
     }
 
@@ -194,9 +178,9 @@ mod tests {
         std::fs::write(&keys, "mine").expect("written");
         std::os::unix::fs::symlink(&keys, path.with_extension("partial")).expect("planted");
         let (mut spool, _) = Spool::open(&path).expect("opened");
-        spool.save(sample(1).as_parts()).expect("saved");
+        spool.save(&sample(1)).expect("saved");
         std::os::unix::fs::symlink(&keys, path.with_extension("partial")).expect("planted");
-        spool.replace([sample(2).as_parts()].into_iter(), 0).expect("written");
+        spool.replace([sample(2)].iter(), 0).expect("written");
         std::fs::remove_file(&path).expect("removed");
         std::os::unix::fs::symlink(&keys, &path).expect("planted");
         assert!(Spool::open(&path).is_err());
@@ -210,9 +194,9 @@ mod tests {
         let long = KeptSample { message: vec![1; 100_000], ..sample(1) };
         let mut most = 0;
         for _ in 0..100 {
-            spool.save(long.as_parts()).expect("saved");
+            spool.save(&long).expect("saved");
             if spool.is_long(1) {
-                spool.replace([long.as_parts()].into_iter(), 0).expect("written");
+                spool.replace([&long].into_iter(), 0).expect("written");
             }
             most = most.max(spool.n_bytes);
         }

@@ -47,10 +47,7 @@ pub(super) struct Uplink {
 trait Reader {
     /// The next sample's header and encoded message.
     fn next(&mut self, port: &str) -> anyhow::Result<Option<(Header, Vec<u8>)>>;
-    fn counts(&self) -> InputCounts;
-    fn commit_late(&mut self, key: SampleId, counts: &InputCounts);
-    fn written(&self) -> Option<SampleId>;
-    fn connect(&mut self) -> anyhow::Result<()>;
+    fn port(&mut self) -> &mut UntypedSubscriber;
 }
 
 impl Uplink {
@@ -76,7 +73,7 @@ impl Uplink {
             buffer: config.buffer,
             stall_limit_nanos: deadlines_nanos.min(LONGEST_STALL_NANOS),
         };
-        let mut outgoing = Outgoing::new(options, last);
+        let mut outgoing = Outgoing::new(options, last, subscriber.writer());
         outgoing.restore(saved.samples, saved.n_lost);
         // Samples that were saved and not committed come again, and must not be there twice.
         spool.replace(outgoing.committed(), saved.n_lost).with_context(|| path.display().to_string())?;
@@ -115,7 +112,7 @@ impl Uplink {
             }
             self.outgoing.push(key, message, header.origin_nanos, now_nanos);
             self.last = Some(key);
-            self.uncommitted.push_back((key, self.reader.counts()));
+            self.uncommitted.push_back((key, self.reader.port().counts()));
         }
         Ok(true)
     }
@@ -152,15 +149,14 @@ impl Uplink {
         let Some(idx) = self.uncommitted.iter().position(|(key, _)| *key == point) else { return };
         // A reader that is restarted continues after this sample, with the counts of that time.
         if let Some((key, counts)) = self.uncommitted.drain(..=idx).next_back() {
-            self.reader.commit_late(key, &counts);
+            self.reader.port().commit_late(key, &counts);
         }
     }
 
     /// Whether all samples of the writer were read.
-    pub(super) fn has_taken_all(&self) -> bool {
-        let is_past =
-            |written: SampleId| self.last.is_some_and(|last| last.epoch == written.epoch && last.seq >= written.seq);
-        self.reader.written().is_none_or(is_past)
+    pub(super) fn has_taken_all(&mut self) -> bool {
+        let Some(written) = self.reader.port().written() else { return true };
+        self.last.is_some_and(|last| last.epoch == written.epoch && last.seq >= written.seq)
     }
 
     /// Connects to publishers that are new.
@@ -168,7 +164,8 @@ impl Uplink {
     /// # Errors
     /// The port fails.
     pub(super) fn connect(&mut self) -> anyhow::Result<()> {
-        self.reader.connect()
+        self.reader.port().connect()?;
+        Ok(())
     }
 }
 
@@ -185,20 +182,7 @@ impl<M: Message> Reader for Subscriber<M> {
         Ok(Some((header, message)))
     }
 
-    fn counts(&self) -> InputCounts {
-        UntypedSubscriber::counts(self)
-    }
-
-    fn commit_late(&mut self, key: SampleId, counts: &InputCounts) {
-        UntypedSubscriber::commit_late(self, key, counts);
-    }
-
-    fn written(&self) -> Option<SampleId> {
-        UntypedSubscriber::written(self)
-    }
-
-    fn connect(&mut self) -> anyhow::Result<()> {
-        UntypedSubscriber::connect(self)?;
-        Ok(())
+    fn port(&mut self) -> &mut UntypedSubscriber {
+        self
     }
 }

@@ -207,7 +207,7 @@ pub enum Body<'a> {
         /// The number of the request: the receiver counts its requests.
         run: u32,
         /// The last sample that the receiver has; `None` if it has none.
-        after: Option<WireKey>,
+        after: Option<SampleId>,
     },
     #[serde(borrow)]
     Sample(SampleFrame<'a>),
@@ -220,7 +220,7 @@ pub enum Body<'a> {
         /// The number of samples that were received of this request.
         n_received: u64,
         /// The last sample that all readers of the channel have answered.
-        answered: Option<WireKey>,
+        answered: Option<SampleId>,
     },
     /// A channel has no more samples: its writer has ended.
     End {
@@ -229,7 +229,7 @@ pub enum Body<'a> {
         /// The request that this frame answers.
         run: u32,
         /// The last sample of the writer; `None` if it has sent nothing.
-        last: Option<WireKey>,
+        last: Option<SampleId>,
     },
     /// The receiver has published all samples up to the end.
     Ended {
@@ -241,7 +241,7 @@ pub enum Body<'a> {
 }
 
 /// The identity and the state of a link.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Hello {
     /// The sender's version of blindgrasp.
     #[serde(deserialize_with = "name")]
@@ -303,25 +303,6 @@ pub struct SampleFrame<'a> {
     /// The message as encoded by [`sample`](super::sample).
     #[serde(borrow, serialize_with = "as_bytes")]
     pub message: &'a [u8],
-}
-
-/// A [`SampleId`] as it is encoded.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-pub struct WireKey {
-    pub epoch: u64,
-    pub seq: u64,
-}
-
-impl From<SampleId> for WireKey {
-    fn from(SampleId { epoch, seq }: SampleId) -> Self {
-        WireKey { epoch, seq }
-    }
-}
-
-impl From<WireKey> for SampleId {
-    fn from(WireKey { epoch, seq }: WireKey) -> Self {
-        SampleId { epoch, seq }
-    }
 }
 
 #[cfg(test)]

@@ -4,19 +4,7 @@ const PLAIN: &[u8] = b"bg\x04\0a frame";
 
 fn hello(agreement: &Agreement, candidate: Option<PublicKey>) -> Hello {
     let (key, heard_key) = agreement.for_hello(candidate);
-    Hello {
-        version: String::new(),
-        machine: String::new(),
-        heard: None,
-        key: Some(key),
-        heard_key,
-        fingerprint: 0,
-        run: 0,
-        is_cut_off: false,
-        lacks_request: false,
-        exports: Vec::new(),
-        is_ready: false,
-    }
+    Hello { key: Some(key), heard_key, ..Hello::default() }
 }
 
 fn agreements() -> [Agreement; 2] {

@@ -7,7 +7,7 @@ use std::os::unix::fs::PermissionsExt;
 
 use super::*;
 use crate::keys::{KeyRequest, make, renew_authority, revoke};
-use blindgrasp_graph::link::config::{Endpoints, key_files};
+use blindgrasp_graph::link::config::key_files;
 
 const FRAME: &[u8] = b"bg\x04\0a hello";
 
@@ -20,9 +20,9 @@ fn request(folder: &Path, machines: &[&str], namespace: Option<&str>) -> KeyRequ
         folder: folder.into(),
         machines: machines.iter().map(ToString::to_string).collect(),
         namespace: namespace.map(Into::into),
-        router: false,
         days: 90,
         renew: true,
+        ..KeyRequest::default()
     }
 }
 
@@ -37,16 +37,8 @@ fn config(folder: &Path, machine: &str, namespace: Option<&str>) -> LinkConfig {
         graph: "g".into(),
         namespace: namespace.map(Into::into),
         machine: machine.into(),
-        run: 1,
-        fingerprint: 0,
-        peers: Vec::new(),
-        exports: Vec::new(),
-        imports: Vec::new(),
-        endpoints: Endpoints::default(),
         keys: Some(key_files(folder, machine)),
-        insecure: false,
-        deadline_millis: 200,
-        buffer: 8,
+        ..LinkConfig::default()
     }
 }
 

@@ -2,7 +2,7 @@
 //! one direction or in both. Both ends are killed and restarted meanwhile. The ends find and lose each other by what their
 //! links say ([`Peer`](crate::peer::Peer)).
 
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::{BTreeSet, HashMap, VecDeque};
 
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -14,6 +14,7 @@ use crate::peer::{Change, Rejection};
 use crate::wire::Body;
 use blindgrasp_graph::link::config::KeyKind;
 use blindgrasp_operator::link_status::PeerState;
+use blindgrasp_operator::written::Written;
 
 const MILLI: u64 = 1_000_000;
 
@@ -47,8 +48,6 @@ struct Faults {
     kill_receiver: f64,
     most_kills: u32,
     new_epoch: f64,
-    /// Epochs are in no order, as after a clock was set back.
-    any_epoch: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -88,7 +87,7 @@ struct World {
     /// All samples of the writer, in order.
     written: Vec<SampleId>,
     /// The position of each of them, from 1.
-    places: BTreeMap<SampleId, usize>,
+    places: HashMap<SampleId, usize>,
     /// Number of samples that the sender has taken.
     n_taken: usize,
     sender: Outgoing,
@@ -117,16 +116,6 @@ struct World {
     has_faults: bool,
 }
 
-/// The committed samples that are not answered, as a file holds them.
-fn saved(sender: &Outgoing) -> Vec<KeptSample> {
-    let kept = |(key, origin_nanos, message): (SampleId, u64, &[u8])| KeptSample {
-        key,
-        origin_nanos,
-        message: message.into(),
-    };
-    sender.committed().map(kept).collect()
-}
-
 const SENDER: usize = 0;
 const RECEIVER: usize = 1;
 
@@ -137,9 +126,9 @@ impl World {
             rng: ChaCha8Rng::seed_from_u64(seed),
             now_millis: 1,
             written: Vec::new(),
-            places: BTreeMap::new(),
+            places: HashMap::new(),
             n_taken: 0,
-            sender: Outgoing::new(setting.options, None),
+            sender: Outgoing::new(setting.options, None, None),
             committed: None,
             spool: Default::default(),
             receiver: Incoming::new(setting.options.policy, seed, None),
@@ -188,12 +177,12 @@ impl World {
     fn commit_point(&mut self) -> Option<SampleId> {
         let now_nanos = self.now_nanos();
         if self.ends[SENDER].is_alive {
-            while let Some((key, origin_nanos, message)) = self.sender.next_to_save(now_nanos) {
-                self.spool.0.push(KeptSample { key, origin_nanos, message: message.into() });
+            while let Some(sample) = self.sender.next_to_save(now_nanos) {
+                self.spool.0.push(sample.clone());
                 self.sender.saved();
             }
             if self.happens(0.05) {
-                self.spool.0 = saved(&self.sender);
+                self.spool.0 = self.sender.committed().cloned().collect();
             }
             self.spool.1 = self.sender.n_lost_to_save();
             // It may be killed between the two.
@@ -230,9 +219,10 @@ impl World {
         if !self.ends[SENDER].is_alive && now_millis >= self.ends[SENDER].back_at_millis {
             self.ends[SENDER] = EndProcess::new(SENDER, self.ends[SENDER].link.own.instance + 1);
             let begun_after = self.committed;
-            self.sender = Outgoing::new(self.setting.options, begun_after);
+            let written = self.written.iter().fold(None, |written, key| Written::with(written, *key));
+            self.sender = Outgoing::new(self.setting.options, begun_after, written);
             self.sender.restore(std::mem::take(&mut self.spool.0), self.spool.1);
-            self.spool.0 = saved(&self.sender);
+            self.spool.0 = self.sender.committed().cloned().collect();
             self.n_taken = self.place_of(begun_after);
         }
         if !self.ends[RECEIVER].is_alive && now_millis >= self.ends[RECEIVER].back_at_millis {
@@ -301,10 +291,8 @@ impl World {
             let may_change = !is_lossless || commit_place == self.written.len();
             let next = match last {
                 Some(_) if may_change && self.happens(setting.faults.new_epoch) => {
-                    let epochs: BTreeSet<u64> = self.written.iter().map(|key| key.epoch).collect();
-                    let newest = epochs.last().expect("one") + 1;
-                    let any = self.rng.random_range(1..u64::MAX);
-                    key(if setting.faults.any_epoch { any } else { newest }, 0)
+                    // The values of epochs are in no order.
+                    key(self.rng.random_range(1..u64::MAX), 0)
                 }
                 Some(last) => key(last.epoch, last.seq + 1),
                 None => key(1 << 32, 0),
@@ -490,7 +478,6 @@ const BAD_NETWORK: Faults = Faults {
     kill_receiver: 0.0,
     most_kills: u32::MAX,
     new_epoch: 0.003,
-    any_epoch: true,
 };
 
 fn worlds(setting: Setting) -> impl Iterator<Item = World> {
@@ -540,8 +527,7 @@ fn a_receiver_that_is_killed_again_and_again_misses_nothing() {
 /// The sender is killed while it is cut off as well. Its successor sends the samples that the file holds.
 #[test]
 fn a_sender_that_is_killed_again_and_again_loses_nothing() {
-    // A new process knows the order of epochs by their numbers alone.
-    let faults = Faults { kill_sender: 0.004, any_epoch: false, ..BAD_NETWORK };
+    let faults = Faults { kill_sender: 0.004, ..BAD_NETWORK };
     let mut n_kills = 0;
     for world in worlds(setting(LOSSLESS, faults)) {
         assert_eq!((world.n_missing(), world.n_lost), (0, 0));
@@ -555,7 +541,6 @@ fn a_sender_that_is_killed_while_it_is_connected_loses_nothing() {
     // There are no cuts, so that the writer's history holds all samples that are not answered.
     let options = OutgoingOptions { capacity: 1_000_000, ..LOSSLESS };
     let faults = Faults { cut: 0.0, loss: 0.0, kill_sender: 0.004, kill_receiver: 0.0, ..BAD_NETWORK };
-    let faults = Faults { any_epoch: false, ..faults };
     for seed in 0..40 {
         let mut world = World::new(setting(options, faults), seed);
         world.run();
@@ -598,7 +583,7 @@ fn a_latest_channel_delivers_or_counts_each_sample_and_delivers_the_newest() {
 
 #[test]
 fn a_latest_channel_delivers_the_newest_when_either_end_is_killed() {
-    let faults = Faults { kill_sender: 0.003, kill_receiver: 0.003, any_epoch: false, ..BAD_NETWORK };
+    let faults = Faults { kill_sender: 0.003, kill_receiver: 0.003, ..BAD_NETWORK };
     for world in worlds(setting(LATEST, faults)) {
         world.delivered();
         assert_eq!(world.lives.iter().flatten().last(), world.written.last());

@@ -6,7 +6,9 @@ use std::collections::BTreeSet;
 
 use super::*;
 
-const N_SAMPLES: u64 = 3;
+/// The samples that are written. The values of their epochs fall and rise.
+const KEYS: [SampleId; 4] = [key(5, 0), key(2, 0), key(2, 1), key(9, 0)];
+const N_SAMPLES: usize = KEYS.len();
 /// The writer's limit; its history holds what is not committed.
 const CAPACITY: usize = 2;
 /// Late enough for a sample to be committed while the receiver is away.
@@ -19,30 +21,30 @@ const OPTIONS: OutgoingOptions = OutgoingOptions {
     stall_limit_nanos: u64::MAX,
 };
 
-fn key(seq: u64) -> SampleId {
-    SampleId { epoch: 1, seq }
+const fn key(epoch: u64, seq: u64) -> SampleId {
+    SampleId { epoch, seq }
 }
 
-/// The content of the file without samples that are needed no more.
-fn saved(sender: &Outgoing) -> Vec<KeptSample> {
-    let kept = |(key, origin_nanos, message): (SampleId, u64, &[u8])| KeptSample {
-        key,
-        origin_nanos,
-        message: message.into(),
-    };
-    sender.committed().map(kept).collect()
+/// How many samples there are up to this one.
+fn n_up_to(key: Option<SampleId>) -> usize {
+    key.map_or(0, |key| 1 + KEYS.iter().position(|other| *other == key).expect("one of them"))
+}
+
+/// The last of the first `n` samples.
+fn last_of(n: usize) -> Option<SampleId> {
+    Some(KEYS[n.checked_sub(1)?])
 }
 
 #[derive(Debug, Clone)]
 struct State {
-    n_written: u64,
+    n_written: usize,
     /// On the cursors: the sample up to which the writer forgets.
     committed: Option<SampleId>,
     /// The number of samples that the link has read.
-    n_read: u64,
+    n_read: usize,
     sender: Outgoing,
     spool: Vec<KeptSample>,
-    n_received: u64,
+    n_received: usize,
     is_wrong: bool,
     run: u32,
     n_kills: u32,
@@ -82,7 +84,7 @@ impl State {
             n_written: 0,
             committed: None,
             n_read: 0,
-            sender: Outgoing::new(OPTIONS, None),
+            sender: Outgoing::new(OPTIONS, None, None),
             spool: Vec::new(),
             n_received: 0,
             is_wrong: false,
@@ -95,10 +97,14 @@ impl State {
     /// The state after a step; `None` if the step is not possible.
     fn after(&self, step: Step, saves: bool) -> Option<State> {
         let mut next = self.clone();
-        let n_committed = self.committed.map_or(0, |committed| committed.seq + 1);
+        let n_committed = n_up_to(self.committed);
         match step {
             Step::Write => {
-                if self.n_written == N_SAMPLES || self.n_written - n_committed >= CAPACITY as u64 {
+                let Some(written) = KEYS.get(self.n_written) else { return None };
+                // A new epoch begins when the one before is answered.
+                let n_most =
+                    if last_of(self.n_written).is_some_and(|last| last.epoch != written.epoch) { 1 } else { CAPACITY };
+                if self.n_written - n_committed >= n_most {
                     return None;
                 }
                 next.n_written += 1;
@@ -107,13 +113,13 @@ impl State {
                 if self.n_read == self.n_written || !next.sender.wants_more(self.sender.run.is_some(), NOW_NANOS) {
                     return None;
                 }
-                next.sender.push(key(self.n_read), vec![self.n_read as u8], 0, 0);
+                next.sender.push(KEYS[self.n_read], vec![self.n_read as u8], 0, 0);
                 next.n_read += 1;
             }
             Step::Save => {
-                let (key, origin_nanos, message) = self.sender.next_to_save(NOW_NANOS)?;
+                let sample = self.sender.next_to_save(NOW_NANOS)?;
                 if saves {
-                    next.spool.push(KeptSample { key, origin_nanos, message: message.into() });
+                    next.spool.push(sample.clone());
                 }
                 next.sender.saved();
             }
@@ -128,16 +134,17 @@ impl State {
                 if kept.len() >= self.spool.len() {
                     return None;
                 }
-                next.spool = saved(&self.sender);
+                next.spool = self.sender.committed().cloned().collect();
             }
             Step::Kill => {
                 if self.n_kills == 2 {
                     return None;
                 }
                 next.n_kills += 1;
-                next.sender = Outgoing::new(OPTIONS, self.committed);
+                let written = KEYS[..self.n_written].iter().fold(None, |written, key| Written::with(written, *key));
+                next.sender = Outgoing::new(OPTIONS, self.committed, written);
                 next.sender.restore(self.spool.clone(), 0);
-                next.spool = saved(&next.sender);
+                next.spool = next.sender.committed().cloned().collect();
                 next.n_read = n_committed;
             }
             Step::Resume => {
@@ -170,21 +177,22 @@ impl State {
 
     fn resume(&mut self) {
         self.run += 1;
-        self.sender.on_resume(self.run, self.n_received.checked_sub(1).map(key));
+        self.sender.on_resume(self.run, last_of(self.n_received));
     }
 
     /// Hands the next sample to the receiver; false if none is due.
     fn deliver(&mut self) -> bool {
         let Some(next) = self.sender.next(NOW_NANOS) else { return false };
         // The receiver takes what comes, as from a writer whose numbers have gaps.
-        self.is_wrong |= next.key.seq != self.n_received;
-        self.n_received = self.n_received.max(next.key.seq + 1);
+        let n_received = n_up_to(Some(next.key));
+        self.is_wrong |= n_received != self.n_received + 1;
+        self.n_received = self.n_received.max(n_received);
         true
     }
 
     fn answer(&mut self) {
         let n = self.n_received;
-        self.sender.on_ack(self.run, n, n.checked_sub(1).map(key), NOW_NANOS);
+        self.sender.on_ack(self.run, n as u64, last_of(n), NOW_NANOS);
     }
 
     /// Whether the receiver gets all samples from here on without any fault.

@@ -3,13 +3,20 @@ use super::*;
 const EPOCH: u64 = 5;
 const NONE: [u64; 0] = [];
 const STALL_LIMIT: u64 = 3_000_000_000;
+const OPTIONS: OutgoingOptions = OutgoingOptions {
+    policy: EdgePolicy::Lossless,
+    window: 8,
+    capacity: 8,
+    buffer: 100,
+    stall_limit_nanos: STALL_LIMIT,
+};
 
 fn key(seq: u64) -> SampleId {
     SampleId { epoch: EPOCH, seq }
 }
 
 fn outgoing(policy: EdgePolicy, window: usize, capacity: usize, buffer: usize) -> Outgoing {
-    Outgoing::new(OutgoingOptions { policy, window, capacity, buffer, stall_limit_nanos: STALL_LIMIT }, None)
+    Outgoing::new(OutgoingOptions { policy, window, capacity, buffer, stall_limit_nanos: STALL_LIMIT }, None, None)
 }
 
 fn push(outgoing: &mut Outgoing, seqs: std::ops::Range<u64>) {
@@ -80,14 +87,7 @@ fn a_receiver_may_have_samples_that_are_no_longer_kept_or_not_yet_pushed() {
         assert_eq!(sent(&mut outgoing, 0), expected, "{after:?}");
     }
     // This process has taken over, and reads samples again that the receiver has from the earlier process.
-    let options = OutgoingOptions {
-        policy: EdgePolicy::Lossless,
-        window: 8,
-        capacity: 8,
-        buffer: 100,
-        stall_limit_nanos: STALL_LIMIT,
-    };
-    let mut outgoing = Outgoing::new(options, Some(key(1)));
+    let mut outgoing = Outgoing::new(OPTIONS, Some(key(1)), Written::with(None, key(4)));
     outgoing.on_resume(1, Some(key(4)));
     push(&mut outgoing, 2..7);
     assert_eq!(sent(&mut outgoing, 0), [5, 6]);
@@ -303,13 +303,6 @@ fn the_end_is_sent_when_all_is_answered_and_after_each_request() {
 #[test]
 fn a_process_that_takes_over_goes_on_with_what_was_saved() {
     let kept = |seq| KeptSample { key: key(seq), origin_nanos: 100 + seq, message: vec![seq as u8] };
-    let options = OutgoingOptions {
-        policy: EdgePolicy::Lossless,
-        window: 8,
-        capacity: 8,
-        buffer: 100,
-        stall_limit_nanos: STALL_LIMIT,
-    };
     // Saved samples, the last committed one, the last one that the receiver has, and the samples that it gets. The writer sends
     // those behind the committed one again.
     for (saved, committed, after, expected) in [
@@ -322,7 +315,7 @@ fn a_process_that_takes_over_goes_on_with_what_was_saved() {
         (4..8, 3, Some(3), vec![4, 5, 6, 7, 8, 9]),
         (4..6, 7, Some(7), vec![8, 9]),
     ] {
-        let mut outgoing = Outgoing::new(options, Some(key(committed)));
+        let mut outgoing = Outgoing::new(OPTIONS, Some(key(committed)), Written::with(None, key(8)));
         outgoing.restore(saved.clone().map(kept).collect(), 0);
         assert_eq!(outgoing.commit_point(), Some(key(committed)));
         push(&mut outgoing, committed + 1..10);

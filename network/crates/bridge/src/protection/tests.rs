@@ -5,7 +5,7 @@ use std::path::Path;
 use super::*;
 use crate::keys::{KeyRequest, make, revoke};
 use crate::peer::{Change, Own, Peer, Rejection};
-use blindgrasp_graph::link::config::{Endpoints, LinkConfig, key_files};
+use blindgrasp_graph::link::config::{LinkConfig, key_files};
 use blindgrasp_operator::link_status::PeerState;
 
 const DEADLINE_NANOS: u64 = 150_000_000;
@@ -31,10 +31,8 @@ fn keys(machines: &[&str]) -> tempfile::TempDir {
     let request = KeyRequest {
         folder: folder.path().into(),
         machines: machines.iter().map(ToString::to_string).collect(),
-        namespace: None,
-        router: false,
         days: 90,
-        renew: false,
+        ..KeyRequest::default()
     };
     make(&request, OffsetDateTime::now_utc()).expect("made");
     folder
@@ -44,18 +42,9 @@ fn keys(machines: &[&str]) -> tempfile::TempDir {
 fn end_as(folder: Option<&Path>, [machine, signer, peer]: [&str; 3], instance: u64) -> End {
     let config = LinkConfig {
         graph: "g".into(),
-        namespace: None,
         machine: signer.into(),
-        run: 1,
-        fingerprint: 9,
-        peers: Vec::new(),
-        exports: Vec::new(),
-        imports: Vec::new(),
-        endpoints: Endpoints::default(),
         keys: folder.map(|folder| key_files(folder, signer)),
-        insecure: false,
-        deadline_millis: 150,
-        buffer: 8,
+        ..LinkConfig::default()
     };
     let identity = Identity::load(&config, OffsetDateTime::now_utc()).expect("fit").map(Arc::new);
     let agreement = |_: &Arc<Identity>| Agreement::new(&config.key_prefix(), machine, peer, instance).expect("made");
@@ -304,10 +293,9 @@ fn a_machine_that_is_revoked_is_cut_off_until_it_has_a_new_certificate() {
     let request = KeyRequest {
         folder: folder.path().into(),
         machines: vec!["robot".into()],
-        namespace: None,
-        router: false,
         days: 90,
         renew: true,
+        ..KeyRequest::default()
     };
     make(&request, OffsetDateTime::now_utc()).expect("renewed");
     assert!(second(&mut robot, &mut brain, false));

@@ -3,7 +3,7 @@ use crate::sample;
 use blindgrasp_messages::{Header, Message, Phase, Stamped, TactileFrame};
 
 fn bodies(message: &[u8]) -> Vec<Body<'_>> {
-    let key = WireKey { epoch: u64::MAX, seq: 7 };
+    let key = SampleId { epoch: u64::MAX, seq: 7 };
     let channel = ExportedChannel {
         port: "contacts/contacts".into(),
         type_name: "blindgrasp/ContactSet/7".into(),
@@ -14,13 +14,13 @@ fn bodies(message: &[u8]) -> Vec<Body<'_>> {
         machine: "robot".into(),
         heard: Some(3),
         key: Some([7; 32]),
-        heard_key: None,
         fingerprint: u64::MAX,
         run: 5,
         is_cut_off: true,
         lacks_request: true,
         exports: vec![channel; 3],
         is_ready: true,
+        ..Hello::default()
     };
     let sample = SampleFrame {
         channel: 3,
@@ -135,15 +135,8 @@ fn names_are_short_and_printable_and_lists_are_not_endless() {
         let body = Body::Hello(Hello {
             version: version.into(),
             machine: "robot".into(),
-            heard: None,
-            key: None,
-            heard_key: None,
-            fingerprint: 1,
-            run: 2,
-            is_cut_off: false,
-            lacks_request: false,
             exports: vec![channel; n_exports],
-            is_ready: true,
+            ..Hello::default()
         });
         let bytes = encoded(&Frame { instance: 1, counter: 1, body });
         Frame::decode(&bytes).map(|_| ()).map_err(|error| error.to_string())
