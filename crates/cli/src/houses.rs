@@ -26,7 +26,7 @@ pub const LAB: House = House {
         ("train", "Train a model on recordings with labels"),
         ("evaluate", "Compare decisions with labels, on recordings or by folds"),
         ("trials", "Lift objects in simulated physics, as the paper did"),
-        ("model", "Describe, adapt or export a model, or rate approaches"),
+        ("model", "Describe or adapt a model, or rate approaches"),
         ("sensors", "Learn a healthy hand's sensors, or look for faults in recordings"),
         ("new hand", "A hand: its URDF and a pad layout"),
     ],

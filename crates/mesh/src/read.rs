@@ -46,8 +46,10 @@ pub fn is_mesh_file(path: &Path) -> bool {
     parser_of(path).is_some()
 }
 
+type Parser = fn(&[u8]) -> Result<Soup, Problem>;
+
 /// The parser of the format that a file's extension says, in upper or lower case.
-fn parser_of(path: &Path) -> Option<fn(&[u8]) -> Result<Soup, Problem>> {
+fn parser_of(path: &Path) -> Option<Parser> {
     let extension = path.extension()?.to_string_lossy().to_ascii_lowercase();
     Some(match extension.as_str() {
         "off" => off::parse,
