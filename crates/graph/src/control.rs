@@ -1,4 +1,4 @@
-//! How commands talk to a running graph: lines of JSON over the abstract unix socket that bears the graph's name.
+//! How commands talk to a running graph: lines of JSON over the unix socket that bears the graph's name.
 //!
 //! A client sends one [`Request`] a line and reads [`Reply`]s until the last one of its request. The launcher answers
 //! its own user only.
