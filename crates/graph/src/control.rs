@@ -134,6 +134,13 @@ pub enum Reply {
     },
 }
 
+impl Reply {
+    /// The refusal of a request that has changed nothing.
+    pub fn refusal(message: impl Into<String>) -> Reply {
+        Reply::Error { message: message.into(), rolled_back: false }
+    }
+}
+
 /// An output of a node that is shadowed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ShadowOutput {

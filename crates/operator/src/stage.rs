@@ -755,12 +755,12 @@ mod tests {
 
     /// A stage whose state is a number and the model that it belongs to.
     #[derive(Debug, PartialEq)]
-    struct Learner {
+    struct LearningStage {
         model: u64,
         n_learned: u64,
     }
 
-    impl Stage for Learner {
+    impl Stage for LearningStage {
         type In = Prediction;
         type Out = LiftDecision;
 
@@ -804,7 +804,7 @@ mod tests {
             (Some(&other), None, (Some(90), 0)),
             (None, None, (None, 0)),
         ] {
-            let mut stage = Learner { model: 1, n_learned: 304 };
+            let mut stage = LearningStage { model: 1, n_learned: 304 };
             let snapshot = restore_stage(&mut stage, found.map(Vec::as_slice), handed_over.map(Vec::as_slice));
             let last = snapshot.expect("restored").and_then(|snapshot| snapshot.last);
             assert_eq!((last.map(|last| last.seq), stage.n_learned), expected);
