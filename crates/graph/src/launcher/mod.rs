@@ -331,12 +331,17 @@ impl Launcher {
         let pins = graph.nodes.iter().map(|node| (node.id.clone(), node.sha256.clone())).collect();
         let server = server::serve(control, pins, &launcher.sender, audit).map_err(LaunchError::Control)?;
         launcher.clients.server = Some(server);
-        for idx in 0..launcher.members.len() {
-            if launcher.members[idx].active.is_none() {
-                launcher.spawn_active(idx)?;
+        launcher.spawn_all()?;
+        Ok(launcher)
+    }
+
+    fn spawn_all(&mut self) -> Result<(), LaunchError> {
+        for idx in 0..self.members.len() {
+            if self.members[idx].active.is_none() {
+                self.spawn_active(idx)?;
             }
         }
-        Ok(launcher)
+        Ok(())
     }
 
     /// The members that share the process of a member, itself included, in the graph's order.

@@ -371,9 +371,11 @@ mod tests {
         const VARIABLE: &str = "BLINDGRASP_TEST_LACKS";
         if std::env::var_os(VARIABLE).is_none() {
             let mut lacking = std::process::Command::new(std::env::current_exe().expect("this program"));
-            let name = std::thread::current().name().expect("the name of this test").to_owned();
-            let output = lacking.args(["--exact", &name, "--nocapture"]).env(VARIABLE, "1").output().expect("started");
-            return assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+            let name = "a_graph_without_threads_and_descriptors_can_be_stopped_and_says_why_it_does_nothing_else";
+            lacking.args(["--exact", &format!("launcher::server::tests::{name}")]).env(VARIABLE, "1");
+            let output = lacking.output().expect("started");
+            let said = String::from_utf8_lossy(&output.stdout);
+            return assert!(output.status.success() && said.contains("1 passed"), "{said}");
         }
         let served = served();
         let [silent, stopping] = [(); 2].map(|()| {

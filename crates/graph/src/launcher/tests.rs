@@ -1,6 +1,7 @@
 //! A launcher of one node, whose program is a script that reports like an operator.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::time::Duration;
@@ -23,6 +24,16 @@ pub(super) const STUB: &str = "stub";
 pub(super) struct Launched {
     pub(super) launcher: Launcher,
     _namespace: Namespace,
+    _logs: Logs,
+}
+
+/// The folder of its logs, which goes with it.
+struct Logs(PathBuf);
+
+impl Drop for Logs {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
 }
 
 /// Launches a script of sh, which finds `argument` in `$0`, and reports to descriptor 3. It has said that it is ready.
@@ -62,7 +73,8 @@ pub(super) fn launched(name: &str, script: &str, argument: &str) -> Launched {
     let started = Launcher::start(&graph, &name, plan, cursors, namespace.listener(), Arc::default(), options);
     let mut launcher = started.expect("started");
     assert_eq!(launcher.wait_until_ready(&|| true, &|| false).expect("ready"), None);
-    Launched { launcher, _namespace: namespace }
+    let logs = Logs(launcher.log_folder.path().into());
+    Launched { launcher, _namespace: namespace, _logs: logs }
 }
 
 /// A request of a client, and its replies.
