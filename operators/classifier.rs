@@ -61,7 +61,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         dictionary_id,
         memory: Memory::new(params.adapt),
         adapt: params.adapt,
-        reported: [0; 3],
+        reported: None,
     };
     stage::run(operator, "feature", "prediction", 0, identity, classify)
 }
@@ -75,8 +75,8 @@ struct Classify {
     /// Earlier frames of the open grasp, or of the day. It stays empty if the model judges each frame alone.
     memory: Memory,
     adapt: Adapt,
-    /// Kept and dropped lifts, and changes of the readings, in the node's status.
-    reported: [u64; 3],
+    /// Kept and dropped lifts, and changes of the readings, in the node's status; `None` if the launcher does not know them.
+    reported: Option<[u64; 3]>,
 }
 
 impl Stage for Classify {
@@ -95,8 +95,9 @@ impl Stage for Classify {
         encode_state((self.dictionary_id, &self.model.checksum, &self.memory), bytes)
     }
 
-    fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
+    fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
         self.memory = Memory::default();
+        let mut is_of_this_model = false;
         if let Some(bytes) = state {
             let ((dictionary_id, checksum, memory), _) =
                 bincode::serde::decode_from_slice::<(u64, String, Memory), _>(bytes, STATE_FORMAT)?;
@@ -104,14 +105,16 @@ impl Stage for Classify {
             if dictionary_id == self.dictionary_id {
                 self.memory = memory;
             }
+            is_of_this_model = checksum == self.model.checksum;
             // Another model has other log-odds.
-            if checksum != self.model.checksum {
+            if !is_of_this_model {
                 self.memory.lifts = OwnLifts::default();
             }
         }
         self.memory.adapt = self.adapt;
+        self.reported = None;
         self.report();
-        Ok(())
+        Ok(is_of_this_model)
     }
 
     fn look(&mut self) {
@@ -136,16 +139,16 @@ impl Classify {
     fn report(&mut self) {
         let lifts = &self.memory.lifts;
         let counts = [lifts.n_kept(), lifts.n_dropped(), lifts.n_changes()];
-        if counts == self.reported {
+        if self.reported == Some(counts) {
             return;
         }
-        if counts[2] > self.reported[2] && self.adapt == Adapt::On {
+        if self.reported.is_some_and(|reported| counts[2] > reported[2]) && self.adapt == Adapt::On {
             tracing::warn!(
                 "the hand's readings have changed (another skin, another gain): outcomes of lifts before are forgotten, and the \
                  model judges as it was trained until there are new ones"
             );
         }
-        self.reported = counts;
+        self.reported = Some(counts);
         let names = ["outcomes/kept", "outcomes/dropped", "outcomes/changes"].map(String::from);
         self.operator.has_counted_in_all(names.into_iter().zip(counts).collect::<BTreeMap<_, _>>());
     }

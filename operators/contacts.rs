@@ -168,7 +168,7 @@ impl Stage for FindContacts {
         }
     }
 
-    fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
+    fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
         if let Some(watch) = &mut self.watch {
             let restored = match state {
                 Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
@@ -176,6 +176,6 @@ impl Stage for FindContacts {
             };
             (watch.memory, watch.reported.grasp, watch.reported.counts) = restored;
         }
-        Ok(())
+        Ok(state.is_some())
     }
 }

@@ -199,7 +199,8 @@ impl Stage for Arbiter {
         encode_state((self.arbiter.state(), self.last, self.n_decisions, self.ended), bytes)
     }
 
-    fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<()> {
+    fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
+        let is_there = state.is_some();
         self.decided.clear();
         // Silence counts from now: before, this instance did not listen.
         self.last_arrival_nanos = blindgrasp_operator::monotonic_nanos();
@@ -213,7 +214,7 @@ impl Stage for Arbiter {
         self.has_replaced(&promise);
         self.report();
         (self.last, self.n_decisions) = (last, n_decisions);
-        Ok(())
+        Ok(is_there)
     }
 
     fn set(&mut self, params: &Map<String, Value>) -> anyhow::Result<()> {

@@ -277,7 +277,7 @@ fn say(stdin: &Mutex<Option<ChildStdin>>, line: &str) {
 /// The destination that the dataflow files of the graphs here name for a machine, or its name.
 fn host_of(machine: &str) -> anyhow::Result<String> {
     let mut hosts: Vec<String> = Vec::new();
-    for graph in running_graphs().unwrap_or_default() {
+    for graph in running_graphs() {
         let named = status(&graph).ok().and_then(|status| status.ssh_hosts.get(machine).cloned());
         hosts.extend(named);
     }

@@ -72,7 +72,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         && is_graph_name(name)
         && !path.exists()
     {
-        if running_graphs().unwrap_or_default().iter().any(|graph| graph == name) {
+        if running_graphs().iter().any(|graph| graph == name) {
             bail!("'{name}' is a running graph: blindgrasp ps {name} describes it, blindgrasp view {name} shows it");
         }
         let hands = builtin_names();

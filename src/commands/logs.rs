@@ -46,7 +46,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let folder = log_folder(arguments.graph.as_deref())?;
     let opened = LogTail::open(folder, arguments.operator.as_deref(), arguments.lines, u64::MAX);
     if let (Err(_), Some(name)) = (&opened, &arguments.operator)
-        && running_graphs().unwrap_or_default().contains(name)
+        && running_graphs().contains(name)
     {
         bail!("'{name}' is a running graph, expected one of its nodes: blindgrasp logs -g {name}");
     }

@@ -91,7 +91,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 
 fn listing() -> anyhow::Result<Listing> {
     let mut listing = Listing { graphs: Vec::new(), not_answering: Vec::new() };
-    for graph in running_graphs()? {
+    for graph in running_graphs() {
         match status(&graph) {
             Ok(status) => listing.graphs.push(completed(status)),
             Err(error) => {

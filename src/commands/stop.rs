@@ -33,7 +33,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(destination) = arguments.machine.destination()? {
         return destination.run();
     }
-    let graphs = if arguments.all { running_graphs()? } else { vec![pick_starting_graph(arguments.graph.as_deref())?] };
+    let graphs = if arguments.all { running_graphs() } else { vec![pick_starting_graph(arguments.graph.as_deref())?] };
     if graphs.is_empty() {
         print_diagnostic("no graph is running");
     }

@@ -108,6 +108,22 @@ fn decisions_that_cannot_be_written_are_an_error() {
     }
 }
 
+/// The program behind `run --json | program` dies.
+#[test]
+fn a_reader_of_the_decisions_that_has_gone_is_told_of_and_the_graph_goes_on() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (name, said) = (unique_name(), folder.path().join("said"));
+    let mut command = blindgrasp();
+    command.args(["run", "--json", "--name", &name]).args(FAST_FOREVER).arg(dataflow(folder.path(), &[]));
+    let stderr = std::fs::File::create(&said).expect("made");
+    let mut graph = command.stdout(Stdio::piped()).stderr(stderr).spawn().expect("started");
+    drop(graph.stdout.take());
+    let has_said = || std::fs::read_to_string(&said).expect("read");
+    wait_until(|| has_said().contains("stdout takes no more lines"), has_said);
+    run(&["stop", &name], 0);
+    assert_eq!(graph.wait().expect("waited").code(), Some(0), "{}", has_said());
+}
+
 /// The reason of a program that fails at its start is in the message, and it is not tried again and again.
 #[test]
 fn a_permanent_error_ends_at_once_and_says_why() {

@@ -19,7 +19,7 @@ pub fn answer_shell(command: impl Fn() -> Command) {
 }
 
 pub fn graphs() -> ArgValueCandidates {
-    ArgValueCandidates::new(|| candidates(running_graphs().unwrap_or_default()))
+    ArgValueCandidates::new(|| candidates(running_graphs()))
 }
 
 /// The other machines of the running graphs.
@@ -70,7 +70,7 @@ pub fn with_files(current: &OsStr, words: Vec<&str>) -> Vec<CompletionCandidate>
 fn of_status(words: fn(&GraphStatus) -> Vec<String>) -> ArgValueCandidates {
     ArgValueCandidates::new(move || {
         let mut found = Vec::new();
-        for graph in running_graphs().unwrap_or_default() {
+        for graph in running_graphs() {
             if let Ok(mut connection) = Connection::open(&graph)
                 && let Ok(Reply::Status(status)) = connection.ask(&Request::Status, ANSWER_LIMIT)
             {

@@ -1,4 +1,4 @@
-//! How commands talk to a running graph: lines of JSON over the abstract unix socket that bears the graph's name.
+//! How commands talk to a running graph: lines of JSON over the unix socket that bears the graph's name.
 //!
 //! A client sends one [`Request`] a line and reads [`Reply`]s until the last one of its request. The launcher answers
 //! its own user only.
@@ -132,6 +132,13 @@ pub enum Reply {
         /// Whether a replacement had taken over and the old operator is active again.
         rolled_back: bool,
     },
+}
+
+impl Reply {
+    /// The refusal of a request that has changed nothing.
+    pub fn refusal(message: impl Into<String>) -> Reply {
+        Reply::Error { message: message.into(), rolled_back: false }
+    }
 }
 
 /// An output of a node that is shadowed.

@@ -22,6 +22,9 @@ use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
 
 /// The end of a socket's name.
 const SUFFIX: &str = ".sock";
+/// The [`refusal`] of a socket that a process holds, and of one whose process has died.
+const HELD: Errno = Errno::PROTOTYPE;
+const DEAD: Errno = Errno::CONNREFUSED;
 /// The lock of a folder, which is held for less than a millisecond, is tried so often.
 const N_LOCK_TRIES: u32 = 300;
 const LOCK_PAUSE: Duration = Duration::from_millis(10);
@@ -81,7 +84,7 @@ impl Drop for ControlSocket {
 pub fn connect(graph: &str) -> rustix::io::Result<OwnedFd> {
     let mut outcome = Err(Errno::NOENT);
     for folder in own_folders() {
-        match connect_to(&path_in(&folder, graph)) {
+        match connect_to(&path_in(&folder, graph), SocketType::STREAM) {
             Err(Errno::NOENT) => {}
             // A folder may still have the socket of a dead process, and another one that of a living.
             Err(Errno::CONNREFUSED) => outcome = Err(Errno::CONNREFUSED),
@@ -91,76 +94,56 @@ pub fn connect(graph: &str) -> rustix::io::Result<OwnedFd> {
     outcome
 }
 
-fn connect_to(path: &Path) -> rustix::io::Result<OwnedFd> {
+fn connect_to(path: &Path, kind: SocketType) -> rustix::io::Result<OwnedFd> {
     let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-    let socket = rustix::net::socket_with(AddressFamily::UNIX, SocketType::STREAM, flags, None)?;
+    let socket = rustix::net::socket_with(AddressFamily::UNIX, kind, flags, None)?;
     rustix::net::connect(&socket, &SocketAddrUnix::new(path)?)?;
     Ok(socket)
 }
 
 /// The names under which processes listen, sorted.
-///
-/// # Errors
-/// The kernel's list of sockets cannot be read.
-pub fn names() -> Result<Vec<String>> {
-    // A file outlives a process that is killed; the kernel's list doesn't. Connecting would disturb those that listen.
-    let sockets = String::from_utf8_lossy(&std::fs::read("/proc/net/unix")?).into_owned();
-    let mut names = Vec::new();
-    for folder in own_folders() {
-        let listening = listening(&sockets, &folder);
-        names.extend(listening.into_iter().filter(|name| path_in(&folder, name).exists()));
-    }
+pub fn names() -> Vec<String> {
+    let mut names: Vec<String> =
+        sockets().filter(|(_, path)| refusal(path) == Some(HELD)).map(|(name, _)| name).collect();
     names.sort();
     names.dedup();
-    Ok(names)
+    names
+}
+
+/// The sockets of graphs, also those of dead processes: names and files.
+fn sockets() -> impl Iterator<Item = (String, PathBuf)> {
+    let entries = own_folders().into_iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flatten();
+    entries.filter_map(|entry| {
+        let entry = entry.ok()?;
+        let name = entry.file_name().to_str()?.strip_suffix(SUFFIX)?.to_string();
+        Some((name, entry.path()))
+    })
+}
+
+/// The error with which a socket refuses one of another type: it tells whether a process holds it, and nobody has to accept a
+/// client. The kernel's list of sockets has only those of one network namespace.
+fn refusal(path: &Path) -> Option<Errno> {
+    connect_to(path, SocketType::DGRAM).err()
 }
 
 /// The names of processes that were killed, with the files that they have left.
 pub fn dead() -> Vec<(String, PathBuf)> {
-    own_folders().iter().filter_map(|folder| dead_in(folder).ok()).flatten().collect()
+    let mut dead: Vec<(String, PathBuf)> = sockets().filter(|(_, path)| refusal(path) == Some(DEAD)).collect();
+    dead.sort();
+    dead
 }
 
 /// Removes the files of processes that were killed.
 pub fn remove_dead() {
-    for folder in own_folders() {
-        if let Ok(_lock) = lock(&folder) {
-            for (_, path) in dead_in(&folder).unwrap_or_default() {
-                let _ = std::fs::remove_file(path);
-            }
-        }
-    }
-}
-
-fn dead_in(folder: &Path) -> Result<Vec<(String, PathBuf)>> {
-    let living = names()?;
-    let mut dead = Vec::new();
-    for path in std::fs::read_dir(folder)?.filter_map(|entry| Some(entry.ok()?.path())) {
-        let name = path.file_name().and_then(|name| name.to_str()).and_then(|name| name.strip_suffix(SUFFIX));
-        // A container that shares the folder may have a list of sockets of its own.
-        if let Some(name) = name.filter(|name| !living.iter().any(|living| living == name))
-            && matches!(connect_to(&path), Err(Errno::CONNREFUSED))
+    for (_, path) in dead() {
+        // A process may have taken the name meanwhile.
+        if let Some(folder) = path.parent()
+            && let Ok(_lock) = lock(folder)
+            && refusal(&path) == Some(DEAD)
         {
-            dead.push((name.to_string(), path));
+            let _ = std::fs::remove_file(path);
         }
     }
-    dead.sort();
-    Ok(dead)
-}
-
-/// The names of sockets in a folder. The columns are number, references, protocol, flags, type, state, inode, path.
-fn listening(sockets: &str, folder: &Path) -> Vec<String> {
-    /// `__SO_ACCEPTCON`: it listens. Sockets of accepted connections have the same name.
-    const LISTENS: u32 = 1 << 16;
-    let names = sockets.lines().filter_map(|line| {
-        let columns: Vec<&str> = line.split_whitespace().collect();
-        let is_listening = u32::from_str_radix(columns.get(3)?, 16).is_ok_and(|flags| flags & LISTENS != 0);
-        let name = Path::new(columns.get(7)?).strip_prefix(folder).ok()?.to_str()?.strip_suffix(SUFFIX)?;
-        is_listening.then(|| name.to_string())
-    });
-    let mut names: Vec<String> = names.collect();
-    names.sort();
-    names.dedup();
-    names
 }
 
 /// The socket at which a live tactile source listens by default: other users cannot send frames.
@@ -301,13 +284,13 @@ mod tests {
         assert_eq!(connect(&name).expect_err("nobody listens"), Errno::NOENT);
         let socket = ControlSocket::bind(&name).expect("free");
         assert_eq!(std::fs::metadata(&folder).expect("made").mode() & 0o777, 0o700);
-        assert!(names().expect("read").contains(&name));
+        assert!(names().contains(&name));
         assert_eq!(ControlSocket::bind(&name).expect_err("taken").kind(), ErrorKind::AddrInUse);
         drop(socket);
         assert!(!path_of(&name).exists());
         // A process that is killed leaves the file.
         drop(UnixListener::bind(path_of(&name)).expect("free"));
-        assert!(!names().expect("read").contains(&name) && path_of(&name).exists());
+        assert!(!names().contains(&name) && path_of(&name).exists());
         assert!(dead().contains(&(name.clone(), path_of(&name))));
         remove_dead();
         assert!(!path_of(&name).exists());
@@ -363,17 +346,28 @@ mod tests {
         assert_ne!(choose(&drawn(parent.path(), "blindgrasp-77"), own_uid()).expect("made"), made);
     }
 
+    /// The kernel has a list of sockets for each network namespace: a container with the files of its host has another one.
     #[test]
-    fn sockets_that_listen_in_the_folder_are_listed() {
-        let sockets = "Num       RefCount Protocol Flags    Type St Inode Path
-000000009338ee63: 00000003 00000000 00000000 0001 03  1574
-000000009338ee64: 00000002 00000000 00010000 0001 01  1575 /tmp/blindgrasp-1000/gate.sock
-000000009338ee65: 00000003 00000000 00000000 0001 03  1576 /tmp/blindgrasp-1000/gate.sock
-000000009338ee66: 00000003 00000000 00000000 0001 03  1577 /tmp/blindgrasp-1000/accepted.sock
-000000009338ee67: 00000002 00000000 00010000 0001 01  1578 /tmp/blindgrasp-100/other-user.sock
-000000009338ee68: 00000002 00000000 00010000 0001 01  1579 @/tmp/blindgrasp-1000/abstract.sock
-000000009338ee6a: 00000002 00000000 00010000 0001 01  1581 /tmp/blindgrasp-1000/arm-2.sock
-";
-        assert_eq!(listening(sockets, Path::new("/tmp/blindgrasp-1000")), ["arm-2", "gate"]);
+    fn a_graph_in_another_network_namespace_is_seen() {
+        const VARIABLE: &str = "BLINDGRASP_TEST_SEES";
+        if let Ok(name) = std::env::var(VARIABLE) {
+            return assert!(names().iter().any(|seen| *seen == name));
+        }
+        let elsewhere = |program: &std::ffi::OsStr| {
+            let mut command = std::process::Command::new("unshare");
+            command.arg("--net").arg(program);
+            command
+        };
+        if !elsewhere("true".as_ref()).output().is_ok_and(|output| output.status.success()) {
+            eprintln!("SKIPPED: this user may make no network namespace");
+            return;
+        }
+        let name = format!("seen-{}", std::process::id());
+        let _socket = ControlSocket::bind(&name).expect("free");
+        let mut looking = elsewhere(std::env::current_exe().expect("this program").as_os_str());
+        looking.args(["--exact", "control_socket::tests::a_graph_in_another_network_namespace_is_seen"]);
+        let looked = looking.env(VARIABLE, name).output().expect("started");
+        let said = String::from_utf8_lossy(&looked.stdout);
+        assert!(looked.status.success() && said.contains("1 passed"), "{said}");
     }
 }

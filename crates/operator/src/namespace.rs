@@ -83,6 +83,11 @@ pub enum NamespaceError {
     Unprotected,
     #[error("{} must be a folder of this user with mode 0700, as the launcher made it", folder.display())]
     Foreign { folder: PathBuf },
+    #[error(
+        "{} is gone, expected as long as the graph runs: another program has removed it; stop the graph and start it again",
+        folder.display()
+    )]
+    Removed { folder: PathBuf },
     #[error("cannot join the graph's shared memory at {}", folder.display())]
     Join { folder: PathBuf, source: BoxedError },
 }
@@ -315,6 +320,10 @@ pub fn join(domain: &NamespaceWiring, node: &str) -> Result<Node<PrivateService>
     if !metadata.is_dir() || metadata.uid() != own_uid() || metadata.mode() & OTHERS != 0 {
         return Err(NamespaceError::Foreign { folder: domain.folder.clone() });
     }
+    // iceoryx2 would make a new one, in which this process finds none of the others.
+    if !domain.ports().is_dir() {
+        return Err(NamespaceError::Removed { folder: domain.ports() });
+    }
     let config = config(domain)?;
     let name = NodeName::new(node).map_err(|error| refused(error.into()))?;
     NodeBuilder::new()
@@ -440,6 +449,16 @@ mod tests {
         std::fs::set_permissions(folder, Permissions::from_mode(0o755)).expect("opened");
         let refused = join(namespace.wiring(), "three").expect_err("open to others");
         assert!(matches!(refused, NamespaceError::Foreign { .. }), "{refused}");
+    }
+
+    #[test]
+    fn a_process_does_not_join_a_graph_whose_files_were_removed() {
+        let namespace = reserved("removed");
+        std::fs::remove_dir_all(namespace.wiring().ports()).expect("removed");
+        let refused = join(namespace.wiring(), "one").expect_err("nobody would find it");
+        assert!(matches!(refused, NamespaceError::Removed { .. }), "{refused}");
+        std::fs::remove_dir_all(&namespace.wiring().folder).expect("removed");
+        assert!(join(namespace.wiring(), "one").is_err());
     }
 
     #[test]

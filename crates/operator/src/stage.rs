@@ -29,6 +29,10 @@ const QUICK_NANOS: u64 = 20_000;
 /// A standby reports that it is warm after so many samples.
 pub(crate) const N_WARM: u64 = 8;
 
+/// The warning of an operator that takes over again from a replacement without a state, or with that of something else.
+pub(crate) const STATE_OF_HAND_OVER: &str = "the failed replacement has left no state that this operator can use: it goes on \
+     with its state of the hand-over, without the samples since";
+
 /// The format of states: numbers of fixed size, which cost bytes but hardly any time.
 pub const STATE_FORMAT: bincode::config::Configuration<bincode::config::LittleEndian, bincode::config::Fixint> =
     bincode::config::standard().with_fixed_int_encoding();
@@ -92,12 +96,13 @@ pub trait Stage {
         Ok(())
     }
 
-    /// Takes over a state that another instance has written, or begins anew.
+    /// Takes over a state that another instance has written, or begins anew. False if it cannot go on with all of that state,
+    /// for example because another model has written it, or if there is none.
     ///
     /// # Errors
     /// The state cannot be decoded.
-    fn restore(&mut self, _state: Option<&[u8]>) -> anyhow::Result<()> {
-        Ok(())
+    fn restore(&mut self, _state: Option<&[u8]>) -> anyhow::Result<bool> {
+        Ok(false)
     }
 
     /// Takes new values of its live parameters.
@@ -195,6 +200,8 @@ struct Instance<S: Stage> {
     outbox: Outbox<S::Out>,
     /// Memory for the bytes of its state.
     saved: Vec<u8>,
+    /// The saved state with which it has handed over, in case that its replacement fails.
+    handed_over: Option<Vec<u8>>,
     /// Of a stage with state: the work that was begun and gave way.
     pending: Option<Pending<S::In>>,
     /// It has said that the graph must end.
@@ -252,6 +259,7 @@ pub fn run<S: Stage + 'static>(
         answers: Answers::with_capacity(max_items),
         outbox: Outbox::new(),
         saved: Vec::new(),
+        handed_over: None,
         pending: None,
         is_unfit: false,
         is_active: !operator.begins_as_standby(),
@@ -353,6 +361,7 @@ impl<S: Stage> Instance<S> {
                 Command::HandOver => {
                     self.is_active = false;
                     self.put_pending_back();
+                    self.handed_over = if self.has_state { self.operator.saved_state() } else { None };
                     self.operator.handed_over();
                 }
                 Command::Set { id, params } => {
@@ -681,18 +690,39 @@ impl<S: Stage> Instance<S> {
         Ok(())
     }
 
-    /// Takes over the saved state; `None` if the stage has none or no state was saved, so that it begins anew.
+    /// Takes over the saved state; `None` if the stage has none or no state was saved.
     fn restore(&mut self) -> anyhow::Result<Option<Snapshot>> {
         let saved = if self.has_state { self.operator.saved_state() } else { None };
-        let Some(bytes) = saved else {
-            self.stage.restore(None)?;
-            return Ok(None);
-        };
-        let (snapshot, n_bytes) = bincode::serde::decode_from_slice::<Snapshot, _>(&bytes, STATE_FORMAT)
-            .context("the node's saved state cannot be read")?;
-        self.stage.restore(Some(&bytes[n_bytes..]))?;
-        Ok(Some(snapshot))
+        restore_stage(&mut self.stage, saved.as_deref(), self.handed_over.take().as_deref())
     }
+}
+
+/// Gives a stage the saved state. Where its replacement, which has failed, has left none that it can use, it goes on with the
+/// state with which it handed over; the place in the stream stays that of the replacement.
+fn restore_stage(
+    stage: &mut impl Stage,
+    saved: Option<&[u8]>,
+    handed_over: Option<&[u8]>,
+) -> anyhow::Result<Option<Snapshot>> {
+    let (mut snapshot, mut state) = (None, None);
+    if let Some(bytes) = saved {
+        let (found, rest) = decode_snapshot(bytes)?;
+        (snapshot, state) = (Some(found), Some(rest));
+    }
+    if !stage.restore(state)?
+        && let Some(bytes) = handed_over
+    {
+        stage.restore(Some(decode_snapshot(bytes)?.1))?;
+        tracing::warn!("{STATE_OF_HAND_OVER}");
+    }
+    Ok(snapshot)
+}
+
+/// A saved state, and in it the bytes of the stage's own.
+fn decode_snapshot(bytes: &[u8]) -> anyhow::Result<(Snapshot, &[u8])> {
+    let (snapshot, n_bytes) =
+        bincode::serde::decode_from_slice(bytes, STATE_FORMAT).context("the node's saved state cannot be read")?;
+    Ok((snapshot, &bytes[n_bytes..]))
 }
 
 /// The next sample: one that was taken and not answered, or the next in order.
@@ -714,5 +744,70 @@ pub(crate) fn arrival_nanos(operator: &Operator, header: &Header) -> u64 {
     match operator.clock() {
         Clock::Machine => crate::monotonic_nanos(),
         Clock::Recording => header.origin_nanos,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use blindgrasp_messages::{LiftDecision, Prediction};
+
+    use super::*;
+
+    /// A stage whose state is a number and the model that it belongs to.
+    #[derive(Debug, PartialEq)]
+    struct LearningStage {
+        model: u64,
+        n_learned: u64,
+    }
+
+    impl Stage for LearningStage {
+        type In = Prediction;
+        type Out = LiftDecision;
+
+        fn answer(
+            &mut self,
+            _: &<Prediction as Message>::Head,
+            _: &[<Prediction as Message>::Item],
+            _: u64,
+            _: &mut Answers<LiftDecision>,
+        ) {
+        }
+
+        fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
+            let saved = state.map(|bytes| bincode::serde::decode_from_slice::<(u64, u64), _>(bytes, STATE_FORMAT));
+            let (model, n_learned) = saved.transpose()?.map_or((0, 0), |(saved, _)| saved);
+            self.n_learned = if model == self.model { n_learned } else { 0 };
+            Ok(model == self.model)
+        }
+    }
+
+    fn saved(seq: u64, model: u64, n_learned: u64) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        let last = Some(SampleId { epoch: 3, seq });
+        encode_state((last, InputCounts::default(), VecDeque::<Entry>::new()), &mut bytes).expect("encoded");
+        encode_state((model, n_learned), &mut bytes).expect("encoded");
+        bytes
+    }
+
+    #[test]
+    fn an_operator_whose_replacement_fails_goes_on_with_what_it_has_learned() {
+        let own = saved(10, 1, 304);
+        let other = saved(90, 2, 7);
+        let newer = saved(90, 1, 310);
+        for (found, handed_over, expected) in [
+            // Its replacement had another model, or no state, which drops the saved one.
+            (Some(&other), Some(&own), (Some(90), 304)),
+            (None, Some(&own), (None, 304)),
+            // Its replacement has gone on with its state.
+            (Some(&newer), Some(&own), (Some(90), 310)),
+            // It has not been active before.
+            (Some(&other), None, (Some(90), 0)),
+            (None, None, (None, 0)),
+        ] {
+            let mut stage = LearningStage { model: 1, n_learned: 304 };
+            let snapshot = restore_stage(&mut stage, found.map(Vec::as_slice), handed_over.map(Vec::as_slice));
+            let last = snapshot.expect("restored").and_then(|snapshot| snapshot.last);
+            assert_eq!((last.map(|last| last.seq), stage.n_learned), expected);
+        }
     }
 }

@@ -118,7 +118,7 @@ mod tests {
         }
     }
 
-    /// Each repetition of a recording with several epochs goes on with the numbers of each of them.
+    /// A source may go on with an epoch that it has left.
     #[test]
     fn an_epoch_that_comes_back_with_higher_numbers_is_a_later_one() {
         let written = after(&[id(1, 0), id(1, 1), id(2, 0), id(1, 2)]);

@@ -1,11 +1,13 @@
 //! A recording played once or several times, from wherever its readers are.
 //!
 //! Samples keep their recorded numbers and times; each repetition continues the numbers, times and grasps of the one
-//! before it. So a player that comes back after a crash finds its place by the number that its readers answered last.
+//! before it. Of a recording with several epochs, it repeats the numbers and has other epochs: as in the first round, each of
+//! them begins with its source's first sample. So a player that comes back after a crash finds its place by the number that its readers answered last.
 //!
 //! A small recording is read through when it is opened, and its samples are kept in the form in which they lie in shared
 //! memory: to play them, nothing is read, decoded or allocated. Other recordings are read while they are played.
 
+use std::collections::BTreeSet;
 use std::ops::Range;
 use std::path::PathBuf;
 
@@ -20,6 +22,8 @@ use blindgrasp_recording::{Reach, RecordingIndex};
 
 /// A larger recording is not read through before its first sample goes out: that would take seconds.
 const MAX_CHECKED_BYTES: u64 = 64 << 20;
+/// The distance of the epochs of two repetitions, so great that they are not those of the recording.
+const EPOCH_STEP: u64 = 1 << 32;
 /// Samples that take more memory are not kept. Every graph on the machine may have a player.
 const MAX_KEPT_BYTES: usize = 64 << 20;
 
@@ -147,8 +151,8 @@ impl<M: Played> Player<M> {
         }
         let n_frames = self.extent.as_ref().map_or(0, |extent| extent.n_frames);
         self.repetition = self.extent.as_ref().map_or(0, |extent| match extent.n_truth_numbers {
-            0 => self.frames.repetition(extent.n_frame_numbers),
-            n => self.frames.repetition(extent.n_frame_numbers).min(self.truths.repetition(n)),
+            0 => self.frames.repetition(extent, extent.n_frame_numbers),
+            n => self.frames.repetition(extent, extent.n_frame_numbers).min(self.truths.repetition(extent, n)),
         });
         self.n_frames = self.repetition.saturating_mul(n_frames);
         Ok(true)
@@ -265,12 +269,17 @@ impl<M: Played> Player<M> {
     fn shifted(&self, recorded: &Header, n_numbers: impl Fn(&Extent) -> u64) -> Header {
         let (n_numbers, duration_nanos) =
             self.extent.as_ref().map_or((0, 0), |extent| (n_numbers(extent), extent.duration_nanos()));
-        Header {
-            seq: recorded.seq.saturating_add(self.repetition.saturating_mul(n_numbers)),
+        let mut header = Header {
             stamp_nanos: recorded.stamp_nanos.saturating_add(self.repetition.saturating_mul(duration_nanos)),
             hand_id: if recorded.hand_id == 0 { self.hand_id } else { recorded.hand_id },
             ..*recorded
+        };
+        if self.extent.as_ref().is_some_and(Extent::has_several_epochs) {
+            header.epoch = recorded.epoch.wrapping_add(self.repetition.wrapping_mul(EPOCH_STEP));
+        } else {
+            header.seq = recorded.seq.saturating_add(self.repetition.saturating_mul(n_numbers));
         }
+        header
     }
 
     fn shifted_grasp_id(&self, recorded: u64) -> u64 {
@@ -330,8 +339,13 @@ struct Resume {
 
 impl Resume {
     /// The repetition of that sample.
-    fn repetition(&self, n_numbers: u64) -> u64 {
-        self.after.map_or(0, |key| key.seq / n_numbers.max(1))
+    fn repetition(&self, extent: &Extent, n_numbers: u64) -> u64 {
+        let Some(after) = self.after else { return 0 };
+        if !extent.has_several_epochs() {
+            return after.seq / n_numbers.max(1);
+        }
+        let distances = extent.epochs.iter().map(|epoch| after.epoch.wrapping_sub(*epoch));
+        distances.filter(|distance| distance % EPOCH_STEP == 0).min().map_or(0, |distance| distance / EPOCH_STEP)
     }
 
     /// Whether the readers have this sample. Samples must be asked for in order.
@@ -351,6 +365,8 @@ impl Resume {
 /// What a recording has, once it was read through.
 #[derive(Default)]
 struct Extent {
+    /// Those of the frames.
+    epochs: BTreeSet<u64>,
     n_frames: u64,
     /// One more than the greatest number of a frame.
     n_frame_numbers: u64,
@@ -365,7 +381,8 @@ impl Extent {
     fn add(&mut self, next: &Next) {
         let grasp_id = match next {
             Next::Frame(frame) => {
-                let Header { seq, stamp_nanos, .. } = frame.header;
+                let Header { seq, stamp_nanos, epoch, .. } = frame.header;
+                self.epochs.insert(epoch);
                 self.n_frames += 1;
                 self.n_frame_numbers = self.n_frame_numbers.max(seq.saturating_add(1));
                 let (first, last, step) = self.stamps.unwrap_or((stamp_nanos, stamp_nanos, 0));
@@ -380,6 +397,10 @@ impl Extent {
             Next::Nothing => return,
         };
         self.n_grasp_ids = self.n_grasp_ids.max(grasp_id.saturating_add(1));
+    }
+
+    fn has_several_epochs(&self) -> bool {
+        self.epochs.len() > 1
     }
 
     /// From the first frame to the time at which the first frame of the next repetition is due.
@@ -414,13 +435,22 @@ mod tests {
 
     /// Grasps of three frames each, a second apart, with a label before each grasp. The fifth frame was lost.
     fn write(writer: &mut RecordingWriter, n_grasps: u64, n_cells: usize) {
+        write_in_epochs(writer, n_grasps, n_cells, u64::MAX);
+    }
+
+    /// As [`write`]. Each `n_in_epoch` grasps are of an epoch of their own, whose numbers begin at 0.
+    fn write_in_epochs(writer: &mut RecordingWriter, n_grasps: u64, n_cells: usize, n_in_epoch: u64) {
         for grasp_id in 0..n_grasps {
-            let header = Header { seq: grasp_id, stamp_nanos: grasp_id * 3_000_000_000, epoch: 2, ..Header::default() };
+            let epoch = 2 + grasp_id / n_in_epoch;
+            let seq = grasp_id % n_in_epoch;
+            let header = Header { seq, stamp_nanos: grasp_id * 3_000_000_000, epoch, ..Header::default() };
             let object = format!("object {grasp_id}");
             let message = GraspTruth { grasp_id, epsilon: 0.1 * grasp_id as f64, object, ..GraspTruth::default() };
             writer.write("/truth", &Stamped { header, message }).expect("written");
             for seq in (grasp_id * 3..).take(3).filter(|seq| *seq != 4) {
-                let header = Header { seq, stamp_nanos: seq * 1_000_000_000, epoch: 2, ..Header::default() };
+                let stamp_nanos = seq * 1_000_000_000;
+                let header =
+                    Header { seq: seq % n_in_epoch.saturating_mul(3), stamp_nanos, epoch, ..Header::default() };
                 let cells_newtons = (0..n_cells).map(|idx| (seq as f64 + idx as f64 * 0.7).sin()).collect();
                 let joints = vec![seq as f64; 1 + grasp_id as usize % 4];
                 let message = TactileFrame { grasp_id, joints, cells_newtons, ..TactileFrame::default() };
@@ -492,18 +522,33 @@ mod tests {
 
     #[test]
     fn a_player_that_comes_back_goes_on_in_the_middle_of_a_repetition() {
-        let path = recording(|writer| write(writer, 4, 2));
-        let program = program(&path, Selection::default(), 3);
-        let whole = play(&mut open(&program, WAYS[0])).expect("played");
-        for way in WAYS {
-            for n_sent in 0..=whole.len() {
-                let (sent, rest) = whole.split_at(n_sent);
-                let last = |of_frames| sent.iter().rfind(|(_, is_frame, _)| *is_frame == of_frames).map(|(.., id)| *id);
-                let mut player = open(&program, way);
-                assert!(player.resume(last(true), last(false), &mut || true).expect("resumed"));
-                assert_eq!(play(&mut player).expect("played"), rest, "after {n_sent} samples, {way:?}");
+        for n_in_epoch in [u64::MAX, 2] {
+            let path = recording(|writer| write_in_epochs(writer, 4, 2, n_in_epoch));
+            let program = program(&path, Selection::default(), 3);
+            let whole = play(&mut open(&program, WAYS[0])).expect("played");
+            for way in WAYS {
+                for n_sent in 0..=whole.len() {
+                    let (sent, rest) = whole.split_at(n_sent);
+                    let last =
+                        |of_frames| sent.iter().rfind(|(_, is_frame, _)| *is_frame == of_frames).map(|(.., id)| *id);
+                    let mut player = open(&program, way);
+                    assert!(player.resume(last(true), last(false), &mut || true).expect("resumed"));
+                    assert_eq!(play(&mut player).expect("played"), rest, "after {n_sent} samples, {way:?}");
+                }
             }
         }
+    }
+
+    /// The arbiter trusts a new epoch from its source's first sample on, which has the number 0.
+    #[test]
+    fn each_epoch_of_a_repetition_begins_as_that_of_the_first_round() {
+        let path = recording(|writer| write_in_epochs(writer, 4, 2, 2));
+        let played = play(&mut open(&program(&path, Selection::default(), 3), WAYS[0])).expect("played");
+        let frames: Vec<SampleId> = played.iter().filter(|(_, is_frame, _)| *is_frame).map(|(.., id)| *id).collect();
+        let firsts: Vec<&[SampleId]> = frames.chunk_by(|a, b| a.epoch == b.epoch).collect();
+        assert!(firsts.len() == 6 && firsts.iter().all(|samples| samples[0].seq == 0), "{firsts:?}");
+        let epochs: BTreeSet<u64> = frames.iter().map(|id| id.epoch).collect();
+        assert_eq!(epochs.len(), 6, "none comes again");
     }
 
     #[test]

@@ -10,7 +10,7 @@ use crate::run::Tap;
 use blindgrasp_graph::log::printable;
 use blindgrasp_graph::run::{RunSink, SeenDecision};
 use blindgrasp_messages::{Action, GraspTruth, LiftOutcome};
-use blindgrasp_operator::diagnostics::LinePrinter;
+use blindgrasp_operator::diagnostics::{LinePrinter, print_diagnostic};
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::text::harmless;
 use blindgrasp_recording::Record;
@@ -34,6 +34,7 @@ pub(super) struct Console {
     is_coloured: bool,
     /// Decisions are made and recorded whether or not stdout is read.
     pub(super) printer: LinePrinter,
+    has_said_that_nobody_reads: bool,
     pub(super) recorder: Option<Recorder>,
     pub(super) report: Option<RunReport>,
     tap: Option<Tap>,
@@ -70,7 +71,7 @@ impl Console {
         let variable = |name| std::env::var_os(name).unwrap_or_default();
         let is_coloured =
             std::io::stdout().is_terminal() && variable("NO_COLOR").is_empty() && variable("TERM") != "dumb";
-        Console { json, is_quiet, is_coloured, printer, recorder, report, tap }
+        Console { json, is_quiet, is_coloured, printer, has_said_that_nobody_reads: false, recorder, report, tap }
     }
 }
 
@@ -94,6 +95,11 @@ impl RunSink for Console {
         }
         if self.is_quiet {
             return Ok(());
+        }
+        if self.printer.has_ended() && !std::mem::replace(&mut self.has_said_that_nobody_reads, true) {
+            print_diagnostic(
+                "blindgrasp: stdout takes no more lines: the graph goes on, and its decisions are not printed",
+            );
         }
         let SeenDecision { header, decision, latency_nanos, truth } = *seen;
         let mut decision = decision.clone();

@@ -1,10 +1,13 @@
 //! A model learns from the lifts of the robot that it runs on: outcomes are labels, correct a model, and correct a running graph.
 
 use std::path::Path;
+use std::process::Stdio;
 
 use crate::common::live::{PATIENT, changed, grasps, listening};
 use crate::common::python::utf8;
-use crate::common::{Graph, HAND, MODEL, dataflow, json_lines, json_of, project, run, text, wait_until};
+use crate::common::{
+    Graph, HAND, MODEL, blindgrasp, dataflow, json_lines, json_of, project, run, signal, text, wait_until,
+};
 use crate::import::pincer;
 use blindgrasp_messages::{Header, Phase, Stamped, TactileFrame};
 use blindgrasp_stages::own_lifts::Adapt;
@@ -202,6 +205,15 @@ fn a_graph_learns_from_its_lifts_through_kills_and_swaps() {
     tell(&mut judge, 30..60);
     run(&["swap", "classifier", "--probation", "0", "--graph", &graph.name], 0);
     tell(&mut judge, 60..90);
+    // A replacement that does not learn has no state. It fails, and the old one goes on with what it has learned.
+    let old = graph.pid_of("classifier");
+    let mut swapping = blindgrasp();
+    swapping.args(["swap", "classifier", "--set", "adapt=off", "--probation", "60", "--graph", &graph.name]);
+    let mut swapping = swapping.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("started");
+    wait_until(|| graph.pid_of("classifier") != old, || graph.said());
+    signal(graph.pid_of("classifier"), rustix::process::Signal::KILL);
+    assert_eq!(swapping.wait().expect("waited").code(), Some(1));
+    assert_eq!(graph.pid_of("classifier"), old, "{}", graph.said());
     let set = |adapt: &str| drop(run(&["set", &format!("classifier.adapt={adapt}"), "--graph", &graph.name], 0));
     set("frozen");
     judge.adapt(Adapt::Frozen);

@@ -218,7 +218,7 @@ fn say_if_silent(poller: &Poller, view: &mut View) -> bool {
 fn next_graph(poller: &mut Poller, view: &mut View) {
     let shown = view.now.status.graph.clone();
     let has_ended = view.has_ended();
-    let mut graphs = running_graphs().unwrap_or_default();
+    let mut graphs = running_graphs();
     let n_before = graphs.partition_point(|graph| *graph <= shown);
     graphs.rotate_left(n_before);
     let next = graphs.into_iter().find(|graph| *graph != shown || has_ended);

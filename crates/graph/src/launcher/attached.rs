@@ -40,7 +40,7 @@ impl Launcher {
                     Some(AttachedReader { client, reply: reply.clone(), is_flight_recorder });
                 Reply::Attached(attachment)
             }
-            Err(message) => Reply::Error { message, rolled_back: false },
+            Err(message) => Reply::refusal(message),
         };
         let _ = reply.try_send(answer);
     }
@@ -100,7 +100,7 @@ impl Launcher {
         })
     }
 
-    fn last_sent_at(&self, port: &Port) -> Option<blindgrasp_operator::cursors::SampleId> {
+    pub(super) fn last_sent_at(&self, port: &Port) -> Option<blindgrasp_operator::cursors::SampleId> {
         self.cursors.output(self.plan.output_slot(port)?).key()
     }
 

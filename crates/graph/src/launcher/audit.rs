@@ -12,6 +12,7 @@ use blindgrasp_operator::wiring::{LogEntry, LogLevel};
 const MAX_CHARS: usize = 300;
 
 /// The requests of one connection.
+#[derive(Clone)]
 pub(super) struct Trail {
     log: Log,
     client: String,

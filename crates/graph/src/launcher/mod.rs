@@ -18,9 +18,13 @@ mod log_writer;
 mod process;
 mod server;
 mod service;
+mod set;
 mod slow_nodes;
+mod starter;
 mod supervision;
 mod swap;
+#[cfg(test)]
+mod tests;
 mod wake_policy;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -30,10 +34,6 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use rustix::io::Errno;
-use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
-use serde_json::Value;
-
 use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
 use crate::dataflow::pins::PinError;
 use crate::dataflow::{Graph, Node, Program};
@@ -41,9 +41,10 @@ use crate::launcher::clients::Clients;
 use crate::launcher::link_book::LinkBook;
 use crate::launcher::log_writer::{Log, LogWriter};
 pub use crate::launcher::process::ZENOH_THREADS;
-use crate::launcher::process::{LineSink, Process, ProcessOutput, Start};
+use crate::launcher::process::{LineSink, PreparedProgram, Process, ProcessOutput, Start};
 use crate::launcher::server::Ask;
 use crate::launcher::service::Service;
+use crate::launcher::set::PendingSet;
 use crate::launcher::slow_nodes::SlowNodes;
 use crate::launcher::swap::Swap;
 use crate::launcher::wake_policy::WakePolicy;
@@ -56,6 +57,8 @@ use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::namespace::{self, NamespaceError};
 use blindgrasp_operator::text::did_you_mean;
 use blindgrasp_operator::wiring::{Clock, Command, LogEntry, LogLevel, Report, WaitMode};
+use rustix::io::Errno;
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
 /// The status of a graph without trouble.
 const RUNNING: &str = "running";
@@ -75,8 +78,6 @@ const MAX_UNREAD_LINES: usize = 4096;
 const READ_LIMIT: Duration = Duration::from_secs(30);
 /// The limit of descriptors is not raised further: a connection of a stranger takes about 15 kB of the link's memory.
 const MOST_DESCRIPTORS: u64 = 1 << 16;
-/// An operator must apply a parameter within this time.
-const SET_LIMIT: Duration = Duration::from_secs(5);
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct LaunchOptions {
@@ -139,6 +140,10 @@ pub enum LaunchError {
 }
 
 impl LaunchError {
+    fn of_spawn(node: &Node, source: std::io::Error) -> LaunchError {
+        LaunchError::Spawn { node: node.id.clone(), program: node.program.display().to_string(), source }
+    }
+
     /// Whether the machine lacks descriptors, processes or memory, which may pass.
     fn is_shortage(&self) -> bool {
         let LaunchError::Spawn { source, .. } = self else { return false };
@@ -201,6 +206,7 @@ pub struct Launcher {
     has_gone: bool,
     n_processes: u64,
     n_sets: u64,
+    settings: Vec<PendingSet>,
     service: Service,
     is_to_begin_again: bool,
     /// No sample is on its way any more: a sample that was sent and not received is lost.
@@ -309,6 +315,7 @@ impl Launcher {
             has_gone: false,
             n_processes: 0,
             n_sets: 0,
+            settings: Vec::new(),
             service: Service::of_this_process(),
             is_to_begin_again: false,
             has_ended: false,
@@ -320,15 +327,21 @@ impl Launcher {
         for node in &graph.nodes {
             launcher.members.push(Member::new(node, launcher.logs.log(&node.id)));
         }
-        for idx in 0..launcher.members.len() {
-            if launcher.members[idx].active.is_none() {
-                launcher.spawn_active(idx)?;
-            }
-        }
         let audit = launcher.logs.log_if_written(AUDIT);
         let pins = graph.nodes.iter().map(|node| (node.id.clone(), node.sha256.clone())).collect();
-        launcher.clients.serve(control, pins, &launcher.sender, audit).map_err(LaunchError::Control)?;
+        let server = server::serve(control, pins, &launcher.sender, audit).map_err(LaunchError::Control)?;
+        launcher.clients.server = Some(server);
+        launcher.spawn_all()?;
         Ok(launcher)
+    }
+
+    fn spawn_all(&mut self) -> Result<(), LaunchError> {
+        for idx in 0..self.members.len() {
+            if self.members[idx].active.is_none() {
+                self.spawn_active(idx)?;
+            }
+        }
+        Ok(())
     }
 
     /// The members that share the process of a member, itself included, in the graph's order.
@@ -356,18 +369,11 @@ impl Launcher {
         let mut starts = Vec::with_capacity(nodes.len());
         // The instances of a group's nodes live and end together, so a place that is free for one is free for all.
         let n_before = nodes.first().map_or(0, |(idx, _)| self.make_room_for_instance(*idx));
-        let failed = |node: &Node, source| LaunchError::Spawn {
-            node: node.id.clone(),
-            program: node.program.display().to_string(),
-            source,
-        };
         for (idx, node) in nodes {
-            let checked = node.sha256.check(&node.program, &node.params);
-            checked.map_err(|source| LaunchError::Pin { node: node.id.clone(), source })?;
-            let mut wiring = self
-                .plan
-                .wiring(node, n_before, standby)
-                .ok_or_else(|| failed(node, std::io::Error::other("its ports are not those of the running graph")))?;
+            let Some(mut wiring) = self.plan.wiring(node, n_before, standby) else {
+                let error = std::io::Error::other("its ports are not those of the running graph");
+                return Err(LaunchError::of_spawn(node, error));
+            };
             if !standby {
                 wiring.skip.clone_from(&self.members[*idx].quarantine);
                 wiring.suspect = self.members[*idx].deadly;
@@ -387,7 +393,10 @@ impl Launcher {
         let Some((_, first)) = nodes.first() else {
             return Ok(Vec::new());
         };
-        Process::spawn(starts, self.host.as_ref(), &self.sender).map_err(|source| failed(first, source))
+        let failed = |source| LaunchError::of_spawn(first, source);
+        let prepared = PreparedProgram::of(&starts, self.host.as_ref()).map_err(failed)?;
+        let begun = self.begin(nodes, prepared)?;
+        Process::of(&starts, begun, &self.sender).map_err(failed)
     }
 
     /// The number of a node's next instance: the first whose heartbeat slot is free. `None` if too many old instances are on
@@ -708,12 +717,15 @@ impl Launcher {
         let next_restart = self.members.iter().filter_map(|member| member.restart_at).min();
         let until_restart = next_restart.map(|at| at.saturating_duration_since(Instant::now()));
         self.listen(until_restart.map_or(limit, |until| limit.min(until)));
+        self.supervise_others(&[]);
         if let Some(error) = self.failure.take() {
             return Err(error);
         }
-        self.supervise()?;
         self.go_on_with_swap();
-        while let Some(ask) = self.clients.waiting.pop_front() {
+        self.look_at_settings();
+        while !self.is_setting()
+            && let Some(ask) = self.clients.waiting.pop_front()
+        {
             self.answer(*ask);
         }
         self.retire_leaving();
@@ -806,16 +818,18 @@ impl Launcher {
 
     fn on_output(&mut self, id: u64, output: ProcessOutput) {
         let found = self.members.iter_mut().find_map(|member| {
+            let is_active = member.active.as_ref().is_some_and(|process| process.id == id);
             let mut processes = member.active.iter_mut().chain(member.standby.iter_mut());
             let process = processes.find(|process| process.id == id)?;
-            Some((&member.node.id, &member.log, &mut member.counts, process))
+            Some((&member.node.id, &member.log, &mut member.counts, process, is_active))
         });
         // The output of a process on its way out is not needed.
-        let Some((node, log, totals, process)) = found else {
+        let Some((node, log, totals, process, is_active)) = found else {
             return;
         };
         match output {
             ProcessOutput::Report(Report::Link(status)) => self.link.on_status(id, *status),
+            ProcessOutput::Report(Report::Set { id, from_seq, error }) => self.on_set(id, from_seq, error),
             ProcessOutput::Report(Report::Unfit { message }) => {
                 let node = node.clone();
                 self.failure.get_or_insert(LaunchError::Failed { node, what: message, log: Vec::new() });
@@ -827,11 +841,12 @@ impl Launcher {
                         let entry = LogEntry { level: Some(LogLevel::Error), ..LogEntry::plain(message) };
                         log.write(entry);
                     }
+                    // A standby counts what the active process counts as well.
+                    Report::Counts { in_all: true, .. } if !is_active => {}
                     Report::Counts { counts, in_all: true } => {
-                        for (name, count) in counts {
-                            let total = totals.entry(name.clone()).or_default();
-                            // An instance that takes over may have a state from before the last report.
-                            *total = (*total).max(*count);
+                        // Zeros are shown in the place of other counts, and not by themselves.
+                        if counts.iter().any(|(name, count)| *count > 0 || totals.contains_key(name)) {
+                            totals.extend(counts.clone());
                         }
                     }
                     Report::Counts { counts, in_all: false } => {
@@ -921,65 +936,13 @@ impl Launcher {
             // Answered in `on_ask`.
             Request::Status | Request::Stop | Request::Attach { .. } | Request::Keep => {}
             Request::Set { node, param, value } => {
-                let reply = match self.set(&node, &param, &value) {
-                    Ok(reply) => reply,
-                    Err(message) => Reply::Error { message, rolled_back: false },
-                };
-                let _ = ask.reply.try_send(reply);
+                if let Err(message) = self.set(&node, param, &value, &ask.reply) {
+                    let _ = ask.reply.try_send(Reply::refusal(message));
+                }
             }
             Request::Swap(request) => self.begin_swap(request, ask.description, ask.client, ask.reply),
             Request::Promote => self.on_promote(true, ask.client, ask.reply),
             Request::Abandon => self.on_promote(false, ask.client, ask.reply),
-        }
-    }
-
-    fn set(&mut self, id: &str, param: &str, value: &Value) -> Result<Reply, String> {
-        let idx = self.member_idx(id)?;
-        if self.swap.as_ref().is_some_and(|swap| swap.concerns(id)) {
-            return Err(format!("node '{id}' is being swapped; try again when that is over"));
-        }
-        let member = &mut self.members[idx];
-        let description = &member.node.description;
-        crate::dataflow::live_param(description, param)?;
-        let value = crate::dataflow::accept_param_value(description, param, value, &self.folder)?;
-        let Some(process) = member.active.as_mut().filter(|process| process.is_ready()) else {
-            return Err(format!("node '{id}' is not running at the moment"));
-        };
-        let mut params = member.node.params.clone();
-        let old = params.insert(param.into(), value.clone()).unwrap_or(Value::Null);
-        process.set_answer = None;
-        self.n_sets += 1;
-        let id_of_set = self.n_sets;
-        process.tell(&Command::Set { id: id_of_set, params: params.clone() });
-        let process_id = process.id;
-        let start = Instant::now();
-        let answer = loop {
-            let process = self.members[idx].active.as_mut().filter(|process| process.id == process_id);
-            let Some(process) = process else {
-                return Err(format!("node '{id}' ended before it took the value"));
-            };
-            process.look();
-            // The answer to an earlier request, which was given up, may come late.
-            if let Some(answer) = process.set_answer.take().filter(|(id, _, _)| *id == id_of_set) {
-                break answer;
-            }
-            if process.exit.is_some() {
-                return Err(format!("node '{id}' ended before it took the value"));
-            }
-            if start.elapsed() > SET_LIMIT {
-                return Err(format!("node '{id}' did not take the value within {} s", SET_LIMIT.as_secs()));
-            }
-            self.listen(Duration::from_millis(1));
-            self.supervise_others(&[idx]);
-        };
-        match answer {
-            (_, _, Some(error)) => Err(format!("node '{id}' does not take it: {error}")),
-            (_, from_seq, None) => {
-                self.members[idx].node.params = params;
-                let from = from_seq.map_or("the first sample".into(), |seq| format!("sample {seq}"));
-                self.say(&format!("blindgrasp: {id}.{param}: {old} -> {value}, from {from} on"));
-                Ok(Reply::Set { old, new: value, from_seq })
-            }
         }
     }
 

@@ -2,12 +2,12 @@
 
 use std::cell::RefCell;
 use std::collections::{BTreeMap, VecDeque};
-use std::io::{BufRead, BufReader, PipeReader, Read, Write};
+use std::io::{BufRead, BufReader, PipeReader, PipeWriter, Read, Write};
 use std::os::fd::{AsRawFd, BorrowedFd, RawFd};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::process::{Child, ChildStdin, Command as Program, ExitStatus, Stdio};
 use std::rc::Rc;
-use std::sync::mpsc::SyncSender;
+use std::sync::mpsc::{Sender, SyncSender};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -81,8 +81,6 @@ pub(super) struct Process {
     pub(super) has_taken_over: bool,
     /// It has computed samples as a standby.
     pub(super) is_warm: bool,
-    /// Its answer to the last [`Command::Set`].
-    pub(super) set_answer: Option<(u64, Option<u64>, Option<String>)>,
     /// Its counts of other things than samples, since it started.
     pub(super) counts: BTreeMap<String, u64>,
     /// The launcher's reason to end it.
@@ -103,6 +101,8 @@ pub(super) struct Process {
 /// A process of the system.
 struct Shared {
     child: Child,
+    /// The thread that has started it lives as long as this.
+    _life: Sender<()>,
     stdin: Option<ChildStdin>,
     /// The commands that its stdin has no room for yet.
     unwritten: Vec<u8>,
@@ -137,19 +137,39 @@ pub(super) struct LineSink {
     pub(super) printer: Option<Arc<Mutex<LinePrinter>>>,
 }
 
-impl Process {
-    /// Starts the program of a node, or of the nodes of a group, in a process group of its own. The output about a node goes to
-    /// `events` under its id. There is one [`Process`] for each node.
+/// The program of a process that is to be started.
+pub(super) struct PreparedProgram {
+    pub(super) command: Program,
+    options: ProcessOptions,
+    its_reports: PipeWriter,
+    lines: PipeReader,
+    reports: PipeReader,
+}
+
+/// A program that has begun.
+pub(super) struct BegunProgram {
+    child: Unclaimed,
+    /// Its thread lives as long as this.
+    life: Sender<()>,
+    lines: PipeReader,
+    reports: PipeReader,
+}
+
+/// A child that is killed if no [`Process`] takes it.
+struct Unclaimed(Option<Child>);
+
+impl PreparedProgram {
+    /// Prepares the program of a node, or of the nodes of a group, for a process group of its own. The process tells its id
+    /// before the program begins.
     ///
     /// # Errors
-    /// The system cannot start the program.
-    pub(super) fn spawn(
-        starts: Vec<Start<'_>>,
+    /// The system has no descriptors left, or the nodes have no such program.
+    pub(super) fn of(
+        starts: &[Start<'_>],
         host: Option<&dataflow::Program>,
-        events: &SyncSender<Event>,
-    ) -> std::io::Result<Vec<Process>> {
+    ) -> std::io::Result<(PreparedProgram, PipeReader)> {
         let node = starts.first().ok_or(std::io::ErrorKind::InvalidInput)?.node;
-        let mut command = wired_program(node, &starts, host)?;
+        let mut command = wired_program(node, starts, host)?;
         // Text for the log has a pipe, and reports have another: no text is ever a report.
         let (lines, its_lines) = std::io::pipe()?;
         let (reports, its_reports) = std::io::pipe()?;
@@ -167,28 +187,73 @@ impl Process {
         let options = node.process.clone();
         let memory_max = node.memory_max_mib.map(|mib| Rlimit { current: Some(mib << 20), maximum: Some(mib << 20) });
         let launcher_pid = rustix::process::getpid();
+        let (its_pid, tells_pid) = std::io::pipe()?;
+        let before_exec = move || {
+            rustix::io::write(&tells_pid, &rustix::process::getpid().as_raw_nonzero().get().to_ne_bytes())?;
+            before_exec(&options, memory_max, launcher_pid, reports_number)
+        };
         // SAFETY: between fork and exec the closure makes system calls alone; it neither allocates nor takes a lock.
-        unsafe { command.pre_exec(move || before_exec(&options, memory_max, launcher_pid, reports_number)) };
-        let mut child = command.spawn().map_err(|error| explain(error, &node.process))?;
+        unsafe { command.pre_exec(before_exec) };
+        Ok((PreparedProgram { command, options: node.process.clone(), its_reports, lines, reports }, its_pid))
+    }
+
+    /// Starts the program. It may take for ever: the new process may be stopped before the program begins, and a file system
+    /// may hang.
+    ///
+    /// # Errors
+    /// The system cannot start the program.
+    pub(super) fn begin(self, life: Sender<()>) -> std::io::Result<BegunProgram> {
+        let PreparedProgram { mut command, options, its_reports, lines, reports } = self;
+        let child = command.spawn().map_err(|error| explain(error, &options))?;
         // The ends of the pipes that are the process's alone: the others see its end.
         drop((command, its_reports));
+        Ok(BegunProgram { child: Unclaimed(Some(child)), life, lines, reports })
+    }
+}
+
+impl Drop for Unclaimed {
+    fn drop(&mut self) {
+        if let Some(child) = &mut self.0 {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+    }
+}
+
+impl Process {
+    /// Takes a program that has begun. The output about a node goes to `events` under its id. There is one [`Process`] for each
+    /// node.
+    ///
+    /// # Errors
+    /// The system has no threads left.
+    pub(super) fn of(
+        starts: &[Start<'_>],
+        begun: BegunProgram,
+        events: &SyncSender<Event>,
+    ) -> std::io::Result<Vec<Process>> {
+        let BegunProgram { mut child, life, lines, reports } = begun;
         let hearers: Vec<Hearer> = starts
             .iter()
             .map(|start| Hearer { id: start.id, sink: start.sink.clone(), lines: Lines::default() })
             .collect();
-        if let Err(error) = hear(lines, reports, &hearers, events) {
-            let _ = child.kill();
-            let _ = child.wait();
-            return Err(error);
-        }
+        hear(lines, reports, &hearers, events)?;
+        let Some(mut child) = child.0.take() else { return Ok(Vec::new()) };
         let stdin = child.stdin.take();
         if let Some(stdin) = &stdin {
             // An operator that does not read its commands must not stop the launcher.
             rustix::io::ioctl_fionbio(stdin, true)?;
         }
         let n_needed = starts.len();
-        let shared =
-            Shared { child, stdin, unwritten: Vec::new(), exit: None, failure: None, is_killed: false, n_needed };
+        let shared = Shared {
+            child,
+            _life: life,
+            stdin,
+            unwritten: Vec::new(),
+            exit: None,
+            failure: None,
+            is_killed: false,
+            n_needed,
+        };
         let shared = Rc::new(RefCell::new(shared));
         Ok(starts.iter().zip(hearers).map(|(start, hearer)| Process::new(start, hearer.lines, &shared)).collect())
     }
@@ -209,7 +274,6 @@ impl Process {
             has_sent_all: false,
             has_taken_over: false,
             is_warm: false,
-            set_answer: None,
             counts: BTreeMap::new(),
             finding: None,
             exit: None,
@@ -263,7 +327,6 @@ impl Process {
             Report::HandedOver { has_sent_all } => (self.has_handed_over, self.has_sent_all) = (true, has_sent_all),
             Report::TookOver => self.has_taken_over = true,
             Report::Warm { .. } => self.is_warm = true,
-            Report::Set { id, from_seq, error } => self.set_answer = Some((id, from_seq, error)),
             Report::Counts { counts, in_all: false } => self.counts = counts,
             Report::Connected => self.is_connected = true,
             Report::Finished => self.is_done = true,
@@ -272,6 +335,7 @@ impl Process {
             Report::Failed { message } => self.shared.borrow_mut().failure = Some(message),
             Report::Counts { in_all: true, .. }
             | Report::Log(_)
+            | Report::Set { .. }
             | Report::Ended { .. }
             | Report::Link(_)
             | Report::Unfit { .. } => {}

@@ -1,12 +1,14 @@
 //! The launcher's end of [`control`](crate::control): reads requests and hands them to its loop.
 
 use std::collections::BTreeMap;
+use std::fs::File;
 use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, TryRecvError, channel, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
 
 use crate::control::{Reply, Request, SwapRequest};
 use crate::dataflow::pins::Pins;
@@ -22,12 +24,13 @@ const MAX_REQUEST_BYTES: u64 = 1 << 20;
 /// This many replies may wait for a client to read them; further replies are dropped.
 const MAX_PENDING_REPLIES: usize = 256;
 /// The pause after a failure to accept a client.
-const RETRY_PAUSE: std::time::Duration = std::time::Duration::from_millis(100);
+const RETRY_PAUSE: Duration = Duration::from_millis(100);
 /// The most clients at a time.
 const MAX_CLIENTS: usize = 32;
 /// Clients beyond them may only ask to stop the graph, within this time, as many at a time.
 const MAX_LATE_CLIENTS: usize = 8;
-const LATE_LIMIT: std::time::Duration = std::time::Duration::from_secs(1);
+const LATE_LIMIT: Duration = Duration::from_secs(1);
+const LATE_PAUSE: Duration = Duration::from_millis(20);
 
 /// A request and where to answer.
 pub(super) struct Ask {
@@ -67,56 +70,91 @@ pub(super) fn serve(
     events: &SyncSender<Event>,
     audit: Log,
 ) -> std::io::Result<Server> {
-    let pins = Arc::new(pins);
-    let accepting = listener.try_clone()?;
+    let (late, late_clients) = channel();
+    let accepting = Accepting {
+        listener: listener.try_clone()?,
+        late,
+        spare: File::open("/dev/null").ok(),
+        n_clients: Arc::default(),
+        pins: Arc::new(pins),
+        events: events.clone(),
+    };
     let events = events.clone();
-    let thread = std::thread::Builder::new().spawn(move || {
-        let (next_client, n_clients) = (AtomicU64::new(0), Arc::new(AtomicUsize::new(0)));
-        for stream in accepting.incoming() {
-            let stream = match stream {
-                Ok(stream) => stream,
-                Err(error) if error.kind() == ErrorKind::InvalidInput => return,
-                Err(_) => {
-                    // Out of descriptors, for example; this may pass.
-                    std::thread::sleep(RETRY_PAUSE);
-                    continue;
+    std::thread::Builder::new().spawn(move || attend_late(&late_clients, &events))?;
+    let thread = std::thread::Builder::new().spawn(move || accepting.accept(&audit))?;
+    Ok(Server { listener: listener.try_clone()?, thread: Some(thread) })
+}
+
+/// The thread that accepts clients.
+struct Accepting {
+    listener: UnixListener,
+    /// The thread for clients that get none of their own.
+    late: Sender<LateClient>,
+    /// A descriptor that is given up for a client that asks the graph to stop when there is no other.
+    spare: Option<File>,
+    n_clients: Arc<AtomicUsize>,
+    pins: Arc<BTreeMap<String, Pins>>,
+    events: SyncSender<Event>,
+}
+
+impl Accepting {
+    fn accept(mut self, audit: &Log) {
+        for client in 0.. {
+            let stream = loop {
+                match self.listener.accept() {
+                    Ok((stream, _)) => break stream,
+                    Err(error) if error.kind() == ErrorKind::InvalidInput => return,
+                    // Out of descriptors, for example.
+                    Err(_) if self.spare.take().is_some() => {}
+                    Err(_) => std::thread::sleep(RETRY_PAUSE),
                 }
             };
+            if self.spare.is_none() {
+                self.spare = File::open("/dev/null").ok();
+            }
             let Some(client_name) = own_user(&stream) else {
                 continue;
             };
             let trail = Trail::new(audit.clone(), client_name);
-            let n_before = n_clients.fetch_add(1, Ordering::Relaxed);
-            if n_before >= MAX_CLIENTS + MAX_LATE_CLIENTS {
-                n_clients.fetch_sub(1, Ordering::Relaxed);
-                // It is told within the room of the socket: nothing waits for it.
-                let _ = stream.set_nonblocking(true);
-                let _ = refuse(&stream, too_many());
-                continue;
-            }
-            let is_late = n_before >= MAX_CLIENTS;
-            let (client, events, n_clients) =
-                (next_client.fetch_add(1, Ordering::Relaxed), events.clone(), Arc::clone(&n_clients));
-            let pins = Arc::clone(&pins);
-            let (other_end, place) = (stream.try_clone(), Arc::clone(&n_clients));
-            let attending = move || {
-                if is_late {
-                    attend_late(stream, client, &pins, &events, trail);
-                } else {
-                    attend(BufReader::new(stream), client, &pins, &events, trail);
-                }
-                n_clients.fetch_sub(1, Ordering::Relaxed);
+            let refusal = match self.attend(&stream, client, trail.clone()) {
+                Ok(true) => continue,
+                Ok(false) => format!("too many commands at work ({MAX_CLIENTS}): end some of them"),
+                Err(error) => format!("the graph has no thread or descriptor for the command ({error})"),
             };
-            if let Err(error) = std::thread::Builder::new().spawn(attending) {
-                place.fetch_sub(1, Ordering::Relaxed);
-                if let Ok(stream) = other_end {
-                    let _ = stream.set_nonblocking(true);
-                    let _ = refuse(&stream, no_thread(&error));
-                }
-            }
+            let refusal = format!("{refusal}; stop still works");
+            let late = LateClient { stream, client, trail, refusal, since: Instant::now(), replies: None };
+            // Its thread lives as long as this one.
+            let _ = self.late.send(late);
         }
-    })?;
-    Ok(Server { listener: listener.try_clone()?, thread: Some(thread) })
+    }
+
+    /// Attends to a client on threads of its own; false if there are too many clients.
+    ///
+    /// # Errors
+    /// There is no thread or descriptor left.
+    fn attend(&self, stream: &UnixStream, client: u64, trail: Trail) -> std::io::Result<bool> {
+        let place = Arc::clone(&self.n_clients);
+        // This thread alone adds to it.
+        if place.load(Ordering::Relaxed) >= MAX_CLIENTS {
+            return Ok(false);
+        }
+        let (reader, writer) = (BufReader::new(stream.try_clone()?), stream.try_clone()?);
+        let (reply, replies) = sync_channel(MAX_PENDING_REPLIES);
+        let trail = Arc::new(Mutex::new(trail));
+        let its_trail = Arc::clone(&trail);
+        std::thread::Builder::new().spawn(move || write_replies(writer, &replies, &its_trail))?;
+        let (pins, events) = (Arc::clone(&self.pins), self.events.clone());
+        place.fetch_add(1, Ordering::Relaxed);
+        let attending = move || {
+            attend(reader, client, &pins, &events, &reply, &trail);
+            place.fetch_sub(1, Ordering::Relaxed);
+        };
+        let spawned = std::thread::Builder::new().spawn(attending);
+        if spawned.is_err() {
+            self.n_clients.fetch_sub(1, Ordering::Relaxed);
+        }
+        spawned.map(|_| true)
+    }
 }
 
 /// The client for the audit log, if it is of this user.
@@ -126,64 +164,84 @@ fn own_user(stream: &UnixStream) -> Option<String> {
     (peer.uid == rustix::process::getuid().as_raw()).then(|| format!("uid {} pid {pid}", peer.uid))
 }
 
-fn too_many() -> String {
-    format!("too many commands at work ({MAX_CLIENTS}): end some of them; stop still works")
-}
-
-fn no_thread(error: &std::io::Error) -> String {
-    format!("the graph cannot make a thread for the command ({error}): try again, or raise the limit of processes")
-}
-
-/// Tells a client why it is not attended to.
-fn refuse(mut stream: &UnixStream, message: String) -> std::io::Result<()> {
-    let reply = Reply::Error { message, rolled_back: false };
-    stream.write_all(format!("{}\n", serde_json::to_string(&reply)?).as_bytes())
-}
-
-/// Attends to a client beyond the others if its first request is to stop the graph.
-fn attend_late(
+/// A client without a place of its own. It may only ask the graph to stop.
+struct LateClient {
     stream: UnixStream,
     client: u64,
-    pins: &BTreeMap<String, Pins>,
-    events: &SyncSender<Event>,
     trail: Trail,
-) {
-    let is_limited = stream.set_read_timeout(Some(LATE_LIMIT)).is_ok();
-    let mut reader = BufReader::new(stream);
-    // A request to stop fits into the reader's memory, from which it is not taken yet.
-    let is_stop = is_limited
-        && reader.fill_buf().is_ok_and(|bytes| {
-            let line = bytes.split(|byte| *byte == b'\n').next().unwrap_or_default();
-            matches!(serde_json::from_slice(line), Ok(Request::Stop))
-        });
-    if is_stop && reader.get_ref().set_read_timeout(None).is_ok() {
-        attend(reader, client, pins, events, trail);
-    } else {
-        // A client that does not read has gone, or goes on alone.
-        let _ = refuse(reader.get_ref(), too_many());
+    /// The answer to everything else.
+    refusal: String,
+    since: Instant,
+    /// Once it has asked the graph to stop.
+    replies: Option<Receiver<Reply>>,
+}
+
+/// Attends to clients that get no thread of their own. This thread is there from the start, so that a graph that lacks threads
+/// or descriptors can be stopped.
+fn attend_late(clients: &Receiver<LateClient>, events: &SyncSender<Event>) {
+    let mut attended: Vec<LateClient> = Vec::new();
+    loop {
+        let pause = if attended.is_empty() { LATE_LIMIT } else { LATE_PAUSE };
+        match clients.recv_timeout(pause) {
+            Ok(client) if attended.len() < MAX_LATE_CLIENTS => attended.push(client),
+            Ok(mut client) => client.tell(&Reply::refusal(&client.refusal)),
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => return,
+        }
+        attended.retain_mut(|client| client.go_on(events));
     }
 }
 
+impl LateClient {
+    /// Listens to it, or passes on the graph's answers; false when it is attended to.
+    fn go_on(&mut self, events: &SyncSender<Event>) -> bool {
+        if let Some(replies) = &self.replies {
+            let reply = replies.try_recv();
+            if let Ok(reply) = &reply {
+                self.tell(reply);
+            }
+            return !matches!(reply, Err(TryRecvError::Disconnected));
+        }
+        let mut bytes = [0; 256];
+        match self.stream.set_nonblocking(true).and_then(|()| self.stream.read(&mut bytes)) {
+            Ok(_) => {}
+            Err(error) if error.kind() == ErrorKind::WouldBlock && self.since.elapsed() < LATE_LIMIT => return true,
+            Err(_) => {}
+        }
+        let line = bytes.split(|byte| *byte == b'\n').next().unwrap_or_default();
+        if let Ok(request @ Request::Stop) = serde_json::from_slice(line) {
+            self.trail.asked(&request);
+            let (reply, replies) = sync_channel(MAX_PENDING_REPLIES);
+            self.replies = Some(replies);
+            return events
+                .send(Event::Ask(Box::new(Ask { client: self.client, request, description: None, reply })))
+                .is_ok();
+        }
+        // A client that does not read has gone, or goes on alone.
+        self.tell(&Reply::refusal(&self.refusal));
+        false
+    }
+
+    /// Nothing waits for a client that does not read.
+    fn tell(&mut self, reply: &Reply) {
+        self.trail.answered(reply);
+        let _ = write_reply(&mut self.stream, reply);
+    }
+}
+
+fn write_reply(stream: &mut UnixStream, reply: &Reply) -> std::io::Result<()> {
+    stream.write_all(format!("{}\n", serde_json::to_string(reply)?).as_bytes())
+}
+
+/// Reads the requests of a client until it goes.
 fn attend(
     mut reader: BufReader<UnixStream>,
     client: u64,
     pins: &BTreeMap<String, Pins>,
     events: &SyncSender<Event>,
-    trail: Trail,
+    reply: &SyncSender<Reply>,
+    trail: &Mutex<Trail>,
 ) {
-    let Ok(writer) = reader.get_ref().try_clone() else {
-        return;
-    };
-    let (reply, replies) = sync_channel(MAX_PENDING_REPLIES);
-    let trail = Arc::new(Mutex::new(trail));
-    let writing = {
-        let trail = Arc::clone(&trail);
-        move || write_replies(writer, &replies, &trail)
-    };
-    if let Err(error) = std::thread::Builder::new().spawn(writing) {
-        let _ = refuse(reader.get_ref(), no_thread(&error));
-        return;
-    }
     let mut line = Vec::new();
     loop {
         line.clear();
@@ -201,8 +259,7 @@ fn attend(
                 }
             }
             Err(error) => {
-                let message = format!("not a request of this version ({error})");
-                let _ = reply.try_send(Reply::Error { message, rolled_back: false });
+                let _ = reply.try_send(Reply::refusal(format!("not a request of this version ({error})")));
             }
         }
     }
@@ -229,9 +286,7 @@ fn describe_replacement(
 fn write_replies(mut writer: UnixStream, replies: &Receiver<Reply>, trail: &Mutex<Trail>) {
     for reply in replies {
         trail.lock().unwrap_or_else(PoisonError::into_inner).answered(&reply);
-        if let Ok(json) = serde_json::to_string(&reply)
-            && writer.write_all(format!("{json}\n").as_bytes()).is_err()
-        {
+        if write_reply(&mut writer, &reply).is_err() {
             return;
         }
     }
@@ -239,46 +294,109 @@ fn write_replies(mut writer: UnixStream, replies: &Receiver<Reply>, trail: &Mute
 
 #[cfg(test)]
 mod tests {
+    use std::os::fd::AsRawFd;
+
+    use rustix::net::{AddressFamily, SocketAddrUnix, SocketType};
+    use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+
     use super::*;
     use crate::launcher::log_writer::LogWriter;
     use crate::log::{AUDIT, LogFolder, LogFormat};
 
+    /// A served socket.
+    struct Served {
+        socket: std::path::PathBuf,
+        asked: Receiver<Event>,
+        _server: Server,
+        _folder: tempfile::TempDir,
+    }
+
+    fn served() -> Served {
+        let folder = tempfile::tempdir().expect("a folder");
+        let writer = LogWriter::new(LogFolder::at(folder.path().join("graph")), LogFormat::Text);
+        let socket = folder.path().join("socket");
+        let listener = UnixListener::bind(&socket).expect("bound");
+        let (events, asked) = sync_channel(64);
+        let server = serve(&listener, BTreeMap::new(), &events, writer.log_if_written(AUDIT)).expect("served");
+        Served { socket, asked, _server: server, _folder: folder }
+    }
+
+    impl Served {
+        fn connect(&self) -> UnixStream {
+            UnixStream::connect(&self.socket).expect("connected")
+        }
+
+        fn answered(&self, client: &UnixStream, reply: Reply) -> String {
+            let Ok(Event::Ask(asked)) = self.asked.recv() else { panic!("a request") };
+            asked.reply.send(reply).expect("sent");
+            said(client)
+        }
+    }
+
+    fn ask(mut client: &UnixStream, request: &Request) {
+        writeln!(client, "{}", serde_json::to_string(request).expect("JSON")).expect("sent");
+    }
+
+    fn said(client: &UnixStream) -> String {
+        let mut line = String::new();
+        BufReader::new(client).read_line(&mut line).expect("read");
+        line
+    }
+
     /// Clients of the same user, or of the link, may leave no place for others.
     #[test]
     fn beyond_the_most_clients_stop_is_served_and_others_are_told() {
-        let temporary = tempfile::tempdir().expect("a folder");
-        let writer = LogWriter::new(LogFolder::at(temporary.path().join("graph")), LogFormat::Text);
-        let socket = temporary.path().join("socket");
-        let listener = UnixListener::bind(&socket).expect("bound");
-        let (events, asked) = sync_channel(64);
-        let _server = serve(&listener, BTreeMap::new(), &events, writer.log_if_written(AUDIT)).expect("served");
-        let connect = || UnixStream::connect(&socket).expect("connected");
-        let ask = |mut client: &UnixStream, request: &Request| {
-            writeln!(client, "{}", serde_json::to_string(request).expect("JSON")).expect("sent");
-        };
-        let said = |client: &UnixStream| {
-            let mut line = String::new();
-            BufReader::new(client).read_line(&mut line).expect("read");
-            line
-        };
-        let answered = |client: &UnixStream, reply: Reply| {
-            let Ok(Event::Ask(asked)) = asked.recv() else { panic!("a request") };
-            asked.reply.send(reply).expect("sent");
-            said(client)
-        };
-        let clients: Vec<UnixStream> = (0..MAX_CLIENTS).map(|_| connect()).collect();
+        let served = served();
+        let clients: Vec<UnixStream> = (0..MAX_CLIENTS).map(|_| served.connect()).collect();
         for client in &clients {
             ask(client, &Request::Status);
-            answered(client, Reply::Stopping);
+            served.answered(client, Reply::Stopping);
         }
-        let late = connect();
+        let silent: Vec<UnixStream> = (0..MAX_LATE_CLIENTS / 2).map(|_| served.connect()).collect();
+        let late = served.connect();
         ask(&late, &Request::Status);
         assert!(said(&late).contains("too many commands at work"));
-        let stopping = connect();
+        let stopping = served.connect();
         ask(&stopping, &Request::Stop);
-        assert!(answered(&stopping, Reply::Stopping).contains("stopping"));
+        assert!(served.answered(&stopping, Reply::Stopping).contains("stopping"));
+        assert!(silent.iter().all(|client| said(client).contains("stop still works")));
         // The others still have their places.
         ask(&clients[0], &Request::Status);
-        answered(&clients[0], Reply::Drained);
+        served.answered(&clients[0], Reply::Drained);
+    }
+
+    /// The limits of a process are those of all its tests: this one has a process of its own.
+    #[test]
+    fn a_graph_without_threads_and_descriptors_can_be_stopped_and_says_why_it_does_nothing_else() {
+        const VARIABLE: &str = "BLINDGRASP_TEST_LACKS";
+        if std::env::var_os(VARIABLE).is_none() {
+            let mut lacking = std::process::Command::new(std::env::current_exe().expect("this program"));
+            let name = "a_graph_without_threads_and_descriptors_can_be_stopped_and_says_why_it_does_nothing_else";
+            lacking.args(["--exact", &format!("launcher::server::tests::{name}")]).env(VARIABLE, "1");
+            let output = lacking.output().expect("started");
+            let said = String::from_utf8_lossy(&output.stdout);
+            return assert!(output.status.success() && said.contains("1 passed"), "{said}");
+        }
+        let served = served();
+        let [silent, stopping] = [(); 2].map(|()| {
+            let socket = rustix::net::socket(AddressFamily::UNIX, SocketType::STREAM, None).expect("a socket");
+            UnixStream::from(socket)
+        });
+        let connect = |client: &UnixStream| {
+            rustix::net::connect(client, &SocketAddrUnix::new(&served.socket).expect("a path")).expect("connected");
+        };
+        let limit = getrlimit(Resource::Nofile);
+        let lowest_free = File::open("/dev/null").expect("opened").as_raw_fd() as u64;
+        setrlimit(Resource::Nofile, Rlimit { current: Some(lowest_free), ..limit }).expect("lowered");
+        // The system has a descriptor ready for the first one, and the spare one is for the second.
+        connect(&silent);
+        connect(&stopping);
+        ask(&stopping, &Request::Stop);
+        let answer = served.answered(&stopping, Reply::Stopping);
+        ask(&silent, &Request::Status);
+        let refusal = said(&silent);
+        setrlimit(Resource::Nofile, limit).expect("raised");
+        assert!(answer.contains("stopping"), "{answer}");
+        assert!(refusal.contains("no thread or descriptor") && refusal.contains("os error 24"), "{refusal}");
     }
 }

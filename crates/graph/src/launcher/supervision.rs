@@ -35,15 +35,8 @@ fn pause_before(restart: &Restart, n_before: u32, wait_limit: Duration) -> Durat
 }
 
 impl Launcher {
-    /// Finds dead and hung processes, and starts them again if they may be.
-    pub(super) fn supervise(&mut self) -> Result<(), LaunchError> {
-        self.kill_hung();
-        (0..self.members.len()).try_for_each(|idx| self.supervise_node(idx))?;
-        self.restart_due();
-        Ok(())
-    }
-
-    /// Supervises all nodes but those that the launcher waits for. To be called in every loop that waits.
+    /// Finds dead and hung processes, and starts them again if they may be, of all nodes but those that the launcher waits for.
+    /// To be called in every loop that waits.
     pub(super) fn supervise_others(&mut self, awaited: &[usize]) {
         self.kill_hung();
         for idx in 0..self.members.len() {
@@ -279,6 +272,8 @@ impl Launcher {
             self.reap();
             return idxs.into_iter().for_each(|idx| self.members[idx].restart_at = Some(again));
         }
+        // While it begins, nobody starts it once more.
+        idxs.iter().for_each(|idx| self.members[*idx].restart_at = None);
         let failure = self.spawn_active(idx).err().map(|error| (error.is_shortage(), anyhow::Error::from(error)));
         if let Some((true, error)) = &failure {
             let (ending, when) = (format!("is missing ({error:#})"), "the machine can start processes again");
@@ -288,7 +283,6 @@ impl Launcher {
         let is_counted = !self.members.iter().any(|member| member.waits_for_room);
         for idx in &idxs {
             let member = &mut self.members[*idx];
-            member.restart_at = None;
             if is_counted {
                 member.restarts.push_back(Instant::now());
             }

@@ -117,11 +117,6 @@ impl Launcher {
             match self.spawn(&nodes, true) {
                 Ok(processes) => {
                     for ((idx, _), process) in nodes.into_iter().zip(processes) {
-                        for target in &mut swap.targets {
-                            if target.idx == idx {
-                                target.new_pid = process.pid();
-                            }
-                        }
                         self.members[idx].standby = Some(process);
                     }
                 }
@@ -131,6 +126,9 @@ impl Launcher {
                     return self.abandon_swap(&message);
                 }
             }
+        }
+        for target in &mut swap.targets {
+            target.new_pid = self.members[target.idx].standby.as_ref().map_or(0, Process::pid);
         }
         let starting: Vec<_> =
             swap.targets.iter().map(|target| format!("{} (process {})", target.node.id, target.new_pid)).collect();
@@ -479,9 +477,7 @@ impl Launcher {
     fn last_sent(&self, idx: usize) -> Vec<(Port, SampleId)> {
         let mut sent = Vec::new();
         for (port, _) in self.members[idx].node.output_ports() {
-            if let Some(slot) = self.plan.output_slot(&port)
-                && let Some(key) = self.cursors.output(slot).key()
-            {
+            if let Some(key) = self.last_sent_at(&port) {
                 sent.push((port, key));
             }
         }
@@ -573,8 +569,7 @@ impl Launcher {
                     self.say(&format!("blindgrasp: swap abandoned: {message}"));
                     let is_old_one_there = swap.targets.iter().all(|target| self.members[target.idx].active.is_some());
                     let outcome = if is_old_one_there { "the old one goes on" } else { "nothing has changed" };
-                    let message = format!("{message}; {outcome}");
-                    swap.tell(Reply::Error { message, rolled_back: false });
+                    swap.tell(Reply::refusal(format!("{message}; {outcome}")));
                 }
             }
         }
@@ -649,7 +644,7 @@ impl Launcher {
             .filter(|input| !input.partner && targets.iter().any(|target| target.node.id == input.from_node));
         from_targets.into_iter().all(|input| {
             let from = (input.from_node.clone(), input.from_port.clone());
-            let sent = self.plan.output_slot(&from).and_then(|slot| self.cursors.output(slot).key());
+            let sent = self.last_sent_at(&from);
             let answered = self.plan.input_slot(&node.id, &input.port).and_then(|slot| self.cursors.input(slot).key());
             sent.is_none() || sent == answered
         })
@@ -663,14 +658,14 @@ impl Launcher {
             Some(key) if !node.is_source() => key,
             _ => {
                 let (port, _) = node.output_ports().next()?;
-                self.cursors.output(self.plan.output_slot(&port)?).key()
+                self.last_sent_at(&port)
             }
         }
     }
 }
 
 fn refuse(reply: &SyncSender<Reply>, message: &str) {
-    let _ = reply.try_send(Reply::Error { message: message.into(), rolled_back: false });
+    let _ = reply.try_send(Reply::refusal(message));
 }
 
 /// Whether the readers will receive all that an operator, and those before it, have sent.
@@ -682,20 +677,27 @@ fn type_of<'a>(ports: &'a [PortDescription], name: &str) -> Option<&'a str> {
     ports.iter().find(|port| port.name == name).map(|port| port.type_name.as_str())
 }
 
+/// Whether a replacement has a port of this name and type, as its node does. `words` are for the message.
+fn check_port(
+    node: &Node,
+    words: (&str, &str),
+    offered: &[PortDescription],
+    (name, expected): (&str, &str),
+) -> Result<(), String> {
+    let (side, verb) = words;
+    match type_of(offered, name) {
+        None => Err(format!("the replacement has no {side} '{name}', which '{}' has", node.id)),
+        Some(found) if found != expected => {
+            Err(format!("the replacement's {side} '{name}' {verb} {found}, '{}' has {expected}", node.id))
+        }
+        Some(_) => Ok(()),
+    }
+}
+
 /// Whether a program can stand where a node stands.
 fn check_ports(node: &Node, description: &OperatorDescription) -> Result<(), String> {
     for input in &node.inputs {
-        match type_of(&description.inputs, &input.port) {
-            None => return Err(format!("the replacement has no input '{}', which '{}' has", input.port, node.id)),
-            Some(found) if found != input.type_name => {
-                let expected = &input.type_name;
-                return Err(format!(
-                    "the replacement's input '{}' takes {found}, '{}' has {expected}",
-                    input.port, node.id
-                ));
-            }
-            Some(_) => {}
-        }
+        check_port(node, ("input", "takes"), &description.inputs, (&input.port, &input.type_name))?;
     }
     for port in &description.inputs {
         if !port.optional && node.inputs.iter().all(|input| input.port != port.name) {
@@ -703,17 +705,7 @@ fn check_ports(node: &Node, description: &OperatorDescription) -> Result<(), Str
         }
     }
     for output in node.outputs() {
-        match type_of(&description.outputs, &output.name) {
-            None => return Err(format!("the replacement has no output '{}', which '{}' has", output.name, node.id)),
-            Some(found) if found != output.type_name => {
-                let expected = &output.type_name;
-                return Err(format!(
-                    "the replacement's output '{}' gives {found}, '{}' has {expected}",
-                    output.name, node.id
-                ));
-            }
-            Some(_) => {}
-        }
+        check_port(node, ("output", "gives"), &description.outputs, (&output.name, &output.type_name))?;
     }
     match description.outputs.iter().find(|port| type_of(node.outputs(), &port.name).is_none()) {
         Some(port) => Err(format!("the replacement has an output '{}', which '{}' lacks", port.name, node.id)),

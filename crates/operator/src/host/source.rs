@@ -41,8 +41,9 @@ struct HostedSource {
     ask_at: Option<Instant>,
     is_open: bool,
     is_done: bool,
-    /// Of a source that resumes: the last sample of each output that came from it.
-    came: BTreeMap<usize, SampleId>,
+    /// Of a source that resumes: the samples of each output that came from it.
+    came: BTreeMap<usize, Came>,
+    has_warned: bool,
     /// Room that the next sample may take.
     n_next_bytes: usize,
 }
@@ -89,6 +90,7 @@ pub(super) fn run(
         is_open: false,
         is_done: false,
         came: BTreeMap::new(),
+        has_warned: false,
         n_next_bytes,
     };
     if !operator.begins_as_standby() {
@@ -171,6 +173,26 @@ impl Source for HostedSource {
 
     fn next_seq(&self) -> Option<u64> {
         self.outputs.first()?.port.last().map(|last| last.seq + 1)
+    }
+}
+
+/// The samples of an output that came.
+#[derive(Default)]
+struct Came {
+    last: Option<SampleId>,
+    /// The last one of the epoch before.
+    ended: Option<SampleId>,
+}
+
+impl Came {
+    /// Takes the next sample, and says whether readers take it for one of the epoch before, which they have.
+    fn is_of_ended_epoch(&mut self, key: SampleId) -> bool {
+        if let Some(last) = self.last.replace(key)
+            && last.epoch != key.epoch
+        {
+            return is_at_most(key, self.ended.replace(last));
+        }
+        false
     }
 }
 
@@ -314,11 +336,21 @@ impl HostedSource {
             let output = &mut self.outputs[idx];
             let mut header = output.port.header_of(&part.head).unwrap_or_default();
             let key = SampleId { epoch: header.epoch, seq: header.seq };
-            let before = self.came.insert(idx, key);
-            if before.is_some_and(|before| is_at_most(key, Some(before))) {
-                let (seq, name) = (key.seq, &output.name);
-                let before = before.map_or(0, |before| before.seq);
+            let came = self.came.entry(idx).or_default();
+            if let Some(before) = came.last
+                && is_at_most(key, Some(before))
+            {
+                let (seq, name, before) = (key.seq, &output.name, before.seq);
                 anyhow::bail!("sample {seq} of the output {name} came after {before}, expected a greater number");
+            }
+            if came.is_of_ended_epoch(key) && !std::mem::replace(&mut self.has_warned, true) {
+                tracing::warn!(
+                    "sample {} of the output {} is dropped, because readers have the samples of epoch {} up to a greater \
+                     number: expected an epoch that was not used before",
+                    key.seq,
+                    output.name,
+                    key.epoch
+                );
             }
             if let Some(known) = output.known {
                 let is_past = key.epoch == known.epoch && key.seq >= known.seq;
@@ -338,5 +370,21 @@ impl HostedSource {
             }
         }
         Ok(Sent::Yes)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_epoch_that_is_used_again_is_told_from_one_that_goes_on() {
+        let mut came = Came::default();
+        let mut take = |epoch, seq| came.is_of_ended_epoch(SampleId { epoch, seq });
+        for (epoch, seq, expected) in
+            [(1, 0, false), (1, 1, false), (2, 0, false), (1, 0, true), (3, 0, false), (1, 2, false)]
+        {
+            assert_eq!(take(epoch, seq), expected, "{epoch}.{seq}");
+        }
     }
 }

@@ -20,7 +20,7 @@ use crate::monotonic_nanos;
 use crate::operator::{Operator, TICK, Task, Turn, run_in_turn};
 use crate::partner::Partners;
 use crate::port::Sent;
-use crate::stage::{N_WARM, ROOM_PAUSE, arrival_nanos, too_late};
+use crate::stage::{N_WARM, ROOM_PAUSE, STATE_OF_HAND_OVER, arrival_nanos, too_late};
 use crate::wiring::{Clock, Command, InputCounts, OnLate};
 
 /// The most samples that a program gets at once.
@@ -43,6 +43,8 @@ struct HostedStage {
     numbers_itself: bool,
     /// The state of the program after the last message.
     state: Vec<u8>,
+    /// The saved state with which it has handed over, in case that its replacement fails.
+    handed_over: Option<Vec<u8>>,
     /// When the program wants to hear of silence.
     deadline_nanos: Option<u64>,
     /// The input whose turn it is.
@@ -88,6 +90,7 @@ pub(super) fn run(
         store: if is_alike { None } else { Some(Store::new(operator)?) },
         ready,
         state: Vec::new(),
+        handed_over: None,
         deadline_nanos: None,
         turn: 0,
         last: None,
@@ -273,6 +276,9 @@ impl HostedStage {
                 }
                 Command::HandOver => {
                     self.is_active = false;
+                    if let Some(store) = &mut self.store {
+                        self.handed_over = store.restore(&mut self.inputs, &mut self.outputs, false, false)?.state;
+                    }
                     self.operator.handed_over();
                 }
                 Command::Set { id, params } => {
@@ -675,7 +681,11 @@ impl HostedStage {
         let Some(store) = &mut self.store else { return Ok(()) };
         let restored = store.restore(&mut self.inputs, &mut self.outputs, is_handed_over, false)?;
         if self.ready.has_state {
-            let work = super::restore(&mut self.child, restored.state.as_deref())?;
+            let own = self.handed_over.take();
+            if restored.state.is_none() && own.is_some() {
+                tracing::warn!("{STATE_OF_HAND_OVER}");
+            }
+            let work = super::restore(&mut self.child, restored.state.or(own).as_deref())?;
             self.deadline_nanos = work.deadline_nanos();
             self.state = work.state;
         }

@@ -305,7 +305,7 @@ impl Store {
                 let state = take_in(&places, &content[n_bytes..], inputs, outputs, is_handed_over)?;
                 return Ok(Restored { state: Some(state), is_done: places.is_done });
             }
-            tracing::info!("the saved state is older than the last samples of this node: it begins anew");
+            tracing::info!("the saved state is older than the last samples of this node: it is not used");
         }
         for (input, (last, counts)) in inputs.iter_mut().zip(answered) {
             (input.last, input.counts) = (last, counts);
