@@ -230,10 +230,12 @@ impl Credit {
     }
 
     /// Notes, after a long wait, that samples which an earlier instance has sent exist nowhere any more if there is no other
-    /// publisher: the next epoch may begin without the readers' answers to them, which readers count as missing.
-    pub(crate) fn has_waited_long(&mut self, written: Option<Written>, n_publishers: usize) {
+    /// publisher: the next epoch may begin without the readers' answers to them, which readers count as missing. If this
+    /// publisher can begin again, it sends them: see [`Credit::lost_predecessor`].
+    pub(crate) fn has_waited_long(&mut self, places: &impl Places, written: Option<Written>, n_publishers: usize) {
         let last = written.map(|written| written.last);
-        self.lost = last.filter(|_| n_publishers == 1 && self.own_last != last);
+        let may_begin_again = self.lost_predecessor(places, written, n_publishers).is_some();
+        self.lost = last.filter(|_| n_publishers == 1 && self.own_last != last && !may_begin_again);
     }
 
     /// Whether a reader without room, or one behind it, is among these: it cannot go on while this publisher waits for it in
@@ -468,13 +470,18 @@ mod tests {
         let mut credit = credit_of_chain();
         credit.begin(false, &places, Some(written));
         for (n_publishers, has_room) in [(2, false), (1, true)] {
-            credit.has_waited_long(Some(written), n_publishers);
+            credit.has_waited_long(&places, Some(written), n_publishers);
             assert_eq!(credit.first_without_room(&places, Some(written), id(2, 0)).is_none(), has_room);
         }
         // Its own samples are not lost, however long it waits.
         written = Written::with(Some(written), id(2, 0)).expect("a new sample");
         credit.has_sent(id(2, 0));
-        credit.has_waited_long(Some(written), 1);
+        credit.has_waited_long(&places, Some(written), 1);
+        assert!(credit.first_without_room(&places, Some(written), id(9, 0)).is_some());
+        // Its predecessor has ended with them: it begins again.
+        let mut credit = credit_of_chain();
+        credit.begin(true, &places, Some(written));
+        credit.has_waited_long(&places, Some(written), 1);
         assert!(credit.first_without_room(&places, Some(written), id(9, 0)).is_some());
     }
 

@@ -622,7 +622,7 @@ impl Search {
         let mut next = world.clone();
         let written = *world.slots.written.get(node)?;
         let n_publishers = 1 + usize::from(world.nodes[node].old.is_some());
-        next.nodes[node].active.as_mut()?.credit.has_waited_long(written, n_publishers);
+        next.nodes[node].active.as_mut()?.credit.has_waited_long(&world.slots, written, n_publishers);
         (next.nodes[node] != world.nodes[node]).then_some(next)
     }
 
@@ -797,7 +797,7 @@ fn assert_whole(budgets: &[Budget]) {
 #[test]
 fn kills_swaps_and_late_connections_lose_and_repeat_nothing() {
     let swap_of = |node| Budget { node: Some(node), ..SWAP };
-    assert_whole(&[Budget { n_kills: 1, ..KILLS }, swap_of(STATELESS), swap_of(STATEFUL), LATE]);
+    assert_whole(&[Budget { n_kills: 1, ..KILLS }, swap_of(SOURCE), swap_of(STATELESS), swap_of(STATEFUL), LATE]);
 }
 
 /// F1, F3: the only instance that has samples ends together with their reader, and a sample is left without an answer.

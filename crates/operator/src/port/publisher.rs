@@ -397,7 +397,8 @@ impl UntypedPublisher {
     fn pass_lost_samples(&mut self, waited: Duration) {
         if waited > START_HOLD_LIMIT.min(self.wait_limit / 2) {
             let n_publishers = self.sender.pub_sub.dynamic_config().number_of_publishers();
-            self.credit.has_waited_long(self.written(), n_publishers);
+            let written = self.written();
+            self.credit.has_waited_long(&*self.cursors, written, n_publishers);
         }
     }
 
