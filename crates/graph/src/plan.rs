@@ -405,8 +405,11 @@ impl Plan {
             let is_waited_for = next.options.policy == EdgePolicy::Lossless && !next.feedback && next.to.is_some();
             next.from.0 == *node && is_waited_for
         });
-        next.filter_map(|next| Some(ReaderWiring { slot: self.reader_slot(next)?, behind: self.behind(next) }))
-            .collect()
+        let readers = next.filter_map(|next| {
+            let (slot, writer_slot) = (self.reader_slot(next)?, *self.output_slots.get(&next.from)?);
+            Some(ReaderWiring { slot, writer_slot, behind: self.behind(next) })
+        });
+        readers.collect()
     }
 
     fn reader_slot(&self, edge: &PlannedEdge) -> Option<usize> {

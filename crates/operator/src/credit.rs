@@ -13,6 +13,8 @@ use crate::written::Written;
 pub(crate) trait Places {
     /// The last sample that a reader has answered.
     fn answered(&self, slot: usize) -> Option<SampleId>;
+    /// The last sample that the writer with this slot has sent.
+    fn sent(&self, slot: usize) -> Option<SampleId>;
     /// How many samples it has answered whose number was not above those before.
     fn n_repeated(&self, slot: usize) -> u64;
     /// Whether no process will read on.
@@ -22,6 +24,10 @@ pub(crate) trait Places {
 impl Places for SharedCursors {
     fn answered(&self, slot: usize) -> Option<SampleId> {
         self.input(slot).key()
+    }
+
+    fn sent(&self, slot: usize) -> Option<SampleId> {
+        self.output(slot).key()
     }
 
     fn n_repeated(&self, slot: usize) -> u64 {
@@ -46,14 +52,18 @@ pub(crate) struct Credit {
     /// Its last samples, as many as an attached reader may leave unanswered.
     newest: VecDeque<SampleId>,
     n_newest: usize,
+    /// The last sample that was sent, if readers lack samples up to it that no publisher has any more.
+    lost: Option<SampleId>,
 }
 
 /// A reader whose unanswered samples the publisher must be able to send again.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(crate) struct Reader {
     pub(crate) slot: usize,
+    /// Of a reader behind another one: the slot of the output that it reads.
+    writer_slot: Option<usize>,
     limit: Limit,
-    /// The last sample that it had answered at the last look, and its count of repeated samples.
+    /// Its place at the last look, and its count of repeated samples.
     key: Option<SampleId>,
     n_repeated: u64,
     /// How many repeated samples of this very publisher it had not answered then. They take places in its queue, too.
@@ -87,12 +97,15 @@ struct Next<'a> {
     is_repeatable: bool,
     /// See [`Credit::newest`].
     newest: &'a VecDeque<SampleId>,
+    /// See [`Credit::lost`].
+    lost: Option<SampleId>,
 }
 
 impl Reader {
     fn of_port(wiring: &ConsumerWiring, history: usize) -> Reader {
         Reader {
             slot: wiring.slot,
+            writer_slot: None,
             limit: Limit::Queue(wiring.capacity as u64),
             key: None,
             n_repeated: 0,
@@ -106,6 +119,7 @@ impl Reader {
     fn further_on(wiring: &ReaderWiring, history: usize) -> Reader {
         Reader {
             slot: wiring.slot,
+            writer_slot: Some(wiring.writer_slot),
             limit: Limit::History(history as u64),
             key: None,
             n_repeated: 0,
@@ -116,9 +130,20 @@ impl Reader {
         }
     }
 
-    fn has_room(&mut self, places: &impl Places, next: &Next<'_>) -> bool {
+    /// The last sample that it has answered. A reader that has answered all that was sent to it has passed as well what the
+    /// reader before it, which has come to `before`, has left without an answer.
+    fn place(&self, places: &impl Places, written: Option<&Written>, before: Option<SampleId>) -> Option<SampleId> {
+        let answered = places.answered(self.slot);
+        match (self.writer_slot, written) {
+            (Some(slot), Some(written)) if places.sent(slot) == answered => written.ahead(answered, before),
+            _ => answered,
+        }
+    }
+
+    /// `before` is the place of the reader before it.
+    fn has_room(&mut self, places: &impl Places, next: &Next<'_>, before: Option<SampleId>) -> bool {
         if next.is_repeat || !(self.key.is_some() && self.is_near(next)) {
-            self.key = places.answered(self.slot);
+            self.key = self.place(places, next.written.as_ref(), before);
             let n_repeated = places.n_repeated(self.slot);
             self.n_repeats = self.n_repeats.saturating_sub(n_repeated.saturating_sub(self.n_repeated));
             self.n_repeated = n_repeated;
@@ -126,7 +151,13 @@ impl Reader {
                 return places.is_given_up(self.slot);
             }
         }
-        self.behind.iter_mut().all(|reader| reader.has_room(places, next)) || places.is_given_up(self.slot)
+        let key = self.key;
+        if self.behind.iter_mut().all(|reader| reader.has_room(places, next, key)) {
+            return true;
+        }
+        // It is looked at again, because the places of those behind may depend on its own.
+        self.key = None;
+        places.is_given_up(self.slot)
     }
 
     fn is_near(&self, next: &Next<'_>) -> bool {
@@ -145,7 +176,7 @@ impl Reader {
         }
         // A new epoch begins when every reader that is not attached has answered the one before.
         if begins_epoch {
-            return false;
+            return next.lost == Some(written.last);
         }
         // It had answered the epoch before, or it has just come.
         let first_unanswered = is_within_epoch.map_or(written.first_seq, |key| key.seq + 1);
@@ -158,11 +189,17 @@ impl Reader {
 
     /// Of the places of this reader and of those behind it, without readers that were given up, the one furthest behind; the
     /// outer `None` if there is no reader.
-    fn least(&self, places: &impl Places, written: Option<&Written>) -> Option<Option<SampleId>> {
+    fn least(
+        &self,
+        places: &impl Places,
+        written: Option<&Written>,
+        before: Option<SampleId>,
+    ) -> Option<Option<SampleId>> {
         if places.is_given_up(self.slot) {
             return None;
         }
-        let mut least = places.answered(self.slot);
+        let place = self.place(places, written, before);
+        let mut least = place;
         // No writer goes back to an earlier epoch for an attached reader.
         if self.is_attached()
             && let Some(written) = written
@@ -171,7 +208,7 @@ impl Reader {
             least = written.before;
         }
         for reader in &self.behind {
-            if let Some(key) = reader.least(places, written) {
+            if let Some(key) = reader.least(places, written, place) {
                 least = written.and_then(|written| written.behind(least, key));
             }
         }
@@ -199,7 +236,7 @@ impl Credit {
         let n_newest = attached.map(|reader| reader.capacity).max().unwrap_or(0);
         let readers = consumers.iter().map(|reader| Reader::of_port(reader, history)).collect();
         let newest = VecDeque::with_capacity(n_newest);
-        Credit { readers, begun_after: None, own_first: None, own_last: None, newest, n_newest }
+        Credit { readers, begun_after: None, own_first: None, own_last: None, newest, n_newest, lost: None }
     }
 
     /// The first reader that has no room for a sample, if there is one.
@@ -213,9 +250,18 @@ impl Credit {
         let is_repeat = self.is_repeat(key);
         let last = if is_repeat { self.own_last } else { None };
         let key = last.map_or(key, |last| SampleId { seq: last.seq + 1, ..last });
-        let (is_repeatable, newest) = (self.begun_after.is_some(), &self.newest);
-        let next = Next { key, is_repeat, written, own_first, is_repeatable, newest };
-        self.readers.iter_mut().find_map(|reader| (!reader.has_room(places, &next)).then_some(&*reader))
+        let (is_repeatable, newest, lost) = (self.begun_after.is_some(), &self.newest, self.lost);
+        let next = Next { key, is_repeat, written, own_first, is_repeatable, newest, lost };
+        self.readers.iter_mut().find_map(|reader| (!reader.has_room(places, &next, None)).then_some(&*reader))
+    }
+
+    /// Notes, after a long wait, that samples which an earlier instance has sent exist nowhere any more if there is no other
+    /// publisher: the next epoch may begin without the readers' answers to them, which readers count as missing. If this
+    /// publisher can begin again, it sends them: see [`Credit::lost_predecessor`].
+    pub(crate) fn has_waited_long(&mut self, places: &impl Places, written: Option<Written>, n_publishers: usize) {
+        let last = written.map(|written| written.last);
+        let may_begin_again = self.lost_predecessor(places, written, n_publishers).is_some();
+        self.lost = last.filter(|_| n_publishers == 1 && self.own_last != last && !may_begin_again);
     }
 
     /// Whether a reader without room, or one behind it, is among these: it cannot go on while this publisher waits for it in
@@ -314,7 +360,7 @@ impl Credit {
     /// The last sample that the reader furthest behind has answered; the outer `None` if there is no reader.
     fn least_answered(&self, places: &impl Places, written: Option<Written>) -> Option<Option<SampleId>> {
         let written = written.as_ref();
-        let least = self.readers.iter().filter_map(|reader| reader.least(places, written));
+        let least = self.readers.iter().filter_map(|reader| reader.least(places, written, None));
         least.reduce(|a, b| written.and_then(|written| written.behind(a, b)))
     }
 
@@ -330,11 +376,12 @@ impl Credit {
         places: &impl Places,
         written: Option<Written>,
     ) -> Vec<&Reader> {
-        let lacking = self.readers.iter().filter(|reader| match (reader.least(places, written.as_ref()), written) {
-            (None, _) | (_, None) => false,
-            (Some(None), _) => true,
-            (Some(Some(place)), Some(written)) => !written.is_past(place, key),
-        });
+        let lacking =
+            self.readers.iter().filter(|reader| match (reader.least(places, written.as_ref(), None), written) {
+                (None, _) | (_, None) => false,
+                (Some(None), _) => true,
+                (Some(Some(place)), Some(written)) => !written.is_past(place, key),
+            });
         lacking.collect()
     }
 }
@@ -349,6 +396,10 @@ mod tests {
     impl Places for Place {
         fn answered(&self, _: usize) -> Option<SampleId> {
             self.0
+        }
+
+        fn sent(&self, _: usize) -> Option<SampleId> {
+            None
         }
 
         fn n_repeated(&self, _: usize) -> u64 {
@@ -381,7 +432,6 @@ mod tests {
     /// An observer that stands still while epochs change was given up with most of its places free.
     #[test]
     fn an_attached_reader_has_room_for_its_places_whatever_the_epochs() {
-        let id = |epoch, seq| SampleId { epoch, seq };
         let keys = [id(9, 0), id(2, 0), id(5, 0), id(5, 1), id(1, 0), id(1, 1), id(1, 2)];
         let (mut credit, mut written) = (Credit::new(&[reader(vec![])], 4), None);
         assert_eq!(n_sent(&mut credit, &mut written, &keys, &Place(None, 0)), 1, "another reader is waited for");
@@ -397,8 +447,8 @@ mod tests {
 
     #[test]
     fn repeated_samples_take_places_in_the_queue_until_they_are_answered() {
-        let ids = |seqs: &[u64]| seqs.iter().map(|seq| SampleId { epoch: 7, seq: *seq }).collect::<Vec<_>>();
-        let place = |seq, n_repeated| Place(Some(SampleId { epoch: 7, seq }), n_repeated);
+        let ids = |seqs: &[u64]| seqs.iter().map(|seq| id(7, *seq)).collect::<Vec<_>>();
+        let place = |seq, n_repeated| Place(Some(id(7, seq)), n_repeated);
         let (mut credit, mut written) = (Credit::new(&[reader(vec![])], 4), None);
         let mut send = |seqs: &[u64], place: Place| n_sent(&mut credit, &mut written, &ids(seqs), &place);
         // The reader has counted repeated samples of an earlier writer.
@@ -409,5 +459,93 @@ mod tests {
         assert_eq!(send(&[3, 4, 4, 4, 4], place(3, 13)), 2);
         // It has answered all.
         assert_eq!(send(&[5, 6, 7, 8, 9], place(4, 16)), 4);
+    }
+
+    /// The places of two readers in a row, and the last sample that the first one has sent to the second.
+    struct Chain([Option<SampleId>; 2], Option<SampleId>);
+
+    impl Places for Chain {
+        fn answered(&self, slot: usize) -> Option<SampleId> {
+            self.0[slot]
+        }
+
+        fn sent(&self, _: usize) -> Option<SampleId> {
+            self.1
+        }
+
+        fn n_repeated(&self, _: usize) -> u64 {
+            0
+        }
+
+        fn is_given_up(&self, _: usize) -> bool {
+            false
+        }
+    }
+
+    fn id(epoch: u64, seq: u64) -> SampleId {
+        SampleId { epoch, seq }
+    }
+
+    /// The credit of the writer before a [`Chain`].
+    fn credit_of_chain() -> Credit {
+        let behind = vec![ReaderWiring { slot: 1, writer_slot: 2, behind: vec![] }];
+        Credit::new(&[ConsumerWiring { behind, ..reader(vec![]) }], 4)
+    }
+
+    /// F3: the last sample of an epoch was left without an answer.
+    #[test]
+    fn an_epoch_begins_when_readers_have_answered_all_that_they_were_sent() {
+        let written = Written { last: id(7, 1), first_seq: 0, before: None };
+        let mut credit = credit_of_chain();
+        let mut has_room = |answered: [u64; 2], sent| {
+            let places = Chain(answered.map(|seq| Some(id(7, seq))), Some(id(7, sent)));
+            credit.first_without_room(&places, Some(written), id(2, 0)).is_none()
+        };
+        assert!(!has_room([0, 0], 0), "the first one has not answered 1");
+        assert!(!has_room([1, 0], 1), "the answer to 1 is on its way");
+        assert!(has_room([1, 0], 0), "the first one has left 1 without an answer");
+        assert!(has_room([1, 1], 1));
+        let left_out = Chain([Some(id(7, 1)), Some(id(7, 0))], Some(id(7, 0)));
+        assert_eq!(credit.known(false, &left_out, Some(written)), Some(id(7, 1)), "nobody needs it again");
+    }
+
+    /// F3: a source that cannot give its samples again dies together with its reader.
+    #[test]
+    fn an_epoch_begins_in_the_end_if_no_publisher_has_the_samples_before_it() {
+        let mut written = Written { last: id(7, 1), first_seq: 0, before: None };
+        let places = Chain([Some(id(7, 0)); 2], Some(id(7, 0)));
+        let mut credit = credit_of_chain();
+        credit.begin(false, &places, Some(written));
+        for (n_publishers, has_room) in [(2, false), (1, true)] {
+            credit.has_waited_long(&places, Some(written), n_publishers);
+            assert_eq!(credit.first_without_room(&places, Some(written), id(2, 0)).is_none(), has_room);
+        }
+        // Its own samples are not lost, however long it waits.
+        written = Written::with(Some(written), id(2, 0)).expect("a new sample");
+        credit.has_sent(id(2, 0));
+        credit.has_waited_long(&places, Some(written), 1);
+        assert!(credit.first_without_room(&places, Some(written), id(9, 0)).is_some());
+        // Its predecessor has ended with them: it begins again.
+        let mut credit = credit_of_chain();
+        credit.begin(true, &places, Some(written));
+        credit.has_waited_long(&places, Some(written), 1);
+        assert!(credit.first_without_room(&places, Some(written), id(9, 0)).is_some());
+    }
+
+    /// L8: it was handed over to, or has begun again and has not sent again what its predecessor had sent.
+    #[test]
+    fn an_instance_knows_whether_its_memory_has_all_that_is_not_answered() {
+        let written = Some(Written { last: id(7, 2), first_seq: 0, before: None });
+        let places = Chain([Some(id(7, 0)); 2], Some(id(7, 0)));
+        let mut credit = credit_of_chain();
+        credit.begin(true, &places, written);
+        assert!(credit.has_sent_all(written));
+        let mut credit = credit_of_chain();
+        credit.begin(false, &places, written);
+        assert!(!credit.has_sent_all(written));
+        credit.has_sent(id(7, 1));
+        assert!(!credit.has_sent_all(written));
+        credit.has_sent(id(7, 2));
+        assert!(credit.has_sent_all(written));
     }
 }

@@ -12,8 +12,9 @@ use crate::cursors::SampleId;
 use crate::wiring::InputCounts;
 use crate::written::Written;
 
-/// An early sample waits at most this long for those before it.
-pub const HOLD_LIMIT: Duration = Duration::from_millis(50);
+/// An early sample waits at most this long for those before it: longer than a writer needs to notice that its predecessor has
+/// ended ([`TICK`](crate::operator::TICK)).
+pub const HOLD_LIMIT: Duration = Duration::from_millis(250);
 /// A reader that has just begun waits so long for samples that were sent before: each publisher gives it those that it kept once
 /// it has noticed the reader, and on a busy machine one publisher can be much later than another.
 pub const START_HOLD_LIMIT: Duration = Duration::from_secs(2);
@@ -58,6 +59,8 @@ struct Epoch {
     value: u64,
     /// The number of its first sample, if the writer has said it.
     first_seq: Option<u64>,
+    /// The number of its last sample, if it is over.
+    last_seq: Option<u64>,
 }
 
 /// The sequencer's answer to a sample.
@@ -99,7 +102,7 @@ impl<T> Sequencer<T> {
         Sequencer {
             epochs: counted
                 .iter()
-                .map(|counted| Epoch { generation: 0, value: counted.epoch, first_seq: None })
+                .map(|counted| Epoch { generation: 0, value: counted.epoch, first_seq: None, last_seq: None })
                 .collect(),
             // Nothing is missing between the two: the earlier instance received it.
             last: answered,
@@ -155,7 +158,12 @@ impl<T> Sequencer<T> {
             return None;
         }
         let generation = self.epochs.back().map_or(0, |epoch| epoch.generation + 1);
-        self.epochs.push_back(Epoch { generation, value: key.epoch, first_seq });
+        if let (Some(ended), Some(before)) = (self.epochs.back_mut(), current.and_then(|written| written.before))
+            && ended.value == before.epoch
+        {
+            ended.last_seq = Some(before.seq);
+        }
+        self.epochs.push_back(Epoch { generation, value: key.epoch, first_seq, last_seq: None });
         if self.epochs.len() > N_EPOCHS {
             self.epochs.pop_front();
         }
@@ -211,7 +219,10 @@ impl<T> Sequencer<T> {
         let may_begin_elsewhere = self.takes_what_comes && self.last.is_none();
         if self.may_hold && (self.is_early(place) || may_begin_elsewhere) {
             let may_be_elsewhere = (n_before > 0 || may_begin_elsewhere) && is_first_of_publisher;
-            if !self.held.is_empty() || (may_be_elsewhere && (self.publishers.len() > 1 || has_other_publishers())) {
+            // Where no other publisher is left, the one that has sent the samples before may notice that, and send them.
+            let were_sent = n_before > 0 && written.is_some() && (self.last.is_some() || self.since_first(place) > 0);
+            let may_come = may_be_elsewhere && (were_sent || self.publishers.len() > 1 || has_other_publishers());
+            if may_come || !self.held.is_empty() {
                 self.held.insert(place, (sample, now()));
                 return Placing::Hold;
             }
@@ -305,8 +316,11 @@ impl<T> Sequencer<T> {
     fn n_before(&self, place: Place) -> u64 {
         match self.last {
             Some((generation, seq)) if generation == place.0 => place.1.saturating_sub(seq).saturating_sub(1),
-            // A new epoch may begin at any number; its writer says at which.
-            Some(_) => self.since_first(place),
+            // A new epoch may begin at any number; its writer says at which, and where the one before has ended.
+            Some((generation, seq)) => {
+                let ended = self.epoch(generation).and_then(|epoch| epoch.last_seq);
+                ended.map_or(0, |last_seq| last_seq.saturating_sub(seq)) + self.since_first(place)
+            }
             None if self.takes_what_comes => 0,
             None if self.begins_at_zero && self.counted.is_none() => place.1,
             None if self.begins_at_zero => self.since_first(place),
@@ -535,6 +549,55 @@ mod tests {
         let mut first = Sequencer::resume(None, None, InputCounts::default()).beginning_at(start, None);
         assert_eq!(first.push(5, id(5), 2, None, || true, || start), Placing::Hold);
         assert_eq!(first.next_overdue(start + HOLD_LIMIT), Some(5));
+    }
+
+    /// F1: a publisher that was handed over to has sent 1 when its predecessor ends with 0, and the reader with it. It notices
+    /// within a tick, begins again, and sends 0 too.
+    #[test]
+    fn samples_before_the_first_one_of_the_only_publisher_may_come_again() {
+        let start = Instant::now();
+        let id = |seq| SampleId { epoch: EPOCH, seq };
+        let written = Written { last: id(1), first_seq: 0, before: None };
+        let resumed = Sequencer::resume(None, None, InputCounts::default());
+        let push = |sequencer: &mut Sequencer<u64>, seq, publisher| {
+            sequencer.push(seq, id(seq), publisher, Some(&written), || false, || start)
+        };
+        let mut sequencer = resumed.clone();
+        assert_eq!(push(&mut sequencer, 1, 2), Placing::Hold);
+        assert_eq!(sequencer.next_overdue(start + 2 * crate::operator::TICK), None);
+        assert_eq!(push(&mut sequencer, 0, 3), Placing::Deliver(0));
+        assert_eq!(sequencer.next_in_order(), Some(1));
+        // They do not come: they are missing.
+        let mut sequencer = resumed.clone();
+        assert_eq!(push(&mut sequencer, 1, 2), Placing::Hold);
+        assert_eq!((sequencer.next_overdue(start + HOLD_LIMIT), sequencer.counts().n_missing), (Some(1), 1));
+        // A recording that begins at 1 has nothing before it.
+        let written = Written { first_seq: 1, ..written };
+        let placing = resumed.clone().push(1, id(1), 2, Some(&written), || false, || start);
+        assert_eq!(placing, Placing::Deliver(1));
+    }
+
+    /// The writer has begun an epoch although its reader has not answered the end of the one before: see
+    /// [`Credit::has_waited_long`](crate::credit::Credit::has_waited_long).
+    #[test]
+    fn the_end_of_an_epoch_is_awaited_and_missing_if_it_does_not_come() {
+        let (start, old, new) = (Instant::now(), EPOCH, EPOCH - 1);
+        let key = |epoch, seq| SampleId { epoch, seq };
+        let written = Written { last: key(new, 0), first_seq: 0, before: Some(key(old, 7)) };
+        let counts = InputCounts { n_received: 6, ..InputCounts::default() };
+        let resumed = Sequencer::resume(Some(key(old, 5)), Some(key(old, 5)), counts);
+        let push = |sequencer: &mut Sequencer<_>, key, publisher| {
+            sequencer.push(key, key, publisher, Some(&written), || false, || start)
+        };
+        let mut sequencer = resumed.clone();
+        assert_eq!(push(&mut sequencer, key(new, 0), 2), Placing::Hold);
+        assert_eq!(push(&mut sequencer, key(old, 6), 1), Placing::Deliver(key(old, 6)), "it was in another queue");
+        assert_eq!(push(&mut sequencer, key(old, 7), 1), Placing::Deliver(key(old, 7)));
+        assert_eq!(sequencer.next_in_order(), Some(key(new, 0)));
+        let mut sequencer = resumed;
+        assert_eq!(push(&mut sequencer, key(new, 0), 2), Placing::Hold);
+        assert_eq!(sequencer.next_overdue(start + HOLD_LIMIT), Some(key(new, 0)));
+        assert_eq!(sequencer.counts().n_missing, 2);
     }
 
     /// A standby has opened its publisher and sends nothing: the gaps of the other publisher are gaps.

@@ -255,6 +255,8 @@ pub struct ConsumerWiring {
 pub struct ReaderWiring {
     /// The reader's slot on the cursors.
     pub slot: usize,
+    /// The slot of the output that it reads.
+    pub writer_slot: usize,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub behind: Vec<ReaderWiring>,
 }

@@ -66,6 +66,15 @@ impl Written {
         }
     }
 
+    /// Whether a sample is one that a writer with this record has sent after another one, if it has sent both.
+    pub fn is_after(record: Option<Written>, key: SampleId, other: Option<SampleId>) -> bool {
+        let Some(other) = other else { return true };
+        match record {
+            Some(written) => !written.is_past(other, key),
+            None => other.epoch != key.epoch || other.seq < key.seq,
+        }
+    }
+
     /// Of two places of readers, the one further behind; a reader that has answered nothing has none.
     pub fn behind(&self, a: Option<SampleId>, b: Option<SampleId>) -> Option<SampleId> {
         let (a, b) = (a?, b?);

@@ -46,6 +46,7 @@ use crate::launcher::server::Ask;
 use crate::launcher::service::Service;
 use crate::launcher::set::PendingSet;
 use crate::launcher::slow_nodes::SlowNodes;
+pub(crate) use crate::launcher::supervision::QUARANTINED;
 use crate::launcher::swap::Swap;
 use crate::launcher::wake_policy::WakePolicy;
 use crate::log::AUDIT;

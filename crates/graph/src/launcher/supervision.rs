@@ -18,7 +18,7 @@ const MAX_BACKOFF: Duration = Duration::from_secs(10);
 const ROOM_PAUSE: Duration = Duration::from_millis(500);
 
 /// The name of the count of samples that are left without an answer.
-const QUARANTINED: &str = "quarantined";
+pub(crate) const QUARANTINED: &str = "quarantined";
 const MAX_QUARANTINE: usize = 64;
 
 /// A launcher that has not looked for longer than this was stopped.

@@ -211,7 +211,7 @@ impl<S: RunSink> RunLog<S> {
             undecided: self.n_undecided + self.truths.len(),
             latency_nanos: latency(&self.latencies_nanos),
             samples_lost: dropped(EdgePolicy::Lossless)
-                + skipped_by_stages(ran.graph, &edges)
+                + skipped_by_stages(ran.graph, &ran.status.nodes, &edges)
                 + n_lost_to_machines
                 // What never reached another machine is missing in its answers as well.
                 + missing_from_machines(ran.graph, &edges).saturating_sub(n_lost_to_machines),

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
-use crate::control::{EdgeStatus, GraphStatus};
+use crate::control::{EdgeStatus, GraphStatus, NodeStatus};
 use crate::dataflow::{EdgePolicy, Graph, Node};
-use crate::launcher::{End, LaunchError};
+use crate::launcher::{End, LaunchError, QUARANTINED};
 use crate::plan::Port;
 use blindgrasp_messages::score::Score;
 use blindgrasp_operator::link_status::LinkStatus;
@@ -100,9 +100,9 @@ pub(super) fn edges(ran: &Ran<'_>, observed: &BTreeMap<String, InputCounts>) -> 
     edges
 }
 
-/// Samples that a stage did not answer: numbers that are missing behind it but not before it. Samples that the edge
-/// behind it dropped are counted there.
-pub(super) fn skipped_by_stages(graph: &Graph, edges: &[EdgeStatus]) -> u64 {
+/// Samples that a stage did not answer: numbers that are missing behind it but not before it, or those in quarantine if they
+/// are more. Samples that the edge behind it dropped are counted there.
+pub(super) fn skipped_by_stages(graph: &Graph, nodes: &[NodeStatus], edges: &[EdgeStatus]) -> u64 {
     graph
         .nodes
         .iter()
@@ -112,7 +112,10 @@ pub(super) fn skipped_by_stages(graph: &Graph, edges: &[EdgeStatus]) -> u64 {
             let behind = edges.iter().filter(|edge| edge.from.starts_with(&prefix));
             let before = edges.iter().filter(|edge| edge.to.starts_with(&prefix));
             let n_behind = behind.map(|edge| edge.missing.saturating_sub(edge.dropped)).max().unwrap_or(0);
-            n_behind.saturating_sub(before.map(|edge| edge.missing).max().unwrap_or(0))
+            let n_skipped = n_behind.saturating_sub(before.map(|edge| edge.missing).max().unwrap_or(0));
+            let status = nodes.iter().find(|status| status.node == node.id);
+            let n_quarantined = status.and_then(|status| status.counts.get(QUARANTINED)).copied();
+            n_skipped.max(n_quarantined.unwrap_or(0))
         })
         .sum()
 }

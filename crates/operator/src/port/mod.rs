@@ -62,3 +62,116 @@ pub type BoxedError = Box<dyn std::error::Error + Send + Sync>;
 pub fn sample_id(header: &Header) -> SampleId {
     SampleId { epoch: header.epoch, seq: header.seq }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+    use std::sync::Arc;
+    use std::time::Duration;
+
+    use blindgrasp_messages::{LiftDecision, Message};
+
+    use super::*;
+    use crate::cursors::{N_AGE_SLOTS, SharedCursors};
+    use crate::namespace;
+    use crate::wiring::{
+        ConsumerWiring, EdgePolicy, InputCounts, InputWiring, NamespaceWiring, OnLate, OutputWiring, ServiceWiring,
+    };
+
+    const OUTPUT: usize = 0;
+    const INPUT: usize = 1;
+
+    fn service(name: &str) -> ServiceWiring {
+        ServiceWiring {
+            name: name.into(),
+            type_name: LiftDecision::TYPE_NAME.into(),
+            history: 2,
+            max_capacity: 2,
+            max_borrowed: 3,
+            max_publishers: 2,
+            max_subscribers: 2,
+            max_nodes: 2,
+        }
+    }
+
+    /// Both ends of an edge in one process, and its cursors.
+    fn edge(folder: &std::path::Path) -> (Publisher<LiftDecision>, Subscriber<LiftDecision>, Arc<SharedCursors>) {
+        std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o700)).expect("its own");
+        let domain = NamespaceWiring { folder: folder.into() };
+        std::fs::create_dir_all(domain.ports()).expect("a folder");
+        let node = namespace::join(&domain, "test").expect("joined");
+        let n_slots = INPUT + 2 + N_AGE_SLOTS;
+        let cursors = Arc::new(SharedCursors::create(&folder.join("test"), n_slots, 0).expect("cursors"));
+        let consumer = ConsumerWiring {
+            slot: INPUT,
+            capacity: 2,
+            attached_slots: vec![],
+            attached_limit_millis: 0,
+            behind: vec![],
+        };
+        let output = OutputWiring {
+            service: service("edge"),
+            shadow: service("shadow"),
+            slot: OUTPUT,
+            consumers: vec![consumer],
+            bells: vec![],
+            wait_limit_millis: 60_000,
+        };
+        let input = InputWiring {
+            service: service("edge"),
+            policy: EdgePolicy::Lossless,
+            capacity: 2,
+            deadline_nanos: None,
+            on_late: OnLate::Count,
+            tolerance_nanos: 0,
+            partner_wait_nanos: 0,
+            slot: Some(INPUT),
+            writer_slot: OUTPUT,
+        };
+        let publisher = Publisher::open(&node, &cursors, &output, 0).expect("opened");
+        let subscriber = Subscriber::open(&node, Some(&cursors), &input).expect("opened");
+        (publisher, subscriber, cursors)
+    }
+
+    fn head(seq: u64) -> <LiftDecision as Message>::Head {
+        LiftDecision::default().to_parts(Header { seq, epoch: 7, ..Header::default() }).0
+    }
+
+    /// L9, and what an instance with a state finds that takes over.
+    #[test]
+    fn a_publisher_gives_way_to_its_own_reader_and_the_cursor_follows_the_saved_state() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (mut publisher, mut subscriber, cursors) = edge(folder.path());
+        let key = |seq| Some(SampleId { epoch: 7, seq });
+        publisher.begin(false);
+        subscriber.take_over(None);
+        subscriber.connect().expect("connected");
+        for seq in 0..2 {
+            assert_eq!(publisher.send(head(seq), &[], &mut || false).expect("sent"), Sent::Yes);
+        }
+        publisher.shares_process_with(vec![INPUT]);
+        let mut n_asked = 0;
+        let sent = publisher.send(head(2), &[], &mut || {
+            n_asked += 1;
+            n_asked > 100
+        });
+        assert_eq!((sent.expect("no error"), n_asked), (Sent::GaveWay, 0), "waiting is in vain");
+        assert!(
+            !publisher.has_room_for(&Header { seq: 2, epoch: 7, ..Header::default() }, Duration::ZERO).expect("ok")
+        );
+        assert_eq!(cursors.output(OUTPUT).key(), key(1), "a sample that was not sent is not counted");
+        for seq in 0..2 {
+            let sample = subscriber.receive().expect("no error").expect("a sample");
+            assert_eq!(sample.head().header.seq, seq);
+            subscriber.commit(&sample.head().header);
+        }
+        assert!(subscriber.is_caught_up());
+        // A sample that is answered again does not move the cursor back; a saved state does.
+        subscriber.commit(&Header { seq: 0, epoch: 7, ..Header::default() });
+        assert_eq!(cursors.input(INPUT).key(), key(1));
+        let counts = InputCounts { n_received: 1, ..InputCounts::default() };
+        subscriber.take_over_at(key(0), counts);
+        assert_eq!((cursors.input(INPUT).key(), cursors.input(INPUT).counts()), (key(0), counts));
+        assert_eq!(publisher.begin(false), key(1), "its own samples lie in its memory");
+    }
+}

@@ -17,6 +17,7 @@ use super::{PortError, sample_id};
 use crate::credit::{Credit, Reader};
 use crate::cursors::{COMPARE_BELL, OutputSlot, SampleId, SharedCursors};
 use crate::private_service::PrivateService;
+use crate::sequencer::START_HOLD_LIMIT;
 use crate::wiring::{OutputWiring, ServiceWiring};
 use crate::written::Written;
 use blindgrasp_messages::{Header, Message};
@@ -231,6 +232,8 @@ pub struct UntypedPublisher {
     own_readers: Vec<usize>,
     /// See [`Credit::has_sent_all`].
     has_sent_all: Arc<AtomicBool>,
+    /// The last sample that had no room at first, and since when.
+    waits_since: Option<(SampleId, Instant)>,
     /// See [`UntypedPublisher::delay_bells`].
     delays_bells: bool,
 }
@@ -250,6 +253,7 @@ impl UntypedPublisher {
             wait_limit: Duration::from_millis(wiring.wait_limit_millis),
             own_readers: Vec::new(),
             has_sent_all: Arc::new(AtomicBool::new(true)),
+            waits_since: None,
             delays_bells: false,
         })
     }
@@ -285,6 +289,7 @@ impl UntypedPublisher {
     /// one that it has sent; otherwise, the last one that the readers, and those behind them, have answered.
     pub fn begin(&mut self, is_handed_over: bool) -> Option<SampleId> {
         let written = self.written();
+        self.waits_since = None;
         let known = self.credit.begin(is_handed_over, &*self.cursors, written);
         self.has_sent_all.store(self.credit.has_sent_all(written), Ordering::Relaxed);
         known
@@ -367,6 +372,7 @@ impl UntypedPublisher {
             return Ok(true);
         }
         self.give_up_attached(key, waited);
+        self.pass_lost_samples(waited);
         self.look_for_readers()?;
         Ok(self.has_room(key))
     }
@@ -384,6 +390,15 @@ impl UntypedPublisher {
             if !gives_up(reader, waited, &cursors) {
                 return;
             }
+        }
+    }
+
+    /// Begins the next epoch without the last samples of the one before, if no publisher has them any more.
+    fn pass_lost_samples(&mut self, waited: Duration) {
+        if waited > START_HOLD_LIMIT.min(self.wait_limit / 2) {
+            let n_publishers = self.sender.pub_sub.dynamic_config().number_of_publishers();
+            let written = self.written();
+            self.credit.has_waited_long(&*self.cursors, written, n_publishers);
         }
     }
 
@@ -414,7 +429,14 @@ impl UntypedPublisher {
         if self.has_room(key) {
             return Ok(Sent::Yes);
         }
+        // A publisher that gives way to its reader, in one process, comes back with the same sample.
+        let since = match self.waits_since {
+            Some((waiting, since)) if waiting == key => since,
+            _ => Instant::now(),
+        };
+        self.waits_since = Some((key, since));
         self.wait(key, should_yield, |publisher, waited| {
+            publisher.pass_lost_samples(since.elapsed());
             if publisher.has_room(key) {
                 return Wait::Over;
             }

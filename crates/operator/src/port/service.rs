@@ -130,3 +130,29 @@ fn service_name(wiring: &ServiceWiring) -> Result<ServiceName, PortError> {
 pub(super) fn open_failed(wiring: &ServiceWiring, source: impl Into<BoxedError>) -> PortError {
     PortError::Open { service: wiring.name.clone(), source: source.into() }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// L4: iceoryx2 itself does not try again.
+    #[test]
+    fn a_connection_that_could_not_be_made_is_tried_again_until_it_is() {
+        let mut connections = Connections::default();
+        let mut n_tries = 0;
+        connections.mend(|| unreachable!("all are made")).expect("nothing to mend");
+        connections.has_failed.store(true, Ordering::Relaxed);
+        while !connections.are_made() {
+            let tried = connections.mend(|| {
+                n_tries += 1;
+                n_tries == 3
+            });
+            tried.expect("within the limit");
+        }
+        assert_eq!(n_tries, 3);
+        connections.has_failed.store(true, Ordering::Relaxed);
+        let long_ago = Instant::now() - 2 * CONNECT_LIMIT;
+        connections.failing = Some((long_ago, long_ago));
+        connections.mend(|| true).expect_err("it has failed for too long");
+    }
+}

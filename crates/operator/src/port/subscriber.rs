@@ -234,11 +234,7 @@ impl UntypedSubscriber {
 
     /// Whether a sample is one that its writer has sent after another one, if it has sent both.
     pub(crate) fn is_after(&self, key: SampleId, other: Option<SampleId>) -> bool {
-        let Some(other) = other else { return true };
-        match self.writer() {
-            Some(written) => !written.is_past(other, key),
-            None => other.epoch != key.epoch || other.seq < key.seq,
-        }
+        Written::is_after(self.writer(), key, other)
     }
 
     /// Whether its writer is on another machine whose link is cut off.
