@@ -844,11 +844,11 @@ impl Launcher {
                     }
                     // A standby counts what the active process counts as well.
                     Report::Counts { in_all: true, .. } if !is_active => {}
-                    Report::Counts { counts, in_all: true } => {
-                        // Zeros are shown in the place of other counts, and not by themselves.
-                        if counts.iter().any(|(name, count)| *count > 0 || totals.contains_key(name)) {
-                            totals.extend(counts.clone());
-                        }
+                    // Zeros are shown in the place of other counts, and not by themselves.
+                    Report::Counts { counts, in_all: true }
+                        if counts.iter().any(|(name, count)| *count > 0 || totals.contains_key(name)) =>
+                    {
+                        totals.extend(counts.clone());
                     }
                     Report::Counts { counts, in_all: false } => {
                         for (name, count) in counts {
