@@ -2,7 +2,8 @@
 //!
 //! Samples keep their recorded numbers and times; each repetition continues the numbers, times and grasps of the one
 //! before it. Of a recording with several epochs, it repeats the numbers and has other epochs: as in the first round, each of
-//! them begins with its source's first sample. So a player that comes back after a crash finds its place by the number that its readers answered last.
+//! them begins with its source's first sample. So a player that comes back after a crash finds its place by the sample that
+//! its readers answered last.
 //!
 //! A small recording is read through when it is opened, and its samples are kept in the form in which they lie in shared
 //! memory: to play them, nothing is read, decoded or allocated. Other recordings are read while they are played.
