@@ -196,9 +196,12 @@ fn of_many_epochs(folder: &Path) -> (String, String) {
     change("recordings/held-out.mcap", path.to_str().expect("UTF-8"))
 }
 
+/// The name of an act in messages, and the act.
+type Act<'a> = (&'a str, &'a dyn Fn(&Graph));
+
 /// Acts on a graph soon after an epoch has begun, an epoch for each act: the histories have samples of two epochs then. It must
 /// not disturb the graph.
-fn act_in_new_epochs(changes: &[(String, String)], n_restarts: u64, acts: &[(&str, &dyn Fn(&Graph))]) {
+fn act_in_new_epochs(changes: &[(String, String)], n_restarts: u64, acts: &[Act<'_>]) {
     let folder = tempfile::tempdir().expect("a folder");
     let flow = patient(folder.path(), &[changes, &[of_many_epochs(folder.path())]].concat());
     let graph = paused(&flow, N_FRAMES, &[]);
@@ -221,7 +224,7 @@ fn swap_at_once(graph: &Graph, node: &str) {
 
 #[test]
 fn nodes_killed_or_swapped_in_a_new_epoch_lose_nothing() {
-    let acts: [(&str, &dyn Fn(&Graph)); 11] = [
+    let acts: [Act<'_>; 11] = [
         ("contacts killed", &|graph| graph.kill("contacts")),
         ("encoder killed", &|graph| graph.kill("encoder")),
         ("classifier killed", &|graph| graph.kill("classifier")),
@@ -252,7 +255,7 @@ fn python_classifier(folder: &Path, role: &str) -> (String, String) {
 fn a_python_stage_killed_or_swapped_in_a_new_epoch_loses_nothing() {
     let folder = tempfile::tempdir().expect("a folder");
     let python = [python_classifier(folder.path(), "plain")];
-    let acts: [(&str, &dyn Fn(&Graph)); 2] = [
+    let acts: [Act<'_>; 2] = [
         ("a stage in Python killed", &|graph| graph.kill("classifier")),
         ("a stage in Python swapped", &|graph| swap_at_once(graph, "classifier")),
     ];

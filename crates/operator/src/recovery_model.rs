@@ -580,7 +580,8 @@ impl Search {
         }
         for node in 0..4 {
             let is_meant = self.budget.node.is_none_or(|only| only == node);
-            if !is_meant && !(self.budget.kills_reader && Some(node) == self.budget.node.map(|only| only + 1)) {
+            let is_its_reader = self.budget.node.is_some_and(|only| only + 1 == node);
+            if !(is_meant || self.budget.kills_reader && is_its_reader) {
                 continue;
             }
             let is_alive = [world.nodes[node].old.is_some(), world.nodes[node].active.is_some()];

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use crate::common::{
-    Graph, assert_nothing_left, blindgrasp, fails, json_lines, json_of, project, run, shared_folder, signal,
+    Graph, assert_nothing_left, blindgrasp, json_lines, json_of, project, run, shared_folder, signal,
     stubborn_classifier, text, unique_name,
 };
 use rustix::process::Signal;

@@ -100,7 +100,7 @@ impl State {
         let n_committed = n_up_to(self.committed);
         match step {
             Step::Write => {
-                let Some(written) = KEYS.get(self.n_written) else { return None };
+                let written = KEYS.get(self.n_written)?;
                 // A new epoch begins when the one before is answered.
                 let n_most =
                     if last_of(self.n_written).is_some_and(|last| last.epoch != written.epoch) { 1 } else { CAPACITY };
