@@ -69,7 +69,7 @@ mod tests {
     use std::sync::Arc;
     use std::time::Duration;
 
-    use blindgrasp_messages::{LiftDecision, Message, Recorded as _};
+    use blindgrasp_messages::{LiftDecision, Message, Recorded};
 
     use super::*;
     use crate::cursors::{N_AGE_SLOTS, SharedCursors};
