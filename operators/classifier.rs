@@ -117,6 +117,10 @@ impl Stage for Classify {
         Ok(is_of_this_model)
     }
 
+    fn has_missed_samples(&mut self) {
+        self.memory.forget_grasp();
+    }
+
     fn look(&mut self) {
         self.report();
     }

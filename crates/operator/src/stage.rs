@@ -105,6 +105,9 @@ pub trait Stage {
         Ok(false)
     }
 
+    /// Called when samples since its state were answered by another instance: a thing that it has followed has a hole.
+    fn has_missed_samples(&mut self) {}
+
     /// Takes new values of its live parameters.
     ///
     /// # Errors
@@ -704,18 +707,23 @@ fn restore_stage(
     saved: Option<&[u8]>,
     handed_over: Option<&[u8]>,
 ) -> anyhow::Result<Option<Snapshot>> {
-    let (mut snapshot, mut state) = (None, None);
-    if let Some(bytes) = saved {
-        let (found, rest) = decode_snapshot(bytes)?;
-        (snapshot, state) = (Some(found), Some(rest));
-    }
-    if !stage.restore(state)?
-        && let Some(bytes) = handed_over
-    {
+    let restored = restore_saved(stage, saved);
+    let Some(bytes) = handed_over else { return Ok(restored?.0) };
+    // The replacement may have left bytes that this stage cannot read.
+    let (snapshot, is_whole) = restored.unwrap_or((None, false));
+    if !is_whole {
         stage.restore(Some(decode_snapshot(bytes)?.1))?;
+        stage.has_missed_samples();
         tracing::warn!("{STATE_OF_HAND_OVER}");
     }
     Ok(snapshot)
+}
+
+/// The place of a saved state, and whether the stage goes on with all of it.
+fn restore_saved(stage: &mut impl Stage, saved: Option<&[u8]>) -> anyhow::Result<(Option<Snapshot>, bool)> {
+    let Some(bytes) = saved else { return Ok((None, stage.restore(None)?)) };
+    let (snapshot, state) = decode_snapshot(bytes)?;
+    Ok((Some(snapshot), stage.restore(Some(state))?))
 }
 
 /// A saved state, and in it the bytes of the stage's own.

@@ -57,6 +57,11 @@ impl Written {
         matches!(self.place(key), Place::Current(_))
     }
 
+    /// Whether the writer is in this epoch, or was in it right before.
+    pub fn knows(&self, epoch: u64) -> bool {
+        self.last.epoch == epoch || self.before.is_some_and(|before| before.epoch == epoch)
+    }
+
     /// Whether a reader that has come to `reached` has passed a sample that was sent. If both are of older epochs than the
     /// writer remembers, that is only known within one of them.
     pub fn is_past(&self, reached: SampleId, key: SampleId) -> bool {

@@ -23,7 +23,7 @@ use blindgrasp_recording::{Reach, RecordingIndex};
 
 /// A larger recording is not read through before its first sample goes out: that would take seconds.
 const MAX_CHECKED_BYTES: u64 = 64 << 20;
-/// The distance of the epochs of two repetitions, so great that they are not those of the recording.
+/// The distance of the epochs of two repetitions is a multiple of this that is greater than all distances in the recording.
 const EPOCH_STEP: u64 = 1 << 32;
 /// Samples that take more memory are not kept. Every graph on the machine may have a player.
 const MAX_KEPT_BYTES: usize = 64 << 20;
@@ -276,7 +276,9 @@ impl<M: Played> Player<M> {
             ..*recorded
         };
         if self.extent.as_ref().is_some_and(Extent::has_several_epochs) {
-            header.epoch = recorded.epoch.wrapping_add(self.repetition.wrapping_mul(EPOCH_STEP));
+            header.epoch = recorded
+                .epoch
+                .wrapping_add(self.repetition.wrapping_mul(self.extent.as_ref().map_or(0, Extent::epoch_step)));
         } else {
             header.seq = recorded.seq.saturating_add(self.repetition.saturating_mul(n_numbers));
         }
@@ -345,8 +347,9 @@ impl Resume {
         if !extent.has_several_epochs() {
             return after.seq / n_numbers.max(1);
         }
+        let step = extent.epoch_step();
         let distances = extent.epochs.iter().map(|epoch| after.epoch.wrapping_sub(*epoch));
-        distances.filter(|distance| distance % EPOCH_STEP == 0).min().map_or(0, |distance| distance / EPOCH_STEP)
+        distances.filter(|distance| distance % step == 0).min().map_or(0, |distance| distance / step)
     }
 
     /// Whether the readers have this sample. Samples must be asked for in order.
@@ -402,6 +405,11 @@ impl Extent {
 
     fn has_several_epochs(&self) -> bool {
         self.epochs.len() > 1
+    }
+
+    fn epoch_step(&self) -> u64 {
+        let (Some(first), Some(last)) = (self.epochs.first(), self.epochs.last()) else { return EPOCH_STEP };
+        EPOCH_STEP.saturating_mul(1 + (last - first) / EPOCH_STEP)
     }
 
     /// From the first frame to the time at which the first frame of the next repetition is due.

@@ -134,7 +134,10 @@ impl EdgeSpan {
     /// Whether the edge has come as far as the end. The source has come to `source`.
     fn has_reached(&mut self, end: SampleId, source: &Written, cursors: &SharedCursors) -> bool {
         if self.is_numbered {
-            return self.seen.is_some_and(|seen| source.is_past(seen, end));
+            let own = cursors.output(self.writer_slot).written().map(|own| own.last.epoch);
+            // The samples of another source have epochs of their own.
+            let is_of_source = own.is_none_or(|epoch| source.knows(epoch));
+            return !is_of_source || self.seen.is_some_and(|seen| source.is_past(seen, end));
         }
         if !self.is_said_once {
             return true;

@@ -84,8 +84,13 @@ impl Memory {
 
     /// Begins with a recording: its grasps belong to those before only if both say the same day.
     pub fn begin_recording(&mut self) {
-        self.grasp = GraspHistory::default();
+        self.forget_grasp();
         self.day.begin_recording();
+    }
+
+    /// Forgets the frames of the open grasp, of which some were missed.
+    pub fn forget_grasp(&mut self) {
+        self.grasp = GraspHistory::default();
     }
 }
 

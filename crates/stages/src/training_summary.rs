@@ -17,8 +17,7 @@ pub struct TrainingSummary {
     pub recordings: Vec<String>,
     /// The program and options that made each recording, from its metadata.
     pub made_by: Vec<String>,
-    /// Number of simulated recordings for each meaning of "stable". Empty if it is the wrench space's in all of them by
-    /// their own metadata.
+    /// Number of simulated recordings for each meaning of "stable". Empty if it is the wrench space's in all of them.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub labels: BTreeMap<Label, usize>,
     pub recipe: Recipe,

@@ -15,7 +15,6 @@ use blindgrasp_stages::classifier::boosting::BoostedTrees;
 use blindgrasp_stages::classifier::svm::RbfSvm;
 use blindgrasp_stages::classifier::{Blend, Predictor};
 use blindgrasp_stages::day::{Baseline, DayMethod};
-use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::own_lifts::Correction;
 use blindgrasp_stages::probe::ProbeModel;
@@ -230,9 +229,8 @@ fn described(model: &Model) -> Vec<(&'static str, String)> {
         ),
         ("checksum", model.checksum.clone()),
     ];
-    let relabelled = training.labels.contains_key(&Label::WrenchSpace).then(|| Label::WrenchSpace.meaning().to_owned());
     let optional = [
-        ("label", label_line(&training.labels).or(relabelled)),
+        ("label", label_line(&training.labels)),
         ("day", day_line(model)),
         ("recalibrated", recalibration_line(model)),
     ];

@@ -256,8 +256,7 @@ fn a_real_hand_on_another_day_is_judged_or_held() {
     let judged = |recipe: &str, more: &[&str]| -> Value {
         let model = at(&format!("{recipe}.json"));
         run(&[&["train", down, tilted, side, "--recipe", recipe, "--out", &model], more].concat(), 0);
-        let report = run(&["evaluate", &model, other, "--json"], 0).stdout;
-        serde_json::from_slice(&report).expect("JSON")
+        json_of(&["evaluate", &model, other, "--json"])
     };
     // The days of the grasps hold, whatever judges them; this recipe is the faster one.
     let plain = judged("boosted", &[]);

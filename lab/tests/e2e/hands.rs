@@ -3,12 +3,9 @@
 use std::path::Path;
 use std::process::Command;
 
+use crate::common::mistakes::read;
 use crate::common::python::{python, utf8};
 use crate::common::{blindgrasp, json_of, program, project, report_data, run, text};
-
-fn read(path: &str) -> String {
-    std::fs::read_to_string(project().join(path)).expect("readable")
-}
 
 /// Runs a command in a folder.
 fn run_in(folder: &Path, arguments: &[&str], exit_code: i32) -> (String, String) {

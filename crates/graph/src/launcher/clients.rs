@@ -11,6 +11,8 @@ use crate::plan::N_ATTACHED;
 #[derive(Default)]
 pub(super) struct Clients {
     pub(super) server: Option<Server>,
+    /// The client whose swap is being begun: the launcher listens meanwhile. `None` if it has gone.
+    pub(super) begins_swap: Option<u64>,
     /// Requests that came while the launcher was busy.
     pub(super) waiting: VecDeque<Box<Ask>>,
     /// The clients that asked the graph to stop. The end of their connection says that it has ended.

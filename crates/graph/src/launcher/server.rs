@@ -333,6 +333,18 @@ mod tests {
         }
     }
 
+    /// The server's threads wait for clients then.
+    fn wait_until_all_others_sleep() {
+        let own = rustix::thread::gettid().as_raw_nonzero().to_string();
+        let is_awake = |task: &std::fs::DirEntry| {
+            let stat = std::fs::read_to_string(task.path().join("stat")).unwrap_or_default();
+            task.file_name() != own.as_str() && !stat.contains(") S ")
+        };
+        while std::fs::read_dir("/proc/self/task").expect("readable").flatten().any(|task| is_awake(&task)) {
+            std::thread::sleep(RETRY_PAUSE);
+        }
+    }
+
     fn ask(mut client: &UnixStream, request: &Request) {
         writeln!(client, "{}", serde_json::to_string(request).expect("JSON")).expect("sent");
     }
@@ -385,6 +397,7 @@ mod tests {
         let connect = |client: &UnixStream| {
             rustix::net::connect(client, &SocketAddrUnix::new(&served.socket).expect("a path")).expect("connected");
         };
+        wait_until_all_others_sleep();
         let limit = getrlimit(Resource::Nofile);
         let lowest_free = File::open("/dev/null").expect("opened").as_raw_fd() as u64;
         setrlimit(Resource::Nofile, Rlimit { current: Some(lowest_free), ..limit }).expect("lowered");

@@ -12,9 +12,11 @@ use crate::dataflow::Node;
 use crate::launcher::process::{BegunProgram, PreparedProgram};
 use crate::launcher::{LaunchError, Launcher};
 
-/// A process must begin within this time while the graph runs. At its start it has as long as to be ready: a pinned recording
-/// may be long.
+/// A process must begin within this time while the graph runs. At its start, and with files whose digest is read before, it has
+/// as long as to be ready: a pinned recording may be long.
 const BEGIN_LIMIT: Duration = Duration::from_secs(5);
+/// A process that is being started when the graph is asked to stop still has this time.
+const STOP_LIMIT: Duration = Duration::from_secs(1);
 /// The launcher looks after the others this often while a program takes its time.
 const LOOK_PAUSE: Duration = Duration::from_millis(5);
 
@@ -27,8 +29,8 @@ impl Launcher {
     ) -> Result<BegunProgram, LaunchError> {
         let idxs: Vec<usize> = nodes.iter().map(|(idx, _)| *idx).collect();
         let first = &nodes[0].1;
-        let limit = if self.has_gone { BEGIN_LIMIT } else { self.options.startup_limit };
-        let was_asked_to_stop = self.clients.is_asked_to_stop;
+        let has_digests = nodes.iter().any(|(_, node)| !node.sha256.is_empty());
+        let most = if self.has_gone && !has_digests { BEGIN_LIMIT } else { self.options.startup_limit };
         let (answer, begun) = channel();
         let checked: Vec<Node> = nodes.iter().map(|(_, node)| node.clone()).collect();
         let work = move || {
@@ -48,12 +50,14 @@ impl Launcher {
                     return Err(LaunchError::of_spawn(first, std::io::Error::other("its thread has failed")));
                 }
             }
-            let is_to_stop = self.clients.is_asked_to_stop && !was_asked_to_stop;
-            if is_to_stop || start.elapsed() > limit {
+            let limit = if self.clients.is_asked_to_stop { most.min(STOP_LIMIT) } else { most };
+            if start.elapsed() > limit {
                 kill_process_of(its_pid);
-                let secs = start.elapsed().as_secs_f64();
-                let what =
-                    format!("it has not begun within {secs:.1} s: its process was stopped, or a file system hangs");
+                let secs = limit.as_secs_f64();
+                let what = format!(
+                    "it has not begun within {secs:.1} s: its process was stopped, a file system hangs, or a file with a digest \
+                     (sha256) takes long to read"
+                );
                 let error = std::io::Error::new(std::io::ErrorKind::TimedOut, what);
                 return Err(LaunchError::of_spawn(first, error));
             }
@@ -102,7 +106,7 @@ mod tests {
         let mut graph = launched("stopped", "exec cat > /dev/null", "");
         let launcher = &mut graph.launcher;
         launcher.has_gone = false;
-        launcher.options.startup_limit = Duration::from_millis(200);
+        launcher.options.startup_limit = Duration::from_secs(2);
         let node = launcher.members[0].node.clone();
         let prepared = |launcher: &Launcher| {
             let wiring = launcher.plan.wiring(&node, 1, true).expect("wired");
@@ -124,6 +128,7 @@ mod tests {
         let LaunchError::Spawn { source, .. } = error else { panic!("{error}") };
         assert_eq!(source.kind(), std::io::ErrorKind::TimedOut);
         assert!(matches!(replies.try_recv(), Ok(Reply::Status(_))));
+        launcher.options.startup_limit = Duration::from_secs(60);
         let next = prepared(launcher);
         assert!(launcher.begin(&nodes, next).is_ok());
         // It is killed.

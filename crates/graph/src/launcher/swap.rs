@@ -105,6 +105,7 @@ impl Launcher {
             Err(message) => return refuse(&reply, &message),
         };
         let mut swap = Swap { request, client, reply, targets, phase: Phase::Starting, since: Instant::now() };
+        self.clients.begins_swap = Some(client);
         for at in 0..swap.targets.len() {
             let idx = swap.targets[at].idx;
             if self.members[idx].standby.is_some() {
@@ -134,6 +135,9 @@ impl Launcher {
             swap.targets.iter().map(|target| format!("{} (process {})", target.node.id, target.new_pid)).collect();
         swap.progress(format!("started beside the running one: {}", starting.join(", ")));
         self.swap = Some(swap);
+        if self.clients.begins_swap.take().is_none() {
+            self.on_client_gone(client);
+        }
     }
 
     /// The replacements, checked against the graph as it runs.
@@ -603,6 +607,9 @@ impl Launcher {
 
     /// A swap whose client goes before the replacement is active is abandoned.
     pub(super) fn on_client_gone(&mut self, client: u64) {
+        if self.clients.begins_swap == Some(client) {
+            self.clients.begins_swap = None;
+        }
         if self.swap.as_ref().is_some_and(|swap| swap.client == client && swap.phase != Phase::Probation) {
             self.abandon_swap("the command that asked for it has gone");
         }

@@ -25,8 +25,8 @@ use draft::Draft;
 
 /// A hand: its URDF and a pad layout.
 ///
-/// The folder gets the URDF (expanded, if it is a xacro file, and with the collision meshes beside it), the pad
-/// layout. Without --cells and --grid, the links and joints are listed and nothing is made.
+/// The folder gets the pad layout and the URDF (expanded, if it is a xacro file, with the collision meshes beside it).
+/// Without --cells and --grid, the links and joints are listed and nothing is made.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                   blindgrasp new hand my_gripper --urdf gripper.urdf\n  \

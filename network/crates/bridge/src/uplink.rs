@@ -122,6 +122,11 @@ impl Uplink {
         let now_nanos = monotonic_nanos();
         let mut outcome = self.spool.save_lost(self.outgoing.n_lost_to_save());
         while let Some(sample) = self.outgoing.next_to_save(now_nanos) {
+            // All that the file has is answered. Samples of earlier epochs there would be sent once more.
+            if self.outgoing.committed().len() == 0 {
+                let emptied = self.spool.replace(std::iter::empty(), self.outgoing.n_lost_to_save());
+                outcome = outcome.and(emptied);
+            }
             let saved = self.spool.save(sample);
             outcome = outcome.and(saved);
             self.outgoing.saved();

@@ -389,13 +389,12 @@ fn check_examples(read: &Examples, recordings: &[PathBuf]) -> Result<(), Trainin
 /// The fold of each example. All grasps of an object are in one fold.
 ///
 /// # Errors
-/// Fewer objects than folds, or than two.
+/// Fewer objects than folds.
 fn folds_by_object(examples: &[&Example], n_folds: usize) -> Result<Vec<usize>, TrainingError> {
     let objects: BTreeSet<&str> = examples.iter().map(|example| example.object.as_str()).collect();
-    let n_needed = n_folds.max(2);
-    if objects.len() < n_needed {
+    if objects.len() < n_folds {
         return Err(TrainingError::Data(format!(
-            "grasps with contact of {}: expected at least {n_needed} objects, one for each fold of the cross-validation, with stable \
+            "grasps with contact of {}: expected at least {n_folds} objects, one for each fold of the cross-validation, with stable \
              and unstable grasps of several; record more objects, or say which grasps are of which object",
             Split::Object.counted(objects.len())
         )));
@@ -576,7 +575,6 @@ mod tests {
         let refused = |n: usize, n_folds| folds(n, n_folds).expect_err("too few").to_string();
         assert!(refused(1, 5).starts_with("grasps with contact of 1 object: expected at least 5 objects"));
         assert!(refused(2, 5).starts_with("grasps with contact of 2 objects: expected at least 5 objects"));
-        assert!(refused(1, 1).contains("expected at least 2 objects"));
         assert_eq!(folds(2, 2).expect("folds"), [0, 1]);
     }
 }

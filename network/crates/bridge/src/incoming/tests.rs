@@ -178,10 +178,13 @@ impl World {
         let now_nanos = self.now_nanos();
         if self.ends[SENDER].is_alive {
             while let Some(sample) = self.sender.next_to_save(now_nanos) {
+                if self.sender.committed().len() == 0 {
+                    self.spool.0.clear();
+                }
                 self.spool.0.push(sample.clone());
                 self.sender.saved();
             }
-            if self.happens(0.05) {
+            if self.happens(0.001) {
                 self.spool.0 = self.sender.committed().cloned().collect();
             }
             self.spool.1 = self.sender.n_lost_to_save();
