@@ -48,6 +48,8 @@ pub struct Sequencer<T> {
     may_hold: bool,
     /// Nothing is missing before the first sample.
     takes_what_comes: bool,
+    /// Its node was given up, and no sample has come since.
+    was_given_up: bool,
     /// The last sample that was sent before this reader began, and until when those up to it are awaited.
     awaited: Option<(SampleId, Instant)>,
     counts: InputCounts,
@@ -86,6 +88,7 @@ impl<T> Sequencer<T> {
             held: BTreeMap::new(),
             may_hold: true,
             takes_what_comes: false,
+            was_given_up: false,
             awaited: None,
             counts: InputCounts::default(),
         }
@@ -122,6 +125,12 @@ impl<T> Sequencer<T> {
     /// The order of a reader that goes on with the first sample that its writer still has.
     pub fn taking_what_comes(self) -> Self {
         Sequencer { takes_what_comes: true, ..self }
+    }
+
+    /// The order of a reader whose node was given up. No writer has waited for it, so that the samples before the first one that
+    /// comes are missing at once.
+    pub fn after_giving_up(self) -> Self {
+        Sequencer { was_given_up: true, ..self }
     }
 
     /// The order of a reader that begins at `start`, when `sent` was the last sample that its writer had sent.
@@ -220,7 +229,8 @@ impl<T> Sequencer<T> {
         if self.may_hold && (self.is_early(place) || may_begin_elsewhere) {
             let may_be_elsewhere = (n_before > 0 || may_begin_elsewhere) && is_first_of_publisher;
             // Where no other publisher is left, the one that has sent the samples before may notice that, and send them.
-            let were_sent = n_before > 0 && written.is_some() && (self.last.is_some() || self.since_first(place) > 0);
+            let may_be_sent = written.is_some() && !self.was_given_up;
+            let were_sent = n_before > 0 && may_be_sent && (self.last.is_some() || self.since_first(place) > 0);
             let may_come = may_be_elsewhere && (were_sent || self.publishers.len() > 1 || has_other_publishers());
             if may_come || !self.held.is_empty() {
                 self.held.insert(place, (sample, now()));
@@ -334,7 +344,7 @@ impl<T> Sequencer<T> {
     }
 
     fn deliver(&mut self, place: Place, n_missing: u64) {
-        self.last = Some(place);
+        (self.last, self.was_given_up) = (Some(place), false);
         if self.counted.is_some_and(|counted| place <= counted) {
             return;
         }
@@ -571,6 +581,8 @@ mod tests {
         let mut sequencer = resumed.clone();
         assert_eq!(push(&mut sequencer, 1, 2), Placing::Hold);
         assert_eq!((sequencer.next_overdue(start + HOLD_LIMIT), sequencer.counts().n_missing), (Some(1), 1));
+        let mut sequencer = resumed.clone().after_giving_up();
+        assert_eq!((push(&mut sequencer, 1, 2), sequencer.counts().n_missing), (Placing::Deliver(1), 1));
         // A recording that begins at 1 has nothing before it.
         let written = Written { first_seq: 1, ..written };
         let placing = resumed.clone().push(1, id(1), 2, Some(&written), || false, || start);
