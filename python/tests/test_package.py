@@ -189,6 +189,15 @@ class Recordings(Folder):
         with self.assertRaisesRegex(ValueError, "not those of the model's hand"):
             model.predict(table.rename(columns={"cell_palm_0": "cell_plam_0"}))
 
+    def test_the_labels_of_a_table_are_those_of_its_predictions(self):
+        table = blindgrasp.Recording(HELD_OUT).to_frame().head(12)
+        model = blindgrasp.Model(MODEL)
+        labels = [grasp.label for grasp in blindgrasp.Recording(HELD_OUT)][:12]
+        self.assertEqual(model.predict(table).labels, labels)
+        table["stable"] = table["stable"].astype("boolean").mask(table.index == 3)
+        self.assertEqual(model.predict(table).labels, [*labels[:3], None, *labels[4:]])
+        self.assertFalse(model.predict(table.drop(columns="stable")).is_labelled.any())
+
     def test_a_row_that_is_not_finite_is_held(self):
         table = blindgrasp.Recording(HELD_OUT).to_frame().head(2)
         table.loc[0, "cell_0"] = np.nan
