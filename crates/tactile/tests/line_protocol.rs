@@ -99,6 +99,17 @@ fn a_line_with_a_checksum_is_refused_if_a_byte_changes() {
 }
 
 #[test]
+fn a_number_that_is_none_is_a_missing_one() {
+    let line = r#"{"joints":[NaN],"cells_newtons":[0,NaN,null],"phase":"open","object":"a NaN"}"#;
+    let found = parse(line.as_bytes()).expect("a frame");
+    assert!(found.joints[0].is_nan() && found.cells_newtons[1].is_nan() && found.cells_newtons[2].is_nan());
+    assert_eq!((found.cells_newtons[0], found.object.as_deref()), (0.0, Some("a NaN")));
+    for wrong in ["Infinity", "nan"] {
+        parse(line.replace("[NaN]", &format!("[{wrong}]")).as_bytes()).expect_err(wrong);
+    }
+}
+
+#[test]
 fn values_that_no_hand_has_are_refused() {
     for (joints, cells_newtons, word) in [
         (vec![], vec![0.0, 0.0], "joints has 0 numbers, the hand 1"),
