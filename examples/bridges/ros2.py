@@ -307,7 +307,7 @@ def message_class(where, name, field):
     return found
 
 
-def bridge(table, address):
+def bridge(table, address, hand=None):
     import rclpy
     from rclpy.clock import Clock
     from rclpy.executors import SingleThreadedExecutor
@@ -315,7 +315,7 @@ def bridge(table, address):
     from rclpy.subscription import Subscription
 
     check_table(table)
-    source = line_protocol.Source(address)
+    source = line_protocol.Source(address, hand=hand)
     frames = Frames(table, source.hand)
     rclpy.init()
     node = rclpy.create_node("blindgrasp_hand_bridge")
@@ -402,7 +402,7 @@ def main():
     with open(arguments.table, encoding="utf-8") as file:
         table = yaml.safe_load(file)
     try:
-        bridge(table, arguments.address)
+        bridge(table, arguments.address, arguments.hand)
     except ValueError as error:
         sys.exit(f"{arguments.table}: {error}")
 
