@@ -187,6 +187,9 @@ class Frames:
                 raise ValueError(f"names: {len(names)} names, but `field` has {len(values)} values: name each of them, in order")
         else:
             names, values = message.name, message.position
+        twice = sorted(name for name in self.sources if list(names).count(name) > 1)
+        if twice:
+            raise ValueError(f"joints: the name {twice[0]} stands in a message twice")
         ours = {name: (value, stamp) for name, value in zip(names, values) if name in self.sources}
         self.values.update(ours)
         for name in ours:

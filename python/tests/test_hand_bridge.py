@@ -69,6 +69,11 @@ class Frames(unittest.TestCase):
         expected = {"cells_newtons": [1.0, 2.5, 4.0, 3.0], "phase": "settled", "seq": 1, "stamp_nanos": self.t}
         self.assertEqual(frame, expected)
 
+    def test_a_name_twice_in_a_message_is_refused(self):
+        twice = Message(header=header(self.t), name=["wrist", "wrist"], position=[0.1, 0.2])
+        with self.assertRaisesRegex(ValueError, "the name wrist stands in a message twice"):
+            self.frames.take_joints(twice, self.t)
+
     def test_old_topics_make_no_frame(self):
         self.frames.take_joints(joints(self.t), self.t)
         self.assertIsNotNone(self.send(self.t + 100 * MILLI))
