@@ -623,6 +623,14 @@ class Mjcf(Folder):
         told = urdf_of(path, self.folder / "hand.urdf")
         self.assertEqual(len(told), 1)
         self.assertIn("'f2' and 't' make a loop (connect)", told[0])
+        # The same loop between sites, as onshape-to-robot writes it, and shapes that touch nothing.
+        sites = MJCF.replace("<equality>", '<equality><connect site1="s1" site2="s2"/>')
+        for body, site in (("f2", "s1"), ("t", "s2")):
+            sites = re.sub(f"(<body name=['\"]{body}['\"][^>]*>)", rf'\1<site name="{site}"/>', sites)
+        path.write_text(sites)
+        self.assertIn("'f2' and 't' make a loop (connect)", urdf_of(path, self.folder / "hand.urdf")[0])
+        path.write_text(re.sub("<geom ", '<geom contype="0" conaffinity="0" ', re.sub(" con(type|affinity)=.[01].", "", MJCF)))
+        self.assertIn("shapes can touch others", urdf_of(path, self.folder / "hand.urdf")[0])
         path.write_text("<mujoco><nothing/></mujoco>")
         with self.assertRaises(ValueError):
             urdf_of(path, self.folder / "hand.urdf")
