@@ -38,24 +38,7 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
     }
     let mut written = Vec::new();
     for recording in recordings {
-        // The recording's own dataflow file is not known yet: all are replayed with the one of the command, and with the params
-        // of the recorded graph.
-        let file_graph = checked(&dataflow::load(runner.dataflow)?, &[], Scope::Everything)?;
-        let reader = RecordingReader::open(recording)?;
-        let set = settings::recorded(&reader, &file_graph);
-        let graph = runner.graph(&Expectations { set, ..Expectations::default() }, runner.overrides)?;
-        let (_fed, decisions) = runner.decide(recording, &graph, runner.overrides)?;
-        if let Some((grasp_id, reason)) = decisions.held_as_another() {
-            bail!(
-                "{}: the replay holds grasp {grasp_id} as {}, so it says nothing of the graph that was recorded: give that \
-                 graph's --dataflow, or --set hand=HAND.yaml and --set model=MODEL.json",
-                recording.display(),
-                reason.as_str()
-            );
-        }
-        let mut expected = decisions.to_expectations();
-        expected.dataflow = other_dataflow(runner.dataflow, recording)?;
-        expected.set = other_params(&file_graph, &graph, recording)?;
+        let (graph, decisions, expected) = replayed(runner, recording)?;
         let remarks: BTreeMap<u64, String> =
             decisions.dropped().map(|grasp_id| (grasp_id, "its lift dropped the object".into())).collect();
         let path = path_of(recording);
@@ -77,7 +60,7 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
             if let Some(text) = describe_changes(&changed) {
                 print_line(&format!("  the replay decides otherwise than recorded, {text}"))?;
             }
-            if let Some(note) = settings::differing(&reader, &graph) {
+            if let Some(note) = settings::differing(&RecordingReader::open(recording)?, &graph) {
                 print_line(&format!("  {note}"))?;
             }
         }
@@ -91,6 +74,28 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
         print_text(&serde_json::to_string_pretty(&json!({ "recordings": written }))?)?;
     }
     Ok(Outcome::Done)
+}
+
+/// The graph that a recording is replayed with, what it decides, and the expectations that follow.
+fn replayed(runner: &Runner<'_>, recording: &Path) -> anyhow::Result<(Graph, Decisions, Expectations)> {
+    // The recording's own dataflow file is not known yet: all are replayed with the one of the command, and with the params of
+    // the recorded graph.
+    let file_graph = checked(&dataflow::load(runner.dataflow)?, &[], Scope::Everything)?;
+    let set = settings::recorded(&RecordingReader::open(recording)?, &file_graph);
+    let graph = runner.graph(&Expectations { set, ..Expectations::default() }, runner.overrides)?;
+    let (_fed, decisions) = runner.decide(recording, &graph, runner.overrides)?;
+    if let Some((grasp_id, reason)) = decisions.held_as_another() {
+        bail!(
+            "{}: the replay holds grasp {grasp_id} as {}, so it says nothing of the graph that was recorded: give that graph's \
+             --dataflow, or --set hand=HAND.yaml and --set model=MODEL.json",
+            recording.display(),
+            reason.as_str()
+        );
+    }
+    let mut expected = decisions.to_expectations();
+    expected.dataflow = other_dataflow(runner.dataflow, recording)?;
+    expected.set = other_params(&file_graph, &graph, recording)?;
+    Ok((graph, decisions, expected))
 }
 
 fn absolute(path: &Path) -> anyhow::Result<PathBuf> {
