@@ -68,7 +68,7 @@ fn a_line_is_a_frame_or_is_refused_in_words() {
     for (line, word) in [
         (&br#"{"joints":[0.5],"cells_newtons":[0,1],"phase":"open","grasp":1}"#[..], "unknown field `grasp`"),
         (br#"{"joints":[0.5],"phase":"open"}"#, "missing field `cells_newtons`"),
-        (br#"{"joints":[0.5],"cells_newtons":[NaN,1],"phase":"open"}"#, "expected value"),
+        (br#"{"joints":[0.5],"cells_newtons":[Infinity,1],"phase":"open"}"#, "expected value"),
         (br#"{"joints":[0.5],"cells_newtons":[1e999,1],"phase":"open"}"#, "number out of range"),
         (br#"{"joints":[0.5],"cells_newtons":[0,1],"phase":"close"}"#, "unknown variant `close`"),
         (br#"{"joints":[0.5],"cells_newtons":[0,1],"phase":"open","seq":-1}"#, "seq"),
