@@ -132,7 +132,7 @@ def main():
         modbus = Modbus(arguments.host, arguments.port, arguments.unit)
     except OSError as error:
         sys.exit(f"{arguments.host}:{arguments.port}: {error}; expected the hand's Modbus TCP server (--host, --port)")
-    source = line_protocol.Source(arguments.address, len(CLOSED_RAD), sum(words for _, words in PADS))
+    source = line_protocol.Source(arguments.address, len(CLOSED_RAD), sum(words for _, words in PADS), arguments.hand)
     try:
         source.send_all(frames(modbus, arguments.newtons_per_count, arguments.rate))
     except ModbusError as error:

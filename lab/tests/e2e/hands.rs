@@ -362,6 +362,42 @@ fn a_hand_is_made_from_the_urdf_of_a_whole_robot() {
 }
 
 #[test]
+fn a_urdf_in_which_nothing_moves_is_told_why() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let refused = |urdf: &str, more: &[&str]| {
+        std::fs::write(folder.path().join("gripper.urdf"), urdf).expect("written");
+        run_in(folder.path(), &other(more), 1).1
+    };
+    let said = refused(XACRO, &[]);
+    assert!(said.contains("gripper.urdf: it is a xacro file: give it a name that ends in .xacro"), "{said}");
+    let locked = "<robot name=\"r\"><link name=\"base\"/><link name=\"jaw\"/><joint name=\"slide\" type=\"prismatic\">\
+                  <parent link=\"base\"/><child link=\"jaw\"/><axis xyz=\"0 1 0\"/><limit lower=\"0\" upper=\"0\"/></joint></robot>";
+    let said = refused(locked, &[]);
+    assert!(said.contains("0 joints, expected 1 to 32: joint 'slide' has the limits 0 and 0"), "{said}");
+    let said = refused(&locked.replace("prismatic", "fixed"), &[]);
+    assert!(said.contains("no joint of the type revolute, continuous or prismatic"), "{said}");
+    let said = refused(&locked.replace("upper=\"0\"", "upper=\"0.1\""), &["--base", "jaw"]);
+    assert!(said.contains("below --base jaw nothing moves: name a link above it"), "{said}");
+    let said = refused(&locked.replace("upper=\"0\"", "upper=\"1.3\""), &[]);
+    assert!(said.contains("0..1.3") && said.contains("give the first link of the hand with --base LINK"), "{said}");
+}
+
+#[test]
+fn a_mesh_of_another_computer_is_copied_beside_the_hand() {
+    let folder = tempfile::tempdir().expect("a folder");
+    package(folder.path());
+    let moved = XACRO.replace("package://my_gripper", "/home/someone/ws");
+    std::fs::write(folder.path().join("my_gripper/urdf/gripper.urdf.xacro"), moved).expect("written");
+    let new = ["new", "hand", "mine", "--urdf", URDF, "--open", "jaw=0.04", "--grid", "left_jaw=4x3"];
+    let (_, stderr) = run_in(folder.path(), &new, 0);
+    assert!(
+        stderr.contains("mesh /home/someone/ws/meshes/jaw.obj is not there") && stderr.contains("is taken"),
+        "{stderr}"
+    );
+    assert!(folder.path().join("mine/meshes/jaw.obj").is_file());
+}
+
+#[test]
 fn a_hand_is_drawn_by_itself() {
     let folder = tempfile::tempdir().expect("a folder");
     let html = folder.path().join("hand.html");
