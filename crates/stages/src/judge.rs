@@ -26,8 +26,17 @@ pub struct Judge {
     next_seq: u64,
     contacts: Vec<Contact>,
     values: Vec<f64>,
-    /// Of the last frame at rest that was out of distribution: its grasp, and the limits that it violates.
-    unusual: (u64, Vec<Violation>),
+    found: Findings,
+}
+
+/// What speaks against the last grasp of which something does.
+#[derive(Debug, Default)]
+struct Findings {
+    grasp_id: u64,
+    /// The limits that its last frame violates that was at rest and out of distribution.
+    violations: Vec<Violation>,
+    /// The first reading that made a frame invalid.
+    invalid: Option<String>,
 }
 
 /// The judgement of a frame.
@@ -65,7 +74,7 @@ impl Judge {
             next_seq: 0,
             contacts: Vec::new(),
             values: Vec::new(),
-            unusual: (0, Vec::new()),
+            found: Findings::default(),
         })
     }
 
@@ -108,8 +117,14 @@ impl Judge {
         let (summary, parts) = steps::find_contacts(&self.hand, &mut self.finder, &head, &items, &mut self.contacts);
         let contacts = steps::contact_set(&self.hand, &head, summary, parts.as_ref());
         let feature = steps::encode(&self.model, self.dictionary_id, &contacts, &self.contacts, &mut self.values);
+        if self.found.grasp_id != frame.grasp_id {
+            self.found = Findings { grasp_id: frame.grasp_id, ..Findings::default() };
+        }
+        if self.found.invalid.is_none() {
+            self.found.invalid = steps::explain_fault(&self.hand, &summary, parts.as_ref());
+        }
         if feature.fault == Fault::OutOfDistribution.code() && frame.phase.decides() {
-            self.unusual = (frame.grasp_id, steps::violations(&self.model, &contacts, &self.contacts));
+            self.found.violations = steps::violations(&self.model, &contacts, &self.contacts);
         }
         let head = steps::classify(&self.model, self.dictionary_id, &mut self.memory, &feature, &self.values);
         let mut decisions = Vec::new();
@@ -122,9 +137,21 @@ impl Judge {
 
     /// The limits that a grasp violates which has just been held as out of distribution; none for another decision.
     pub fn violations(&self, decision: &LiftDecision) -> &[Violation] {
-        let (grasp_id, violations) = &self.unusual;
-        let is_of_it = decision.reason == Reason::OutOfDistribution && decision.grasp_id == *grasp_id;
-        if is_of_it { violations } else { &[] }
+        let is_of_it = decision.reason == Reason::OutOfDistribution && decision.grasp_id == self.found.grasp_id;
+        if is_of_it { &self.found.violations } else { &[] }
+    }
+
+    /// Why a grasp was held that has just been decided, sentence by sentence: by names of joints, pads and links, with
+    /// what was found and what was expected. Empty if its reason says all that is known.
+    pub fn explain(&self, decision: &LiftDecision) -> Vec<String> {
+        if decision.grasp_id != self.found.grasp_id {
+            return Vec::new();
+        }
+        match decision.reason {
+            Reason::Invalid => self.found.invalid.iter().cloned().collect(),
+            Reason::OutOfDistribution => self.found.violations.iter().map(Violation::to_string).collect(),
+            _ => Vec::new(),
+        }
     }
 
     /// Holds the open grasp, if any, because no more frames come.
@@ -148,6 +175,7 @@ impl Judge {
     fn forget_grasps(&mut self) {
         self.arbiter = LiftArbiter::new(*self.arbiter.options());
         self.next_seq = 0;
+        self.found = Findings::default();
     }
 }
 
@@ -180,6 +208,25 @@ mod tests {
         let error = Judge::new(hand("shadow-biotac-sp"), model).err().expect("refused").to_string();
         assert!(error.contains("the model is for the hand 'barrett-bh8-280'"), "{error}");
         assert!(error.contains("not for 'shadow-biotac-sp'"), "{error}");
+    }
+
+    #[test]
+    fn an_invalid_grasp_is_explained_by_the_joint_that_made_it_so() {
+        let mut judge = judge();
+        let mut degrees = frame(Phase::Closing);
+        degrees.joints[1] = 39.4;
+        assert_eq!(judge.frame(0, &degrees), []);
+        // Another reading decides, but the first one is the cause.
+        degrees.joints[1] = f64::NAN;
+        degrees.phase = Phase::Settled;
+        let decision = judge.frame(10_000_000, &degrees).pop().expect("decided");
+        assert_eq!(decision.reason, Reason::Invalid);
+        let [why] = &judge.explain(&decision)[..] else { panic!("one sentence") };
+        assert!(why.starts_with("joint finger_1 reads 39.4, expected 0 to "), "{why}");
+        // The next grasp has another reason.
+        let next = TactileFrame { grasp_id: 2, ..frame(Phase::Settled) };
+        let decision = judge.frame(20_000_000, &next).pop().expect("decided");
+        assert_eq!((decision.reason, judge.explain(&decision)), (Reason::NoContact, vec![]));
     }
 
     #[test]

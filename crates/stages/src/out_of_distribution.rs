@@ -57,7 +57,7 @@ impl fmt::Display for Violation {
 }
 
 /// Four significant digits.
-fn short(value: f64) -> String {
+pub(crate) fn short(value: f64) -> String {
     // Without the sign of a zero.
     let text = (format!("{value:.3e}").parse::<f64>().unwrap_or(value) + 0.0).to_string();
     if text.len() > 12 { format!("{value:.3e}") } else { text }
