@@ -4,7 +4,7 @@ use blindgrasp_messages::{Contact, Fault, Header, LiftDecision, Message, Predict
 
 use crate::contacts::ContactFinder;
 use crate::hand::Hand;
-use crate::lift_arbiter::{ArbiterOptions, LiftArbiter};
+use crate::lift_arbiter::{ArbiterOptions, LiftArbiter, Staleness};
 use crate::model::{Memory, Model, OtherHand};
 use crate::out_of_distribution::Violation;
 use crate::own_lifts::{Adapt, OwnLifts};
@@ -99,7 +99,7 @@ impl Judge {
     /// Takes the next frame, and returns the decisions that come with it, in order ([`Judged::decisions`]): also a probe
     /// before a decision, or what the arm should do while it lifts. `stamp_nanos` is the time of the
     /// reading by the source's clock: frames of one time are one reading and have one vote, and a grasp whose frames
-    /// come more than 100 ms apart (see [`ArbiterOptions`]) is held.
+    /// come too far apart (see [`ArbiterOptions`]) is held.
     pub fn frame(&mut self, stamp_nanos: u64, frame: &TactileFrame) -> Vec<LiftDecision> {
         let header = Header { seq: self.next_seq, stamp_nanos, hand_id: self.hand_id, ..Header::default() };
         self.judge(header, frame).decisions
@@ -149,6 +149,7 @@ impl Judge {
         }
         match decision.reason {
             Reason::Invalid => self.found.invalid.iter().cloned().collect(),
+            Reason::Stale => self.arbiter.staleness(decision.grasp_id).iter().map(Staleness::to_string).collect(),
             Reason::OutOfDistribution => self.found.violations.iter().map(Violation::to_string).collect(),
             _ => Vec::new(),
         }
