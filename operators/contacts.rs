@@ -145,9 +145,11 @@ impl Stage for FindContacts {
 
     fn answer(&mut self, head: &TactileFrameHead, items: &[f64], _now_nanos: u64, answers: &mut Answers<ContactSet>) {
         let (mut summary, parts) = find_contacts(&self.hand, &mut self.finder, head, items, answers.items());
-        // Once for each grasp: its frames mostly have one fault.
+        // Once for each grasp: its frames mostly have one fault. A hand that closes may have no contact yet.
+        let is_at_rest = Phase::from_code(head.phase).is_ok_and(Phase::decides);
         if self.told != Some(head.grasp_id)
-            && let Some(why) = explain_fault(&self.hand, &summary, parts.as_ref())
+            && (is_at_rest || summary.fault != Fault::NoContact)
+            && let Some(why) = explain_fault(&self.hand, &self.finder, &summary, parts.as_ref())
         {
             self.told = Some(head.grasp_id);
             print_diagnostic(&format!("grasp {} cannot be judged: {why}", head.grasp_id));

@@ -175,6 +175,28 @@ impl ContactFinder {
         ContactSummary { n_pads_in_contact, self_collision: !self.touching.is_empty(), n_self_contacts, fault }
     }
 
+    /// The links that touch each other on which cells of the last frame feel, if it has no contact for this reason: for people.
+    pub fn self_contact(&self, hand: &Hand, cells_newtons: &[f64]) -> Option<String> {
+        let thresholds_newtons = hand.noise_thresholds_newtons();
+        let mut links_that_feel = Vec::new();
+        for pad in &hand.pads {
+            let cells = pad.first_cell_idx..pad.first_cell_idx + pad.cells.len();
+            if active_idxs(&cells_newtons[cells.clone()], &thresholds_newtons[cells]).next().is_some() {
+                links_that_feel.push(pad.link_idx);
+            }
+        }
+        let mut pairs = Vec::new();
+        for (a, b) in &self.touching {
+            if links_that_feel.contains(a) || links_that_feel.contains(b) {
+                pairs.push(format!("{} and {}", hand.links[*a].name, hand.links[*b].name));
+            }
+        }
+        if pairs.is_empty() {
+            return None;
+        }
+        Some(format!("cells feel, but only on links that touch each other: {}", pairs.join("; ")))
+    }
+
     /// Whether a point of a link, in the palm frame, is near to a link that touches that link.
     fn feels_hand(&self, hand: &Hand, link_idx: usize, position: &Point3<f64>) -> bool {
         for &(a, b) in &self.touching {
@@ -399,6 +421,11 @@ mod tests {
             let (summary, contacts) = run(0, &TOUCHING, &pressed);
             let found = (summary.fault, summary.n_self_contacts, contacts.len());
             assert_eq!(found, (Fault::NoContact, n_pressed, 0));
+            let mut finder = ContactFinder::default();
+            finder.find(&hand(), 0, &TOUCHING, &pressed, &mut Vec::new());
+            let said = finder.self_contact(&hand(), &pressed).expect("cells feel");
+            assert!(said.ends_with(": distal_1 and distal_3; distal_2 and distal_3"), "{said}");
+            assert_eq!(finder.self_contact(&hand(), &[0.0; 96]), None);
         }
     }
 

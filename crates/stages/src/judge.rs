@@ -37,6 +37,8 @@ struct Findings {
     violations: Vec<Violation>,
     /// The first reading that made a frame invalid.
     invalid: Option<String>,
+    /// Why its last frame at rest has no contact although cells feel.
+    self_contact: Option<String>,
 }
 
 /// The judgement of a frame.
@@ -120,8 +122,14 @@ impl Judge {
         if self.found.grasp_id != frame.grasp_id {
             self.found = Findings { grasp_id: frame.grasp_id, ..Findings::default() };
         }
-        if self.found.invalid.is_none() {
-            self.found.invalid = steps::explain_fault(&self.hand, &summary, parts.as_ref());
+        if summary.fault != Fault::NoContact || frame.phase.decides() {
+            let why = steps::explain_fault(&self.hand, &self.finder, &summary, parts.as_ref());
+            let found = &mut self.found;
+            if summary.fault == Fault::NoContact {
+                found.self_contact = why;
+            } else if found.invalid.is_none() {
+                found.invalid = why;
+            }
         }
         if feature.fault == Fault::OutOfDistribution.code() && frame.phase.decides() {
             self.found.violations = steps::violations(&self.model, &contacts, &self.contacts);
@@ -149,6 +157,7 @@ impl Judge {
         }
         match decision.reason {
             Reason::Invalid => self.found.invalid.iter().cloned().collect(),
+            Reason::NoContact => self.found.self_contact.iter().cloned().collect(),
             Reason::Stale => self.arbiter.staleness(decision.grasp_id).iter().map(Staleness::to_string).collect(),
             Reason::OutOfDistribution => self.found.violations.iter().map(Violation::to_string).collect(),
             _ => Vec::new(),

@@ -35,11 +35,17 @@ pub fn find_contacts<'a>(
     }
 }
 
-/// What makes the frame faulty that [`find_contacts`] has just read, for people: the joint or cell by its name.
-pub fn explain_fault(hand: &Hand, summary: &ContactSummary, parts: Option<&FrameParts<'_>>) -> Option<String> {
+/// What makes the frame faulty that [`find_contacts`] has just read, for people: joint, cell or links by their names.
+pub fn explain_fault(
+    hand: &Hand,
+    finder: &ContactFinder,
+    summary: &ContactSummary,
+    parts: Option<&FrameParts<'_>>,
+) -> Option<String> {
     let FrameParts { joints, cells_newtons, .. } = parts?;
     match summary.fault {
         Fault::WrongLength | Fault::InvalidValue => invalid_reading(hand, joints, cells_newtons),
+        Fault::NoContact => finder.self_contact(hand, cells_newtons),
         _ => None,
     }
 }
