@@ -4,7 +4,7 @@ use blindgrasp_messages::{Contact, Fault, Header, LiftDecision, Message, Predict
 
 use crate::contacts::ContactFinder;
 use crate::hand::Hand;
-use crate::lift_arbiter::{ArbiterOptions, LiftArbiter, Staleness};
+use crate::lift_arbiter::{ArbiterOptions, LiftArbiter, Probe, Staleness};
 use crate::model::{Memory, Model, OtherHand};
 use crate::out_of_distribution::Violation;
 use crate::own_lifts::{Adapt, OwnLifts};
@@ -63,8 +63,9 @@ impl Judge {
     ///
     /// # Errors
     /// The model is of another hand.
-    pub fn with_options(hand: Hand, model: Model, options: ArbiterOptions) -> Result<Judge, OtherHand> {
+    pub fn with_options(hand: Hand, mut model: Model, options: ArbiterOptions) -> Result<Judge, OtherHand> {
         model.check_hand(&hand)?;
+        model.name_quantities(&hand);
         Ok(Judge {
             hand_id: hand.id(),
             dictionary_id: model.dictionary_id(),
@@ -157,6 +158,9 @@ impl Judge {
         }
         match decision.reason {
             Reason::Invalid => self.found.invalid.iter().cloned().collect(),
+            Reason::Unstable if self.arbiter.options().probe == Probe::None && self.model.day.is_none() => {
+                self.model.speak_against(&self.hand, &self.values).into_iter().collect()
+            }
             Reason::NoContact => self.found.self_contact.iter().cloned().collect(),
             Reason::Stale => self.arbiter.staleness(decision.grasp_id).iter().map(Staleness::to_string).collect(),
             Reason::OutOfDistribution => self.found.violations.iter().map(Violation::to_string).collect(),
@@ -237,6 +241,28 @@ mod tests {
         let next = TactileFrame { grasp_id: 2, ..frame(Phase::Settled) };
         let decision = judge.frame(20_000_000, &next).pop().expect("decided");
         assert_eq!((decision.reason, judge.explain(&decision)), (Reason::NoContact, vec![]));
+    }
+
+    #[test]
+    fn a_grasp_unlike_the_training_is_explained_by_names_whatever_the_file_of_the_model_says() {
+        let mut judge = judge();
+        let felt = TactileFrame { cells_newtons: vec![1.0; 96], ..frame(Phase::Settled) };
+        let decision = judge.frame(0, &felt).pop().expect("decided");
+        assert_eq!(decision.reason, Reason::OutOfDistribution);
+        let why = judge.explain(&decision).join("\n");
+        assert!(why.contains("contacts of pad finger_1: 24, trained from 0 to "), "{why}");
+    }
+
+    #[test]
+    fn an_unstable_grasp_is_explained_by_two_values_of_pads_or_joints() {
+        let mut judge = judge();
+        let mut felt = frame(Phase::Settled);
+        felt.cells_newtons[0] = 1.0;
+        judge.frame(0, &felt);
+        // As if the model had said so.
+        let decision = LiftDecision { grasp_id: 1, reason: Reason::Unstable, ..LiftDecision::default() };
+        let [why] = &judge.explain(&decision)[..] else { panic!("one sentence") };
+        assert!(why.starts_with("most against it: ") && why.matches(" is ").count() == 2, "{why}");
     }
 
     #[test]
