@@ -1,6 +1,6 @@
 //! From contacts to the feature.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use blindgrasp_messages::{ContactSet, Fault, GraspFeature, Phase, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
@@ -8,7 +8,7 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage;
-use blindgrasp_stages::{Model, steps};
+use blindgrasp_stages::{Hand, Model, steps};
 use serde::Deserialize;
 
 use crate::beginning::FileNode;
@@ -36,7 +36,13 @@ pub(crate) fn check(node: &FileNode) -> anyhow::Result<()> {
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
-    let model = Model::load(&params.model)?;
+    let mut model = Model::load(&params.model)?;
+    // A model of this version has the names of the hand's parts. An older one of a built-in hand gets them.
+    if let Ok(hand) = Hand::load(Path::new(&model.hand.name))
+        && hand.id() == model.hand.id
+    {
+        model.name_quantities(&hand);
+    }
     let dictionary_id = model.dictionary_id();
     let n_features = model.features.len();
     let identity = model.identity();

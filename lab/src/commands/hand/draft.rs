@@ -6,7 +6,7 @@ use anyhow::{Context, bail};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_simulator::mechanism::Mechanism;
 use blindgrasp_simulator::pad_grid::pad_grid;
-use blindgrasp_simulator::palm_frame::{best_value, idle_pads, odd_joints, palm_fit, self_pressing};
+use blindgrasp_simulator::palm_frame::{best_value, idle_pads, odd_joints, pairs_that_meet, palm_fit, self_pressing};
 use blindgrasp_stages::hand::{BareHand, Hand, Joint, Motion, PALM_FRAME, Pad};
 use nalgebra::{Isometry3, Point3};
 
@@ -180,6 +180,16 @@ impl Draft {
                 100.0 * share,
                 hand.links[a].name,
                 hand.links[b].name
+            ));
+        }
+        let mut met = Vec::new();
+        for (a, b) in pairs_that_meet(&hand)? {
+            met.push(format!("{} and {}", hand.links[a].name, hand.links[b].name));
+        }
+        if !met.is_empty() {
+            print_diagnostic(&format!(
+                "as the hand closes on balls, links with pads touch other links, where their cells count as no contact: {}",
+                met.join("; ")
             ));
         }
         Ok(())
