@@ -1,5 +1,6 @@
 //! A hand on its way to a layout: the palm frame and the joints that are set before a grasp, where the user gave none.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -7,13 +8,18 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_simulator::mechanism::Mechanism;
 use blindgrasp_simulator::pad_grid::pad_grid;
 use blindgrasp_simulator::palm_frame::{best_value, idle_pads, odd_joints, palm_fit, self_pressing};
+use blindgrasp_simulator::planner::PlannerOptions;
+use blindgrasp_simulator::touches::{Touch, closings};
 use blindgrasp_stages::hand::{BareHand, Hand, Joint, Motion, PALM_FRAME, Pad};
-use nalgebra::{Isometry3, Point3};
+use nalgebra::{Isometry3, Point3, Vector3};
 
-use super::{Arguments, NewPad};
+use super::{Arguments, NewPad, print_text};
 
 /// A draft must have a score that is better than another's by this much.
 const LEAST_GAIN: f64 = 0.05;
+
+/// The hand closes on so many objects to find where it touches them.
+const N_CLOSINGS: u64 = 48;
 
 /// A joint of which both limits are as far from the open value closes to the upper one. Opened by this part of its range, it closes
 /// to the lower one.
@@ -62,13 +68,31 @@ impl Draft {
         Ok(draft)
     }
 
+    /// The pads of the table and of the grids, whose cells lie where the hand touches objects as it closes on them.
+    pub(super) fn laid_pads(&self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<Vec<NewPad>> {
+        let mut pads = self.pads(table, arguments, &[])?;
+        // The planner comes with the pads to the object, so the pads that lie where it comes are laid twice.
+        for n_approaches in [1, PlannerOptions::default().n_approaches] {
+            if !arguments.grids.is_empty() {
+                let touches = closings(&self.with_pads(&pads), N_CLOSINGS, n_approaches)?.concat();
+                pads = self.pads(table, arguments, &touches)?;
+            }
+        }
+        for (link, [rows, columns]) in &arguments.grids {
+            let n_cells = pads.iter().find(|pad| pad.name == *link).map_or(0, |pad| pad.cells.len());
+            let n_missing = rows * columns - n_cells;
+            if n_missing > 0 {
+                print_diagnostic(&format!(
+                    "--grid {link}={rows}x{columns}: {n_missing} of {} cells are left out: the link has no face under them",
+                    rows * columns
+                ));
+            }
+        }
+        Ok(pads)
+    }
+
     /// The pads of the table and of the grids.
-    pub(super) fn pads(
-        &self,
-        table: &[NewPad],
-        arguments: &Arguments,
-        tells_missing: bool,
-    ) -> anyhow::Result<Vec<NewPad>> {
+    fn pads(&self, table: &[NewPad], arguments: &Arguments, touches: &[Touch]) -> anyhow::Result<Vec<NewPad>> {
         let mechanism = Mechanism::new(&self.hand);
         let mut pads = table.to_vec();
         for (link, [rows, columns]) in &arguments.grids {
@@ -77,15 +101,8 @@ impl Draft {
             let link_idx = links.iter().position(|other| other.name == *link);
             let link_idx =
                 link_idx.with_context(|| format!("--grid: the URDF has no link '{link}' (it has {})", known()))?;
-            let cells = pad_grid(&mechanism, link_idx, [*rows, *columns], arguments.threshold);
+            let cells = pad_grid(&mechanism, link_idx, [*rows, *columns], touches, arguments.threshold);
             let cells = cells.map_err(|reason| anyhow::anyhow!("--grid {link}: {reason}"))?;
-            let n_missing = rows * columns - cells.len();
-            if n_missing > 0 && tells_missing {
-                print_diagnostic(&format!(
-                    "--grid {link}={rows}x{columns}: {n_missing} of {} cells are left out: the link has no face under them",
-                    rows * columns
-                ));
-            }
             pads.push(NewPad { name: link.clone(), link: link.clone(), cells });
         }
         Ok(pads)
@@ -96,7 +113,7 @@ impl Draft {
     /// # Errors
     /// A joint that moves all pads together, as a wrist does.
     pub(super) fn fit(&mut self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<()> {
-        let hand = self.with_pads(&self.pads(table, arguments, false)?);
+        let hand = self.with_pads(&self.pads(table, arguments, &[])?);
         if let Some((joint, link)) = wrist(&hand).filter(|(joint, _)| !arguments.preshape.contains(joint)) {
             bail!("joint '{joint}' moves all pads together, as a wrist does: give the hand alone with --base {link}");
         }
@@ -185,6 +202,38 @@ impl Draft {
         Ok(())
     }
 
+    /// Prints the share of planned closings that a cell feels, and names the pads that feel less than half of their link's
+    /// contacts.
+    pub(super) fn tell_felt(&self, pads: &[NewPad]) -> anyhow::Result<()> {
+        let hand = self.with_pads(pads);
+        let closings = closings(&hand, N_CLOSINGS, PlannerOptions::default().n_approaches)?;
+        let n_felt = closings.iter().filter(|touches| touches.iter().any(|touch| touch.is_felt)).count();
+        print_text(&format!(
+            "\nclosed on training objects: a cell feels {n_felt} of {} planned grasps",
+            closings.len()
+        ))?;
+        let touches = closings.concat();
+        let mut told = BTreeSet::new();
+        for pad in &hand.pads {
+            let on_link: Vec<&Touch> = touches.iter().filter(|touch| touch.link_idx == pad.link_idx).collect();
+            let unfelt: Vec<&&Touch> = on_link.iter().filter(|touch| !touch.is_felt).collect();
+            if 2 * unfelt.len() <= on_link.len() || !told.insert(pad.link_idx) {
+                continue;
+            }
+            let middle =
+                unfelt.iter().map(|touch| touch.point_in_link_m.coords).sum::<Vector3<f64>>() / unfelt.len() as f64;
+            let [x, y, z] = [middle.x, middle.y, middle.z].map(|metres| round(metres, 1e3));
+            print_diagnostic(&format!(
+                "the cells on link '{}' feel {} of its {} contacts: the others lie around [{x}, {y}, {z}] m in the link's frame; \
+                 lay cells there (--cells), more of them (--grid), or use a link that meets the object first",
+                hand.links[pad.link_idx].name,
+                on_link.len() - unfelt.len(),
+                on_link.len()
+            ));
+        }
+        Ok(())
+    }
+
     fn read(&mut self) -> anyhow::Result<()> {
         self.hand = Hand::without_cells(&self.source, &self.urdf, &self.bare)?;
         Ok(())
@@ -247,7 +296,7 @@ impl Fitted {
         let Fitted { draft, told, .. } = self;
         let (mut still, mut turned) = (Vec::new(), Vec::new());
         if arguments.preshape.is_empty() {
-            let hand = draft.with_pads(&draft.pads(table, arguments, false)?);
+            let hand = draft.with_pads(&draft.pads(table, arguments, &[])?);
             let odd = odd_joints(&hand)?;
             let two_way = draft.two_way_joints(arguments);
             still = odd.sideways;
@@ -297,7 +346,7 @@ impl Fitted {
     fn find_palm_frame(&mut self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<()> {
         let Fitted { draft, told, score } = self;
         let palm = draft.hand.palm_link().name.clone();
-        let hand = draft.with_pads(&draft.pads(table, arguments, false)?).with_moving_pads();
+        let hand = draft.with_pads(&draft.pads(table, arguments, &[])?).with_moving_pads();
         let fit = palm_fit(&hand)?;
         *score = fit.score;
         let pose = rounded(&fit.link_from_palm);
@@ -324,7 +373,7 @@ impl Fitted {
         let Fitted { draft, told, .. } = self;
         let mut values = Vec::new();
         for idx in still {
-            let hand = draft.with_pads(&draft.pads(table, arguments, false)?).with_moving_pads();
+            let hand = draft.with_pads(&draft.pads(table, arguments, &[])?).with_moving_pads();
             let value = round(best_value(&hand, *idx)?, 1e4);
             let name = draft.hand.joints[*idx].name.clone();
             values.push((name.clone(), value));
