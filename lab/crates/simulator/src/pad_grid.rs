@@ -186,7 +186,7 @@ mod tests {
     use blindgrasp_stages::hand::{BareHand, Pad};
 
     use super::*;
-    use crate::touches::closings;
+    use crate::touches::{all_touches, closings};
 
     /// A gripper whose fingers are thin at the tip, set back below it, and thick at the root, as those of the Franka hand.
     fn stepped_gripper() -> Hand {
@@ -237,11 +237,11 @@ mod tests {
     fn a_grid_lies_where_the_hand_touches_objects() {
         let bare = stepped_gripper();
         let spread = with_grids(&bare, &[]);
-        let touches = closings(&spread, 48, 1).expect("closes").concat();
+        let touches = all_touches(closings(&spread, 48, 1).expect("closes"));
         let laid = with_grids(&bare, &touches);
         let felt = |hand: &Hand| {
             let closings = closings(hand, 24, 16).expect("closes");
-            closings.iter().filter(|touches| touches.iter().any(|touch| touch.is_felt)).count() as f64
+            closings.iter().filter(|closing| closing.touches.iter().any(|touch| touch.is_felt)).count() as f64
                 / closings.len() as f64
         };
         let (before, after) = (felt(&spread), felt(&laid));

@@ -6,9 +6,11 @@ use nalgebra::{Point3, UnitVector3};
 use rand::RngExt;
 
 use crate::candidate::{candidate_rng, grasp};
+use crate::loaded_contacts::grasp_case;
 use crate::mechanism::Mechanism;
 use crate::options::SimulatorOptions;
 use crate::planner::plan_start;
+use crate::wrench_space::quality;
 
 /// A contact of a link with an object.
 #[derive(Debug, Clone)]
@@ -19,6 +21,15 @@ pub struct Touch {
     pub normal_in_link: UnitVector3<f64>,
     /// Whether a cell feels it.
     pub is_felt: bool,
+}
+
+/// A hand that closed on an object.
+#[derive(Debug, Clone)]
+pub struct Closing {
+    /// At least one.
+    pub touches: Vec<Touch>,
+    /// Whether the contacts resist every wrench, given enough force, and no links press on each other.
+    pub is_held: bool,
 }
 
 /// Why a hand could not be closed on objects.
@@ -32,12 +43,12 @@ pub enum TouchesError {
     Objects(#[from] SelectionError),
 }
 
-/// The contacts of each of `n_closings` on training objects, of which each is planned as the best of `n_approaches`.
-/// Closings without a contact are left out.
+/// So many closings on training objects, of which each is planned as the best of `n_approaches`. Those without a contact are
+/// left out.
 ///
 /// # Errors
 /// The hand's joints do not fit together.
-pub fn closings(hand: &Hand, n_closings: u64, n_approaches: usize) -> Result<Vec<Vec<Touch>>, TouchesError> {
+pub fn closings(hand: &Hand, n_closings: u64, n_approaches: usize) -> Result<Vec<Closing>, TouchesError> {
     let objects: Vec<Object> = select("train")?;
     let mechanism = Mechanism::new(hand);
     let mut options = SimulatorOptions::default();
@@ -62,7 +73,14 @@ pub fn closings(hand: &Hand, n_closings: u64, n_approaches: usize) -> Result<Vec
                 is_felt: contact.cells_newtons.iter().any(|(idx, newtons)| *newtons > thresholds[*idx]),
             });
         }
-        closings.push(touches);
+        let quality = quality(&grasp_case(object, &exploration.palm_from_object, &contacts, options.friction));
+        let is_closed = quality.is_ok_and(|quality| quality.force_closure);
+        closings.push(Closing { is_held: is_closed && touches.len() == contacts.len(), touches });
     }
     Ok(closings)
+}
+
+/// The contacts of all closings.
+pub fn all_touches(closings: Vec<Closing>) -> Vec<Touch> {
+    closings.into_iter().flat_map(|closing| closing.touches).collect()
 }

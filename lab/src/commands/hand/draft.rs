@@ -9,7 +9,7 @@ use blindgrasp_simulator::mechanism::Mechanism;
 use blindgrasp_simulator::pad_grid::pad_grid;
 use blindgrasp_simulator::palm_frame::{best_value, idle_pads, odd_joints, palm_fit, self_pressing};
 use blindgrasp_simulator::planner::PlannerOptions;
-use blindgrasp_simulator::touches::{Touch, closings};
+use blindgrasp_simulator::touches::{Touch, all_touches, closings};
 use blindgrasp_stages::hand::{BareHand, Hand, Joint, Motion, PALM_FRAME, Pad};
 use nalgebra::{Isometry3, Point3, Vector3};
 
@@ -49,6 +49,7 @@ enum Opening {
 /// A draft with a palm frame, how well the hand closes in it, and the lines that tell the choices.
 struct Fitted {
     draft: Draft,
+    opening: Opening,
     score: f64,
     told: Vec<String>,
 }
@@ -74,7 +75,7 @@ impl Draft {
         // The planner comes with the pads to the object, so the pads that lie where it comes are laid twice.
         for n_approaches in [1, PlannerOptions::default().n_approaches] {
             if !arguments.grids.is_empty() {
-                let touches = closings(&self.with_pads(&pads), N_CLOSINGS, n_approaches)?.concat();
+                let touches = all_touches(closings(&self.with_pads(&pads), N_CLOSINGS, n_approaches)?);
                 pads = self.pads(table, arguments, &touches)?;
             }
         }
@@ -117,21 +118,32 @@ impl Draft {
         if let Some((joint, link)) = wrist(&hand).filter(|(joint, _)| !arguments.preshape.contains(joint)) {
             bail!("joint '{joint}' moves all pads together, as a wrist does: give the hand alone with --base {link}");
         }
-        let mut best = self.fitted(table, arguments, Opening::AsGiven)?;
+        let mut best = self.fitted(table, arguments, Opening::AsGiven, false)?;
         let mut others = Vec::new();
         // Joints with as much way to one limit as to the other may close either way.
         if !self.two_way_joints(arguments).is_empty() {
             others.extend([Opening::TwoWay(-0.25), Opening::TwoWay(0.25)]);
         }
-        // 0 is the closed hand of many grippers.
-        if best.score < LEAST_GAIN {
-            others.push(Opening::Reversed);
-        }
         for opening in others {
             // Another open hand may leave a grid without cells.
-            let Ok(other) = self.fitted(table, arguments, opening) else { continue };
+            let Ok(other) = self.fitted(table, arguments, opening, false) else { continue };
             if other.score > best.score + LEAST_GAIN {
                 best = other;
+            }
+        }
+        // 0 is the closed hand of many grippers. A jaw that closes on a fixed one may hold things with its back, too.
+        if let Ok(reversed) = self.fitted(table, arguments, Opening::Reversed, false)
+            && reversed.score > LEAST_GAIN
+            && (best.score < LEAST_GAIN
+                || reversed.draft.held(table, arguments)? > best.draft.held(table, arguments)?)
+        {
+            best = reversed;
+        }
+        // Balls before the palm do not tell all: the link's own frame may do better with objects of other shapes.
+        if best.draft.bare.palm != self.bare.palm {
+            let own = self.fitted(table, arguments, best.opening, true)?;
+            if own.draft.held(table, arguments)? > best.draft.held(table, arguments)? {
+                best = own;
             }
         }
         for line in &best.told {
@@ -139,6 +151,13 @@ impl Draft {
         }
         *self = best.draft;
         Ok(())
+    }
+
+    /// How many planned grasps hold their objects.
+    fn held(&self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<usize> {
+        let hand = self.with_pads(&self.pads(table, arguments, &[])?);
+        let closings = closings(&hand, N_CLOSINGS, PlannerOptions::default().n_approaches)?;
+        Ok(closings.iter().filter(|closing| closing.is_held).count())
     }
 
     /// Names of closing joints whose limits are as far from the open value on both sides, and whose open value nobody gave.
@@ -151,9 +170,15 @@ impl Draft {
         self.hand.joints.iter().filter(is_two_way).map(|joint| joint.name.clone()).collect()
     }
 
-    /// The draft with an open hand, its palm frame and the joints that do not close.
-    fn fitted(&self, table: &[NewPad], arguments: &Arguments, opening: Opening) -> anyhow::Result<Fitted> {
-        let mut fitted = Fitted { draft: self.clone(), score: 0.0, told: Vec::new() };
+    /// The draft with an open hand, its palm frame (its own, if it is to keep that) and the joints that do not close.
+    fn fitted(
+        &self,
+        table: &[NewPad],
+        arguments: &Arguments,
+        opening: Opening,
+        keeps_frame: bool,
+    ) -> anyhow::Result<Fitted> {
+        let mut fitted = Fitted { draft: self.clone(), opening, score: 0.0, told: Vec::new() };
         if let Opening::Reversed = opening {
             fitted.open_reversed(arguments)?;
         }
@@ -161,7 +186,9 @@ impl Draft {
         if let Opening::TwoWay(part) = opening {
             fitted.open_two_way(part, arguments)?;
         }
-        fitted.find_palm_frame(table, arguments)?;
+        if !keeps_frame {
+            fitted.find_palm_frame(table, arguments)?;
+        }
         fitted.set_still(&still, table, arguments)?;
         Ok(fitted)
     }
@@ -207,12 +234,12 @@ impl Draft {
     pub(super) fn tell_felt(&self, pads: &[NewPad]) -> anyhow::Result<()> {
         let hand = self.with_pads(pads);
         let closings = closings(&hand, N_CLOSINGS, PlannerOptions::default().n_approaches)?;
-        let n_felt = closings.iter().filter(|touches| touches.iter().any(|touch| touch.is_felt)).count();
+        let n_felt = closings.iter().filter(|closing| closing.touches.iter().any(|touch| touch.is_felt)).count();
         print_text(&format!(
             "\nclosed on training objects: a cell feels {n_felt} of {} planned grasps",
             closings.len()
         ))?;
-        let touches = closings.concat();
+        let touches = all_touches(closings);
         let mut told = BTreeSet::new();
         for pad in &hand.pads {
             let on_link: Vec<&Touch> = touches.iter().filter(|touch| touch.link_idx == pad.link_idx).collect();
@@ -344,7 +371,7 @@ impl Fitted {
 
     /// Finds the palm frame in which the hand closes best, and takes it unless the user gave one.
     fn find_palm_frame(&mut self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<()> {
-        let Fitted { draft, told, score } = self;
+        let Fitted { draft, told, score, .. } = self;
         let palm = draft.hand.palm_link().name.clone();
         let hand = draft.with_pads(&draft.pads(table, arguments, &[])?).with_moving_pads();
         let fit = palm_fit(&hand)?;
