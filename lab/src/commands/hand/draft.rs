@@ -444,10 +444,13 @@ fn wrist(hand: &Hand) -> Option<(String, String)> {
     let chains: Vec<Vec<usize>> = hand.pads.iter().map(|pad| movers(pad.link_idx)).collect();
     let (first, others) = chains.split_first()?;
     let lowest = *first.iter().find(|idx| others.iter().all(|chain| chain.contains(idx)))?;
-    // A link with a pad of its own is a finger's.
-    let is_one_finger = chains.iter().any(|chain| chain.first() == Some(&lowest));
+    // The links on it that move the pads. Of one finger there is one; a palm bears several fingers.
+    let mut borne = BTreeSet::new();
+    for chain in &chains {
+        borne.extend(chain.iter().take_while(|idx| **idx != lowest).last());
+    }
     let Motion::Joint { joint_idx, .. } = hand.links[lowest].motion else { return None };
-    (!is_one_finger).then(|| (hand.joints[joint_idx].name.clone(), hand.links[lowest].name.clone()))
+    (borne.len() > 1).then(|| (hand.joints[joint_idx].name.clone(), hand.links[lowest].name.clone()))
 }
 
 fn isometry([x, y, z, roll, pitch, yaw]: [f64; 6]) -> Isometry3<f64> {
