@@ -69,6 +69,42 @@ impl Draft {
         Ok(draft)
     }
 
+    /// Moves cells on links without shapes to the link that these are fixed to: makers write a frame for each sensor.
+    pub(super) fn move_to_bodies(&mut self, table: &mut [NewPad]) -> anyhow::Result<()> {
+        let links = &self.hand.links;
+        let mut n_moved = 0;
+        for pad in table {
+            let Some(mut idx) = links.iter().position(|link| link.name == pad.link) else { continue };
+            let frame_idx = idx;
+            let mut body_from_link = Isometry3::identity();
+            while links[idx].shapes.is_empty()
+                && matches!(links[idx].motion, Motion::Fixed)
+                && let Some(parent_idx) = links[idx].parent_idx
+            {
+                body_from_link = links[idx].parent_from_joint * body_from_link;
+                idx = parent_idx;
+            }
+            if idx == frame_idx || links[idx].shapes.is_empty() {
+                continue;
+            }
+            n_moved += 1;
+            for cell in &mut pad.cells {
+                cell.position_in_link_m = body_from_link * cell.position_in_link_m;
+                cell.normal_in_link = body_from_link.rotation * cell.normal_in_link;
+                cell.along_in_link = body_from_link.rotation * cell.along_in_link;
+            }
+            pad.link = links[idx].name.clone();
+            self.bare.padded_links.push(pad.link.clone());
+        }
+        if n_moved == 0 {
+            return Ok(());
+        }
+        print_diagnostic(&format!(
+            "{n_moved} pads of the table are on links without collision shapes: their cells belong to the links that bear these"
+        ));
+        self.read()
+    }
+
     /// The pads of the table and of the grids, whose cells lie where the hand touches objects as it closes on them.
     pub(super) fn laid_pads(&self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<Vec<NewPad>> {
         let mut pads = self.pads(table, arguments, &[])?;

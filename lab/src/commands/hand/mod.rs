@@ -147,6 +147,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         )?;
         return Ok(Outcome::Done);
     }
+    draft.move_to_bodies(&mut table)?;
     draft.fit(&table, arguments)?;
     let pads = draft.laid_pads(&table, arguments)?;
     draft.warn(&pads)?;
