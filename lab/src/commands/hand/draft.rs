@@ -348,6 +348,9 @@ impl Fitted {
                 opened.push((joint.name.clone(), joint.closed()));
             }
         }
+        if opened.is_empty() {
+            bail!("every joint has its open value, or is set before a grasp");
+        }
         self.told
             .push(format!("the hand is open where it could be taken for closed: as by --open {}", listed(&opened)));
         self.draft.bare.open.extend(opened);
@@ -481,7 +484,7 @@ fn wrist(hand: &Hand) -> Option<(String, String)> {
     let (first, others) = chains.split_first()?;
     let lowest = *first.iter().find(|idx| others.iter().all(|chain| chain.contains(idx)))?;
     // The links on it that move the pads. Of one finger there is one; a palm bears several fingers.
-    let mut borne = BTreeSet::new();
+    let mut borne: BTreeSet<usize> = BTreeSet::new();
     for chain in &chains {
         borne.extend(chain.iter().take_while(|idx| **idx != lowest).last());
     }
