@@ -19,9 +19,6 @@ const SELDOM: f64 = 0.03;
 const AXIS_COS: f64 = std::f64::consts::FRAC_1_SQRT_2;
 /// The cells reach this far beyond the outermost touches, metres, where the link does: about the radius of a patch.
 const AROUND_TOUCHES_M: f64 = 0.003;
-/// The part of a cell's place that the cell takes, along each direction.
-const SHARE_OF_PITCH: f64 = 0.85;
-
 /// A cell that looks farther aside than this from the side that it is on is left out: it lies on a flank. 65°.
 const LEAST_FACING: f64 = 0.42;
 
@@ -52,7 +49,7 @@ pub fn pad_grid(
     let [row_range, column_range] =
         [along, across].map(|direction| covered(extent(hand, link_idx, &direction), &direction, &touched));
     let ranges = [(row_range, n_rows), (column_range, n_columns)];
-    let size_m = ranges.map(|([least, most], n)| (most - least) / n as f64 * SHARE_OF_PITCH);
+    let size_m = ranges.map(|([least, most], n)| (most - least) / n as f64);
     let [_, outermost_m] = extent(hand, link_idx, &inner);
     let surfaces: Vec<(Pose, SharedShape)> =
         link.shapes.iter().map(|shape| (pose_from_isometry(&shape.link_from_shape), shape.rounded())).collect();
