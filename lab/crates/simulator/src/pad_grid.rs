@@ -25,8 +25,8 @@ const LEAST_FACING: f64 = 0.42;
 /// Cells in a grid of `rows` × `columns` on a link: on the side towards which it moves as the open hand closes; of a link that does
 /// not move, on the side that was touched most, or that of the palm's +z. The grid covers the part of that side that was
 /// touched, up to the link's edges. Its rows follow the longer direction of the side, outwards. Each cell lies on the link's
-/// collision shapes, where a line against the direction of closing meets them. Cells that would lie beside the shapes, or on their
-/// flanks, are left out, as at a tapered tip.
+/// collision shapes, where a line against the direction of closing meets them. A row is as wide as the face under it. Cells that
+/// would lie beside the shapes, or on their flanks, are left out.
 ///
 /// # Errors
 /// A link without collision shapes, or a grid of which no cell lies on them.
@@ -46,23 +46,33 @@ pub fn pad_grid(
     let (along, across) = face_directions(hand, link_idx, &inner);
     let touched = |touch: &&Touch| touch.link_idx == link_idx && touch.normal_in_link.dot(&inner) >= LEAST_FACING;
     let touched: Vec<Point3<f64>> = touches.iter().filter(touched).map(|touch| touch.point_in_link_m).collect();
-    let [row_range, column_range] =
-        [along, across].map(|direction| covered(extent(hand, link_idx, &direction), &direction, &touched));
-    let ranges = [(row_range, n_rows), (column_range, n_columns)];
-    let size_m = ranges.map(|([least, most], n)| (most - least) / n as f64);
+    let row_range = covered(extent(hand, link_idx, &along), &along, &touched);
+    let column_range = covered(extent(hand, link_idx, &across), &across, &touched);
+    let row_ends = row_ends(row_range, &along, &touched, n_rows);
     let [_, outermost_m] = extent(hand, link_idx, &inner);
     let surfaces: Vec<(Pose, SharedShape)> =
         link.shapes.iter().map(|shape| (pose_from_isometry(&shape.link_from_shape), shape.rounded())).collect();
+    // The face under a place of the grid.
+    let face_at = |along_m: f64, across_m: f64| {
+        let from = along.into_inner() * along_m + across.into_inner() * across_m;
+        let met = meet(&surfaces, &(from + inner.into_inner() * (outermost_m + 0.01)), &inner)?;
+        (met.1.dot(&inner) >= LEAST_FACING).then_some(met)
+    };
     let mut cells: Vec<Cell> = Vec::new();
-    for idx in 0..n_rows * n_columns {
-        let (row, column) = (idx / n_columns, idx % n_columns);
-        let from = along.into_inner() * place(row_range, row, n_rows)
-            + across.into_inner() * place(column_range, column, n_columns)
-            + inner.into_inner() * (outermost_m + 0.01);
-        let Some((position_in_link_m, normal_in_link)) = meet(&surfaces, &from, &inner) else { continue };
-        let along = along.into_inner() - normal_in_link.into_inner() * normal_in_link.dot(&along);
-        let Some(along_in_link) = Unit::try_new(along, 1e-6) else { continue };
-        if normal_in_link.dot(&inner) >= LEAST_FACING {
+    for ends in row_ends.windows(2) {
+        let row_m = (ends[0] + ends[1]) / 2.0;
+        let Some([left_m, right_m]) = width_of_face(column_range, |across_m| face_at(row_m, across_m).is_some()) else {
+            continue;
+        };
+        let pitch_m = (right_m - left_m) / n_columns as f64;
+        for column in 0..n_columns {
+            let Some((position_in_link_m, normal_in_link)) = face_at(row_m, left_m + pitch_m * (column as f64 + 0.5))
+            else {
+                continue;
+            };
+            let in_face = along.into_inner() - normal_in_link.into_inner() * normal_in_link.dot(&along);
+            let Some(along_in_link) = Unit::try_new(in_face, 1e-6) else { continue };
+            let size_m = [ends[1] - ends[0], pitch_m];
             cells.push(Cell { position_in_link_m, normal_in_link, along_in_link, size_m, noise_threshold_newtons });
         }
     }
@@ -87,9 +97,30 @@ fn covered([least, most]: [f64; 2], direction: &UnitVector3<f64>, touched: &[Poi
     [(first - AROUND_TOUCHES_M).max(least), (last + AROUND_TOUCHES_M).min(most)]
 }
 
-/// The middle of a row or column among `n` of the part that cells cover.
-fn place([least, most]: [f64; 2], idx: usize, n: usize) -> f64 {
-    least + (most - least) * (idx as f64 + 0.5) / n as f64
+/// Where the rows begin and end. They are narrower where the face was touched often, by half at most.
+fn row_ends([least, most]: [f64; 2], along: &UnitVector3<f64>, touched: &[Point3<f64>], n_rows: usize) -> Vec<f64> {
+    let mut places: Vec<f64> = touched.iter().map(|point| point.coords.dot(along).clamp(least, most)).collect();
+    places.sort_by(f64::total_cmp);
+    let mut ends = vec![least];
+    for row in 1..n_rows {
+        let part = row as f64 / n_rows as f64;
+        let even = least + (most - least) * part;
+        let of_touches =
+            if places.len() < LEAST_TOUCHES { even } else { places[(places.len() as f64 * part) as usize] };
+        ends.push((even + of_touches) / 2.0);
+    }
+    ends.push(most);
+    ends
+}
+
+/// The part of a range over which a row has a face under it.
+fn width_of_face([least, most]: [f64; 2], has_face: impl Fn(f64) -> bool) -> Option<[f64; 2]> {
+    const N_SLICES: usize = 64;
+    let slice_m = (most - least) / N_SLICES as f64;
+    let with_face = |idx: &usize| has_face(least + slice_m * (*idx as f64 + 0.5));
+    let first = (0..N_SLICES).find(with_face)?;
+    let last = (0..N_SLICES).rfind(with_face)?;
+    Some([least + slice_m * first as f64, least + slice_m * (last + 1) as f64])
 }
 
 /// The mean direction in the link's frame in which its middle moves until the hand is half closed, along the nearest axis of

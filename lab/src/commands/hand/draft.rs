@@ -117,7 +117,7 @@ impl Draft {
         }
         for (link, [rows, columns]) in &arguments.grids {
             let n_cells = pads.iter().find(|pad| pad.name == *link).map_or(0, |pad| pad.cells.len());
-            let n_missing = rows * columns - n_cells;
+            let n_missing = (rows * columns).saturating_sub(n_cells);
             if n_missing > 0 {
                 print_diagnostic(&format!(
                     "--grid {link}={rows}x{columns}: {n_missing} of {} cells are left out: the link has no face under them",
