@@ -180,7 +180,7 @@ pub(crate) fn candidate_rng(seed: u64, candidate: u64, part: u64) -> ChaCha8Rng 
 }
 
 /// Explores and finds the contacts with the object and of links with each other. `None` without a contact with the object.
-fn grasp(
+pub(crate) fn grasp(
     mechanism: &Mechanism<'_>,
     object: &Object,
     start: &Start,

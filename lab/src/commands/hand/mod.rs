@@ -149,9 +149,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         )?;
         return Ok(Outcome::Done);
     }
+    draft.move_to_bodies(&mut table)?;
     draft.fit(&table, arguments)?;
-    let pads = draft.pads(&table, arguments, true)?;
+    let pads = draft.laid_pads(&table, arguments)?;
     draft.warn(&pads)?;
+    draft.tell_felt(&pads)?;
     let Draft { urdf, hand, bare, .. } = draft;
     let (urdf, meshes) = with_meshes_beside(&urdf, source.parent().unwrap_or(Path::new("")))?;
     let layout = layout(name, &hand, &pads, &bare);
