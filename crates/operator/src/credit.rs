@@ -261,7 +261,8 @@ impl Credit {
     pub(crate) fn has_waited_long(&mut self, places: &impl Places, written: Option<Written>, n_publishers: usize) {
         let last = written.map(|written| written.last);
         let may_begin_again = self.lost_predecessor(places, written, n_publishers).is_some();
-        self.lost = last.filter(|_| n_publishers == 1 && self.own_last != last && !may_begin_again);
+        let is_alone = n_publishers == 1 && self.own_last != last;
+        self.lost = if is_alone && !may_begin_again { last } else { None };
     }
 
     /// Whether a reader without room, or one behind it, is among these: it cannot go on while this publisher waits for it in
