@@ -350,6 +350,8 @@ fn an_operator_that_was_given_up_is_healed_by_a_swap() {
     );
     let status = graph.status();
     assert_eq!((&status["state"], &status["message"]), (&"running".into(), &Value::Null), "{status}");
+    // The grasp that was open is held first.
+    graph.wait_for_decisions(A_FEW_GRASPS);
     let n_before = graph.n_decisions();
     graph.wait_for_decisions(2 * A_FEW_GRASPS);
     // Its writers wait for it again, and it is supervised.

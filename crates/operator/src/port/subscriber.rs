@@ -153,7 +153,9 @@ impl UntypedSubscriber {
     fn begin_with(&mut self, sequencer: Sequencer<UntypedSample>) {
         let now = Instant::now();
         let written = self.writer();
-        let sequencer = sequencer.beginning_at(now, written.map(|written| written.last));
+        // Nobody was waited for while the node was given up: what was sent meanwhile does not come any more.
+        let sent = if self.is_given_up() { None } else { written.map(|written| written.last) };
+        let sequencer = sequencer.beginning_at(now, sent);
         let sequencer = if self.may_hold { sequencer } else { sequencer.without_waiting() };
         let before = std::mem::replace(&mut self.sequencer, sequencer);
         // Samples that this reader has received and not answered exist nowhere else any more.
