@@ -557,7 +557,7 @@ impl Hand {
     }
 
     /// The joints' values of the open hand.
-    pub fn open_joints_rad(&self) -> Vec<f64> {
+    pub fn open_joints(&self) -> Vec<f64> {
         self.joints.iter().map(Joint::open).collect()
     }
 

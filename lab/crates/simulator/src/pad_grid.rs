@@ -137,7 +137,7 @@ fn inner_direction(
     let middle = middle(hand, link_idx);
     let nearest = mechanism.nearest_closing_joint(link_idx);
     let mut sum = Vector3::zeros();
-    let postures = hand.closing_postures(&hand.open_joints_rad(), N_STEPS);
+    let postures = hand.closing_postures(&hand.open_joints(), N_STEPS);
     for posture in &postures[..=N_STEPS / 2] {
         let palm_from_links = hand.palm_from_links(posture)?;
         let palm_from_link = &palm_from_links[link_idx];

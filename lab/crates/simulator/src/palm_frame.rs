@@ -88,7 +88,7 @@ pub fn idle_pads(hand: &Hand) -> Result<Vec<usize>, JointError> {
 /// The hand's joints do not fit together.
 pub fn self_pressing(hand: &Hand) -> Result<(f64, Option<(usize, usize)>), JointError> {
     const N_STEPS: usize = 20;
-    let postures = hand.closing_postures(&hand.open_joints_rad(), N_STEPS);
+    let postures = hand.closing_postures(&hand.open_joints(), N_STEPS);
     // The second half of an empty closing is always fingers on fingers.
     let postures = &postures[..=N_STEPS / 2];
     let mut pressing = Vec::new();
@@ -127,7 +127,7 @@ fn ball(radius_m: f64) -> Object {
 /// The open hand closes on a ball before its palm.
 fn close_on(mechanism: &Mechanism<'_>, ball: &Object, back_off_m: f64) -> Result<Option<Exploration>, JointError> {
     let start = Start {
-        open_joints_rad: mechanism.hand.open_joints_rad(),
+        open_joints: mechanism.hand.open_joints(),
         palm_from_object_rotation: UnitQuaternion::identity(),
         lateral_offset_m: [0.0; 2],
         back_off_m,
@@ -231,7 +231,7 @@ fn balance(
 fn directions(hand: &Hand) -> Result<Vec<UnitVector3<f64>>, JointError> {
     let axes = [Vector3::z_axis(), Vector3::x_axis(), Vector3::y_axis()];
     let mut directions: Vec<UnitVector3<f64>> = axes.into_iter().flat_map(|axis| [axis, -axis]).collect();
-    let cells = hand.cells_in_palm(&hand.open_joints_rad())?;
+    let cells = hand.cells_in_palm(&hand.open_joints())?;
     let mean: Vector3<f64> =
         cells.iter().map(|cell| cell.normal_in_palm.into_inner()).sum::<Vector3<f64>>() / cells.len() as f64;
     let between = directions.iter().all(|axis| axis.dot(&mean) < 0.94 * mean.norm());
@@ -246,7 +246,7 @@ fn directions(hand: &Hand) -> Result<Vec<UnitVector3<f64>>, JointError> {
 fn frame_along(hand: &Hand, direction: &UnitVector3<f64>) -> Result<Isometry3<f64>, JointError> {
     let rotation = UnitQuaternion::rotation_between(&Vector3::z(), direction)
         .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
-    let postures = hand.closing_postures(&hand.open_joints_rad(), 2);
+    let postures = hand.closing_postures(&hand.open_joints(), 2);
     let palm_from_links = hand.palm_from_links(&postures[1])?;
     let middles = hand.pads.iter().map(|pad| (palm_from_links[pad.link_idx] * pad.middle_in_link_m()).coords);
     let middle = middles.sum::<Vector3<f64>>() / hand.pads.len() as f64;
@@ -273,7 +273,7 @@ pub fn odd_joints(hand: &Hand) -> Result<OddJoints, JointError> {
     /// Of a pad's motion, the part towards its normal.
     const LEAST_TOWARDS: f64 = 0.35;
     let mechanism = Mechanism::new(hand);
-    let palm_from_links = hand.palm_from_links(&hand.open_joints_rad())?;
+    let palm_from_links = hand.palm_from_links(&hand.open_joints())?;
     let opposed = mechanism.opposed_joints(&palm_from_links);
     let mut odd = OddJoints { sideways: Vec::new(), opposed: Vec::new() };
     let mut others = Vec::new();

@@ -470,7 +470,7 @@ impl Fitted {
 
 /// Pads of which more than half of the cells lie inside the shapes of another link while the hand is open, with their number.
 fn buried_pads(hand: &Hand) -> anyhow::Result<Vec<(&Pad, usize, &str)>> {
-    let palm_from_links = hand.palm_from_links(&hand.open_joints_rad())?;
+    let palm_from_links = hand.palm_from_links(&hand.open_joints())?;
     let mut buried = Vec::new();
     for pad in &hand.pads {
         let others = (0..hand.links.len()).filter(|idx| *idx != pad.link_idx);
