@@ -37,15 +37,15 @@ pub(crate) fn check(node: &FileNode) -> anyhow::Result<()> {
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
     let mut model = Model::load(&params.model)?;
+    // Both are those of the model's file, as the classifier reads it.
+    let (dictionary_id, identity) = (model.dictionary_id(), model.identity());
     // A model of this version has the names of the hand's parts. An older one of a built-in hand gets them.
     if let Ok(hand) = Hand::load(Path::new(&model.hand.name))
         && hand.id() == model.hand.id
     {
         model.name_quantities(&hand);
     }
-    let dictionary_id = model.dictionary_id();
     let n_features = model.features.len();
-    let identity = model.identity();
     let mut told = None;
     let encode = stage::from_fn::<ContactSet, GraspFeature, _>(move |head, contacts, values| {
         let feature = steps::encode(&model, dictionary_id, head, contacts, values);

@@ -65,10 +65,11 @@ impl Judge {
     /// The model is of another hand.
     pub fn with_options(hand: Hand, mut model: Model, options: ArbiterOptions) -> Result<Judge, OtherHand> {
         model.check_hand(&hand)?;
+        let dictionary_id = model.dictionary_id();
         model.name_quantities(&hand);
         Ok(Judge {
             hand_id: hand.id(),
-            dictionary_id: model.dictionary_id(),
+            dictionary_id,
             hand,
             model,
             finder: ContactFinder::default(),
