@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use blindgrasp_messages::{Contact, ContactSet, Fault, FrameParts, Phase, Recorded, TactileFrame, TactileFrameHead};
 use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
@@ -12,7 +13,7 @@ use blindgrasp_stages::contacts::{ContactFinder, ContactSummary};
 use blindgrasp_stages::day::GraspPlace;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::sensors::{Described, SensorCheck, SensorFault, SensorMemory};
-use blindgrasp_stages::steps::{contact_set, find_contacts};
+use blindgrasp_stages::steps::{contact_set, explain_fault, find_contacts};
 use serde::Deserialize;
 
 use crate::beginning::FileNode;
@@ -45,7 +46,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         watch = Some(Watch { operator: operator.clone(), check, memory, reported });
     }
     let max_contacts = hand.n_cells();
-    let stage = FindContacts { hand, finder: ContactFinder::default(), watch };
+    let stage = FindContacts { hand, finder: ContactFinder::default(), watch, told: None };
     stage::run(operator, "tactile", "contacts", max_contacts, identity, stage)
 }
 
@@ -73,6 +74,8 @@ struct FindContacts {
     finder: ContactFinder,
     /// The watch over the sensors, which remembers their readings.
     watch: Option<Watch>,
+    /// The last grasp of which a faulty frame was explained.
+    told: Option<u64>,
 }
 
 /// Finds faulty sensors.
@@ -142,6 +145,15 @@ impl Stage for FindContacts {
 
     fn answer(&mut self, head: &TactileFrameHead, items: &[f64], _now_nanos: u64, answers: &mut Answers<ContactSet>) {
         let (mut summary, parts) = find_contacts(&self.hand, &mut self.finder, head, items, answers.items());
+        // Once for each grasp: its frames mostly have one fault. A hand that closes may have no contact yet.
+        let is_at_rest = Phase::from_code(head.phase).is_ok_and(Phase::decides);
+        if self.told != Some(head.grasp_id)
+            && (is_at_rest || summary.fault != Fault::NoContact)
+            && let Some(why) = explain_fault(&self.hand, &self.finder, &summary, parts.as_ref())
+        {
+            self.told = Some(head.grasp_id);
+            print_diagnostic(&format!("grasp {} cannot be judged: {why}", head.grasp_id));
+        }
         let phase = Phase::from_code(head.phase).ok().filter(|phase| !phase.is_over());
         if let (Some(watch), Some(parts), Some(phase)) = (&mut self.watch, &parts, phase)
             && matches!(summary.fault, Fault::None | Fault::NoContact)

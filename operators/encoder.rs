@@ -1,6 +1,6 @@
 //! From contacts to the feature.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use blindgrasp_messages::{ContactSet, Fault, GraspFeature, Phase, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
@@ -8,7 +8,7 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage;
-use blindgrasp_stages::{Model, steps};
+use blindgrasp_stages::{Hand, Model, steps};
 use serde::Deserialize;
 
 use crate::beginning::FileNode;
@@ -36,10 +36,16 @@ pub(crate) fn check(node: &FileNode) -> anyhow::Result<()> {
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let params: Params = operator.params()?;
-    let model = Model::load(&params.model)?;
-    let dictionary_id = model.dictionary_id();
+    let mut model = Model::load(&params.model)?;
+    // Both are those of the model's file, as the classifier reads it.
+    let (dictionary_id, identity) = (model.dictionary_id(), model.identity());
+    // A model of this version has the names of the hand's parts. An older one of a built-in hand gets them.
+    if let Ok(hand) = Hand::load(Path::new(&model.hand.name))
+        && hand.id() == model.hand.id
+    {
+        model.name_quantities(&hand);
+    }
     let n_features = model.features.len();
-    let identity = model.identity();
     let mut told = None;
     let encode = stage::from_fn::<ContactSet, GraspFeature, _>(move |head, contacts, values| {
         let feature = steps::encode(&model, dictionary_id, head, contacts, values);

@@ -148,8 +148,11 @@ impl<'a> Check<'a> {
         while let Some(part) = source {
             self.hand(part, classifier, &model);
             if part.operator == "tactile_source" && part.params.get("driver") != Some(&"recording".into()) {
-                self.label(part, classifier, &model);
-                self.bound(arbiter, classifier, &model);
+                if learned_from_wrench_space(&model) {
+                    self.label(part, classifier);
+                } else {
+                    self.bound(arbiter, classifier, &model);
+                }
             }
             source = if part.operator == "senses" { self.part_before(part, "tactile") } else { None };
         }
@@ -209,59 +212,61 @@ impl<'a> Check<'a> {
     }
 
     /// A live hand may lift an object, which the paper's label says nothing of.
-    fn label(&mut self, source: &Part, classifier: &Part, model: &Model) {
-        if learned_from_wrench_space(model) {
-            self.fit.warnings.push(Misfit {
-                kind: MisfitKind::Label,
-                node: source.node.clone(),
-                message: format!(
-                    "its hand is real, and the model of node '{}' ({}) learned the paper's label, which does not say whether \
-                     a lifted object stays in the hand",
-                    classifier.node,
-                    path_of(classifier, "model").display()
-                ),
-                help: "expected a model that was trained on lifts (simulate --label lift)".into(),
-            });
-        }
+    fn label(&mut self, source: &Part, classifier: &Part) {
+        self.fit.warnings.push(Misfit {
+            kind: MisfitKind::Label,
+            node: source.node.clone(),
+            message: format!(
+                "its hand is real, and the model of node '{}' ({}) learned the paper's label, which does not say whether \
+                 a lifted object stays in the hand",
+                classifier.node,
+                path_of(classifier, "model").display()
+            ),
+            help: "expected a model that was trained on lifts (simulate --label lift)".into(),
+        });
     }
 
-    /// A live hand without the test lift for which the model promises fewer drops.
+    /// A live hand with a promise that the model does not back, or without the test lift for which it promises fewer drops.
     fn bound(&mut self, arbiter: &Part, classifier: &Part, model: &Model) {
-        let most = |look: &str| {
-            let policy = model.training.policies.iter().find(|policy| policy.look == look)?;
-            policy.promise.map(|promise| promise.drops_of_lifts.at_most)
-        };
         let name = arbiter.params.get("probe").and_then(Value::as_str).unwrap_or("none");
-        let (Some(best), false) = (most("test_lifted"), name == "test_lift") else { return };
-        let own = most(if name == "squeeze" { "squeezed" } else { "settled" });
-        if own.is_some_and(|own| own <= best) {
+        let best = if name == "test_lift" { None } else { most_drops(model, "test_lifted") };
+        let own = match name {
+            "squeeze" => most_drops(model, "squeezed"),
+            "test_lift" => most_drops(model, "test_lifted"),
+            _ => most_drops(model, "settled"),
+        };
+        let promised = arbiter.params.get("promised_drops").and_then(Value::as_f64);
+        let is_weaker = best.is_some_and(|best| own.is_none_or(|own| own > best));
+        let is_unbacked = promised.is_some_and(|promised| promised < own.unwrap_or(1.0));
+        if !is_weaker && !is_unbacked {
             return;
         }
         let percent = |share: f64| format!("{:.1} %", 100.0 * share);
-        let promised = arbiter.params.get("promised_drops").and_then(Value::as_f64);
-        let otherwise = match own {
-            None => {
-                format!("; otherwise another model, because no promised_drops is backed by this one with probe: {name}")
-            }
+        let mut message = format!(
+            "probe is {name}, and so the model of node '{}' ({}) {}",
+            classifier.node,
+            path_of(classifier, "model").display(),
+            own.map_or("has no bound on drops".into(), |own| format!(
+                "lets at most {} of the lifts drop",
+                percent(own)
+            ))
+        );
+        let mut remedies = Vec::new();
+        if let Some(best) = best.filter(|_| is_weaker) {
+            message +=
+                &format!("; after a test lift, at most {} (new objects in simulation, 95 % confidence)", percent(best));
+            remedies.push("probe: test_lift, if the arm can lift by 10 mm and wait".into());
+        }
+        match own {
+            None => remedies
+                .push(format!("another model, because no promised_drops is backed by this one with probe: {name}")),
             Some(own) if promised.is_none_or(|promised| promised < own) => {
-                format!("; otherwise promised_drops of at least {:.2}", (100.0 * own).ceil() / 100.0)
+                remedies.push(format!("promised_drops of at least {:.2}", (100.0 * own).ceil() / 100.0));
             }
-            Some(_) => String::new(),
-        };
-        let own = own
-            .map_or("has no bound on drops".into(), |own| format!("lets at most {} of the lifts drop", percent(own)));
-        self.fit.warnings.push(Misfit {
-            kind: MisfitKind::Bound,
-            node: arbiter.node.clone(),
-            message: format!(
-                "probe is {name}, and so the model of node '{}' ({}) {own}; after a test lift, at most {} (new objects in \
-                 simulation, 95 % confidence)",
-                classifier.node,
-                path_of(classifier, "model").display(),
-                percent(best)
-            ),
-            help: format!("expected probe: test_lift, if the arm can lift by 10 mm and wait{otherwise}"),
-        });
+            Some(_) => {}
+        }
+        let help = format!("expected {}", remedies.join("; otherwise "));
+        self.fit.warnings.push(Misfit { kind: MisfitKind::Bound, node: arbiter.node.clone(), message, help });
     }
 
     /// The endpoints and keys of a node that speaks Zenoh.
@@ -328,6 +333,14 @@ impl<'a> Check<'a> {
 
 fn path_of(part: &Part, param: &str) -> PathBuf {
     part.params.get(param).and_then(Value::as_str).unwrap_or_default().into()
+}
+
+/// The share of the lifts that at most drop when a look decides, by training or by the robot's own lifts.
+fn most_drops(model: &Model, look: &str) -> Option<f64> {
+    let own_lifts = model.training.own_lifts.as_ref().filter(|own| own.look == look);
+    let policy = model.training.policies.iter().find(|policy| policy.look == look);
+    let promise = own_lifts.and_then(|own| own.promise).or(policy.and_then(|policy| policy.promise))?;
+    Some(promise.drops_of_lifts.at_most)
 }
 
 /// The judge of a test lift, which follows a squeeze that is judged as well.
@@ -416,6 +429,36 @@ mod tests {
         own[3].operator = String::new();
         assert!(check_fit(&own).errors.is_empty());
         assert!(check_fit(&gate(HAND, "models/none.json", "test_lift")).errors.is_empty());
+    }
+
+    #[test]
+    fn a_promise_that_the_look_in_use_does_not_keep_is_warned_of() {
+        for (probe, promised, expected) in [
+            ("test_lift", 0.1, None),
+            ("test_lift", 0.05, Some("lets at most 8.1 % of the lifts drop: expected promised_drops of at least 0.09")),
+            ("squeeze", 1.0, Some("otherwise another model, because no promised_drops is backed by this one")),
+        ] {
+            let mut parts = gate(HAND, LIFTS, probe);
+            parts[4].params.insert("promised_drops".into(), promised.into());
+            let warnings = check_fit(&parts).warnings;
+            assert_eq!(warnings.len(), usize::from(expected.is_some()), "{probe}: {warnings:?}");
+            for (Misfit { message, help, .. }, expected) in warnings.iter().zip(expected) {
+                assert!(format!("{message}: {help}").contains(expected), "{message}: {help}");
+            }
+        }
+        // A model without a test lift.
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("settled.json");
+        let mut model = Model::load(Path::new(&project(LIFTS))).expect("a model");
+        model.test_lifted = None;
+        model.training.policies.retain(|policy| policy.look == "settled");
+        model.save(&path).expect("saved");
+        let mut parts = gate(HAND, path.to_str().expect("UTF-8"), "none");
+        assert!(check_fit(&parts).warnings.is_empty(), "nothing is promised");
+        parts[4].params.insert("promised_drops".into(), 0.1.into());
+        let warnings = check_fit(&parts).warnings;
+        assert_eq!(warnings.len(), 1, "{warnings:?}");
+        assert_eq!(warnings[0].help, "expected promised_drops of at least 0.23");
     }
 
     #[test]

@@ -2,7 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use blindgrasp_messages::{Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Recorded};
+use blindgrasp_messages::{
+    Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Reason, Recorded,
+};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
@@ -48,7 +50,7 @@ pub(crate) fn describe() -> OperatorDescription {
             "max_gap_ms",
             millis(),
             Some((default.max_gap_nanos as f64 / 1e6).into()),
-            "How far apart two predictions of a grasp may be by the source's clock",
+            "How far apart two predictions of a grasp may be by the source's clock; three periods of the source, if that is more",
         )
         .live_param(
             "max_age_ms",
@@ -146,9 +148,7 @@ impl Stage for Arbiter {
         match Prediction::from_parts(head, items) {
             Ok(prediction) => {
                 // The clock of a frame from the future cannot be trusted: the frame counts as infinitely old.
-                let has_expired = head.header.valid_until_nanos().is_some_and(|until_nanos| now_nanos > until_nanos);
-                let age_nanos = if has_expired { None } else { now_nanos.checked_sub(head.header.origin_nanos) };
-                let age_nanos = age_nanos.unwrap_or(u64::MAX);
+                let age_nanos = now_nanos.checked_sub(head.header.origin_nanos).unwrap_or(u64::MAX);
                 self.arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut self.decided);
             }
             Err(error) => {
@@ -164,13 +164,19 @@ impl Stage for Arbiter {
         if let Ok(mut decision) = LiftDecision::from_parts(head, &[])
             && decision.expire(head.header.valid_until_nanos(), now_nanos)
         {
-            tracing::warn!(grasp_id = head.grasp_id, "a lift was not sent in time: it is a hold");
+            let age_ms = now_nanos.saturating_sub(head.header.origin_nanos) as f64 / 1e6;
+            let valid_ms = head.header.valid_nanos as f64 / 1e6;
+            tracing::warn!(
+                grasp_id = head.grasp_id,
+                "a lift was not sent in time, {age_ms:.1} ms after its frame, and expired after {valid_ms:.1} ms (max_age_ms): it is a \
+                 hold"
+            );
             (*head, _) = decision.to_parts(head.header);
         }
     }
 
     fn deadline_nanos(&self) -> Option<u64> {
-        let deadline = self.last_arrival_nanos.saturating_add(self.arbiter.options().max_age_nanos);
+        let deadline = self.last_arrival_nanos.saturating_add(self.arbiter.silence_limit_nanos());
         self.arbiter.has_open_grasp().then_some(deadline.saturating_add(1))
     }
 
@@ -276,6 +282,11 @@ impl Arbiter {
     /// Answers under the header of the last prediction, but with numbers that count the decisions.
     fn publish(&mut self, answers: &mut Answers<LiftDecision>) {
         for decision in self.decided.drain(..) {
+            if decision.reason == Reason::Stale
+                && let Some(staleness) = self.arbiter.staleness(decision.grasp_id)
+            {
+                tracing::warn!("grasp {} is stale: {staleness}", decision.grasp_id);
+            }
             // By a recording's clock nothing expires.
             let valid_nanos = if self.clock == Clock::Machine { self.arbiter.options().max_age_nanos } else { 0 };
             let (head, _) = decision.to_parts(Header { seq: self.n_decisions, valid_nanos, ..self.last });

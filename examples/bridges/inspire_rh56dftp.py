@@ -6,7 +6,8 @@
 
 It reads the angles, the state and the 17 pads of the hand, and writes nothing: another program closes the hand. The phase
 comes from the state of the six drives: the hand is settled when all have rested for 0.2 s after closing, and open when its
-fingers rest above 900. A drive with a fault ends the frames until it has none.
+fingers rest above 900. A drive with a fault ends the frames until it has none. So does a hand that does not answer: the
+bridge connects again, and ends if it gets no answer for 10 s.
 
 Addresses, orders and codes are those of the maker's manual (HWKV1.0.0cn); it gives no newtons for the readings of 0 to 4095,
 so --newtons-per-count is assumed until you measure it. The angles of 0 to 1000 (open) are taken as parts of the joints' range.
@@ -24,6 +25,9 @@ ANGLES, STATES = (1546, 6), (1612, 3)
 FINGER = ((0, 9), (18, 96), (210, 80))
 PADS = [(3000 + 370 * finger + offset, words) for finger in range(4) for offset, words in FINGER]
 PADS += [(4480, 9), (4498, 96), (4690, 9), (4708, 96), (4900, 112)]
+# The same words in fewer requests: a tip and the nail behind it lie side by side.
+JOINED_PADS = [read for finger in range(4) for read in ((3000 + 370 * finger, 105), (3210 + 370 * finger, 80))]
+JOINED_PADS += [(4480, 105), (4690, 105), (4900, 112)]
 # Upper limits of the joints in the hand's order: little, ring, middle and index finger, the thumb's bend and its turn.
 CLOSED_RAD = (1.4381, 1.4381, 1.4381, 1.4381, 0.5864, 1.1641)
 # A drive that has reached its force holds against it.
@@ -31,27 +35,52 @@ HOLDS = 3
 MOTIONS = {0: "opens", 1: "closes", 2: "rests", HOLDS: "rests", 5: "rests", 6: "rests"}
 # Fingers and thumb whose angles are all above this are open.
 OPEN_ANGLE = 900
-SILENT_SECS = 1.0
+# An answer that takes longer is given up, with its connection.
+SILENT_SECS = 0.5
+GONE_SECS = 10.0
 
 
 class ModbusError(Exception):
     """The hand does not answer as it should."""
 
 
+class Silence(Exception):
+    """The hand does not answer: the connection is of no use any more, because an answer may still come."""
+
+
 class Modbus:
     """Reads holding registers by Modbus TCP (function 3)."""
 
     def __init__(self, host, port, unit):
-        self.connection = socket.create_connection((host, port), timeout=SILENT_SECS)
+        self.place, self.unit = (host, port), unit
+        self.connect()
+
+    def connect(self):
+        self.connection = socket.create_connection(self.place, timeout=SILENT_SECS)
         self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.unit, self.number = unit, 0
+        # How far the numbers of the answers are behind those of the requests: the hand's firmware is one behind.
+        self.number, self.lag = 0, None
+
+    def connect_again(self):
+        """Connects until the hand answers."""
+        until = time.monotonic() + GONE_SECS
+        while True:
+            self.connection.close()
+            try:
+                self.connect()
+                self.read(*STATES)
+                return
+            except (OSError, Silence) as error:
+                if time.monotonic() > until:
+                    raise ModbusError(f"no answer for {GONE_SECS:.0f} s: {error}") from error
+            time.sleep(0.1)
 
     def receive(self, n_bytes):
         received = b""
         while len(received) < n_bytes:
             part = self.connection.recv(n_bytes - len(received))
             if not part:
-                raise ModbusError("it closed the connection")
+                raise Silence("it closed the connection")
             received += part
         return received
 
@@ -63,9 +92,12 @@ class Modbus:
             number, protocol, length, _unit = struct.unpack(">HHHB", self.receive(7))
             answer = self.receive(length - 1)
         except OSError as error:
-            raise ModbusError(str(error)) from error
-        if (number, protocol) != (self.number, 0):
-            raise ModbusError(f"answer {number} to request {self.number}")
+            raise Silence(str(error)) from error
+        # One request is under way, so each answer is to it, whatever its number; but numbers that jump show a lost answer.
+        lag = (self.number - number) % 0x10000
+        self.lag = lag if self.lag is None else self.lag
+        if (lag, protocol) != (self.lag, 0):
+            raise Silence(f"answer {number} to request {self.number}, expected a number {self.lag} behind it")
         if answer[:1] == b"\x83" and len(answer) == 2:
             raise ModbusError(f"registers at {address}: exception {answer[1]}")
         if answer[:2] != bytes([3, 2 * n_words]) or len(answer) != 2 + 2 * n_words:
@@ -89,15 +121,33 @@ def motion_of(states):
     return "opens" if "opens" in motions else "rests"
 
 
+def requests_of_pads(modbus):
+    """The requests that read all pads: the fewer ones, unless the hand refuses them."""
+    try:
+        for request in JOINED_PADS:
+            modbus.read(*request)
+        return JOINED_PADS
+    except ModbusError:
+        return PADS
+
+
 def frames(modbus, newtons_per_count, rate):
-    """Yields the hand's frames, `rate` a second; a sentence in place of one that a fault of the hand has cost."""
+    """Yields the hand's frames, `rate` a second; a sentence in place of one that a fault or a pause of the hand has cost."""
     phase = line_protocol.StatusPhase()
-    seq, begin = 0, time.monotonic()
+    seq, begin, requests = 0, time.monotonic(), None
     while True:
-        stamp_nanos = line_protocol.now_nanos()
-        states = modbus.read(*STATES)
-        angles = struct.unpack(">6h", modbus.read(*ANGLES))
-        counts = [count for pad in PADS for count in struct.unpack(f">{pad[1]}h", modbus.read(*pad))]
+        try:
+            requests = requests or requests_of_pads(modbus)
+            stamp_nanos = line_protocol.now_nanos()
+            states = modbus.read(*STATES)
+            angles = struct.unpack(">6h", modbus.read(*ANGLES))
+            counts = [count for pad in requests for count in struct.unpack(f">{pad[1]}h", modbus.read(*pad))]
+        except Silence as silence:
+            yield f"the hand does not answer ({silence}): no frames until it does"
+            modbus.connect_again()
+            # The missing number holds the grasp that the pause was in.
+            seq += 1
+            continue
         motion = motion_of(states)
         phase_word = phase.of(stamp_nanos, motion, min(angles[:5]) > OPEN_ANGLE)
         if motion is None:
@@ -132,7 +182,7 @@ def main():
         modbus = Modbus(arguments.host, arguments.port, arguments.unit)
     except OSError as error:
         sys.exit(f"{arguments.host}:{arguments.port}: {error}; expected the hand's Modbus TCP server (--host, --port)")
-    source = line_protocol.Source(arguments.address, len(CLOSED_RAD), sum(words for _, words in PADS))
+    source = line_protocol.Source(arguments.address, len(CLOSED_RAD), sum(words for _, words in PADS), arguments.hand)
     try:
         source.send_all(frames(modbus, arguments.newtons_per_count, arguments.rate))
     except ModbusError as error:

@@ -19,6 +19,7 @@ def options(description):
     """The options that all bridges have."""
     found = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     found.add_argument("--address", help="of tactile_source, unix:PATH or HOST:PORT; without it, its socket in a folder of this user")
+    found.add_argument("--hand", help="name or identity (hand_id) of the hand whose frames these are; a graph for another one gets none")
     return found
 
 
@@ -66,8 +67,10 @@ class Source:
     """A connection to tactile_source. `hand` is its first line: the hand that it expects. If the source goes, a thread connects
     again, and frames are lost meanwhile: readings that waited for the next source would look fresh to it."""
 
-    def __init__(self, address, n_joints=None, n_cells=None):
+    def __init__(self, address, n_joints=None, n_cells=None, hand=None):
         self.address = address
+        # A left and a right hand have as many joints and cells.
+        self.own_hand = hand
         self.connection, self.hand = self.open()
         # Why the bridge must end.
         self.fault = None
@@ -93,6 +96,8 @@ class Source:
             time.sleep(1)
         if "refused" in hand:
             sys.exit(hand["why"])
+        if self.own_hand not in (None, hand["hand"], hand.get("hand_id")):
+            sys.exit(f"the graph is for the hand {hand['hand']}, this bridge for {self.own_hand}: give each graph an address, and its bridge the same")
         print(f"connected: {hand['hand']}, {hand['n_joints']} joints, {hand['n_cells']} cells", file=sys.stderr)
         # Every further line names the fault of a frame.
         threading.Thread(target=self.tell, args=(answers,), daemon=True).start()
@@ -117,6 +122,8 @@ class Source:
 
     def send(self, frame):
         """Sends a frame; returns whether there was a connection. A frame is lost if the source has gone."""
+        if self.own_hand is not None:
+            frame = {"hand": self.own_hand, **frame}
         if self.fault is not None:
             sys.exit(self.fault)
         if self.connection is None:

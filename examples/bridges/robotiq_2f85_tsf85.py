@@ -205,7 +205,7 @@ def main():
         sensor, gripper = opened(arguments.sensor), Gripper(opened(arguments.gripper))
     except (OSError, termios.error) as error:
         sys.exit(f"{error}; expected two serial devices (--sensor, --gripper)")
-    source = line_protocol.Source(arguments.address, 1, 2 * N_CELLS)
+    source = line_protocol.Source(arguments.address, 1, 2 * N_CELLS, arguments.hand)
     try:
         source.send_all(frames(sensor, gripper, arguments.newtons_per_count))
     except DeviceError as error:

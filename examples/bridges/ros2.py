@@ -187,6 +187,9 @@ class Frames:
                 raise ValueError(f"names: {len(names)} names, but `field` has {len(values)} values: name each of them, in order")
         else:
             names, values = message.name, message.position
+        twice = sorted(name for name in self.sources if list(names).count(name) > 1)
+        if twice:
+            raise ValueError(f"joints: the name {twice[0]} stands in a message twice")
         ours = {name: (value, stamp) for name, value in zip(names, values) if name in self.sources}
         self.values.update(ours)
         for name in ours:
@@ -307,7 +310,7 @@ def message_class(where, name, field):
     return found
 
 
-def bridge(table, address):
+def bridge(table, address, hand=None):
     import rclpy
     from rclpy.clock import Clock
     from rclpy.executors import SingleThreadedExecutor
@@ -315,7 +318,7 @@ def bridge(table, address):
     from rclpy.subscription import Subscription
 
     check_table(table)
-    source = line_protocol.Source(address)
+    source = line_protocol.Source(address, hand=hand)
     frames = Frames(table, source.hand)
     rclpy.init()
     node = rclpy.create_node("blindgrasp_hand_bridge")
@@ -402,7 +405,7 @@ def main():
     with open(arguments.table, encoding="utf-8") as file:
         table = yaml.safe_load(file)
     try:
-        bridge(table, arguments.address)
+        bridge(table, arguments.address, arguments.hand)
     except ValueError as error:
         sys.exit(f"{arguments.table}: {error}")
 

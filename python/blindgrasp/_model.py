@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ._program import Process, answer_of
 from ._recording import Grasp, Recording
-from ._tables import cell_names, check_pandas, label_columns, table_of
+from ._tables import cell_names, check_pandas, label_columns, labels_of, table_of
 from ._types import Label
 
 if TYPE_CHECKING:
@@ -197,7 +197,7 @@ class Model:
         `source` may also be a table of `Recording.to_frame`; or the joints, if `cells_newtons` is given: arrays
         (n_grasps, n_joints) and (n_grasps, n_cells) of a settled frame, or (n_grasps, n_frames, n_joints) and
         (n_grasps, n_frames, n_cells) of several. `grasp_id` is then the row. The last frame is repeated if there are
-        fewer than three, which is how many the arbiter asks for.
+        fewer than three, which is how many the arbiter asks for. The labels are those of the table.
 
         Raises ProgramError if a recording cannot be read or is of another hand, and ValueError if arrays or tables have
         other numbers of joints or cells than the hand.
@@ -205,7 +205,9 @@ class Model:
         if cells_newtons is not None:
             return self._predict_settled(_settled_grasps({"joints": source, "cells_newtons": cells_newtons}))
         if hasattr(source, "columns"):
-            return self._predict_settled(_settled_grasps(_arrays_of_table(source, self._cell_columns)))
+            grasps = _settled_grasps(_arrays_of_table(source, self._cell_columns))
+            labelled = zip(grasps, labels_of(source), strict=True)
+            return self._predict_settled([dataclasses.replace(grasp, label=label) for grasp, label in labelled])
         if isinstance(source, np.ndarray):
             raise TypeError("one array: expected two, the joints and the cells")
         given: Any = [source] if isinstance(source, (str, PathLike, Recording, Grasp)) else source

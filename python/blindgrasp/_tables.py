@@ -50,6 +50,14 @@ def label_columns(labels: Sequence[Label | None]) -> dict[str, Any]:
     }
 
 
+def labels_of(table: Any) -> list[Label | None]:
+    """The labels in the columns of `label_columns`; None for each row of a table without them."""
+    names = ["stable", "object", "class", "epsilon", "volume"]
+    columns = table.reindex(columns=names).astype(object)
+    rows = columns.where(columns.notna(), None).to_dict("records")
+    return [None if row["stable"] is None else Label.from_json(row | {"stable": bool(row["stable"])}) for row in rows]
+
+
 def mean_of_rows(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """The mean of each column without its NaN; NaN where there is no number."""
     n_known = np.sum(~np.isnan(rows), axis=0)

@@ -62,6 +62,11 @@ class _Conversion:
         for body in range(self.model.nbody):
             self._add_body(body)
         self._tell_loops()
+        if self.robot.find("link/collision") is None:
+            self.told.append(
+                f"none of the {self.model.ngeom} shapes can touch others (contype and conaffinity are 0): the links have no "
+                "collision shapes, so give those that touch an object contype 1"
+            )
         self.urdf_path.parent.mkdir(parents=True, exist_ok=True)
         ElementTree.indent(self.robot)
         ElementTree.ElementTree(self.robot).write(self.urdf_path, encoding="utf-8", xml_declaration=True)
@@ -188,8 +193,11 @@ class _Conversion:
         kinds = {int(mujoco.mjtEq.mjEQ_CONNECT): "connect", int(mujoco.mjtEq.mjEQ_WELD): "weld"}
         for idx in range(model.neq):
             kind = kinds.get(int(model.eq_type[idx]))
-            if kind and int(model.eq_objtype[idx]) == int(mujoco.mjtObj.mjOBJ_BODY):
-                ends = [self.name("body", int(end)) for end in (model.eq_obj1id[idx], model.eq_obj2id[idx])]
+            if kind:
+                bodies = [int(model.eq_obj1id[idx]), int(model.eq_obj2id[idx])]
+                if int(model.eq_objtype[idx]) == int(mujoco.mjtObj.mjOBJ_SITE):
+                    bodies = [int(model.site_bodyid[site]) for site in bodies]
+                ends = [self.name("body", body) for body in bodies]
                 self.told.append(
                     f"the bodies '{ends[0]}' and '{ends[1]}' make a loop ({kind}), which a URDF cannot have: let the joints "
                     "between them mimic the driven one by hand"

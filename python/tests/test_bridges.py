@@ -1,11 +1,13 @@
 """Tests of the bridges of examples/bridges with stand-ins of the devices, written after the makers' manuals."""
 
 import asyncio
+import contextlib
 import itertools
 import json
 import os
 import pty
 import select
+import socket
 import struct
 import subprocess
 import sys
@@ -130,6 +132,51 @@ class Hand:
         self.thread.join()
 
 
+class LaggingHand:
+    """An Inspire RH56DFTP whose answers bear the number of the request before. An open hand; each word of the pads is its address
+    behind 3000."""
+
+    def __init__(self):
+        self.is_paused, self.refused = threading.Event(), None
+        self.words_of_pads = [address - 3000 + 2 * word for address, words in inspire.PADS for word in range(words)]
+        self.server = socket.create_server(("127.0.0.1", 0))
+        self.port = self.server.getsockname()[1]
+        self.is_over = False
+        self.thread = threading.Thread(target=self.serve)
+        self.thread.start()
+
+    def serve(self):
+        while True:
+            connection = self.server.accept()[0]
+            if self.is_over:
+                return
+            threading.Thread(target=self.answer, args=(connection,), daemon=True).start()
+
+    def answer(self, connection):
+        with connection, contextlib.suppress(OSError):
+            while request := connection.recv(12):
+                while self.is_paused.is_set():
+                    time.sleep(0.01)
+                number, _, _, unit, function, address, n_words = struct.unpack(">HHHBBHH", request)
+                if n_words == self.refused:
+                    body = bytes([function | 0x80, 3])
+                else:
+                    words = [self.word(address + 2 * idx) for idx in range(n_words)]
+                    body = struct.pack(f">BB{n_words}H", function, 2 * n_words, *words)
+                number = (number - 1) % 0x10000
+                connection.sendall(struct.pack(">HHHB", number, 0, len(body) + 1, unit) + body)
+
+    @staticmethod
+    def word(address):
+        return address if address >= 3000 else 1000 if address < 1612 else 0x0202
+
+    def stop(self):
+        self.is_over = True
+        socket.create_connection(("127.0.0.1", self.port)).close()
+        self.thread.join()
+        self.server.close()
+
+
 class Inspire(unittest.TestCase):
     def test_angles_and_states_have_their_meaning(self):
         self.assertEqual(inspire.joints_of([1000] * 6), [0.0] * 6)
@@ -143,6 +190,8 @@ class Inspire(unittest.TestCase):
     def test_the_pads_are_those_of_the_layout(self):
         self.assertEqual(list(cells_of("inspire-rh56dftp").values()), [words for _, words in inspire.PADS])
         self.assertEqual((inspire.PADS[0], inspire.PADS[11], inspire.PADS[-1]), ((3000, 9), (4320, 80), (4900, 112)))
+        words = [[at + 2 * idx for at, n in reads for idx in range(n)] for reads in (inspire.PADS, inspire.JOINED_PADS)]
+        self.assertEqual(words[0], words[1])
 
     def test_a_grasp_goes_from_the_hand_to_the_graph(self):
         hand = Hand()
@@ -151,7 +200,7 @@ class Inspire(unittest.TestCase):
         received = ReceivedFrames(self, "inspire-rh56dftp", "inspire_rh56dftp.py", *options)
 
         def frames(n):
-            until = hand.n_reads + 19 * n
+            until = hand.n_reads + (2 + len(inspire.JOINED_PADS)) * n
             wait_until(lambda: hand.n_reads >= until, "the bridge's reading")
 
         # Readings at rest: one is above its zero, one below.
@@ -200,8 +249,26 @@ class Inspire(unittest.TestCase):
         with self.assertRaisesRegex(inspire.ModbusError, "registers at 7000: exception 2"):
             modbus.read(7000, 3)
         hand.stop()
-        with self.assertRaises(inspire.ModbusError):
+        with self.assertRaises(inspire.Silence):
             modbus.read(4900, 112)
+
+    def test_a_hand_whose_numbers_lag_and_that_pauses_goes_on(self):
+        hand = LaggingHand()
+        self.addCleanup(hand.stop)
+        modbus = inspire.Modbus("127.0.0.1", hand.port, 1)
+        self.addCleanup(lambda: modbus.connection.close())
+        frames = inspire.frames(modbus, 0.001, 1000.0)
+        found = [next(frames) for _ in range(3)]
+        self.assertEqual([frame["seq"] for frame in found], [0, 1, 2])
+        self.assertEqual(found[0]["cells_newtons"], [0.001 * (3000 + word) for word in hand.words_of_pads])
+        hand.is_paused.set()
+        self.assertIn("the hand does not answer", next(frames))
+        threading.Timer(1.0, hand.is_paused.clear).start()
+        self.assertEqual(next(frames)["seq"], 4)
+        # A hand that refuses the joined requests is read pad by pad.
+        hand.refused = 105
+        refused = inspire.frames(modbus, 0.001, 1000.0)
+        self.assertEqual(next(refused)["cells_newtons"], found[0]["cells_newtons"])
 
 
 def packet(*blocks):

@@ -69,6 +69,11 @@ class Frames(unittest.TestCase):
         expected = {"cells_newtons": [1.0, 2.5, 4.0, 3.0], "phase": "settled", "seq": 1, "stamp_nanos": self.t}
         self.assertEqual(frame, expected)
 
+    def test_a_name_twice_in_a_message_is_refused(self):
+        twice = Message(header=header(self.t), name=["wrist", "wrist"], position=[0.1, 0.2])
+        with self.assertRaisesRegex(ValueError, "the name wrist stands in a message twice"):
+            self.frames.take_joints(twice, self.t)
+
     def test_old_topics_make_no_frame(self):
         self.frames.take_joints(joints(self.t), self.t)
         self.assertIsNotNone(self.send(self.t + 100 * MILLI))
@@ -241,6 +246,11 @@ class Reconnects(unittest.TestCase):
                 self.assertEqual(json.loads(lines.readline()), {"seq": 2})
             with self.assertRaisesRegex(SystemExit, "is now for the hand other"):
                 sends({**HAND, "hand": "other"})
+            thread = threading.Thread(target=greet, args=(HAND,))
+            thread.start()
+            with self.assertRaisesRegex(SystemExit, "the hand gripper, this bridge for left"):
+                bridge.line_protocol.Source(f"unix:{path}", hand="left")
+            thread.join()
             source.close()
 
     def test_a_socket_is_sought_in_the_folders_of_this_user(self):
@@ -326,7 +336,7 @@ class Bridge(unittest.TestCase):
             with mock.patch("sys.stderr"):
                 self.source = bridge.line_protocol.Source(f"unix:{folder}/tactile.hand")
             classes = mock.patch.object(bridge, "message_class", lambda where, kind, field: kind)
-            kept = mock.patch.object(bridge.line_protocol, "Source", lambda address: self.source)
+            kept = mock.patch.object(bridge.line_protocol, "Source", lambda address, hand: self.source)
             said = io.StringIO()
             with mock.patch.dict(sys.modules, modules), contextlib.redirect_stderr(said), classes, kept:
                 bridge.bridge(TABLE, None)

@@ -189,6 +189,15 @@ class Recordings(Folder):
         with self.assertRaisesRegex(ValueError, "not those of the model's hand"):
             model.predict(table.rename(columns={"cell_palm_0": "cell_plam_0"}))
 
+    def test_the_labels_of_a_table_are_those_of_its_predictions(self):
+        table = blindgrasp.Recording(HELD_OUT).to_frame().head(12)
+        model = blindgrasp.Model(MODEL)
+        labels = [grasp.label for grasp in blindgrasp.Recording(HELD_OUT)][:12]
+        self.assertEqual(model.predict(table).labels, labels)
+        table["stable"] = table["stable"].astype("boolean").mask(table.index == 3)
+        self.assertEqual(model.predict(table).labels, [*labels[:3], None, *labels[4:]])
+        self.assertFalse(model.predict(table.drop(columns="stable")).is_labelled.any())
+
     def test_a_row_that_is_not_finite_is_held(self):
         table = blindgrasp.Recording(HELD_OUT).to_frame().head(2)
         table.loc[0, "cell_0"] = np.nan
@@ -614,6 +623,14 @@ class Mjcf(Folder):
         told = urdf_of(path, self.folder / "hand.urdf")
         self.assertEqual(len(told), 1)
         self.assertIn("'f2' and 't' make a loop (connect)", told[0])
+        # The same loop between sites, as onshape-to-robot writes it, and shapes that touch nothing.
+        sites = MJCF.replace("<equality>", '<equality><connect site1="s1" site2="s2"/>')
+        for body, site in (("f2", "s1"), ("t", "s2")):
+            sites = re.sub(f"(<body name=['\"]{body}['\"][^>]*>)", rf'\1<site name="{site}"/>', sites)
+        path.write_text(sites)
+        self.assertIn("'f2' and 't' make a loop (connect)", urdf_of(path, self.folder / "hand.urdf")[0])
+        path.write_text(re.sub("<geom ", '<geom contype="0" conaffinity="0" ', re.sub(" con(type|affinity)=.[01].", "", MJCF)))
+        self.assertIn("shapes can touch others", urdf_of(path, self.folder / "hand.urdf")[0])
         path.write_text("<mujoco><nothing/></mujoco>")
         with self.assertRaises(ValueError):
             urdf_of(path, self.folder / "hand.urdf")

@@ -40,13 +40,17 @@ pub(super) fn detach(name: &str, json: bool) -> anyhow::Result<Outcome> {
     let mut child = command.spawn().context("cannot start the graph in the background")?;
     loop {
         if let Some(status) = child.try_wait().context("cannot wait for the graph")? {
+            // A short recording may be over before the graph was seen to run.
+            if status.success() {
+                break;
+            }
             let lines: Vec<String> = log.read().unwrap_or_default().into_iter().map(|line| line.text).collect();
             bail!("the graph did not start ({status}):\n{}", lines.join("\n"));
         }
-        // Another graph of that name may answer while ours is about to be refused.
+        // Another graph of that name may answer while ours is about to be refused, and one whose source failed is stopping.
         if let Ok(status) = client::status(name)
             && status.pid == child.id()
-            && status.state != GraphState::Starting
+            && matches!(status.state, GraphState::Running | GraphState::Degraded)
         {
             break;
         }

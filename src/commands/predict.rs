@@ -123,6 +123,7 @@ fn print(json: bool, file: &Path, decided: &Decided, truth: Option<&GraspTruth>)
                 "probability_stable": probability_stable,
                 "truth": truth,
                 "violations": decided.violations,
+                "why": decided.why,
             })
             .to_string(),
         );
@@ -133,5 +134,8 @@ fn print(json: bool, file: &Path, decided: &Decided, truth: Option<&GraspTruth>)
     let probability = if has_probability(*reason) { format!("{probability_stable:.3}") } else { "-".into() };
     let line = format!("grasp {grasp_id:>5}  {}  p {probability:>5}  {:<14}{truth}", action.shown(), reason.as_str());
     print_line(line.trim_end())?;
-    decided.violations.iter().try_for_each(|violation| print_line(&format!("             {violation}")))
+    for sentence in &decided.why {
+        print_line(&format!("             {sentence}"))?;
+    }
+    Ok(())
 }

@@ -89,7 +89,7 @@ fn a_drop_becomes_a_test_that_fails_until_the_grasp_is_held() {
     let port = free_port();
     let params = format!("driver: listen\n      address: 127.0.0.1:{port}\n      {PATIENT}");
     let flow = live_dataflow(folder.path(), &params);
-    let graph = Graph::launch(&unique_name(), &flow, &[]);
+    let graph = Graph::launch(&unique_name(), &flow, &["--set", "lift_arbiter.max_gap_ms=2000"]);
     wait_until(|| graph.said().contains("listening on"), || graph.said());
     let out = folder.path().join("robot.mcap");
     let mut recorder = FlightRecorder::start(&graph.name, &out, &["--keep", "10m", "--after", "0"]);
@@ -113,10 +113,14 @@ fn a_drop_becomes_a_test_that_fails_until_the_grasp_is_held() {
     assert_eq!(written["why"], json!(["dropped"]), "{written}");
     assert!(file.to_string_lossy().ends_with("-dropped.mcap"), "{}", file.display());
     let (file, flow) = (file.to_str().expect("UTF-8"), flow.to_str().expect("UTF-8"));
+    // A replay with another hand holds every grasp, which expects nothing of the graph.
+    let other_hand = ["--set", "contacts.hand=hands/parallel-gripper.yaml"];
+    fails(&[&["test", "--init", file, "--dataflow", flow][..], &other_hand].concat(), "as wrong_hand");
     let made = json_of(&["test", "--init", file, "--dataflow", flow, "--json"]);
     assert_eq!(made["recordings"][0]["dropped"], json!([4]), "{made}");
     let expectations = Path::new(file).with_extension("expect.yaml");
     let expected = std::fs::read_to_string(&expectations).expect("written");
+    assert!(expected.contains("set:\n  - \"lift_arbiter.max_gap_ms=2000"), "the params of the run: {expected}");
     assert!(expected.contains("  4: hold    # its lift dropped the object"), "{expected}");
     // The graph lifted it, so the test fails as long as it does.
     let is_lifted = made["recordings"][0]["is_met"] == json!(false);

@@ -35,6 +35,13 @@ fn predictions_are_the_decisions_of_a_graph() {
     assert!(said.starts_with("grasp     0  LIFT  p 0.762  stable          label: stable (vase-20)\n"), "{said}");
     // No probability decided that nothing is felt. JSON has a number, as the messages have.
     assert!(said.contains("  HOLD  p     -  no_contact ") && !said.contains("p 0.000"), "{said}");
+    // Each grasp that the model holds has the two values that spoke most against it.
+    let n_unstable = predicted.iter().filter(|line| line["reason"] == "unstable").count();
+    assert_eq!(said.matches("\n             most against it: ").count(), n_unstable, "{said}");
+    // Of the 37 grasps without contact, cells feel 14 where the hand touches itself.
+    let unfelt = predicted.iter().filter(|line| line["reason"] == "no_contact");
+    let self_contacts = "cells feel, but only on links that touch each other: ";
+    assert_eq!((unfelt.count(), said.matches(self_contacts).count()), (37, 14), "{said}");
     let unfelt = predicted.iter().find(|line| line["reason"] == "no_contact").expect("an empty hand");
     assert_eq!(unfelt["probability_stable"], 0.0);
 }

@@ -354,6 +354,16 @@ fn messages_of_another_version_are_refused_and_unknown_ones_passed_over() {
     foreign_file(&path, "/prediction", &schema.name, &commented, &message.data);
     assert_eq!(read(&path).expect("the same")[0].1, prediction(0, 3));
 
+    // Bags of rosbag2: names as ROS 1 wrote them, no definition, messages that are compressed one by one.
+    foreign_file(&path, "/prediction", &schema.name.replace("/msg/", "/"), &definition, &message.data);
+    assert_eq!(read(&path).expect("the same")[0].1, prediction(0, 3));
+    foreign_file(&path, "/prediction", &schema.name, "", &message.data);
+    let error = read(&path).expect_err("no definition").to_string();
+    assert!(error.contains("no definition") && error.contains("ros2 bag convert"), "{error}");
+    foreign_file(&path, "/prediction", &schema.name, &definition, &[0x28, 0xb5, 0x2f, 0xfd, 0, 0]);
+    let error = read(&path).expect_err("compressed").to_string();
+    assert!(error.contains("--compression-mode message") && !error.contains("--repair"), "{error}");
+
     let other = definition.replace("bool unsure\n", "float32 unsure\n");
     assert_ne!(other, definition);
     foreign_file(&path, "/grip/prediction", &schema.name, &other, &message.data);

@@ -453,6 +453,19 @@ fn a_driver_without_what_it_needs_is_refused_by_name() {
     }
 }
 
+/// Two hands with one socket: the second graph stops while `run --detach` waits for it.
+#[test]
+fn a_graph_in_the_background_whose_source_cannot_listen_has_not_started() {
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+    let folder = tempfile::tempdir().expect("a folder");
+    let address = format!("address: {}", taken.local_addr().expect("bound"));
+    let (name, flow) = (unique_name(), live_dataflow(folder.path(), &address));
+    let output = run(&["run", "--detach", "--name", &name, flow.to_str().expect("UTF-8")], 1);
+    let said = text(&output.stderr);
+    assert!(said.contains("did not start") && said.contains("give each graph an address"), "{said}");
+    assert_nothing_left(&name);
+}
+
 #[test]
 fn the_live_graph_that_comes_with_the_project_is_sound() {
     let output = run(&["run", "--check", "dataflow-live.yaml"], 0);

@@ -13,7 +13,7 @@ use blindgrasp_messages::files::open_regular;
 use blindgrasp_messages::{GraspTruth, Header, OwnedSenses, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_stages::Hand;
 use blindgrasp_tactile::cell_zeros::{AllowedReadings, CellZeros};
-use blindgrasp_tactile::line_protocol;
+use blindgrasp_tactile::{ExpectedHand, line_protocol};
 
 /// The time between two frames that have no stamp.
 const PERIOD_NANOS: u64 = 10_000_000;
@@ -120,7 +120,7 @@ fn read_line(
     hand: &Hand,
     zeros: &mut Result<CellZeros, String>,
 ) -> anyhow::Result<Line> {
-    let value: Value = serde_json::from_str(line).context("not a line of JSON")?;
+    let value: Value = serde_json::from_str(&line_protocol::with_null_for_nan(line)).context("not a line of JSON")?;
     if value.get("data").is_none() {
         return of_bridge(line, earlier, hand, zeros.as_mut().map_err(|reason| anyhow::anyhow!("{reason}"))?);
     }
@@ -163,7 +163,8 @@ fn of_bridge(
     hand: &Hand,
     zeros: &mut CellZeros,
 ) -> anyhow::Result<Line> {
-    let mut reading = line_protocol::parse(line.as_bytes()).map_err(|refusal| anyhow::anyhow!("{}", refusal.why))?;
+    let reading = line_protocol::parse(line.as_bytes()).and_then(|reading| ExpectedHand::of(hand).check(reading));
+    let mut reading = reading.map_err(|refusal| anyhow::anyhow!("{}", refusal.why))?;
     let allowed = zeros.allowed();
     // A frame of another hand is refused later.
     if allowed.has_cells(reading.cells_newtons.len()) {

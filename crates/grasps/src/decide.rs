@@ -19,6 +19,8 @@ pub struct Decided {
     pub truth: Option<GraspTruth>,
     /// The limits that it violates, if it was held as out of distribution.
     pub violations: Vec<Violation>,
+    /// Why it was held, sentence by sentence.
+    pub why: Vec<String>,
 }
 
 /// Decides every grasp of a recording in order, as a graph that begins with it. A grasp without a decision is held.
@@ -43,15 +45,15 @@ pub fn decide_frames(judge: &mut Judge, frames: &[Stamped<TactileFrame>]) -> Vec
 fn sample(judge: &mut Judge, frame: &Stamped<TactileFrame>) -> Vec<Decided> {
     let decisions = judge.sample(frame).decisions;
     let explained = decisions.into_iter().map(|decision| {
-        let violations = judge.violations(&decision).to_vec();
-        Decided { violations, ..Decided::from(decision) }
+        let (violations, why) = (judge.violations(&decision).to_vec(), judge.explain(&decision));
+        Decided { violations, why, ..Decided::from(decision) }
     });
     explained.collect()
 }
 
 impl From<LiftDecision> for Decided {
     fn from(decision: LiftDecision) -> Self {
-        Decided { decision, reading_id: None, truth: None, violations: Vec::new() }
+        Decided { decision, reading_id: None, truth: None, violations: Vec::new(), why: Vec::new() }
     }
 }
 

@@ -84,7 +84,7 @@ fn usable(
     let settled = settled.ok_or("no settled frame")?;
     let noted = note_reading(seen, settled.reading_id, recording_idx, truth.stable);
     if settled.fault != Fault::None {
-        return Err(settled.fault.as_str());
+        return Err(settled.left_out_as());
     }
     noted?;
     Ok((settled, truth))

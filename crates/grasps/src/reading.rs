@@ -5,10 +5,13 @@ use std::collections::{BTreeMap, HashMap};
 
 use crate::dataset::DatasetError;
 use blindgrasp_messages::{Contact, Fault, OwnedSenses, Phase, Stamped, TactileFrame};
-use blindgrasp_stages::contacts::{clip_to_limits, contacts_from_frame};
+use blindgrasp_stages::contacts::{ContactSummary, clip_to_limits, contacts_from_frame};
 use blindgrasp_stages::encoder::FeltReading;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::training_summary::ReadingId;
+
+/// Why a grasp is left out whose cells feel, but only on links of the hand that touch each other.
+pub const SELF_CONTACT: &str = "contact between links of the hand alone";
 
 /// What a frame felt. A frame that cannot be used has no contacts.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -20,16 +23,16 @@ pub struct Felt {
 
 impl Felt {
     pub fn of(hand: &Hand, frame: &Stamped<TactileFrame>) -> Felt {
-        Felt::with_fault(hand, frame).0
+        Felt::with_summary(hand, frame).0
     }
 
-    /// What the encoder gets of a frame, and why it cannot be used.
-    fn with_fault(hand: &Hand, frame: &Stamped<TactileFrame>) -> (Felt, Fault) {
+    /// What the encoder gets of a frame, and what is known besides.
+    fn with_summary(hand: &Hand, frame: &Stamped<TactileFrame>) -> (Felt, ContactSummary) {
         let TactileFrame { joints, cells_newtons, senses, .. } = &frame.message;
         let mut felt = Felt { joints: joints.clone(), contacts: Vec::new(), senses: senses.clone() };
         let summary = contacts_from_frame(hand, frame.header.hand_id, joints, cells_newtons, &mut felt.contacts);
         clip_to_limits(hand, &mut felt.joints);
-        (felt, summary.fault)
+        (felt, summary)
     }
 
     pub fn reading(&self) -> FeltReading<'_> {
@@ -43,6 +46,8 @@ pub struct Settled {
     pub felt: Felt,
     /// Why it has no feature.
     pub fault: Fault,
+    /// [`ContactSummary::n_self_contacts`]
+    n_self_contacts: u32,
     pub reading_id: ReadingId,
     /// The number of its recording day; 0 if it is not known.
     pub day: u32,
@@ -53,8 +58,13 @@ impl Settled {
     pub fn of(hand: &Hand, frames: &[Stamped<TactileFrame>]) -> Option<Settled> {
         let frame = frames.iter().find(|frame| frame.message.phase == Phase::Settled)?;
         let reading_id = ReadingId::of(&frame.message.joints, &frame.message.cells_newtons);
-        let (felt, fault) = Felt::with_fault(hand, frame);
-        Some(Settled { felt, fault, reading_id, day: frame.message.day })
+        let (felt, ContactSummary { fault, n_self_contacts, .. }) = Felt::with_summary(hand, frame);
+        Some(Settled { felt, fault, n_self_contacts, reading_id, day: frame.message.day })
+    }
+
+    /// Why its grasp is left out, if it has a fault.
+    pub fn left_out_as(&self) -> &'static str {
+        if self.fault == Fault::NoContact && self.n_self_contacts > 0 { SELF_CONTACT } else { self.fault.as_str() }
     }
 }
 

@@ -95,8 +95,8 @@ impl FileKind {
             }
             FileKind::Picture => "a picture or a PDF",
             FileKind::Archive => {
-                "a compressed file (.xlsx, .npz and .pt are such files as well): unpack it, or read it in Python and give the table to \
-                 blindgrasp.from_table (docs/python.md)"
+                "a compressed file (.xlsx, .npz and .pt are such files as well): unpack it (.mcap.zstd: zstd -d FILE), or read it in \
+                 Python and give the table to blindgrasp.from_table (docs/python.md)"
             }
             FileKind::Array => {
                 "a file of arrays: read it in Python and give the table to blindgrasp.from_table (docs/python.md)"

@@ -37,9 +37,11 @@ const MAX_LINES: usize = 256;
 /// operator that does not tell by itself that nothing listens at an endpoint of Zenoh.
 pub(super) fn install(tells_refused: bool, say: impl Fn(LogEntry) + Send + Sync + 'static) {
     let asked_for = std::env::var(FILTER_VARIABLE).ok();
-    let filter = asked_for.as_deref().map(str::parse::<Targets>);
-    let unreadable = filter.as_ref().and_then(|filter| filter.as_ref().err().map(ToString::to_string));
-    let filter = filter.and_then(Result::ok);
+    let (filter, unreadable) = match asked_for.as_deref().map(levels_in) {
+        None => (None, None),
+        Some(Ok(filter)) => (Some(filter), None),
+        Some(Err(error)) => (None, Some(error)),
+    };
     // A user who asks for certain levels gets every line of them.
     let repeats = filter.is_none().then(|| Repeats { tells_refused, ..Repeats::default() });
     let filter = filter.unwrap_or_else(|| {
@@ -51,6 +53,18 @@ pub(super) fn install(tells_refused: bool, say: impl Fn(LogEntry) + Send + Sync 
     if let Some(error) = unreadable {
         tracing::warn!("{FILTER_VARIABLE} is not read: {error}");
     }
+}
+
+/// The levels that a variable asks for. The library takes any other word for a module, and then logs nothing else.
+fn levels_in(text: &str) -> Result<Targets, String> {
+    for word in text.split(',').map(str::trim) {
+        if !word.is_empty() && !word.contains('=') && word.parse::<LevelFilter>().is_err() {
+            return Err(format!(
+                "'{word}' is no level: expected off, error, warn, info, debug or trace, or MODULE=LEVEL for one module"
+            ));
+        }
+    }
+    text.parse::<Targets>().map_err(|error| error.to_string())
 }
 
 struct Sayer<F> {
@@ -213,6 +227,17 @@ mod tests {
         let json = serde_json::to_value(&said[0]).expect("JSON");
         assert_eq!(json["level"], "warn");
         assert_eq!(json["fields"]["cell"], 7);
+    }
+
+    #[test]
+    fn a_word_that_is_no_level_is_told() {
+        for text in ["info", "debug,", "info, my_operator=trace", "OFF", ""] {
+            assert!(levels_in(text).is_ok(), "{text}");
+        }
+        for (text, expected) in [("everything", "'everything' is no level"), ("info,mine=loud", "invalid")] {
+            let error = levels_in(text).expect_err(text);
+            assert!(error.contains(expected), "{error}");
+        }
     }
 
     #[test]

@@ -8,6 +8,10 @@ use mcap::records::{Channel, Record as McapRecord, SchemaHeader, op};
 use super::source::parse_record;
 use super::types::{MESSAGE_ENCODING, OurType, SCHEMA_ENCODING, our_types};
 
+/// The remedy for a bag whose recorder did not know the types.
+pub(super) const CONVERT: &str =
+    "source a workspace with blindgrasp_msgs, and record there or write the bag anew with ros2 bag convert";
+
 /// The schemas and channels of a file, as far as it was read.
 #[derive(Default)]
 pub(super) struct Channels {
@@ -44,7 +48,12 @@ impl Channels {
             return Ok(());
         }
         match parse_record(opcode, data)? {
-            McapRecord::Schema { header: SchemaHeader { id, name, encoding }, data } => {
+            McapRecord::Schema { header: SchemaHeader { id, mut name, encoding }, data } => {
+                // Some programs leave out /msg.
+                let full_name = name.replacen('/', "/msg/", 1);
+                if our_types(&full_name).next().is_some() {
+                    name = full_name;
+                }
                 let schema = Schema { name, encoding, data: data.into_owned() };
                 if self.schemas.get(&id).is_some_and(|known| *known != schema) {
                     return Err(format!("two schemas have the number {id}"));
@@ -163,15 +172,18 @@ impl Channels {
 
 fn difference(channel: &Channel, schema: &Schema, ours: &str) -> Option<String> {
     let topic = &channel.topic;
-    for (what, found, expected) in [
-        ("messages are encoded as", channel.message_encoding.as_str(), MESSAGE_ENCODING),
-        ("definition is in the form", schema.encoding.as_str(), SCHEMA_ENCODING),
-    ] {
-        if found != expected {
-            return Some(format!("{topic}: its {what} '{found}', expected '{expected}'"));
-        }
+    if channel.message_encoding != MESSAGE_ENCODING {
+        let found = &channel.message_encoding;
+        return Some(format!("{topic}: its messages are encoded as '{found}', expected '{MESSAGE_ENCODING}'"));
     }
     let definition = String::from_utf8_lossy(&schema.data);
+    if schema.encoding != SCHEMA_ENCODING || definition.trim().is_empty() {
+        let found = if definition.trim().is_empty() { "no definition" } else { "a definition in another form" };
+        return Some(format!(
+            "{topic}: the file holds {found} of {} ('{}'), expected one in the form '{SCHEMA_ENCODING}': {CONVERT}",
+            schema.name, schema.encoding
+        ));
+    }
     let (found, expected) = first_difference(&definition, ours)?;
     Some(format!("{topic}: its {} has the line '{found}' where this version has '{expected}'", schema.name))
 }

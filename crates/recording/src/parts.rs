@@ -157,15 +157,20 @@ pub fn recordings_in(paths: &[PathBuf]) -> Result<Vec<PathBuf>, RecordingError> 
             continue;
         }
         let io = |source| RecordingError::Io { path: path.clone(), source };
-        let mut found = Vec::new();
+        let (mut found, mut compressed) = (Vec::new(), None);
         for entry in std::fs::read_dir(path).map_err(io)? {
             let file = entry.map_err(io)?.path();
-            if file.extension().is_some_and(|extension| extension == "mcap") {
+            if file.to_string_lossy().ends_with(".mcap.zstd") {
+                compressed = Some(file);
+            } else if file.extension().is_some_and(|extension| extension == "mcap") {
                 found.push(file);
             }
         }
         if found.is_empty() {
-            return Err(invalid("there is no recording in this folder: expected files that end in .mcap".into()));
+            return Err(invalid(match compressed {
+                Some(file) => format!("{} is compressed: unpack it (zstd -d {})", file.display(), file.display()),
+                None => "there is no recording in this folder: expected files that end in .mcap".into(),
+            }));
         }
         found.sort();
         all.extend(found);
@@ -208,6 +213,14 @@ mod tests {
         std::fs::create_dir(&full).expect("made");
         std::fs::write(full.join("x"), "").expect("written");
         assert!(manifest(1).claim(&full).expect_err("full").to_string().contains("other files"));
+    }
+
+    #[test]
+    fn a_compressed_file_of_a_folder_is_named() {
+        let folder = tempfile::tempdir().expect("a folder");
+        std::fs::write(folder.path().join("bag_0.mcap.zstd"), "").expect("written");
+        let error = recordings_in(&[folder.path().into()]).expect_err("compressed").to_string();
+        assert!(error.contains("bag_0.mcap.zstd is compressed: unpack it (zstd -d "), "{error}");
     }
 
     #[test]

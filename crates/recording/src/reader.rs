@@ -13,7 +13,7 @@ use super::channels::Channels;
 use super::chosen::Reach;
 use super::source::{Growth, Input, MAX_RECORD_BYTES, read_records, with_cause};
 use super::summary;
-use super::types::OurType;
+use super::types::{COMPRESSED, OurType};
 use super::{RecordingError, RecordingInfo};
 
 /// Bytes of a message before its data: channel, number, two times.
@@ -123,7 +123,9 @@ impl RecordingReader {
                     Ok(message) => take(message),
                     Err(what) => Some(Err(what)),
                 });
-                taken.map(|taken| taken.map_err(damaged))
+                taken.map(|taken| {
+                    taken.map_err(|what| if what.ends_with(COMPRESSED) { invalid(what) } else { damaged(what) })
+                })
             }
             op::DATA_END => {
                 *is_past_data = true;

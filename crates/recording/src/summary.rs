@@ -10,7 +10,7 @@ use blindgrasp_messages::files::open_regular;
 use mcap::records::{ChunkIndex, MetadataIndex, Record as McapRecord, Statistics, op};
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
 
-use super::channels::Channels;
+use super::channels::{CONVERT, Channels};
 use super::repair::unknown_info;
 use super::source::{Growth, MAX_RECORD_BYTES, PREFIX_BYTES, longest_record, parse_record, read_records};
 use super::{METADATA_NAME, RecordingError, RecordingInfo};
@@ -89,6 +89,9 @@ pub(super) fn open(path: &Path) -> Result<(File, FileSummary), RecordingError> {
 
 /// What to say of a recording whose messages are not ours.
 pub(super) fn other_version(difference: &str, info: &RecordingInfo) -> String {
+    if difference.ends_with(CONVERT) {
+        return difference.into();
+    }
     let version = &info.version;
     format!(
         "{difference}: blindgrasp {version} wrote it, in another version of the messages; read it with blindgrasp {version}"

@@ -9,6 +9,11 @@ use blindgrasp_messages::{ContactSet, Header, Record, Recorded, Sense, Stamped, 
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
 const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
+/// How data that zstd has compressed begin.
+const ZSTD_BEGIN: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
+/// What is wrong with messages that rosbag2 has compressed one by one. They are whole, so that a repair changes nothing.
+pub(super) const COMPRESSED: &str = "each message is compressed by itself (--compression-mode message), which MCAP does not know: \
+                                     write the bag anew with ros2 bag convert and without compression_mode";
 /// How messages and their definitions are encoded, in MCAP's words.
 pub(super) const MESSAGE_ENCODING: &str = "cdr";
 pub(super) const SCHEMA_ENCODING: &str = "ros2msg";
@@ -77,6 +82,9 @@ pub fn encode(value: &impl Serialize, data: &mut Vec<u8>) -> Result<(), String> 
 }
 
 fn body(data: &[u8]) -> Result<&[u8], String> {
+    if data.starts_with(&ZSTD_BEGIN) {
+        return Err(COMPRESSED.into());
+    }
     data.strip_prefix(&CDR_LITTLE_ENDIAN[..]).ok_or_else(|| "expected little-endian CDR".into())
 }
 

@@ -12,6 +12,9 @@ use super::rewrite::{FedEdge, Origin};
 use blindgrasp_messages::{Action, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Phase, Reason, Recorded};
 use blindgrasp_recording::{Record, RecordingError, RecordingReader};
 
+/// Fewest labelled grasps of which an accuracy is expected: one of three lifts that is held instead is a third.
+const FEWEST_FOR_ACCURACY: usize = 20;
+
 /// The outcome of one check.
 #[derive(Debug, Serialize)]
 pub struct Check {
@@ -248,7 +251,8 @@ impl Decisions {
     }
 
     /// The decisions as expectations of later replays: a lift that dropped its object should have been held. With labels,
-    /// accuracy and false positives are expected as they are, and otherwise every decision.
+    /// false positives are expected as they are, and of [`FEWEST_FOR_ACCURACY`] or more the accuracy; without labels, every
+    /// decision.
     pub fn to_expectations(&self) -> Expectations {
         let mut expected = Expectations::default();
         if self.truths.is_empty() {
@@ -256,13 +260,22 @@ impl Decisions {
             expected.decisions.extend(said);
         } else {
             let Tally { n_right, n_false_positive, .. } = self.tally();
-            // Rounded down, so that the text reads back as a bound that is met.
-            let accuracy = n_right as f64 / self.truths.len() as f64;
-            expected.accuracy_at_least = Some((1e4 * accuracy).floor() / 1e4);
+            if self.truths.len() >= FEWEST_FOR_ACCURACY {
+                // Rounded down, so that the text reads back as a bound that is met.
+                let accuracy = n_right as f64 / self.truths.len() as f64;
+                expected.accuracy_at_least = Some((1e4 * accuracy).floor() / 1e4);
+            }
             expected.false_positives_at_most = Some(n_false_positive);
         }
         expected.decisions.extend(self.dropped().map(|grasp_id| (grasp_id, (Action::Hold, None))));
         expected
+    }
+
+    /// The first grasp that is held because hand or model are others than the graph's.
+    pub fn held_as_another(&self) -> Option<(u64, Reason)> {
+        let is_another = |reason: Reason| matches!(reason, Reason::WrongHand | Reason::WrongModel);
+        let held = self.decisions.iter().find(|(_, decision)| is_another(decision.reason));
+        held.map(|(grasp_id, decision)| (*grasp_id, decision.reason))
     }
 
     /// The grasps that were lifted and dropped their objects.

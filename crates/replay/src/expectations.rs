@@ -3,6 +3,7 @@
 //! ```yaml
 //! version: 1
 //! dataflow: ../dataflow.yaml        # for a recording of another hand; relative to this file
+//! set: [lift_arbiter.probe=none, classifier.model=../models/mine.json]    # as --set; a path that begins with . likewise
 //! accuracy_at_least: 0.9            # of the labelled grasps
 //! false_positives_at_most: 0        # unstable grasps that are lifted
 //! decisions: {3: lift, 7: hold no_contact}
@@ -22,14 +23,24 @@ use blindgrasp_messages::{Action, Reason};
 use blindgrasp_operator::text::did_you_mean;
 
 /// The keys of an expectations file.
-const KEYS: [&str; 7] =
-    ["version", "dataflow", "accuracy_at_least", "false_positives_at_most", "decisions", "reasons", "tolerances"];
+const KEYS: [&str; 8] = [
+    "version",
+    "dataflow",
+    "set",
+    "accuracy_at_least",
+    "false_positives_at_most",
+    "decisions",
+    "reasons",
+    "tolerances",
+];
 
 /// Expectations beyond the recorded samples; by default there are none.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Expectations {
     /// The dataflow file for the recording, if it is another than the usual one.
     pub dataflow: Option<PathBuf>,
+    /// Params with other values than in the dataflow file, as they stand after `--set`.
+    pub set: Vec<String>,
     pub accuracy_at_least: Option<f64>,
     /// The most unstable grasps that may be lifted.
     pub false_positives_at_most: Option<usize>,
@@ -53,6 +64,8 @@ struct Written {
     version: u64,
     #[serde(default, deserialize_with = "given")]
     dataflow: Option<PathBuf>,
+    #[serde(default)]
+    set: Vec<String>,
     #[serde(default, deserialize_with = "given")]
     accuracy_at_least: Option<f64>,
     #[serde(default, deserialize_with = "given")]
@@ -86,8 +99,16 @@ impl Expectations {
             Err(error) => return Err(invalid(error.to_string())),
         };
         let mut expectations = Expectations::parse(&text).map_err(invalid)?;
+        let folder = path.parent().unwrap_or(Path::new(""));
         if let Some(dataflow) = &mut expectations.dataflow {
-            *dataflow = path.parent().unwrap_or(Path::new("")).join(&*dataflow);
+            *dataflow = folder.join(&*dataflow);
+        }
+        for set in &mut expectations.set {
+            if let Some((place, value)) = set.split_once('=')
+                && (value.starts_with("./") || value.starts_with("../"))
+            {
+                *set = format!("{place}={}", folder.join(value).display());
+            }
         }
         Ok(Some(expectations))
     }
@@ -123,6 +144,7 @@ impl Expectations {
         });
         Ok(Expectations {
             dataflow: written.dataflow,
+            set: written.set,
             accuracy_at_least: share("accuracy_at_least", written.accuracy_at_least)?,
             false_positives_at_most: written.false_positives_at_most,
             decisions: decisions.collect::<Result<_, String>>()?,
@@ -137,6 +159,10 @@ impl Expectations {
         if let Some(dataflow) = &self.dataflow {
             lines.push(format!("dataflow: {}", serde_json::json!(dataflow)));
         }
+        if !self.set.is_empty() {
+            lines.push("set:".into());
+        }
+        lines.extend(self.set.iter().map(|set| format!("  - {}", serde_json::json!(set))));
         if let Some(share) = self.accuracy_at_least {
             lines.push(format!("accuracy_at_least: {share}"));
         }
@@ -220,6 +246,18 @@ mod tests {
                 assert!(key == "dataflow" || Expectations::parse(&text).is_err(), "{text}");
             }
         }
+    }
+
+    #[test]
+    fn params_are_kept_and_their_paths_are_those_of_the_file() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let recording = folder.path().join("run.mcap");
+        let set = ["lift_arbiter.probe=none", "classifier.model=../models/mine.json"].map(String::from).to_vec();
+        let text = Expectations { set, ..Expectations::default() }.to_yaml(&BTreeMap::new());
+        std::fs::write(path_of(&recording), text).expect("written");
+        let read = Expectations::of(&recording).expect("readable").expect("there");
+        let model = folder.path().join("../models/mine.json");
+        assert_eq!(read.set, ["lift_arbiter.probe=none".into(), format!("classifier.model={}", model.display())]);
     }
 
     #[test]

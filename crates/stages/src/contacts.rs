@@ -7,7 +7,8 @@
 
 use nalgebra::{Isometry3, Point3, Vector3};
 
-use crate::hand::{Hand, PosedShapes};
+use crate::hand::{Hand, Joint, JointKind, PosedShapes};
+use crate::out_of_distribution::short;
 use blindgrasp_messages::{Contact, Fault, MAX_PADS};
 
 /// How far beyond its limits a joint may read: an encoder's offset. It counts as at the limit then.
@@ -63,6 +64,43 @@ pub fn clip_to_limits(hand: &Hand, joints: &mut [f64]) {
             *value = value.clamp(joint.lower, joint.upper);
         }
     }
+}
+
+/// The joint or cell that makes a frame invalid, with its value and what was expected: for people.
+pub fn invalid_reading(hand: &Hand, joints: &[f64], cells_newtons: &[f64]) -> Option<String> {
+    let (n_joints, n_cells) = (hand.joints.len(), hand.n_cells());
+    if joints.len() != n_joints || cells_newtons.len() != n_cells {
+        let (found_joints, found_cells) = (joints.len(), cells_newtons.len());
+        return Some(format!(
+            "it has {found_joints} joints and {found_cells} cells, expected {n_joints} and {n_cells}"
+        ));
+    }
+    let outside =
+        || joints.iter().zip(&hand.joints).filter(|(value, joint)| !joint.allows(**value, LIMIT_TOLERANCE_RAD));
+    if let Some((value, joint)) = outside().next() {
+        let (lower, upper, unit) = (short(joint.lower), short(joint.upper), joint.kind.unit());
+        let mut found = format!("joint {} reads {}, expected {lower} to {upper} {unit}", joint.name, short(*value));
+        let mut finite = outside().filter(|(value, _)| value.is_finite());
+        if value.is_finite() && finite.all(|(value, joint)| joint.allows(in_si(joint, *value), LIMIT_TOLERANCE_RAD)) {
+            let other_unit = if joint.kind == JointKind::Revolute { "degrees" } else { "millimetres" };
+            found += &format!(": {other_unit}? ({} {unit})", short(in_si(joint, *value)));
+        }
+        match outside().count() - 1 {
+            0 => {}
+            1 => found += "; another joint is outside its range, too",
+            n_others => found += &format!("; {n_others} other joints are outside their range, too"),
+        }
+        return Some(found);
+    }
+    let (cell_idx, newtons) = cells_newtons.iter().enumerate().find(|(_, newtons)| !are_forces(&[**newtons]))?;
+    let pad = hand.pads.iter().rfind(|pad| pad.first_cell_idx <= cell_idx)?;
+    let (idx, unit) = (cell_idx - pad.first_cell_idx, hand.cell_unit.word());
+    Some(format!("cell {idx} of pad {} reads {}, expected 0 to {MAX_CELL_NEWTONS} {unit}", pad.name, short(*newtons)))
+}
+
+/// A value in degrees or millimetres, in radians or metres.
+fn in_si(joint: &Joint, value: f64) -> f64 {
+    if joint.kind == JointKind::Revolute { value.to_radians() } else { value / 1000.0 }
 }
 
 /// Finds the contacts of frame after frame as [`contacts_from_frame`] does, in memory that it keeps.
@@ -135,6 +173,28 @@ impl ContactFinder {
         let n_pads_in_contact = contacts.chunk_by(|a, b| a.pad == b.pad).count() as u32;
         let fault = if contacts.is_empty() { Fault::NoContact } else { Fault::None };
         ContactSummary { n_pads_in_contact, self_collision: !self.touching.is_empty(), n_self_contacts, fault }
+    }
+
+    /// The links that touch each other on which cells of the last frame feel, if it has no contact for this reason: for people.
+    pub fn self_contact(&self, hand: &Hand, cells_newtons: &[f64]) -> Option<String> {
+        let thresholds_newtons = hand.noise_thresholds_newtons();
+        let mut links_that_feel = Vec::new();
+        for pad in &hand.pads {
+            let cells = pad.first_cell_idx..pad.first_cell_idx + pad.cells.len();
+            if active_idxs(&cells_newtons[cells.clone()], &thresholds_newtons[cells]).next().is_some() {
+                links_that_feel.push(pad.link_idx);
+            }
+        }
+        let mut pairs = Vec::new();
+        for (a, b) in &self.touching {
+            if links_that_feel.contains(a) || links_that_feel.contains(b) {
+                pairs.push(format!("{} and {}", hand.links[*a].name, hand.links[*b].name));
+            }
+        }
+        if pairs.is_empty() {
+            return None;
+        }
+        Some(format!("cells feel, but only on links that touch each other: {}", pairs.join("; ")))
     }
 
     /// Whether a point of a link, in the palm frame, is near to a link that touches that link.
@@ -256,6 +316,29 @@ mod tests {
     }
 
     #[test]
+    fn the_reading_that_makes_a_frame_invalid_is_named() {
+        let hand = hand();
+        let mut joints = [0.0; 7];
+        let mut cells = [0.0; 96];
+        let found = |joints: &[f64], cells: &[f64]| invalid_reading(&hand, joints, cells);
+        assert_eq!(found(&joints, &cells), None);
+        joints[1] = 39.4;
+        let degrees = "joint finger_1 reads 39.4, expected 0 to 2.443 rad: degrees? (0.6877 rad)";
+        assert_eq!(found(&joints, &cells).as_deref(), Some(degrees));
+        joints[2] = f64::NAN;
+        assert_eq!(found(&joints, &cells), Some(format!("{degrees}; another joint is outside its range, too")));
+        // The first of them could be in degrees, the others not.
+        joints = [2048.0; 7];
+        joints[0] = 170.0;
+        let ticks = "joint spread reads 170, expected 0 to 3.142 rad; 6 other joints are outside their range, too";
+        assert_eq!(found(&joints, &cells).as_deref(), Some(ticks));
+        cells[25] = f64::NAN;
+        let cell = "cell 1 of pad finger_1 reads NaN, expected 0 to 1000000 newtons";
+        assert_eq!(found(&[0.0; 7], &cells).as_deref(), Some(cell));
+        assert_eq!(found(&[], &cells).as_deref(), Some("it has 0 joints and 96 cells, expected 7 and 96"));
+    }
+
+    #[test]
     fn a_joint_that_reads_beyond_its_stop_is_at_it() {
         let hand = hand();
         let stops: Vec<f64> = hand.joints.iter().map(|joint| joint.upper).collect();
@@ -338,6 +421,11 @@ mod tests {
             let (summary, contacts) = run(0, &TOUCHING, &pressed);
             let found = (summary.fault, summary.n_self_contacts, contacts.len());
             assert_eq!(found, (Fault::NoContact, n_pressed, 0));
+            let mut finder = ContactFinder::default();
+            finder.find(&hand(), 0, &TOUCHING, &pressed, &mut Vec::new());
+            let said = finder.self_contact(&hand(), &pressed).expect("cells feel");
+            assert!(said.ends_with(": distal_1 and distal_3; distal_2 and distal_3"), "{said}");
+            assert_eq!(finder.self_contact(&hand(), &[0.0; 96]), None);
         }
     }
 

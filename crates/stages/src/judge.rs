@@ -4,7 +4,7 @@ use blindgrasp_messages::{Contact, Fault, Header, LiftDecision, Message, Predict
 
 use crate::contacts::ContactFinder;
 use crate::hand::Hand;
-use crate::lift_arbiter::{ArbiterOptions, LiftArbiter};
+use crate::lift_arbiter::{ArbiterOptions, LiftArbiter, Probe, Staleness};
 use crate::model::{Memory, Model, OtherHand};
 use crate::out_of_distribution::Violation;
 use crate::own_lifts::{Adapt, OwnLifts};
@@ -26,8 +26,19 @@ pub struct Judge {
     next_seq: u64,
     contacts: Vec<Contact>,
     values: Vec<f64>,
-    /// Of the last frame at rest that was out of distribution: its grasp, and the limits that it violates.
-    unusual: (u64, Vec<Violation>),
+    found: Findings,
+}
+
+/// What speaks against the last grasp of which something does.
+#[derive(Debug, Default)]
+struct Findings {
+    grasp_id: u64,
+    /// The limits that its last frame violates that was at rest and out of distribution.
+    violations: Vec<Violation>,
+    /// The first reading that made a frame invalid.
+    invalid: Option<String>,
+    /// Why its last frame at rest has no contact although cells feel.
+    self_contact: Option<String>,
 }
 
 /// The judgement of a frame.
@@ -52,11 +63,13 @@ impl Judge {
     ///
     /// # Errors
     /// The model is of another hand.
-    pub fn with_options(hand: Hand, model: Model, options: ArbiterOptions) -> Result<Judge, OtherHand> {
+    pub fn with_options(hand: Hand, mut model: Model, options: ArbiterOptions) -> Result<Judge, OtherHand> {
         model.check_hand(&hand)?;
+        let dictionary_id = model.dictionary_id();
+        model.name_quantities(&hand);
         Ok(Judge {
             hand_id: hand.id(),
-            dictionary_id: model.dictionary_id(),
+            dictionary_id,
             hand,
             model,
             finder: ContactFinder::default(),
@@ -65,7 +78,7 @@ impl Judge {
             next_seq: 0,
             contacts: Vec::new(),
             values: Vec::new(),
-            unusual: (0, Vec::new()),
+            found: Findings::default(),
         })
     }
 
@@ -90,7 +103,7 @@ impl Judge {
     /// Takes the next frame, and returns the decisions that come with it, in order ([`Judged::decisions`]): also a probe
     /// before a decision, or what the arm should do while it lifts. `stamp_nanos` is the time of the
     /// reading by the source's clock: frames of one time are one reading and have one vote, and a grasp whose frames
-    /// come more than 100 ms apart (see [`ArbiterOptions`]) is held.
+    /// come too far apart (see [`ArbiterOptions`]) is held.
     pub fn frame(&mut self, stamp_nanos: u64, frame: &TactileFrame) -> Vec<LiftDecision> {
         let header = Header { seq: self.next_seq, stamp_nanos, hand_id: self.hand_id, ..Header::default() };
         self.judge(header, frame).decisions
@@ -108,8 +121,20 @@ impl Judge {
         let (summary, parts) = steps::find_contacts(&self.hand, &mut self.finder, &head, &items, &mut self.contacts);
         let contacts = steps::contact_set(&self.hand, &head, summary, parts.as_ref());
         let feature = steps::encode(&self.model, self.dictionary_id, &contacts, &self.contacts, &mut self.values);
+        if self.found.grasp_id != frame.grasp_id {
+            self.found = Findings { grasp_id: frame.grasp_id, ..Findings::default() };
+        }
+        if summary.fault != Fault::NoContact || frame.phase.decides() {
+            let why = steps::explain_fault(&self.hand, &self.finder, &summary, parts.as_ref());
+            let found = &mut self.found;
+            if summary.fault == Fault::NoContact {
+                found.self_contact = why;
+            } else if found.invalid.is_none() {
+                found.invalid = why;
+            }
+        }
         if feature.fault == Fault::OutOfDistribution.code() && frame.phase.decides() {
-            self.unusual = (frame.grasp_id, steps::violations(&self.model, &contacts, &self.contacts));
+            self.found.violations = steps::violations(&self.model, &contacts, &self.contacts);
         }
         let head = steps::classify(&self.model, self.dictionary_id, &mut self.memory, &feature, &self.values);
         let mut decisions = Vec::new();
@@ -122,9 +147,26 @@ impl Judge {
 
     /// The limits that a grasp violates which has just been held as out of distribution; none for another decision.
     pub fn violations(&self, decision: &LiftDecision) -> &[Violation] {
-        let (grasp_id, violations) = &self.unusual;
-        let is_of_it = decision.reason == Reason::OutOfDistribution && decision.grasp_id == *grasp_id;
-        if is_of_it { violations } else { &[] }
+        let is_of_it = decision.reason == Reason::OutOfDistribution && decision.grasp_id == self.found.grasp_id;
+        if is_of_it { &self.found.violations } else { &[] }
+    }
+
+    /// Why a grasp was held that has just been decided, sentence by sentence: by names of joints, pads and links, with
+    /// what was found and what was expected. Empty if its reason says all that is known.
+    pub fn explain(&self, decision: &LiftDecision) -> Vec<String> {
+        if decision.grasp_id != self.found.grasp_id {
+            return Vec::new();
+        }
+        match decision.reason {
+            Reason::Invalid => self.found.invalid.iter().cloned().collect(),
+            Reason::Unstable if self.arbiter.options().probe == Probe::None && self.model.day.is_none() => {
+                self.model.speak_against(&self.hand, &self.values).into_iter().collect()
+            }
+            Reason::NoContact => self.found.self_contact.iter().cloned().collect(),
+            Reason::Stale => self.arbiter.staleness(decision.grasp_id).iter().map(Staleness::to_string).collect(),
+            Reason::OutOfDistribution => self.found.violations.iter().map(Violation::to_string).collect(),
+            _ => Vec::new(),
+        }
     }
 
     /// Holds the open grasp, if any, because no more frames come.
@@ -148,6 +190,7 @@ impl Judge {
     fn forget_grasps(&mut self) {
         self.arbiter = LiftArbiter::new(*self.arbiter.options());
         self.next_seq = 0;
+        self.found = Findings::default();
     }
 }
 
@@ -180,6 +223,47 @@ mod tests {
         let error = Judge::new(hand("shadow-biotac-sp"), model).err().expect("refused").to_string();
         assert!(error.contains("the model is for the hand 'barrett-bh8-280'"), "{error}");
         assert!(error.contains("not for 'shadow-biotac-sp'"), "{error}");
+    }
+
+    #[test]
+    fn an_invalid_grasp_is_explained_by_the_joint_that_made_it_so() {
+        let mut judge = judge();
+        let mut degrees = frame(Phase::Closing);
+        degrees.joints[1] = 39.4;
+        assert_eq!(judge.frame(0, &degrees), []);
+        // Another reading decides, but the first one is the cause.
+        degrees.joints[1] = f64::NAN;
+        degrees.phase = Phase::Settled;
+        let decision = judge.frame(10_000_000, &degrees).pop().expect("decided");
+        assert_eq!(decision.reason, Reason::Invalid);
+        let [why] = &judge.explain(&decision)[..] else { panic!("one sentence") };
+        assert!(why.starts_with("joint finger_1 reads 39.4, expected 0 to "), "{why}");
+        // The next grasp has another reason.
+        let next = TactileFrame { grasp_id: 2, ..frame(Phase::Settled) };
+        let decision = judge.frame(20_000_000, &next).pop().expect("decided");
+        assert_eq!((decision.reason, judge.explain(&decision)), (Reason::NoContact, vec![]));
+    }
+
+    #[test]
+    fn a_grasp_unlike_the_training_is_explained_by_names_whatever_the_file_of_the_model_says() {
+        let mut judge = judge();
+        let felt = TactileFrame { cells_newtons: vec![1.0; 96], ..frame(Phase::Settled) };
+        let decision = judge.frame(0, &felt).pop().expect("decided");
+        assert_eq!(decision.reason, Reason::OutOfDistribution);
+        let why = judge.explain(&decision).join("\n");
+        assert!(why.contains("contacts of pad finger_1: 24, trained from 0 to "), "{why}");
+    }
+
+    #[test]
+    fn an_unstable_grasp_is_explained_by_two_values_of_pads_or_joints() {
+        let mut judge = judge();
+        let mut felt = frame(Phase::Settled);
+        felt.cells_newtons[0] = 1.0;
+        judge.frame(0, &felt);
+        // As if the model had said so.
+        let decision = LiftDecision { grasp_id: 1, reason: Reason::Unstable, ..LiftDecision::default() };
+        let [why] = &judge.explain(&decision)[..] else { panic!("one sentence") };
+        assert!(why.starts_with("most against it: ") && why.matches(" is ").count() == 2, "{why}");
     }
 
     #[test]

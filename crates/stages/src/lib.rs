@@ -59,6 +59,7 @@ pub mod promise_monitor;
 pub mod recipe;
 pub mod sensors;
 mod shift_test;
+mod source_pace;
 pub mod steps;
 pub mod training_summary;
 

@@ -17,11 +17,14 @@
 //!
 //! While the arm lifts, frames of the phase `lifting` are watched, and `tighten` or `set_down` may follow (`LiftWatch`).
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
 
 use crate::decided::Decided;
 use crate::lift_watch::LiftWatch;
 use crate::promise_monitor::PromiseMonitor;
+use crate::source_pace::SourcePace;
 use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction, Reason};
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -30,7 +33,8 @@ pub struct ArbiterOptions {
     pub votes: u32,
     /// The least probability with which a prediction counts as stable, in addition to the model's own threshold.
     pub min_probability_stable: f64,
-    /// Greatest time between two predictions of a grasp by the source's clock. A later one counts as stale.
+    /// Greatest time between two predictions of a grasp by the source's clock. A later one counts as stale, unless the source
+    /// is as slow as that (`SourcePace`).
     pub max_gap_nanos: u64,
     /// Greatest age of a prediction on arrival, since its source published it on this machine.
     pub max_age_nanos: u64,
@@ -91,6 +95,51 @@ impl Default for ArbiterOptions {
 pub struct LiftArbiter {
     options: ArbiterOptions,
     state: ArbiterState,
+    /// Why the last grasp with stale predictions has them.
+    stale: Option<(u64, Staleness)>,
+}
+
+/// The limit that makes a grasp stale, and what was found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Staleness {
+    /// Two of its frames are too far apart by the source's clock.
+    Gap { found_nanos: u64, limit_nanos: u64 },
+    /// A prediction was too old on arrival.
+    Age { found_nanos: u64, limit_nanos: u64 },
+    /// A prediction may no longer be acted upon: [`Header::valid_nanos`].
+    Expiry { found_nanos: u64, limit_nanos: u64 },
+    /// A prediction is of the future.
+    Future,
+    /// No prediction came while it was open.
+    Silence { limit_nanos: u64 },
+}
+
+impl fmt::Display for Staleness {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let millis = |nanos: u64| nanos as f64 / 1e6;
+        match *self {
+            Staleness::Gap { found_nanos, limit_nanos } => write!(
+                f,
+                "two frames are {:.1} ms apart, expected at most {:.1} ms (max_gap_ms, or more for a source that is steadily slow)",
+                millis(found_nanos),
+                millis(limit_nanos)
+            ),
+            Staleness::Age { found_nanos, limit_nanos } => {
+                let (found, limit) = (millis(found_nanos), millis(limit_nanos));
+                write!(f, "a frame was {found:.1} ms old, expected at most {limit:.1} ms (max_age_ms)")
+            }
+            Staleness::Expiry { found_nanos, limit_nanos } => {
+                let (found, limit) = (millis(found_nanos), millis(limit_nanos));
+                write!(f, "a frame was {found:.1} ms old, and expired after {limit:.1} ms (set by its machine)")
+            }
+            Staleness::Future => f.write_str("a frame's time lies in the future: the clock was set back"),
+            Staleness::Silence { limit_nanos } => write!(
+                f,
+                "no frame came for more than {:.1} ms (max_age_ms, or more for a source that is steadily slow)",
+                millis(limit_nanos)
+            ),
+        }
+    }
 }
 
 /// What an arbiter knows between predictions. Another arbiter can continue from it.
@@ -99,6 +148,7 @@ pub struct ArbiterState {
     /// The options that the votes were counted with.
     options: ArbiterOptions,
     last: Option<Header>,
+    pace: SourcePace,
     open: Option<OpenGrasp>,
     /// Epochs and numbers of decided grasps: a source that starts anew may use its numbers again.
     decided: Decided,
@@ -131,6 +181,8 @@ struct OpenGrasp {
     grasp_id: u64,
     /// The first problem of a prediction of this grasp. It rules out a LIFT.
     doubt: Option<Reason>,
+    /// The greatest distance of its frames before there was a doubt.
+    gap_nanos: u64,
     n_settled: u32,
     /// The phase of the frames that vote: [`Phase::Settled`] until a probe has been asked for.
     awaited: Phase,
@@ -249,6 +301,8 @@ enum PhaseMeaning {
 /// How a prediction comes after the one before it.
 struct Arrival {
     break_in_order: Option<Reason>,
+    /// The time since the prediction before it, if that is of the same open grasp.
+    gap_nanos: u64,
     /// The reason why its numbers have no use: invalid or stale.
     unusable: Option<Reason>,
     /// Frames of one time are one reading: only the first of them votes.
@@ -275,10 +329,26 @@ impl Vote {
     }
 }
 
+impl ArbiterOptions {
+    /// Whether a prediction is too old. Nothing is as old as [`u64::MAX`]: the age of a prediction from the future.
+    fn staleness_of(&self, header: &Header, age_nanos: u64) -> Option<Staleness> {
+        let found_nanos = age_nanos;
+        if age_nanos == u64::MAX {
+            Some(Staleness::Future)
+        } else if age_nanos > self.max_age_nanos {
+            Some(Staleness::Age { found_nanos, limit_nanos: self.max_age_nanos })
+        } else if header.valid_nanos != 0 && age_nanos > header.valid_nanos {
+            Some(Staleness::Expiry { found_nanos, limit_nanos: header.valid_nanos })
+        } else {
+            None
+        }
+    }
+}
+
 impl LiftArbiter {
     /// An arbiter that has seen nothing.
     pub fn new(options: ArbiterOptions) -> Self {
-        LiftArbiter { options, state: ArbiterState { options, ..ArbiterState::default() } }
+        LiftArbiter { options, state: ArbiterState { options, ..ArbiterState::default() }, stale: None }
     }
 
     pub fn state(&self) -> &ArbiterState {
@@ -335,8 +405,15 @@ impl LiftArbiter {
             return;
         };
         let meaning = open.meaning_of(prediction.phase);
+        if open.doubt.is_none() {
+            open.gap_nanos = open.gap_nanos.max(arrival.gap_nanos);
+        }
         let faulty = reason_of(prediction.fault, matches!(meaning, PhaseMeaning::Vote));
         open.doubt = open.doubt.or(arrival.break_in_order).or(faulty).or(arrival.unusable);
+        if matches!(meaning, PhaseMeaning::Vote | PhaseMeaning::Wait | PhaseMeaning::End) {
+            self.judge_gap();
+        }
+        let Some(open) = self.state.open.as_mut() else { return };
         let decision = match meaning {
             PhaseMeaning::Vote => open.vote(header, prediction, arrival.is_new_reading, &options),
             PhaseMeaning::Nothing => None,
@@ -379,6 +456,9 @@ impl LiftArbiter {
 
     /// Holds the open grasp, if any, because no prediction has come for longer than a prediction may be old.
     pub fn on_silence(&mut self) -> Option<LiftDecision> {
+        let limit_nanos = self.silence_limit_nanos();
+        let open = self.state.open.as_ref()?;
+        self.stale = Some((open.grasp_id, Staleness::Silence { limit_nanos }));
         self.hold(Reason::Stale)
     }
 
@@ -389,8 +469,31 @@ impl LiftArbiter {
 
     /// Holds the open grasp, if any, because the next grasp began or the stream ended before its source ended it.
     pub fn on_end(&mut self) -> Option<LiftDecision> {
+        self.judge_gap();
         let reason = self.state.open.as_ref()?.reason_at_end();
         self.hold(reason)
+    }
+
+    /// The limit that a grasp has exceeded which has just been held as stale.
+    pub fn staleness(&self, grasp_id: u64) -> Option<Staleness> {
+        let (of, staleness) = self.stale?;
+        if of == grasp_id { Some(staleness) } else { None }
+    }
+
+    /// How long no prediction may come while a grasp is open.
+    pub fn silence_limit_nanos(&self) -> u64 {
+        self.options.max_age_nanos.max(self.state.pace.longest_gap_nanos())
+    }
+
+    /// Doubts the open grasp if its frames are too far apart. The source's pace is known better at the decision than when the
+    /// gap was seen.
+    fn judge_gap(&mut self) {
+        let limit_nanos = self.options.max_gap_nanos.max(self.state.pace.longest_gap_nanos());
+        let Some(open) = &mut self.state.open else { return };
+        if open.gap_nanos > limit_nanos {
+            open.doubt = Some(Reason::Stale);
+            self.stale = Some((open.grasp_id, Staleness::Gap { found_nanos: open.gap_nanos, limit_nanos }));
+        }
     }
 
     /// Whether a grasp has begun and is not decided.
@@ -403,9 +506,15 @@ impl LiftArbiter {
         let grasp_id = prediction.grasp_id;
         let break_in_order = self.break_in_order(header, grasp_id);
         let state = &mut self.state;
+        let is_open = state.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
+        let mut gap_nanos = 0;
         let mut is_new_reading = true;
         if let Some(last) = state.last.replace(*header) {
             is_new_reading = (last.epoch, last.stamp_nanos) != (header.epoch, header.stamp_nanos);
+            if is_open && break_in_order.is_none() {
+                gap_nanos = header.stamp_nanos - last.stamp_nanos;
+                state.pace.observe(header.epoch, gap_nanos);
+            }
             // A source that was started again may go on with a grasp that is decided, unless it begins with its first sample.
             let goes_on = last.epoch != header.epoch && header.seq != 0;
             if goes_on && state.decided.contains((last.epoch, grasp_id)) {
@@ -413,7 +522,6 @@ impl LiftArbiter {
             }
         }
         // The samples of a grasp are not mixed with those of the next one, so the doubtful samples were not of that one.
-        let is_open = state.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
         if break_in_order.is_none() && (is_open || state.decided.contains((header.epoch, grasp_id))) {
             state.pending_doubt = None;
         }
@@ -421,14 +529,12 @@ impl LiftArbiter {
         let is_valid = prediction.decision_value.is_finite()
             && (0.0..=1.0).contains(&prediction.probability_stable)
             && !(prediction.stable && prediction.unsure);
-        let unusable = if !is_valid {
-            Some(Reason::Invalid)
-        } else if age_nanos > self.options.max_age_nanos {
-            Some(Reason::Stale)
-        } else {
-            None
-        };
-        Arrival { break_in_order, unusable, is_new_reading }
+        let staleness = self.options.staleness_of(header, age_nanos);
+        if let Some(staleness) = staleness {
+            self.stale = Some((grasp_id, staleness));
+        }
+        let unusable = if is_valid { staleness.map(|_| Reason::Stale) } else { Some(Reason::Invalid) };
+        Arrival { break_in_order, gap_nanos, unusable, is_new_reading }
     }
 
     /// Counts the outcome of the last lift, once.
@@ -465,6 +571,7 @@ impl LiftArbiter {
             epoch,
             grasp_id,
             doubt: pending_doubt.take().or(promise.is_withdrawn().then_some(Reason::PromiseWithdrawn)),
+            gap_nanos: 0,
             n_settled: 0,
             awaited: Phase::Settled,
             is_probe_pending: false,
@@ -514,8 +621,7 @@ impl LiftArbiter {
         if header.hand_id != last.hand_id {
             return Some(Reason::WrongHand);
         }
-        let same_grasp = self.state.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
-        (same_grasp && header.stamp_nanos - last.stamp_nanos > self.options.max_gap_nanos).then_some(Reason::Stale)
+        None
     }
 }
 
@@ -705,6 +811,48 @@ mod tests {
         ] {
             stream(ArbiterOptions::default()).takes(history);
         }
+    }
+
+    #[test]
+    fn a_slow_hand_is_decided_once_its_pace_is_known_and_held_if_it_stops() {
+        const SLOW_NANOS: u64 = 125_000_000;
+        let mut s = stream(ArbiterOptions::default());
+        let reasons = |s: &mut Stream, letters: &str| -> Vec<Reason> {
+            let mut reasons = Vec::new();
+            for letter in letters.chars() {
+                s.header.stamp_nanos += SLOW_NANOS - STEP_NANOS;
+                reasons.extend(s.take(letter).into_iter().map(|decision| decision.reason));
+            }
+            reasons
+        };
+        let gap = |found_ms: u64, limit_ms: u64| {
+            Some(Staleness::Gap { found_nanos: found_ms * 1_000_000, limit_nanos: limit_ms * 1_000_000 })
+        };
+        assert_eq!(s.arbiter.silence_limit_nanos(), 200_000_000);
+        assert_eq!((reasons(&mut s, "cccc+"), s.arbiter.staleness(0)), (vec![Reason::Stale], gap(125, 100)));
+        s.take('N');
+        assert_eq!((reasons(&mut s, "cccccc+++"), s.arbiter.staleness(1)), (vec![Reason::Stable], None));
+        assert_eq!(s.arbiter.silence_limit_nanos(), 375_000_000);
+        s.take('N');
+        assert_eq!(reasons(&mut s, "cc+"), []);
+        s.header.stamp_nanos += 2 * SLOW_NANOS + 1_000_000;
+        assert_eq!((reasons(&mut s, "+"), s.arbiter.staleness(2)), (vec![Reason::Stale], gap(376, 375)));
+        // Another source has shown no pace.
+        s.take('E');
+        s.take('N');
+        assert_eq!((reasons(&mut s, "cc+"), s.arbiter.staleness(3)), (vec![Reason::Stale], gap(125, 100)));
+    }
+
+    #[test]
+    fn a_stale_grasp_names_its_limit() {
+        let options = ArbiterOptions::default();
+        let header = Header { valid_nanos: 50_000_000, ..Header::default() };
+        let said = |age_nanos| options.staleness_of(&header, age_nanos).map(|staleness| staleness.to_string());
+        assert_eq!(said(50_000_000), None);
+        let [expired, old, future] = [60_000_000, 312_000_000, u64::MAX].map(|age| said(age).expect("stale"));
+        assert_eq!(expired, "a frame was 60.0 ms old, and expired after 50.0 ms (set by its machine)");
+        assert_eq!(old, "a frame was 312.0 ms old, expected at most 200.0 ms (max_age_ms)");
+        assert!(future.contains("future"), "{future}");
     }
 
     #[test]

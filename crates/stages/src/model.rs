@@ -11,11 +11,11 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::approach::ApproachPrior;
-use crate::classifier::{Classifier, Verdict};
+use crate::classifier::{Classifier, Predictor, Verdict};
 use crate::day::{DayMemory, DayModel, GraspPlace};
-use crate::encoder::{FeatureExtractor, FeltReading};
+use crate::encoder::{FeatureExtractor, FeltReading, Scaling};
 use crate::hand::Hand;
-use crate::out_of_distribution::{TrainingRange, Violation};
+use crate::out_of_distribution::{TrainingRange, Violation, quantities, short};
 use crate::own_lifts::{Adapt, Looked, OwnLifts};
 use crate::probe::{GraspHistory, ProbeModel, pad_newtons, signals};
 use crate::shift_test::numbers;
@@ -285,6 +285,53 @@ impl Model {
     pub fn violations(&self, phase: Phase, reading: &FeltReading<'_>) -> Vec<Violation> {
         let range = self.training_range_in(phase);
         range.map_or(Vec::new(), |range| range.violations(&self.features, reading.joints, reading.contacts))
+    }
+
+    /// Names pads and joints in its limits: files of older versions hold their numbers.
+    pub fn name_quantities(&mut self, hand: &Hand) {
+        let names = quantities(hand);
+        let probes = [&mut self.squeezed, &mut self.test_lifted].into_iter().flatten();
+        let ranges = std::iter::once(&mut self.training_range).chain(probes.map(|probe| &mut probe.training_range));
+        for range in ranges {
+            for (limits, quantity) in range.limits.iter_mut().zip(&names) {
+                limits.quantity.clone_from(&quantity.name);
+            }
+        }
+    }
+
+    /// The two values of pads and joints in the feature of a settled frame that speak most against the grasp, for people. Only
+    /// trees can tell.
+    pub fn speak_against(&self, hand: &Hand, values: &[f64]) -> Option<String> {
+        let trees = match &self.classifier.predictor {
+            Predictor::Boosting(trees) => trees,
+            Predictor::Blend(blend) => &blend.trees,
+            Predictor::Svm(_) => return None,
+        };
+        if values.len() != trees.n_features {
+            return None;
+        }
+        let mut against = Vec::new();
+        for (idx, contribution) in trees.contributions(values).into_iter().enumerate() {
+            if contribution < 0.0 {
+                against.push((contribution, idx));
+            }
+        }
+        against.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let names = self.features.value_names(hand);
+        // A name with a dot is of a pad or joint; a word of the histogram or a wrench has none.
+        against.retain(|(_, idx)| names[*idx].contains('.'));
+        let mut said = Vec::new();
+        for (_, idx) in against.into_iter().take(2) {
+            let (mean, deviation) = match &self.features.scaling {
+                Some(Scaling { mean, per_deviation }) if per_deviation[idx] > 0.0 => {
+                    (mean[idx], 1.0 / per_deviation[idx])
+                }
+                Some(Scaling { mean, .. }) => (mean[idx], 0.0),
+                None => (0.0, 1.0),
+            };
+            said.push(format!("{} is {}", names[idx], short(values[idx] * deviation + mean)));
+        }
+        if said.is_empty() { None } else { Some(format!("most against it: {}", said.join(", "))) }
     }
 
     /// Whether it judges anything but settled grasps.

@@ -16,7 +16,7 @@ use std::ops::RangeInclusive;
 use serde::{Deserialize, Serialize};
 
 use crate::encoder::FeatureExtractor;
-use crate::hand::Hand;
+use crate::hand::{Hand, Pad};
 use blindgrasp_messages::{Contact, Fault, MAX_PADS};
 
 /// The limits of a model's training grasps.
@@ -57,7 +57,7 @@ impl fmt::Display for Violation {
 }
 
 /// Four significant digits.
-fn short(value: f64) -> String {
+pub(crate) fn short(value: f64) -> String {
     // Without the sign of a zero.
     let text = (format!("{value:.3e}").parse::<f64>().unwrap_or(value) + 0.0).to_string();
     if text.len() > 12 { format!("{value:.3e}") } else { text }
@@ -148,17 +148,17 @@ pub fn quantities(hand: &Hand) -> Vec<Quantity> {
         |name: String, resolution| Quantity { name, possible: 0.0..=f64::INFINITY, resolution, gain_resolution: 0.0 };
     let force = |name| Quantity { gain_resolution: FORCE_GAIN_RESOLUTION, ..quantity(name, FORCE_RESOLUTION_NEWTONS) };
     let mut quantities = Vec::new();
-    for (idx, joint) in hand.joints.iter().enumerate() {
-        let name = format!("position of joint {idx}, {}", joint.kind.unit());
+    for joint in &hand.joints {
+        let name = format!("position of joint {}, {}", joint.name, joint.kind.unit());
         let resolution = ANGLE_RESOLUTION_RAD * joint.kind.per_radian();
         quantities.push(Quantity { possible: joint.lower..=joint.upper, ..quantity(name, resolution) });
     }
-    for (idx, joint) in hand.joints.iter().enumerate().filter(|(_, joint)| joint.coupling.is_some()) {
-        let name = format!("breakaway of joint {idx}, {}", joint.kind.unit());
+    for joint in hand.joints.iter().filter(|joint| joint.coupling.is_some()) {
+        let name = format!("breakaway of joint {}, {}", joint.name, joint.kind.unit());
         let resolution = ANGLE_RESOLUTION_RAD * joint.kind.per_radian();
         quantities.push(Quantity { possible: f64::NEG_INFINITY..=f64::INFINITY, ..quantity(name, resolution) });
     }
-    for pad in 0..hand.pads.len() {
+    for Pad { name: pad, .. } in &hand.pads {
         let of_pad: [Quantity; N_PAD_QUANTITIES] = [
             force(format!("load of pad {pad}, newtons")),
             quantity(format!("contacts of pad {pad}"), CONTACTS_RESOLUTION),
@@ -278,14 +278,14 @@ mod tests {
         let e = |squared_mm: f64| libm::exp(-squared_mm / 400.0);
         let mass = 0.75 * (1.0 + e(1600.0)) + 0.25 * (e(900.0) + e(100.0));
         for (name, expected) in [
-            ("position of joint 1", 1.4),
-            ("breakaway of joint 4", 0.2),
-            ("load of pad 0", 0.0),
-            ("load of pad 1", 4.0),
-            ("contacts of pad 1", 2.0),
-            ("greatest force on a cell of pad 1", 3.0),
-            ("greatest over mean force on the cells of pad 1", 1.5),
-            ("spread of the load of pad 1", spread),
+            ("position of joint finger_1,", 1.4),
+            ("breakaway of joint distal_1,", 0.2),
+            ("load of pad palm,", 0.0),
+            ("load of pad finger_1,", 4.0),
+            ("contacts of pad finger_1", 2.0),
+            ("greatest force on a cell of pad finger_1", 3.0),
+            ("greatest over mean force on the cells of pad finger_1", 1.5),
+            ("spread of the load of pad finger_1", spread),
             ("greatest distance", 0.01),
             ("mass", mass),
         ] {

@@ -338,8 +338,8 @@ impl SensorMemory {
 /// The frames of a grasp until the hand has settled, as far as the detectors need them.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct GraspSummary {
-    /// Joint angles of the last open frame.
-    open_joints_rad: Vec<f64>,
+    /// The joints of the last open frame, rad or m.
+    open_joints: Vec<f64>,
     /// For each pad: mean, mean of squares and greatest reading of its cells in the open frames, newtons.
     open_newtons: Vec<[f64; 3]>,
     n_open: u32,
@@ -369,7 +369,7 @@ impl GraspSummary {
     pub fn add(&mut self, hand: &Hand, phase: Phase, joints: &[f64], contacts: &[Contact], cells_newtons: &[f64]) {
         match phase {
             Phase::Open => {
-                self.open_joints_rad = joints.to_vec();
+                self.open_joints = joints.to_vec();
                 self.open_newtons.resize(hand.pads.len(), [0.0; 3]);
                 self.n_open += 1;
                 for (of, pad) in self.open_newtons.iter_mut().zip(&hand.pads) {
@@ -391,7 +391,7 @@ impl GraspSummary {
 
     /// When a joint stopped that is now at `value`, if it closed evenly before.
     fn stalled(&self, hand: &Hand, joint: usize, value: f64) -> f64 {
-        let Some(open) = self.open_joints_rad.get(joint) else { return NEVER };
+        let Some(open) = self.open_joints.get(joint) else { return NEVER };
         let so_far = || std::iter::once(*open).chain(self.closing_rad.iter().map(|joints| joints[joint]));
         let fastest = so_far()
             .zip(so_far().skip(1))
@@ -417,7 +417,7 @@ impl GraspSummary {
         for (idx, (angle, joint)) in joints.iter().zip(&hand.joints).enumerate() {
             let breakaway =
                 joint.coupling.as_ref().map_or(0.0, |coupling| angle - coupling.ratio * joints[coupling.follows_idx]);
-            let open = self.open_joints_rad.get(idx).copied();
+            let open = self.open_joints.get(idx).copied();
             values.extend([*angle, open.unwrap_or(NEVER), breakaway, self.stalled(hand, idx, *angle)]);
         }
         let loads = pad_loads(hand, contacts);

@@ -8,7 +8,7 @@ use blindgrasp_messages::{
     TactileFrameHead,
 };
 
-use crate::contacts::{ContactFinder, ContactSummary, clip_to_limits};
+use crate::contacts::{ContactFinder, ContactSummary, clip_to_limits, invalid_reading};
 use crate::day::GraspPlace;
 use crate::encoder::FeltReading;
 use crate::hand::Hand;
@@ -32,6 +32,21 @@ pub fn find_contacts<'a>(
             contacts.clear();
             (ContactSummary { fault: Fault::Malformed, ..ContactSummary::default() }, None)
         }
+    }
+}
+
+/// What makes the frame faulty that [`find_contacts`] has just read, for people: joint, cell or links by their names.
+pub fn explain_fault(
+    hand: &Hand,
+    finder: &ContactFinder,
+    summary: &ContactSummary,
+    parts: Option<&FrameParts<'_>>,
+) -> Option<String> {
+    let FrameParts { joints, cells_newtons, .. } = parts?;
+    match summary.fault {
+        Fault::WrongLength | Fault::InvalidValue => invalid_reading(hand, joints, cells_newtons),
+        Fault::NoContact => finder.self_contact(hand, cells_newtons),
+        _ => None,
     }
 }
 

@@ -87,6 +87,9 @@ pub struct OwnLiftsSummary {
     pub n_outside: usize,
     /// The bounds of drops of this robot; `None` if no lift is made.
     pub promise: Option<Promise>,
+    /// Whether some of the lifts are simulated. Models of earlier versions do not say so.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub in_simulation: bool,
 }
 
 impl TrainingSummary {

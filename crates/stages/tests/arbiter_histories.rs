@@ -7,6 +7,8 @@ use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter, Probe};
 use rayon::prelude::*;
 
 const STEP_NANOS: u64 = 10_000_000;
+/// The distance of the frames of a slow hand, more than the limit of others.
+const SLOW_NANOS: u64 = 125_000_000;
 
 /// How an input differs from the settled, stable prediction that comes next in the same grasp; [`Input::after`] says it of each
 /// letter. The inputs of histories with a probe, and of those with a lift that is watched, are fewer so that they may be longer.
@@ -15,6 +17,7 @@ type Step = char;
 const STEPS: &str = "+-?ceNnFM=~GBLRHEWo!iUZXd";
 const STEPS_WITH_PROBE: &str = "+-?ceNM=LEo!ZqpltTd";
 const STEPS_WHILE_LIFTING: &str = "+eNM~LEo!UZXdawv";
+const STEPS_OF_SLOW_HANDS: &str = "+sSgG=NLEoX";
 
 /// An input as the arbiter gets it. A silence and a cut link have the header and the grasp of the input before them.
 #[derive(Debug, Clone)]
@@ -46,7 +49,7 @@ impl Input {
         let prediction = match step {
             '-' | '~' => unstable,
             '?' => Prediction { unsure: true, ..unstable },
-            'c' => Prediction { phase: Phase::Closing, ..stable },
+            'c' | 's' => Prediction { phase: Phase::Closing, ..stable },
             'e' => Prediction { phase: Phase::Ended, ..stable },
             'q' => Prediction { phase: Phase::Squeezed, ..stable },
             'p' => Prediction { phase: Phase::Squeezed, ..unstable },
@@ -76,6 +79,8 @@ impl Input {
             'M' => header.made_by += 1,
             '=' | '~' => header.stamp_nanos = header.stamp_nanos.saturating_sub(STEP_NANOS),
             'G' => header.stamp_nanos += options.max_gap_nanos,
+            's' | 'S' => header.stamp_nanos += SLOW_NANOS - STEP_NANOS,
+            'g' => header.stamp_nanos += 3 * SLOW_NANOS,
             'B' => header.stamp_nanos = header.stamp_nanos.saturating_sub(2 * STEP_NANOS),
             'L' => header.seq += 1,
             'R' => header.seq = header.seq.saturating_sub(1),
@@ -112,6 +117,29 @@ impl Input {
         (now.epoch, now.hand_id, now.seq) == (before.epoch, before.hand_id, before.seq + 1)
             && now.stamp_nanos >= before.stamp_nanos
     }
+}
+
+/// How far apart the inputs of a grasp may be that is decided at the last input: the option, or three times the median of the
+/// last nine distances of inputs of an undecided grasp that followed each other in its epoch, if that is more, at most 1 s.
+fn gap_limit_nanos(history: &[Input], decided: &[(usize, u64)], options: &ArbiterOptions) -> u64 {
+    let samples: Vec<(usize, &Input)> = history.iter().enumerate().filter(|(_, input)| input.is_sample()).collect();
+    let mut distances = Vec::new();
+    for pair in samples.windows(2).rev() {
+        let [(_, before), (now_idx, now)] = [pair[0], pair[1]];
+        let (epoch, of_last) = (now.header.epoch, samples.last().map(|(_, last)| last.header.epoch));
+        let id = now.prediction.grasp_id;
+        let is_decided = decided
+            .iter()
+            .any(|(idx, decided_id)| *decided_id == id && *idx < now_idx && history[*idx].header.epoch == epoch);
+        let is_distance = before.grasp() == now.grasp() && now.follows(before) && !is_decided;
+        let nanos = now.header.stamp_nanos.saturating_sub(before.header.stamp_nanos);
+        if of_last == Some(epoch) && is_distance && nanos > 0 && distances.len() < 9 {
+            distances.push(nanos);
+        }
+    }
+    distances.sort_unstable();
+    let of_source = if distances.len() == 9 { (3 * distances[4]).min(1_000_000_000) } else { 0 };
+    options.max_gap_nanos.max(of_source)
 }
 
 fn is_plain_prediction(input: &Input, options: &ArbiterOptions) -> bool {
@@ -172,8 +200,9 @@ fn may_lift(history: &[Input], decided: &[(usize, u64)], options: &ArbiterOption
         }
         Some(previous) => previous.step != 'U' && grasp.first().is_some_and(|first| first.follows(previous)),
     };
+    let limit_nanos = gap_limit_nanos(history, decided, options);
     let is_unbroken = grasp.windows(2).all(|pair| {
-        pair[1].follows(&pair[0]) && pair[1].header.stamp_nanos - pair[0].header.stamp_nanos <= options.max_gap_nanos
+        pair[1].follows(&pair[0]) && pair[1].header.stamp_nanos - pair[0].header.stamp_nanos <= limit_nanos
     });
     // The row goes back to the first input of as many different times as there are votes.
     let mut times = Vec::new();
@@ -377,6 +406,16 @@ fn no_history_lifts_against_the_specification_and_each_grasp_is_decided_once() {
         // Nothing; a grasp with one vote less than it needs; a grasp that is decided.
         let beginnings = [0, votes as usize - 1, votes as usize].map(|n_stable| "+".repeat(n_stable));
         explore(options, STEPS, &beginnings, 5);
+    }
+}
+
+#[test]
+fn no_history_of_a_slow_hand_lifts_after_a_gap_that_is_long_for_this_hand() {
+    for votes in [1, 2] {
+        let options = ArbiterOptions { votes, ..ArbiterOptions::default() };
+        // Its pace is not known yet; it is known; it was known, and the hand is faster now.
+        let beginnings = ["ssssss", "ssssssssss", "scccccssssscc"].map(String::from);
+        explore(options, STEPS_OF_SLOW_HANDS, &beginnings, 5);
     }
 }
 

@@ -82,10 +82,11 @@ pub enum Event {
 /// One reading of all joints and cells.
 #[derive(Debug, Clone, PartialEq, Default, Deserialize)]
 pub struct Reading {
-    /// Radians, or metres for a joint that slides, in the hand's order.
+    /// Radians, or metres for a joint that slides, in the hand's order. A missing one is not a number, and refused.
+    #[serde(deserialize_with = "with_missing")]
     pub joints: Vec<f64>,
     /// Force on each cell, pad after pad in the hand's order, newtons (or the unit of the hand's layout). A missing one, `null`
-    /// in a line, is not a number.
+    /// or `NaN` in a line, is not a number.
     #[serde(deserialize_with = "with_missing")]
     pub cells_newtons: Vec<f64>,
     pub phase: Phase,
@@ -107,11 +108,14 @@ pub struct Reading {
     /// The object's name. It counts in frames of the phases kept and dropped.
     #[serde(default)]
     pub object: Option<String>,
+    /// The name or the identity of the hand that sends, if the sender says it.
+    #[serde(default)]
+    pub hand: Option<String>,
 }
 
 fn with_missing<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Vec<f64>, D::Error> {
-    let cells: Vec<Option<f64>> = Deserialize::deserialize(deserializer)?;
-    Ok(cells.into_iter().map(|cell| cell.unwrap_or(f64::NAN)).collect())
+    let numbers: Vec<Option<f64>> = Deserialize::deserialize(deserializer)?;
+    Ok(numbers.into_iter().map(|number| number.unwrap_or(f64::NAN)).collect())
 }
 
 impl Reading {
@@ -190,7 +194,10 @@ impl RefusalKind {
 /// Why a driver cannot work.
 #[derive(Debug, thiserror::Error)]
 pub enum DriverError {
-    #[error("cannot listen on {address}: {source}; give another address, or end what listens there")]
+    #[error(
+        "cannot listen on {address}: {source}; end what listens there, or give each graph an address of its own, and its \
+         bridge the same one (--set SOURCE.address=unix:PATH, --address unix:PATH)"
+    )]
     Listen { address: String, source: std::io::Error },
     #[error("'{key}' is no key expression of Zenoh: {why}")]
     Key { key: String, why: String },
@@ -238,6 +245,20 @@ impl ExpectedHand {
                 .map(|pad| ExpectedPad { name: pad.name.clone(), n_cells: pad.cells.len() })
                 .collect(),
             cell_unit: hand.cell_unit.word(),
+        }
+    }
+
+    /// A reading that does not say that it is of another hand: a left and a right hand have as many cells.
+    ///
+    /// # Errors
+    /// It names another hand.
+    pub fn check(&self, reading: Reading) -> Result<Reading, Refusal> {
+        match &reading.hand {
+            Some(found) if *found != self.hand && *found != self.hand_id => Err(Refusal::malformed(format!(
+                "the frame is of the hand {found}: expected {} (hand_id {})",
+                self.hand, self.hand_id
+            ))),
+            _ => Ok(reading),
         }
     }
 }

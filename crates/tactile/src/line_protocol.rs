@@ -34,6 +34,7 @@ pub fn parse(line: &[u8]) -> Result<Reading, Refusal> {
     if !text.trim_start().starts_with('{') {
         return Err(Refusal::malformed("not a frame: expected an object with joints, cells_newtons and phase".into()));
     }
+    let text = &*with_null_for_nan(text);
     let reading: Reading =
         serde_json::from_str(text).map_err(|error| Refusal::malformed(format!("not a frame: {error}")))?;
     match reading.object.as_ref().map(String::len) {
@@ -45,6 +46,21 @@ pub fn parse(line: &[u8]) -> Result<Reading, Refusal> {
 }
 
 const NAME_TOO_LONG: usize = MAX_NAME_BYTES + 1;
+
+/// A line as JSON has it: Python's json writes NaN for a number that is none, which the standard does not know.
+pub fn with_null_for_nan(text: &str) -> Cow<'_, str> {
+    if !text.contains("NaN") {
+        return text.into();
+    }
+    let (mut plain, mut in_name) = (String::new(), false);
+    for part in text.split_inclusive('"') {
+        plain += &if in_name { part.into() } else { part.replace("NaN", "null") };
+        if !part.ends_with("\\\"") {
+            in_name = !in_name;
+        }
+    }
+    plain.into()
+}
 
 /// A line without its checksum: the last key `crc`, if it has one, is the CRC-32 of the line without that key.
 fn without_checksum(text: &str) -> Result<Cow<'_, str>, String> {

@@ -64,6 +64,7 @@ impl Replay {
                     stamp_nanos: Some(frame.header.stamp_nanos),
                     day: Some(message.day),
                     object: None,
+                    hand: None,
                 });
                 return Ok(());
             }

@@ -248,7 +248,7 @@ impl Stream {
         let mut n_reads = 0;
         loop {
             let connection = self.connection.as_mut()?;
-            if let Some(event) = connection.next_line(now_nanos) {
+            if let Some(event) = connection.next_line(&self.hand, now_nanos) {
                 return Some(event);
             }
             if let Some(end) = &connection.end {
@@ -270,7 +270,7 @@ impl Stream {
                 n_reads += 1;
                 // A sender of empty lines, or of a line without end, must not keep the source from its other work.
                 if n_reads == MAX_READS {
-                    return connection.next_line(now_nanos);
+                    return connection.next_line(&self.hand, now_nanos);
                 }
                 continue;
             }
@@ -372,7 +372,7 @@ impl TactileDriver for Stream {
 }
 
 impl Connection {
-    fn next_line(&mut self, now_nanos: u64) -> Option<Event> {
+    fn next_line(&mut self, hand: &ExpectedHand, now_nanos: u64) -> Option<Event> {
         let piece = self.lines.next_piece()?;
         self.n_lines += 1;
         Some(match piece {
@@ -380,7 +380,7 @@ impl Connection {
                 let why = "longer than any frame of this hand: see max_line_bytes of the greeting".to_string();
                 Event::Refused(Refusal { kind: RefusalKind::Oversized, why })
             }
-            Piece::Line(line, since_nanos) => match parse(line) {
+            Piece::Line(line, since_nanos) => match parse(line).and_then(|reading| hand.check(reading)) {
                 Ok(reading) => {
                     self.has_read = true;
                     self.last_frame_nanos = now_nanos;

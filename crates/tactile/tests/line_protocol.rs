@@ -68,7 +68,7 @@ fn a_line_is_a_frame_or_is_refused_in_words() {
     for (line, word) in [
         (&br#"{"joints":[0.5],"cells_newtons":[0,1],"phase":"open","grasp":1}"#[..], "unknown field `grasp`"),
         (br#"{"joints":[0.5],"phase":"open"}"#, "missing field `cells_newtons`"),
-        (br#"{"joints":[0.5],"cells_newtons":[NaN,1],"phase":"open"}"#, "expected value"),
+        (br#"{"joints":[0.5],"cells_newtons":[Infinity,1],"phase":"open"}"#, "expected value"),
         (br#"{"joints":[0.5],"cells_newtons":[1e999,1],"phase":"open"}"#, "number out of range"),
         (br#"{"joints":[0.5],"cells_newtons":[0,1],"phase":"close"}"#, "unknown variant `close`"),
         (br#"{"joints":[0.5],"cells_newtons":[0,1],"phase":"open","seq":-1}"#, "seq"),
@@ -96,6 +96,17 @@ fn a_line_with_a_checksum_is_refused_if_a_byte_changes() {
     }
     let amid = line.replace("1429317490", "x").replace("seq", "crc");
     assert!(parse(amid.as_bytes()).expect_err("no number").why.contains("last key"));
+}
+
+#[test]
+fn a_number_that_is_none_is_a_missing_one() {
+    let line = r#"{"joints":[NaN],"cells_newtons":[0,NaN,null],"phase":"open","object":"a NaN"}"#;
+    let found = parse(line.as_bytes()).expect("a frame");
+    assert!(found.joints[0].is_nan() && found.cells_newtons[1].is_nan() && found.cells_newtons[2].is_nan());
+    assert_eq!((found.cells_newtons[0], found.object.as_deref()), (0.0, Some("a NaN")));
+    for wrong in ["Infinity", "nan"] {
+        parse(line.replace("[NaN]", &format!("[{wrong}]")).as_bytes()).expect_err(wrong);
+    }
 }
 
 #[test]

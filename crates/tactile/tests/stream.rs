@@ -49,6 +49,27 @@ fn a_socket_file_is_the_users_own_and_one_that_was_left_is_replaced() {
 }
 
 #[test]
+fn frames_of_another_hand_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("hand.sock");
+    let mut source = source(&path);
+    source.open(0).expect("free");
+    let mut bridge = UnixStream::connect(&path).expect("connected");
+    assert_eq!(events(&mut source, SEC), [Event::Began]);
+    let of_hand = |hand: &str| {
+        let frame = std::str::from_utf8(FRAME).expect("UTF-8");
+        frame.replacen('{', &format!("{{\"hand\":\"{hand}\","), 1)
+    };
+    bridge.write_all(of_hand("left").as_bytes()).expect("sent");
+    let [Event::Refused(refusal)] = &events(&mut source, SEC)[..] else { panic!("expected a refusal") };
+    assert_eq!(refusal.why, "the frame is of the hand left: expected test (hand_id 0)");
+    for own in ["test", "0"] {
+        bridge.write_all(of_hand(own).as_bytes()).expect("sent");
+        assert!(matches!(events(&mut source, SEC)[..], [Event::Frame(..)]), "{own}");
+    }
+}
+
+#[test]
 fn a_client_that_says_nothing_gives_way_and_a_sender_does_not() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("hand.sock");

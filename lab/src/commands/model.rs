@@ -125,13 +125,13 @@ fn own_lifts_lines(model: &Model) -> Vec<String> {
         let (a, b) = (correction.a, correction.b.abs());
         format!("when {}, log-odds are {a:.3} x those of the model {sign} {b:.3} ({losses})", own.look)
     };
-    let mut lines =
-        vec![format!("by {n_lifts} lifts of {n_objects} objects on this robot, {n_kept} kept: {corrected}")];
+    let world = if own.in_simulation { "in simulation" } else { "on this robot" };
+    let mut lines = vec![format!("by {n_lifts} lifts of {n_objects} objects {world}, {n_kept} kept: {corrected}")];
     if own.n_outside > 0 {
         lines.push(format!("limits are wider, because they held {} of these grasps", own.n_outside));
     }
     lines.push(match &own.promise {
-        Some(promise) => format!("of these lifts it makes {}; promised on this robot: {promise}", own.n_lifted),
+        Some(promise) => format!("of these lifts it makes {}; promised {world}: {promise}", own.n_lifted),
         None => "of these lifts it makes none".into(),
     });
     lines

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -14,6 +13,7 @@ use serde::Serialize;
 use super::object_list::list;
 use super::trials::physics;
 use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text, word};
+use blindgrasp_cli::stop_signal;
 use blindgrasp_grasps::dataset::REPORT_METADATA;
 use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
 use blindgrasp_objects::{objects_id, objects_named};
@@ -133,10 +133,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         made_by: format!("simulation of objects '{}' with {}", arguments.objects, serde_json::to_string(&options)?),
         version: env!("CARGO_PKG_VERSION").into(),
     };
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
-    }
+    let stop = stop_signal()?;
     let simulation = Simulation { hand: &hand, objects: &objects, options: &options };
     let job = Job { simulation, info: &info, stop: &stop };
     let report = if is_file { job.to_file(out, arguments.overwrite)? } else { job.to_folder(out, arguments)? };
@@ -200,15 +197,19 @@ impl Job<'_> {
                 Err(error) => return Err(error.into()),
             };
             report.add(&done);
-            if out.exists() {
-                bail!("{why}: {} stays as it was (--out with a folder keeps what is done)", out.display());
-            }
             if report.n_grasps == 0 {
                 bail!("{why}: nothing is recorded");
             }
+            // What took hours must not take the place of a whole recording, nor be lost.
+            let mut of_before = String::new();
+            if let Ok(before) = out.canonicalize() {
+                let kept = before.with_extension("before.mcap");
+                std::fs::rename(&before, &kept).with_context(|| format!("cannot make {}", kept.display()))?;
+                of_before = format!(", the recording that was there in {}", kept.display());
+            }
             writer.finish(&report)?;
             bail!(
-                "{why}: the first {} of {} grasps are in {} (--out with a folder goes on from what is done)",
+                "{why}: the first {} of {} grasps are in {}{of_before} (--out with a folder goes on from what is done)",
                 report.n_grasps,
                 self.simulation.options.n_grasps,
                 out.display()

@@ -8,6 +8,7 @@ use clap::Args;
 use super::evaluate::print_label;
 use super::{Outcome, check_new, completions, number_in, percent, print_line};
 use blindgrasp_grasps::dataset::hand_of;
+use blindgrasp_grasps::reading::SELF_CONTACT;
 use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, TrainingSummary, train};
 use blindgrasp_messages::Fault;
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -213,12 +214,13 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
         ));
         lines.extend(policy.promise.map(|promise| format!("promised for new objects {world}: {promise}")));
     }
-    let n_unfelt = model.training.n_excluded.get(Fault::NoContact.as_str()).copied().unwrap_or(0);
-    if !model.training.policies.is_empty() && n_unfelt > 0 {
+    let [n_unfelt, n_self_contacts] = [Fault::NoContact.as_str(), SELF_CONTACT]
+        .map(|reason| model.training.n_excluded.get(reason).copied().unwrap_or(0));
+    if !model.training.policies.is_empty() && n_unfelt + n_self_contacts > 0 {
         lines.push(format!(
-            "attempts without contact, and their time, are not counted: no cell feels {n_unfelt} of the {} grasps, and a robot \
-             holds such a grasp and tries again",
-            n_unfelt + model.training.n_grasps
+            "attempts without contact, and their time, are not counted: of the {} grasps, no cell feels {n_unfelt}, and \
+             {n_self_contacts} are felt only on links that touch each other; a robot holds such a grasp and tries again",
+            n_unfelt + n_self_contacts + model.training.n_grasps
         ));
     }
     lines

@@ -411,6 +411,7 @@ fn predictions_that_do_not_fit_are_refused() {
     let figures = ["--figures", utf8(folder.path())];
     fails(&[&["evaluate", RECORDING, "--predictions", utf8(&table)], &figures[..]].concat(), "is an input");
     fails(&["evaluate", RECORDING, "--predictions", utf8(&table), "--probe", "squeeze"], "give a model as well");
+    fails(&["evaluate", MODEL, RECORDING, "--probe", "test_lift"], "judges no test_lifted grasps");
 }
 
 /// A robot's own table: the report must not say that it was simulated.

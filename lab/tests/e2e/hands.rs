@@ -362,6 +362,42 @@ fn a_hand_is_made_from_the_urdf_of_a_whole_robot() {
 }
 
 #[test]
+fn a_urdf_in_which_nothing_moves_is_told_why() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let refused = |urdf: &str, more: &[&str]| {
+        std::fs::write(folder.path().join("gripper.urdf"), urdf).expect("written");
+        run_in(folder.path(), &other(more), 1).1
+    };
+    let said = refused(XACRO, &[]);
+    assert!(said.contains("gripper.urdf: it is a xacro file: give it a name that ends in .xacro"), "{said}");
+    let locked = "<robot name=\"r\"><link name=\"base\"/><link name=\"jaw\"/><joint name=\"slide\" type=\"prismatic\">\
+                  <parent link=\"base\"/><child link=\"jaw\"/><axis xyz=\"0 1 0\"/><limit lower=\"0\" upper=\"0\"/></joint></robot>";
+    let said = refused(locked, &[]);
+    assert!(said.contains("0 joints, expected 1 to 32: joint 'slide' has the limits 0 and 0"), "{said}");
+    let said = refused(&locked.replace("prismatic", "fixed"), &[]);
+    assert!(said.contains("no joint of the type revolute, continuous or prismatic"), "{said}");
+    let said = refused(&locked.replace("upper=\"0\"", "upper=\"0.1\""), &["--base", "jaw"]);
+    assert!(said.contains("below --base jaw nothing moves: name a link above it"), "{said}");
+    let said = refused(&locked.replace("upper=\"0\"", "upper=\"1.3\""), &[]);
+    assert!(said.contains("0..1.3") && said.contains("give the first link of the hand with --base LINK"), "{said}");
+}
+
+#[test]
+fn a_mesh_of_another_computer_is_copied_beside_the_hand() {
+    let folder = tempfile::tempdir().expect("a folder");
+    package(folder.path());
+    let moved = XACRO.replace("package://my_gripper", "/home/someone/ws");
+    std::fs::write(folder.path().join("my_gripper/urdf/gripper.urdf.xacro"), moved).expect("written");
+    let new = ["new", "hand", "mine", "--urdf", URDF, "--open", "jaw=0.04", "--grid", "left_jaw=4x3"];
+    let (_, stderr) = run_in(folder.path(), &new, 0);
+    assert!(
+        stderr.contains("mesh /home/someone/ws/meshes/jaw.obj is not there") && stderr.contains("is taken"),
+        "{stderr}"
+    );
+    assert!(folder.path().join("mine/meshes/jaw.obj").is_file());
+}
+
+#[test]
 fn a_hand_is_drawn_by_itself() {
     let folder = tempfile::tempdir().expect("a folder");
     let html = folder.path().join("hand.html");
@@ -383,4 +419,76 @@ fn a_hand_is_drawn_by_itself() {
         error.contains("joint 'joint_1' is 9 rad, expected -0.1960 to 1.6100; 9 degrees are 0.1571 rad"),
         "{error}"
     );
+}
+
+/// A palm with three fingers that close to its axis, and more links and joints.
+fn fingers_urdf(more: &str) -> String {
+    let mut fingers = String::new();
+    for (idx, place) in
+        ["0.05 0 0' rpy='0 0 0", "-0.025 0.0433 0' rpy='0 0 2.0944", "-0.025 -0.0433 0' rpy='0 0 -2.0944"]
+            .iter()
+            .enumerate()
+    {
+        fingers += &format!(
+            "<link name='f{idx}'><collision><origin xyz='0 0 0.05'/><geometry><box size='0.012 0.02 0.09'/></geometry></collision>\
+             </link><joint name='j{idx}' type='revolute'><parent link='palm'/><child link='f{idx}'/><origin xyz='{place}'/>\
+             <axis xyz='0 -1 0'/><limit lower='-0.4' upper='1.2'/></joint>"
+        );
+    }
+    format!(
+        "<robot name='fingers'><link name='palm'><collision><origin xyz='0 0 -0.015'/><geometry><cylinder radius='0.05' \
+         length='0.03'/></geometry></collision></link>{fingers}{more}</robot>"
+    )
+}
+
+#[test]
+fn a_wrist_beside_a_palm_with_a_pad_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let wrist = "<link name='forearm'/><joint name='wrist' type='revolute'><parent link='forearm'/><child link='palm'/>\
+                 <axis xyz='0 1 0'/><limit lower='-0.7' upper='0.5'/></joint>";
+    std::fs::write(folder.path().join("gripper.urdf"), fingers_urdf(wrist)).expect("written");
+    let fingers = ["--grid", "f0=3x2", "--grid", "f1=3x2", "--grid", "f2=3x2"];
+    for palm in [&[][..], &["--grid", "palm=3x3"]] {
+        let (_, stderr) = run_in(folder.path(), &other(&[&fingers[..], palm].concat()), 1);
+        assert!(stderr.contains("joint 'wrist' moves all pads together"), "{palm:?}: {stderr}");
+    }
+}
+
+#[test]
+fn cells_on_sensor_frames_belong_to_the_finger() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (mut frames, mut table) = (String::new(), "link,x,y,z,nx,ny,nz\n".to_owned());
+    for idx in 0..3 {
+        frames += &format!(
+            "<link name='s{idx}'/><joint name='s{idx}' type='fixed'><parent link='f{idx}'/><child link='s{idx}'/><origin \
+             xyz='-0.006 0 0.07' rpy='0 -1.5708 0'/></joint>"
+        );
+        table += &format!("s{idx},0,0,0,0,0,1\n");
+    }
+    std::fs::write(folder.path().join("gripper.urdf"), fingers_urdf(&frames)).expect("written");
+    std::fs::write(folder.path().join("cells.csv"), table).expect("written");
+    let (_, stderr) = run_in(folder.path(), &other(&["--cells", "cells.csv"]), 0);
+    assert!(stderr.contains("3 pads of the table are on links without collision shapes"), "{stderr}");
+    assert!(!stderr.contains("where they feel nothing"), "{stderr}");
+    let layout = std::fs::read_to_string(folder.path().join("other/other.yaml")).expect("a layout");
+    assert!(layout.contains("{name: \"s1\", link: \"f1\"") && layout.contains("at_m: [-0.006, 0, 0.07]"), "{layout}");
+}
+
+#[test]
+fn a_jaw_closes_on_a_fixed_one() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let jaw = "<geometry><box size='0.008 0.024 0.09'/></geometry></collision>";
+    let urdf = format!(
+        "<robot name='jaw'><link name='base'><collision><origin xyz='0 0 -0.02'/><geometry><box size='0.06 0.03 0.04'/></geometry>\
+         </collision><collision><origin xyz='0.012 0 0.045'/>{jaw}</link><link name='jaw'><collision><origin xyz='0 0 0.045'/>\
+         {jaw}</link><joint name='j' type='revolute'><parent link='base'/><child link='jaw'/><origin xyz='-0.006 0 0'/>\
+         <axis xyz='0 -1 0'/><limit lower='-0.17' upper='1.74'/></joint></robot>"
+    );
+    std::fs::write(folder.path().join("gripper.urdf"), urdf).expect("written");
+    let (stdout, stderr) = run_in(folder.path(), &other(&["--grid", "base=4x3", "--grid", "jaw=4x3"]), 0);
+    assert!(stderr.contains("--open j=1.74"), "{stderr}");
+    assert!(stdout.contains("planned grasps"), "{stdout}");
+    // The cells of the fixed jaw look at the other one.
+    let layout = std::fs::read_to_string(folder.path().join("other/other.yaml")).expect("a layout");
+    assert!(layout.contains("normal: [-1, 0, 0]") && layout.contains("normal: [1, 0, 0]"), "{layout}");
 }

@@ -342,6 +342,23 @@ fn each_bad_row_is_named() {
 }
 
 #[test]
+fn a_cell_may_be_missing_where_the_layout_says_so() {
+    let folder = Folder::new();
+    let row = "cup,,yes,0.5,,2\ncup,,no,NaN,null,2\n";
+    let advice =
+        "column 'l_2': expected a number from 0 to 1000000, found nothing; a pad whose cells may be missing says";
+    folder.refuse(format!("{TABLE}{row}"), &[], 1, &[advice]);
+    let layout = LAYOUT.replacen("{name: left,", "{name: left, may_be_missing: true,", 1);
+    assert_ne!(layout, LAYOUT);
+    folder.write("pincer.yaml", layout);
+    let report = folder.import(format!("{TABLE}{row}"), &[]);
+    assert_eq!(report["n_grasps"], 4);
+    let cells = folder.exported("/tactile").pop().expect("a frame")["data"]["cells_newtons"].clone();
+    assert_eq!(cells, json!([0.0, 0.0, 2.0]));
+    folder.refuse(format!("{TABLE}cup,,yes,0.5,1,\n"), &[], 1, &["column 'r_1': expected a number", "found nothing"]);
+}
+
+#[test]
 fn bad_rows_are_counted_beyond_those_shown() {
     let folder = Folder::new();
     let bad: String = (0..25).map(|_| "cup,,yes,0.5,1.25,x\n").collect();

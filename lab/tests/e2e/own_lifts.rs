@@ -6,10 +6,13 @@ use std::process::Stdio;
 use crate::common::live::{PATIENT, changed, grasps, listening};
 use crate::common::python::utf8;
 use crate::common::{
-    Graph, HAND, MODEL, blindgrasp, dataflow, json_lines, json_of, project, run, signal, text, wait_until,
+    Graph, HAND, MODEL, RECORDING, blindgrasp, dataflow, fails, json_lines, json_of, project, run, signal, text,
+    wait_until,
 };
 use crate::import::pincer;
+use blindgrasp_learning::training::{Examples, adapt_on};
 use blindgrasp_messages::{Header, Phase, Stamped, TactileFrame};
+use blindgrasp_stages::label::Label;
 use blindgrasp_stages::own_lifts::Adapt;
 use blindgrasp_stages::{Hand, Judge, Model};
 use rand::{RngExt, SeedableRng};
@@ -128,6 +131,22 @@ fn the_outcomes_of_a_bridge_are_labels_and_correct_a_model() {
         (0..8).fold(bridge_lines(5, 40, 0.0, true), |lines, idx| lines.replace(&format!("thing-{idx}"), "thing"));
     let (one, _) = imported("one", &of_one, 0);
     assert!(adapt(&model, &one, 1).1.contains("all lifts are of one object"), "one object");
+
+    // Simulated lifts are named as such. The paper's label says nothing of a lift.
+    let layout = Hand::load(Path::new(&hand)).expect("a hand");
+    let mut read = Examples::read(&layout, &[own.clone().into()], |_, _| {}).expect("examples");
+    let known = Model::load(Path::new(&model)).expect("a model");
+    read.labels.insert(Label::Lift, 1);
+    adapt_on(&layout, &known, &read, &[]).expect("adapted").save(Path::new(&adapted)).expect("saved");
+    let shown = text(&run(&["model", "show", &adapted], 0).stdout).to_owned();
+    assert!(shown.contains("objects in simulation") && !shown.contains("on this robot"), "{shown}");
+    read.labels.insert(Label::WrenchSpace, 1);
+    let error = adapt_on(&layout, &known, &read, &[]).expect_err("refused").to_string();
+    assert!(error.contains("have the paper's label"), "{error}");
+    fails(
+        &["model", "adapt", "models/barrett-bh8-280-lifts.json", RECORDING, "--out", &at("none.json")],
+        "have the paper's label",
+    );
 
     // Lines that do not fit the hand, or that are no lines, are named.
     for (lines, expected) in [

@@ -97,30 +97,42 @@ fn info_adds_up_and_agrees_with_the_simulations_report() {
 
 #[test]
 fn a_file_is_interrupted_whole_and_leaves_nothing_else() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let out = folder.path().join("big.mcap");
+    // The last one is of a terminal that is closed.
+    for signal in [rustix::process::Signal::INT, rustix::process::Signal::HUP] {
+        let folder = tempfile::tempdir().expect("a folder");
+        let out = folder.path().join("big.mcap");
+        let said = interrupted(&out, signal);
+        // The signal may come after the first grasps.
+        let is_empty = said.contains("interrupted: nothing is recorded");
+        assert!(is_empty || said.contains("interrupted: the first "), "{said}");
+        assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), usize::from(!is_empty));
+        if !is_empty {
+            run(&["info", out.to_str().expect("UTF-8")], 0);
+            let before = std::fs::read(&out).expect("a recording");
+            let said = interrupted(&out, signal);
+            let kept = if said.contains("nothing is recorded") { out } else { folder.path().join("big.before.mcap") };
+            assert!(std::fs::read(&kept).expect("the recording before") == before, "{said}");
+        }
+    }
+}
+
+/// What a simulation says that gets a signal once it has begun.
+fn interrupted(out: &Path, signal: rustix::process::Signal) -> String {
     let child = blindgrasp()
-        .args(["simulate", "--objects", "box", "--grasps", "1000000", "--out", out.to_str().expect("UTF-8")])
+        .args(["simulate", "--objects", "box", "--grasps", "1000000", "--overwrite"])
+        .args(["--out", out.to_str().expect("UTF-8")])
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
         .expect("started");
-    let partial = folder.path().join("big.mcap.partial");
-    while !partial.exists() {
+    let partial = format!("{}.partial", out.display());
+    while !Path::new(&partial).exists() {
         std::thread::sleep(Duration::from_millis(2));
     }
-    rustix::process::kill_process(rustix::process::Pid::from_child(&child), rustix::process::Signal::INT)
-        .expect("signalled");
+    rustix::process::kill_process(rustix::process::Pid::from_child(&child), signal).expect("signalled");
     let output = child.wait_with_output().expect("ended");
     assert_eq!(output.status.code(), Some(1));
-    // The signal may come after the first grasps.
-    let said = text(&output.stderr);
-    let is_empty = said.contains("interrupted: nothing is recorded");
-    assert!(is_empty || said.contains("interrupted: the first "), "{said}");
-    assert_eq!(std::fs::read_dir(folder.path()).expect("a folder").count(), usize::from(!is_empty));
-    if !is_empty {
-        run(&["info", out.to_str().expect("UTF-8")], 0);
-    }
+    text(&output.stderr).to_owned()
 }
 
 #[test]

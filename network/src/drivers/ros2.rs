@@ -251,6 +251,11 @@ impl Ros2 {
         if angles.len() != names.len() {
             return Err(format!("{} names and {} positions", names.len(), angles.len()));
         }
+        for wanted in &self.topics.hand_joints {
+            if names.iter().filter(|name| **name == wanted.name).count() > 1 {
+                return Err(format!("joint '{}' stands in it twice", wanted.name));
+            }
+        }
         let mut has_any = false;
         for (wanted, joint) in self.topics.hand_joints.iter().zip(&mut self.joints) {
             if let Some(idx) = names.iter().position(|name| *name == wanted.name) {
@@ -730,6 +735,11 @@ mod tests {
         assert!(refused(large).contains("it has 10485760 bytes"));
         let torn = joints(&driver, &["a", "b"], &[0.1], 1);
         assert_eq!(why(take(&mut driver, Topic::Joints, torn, 1, None)), "/joint_states: 2 names and 1 positions");
+        let twice = joints(&driver, &["a", "a"], &[0.1, 0.2], 1);
+        assert_eq!(
+            why(take(&mut driver, Topic::Joints, twice, 1, None)),
+            "/joint_states: joint 'a' stands in it twice"
+        );
         let phase = message(&driver, Topic::Phase, &"asleep", 1);
         assert_eq!(why(take(&mut driver, Topic::Phase, phase, 1, None)), "/phase: 'asleep' is no phase");
     }

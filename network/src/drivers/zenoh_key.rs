@@ -10,8 +10,10 @@ use blindgrasp_messages::TactileFrame;
 use blindgrasp_recording::cdr;
 use blindgrasp_ros::network::Network;
 use blindgrasp_ros_node::node::{Rights, open};
-use blindgrasp_tactile::line_protocol::parse;
-use blindgrasp_tactile::{Arrival, DriverError, Event, Place, Reading, Refusal, RefusalKind, TactileDriver};
+use blindgrasp_tactile::line_protocol::{max_line_bytes, parse};
+use blindgrasp_tactile::{
+    Arrival, DriverError, Event, ExpectedHand, Place, Reading, Refusal, RefusalKind, TactileDriver,
+};
 use zenoh::Wait;
 
 /// The bytes of a frame, none if there are too many, and their number.
@@ -24,7 +26,7 @@ pub(crate) struct ZenohKey {
     network: Network,
     key: String,
     max_bytes: usize,
-    hand_id: u64,
+    hand: ExpectedHand,
     has_begun: bool,
     inbox: Option<Arc<Inbox<FrameBytes>>>,
     /// From the sender's numbers of frames to those of the source.
@@ -33,54 +35,25 @@ pub(crate) struct ZenohKey {
 }
 
 impl ZenohKey {
-    /// A driver for a key expression. A frame of more than `max_bytes` is refused, and one that names another hand.
+    /// A driver for a key expression. A frame that is too long is refused, and one that names another hand.
     ///
     /// # Errors
     /// It is no key expression.
-    pub(crate) fn new(network: Network, key: String, max_bytes: usize, hand_id: u64) -> Result<Self, DriverError> {
+    pub(crate) fn new(network: Network, key: String, hand: ExpectedHand) -> Result<Self, DriverError> {
         let error = zenoh::key_expr::KeyExpr::new(key.as_str()).err().map(|error| error.to_string());
         match error {
             Some(why) => Err(DriverError::Key { key, why }),
             None => Ok(ZenohKey {
                 network,
                 key,
-                max_bytes,
-                hand_id,
+                max_bytes: max_line_bytes(&hand),
+                hand,
                 has_begun: false,
                 inbox: None,
                 offset: 0,
                 pending: None,
             }),
         }
-    }
-}
-
-impl ZenohKey {
-    /// The reading in a message `blindgrasp_msgs/msg/TactileFrame`.
-    ///
-    /// # Errors
-    /// It is no such message, or of another hand.
-    fn frame_of(&self, bytes: &[u8]) -> Result<Reading, Refusal> {
-        let found = cdr::decode::<TactileFrame>(bytes);
-        let found = found.map_err(|why| Refusal::malformed(format!("not a TactileFrame in CDR: {why}")))?;
-        let (header, frame) = (found.header, found.message);
-        if header.hand_id != 0 && header.hand_id != self.hand_id {
-            return Err(Refusal::malformed(format!(
-                "the hand is {:016x}, expected {:016x}",
-                header.hand_id, self.hand_id
-            )));
-        }
-        Ok(Reading {
-            joints: frame.joints,
-            cells_newtons: frame.cells_newtons,
-            phase: frame.phase,
-            senses: frame.senses,
-            grasp_id: Some(frame.grasp_id),
-            seq: Some(header.seq),
-            stamp_nanos: Some(header.stamp_nanos).filter(|nanos| *nanos > 0),
-            day: Some(frame.day).filter(|day| *day > 0),
-            object: None,
-        })
     }
 }
 
@@ -140,8 +113,8 @@ impl TactileDriver for ZenohKey {
             let why = format!("{n_bytes} bytes, a frame of this hand has at most {}", self.max_bytes);
             return refused(RefusalKind::Oversized, why);
         }
-        let reading = if bytes.starts_with(&CDR_BEGIN) { self.frame_of(&bytes) } else { parse(bytes.trim_ascii_end()) };
-        match reading {
+        let reading = if bytes.starts_with(&CDR_BEGIN) { frame_of(&bytes) } else { parse(bytes.trim_ascii_end()) };
+        match reading.and_then(|reading| self.hand.check(reading)) {
             Ok(mut reading) => {
                 let last = place.seq;
                 // A sender that was switched off and on counts from its first number again: a gap before that frame.
@@ -164,4 +137,27 @@ impl TactileDriver for ZenohKey {
     }
 
     fn refused(&mut self, _refusal: &Refusal, _now_nanos: u64) {}
+}
+
+/// The reading in a message `blindgrasp_msgs/msg/TactileFrame`.
+///
+/// # Errors
+/// It is no such message.
+fn frame_of(bytes: &[u8]) -> Result<Reading, Refusal> {
+    let found = cdr::decode::<TactileFrame>(bytes);
+    let found = found.map_err(|why| Refusal::malformed(format!("not a TactileFrame in CDR: {why}")))?;
+    let (header, frame) = (found.header, found.message);
+    let hand = Some(header.hand_id).filter(|hand_id| *hand_id != 0).map(|hand_id| format!("{hand_id:016x}"));
+    Ok(Reading {
+        joints: frame.joints,
+        cells_newtons: frame.cells_newtons,
+        phase: frame.phase,
+        senses: frame.senses,
+        grasp_id: Some(frame.grasp_id),
+        seq: Some(header.seq),
+        stamp_nanos: Some(header.stamp_nanos).filter(|nanos| *nanos > 0),
+        day: Some(frame.day).filter(|day| *day > 0),
+        object: None,
+        hand,
+    })
 }

@@ -10,7 +10,6 @@ use blindgrasp_operators::connection::{ConnectionParams, warn_if_open};
 use blindgrasp_operators::tactile_source::{AskedDriver, check_with, robot_driver, work_with};
 use blindgrasp_ros_node::node::topic_name;
 use blindgrasp_stages::hand::Hand;
-use blindgrasp_tactile::line_protocol::max_line_bytes;
 use blindgrasp_tactile::{ExpectedHand, TactileDriver};
 use serde::Deserialize;
 
@@ -70,8 +69,7 @@ fn driver(asked: &AskedDriver<'_>) -> anyhow::Result<Box<dyn TactileDriver>> {
         "zenoh" => {
             let params: ZenohParams = parse_params(asked.params)?;
             let key = params.key.context("driver zenoh needs the param 'key', like hand/frames")?;
-            let max_bytes = max_line_bytes(&ExpectedHand::of(asked.hand));
-            Ok(Box::new(ZenohKey::new(params.connection.network()?, key, max_bytes, asked.hand.id())?))
+            Ok(Box::new(ZenohKey::new(params.connection.network()?, key, ExpectedHand::of(asked.hand))?))
         }
         _ => robot_driver(asked),
     }

@@ -127,10 +127,21 @@ impl Runner<'_> {
         Ok(())
     }
 
-    /// The graph of the dataflow file that is expected, or of the usual one.
+    /// The graph of the dataflow file that is expected, or of the usual one. The command's overrides come before those that are
+    /// expected.
     pub(super) fn graph(&self, expected: &Expectations, overrides: &[Override]) -> anyhow::Result<Graph> {
         let file = dataflow::load(expected.dataflow.as_deref().unwrap_or(self.dataflow))?;
-        fitting(&file, overrides, dataflow::Scope::Everything, OnMisfit::Warn)
+        let mut all = overrides.to_vec();
+        for text in &expected.set {
+            let set = Override::parse(text).map_err(|reason| anyhow::anyhow!("set of the expectations: {reason}"))?;
+            let is_given = |given: &Override| {
+                given.param == set.param && (given.node.is_none() || set.node.is_none() || given.node == set.node)
+            };
+            if !overrides.iter().any(is_given) {
+                all.push(set);
+            }
+        }
+        fitting(&file, &all, dataflow::Scope::Everything, OnMisfit::Warn)
     }
 
     /// The decisions of a replay. Lost samples are an error.

@@ -9,6 +9,8 @@ use serde_json::json;
 use super::case::Runner;
 use super::{Outcome, project_recordings, settings};
 use crate::commands::{print_line, print_text, write_out};
+use blindgrasp_cli::graph_file::checked;
+use blindgrasp_graph::dataflow::{self, Graph, Scope};
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_replay::checks::{Decisions, describe_changes};
 use blindgrasp_replay::expectations::{Expectations, path_of};
@@ -36,11 +38,7 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
     }
     let mut written = Vec::new();
     for recording in recordings {
-        // The recording's own dataflow file is not known yet: all are replayed with the one of the command.
-        let graph = runner.graph(&Expectations::default(), runner.overrides)?;
-        let (_fed, decisions) = runner.decide(recording, &graph, runner.overrides)?;
-        let mut expected = decisions.to_expectations();
-        expected.dataflow = other_dataflow(runner.dataflow, recording)?;
+        let (graph, decisions, expected) = replayed(runner, recording)?;
         let remarks: BTreeMap<u64, String> =
             decisions.dropped().map(|grasp_id| (grasp_id, "its lift dropped the object".into())).collect();
         let path = path_of(recording);
@@ -78,6 +76,28 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
     Ok(Outcome::Done)
 }
 
+/// The graph that a recording is replayed with, what it decides, and the expectations that follow.
+fn replayed(runner: &Runner<'_>, recording: &Path) -> anyhow::Result<(Graph, Decisions, Expectations)> {
+    // The recording's own dataflow file is not known yet: all are replayed with the one of the command, and with the params of
+    // the recorded graph.
+    let file_graph = checked(&dataflow::load(runner.dataflow)?, &[], Scope::Everything)?;
+    let set = settings::recorded(&RecordingReader::open(recording)?, &file_graph);
+    let graph = runner.graph(&Expectations { set, ..Expectations::default() }, runner.overrides)?;
+    let (_fed, decisions) = runner.decide(recording, &graph, runner.overrides)?;
+    if let Some((grasp_id, reason)) = decisions.held_as_another() {
+        bail!(
+            "{}: the replay holds grasp {grasp_id} as {}, so it says nothing of the graph that was recorded: give that graph's \
+             --dataflow, or --set hand=HAND.yaml and --set model=MODEL.json",
+            recording.display(),
+            reason.as_str()
+        );
+    }
+    let mut expected = decisions.to_expectations();
+    expected.dataflow = other_dataflow(runner.dataflow, recording)?;
+    expected.set = other_params(&file_graph, &graph, recording)?;
+    Ok((graph, decisions, expected))
+}
+
 fn absolute(path: &Path) -> anyhow::Result<PathBuf> {
     path.canonicalize().with_context(|| path.display().to_string())
 }
@@ -91,11 +111,40 @@ fn other_dataflow(dataflow: &Path, recording: &Path) -> anyhow::Result<Option<Pa
     if given == Path::new("dataflow.yaml") || is_the_projects {
         return Ok(None);
     }
-    let n_common = dataflow.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
+    Ok(Some(relative(&dataflow, folder)))
+}
+
+/// The params that have other values than in the dataflow file, with paths relative to the recording's folder. The recording
+/// takes the place of the source.
+fn other_params(file_graph: &Graph, graph: &Graph, recording: &Path) -> anyhow::Result<Vec<String>> {
+    let recording = absolute(recording)?;
+    let folder = recording.parent().unwrap_or(Path::new("/"));
+    let mut sets = Vec::new();
+    for node in graph.nodes.iter().filter(|node| !node.is_source()) {
+        for (name, value) in &node.params {
+            if file_graph.node(&node.id).and_then(|node| node.params.get(name)) == Some(value) {
+                continue;
+            }
+            let text = match value.as_str() {
+                Some(path) if path.starts_with('/') => {
+                    Path::new(".").join(relative(Path::new(path), folder)).display().to_string()
+                }
+                Some(text) => text.into(),
+                None => value.to_string(),
+            };
+            sets.push(format!("{}.{name}={text}", node.id));
+        }
+    }
+    Ok(sets)
+}
+
+/// A path as seen from a folder. Both begin at the root.
+fn relative(path: &Path, folder: &Path) -> PathBuf {
+    let n_common = path.components().zip(folder.components()).take_while(|(a, b)| a == b).count();
     let mut relative = PathBuf::new();
     for _ in folder.components().skip(n_common) {
         relative.push("..");
     }
-    relative.extend(dataflow.components().skip(n_common));
-    Ok(Some(relative))
+    relative.extend(path.components().skip(n_common));
+    relative
 }

@@ -1,9 +1,32 @@
 //! The settings that a recorded graph had and the tested graph has not: a common reason for differing samples.
 
+use std::path::Path;
+
 use blindgrasp_graph::dataflow::Graph;
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_stages::model::Model;
 use serde_json::Value;
+
+/// The params of the recorded graph that have other values than in the dataflow file, as they stand after `--set`. A file that is
+/// not there any more is left out.
+pub(super) fn recorded(recording: &RecordingReader, file_graph: &Graph) -> Vec<String> {
+    let about = recording.metadata("graph").and_then(|about| about.get("graph"));
+    let recorded: Value = about.and_then(|text| serde_json::from_str(text).ok()).unwrap_or_default();
+    let mut sets = Vec::new();
+    for then in recorded["nodes"].as_array().into_iter().flatten() {
+        let node = then["id"].as_str().and_then(|id| file_graph.node(id)).filter(|node| !node.is_source());
+        let (Some(node), Some(params)) = (node, then["params"].as_object()) else { continue };
+        for (name, value) in params {
+            let is_known = node.description.params.iter().any(|param| param.name == *name);
+            let text = value.as_str().map_or_else(|| value.to_string(), String::from);
+            let is_gone = is_path(value) && !Path::new(&text).exists();
+            if is_known && !is_gone && node.params.get(name) != Some(value) && !value.is_null() {
+                sets.push(format!("{}.{name}={text}", node.id));
+            }
+        }
+    }
+    sets
+}
 
 /// A note on the parameters and models that differ; `None` if none do, or the recording does not say.
 pub(super) fn differing(recording: &RecordingReader, graph: &Graph) -> Option<String> {

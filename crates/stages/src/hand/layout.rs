@@ -132,6 +132,14 @@ impl Layout {
 
     fn build(self, tree: Tree, least_cells: usize) -> Result<Hand, String> {
         let joints = self.joints(&tree)?;
+        if joints.is_empty() {
+            let stand = if tree.fixed_joints.is_empty() {
+                "the URDF has no joint of the type revolute, continuous or prismatic".into()
+            } else {
+                tree.fixed_joints.join("; ")
+            };
+            return Err(format!("0 joints, expected 1 to {MAX_JOINTS}: {stand}"));
+        }
         let reference_link_idx = link_idx(&tree, &self.reference_link, "reference_link")?;
         let pads = self.pads(&tree)?;
         let cells = pads.iter().flat_map(|pad| &pad.cells);

@@ -14,6 +14,9 @@ const N_CORNERS_OF_PADDED: usize = 200;
 /// The same of a link without: its surface is within some 2 % of its size, and distances to it take a quarter of the time.
 const N_CORNERS_OF_OTHERS: usize = 48;
 
+/// The longest mesh of a hand's link. One in millimetres is far longer.
+const MAX_MESH_M: f64 = 2.0;
+
 /// The convex hull of a mesh file, whose coordinates are multiplied by `scale`, for a link with or without a pad.
 ///
 /// # Errors
@@ -26,6 +29,14 @@ pub(super) fn hull(path: &Path, scale: [f64; 3], has_pad: bool) -> Result<Shared
         .iter()
         .map(|point| Vector::new(point.x * scale[0], point.y * scale[1], point.z * scale[2]))
         .collect();
+    let length_m = (0..3).map(|axis| extent(&points, axis)).fold(0.0, f64::max);
+    if length_m > MAX_MESH_M {
+        return Err(format!(
+            "mesh {} is {length_m:.0} m long, expected at most {MAX_MESH_M} m: write scale=\"0.001 0.001 0.001\" in its <mesh> \
+             if it is in millimetres (inches: 0.0254)",
+            path.display()
+        ));
+    }
     let refused = |reason: &dyn std::fmt::Display| format!("{}: it has no convex hull: {reason}", path.display());
     let hull = |points: &[Vector]| try_convex_hull(points).map_err(|error| refused(&error));
     let (mut corners, mut triangles) = hull(&points)?;
@@ -39,6 +50,15 @@ pub(super) fn hull(path: &Path, scale: [f64; 3], has_pad: bool) -> Result<Shared
     let shape = SharedShape::convex_mesh(corners, &triangles);
     // A flat mesh has a hull without a volume; a cube of a tenth of a millimetre has 1e-12 m³.
     shape.filter(|shape| shape.mass_properties(1.0).mass() > 1e-12).ok_or_else(|| refused(&"it is flat"))
+}
+
+fn extent(points: &[Vector], axis: usize) -> f64 {
+    let (mut least, mut most) = (f64::INFINITY, f64::NEG_INFINITY);
+    for point in points {
+        least = least.min(point[axis]);
+        most = most.max(point[axis]);
+    }
+    most - least
 }
 
 /// Directions that are spread evenly over the sphere (a Fibonacci lattice).
@@ -76,6 +96,47 @@ pub fn find(named: &str, urdf_folder: &Path) -> Result<PathBuf, String> {
              beside one of these, or in ROS_PACKAGE_PATH or AMENT_PREFIX_PATH"
         )
     })
+}
+
+/// The file that a URDF names, as [`find`] does; or, for a path of another computer or system, the file in the URDF's folder or
+/// beside it with the longest same end of its path, in whatever case.
+///
+/// # Errors
+/// Neither is there.
+pub fn find_alike(named: &str, urdf_folder: &Path) -> Result<PathBuf, String> {
+    let found = find(named, urdf_folder);
+    if found.as_ref().is_ok_and(|file| file.is_file()) {
+        return found;
+    }
+    let plain = named.replace('\\', "/").replace("%20", " ");
+    let parts: Vec<&str> = plain.split('/').filter(|part| !matches!(*part, "" | "." | "..")).collect();
+    let folder = std::path::absolute(urdf_folder).unwrap_or_else(|_| urdf_folder.into());
+    for start in 0..parts.len() {
+        for root in folder.ancestors().take(2) {
+            if let Some(file) = file_below(root, &parts[start..]) {
+                return Ok(file);
+            }
+        }
+    }
+    found.and_then(|_| {
+        Err(format!("{named}: no such file, and none in {} or beside it whose path ends alike", folder.display()))
+    })
+}
+
+/// The file at this path below a folder; a name in another case is taken if there is none in this one.
+fn file_below(folder: &Path, parts: &[&str]) -> Option<PathBuf> {
+    let Some((first, rest)) = parts.split_first() else { return folder.is_file().then(|| folder.into()) };
+    if let Some(file) = file_below(&folder.join(first), rest) {
+        return Some(file);
+    }
+    for entry in std::fs::read_dir(folder).ok()?.flatten() {
+        if entry.file_name().to_string_lossy().to_lowercase() == first.to_lowercase()
+            && let Some(file) = file_below(&entry.path(), rest)
+        {
+            return Some(file);
+        }
+    }
+    None
 }
 
 /// Folders in which a package of ROS may be: a folder above `from` or beside one of those that has its name, or whose
@@ -150,6 +211,45 @@ mod tests {
             let of_ball_m3 = 4.0 / 3.0 * std::f64::consts::PI * 0.02_f64.powi(3);
             assert!((least_volume..1.0).contains(&(volume_m3 / of_ball_m3)), "{}", volume_m3 / of_ball_m3);
         }
+    }
+
+    #[test]
+    fn a_mesh_in_millimetres_is_named_with_the_scale_to_set() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("ball.obj");
+        std::fs::write(&path, ball_obj()).expect("written");
+        let error = hull(&path, [1.0; 3], true).expect_err("40 m");
+        assert!(error.contains("ball.obj is 40 m long") && error.contains("scale=\"0.001 0.001 0.001\""), "{error}");
+    }
+
+    #[test]
+    fn a_mesh_of_another_computer_is_found_by_the_end_of_its_path() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let urdf = folder.path().join("urdf");
+        for name in ["urdf/m", "meshes/collision"] {
+            std::fs::create_dir_all(folder.path().join(name)).expect("made");
+        }
+        let [near, far] = ["urdf/m/tip one.stl", "meshes/collision/palm.stl"].map(|name| folder.path().join(name));
+        for file in [&near, &far] {
+            std::fs::write(file, "").expect("written");
+        }
+        for (named, expected) in [
+            ("m/tip one.stl", &near),
+            ("m\\tip one.stl", &near),
+            ("m/tip%20one.stl", &near),
+            ("M/Tip One.STL", &near),
+            ("package:///m/tip one.stl", &near),
+            ("/home/someone/ws/src/trio/m/tip one.stl", &near),
+            ("file://$(find trio)/m/tip one.stl", &near),
+            ("C:\\ws\\meshes\\collision\\palm.stl", &far),
+            ("package://nowhere/meshes/collision/palm.stl", &far),
+        ] {
+            let found = find_alike(named, &urdf).expect(named);
+            assert_eq!(found.canonicalize().expect("there"), expected.canonicalize().expect("there"), "{named}");
+        }
+        let error = find_alike("/home/someone/none.stl", &urdf).expect_err("none");
+        assert!(error.contains("none.stl: no such file, and none in"), "{error}");
+        assert!(find_alike("package://nowhere/none.stl", &urdf).expect_err("none").contains("'nowhere'"));
     }
 
     #[test]

@@ -28,7 +28,7 @@ use sha2::{Digest, Sha256};
 use layout::Layout;
 
 pub use kinematics::{CellPose, JointError};
-pub use meshes::{find as find_mesh, find_package};
+pub use meshes::{find as find_mesh, find_alike as find_mesh_alike, find_package};
 pub(crate) use self_collision::PosedShapes;
 pub use self_collision::pose_from_isometry;
 pub use urdf_part::{part_below, with_meshes_renamed};
@@ -491,7 +491,11 @@ impl Hand {
     pub fn without_cells(urdf_path: &Path, urdf: &str, bare: &BareHand) -> Result<Hand, HandError> {
         let folder = urdf_path.parent().unwrap_or(Path::new(""));
         let tree = urdf::parse(urdf_path, urdf, |link, mesh, scale| {
-            meshes::hull(&meshes::find(mesh, folder)?, scale, bare.padded_links.iter().any(|padded| padded == link))
+            meshes::hull(
+                &meshes::find_alike(mesh, folder)?,
+                scale,
+                bare.padded_links.iter().any(|padded| padded == link),
+            )
         })?;
         let mut hand = Layout::without_cells(&tree, bare).into_hand(urdf_path, tree, 0)?;
         hand.self_collision_pairs = self_collision::pairs(&hand);
@@ -553,7 +557,7 @@ impl Hand {
     }
 
     /// The joints' values of the open hand.
-    pub fn open_joints_rad(&self) -> Vec<f64> {
+    pub fn open_joints(&self) -> Vec<f64> {
         self.joints.iter().map(Joint::open).collect()
     }
 

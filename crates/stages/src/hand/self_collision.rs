@@ -94,7 +94,7 @@ pub fn pose_from_isometry(isometry: &Isometry3<f64>) -> Pose {
 /// The pairs to check: with shapes, not joined to each other, and apart in the open hand (links that overlap there are built into each
 /// other, as in MoveIt's setup assistant).
 pub(super) fn pairs(hand: &Hand) -> Vec<(usize, usize)> {
-    let Ok(palm_from_links) = hand.palm_from_links(&hand.open_joints_rad()) else {
+    let Ok(palm_from_links) = hand.palm_from_links(&hand.open_joints()) else {
         return Vec::new();
     };
     // Links that cannot move against each other count as one body, named after the link nearest to the root.

@@ -116,7 +116,12 @@ impl UrdfReading {
     fn enter(&mut self, element: &BytesStart<'_>) -> Result<(), String> {
         let name = element.name().as_ref().to_owned();
         if self.path.is_empty() && (name != "robot" || self.robot.is_some()) {
-            return Err(format!("not a URDF: expected XML with one <robot>, found <{name}>"));
+            let converter = if name == "mujoco" {
+                ": make a URDF of it with python3 -P -m blindgrasp.mjcf FILE.xml FILE.urdf"
+            } else {
+                ""
+            };
+            return Err(format!("not a URDF: expected XML with one <robot>, found <{name}>{converter}"));
         }
         self.path.push(name);
         if self.path.len() > MAX_DEPTH {
@@ -361,6 +366,7 @@ mod tests {
             ("a robot", "found none"),
             ("<hand/>", "one <robot>, found <hand>"),
             ("<robot/><robot/>", "one <robot>, found <robot>"),
+            ("<mujoco/>", "found <mujoco>: make a URDF of it with python3 -P -m blindgrasp.mjcf"),
             ("<robot>\n<link name='a'>", "cut off: it ends inside of <link>"),
             ("<robot>\n<!-- ", "line 2: not a URDF, or cut off"),
             ("<robot>\n<link name='a'>\n</robot>", "line 3: not a URDF, or cut off"),

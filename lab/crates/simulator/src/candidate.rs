@@ -180,7 +180,7 @@ pub(crate) fn candidate_rng(seed: u64, candidate: u64, part: u64) -> ChaCha8Rng 
 }
 
 /// Explores and finds the contacts with the object and of links with each other. `None` without a contact with the object.
-fn grasp(
+pub(crate) fn grasp(
     mechanism: &Mechanism<'_>,
     object: &Object,
     start: &Start,
@@ -396,7 +396,7 @@ mod tests {
         let mechanism = Mechanism::new(&hand);
         let ball = Object::new("ball".into(), "ball".into(), SharedShape::ball(0.045), 300.0, false);
         let start = Start {
-            open_joints_rad: hand.posture([("spread", std::f64::consts::FRAC_PI_3)]).expect("in range"),
+            open_joints: hand.posture([("spread", std::f64::consts::FRAC_PI_3)]).expect("in range"),
             palm_from_object_rotation: UnitQuaternion::identity(),
             lateral_offset_m: [0.0, 0.0],
             back_off_m: 0.0,
@@ -419,7 +419,7 @@ mod tests {
         let mut middles_m = Vec::new();
         for aside_m in [-0.012, -0.004, 0.0, 0.004, 0.012] {
             let start = Start {
-                open_joints_rad: hand.open_joints_rad(),
+                open_joints: hand.open_joints(),
                 palm_from_object_rotation: UnitQuaternion::identity(),
                 lateral_offset_m: [aside_m, 0.0],
                 back_off_m: 0.02,

@@ -46,6 +46,7 @@ pub mod simulator;
 pub mod skin;
 pub mod soft_finger;
 pub mod tactile_sensor;
+pub mod touches;
 pub mod trial;
 pub mod wrench_space;
 

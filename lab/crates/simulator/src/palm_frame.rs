@@ -10,7 +10,7 @@ use parry3d_f64::shape::SharedShape;
 
 use crate::mechanism::Mechanism;
 use crate::pad_grid::extent;
-use crate::protocol::{ProtocolOptions, Start};
+use crate::protocol::{Exploration, ProtocolOptions, Start};
 use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::{Hand, JointError, pose_from_isometry};
 
@@ -88,7 +88,7 @@ pub fn idle_pads(hand: &Hand) -> Result<Vec<usize>, JointError> {
 /// The hand's joints do not fit together.
 pub fn self_pressing(hand: &Hand) -> Result<(f64, Option<(usize, usize)>), JointError> {
     const N_STEPS: usize = 20;
-    let postures = hand.closing_postures(&hand.open_joints_rad(), N_STEPS);
+    let postures = hand.closing_postures(&hand.open_joints(), N_STEPS);
     // The second half of an empty closing is always fingers on fingers.
     let postures = &postures[..=N_STEPS / 2];
     let mut pressing = Vec::new();
@@ -97,6 +97,42 @@ pub fn self_pressing(hand: &Hand) -> Result<(f64, Option<(usize, usize)>), Joint
     }
     let commonest = pressing.iter().max_by_key(|pair| pressing.iter().filter(|other| other == pair).count()).copied();
     Ok((pressing.len() as f64 / postures.len() as f64, commonest))
+}
+
+/// The pairs of links, by their indices, that touch each other as the hand closes on balls before the palm, if one of them bears
+/// a pad: what its cells feel there is no object.
+///
+/// # Errors
+/// The hand's joints do not fit together.
+pub fn pairs_that_meet(hand: &Hand) -> Result<BTreeSet<(usize, usize)>, JointError> {
+    let mechanism = Mechanism::new(hand);
+    let mut pairs = BTreeSet::new();
+    for radius_m in BALL_RADII_M {
+        for back_off_m in BACK_OFFS_M {
+            let Some(exploration) = close_on(&mechanism, &ball(radius_m), back_off_m)? else { continue };
+            for (a, b) in hand.touching_links(&exploration.posture(exploration.end))? {
+                if hand.pads.iter().any(|pad| pad.link_idx == a || pad.link_idx == b) {
+                    pairs.insert((a, b));
+                }
+            }
+        }
+    }
+    Ok(pairs)
+}
+
+fn ball(radius_m: f64) -> Object {
+    Object::new("ball".into(), "ball".into(), SharedShape::ball(radius_m), 1000.0, false)
+}
+
+/// The open hand closes on a ball before its palm.
+fn close_on(mechanism: &Mechanism<'_>, ball: &Object, back_off_m: f64) -> Result<Option<Exploration>, JointError> {
+    let start = Start {
+        open_joints: mechanism.hand.open_joints(),
+        palm_from_object_rotation: UnitQuaternion::identity(),
+        lateral_offset_m: [0.0; 2],
+        back_off_m,
+    };
+    mechanism.explore(ball, &start, &ProtocolOptions::default())
 }
 
 /// A frame that was tried.
@@ -112,20 +148,13 @@ impl Trial {
     fn of(hand: &Hand, link_from_palm: Isometry3<f64>) -> Result<Trial, JointError> {
         let hand = hand.with_palm_frame(link_from_palm);
         let mechanism = Mechanism::new(&hand);
-        let protocol = ProtocolOptions::default();
         let mut near = BTreeSet::new();
         let mut sum = 0.0;
         for radius_m in BALL_RADII_M {
-            let ball = Object::new("ball".into(), "ball".into(), SharedShape::ball(radius_m), 1000.0, false);
+            let ball = ball(radius_m);
             let mut most = 0.0_f64;
             for back_off_m in BACK_OFFS_M {
-                let start = Start {
-                    open_joints_rad: hand.open_joints_rad(),
-                    palm_from_object_rotation: UnitQuaternion::identity(),
-                    lateral_offset_m: [0.0; 2],
-                    back_off_m,
-                };
-                let Some(exploration) = mechanism.explore(&ball, &start, &protocol)? else { continue };
+                let Some(exploration) = close_on(&mechanism, &ball, back_off_m)? else { continue };
                 let palm_from_links = hand.palm_from_links(&exploration.posture(exploration.end))?;
                 let centre = exploration.palm_from_object * Point3::origin();
                 let felt = felt(&hand, &palm_from_links, &centre, radius_m);
@@ -202,7 +231,7 @@ fn balance(
 fn directions(hand: &Hand) -> Result<Vec<UnitVector3<f64>>, JointError> {
     let axes = [Vector3::z_axis(), Vector3::x_axis(), Vector3::y_axis()];
     let mut directions: Vec<UnitVector3<f64>> = axes.into_iter().flat_map(|axis| [axis, -axis]).collect();
-    let cells = hand.cells_in_palm(&hand.open_joints_rad())?;
+    let cells = hand.cells_in_palm(&hand.open_joints())?;
     let mean: Vector3<f64> =
         cells.iter().map(|cell| cell.normal_in_palm.into_inner()).sum::<Vector3<f64>>() / cells.len() as f64;
     let between = directions.iter().all(|axis| axis.dot(&mean) < 0.94 * mean.norm());
@@ -217,7 +246,7 @@ fn directions(hand: &Hand) -> Result<Vec<UnitVector3<f64>>, JointError> {
 fn frame_along(hand: &Hand, direction: &UnitVector3<f64>) -> Result<Isometry3<f64>, JointError> {
     let rotation = UnitQuaternion::rotation_between(&Vector3::z(), direction)
         .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI));
-    let postures = hand.closing_postures(&hand.open_joints_rad(), 2);
+    let postures = hand.closing_postures(&hand.open_joints(), 2);
     let palm_from_links = hand.palm_from_links(&postures[1])?;
     let middles = hand.pads.iter().map(|pad| (palm_from_links[pad.link_idx] * pad.middle_in_link_m()).coords);
     let middle = middles.sum::<Vector3<f64>>() / hand.pads.len() as f64;
@@ -244,7 +273,7 @@ pub fn odd_joints(hand: &Hand) -> Result<OddJoints, JointError> {
     /// Of a pad's motion, the part towards its normal.
     const LEAST_TOWARDS: f64 = 0.35;
     let mechanism = Mechanism::new(hand);
-    let palm_from_links = hand.palm_from_links(&hand.open_joints_rad())?;
+    let palm_from_links = hand.palm_from_links(&hand.open_joints())?;
     let opposed = mechanism.opposed_joints(&palm_from_links);
     let mut odd = OddJoints { sideways: Vec::new(), opposed: Vec::new() };
     let mut others = Vec::new();
@@ -330,6 +359,23 @@ mod tests {
         assert_eq!((odd.sideways, odd.opposed), (vec![hand.joint_idx("spread").expect("a joint")], vec![]));
         let odd = odd_joints(&built_in("parallel-gripper")).expect("fits");
         assert_eq!((odd.sideways, odd.opposed), (vec![], vec![]));
+    }
+
+    #[test]
+    fn links_that_meet_on_a_ball_are_named_if_they_bear_pads() {
+        let gripper = built_in("parallel-gripper");
+        assert_eq!(pairs_that_meet(&gripper).expect("fits"), BTreeSet::new());
+        // Spread by half a radian, finger 3 closes between the others.
+        let mut hand = built_in("barrett-bh8-280");
+        let spread = hand.joint_idx("spread").expect("a joint");
+        hand.joints[spread].open = Some(0.5);
+        let mut met = Vec::new();
+        for (a, b) in pairs_that_meet(&hand).expect("fits") {
+            met.push((hand.links[a].name.clone(), hand.links[b].name.clone()));
+        }
+        assert!(met.contains(&("distal_1".into(), "distal_3".into())), "{met:?}");
+        hand.pads.clear();
+        assert_eq!(pairs_that_meet(&hand).expect("fits"), BTreeSet::new());
     }
 
     #[test]

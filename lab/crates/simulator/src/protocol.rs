@@ -97,7 +97,7 @@ pub(crate) fn check_preshape_range(options: [&'static str; 2], [least, most]: [f
 #[derive(Debug, Clone)]
 pub struct Start {
     /// The joints before closing: preshape joints drawn, the others open.
-    pub open_joints_rad: Vec<f64>,
+    pub open_joints: Vec<f64>,
     /// Rotation of the object in the palm frame: direction and roll of the approach in one.
     pub palm_from_object_rotation: UnitQuaternion<f64>,
     /// The object's centre of mass off the palm's axis, x and y of the palm frame.
@@ -111,7 +111,7 @@ pub struct Start {
 pub struct Exploration {
     pub palm_from_object: Isometry3<f64>,
     /// The joints before closing.
-    pub open_joints_rad: Vec<f64>,
+    pub open_joints: Vec<f64>,
     /// The joints that closed, with their ends.
     pub joints: Vec<ClosingJoint>,
     /// The progress (radians of a leader) at which the last joint stopped.
@@ -121,13 +121,13 @@ pub struct Exploration {
 impl Exploration {
     /// The joints at a progress between 0 (open) and [`Exploration::end`] (settled).
     pub fn posture(&self, progress: f64) -> Vec<f64> {
-        posture(&self.open_joints_rad, &self.joints, progress)
+        posture(&self.open_joints, &self.joints, progress)
     }
 }
 
 /// Draws a random start.
 pub fn draw_start(hand: &Hand, options: &ProtocolOptions, rng: &mut impl rand::Rng) -> Start {
-    let open_joints_rad = hand
+    let open_joints = hand
         .joints
         .iter()
         .map(|joint| {
@@ -143,7 +143,7 @@ pub fn draw_start(hand: &Hand, options: &ProtocolOptions, rng: &mut impl rand::R
     let radius_m = options.lateral_offset_m * rng.random::<f64>().sqrt();
     let (sin, cos) = (std::f64::consts::TAU * rng.random::<f64>()).sin_cos();
     Start {
-        open_joints_rad,
+        open_joints,
         palm_from_object_rotation: random_rotation(rng),
         lateral_offset_m: [radius_m * cos, radius_m * sin],
         back_off_m: options.back_off_m,
@@ -174,14 +174,14 @@ impl Mechanism<'_> {
         start: &Start,
         options: &ProtocolOptions,
     ) -> Result<Option<Exploration>, JointError> {
-        if self.hand.self_collides(&start.open_joints_rad)? {
+        if self.hand.self_collides(&start.open_joints)? {
             return Ok(None);
         }
         let Some(mut palm_from_object) = self.approach(object, start, options)? else {
             return Ok(None);
         };
         palm_from_object.translation.vector.z += start.back_off_m;
-        self.close_from(object, palm_from_object, start.open_joints_rad.clone(), options).map(Some)
+        self.close_from(object, palm_from_object, start.open_joints.clone(), options).map(Some)
     }
 
     /// Closes the open hand around an object, which fingers of one motor may push.
@@ -192,22 +192,22 @@ impl Mechanism<'_> {
         &self,
         object: &Object,
         mut palm_from_object: Isometry3<f64>,
-        open_joints_rad: Vec<f64>,
+        open_joints: Vec<f64>,
         options: &ProtocolOptions,
     ) -> Result<Exploration, JointError> {
-        let mut joints = self.close(object, &palm_from_object, &open_joints_rad, options)?;
+        let mut joints = self.close(object, &palm_from_object, &open_joints, options)?;
         for _ in 0..MOST_PUSHES {
-            let posture = posture(&open_joints_rad, &joints, f64::INFINITY);
+            let posture = posture(&open_joints, &joints, f64::INFINITY);
             let Some(push) = self.push(object, &palm_from_object, &posture, &joints, options)? else { break };
             let pushed = Translation3::from(push) * palm_from_object;
-            if !self.is_apart(object, &pushed, &open_joints_rad)? {
+            if !self.is_apart(object, &pushed, &open_joints)? {
                 break;
             }
             palm_from_object = pushed;
-            joints = self.close(object, &palm_from_object, &open_joints_rad, options)?;
+            joints = self.close(object, &palm_from_object, &open_joints, options)?;
         }
         let end = joints.iter().map(|joint| joint.end).fold(0.0, f64::max);
-        Ok(Exploration { palm_from_object, open_joints_rad, joints, end })
+        Ok(Exploration { palm_from_object, open_joints, joints, end })
     }
 
     /// The way by which fingers of one motor push the object, until a finger that comes from the other side holds it: in the
@@ -303,7 +303,7 @@ impl Mechanism<'_> {
         start: &Start,
         options: &ProtocolOptions,
     ) -> Result<Option<Isometry3<f64>>, JointError> {
-        let palm_from_links = self.hand.palm_from_links(&start.open_joints_rad)?;
+        let palm_from_links = self.hand.palm_from_links(&start.open_joints)?;
         let [x, y] = start.lateral_offset_m;
         let rotation = start.palm_from_object_rotation;
         let at = |z: f64| {
@@ -331,7 +331,7 @@ impl Mechanism<'_> {
         &self,
         object: &Object,
         palm_from_object: &Isometry3<f64>,
-        open_joints_rad: &[f64],
+        open_joints: &[f64],
         options: &ProtocolOptions,
     ) -> Result<Vec<ClosingJoint>, JointError> {
         let mut closing = Closing {
@@ -348,8 +348,7 @@ impl Mechanism<'_> {
         let mut pair_due = vec![0.0; self.pairs.len()];
         loop {
             let progress = closing.progress;
-            closing.palm_from_links =
-                self.hand.palm_from_links(&posture(open_joints_rad, &closing.joints, progress))?;
+            closing.palm_from_links = self.hand.palm_from_links(&posture(open_joints, &closing.joints, progress))?;
             for (shape, due) in self.shapes.iter().zip(&mut shape_due) {
                 if *due <= progress {
                     *due = closing.look_at_shape(shape);
@@ -447,8 +446,8 @@ fn stop_m(options: &ProtocolOptions) -> f64 {
     options.touch_tolerance_m / 2.0
 }
 
-fn posture(open_joints_rad: &[f64], joints: &[ClosingJoint], progress: f64) -> Vec<f64> {
-    let mut posture = open_joints_rad.to_vec();
+fn posture(open_joints: &[f64], joints: &[ClosingJoint], progress: f64) -> Vec<f64> {
+    let mut posture = open_joints.to_vec();
     for joint in joints {
         posture[joint.joint_idx] += joint.rate * progress.min(joint.end);
     }

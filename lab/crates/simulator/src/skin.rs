@@ -138,7 +138,7 @@ mod tests {
     /// What the cells of the Barrett's palm feel of 4 N at a place of its frame.
     fn felt(bell: Bell, x_m: f64, y_m: f64) -> Vec<f64> {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let links = hand.palm_from_links(&hand.open_joints_rad()).expect("links");
+        let links = hand.palm_from_links(&hand.open_joints()).expect("links");
         let direction = -nalgebra::Vector3::z_axis();
         let link_idx = hand.pads[0].link_idx;
         let pressure = Pressure { link_idx, point_m: Point3::new(x_m, y_m, 0.0), direction, newtons: 4.0 };

@@ -1,19 +1,25 @@
 //! A hand on its way to a layout: the palm frame and the joints that are set before a grasp, where the user gave none.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_simulator::mechanism::Mechanism;
 use blindgrasp_simulator::pad_grid::pad_grid;
-use blindgrasp_simulator::palm_frame::{best_value, idle_pads, odd_joints, palm_fit, self_pressing};
+use blindgrasp_simulator::palm_frame::{best_value, idle_pads, odd_joints, pairs_that_meet, palm_fit, self_pressing};
+use blindgrasp_simulator::planner::PlannerOptions;
+use blindgrasp_simulator::touches::{Touch, all_touches, closings};
 use blindgrasp_stages::hand::{BareHand, Hand, Joint, Motion, PALM_FRAME, Pad};
-use nalgebra::{Isometry3, Point3};
+use nalgebra::{Isometry3, Point3, Vector3};
 
-use super::{Arguments, NewPad};
+use super::{Arguments, NewPad, print_text};
 
 /// A draft must have a score that is better than another's by this much.
 const LEAST_GAIN: f64 = 0.05;
+
+/// The hand closes on so many objects to find where it touches them.
+const N_CLOSINGS: u64 = 48;
 
 /// A joint of which both limits are as far from the open value closes to the upper one. Opened by this part of its range, it closes
 /// to the lower one.
@@ -43,6 +49,7 @@ enum Opening {
 /// A draft with a palm frame, how well the hand closes in it, and the lines that tell the choices.
 struct Fitted {
     draft: Draft,
+    opening: Opening,
     score: f64,
     told: Vec<String>,
 }
@@ -62,13 +69,67 @@ impl Draft {
         Ok(draft)
     }
 
+    /// Moves cells on links without shapes to the link that these are fixed to: makers write a frame for each sensor.
+    pub(super) fn move_to_bodies(&mut self, table: &mut [NewPad]) -> anyhow::Result<()> {
+        let links = &self.hand.links;
+        let mut n_moved = 0;
+        for pad in table {
+            let Some(mut idx) = links.iter().position(|link| link.name == pad.link) else { continue };
+            let frame_idx = idx;
+            let mut body_from_link = Isometry3::identity();
+            while links[idx].shapes.is_empty()
+                && matches!(links[idx].motion, Motion::Fixed)
+                && let Some(parent_idx) = links[idx].parent_idx
+            {
+                body_from_link = links[idx].parent_from_joint * body_from_link;
+                idx = parent_idx;
+            }
+            if idx == frame_idx || links[idx].shapes.is_empty() {
+                continue;
+            }
+            n_moved += 1;
+            for cell in &mut pad.cells {
+                cell.position_in_link_m = body_from_link * cell.position_in_link_m;
+                cell.normal_in_link = body_from_link.rotation * cell.normal_in_link;
+                cell.along_in_link = body_from_link.rotation * cell.along_in_link;
+            }
+            pad.link = links[idx].name.clone();
+            self.bare.padded_links.push(pad.link.clone());
+        }
+        if n_moved == 0 {
+            return Ok(());
+        }
+        print_diagnostic(&format!(
+            "{n_moved} pads of the table are on links without collision shapes: their cells belong to the links that bear these"
+        ));
+        self.read()
+    }
+
+    /// The pads of the table and of the grids, whose cells lie where the hand touches objects as it closes on them.
+    pub(super) fn laid_pads(&self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<Vec<NewPad>> {
+        let mut pads = self.pads(table, arguments, &[])?;
+        // The planner comes with the pads to the object, so the pads that lie where it comes are laid twice.
+        for n_approaches in [1, PlannerOptions::default().n_approaches] {
+            if !arguments.grids.is_empty() {
+                let touches = all_touches(closings(&self.with_pads(&pads), N_CLOSINGS, n_approaches)?);
+                pads = self.pads(table, arguments, &touches)?;
+            }
+        }
+        for (link, [rows, columns]) in &arguments.grids {
+            let n_cells = pads.iter().find(|pad| pad.name == *link).map_or(0, |pad| pad.cells.len());
+            let n_missing = (rows * columns).saturating_sub(n_cells);
+            if n_missing > 0 {
+                print_diagnostic(&format!(
+                    "--grid {link}={rows}x{columns}: {n_missing} of {} cells are left out: the link has no face under them",
+                    rows * columns
+                ));
+            }
+        }
+        Ok(pads)
+    }
+
     /// The pads of the table and of the grids.
-    pub(super) fn pads(
-        &self,
-        table: &[NewPad],
-        arguments: &Arguments,
-        tells_missing: bool,
-    ) -> anyhow::Result<Vec<NewPad>> {
+    fn pads(&self, table: &[NewPad], arguments: &Arguments, touches: &[Touch]) -> anyhow::Result<Vec<NewPad>> {
         let mechanism = Mechanism::new(&self.hand);
         let mut pads = table.to_vec();
         for (link, [rows, columns]) in &arguments.grids {
@@ -77,15 +138,8 @@ impl Draft {
             let link_idx = links.iter().position(|other| other.name == *link);
             let link_idx =
                 link_idx.with_context(|| format!("--grid: the URDF has no link '{link}' (it has {})", known()))?;
-            let cells = pad_grid(&mechanism, link_idx, [*rows, *columns], arguments.threshold);
+            let cells = pad_grid(&mechanism, link_idx, [*rows, *columns], touches, arguments.threshold);
             let cells = cells.map_err(|reason| anyhow::anyhow!("--grid {link}: {reason}"))?;
-            let n_missing = rows * columns - cells.len();
-            if n_missing > 0 && tells_missing {
-                print_diagnostic(&format!(
-                    "--grid {link}={rows}x{columns}: {n_missing} of {} cells are left out: the link has no face under them",
-                    rows * columns
-                ));
-            }
             pads.push(NewPad { name: link.clone(), link: link.clone(), cells });
         }
         Ok(pads)
@@ -96,25 +150,36 @@ impl Draft {
     /// # Errors
     /// A joint that moves all pads together, as a wrist does.
     pub(super) fn fit(&mut self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<()> {
-        let hand = self.with_pads(&self.pads(table, arguments, false)?);
+        let hand = self.with_pads(&self.pads(table, arguments, &[])?);
         if let Some((joint, link)) = wrist(&hand).filter(|(joint, _)| !arguments.preshape.contains(joint)) {
             bail!("joint '{joint}' moves all pads together, as a wrist does: give the hand alone with --base {link}");
         }
-        let mut best = self.fitted(table, arguments, Opening::AsGiven)?;
+        let mut best = self.fitted(table, arguments, Opening::AsGiven, false)?;
         let mut others = Vec::new();
         // Joints with as much way to one limit as to the other may close either way.
         if !self.two_way_joints(arguments).is_empty() {
             others.extend([Opening::TwoWay(-0.25), Opening::TwoWay(0.25)]);
         }
-        // 0 is the closed hand of many grippers.
-        if best.score < LEAST_GAIN {
-            others.push(Opening::Reversed);
-        }
         for opening in others {
             // Another open hand may leave a grid without cells.
-            let Ok(other) = self.fitted(table, arguments, opening) else { continue };
+            let Ok(other) = self.fitted(table, arguments, opening, false) else { continue };
             if other.score > best.score + LEAST_GAIN {
                 best = other;
+            }
+        }
+        // 0 is the closed hand of many grippers. A jaw that closes on a fixed one may hold things with its back, too.
+        if let Ok(reversed) = self.fitted(table, arguments, Opening::Reversed, false)
+            && reversed.score > LEAST_GAIN
+            && (best.score < LEAST_GAIN
+                || reversed.draft.held(table, arguments)? > best.draft.held(table, arguments)?)
+        {
+            best = reversed;
+        }
+        // Balls before the palm do not tell all: the link's own frame may do better with objects of other shapes.
+        if best.draft.bare.palm != self.bare.palm {
+            let own = self.fitted(table, arguments, best.opening, true)?;
+            if own.draft.held(table, arguments)? > best.draft.held(table, arguments)? {
+                best = own;
             }
         }
         for line in &best.told {
@@ -122,6 +187,13 @@ impl Draft {
         }
         *self = best.draft;
         Ok(())
+    }
+
+    /// How many planned grasps hold their objects.
+    fn held(&self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<usize> {
+        let hand = self.with_pads(&self.pads(table, arguments, &[])?);
+        let closings = closings(&hand, N_CLOSINGS, PlannerOptions::default().n_approaches)?;
+        Ok(closings.iter().filter(|closing| closing.is_held).count())
     }
 
     /// Names of closing joints whose limits are as far from the open value on both sides, and whose open value nobody gave.
@@ -134,9 +206,15 @@ impl Draft {
         self.hand.joints.iter().filter(is_two_way).map(|joint| joint.name.clone()).collect()
     }
 
-    /// The draft with an open hand, its palm frame and the joints that do not close.
-    fn fitted(&self, table: &[NewPad], arguments: &Arguments, opening: Opening) -> anyhow::Result<Fitted> {
-        let mut fitted = Fitted { draft: self.clone(), score: 0.0, told: Vec::new() };
+    /// The draft with an open hand, its palm frame (its own, if it is to keep that) and the joints that do not close.
+    fn fitted(
+        &self,
+        table: &[NewPad],
+        arguments: &Arguments,
+        opening: Opening,
+        keeps_frame: bool,
+    ) -> anyhow::Result<Fitted> {
+        let mut fitted = Fitted { draft: self.clone(), opening, score: 0.0, told: Vec::new() };
         if let Opening::Reversed = opening {
             fitted.open_reversed(arguments)?;
         }
@@ -144,7 +222,9 @@ impl Draft {
         if let Opening::TwoWay(part) = opening {
             fitted.open_two_way(part, arguments)?;
         }
-        fitted.find_palm_frame(table, arguments)?;
+        if !keeps_frame {
+            fitted.find_palm_frame(table, arguments)?;
+        }
         fitted.set_still(&still, table, arguments)?;
         Ok(fitted)
     }
@@ -180,6 +260,48 @@ impl Draft {
                 100.0 * share,
                 hand.links[a].name,
                 hand.links[b].name
+            ));
+        }
+        let mut met = Vec::new();
+        for (a, b) in pairs_that_meet(&hand)? {
+            met.push(format!("{} and {}", hand.links[a].name, hand.links[b].name));
+        }
+        if !met.is_empty() {
+            print_diagnostic(&format!(
+                "as the hand closes on balls, links with pads touch other links, where their cells count as no contact: {}",
+                met.join("; ")
+            ));
+        }
+        Ok(())
+    }
+
+    /// Prints the share of planned closings that a cell feels, and names the pads that feel less than half of their link's
+    /// contacts.
+    pub(super) fn tell_felt(&self, pads: &[NewPad]) -> anyhow::Result<()> {
+        let hand = self.with_pads(pads);
+        let closings = closings(&hand, N_CLOSINGS, PlannerOptions::default().n_approaches)?;
+        let n_felt = closings.iter().filter(|closing| closing.touches.iter().any(|touch| touch.is_felt)).count();
+        print_text(&format!(
+            "\nclosed on training objects: a cell feels {n_felt} of {} planned grasps",
+            closings.len()
+        ))?;
+        let touches = all_touches(closings);
+        let mut told = BTreeSet::new();
+        for pad in &hand.pads {
+            let on_link: Vec<&Touch> = touches.iter().filter(|touch| touch.link_idx == pad.link_idx).collect();
+            let unfelt: Vec<&&Touch> = on_link.iter().filter(|touch| !touch.is_felt).collect();
+            if 2 * unfelt.len() <= on_link.len() || !told.insert(pad.link_idx) {
+                continue;
+            }
+            let middle =
+                unfelt.iter().map(|touch| touch.point_in_link_m.coords).sum::<Vector3<f64>>() / unfelt.len() as f64;
+            let [x, y, z] = [middle.x, middle.y, middle.z].map(|metres| round(metres, 1e3));
+            print_diagnostic(&format!(
+                "the cells on link '{}' feel {} of its {} contacts: the others lie around [{x}, {y}, {z}] m in the link's frame; \
+                 lay cells there (--cells), more of them (--grid), or use a link that meets the object first",
+                hand.links[pad.link_idx].name,
+                on_link.len() - unfelt.len(),
+                on_link.len()
             ));
         }
         Ok(())
@@ -236,6 +358,9 @@ impl Fitted {
                 opened.push((joint.name.clone(), joint.closed()));
             }
         }
+        if opened.is_empty() {
+            bail!("every joint has its open value, or is set before a grasp");
+        }
         self.told
             .push(format!("the hand is open where it could be taken for closed: as by --open {}", listed(&opened)));
         self.draft.bare.open.extend(opened);
@@ -247,7 +372,7 @@ impl Fitted {
         let Fitted { draft, told, .. } = self;
         let (mut still, mut turned) = (Vec::new(), Vec::new());
         if arguments.preshape.is_empty() {
-            let hand = draft.with_pads(&draft.pads(table, arguments, false)?);
+            let hand = draft.with_pads(&draft.pads(table, arguments, &[])?);
             let odd = odd_joints(&hand)?;
             let two_way = draft.two_way_joints(arguments);
             still = odd.sideways;
@@ -295,9 +420,9 @@ impl Fitted {
 
     /// Finds the palm frame in which the hand closes best, and takes it unless the user gave one.
     fn find_palm_frame(&mut self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<()> {
-        let Fitted { draft, told, score } = self;
+        let Fitted { draft, told, score, .. } = self;
         let palm = draft.hand.palm_link().name.clone();
-        let hand = draft.with_pads(&draft.pads(table, arguments, false)?).with_moving_pads();
+        let hand = draft.with_pads(&draft.pads(table, arguments, &[])?).with_moving_pads();
         let fit = palm_fit(&hand)?;
         *score = fit.score;
         let pose = rounded(&fit.link_from_palm);
@@ -324,7 +449,7 @@ impl Fitted {
         let Fitted { draft, told, .. } = self;
         let mut values = Vec::new();
         for idx in still {
-            let hand = draft.with_pads(&draft.pads(table, arguments, false)?).with_moving_pads();
+            let hand = draft.with_pads(&draft.pads(table, arguments, &[])?).with_moving_pads();
             let value = round(best_value(&hand, *idx)?, 1e4);
             let name = draft.hand.joints[*idx].name.clone();
             values.push((name.clone(), value));
@@ -345,7 +470,7 @@ impl Fitted {
 
 /// Pads of which more than half of the cells lie inside the shapes of another link while the hand is open, with their number.
 fn buried_pads(hand: &Hand) -> anyhow::Result<Vec<(&Pad, usize, &str)>> {
-    let palm_from_links = hand.palm_from_links(&hand.open_joints_rad())?;
+    let palm_from_links = hand.palm_from_links(&hand.open_joints())?;
     let mut buried = Vec::new();
     for pad in &hand.pads {
         let others = (0..hand.links.len()).filter(|idx| *idx != pad.link_idx);
@@ -368,10 +493,13 @@ fn wrist(hand: &Hand) -> Option<(String, String)> {
     let chains: Vec<Vec<usize>> = hand.pads.iter().map(|pad| movers(pad.link_idx)).collect();
     let (first, others) = chains.split_first()?;
     let lowest = *first.iter().find(|idx| others.iter().all(|chain| chain.contains(idx)))?;
-    // A link with a pad of its own is a finger's.
-    let is_one_finger = chains.iter().any(|chain| chain.first() == Some(&lowest));
+    // The links on it that move the pads. Of one finger there is one; a palm bears several fingers.
+    let mut borne: BTreeSet<usize> = BTreeSet::new();
+    for chain in &chains {
+        borne.extend(chain.iter().take_while(|idx| **idx != lowest).last());
+    }
     let Motion::Joint { joint_idx, .. } = hand.links[lowest].motion else { return None };
-    (!is_one_finger).then(|| (hand.joints[joint_idx].name.clone(), hand.links[lowest].name.clone()))
+    (borne.len() > 1).then(|| (hand.joints[joint_idx].name.clone(), hand.links[lowest].name.clone()))
 }
 
 fn isometry([x, y, z, roll, pitch, yaw]: [f64; 6]) -> Isometry3<f64> {

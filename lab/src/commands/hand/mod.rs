@@ -11,7 +11,9 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_stages::hand::{BareHand, Cell, Hand, find_mesh, part_below, read_urdf, with_meshes_renamed};
+use blindgrasp_stages::hand::{
+    BareHand, Cell, Hand, find_mesh, find_mesh_alike, part_below, read_urdf, with_meshes_renamed,
+};
 use clap::Args;
 use nalgebra::{Unit, Vector3};
 use serde::Deserialize;
@@ -147,9 +149,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         )?;
         return Ok(Outcome::Done);
     }
+    draft.move_to_bodies(&mut table)?;
     draft.fit(&table, arguments)?;
-    let pads = draft.pads(&table, arguments, true)?;
+    let pads = draft.laid_pads(&table, arguments)?;
     draft.warn(&pads)?;
+    draft.tell_felt(&pads)?;
     let Draft { urdf, hand, bare, .. } = draft;
     let (urdf, meshes) = with_meshes_beside(&urdf, source.parent().unwrap_or(Path::new("")))?;
     let layout = layout(name, &hand, &pads, &bare);
@@ -229,13 +233,23 @@ fn urdf_text(path: &Path, xacro_arguments: &[String]) -> anyhow::Result<String> 
     if !xacro_arguments.is_empty() {
         bail!("--xacro-arg is of no use to {}: its name does not end in .xacro", path.display());
     }
-    Ok(read_urdf(path)?)
+    let urdf = read_urdf(path)?;
+    if urdf.contains("<xacro:") {
+        bail!("{}: it is a xacro file: give it a name that ends in .xacro, so that it is expanded", path.display());
+    }
+    Ok(urdf)
 }
 
 /// Adds the remedy to an error that the URDF of a whole robot makes.
 fn with_base_advice(error: anyhow::Error, arguments: &Arguments) -> anyhow::Error {
     let text = format!("{error:#}");
-    let is_large = text.contains("more than 256 links") || text.contains("joints, expected 1 to");
+    if let Some(base) = &arguments.base
+        && text.contains(": 0 joints")
+    {
+        return anyhow::anyhow!("{text}; below --base {base} nothing moves: name a link above it");
+    }
+    // The lift of an arm is longer than any slide of a hand.
+    let is_large = ["more than 256 links", "joints, expected 1 to", " m of 0"].iter().any(|found| text.contains(found));
     if !is_large || arguments.base.is_some() || text.contains(" 0 joints") {
         return error;
     }
@@ -358,7 +372,10 @@ fn size_by_neighbours(pad: &mut NewPad) {
 fn with_meshes_beside(urdf: &str, urdf_folder: &Path) -> anyhow::Result<(String, Vec<(PathBuf, String)>)> {
     let mut copies: BTreeMap<PathBuf, String> = BTreeMap::new();
     let text = with_meshes_renamed(urdf, |named| {
-        let Some(file) = find_mesh(named, urdf_folder).ok().filter(|file| file.is_file()) else { return Ok(None) };
+        let Ok(file) = find_mesh_alike(named, urdf_folder) else { return Ok(None) };
+        if !find_mesh(named, urdf_folder).is_ok_and(|named| named.is_file()) && !copies.contains_key(&file) {
+            print_diagnostic(&format!("mesh {named} is not there: {} is taken, whose path ends alike", file.display()));
+        }
         let name = file.file_name().and_then(|name| name.to_str()).unwrap_or("mesh.stl").to_owned();
         let (n, taken) = (copies.len(), copies.values().any(|other| *other == format!("meshes/{name}")));
         let beside = copies

@@ -14,6 +14,7 @@ use super::statistics::{Estimate, N_RESAMPLES};
 use super::{Evaluated, Evaluation, Trained};
 use crate::file_name;
 use crate::training::{Example, Examples};
+use blindgrasp_grasps::reading::SELF_CONTACT;
 use blindgrasp_messages::Fault;
 use blindgrasp_pictures::DrawnWord;
 use blindgrasp_stages::label::Label;
@@ -364,7 +365,10 @@ fn data(decided: &[JudgedGrasp], n_excluded: BTreeMap<String, usize>) -> Data {
         n_held_unjudged: count(|grasp| !grasp.judged),
         n_held_unjudged_stable: count(|grasp| !grasp.judged && grasp.stable),
         // Grasps without contact are in the figures over all grasps.
-        n_excluded: n_excluded.into_iter().filter(|(reason, _)| reason != Fault::NoContact.as_str()).collect(),
+        n_excluded: n_excluded
+            .into_iter()
+            .filter(|(reason, _)| reason != Fault::NoContact.as_str() && reason != SELF_CONTACT)
+            .collect(),
         n_objects: distinct(|grasp| &grasp.object),
         n_classes: distinct(|grasp| &grasp.class),
     }

@@ -292,9 +292,11 @@ impl RowReader<'_> {
         }
         let object = self.name(record, self.columns.group)?;
         let class = self.columns.class.map_or(Ok(object.clone()), |class| self.name(record, class))?;
-        let thresholds = self.hand.cells().map(|(_, cell)| cell.noise_threshold_newtons);
-        let cells = self.columns.cells.iter().zip(thresholds);
-        let cells = cells.map(|(idx, threshold)| self.reading(record, *idx, threshold)).collect::<Result<_, _>>()?;
+        let mut cells = Vec::new();
+        for (idx, (pad_idx, cell)) in self.columns.cells.iter().zip(self.hand.cells()) {
+            let may_be_missing = self.hand.pads[pad_idx].may_be_missing;
+            cells.push(self.reading(record, *idx, cell.noise_threshold_newtons, may_be_missing)?);
+        }
         let joints = match &options.joints {
             Joints::Fixed(joints) => joints.clone(),
             Joints::Columns(_) => (0..self.columns.joints.len())
@@ -334,15 +336,27 @@ impl RowReader<'_> {
         }
     }
 
-    fn reading(&self, record: &csv::StringRecord, idx: usize, threshold: f64) -> Result<f64, String> {
+    fn reading(
+        &self,
+        record: &csv::StringRecord,
+        idx: usize,
+        threshold: f64,
+        may_be_missing: bool,
+    ) -> Result<f64, String> {
         let reading: Option<f64> = record[idx].parse().ok();
+        let is_missing = matches!(&record[idx], "" | "null") || reading.is_some_and(f64::is_nan);
+        if is_missing && may_be_missing {
+            return Ok(0.0);
+        }
         // Sensors that are tared read a little below zero. The stages take larger readings for those of a broken sensor.
         if let Some(usable) = reading.filter(|reading| (-threshold..=MAX_CELL_NEWTONS).contains(reading)) {
             return Ok(usable.max(0.0));
         }
         let (column, found) = (&self.header[idx], found(&record[idx]));
         let mut advice = String::new();
-        if reading.is_some_and(|reading| reading < 0.0) {
+        if is_missing {
+            advice = "; a pad whose cells may be missing says may_be_missing in the hand's layout".into();
+        } else if reading.is_some_and(|reading| reading < 0.0) {
             advice = format!("; take readings below zero for 0: {BY_PANDAS}");
         } else if record[idx].replace(',', ".").parse::<f64>().is_ok() && reading.is_none() {
             advice = format!("; the decimal point is a dot: {BY_PANDAS}");

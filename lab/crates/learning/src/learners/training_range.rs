@@ -179,11 +179,11 @@ mod tests {
         let stuck = vec![contact(0, 0.005, 1.5), contact(3, 0.0, 15.0)];
         let far = vec![contact(0, 0.1, 1.5), contact(3, 0.0, 1.0)];
         for (joints, contacts, named) in [
-            (posture(2.4, 0.1), usual(), "position of joint 1"),
-            (posture(1.0, -0.2), usual(), "breakaway of joint 4"),
-            (posture(1.0, 0.1), stuck, "greatest force on a cell of pad 1"),
+            (posture(2.4, 0.1), usual(), "position of joint finger_1,"),
+            (posture(1.0, -0.2), usual(), "breakaway of joint distal_1,"),
+            (posture(1.0, 0.1), stuck, "greatest force on a cell of pad finger_1,"),
             (posture(1.0, 0.1), far, "greatest distance"),
-            (posture(1.0, 0.1), vec![Contact { pad: 2, ..contact(0, 0.005, 1.5) }], "load of pad 2"),
+            (posture(1.0, 0.1), vec![Contact { pad: 2, ..contact(0, 0.005, 1.5) }], "load of pad finger_2,"),
         ] {
             assert_eq!(range.check(&features, &joints, &contacts), Err(Fault::OutOfDistribution));
             let violations = range.violations(&features, &joints, &contacts);

@@ -21,6 +21,7 @@ use blindgrasp_stages::classifier::Classifier;
 use blindgrasp_stages::day::{DayMethod, DayModel, DayStatistics, LabelledGrasp, Recalibration, covariance};
 use blindgrasp_stages::encoder::FeltReading;
 use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::out_of_distribution::TrainingRange;
 use blindgrasp_stages::own_lifts::{
@@ -41,7 +42,7 @@ const FEWEST_FOR_LIMITS: usize = 30;
 /// days. The grasps count as trained on.
 ///
 /// # Errors
-/// Recordings that cannot be used, that the model was trained on, or with too few labelled grasps.
+/// Recordings that cannot be used, whose label is the paper's, that the model was trained on, or with too few labelled grasps.
 pub fn adapt(hand: &Hand, model: &Model, recordings: &[PathBuf]) -> Result<Model, TrainingError> {
     adapt_on(hand, model, &Examples::read(hand, recordings, |_, _| {})?, recordings)
 }
@@ -53,6 +54,13 @@ pub fn adapt(hand: &Hand, model: &Model, recordings: &[PathBuf]) -> Result<Model
 pub fn adapt_on(hand: &Hand, model: &Model, read: &Examples, recordings: &[PathBuf]) -> Result<Model, TrainingError> {
     if model.hand.id != hand.id() {
         return refused(format!("the recordings are of the hand '{}', the model of '{}'", hand.name, model.hand.name));
+    }
+    if read.labels.contains_key(&Label::WrenchSpace) {
+        return refused(
+            "the recordings have the paper's label, which does not say whether a lifted object stays in the hand: expected \
+             outcomes of lifts, of the robot or of simulate --label lift"
+                .into(),
+        );
     }
     let mut trained_on = model.training.trained_on.clone().unwrap_or_default();
     if let Some(known) = read.examples.iter().find(|example| trained_on.grasps.contains(&example.reading_id)) {
@@ -132,6 +140,7 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
         n_lifted: own.n_lifted,
         n_outside: if is_unlike { n_outside } else { 0 },
         promise: own.promise,
+        in_simulation: !read.labels.is_empty(),
     });
     Ok(adapted)
 }

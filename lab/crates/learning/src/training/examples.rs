@@ -189,7 +189,7 @@ impl Examples {
                     }
                 }
                 (Some(FeltGrasp { settled, .. }), Some(truth)) => {
-                    exclude(settled.fault.as_str());
+                    exclude(settled.left_out_as());
                     // Two grasps of one recording may have equal readings. In two recordings it is the same grasp.
                     let first = seen.entry(settled.reading_id).or_insert((recording_idx, truth.stable)).0;
                     if settled.fault == Fault::NoContact && first == recording_idx {
@@ -224,6 +224,7 @@ impl Example {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use blindgrasp_grasps::reading::SELF_CONTACT;
 
     #[test]
     fn grasps_in_memory_are_the_examples_of_their_recording() {
@@ -235,5 +236,6 @@ mod tests {
         let of_file = Examples::read(&hand, &[path], |_, _| {}).expect("readable");
         assert_eq!(of_memory.examples, of_file.examples);
         assert_eq!((&of_memory.unfelt, &of_memory.n_excluded), (&of_file.unfelt, &of_file.n_excluded));
+        assert_eq!((of_file.n_excluded["no_contact"], of_file.n_excluded[SELF_CONTACT]), (23, 14));
     }
 }

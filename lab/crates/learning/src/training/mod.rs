@@ -31,7 +31,7 @@ use crate::learners::platt::{PlattError, fit_platt};
 use crate::learners::svm::train_svm;
 use crate::learners::training_range::{learn_training_range, widened_for_other_days};
 use blindgrasp_grasps::dataset::DatasetError;
-use blindgrasp_messages::{MAX_FEATURES, Phase};
+use blindgrasp_messages::{Fault, MAX_FEATURES, Phase};
 use blindgrasp_stages::classifier::boosting::{BoostedTrees, BoostingError, BoostingParams};
 use blindgrasp_stages::classifier::calibration::PlattCalibration;
 use blindgrasp_stages::classifier::svm::SvmError;
@@ -95,6 +95,12 @@ pub enum TrainingError {
     Boosting(#[from] BoostingError),
     #[error("the calibration")]
     Calibration(#[from] PlattError),
+    /// Training failed, perhaps because cells lie where the hand touches nothing.
+    #[error(
+        "no cell feels {n_unfelt} of the {n_grasps} grasps, and they teach nothing; lay cells where the hand touches objects \
+         (blindgrasp new hand says how many grasps they feel)"
+    )]
+    Unfelt { n_unfelt: usize, n_grasps: usize, source: Box<TrainingError> },
     /// Recordings or options that cannot be trained with.
     #[error("{0}")]
     Data(String),
@@ -125,9 +131,29 @@ pub fn train(
     read: &Examples,
     recordings: &[PathBuf],
     options: &TrainingOptions,
-    mut progress: impl FnMut(&str),
+    progress: impl FnMut(&str),
 ) -> Result<Model, TrainingError> {
     options.check()?;
+    train_checked(hand, read, recordings, options, progress).map_err(|error| with_unfelt_share(error, read))
+}
+
+/// Adds the share of grasps that no cell feels to an error, where that may be its cause.
+fn with_unfelt_share(error: TrainingError, read: &Examples) -> TrainingError {
+    let n_unfelt = read.n_excluded.get(Fault::NoContact.as_str()).copied().unwrap_or(0);
+    let n_grasps = read.grasps.len();
+    if 4 * n_unfelt <= n_grasps {
+        return error;
+    }
+    TrainingError::Unfelt { n_unfelt, n_grasps, source: Box::new(error) }
+}
+
+fn train_checked(
+    hand: &Hand,
+    read: &Examples,
+    recordings: &[PathBuf],
+    options: &TrainingOptions,
+    mut progress: impl FnMut(&str),
+) -> Result<Model, TrainingError> {
     let recipe = &options.recipe;
     check_examples(read, recordings)?;
     let examples: Vec<&Example> = read.examples.iter().collect();
@@ -565,6 +591,18 @@ mod tests {
             );
             assert_eq!(error.contains("0.1875"), brier >= 0.1875, "{error}");
         }
+    }
+
+    #[test]
+    fn lack_of_grasps_names_the_share_that_no_cell_felt() {
+        let told = |n_unfelt: usize| {
+            let n_excluded = BTreeMap::from([(Fault::NoContact.as_str().to_owned(), n_unfelt)]);
+            let read = Examples { n_excluded, grasps: (0..12).map(|idx| (0, idx)).collect(), ..Examples::default() };
+            let error = check_examples(&read, &[]).expect_err("no examples");
+            with_unfelt_share(error, &read).to_string()
+        };
+        assert!(told(11).contains("no cell feels 11 of the 12 grasps"), "{}", told(11));
+        assert!(!told(3).contains("no cell feels"), "{}", told(3));
     }
 
     #[test]

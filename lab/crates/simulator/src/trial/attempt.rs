@@ -156,7 +156,7 @@ impl<'a> Attempt<'a> {
         };
         let stand_off = Isometry3::translation(0.0, 0.0, options.protocol.stand_off_m);
         let palm_from_world = stand_off * touch.palm_from_world;
-        let (plan, body) = HandBody::new(&mechanism, &start.open_joints_rad, &options.physics)?;
+        let (plan, body) = HandBody::new(&mechanism, &start.open_joints, &options.physics)?;
         let (standing, physics) = (&touch.world_from_target, &options.physics);
         let mut engine: Box<dyn Engine> = match physics.engine {
             PhysicsEngine::Rapier => Box::new(World::new(target, standing, &palm_from_world, &plan, physics)?),

@@ -158,7 +158,7 @@ impl Drive {
 pub(super) struct HandBody {
     drives: Vec<Drive>,
     n_axles: usize,
-    open_joints_rad: Vec<f64>,
+    open_joints: Vec<f64>,
 }
 
 impl HandBody {
@@ -168,18 +168,18 @@ impl HandBody {
     /// A hand of more links than an engine tells apart.
     pub(super) fn new(
         mechanism: &Mechanism<'_>,
-        open_joints_rad: &[f64],
+        open_joints: &[f64],
         options: &PhysicsOptions,
     ) -> Result<(HandPlan, HandBody), TrialError> {
         let hand = mechanism.hand;
-        let palm_from_links = hand.palm_from_links(open_joints_rad).map_err(|error| TrialError::hand(hand, error))?;
+        let palm_from_links = hand.palm_from_links(open_joints).map_err(|error| TrialError::hand(hand, error))?;
         let mut plan = HandPlan::default();
         let mut placed = LinkBodies { hand, bodies: Vec::new(), body_from_links: Vec::new() };
         let mut drives: Vec<Drive> = Vec::new();
         for (link_idx, link) in hand.links.iter().enumerate() {
             let palm_from_link = palm_from_links[link_idx];
             let parent = link.parent_idx.and_then(|parent_idx| placed.bodies[parent_idx]);
-            let joint_from_link = link.motion.joint_from_link(open_joints_rad);
+            let joint_from_link = link.motion.joint_from_link(open_joints);
             let Some((joint_idx, axle)) = Axle::of_link(mechanism, link_idx, plan.bodies.len(), options) else {
                 let parent_from_link = link.parent_from_joint * joint_from_link;
                 placed.bodies.push(parent);
@@ -202,12 +202,12 @@ impl HandBody {
                 kind: axle.kind,
                 parent_from_axis: parent_from_joint * (joint_from_link * body_from_axis),
                 body_from_axis,
-                mass: body_mass(mechanism, link_idx, open_joints_rad, options),
+                mass: body_mass(mechanism, link_idx, open_joints, options),
                 armature: 0.0,
             });
             match drives.iter_mut().find(|drive| drive.joint_idx == joint_idx) {
                 Some(drive) => drive.axles.push(axle),
-                None => drives.push(Drive::new(hand, joint_idx, open_joints_rad[joint_idx], axle)),
+                None => drives.push(Drive::new(hand, joint_idx, open_joints[joint_idx], axle)),
             }
         }
         for drive in &mut drives {
@@ -221,7 +221,7 @@ impl HandBody {
         }
         plan.shapes = placed.shapes(mechanism, &palm_from_links)?;
         let n_axles = plan.bodies.len();
-        Ok((plan, HandBody { drives, n_axles, open_joints_rad: open_joints_rad.to_vec() }))
+        Ok((plan, HandBody { drives, n_axles, open_joints: open_joints.to_vec() }))
     }
 
     /// Holds the open hand.
@@ -240,7 +240,7 @@ impl HandBody {
     }
 
     fn values(&self, travel: impl Fn(&Drive) -> f64) -> Vec<f64> {
-        let mut values = self.open_joints_rad.clone();
+        let mut values = self.open_joints.clone();
         for drive in &self.drives {
             values[drive.joint_idx] = drive.open + drive.sign * travel(drive);
         }
@@ -250,7 +250,7 @@ impl HandBody {
     /// The torque of each joint's motor or gear, from the gear's twist, newton metres; of a slide the force, newtons. It is
     /// 0 of a joint without a motor.
     pub(super) fn torques(&self, engine: &dyn Engine) -> Vec<f64> {
-        let mut torques = vec![0.0; self.open_joints_rad.len()];
+        let mut torques = vec![0.0; self.open_joints.len()];
         for drive in &self.drives {
             torques[drive.joint_idx] = drive.sign * ((drive.target - drive.travel(engine)) * drive.stiffness);
         }
@@ -504,7 +504,7 @@ fn body_from_axis(hand: &Hand, motion: &Motion) -> Isometry3<f64> {
 fn body_mass(
     mechanism: &Mechanism<'_>,
     link_idx: usize,
-    open_joints_rad: &[f64],
+    open_joints: &[f64],
     options: &PhysicsOptions,
 ) -> MassProperties {
     let mut parts: Vec<MassProperties> = Vec::new();
@@ -514,8 +514,8 @@ fn body_mass(
     }
     for (child_idx, child) in mechanism.hand.links.iter().enumerate() {
         if child.parent_idx == Some(link_idx) && closing_joint(mechanism, child_idx).is_none() {
-            let link_from_child = child.parent_from_joint * child.motion.joint_from_link(open_joints_rad);
-            let mass = body_mass(mechanism, child_idx, open_joints_rad, options);
+            let link_from_child = child.parent_from_joint * child.motion.joint_from_link(open_joints);
+            let mass = body_mass(mechanism, child_idx, open_joints, options);
             parts.push(mass.transform_by(&pose_from_isometry(&link_from_child)));
         }
     }
@@ -551,7 +551,7 @@ mod tests {
         // The stand is far away.
         let palm_from_world = Isometry3::translation(0.0, 0.0, -5.0);
         let world_from_target = Isometry3::translation(x, y, 5.0 + z);
-        let (plan, mut body) = HandBody::new(&mechanism, &hand.open_joints_rad(), &options).expect("a hand");
+        let (plan, mut body) = HandBody::new(&mechanism, &hand.open_joints(), &options).expect("a hand");
         let mut world = World::new(&target, &world_from_target, &palm_from_world, &plan, &options).expect("a world");
         world.engine.gravity = to_engine(&Vector3::zeros());
         body.hold(&mut world, &options);

@@ -66,8 +66,8 @@ pub struct Start {
     pub world_from_palm_xyzw: [f64; 4],
     /// The target's centre of mass off the palm's axis, x and y of the palm frame.
     pub lateral_offset_m: [f64; 2],
-    /// The joints before closing: preshape joints are set, the others open.
-    pub open_joints_rad: Vec<f64>,
+    /// The joints before closing, rad or m: preshape joints are set, the others open.
+    pub open_joints: Vec<f64>,
     /// The target's turn about the vertical.
     pub yaw_rad: f64,
 }

@@ -64,7 +64,7 @@ pub fn draw_start(
         let start = Start {
             world_from_palm_xyzw: world_from_palm.coords.into(),
             lateral_offset_m: drawn.lateral_offset_m,
-            open_joints_rad: drawn.open_joints_rad,
+            open_joints: drawn.open_joints,
             yaw_rad,
         };
         if let Some(touch) = first_touch(&mechanism, target, &start)?
@@ -101,15 +101,14 @@ fn plan(
         let start = Start {
             world_from_palm_xyzw: world_from_palm.coords.into(),
             lateral_offset_m: drawn.lateral_offset_m,
-            open_joints_rad: drawn.open_joints_rad.clone(),
+            open_joints: drawn.open_joints.clone(),
             yaw_rad,
         };
         let Some(touch) = first_touch(mechanism, target, &start)? else { continue };
         if stand_distance_m(mechanism, &start, &touch.palm_from_world, &options.physics)? < protocol.stand_clearance_m {
             continue;
         }
-        let explored =
-            mechanism.close_from(&target.object, touch.palm_from_target, start.open_joints_rad.clone(), range);
+        let explored = mechanism.close_from(&target.object, touch.palm_from_target, start.open_joints.clone(), range);
         let exploration = explored.map_err(|error| TrialError::hand(mechanism.hand, error))?;
         let energy = energy(mechanism.hand, &target.object, &exploration, planner);
         let energy = energy.map_err(|error| TrialError::hand(mechanism.hand, error))?;
@@ -158,7 +157,7 @@ pub fn choose_start(
 fn probability_kept(prior: &ApproachPrior, start: &Start) -> f64 {
     let world_from_palm = UnitQuaternion::from_quaternion(nalgebra::Quaternion::from(start.world_from_palm_xyzw));
     let down = world_from_palm.inverse() * -Vector3::z();
-    prior.probability_kept(down.into(), &start.open_joints_rad).unwrap_or(0.0)
+    prior.probability_kept(down.into(), &start.open_joints).unwrap_or(0.0)
 }
 
 /// The seed of the sensor's noise in attempt number `attempt` of trial number `trial`: a pure function of them and the
@@ -190,12 +189,12 @@ pub(super) fn first_touch(
     let world_from_target = world_from_standing(target, start.yaw_rad);
     let world_from_palm = UnitQuaternion::from_quaternion(nalgebra::Quaternion::from(start.world_from_palm_xyzw));
     let from = protocol::Start {
-        open_joints_rad: start.open_joints_rad.clone(),
+        open_joints: start.open_joints.clone(),
         palm_from_object_rotation: world_from_palm.inverse() * world_from_target.rotation,
         lateral_offset_m: start.lateral_offset_m,
         back_off_m: 0.0,
     };
-    if mechanism.hand.self_collides(&start.open_joints_rad).map_err(|error| TrialError::hand(mechanism.hand, error))? {
+    if mechanism.hand.self_collides(&start.open_joints).map_err(|error| TrialError::hand(mechanism.hand, error))? {
         return Ok(None);
     }
     let palm_from_target = mechanism
@@ -224,10 +223,8 @@ pub(super) fn stand_distance_m(
     palm_from_world: &Isometry3<f64>,
     options: &PhysicsOptions,
 ) -> Result<f64, TrialError> {
-    let palm_from_links = mechanism
-        .hand
-        .palm_from_links(&start.open_joints_rad)
-        .map_err(|error| TrialError::hand(mechanism.hand, error))?;
+    let palm_from_links =
+        mechanism.hand.palm_from_links(&start.open_joints).map_err(|error| TrialError::hand(mechanism.hand, error))?;
     let (stand, pose) = (stand_shape(options), pose_from_isometry(&(palm_from_world * world_from_stand(options))));
     let distance_m = mechanism.shapes.iter().map(|shape| {
         let shape_pose = shape.pose_in_palm(&palm_from_links);
