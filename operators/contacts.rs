@@ -148,11 +148,12 @@ impl Stage for FindContacts {
         // Once for each grasp: its frames mostly have one fault. A hand that closes may have no contact yet.
         let is_at_rest = Phase::from_code(head.phase).is_ok_and(Phase::decides);
         if self.told != Some(head.grasp_id)
+            && Phase::from_code(head.phase).is_ok_and(|phase| !phase.is_over())
             && (is_at_rest || summary.fault != Fault::NoContact)
             && let Some(why) = explain_fault(&self.hand, &self.finder, &summary, parts.as_ref())
         {
             self.told = Some(head.grasp_id);
-            print_diagnostic(&format!("grasp {} cannot be judged: {why}", head.grasp_id));
+            print_diagnostic(&format!("a frame of grasp {} cannot be judged: {why}", head.grasp_id));
         }
         let phase = Phase::from_code(head.phase).ok().filter(|phase| !phase.is_over());
         if let (Some(watch), Some(parts), Some(phase)) = (&mut self.watch, &parts, phase)

@@ -56,7 +56,8 @@ pub(crate) fn describe() -> OperatorDescription {
             "max_age_ms",
             millis(),
             Some((default.max_age_nanos as f64 / 1e6).into()),
-            "How old a prediction may be on arrival, and how long none may come while a grasp is open",
+            "How old a prediction may be on arrival, and how long none may come while a grasp is open (or three periods of the source, if \
+             that is more)",
         )
         .live_param(
             "probe",

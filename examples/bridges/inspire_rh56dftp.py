@@ -70,7 +70,7 @@ class Modbus:
                 self.connect()
                 self.read(*STATES)
                 return
-            except (OSError, Silence) as error:
+            except (OSError, Silence, ModbusError) as error:
                 if time.monotonic() > until:
                     raise ModbusError(f"no answer for {GONE_SECS:.0f} s: {error}") from error
             time.sleep(0.1)

@@ -42,7 +42,7 @@ pub(super) fn detach(name: &str, json: bool) -> anyhow::Result<Outcome> {
         if let Some(status) = child.try_wait().context("cannot wait for the graph")? {
             // A short recording may be over before the graph was seen to run.
             if status.success() {
-                break;
+                return said_over(name, &folder, json);
             }
             let lines: Vec<String> = log.read().unwrap_or_default().into_iter().map(|line| line.text).collect();
             bail!("the graph did not start ({status}):\n{}", lines.join("\n"));
@@ -64,6 +64,16 @@ pub(super) fn detach(name: &str, json: bool) -> anyhow::Result<Outcome> {
             "graph '{name}' runs in the background (process {pid}); its logs are in {logs}\n\
              blindgrasp ps {name}    blindgrasp logs -f --graph {name}    blindgrasp stop {name}"
         )
+    })?;
+    Ok(Outcome::Done)
+}
+
+fn said_over(name: &str, folder: &LogFolder, json: bool) -> anyhow::Result<Outcome> {
+    let logs = folder.path().display().to_string();
+    print_text(&if json {
+        json!({ "graph": name, "pid": null, "log_folder": logs }).to_string()
+    } else {
+        format!("graph '{name}' has run and is over; its logs are in {logs}")
     })?;
     Ok(Outcome::Done)
 }

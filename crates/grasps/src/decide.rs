@@ -36,7 +36,7 @@ pub fn decide(judge: &mut Judge, recording: &Path) -> Result<Vec<Decided>, Datas
 pub fn decide_frames(judge: &mut Judge, frames: &[Stamped<TactileFrame>]) -> Vec<Decided> {
     judge.reset();
     let mut decided: Vec<Decided> = frames.iter().flat_map(|frame| sample(judge, frame)).collect();
-    decided.extend(judge.end().map(Decided::from));
+    decided.extend(end(judge));
     decided.retain(|decided| decided.decision.action.decides());
     decided
 }
@@ -44,11 +44,18 @@ pub fn decide_frames(judge: &mut Judge, frames: &[Stamped<TactileFrame>]) -> Vec
 /// The decisions that come with a frame.
 fn sample(judge: &mut Judge, frame: &Stamped<TactileFrame>) -> Vec<Decided> {
     let decisions = judge.sample(frame).decisions;
-    let explained = decisions.into_iter().map(|decision| {
-        let (violations, why) = (judge.violations(&decision).to_vec(), judge.explain(&decision));
-        Decided { violations, why, ..Decided::from(decision) }
-    });
-    explained.collect()
+    decisions.into_iter().map(|decision| explained(judge, decision)).collect()
+}
+
+/// The decision that comes when the frames end.
+fn end(judge: &mut Judge) -> Option<Decided> {
+    let decision = judge.end()?;
+    Some(explained(judge, decision))
+}
+
+fn explained(judge: &Judge, decision: LiftDecision) -> Decided {
+    let (violations, why) = (judge.violations(&decision).to_vec(), judge.explain(&decision));
+    Decided { violations, why, ..Decided::from(decision) }
 }
 
 impl From<LiftDecision> for Decided {
@@ -77,7 +84,7 @@ pub fn decide_recording(judge: &mut Judge, path: &Path) -> Result<Vec<Decided>, 
         let settled = frames.iter().map(|frame| &frame.message).find(|frame| frame.phase == Phase::Settled);
         settled.map(|frame| ReadingId::of(&frame.joints, &frame.cells_newtons))
     })?;
-    decisions.extend(judge.end().map(Decided::from));
+    decisions.extend(end(judge));
     if grasps.is_empty() {
         let message = "it holds no tactile frames to decide on".into();
         return Err(DatasetError::Unusable { path: path.into(), message });

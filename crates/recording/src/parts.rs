@@ -157,20 +157,18 @@ pub fn recordings_in(paths: &[PathBuf]) -> Result<Vec<PathBuf>, RecordingError> 
             continue;
         }
         let io = |source| RecordingError::Io { path: path.clone(), source };
-        let (mut found, mut compressed) = (Vec::new(), None);
+        let mut found = Vec::new();
         for entry in std::fs::read_dir(path).map_err(io)? {
             let file = entry.map_err(io)?.path();
             if file.to_string_lossy().ends_with(".mcap.zstd") {
-                compressed = Some(file);
+                let file = file.display();
+                return Err(invalid(format!("{file} is compressed: unpack it (zstd -d {file})")));
             } else if file.extension().is_some_and(|extension| extension == "mcap") {
                 found.push(file);
             }
         }
         if found.is_empty() {
-            return Err(invalid(match compressed {
-                Some(file) => format!("{} is compressed: unpack it (zstd -d {})", file.display(), file.display()),
-                None => "there is no recording in this folder: expected files that end in .mcap".into(),
-            }));
+            return Err(invalid("there is no recording in this folder: expected files that end in .mcap".into()));
         }
         found.sort();
         all.extend(found);

@@ -124,7 +124,7 @@ impl RecordingReader {
                     Err(what) => Some(Err(what)),
                 });
                 taken.map(|taken| {
-                    taken.map_err(|what| if what.ends_with(COMPRESSED) { invalid(what) } else { damaged(what) })
+                    taken.map_err(|what| if what.contains(COMPRESSED) { invalid(what) } else { damaged(what) })
                 })
             }
             op::DATA_END => {

@@ -89,7 +89,7 @@ pub(super) fn open(path: &Path) -> Result<(File, FileSummary), RecordingError> {
 
 /// What to say of a recording whose messages are not ours.
 pub(super) fn other_version(difference: &str, info: &RecordingInfo) -> String {
-    if difference.ends_with(CONVERT) {
+    if difference.contains(CONVERT) {
         return difference.into();
     }
     let version = &info.version;

@@ -251,8 +251,8 @@ impl Decisions {
     }
 
     /// The decisions as expectations of later replays: a lift that dropped its object should have been held. With labels,
-    /// false positives are expected as they are, and of [`FEWEST_FOR_ACCURACY`] or more the accuracy; without labels, every
-    /// decision.
+    /// false positives are expected as they are, and of [`FEWEST_FOR_ACCURACY`] or more the accuracy, of fewer the right lifts;
+    /// without labels, every decision.
     pub fn to_expectations(&self) -> Expectations {
         let mut expected = Expectations::default();
         if self.truths.is_empty() {
@@ -266,9 +266,21 @@ impl Decisions {
                 expected.accuracy_at_least = Some((1e4 * accuracy).floor() / 1e4);
             }
             expected.false_positives_at_most = Some(n_false_positive);
+            if self.truths.len() < FEWEST_FOR_ACCURACY {
+                // Else a graph that holds everything would pass.
+                expected.decisions.extend(self.right_lifts().map(|grasp_id| (grasp_id, (Action::Lift, None))));
+            }
         }
         expected.decisions.extend(self.dropped().map(|grasp_id| (grasp_id, (Action::Hold, None))));
         expected
+    }
+
+    /// The grasps that were lifted and are labelled as stable.
+    fn right_lifts(&self) -> impl Iterator<Item = u64> + '_ {
+        let lifted = self.decisions.iter().filter(|(_, decision)| decision.action == Action::Lift);
+        lifted
+            .map(|(grasp_id, _)| *grasp_id)
+            .filter(|grasp_id| self.truths.get(grasp_id).is_some_and(|truth| truth.stable))
     }
 
     /// The first grasp that is held because hand or model are others than the graph's.

@@ -80,8 +80,9 @@ pub fn invalid_reading(hand: &Hand, joints: &[f64], cells_newtons: &[f64]) -> Op
     if let Some((value, joint)) = outside().next() {
         let (lower, upper, unit) = (short(joint.lower), short(joint.upper), joint.kind.unit());
         let mut found = format!("joint {} reads {}, expected {lower} to {upper} {unit}", joint.name, short(*value));
-        let mut finite = outside().filter(|(value, _)| value.is_finite());
-        if value.is_finite() && finite.all(|(value, joint)| joint.allows(in_si(joint, *value), LIMIT_TOLERANCE_RAD)) {
+        let fits = |(value, joint): (&f64, &Joint)| joint.allows(in_si(joint, *value), LIMIT_TOLERANCE_RAD);
+        let is_far = outside().any(|(value, joint)| is_far(joint, *value));
+        if value.is_finite() && is_far && outside().filter(|(value, _)| value.is_finite()).all(fits) {
             let other_unit = if joint.kind == JointKind::Revolute { "degrees" } else { "millimetres" };
             found += &format!(": {other_unit}? ({} {unit})", short(in_si(joint, *value)));
         }
@@ -96,6 +97,11 @@ pub fn invalid_reading(hand: &Hand, joints: &[f64], cells_newtons: &[f64]) -> Op
     let pad = hand.pads.iter().rfind(|pad| pad.first_cell_idx <= cell_idx)?;
     let (idx, unit) = (cell_idx - pad.first_cell_idx, hand.cell_unit.word());
     Some(format!("cell {idx} of pad {} reads {}, expected 0 to {MAX_CELL_NEWTONS} {unit}", pad.name, short(*newtons)))
+}
+
+/// Whether a value is more than a turn or a metre: a smaller one is more likely a wrong zero than another unit.
+fn is_far(joint: &Joint, value: f64) -> bool {
+    value.abs() > if joint.kind == JointKind::Revolute { std::f64::consts::TAU } else { 1.0 }
 }
 
 /// A value in degrees or millimetres, in radians or metres.
@@ -327,6 +333,9 @@ mod tests {
         assert_eq!(found(&joints, &cells).as_deref(), Some(degrees));
         joints[2] = f64::NAN;
         assert_eq!(found(&joints, &cells), Some(format!("{degrees}; another joint is outside its range, too")));
+        // A wrong zero is no other unit.
+        let near = found(&[0.0, 2.6, 0.0, 0.0, 0.0, 0.0, 0.0], &cells);
+        assert_eq!(near.as_deref(), Some("joint finger_1 reads 2.6, expected 0 to 2.443 rad"));
         // The first of them could be in degrees, the others not.
         joints = [2048.0; 7];
         joints[0] = 170.0;

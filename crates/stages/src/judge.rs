@@ -27,6 +27,8 @@ pub struct Judge {
     contacts: Vec<Contact>,
     values: Vec<f64>,
     found: Findings,
+    /// Of the grasp before.
+    found_before: Findings,
 }
 
 /// What speaks against the last grasp of which something does.
@@ -79,6 +81,7 @@ impl Judge {
             contacts: Vec::new(),
             values: Vec::new(),
             found: Findings::default(),
+            found_before: Findings::default(),
         })
     }
 
@@ -122,7 +125,8 @@ impl Judge {
         let contacts = steps::contact_set(&self.hand, &head, summary, parts.as_ref());
         let feature = steps::encode(&self.model, self.dictionary_id, &contacts, &self.contacts, &mut self.values);
         if self.found.grasp_id != frame.grasp_id {
-            self.found = Findings { grasp_id: frame.grasp_id, ..Findings::default() };
+            let found = Findings { grasp_id: frame.grasp_id, ..Findings::default() };
+            self.found_before = std::mem::replace(&mut self.found, found);
         }
         if summary.fault != Fault::NoContact || frame.phase.decides() {
             let why = steps::explain_fault(&self.hand, &self.finder, &summary, parts.as_ref());
@@ -154,19 +158,25 @@ impl Judge {
     /// Why a grasp was held that has just been decided, sentence by sentence: by names of joints, pads and links, with
     /// what was found and what was expected. Empty if its reason says all that is known.
     pub fn explain(&self, decision: &LiftDecision) -> Vec<String> {
-        if decision.grasp_id != self.found.grasp_id {
-            return Vec::new();
-        }
+        let is_of_last_frame = decision.grasp_id == self.found.grasp_id;
+        // A grasp may be held when the next one begins.
+        let found = if is_of_last_frame { &self.found } else { &self.found_before };
         match decision.reason {
-            Reason::Invalid => self.found.invalid.iter().cloned().collect(),
-            Reason::Unstable if self.arbiter.options().probe == Probe::None && self.model.day.is_none() => {
+            Reason::Stale => self.arbiter.staleness(decision.grasp_id).iter().map(Staleness::to_string).collect(),
+            _ if decision.grasp_id != found.grasp_id => Vec::new(),
+            Reason::Invalid => found.invalid.iter().cloned().collect(),
+            Reason::Unstable if is_of_last_frame && self.is_settled_alone() => {
                 self.model.speak_against(&self.hand, &self.values).into_iter().collect()
             }
-            Reason::NoContact => self.found.self_contact.iter().cloned().collect(),
-            Reason::Stale => self.arbiter.staleness(decision.grasp_id).iter().map(Staleness::to_string).collect(),
-            Reason::OutOfDistribution => self.found.violations.iter().map(Violation::to_string).collect(),
+            Reason::NoContact => found.self_contact.iter().cloned().collect(),
+            Reason::OutOfDistribution => found.violations.iter().map(Violation::to_string).collect(),
             _ => Vec::new(),
         }
+    }
+
+    /// Whether the settled frame of a grasp is judged alone, without a probe or other grasps of its day.
+    fn is_settled_alone(&self) -> bool {
+        self.arbiter.options().probe == Probe::None && self.model.day.is_none()
     }
 
     /// Holds the open grasp, if any, because no more frames come.
@@ -190,7 +200,7 @@ impl Judge {
     fn forget_grasps(&mut self) {
         self.arbiter = LiftArbiter::new(*self.arbiter.options());
         self.next_seq = 0;
-        self.found = Findings::default();
+        (self.found, self.found_before) = Default::default();
     }
 }
 
@@ -263,7 +273,7 @@ mod tests {
         // As if the model had said so.
         let decision = LiftDecision { grasp_id: 1, reason: Reason::Unstable, ..LiftDecision::default() };
         let [why] = &judge.explain(&decision)[..] else { panic!("one sentence") };
-        assert!(why.starts_with("most against it: ") && why.matches(" is ").count() == 2, "{why}");
+        assert!(why.starts_with("of pads and joints, most against it: ") && why.matches(" is ").count() == 2, "{why}");
     }
 
     #[test]

@@ -95,12 +95,12 @@ impl Default for ArbiterOptions {
 pub struct LiftArbiter {
     options: ArbiterOptions,
     state: ArbiterState,
-    /// Why the last grasp with stale predictions has them.
-    stale: Option<(u64, Staleness)>,
+    /// The last grasp that was held as stale, and why.
+    held_stale: Option<(u64, Staleness)>,
 }
 
 /// The limit that makes a grasp stale, and what was found.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Staleness {
     /// Two of its frames are too far apart by the source's clock.
     Gap { found_nanos: u64, limit_nanos: u64 },
@@ -108,8 +108,10 @@ pub enum Staleness {
     Age { found_nanos: u64, limit_nanos: u64 },
     /// A prediction may no longer be acted upon: [`Header::valid_nanos`].
     Expiry { found_nanos: u64, limit_nanos: u64 },
-    /// A prediction is of the future.
+    /// A prediction has a time that this machine's clock has not reached.
     Future,
+    /// A prediction has no time on this machine's clock.
+    Unknown,
     /// No prediction came while it was open.
     Silence { limit_nanos: u64 },
 }
@@ -120,7 +122,7 @@ impl fmt::Display for Staleness {
         match *self {
             Staleness::Gap { found_nanos, limit_nanos } => write!(
                 f,
-                "two frames are {:.1} ms apart, expected at most {:.1} ms (max_gap_ms, or more for a source that is steadily slow)",
+                "two frames are {:.1} ms apart, expected at most {:.1} ms (max_gap_ms, or three periods of the source)",
                 millis(found_nanos),
                 millis(limit_nanos)
             ),
@@ -132,10 +134,13 @@ impl fmt::Display for Staleness {
                 let (found, limit) = (millis(found_nanos), millis(limit_nanos));
                 write!(f, "a frame was {found:.1} ms old, and expired after {limit:.1} ms (set by its machine)")
             }
-            Staleness::Future => f.write_str("a frame's time lies in the future: the clock was set back"),
+            Staleness::Future => f.write_str("a frame's time lies after this machine's clock"),
+            Staleness::Unknown => {
+                f.write_str("a frame's age is not known: its link has not compared the two machines' clocks yet")
+            }
             Staleness::Silence { limit_nanos } => write!(
                 f,
-                "no frame came for more than {:.1} ms (max_age_ms, or more for a source that is steadily slow)",
+                "no frame came for more than {:.1} ms (max_age_ms, or three periods of the source)",
                 millis(limit_nanos)
             ),
         }
@@ -181,8 +186,8 @@ struct OpenGrasp {
     grasp_id: u64,
     /// The first problem of a prediction of this grasp. It rules out a LIFT.
     doubt: Option<Reason>,
-    /// The greatest distance of its frames before there was a doubt.
-    gap_nanos: u64,
+    /// Why predictions of it are stale.
+    stale: Option<Staleness>,
     n_settled: u32,
     /// The phase of the frames that vote: [`Phase::Settled`] until a probe has been asked for.
     awaited: Phase,
@@ -301,10 +306,10 @@ enum PhaseMeaning {
 /// How a prediction comes after the one before it.
 struct Arrival {
     break_in_order: Option<Reason>,
-    /// The time since the prediction before it, if that is of the same open grasp.
-    gap_nanos: u64,
-    /// The reason why its numbers have no use: invalid or stale.
-    unusable: Option<Reason>,
+    /// Why it is stale, if it is.
+    stale: Option<Staleness>,
+    /// Its numbers may be used.
+    is_valid: bool,
     /// Frames of one time are one reading: only the first of them votes.
     is_new_reading: bool,
 }
@@ -335,6 +340,8 @@ impl ArbiterOptions {
         let found_nanos = age_nanos;
         if age_nanos == u64::MAX {
             Some(Staleness::Future)
+        } else if header.origin_nanos == 0 && age_nanos > self.max_age_nanos {
+            Some(Staleness::Unknown)
         } else if age_nanos > self.max_age_nanos {
             Some(Staleness::Age { found_nanos, limit_nanos: self.max_age_nanos })
         } else if header.valid_nanos != 0 && age_nanos > header.valid_nanos {
@@ -348,7 +355,7 @@ impl ArbiterOptions {
 impl LiftArbiter {
     /// An arbiter that has seen nothing.
     pub fn new(options: ArbiterOptions) -> Self {
-        LiftArbiter { options, state: ArbiterState { options, ..ArbiterState::default() }, stale: None }
+        LiftArbiter { options, state: ArbiterState { options, ..ArbiterState::default() }, held_stale: None }
     }
 
     pub fn state(&self) -> &ArbiterState {
@@ -398,22 +405,18 @@ impl LiftArbiter {
         if let Some(watch) = &mut self.state.watch
             && (arrival.is_new_reading || prediction.phase == Phase::Ended)
         {
-            let is_trusted = arrival.break_in_order.is_none() && arrival.unusable.is_none();
+            let is_trusted = arrival.break_in_order.is_none() && arrival.is_valid && arrival.stale.is_none();
             decisions.extend(watch.on_prediction(header, prediction, is_trusted, options.votes.max(1)));
         }
         let Some(open) = self.open((header.epoch, prediction.grasp_id), decisions) else {
             return;
         };
         let meaning = open.meaning_of(prediction.phase);
-        if open.doubt.is_none() {
-            open.gap_nanos = open.gap_nanos.max(arrival.gap_nanos);
-        }
         let faulty = reason_of(prediction.fault, matches!(meaning, PhaseMeaning::Vote));
-        open.doubt = open.doubt.or(arrival.break_in_order).or(faulty).or(arrival.unusable);
-        if matches!(meaning, PhaseMeaning::Vote | PhaseMeaning::Wait | PhaseMeaning::End) {
-            self.judge_gap();
-        }
-        let Some(open) = self.state.open.as_mut() else { return };
+        let invalid = if arrival.is_valid { None } else { Some(Reason::Invalid) };
+        let stale = arrival.stale.map(|_| Reason::Stale);
+        open.stale = open.stale.or(arrival.stale);
+        open.doubt = open.doubt.or(arrival.break_in_order).or(faulty).or(invalid).or(stale);
         let decision = match meaning {
             PhaseMeaning::Vote => open.vote(header, prediction, arrival.is_new_reading, &options),
             PhaseMeaning::Nothing => None,
@@ -444,7 +447,9 @@ impl LiftArbiter {
     /// have been one of another grasp, so it counts against the next grasp as well.
     pub fn on_unreadable(&mut self, header: &Header, grasp_id: u64, decisions: &mut Vec<LiftDecision>) {
         let break_in_order = self.break_in_order(header, grasp_id);
-        self.state.last = Some(*header);
+        if self.state.last.replace(*header).is_some_and(|last| last.epoch != header.epoch) {
+            self.state.pace = SourcePace::default();
+        }
         if let Some(watch) = self.state.watch.as_mut() {
             watch.forget_votes();
         }
@@ -457,8 +462,8 @@ impl LiftArbiter {
     /// Holds the open grasp, if any, because no prediction has come for longer than a prediction may be old.
     pub fn on_silence(&mut self) -> Option<LiftDecision> {
         let limit_nanos = self.silence_limit_nanos();
-        let open = self.state.open.as_ref()?;
-        self.stale = Some((open.grasp_id, Staleness::Silence { limit_nanos }));
+        let open = self.state.open.as_mut()?;
+        open.stale = open.stale.or(Some(Staleness::Silence { limit_nanos }));
         self.hold(Reason::Stale)
     }
 
@@ -469,31 +474,19 @@ impl LiftArbiter {
 
     /// Holds the open grasp, if any, because the next grasp began or the stream ended before its source ended it.
     pub fn on_end(&mut self) -> Option<LiftDecision> {
-        self.judge_gap();
         let reason = self.state.open.as_ref()?.reason_at_end();
         self.hold(reason)
     }
 
     /// The limit that a grasp has exceeded which has just been held as stale.
     pub fn staleness(&self, grasp_id: u64) -> Option<Staleness> {
-        let (of, staleness) = self.stale?;
+        let (of, staleness) = self.held_stale?;
         if of == grasp_id { Some(staleness) } else { None }
     }
 
     /// How long no prediction may come while a grasp is open.
     pub fn silence_limit_nanos(&self) -> u64 {
         self.options.max_age_nanos.max(self.state.pace.longest_gap_nanos())
-    }
-
-    /// Doubts the open grasp if its frames are too far apart. The source's pace is known better at the decision than when the
-    /// gap was seen.
-    fn judge_gap(&mut self) {
-        let limit_nanos = self.options.max_gap_nanos.max(self.state.pace.longest_gap_nanos());
-        let Some(open) = &mut self.state.open else { return };
-        if open.gap_nanos > limit_nanos {
-            open.doubt = Some(Reason::Stale);
-            self.stale = Some((open.grasp_id, Staleness::Gap { found_nanos: open.gap_nanos, limit_nanos }));
-        }
     }
 
     /// Whether a grasp has begun and is not decided.
@@ -507,13 +500,19 @@ impl LiftArbiter {
         let break_in_order = self.break_in_order(header, grasp_id);
         let state = &mut self.state;
         let is_open = state.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
-        let mut gap_nanos = 0;
+        let mut stale = self.options.staleness_of(header, age_nanos);
         let mut is_new_reading = true;
         if let Some(last) = state.last.replace(*header) {
             is_new_reading = (last.epoch, last.stamp_nanos) != (header.epoch, header.stamp_nanos);
-            if is_open && break_in_order.is_none() {
-                gap_nanos = header.stamp_nanos - last.stamp_nanos;
-                state.pace.observe(header.epoch, gap_nanos);
+            if last.epoch != header.epoch {
+                state.pace = SourcePace::default();
+            } else if break_in_order.is_none() {
+                let found_nanos = header.stamp_nanos - last.stamp_nanos;
+                let limit_nanos = self.options.max_gap_nanos.max(state.pace.longest_gap_nanos());
+                if is_open && found_nanos > limit_nanos {
+                    stale = Some(Staleness::Gap { found_nanos, limit_nanos });
+                }
+                state.pace.observe(found_nanos);
             }
             // A source that was started again may go on with a grasp that is decided, unless it begins with its first sample.
             let goes_on = last.epoch != header.epoch && header.seq != 0;
@@ -529,12 +528,7 @@ impl LiftArbiter {
         let is_valid = prediction.decision_value.is_finite()
             && (0.0..=1.0).contains(&prediction.probability_stable)
             && !(prediction.stable && prediction.unsure);
-        let staleness = self.options.staleness_of(header, age_nanos);
-        if let Some(staleness) = staleness {
-            self.stale = Some((grasp_id, staleness));
-        }
-        let unusable = if is_valid { staleness.map(|_| Reason::Stale) } else { Some(Reason::Invalid) };
-        Arrival { break_in_order, gap_nanos, unusable, is_new_reading }
+        Arrival { break_in_order, stale, is_valid, is_new_reading }
     }
 
     /// Counts the outcome of the last lift, once.
@@ -571,7 +565,7 @@ impl LiftArbiter {
             epoch,
             grasp_id,
             doubt: pending_doubt.take().or(promise.is_withdrawn().then_some(Reason::PromiseWithdrawn)),
-            gap_nanos: 0,
+            stale: None,
             n_settled: 0,
             awaited: Phase::Settled,
             is_probe_pending: false,
@@ -593,7 +587,10 @@ impl LiftArbiter {
 
     /// Remembers that the open grasp is decided, and begins to watch it if it is lifted.
     fn close(&mut self, decision: &LiftDecision) {
-        let Some(OpenGrasp { epoch, grasp_id, .. }) = self.state.open.take() else { return };
+        let Some(OpenGrasp { epoch, grasp_id, stale, .. }) = self.state.open.take() else { return };
+        if decision.reason == Reason::Stale {
+            self.held_stale = stale.map(|stale| (grasp_id, stale));
+        }
         self.state.decided.push((epoch, grasp_id), self.options.n_remembered);
         if decision.action == Action::Lift {
             let before = self.state.lifted.replace(grasp_id);
@@ -830,8 +827,10 @@ mod tests {
         };
         assert_eq!(s.arbiter.silence_limit_nanos(), 200_000_000);
         assert_eq!((reasons(&mut s, "cccc+"), s.arbiter.staleness(0)), (vec![Reason::Stale], gap(125, 100)));
+        // Frames of a decided grasp show the pace as well.
+        assert_eq!(reasons(&mut s, "++++"), []);
         s.take('N');
-        assert_eq!((reasons(&mut s, "cccccc+++"), s.arbiter.staleness(1)), (vec![Reason::Stable], None));
+        assert_eq!((reasons(&mut s, "c+++"), s.arbiter.staleness(1)), (vec![Reason::Stable], None));
         assert_eq!(s.arbiter.silence_limit_nanos(), 375_000_000);
         s.take('N');
         assert_eq!(reasons(&mut s, "cc+"), []);
@@ -844,15 +843,29 @@ mod tests {
     }
 
     #[test]
+    fn a_fast_source_that_stands_still_now_and_then_is_held() {
+        let mut s = stream(ArbiterOptions::default());
+        for _ in 0..5 {
+            assert_eq!(s.take('c'), []);
+            s.header.stamp_nanos += 900_000_000;
+            assert_eq!(s.take('c'), []);
+        }
+        assert_eq!(s.take('+').first().map(|decision| decision.reason), Some(Reason::Stale));
+    }
+
+    #[test]
     fn a_stale_grasp_names_its_limit() {
         let options = ArbiterOptions::default();
-        let header = Header { valid_nanos: 50_000_000, ..Header::default() };
+        let header = Header { origin_nanos: 1, valid_nanos: 50_000_000, ..Header::default() };
         let said = |age_nanos| options.staleness_of(&header, age_nanos).map(|staleness| staleness.to_string());
         assert_eq!(said(50_000_000), None);
         let [expired, old, future] = [60_000_000, 312_000_000, u64::MAX].map(|age| said(age).expect("stale"));
         assert_eq!(expired, "a frame was 60.0 ms old, and expired after 50.0 ms (set by its machine)");
         assert_eq!(old, "a frame was 312.0 ms old, expected at most 200.0 ms (max_age_ms)");
-        assert!(future.contains("future"), "{future}");
+        assert!(future.contains("after this machine's clock"), "{future}");
+        let unknown =
+            options.staleness_of(&Header::default(), 86_400_000_000_000).map(|staleness| staleness.to_string());
+        assert!(unknown.is_some_and(|unknown| unknown.contains("is not known")));
     }
 
     #[test]

@@ -331,7 +331,7 @@ impl Model {
             };
             said.push(format!("{} is {}", names[idx], short(values[idx] * deviation + mean)));
         }
-        if said.is_empty() { None } else { Some(format!("most against it: {}", said.join(", "))) }
+        if said.is_empty() { None } else { Some(format!("of pads and joints, most against it: {}", said.join(", "))) }
     }
 
     /// Whether it judges anything but settled grasps.

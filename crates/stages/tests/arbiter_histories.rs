@@ -119,26 +119,20 @@ impl Input {
     }
 }
 
-/// How far apart the inputs of a grasp may be that is decided at the last input: the option, or three times the median of the
-/// last nine distances of inputs of an undecided grasp that followed each other in its epoch, if that is more, at most 1 s.
-fn gap_limit_nanos(history: &[Input], decided: &[(usize, u64)], options: &ArbiterOptions) -> u64 {
-    let samples: Vec<(usize, &Input)> = history.iter().enumerate().filter(|(_, input)| input.is_sample()).collect();
+/// How far apart the last input may be from the one before it in its grasp: the option, or three times the third smallest of the
+/// nine distances before, of inputs that followed each other in its epoch, if that is more, at most 1 s.
+fn gap_limit_nanos(before: &[Input], epoch: u64, options: &ArbiterOptions) -> u64 {
+    let samples: Vec<&Input> = before.iter().filter(|input| input.is_sample()).collect();
     let mut distances = Vec::new();
     for pair in samples.windows(2).rev() {
-        let [(_, before), (now_idx, now)] = [pair[0], pair[1]];
-        let (epoch, of_last) = (now.header.epoch, samples.last().map(|(_, last)| last.header.epoch));
-        let id = now.prediction.grasp_id;
-        let is_decided = decided
-            .iter()
-            .any(|(idx, decided_id)| *decided_id == id && *idx < now_idx && history[*idx].header.epoch == epoch);
-        let is_distance = before.grasp() == now.grasp() && now.follows(before) && !is_decided;
-        let nanos = now.header.stamp_nanos.saturating_sub(before.header.stamp_nanos);
-        if of_last == Some(epoch) && is_distance && nanos > 0 && distances.len() < 9 {
+        let nanos = pair[1].header.stamp_nanos.saturating_sub(pair[0].header.stamp_nanos);
+        let [last, now] = [pair[0], pair[1]];
+        if now.header.epoch == epoch && now.follows(last) && now.step != 'U' && nanos > 0 && distances.len() < 9 {
             distances.push(nanos);
         }
     }
     distances.sort_unstable();
-    let of_source = if distances.len() == 9 { (3 * distances[4]).min(1_000_000_000) } else { 0 };
+    let of_source = if distances.len() == 9 { (3 * distances[2]).min(1_000_000_000) } else { 0 };
     options.max_gap_nanos.max(of_source)
 }
 
@@ -200,9 +194,10 @@ fn may_lift(history: &[Input], decided: &[(usize, u64)], options: &ArbiterOption
         }
         Some(previous) => previous.step != 'U' && grasp.first().is_some_and(|first| first.follows(previous)),
     };
-    let limit_nanos = gap_limit_nanos(history, decided, options);
-    let is_unbroken = grasp.windows(2).all(|pair| {
-        pair[1].follows(&pair[0]) && pair[1].header.stamp_nanos - pair[0].header.stamp_nanos <= limit_nanos
+    let is_unbroken = (1..grasp.len()).all(|idx| {
+        let (last, now) = (&grasp[idx - 1], &grasp[idx]);
+        let limit_nanos = gap_limit_nanos(&history[..before.len() + idx], now.header.epoch, options);
+        now.follows(last) && now.header.stamp_nanos - last.header.stamp_nanos <= limit_nanos
     });
     // The row goes back to the first input of as many different times as there are votes.
     let mut times = Vec::new();

@@ -255,7 +255,7 @@ impl ExpectedHand {
     pub fn check(&self, reading: Reading) -> Result<Reading, Refusal> {
         match &reading.hand {
             Some(found) if *found != self.hand && *found != self.hand_id => Err(Refusal::malformed(format!(
-                "the frame is of the hand {found}: expected {} (hand_id {})",
+                "the frame is of the hand {found}: expected {} (hand_id {}); give each hand's graph and bridge an address of their own",
                 self.hand, self.hand_id
             ))),
             _ => Ok(reading),

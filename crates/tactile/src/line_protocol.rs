@@ -55,7 +55,9 @@ pub fn with_null_for_nan(text: &str) -> Cow<'_, str> {
     let (mut plain, mut in_name) = (String::new(), false);
     for part in text.split_inclusive('"') {
         plain += &if in_name { part.into() } else { part.replace("NaN", "null") };
-        if !part.ends_with("\\\"") {
+        let before_quote = part.trim_end_matches('"');
+        let n_escapes = before_quote.len() - before_quote.trim_end_matches('\\').len();
+        if n_escapes.is_multiple_of(2) {
             in_name = !in_name;
         }
     }

@@ -80,8 +80,8 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
 fn replayed(runner: &Runner<'_>, recording: &Path) -> anyhow::Result<(Graph, Decisions, Expectations)> {
     // The recording's own dataflow file is not known yet: all are replayed with the one of the command, and with the params of
     // the recorded graph.
-    let file_graph = checked(&dataflow::load(runner.dataflow)?, &[], Scope::Everything)?;
-    let set = settings::recorded(&RecordingReader::open(recording)?, &file_graph);
+    let given = checked(&dataflow::load(runner.dataflow)?, runner.overrides, Scope::Everything)?;
+    let set = settings::recorded(&RecordingReader::open(recording)?, &given);
     let graph = runner.graph(&Expectations { set, ..Expectations::default() }, runner.overrides)?;
     let (_fed, decisions) = runner.decide(recording, &graph, runner.overrides)?;
     if let Some((grasp_id, reason)) = decisions.held_as_another() {
@@ -94,7 +94,10 @@ fn replayed(runner: &Runner<'_>, recording: &Path) -> anyhow::Result<(Graph, Dec
     }
     let mut expected = decisions.to_expectations();
     expected.dataflow = other_dataflow(runner.dataflow, recording)?;
-    expected.set = other_params(&file_graph, &graph, recording)?;
+    // The file as `test` reads it later: without the command's params, and elsewhere without the variables of this environment.
+    let plain = dataflow::load_with(runner.dataflow, &|_| None);
+    let plain = plain.ok().and_then(|file| checked(&file, &[], Scope::Everything).ok());
+    expected.set = other_params(plain.as_ref(), &graph, recording)?;
     Ok((graph, decisions, expected))
 }
 
@@ -114,19 +117,20 @@ fn other_dataflow(dataflow: &Path, recording: &Path) -> anyhow::Result<Option<Pa
     Ok(Some(relative(&dataflow, folder)))
 }
 
-/// The params that have other values than in the dataflow file, with paths relative to the recording's folder. The recording
-/// takes the place of the source.
-fn other_params(file_graph: &Graph, graph: &Graph, recording: &Path) -> anyhow::Result<Vec<String>> {
+/// The params that have other values than in the dataflow file, or all if it cannot be used alone, with paths relative to the
+/// recording's folder. The recording takes the place of the source.
+fn other_params(plain: Option<&Graph>, graph: &Graph, recording: &Path) -> anyhow::Result<Vec<String>> {
     let recording = absolute(recording)?;
     let folder = recording.parent().unwrap_or(Path::new("/"));
     let mut sets = Vec::new();
     for node in graph.nodes.iter().filter(|node| !node.is_source()) {
         for (name, value) in &node.params {
-            if file_graph.node(&node.id).and_then(|node| node.params.get(name)) == Some(value) {
+            let in_file = plain.and_then(|graph| graph.node(&node.id)).and_then(|node| node.params.get(name));
+            if value.is_null() || in_file == Some(value) {
                 continue;
             }
             let text = match value.as_str() {
-                Some(path) if path.starts_with('/') => {
+                Some(path) if settings::is_path(node, name) => {
                     Path::new(".").join(relative(Path::new(path), folder)).display().to_string()
                 }
                 Some(text) => text.into(),

@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use blindgrasp_graph::dataflow::Graph;
+use blindgrasp_graph::dataflow::{Graph, Node};
+use blindgrasp_operator::param::ParamKind;
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_stages::model::Model;
 use serde_json::Value;
@@ -19,7 +20,7 @@ pub(super) fn recorded(recording: &RecordingReader, file_graph: &Graph) -> Vec<S
         for (name, value) in params {
             let is_known = node.description.params.iter().any(|param| param.name == *name);
             let text = value.as_str().map_or_else(|| value.to_string(), String::from);
-            let is_gone = is_path(value) && !Path::new(&text).exists();
+            let is_gone = is_path(node, name) && !Path::new(&text).exists();
             if is_known && !is_gone && node.params.get(name) != Some(value) && !value.is_null() {
                 sets.push(format!("{}.{name}={text}", node.id));
             }
@@ -46,7 +47,7 @@ pub(super) fn differing(recording: &RecordingReader, graph: &Graph) -> Option<St
                 if then.zip(now.as_ref()).is_some_and(|(then, now)| then != now.checksum) {
                     differing.push(format!("{at} was another model"));
                 }
-            } else if !then.is_null() && then != now && !is_path(now) {
+            } else if !then.is_null() && then != now && !is_path(node, name) {
                 differing.push(format!("{at} was {then} and is {now}"));
             }
         }
@@ -56,6 +57,7 @@ pub(super) fn differing(recording: &RecordingReader, graph: &Graph) -> Option<St
 }
 
 /// Folders differ from machine to machine.
-fn is_path(value: &Value) -> bool {
-    value.as_str().is_some_and(|text| text.starts_with('/'))
+pub(super) fn is_path(node: &Node, param: &str) -> bool {
+    let param = node.description.params.iter().find(|known| known.name == param);
+    param.is_some_and(|param| matches!(param.kind, ParamKind::Path { .. }))
 }

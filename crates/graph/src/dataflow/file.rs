@@ -62,16 +62,16 @@ impl DataflowFile {
 /// When the file cannot be read, is larger than 1 MiB, is not UTF-8, is not YAML without anchors, aliases and tags, is
 /// of another version, or is no mapping. Other mistakes are left to [`crate::dataflow::check()`].
 pub fn load(path: &Path) -> Result<DataflowFile, DataflowError> {
-    load_with(path, &[])
+    load_with(path, &|name| std::env::var(name).ok())
 }
 
-/// As [`load`], with these variables, which come before those of the environment.
+/// As [`load`], with other variables than those of the environment.
 ///
 /// # Errors
 /// As [`load`].
-pub fn load_with(path: &Path, variables: &[(&str, &str)]) -> Result<DataflowFile, DataflowError> {
+pub fn load_with(path: &Path, variable: &dyn Fn(&str) -> Option<String>) -> Result<DataflowFile, DataflowError> {
     match read(path) {
-        Ok(bytes) => parse_with(path, &bytes, variables),
+        Ok(bytes) => parse_with(path, &bytes, variable),
         Err(error) => {
             let mut diagnostics = Diagnostics::new(path);
             let in_folder = path.join("dataflow.yaml");
@@ -93,12 +93,16 @@ pub fn load_with(path: &Path, variables: &[(&str, &str)]) -> Result<DataflowFile
 /// # Errors
 /// As [`load`].
 pub fn parse(path: &Path, content: &[u8]) -> Result<DataflowFile, DataflowError> {
-    parse_with(path, content, &[])
+    parse_with(path, content, &|name| std::env::var(name).ok())
 }
 
-fn parse_with(path: &Path, content: &[u8], variables: &[(&str, &str)]) -> Result<DataflowFile, DataflowError> {
+fn parse_with(
+    path: &Path,
+    content: &[u8],
+    variable: &dyn Fn(&str) -> Option<String>,
+) -> Result<DataflowFile, DataflowError> {
     let mut diagnostics = Diagnostics::new(path);
-    match read_file(path, content, variables, &mut diagnostics) {
+    match read_file(path, content, variable, &mut diagnostics) {
         Some(file) => Ok(DataflowFile { diagnostics, ..file }),
         None => Err(diagnostics.into_error()),
     }
@@ -114,7 +118,7 @@ fn read(path: &Path) -> std::io::Result<Vec<u8>> {
 fn read_file(
     path: &Path,
     content: &[u8],
-    variables: &[(&str, &str)],
+    variable: &dyn Fn(&str) -> Option<String>,
     diagnostics: &mut Diagnostics,
 ) -> Option<DataflowFile> {
     let text = text_of(content, diagnostics)?;
@@ -125,7 +129,7 @@ fn read_file(
             return None;
         }
     };
-    let root = read_root(text, variables, diagnostics)?;
+    let root = read_root(text, variable, diagnostics)?;
     let start = root.at;
     let entries = entries_of_this_version(root, diagnostics)?;
     let mut file = DataflowFile {
@@ -194,19 +198,12 @@ fn text_of<'a>(content: &'a [u8], diagnostics: &mut Diagnostics) -> Option<&'a s
 }
 
 /// The document with its variables filled in.
-fn read_root(text: &str, variables: &[(&str, &str)], diagnostics: &mut Diagnostics) -> Option<Value> {
+fn read_root(text: &str, variable: &dyn Fn(&str) -> Option<String>, diagnostics: &mut Diagnostics) -> Option<Value> {
     let mut root = yaml::parse(text, diagnostics)?;
     let n_before = diagnostics.len();
-    fill_in(&mut root, &|name| variable(variables, name), diagnostics);
+    fill_in(&mut root, variable, diagnostics);
     // A value that is not known would be a second mistake.
     if diagnostics.len() > n_before { None } else { Some(root) }
-}
-
-fn variable(variables: &[(&str, &str)], name: &str) -> Option<String> {
-    match variables.iter().find(|(known, _)| *known == name) {
-        Some((_, value)) => Some((*value).to_owned()),
-        None => std::env::var(name).ok(),
-    }
 }
 
 /// The keys of a file with their values. In another version, the other keys may mean something else.

@@ -39,7 +39,8 @@ pub(super) struct Setup {
 impl Setup {
     /// Reads the file and finds the node whose outcomes are counted.
     pub(super) fn new(arguments: &Arguments) -> anyhow::Result<Setup> {
-        let file = dataflow::load_with(&arguments.dataflow, &[("SOURCE", SOURCE)])?;
+        let variable = |name: &str| if name == "SOURCE" { Some(SOURCE.into()) } else { std::env::var(name).ok() };
+        let file = dataflow::load_with(&arguments.dataflow, &variable)?;
         let graph = checked(&file, &arguments.overrides, Scope::Everything)?;
         if graph.machines.is_some() {
             bail!("{}: trials run on one machine, and the file names several", arguments.dataflow.display());
