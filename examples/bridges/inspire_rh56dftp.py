@@ -96,7 +96,9 @@ class Modbus:
         # One request is under way, so each answer is to it, whatever its number; but numbers that jump show a lost answer.
         lag = (self.number - number) % 0x10000
         self.lag = lag if self.lag is None else self.lag
-        if (lag, protocol) != (self.lag, 0):
+        if protocol != 0:
+            raise Silence(f"an answer of protocol {protocol}, expected 0 (Modbus)")
+        if lag != self.lag:
             raise Silence(f"answer {number} to request {self.number}, expected a number {self.lag} behind it")
         if answer[:1] == b"\x83" and len(answer) == 2:
             raise ModbusError(f"registers at {address}: exception {answer[1]}")
@@ -145,6 +147,8 @@ def frames(modbus, newtons_per_count, rate):
         except Silence as silence:
             yield f"the hand does not answer ({silence}): no frames until it does"
             modbus.connect_again()
+            # The hand may have closed meanwhile, and one that holds an object must not count as open.
+            phase.of(line_protocol.now_nanos(), None, False)
             # The missing number holds the grasp that the pause was in.
             seq += 1
             continue

@@ -189,7 +189,7 @@ class Frames:
             names, values = message.name, message.position
         twice = sorted(name for name in self.sources if list(names).count(name) > 1)
         if twice:
-            raise ValueError(f"joints: the name {twice[0]} stands in a message twice")
+            raise ValueError(f"the name {twice[0]} stands in a message twice: one node must send each joint once")
         ours = {name: (value, stamp) for name, value in zip(names, values) if name in self.sources}
         self.values.update(ours)
         for name in ours:

@@ -137,7 +137,7 @@ class LaggingHand:
     behind 3000."""
 
     def __init__(self):
-        self.is_paused, self.refused = threading.Event(), None
+        self.is_paused, self.refused, self.angle = threading.Event(), None, 1000
         self.words_of_pads = [address - 3000 + 2 * word for address, words in inspire.PADS for word in range(words)]
         self.server = socket.create_server(("127.0.0.1", 0))
         self.port = self.server.getsockname()[1]
@@ -166,9 +166,8 @@ class LaggingHand:
                 number = (number - 1) % 0x10000
                 connection.sendall(struct.pack(">HHHB", number, 0, len(body) + 1, unit) + body)
 
-    @staticmethod
-    def word(address):
-        return address if address >= 3000 else 1000 if address < 1612 else 0x0202
+    def word(self, address):
+        return address if address >= 3000 else self.angle if address < 1612 else 0x0202
 
     def stop(self):
         self.is_over = True
@@ -269,6 +268,12 @@ class Inspire(unittest.TestCase):
         hand.refused = 105
         refused = inspire.frames(modbus, 0.001, 1000.0)
         self.assertEqual(next(refused)["cells_newtons"], found[0]["cells_newtons"])
+        # It may have closed on an object while it paused.
+        hand.is_paused.set()
+        self.assertIn("the hand does not answer", next(frames))
+        hand.angle = 300
+        threading.Timer(0.1, hand.is_paused.clear).start()
+        self.assertIn("the hand has not been open", next(frames))
 
 
 def packet(*blocks):

@@ -203,7 +203,8 @@ impl Job<'_> {
             // What took hours must not take the place of a whole recording, nor be lost.
             let mut of_before = String::new();
             if let Ok(before) = out.canonicalize() {
-                let kept = before.with_extension("before.mcap");
+                let mut names = (1..).map(|number| before.with_extension(format!("before-{number}.mcap")));
+                let kept = names.find(|name| !name.exists()).unwrap_or(before.clone());
                 std::fs::rename(&before, &kept).with_context(|| format!("cannot make {}", kept.display()))?;
                 of_before = format!(", the recording that was there in {}", kept.display());
             }

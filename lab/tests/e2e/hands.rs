@@ -472,6 +472,7 @@ fn cells_on_sensor_frames_belong_to_the_finger() {
     assert!(!stderr.contains("where they feel nothing"), "{stderr}");
     let layout = std::fs::read_to_string(folder.path().join("other/other.yaml")).expect("a layout");
     assert!(layout.contains("{name: \"s1\", link: \"f1\"") && layout.contains("at_m: [-0.006, 0, 0.07]"), "{layout}");
+    assert!(layout.contains("normal: [-1, 0,"), "{layout}");
 }
 
 #[test]

@@ -110,7 +110,7 @@ fn a_file_is_interrupted_whole_and_leaves_nothing_else() {
             run(&["info", out.to_str().expect("UTF-8")], 0);
             let before = std::fs::read(&out).expect("a recording");
             let said = interrupted(&out, signal);
-            let kept = if said.contains("nothing is recorded") { out } else { folder.path().join("big.before.mcap") };
+            let kept = if said.contains("nothing is recorded") { out } else { folder.path().join("big.before-1.mcap") };
             assert!(std::fs::read(&kept).expect("the recording before") == before, "{said}");
         }
     }

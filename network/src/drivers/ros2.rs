@@ -253,7 +253,7 @@ impl Ros2 {
         }
         for wanted in &self.topics.hand_joints {
             if names.iter().filter(|name| **name == wanted.name).count() > 1 {
-                return Err(format!("joint '{}' stands in it twice", wanted.name));
+                return Err(format!("joint '{}' stands in it twice: one node must send each joint once", wanted.name));
             }
         }
         let mut has_any = false;
@@ -738,7 +738,7 @@ mod tests {
         let twice = joints(&driver, &["a", "a"], &[0.1, 0.2], 1);
         assert_eq!(
             why(take(&mut driver, Topic::Joints, twice, 1, None)),
-            "/joint_states: joint 'a' stands in it twice"
+            "/joint_states: joint 'a' stands in it twice: one node must send each joint once"
         );
         let phase = message(&driver, Topic::Phase, &"asleep", 1);
         assert_eq!(why(take(&mut driver, Topic::Phase, phase, 1, None)), "/phase: 'asleep' is no phase");

@@ -123,6 +123,9 @@ impl UrdfReading {
             };
             return Err(format!("not a URDF: expected XML with one <robot>, found <{name}>{converter}"));
         }
+        if name.starts_with("xacro:") {
+            return Err("it is a xacro file: give it a name that ends in .xacro, so that it is expanded".into());
+        }
         self.path.push(name);
         if self.path.len() > MAX_DEPTH {
             return Err(format!("not a URDF: XML elements nested deeper than {MAX_DEPTH}"));

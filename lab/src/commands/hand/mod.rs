@@ -233,11 +233,7 @@ fn urdf_text(path: &Path, xacro_arguments: &[String]) -> anyhow::Result<String> 
     if !xacro_arguments.is_empty() {
         bail!("--xacro-arg is of no use to {}: its name does not end in .xacro", path.display());
     }
-    let urdf = read_urdf(path)?;
-    if urdf.contains("<xacro:") {
-        bail!("{}: it is a xacro file: give it a name that ends in .xacro, so that it is expanded", path.display());
-    }
-    Ok(urdf)
+    Ok(read_urdf(path)?)
 }
 
 /// Adds the remedy to an error that the URDF of a whole robot makes.
