@@ -432,7 +432,7 @@ mod tests {
     /// Whether the recording is checked before it is played, and whether its samples are kept.
     const WAYS: [(u64, usize); 3] = [(u64::MAX, usize::MAX), (u64::MAX, 0), (0, 0)];
 
-    /// A recording with what is written into it.
+    /// A recording with the samples that `write` adds.
     fn recording(write: impl FnOnce(&mut RecordingWriter)) -> TempPath {
         let path = tempfile::NamedTempFile::new().expect("a file").into_temp_path();
         let info = RecordingInfo { hand: "h".into(), hand_id: HAND_ID, made_by: "a test".into(), version: "0".into() };

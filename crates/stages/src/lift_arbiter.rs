@@ -777,7 +777,7 @@ mod tests {
             "++n++$[0 Hold NoAgreement]",
             // A lying sensor while closing is remembered.
             "!+[0 Hold Invalid]++$",
-            // A grasp whose source has no more frames is decided: what is decided stays so, and a doubt is still the reason.
+            // A grasp whose source has no more frames is decided and stays so, and a doubt is still the reason.
             "++e[0 Hold NoAgreement]N+++[1 Lift Stable]eNe[2 Hold Missing]N!e[3 Hold Invalid]$",
             // The next grasp ends the one before. A sample of a decided grasp amid another one holds that one.
             "+N+[0 Hold NoAgreement]++[1 Lift Stable]P+++N+$",

@@ -224,7 +224,7 @@ fn a_graph_learns_from_its_lifts_through_kills_and_swaps() {
     tell(&mut judge, 30..60);
     run(&["swap", "classifier", "--probation", "0", "--graph", &graph.name], 0);
     tell(&mut judge, 60..90);
-    // A replacement that does not learn has no state. It fails, and the old one goes on with what it has learned.
+    // A replacement that does not learn has no state. It fails, and the old one goes on with its own state.
     let old = graph.pid_of("classifier");
     let mut swapping = blindgrasp();
     swapping.args(["swap", "classifier", "--set", "adapt=off", "--probation", "60", "--graph", &graph.name]);
@@ -245,7 +245,7 @@ fn a_graph_learns_from_its_lifts_through_kills_and_swaps() {
     tell(&mut judge, 105..N_GRASPS);
     let arbiter = graph.node("lift_arbiter")["counts"].clone();
     let listed = text(&run(&["ps", &graph.name], 0).stdout).to_string();
-    assert!(listed.contains("of this robot's lifts drop (95 % confidence"), "{listed}\n{arbiter}");
+    assert!(listed.contains("of this robot's lifts drop (95 % confidence if"), "{listed}\n{arbiter}");
     let ended = graph.stop();
     assert_eq!(ended.code, Some(0), "{}\n{}", ended.summary, ended.stderr);
     assert_eq!(ended.decisions.iter().map(decision).collect::<Vec<_>>(), expected);

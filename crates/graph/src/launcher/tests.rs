@@ -20,7 +20,7 @@ use blindgrasp_operator::wiring::{Clock, Report, Sandbox};
 /// The node of all these graphs.
 pub(super) const STUB: &str = "stub";
 
-/// A launched graph. What is declared first goes first.
+/// A launched graph. Its fields are dropped in this order.
 pub(super) struct Launched {
     pub(super) launcher: Launcher,
     _namespace: Namespace,
