@@ -27,7 +27,6 @@ from .options import REQUIRED
 SUBJECTS = (
     "runtime",
     "rate_max",
-    "peers",
     "side_by_side",
     "gaps",
     "soak",
@@ -37,7 +36,6 @@ SUBJECTS = (
     "tactile_source",
     "top",
     "view",
-    "ros2",
     "machines",
     "robots",
     "simulator",
