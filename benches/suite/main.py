@@ -31,7 +31,6 @@ SUBJECTS = (
     "gaps",
     "soak",
     "recording",
-    "mcap",
     "python",
     "tactile_source",
     "top",
