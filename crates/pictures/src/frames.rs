@@ -10,7 +10,6 @@ use super::grasp::Placed;
 use super::scene::{HandScene, Surface, rounded, rows};
 use blindgrasp_mesh::Mesh;
 use blindgrasp_mesh::shape::mesh_of_shape;
-use blindgrasp_messages::TactileFrame;
 use blindgrasp_stages::hand::Hand;
 
 const POST: Rgb = [0.902, 0.878, 0.835];
@@ -58,7 +57,14 @@ impl DrawnFrames {
             let frame = &all[*idx];
             let since_start_nanos = frame.header.stamp_nanos.saturating_sub(all[0].header.stamp_nanos);
             let title = format!("{}, {:.0} ms", frame.message.phase.as_str(), since_start_nanos as f64 / 1e6);
-            drawn.push(placed, &frame.message, &frame.message.joints, title)?;
+            let poses = placed.hand.palm_from_links(&frame.message.joints);
+            let poses = poses.map_err(|source| PictureError::Joints { grasp_id: placed.grasp.grasp_id, source })?;
+            let cells = frame.message.cells_newtons.iter();
+            drawn.frames.push(DrawnFrame {
+                title,
+                links: poses.iter().map(|pose| Some(rows(pose))).collect(),
+                cells: cells.map(|force| force.is_finite().then(|| rounded(*force))).collect(),
+            });
         }
         Ok(drawn)
     }
@@ -99,23 +105,6 @@ impl DrawnFrames {
             }
         }
         Ok(drawn)
-    }
-
-    fn push(
-        &mut self,
-        placed: &Placed<'_>,
-        frame: &TactileFrame,
-        joints: &[f64],
-        title: String,
-    ) -> Result<(), PictureError> {
-        let poses = placed.hand.palm_from_links(joints);
-        let poses = poses.map_err(|source| PictureError::Joints { grasp_id: placed.grasp.grasp_id, source })?;
-        self.frames.push(DrawnFrame {
-            title,
-            links: poses.iter().map(|pose| Some(rows(pose))).collect(),
-            cells: frame.cells_newtons.iter().map(|force| force.is_finite().then(|| rounded(*force))).collect(),
-        });
-        Ok(())
     }
 }
 
