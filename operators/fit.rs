@@ -147,7 +147,7 @@ impl<'a> Check<'a> {
         let mut source = self.part_before(contacts, "tactile");
         while let Some(part) = source {
             self.hand(part, classifier, &model);
-            if part.operator == "tactile_source" && part.params.get("driver") != Some(&"recording".into()) {
+            if part.operator == "tactile_source" {
                 if learned_from_wrench_space(&model) {
                     self.label(part, classifier);
                 } else {

@@ -1,5 +1,4 @@
-//! The hardware's side of the graph: live tactile frames from a bridge over TCP, a serial device, or a recording that is
-//! played as the hardware would send it.
+//! The hardware's side of the graph: live tactile frames from a bridge over a socket, or from a serial device.
 //!
 //! A frame that is malformed, late or out of order is counted and refused. It leaves a gap in the numbers, so that the
 //! arbiter holds the grasp it belonged to. The source finds a lost sender again by itself. A source that is started again
@@ -27,7 +26,6 @@ use blindgrasp_stages::day::MAX_DAY;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_tactile::cell_zeros::{CellZeros, Zeroed};
 use blindgrasp_tactile::gate::{Accepted, Counts, FrameFilter, Shape};
-use blindgrasp_tactile::replay::Replay;
 use blindgrasp_tactile::stream::{Link, Stream};
 use blindgrasp_tactile::{Arrival, Event, ExpectedHand, Place, Reading, Refusal, RefusalKind, TactileDriver};
 use serde::Deserialize;
@@ -37,7 +35,7 @@ use crate::beginning::FileNode;
 use crate::connection::{with_connection_params, with_network_params};
 use crate::houses::NETWORK_PROGRAM;
 
-const DRIVERS: [&str; 6] = ["listen", "connect", "serial", "recording", "ros2", "zenoh"];
+const DRIVERS: [&str; 5] = ["listen", "connect", "serial", "ros2", "zenoh"];
 const DEFAULT_BAUD: u32 = 115_200;
 /// The parameters that the source has with each driver.
 const COMMON_PARAMS: [&str; 5] = ["driver", "hand", "max_delay_ms", "day", "zero_when_open"];
@@ -63,7 +61,6 @@ struct RobotParams {
     address: Option<String>,
     device: Option<PathBuf>,
     baud: Option<u32>,
-    recording: Option<PathBuf>,
     idle_limit_ms: Option<f64>,
 }
 
@@ -111,7 +108,6 @@ pub fn describe() -> OperatorDescription {
             ParamKind::Integer { min: Some(50), max: Some(20_000_000) },
             "serial: bits per second, 115200 by default",
         )
-        .optional_param("recording", file(true), "recording: the recording (MCAP)")
         .live_param(
             "max_delay_ms",
             millis(1.0),
@@ -251,13 +247,8 @@ fn setup(node_params: &Map<String, Value>, has_sandbox: bool, make_driver: MakeD
     }
     refuse_unused(&params.driver, node_params)?;
     let driver = make_driver(&AskedDriver { name: &params.driver, params: node_params, hand: &hand, has_sandbox })?;
-    let mut sensed = hand.clone();
-    if params.driver == "recording" {
-        // A recording holds forces, which rise.
-        sensed.pads.iter_mut().for_each(|pad| pad.falls_under_load = false);
-    }
     let zeros =
-        CellZeros::new(&sensed, params.zero_when_open).map_err(|reason| anyhow!("hand {}: {reason}", hand.name))?;
+        CellZeros::new(&hand, params.zero_when_open).map_err(|reason| anyhow!("hand {}: {reason}", hand.name))?;
     Ok(SourceParts { params, hand, driver, zeros })
 }
 
@@ -287,10 +278,10 @@ fn params_of(driver: &str) -> Vec<String> {
     connection.params.into_iter().chain(own).map(|param| param.name).collect()
 }
 
-/// A driver for the line protocol or a recording.
+/// A driver for the line protocol.
 ///
 /// # Errors
-/// A param is missing, or the recording cannot be read.
+/// A param is missing or of no use.
 pub fn robot_driver(asked: &AskedDriver<'_>) -> anyhow::Result<Box<dyn TactileDriver>> {
     let params: RobotParams = parse_params(asked.params)?;
     let name = asked.name;
@@ -307,10 +298,6 @@ pub fn robot_driver(asked: &AskedDriver<'_>) -> anyhow::Result<Box<dyn TactileDr
             device: params.device.with_context(|| lacks("device", "/dev/ttyACM0"))?,
             baud: params.baud.unwrap_or(DEFAULT_BAUD),
         },
-        "recording" => {
-            let recording = params.recording.with_context(|| lacks("recording", "recordings/mine.mcap"))?;
-            return Ok(Box::new(Replay::new(&recording, asked.hand)?));
-        }
         _ => bail!("the driver {name} is in {NETWORK_PROGRAM}, not in this program"),
     };
     if let Link::Listen { address } | Link::Connect { address } = &link
@@ -387,10 +374,6 @@ impl Source for TactileSource<'_> {
             Event::Refused(refusal) => {
                 self.gate.refused(refusal.kind);
                 self.refuse(&refusal);
-            }
-            Event::Ended => {
-                self.gate.ended();
-                return Ok(Step::Done);
             }
         }
         Ok(Step::Next)

@@ -46,13 +46,13 @@ def default_with(folder, lines):
     return path
 
 
-def judging_nodes(source, **more):
-    """The default graph behind this node's frames, as operators of a dataflow file. `more` are keys of every node."""
+def judging_nodes(source):
+    """The default graph behind this node's frames, as operators of a dataflow file."""
     return {
-        "contacts": {"inputs": {"tactile": f"{source}/tactile"}, "params": {"hand": str(HAND)}, **more},
-        "encoder": {"inputs": {"contacts": "contacts/contacts"}, "params": {"model": str(MODEL)}, **more},
-        "classifier": {"inputs": {"feature": "encoder/feature"}, "params": {"model": str(MODEL)}, **more},
-        "lift_arbiter": {"inputs": {"prediction": "classifier/prediction"}, "params": {"max_age_ms": 60000}, **more},
+        "contacts": {"inputs": {"tactile": f"{source}/tactile"}, "params": {"hand": str(HAND)}},
+        "encoder": {"inputs": {"contacts": "contacts/contacts"}, "params": {"model": str(MODEL)}},
+        "classifier": {"inputs": {"feature": "encoder/feature"}, "params": {"model": str(MODEL)}},
+        "lift_arbiter": {"inputs": {"prediction": "classifier/prediction"}, "params": {"max_age_ms": 60000}},
     }
 
 

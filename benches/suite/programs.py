@@ -41,14 +41,6 @@ def blindgrasp(*arguments):
     return output(BLINDGRASP, *arguments)
 
 
-def build_peer(name):
-    """The program of benches/NAME, which is no part of the workspace, built."""
-    manifest, target = PROJECT / "benches" / name / "Cargo.toml", PROJECT / "target" / name
-    command = ["cargo", "build", "--release", "--quiet", "--manifest-path", manifest, "--target-dir", target]
-    subprocess.run(command, check=True, stdout=sys.stderr)
-    return target / "release" / f"{name}-peer"
-
-
 @functools.cache
 def bench_program(name):
     """The program of benches/, built."""

@@ -11,10 +11,8 @@ use std::io::{BufRead, IsTerminal, Write};
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
-use std::process::{Child, ChildStdin, ChildStdout, Command, ExitStatus, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::mpsc::{Receiver, channel};
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Duration;
 
 use anyhow::{Context, bail};
@@ -32,8 +30,6 @@ const VARIABLE: &str = "BLINDGRASP_OVER_SSH";
 const SSH_VARIABLE: &str = "BLINDGRASP_SSH";
 /// A line to the command on the other machine: stop, as with Ctrl-C.
 const STOP: &str = "stop";
-/// A line to `record` on the other machine: its files have arrived.
-const KEPT: &str = "kept";
 /// The caller checks this often whether the command has ended or is to be stopped.
 const POLL: Duration = Duration::from_millis(20);
 /// The exit code of `ssh` if it has no connection.
@@ -42,8 +38,6 @@ const NO_CONNECTION: i32 = 255;
 const NOT_STARTED: [i32; 2] = [126, 127];
 /// The exit code of a shell for a command that Ctrl-C has ended.
 const INTERRUPTED: u8 = 130;
-/// Tells that the caller has the files of a recording; its end, that the caller has gone.
-static WHEN_KEPT: OnceLock<Mutex<Receiver<()>>> = OnceLock::new();
 
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Another machine")]
@@ -61,14 +55,6 @@ pub(super) struct MachineArgument {
 pub(super) struct Destination {
     pub(super) machine: String,
     pub(super) host: String,
-}
-
-/// A command that runs on another machine.
-pub(super) struct There {
-    child: Child,
-    stdin: Arc<Mutex<Option<ChildStdin>>>,
-    /// How often Ctrl-C was pressed here.
-    n_stops: Arc<AtomicUsize>,
 }
 
 impl MachineArgument {
@@ -98,8 +84,9 @@ impl Destination {
     /// # Errors
     /// There is no connection, or no program `blindgrasp`.
     pub(super) fn run(&self) -> anyhow::Result<Outcome> {
-        let there = self.start(Stdio::inherit())?;
-        let (status, is_stopped) = there.wait()?;
+        let n_stops = stop_requests()?;
+        let mut ssh = self.command("-T")?.stdin(Stdio::piped()).spawn().context("cannot start ssh")?;
+        let (status, is_stopped) = wait(&mut ssh, &n_stops)?;
         self.outcome(status, is_stopped)
     }
 
@@ -110,18 +97,6 @@ impl Destination {
     pub(super) fn run_on_terminal(&self) -> anyhow::Result<Outcome> {
         let status = self.command("-t")?.status().context("cannot start ssh")?;
         self.outcome(status, false)
-    }
-
-    /// Starts this process's command there.
-    ///
-    /// # Errors
-    /// ssh cannot be started.
-    pub(super) fn start(&self, stdout: Stdio) -> anyhow::Result<There> {
-        let n_stops = stop_requests()?;
-        let mut command = self.command("-T")?;
-        let mut child = command.stdin(Stdio::piped()).stdout(stdout).spawn().context("cannot start ssh")?;
-        let stdin = Arc::new(Mutex::new(child.stdin.take()));
-        Ok(There { child, stdin, n_stops })
     }
 
     fn command(&self, terminal: &str) -> anyhow::Result<Command> {
@@ -152,7 +127,7 @@ impl Destination {
     ///
     /// # Errors
     /// There is no connection, or no program `blindgrasp`.
-    pub(super) fn outcome(&self, status: ExitStatus, is_stopped: bool) -> anyhow::Result<Outcome> {
+    fn outcome(&self, status: ExitStatus, is_stopped: bool) -> anyhow::Result<Outcome> {
         let Destination { machine, host } = self;
         match status.code() {
             Some(0) => Ok(Outcome::Done),
@@ -177,43 +152,29 @@ impl Destination {
     }
 }
 
-impl There {
-    pub(super) fn take_stdout(&mut self) -> anyhow::Result<ChildStdout> {
-        self.child.stdout.take().context("ssh has no stdout")
-    }
-
-    /// Says to the command that its files have arrived, or else hangs up.
-    pub(super) fn acknowledgement(&self) -> impl FnOnce(bool) + Send + 'static {
-        let stdin = Arc::clone(&self.stdin);
-        move |have_arrived| {
-            if have_arrived {
-                say(&stdin, KEPT);
-            } else {
-                *stdin.lock().unwrap_or_else(PoisonError::into_inner) = None;
-            }
+/// Waits for the end of the command there, and passes Ctrl-C on: a second one ends ssh. Returns whether it was pressed.
+///
+/// # Errors
+/// ssh cannot be waited for.
+fn wait(ssh: &mut Child, n_stops: &AtomicUsize) -> anyhow::Result<(ExitStatus, bool)> {
+    let mut n_said = 0;
+    loop {
+        if let Some(status) = ssh.try_wait().context("cannot wait for ssh")? {
+            return Ok((status, n_said > 0));
         }
-    }
-
-    /// Waits for the end of the command, and passes Ctrl-C on: a second one ends ssh. Returns whether it was pressed.
-    ///
-    /// # Errors
-    /// ssh cannot be waited for.
-    pub(super) fn wait(mut self) -> anyhow::Result<(ExitStatus, bool)> {
-        let mut n_said = 0;
-        loop {
-            if let Some(status) = self.child.try_wait().context("cannot wait for ssh")? {
-                return Ok((status, n_said > 0));
-            }
-            let n_stops = self.n_stops.load(Ordering::Relaxed);
-            if n_stops > 0 && n_said == 0 {
-                say(&self.stdin, STOP);
-            }
-            if n_stops > 1 {
-                let _ = self.child.kill();
-            }
-            n_said = n_stops;
-            std::thread::sleep(POLL);
+        let n_stops = n_stops.load(Ordering::Relaxed);
+        if n_stops > 0
+            && n_said == 0
+            && let Some(stdin) = ssh.stdin.as_mut()
+        {
+            // If it has ended, there is nobody to tell.
+            let _ = writeln!(stdin, "{STOP}").and_then(|()| stdin.flush());
         }
+        if n_stops > 1 {
+            let _ = ssh.kill();
+        }
+        n_said = n_stops;
+        std::thread::sleep(POLL);
     }
 }
 
@@ -236,25 +197,14 @@ pub(crate) fn answer_caller() {
     if std::io::stdin().is_terminal() {
         return;
     }
-    let (kept, when_kept) = channel();
-    let _ = WHEN_KEPT.set(Mutex::new(when_kept));
-    std::thread::spawn(move || {
+    std::thread::spawn(|| {
         for line in std::io::stdin().lock().lines().map_while(Result::ok) {
-            match line.as_str() {
-                STOP => stop_self(),
-                KEPT => drop(kept.send(())),
-                _ => {}
+            if line == STOP {
+                stop_self();
             }
         }
-        drop(kept);
         stop_self();
     });
-}
-
-/// Waits until the caller has the files of a recording, or has gone; returns whether it has them.
-pub(super) fn has_caller_kept() -> bool {
-    let Some(when_kept) = WHEN_KEPT.get() else { return false };
-    when_kept.lock().unwrap_or_else(PoisonError::into_inner).recv().is_ok()
 }
 
 /// Whether this process was called by [`Destination`].
@@ -265,13 +215,6 @@ pub(super) fn is_over_ssh() -> bool {
 /// As Ctrl-C does.
 fn stop_self() {
     let _ = kill_process(getpid(), Signal::INT);
-}
-
-fn say(stdin: &Mutex<Option<ChildStdin>>, line: &str) {
-    if let Some(stdin) = stdin.lock().unwrap_or_else(PoisonError::into_inner).as_mut() {
-        // If it has ended, there is nobody to tell.
-        let _ = writeln!(stdin, "{line}").and_then(|()| stdin.flush());
-    }
 }
 
 /// The destination that the dataflow files of the graphs here name for a machine, or its name.
@@ -305,7 +248,7 @@ fn words_for_shell(words: impl Iterator<Item = OsString>) -> OsString {
 }
 
 /// A word that sh, bash, zsh and fish take as it is. fish takes a backslash in single quotes for an escape.
-pub(super) fn quoted(word: &OsStr) -> OsString {
+fn quoted(word: &OsStr) -> OsString {
     if !word.is_empty() && word.as_bytes().iter().all(|byte| byte.is_ascii_alphanumeric() || b"_-./".contains(byte)) {
         return word.to_owned();
     }

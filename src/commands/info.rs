@@ -1,14 +1,12 @@
 //! `blindgrasp info`
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::ffi::OsStr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::{Context, bail};
 use clap::Args;
 
 use super::{Outcome, completions, hand_cells, percent, print_line, print_text};
-use blindgrasp_cli::houses::LAB;
 use blindgrasp_cli::joint;
 use blindgrasp_graph::client::{is_graph_name, running_graphs};
 use blindgrasp_grasps::dataset::{REPORT_METADATA, hand_of};
@@ -22,21 +20,17 @@ use blindgrasp_stages::label::Label;
 /// Recordings that together are larger than this are read only with --full.
 const MAX_READ_BYTES: u64 = 256 << 20;
 
-/// Describe recordings, a hand or grasp cases.
+/// Describe recordings or a hand.
 #[derive(Debug, Args)]
 #[command(
     after_help = "Examples:\n  blindgrasp info recordings/held-out.mcap\n  blindgrasp info data/paper --json\n  \
-                        blindgrasp info grasps.json                 epsilon and volume of grasps given by their contacts\n  \
                         blindgrasp info hands/barrett-bh8-280.yaml --joints spread=0.5     where the cells are\n\n\
                         Quantiles are of the grasps with force closure; contacts are of each grasp's last settled frame.\n\n\
                         Recordings of more than 256 MiB together are not read: their index says how long and large they\n\
                         are and what topics they have; --full reads them."
 )]
 pub(super) struct Arguments {
-    /// Recordings (MCAP) or folders of them; or one pad layout, or one file of cases
-    ///
-    /// A pad layout is a YAML file, or the name of a built-in hand. Grasp cases are a JSON file (docs/simulator.md), - for
-    /// stdin.
+    /// Recordings (MCAP) or folders of them; or one pad layout: a YAML file, or the name of a built-in hand
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
@@ -58,14 +52,10 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    if let [path] = arguments.recordings.as_slice() {
-        if hand_cells::is_hand(path) {
-            return hand_cells::print(path, &arguments.joints, arguments.json);
-        }
-        if are_cases(path) {
-            let is_json = arguments.json.then_some("--json");
-            match LAB.become_it([OsStr::new("quality"), path.as_os_str()].into_iter().chain(is_json.map(OsStr::new)))? {}
-        }
+    if let [path] = arguments.recordings.as_slice()
+        && hand_cells::is_hand(path)
+    {
+        return hand_cells::print(path, &arguments.joints, arguments.json);
     }
     if let [path] = arguments.recordings.as_slice()
         && let Some(name) = path.to_str()
@@ -110,11 +100,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         print_summary(&hand, &summary)?;
     }
     Ok(Outcome::Done)
-}
-
-/// Whether a path names grasp cases: a JSON file, or `-` for stdin.
-fn are_cases(path: &Path) -> bool {
-    path == Path::new("-") || path.extension().is_some_and(|extension| extension == "json" || extension == "jsonl")
 }
 
 fn repair_all(recordings: &[PathBuf], json: bool) -> anyhow::Result<Outcome> {

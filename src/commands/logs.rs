@@ -44,7 +44,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         return destination.run();
     }
     let folder = log_folder(arguments.graph.as_deref())?;
-    let opened = LogTail::open(folder, arguments.operator.as_deref(), arguments.lines, u64::MAX);
+    let opened = LogTail::open(folder, arguments.operator.as_deref(), arguments.lines);
     if let (Err(_), Some(name)) = (&opened, &arguments.operator)
         && running_graphs().contains(name)
     {

@@ -9,7 +9,6 @@ use clap::Args;
 use serde::Serialize;
 use serde_json::json;
 
-use super::elsewhere::{MachineArgument, is_over_ssh};
 use super::recording_arguments::RecordingArguments;
 use super::text_table::TextTable;
 use super::{Outcome, check_output, completions, print_line, secs_in, stop_signal};
@@ -24,7 +23,6 @@ use blindgrasp_session::recorder::{Recorded, Recorder, check_recording};
 use blindgrasp_session::span::{EdgeSpan, Span, SpanOfEdge};
 
 mod keep;
-mod over_ssh;
 
 /// The command checks this often whether it was interrupted or its time is over.
 const POLL: Duration = Duration::from_millis(50);
@@ -34,8 +32,7 @@ const POLL: Duration = Duration::from_millis(50);
 /// No sample is missing, and the graph is not held up.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp record grasp_gate --out /tmp/robot.mcap --rotate-size 1GB\n\n\
-                        Ctrl-C ends the recording; the graph goes on. The graph does not wait for a recorder that is too slow.\n\
-                        With --machine, the files are written there and copied to --out at the end.\n\n\
+                        Ctrl-C ends the recording; the graph goes on. The graph does not wait for a recorder that is too slow.\n\n\
                         With --keep it is a flight recorder: it writes nothing until a lift drops its object, a fault holds a \
                         grasp, or `blindgrasp record GRAPH --write-kept` (or SIGUSR1) asks for it. `blindgrasp test --init FILE` \
                         makes the file a test.\n  \
@@ -50,13 +47,13 @@ pub(super) struct Arguments {
     out: Option<PathBuf>,
     /// Hold the last so many seconds in memory, and write them when something has happened
     #[arg(long, value_name = "TIME", value_parser = |text: &str| secs_in(text, 1.0..=3600.0),
-          conflicts_with_all = ["edges", "rotate_size", "rotate_every", "overwrite", "machine"])]
+          conflicts_with_all = ["edges", "rotate_size", "rotate_every", "overwrite"])]
     keep: Option<f64>,
     /// With --keep, go on for so many seconds after it has happened
     #[arg(long, value_name = "TIME", default_value = "3", requires = "keep", value_parser = |text: &str| secs_in(text, 0.0..=600.0))]
     after: f64,
     /// Ask the recorders of the graph that have --keep to write now
-    #[arg(long, conflicts_with_all = ["out", "keep", "edges", "for_secs", "machine"])]
+    #[arg(long, conflicts_with_all = ["out", "keep", "edges", "for_secs"])]
     write_kept: bool,
     /// Record only the edges from these outputs, separated by commas
     #[arg(long, value_name = "NODE/PORT", value_delimiter = ',')]
@@ -69,8 +66,6 @@ pub(super) struct Arguments {
     /// Print JSON
     #[arg(long)]
     json: bool,
-    #[command(flatten)]
-    machine: MachineArgument,
 }
 
 #[derive(Debug, Serialize)]
@@ -89,18 +84,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if arguments.write_kept {
         return keep::ask(arguments);
     }
-    if is_over_ssh() {
-        return over_ssh::record_for_caller(arguments);
-    }
     let out = arguments.out()?;
     if let Some(secs) = arguments.keep {
         return keep::keep(arguments, out, Duration::from_secs_f64(secs));
     }
     check_output(out, &[])?;
     check_recording(out, &arguments.recording.options())?;
-    if let Some(destination) = arguments.machine.destination()? {
-        return over_ssh::record_there(arguments, &destination);
-    }
     let summary = record(arguments, out)?;
     // The exit code tells of a loss, even if stdout is closed.
     summary.lines(arguments.json).iter().try_for_each(|line| print_line(line))?;

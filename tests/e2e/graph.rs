@@ -1,8 +1,6 @@
 //! `blindgrasp view` of graphs, as a user runs it.
 
-use crate::common::{
-    FAST_FOREVER, Graph, ON_TWO_MACHINES, blindgrasp, dataflow, fails, project, run, script, text, unique_name,
-};
+use crate::common::{ON_TWO_MACHINES, blindgrasp, dataflow, fails, run, script, text, unique_name};
 use serde_json::Value;
 
 fn drawn(arguments: &[&str]) -> String {
@@ -99,35 +97,9 @@ fn mistakes_are_reported_as_by_check() {
     assert_eq!(graph, check);
     assert!(graph.contains("did you mean 'votes'?"), "{graph}");
     let name = unique_name();
-    fails(&["view", &name, "--json"], &format!("no graph '{name}' is running"));
-    run(&["view", "dataflow.yaml", "--interval", "1"], 2);
-    run(&["view", &name, "--interval", "1"], 2);
-}
-
-#[test]
-fn a_running_graph_has_states_rates_and_restarts() {
-    let graph = Graph::start(&project().join("dataflow.yaml"), &FAST_FOREVER);
-    graph.kill("encoder");
-    let running = [graph.name.as_str(), "--interval", "0.5"];
-    let found = drawn(&[&running[..], &["--format", "mermaid"]].concat());
-    assert!(found.contains("n1[\"contacts<br/>running\"]"), "{found}");
-    assert!(found.contains("n2[\"encoder<br/>running<br/>restarts: 1\"]"), "{found}");
-    assert!(found.contains("style n2 stroke:"), "{found}");
-    let edge = found.lines().find(|line| line.trim().starts_with("n0 -->") && line.ends_with("n1")).expect("an edge");
-    assert!(
-        edge.contains("|\"tactile<br/>TactileFrame/5<br/>") && edge.contains("/s, ") && edge.contains(" old\""),
-        "{edge}"
-    );
-
-    let json = json(&running);
-    assert_eq!(json["nodes"][2]["running"]["n_restarts"], 1);
-    for edge in json["edges"].as_array().expect("edges") {
-        assert!(edge["running"]["rate_hz"].as_f64().expect("a rate") > 0.0, "{edge}");
-        assert!(edge["type_name"].as_str().expect("a type").starts_with("blindgrasp/"), "{edge}");
-    }
-    let dot = drawn(&[&running[..], &["--format", "dot"]].concat());
-    assert!(dot.contains("restarts: 1\", fillcolor"), "{dot}");
-    graph.stop();
+    fails(&["view", &name], &format!("no graph '{name}' is running"));
+    let refused = text(&run(&["view", &name, "--json"], 2).stderr);
+    assert!(refused.contains("for a dataflow file") && refused.contains("blindgrasp ps --json"), "{refused}");
 }
 
 #[test]

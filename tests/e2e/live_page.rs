@@ -6,7 +6,7 @@ use std::process::Command;
 
 use crate::common::browser::{Browser, Running};
 use crate::common::python::python;
-use crate::common::{Graph, RECORDING, blindgrasp, project, report_data, run, swap, unique_name, wait_until};
+use crate::common::{Graph, RECORDING, blindgrasp, project, run, swap, unique_name, wait_until};
 use blindgrasp_messages::Action;
 use blindgrasp_recording::{Record, RecordingReader};
 use blindgrasp_stages::hand::Hand;
@@ -420,53 +420,6 @@ fn the_page_of_a_hand_writes_no_forces() {
     assert_eq!(browser.ask("axe"), Value::Array(vec![]));
     browser.ask("size 400 800");
     assert_eq!(browser.ask("document.documentElement.scrollWidth <= window.innerWidth"), true);
-}
-
-/// The report of a run draws its wrong decisions in the browser.
-#[test]
-fn the_report_of_a_run_draws_the_wrong_decisions() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let page = folder.path().join("run.html");
-    let page = page.to_str().expect("UTF-8");
-    let flow = project().join("dataflow.yaml");
-    let flow = flow.to_str().expect("UTF-8");
-    run(&["run", flow, "--name", &unique_name(), "--set", "recorded_source.rate=max", "--report", page], 0);
-    let data = report_data(&std::fs::read_to_string(page).expect("a page"));
-    let summary = &data["data"]["summary"];
-    let Some(mut browser) = Browser::open(&format!("file://{page}")) else { return };
-    let n_cards = browser.ask("document.querySelectorAll('.card').length").as_u64().expect("a number");
-    assert!(n_cards > 2);
-    let shown = browser.ask("document.querySelector('main').innerText");
-    let shown = shown.as_str().expect("a text");
-    assert!(shown.contains(&format!("finished: {} grasps, ", summary["grasps"])), "{shown}");
-    for wrong in ["wrong_lifts", "wrong_holds"] {
-        let n = data["data"][wrong]["n"].as_u64().expect("a number");
-        assert!(shown.contains(&format!("{n} in all; the first {} are shown.", n.min(6))), "{shown}");
-    }
-    for (reason, n) in summary["reasons"].as_object().expect("reasons") {
-        assert!(shown.contains(&format!("{reason}\t{n}")), "{reason}: {shown}");
-    }
-    for edge in summary["edges"].as_array().expect("edges") {
-        let (from, to) = (edge["from"].as_str().expect("a port"), edge["to"].as_str().expect("a port"));
-        assert!(shown.contains(&format!("{from}\t{to}\t{}\t{}", edge["sent"], edge["received"])), "{from}: {shown}");
-    }
-    // Its scripts begin after the page is loaded.
-    browser.wait_until(&format!("window.blindgrasp?.drawn === {n_cards} && blindgrasp.shown !== null"));
-    // Every card has a picture.
-    let is_drawn = "[...document.querySelectorAll('.card canvas')].every((canvas) => \
-                    canvas.getContext('2d').getImageData(0, 0, 280, 210).data.some((value) => value > 0))";
-    assert_eq!(browser.ask(is_drawn), true);
-    browser.click(".card:last-child");
-    let chosen = browser.ask("document.querySelector('.card[aria-pressed=true] b').textContent");
-    assert_eq!(chosen, browser.ask("blindgrasp.shown"));
-    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
-    browser.ask("dark");
-    let ground = "getComputedStyle(document.querySelector('figure svg > rect')).fill";
-    assert_eq!(browser.ask(ground), "rgb(29, 35, 42)", "charts are dark, too");
-    browser.ask("size 400 800");
-    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
-    assert_eq!(browser.ask("document.documentElement.scrollWidth <= window.innerWidth"), true);
-    assert_eq!(browser.ask("errors"), Value::Array(vec![]));
 }
 
 /// Messages decoded by rosbags, from a connection by websockets: neither was written here.

@@ -34,7 +34,6 @@ mod record;
 mod recording_files;
 mod regression;
 mod replay;
-mod run_report;
 mod sandbox;
 mod scaffold;
 mod schema;

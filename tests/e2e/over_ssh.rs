@@ -1,16 +1,15 @@
 //! Commands with `--machine`, through `ssh` to a real `sshd` on the loopback interface. Both sides are this machine, so
 //! that what a command does there can be compared with what it does here.
 
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, BufReader};
 use std::net::TcpListener;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 
 use crate::common::{
     FAST_FOREVER, Graph, ON_TWO_MACHINES, blindgrasp, dataflow, json_lines, own_operator, program, run, script, signal,
     skipped, text, unique_name, wait_until,
 };
-use blindgrasp_recording::RecordingReader;
 use rustix::process::Signal;
 use serde_json::json;
 
@@ -121,27 +120,9 @@ impl Running {
         Running(command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("started"))
     }
 
-    /// Waits for a line on stderr that begins so.
-    fn wait_for(&mut self, beginning: &str) {
-        let mut byte = [0];
-        let mut line = String::new();
-        while !line.starts_with(beginning) || !line.ends_with('\n') {
-            if line.ends_with('\n') {
-                line.clear();
-            }
-            let n = self.0.stderr.as_mut().expect("piped").read(&mut byte).expect("read");
-            assert_eq!(n, 1, "it has ended: {line}");
-            line.push(char::from(byte[0]));
-        }
-    }
-
     /// Exit code, stdout, stderr.
-    fn stop(self, with: Signal) -> (Option<i32>, String, String) {
+    fn stop(mut self, with: Signal) -> (Option<i32>, String, String) {
         signal(self.0.id() as i32, with);
-        self.finish()
-    }
-
-    fn finish(mut self) -> (Option<i32>, String, String) {
         let out = std::io::read_to_string(self.0.stdout.take().expect("piped")).expect("read");
         let err = std::io::read_to_string(self.0.stderr.take().expect("piped")).expect("read");
         (self.0.wait().expect("waited").code(), out, err)
@@ -153,19 +134,6 @@ impl Drop for Running {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
-}
-
-fn frames(path: &Path) -> Vec<(u64, u64)> {
-    let records = RecordingReader::open(path).expect("opened").map(|record| record.expect("readable"));
-    let frames = records.filter(|(topic, _)| topic == "/tactile");
-    frames.map(|(_, record)| (record.header().epoch, record.header().seq)).collect()
-}
-
-/// What a recorder on the other machine has left behind under this name.
-fn left_there(name: &str) -> Vec<PathBuf> {
-    let folders = std::fs::read_dir("/var/tmp").expect("readable").flatten().map(|entry| entry.path());
-    let of_recorder = folders.filter(|path| path.display().to_string().starts_with("/var/tmp/blindgrasp-"));
-    of_recorder.map(|folder| folder.join(name)).filter(|file| file.exists()).collect()
 }
 
 /// Processes with these words in their command lines.
@@ -219,71 +187,6 @@ fn commands_do_there_what_they_do_here() {
     let stopped = sshd.on_brain(&["stop", name, "--json"], 0);
     assert_eq!(json_lines(&stopped.stdout)[0]["ended"], json!([name]));
     assert_eq!(graph.finish().code, Some(0));
-}
-
-#[test]
-fn a_recording_there_is_written_here() {
-    let Some(sshd) = Sshd::start() else { return };
-    let folder = tempfile::tempdir().expect("a folder");
-    // At a rate at which a busy machine misses no sample.
-    let arguments = FAST_FOREVER.map(|argument| argument.replace("rate=16", "rate=4"));
-    let arguments = arguments.each_ref().map(String::as_str);
-    let graph = Graph::start(&dataflow(folder.path(), &[]), &arguments);
-    let record = |out: &Path, more: &[&str]| {
-        let mut command = sshd.blindgrasp();
-        command.args(["record", &graph.name, "--json", "--out"]).arg(out).args(more);
-        command
-    };
-    let there = ["--machine", "brain"];
-    // Both at the same time: the one there records a part of what the one here records.
-    let unique = unique_name();
-    let [near, far] = ["near", "far"].map(|place| folder.path().join(format!("{place}-{unique}.mcap")));
-    let mut recorder_here = Running::start(record(&near, &[]));
-    recorder_here.wait_for("recording ");
-    let mut recorder_there = Running::start(record(&far, &there));
-    recorder_there.wait_for("recording ");
-    graph.wait_for_decisions(10);
-    assert!(!far.exists() && left_there(&format!("far-{unique}.mcap")).len() == 1);
-    let (code, out, err) = recorder_there.stop(Signal::INT);
-    assert_eq!(code, Some(0), "{out}\n{err}");
-    let summary = json_lines(out.as_bytes()).pop().expect("a summary");
-    assert_eq!((&summary["missing"], &summary["ended"]), (&json!(0), &json!("detached")), "{summary}");
-    assert_eq!(summary["files"], json!([far]));
-    assert_eq!(recorder_here.stop(Signal::INT).0, Some(0));
-    let (near, far_frames) = (frames(&near), frames(&far));
-    assert!(far_frames.len() > 50, "{} frames", far_frames.len());
-    let begin = near.iter().position(|frame| *frame == far_frames[0]).expect("the first frame");
-    assert_eq!(near[begin..begin + far_frames.len()], far_frames[..]);
-    assert!(left_there(&format!("far-{unique}.mcap")).is_empty());
-
-    // It replaces nothing, and takes nothing but the name of a file.
-    let refused = record(&far, &there).output().expect("started");
-    assert!(refused.status.code() == Some(1) && text(&refused.stderr).contains("the file exists"));
-    assert_eq!(frames(&far), far_frames);
-    // A recording of several files.
-    let parts = folder.path().join("parts.mcap");
-    let split = record(&parts, &["--rotate-every", "500ms", "--for", "2", "--machine", "brain"]);
-    let (code, out, err) = Running::start(split).finish();
-    // A machine with other work may miss samples.
-    assert!([Some(0), Some(3)].contains(&code), "{err}");
-    let files = json_lines(out.as_bytes())[0]["files"].as_array().expect("files").clone();
-    assert!(
-        files.len() > 1 && files.iter().all(|file| Path::new(file.as_str().expect("a path")).exists()),
-        "{files:?}"
-    );
-
-    // A caller that is killed leaves a whole recording there.
-    let lost = format!("lost-{unique}.mcap");
-    let mut recorder = Running::start(record(&folder.path().join(&lost), &there));
-    recorder.wait_for("recording ");
-    graph.wait_for_decisions(5);
-    recorder.stop(Signal::KILL);
-    let is_ended = || processes(&format!("record {} --json --out", graph.name)).is_empty();
-    wait_until(is_ended, || "the recorder there goes on".into());
-    let left = left_there(&lost).pop().expect("a recording");
-    assert!(frames(&left).len() > 10);
-    std::fs::remove_dir_all(left.parent().expect("a folder")).expect("removed");
-    graph.stop();
 }
 
 #[test]
@@ -376,27 +279,6 @@ fn exit_codes_and_the_programs_there() {
         let output = sshd.on_brain(&["ps"], code);
         assert_eq!((text(&output.stdout), text(&output.stderr)), ("out\n".into(), "err\n".into()));
     }
-    // A shell that prints at its start would spoil a recording.
-    script(folder.path(), "blindgrasp", "echo Welcome");
-    let out = folder.path().join("never.mcap");
-    let spoilt = text(&sshd.on_brain(&["record", "--out", out.to_str().expect("UTF-8")], 1).stderr);
-    assert!(spoilt.contains("sends 'Welcome' in place of a recording"), "{spoilt}");
-    // It cannot choose where its files go.
-    let sends = |name: &str| {
-        let lines = format!(
-            "{{\"folder\":\"/there\"}}\\n{{\"lines\":[],\"files\":[{{\"name\":\"{name}\",\"n_bytes\":1}}]}}\\nx"
-        );
-        script(folder.path(), "blindgrasp", &format!("printf '{lines}'; read answer; exit 3"));
-    };
-    for name in ["../never.mcap", "/tmp/never.mcap", "other.mcap", ".."] {
-        sends(name);
-        let refused = text(&sshd.on_brain(&["record", "--out", out.to_str().expect("UTF-8")], 1).stderr);
-        let expected = "stays on machine 'brain': scp 'brain:/there/*' .";
-        assert!(refused.contains(expected) && !out.exists(), "{name}: {refused}");
-    }
-    sends("never.mcap");
-    sshd.on_brain(&["record", "--out", out.to_str().expect("UTF-8")], 3);
-    assert_eq!(std::fs::read(&out).expect("arrived"), b"x");
     // Another version, by a program in ssh's place that changes it.
     let other = script(
         folder.path(),

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use crate::common::live::{Bridge, PATIENT, changed, free_port, grasps, line, listening, live_dataflow};
 use crate::common::{
-    Graph, MODEL, RECORDING, assert_nothing_left, blindgrasp, dataflow, decisions_of, fails, project, run, signal,
-    text, undisturbed, unique_name, wait_until,
+    Graph, MODEL, assert_nothing_left, blindgrasp, fails, project, run, signal, text, undisturbed, unique_name,
+    wait_until,
 };
 use blindgrasp_messages::{Phase, Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingReader};
@@ -421,27 +421,10 @@ fn frames_over_a_serial_device_are_decided_as_those_of_the_recording() {
 }
 
 #[test]
-fn a_recording_is_played_at_its_own_speed_and_decided_as_by_the_recorded_source() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let recording = folder.path().join("few.mcap");
-    let out = recording.to_str().expect("UTF-8");
-    run(&["simulate", "--objects", "held-out", "--grasps", "6", "--seed", "3", "--out", out], 0);
-    let flow = dataflow(folder.path(), &[(&format!("recording: {RECORDING}"), &format!("recording: {out}"))]);
-    let expected = decisions_of(&flow);
-    let params = format!("driver: recording\n      recording: {out}\n      {PATIENT}");
-    let graph = Graph::launch(&unique_name(), &live_dataflow(folder.path(), &params), &[]);
-    let ended = graph.finish();
-    assert_eq!(ended.code, Some(0), "{}", ended.stderr);
-    assert_eq!((ended.decisions.len(), expected.len()), (6, 6), "{}", ended.stderr);
-    ended.assert_decided_as(&expected, "played");
-}
-
-#[test]
 fn a_driver_without_what_it_needs_is_refused_by_name() {
     for (params, words) in [
         ("driver: connect", "driver connect needs the param 'address', like robot.local:7400"),
         ("driver: serial", "driver serial needs the param 'device', like /dev/ttyACM0"),
-        ("driver: recording", "driver recording needs the param 'recording'"),
         ("driver: listen\n      baud: 9600", "param 'baud' is of no use to driver listen"),
         ("driver: listen\n      address: nowhere", "cannot listen on nowhere"),
     ] {

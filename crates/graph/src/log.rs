@@ -267,13 +267,12 @@ impl LogReader {
         Ok(parse_lines(&self.name, &content))
     }
 
-    /// The last `n_lines` lines, but not more than `max_bytes`; [`read`](Self::read) goes on behind them. Only these lines
-    /// are read.
+    /// The last `n_lines` lines; [`read`](Self::read) goes on behind them. Only these lines are read.
     ///
     /// # Errors
     /// A file cannot be read.
-    fn read_newest(&mut self, n_lines: usize, max_bytes: u64) -> std::io::Result<Vec<LogLine>> {
-        let mut tail = Tail { n_more: n_lines, bytes_left: max_bytes, blocks: Vec::new() };
+    fn read_newest(&mut self, n_lines: usize) -> std::io::Result<Vec<LogLine>> {
+        let mut tail = Tail { n_more: n_lines, blocks: Vec::new() };
         let mut inodes = Vec::new();
         for age in 0..=N_OLD_FILES {
             let mut file = match File::open(self.folder.file(&self.name, age)) {
@@ -329,7 +328,6 @@ impl LogReader {
 struct Tail {
     /// The number of lines that are missing.
     n_more: usize,
-    bytes_left: u64,
     /// Whole lines, the oldest first.
     blocks: Vec<Vec<u8>>,
 }
@@ -341,10 +339,9 @@ impl Tail {
         let end = file.seek(SeekFrom::End(0))?;
         let (mut start, mut n_newlines, mut blocks) = (end, 0, Vec::new());
         // The newline before the first wanted line is read as well.
-        while start > 0 && n_newlines <= self.n_more && self.bytes_left > 0 {
-            let n_bytes = start.min(BLOCK_BYTES).min(self.bytes_left);
+        while start > 0 && n_newlines <= self.n_more {
+            let n_bytes = start.min(BLOCK_BYTES);
             start -= n_bytes;
-            self.bytes_left -= n_bytes;
             let mut block = vec![0; n_bytes as usize];
             file.seek(SeekFrom::Start(start))?;
             file.read_exact(&mut block)?;
@@ -376,16 +373,11 @@ pub struct LogTail {
 }
 
 impl LogTail {
-    /// The last `n_lines` lines of all operators together, or of one, and at most the last `max_bytes` of each log.
+    /// The last `n_lines` lines of all operators together, or of one.
     ///
     /// # Errors
     /// There are no such logs, or they cannot be read.
-    pub fn open(
-        folder: LogFolder,
-        operator: Option<&str>,
-        n_lines: usize,
-        max_bytes: u64,
-    ) -> std::io::Result<(LogTail, Vec<LogLine>)> {
+    pub fn open(folder: LogFolder, operator: Option<&str>, n_lines: usize) -> std::io::Result<(LogTail, Vec<LogLine>)> {
         let mut tail = LogTail { folder, operator: operator.map(str::to_string), readers: Vec::new() };
         tail.find_new()?;
         if tail.readers.is_empty() {
@@ -395,7 +387,7 @@ impl LogTail {
             let message = format!("no log of {whose} in {}; {known}", tail.folder.path().display());
             return Err(std::io::Error::new(std::io::ErrorKind::NotFound, message));
         }
-        let logs = tail.readers.iter_mut().map(|reader| reader.read_newest(n_lines, max_bytes));
+        let logs = tail.readers.iter_mut().map(|reader| reader.read_newest(n_lines));
         let mut lines = merge(logs.collect::<std::io::Result<_>>()?);
         lines.drain(..lines.len().saturating_sub(n_lines));
         Ok((tail, lines))
@@ -634,17 +626,12 @@ mod tests {
         let kept = all(&folder, "a");
         for n_lines in 0..kept.len() + 3 {
             let mut reader = LogReader::new(&folder, "a");
-            let newest = reader.read_newest(n_lines, u64::MAX).expect("readable");
+            let newest = reader.read_newest(n_lines).expect("readable");
             assert_eq!(newest, kept[kept.len().saturating_sub(n_lines)..], "{n_lines}");
             assert_eq!(reader.read().expect("readable"), []);
         }
-        // Only whole lines of the last bytes; a line has 32.
-        for (max_bytes, n_lines) in [(0, 0), (31, 0), (32, 0), (33, 1), (64, 1), (65, 2), (150, 4)] {
-            let newest = LogReader::new(&folder, "a").read_newest(100, max_bytes).expect("readable");
-            assert!(newest.len().abs_diff(n_lines) <= 1 && kept.ends_with(&newest), "{max_bytes}: {newest:?}");
-        }
         let mut reader = LogReader::new(&folder, "a");
-        reader.read_newest(1, u64::MAX).expect("readable");
+        reader.read_newest(1).expect("readable");
         (40..50).for_each(|number| log.write(&LogEntry::plain(number.to_string())));
         let expected: Vec<String> = (40..50).map(|number| number.to_string()).collect();
         assert_eq!(texts(&reader.read().expect("readable")), expected);
@@ -652,10 +639,10 @@ mod tests {
         let mut reader = LogReader::new(&folder, "a");
         let mut file = File::options().append(true).open(folder.file("a", 0)).expect("opened");
         file.write_all(b"half").expect("written");
-        assert_eq!(texts(&reader.read_newest(1, u64::MAX).expect("readable")), ["49"]);
+        assert_eq!(texts(&reader.read_newest(1).expect("readable")), ["49"]);
         file.write_all(b" and half\n").expect("written");
         assert_eq!(texts(&reader.read().expect("readable")), ["half and half"]);
-        assert_eq!(LogReader::new(&folder, "none").read_newest(5, u64::MAX).expect("readable"), []);
+        assert_eq!(LogReader::new(&folder, "none").read_newest(5).expect("readable"), []);
     }
 
     #[test]

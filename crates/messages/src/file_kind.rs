@@ -18,7 +18,6 @@ pub enum FileKind {
     Sensors,
     Dataflow,
     PadLayout,
-    GraspCases,
     FrameLines,
     Json,
     Urdf,
@@ -85,7 +84,6 @@ impl FileKind {
             FileKind::PadLayout => {
                 "the pad layout of a hand: --hand takes it, blindgrasp info prints it, blindgrasp view draws it"
             }
-            FileKind::GraspCases => "grasps given by their contacts: blindgrasp info judges them",
             FileKind::FrameLines => "frames as lines of JSON: blindgrasp import --lines makes a recording of them",
             FileKind::Json => "JSON of another kind",
             FileKind::Urdf => "a URDF: blindgrasp new hand NAME --urdf FILE makes a hand of it",
@@ -139,8 +137,6 @@ fn of_json(text: &str) -> FileKind {
         FileKind::Model
     } else if begin.contains("\"blindgrasp-sensors/") {
         FileKind::Sensors
-    } else if text.contains("\"contacts\"") && text.contains("\"centre_of_mass_m\"") {
-        FileKind::GraspCases
     } else if text.contains("\"operators\"") || text.contains("operators:") {
         FileKind::Dataflow
     } else if begin.starts_with('{') && ["\"topic\"", "\"cells\""].iter().any(|key| text.contains(key)) {

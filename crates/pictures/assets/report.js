@@ -19,9 +19,9 @@ const begin = (title, ...lead) => {
   main.append(make("h1", {}, title), make("p", { class: "lead" }, ...lead));
 };
 const section = (title, ...children) => main.append(make("section", {}, make("h2", {}, title), ...children));
-// The first columns hold texts, the others numbers. A cell is a text, or a list of texts and elements.
-const table = (head, rows, { nTexts = 1, isOwn = () => false } = {}) => {
-  const cells = (name, texts) => texts.map((text, idx) => make(name, { ...(name === "th" ? { scope: "col" } : {}), ...(idx < nTexts ? {} : { class: "number" }) }, text));
+// The first column holds texts, the others numbers. A cell is a text, or a list of texts and elements.
+const table = (head, rows, { isOwn = () => false } = {}) => {
+  const cells = (name, texts) => texts.map((text, idx) => make(name, { ...(name === "th" ? { scope: "col" } : {}), ...(idx < 1 ? {} : { class: "number" }) }, text));
   const body = rows.map((row, idx) => make("tr", isOwn(idx) ? { class: "own" } : {}, cells("td", row)));
   // On a small screen it is scrolled, also by keys.
   return make("div", { class: "scroll", tabindex: 0 },
@@ -207,73 +207,6 @@ const errorsByClass = ({ name, by_class }, highest) => barChart({
   ],
 });
 
-// --- the report of a run
-const runReport = ({ summary, step, others, wrong_lifts, wrong_holds, changes, problem }) => {
-  begin(`Run of ${summary.graph}`, runLead(summary));
-  section("Decisions", table(["reason", "grasps"], Object.entries(summary.reasons).map(([reason, n]) => [reason, String(n)])));
-  const n_drawn = Math.max(wrong_lifts.points.length, wrong_holds.points.length), n_wrong = Math.max(wrong_lifts.n, wrong_holds.n);
-  main.append(figure(timeline(others, wrong_holds.points, wrong_lifts.points), [
-    step > 1 ? `Of the right decisions, every ${step}th is drawn. ` : "",
-    n_wrong > n_drawn ? `Of the wrong ones of a kind, the first ${n_drawn} are drawn.` : ""].join("")));
-  section("Edges", table(["from", "to", "sent", "received", "missing", "dropped", "late", "age p50", "age p99"],
-    summary.edges.map((edge) => [edge.from, edge.to, ...[edge.sent, edge.received, edge.missing, edge.dropped, edge.late].map(String),
-      ...[0.5, 0.99].map((share) => quantile(edge.ages, share))]), { nTexts: 2, isOwn: (idx) => summary.edges[idx].missing > 0 }));
-  const measured = summary.edges.filter(({ ages }) => ages.length);
-  pairs([...measured.filter(({ to }) => to === "run").slice(-1), ...measured.filter(({ to }) => to !== "run")].map(ageChart));
-  section("Changes and messages", ...changeList(changes));
-  if (problem) main.append(make("p", {}, problem));
-  if (drawn) section("Wrong decisions", cardView(forceScale()));
-  for (const [title, { n, shown }, from] of [["Lifts of unstable grasps", wrong_lifts, 0], ["Holds of stable grasps", wrong_holds, wrong_lifts.shown]]) {
-    const own = (drawn?.frames ?? []).slice(from, from + shown);
-    if (n > 0) section(title, make("p", {}, `${n} in all; the first ${own.length} are shown.`), cardRow(own, from, 210));
-  }
-};
-const runLead = (summary) => {
-  const losses = [[summary.samples_lost, "samples were lost"], [summary.samples_dropped, "samples were dropped for newer ones"],
-    [summary.edges_unknown, "edges do not tell their losses"], [summary.undecided, "grasps were not decided"]];
-  const found = losses.filter(([n]) => n > 0).map(([n, what]) => [bold(`${n} ${what}.`), " "]);
-  const latency = summary.latency_nanos;
-  return [`${summary.end}: ${summary.grasps} grasps, ${summary.lift} lifted, ${summary.hold} held. `,
-    summary.with_truth ? `Of ${summary.with_truth} grasps with a label, ${summary.false_positives} were lifted and unstable. ` : "No grasp has a label. ",
-    latency ? `A decision took ${time(latency.p50)} in the median and ${time(latency.p99)} at 99 %. ` : "",
-    found.length ? found : "No sample was lost. ", `${summary.restarts} restarts, ${summary.swaps} swaps.`];
-};
-// From a round value up to the first one to a round value from the last one on.
-const rangeAround = (values) => {
-  if (!values.length) return [0, 1];
-  const first = values.reduce((a, b) => Math.min(a, b)), last = values.reduce((a, b) => Math.max(a, b));
-  const step = last > first ? 10 ** Math.floor(Math.log10(last - first)) : 1, from = Math.floor(first / step) * step;
-  return [from, Math.max(Math.ceil(last / step) * step, from + step)];
-};
-const timeline = (others, held, lifted) => {
-  const [from, to] = rangeAround([...others, ...held, ...lifted].map(([secs]) => secs));
-  const series = (name, colour, mark, points, radius) => ({ name, colour, mark, marks: points.map(([secs, probability]) => [secs, probability, radius]) });
-  return lineChart({ title: "Probability of stable, by decision", width: 860, height: 340, x: axis("seconds since the start", from, to), y: percentAxis("probability (%)"),
-    series: [series("right, or without a label", "--series-4", 0, others, 2), series("held, stable", "--series-0", 1, held, 3.5),
-      series("lifted, unstable", "--series-1", 2, lifted, 4.5)] }).svg;
-};
-const nSamples = (ages) => ages.reduce((sum, [, n]) => sum + n, 0);
-const quantile = (ages, share) => {
-  const rank = Math.max(1, Math.ceil(nSamples(ages) * share));
-  let below = 0;
-  const found = ages.find(([, n]) => (below += n) >= rank);
-  return found ? time(found[0]) : "–";
-};
-// A bar for each doubling of the age.
-const ageChart = ({ from, to, ages }) => {
-  const octave = (nanos) => Math.floor(Math.log2(Math.max(1, nanos - 1))), first = octave(ages[0][0]), n = nSamples(ages);
-  const heights = Array(octave(ages.at(-1)[0]) - first + 1).fill(0);
-  for (const [nanos, count] of ages) heights[octave(nanos) - first] += count / n;
-  return barChart({ title: `Age on arrival, ${from} to ${to}`, width: 566, height: 280, y: percentAxis("share of samples (%)", roundUp(Math.max(...heights))),
-    groups: heights.map((_, idx) => `≤ ${time(2 ** (first + idx + 1))}`), series: [{ colour: "--series-0", heights }] });
-};
-const changeList = ({ lines, n_left_out, problem }) => {
-  if (problem) return [make("p", {}, `The logs cannot be read: ${problem}`)];
-  if (!lines.length) return [make("p", {}, "None.")];
-  return [table(["time", "operator", "level", "text"], lines, { nTexts: 4, isOwn: (idx) => lines[idx][2] === "error" }),
-    n_left_out ? caption(`${n_left_out} earlier lines are left out: see blindgrasp logs.`) : []];
-};
-
 // --- a hand in three dimensions, on a canvas that can be turned
 const stageView = (label, name) => {
   const save = make("button", { type: "button", class: "save" }, "Save picture");
@@ -295,9 +228,9 @@ const loadStage = async () => {
 };
 
 // --- frames: a card each, and the one that is chosen on the stage
-const cardRow = (frames, from, height) => make("div", { class: "cards" }, frames.map(({ title, lines }, idx) =>
+const cardRow = (frames, from, height) => make("div", { class: "cards" }, frames.map(({ title }, idx) =>
   make("button", { type: "button", class: "card", "data-frame": from + idx, "aria-pressed": false },
-    make("canvas", { width: 280, height, "aria-hidden": true }), make("b", {}, title), lines.map((line) => make("span", {}, line)))));
+    make("canvas", { width: 280, height, "aria-hidden": true }), make("b", {}, title))));
 const cardView = (...captions) => [stageView("The hand of the chosen picture in three dimensions.", "hand"), make("p", { id: "chosen", class: "caption" }), captions];
 const drawCards = async () => {
   const { three, colourStep, makeStage } = await loadStage();
@@ -350,7 +283,7 @@ const trials = ({ lead, tables, strips, made }) => {
 
 // Tests read it.
 window.blindgrasp = { read, count, percent, decimals, pValue, estimate: (found) => make("p", {}, estimate(found)).textContent,
-  axis, percentAxis, rangeAround, roundUp, lineChart, barChart };
-({ evaluation, grasp: graspPage, run: runReport, trials })[kind](data);
+  axis, percentAxis, roundUp, lineChart, barChart };
+({ evaluation, grasp: graspPage, trials })[kind](data);
 if (kind === "grasp") await drawGrasp();
 else if (drawn) await drawCards();

@@ -1,4 +1,4 @@
-//! Frames of a hand as a page draws them: its surfaces once, and frame by frame its posture, its cells and what is said of it.
+//! Frames of a hand as a page draws them: its surfaces once, and its posture and cells frame by frame.
 
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use parry3d_f64::shape::SharedShape;
@@ -6,12 +6,10 @@ use serde::Serialize;
 
 use super::PictureError;
 use super::colour::{OBJECT, Rgb};
-use super::grasp::{Placed, RecordedGrasp};
-use super::pads::pad_summary;
+use super::grasp::Placed;
 use super::scene::{HandScene, Surface, rounded, rows};
 use blindgrasp_mesh::Mesh;
 use blindgrasp_mesh::shape::mesh_of_shape;
-use blindgrasp_messages::TactileFrame;
 use blindgrasp_stages::hand::Hand;
 
 const POST: Rgb = [0.902, 0.878, 0.835];
@@ -31,7 +29,6 @@ pub struct DrawnFrames {
 #[derive(Serialize)]
 struct DrawnFrame {
     title: String,
-    lines: Vec<String>,
     /// The pose of each surface; none where it is not in this frame.
     links: Vec<Option<Vec<f64>>>,
     cells: Vec<Option<f64>>,
@@ -51,21 +48,6 @@ pub struct PosedScene {
 }
 
 impl DrawnFrames {
-    /// Grasps, each at its last settled frame, with the decision, the label and the force of each pad.
-    ///
-    /// # Errors
-    /// A frame is not the hand's.
-    pub fn of_grasps(hand: &Hand, grasps: &[&RecordedGrasp]) -> Result<DrawnFrames, PictureError> {
-        let mut drawn = DrawnFrames { scene: HandScene::new(hand), frames: Vec::new(), scale_newtons: 1.0 };
-        for grasp in grasps {
-            let placed = Placed::new(hand, grasp)?;
-            drawn.scale_newtons = drawn.scale_newtons.max(placed.scale_newtons);
-            let title = format!("Grasp {}", grasp.grasp_id);
-            drawn.push(&placed, placed.frame, placed.joints, title, grasp_lines(&placed))?;
-        }
-        Ok(drawn)
-    }
-
     /// The frames of one grasp, at these places.
     pub(super) fn of_grasp(placed: &Placed<'_>, chosen: &[usize]) -> Result<DrawnFrames, PictureError> {
         let scene = HandScene::new(placed.hand);
@@ -75,7 +57,14 @@ impl DrawnFrames {
             let frame = &all[*idx];
             let since_start_nanos = frame.header.stamp_nanos.saturating_sub(all[0].header.stamp_nanos);
             let title = format!("{}, {:.0} ms", frame.message.phase.as_str(), since_start_nanos as f64 / 1e6);
-            drawn.push(placed, &frame.message, &frame.message.joints, title, Vec::new())?;
+            let poses = placed.hand.palm_from_links(&frame.message.joints);
+            let poses = poses.map_err(|source| PictureError::Joints { grasp_id: placed.grasp.grasp_id, source })?;
+            let cells = frame.message.cells_newtons.iter();
+            drawn.frames.push(DrawnFrame {
+                title,
+                links: poses.iter().map(|pose| Some(rows(pose))).collect(),
+                cells: cells.map(|force| force.is_finite().then(|| rounded(*force))).collect(),
+            });
         }
         Ok(drawn)
     }
@@ -110,7 +99,6 @@ impl DrawnFrames {
                 links[first_thing + thing_idx] = Some(rows(&moment.world_from_thing));
                 drawn.frames.push(DrawnFrame {
                     title: format!("After {:.2} s", moment.secs),
-                    lines: Vec::new(),
                     links,
                     cells: vec![None; hand.n_cells()],
                 });
@@ -118,45 +106,6 @@ impl DrawnFrames {
         }
         Ok(drawn)
     }
-
-    fn push(
-        &mut self,
-        placed: &Placed<'_>,
-        frame: &TactileFrame,
-        joints: &[f64],
-        title: String,
-        lines: Vec<String>,
-    ) -> Result<(), PictureError> {
-        let poses = placed.hand.palm_from_links(joints);
-        let poses = poses.map_err(|source| PictureError::Joints { grasp_id: placed.grasp.grasp_id, source })?;
-        self.frames.push(DrawnFrame {
-            title,
-            lines,
-            links: poses.iter().map(|pose| Some(rows(pose))).collect(),
-            cells: frame.cells_newtons.iter().map(|force| force.is_finite().then(|| rounded(*force))).collect(),
-        });
-        Ok(())
-    }
-}
-
-fn grasp_lines(placed: &Placed<'_>) -> Vec<String> {
-    let grasp = placed.grasp;
-    let mut lines = Vec::new();
-    if let Some(decision) = &grasp.decision {
-        let action = decision.action.as_str();
-        let reason = decision.reason.as_str().replace('_', " ");
-        lines.push(format!("{action}: {reason}, probability {:.2}", decision.probability_stable));
-    }
-    if let Some(truth) = &grasp.truth {
-        let label = if truth.stable { "known to be stable" } else { "known to be unstable" };
-        let object = if truth.object.is_empty() { String::new() } else { format!("; object {}", truth.object) };
-        lines.push(format!("{label}{object}"));
-    }
-    for pad in &placed.hand.pads {
-        let felt = pad_summary(placed.frame, pad, placed.hand.cell_unit);
-        lines.push(format!("{}: {felt}", pad.name.replace('_', " ")));
-    }
-    lines
 }
 
 /// The top of a post whose axis is z.

@@ -19,7 +19,7 @@
 //! * [`dictionary_svg`] - a contact dictionary over the hand.
 //! * [`graph_mermaid`], [`graph_dot`] - a graph of processes.
 //! * [`report_html`] - a report as a page that draws its data by itself, with charts by [`CHART_JS`].
-//! * [`DrawnFrames`] - grasps, or moments of a lift, that such a page draws.
+//! * [`DrawnFrames`] - the frames of a grasp, or moments of a lift, that such a page draws.
 //!
 //! Hands are drawn in the browser alone, by three.js; the page saves a picture of them as PNG. The same input gives the same
 //! bytes.

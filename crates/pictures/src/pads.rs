@@ -4,8 +4,7 @@ use nalgebra::Vector3;
 use serde::Serialize;
 
 use super::scene::rounded;
-use blindgrasp_messages::TactileFrame;
-use blindgrasp_stages::hand::{Cell, CellUnit, Pad};
+use blindgrasp_stages::hand::{Cell, Pad};
 
 /// Cells whose coordinates differ by less are in one row.
 const SAME_ROW_M: f64 = 0.0005;
@@ -80,26 +79,6 @@ fn unrolled(cells: &[Cell], direction: Vector3<f64>, normal: Vector3<f64>) -> Ve
         last = Some(row);
     }
     unrolled
-}
-
-/// The sum of a pad's active cells, and how many they are.
-pub(super) fn pad_summary(frame: &TactileFrame, pad: &Pad, unit: CellUnit) -> String {
-    let active: Vec<f64> = pad
-        .cells
-        .iter()
-        .enumerate()
-        .filter_map(|(idx, cell)| {
-            let newtons = frame.cells_newtons.get(pad.first_cell_idx + idx).copied()?;
-            (newtons > cell.noise_threshold_newtons).then_some(newtons)
-        })
-        .collect();
-    match active.len() {
-        0 => "no contact".into(),
-        n => {
-            let sum = active.iter().sum::<f64>();
-            format!("{sum:.1} {}, {n} cells", unit.symbol()).replace(" 1 cells", " 1 cell")
-        }
-    }
 }
 
 #[cfg(test)]

@@ -18,7 +18,6 @@ pub enum ReportKind {
     Evaluation,
     /// One grasp, or a hand by itself.
     Grasp,
-    Run,
     Trials,
 }
 

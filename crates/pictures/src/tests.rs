@@ -142,17 +142,3 @@ fn frames_and_contacts_of_another_hand_are_refused() {
     refused(&with_contact(|contact| contact.link = 99), "link 99");
     refused(&with_contact(|contact| contact.other_link = 99), "link 99");
 }
-
-#[test]
-fn cards_hold_a_frame_each_and_hostile_names_are_only_text() {
-    let (hand, mut grasp) = recorded("can");
-    grasp.truth.as_mut().expect("a truth").object = "</script><b>\"&".into();
-    let cards = DrawnFrames::of_grasps(&hand, &[&grasp, &grasp]).expect("cards");
-    let html = report_html(ReportKind::Run, &(), Some(&cards)).expect("a page");
-    assert_eq!(html.matches("\"lines\"").count(), 2);
-    assert!(html.contains("known to be stable; object \\u003c/script>\\u003cb>"), "{}", &html[..2000]);
-    assert_eq!(html.matches("</script>").count(), 4, "only the page's own scripts end");
-    let (_, mut other) = recorded("can");
-    other.frames[0].message.cells_newtons.pop();
-    assert!(DrawnFrames::of_grasps(&hand, &[&other]).is_err(), "a frame of another hand");
-}

@@ -48,7 +48,7 @@ pub mod cdr {
 pub use blindgrasp_messages::Record;
 pub use chosen::{Choice, ChosenSamples, RawSample, Reach};
 pub use index::{IndexedTopic, RecordingIndex};
-pub use live::{LiveOptions, LiveRecorder, LiveSummary, is_part_name};
+pub use live::{LiveOptions, LiveRecorder, LiveSummary};
 pub use parts::{Manifest, part_path, recordings_in};
 pub use problems::{Oddity, Problem, Problems};
 pub use reader::RecordingReader;

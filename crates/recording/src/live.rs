@@ -423,7 +423,7 @@ fn is_full(error: &std::io::Error) -> bool {
 }
 
 /// Whether the file `name` beside a recording would be one of its parts.
-pub fn is_part_name(recording: &Path, name: &str) -> bool {
+fn is_part_name(recording: &Path, name: &str) -> bool {
     let behind_stem = name.strip_prefix(&format!("{}-", stem(recording)));
     let number = behind_stem.and_then(|rest| rest.strip_suffix(".mcap"));
     number.is_some_and(|number| number.len() == 5 && number.bytes().all(|byte| byte.is_ascii_digit()))

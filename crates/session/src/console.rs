@@ -5,7 +5,6 @@ use std::io::IsTerminal;
 use serde::Serialize;
 
 use crate::recorder::Recorder;
-use crate::report::RunReport;
 use crate::run::Tap;
 use blindgrasp_graph::log::printable;
 use blindgrasp_graph::run::{RunSink, SeenDecision};
@@ -36,7 +35,6 @@ pub(super) struct Console {
     pub(super) printer: LinePrinter,
     has_said_that_nobody_reads: bool,
     pub(super) recorder: Option<Recorder>,
-    pub(super) report: Option<RunReport>,
     tap: Option<Tap>,
 }
 
@@ -60,18 +58,12 @@ struct OutcomeLine<'a> {
 }
 
 impl Console {
-    pub(super) fn new(
-        json: bool,
-        is_quiet: bool,
-        recorder: Option<Recorder>,
-        report: Option<RunReport>,
-        tap: Option<Tap>,
-    ) -> Console {
+    pub(super) fn new(json: bool, is_quiet: bool, recorder: Option<Recorder>, tap: Option<Tap>) -> Console {
         let printer = LinePrinter::new(std::io::stdout(), MAX_UNREAD_LINES);
         let variable = |name| std::env::var_os(name).unwrap_or_default();
         let is_coloured =
             std::io::stdout().is_terminal() && variable("NO_COLOR").is_empty() && variable("TERM") != "dumb";
-        Console { json, is_quiet, is_coloured, printer, has_said_that_nobody_reads: false, recorder, report, tap }
+        Console { json, is_quiet, is_coloured, printer, has_said_that_nobody_reads: false, recorder, tap }
     }
 }
 
@@ -80,9 +72,6 @@ impl RunSink for Console {
         if let Some(tap) = &mut self.tap {
             tap(topic, &record, received_nanos)?;
         }
-        if let Some(report) = &mut self.report {
-            report.sample(&record);
-        }
         if let Some(recorder) = &mut self.recorder {
             recorder.push(topic, record);
         }
@@ -90,9 +79,6 @@ impl RunSink for Console {
     }
 
     fn decision(&mut self, seen: &SeenDecision<'_>) -> anyhow::Result<()> {
-        if let Some(report) = &mut self.report {
-            report.decision(seen);
-        }
         if self.is_quiet {
             return Ok(());
         }

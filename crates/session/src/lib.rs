@@ -1,7 +1,7 @@
-//! A run of a graph as the commands `run`, `trials`, `replay` and `test` have it: with decisions on stdout, a recording, a
-//! report and a summary.
+//! A run of a graph as the commands `run`, `trials`, `replay` and `test` have it: with decisions on stdout, a recording and a
+//! summary.
 //!
-//! * [`run`] - the run itself. [`recorder`] - records samples beside it. [`mod@report`] - its page. [`table`] - its summary.
+//! * [`run`] - the run itself. [`recorder`] - records samples beside it. [`table`] - its summary.
 //! * [`span`] - what a recorder beside a running graph records. [`flight`] - the last seconds of a graph, kept in memory.
 //! * [`of_graph`] - the facts about a graph that its recording holds.
 //! * [`output`] - files to write, checked before the work begins. [`text_table`] - tables for people.
@@ -11,7 +11,6 @@ pub mod flight;
 pub mod of_graph;
 pub mod output;
 pub mod recorder;
-pub mod report;
 pub mod run;
 pub mod span;
 pub mod table;

@@ -1,18 +1,17 @@
 //! A run of a graph as a command does it: with decisions on stdout, a recording, and the summary at the end.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use serde::Serialize;
 use serde_json::json;
 
 use crate::console::Console;
 use crate::of_graph::of_graph;
-use crate::output::{check_new, check_output, check_page};
+use crate::output::check_output;
 use crate::recorder::{Recorded, Recorder, check_recording};
-use crate::report::RunReport;
 use crate::table::table;
 use blindgrasp_graph::client::metrics;
 use blindgrasp_graph::dataflow::Graph;
@@ -22,7 +21,6 @@ use blindgrasp_graph::run::{self, Run, RunOptions};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_recording::{LiveOptions, Record};
-use blindgrasp_stages::hand::Hand;
 
 /// Receives every sample of a run: its topic and content, and the time of its receipt (CLOCK_BOOTTIME).
 pub type Tap = Box<dyn FnMut(&str, &Record, u64) -> anyhow::Result<()> + Send>;
@@ -37,8 +35,6 @@ pub struct Session {
     pub record_options: LiveOptions,
     /// Prometheus is answered on this port.
     pub metrics: Option<u16>,
-    /// The report is written to this file (HTML) at the end.
-    pub report: Option<PathBuf>,
     /// Decisions and summary are printed as JSON.
     pub json: bool,
     /// Neither decisions nor the summary go to stdout; warnings and errors still go to stderr.
@@ -77,7 +73,7 @@ impl Session {
         let options = RunOptions {
             launch: self.launch,
             clock: self.clock,
-            reads_all: self.record.is_some() || self.tap.is_some() || self.report.is_some(),
+            reads_all: self.record.is_some() || self.tap.is_some(),
             metrics: self.metrics.map(listen).transpose()?,
             is_quiet: self.is_quiet,
         };
@@ -90,12 +86,11 @@ impl Session {
             None => None,
         };
         let is_recorded = recorder.is_some();
-        let report = self.report.as_ref().map(|_| RunReport::begin(hand_of(graph)));
         let run::Ended { summary, sink, outcome } =
-            run.run(Console::new(self.json, self.is_quiet, recorder, report, self.tap), n_stops)?;
+            run.run(Console::new(self.json, self.is_quiet, recorder, self.tap), n_stops)?;
         let n_seen = n_stops.load(Ordering::Relaxed);
 
-        let Console { mut printer, recorder, report, .. } = sink;
+        let Console { mut printer, recorder, .. } = sink;
         let ending = if outcome.is_ok() { Ending::Graph } else { Ending::Broken };
         let mut recorded: Recorded = recorder.map(|recorder| recorder.finish(ending)).unwrap_or_default();
         if outcome.is_err() {
@@ -114,17 +109,7 @@ impl Session {
         if !self.is_quiet {
             summary.print_recording();
         }
-        let reported = match (report, &self.report) {
-            (Some(report), Some(path)) => report.write(path, &summary.run),
-            _ => Ok(()),
-        };
         outcome?;
-        reported?;
-        if let Some(path) = self.report
-            && !self.is_quiet
-        {
-            print_diagnostic(&format!("the report of the run is {}", path.display()));
-        }
         if let Some(error) = printer.take_failure() {
             return Err(error).context("decisions were made that could not be written to stdout");
         }
@@ -133,34 +118,19 @@ impl Session {
         Ok(Ended { summary, is_lossy })
     }
 
-    /// Refuses files to write that would overwrite others.
+    /// Refuses a recording that would overwrite another file.
     fn check_files(&self, graph: &Graph) -> anyhow::Result<()> {
+        let Some(path) = &self.record else { return Ok(()) };
         let params = graph.nodes.iter().flat_map(|node| node.params.values());
         let inputs: Vec<PathBuf> = params.filter_map(|param| Some(PathBuf::from(param.as_str()?))).collect();
-        if let Some(path) = &self.record {
-            check_output(path, &inputs)?;
-            check_recording(path, &self.record_options)?;
-        }
-        if let Some(path) = &self.report {
-            check_page(path, &inputs)?;
-            check_new(path, &inputs, self.record_options.overwrite)?;
-            if self.record.as_ref() == Some(path) {
-                bail!("{} is given for --record and for --report: choose two files", path.display());
-            }
-        }
-        Ok(())
+        check_output(path, &inputs)?;
+        check_recording(path, &self.record_options)
     }
 }
 
 /// Answers Prometheus on a port.
 fn listen(port: u16) -> anyhow::Result<std::net::TcpListener> {
     metrics::listen(port).with_context(|| format!("cannot answer on port {port} (--metrics)"))
-}
-
-/// The hand of the first node with a pad layout. The operator itself says if it cannot be read.
-fn hand_of(graph: &Graph) -> Option<Hand> {
-    let paths = graph.nodes.iter().filter_map(|node| node.params.get("hand")?.as_str());
-    Hand::load(Path::new(paths.into_iter().next()?)).ok()
 }
 
 impl SessionSummary {

@@ -240,7 +240,9 @@ impl FrameFilter {
 
     /// Counts a new connection.
     pub fn began(&mut self) {
-        self.ended();
+        if self.waiting.is_some() {
+            self.disbelieve_waiting();
+        }
         self.counts.connections += 1;
         self.begin_anew();
     }
@@ -248,13 +250,6 @@ impl FrameFilter {
     fn begin_anew(&mut self) {
         self.connection = Connection::default();
         (self.new_clock, self.doubt) = (None, None);
-    }
-
-    /// Counts a frame that still waits when the stream ends.
-    pub fn ended(&mut self) {
-        if self.waiting.is_some() {
-            self.disbelieve_waiting();
-        }
     }
 
     /// Counts a client that was turned away.

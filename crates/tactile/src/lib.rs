@@ -17,7 +17,6 @@
 //! * [`line_protocol`] - lines of JSON, one frame each; pure.
 //! * [`gate`] - order, lateness, numbers; pure.
 //! * [`stream`] - the driver for the line protocol over TCP or a serial device.
-//! * [`replay`] - the driver that plays a recording at its own speed.
 //!
 //! The caller passes the time, in nanoseconds of CLOCK_BOOTTIME.
 
@@ -25,7 +24,6 @@ pub mod cell_zeros;
 pub mod gate;
 pub mod line_protocol;
 mod link;
-pub mod replay;
 pub mod stream;
 
 use rustix::event::PollFd;
@@ -75,8 +73,6 @@ pub enum Event {
     Refused(Refusal),
     /// A second sender was turned away.
     TurnedAway,
-    /// There are no more readings.
-    Ended,
 }
 
 /// One reading of all joints and cells.
@@ -203,10 +199,6 @@ pub enum DriverError {
     Key { key: String, why: String },
     #[error("cannot make an event")]
     Inbox(#[source] std::io::Error),
-    #[error(transparent)]
-    Recording(#[from] blindgrasp_recording::RecordingError),
-    #[error("recording {path}: it is of the hand {found}, expected {expected}")]
-    OtherHand { path: String, found: String, expected: String },
 }
 
 /// The hand whose frames a sender is to send.

@@ -9,7 +9,6 @@ mod mesh;
 mod model;
 mod new;
 mod object_list;
-mod quality;
 mod sensors;
 mod simulate;
 mod train;
@@ -21,7 +20,7 @@ use blindgrasp_session::text_table::percent;
 
 blindgrasp_cli::program! {
     Simulate simulate, Import import, Train train, Evaluate evaluate, Trials trials, Model model, Sensors sensors, New new;
-    hidden Mesh mesh, Quality quality;
+    hidden Mesh mesh;
     operators crate::operators::SHIPPED; others &[]
 }
 

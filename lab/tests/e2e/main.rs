@@ -12,7 +12,6 @@ mod import;
 mod meshes;
 mod mujoco;
 mod own_lifts;
-mod quality;
 mod reference_data;
 mod reproduce;
 mod sensors;

@@ -1,8 +1,11 @@
-//! Compares with reference values that lie beside the project where it is developed. Elsewhere these tests are skipped.
+//! Compares hands and grasp qualities with reference values that lie beside the project where it is developed; elsewhere these
+//! tests are skipped. The simulator's labels are compared with the quality of its scenes.
 
 use std::path::Path;
 
 use crate::common::reference;
+use blindgrasp_objects::select;
+use blindgrasp_simulator::simulator::{SimulatorOptions, simulate_all};
 use blindgrasp_simulator::wrench_space::{GraspCase, quality};
 use blindgrasp_stages::hand::Hand;
 use serde_json::Value;
@@ -45,4 +48,20 @@ fn grasp_quality_agrees_with_qhull() {
         assert!(relative(found.volume, expected("volume")) < 1e-6, "case {idx}: {found:?}");
         assert_eq!(found.n_wrenches as f64, expected("n_wrenches"), "case {idx}");
     }
+}
+
+#[test]
+fn the_quality_of_a_scene_is_the_simulators_label() {
+    let hand = Hand::load("barrett-bh8-280".as_ref()).expect("built in");
+    let objects = select("all").expect("built in");
+    let options = SimulatorOptions { n_grasps: 100, seed: 4, ..Default::default() };
+    let mut n_stable = 0;
+    let sink = |grasp: blindgrasp_simulator::candidate::SimulatedGrasp| {
+        let case = GraspCase::from(&grasp.scene);
+        assert_eq!(quality(&case).expect("a quality").is_stable(), grasp.truth.stable);
+        n_stable += usize::from(grasp.truth.stable);
+        Ok::<(), std::convert::Infallible>(())
+    };
+    simulate_all(&hand, &objects, &options, sink).expect("grasps");
+    assert_eq!(n_stable, 48);
 }

@@ -38,7 +38,7 @@ pub(super) struct Arguments {
     /// Asks each program for its ports and parameters, and prints nodes and edges with every value filled in. The
     /// programs of the file are run for that, with --describe: use only files that you trust. With --machine, the programs and files of other machines need not be here. With --json: {"graph": …}, with
     /// "crossing" edges where the file names machines, or {"errors": […]}.
-    #[arg(long, conflicts_with_all = ["record", "detach", "stay", "metrics", "view", "report"])]
+    #[arg(long, conflicts_with_all = ["record", "detach", "stay", "metrics", "view"])]
     check: bool,
     /// Name of the running graph [default: the file's]
     #[arg(long)]
@@ -84,12 +84,6 @@ pub(super) struct Arguments {
     view: Option<u16>,
     #[command(flatten)]
     rights: Rights,
-    /// Write a report with pictures to this file (.html) at the end
-    ///
-    /// Decisions in time, ages on arrival, losses, the log, and the first wrong decisions where a label is known. Like a recording,
-    /// it reads every edge.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["detach", "stay"])]
-    report: Option<PathBuf>,
     /// Format of the log files: text, or JSON, one object a line
     #[arg(long, value_name = "FORMAT", default_value = "text")]
     log_format: LogFormatArgument,
@@ -288,7 +282,6 @@ fn session(arguments: &Arguments) -> Session {
         record: arguments.record.clone(),
         record_options: arguments.recording.options(),
         metrics: arguments.metrics,
-        report: arguments.report.clone(),
         json: arguments.json,
         is_quiet: arguments.quiet,
         tap: None,

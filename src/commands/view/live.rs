@@ -243,7 +243,7 @@ struct ShownLog {
 
 impl ShownLog {
     fn open(folder: &Path) -> ShownLog {
-        match LogTail::open(LogFolder::at(folder.into()), None, MAX_LOG_LINES, u64::MAX) {
+        match LogTail::open(LogFolder::at(folder.into()), None, MAX_LOG_LINES) {
             Ok((tail, lines)) => ShownLog { tail: Some(tail), lines: lines.into(), is_new: true },
             Err(_) => ShownLog { tail: None, lines: VecDeque::new(), is_new: true },
         }

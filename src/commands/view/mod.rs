@@ -15,7 +15,7 @@ use blindgrasp_graph::client::is_graph_name;
 use blindgrasp_graph::dataflow::Override;
 use clap::{Args, ValueEnum};
 
-use super::{Outcome, secs_in};
+use super::Outcome;
 use blindgrasp_cli::joint;
 
 /// Show a graph or a recording in a browser; draw it, or a hand.
@@ -25,7 +25,6 @@ use blindgrasp_cli::joint;
 #[command(after_help = "Example: blindgrasp view grasp_gate\n         \
                         blindgrasp view recordings/held-out.mcap\n         \
                         blindgrasp view dataflow.yaml --out graph.svg\n         \
-                        blindgrasp view grasp_gate --format mermaid\n         \
                         blindgrasp view recordings/held-out.mcap --grasp 3 --out grasp.html\n         \
                         blindgrasp view allegro --out hand.html\n\n\
                         In a graph, 'run' is the launching command: it reads the decisions, and the label where a source knows it.\n\
@@ -35,7 +34,7 @@ pub(super) struct Arguments {
     /// of a built-in one
     #[arg(default_value = "dataflow.yaml")]
     file: PathBuf,
-    /// Write to this file: .svg, .mmd or .dot for a graph, .html for a grasp or a hand
+    /// Write to this file: .svg, .mmd or .dot for a dataflow file, .html for a grasp or a hand
     #[arg(short, long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// Port of the page of a running graph or a recording, on 127.0.0.1 [default: any free one]
@@ -85,7 +84,7 @@ impl Rights {
 }
 
 #[derive(Debug, Args)]
-#[command(next_help_heading = "A graph")]
+#[command(next_help_heading = "A dataflow file")]
 struct GraphArguments {
     /// Give a param another value than the file does
     ///
@@ -100,10 +99,7 @@ struct GraphArguments {
     /// Format of the picture [default: as the name of --out says, else mermaid]
     #[arg(long, value_enum, conflicts_with = "json")]
     format: Option<Format>,
-    /// Measure the running graph that is drawn for this time [default: 1]
-    #[arg(long, value_name = "TIME", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
-    interval: Option<f64>,
-    /// Print nodes and edges as JSON; of a running graph, with its rates, ages and losses
+    /// Print nodes and edges as JSON
     #[arg(long)]
     json: bool,
 }
@@ -150,9 +146,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(name) = graph_name(arguments) {
         return run_on_graph(name, arguments);
     }
-    if graph.interval.is_some() {
-        refuse("--interval is for a running graph: name one");
-    }
     if arguments.rights.is_any() {
         refuse("--view-control and --foxglove are for the page of a running graph: name one");
     }
@@ -182,7 +175,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         return graph::draw_file(&arguments.file, arguments.out.as_deref(), graph);
     }
     if !graph.overrides.is_empty() || graph.machine.is_some() || graph.format.is_some() || graph.json {
-        refuse("--set, --machine, --format and --json are for graphs: name a dataflow file (.yaml)");
+        refuse("--set, --machine, --format and --json are for a dataflow file: name one (.yaml)");
     }
     match &arguments.out {
         Some(out) => grasp::draw(&arguments.file, out, grasp),
@@ -190,24 +183,18 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
 }
 
-/// Shows or draws a running graph.
+/// Shows a running graph.
 fn run_on_graph(name: &str, arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let (graph, shadow) = (&arguments.graph, arguments.shadow.as_deref());
+    let graph = &arguments.graph;
     if !graph.overrides.is_empty() || graph.machine.is_some() {
         refuse("--set and --machine are for a dataflow file: name one (.yaml)");
     }
     if arguments.out.is_some() || graph.format.is_some() || graph.json {
-        if arguments.port.is_some() || arguments.rights.is_any() || shadow.is_some() {
-            refuse(
-                "--port, --view-control, --foxglove and --shadow are for the page: leave out --out, --format and --json",
-            );
-        }
-        return graph::draw_running(name, arguments.out.as_deref(), graph);
+        refuse(
+            "--out, --format and --json are for a dataflow file: name one (.yaml), or see what runs with `blindgrasp ps --json`",
+        );
     }
-    if graph.interval.is_some() {
-        refuse("--interval is for a drawing: add --out, --format or --json");
-    }
-    live::show(name, arguments.port.unwrap_or(0), false, arguments.rights, shadow)
+    live::show(name, arguments.port.unwrap_or(0), false, arguments.rights, arguments.shadow.as_deref())
 }
 
 /// The name of a running graph, if the argument is one.

@@ -36,8 +36,6 @@ pub struct DrawnNode {
     pub name: String,
     /// Lines below.
     pub notes: Vec<String>,
-    /// Lines below in red; the box is red then, too.
-    pub warnings: Vec<String>,
     /// Whether it is no operator: what only reads the graph.
     pub is_outside: bool,
     /// The group that it is in, by index.
@@ -53,8 +51,6 @@ pub struct DrawnEdge {
     pub to: usize,
     /// What is said of it.
     pub notes: Vec<String>,
-    /// What is wrong with it, in red; the arrow is red then, too.
-    pub warnings: Vec<String>,
     /// Whether samples may give way to newer ones: dashed.
     pub is_dashed: bool,
     /// Whether it goes back to where its samples come from: dashed, drawn below the others.
@@ -67,9 +63,9 @@ pub struct DrawnEdge {
 const CROSSING: &str = "#7a4fb5";
 
 impl DrawnEdge {
-    /// Its lines of text: what is said, what carries it, what is wrong.
+    /// Its lines of text: what is said, and what carries it.
     fn lines(&self) -> impl Iterator<Item = &String> {
-        self.notes.iter().chain(&self.carrier).chain(&self.warnings)
+        self.notes.iter().chain(&self.carrier)
     }
 }
 

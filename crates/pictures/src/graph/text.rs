@@ -4,8 +4,6 @@ use std::fmt::Write;
 
 use super::{CROSSING, DrawnGraph, DrawnNode, tint};
 
-const LOUD: &str = "#b42318";
-
 /// A flowchart for Mermaid, which GitHub and GitLab draw in a block of Markdown marked `mermaid`.
 pub fn graph_mermaid(graph: &DrawnGraph) -> String {
     let mut text = format!("---\ntitle: \"{}\"\n---\nflowchart LR\n", mermaid_text(&graph.title));
@@ -14,7 +12,7 @@ pub fn graph_mermaid(graph: &DrawnGraph) -> String {
     // Writing to a string cannot fail.
     let boxed = |idx: usize, node: &DrawnNode| {
         let (open, close) = if node.is_outside { ("([", "])") } else { ("[", "]") };
-        let lines = [&node.name].into_iter().chain(&node.notes).chain(&node.warnings).collect();
+        let lines = [&node.name].into_iter().chain(&node.notes).collect();
         format!("n{idx}{open}\"{}\"{close}", label(lines))
     };
     for (group_idx, group) in graph.groups.iter().enumerate() {
@@ -33,13 +31,8 @@ pub fn graph_mermaid(graph: &DrawnGraph) -> String {
         let label = if lines.is_empty() { String::new() } else { format!("|\"{}\"|", label(lines)) };
         let _ = writeln!(text, "  n{} {arrow}{label} n{}", edge.from, edge.to);
     }
-    for (idx, _) in graph.nodes.iter().enumerate().filter(|(_, node)| is_loud(node)) {
-        let _ = writeln!(text, "  style n{idx} stroke:{LOUD},color:{LOUD}");
-    }
     for (idx, edge) in graph.edges.iter().enumerate() {
-        if !edge.warnings.is_empty() {
-            let _ = writeln!(text, "  linkStyle {idx} stroke:{LOUD},color:{LOUD}");
-        } else if edge.carrier.is_some() {
+        if edge.carrier.is_some() {
             let _ = writeln!(text, "  linkStyle {idx} stroke:{CROSSING},color:{CROSSING}");
         }
     }
@@ -60,13 +53,10 @@ pub fn graph_dot(graph: &DrawnGraph) -> String {
     );
     let label = |lines: Vec<&String>| lines.into_iter().map(|line| dot_text(line)).collect::<Vec<_>>().join("\\n");
     let boxed = |idx: usize, node: &DrawnNode| {
-        let lines = [&node.name].into_iter().chain(&node.notes).chain(&node.warnings).collect();
+        let lines = [&node.name].into_iter().chain(&node.notes).collect();
         let mut attributes = format!("label=\"{}\"", label(lines));
         if node.is_outside {
             attributes += ", shape=oval, fillcolor=\"#fdf0dd\", color=\"#c77f1a\"";
-        }
-        if is_loud(node) {
-            let _ = write!(attributes, ", fillcolor=\"#fdecea\", color=\"{LOUD}\", fontcolor=\"{LOUD}\"");
         }
         format!("n{idx} [{attributes}];")
     };
@@ -95,9 +85,7 @@ pub fn graph_dot(graph: &DrawnGraph) -> String {
             // It has no say in who stands left of whom.
             attributes += ", constraint=false";
         }
-        if !edge.warnings.is_empty() {
-            let _ = write!(attributes, ", color=\"{LOUD}\", fontcolor=\"{LOUD}\"");
-        } else if edge.carrier.is_some() {
+        if edge.carrier.is_some() {
             let _ = write!(attributes, ", color=\"{CROSSING}\", fontcolor=\"{CROSSING}\"");
         }
         let _ = writeln!(text, "  n{} -> n{} [{attributes}];", edge.from, edge.to);
@@ -113,10 +101,6 @@ fn in_group(graph: &DrawnGraph, group: Option<usize>) -> impl Iterator<Item = (u
 
 fn group_title<'a>(name: &'a String, note: &'a String) -> Vec<&'a String> {
     [name, note].into_iter().filter(|line| !line.is_empty()).collect()
-}
-
-fn is_loud(node: &DrawnNode) -> bool {
-    !node.warnings.is_empty()
 }
 
 /// Text between Mermaid's quotes: its entity codes for all that it, HTML or Markdown would take for something else.

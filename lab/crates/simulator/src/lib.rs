@@ -24,13 +24,10 @@
 //! part and keeps those that fill the asked-for numbers of stable and unstable grasps; [`options`] has its options. With
 //! the label `lift`, the physics of [`crate::trial`] replace the steps between the object and the label.
 //!
-//! [`case_file`] reads grasps of users.
-//!
 //! Without physics this is a geometric simulator: the object does not move, nothing has mass or speed while the fingers
 //! close, and links are rigid but for the contact patch.
 
 pub mod candidate;
-pub mod case_file;
 pub mod contact_points;
 pub mod distance;
 pub mod hull;
