@@ -69,11 +69,16 @@ const showDecision = (decision) => {
   shown.decision = decision;
   const action = byId("action"), name = decision === null ? "none yet" : spoken(decision.action);
   tell("action", name);
-  action.className = `action ${decision === null ? "" : ["lift", "hold"].includes(decision.action) ? decision.action : "probe"}`;
-  if (decision === null) return tell("why", "");
+  if (decision === null) {
+    action.className = "action none";
+    return tell("why", "");
+  }
+  const isFinal = ["lift", "hold"].includes(decision.action), isWrong = verdict(decision).startsWith("false");
+  action.className = `action ${isFinal ? decision.action : "probe"} ${isWrong ? "wrong" : ""}`.trim();
+  const against = decision.against ? `; ${decision.against}` : "";
   const wrong = decision.action === "lift" && decision.truth === false ? " This lift is wrong: the grasp is known to be unstable." : "";
   tell("why", `Grasp ${decision.grasp_id}: ${spoken(decision.reason)}, probability ` +
-    `${decision.probability_stable.toFixed(2)}.${decision.why ?? wrong}`);
+    `${decision.probability_stable.toFixed(2)}${against}.${decision.why ?? wrong}`);
 };
 // A new decision: when it was on the screen, which scripts/benchsuite view reads, and in words.
 const announce = (decision) => {
@@ -163,8 +168,13 @@ const showVotes = ({ side, n }, frame) => {
 // --- a moment of a running graph, present or past
 const past = makeHistory({
   chart: () => { if (!player.grasps.length) liveChart(); },
-  show: (moment, decision, isPaused) => {
+  show: (moment, decision, isPaused, lacking) => {
     showDecision(decision);
+    byId("stage").classList.toggle("lacking", lacking !== null);
+    if (lacking !== null) {
+      tell("moment", `the frame that decided grasp ${lacking.grasp_id} is not kept: no hand is drawn`);
+      for (const id of ["pads", "joints"]) cut(byId(id), 0);
+    }
     showFrame(moment.frame);
     if (isPaused && moment.frame && !isShownHand(moment.frame)) tell("moment", "this frame lacks readings of the hand: an earlier one stays drawn");
     if (isPaused || !moment.frame) tell("waits", "");
@@ -176,7 +186,7 @@ const past = makeHistory({
   },
 });
 shown.past = past;
-const player = makePlayer({ surround: hand.surround, isShownHand, showFrame, showDecision, showShadow, chart });
+const player = makePlayer({ list: past.list, surround: hand.surround, isShownHand, showFrame, showDecision, showShadow, chart });
 shown.player = player;
 setInterval(() => {
   if (document.hidden || player.grasps.length) return;
@@ -212,6 +222,9 @@ const showGraph = (graph) => {
   });
   cut(byId("edges"), graph.edges.length);
   showChoices(graph);
+  if (past.list.asked !== null) past.list.goTo(past.list.asked);
+  past.list.asked = null;
+  if (shown.frame === null && graph.listens) tell("moment", `no frame yet: waits for a bridge at ${graph.listens}; docs/hardware.md says what it sends`);
 };
 
 // --- ages: an old state must not look like the present one
@@ -266,7 +279,11 @@ on("frame", (event) => {
     at: now, probabilities: probabilities.filter((p) => p !== null), shadow: shadow.filter((p) => p !== null), decisions, votes, frame,
     forces: frame && touchOf(frame).map(({ sum }) => sum), feature: values?.length ? values : undefined, words: values?.length ? weights : undefined,
   });
-  labels.forEach(past.label);
+  for (const label of labels) {
+    past.label(label);
+    const [epoch, grasp_id, truth] = label;
+    if (shown.decision && keyOf(shown.decision) === keyOf({ epoch, grasp_id })) showDecision({ ...shown.decision, truth });
+  }
   if (frame) frameAt = now;
   if (past.at !== null) return;
   if (frame) {
