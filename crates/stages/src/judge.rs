@@ -159,8 +159,9 @@ impl Judge {
         }
         match decision.reason {
             Reason::Invalid => self.found.invalid.iter().cloned().collect(),
-            Reason::Unstable if self.arbiter.options().probe == Probe::None && self.model.day.is_none() => {
-                self.model.speak_against(&self.hand, &self.values).into_iter().collect()
+            Reason::Unstable if self.arbiter.options().probe == Probe::None => {
+                let names = self.model.features.value_names(&self.hand);
+                self.model.speak_against(&names, &self.values).into_iter().collect()
             }
             Reason::NoContact => self.found.self_contact.iter().cloned().collect(),
             Reason::Stale => self.arbiter.staleness(decision.grasp_id).iter().map(Staleness::to_string).collect(),

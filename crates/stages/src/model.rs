@@ -13,9 +13,9 @@ use sha2::{Digest, Sha256};
 use crate::approach::ApproachPrior;
 use crate::classifier::{Classifier, Predictor, Verdict};
 use crate::day::{DayMemory, DayModel, GraspPlace};
-use crate::encoder::{FeatureExtractor, FeltReading, Scaling};
+use crate::encoder::{FeatureExtractor, FeltReading, PartNames, Scaling};
 use crate::hand::Hand;
-use crate::out_of_distribution::{TrainingRange, Violation, quantities, short};
+use crate::out_of_distribution::{Limits, TrainingRange, Violation, quantities, short};
 use crate::own_lifts::{Adapt, Looked, OwnLifts};
 use crate::probe::{GraspHistory, ProbeModel, pad_newtons, signals};
 use crate::shift_test::numbers;
@@ -299,15 +299,34 @@ impl Model {
         }
     }
 
+    /// The names of a feature's values ([`FeatureExtractor::value_names`]) without the hand: by the limits of training, which a
+    /// model of this version has with names. The hand of an older one's is known if it is built in.
+    pub fn value_names(&self) -> Vec<String> {
+        if let Ok(hand) = Hand::load(Path::new(&self.hand.name))
+            && hand.id() == self.hand.id
+        {
+            return self.features.value_names(&hand);
+        }
+        let mut parts = PartNames::default();
+        for Limits { quantity, .. } in &self.training_range.limits {
+            // Behind the name is the unit.
+            let Some((quantity, _)) = quantity.rsplit_once(", ") else { continue };
+            parts.joints.extend(quantity.strip_prefix("position of joint "));
+            parts.coupled.extend(quantity.strip_prefix("breakaway of joint "));
+            parts.pads.extend(quantity.strip_prefix("load of pad "));
+        }
+        self.features.names_of_values(&parts)
+    }
+
     /// The two values of pads and joints in the feature of a settled frame that speak most against the grasp, for people. Only
-    /// trees can tell.
-    pub fn speak_against(&self, hand: &Hand, values: &[f64]) -> Option<String> {
+    /// trees can tell, and no model that judges by the day's earlier grasps. `names` are those of the values.
+    pub fn speak_against(&self, names: &[String], values: &[f64]) -> Option<String> {
         let trees = match &self.classifier.predictor {
             Predictor::Boosting(trees) => trees,
             Predictor::Blend(blend) => &blend.trees,
             Predictor::Svm(_) => return None,
         };
-        if values.len() != trees.n_features {
+        if self.day.is_some() || values.len() != trees.n_features || names.len() != values.len() {
             return None;
         }
         let mut against = Vec::new();
@@ -317,7 +336,6 @@ impl Model {
             }
         }
         against.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let names = self.features.value_names(hand);
         // A name with a dot is of a pad or joint; a word of the histogram or a wrench has none.
         against.retain(|(_, idx)| names[*idx].contains('.'));
         let mut said = Vec::new();

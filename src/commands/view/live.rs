@@ -15,9 +15,10 @@ use blindgrasp_graph::client::words::warnings;
 use blindgrasp_graph::client::{Connection, Heard};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_messages::{
-    Action, ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Record, Sense, TactileFrame,
-    with_sample,
+    Action, ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Reason, Record, Sense,
+    TactileFrame, with_sample,
 };
+use blindgrasp_operator::control_socket::tactile_path;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, link_poses};
 use blindgrasp_stages::{Hand, Judge, Judged, Model};
@@ -47,6 +48,8 @@ const MAX_LOG_LINES: usize = 100;
 const MAX_RECENT_CELLS: usize = 1 << 20;
 /// Labels of grasps that wait for their decision.
 const MAX_TRUTHS: usize = 256;
+/// Decisions that wait for their frame, and grasps whose settled feature is kept for the decision.
+const MAX_WAITING: usize = 64;
 
 /// Serves the page until the command is interrupted. A graph that ends may run again. With `waits`, it need not run yet, and the
 /// end of stdin ends the page: the process that started it has gone.
@@ -205,9 +208,11 @@ impl GraphPage<'_> {
     fn show_decision(&self) {
         let mut latest = self.latest();
         if std::mem::take(&mut latest.is_decided)
-            && let Some(decided) = latest.decisions.last()
+            && let Some(mut decided) = latest.decisions.pop()
         {
-            let event = decision_event(decided, &latest.truths);
+            latest.find_grounds(&mut decided);
+            let event = decision_event(&decided, &latest.truths, self.hand.as_ref(), &self.model);
+            latest.decisions.push(decided);
             drop(latest);
             self.viewer.keep("decision", &event.to_string());
         }
@@ -217,9 +222,18 @@ impl GraphPage<'_> {
     fn show_frame(&self) {
         let mut latest = self.latest();
         let mut taken = std::mem::take(&mut *latest);
+        for mut decided in std::mem::take(&mut taken.decisions) {
+            if taken.is_before_frame_of(&decided) && latest.decisions.len() < MAX_WAITING {
+                latest.decisions.push(decided);
+            } else {
+                taken.find_grounds(&mut decided);
+                taken.decisions.push(decided);
+            }
+        }
         // Labels wait for decisions that come later, and votes for more of their kind.
         latest.truths.clone_from(&taken.truths);
         latest.recent = std::mem::take(&mut taken.recent);
+        latest.settled = std::mem::take(&mut taken.settled);
         latest.votes = taken.votes;
         latest.min_probability_stable = taken.min_probability_stable;
         drop(latest);
@@ -286,8 +300,11 @@ struct ShownFrame {
 /// A decision, and the frame that it was made about if that is known.
 struct Decided {
     key: GraspKey,
+    stamp_nanos: u64,
     decision: LiftDecision,
     frame: Option<ShownFrame>,
+    /// The feature of the settled hand, if the model found that unstable.
+    unstable: Option<GraspFeature>,
 }
 
 /// The samples since the last tick.
@@ -298,6 +315,8 @@ struct Latest {
     recent: VecDeque<ShownFrame>,
     contacts: Option<ContactSet>,
     feature: Option<GraspFeature>,
+    /// The last settled feature of each of the last grasps, also of earlier ticks.
+    settled: VecDeque<(GraspKey, GraspFeature)>,
     probabilities: Vec<f64>,
     /// Those of the model beside.
     shadow_probabilities: Vec<f64>,
@@ -408,7 +427,17 @@ impl Latest {
                 self.frame = Some(shown);
             }
             Record::Contacts(sample) if is_shown => self.contacts = Some(sample.message),
-            Record::Feature(sample) if is_shown => self.feature = Some(sample.message),
+            Record::Feature(sample) if is_shown => {
+                if sample.message.phase == Phase::Settled {
+                    let key = (sample.header.epoch, sample.message.grasp_id);
+                    self.settled.retain(|(known, _)| *known != key);
+                    self.settled.push_back((key, sample.message.clone()));
+                    if self.settled.len() > MAX_WAITING {
+                        self.settled.pop_front();
+                    }
+                }
+                self.feature = Some(sample.message);
+            }
             Record::Prediction(sample) if is_shown => {
                 if self.probabilities.len() < MAX_PROBABILITIES {
                     self.probabilities.push(sample.message.probability_stable);
@@ -419,13 +448,9 @@ impl Latest {
             Record::Decision(sample) if sample.message.action == Action::GoOn => {}
             Record::Decision(sample) if is_shown => {
                 self.is_decided = true;
-                // An arbiter decides under the stamp of the last prediction, and that is the frame's.
                 let Header { epoch, stamp_nanos, .. } = sample.header;
-                let mut latest_first = self.recent.iter().rev();
-                let frame =
-                    latest_first.find(|shown| (shown.epoch, shown.stamp_nanos) == (epoch, stamp_nanos)).cloned();
-                let key = (epoch, sample.message.grasp_id);
-                self.decisions.push(Decided { key, decision: sample.message, frame });
+                let (key, decision) = ((epoch, sample.message.grasp_id), sample.message);
+                self.decisions.push(Decided { key, stamp_nanos, decision, frame: None, unstable: None });
             }
             Record::Truth(sample) => {
                 let key = (sample.header.epoch, sample.message.grasp_id);
@@ -440,11 +465,43 @@ impl Latest {
     }
 }
 
+impl Latest {
+    /// Whether the frame of a decision is still to come: a reader of many samples may be further with decisions than with frames.
+    fn is_before_frame_of(&self, decided: &Decided) -> bool {
+        let last = self.recent.back();
+        last.is_some_and(|last| last.epoch == decided.key.0 && last.stamp_nanos < decided.stamp_nanos)
+    }
+
+    /// Finds the frame of a decision, and the feature of an unstable grasp. An arbiter decides under the stamp of the last
+    /// prediction. That may be of the next grasp, so the last frame of the grasp itself is meant.
+    fn find_grounds(&self, decided: &mut Decided) {
+        let key = decided.key;
+        let is_of_it = |shown: &&ShownFrame| {
+            (shown.epoch, shown.frame.grasp_id) == key && shown.stamp_nanos <= decided.stamp_nanos
+        };
+        decided.frame = self.recent.iter().rev().find(is_of_it).cloned();
+        // After a probe, another model has judged.
+        let is_settled = decided.frame.as_ref().is_none_or(|shown| shown.frame.phase == Phase::Settled);
+        if decided.decision.reason == Reason::Unstable && is_settled {
+            let found = self.settled.iter().find(|(known, _)| *known == key);
+            decided.unstable = found.map(|(_, feature)| feature.clone());
+        }
+    }
+}
+
 /// Numbers are texts: JavaScript has no integers beyond 2^53.
-fn decision_event(decided: &Decided, truths: &BTreeMap<GraspKey, bool>) -> Value {
+fn decision_event(
+    decided: &Decided,
+    truths: &BTreeMap<GraspKey, bool>,
+    hand: Option<&Hand>,
+    model: &ShownModel,
+) -> Value {
     let mut event = shadow_event(&decided.decision);
     event["epoch"] = decided.key.0.to_string().into();
     event["truth"] = json!(truths.get(&decided.key));
+    if let (Some(hand), Some(feature)) = (hand, &decided.unstable) {
+        event["against"] = json!(model.speak_against(hand, feature));
+    }
     event
 }
 
@@ -463,7 +520,7 @@ fn frame_event(hand: Option<&Hand>, model: &ShownModel, latest: Latest) -> Optio
         return None;
     }
     let decisions = decisions.iter().map(|decided| {
-        let mut event = decision_event(decided, &truths);
+        let mut event = decision_event(decided, &truths, hand, model);
         if let (Some(hand), Some(shown)) = (hand, &decided.frame) {
             let mut frame = json!({});
             add_frame(&mut frame, hand, &shown.frame, contacts.as_ref());
@@ -514,6 +571,10 @@ fn graph_event(now: &Look, before: Option<&Look>) -> anyhow::Result<String> {
     event["warnings"] = json!(warnings(&now.status));
     let params = now.status.nodes.iter().map(|node| (&node.node, &node.params));
     event["params"] = json!(params.collect::<BTreeMap<_, _>>());
+    if let Some(node) = now.status.nodes.iter().find(|node| node.params.get("driver") == Some(&"listen".into())) {
+        let usual = tactile_path().map_or(Value::Null, |path| format!("unix:{}", path.display()).into());
+        event["listens"] = node.params.get("address").cloned().unwrap_or(usual);
+    }
     Ok(event.to_string())
 }
 

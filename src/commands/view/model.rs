@@ -4,7 +4,9 @@ use std::path::Path;
 
 use anyhow::Context;
 use blindgrasp_graph::control::GraphStatus;
+use blindgrasp_messages::GraspFeature;
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_stages::Hand;
 use blindgrasp_stages::encoder::Block;
 use blindgrasp_stages::model::Model;
 use serde_json::{Value, json};
@@ -40,6 +42,12 @@ impl ShownModel {
         });
         self.source = Some(source);
         Some(self.event().to_string())
+    }
+
+    /// The two values of a settled feature that speak most against the grasp.
+    pub(super) fn speak_against(&self, hand: &Hand, feature: &GraspFeature) -> Option<String> {
+        let model = self.model.as_ref().filter(|model| model.dictionary_id() == feature.dictionary_id)?;
+        model.speak_against(&model.features.value_names(hand), &feature.values)
     }
 
     fn event(&self) -> Value {
