@@ -17,6 +17,9 @@ use serde_json::{Map, Value};
 
 use crate::beginning::FileNode;
 
+/// The shortest pause between two lines of the log about grasps: a recording may be played fast.
+const LOG_PAUSE_NANOS: u64 = 1_000_000_000;
+
 #[derive(Deserialize)]
 struct Params {
     model: PathBuf,
@@ -82,8 +85,8 @@ struct Classify {
     adapt: Adapt,
     /// Kept and dropped lifts, and changes of the readings, in the node's status; `None` if the launcher does not know them.
     reported: Option<[u64; 3]>,
-    /// The last grasp of which the log says what speaks against it.
-    told: Option<u64>,
+    /// The last grasp of which the log says what speaks against it, and when it did.
+    told: Option<(u64, u64)>,
 }
 
 impl Stage for Classify {
@@ -94,9 +97,9 @@ impl Stage for Classify {
         self.has_state
     }
 
-    fn answer(&mut self, head: &GraspFeatureHead, values: &[f64], _now_nanos: u64, answers: &mut Answers<Prediction>) {
+    fn answer(&mut self, head: &GraspFeatureHead, values: &[f64], now_nanos: u64, answers: &mut Answers<Prediction>) {
         let prediction = steps::classify(&self.model, self.dictionary_id, &mut self.memory, head, values);
-        self.explain(&prediction, values);
+        self.explain(&prediction, values, now_nanos);
         answers.push(prediction);
     }
 
@@ -149,15 +152,16 @@ impl Stage for Classify {
 
 impl Classify {
     /// Says once a grasp what speaks most against it, if the model finds the settled hand unstable.
-    fn explain(&mut self, prediction: &PredictionHead, values: &[f64]) {
+    fn explain(&mut self, prediction: &PredictionHead, values: &[f64], now_nanos: u64) {
         let PredictionHead { grasp_id, phase, stable, unsure, fault, .. } = *prediction;
         let is_unstable = phase == Phase::Settled.code() && fault == Fault::None.code() && stable == 0 && unsure == 0;
-        if !is_unstable || self.told == Some(grasp_id) {
+        let is_too_soon = |(told, at): (u64, u64)| told == grasp_id || now_nanos.saturating_sub(at) < LOG_PAUSE_NANOS;
+        if !is_unstable || self.told.is_some_and(is_too_soon) {
             return;
         }
-        self.told = Some(grasp_id);
+        self.told = Some((grasp_id, now_nanos));
         if let Some(against) = self.model.speak_against(&self.value_names, values) {
-            print_diagnostic(&format!("grasp {grasp_id} is unstable: {against}"));
+            print_diagnostic(&format!("grasp {grasp_id} seems unstable: {against}"));
         }
     }
 

@@ -42,7 +42,13 @@ impl fmt::Display for RobotPromise {
 /// The counts of a node in words, and the promise that follows from them.
 pub(super) fn shown_counts(counts: &BTreeMap<String, u64>) -> Vec<String> {
     let promise = RobotPromise::of(counts).map(|promise| promise.to_string());
-    promise.into_iter().chain(counts.iter().map(|(name, count)| printable(&format!("{name} {count}")))).collect()
+    let mut shown: Vec<String> = promise.into_iter().collect();
+    for (name, count) in counts {
+        if *count > 0 {
+            shown.push(printable(&format!("{name} {count}")));
+        }
+    }
+    shown
 }
 
 #[cfg(test)]
@@ -55,6 +61,7 @@ mod tests {
             |kept, dropped| BTreeMap::from([("promise/kept".into(), kept), ("promise/dropped".into(), dropped)]);
         assert_eq!(RobotPromise::of(&BTreeMap::from([("lifts/kept".into(), 7)])), None);
         assert_eq!(RobotPromise::of(&counts(0, 0)), None);
+        assert_eq!(shown_counts(&counts(0, 0)), Vec::<String>::new());
         let shown = shown_counts(&counts(294, 6));
         assert_eq!(shown[0], "at most 5.1 % of this robot's lifts drop (95 % confidence, 6 of 300 did)");
         assert_eq!(shown.len(), 3);

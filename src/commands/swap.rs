@@ -23,6 +23,7 @@ use blindgrasp_messages::Record;
 use blindgrasp_operator::cursors::COMPARE_BELL;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::text::counted;
 use blindgrasp_operator::text::is_name;
 use blindgrasp_operator::wiring::NamespaceWiring;
 
@@ -389,11 +390,11 @@ fn swapped_line(node: &SwappedNode) -> String {
 
 fn formatted(report: &ComparisonReport) -> Vec<String> {
     let agreement = match report.agreement {
-        Some(share) => format!("{} of {} samples agree", percent(Some(share)), report.n_pairs),
+        Some(share) => format!("{} of {} agree", percent(Some(share)), counted(report.n_pairs, "sample")),
         None => "agreement unknown: no sample was answered by both".into(),
     };
     let mut lines = vec![
-        format!("{}: {agreement}, {} grasps with disagreement", report.output, report.disagreements.len()),
+        format!("{}: {agreement}, {} with disagreement", report.output, counted(report.disagreements.len(), "grasp")),
         format!(
             "  answered by the old one only: {} ({} of them in the replacement's time); by the replacement only: {}",
             report.n_only_active, report.n_unanswered, report.n_only_shadow
