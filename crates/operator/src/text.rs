@@ -176,6 +176,11 @@ mod tests {
     use super::*;
 
     #[test]
+    fn one_thing_is_counted_in_the_singular() {
+        assert_eq!([0, 1, 2].map(|n| counted(n, "grasp")), ["0 grasps", "1 grasp", "2 grasps"]);
+    }
+
+    #[test]
     fn no_byte_of_a_stranger_commands_a_terminal() {
         let evil = "\u{1b}]0;own\u{7}a\u{9b}2Jb\rc\u{202e}\td\n";
         let expected = "\\u001b]0;own\\u0007a\\u009b2Jb\\u000dc\\u202e\td\n";

@@ -104,3 +104,18 @@ fn machine(peer: &PeerStatus) -> String {
         total(|channel| channel.n_samples, false)
     )
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_summary_has_no_zeros_and_counts_no_lifts_that_nobody_reports() {
+        let of_node = |kept, unreported| {
+            let counts = [("lifts/dropped", 0), ("lifts/kept", kept), ("lifts/unreported", unreported)];
+            BTreeMap::from([("lift_arbiter".to_owned(), counts.map(|(name, n)| (name.to_owned(), n)).into())])
+        };
+        assert_eq!(counts(&of_node(0, 116)), "");
+        assert_eq!(counts(&of_node(3, 2)), "lift_arbiter: lifts/kept 3, lifts/unreported 2");
+    }
+}

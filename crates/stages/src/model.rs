@@ -517,6 +517,19 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_values_have_the_names_of_a_hand_that_is_no_more_known() {
+        let mut model = Model::parse(include_str!("../../../models/barrett-bh8-280.json")).expect("a model");
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let names = model.features.value_names(&hand);
+        assert_eq!(model.value_names(), names, "of a built-in hand");
+        // As training writes them.
+        model.name_quantities(&hand);
+        model.hand.name = "of-a-stranger".into();
+        assert_eq!(model.value_names(), names);
+        assert!(names.contains(&"finger_1.load".to_owned()), "{names:?}");
+    }
+
+    #[test]
     fn a_file_of_any_size_is_refused_before_it_is_parsed() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("model.json");

@@ -587,6 +587,27 @@ mod tests {
     const EPOCH: u64 = 1_795_879_623_871_224_034;
 
     #[test]
+    fn a_decision_waits_for_the_frame_of_its_own_grasp() {
+        let mut latest = Latest::default();
+        let at = |stamp_nanos| Header { epoch: 1, stamp_nanos, ..Header::default() };
+        let frame = |grasp_id, stamp_nanos| -> Record {
+            Stamped { header: at(stamp_nanos), message: TactileFrame { grasp_id, ..TactileFrame::default() } }.into()
+        };
+        latest.take(frame(5, 10), true);
+        // The first frame of the next grasp decides, and is not read yet.
+        let decision = LiftDecision { grasp_id: 5, ..LiftDecision::default() };
+        latest.take(Stamped { header: at(30), message: decision }.into(), true);
+        let mut decided = latest.decisions.pop().expect("a decision");
+        assert!(latest.is_before_frame_of(&decided));
+        latest.take(frame(5, 20), true);
+        latest.take(frame(6, 30), true);
+        assert!(!latest.is_before_frame_of(&decided));
+        latest.find_grounds(&mut decided);
+        let found = decided.frame.expect("its frame");
+        assert_eq!((found.frame.grasp_id, found.stamp_nanos), (5, 20));
+    }
+
+    #[test]
     fn the_page_tells_no_epoch_and_labels_find_their_decision() {
         let layout = Path::new(env!("CARGO_MANIFEST_DIR")).join("hands/barrett-bh8-280.yaml");
         let hand = Hand::load(&layout).expect("a hand");
@@ -606,7 +627,10 @@ mod tests {
         for record in records {
             reader.take("/topic", record, 0).expect("taken");
         }
-        let latest = std::mem::take(&mut *latest.lock().expect("a lock"));
+        let mut latest = std::mem::take(&mut *latest.lock().expect("a lock"));
+        let mut decided = latest.decisions.pop().expect("a decision");
+        latest.find_grounds(&mut decided);
+        latest.decisions.push(decided);
         let event = frame_event(Some(&hand), &ShownModel::default(), latest).expect("an event");
         assert!(!event.contains(&EPOCH.to_string()), "{event}");
         let event: Value = serde_json::from_str(&event).expect("JSON");
