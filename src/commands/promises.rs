@@ -5,7 +5,7 @@ use std::fmt;
 
 use serde::Serialize;
 
-use blindgrasp_graph::log::printable;
+use blindgrasp_graph::client::words;
 use blindgrasp_stages::promise_monitor::{CONFIDENCE, OUTCOME_COUNTS, drops_at_most};
 
 /// The bound that the reported lifts of a robot allow, since `promised_drops` was set and the readings changed.
@@ -42,13 +42,7 @@ impl fmt::Display for RobotPromise {
 /// The counts of a node in words, and the promise that follows from them.
 pub(super) fn shown_counts(counts: &BTreeMap<String, u64>) -> Vec<String> {
     let promise = RobotPromise::of(counts).map(|promise| promise.to_string());
-    let mut shown: Vec<String> = promise.into_iter().collect();
-    for (name, count) in counts {
-        if *count > 0 {
-            shown.push(printable(&format!("{name} {count}")));
-        }
-    }
-    shown
+    promise.into_iter().chain(words::shown_counts(counts)).collect()
 }
 
 #[cfg(test)]

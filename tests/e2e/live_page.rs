@@ -665,7 +665,8 @@ fn a_page_needs_a_graph_that_runs() {
         blindgrasp().args(["view", "dataflow.yaml", "--port", "1"]).current_dir(project()).output().expect("started");
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(
-        output.status.code() == Some(2) && said.contains("--port is for the page of a running graph or a recording"),
+        output.status.code() == Some(2)
+            && said.contains("--port and --shadow are for the page of a running graph or a recording"),
         "{said}"
     );
 }

@@ -127,9 +127,7 @@ impl Check {
             }
             None => counted(n_recorded, "sample"),
             Some(first) => format!(
-                "{n_differing} of {} differ ({n_found} found), in {}; first: {first}",
-                counted(n_recorded, "sample"),
-                counted(n_grasps, "grasp")
+                "{n_differing} of {n_recorded} samples differ ({n_found} found), grasps: {n_grasps}; first: {first}"
             ),
         };
         let has_passed = is_update || *n_differing == 0;

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use crate::text_table::{TextTable, percent};
+use blindgrasp_graph::client::words::shown_counts;
 use blindgrasp_graph::run::{Latency, RunSummary};
 use blindgrasp_operator::link_status::{ChannelStatus, PeerStatus};
 use blindgrasp_operator::text::counted;
@@ -71,12 +72,8 @@ fn counts(of_nodes: &BTreeMap<String, BTreeMap<String, u64>>) -> String {
     let mut shown = Vec::new();
     for (node, counts) in of_nodes {
         let is_reported = ["lifts/kept", "lifts/dropped"].iter().any(|name| counts.get(*name) > Some(&0));
-        let mut words = Vec::new();
-        for (name, count) in counts {
-            if *count > 0 && (is_reported || name != "lifts/unreported") {
-                words.push(format!("{name} {count}"));
-            }
-        }
+        let mut words = shown_counts(counts);
+        words.retain(|word| is_reported || !word.starts_with("lifts/unreported "));
         if !words.is_empty() {
             shown.push(format!("{node}: {}", words.join(", ")));
         }

@@ -279,6 +279,15 @@ impl FeatureExtractor {
         self.blocks.iter().flat_map(|block| self.block_names(*block, parts)).collect()
     }
 
+    /// A value of a feature before it was scaled; the mean where it does not vary.
+    pub fn unscaled(&self, idx: usize, value: f64) -> f64 {
+        match &self.scaling {
+            Some(Scaling { mean, per_deviation }) if per_deviation[idx] > 0.0 => value / per_deviation[idx] + mean[idx],
+            Some(Scaling { mean, .. }) => mean[idx],
+            None => value,
+        }
+    }
+
     fn block_names(&self, block: Block, parts: &PartNames<'_>) -> Vec<String> {
         let of = |names: &[&str], value: &str| names.iter().map(|name| format!("{name}.{value}")).collect();
         match block {

@@ -13,7 +13,7 @@ use sha2::{Digest, Sha256};
 use crate::approach::ApproachPrior;
 use crate::classifier::{Classifier, Predictor, Verdict};
 use crate::day::{DayMemory, DayModel, GraspPlace};
-use crate::encoder::{FeatureExtractor, FeltReading, PartNames, Scaling};
+use crate::encoder::{FeatureExtractor, FeltReading, PartNames};
 use crate::hand::Hand;
 use crate::out_of_distribution::{Limits, TrainingRange, Violation, quantities, short};
 use crate::own_lifts::{Adapt, Looked, OwnLifts};
@@ -331,23 +331,15 @@ impl Model {
         }
         let mut against = Vec::new();
         for (idx, contribution) in trees.contributions(values).into_iter().enumerate() {
-            if contribution < 0.0 {
+            // A name with a dot is of a pad or joint; a word of the histogram or a wrench has none.
+            if contribution < 0.0 && names[idx].contains('.') {
                 against.push((contribution, idx));
             }
         }
         against.sort_by(|a, b| a.0.total_cmp(&b.0));
-        // A name with a dot is of a pad or joint; a word of the histogram or a wrench has none.
-        against.retain(|(_, idx)| names[*idx].contains('.'));
         let mut said = Vec::new();
         for (_, idx) in against.into_iter().take(2) {
-            let (mean, deviation) = match &self.features.scaling {
-                Some(Scaling { mean, per_deviation }) if per_deviation[idx] > 0.0 => {
-                    (mean[idx], 1.0 / per_deviation[idx])
-                }
-                Some(Scaling { mean, .. }) => (mean[idx], 0.0),
-                None => (0.0, 1.0),
-            };
-            said.push(format!("{} is {}", names[idx], short(values[idx] * deviation + mean)));
+            said.push(format!("{} is {}", names[idx], short(self.features.unscaled(idx, values[idx]))));
         }
         if said.is_empty() { None } else { Some(format!("most against it: {}", said.join(", "))) }
     }

@@ -155,14 +155,12 @@ const showWords = () => {
 };
 
 // --- votes: the arbiter waits for so many settled predictions that agree
-const showVotes = ({ side, n }, frame) => {
+const showVotes = (frame) => {
   const votes = Object.values(shown.graph?.params ?? {}).find((params) => "votes" in params)?.votes;
   if (!votes) return;
   const isProbed = !["open", "closing", "settled", "ended", "lifting"].includes(frame.phase);
-  const wanted = `${votes} settled predictions that agree`;
   tell("waits", past.isDecided(frame) ? "" : isProbed ? `Grasp ${frame.grasp_id} is probed; the hand is ${spoken(frame.phase)}.`
-    : n === 0 ? `Grasp ${frame.grasp_id} waits for ${wanted}; the hand is ${frame.phase}.`
-    : `Grasp ${frame.grasp_id} waits for ${wanted}; the last ${n} say ${side}.`);
+    : `Grasp ${frame.grasp_id} waits for ${votes} settled predictions that agree; the hand is ${frame.phase}.`);
 };
 
 // --- a moment of a running graph, present or past
@@ -178,7 +176,7 @@ const past = makeHistory({
     showFrame(moment.frame);
     if (isPaused && moment.frame && !isShownHand(moment.frame)) tell("moment", "this frame lacks readings of the hand: an earlier one stays drawn");
     if (isPaused || !moment.frame) tell("waits", "");
-    else showVotes(moment.votes, moment.frame);
+    else showVotes(moment.frame);
     // No feature is kept of the frame that decided, and that of another moment would mislead.
     [feature, words] = [moment.feature ?? null, moment.feature ? moment.words : null];
     showFeature();
@@ -272,11 +270,11 @@ on("scene", (scene) => {
   hand.build(scene ?? { links: [], cells: [], hand_colour: [0, 0, 0] });
 });
 on("frame", (event) => {
-  const now = performance.now(), { probabilities, shadow, decisions, labels, votes, feature: values, words: weights } = event;
+  const now = performance.now(), { probabilities, shadow, decisions, labels, feature: values, words: weights } = event;
   const frame = isShownHand(event) ? event : undefined;
   hasShadow ||= shadow.length > 0;
   past.push({
-    at: now, probabilities: probabilities.filter((p) => p !== null), shadow: shadow.filter((p) => p !== null), decisions, votes, frame,
+    at: now, probabilities: probabilities.filter((p) => p !== null), shadow: shadow.filter((p) => p !== null), decisions, frame,
     forces: frame && touchOf(frame).map(({ sum }) => sum), feature: values?.length ? values : undefined, words: values?.length ? weights : undefined,
   });
   for (const label of labels) {
@@ -288,7 +286,7 @@ on("frame", (event) => {
   if (past.at !== null) return;
   if (frame) {
     showFrame(frame);
-    showVotes(votes, frame);
+    showVotes(frame);
   }
   if (values?.length) [feature, words] = [values, weights];
 });

@@ -23,7 +23,6 @@ use blindgrasp_learning::evaluation::{Evaluated, Score, Trained, evaluate};
 use blindgrasp_learning::file_name;
 use blindgrasp_learning::training::{Example, Examples};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operator::text::counted;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, Probe};
@@ -332,9 +331,7 @@ fn print_scores(Evaluated { evaluation, trained, .. }: &Evaluated) -> anyhow::Re
     print_line("judged: without grasps that were held for another reason than the classifier's")?;
     match trained {
         Some(Trained { n_left_out: 0, .. }) => {}
-        Some(Trained { n_left_out, .. }) => {
-            print_line(&format!("left out: {} that the model was trained on", counted(n_left_out, "grasp")))?
-        }
+        Some(trained) => print_line(&format!("left out: {} grasps that the model was trained on", trained.n_left_out))?,
         None => print_line("the model does not name its training grasps: some of these may be among them")?,
     }
     if evaluation.n_without_truth > 0 {
@@ -410,11 +407,8 @@ fn print_judges(report: &Report) -> anyhow::Result<()> {
     }
     let data = &report.data;
     print_line(&format!(
-        "judged: {} of {}; held without a judgement: {}, {} of them stable",
-        counted(data.n_judged, "grasp"),
-        counted(data.n_judged_objects, "object"),
-        data.n_held_unjudged,
-        data.n_held_unjudged_stable
+        "judged: {} grasps of {} objects; held without a judgement: {}, {} of them stable",
+        data.n_judged, data.n_judged_objects, data.n_held_unjudged, data.n_held_unjudged_stable
     ))?;
     for (reason, n) in &data.n_excluded {
         print_line(&format!("left out: {n} with {reason}"))?;

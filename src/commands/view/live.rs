@@ -15,15 +15,13 @@ use blindgrasp_graph::client::words::warnings;
 use blindgrasp_graph::client::{Connection, Heard};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_messages::{
-    Action, ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Reason, Record, Sense,
-    TactileFrame, with_sample,
+    Action, ContactSet, GraspFeature, Header, LiftDecision, Phase, Reason, Record, Sense, TactileFrame, with_sample,
 };
 use blindgrasp_operator::control_socket::tactile_path;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, link_poses};
 use blindgrasp_stages::{Hand, Judge, Judged, Model};
 use blindgrasp_viewer::{Abilities, Viewer};
-use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::super::{Outcome, print_line, stop_signal};
@@ -194,8 +192,6 @@ impl GraphPage<'_> {
         if let Some(event) = self.model.update(&now.status) {
             self.viewer.keep("model", &event);
         }
-        let mut params = now.status.nodes.iter().filter_map(|node| node.params.get("min_probability_stable"));
-        self.latest().min_probability_stable = params.next().and_then(Value::as_f64).unwrap_or_default();
         self.show_log();
     }
 
@@ -210,8 +206,8 @@ impl GraphPage<'_> {
         if std::mem::take(&mut latest.is_decided)
             && let Some(mut decided) = latest.decisions.pop()
         {
-            latest.find_grounds(&mut decided);
-            let event = decision_event(&decided, &latest.truths, self.hand.as_ref(), &self.model);
+            latest.find_grounds(&mut decided, self.hand.as_ref(), &self.model);
+            let event = decision_event(&decided, &latest.truths);
             latest.decisions.push(decided);
             drop(latest);
             self.viewer.keep("decision", &event.to_string());
@@ -226,16 +222,14 @@ impl GraphPage<'_> {
             if taken.is_before_frame_of(&decided) && latest.decisions.len() < MAX_WAITING {
                 latest.decisions.push(decided);
             } else {
-                taken.find_grounds(&mut decided);
+                taken.find_grounds(&mut decided, self.hand.as_ref(), &self.model);
                 taken.decisions.push(decided);
             }
         }
-        // Labels wait for decisions that come later, and votes for more of their kind.
+        // Labels wait for decisions that come later.
         latest.truths.clone_from(&taken.truths);
         latest.recent = std::mem::take(&mut taken.recent);
         latest.settled = std::mem::take(&mut taken.settled);
-        latest.votes = taken.votes;
-        latest.min_probability_stable = taken.min_probability_stable;
         drop(latest);
         if let Some(decision) = &taken.shadow_decision {
             self.viewer.keep("shadow", &shadow_event(decision).to_string());
@@ -303,8 +297,8 @@ struct Decided {
     stamp_nanos: u64,
     decision: LiftDecision,
     frame: Option<ShownFrame>,
-    /// The feature of the settled hand, if the model found that unstable.
-    unstable: Option<GraspFeature>,
+    /// The two values that spoke most against an unstable grasp.
+    against: Option<String>,
 }
 
 /// The samples since the last tick.
@@ -316,7 +310,7 @@ struct Latest {
     contacts: Option<ContactSet>,
     feature: Option<GraspFeature>,
     /// The last settled feature of each of the last grasps, also of earlier ticks.
-    settled: VecDeque<(GraspKey, GraspFeature)>,
+    settled: BTreeMap<GraspKey, GraspFeature>,
     probabilities: Vec<f64>,
     /// Those of the model beside.
     shadow_probabilities: Vec<f64>,
@@ -328,52 +322,6 @@ struct Latest {
     truths: BTreeMap<GraspKey, bool>,
     /// The labels that are new: their decision may be on the page already.
     new_truths: Vec<(GraspKey, bool)>,
-    votes: Votes,
-    /// The arbiter's param.
-    min_probability_stable: f64,
-}
-
-/// The last settled predictions of a grasp that agree, as the arbiter counts them.
-#[derive(Clone, Copy, Default, Serialize)]
-struct Votes {
-    #[serde(skip)]
-    grasp: GraspKey,
-    /// A model agrees with itself only, and a reading that is sent again has one vote.
-    #[serde(skip)]
-    made_by: u64,
-    #[serde(skip)]
-    stamp_nanos: u64,
-    side: Side,
-    n: u32,
-}
-
-#[derive(Clone, Copy, Default, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-enum Side {
-    Stable,
-    #[default]
-    Unstable,
-    Unsure,
-}
-
-impl Votes {
-    fn count(&mut self, header: &Header, prediction: &Prediction, min_probability_stable: f64) {
-        let grasp = (header.epoch, prediction.grasp_id);
-        let side = match prediction {
-            Prediction { stable: true, probability_stable, .. } if *probability_stable >= min_probability_stable => {
-                Side::Stable
-            }
-            Prediction { stable: true, .. } | Prediction { unsure: true, .. } => Side::Unsure,
-            _ => Side::Unstable,
-        };
-        let is_same = self.grasp == grasp && self.made_by == header.made_by;
-        if is_same && self.n > 0 && self.stamp_nanos == header.stamp_nanos {
-            return;
-        }
-        let is_vote = prediction.phase == Phase::Settled && prediction.fault == Fault::None;
-        let n = if is_vote { if is_same && self.side == side { self.n + 1 } else { 1 } } else { 0 };
-        *self = Votes { grasp, made_by: header.made_by, stamp_nanos: header.stamp_nanos, side, n };
-    }
 }
 
 /// Reads a graph's edges. It takes each sample at once, so that no writer waits for a browser.
@@ -430,10 +378,9 @@ impl Latest {
             Record::Feature(sample) if is_shown => {
                 if sample.message.phase == Phase::Settled {
                     let key = (sample.header.epoch, sample.message.grasp_id);
-                    self.settled.retain(|(known, _)| *known != key);
-                    self.settled.push_back((key, sample.message.clone()));
+                    self.settled.insert(key, sample.message.clone());
                     if self.settled.len() > MAX_WAITING {
-                        self.settled.pop_front();
+                        self.settled.pop_first();
                     }
                 }
                 self.feature = Some(sample.message);
@@ -442,7 +389,6 @@ impl Latest {
                 if self.probabilities.len() < MAX_PROBABILITIES {
                     self.probabilities.push(sample.message.probability_stable);
                 }
-                self.votes.count(&sample.header, &sample.message, self.min_probability_stable);
             }
             // Several a second, and nothing to look at.
             Record::Decision(sample) if sample.message.action == Action::GoOn => {}
@@ -450,7 +396,7 @@ impl Latest {
                 self.is_decided = true;
                 let Header { epoch, stamp_nanos, .. } = sample.header;
                 let (key, decision) = ((epoch, sample.message.grasp_id), sample.message);
-                self.decisions.push(Decided { key, stamp_nanos, decision, frame: None, unstable: None });
+                self.decisions.push(Decided { key, stamp_nanos, decision, frame: None, against: None });
             }
             Record::Truth(sample) => {
                 let key = (sample.header.epoch, sample.message.grasp_id);
@@ -472,9 +418,9 @@ impl Latest {
         last.is_some_and(|last| last.epoch == decided.key.0 && last.stamp_nanos < decided.stamp_nanos)
     }
 
-    /// Finds the frame of a decision, and the feature of an unstable grasp. An arbiter decides under the stamp of the last
+    /// Finds the frame of a decision, and the values that speak against an unstable grasp. An arbiter decides under the stamp of the last
     /// prediction. That may be of the next grasp, so the last frame of the grasp itself is meant.
-    fn find_grounds(&self, decided: &mut Decided) {
+    fn find_grounds(&self, decided: &mut Decided, hand: Option<&Hand>, model: &ShownModel) {
         let key = decided.key;
         let is_of_it = |shown: &&ShownFrame| {
             (shown.epoch, shown.frame.grasp_id) == key && shown.stamp_nanos <= decided.stamp_nanos
@@ -482,26 +428,21 @@ impl Latest {
         decided.frame = self.recent.iter().rev().find(is_of_it).cloned();
         // After a probe, another model has judged.
         let is_settled = decided.frame.as_ref().is_none_or(|shown| shown.frame.phase == Phase::Settled);
-        if decided.decision.reason == Reason::Unstable && is_settled {
-            let found = self.settled.iter().find(|(known, _)| *known == key);
-            decided.unstable = found.map(|(_, feature)| feature.clone());
+        if decided.decision.reason == Reason::Unstable
+            && is_settled
+            && let (Some(hand), Some(feature)) = (hand, self.settled.get(&key))
+        {
+            decided.against = model.speak_against(hand, feature);
         }
     }
 }
 
 /// Numbers are texts: JavaScript has no integers beyond 2^53.
-fn decision_event(
-    decided: &Decided,
-    truths: &BTreeMap<GraspKey, bool>,
-    hand: Option<&Hand>,
-    model: &ShownModel,
-) -> Value {
+fn decision_event(decided: &Decided, truths: &BTreeMap<GraspKey, bool>) -> Value {
     let mut event = shadow_event(&decided.decision);
     event["epoch"] = decided.key.0.to_string().into();
     event["truth"] = json!(truths.get(&decided.key));
-    if let (Some(hand), Some(feature)) = (hand, &decided.unstable) {
-        event["against"] = json!(model.speak_against(hand, feature));
-    }
+    event["against"] = json!(decided.against);
     event
 }
 
@@ -515,12 +456,12 @@ pub(super) fn shadow_event(decision: &LiftDecision) -> Value {
 
 /// `None` if there is nothing new.
 fn frame_event(hand: Option<&Hand>, model: &ShownModel, latest: Latest) -> Option<String> {
-    let Latest { frame, contacts, feature, probabilities, shadow_probabilities, decisions, truths, votes, .. } = latest;
+    let Latest { frame, contacts, feature, probabilities, shadow_probabilities, decisions, truths, .. } = latest;
     if frame.is_none() && probabilities.is_empty() && decisions.is_empty() && latest.new_truths.is_empty() {
         return None;
     }
     let decisions = decisions.iter().map(|decided| {
-        let mut event = decision_event(decided, &truths, hand, model);
+        let mut event = decision_event(decided, &truths);
         if let (Some(hand), Some(shown)) = (hand, &decided.frame) {
             let mut frame = json!({});
             add_frame(&mut frame, hand, &shown.frame, contacts.as_ref());
@@ -534,7 +475,6 @@ fn frame_event(hand: Option<&Hand>, model: &ShownModel, latest: Latest) -> Optio
     let labels: Vec<Value> = labels.collect();
     let mut event = json!({
         "probabilities": probabilities, "shadow": shadow_probabilities, "decisions": decisions, "labels": labels,
-        "votes": votes,
     });
     if let Some(feature) = feature {
         event["feature"] = json!(feature.values);
@@ -602,7 +542,7 @@ mod tests {
         latest.take(frame(5, 20), true);
         latest.take(frame(6, 30), true);
         assert!(!latest.is_before_frame_of(&decided));
-        latest.find_grounds(&mut decided);
+        latest.find_grounds(&mut decided, None, &ShownModel::default());
         let found = decided.frame.expect("its frame");
         assert_eq!((found.frame.grasp_id, found.stamp_nanos), (5, 20));
     }
@@ -629,7 +569,7 @@ mod tests {
         }
         let mut latest = std::mem::take(&mut *latest.lock().expect("a lock"));
         let mut decided = latest.decisions.pop().expect("a decision");
-        latest.find_grounds(&mut decided);
+        latest.find_grounds(&mut decided, None, &ShownModel::default());
         latest.decisions.push(decided);
         let event = frame_event(Some(&hand), &ShownModel::default(), latest).expect("an event");
         assert!(!event.contains(&EPOCH.to_string()), "{event}");

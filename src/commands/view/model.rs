@@ -72,14 +72,8 @@ impl ShownModel {
         }
         let Some(at) = features.blocks.iter().position(|block| *block == Block::Histogram) else { return Vec::new() };
         let first: usize = features.blocks[..at].iter().map(|block| features.block_len(*block)).sum();
-        let unscaled = (first..first + features.dictionary.len()).map(|idx| match &features.scaling {
-            Some(scaling) if scaling.per_deviation[idx] > 0.0 => {
-                values[idx] / scaling.per_deviation[idx] + scaling.mean[idx]
-            }
-            Some(scaling) => scaling.mean[idx],
-            None => values[idx],
-        });
-        unscaled.collect()
+        let words = first..first + features.dictionary.len();
+        words.map(|idx| features.unscaled(idx, values[idx])).collect()
     }
 }
 
