@@ -155,8 +155,8 @@ impl Classify {
     fn explain(&mut self, prediction: &PredictionHead, values: &[f64], now_nanos: u64) {
         let PredictionHead { grasp_id, phase, stable, unsure, fault, .. } = *prediction;
         let is_unstable = phase == Phase::Settled.code() && fault == Fault::None.code() && stable == 0 && unsure == 0;
-        let is_too_soon = |(told, at): (u64, u64)| told == grasp_id || now_nanos.saturating_sub(at) < LOG_PAUSE_NANOS;
-        if !is_unstable || self.told.is_some_and(is_too_soon) {
+        let (told, at) = self.told.unwrap_or((u64::MAX, 0));
+        if !is_unstable || told == grasp_id || now_nanos.saturating_sub(at) < LOG_PAUSE_NANOS {
             return;
         }
         self.told = Some((grasp_id, now_nanos));

@@ -422,10 +422,10 @@ impl Latest {
     /// prediction. That may be of the next grasp, so the last frame of the grasp itself is meant.
     fn find_grounds(&self, decided: &mut Decided, hand: Option<&Hand>, model: &ShownModel) {
         let key = decided.key;
-        let is_of_it = |shown: &&ShownFrame| {
-            (shown.epoch, shown.frame.grasp_id) == key && shown.stamp_nanos <= decided.stamp_nanos
-        };
-        decided.frame = self.recent.iter().rev().find(is_of_it).cloned();
+        let mut latest_first = self.recent.iter().rev();
+        let until = decided.stamp_nanos;
+        let frame = latest_first.find(|it| (it.epoch, it.frame.grasp_id) == key && it.stamp_nanos <= until);
+        decided.frame = frame.cloned();
         // After a probe, another model has judged.
         let is_settled = decided.frame.as_ref().is_none_or(|shown| shown.frame.phase == Phase::Settled);
         if decided.decision.reason == Reason::Unstable
