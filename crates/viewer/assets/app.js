@@ -49,6 +49,7 @@ const showFrame = (frame) => {
     largest = roundUp(greatest);
     showScale();
   }
+  byId("stage").classList.remove("lacking");
   shown.frame = frame;
   shown.frames += 1;
   shown.firstFrameMs ??= performance.now();
@@ -168,8 +169,8 @@ const past = makeHistory({
   chart: () => { if (!player.grasps.length) liveChart(); },
   show: (moment, decision, isPaused, lacking) => {
     showDecision(decision);
-    byId("stage").classList.toggle("lacking", lacking !== null);
     if (lacking !== null) {
+      byId("stage").classList.add("lacking");
       tell("moment", `the frame that decided grasp ${lacking.grasp_id} is not kept: no hand is drawn`);
       for (const id of ["pads", "joints"]) cut(byId(id), 0);
     }
@@ -267,6 +268,8 @@ on("scene", (scene) => {
   showShadow(null);
   for (const id of ["pads", "joints"]) cut(byId(id), 0);
   tell("moment", scene ? "no frame yet" : "the graph has no hand that can be shown");
+  // Without a frame its posture is not known.
+  byId("stage").classList.add("lacking");
   hand.build(scene ?? { links: [], cells: [], hand_colour: [0, 0, 0] });
 });
 on("frame", (event) => {
