@@ -605,7 +605,7 @@ mod tests {
         assert_eq!((reports[0].n_pairs, reports[0].agreement), (1, Some(0.0)));
         assert_eq!((reports[1].n_pairs, reports[1].n_only_active), (0, 1));
         let lines = formatted(&reports[0]).join("\n");
-        assert!(lines.contains("0.0 % of 1 samples agree"), "{lines}");
+        assert!(lines.contains("0.0 % of 1 sample agree"), "{lines}");
         assert!(lines.contains("stable (p 0.000) → unstable (p 0.000)  in 1 of its samples"), "{lines}");
     }
 

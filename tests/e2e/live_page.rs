@@ -252,17 +252,19 @@ fn a_browser_pauses_and_looks_at_past_decisions() {
 fn an_empty_page_names_the_socket_that_it_waits_at() {
     let folder = tempfile::tempdir().expect("a folder");
     let socket = format!("unix:{}", folder.path().join("hand.sock").display());
-    let name = unique_name();
-    let settings = ["--set", &format!("source.address={socket}")];
-    let graph = Graph::launch(&name, &project().join("dataflow-live.yaml"), &settings);
-    wait_until(|| graph.status()["state"] == "running", || graph.said());
-    let (_page, address) = Running::page(&name, 0);
-    let Some(mut browser) = Browser::open(&format!("{address}/#grasp=5")) else { return };
+    let settings = ["--view", "--set", &format!("source.address={socket}")];
+    let graph = Graph::launch(&unique_name(), &project().join("dataflow-live.yaml"), &settings);
+    wait_until(|| graph.said().contains("in a browser on this machine: http://"), || graph.said());
+    let said = graph.said();
+    let address = said.split("this machine: ").nth(1).and_then(|rest| rest.lines().next()).expect("an address");
+    let Some(mut browser) = Browser::open(&format!("{}/#grasp=5", address.trim())) else { return };
     browser.wait_until("window.blindgrasp?.graph !== undefined && blindgrasp.graph !== null");
+    browser.wait_until("document.getElementById('moment').textContent.includes('waits for')");
     let moment = browser.text("moment");
     assert!(moment.contains(&format!("waits for a bridge at {socket}; docs/hardware.md")), "{moment}");
     assert_eq!(browser.ask("document.getElementById('action').className"), "action none");
     assert_eq!(browser.text("go-answer"), "grasp 5 is not in the list: it is empty");
+    assert_eq!(browser.ask("getComputedStyle(document.getElementById('stage')).visibility"), "hidden");
     // Colours that colour-blind eyes tell apart come with marks, and the dashed lines with words.
     browser.wait_until("document.getElementById('chart-key').textContent.includes('thresholds')");
     let marks =
