@@ -3,8 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use blindgrasp_messages::{GraspFeature, GraspFeatureHead, Prediction, Recorded};
+use blindgrasp_messages::{Fault, GraspFeature, GraspFeatureHead, Phase, Prediction, PredictionHead, Recorded};
 use blindgrasp_operator::description::OperatorDescription;
+use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
@@ -15,6 +16,9 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use crate::beginning::FileNode;
+
+/// The shortest pause between two lines of the log about grasps: a recording may be played fast.
+const LOG_PAUSE_NANOS: u64 = 1_000_000_000;
 
 #[derive(Deserialize)]
 struct Params {
@@ -57,11 +61,13 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let classify = Classify {
         operator: operator.clone(),
         has_state: model.has_memory() || params.adapt != Adapt::Off,
+        value_names: model.value_names(),
         model,
         dictionary_id,
         memory: Memory::new(params.adapt),
         adapt: params.adapt,
         reported: None,
+        told: None,
     };
     stage::run(operator, "feature", "prediction", 0, identity, classify)
 }
@@ -71,12 +77,16 @@ struct Classify {
     /// It is fixed at the start, because the instance after this one reads the state.
     has_state: bool,
     model: Model,
+    /// Those of a feature's values.
+    value_names: Vec<String>,
     dictionary_id: u64,
     /// Earlier frames of the open grasp, or of the day. It stays empty if the model judges each frame alone.
     memory: Memory,
     adapt: Adapt,
     /// Kept and dropped lifts, and changes of the readings, in the node's status; `None` if the launcher does not know them.
     reported: Option<[u64; 3]>,
+    /// The last grasp of which the log says what speaks against it, and when it did.
+    told: Option<(u64, u64)>,
 }
 
 impl Stage for Classify {
@@ -87,8 +97,10 @@ impl Stage for Classify {
         self.has_state
     }
 
-    fn answer(&mut self, head: &GraspFeatureHead, values: &[f64], _now_nanos: u64, answers: &mut Answers<Prediction>) {
-        answers.push(steps::classify(&self.model, self.dictionary_id, &mut self.memory, head, values));
+    fn answer(&mut self, head: &GraspFeatureHead, values: &[f64], now_nanos: u64, answers: &mut Answers<Prediction>) {
+        let prediction = steps::classify(&self.model, self.dictionary_id, &mut self.memory, head, values);
+        self.explain(&prediction, values, now_nanos);
+        answers.push(prediction);
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
@@ -139,6 +151,20 @@ impl Stage for Classify {
 }
 
 impl Classify {
+    /// Says once a grasp what speaks most against it, if the model finds the settled hand unstable.
+    fn explain(&mut self, prediction: &PredictionHead, values: &[f64], now_nanos: u64) {
+        let PredictionHead { grasp_id, phase, stable, unsure, fault, .. } = *prediction;
+        let is_unstable = phase == Phase::Settled.code() && fault == Fault::None.code() && stable == 0 && unsure == 0;
+        let (told, at) = self.told.unwrap_or((u64::MAX, 0));
+        if !is_unstable || told == grasp_id || now_nanos.saturating_sub(at) < LOG_PAUSE_NANOS {
+            return;
+        }
+        self.told = Some((grasp_id, now_nanos));
+        if let Some(against) = self.model.speak_against(&self.value_names, values) {
+            print_diagnostic(&format!("grasp {grasp_id} seems unstable: {against}"));
+        }
+    }
+
     /// Counts the outcomes that it has learned from in the node's status.
     fn report(&mut self) {
         let lifts = &self.memory.lifts;

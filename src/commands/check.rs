@@ -10,6 +10,7 @@ use blindgrasp_cli::graph_file::{OnMisfit, able_to_begin};
 use blindgrasp_graph::dataflow::{
     self, DataflowError, Edge, Graph, Input, Machines, Node, Override, Restart, RestartPolicy, Scope,
 };
+use blindgrasp_operator::text::counted;
 
 /// Prints the graph with every value filled in, or its mistakes. With --json: {"graph": …}, with "crossing" edges where
 /// the file names machines, or {"errors": […]}.
@@ -69,13 +70,13 @@ fn errors(error: &DataflowError) -> serde_json::Value {
 }
 
 fn print_graph(graph: &Graph) -> std::io::Result<()> {
-    let (n_nodes, n_edges) = (graph.nodes.len(), graph.edges().count());
     let machines = graph.machines.as_ref();
     let on_machines = machines.map_or(String::new(), |machines| {
         let n_crossing = graph.edges().filter(|edge| graph.crossing(edge).is_some()).count();
-        format!(", {} machines, {n_crossing} edges between them", machines.machines.len())
+        format!(", {}, {} between them", counted(machines.machines.len(), "machine"), counted(n_crossing, "edge"))
     });
-    print_text(&format!("graph '{}': {n_nodes} nodes, {n_edges} edges{on_machines}\n", graph.name))?;
+    let (nodes, edges) = (counted(graph.nodes.len(), "node"), counted(graph.edges().count(), "edge"));
+    print_text(&format!("graph '{}': {nodes}, {edges}{on_machines}\n", graph.name))?;
     if let Some(machines) = machines {
         print_machines(machines)?;
     }

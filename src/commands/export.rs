@@ -13,6 +13,7 @@ use super::{Outcome, check_new, data_on_stdout, print_line};
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::feature_table::{FeatureTableError, write_feature_table};
 use blindgrasp_messages::files::{keep_mode, partial_path, private_file};
+use blindgrasp_operator::text::counted;
 use blindgrasp_recording::export::{CsvTable, ExportError, row, table_shapes};
 use blindgrasp_recording::{Record, RecordingReader, recordings_in};
 use blindgrasp_stages::model::Model;
@@ -99,7 +100,8 @@ fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::R
         error => anyhow::Error::from(error).context(format!("cannot write {}", out.display())),
     })?;
     file.finish()?;
-    print_line(&format!("{}: {} grasps, {} values each", out.display(), written.n_rows, model.features.len()))?;
+    let grasps = counted(written.n_rows, "grasp");
+    print_line(&format!("{}: {grasps}, {} values each", out.display(), model.features.len()))?;
     for (reason, n) in &written.n_excluded {
         print_line(&format!("left out: {n} with {reason}"))?;
     }

@@ -5,7 +5,7 @@ use std::fmt;
 
 use serde::Serialize;
 
-use blindgrasp_graph::log::printable;
+use blindgrasp_graph::client::words;
 use blindgrasp_stages::promise_monitor::{CONFIDENCE, OUTCOME_COUNTS, drops_at_most};
 
 /// The bound that the reported lifts of a robot allow, since `promised_drops` was set and the readings changed.
@@ -43,7 +43,7 @@ impl fmt::Display for RobotPromise {
 /// The counts of a node in words, and the promise that follows from them.
 pub(super) fn shown_counts(counts: &BTreeMap<String, u64>) -> Vec<String> {
     let promise = RobotPromise::of(counts).map(|promise| promise.to_string());
-    promise.into_iter().chain(counts.iter().map(|(name, count)| printable(&format!("{name} {count}")))).collect()
+    promise.into_iter().chain(words::shown_counts(counts)).collect()
 }
 
 #[cfg(test)]
@@ -56,6 +56,7 @@ mod tests {
             |kept, dropped| BTreeMap::from([("promise/kept".into(), kept), ("promise/dropped".into(), dropped)]);
         assert_eq!(RobotPromise::of(&BTreeMap::from([("lifts/kept".into(), 7)])), None);
         assert_eq!(RobotPromise::of(&counts(0, 0)), None);
+        assert_eq!(shown_counts(&counts(0, 0)), Vec::<String>::new());
         let shown = shown_counts(&counts(294, 6));
         assert_eq!(shown[0], "at most 5.1 % of this robot's lifts drop (95 % confidence if objects come in random order; 6 of 300 did)");
         assert_eq!(shown.len(), 3);

@@ -23,6 +23,7 @@ use blindgrasp_messages::Record;
 use blindgrasp_operator::cursors::COMPARE_BELL;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::text::counted;
 use blindgrasp_operator::text::is_name;
 use blindgrasp_operator::wiring::NamespaceWiring;
 
@@ -389,11 +390,11 @@ fn swapped_line(node: &SwappedNode) -> String {
 
 fn formatted(report: &ComparisonReport) -> Vec<String> {
     let agreement = match report.agreement {
-        Some(share) => format!("{} of {} samples agree", percent(Some(share)), report.n_pairs),
+        Some(share) => format!("{} of {} agree", percent(Some(share)), counted(report.n_pairs, "sample")),
         None => "agreement unknown: no sample was answered by both".into(),
     };
     let mut lines = vec![
-        format!("{}: {agreement}, {} grasps with disagreement", report.output, report.disagreements.len()),
+        format!("{}: {agreement}, {} with disagreement", report.output, counted(report.disagreements.len(), "grasp")),
         format!(
             "  answered by the old one only: {} ({} of them in the replacement's time); by the replacement only: {}",
             report.n_only_active, report.n_unanswered, report.n_only_shadow
@@ -604,7 +605,7 @@ mod tests {
         assert_eq!((reports[0].n_pairs, reports[0].agreement), (1, Some(0.0)));
         assert_eq!((reports[1].n_pairs, reports[1].n_only_active), (0, 1));
         let lines = formatted(&reports[0]).join("\n");
-        assert!(lines.contains("0.0 % of 1 samples agree"), "{lines}");
+        assert!(lines.contains("0.0 % of 1 sample agree"), "{lines}");
         assert!(lines.contains("stable (p 0.000) → unstable (p 0.000)  in 1 of its samples"), "{lines}");
     }
 

@@ -150,6 +150,18 @@ fn a_browser_pauses_and_looks_at_past_decisions() {
     let (_page, address) = Running::page(&name, 0);
     let Some(mut browser) = Browser::open(&address) else { return };
     browser.wait_until("window.blindgrasp?.past.decisions.filter((decision) => decision.frame?.links).length > 5");
+    // Each has a frame of its own grasp. Of the first ones, none may have been read.
+    let is_of_another = "({ frame, grasp_id }, idx) => (frame ? frame.grasp_id !== grasp_id : idx > 2)";
+    assert_eq!(browser.ask(&format!("blindgrasp.past.decisions.filter({is_of_another})")), Value::Array(vec![]));
+    // The two values that spoke most against an unstable grasp.
+    browser.wait_until("blindgrasp.past.decisions.some(({ reason }) => reason === 'unstable')");
+    let against =
+        "blindgrasp.past.decisions.filter(({ reason }) => reason === 'unstable').map(({ against }) => against)";
+    let against = browser.ask(against);
+    assert!(
+        against.as_array().expect("texts").iter().all(|text| text.to_string().contains("most against it: ")),
+        "{against}"
+    );
     // A grasp that is decided does not wait, at any moment.
     browser.ask(
         "(window.contradictions = [], setInterval(() => { \
@@ -171,6 +183,7 @@ fn a_browser_pauses_and_looks_at_past_decisions() {
            row.querySelector('button').click(); }})() ?? null"
     ));
     let chosen = browser.ask("document.querySelector('#decisions .chosen button').textContent");
+    assert_eq!(browser.ask("location.hash"), format!("#grasp={}", chosen.as_str().expect("a number")));
     assert_eq!(browser.ask("document.getElementById('pause').textContent"), "Go on live");
     assert!(browser.text("why").starts_with(&format!("Grasp {}:", chosen.as_str().expect("a number"))));
     assert!(browser.text("ago").starts_with("the frame that decided grasp"), "{}", browser.text("ago"));
@@ -183,6 +196,33 @@ fn a_browser_pauses_and_looks_at_past_decisions() {
     browser.wait_until(&format!("blindgrasp.past.moments.length > {}", n_kept + 20));
     assert_eq!(browser.ask("blindgrasp.frames"), n_frames);
     assert_eq!(browser.ask("document.body.className"), "");
+    // The list is one stop of the tab order, in which arrow keys move; n and p choose.
+    let stops = "[...document.querySelectorAll('#decisions button')].filter(({ tabIndex }) => tabIndex === 0)";
+    assert_eq!(
+        browser.ask(&format!("{stops}.map(({{ textContent }}) => textContent)")),
+        Value::from(vec![chosen.clone()])
+    );
+    let below = "document.querySelector('#decisions .chosen').nextElementSibling";
+    let press = |key: &str, at: &str| {
+        format!("{at}.dispatchEvent(new KeyboardEvent('keydown', {{ key: '{key}', bubbles: true }}))")
+    };
+    if browser.ask(&format!("{below} !== null")) == true {
+        let older = browser.ask(&format!("{below}.querySelector('button').textContent"));
+        browser.ask(&press("ArrowDown", "document.querySelector('#decisions .chosen button')"));
+        assert_eq!(browser.ask("document.activeElement.textContent"), older);
+        browser.ask(&press("p", "document"));
+        assert_eq!(browser.ask("document.querySelector('#decisions .chosen button').textContent"), older);
+        browser.ask(&press("n", "document"));
+    }
+    assert_eq!(browser.ask("document.querySelector('#decisions .chosen button').textContent"), chosen);
+    // A decision whose frame is not kept shows no other grasp's hand.
+    let lacking = "(({ past }, decision) => { const { frame } = decision; decision.frame = undefined; past.choose(decision); \
+                   decision.frame = frame; return document.getElementById('moment').textContent; })\
+                   (blindgrasp, blindgrasp.past.list.chosen)";
+    let said = browser.ask(lacking);
+    assert!(said.as_str().is_some_and(|text| text.ends_with("is not kept: no hand is drawn")), "{said}");
+    assert_eq!(browser.ask("getComputedStyle(document.getElementById('stage')).visibility"), "hidden");
+    assert_eq!(browser.text("pads"), "");
     // Back through the moments, one by one.
     // At once: a frame that comes between sets the slider back.
     browser.ask(
@@ -196,9 +236,41 @@ fn a_browser_pauses_and_looks_at_past_decisions() {
     browser.ask("dark");
     assert_eq!(browser.ask("axe"), Value::Array(vec![]));
     assert_eq!(browser.ask("document.documentElement.scrollWidth <= window.innerWidth"), true);
-    browser.click("#pause");
+    browser.ask(&press(" ", "document"));
     browser.wait_for_frames(5);
+    assert_eq!(browser.ask("location.hash"), "");
     assert_eq!(browser.ask("errors"), Value::Array(vec![]));
+    // The log says the same, once for a grasp.
+    let log = run(&["logs", "classifier", "--graph", &name], 0);
+    let log = String::from_utf8_lossy(&log.stdout).into_owned();
+    assert!(log.contains(" seems unstable: most against it: "), "{log}");
+    graph.stop();
+}
+
+/// A graph that no hand speaks to yet.
+#[test]
+fn an_empty_page_names_the_socket_that_it_waits_at() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let socket = format!("unix:{}", folder.path().join("hand.sock").display());
+    let settings = ["--view", "--set", &format!("source.address={socket}")];
+    let graph = Graph::launch(&unique_name(), &project().join("dataflow-live.yaml"), &settings);
+    wait_until(|| graph.said().contains("in a browser on this machine: http://"), || graph.said());
+    let said = graph.said();
+    let address = said.split("this machine: ").nth(1).and_then(|rest| rest.lines().next()).expect("an address");
+    let Some(mut browser) = Browser::open(&format!("{}/#grasp=5", address.trim())) else { return };
+    browser.wait_until("window.blindgrasp?.graph !== undefined && blindgrasp.graph !== null");
+    browser.wait_until("document.getElementById('moment').textContent.includes('waits for')");
+    let moment = browser.text("moment");
+    assert!(moment.contains(&format!("waits for a bridge at {socket}; docs/hardware.md")), "{moment}");
+    assert_eq!(browser.ask("document.getElementById('action').className"), "action none");
+    assert_eq!(browser.text("go-answer"), "grasp 5 is not in the list: it is empty");
+    assert_eq!(browser.ask("getComputedStyle(document.getElementById('stage')).visibility"), "hidden");
+    // Colours that colour-blind eyes tell apart come with marks, and the dashed lines with words.
+    browser.wait_until("document.getElementById('chart-key').textContent.includes('thresholds')");
+    let marks =
+        "[...document.querySelectorAll('#chart-key .key')].map(({ dataset }) => dataset.mark).filter(Boolean).join('')";
+    assert_eq!(browser.ask(marks), "┄▲▼△");
+    assert_eq!(browser.ask("axe"), Value::Array(vec![]));
     graph.stop();
 }
 
@@ -316,6 +388,26 @@ fn a_browser_shows_the_grasps_of_a_recording() {
         browser.ask("document.getElementById('frame').dispatchEvent(new Event('input'))");
         browser.ask(&format!("picture {path}.recording.png"));
     }
+    // The wrong decision is marked, in the list as well.
+    assert!(
+        browser.ask("document.getElementById('action').className").as_str().is_some_and(|it| it.ends_with(" wrong"))
+    );
+    assert!(browser.ask("document.querySelector('#decisions .chosen').textContent").to_string().contains('✗'));
+    assert_eq!(browser.ask("document.getElementById('decisions').rows.length"), lifts.len());
+    // The address names the grasp and is obeyed, as is the field; n and p go on from there.
+    assert_eq!(browser.ask("location.hash"), format!("#grasp={id}"));
+    let is_shown = |id: u64| format!("blindgrasp.frame.grasp_id === '{id}' && location.hash === '#grasp={id}'");
+    browser.ask("(document.getElementById('go-to').value = '100', document.querySelector('#go button').click(), null)");
+    browser.wait_until(&is_shown(100));
+    for (key, id) in [("n", 101), ("p", 100)] {
+        browser.ask(&format!("document.dispatchEvent(new KeyboardEvent('keydown', {{ key: '{key}' }}))"));
+        browser.wait_until(&is_shown(id));
+    }
+    browser
+        .ask("(document.getElementById('go-to').value = '99999', document.querySelector('#go button').click(), null)");
+    assert_eq!(browser.text("go-answer"), "grasp 99999 is not in the list: its first one is 0, its last one 239");
+    browser.ask(&format!("(location.hash = '#grasp={id}', null)"));
+    browser.wait_until(&is_shown(id));
     // It plays to the end of the grasp, and goes on.
     browser.ask("document.getElementById('play').click()");
     browser.wait_until(&format!("Number(blindgrasp.frame.grasp_id) > {id} && blindgrasp.player.n > 2"));
@@ -326,6 +418,7 @@ fn a_browser_shows_the_grasps_of_a_recording() {
     browser.ask("latency 600");
     browser.ask("(window.isOld = true, location.reload())");
     browser.wait_until("typeof isOld === 'undefined' && window.blindgrasp?.player?.frames.length > 0");
+    assert_ne!(browser.ask("blindgrasp.player.grasps[blindgrasp.player.at].id"), "0", "that of the address");
     browser.ask("(window.n_checks = 0, setInterval(() => { n_checks += 1; }, 300), null)");
     browser.wait_until("n_checks > 3");
     assert_eq!(browser.ask("document.body.className"), "recorded");
@@ -527,7 +620,8 @@ fn a_page_needs_a_graph_that_runs() {
         blindgrasp().args(["view", "dataflow.yaml", "--port", "1"]).current_dir(project()).output().expect("started");
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(
-        output.status.code() == Some(2) && said.contains("--port is for the page of a running graph or a recording"),
+        output.status.code() == Some(2)
+            && said.contains("--port and --shadow are for the page of a running graph or a recording"),
         "{said}"
     );
 }

@@ -179,8 +179,9 @@ fn commands_do_there_what_they_do_here() {
     let compared = sshd.on_brain(&["swap", "classifier", "--graph", name, "--shadow", "0.5", "--json"], 0);
     assert_eq!(json_lines(&compared.stdout)[0]["result"], "compared");
 
-    let here = run(&["logs", "classifier", "--graph", name, "--json", "-n", "5"], 0);
-    let there = sshd.on_brain(&["logs", "classifier", "--graph", name, "--json", "-n", "5"], 0);
+    // This node says nothing meanwhile.
+    let here = run(&["logs", "recorded_source", "--graph", name, "--json", "-n", "5"], 0);
+    let there = sshd.on_brain(&["logs", "recorded_source", "--graph", name, "--json", "-n", "5"], 0);
     assert!(!here.stdout.is_empty());
     assert_eq!(text(&there.stdout), text(&here.stdout));
 

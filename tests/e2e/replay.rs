@@ -296,7 +296,7 @@ fn a_recording_passes_until_the_model_is_changed() {
     assert_eq!(number("found") - number("expected"), number("difference"));
     assert!(number("difference") != 0.0 && number("difference").abs() < 1e-8, "{first}");
     let table = text(&own.test(&[], 1).stdout);
-    assert!(table.contains("FAIL  /prediction") && table.contains("1 recordings: 0 passed, 1 failed"), "{table}");
+    assert!(table.contains("FAIL  /prediction") && table.contains("1 recording: 0 passed, 1 failed"), "{table}");
 
     // Within a tolerance it passes, and after an update.
     own.expect("tolerances:\n  /prediction: {absolute: 1e-6}\n  /decision: {absolute: 1e-6}\n");
@@ -429,7 +429,7 @@ fn expectations_are_compared_with_the_decisions() {
         |text: &str| std::fs::write(own.path("frames.expect.yaml"), format!("version: 1\n{text}")).expect("written");
     write(&format!("accuracy_at_least: 0\nfalse_positives_at_most: 12\ndecisions: {{3: {right}}}\n"));
     let passed = report(&test(0));
-    assert_eq!(check_text(&passed, "decisions"), "1 grasps as expected");
+    assert_eq!(check_text(&passed, "decisions"), "1 grasp as expected");
     write(&format!("decisions: {{4: {wrong}, 99: hold}}\nreasons: {{stale: 1}}\n"));
     let failed = report(&test(1));
     let said = check_text(&failed, "decisions");

@@ -216,6 +216,9 @@ pub struct GraphStatus {
 pub struct DecisionStatus {
     pub n_lift: u64,
     pub n_hold: u64,
+    /// The holds by reason.
+    #[serde(default)]
+    pub holds: BTreeMap<String, u64>,
     /// Grasps that were lifted and are known to have been unstable.
     pub n_false_positives: u64,
     /// The last decisions, the latest last.

@@ -64,7 +64,13 @@ pub fn made_status(graph: &str) -> GraphStatus {
             },
             made_node("classifier", NodeState::Failed),
         ],
-        decisions: DecisionStatus { n_lift: 60, n_hold: 40, n_false_positives: 1, latest: [lifted].into() },
+        decisions: DecisionStatus {
+            n_lift: 60,
+            n_hold: 40,
+            holds: [("unstable".into(), 30), ("no_contact".into(), 10)].into(),
+            n_false_positives: 1,
+            latest: [lifted].into(),
+        },
         edges: vec![EdgeStatus {
             from: "contacts/contacts".into(),
             to: "classifier/contacts".into(),

@@ -1,6 +1,7 @@
 //! Names and quotes in messages for people.
 
 use std::borrow::Cow;
+use std::fmt::Display;
 use std::io::Write;
 use std::path::Path;
 
@@ -19,6 +20,13 @@ pub const MAX_NAME_CHARS: usize = 32;
 pub fn is_name(text: &str) -> bool {
     (1..=MAX_NAME_CHARS).contains(&text.len())
         && text.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-')
+}
+
+/// A number with its noun: "1 grasp", "240 grasps".
+pub fn counted(n: impl Display, noun: &str) -> String {
+    let n = n.to_string();
+    let ending = if n == "1" { "" } else { "s" };
+    format!("{n} {noun}{ending}")
 }
 
 /// Lines for a terminal: characters that move its cursor, change its colours or reverse its text are escaped as in JSON, like
@@ -166,6 +174,11 @@ fn distance(a: &str, b: &str) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn one_thing_is_counted_in_the_singular() {
+        assert_eq!([0, 1, 2].map(|n| counted(n, "grasp")), ["0 grasps", "1 grasp", "2 grasps"]);
+    }
 
     #[test]
     fn no_byte_of_a_stranger_commands_a_terminal() {

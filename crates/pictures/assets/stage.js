@@ -145,7 +145,7 @@ export const makeStage = (three, canvas) => {
   let words = [];
   const octahedron = geometry([1, 0, 0, -1, 0, 0, 0, 1, 0, 0, -1, 0, 0, 0, 1, 0, 0, -1],
     [0, 2, 4, 2, 1, 4, 1, 3, 4, 3, 0, 4, 2, 0, 5, 1, 2, 5, 3, 1, 5, 0, 3, 5]);
-  const wordSkin = new MeshLambertMaterial({ color: 0x6741d9, flatShading: true, transparent: true, opacity: 0.7 });
+  const wordSkin = new MeshLambertMaterial({ color: 0x8f6cf0, flatShading: true, transparent: true, opacity: 0.7 });
   // The colour of each cell as it is drawn, red, green, blue from 0 to 1.
   function colouredCells() {
     const found = [], colour = new Color();

@@ -10,6 +10,7 @@ use super::comparison::{ComparedEdge, EdgeComparison};
 use super::expectations::Expectations;
 use super::rewrite::{FedEdge, Origin};
 use blindgrasp_messages::{Action, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Phase, Reason, Recorded};
+use blindgrasp_operator::text::counted;
 use blindgrasp_recording::{Record, RecordingError, RecordingReader};
 
 /// Fewest labelled grasps of which an accuracy is expected: one of three lifts that is held instead is a third.
@@ -121,10 +122,12 @@ impl Check {
     pub fn of_edge(comparison: EdgeComparison, is_update: bool) -> Check {
         let EdgeComparison { n_recorded, n_found, n_differing, n_grasps, first, n_not_compared, .. } = &comparison;
         let text = match first {
-            None if *n_not_compared > 0 => format!("{n_recorded} samples, {n_not_compared} more were not compared"),
-            None => format!("{n_recorded} samples"),
+            None if *n_not_compared > 0 => {
+                format!("{}, {n_not_compared} more were not compared", counted(n_recorded, "sample"))
+            }
+            None => counted(n_recorded, "sample"),
             Some(first) => format!(
-                "{n_differing} samples differ ({n_recorded} recorded, {n_found} found), in {n_grasps} grasps; first: {first}"
+                "{n_differing} of {n_recorded} samples differ ({n_found} found), grasps: {n_grasps}; first: {first}"
             ),
         };
         let has_passed = is_update || *n_differing == 0;
@@ -306,7 +309,7 @@ impl Decisions {
         if !expected.decisions.is_empty() {
             let wrong: Vec<String> = expected.decisions.iter().filter_map(|wanted| self.wrong(wanted)).collect();
             let text = match wrong.as_slice() {
-                [] => format!("{} grasps as expected", expected.decisions.len()),
+                [] => format!("{} as expected", counted(expected.decisions.len(), "grasp")),
                 wrong => wrong.join("; "),
             };
             checks.push(Check::new("decisions", wrong.is_empty(), text));
@@ -333,8 +336,9 @@ impl Decisions {
             let accuracy = (n_grasps > 0).then(|| n_right as f64 / n_grasps as f64);
             let percent = |share: f64| format!("{:.1} %", 100.0 * share);
             let text = format!(
-                "{} of {n_grasps} grasps with a label{}, at least {}",
+                "{} of {} with a label{}, at least {}",
                 accuracy.map_or("n/a".into(), percent),
+                counted(n_grasps, "grasp"),
                 if n_undecided > 0 { format!(", {n_undecided} undecided") } else { String::new() },
                 percent(least)
             );
@@ -344,7 +348,7 @@ impl Decisions {
         if let Some(most) = expected.false_positives_at_most {
             let text = match n_decided {
                 0 => "the recording has labels (/truth) of no decided grasp: expected some".into(),
-                _ => format!("{n_false_positive} of {n_decided} grasps with a label, at most {most}"),
+                _ => format!("{n_false_positive} of {} with a label, at most {most}", counted(n_decided, "grasp")),
             };
             let has_passed = n_decided > 0 && n_false_positive <= most;
             checks.push(Check::new("false_positives_at_most", has_passed, text));

@@ -1,8 +1,12 @@
 //! The summary of a run, for a person.
 
+use std::collections::BTreeMap;
+
 use crate::text_table::{TextTable, percent};
+use blindgrasp_graph::client::words::shown_counts;
 use blindgrasp_graph::run::{Latency, RunSummary};
 use blindgrasp_operator::link_status::{ChannelStatus, PeerStatus};
+use blindgrasp_operator::text::counted;
 
 /// The lines of the summary: figures, then a table of the edges.
 pub(super) fn table(summary: &RunSummary) -> Vec<String> {
@@ -16,7 +20,8 @@ pub(super) fn table(summary: &RunSummary) -> Vec<String> {
 }
 
 fn figures(summary: &RunSummary) -> Vec<(&'static str, String)> {
-    let probes = if summary.probes > 0 { format!(", after {} probes", summary.probes) } else { String::new() };
+    let probes =
+        if summary.probes > 0 { format!(", after {}", counted(summary.probes, "probe")) } else { String::new() };
     let end = if summary.end == "finished" { String::new() } else { format!("; the graph was {}", summary.end) };
     let (grasps, lift, hold, undecided) = (summary.grasps, summary.lift, summary.hold, summary.undecided);
     let mut figures =
@@ -34,10 +39,10 @@ fn figures(summary: &RunSummary) -> Vec<(&'static str, String)> {
             (
                 "judged",
                 format!(
-                    "{} grasps: accuracy {}, {} false positives ({})",
-                    judged.n_grasps,
+                    "{}: accuracy {}, {} ({})",
+                    counted(judged.n_grasps, "grasp"),
                     percent(judged.accuracy),
-                    judged.n_false_positive,
+                    counted(judged.n_false_positive, "false positive"),
                     percent(judged.false_positive_share)
                 ),
             ),
@@ -47,7 +52,7 @@ fn figures(summary: &RunSummary) -> Vec<(&'static str, String)> {
     let lost = match (summary.edges_unknown, summary.samples_dropped) {
         (0, 0) => summary.samples_lost.to_string(),
         (0, n) => format!("{}, dropped for newer ones: {n}", summary.samples_lost),
-        (n, _) => format!("{}, unknown on {n} edges", summary.samples_lost),
+        (n, _) => format!("{}, unknown on {}", summary.samples_lost, counted(n, "edge")),
     };
     figures.extend([
         ("reasons", reasons.join(", ")),
@@ -56,13 +61,24 @@ fn figures(summary: &RunSummary) -> Vec<(&'static str, String)> {
         ("restarts, swaps", format!("{}, {}", summary.restarts, summary.swaps)),
     ]);
     let machines: Vec<String> = summary.link.iter().flat_map(|link| &link.peers).map(machine).collect();
-    let counts = summary.counts.iter().map(|(node, counts)| {
-        let counts: Vec<String> = counts.iter().map(|(name, count)| format!("{name} {count}")).collect();
-        format!("{node}: {}", counts.join(", "))
-    });
-    let rare = [("machines", machines.join("; ")), ("counts", counts.collect::<Vec<_>>().join("; "))];
+    let rare = [("machines", machines.join("; ")), ("counts", counts(&summary.counts))];
     figures.extend(rare.into_iter().filter(|(_, text)| !text.is_empty()));
     figures
+}
+
+/// The counts of the nodes in words, without zeros. If no lift was reported, as none is in a recording, the number of those
+/// without a report says nothing.
+fn counts(of_nodes: &BTreeMap<String, BTreeMap<String, u64>>) -> String {
+    let mut shown = Vec::new();
+    for (node, counts) in of_nodes {
+        let is_reported = ["lifts/kept", "lifts/dropped"].iter().any(|name| counts.get(*name) > Some(&0));
+        let mut words = shown_counts(counts);
+        words.retain(|word| is_reported || !word.starts_with("lifts/unreported "));
+        if !words.is_empty() {
+            shown.push(format!("{node}: {}", words.join(", ")));
+        }
+    }
+    shown.join("; ")
 }
 
 fn latency(latency: &Latency) -> String {
@@ -84,4 +100,19 @@ fn machine(peer: &PeerStatus) -> String {
         total(|channel| channel.n_lost, true),
         total(|channel| channel.n_samples, false)
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_summary_has_no_zeros_and_counts_no_lifts_that_nobody_reports() {
+        let of_node = |kept, unreported| {
+            let counts = [("lifts/dropped", 0), ("lifts/kept", kept), ("lifts/unreported", unreported)];
+            BTreeMap::from([("lift_arbiter".to_owned(), counts.map(|(name, n)| (name.to_owned(), n)).into())])
+        };
+        assert_eq!(counts(&of_node(0, 116)), "");
+        assert_eq!(counts(&of_node(3, 2)), "lift_arbiter: lifts/kept 3, lifts/unreported 2");
+    }
 }

@@ -263,27 +263,58 @@ impl FeatureExtractor {
     /// `hist_3`, `finger_1.load`, `spread.position`. A name begins with that of the pad or joint, and no name comes twice
     /// unless a block does.
     pub fn value_names(&self, hand: &Hand) -> Vec<String> {
-        self.blocks.iter().flat_map(|block| self.block_names(*block, hand)).collect()
+        let mut parts = PartNames::default();
+        for joint in &hand.joints {
+            parts.joints.push(&joint.name);
+            if joint.coupling.is_some() {
+                parts.coupled.push(&joint.name);
+            }
+        }
+        parts.pads = hand.pads.iter().map(|pad| pad.name.as_str()).collect();
+        self.names_of_values(&parts)
     }
 
-    fn block_names(&self, block: Block, hand: &Hand) -> Vec<String> {
+    /// As [`FeatureExtractor::value_names`], from the names of the hand's parts.
+    pub(crate) fn names_of_values(&self, parts: &PartNames<'_>) -> Vec<String> {
+        self.blocks.iter().flat_map(|block| self.block_names(*block, parts)).collect()
+    }
+
+    /// A value of a feature before it was scaled; the mean where it does not vary.
+    pub fn unscaled(&self, idx: usize, value: f64) -> f64 {
+        match &self.scaling {
+            Some(Scaling { mean, per_deviation }) if per_deviation[idx] > 0.0 => value / per_deviation[idx] + mean[idx],
+            Some(Scaling { mean, .. }) => mean[idx],
+            None => value,
+        }
+    }
+
+    fn block_names(&self, block: Block, parts: &PartNames<'_>) -> Vec<String> {
+        let of = |names: &[&str], value: &str| names.iter().map(|name| format!("{name}.{value}")).collect();
         match block {
             Block::Histogram => (0..self.dictionary.len()).map(|word_idx| format!("hist_{word_idx}")).collect(),
-            Block::Cells => cell_names(hand, "cell"),
-            Block::RelativeCells => cell_names(hand, "relative_cell"),
-            Block::Joints => hand.joints.iter().map(|joint| format!("{}.position", joint.name)).collect(),
-            Block::Breakaways => {
-                let coupled = hand.joints.iter().filter(|joint| joint.coupling.is_some());
-                coupled.map(|joint| format!("{}.breakaway", joint.name)).collect()
-            }
+            Block::Cells => self.cell_names(parts, "cell"),
+            Block::RelativeCells => self.cell_names(parts, "relative_cell"),
+            Block::Joints => of(&parts.joints, "position"),
+            Block::Breakaways => of(&parts.coupled, "breakaway"),
             Block::Pads => {
-                let of_pad = |pad: &Pad| PAD_VALUES.map(|value| format!("{}.{value}", pad.name));
-                hand.pads.iter().flat_map(of_pad).collect()
+                let of_pad = |pad: &&str| PAD_VALUES.map(|value| format!("{pad}.{value}"));
+                parts.pads.iter().flat_map(of_pad).collect()
             }
             Block::Gravity => GRAVITY_VALUES.map(String::from).into(),
             Block::Wrist => WRIST_VALUES.map(String::from).into(),
-            Block::JointTorques => hand.joints.iter().map(|joint| format!("{}.torque", joint.name)).collect(),
+            Block::JointTorques => of(&parts.joints, "torque"),
         }
+    }
+
+    /// The names of the cells of all pads; a pad's cells are numbered from 0.
+    fn cell_names(&self, parts: &PartNames<'_>, value: &str) -> Vec<String> {
+        let mut names = Vec::new();
+        for (pad, cells) in parts.pads.iter().zip(&self.cells_in_link_m) {
+            for cell_idx in 0..cells.len() {
+                names.push(format!("{pad}.{value}_{cell_idx}"));
+            }
+        }
+        names
     }
 
     fn write_cells(&self, contacts: &[Contact], values: &mut Vec<f64>) {
@@ -371,13 +402,12 @@ impl FeatureExtractor {
     }
 }
 
-/// The names of the cells of all pads; a pad's cells are numbered from 0.
-fn cell_names(hand: &Hand, value: &str) -> Vec<String> {
-    let of_pad = |pad: &Pad| {
-        let name = pad.name.clone();
-        (0..pad.cells.len()).map(move |cell_idx| format!("{name}.{value}_{cell_idx}"))
-    };
-    hand.pads.iter().flat_map(of_pad).collect()
+/// The names of a hand's joints, of the coupled ones among them, and of its pads, each in the hand's order.
+#[derive(Default)]
+pub(crate) struct PartNames<'a> {
+    pub(crate) joints: Vec<&'a str>,
+    pub(crate) coupled: Vec<&'a str>,
+    pub(crate) pads: Vec<&'a str>,
 }
 
 /// The direction of gravity in the palm frame.

@@ -165,18 +165,14 @@ impl Judge {
             Reason::Stale => self.arbiter.staleness(decision.grasp_id).iter().map(Staleness::to_string).collect(),
             _ if decision.grasp_id != found.grasp_id => Vec::new(),
             Reason::Invalid => found.invalid.iter().cloned().collect(),
-            Reason::Unstable if is_of_last_frame && self.is_settled_alone() => {
-                self.model.speak_against(&self.hand, &self.values).into_iter().collect()
+            Reason::Unstable if is_of_last_frame && self.arbiter.options().probe == Probe::None => {
+                let names = self.model.features.value_names(&self.hand);
+                self.model.speak_against(&names, &self.values).into_iter().collect()
             }
             Reason::NoContact => found.self_contact.iter().cloned().collect(),
             Reason::OutOfDistribution => found.violations.iter().map(Violation::to_string).collect(),
             _ => Vec::new(),
         }
-    }
-
-    /// Whether the settled frame of a grasp is judged alone, without a probe or other grasps of its day.
-    fn is_settled_alone(&self) -> bool {
-        self.arbiter.options().probe == Probe::None && self.model.day.is_none()
     }
 
     /// Holds the open grasp, if any, because no more frames come.

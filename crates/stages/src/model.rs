@@ -13,9 +13,9 @@ use sha2::{Digest, Sha256};
 use crate::approach::ApproachPrior;
 use crate::classifier::{Classifier, Predictor, Verdict};
 use crate::day::{DayMemory, DayModel, GraspPlace};
-use crate::encoder::{FeatureExtractor, FeltReading, Scaling};
+use crate::encoder::{FeatureExtractor, FeltReading, PartNames};
 use crate::hand::Hand;
-use crate::out_of_distribution::{TrainingRange, Violation, quantities, short};
+use crate::out_of_distribution::{Limits, TrainingRange, Violation, quantities, short};
 use crate::own_lifts::{Adapt, Looked, OwnLifts};
 use crate::probe::{GraspHistory, ProbeModel, pad_newtons, signals};
 use crate::shift_test::numbers;
@@ -299,37 +299,47 @@ impl Model {
         }
     }
 
+    /// The names of a feature's values ([`FeatureExtractor::value_names`]) without the hand: by the limits of training, which a
+    /// model of this version has with names. The hand of an older one's is known if it is built in.
+    pub fn value_names(&self) -> Vec<String> {
+        if let Ok(hand) = Hand::load(Path::new(&self.hand.name))
+            && hand.id() == self.hand.id
+        {
+            return self.features.value_names(&hand);
+        }
+        let mut parts = PartNames::default();
+        for Limits { quantity, .. } in &self.training_range.limits {
+            // Behind the name is the unit.
+            let Some((quantity, _)) = quantity.rsplit_once(", ") else { continue };
+            parts.joints.extend(quantity.strip_prefix("position of joint "));
+            parts.coupled.extend(quantity.strip_prefix("breakaway of joint "));
+            parts.pads.extend(quantity.strip_prefix("load of pad "));
+        }
+        self.features.names_of_values(&parts)
+    }
+
     /// The two values of pads and joints in the feature of a settled frame that speak most against the grasp, for people. Only
-    /// trees can tell.
-    pub fn speak_against(&self, hand: &Hand, values: &[f64]) -> Option<String> {
+    /// trees can tell, and no model that judges by the day's earlier grasps. `names` are those of the values.
+    pub fn speak_against(&self, names: &[String], values: &[f64]) -> Option<String> {
         let trees = match &self.classifier.predictor {
             Predictor::Boosting(trees) => trees,
             Predictor::Blend(blend) => &blend.trees,
             Predictor::Svm(_) => return None,
         };
-        if values.len() != trees.n_features {
+        if self.day.is_some() || values.len() != trees.n_features || names.len() != values.len() {
             return None;
         }
         let mut against = Vec::new();
         for (idx, contribution) in trees.contributions(values).into_iter().enumerate() {
-            if contribution < 0.0 {
+            // A name with a dot is of a pad or joint; a word of the histogram or a wrench has none.
+            if contribution < 0.0 && names[idx].contains('.') {
                 against.push((contribution, idx));
             }
         }
         against.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let names = self.features.value_names(hand);
-        // A name with a dot is of a pad or joint; a word of the histogram or a wrench has none.
-        against.retain(|(_, idx)| names[*idx].contains('.'));
         let mut said = Vec::new();
         for (_, idx) in against.into_iter().take(2) {
-            let (mean, deviation) = match &self.features.scaling {
-                Some(Scaling { mean, per_deviation }) if per_deviation[idx] > 0.0 => {
-                    (mean[idx], 1.0 / per_deviation[idx])
-                }
-                Some(Scaling { mean, .. }) => (mean[idx], 0.0),
-                None => (0.0, 1.0),
-            };
-            said.push(format!("{} is {}", names[idx], short(values[idx] * deviation + mean)));
+            said.push(format!("{} is {}", names[idx], short(self.features.unscaled(idx, values[idx]))));
         }
         if said.is_empty() { None } else { Some(format!("of pads and joints, most against it: {}", said.join(", "))) }
     }
@@ -497,6 +507,19 @@ fn digest(parts: &[&str]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_values_have_the_names_of_a_hand_that_is_no_more_known() {
+        let mut model = Model::parse(include_str!("../../../models/barrett-bh8-280.json")).expect("a model");
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let names = model.features.value_names(&hand);
+        assert_eq!(model.value_names(), names, "of a built-in hand");
+        // As training writes them.
+        model.name_quantities(&hand);
+        model.hand.name = "of-a-stranger".into();
+        assert_eq!(model.value_names(), names);
+        assert!(names.contains(&"finger_1.load".to_owned()), "{names:?}");
+    }
 
     #[test]
     fn a_file_of_any_size_is_refused_before_it_is_parsed() {

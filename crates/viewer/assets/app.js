@@ -49,6 +49,7 @@ const showFrame = (frame) => {
     largest = roundUp(greatest);
     showScale();
   }
+  byId("stage").classList.remove("lacking");
   shown.frame = frame;
   shown.frames += 1;
   shown.firstFrameMs ??= performance.now();
@@ -69,11 +70,16 @@ const showDecision = (decision) => {
   shown.decision = decision;
   const action = byId("action"), name = decision === null ? "none yet" : spoken(decision.action);
   tell("action", name);
-  action.className = `action ${decision === null ? "" : ["lift", "hold"].includes(decision.action) ? decision.action : "probe"}`;
-  if (decision === null) return tell("why", "");
+  if (decision === null) {
+    action.className = "action none";
+    return tell("why", "");
+  }
+  const isFinal = ["lift", "hold"].includes(decision.action), isWrong = verdict(decision).startsWith("false");
+  action.className = `action ${isFinal ? decision.action : "probe"} ${isWrong ? "wrong" : ""}`.trim();
+  const against = decision.against ? `; ${decision.against}` : "";
   const wrong = decision.action === "lift" && decision.truth === false ? " This lift is wrong: the grasp is known to be unstable." : "";
   tell("why", `Grasp ${decision.grasp_id}: ${spoken(decision.reason)}, probability ` +
-    `${decision.probability_stable.toFixed(2)}.${decision.why ?? wrong}`);
+    `${decision.probability_stable.toFixed(2)}${against}.${decision.why ?? wrong}`);
 };
 // A new decision: when it was on the screen, which scripts/benchsuite view reads, and in words.
 const announce = (decision) => {
@@ -150,25 +156,28 @@ const showWords = () => {
 };
 
 // --- votes: the arbiter waits for so many settled predictions that agree
-const showVotes = ({ side, n }, frame) => {
+const showVotes = (frame) => {
   const votes = Object.values(shown.graph?.params ?? {}).find((params) => "votes" in params)?.votes;
   if (!votes) return;
   const isProbed = !["open", "closing", "settled", "ended", "lifting"].includes(frame.phase);
-  const wanted = `${votes} settled predictions that agree`;
   tell("waits", past.isDecided(frame) ? "" : isProbed ? `Grasp ${frame.grasp_id} is probed; the hand is ${spoken(frame.phase)}.`
-    : n === 0 ? `Grasp ${frame.grasp_id} waits for ${wanted}; the hand is ${frame.phase}.`
-    : `Grasp ${frame.grasp_id} waits for ${wanted}; the last ${n} say ${side}.`);
+    : `Grasp ${frame.grasp_id} waits for ${votes} settled predictions that agree; the hand is ${frame.phase}.`);
 };
 
 // --- a moment of a running graph, present or past
 const past = makeHistory({
   chart: () => { if (!player.grasps.length) liveChart(); },
-  show: (moment, decision, isPaused) => {
+  show: (moment, decision, isPaused, lacking) => {
     showDecision(decision);
+    if (lacking !== null) {
+      byId("stage").classList.add("lacking");
+      tell("moment", `the frame that decided grasp ${lacking.grasp_id} is not kept: no hand is drawn`);
+      for (const id of ["pads", "joints"]) cut(byId(id), 0);
+    }
     showFrame(moment.frame);
     if (isPaused && moment.frame && !isShownHand(moment.frame)) tell("moment", "this frame lacks readings of the hand: an earlier one stays drawn");
     if (isPaused || !moment.frame) tell("waits", "");
-    else showVotes(moment.votes, moment.frame);
+    else showVotes(moment.frame);
     // No feature is kept of the frame that decided, and that of another moment would mislead.
     [feature, words] = [moment.feature ?? null, moment.feature ? moment.words : null];
     showFeature();
@@ -176,7 +185,7 @@ const past = makeHistory({
   },
 });
 shown.past = past;
-const player = makePlayer({ surround: hand.surround, isShownHand, showFrame, showDecision, showShadow, chart });
+const player = makePlayer({ list: past.list, surround: hand.surround, isShownHand, showFrame, showDecision, showShadow, chart });
 shown.player = player;
 setInterval(() => {
   if (document.hidden || player.grasps.length) return;
@@ -212,6 +221,9 @@ const showGraph = (graph) => {
   });
   cut(byId("edges"), graph.edges.length);
   showChoices(graph);
+  if (past.list.asked !== null) past.list.goTo(past.list.asked);
+  past.list.asked = null;
+  if (shown.frame === null && graph.listens) tell("moment", `no frame yet: waits for a bridge at ${graph.listens}; docs/hardware.md says what it sends`);
 };
 
 // --- ages: an old state must not look like the present one
@@ -256,22 +268,28 @@ on("scene", (scene) => {
   showShadow(null);
   for (const id of ["pads", "joints"]) cut(byId(id), 0);
   tell("moment", scene ? "no frame yet" : "the graph has no hand that can be shown");
+  // Without a frame its posture is not known.
+  byId("stage").classList.add("lacking");
   hand.build(scene ?? { links: [], cells: [], hand_colour: [0, 0, 0] });
 });
 on("frame", (event) => {
-  const now = performance.now(), { probabilities, shadow, decisions, labels, votes, feature: values, words: weights } = event;
+  const now = performance.now(), { probabilities, shadow, decisions, labels, feature: values, words: weights } = event;
   const frame = isShownHand(event) ? event : undefined;
   hasShadow ||= shadow.length > 0;
   past.push({
-    at: now, probabilities: probabilities.filter((p) => p !== null), shadow: shadow.filter((p) => p !== null), decisions, votes, frame,
+    at: now, probabilities: probabilities.filter((p) => p !== null), shadow: shadow.filter((p) => p !== null), decisions, frame,
     forces: frame && touchOf(frame).map(({ sum }) => sum), feature: values?.length ? values : undefined, words: values?.length ? weights : undefined,
   });
-  labels.forEach(past.label);
+  for (const label of labels) {
+    past.label(label);
+    const [epoch, grasp_id, truth] = label;
+    if (shown.decision && keyOf(shown.decision) === keyOf({ epoch, grasp_id })) showDecision({ ...shown.decision, truth });
+  }
   if (frame) frameAt = now;
   if (past.at !== null) return;
   if (frame) {
     showFrame(frame);
-    showVotes(votes, frame);
+    showVotes(frame);
   }
   if (values?.length) [feature, words] = [values, weights];
 });

@@ -3,7 +3,7 @@
 const remembered = (() => { try { return sessionStorage; } catch { return null; } })();
 let token = remembered?.getItem("token") ?? null, graph = null;
 const takeToken = () => {
-  if (location.hash.length < 2) return;
+  if (location.hash.length < 2 || graspInAddress() !== null) return;
   token = location.hash.slice(1);
   remembered?.setItem("token", token);
   // It is not seen over a shoulder, nor kept in the history.

@@ -4,16 +4,14 @@ const KEPT_MS = 180_000;
 // Numbers in all that are kept, a few dozen megabytes: of a hand with many cells, fewer seconds.
 const MAX_KEPT_NUMBERS = 3e6;
 const MAX_DECISIONS = 200;
-const WRONG = { "false-positive": ": a wrong lift", "false-negative": ": a wrong hold" };
 
 const keyOf = ({ epoch, grasp_id }) => `${epoch} ${grasp_id}`;
-const labelOf = ({ truth }) => (truth === null || truth === undefined ? "not known" : truth ? "stable" : "not stable");
 const isProbe = (decision) => ["squeeze", "test_lift"].includes(decision.action);
 
-// `show` draws a moment, `chart` the chart.
+// `show` draws a moment, and knows the decision whose frame is not kept; `chart` draws the chart.
 const makeHistory = ({ show, chart }) => {
   // `at` is the time of the page's clock in milliseconds of the moment that is shown, null at present.
-  const state = { moments: [], decisions: [], at: null, decided: new Set(), push, label, pause, resume, clear, isDecided, end, choose, isOver: () => isOver };
+  const state = { moments: [], decisions: [], at: null, decided: new Set(), push, label, pause, resume, clear, isDecided, end, choose, toggle, isNewestFirst: true, isOver: () => isOver };
   let n_kept = 0, chosen = null, isOver = false, isListDue = true, listed = [];
   const last = () => state.moments.at(-1);
 
@@ -29,7 +27,7 @@ const makeHistory = ({ show, chart }) => {
       + (feature?.length ?? 0) + (words?.length ?? 0) + probabilities.length + shadow.length;
     for (const decision of moment.decisions) {
       decision.at = moment.at;
-      decision.clock = Date.now();
+      decision.first = clock(Date.now());
       decide(decision);
       state.decisions.push(decision);
       isListDue = true;
@@ -89,16 +87,23 @@ const makeHistory = ({ show, chart }) => {
   // The last decision at a time.
   state.decisionAt = (at) => state.decisions.findLast((decision) => decision.at <= at) ?? null;
   function choose(decision) { pause(decision.at, decision); }
+  function toggle() { if (state.at === null) pause(Infinity); else resume(); }
 
   function present() {
     const isPaused = state.at !== null;
     const moment = isPaused ? state.moments[idxAt(state.at)] : last();
     if (moment) {
-      // The frame that decided is exact; moments are 30 a second.
-      show(chosen?.frame ? { ...moment, frame: chosen.frame, feature: undefined } : moment, chosen ?? (isPaused ? state.decisionAt(state.at) : state.decisions.at(-1) ?? null), isPaused);
+      // The frame that decided is exact; moments are 30 a second, mostly of other grasps.
+      const ofChosen = { ...moment, frame: chosen?.frame, feature: undefined };
+      show(chosen ? ofChosen : moment, chosen ?? (isPaused ? state.decisionAt(state.at) : state.decisions.at(-1) ?? null), isPaused, chosen?.frame ? null : chosen);
     }
     controls();
-    list();
+    // The list may be that of a recording.
+    if (decisionList.owner === state) {
+      setAddress(chosen?.grasp_id ?? null);
+      list();
+      decisionList.mark(chosen);
+    }
     chart();
   }
   function controls() {
@@ -121,34 +126,16 @@ const makeHistory = ({ show, chart }) => {
   function list() {
     isListDue = false;
     if (state.at === null || isOver || !listed.length) listed = state.decisions.slice().reverse();
-    byId("no-decisions").hidden = listed.length > 0;
-    const body = byId("decisions");
-    listed.forEach((decision, idx) => {
-      const kind = verdict(decision), isShown = decision === chosen;
-      fill(body, idx, [clock(decision.clock), null, spoken(decision.action), spoken(decision.reason), decision.probability_stable.toFixed(2),
-        labelOf(decision) + (WRONG[kind] ?? "")],
-      [4], kind.startsWith("false") ? [5] : []);
-      const row = body.rows[idx], cell = row.cells[1];
-      row.classList.toggle("chosen", isShown);
-      row.cells[2].style.color = `var(${actionColour(decision.action)})`;
-      let button = cell.firstElementChild;
-      if (!button) {
-        button = document.createElement("button");
-        button.type = "button";
-        button.addEventListener("click", () => choose(listed[row.rowIndex - 1]));
-        cell.replaceChildren(button);
-      }
-      if (button.textContent !== decision.grasp_id) button.textContent = decision.grasp_id;
-      button.setAttribute("aria-pressed", String(isShown));
-    });
-    cut(body, listed.length);
+    decisionList.show(listed);
   }
   // Called several times a second.
   state.refresh = () => {
     controls();
     if (isListDue && (state.at === null || isOver)) list();
   };
-  byId("pause").addEventListener("click", () => (state.at === null ? pause(Infinity) : resume()));
+  byId("pause").addEventListener("click", toggle);
   byId("moment-slider").addEventListener("input", () => pause((state.moments[Number(byId("moment-slider").value)] ?? last())?.at ?? Infinity));
+  const decisionList = makeList(state);
+  state.list = decisionList;
   return state;
 };

@@ -1,5 +1,5 @@
-// Small helpers of the page: elements, tables, colours, and texts of times. The server joins page.js, timeline.js, history.js,
-// player.js, control.js and app.js, in this order, into one module: over a slow line each file more would cost a round trip.
+// Small helpers of the page: elements, tables, colours, and texts of times. The server joins page.js, timeline.js, list.js,
+// history.js, player.js, control.js and app.js, in this order, into one module: over a slow line each file more would cost a round trip.
 import * as three from "/three.js";
 import { MAX_CONTACTS, colourStep, makeStage } from "/stage.js";
 import { add, lineChart, roundUp, time, write } from "/chart.js";
@@ -35,20 +35,27 @@ const colour = (name) => getComputedStyle(document.documentElement).getPropertyV
 // The colours of pads and of parts of a feature; beyond eight they begin again.
 const seriesColour = (idx) => `--series-${idx % 8}`;
 const actionColour = (action) => ({ lift: "--lift", hold: "--hold" })[action] ?? "--probe";
-// Swatches with their texts: name and colour each.
+// A lift and a hold differ by their mark, too, and a wrong one has a cross.
+const marked = (decision) => {
+  const mark = { lift: "▲ ", hold: "▼ " }[decision.action] ?? "";
+  return `${mark}${spoken(decision.action)}${verdict(decision).startsWith("false") ? " ✗" : ""}`;
+};
+// Swatches, or marks, with their texts: name, colour and perhaps a mark each.
 const showKeys = (element, keys) => {
   const text = JSON.stringify(keys);
   if (element.dataset.keys === text) return;
   element.dataset.keys = text;
-  element.replaceChildren(...keys.flatMap(([name, colourName]) => {
+  element.replaceChildren(...keys.flatMap(([name, colourName, mark]) => {
     const key = document.createElement("span");
     key.className = "key";
+    if (mark) key.dataset.mark = mark;
     key.style.setProperty("--key", `var(${colourName})`);
     key.textContent = name;
     return [key, " "];
   }));
 };
 
+const counted = (n, noun) => `${n} ${noun}${n === 1 ? "" : "s"}`;
 // A name as it is written in a sentence.
 const spoken = (name) => name.replaceAll("_", " ");
 const clock = (millis) => new Date(millis).toLocaleTimeString([], { hour12: false });

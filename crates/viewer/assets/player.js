@@ -1,19 +1,23 @@
 // A recording: its grasps in a row, and one of them frame by frame.
 
-const COLOURS = { right: "--lift", "false-positive": "--hold", "false-negative": "--probe", other: "--soft" };
+// Colour, top and height of the bar of a grasp: a wrong lift stands out above, a wrong hold below.
+const BARS = { right: ["--lift", 14, 14], "false-positive": ["--trouble", 3, 25], "false-negative": ["--hold", 14, 23], other: ["--soft", 18, 6] };
 
-// Its functions show parts of the page: `surround` an object, `isShownHand` says whether a frame fits the hand, `showFrame`, `showDecision`, `showShadow`, and `chart`.
-const makePlayer = ({ surround, isShownHand, showFrame, showDecision, showShadow, chart }) => {
+// `list` is the list of the page. Its other functions show parts of the page: `surround` an object, `isShownHand` says whether a frame fits the hand, `showFrame`, `showDecision`, `showShadow`, and `chart`.
+const makePlayer = ({ list, surround, isShownHand, showFrame, showDecision, showShadow, chart }) => {
   // `decided` is the number of the frame that decided: without a decision, of the last one of the settled hand; or null.
   const state = { grasps: [], at: -1, frames: [], n: 0, decided: null, isPlaying: false, verdict, go, start };
   let opening = 0, abort = null, run = 0, due = 0, wholeStep = 1;
   const bars = () => {
     const canvas = byId("grasps"), draw = pen(canvas), width = canvas.clientWidth / state.grasps.length;
     state.grasps.forEach((grasp, idx) => {
-      const isShown = idx === state.at;
-      draw.fillStyle = colour(COLOURS[verdict(grasp)]);
-      draw.fillRect(idx * width, isShown ? 0 : 12, Math.max(1, width - (width > 4 ? 1 : 0)), isShown ? 40 : 22);
+      const [name, top, height] = BARS[verdict(grasp)];
+      draw.fillStyle = colour(name);
+      draw.fillRect(idx * width, top, Math.max(1, width - (width > 4 ? 1 : 0)), height);
     });
+    // The one that is shown stands between two lines.
+    draw.fillStyle = colour("--text");
+    for (const x of [state.at * width - 2, (state.at + 1) * width]) draw.fillRect(x, 0, 2, 40);
   };
   const showAt = (n) => {
     const frame = state.frames[n], grasp = state.grasps[state.at];
@@ -39,9 +43,11 @@ const makePlayer = ({ surround, isShownHand, showFrame, showDecision, showShadow
     surround(null);
     showShadow(null);
     bars();
+    list.mark(grasp);
+    setAddress(grasp.id);
     const label = grasp.truth === null ? "" : grasp.truth ? " It was stable." : " It was not stable.";
     const object = grasp.object === "" ? "" : ` Object: ${grasp.object}.`;
-    if (grasp.action !== null) showDecision({ ...grasp, grasp_id: grasp.id, why: label + object });
+    if (grasp.action !== null) showDecision({ ...grasp, why: label + object });
     else {
       byId("action").textContent = "no decision recorded";
       byId("action").className = "action none";
@@ -100,6 +106,7 @@ const makePlayer = ({ surround, isShownHand, showFrame, showDecision, showShadow
     run += 1;
     setPlaying(false);
   };
+  const toggle = () => (state.isPlaying ? stop() : play());
   function go(idx) { if (idx >= 0 && idx < state.grasps.length) open(idx, state.isPlaying); }
   byId("before").addEventListener("click", () => go(state.at - 1));
   byId("after").addEventListener("click", () => go(state.at + 1));
@@ -109,7 +116,7 @@ const makePlayer = ({ surround, isShownHand, showFrame, showDecision, showShadow
     stop();
     go(idx >= 0 ? idx : state.grasps.findIndex(isMistake));
   });
-  byId("play").addEventListener("click", () => (state.isPlaying ? stop() : play()));
+  byId("play").addEventListener("click", toggle);
   byId("frame").addEventListener("input", () => showAt(Number(byId("frame").value)));
   byId("grasps").addEventListener("click", (event) => go(Math.floor(event.offsetX / byId("grasps").clientWidth * state.grasps.length)));
   new ResizeObserver(() => { if (state.grasps.length) { bars(); chart(); } }).observe(byId("grasps"));
@@ -118,7 +125,10 @@ const makePlayer = ({ surround, isShownHand, showFrame, showDecision, showShadow
     if (state.grasps.length) return say(state.summary, false);
     document.body.classList.add("recorded");
     byId("recording").hidden = false;
-    state.grasps = grasps;
+    state.grasps = grasps.map((grasp) => ({ ...grasp, grasp_id: grasp.id, first: grasp.object }));
+    byId("first-column").textContent = "object";
+    list.owner = { choose: (grasp) => go(state.grasps.indexOf(grasp)), toggle };
+    list.show(state.grasps);
     const n = (kind) => grasps.filter((grasp) => verdict(grasp) === kind).length;
     const isKnown = n("other") < grasps.length;
     byId("graph").textContent = file.split("/").at(-1);
@@ -127,10 +137,11 @@ const makePlayer = ({ surround, isShownHand, showFrame, showDecision, showShadow
     const without = grasps.every((grasp) => grasp.action === null) ? "no decisions" : "no labels of decided grasps";
     const other = n("other") > 0 ? `, ${n("other")} not known` : "";
     state.summary = isKnown
-      ? `${grasps.length} grasps, ${n("false-positive")} false positives, ${n("false-negative")} false negatives${other}`
-      : `${grasps.length} grasps, ${without} in the recording`;
+      ? `${counted(grasps.length, "grasp")}, ${counted(n("false-positive"), "false positive")}, ${counted(n("false-negative"), "false negative")}${other}`
+      : `${counted(grasps.length, "grasp")}, ${without} in the recording`;
     say(state.summary, false);
-    open(first);
+    if (list.asked !== null) list.goTo(list.asked);
+    if (state.at < 0) open(first);
   }
   return state;
 };

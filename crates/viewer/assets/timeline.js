@@ -4,6 +4,12 @@
 // Labels of decisions that are nearer would overlap.
 const LABEL_PX = 32;
 
+// The dashed lines in words.
+const dashesOf = ({ threshold, unsure_from }) => {
+  const unsure = unsure_from < threshold ? `unsure from ${unsure_from.toFixed(2)} on, ` : "";
+  return `dashed, the model's thresholds: ${unsure}stable ${threshold < 1 ? `from ${threshold.toFixed(2)} on` : "only after a probe"}`;
+};
+
 // `ticks` are pairs of seconds and text; `cursor` are the seconds of the moment that is shown, or null.
 const drawChart = ({ moments, from, to, ticks, title, cursor, scene, model, hasShadow }) => {
   const svg = byId("chart"), { width, height } = svg.getBoundingClientRect();
@@ -33,18 +39,22 @@ const drawChart = ({ moments, from, to, ticks, title, cursor, scene, model, hasS
   if (isForce) write(svg, scene?.cell_unit ?? "", 2, 12, "start");
   let labelled = -Infinity;
   for (const { secs, decisions } of moments) {
-    for (const { action } of decisions) {
-      const x = at.x(secs), colour = `var(${actionColour(action)})`;
-      add(svg, "path", { d: `M${x} 16V28`, stroke: colour, "stroke-width": 2 });
+    for (const decision of decisions) {
+      const { action } = decision, x = at.x(secs), colour = `var(${actionColour(action)})`;
+      const shape = { lift: "l5 10h-10z", hold: "m-5 0h10l-5 10z" }[action] ?? "l4 5l-4 5l-4 -5z";
+      const fill = verdict(decision).startsWith("false") ? "var(--card)" : colour;
+      add(svg, "path", { d: `M${x} 17${shape}`, fill, stroke: colour, "stroke-width": 1.6 });
       if (x - labelled < LABEL_PX) continue;
       labelled = x;
-      write(svg, spoken(action), x, 13, "middle", { fill: colour });
+      const isAtEdge = x > width - 30;
+      write(svg, spoken(action), isAtEdge ? width - 1 : x, 13, isAtEdge ? "end" : "middle", { fill: colour });
     }
   }
   if (cursor !== null) add(svg, "path", { d: `M${at.x(cursor)} 20V${height - 34}`, stroke: "var(--text)", "stroke-width": 2 });
-  const ofProbability = [["probability", "--mark"], ...(hasShadow ? [["the model beside (--shadow)", "--probe"]] : []), ["threshold, dashed", "--soft"]];
+  const ofProbability = [["probability", "--mark"], ...(hasShadow ? [["the model beside (--shadow)", "--probe"]] : []),
+    ...(model ? [[dashesOf(model), "--soft", "┄"]] : [])];
   showKeys(byId("chart-key"), [
     ...(isForce ? pads.map((name, idx) => [`${spoken(name)}${idx < 8 ? "" : ", dashed"}`, seriesColour(idx)]) : ofProbability),
-    ["lift", "--lift"], ["hold", "--hold"],
+    ["lift", "--lift", "▲"], ["hold", "--hold", "▼"], ["hollow: a wrong one", "--soft", "△"],
   ]);
 };

@@ -61,6 +61,7 @@ const CONTENT_POLICY: &str = "default-src 'none'; script-src 'self'; style-src '
 const APP_JS: &str = concat!(
     include_str!("../assets/page.js"),
     include_str!("../assets/timeline.js"),
+    include_str!("../assets/list.js"),
     include_str!("../assets/history.js"),
     include_str!("../assets/player.js"),
     include_str!("../assets/control.js"),

@@ -9,6 +9,7 @@ use blindgrasp_cli::frame_lines::{FrameLines, read_frames};
 use blindgrasp_cli::joint;
 use blindgrasp_learning::file_name;
 use blindgrasp_learning::import::{Day, ImportOptions, ImportReport, Joints, import_frames, import_table};
+use blindgrasp_operator::text::counted;
 use blindgrasp_stages::hand::Hand;
 
 /// Turn a table (CSV) or lines of frames into a recording
@@ -182,7 +183,7 @@ fn print_report(
         ("cells", format!("in {}", report.cell_unit.word())),
     ];
     for (name, day) in &report.days {
-        lines.push(("day", format!("{name} ({}), {} grasps", day.day, day.n_grasps)));
+        lines.push(("day", format!("{name} ({}), {}", day.day, counted(day.n_grasps, "grasp"))));
     }
     for pad in &report.pads {
         lines.push(("pad", format!("{:<12} {}", pad.pad, range(&pad.columns))));

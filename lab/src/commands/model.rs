@@ -10,6 +10,7 @@ use super::train::{probe_lines, threshold_line};
 use super::{Outcome, check_new, completions, percent, print_line, print_text};
 use blindgrasp_grasps::dataset::{hand_of, label_line};
 use blindgrasp_learning::training::adapt;
+use blindgrasp_operator::text::counted;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::boosting::BoostedTrees;
 use blindgrasp_stages::classifier::svm::RbfSvm;
@@ -126,7 +127,11 @@ fn own_lifts_lines(model: &Model) -> Vec<String> {
         format!("when {}, log-odds are {a:.3} x those of the model {sign} {b:.3} ({losses})", own.look)
     };
     let world = if own.in_simulation { "in simulation" } else { "on this robot" };
-    let mut lines = vec![format!("by {n_lifts} lifts of {n_objects} objects {world}, {n_kept} kept: {corrected}")];
+    let mut lines = vec![format!(
+        "by {} of {} {world}, {n_kept} kept: {corrected}",
+        counted(n_lifts, "lift"),
+        counted(n_objects, "object")
+    )];
     if own.n_outside > 0 {
         lines.push(format!("limits are wider, because they held {} of these grasps", own.n_outside));
     }

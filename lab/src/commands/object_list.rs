@@ -10,6 +10,7 @@ use super::{Outcome, print_line, print_text};
 use blindgrasp_mesh::write_off;
 use blindgrasp_objects::{Object, objects_named};
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::text::counted;
 use blindgrasp_simulator::trial::targets::targets_named;
 
 #[derive(Serialize)]
@@ -36,7 +37,7 @@ pub(super) fn list(objects: &str, folder: Option<&Path>, as_json: bool) -> anyho
     match folder {
         _ if as_json => print_text(&serde_json::to_string_pretty(&rows)?)?,
         Some(folder) => {
-            print_line(&format!("{} objects and catalogue.csv written to {}", rows.len(), folder.display()))?
+            print_line(&format!("{} and catalogue.csv written to {}", counted(rows.len(), "object"), folder.display()))?
         }
         None => print_table(&rows)?,
     }

@@ -10,6 +10,7 @@ use serde_json::json;
 use super::{Outcome, check_new, completions, print_line, print_text};
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_learning::sensors::{alarms, learn, read};
+use blindgrasp_operator::text::counted;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::sensors::{Described, SensorCheck};
 
@@ -88,10 +89,10 @@ fn learn_check(arguments: &LearnArguments) -> anyhow::Result<Outcome> {
     check.save(&arguments.out)?;
     let weak = check.detectors.iter().filter(|detector| detector.power < 0.5);
     print_line(&format!(
-        "{}: {} grasps, {} detectors, {} of them weak",
+        "{}: {}, {}, {} of them weak",
         arguments.out.display(),
-        check.n_grasps,
-        check.detectors.len(),
+        counted(check.n_grasps, "grasp"),
+        counted(check.detectors.len(), "detector"),
         weak.count()
     ))?;
     Ok(Outcome::Done)
@@ -112,7 +113,7 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<Outcome> {
             .collect();
         print_text(&serde_json::to_string_pretty(&json!({"n_grasps": grasps.len(), "faults": faults}))?)?;
     } else {
-        print_line(&format!("{} grasps", grasps.len()))?;
+        print_line(&counted(grasps.len(), "grasp"))?;
         // A fault that goes on is said once.
         for (idx, (grasp_id, fault)) in held.iter().enumerate() {
             if idx == 0 || held[idx - 1].1 != *fault {

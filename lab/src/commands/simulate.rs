@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use clap::Args;
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{HumanDuration, ProgressBar, ProgressStyle};
 use serde::Serialize;
 
 use super::object_list::list;
@@ -160,6 +160,8 @@ fn print_mesh_warnings(warnings: &[String]) {
 
 /// Time between two lines of progress where there is no terminal.
 const TELL_EVERY: Duration = Duration::from_secs(30);
+/// The first line comes after so many grasps: it says how long the others will take.
+const N_FIRST: usize = 10;
 /// So many grasps without a stable one are told.
 const MANY_UNSTABLE: usize = 50;
 
@@ -269,7 +271,8 @@ impl Job<'_> {
     ) -> Result<SimulationReport, SimulateError<RecordingError>> {
         let before = bar.position();
         let options = self.simulation.options;
-        let (mut told_at, mut is_warned) = (Instant::now(), false);
+        let (begun, mut is_warned) = (Instant::now(), false);
+        let (mut told_at, mut is_first) = (begun, before == 0);
         let report = self.simulation.part(
             part,
             || self.stop.load(Ordering::Relaxed),
@@ -284,13 +287,17 @@ impl Job<'_> {
                     bar.suspend(|| print_diagnostic(&none_is_stable(n)));
                 }
                 // Without a terminal there is no bar.
-                if bar.is_hidden() && told_at.elapsed() >= TELL_EVERY {
-                    told_at = Instant::now();
+                let is_due = told_at.elapsed() >= TELL_EVERY || (is_first && report.n_grasps >= N_FIRST);
+                if bar.is_hidden() && is_due {
+                    (told_at, is_first) = (Instant::now(), false);
                     // Of this shard, if it is one.
                     let (n, n_all) = (before as usize + report.n_grasps, bar.length().unwrap_or(0));
                     let (n_tried, rate) = (report.n_candidates, 100.0 * report.natural_stable_rate());
+                    let each = begun.elapsed() / report.n_grasps.max(1) as u32;
+                    let left = HumanDuration(each * (n_all as usize).saturating_sub(n) as u32);
                     print_diagnostic(&format!(
-                        "{n} of {n_all} grasps, {n_tried} candidates tried, {rate:.1} % stable before balancing"
+                        "{n} of {n_all} grasps, about {left} left; part {}: {n_tried} candidates tried, {rate:.1} % stable before balancing",
+                        part.idx
                     ));
                 }
             },

@@ -17,6 +17,7 @@ use blindgrasp_graph::recorded_graph::Ending;
 use blindgrasp_messages::{Recorded as _, TactileFrame};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
+use blindgrasp_operator::text::counted;
 use blindgrasp_recording::{LiveOptions, RecordingInfo};
 use blindgrasp_session::flight::{Excerpt, FlightRecorder, SharedRecorder};
 use blindgrasp_session::of_graph::{nodes, of_graph};
@@ -160,8 +161,10 @@ impl Keeping<'_> {
             json!(excerpt).to_string()
         } else {
             let Excerpt { file, why, frames, grasps, secs, missing, .. } = &excerpt;
-            let missing = if *missing > 0 { format!(", {missing} samples are missing") } else { String::new() };
-            format!("{} ({}): {secs:.1} s, {grasps} grasps, {frames} frames{missing}", file.display(), why.join(", "))
+            let missing =
+                if *missing > 0 { format!(", missing: {}", counted(missing, "sample")) } else { String::new() };
+            let (grasps, frames) = (counted(grasps, "grasp"), counted(frames, "frame"));
+            format!("{} ({}): {secs:.1} s, {grasps}, {frames}{missing}", file.display(), why.join(", "))
         };
         Ok(print_line(&line)?)
     }

@@ -17,6 +17,7 @@ use blindgrasp_graph::dataflow::{self, Graph, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_graph::run::{RunSummary, observed_topics};
 use blindgrasp_messages::{LiftDecision, Recorded};
+use blindgrasp_operator::text::counted;
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_recording::{LiveOptions, RecordingReader};
 use blindgrasp_replay::checks::{self, ChangedDecision, Check, Decisions, describe_changes};
@@ -78,9 +79,9 @@ impl Runner<'_> {
         let n_lost = summary.samples_lost + summary.samples_dropped;
         let has_lost = n_lost > 0 || summary.edges_unknown > 0;
         let text = if has_lost {
-            format!("{n_lost} samples lost, unknown on {} edges", summary.edges_unknown)
+            format!("{} lost, unknown on {}", counted(n_lost, "sample"), counted(summary.edges_unknown, "edge"))
         } else {
-            format!("{} grasps decided, nothing lost", summary.grasps)
+            format!("{} decided, nothing lost", counted(summary.grasps, "grasp"))
         };
         case.checks.push(Check::new("replay", !has_lost, text));
 

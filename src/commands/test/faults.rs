@@ -11,6 +11,7 @@ use crate::commands::text_table::TextTable;
 use crate::commands::{print_line, print_text};
 use blindgrasp_graph::dataflow::Graph;
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::text::counted;
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_replay::checks::{ChangedDecision, Decisions};
 use blindgrasp_replay::expectations::Expectations;
@@ -51,7 +52,7 @@ pub(super) fn run(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) ->
             all.push(json!({"recording": &shown, "fault": fault, "changed_actions": changed}));
         }
         if !is_json {
-            print_line(&format!("{}: {} lifts without a fault", shown, whole.tally().n_lifts))?;
+            print_line(&format!("{shown}: {} without a fault", counted(whole.tally().n_lifts, "lift")))?;
             for line in table.lines().iter().chain(&told) {
                 print_line(&format!("  {line}"))?;
             }
@@ -66,9 +67,10 @@ pub(super) fn run(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) ->
         bail!("no recording of this graph's hand was named: nothing was tested");
     }
     if n_lifted_now > 0 {
-        bail!("{n_lifted_now} grasps are lifted with a fault and held without it");
+        bail!("lifted with a fault and held without it: {}", counted(n_lifted_now, "grasp"));
     }
-    print_diagnostic(&format!("no grasp of {n_replayed} recordings is lifted with a fault that is held without it"));
+    let replayed = counted(n_replayed, "recording");
+    print_diagnostic(&format!("no grasp of {replayed} is lifted with a fault that is held without it"));
     Ok(Outcome::Done)
 }
 

@@ -11,6 +11,7 @@ use super::{Outcome, project_recordings, settings};
 use crate::commands::{print_line, print_text, write_out};
 use blindgrasp_cli::graph_file::checked;
 use blindgrasp_graph::dataflow::{self, Graph, Scope};
+use blindgrasp_operator::text::counted;
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_replay::checks::{Decisions, describe_changes};
 use blindgrasp_replay::expectations::{Expectations, path_of};
@@ -47,9 +48,9 @@ pub(super) fn write(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) 
         let fails = decisions.check(&expected).iter().any(|check| !check.has_passed);
         if !is_json {
             print_line(&format!(
-                "{}: {} grasps",
+                "{}: {}",
                 path.display(),
-                decisions.tally().n_lifts + decisions.tally().n_holds
+                counted(decisions.tally().n_lifts + decisions.tally().n_holds, "grasp")
             ))?;
             for grasp_id in remarks.keys() {
                 print_line(&format!("  grasp {grasp_id} dropped its object: it is expected to be held"))?;

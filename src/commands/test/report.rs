@@ -11,6 +11,7 @@ use serde_json::json;
 use super::case::Case;
 use super::scratch::file_name;
 use crate::commands::{print_line, print_text, write_out};
+use blindgrasp_operator::text::counted;
 use blindgrasp_replay::checks::Check;
 
 pub(super) fn print_case(case: &Case) -> anyhow::Result<()> {
@@ -60,7 +61,7 @@ pub(super) fn print_summary(cases: &[Case], is_json: bool) -> anyhow::Result<()>
             if failed.is_empty() { "-".into() } else { failed.join(", ") }
         ))?;
     }
-    print_line(&format!("{} recordings: {n_passed} passed, {n_failed} failed", cases.len()))?;
+    print_line(&format!("{}: {n_passed} passed, {n_failed} failed", counted(cases.len(), "recording")))?;
     Ok(())
 }
 

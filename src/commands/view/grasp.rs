@@ -13,6 +13,7 @@ use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_mesh::Mesh;
 use blindgrasp_messages::Phase;
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::text::counted;
 use blindgrasp_pictures::{ObjectSurface, RecordedGrasp, grasp_html};
 use blindgrasp_recording::{Record, RecordingReader};
 use blindgrasp_stages::{Hand, Judge, Model};
@@ -94,11 +95,7 @@ fn read_grasp(path: &Path, wanted: Option<u64>) -> anyhow::Result<RecordedGrasp>
     if found.frames.is_empty() {
         let n = grasp_ids.len();
         let gaps = if n as u64 == last - first + 1 { "" } else { ", with gaps" };
-        bail!(
-            "{} has no grasp {grasp_id}: it holds {n} grasp{}, {first} to {last}{gaps}",
-            path.display(),
-            if n == 1 { "" } else { "s" }
-        );
+        bail!("{} has no grasp {grasp_id}: it holds {}, {first} to {last}{gaps}", path.display(), counted(n, "grasp"));
     }
     found.grasp_id = grasp_id;
     Ok(found)

@@ -15,14 +15,13 @@ use blindgrasp_graph::client::words::warnings;
 use blindgrasp_graph::client::{Connection, Heard};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
 use blindgrasp_messages::{
-    Action, ContactSet, Fault, GraspFeature, Header, LiftDecision, Phase, Prediction, Record, Sense, TactileFrame,
-    with_sample,
+    Action, ContactSet, GraspFeature, Header, LiftDecision, Phase, Reason, Record, Sense, TactileFrame, with_sample,
 };
+use blindgrasp_operator::control_socket::tactile_path;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_pictures::{HandScene, link_poses};
 use blindgrasp_stages::{Hand, Judge, Judged, Model};
 use blindgrasp_viewer::{Abilities, Viewer};
-use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::super::{Outcome, print_line, stop_signal};
@@ -47,6 +46,8 @@ const MAX_LOG_LINES: usize = 100;
 const MAX_RECENT_CELLS: usize = 1 << 20;
 /// Labels of grasps that wait for their decision.
 const MAX_TRUTHS: usize = 256;
+/// Decisions that wait for their frame, and grasps whose settled feature is kept for the decision.
+const MAX_WAITING: usize = 64;
 
 /// Serves the page until the command is interrupted. A graph that ends may run again. With `waits`, it need not run yet, and the
 /// end of stdin ends the page: the process that started it has gone.
@@ -191,8 +192,6 @@ impl GraphPage<'_> {
         if let Some(event) = self.model.update(&now.status) {
             self.viewer.keep("model", &event);
         }
-        let mut params = now.status.nodes.iter().filter_map(|node| node.params.get("min_probability_stable"));
-        self.latest().min_probability_stable = params.next().and_then(Value::as_f64).unwrap_or_default();
         self.show_log();
     }
 
@@ -205,9 +204,11 @@ impl GraphPage<'_> {
     fn show_decision(&self) {
         let mut latest = self.latest();
         if std::mem::take(&mut latest.is_decided)
-            && let Some(decided) = latest.decisions.last()
+            && let Some(mut decided) = latest.decisions.pop()
         {
-            let event = decision_event(decided, &latest.truths);
+            latest.find_grounds(&mut decided, self.hand.as_ref(), &self.model);
+            let event = decision_event(&decided, &latest.truths);
+            latest.decisions.push(decided);
             drop(latest);
             self.viewer.keep("decision", &event.to_string());
         }
@@ -217,11 +218,18 @@ impl GraphPage<'_> {
     fn show_frame(&self) {
         let mut latest = self.latest();
         let mut taken = std::mem::take(&mut *latest);
-        // Labels wait for decisions that come later, and votes for more of their kind.
+        for mut decided in std::mem::take(&mut taken.decisions) {
+            if taken.is_before_frame_of(&decided) && latest.decisions.len() < MAX_WAITING {
+                latest.decisions.push(decided);
+            } else {
+                taken.find_grounds(&mut decided, self.hand.as_ref(), &self.model);
+                taken.decisions.push(decided);
+            }
+        }
+        // Labels wait for decisions that come later.
         latest.truths.clone_from(&taken.truths);
         latest.recent = std::mem::take(&mut taken.recent);
-        latest.votes = taken.votes;
-        latest.min_probability_stable = taken.min_probability_stable;
+        latest.settled = std::mem::take(&mut taken.settled);
         drop(latest);
         if let Some(decision) = &taken.shadow_decision {
             self.viewer.keep("shadow", &shadow_event(decision).to_string());
@@ -286,8 +294,11 @@ struct ShownFrame {
 /// A decision, and the frame that it was made about if that is known.
 struct Decided {
     key: GraspKey,
+    stamp_nanos: u64,
     decision: LiftDecision,
     frame: Option<ShownFrame>,
+    /// The two values that spoke most against an unstable grasp.
+    against: Option<String>,
 }
 
 /// The samples since the last tick.
@@ -298,6 +309,8 @@ struct Latest {
     recent: VecDeque<ShownFrame>,
     contacts: Option<ContactSet>,
     feature: Option<GraspFeature>,
+    /// The last settled feature of each of the last grasps, also of earlier ticks.
+    settled: BTreeMap<GraspKey, GraspFeature>,
     probabilities: Vec<f64>,
     /// Those of the model beside.
     shadow_probabilities: Vec<f64>,
@@ -309,52 +322,6 @@ struct Latest {
     truths: BTreeMap<GraspKey, bool>,
     /// The labels that are new: their decision may be on the page already.
     new_truths: Vec<(GraspKey, bool)>,
-    votes: Votes,
-    /// The arbiter's param.
-    min_probability_stable: f64,
-}
-
-/// The last settled predictions of a grasp that agree, as the arbiter counts them.
-#[derive(Clone, Copy, Default, Serialize)]
-struct Votes {
-    #[serde(skip)]
-    grasp: GraspKey,
-    /// A model agrees with itself only, and a reading that is sent again has one vote.
-    #[serde(skip)]
-    made_by: u64,
-    #[serde(skip)]
-    stamp_nanos: u64,
-    side: Side,
-    n: u32,
-}
-
-#[derive(Clone, Copy, Default, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-enum Side {
-    Stable,
-    #[default]
-    Unstable,
-    Unsure,
-}
-
-impl Votes {
-    fn count(&mut self, header: &Header, prediction: &Prediction, min_probability_stable: f64) {
-        let grasp = (header.epoch, prediction.grasp_id);
-        let side = match prediction {
-            Prediction { stable: true, probability_stable, .. } if *probability_stable >= min_probability_stable => {
-                Side::Stable
-            }
-            Prediction { stable: true, .. } | Prediction { unsure: true, .. } => Side::Unsure,
-            _ => Side::Unstable,
-        };
-        let is_same = self.grasp == grasp && self.made_by == header.made_by;
-        if is_same && self.n > 0 && self.stamp_nanos == header.stamp_nanos {
-            return;
-        }
-        let is_vote = prediction.phase == Phase::Settled && prediction.fault == Fault::None;
-        let n = if is_vote { if is_same && self.side == side { self.n + 1 } else { 1 } } else { 0 };
-        *self = Votes { grasp, made_by: header.made_by, stamp_nanos: header.stamp_nanos, side, n };
-    }
 }
 
 /// Reads a graph's edges. It takes each sample at once, so that no writer waits for a browser.
@@ -408,24 +375,28 @@ impl Latest {
                 self.frame = Some(shown);
             }
             Record::Contacts(sample) if is_shown => self.contacts = Some(sample.message),
-            Record::Feature(sample) if is_shown => self.feature = Some(sample.message),
+            Record::Feature(sample) if is_shown => {
+                if sample.message.phase == Phase::Settled {
+                    let key = (sample.header.epoch, sample.message.grasp_id);
+                    self.settled.insert(key, sample.message.clone());
+                    if self.settled.len() > MAX_WAITING {
+                        self.settled.pop_first();
+                    }
+                }
+                self.feature = Some(sample.message);
+            }
             Record::Prediction(sample) if is_shown => {
                 if self.probabilities.len() < MAX_PROBABILITIES {
                     self.probabilities.push(sample.message.probability_stable);
                 }
-                self.votes.count(&sample.header, &sample.message, self.min_probability_stable);
             }
             // Several a second, and nothing to look at.
             Record::Decision(sample) if sample.message.action == Action::GoOn => {}
             Record::Decision(sample) if is_shown => {
                 self.is_decided = true;
-                // An arbiter decides under the stamp of the last prediction, and that is the frame's.
                 let Header { epoch, stamp_nanos, .. } = sample.header;
-                let mut latest_first = self.recent.iter().rev();
-                let frame =
-                    latest_first.find(|shown| (shown.epoch, shown.stamp_nanos) == (epoch, stamp_nanos)).cloned();
-                let key = (epoch, sample.message.grasp_id);
-                self.decisions.push(Decided { key, decision: sample.message, frame });
+                let (key, decision) = ((epoch, sample.message.grasp_id), sample.message);
+                self.decisions.push(Decided { key, stamp_nanos, decision, frame: None, against: None });
             }
             Record::Truth(sample) => {
                 let key = (sample.header.epoch, sample.message.grasp_id);
@@ -440,11 +411,38 @@ impl Latest {
     }
 }
 
+impl Latest {
+    /// Whether the frame of a decision is still to come: a reader of many samples may be further with decisions than with frames.
+    fn is_before_frame_of(&self, decided: &Decided) -> bool {
+        let last = self.recent.back();
+        last.is_some_and(|last| last.epoch == decided.key.0 && last.stamp_nanos < decided.stamp_nanos)
+    }
+
+    /// Finds the frame of a decision, and the values that speak against an unstable grasp. An arbiter decides under the stamp of the last
+    /// prediction. That may be of the next grasp, so the last frame of the grasp itself is meant.
+    fn find_grounds(&self, decided: &mut Decided, hand: Option<&Hand>, model: &ShownModel) {
+        let key = decided.key;
+        let mut latest_first = self.recent.iter().rev();
+        let until = decided.stamp_nanos;
+        let frame = latest_first.find(|it| (it.epoch, it.frame.grasp_id) == key && it.stamp_nanos <= until);
+        decided.frame = frame.cloned();
+        // After a probe, another model has judged.
+        let is_settled = decided.frame.as_ref().is_none_or(|shown| shown.frame.phase == Phase::Settled);
+        if decided.decision.reason == Reason::Unstable
+            && is_settled
+            && let (Some(hand), Some(feature)) = (hand, self.settled.get(&key))
+        {
+            decided.against = model.speak_against(hand, feature);
+        }
+    }
+}
+
 /// Numbers are texts: JavaScript has no integers beyond 2^53.
 fn decision_event(decided: &Decided, truths: &BTreeMap<GraspKey, bool>) -> Value {
     let mut event = shadow_event(&decided.decision);
     event["epoch"] = decided.key.0.to_string().into();
     event["truth"] = json!(truths.get(&decided.key));
+    event["against"] = json!(decided.against);
     event
 }
 
@@ -458,7 +456,7 @@ pub(super) fn shadow_event(decision: &LiftDecision) -> Value {
 
 /// `None` if there is nothing new.
 fn frame_event(hand: Option<&Hand>, model: &ShownModel, latest: Latest) -> Option<String> {
-    let Latest { frame, contacts, feature, probabilities, shadow_probabilities, decisions, truths, votes, .. } = latest;
+    let Latest { frame, contacts, feature, probabilities, shadow_probabilities, decisions, truths, .. } = latest;
     if frame.is_none() && probabilities.is_empty() && decisions.is_empty() && latest.new_truths.is_empty() {
         return None;
     }
@@ -477,7 +475,6 @@ fn frame_event(hand: Option<&Hand>, model: &ShownModel, latest: Latest) -> Optio
     let labels: Vec<Value> = labels.collect();
     let mut event = json!({
         "probabilities": probabilities, "shadow": shadow_probabilities, "decisions": decisions, "labels": labels,
-        "votes": votes,
     });
     if let Some(feature) = feature {
         event["feature"] = json!(feature.values);
@@ -514,6 +511,10 @@ fn graph_event(now: &Look, before: Option<&Look>) -> anyhow::Result<String> {
     event["warnings"] = json!(warnings(&now.status));
     let params = now.status.nodes.iter().map(|node| (&node.node, &node.params));
     event["params"] = json!(params.collect::<BTreeMap<_, _>>());
+    if let Some(node) = now.status.nodes.iter().find(|node| node.params.get("driver") == Some(&"listen".into())) {
+        let usual = tactile_path().map_or(Value::Null, |path| format!("unix:{}", path.display()).into());
+        event["listens"] = node.params.get("address").cloned().unwrap_or(usual);
+    }
     Ok(event.to_string())
 }
 
@@ -524,6 +525,27 @@ mod tests {
     use super::*;
 
     const EPOCH: u64 = 1_795_879_623_871_224_034;
+
+    #[test]
+    fn a_decision_waits_for_the_frame_of_its_own_grasp() {
+        let mut latest = Latest::default();
+        let at = |stamp_nanos| Header { epoch: 1, stamp_nanos, ..Header::default() };
+        let frame = |grasp_id, stamp_nanos| -> Record {
+            Stamped { header: at(stamp_nanos), message: TactileFrame { grasp_id, ..TactileFrame::default() } }.into()
+        };
+        latest.take(frame(5, 10), true);
+        // The first frame of the next grasp decides, and is not read yet.
+        let decision = LiftDecision { grasp_id: 5, ..LiftDecision::default() };
+        latest.take(Stamped { header: at(30), message: decision }.into(), true);
+        let mut decided = latest.decisions.pop().expect("a decision");
+        assert!(latest.is_before_frame_of(&decided));
+        latest.take(frame(5, 20), true);
+        latest.take(frame(6, 30), true);
+        assert!(!latest.is_before_frame_of(&decided));
+        latest.find_grounds(&mut decided, None, &ShownModel::default());
+        let found = decided.frame.expect("its frame");
+        assert_eq!((found.frame.grasp_id, found.stamp_nanos), (5, 20));
+    }
 
     #[test]
     fn the_page_tells_no_epoch_and_labels_find_their_decision() {
@@ -545,7 +567,10 @@ mod tests {
         for record in records {
             reader.take("/topic", record, 0).expect("taken");
         }
-        let latest = std::mem::take(&mut *latest.lock().expect("a lock"));
+        let mut latest = std::mem::take(&mut *latest.lock().expect("a lock"));
+        let mut decided = latest.decisions.pop().expect("a decision");
+        latest.find_grounds(&mut decided, None, &ShownModel::default());
+        latest.decisions.push(decided);
         let event = frame_event(Some(&hand), &ShownModel::default(), latest).expect("an event");
         assert!(!event.contains(&EPOCH.to_string()), "{event}");
         let event: Value = serde_json::from_str(&event).expect("JSON");

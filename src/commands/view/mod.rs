@@ -150,11 +150,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         refuse("--view-control and --foxglove are for the page of a running graph: name one");
     }
     let is_recording = arguments.file.extension().is_some_and(|extension| extension == "mcap");
-    if arguments.port.is_some() && !is_recording {
-        refuse("--port is for the page of a running graph or a recording: name one");
-    }
-    if shadow.is_some() && !is_recording {
-        refuse("--shadow is for the page of a running graph or a recording: name one");
+    if (arguments.port.is_some() || shadow.is_some()) && !is_recording {
+        refuse("--port and --shadow are for the page of a running graph or a recording: name one");
     }
     if hand::is_hand(&arguments.file) {
         let Some(out) = &arguments.out else {

@@ -4,7 +4,9 @@ use std::path::Path;
 
 use anyhow::Context;
 use blindgrasp_graph::control::GraphStatus;
+use blindgrasp_messages::GraspFeature;
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_stages::Hand;
 use blindgrasp_stages::encoder::Block;
 use blindgrasp_stages::model::Model;
 use serde_json::{Value, json};
@@ -42,6 +44,12 @@ impl ShownModel {
         Some(self.event().to_string())
     }
 
+    /// The two values of a settled feature that speak most against the grasp.
+    pub(super) fn speak_against(&self, hand: &Hand, feature: &GraspFeature) -> Option<String> {
+        let model = self.model.as_ref().filter(|model| model.dictionary_id() == feature.dictionary_id)?;
+        model.speak_against(&model.features.value_names(hand), &feature.values)
+    }
+
     fn event(&self) -> Value {
         let Some(Model { features, classifier, .. }) = &self.model else { return Value::Null };
         let blocks = features.blocks.iter().map(|block| json!({"name": block, "n_values": features.block_len(*block)}));
@@ -64,14 +72,8 @@ impl ShownModel {
         }
         let Some(at) = features.blocks.iter().position(|block| *block == Block::Histogram) else { return Vec::new() };
         let first: usize = features.blocks[..at].iter().map(|block| features.block_len(*block)).sum();
-        let unscaled = (first..first + features.dictionary.len()).map(|idx| match &features.scaling {
-            Some(scaling) if scaling.per_deviation[idx] > 0.0 => {
-                values[idx] / scaling.per_deviation[idx] + scaling.mean[idx]
-            }
-            Some(scaling) => scaling.mean[idx],
-            None => values[idx],
-        });
-        unscaled.collect()
+        let words = first..first + features.dictionary.len();
+        words.map(|idx| features.unscaled(idx, values[idx])).collect()
     }
 }
 

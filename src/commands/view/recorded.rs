@@ -10,6 +10,7 @@ use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::decide::decide_alone;
 use blindgrasp_messages::{Action, ContactSet, GraspTruth, LiftDecision, Phase, Recorded as _, Stamped, TactileFrame};
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::text::counted;
 use blindgrasp_pictures::{HandScene, ObjectScene};
 use blindgrasp_recording::{ChosenSamples, Reach, Record};
 use blindgrasp_stages::{Hand, Judge};
@@ -68,7 +69,7 @@ pub(super) fn show(
     let first = match arguments.grasp {
         None => 0,
         Some(id) => list.keys().position(|known| *known == id).ok_or_else(|| {
-            anyhow::anyhow!("{} has no grasp {id}: it has {} grasps", recording.display(), list.len())
+            anyhow::anyhow!("{} has no grasp {id}: it has {}", recording.display(), counted(list.len(), "grasp"))
         })?,
     };
     let scene = serde_json::to_string(&HandScene::new(&hand))?;
@@ -155,7 +156,9 @@ struct Samples {
 impl ShownReading {
     /// The frames of a grasp, with contacts and probability where the recording has them, and the object.
     fn grasp(&mut self, idx: usize) -> anyhow::Result<String> {
-        let Some((id, listed)) = self.list.iter().nth(idx) else { bail!("there are {} grasps", self.list.len()) };
+        let Some((id, listed)) = self.list.iter().nth(idx) else {
+            bail!("the recording has {}", counted(self.list.len(), "grasp"))
+        };
         let most = MAX_FRAMES.min(MAX_READINGS / self.hand.n_cells().max(1) as u64).max(1);
         let step = listed.n_frames.div_ceil(most).max(1);
         let Samples { frames, contacts, probabilities, object } = self.samples(*id, listed, step)?;

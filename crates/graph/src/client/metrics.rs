@@ -20,6 +20,7 @@ use prometheus_client::registry::{Registry, Unit};
 use crate::client;
 use crate::client::usage::{ProcessUsage, usage};
 use crate::control::{EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus};
+use blindgrasp_messages::Reason;
 use blindgrasp_operator::ages::Ages;
 use blindgrasp_operator::link_status::{ChannelStatus, LinkStatus, PeerState};
 
@@ -169,8 +170,11 @@ impl Collector for Figures {
         if let Some(link) = &self.status.link {
             self.link(link, encoder)?;
         }
-        let decided = [("lift", decisions.n_lift), ("hold", decisions.n_hold)];
-        let decided = decided.map(|(action, n)| (vec![of_graph, ("action", action)], n));
+        let mut decided =
+            vec![(vec![of_graph, ("action", "lift"), ("reason", Reason::Stable.as_str())], decisions.n_lift)];
+        for (reason, n) in &decisions.holds {
+            decided.push((vec![of_graph, ("action", "hold"), ("reason", reason)], *n));
+        }
         counter(encoder, "decisions", "Grasps decided", decided)?;
         let help = "Grasps lifted that were unstable, where the source knows the truth";
         counter(encoder, "false_positives", help, [(vec![of_graph], decisions.n_false_positives)])
@@ -324,6 +328,8 @@ fn flag(is_so: bool) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
 
     #[test]
@@ -339,6 +345,35 @@ mod tests {
         }
         assert!(is_for_loopback("GET / HTTP/1.0\r\n\r\n"), "not a browser's");
         assert!(!is_for_loopback(&head("localhost\r\nHost: evil.example")));
+    }
+
+    #[test]
+    fn the_dashboard_asks_for_figures_that_there_are() {
+        let text = text(crate::testing::made_status("gate")).expect("figures");
+        let mut names = BTreeSet::new();
+        for line in text.lines() {
+            if let Some((name, kind)) = line.strip_prefix("# TYPE ").and_then(|line| line.split_once(' ')) {
+                let ending = match kind {
+                    "counter" => "_total",
+                    "histogram" => "_bucket",
+                    _ => "",
+                };
+                names.insert(format!("{name}{ending}"));
+            }
+        }
+        let dashboard = include_str!("../../../../docs/grafana.json");
+        let dashboard: serde_json::Value = serde_json::from_str(dashboard).expect("JSON");
+        for panel in dashboard["panels"].as_array().expect("panels") {
+            for target in panel["targets"].as_array().expect("targets") {
+                let asked = target["expr"].as_str().expect("an expression");
+                let words = asked.split(|char: char| !char.is_ascii_alphanumeric() && char != '_');
+                let found: Vec<&str> = words.filter(|word| word.starts_with("blindgrasp_")).collect();
+                assert!(!found.is_empty() && found.iter().all(|name| names.contains(*name)), "{asked}: {names:?}");
+            }
+        }
+        for label in ["action=\"hold\",reason=\"no_contact\"", "action=\"lift\",reason=\"stable\""] {
+            assert!(text.contains(label), "{text}");
+        }
     }
 
     #[test]

@@ -1,6 +1,9 @@
 //! The state of a graph in words for people.
 
+use std::collections::BTreeMap;
+
 use crate::control::{EdgeStatus, GraphState, GraphStatus, NodeState};
+use crate::log::printable;
 use blindgrasp_operator::link_status::{PeerState, PeerStatus};
 use blindgrasp_operator::wiring::EdgePolicy;
 
@@ -77,6 +80,12 @@ pub fn node_state_word(state: NodeState) -> &'static str {
         NodeState::Done => "done",
         NodeState::Failed => "FAILED",
     }
+}
+
+/// The counts of a node in words, without zeros.
+pub fn shown_counts(counts: &BTreeMap<String, u64>) -> Vec<String> {
+    let counted = counts.iter().filter(|(_, count)| **count > 0);
+    counted.map(|(name, count)| printable(&format!("{name} {count}"))).collect()
 }
 
 /// A duration in at most six letters.

@@ -84,7 +84,10 @@ impl<S: RunSink> RunLog<S> {
         let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
         match decided.action {
             Action::Lift => status.n_lift += 1,
-            Action::Hold => status.n_hold += 1,
+            Action::Hold => {
+                status.n_hold += 1;
+                *status.holds.entry(decided.reason.as_str().into()).or_default() += 1;
+            }
             _ => {}
         }
         status.n_false_positives += u64::from(decided.is_false_positive());
