@@ -95,6 +95,13 @@ pub enum TrainingError {
     Boosting(#[from] BoostingError),
     #[error("the calibration")]
     Calibration(#[from] PlattError),
+    /// No look keeps the bound of drops that was asked for.
+    #[error("{why}")]
+    Promise {
+        why: String,
+        /// The least bound that a look has; 1 if none has one.
+        at_most: f64,
+    },
     /// Training failed, perhaps because cells lie where the hand touches nothing.
     #[error(
         "no cell feels {n_unfelt} of the {n_grasps} grasps, and they teach nothing; lay cells where the hand touches objects \
@@ -104,6 +111,17 @@ pub enum TrainingError {
     /// Recordings or options that cannot be trained with.
     #[error("{0}")]
     Data(String),
+}
+
+impl TrainingError {
+    /// The share of drops that more lenient options could promise.
+    pub fn best_bound(&self) -> Option<f64> {
+        match self {
+            TrainingError::Promise { at_most, .. } if *at_most < 1.0 => Some(*at_most),
+            TrainingError::Unfelt { source, .. } => source.best_bound(),
+            _ => None,
+        }
+    }
 }
 
 /// The result of a recipe before calibration.
@@ -187,7 +205,9 @@ fn train_checked(
         progress("choosing thresholds for trials");
         let of_lifts = !read.labels.contains_key(&Label::WrenchSpace);
         let promises = of_lifts && !recipe.day_baseline;
-        training.policies = choose_thresholds(aim, promises, &judged, &mut classifier, &mut probes, &mut progress)?;
+        let n_grasps = read.grasps.len();
+        training.policies =
+            choose_thresholds(aim, promises, n_grasps, &judged, &mut classifier, &mut probes, &mut progress)?;
     }
     Ok(Model {
         format: FORMAT.into(),

@@ -33,17 +33,46 @@ struct Chosen {
     promise: Option<Promise>,
 }
 
+/// Why a look has no policy.
+struct Refusal {
+    why: String,
+    /// The share of drops that its strictest threshold promises; 1 if it promises nothing.
+    at_most: f64,
+    /// The share of drops that was allowed.
+    max_drops: f64,
+    /// The share of drops that was found.
+    estimate: f64,
+}
+
+/// Farther than from so many times the grasps, a bound is not foretold.
+const MOST_TIMES: f64 = 20.0;
+
+impl Refusal {
+    /// The reason, and what to do. `n_grasps` were recorded.
+    fn told(&self, n_grasps: usize) -> String {
+        // The bound comes nearer to the estimate with the root of the number of objects, as a rule.
+        let times = ((self.at_most - self.estimate) / (self.max_drops - self.estimate)).powi(2);
+        let more = if self.at_most >= 1.0 {
+            "more grasps of more objects".into()
+        } else if self.estimate < self.max_drops && times <= MOST_TIMES {
+            let hundreds = ((times - 1.0) * n_grasps as f64 / 100.0).ceil().max(1.0);
+            format!("about {:.0} more grasps of more objects, or allow more drops", 100.0 * hundreds)
+        } else {
+            "many times as many grasps, or allow more drops".into()
+        };
+        format!("{}: record {more}", self.why)
+    }
+}
+
 impl Aim {
     /// Chooses the policy of a look. The error is the reason why the look has none.
-    fn choose(self, policies: &Policies, look: Phase) -> Result<Chosen, String> {
+    fn choose(self, policies: &Policies, look: Phase) -> Result<Chosen, Refusal> {
+        let nothing = |why: String| Refusal { why, at_most: 1.0, max_drops: 1.0, estimate: 1.0 };
         let max_drops = match self {
             Aim::MaxDrops(max_drops) => max_drops,
             Aim::DropSecs(drop_secs) => {
                 let Some(policy) = policies.cheapest(drop_secs) else {
-                    return Err(format!(
-                        "no threshold leads to a lift when the hand is {}: record more grasps of more objects",
-                        look.as_str()
-                    ));
+                    return Err(nothing(format!("no threshold leads to a lift when the hand is {}", look.as_str())));
                 };
                 return Ok(Chosen { look, policy, drop_secs, promise: policies.promise(drop_secs) });
             }
@@ -64,14 +93,18 @@ impl Aim {
             return Ok(Chosen { look, policy, drop_secs, promise: Some(promise) });
         }
         Err(match policies.promise(DROP_SECS[0]) {
-            None => format!("nothing is lifted when the hand is {}: record more grasps of more objects", look.as_str()),
-            Some(promise) => format!(
-                "when the hand is {}, the strictest threshold promises at most {:.1} % of the lifts to drop, from {} objects: \
-                 record more objects, or allow more drops",
-                look.as_str(),
-                100.0 * promise.drops_of_lifts.at_most,
-                promise.drops_of_lifts.n_objects
-            ),
+            None => nothing(format!("nothing is lifted when the hand is {}", look.as_str())),
+            Some(Promise { drops_of_lifts: Bounded { estimate, at_most, n_objects }, .. }) => Refusal {
+                why: format!(
+                    "when the hand is {}, the strictest threshold promises at most {:.1} % of the lifts to drop, from \
+                     {n_objects} objects",
+                    look.as_str(),
+                    100.0 * at_most
+                ),
+                at_most,
+                max_drops,
+                estimate,
+            },
         })
     }
 }
@@ -93,10 +126,11 @@ impl Chosen {
 
 /// Chooses the thresholds and sets them. A look without a policy never lifts. Attempts are grasps with contact: those that no
 /// cell feels are attempts of a robot as well, and are not counted. `promises` says whether the labels are outcomes of lifts, for
-/// which a promise can be made.
+/// which a promise can be made; `n_grasps` were recorded.
 pub(super) fn choose_thresholds(
     aim: Aim,
     promises: bool,
+    n_grasps: usize,
     judged: &OutOfFold<'_>,
     classifier: &mut Classifier,
     probes: &mut LearnedProbes,
@@ -112,7 +146,9 @@ pub(super) fn choose_thresholds(
     let settled = out_of_fold_probabilities(judged)?;
     let (chosen_looks, refusals) = choose_looks(aim, judged, &settled, probes);
     if chosen_looks.is_empty() || matches!(aim, Aim::DropSecs(_)) && !refusals.is_empty() {
-        return Err(TrainingError::Data(refusals.join("; ")));
+        let told: Vec<String> = refusals.iter().map(|refusal| refusal.told(n_grasps)).collect();
+        let at_most = refusals.iter().map(|refusal| refusal.at_most).fold(1.0, f64::min);
+        return Err(TrainingError::Promise { why: told.join("; "), at_most });
     }
     classifier.threshold_probability = NEVER;
     let stable: Vec<bool> = judged.examples.iter().map(|example| example.stable).collect();
@@ -149,7 +185,7 @@ pub(super) fn choose_thresholds(
     }
     classifier.unsure_from_probability = unsure_from;
     for refusal in refusals {
-        progress(&format!("not lifted: {refusal}"));
+        progress(&format!("not lifted: {}", refusal.told(n_grasps)));
     }
     Ok(summaries)
 }
@@ -160,7 +196,7 @@ fn choose_looks(
     judged: &OutOfFold<'_>,
     settled: &[f64],
     probes: &mut LearnedProbes,
-) -> (Vec<Chosen>, Vec<String>) {
+) -> (Vec<Chosen>, Vec<Refusal>) {
     let (mut chosen_looks, mut refusals) = (Vec::new(), Vec::new());
     let mut stable_from = [NEVER; 2];
     for look in LOOKS {
@@ -207,4 +243,19 @@ fn attempts(judged: &OutOfFold<'_>, settled: &[f64], probes: &LearnedProbes, loo
         });
     }
     attempts
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_refusal_says_how_many_more_grasps_to_record() {
+        let told = |at_most, estimate| Refusal { why: "why".into(), at_most, max_drops: 0.1, estimate }.told(600);
+        // From 0.13 to 0.1 above 0.05: (8 / 5)^2 - 1 = 1.56 times as many more.
+        assert_eq!(told(0.13, 0.05), "why: record about 1000 more grasps of more objects, or allow more drops");
+        assert_eq!(told(0.13, 0.11), "why: record many times as many grasps, or allow more drops");
+        assert_eq!(told(0.3, 0.09), "why: record many times as many grasps, or allow more drops");
+        assert_eq!(told(1.0, 1.0), "why: record more grasps of more objects");
+    }
 }
