@@ -9,7 +9,7 @@ use serde_json::json;
 
 use super::evaluate::command_line;
 use super::simulate::complete_folder;
-use super::{Outcome, number_in, percent, print_line, print_text, write_out, write_report};
+use super::{Outcome, number_in, percent, print_line, print_text, word, write_out, write_report};
 use blindgrasp_cli::graph_file::{OnMisfit, able_to_begin};
 use blindgrasp_cli::{in_shell, stop_signal};
 use blindgrasp_graph::dataflow::{self, Override, Scope};
@@ -39,7 +39,7 @@ const PROMISED_DROPS: f64 = 0.1;
 const WORST_BOUND: f64 = 0.5;
 /// The lifts that are made first. They take minutes, and fewer seldom tell kept objects from dropped ones.
 const FIRST_LIFTS: usize = 500;
-/// The lifts of a part, of which an interruption loses one.
+/// The lifts of a part. An interruption loses those of one part.
 const LIFTS_PER_PART: usize = 100;
 /// The page of the lifts that judge the model.
 const REPORT: &str = "report.html";
@@ -63,6 +63,9 @@ pub(super) struct Arguments {
     /// The bound: at most this share of the lifts drops, with 95 % confidence, for new objects like those lifted.
     #[arg(long, value_name = "SHARE", default_value_t = PROMISED_DROPS, value_parser = |text: &str| number_in(text, 1e-4..=WORST_BOUND))]
     max_drops: f64,
+    /// The probe that the arm can make before it decides: test_lift, by 10 mm, squeeze or none.
+    #[arg(long, default_value = "test_lift", value_parser = |text: &str| word::<Probe>(text, "none, squeeze or test_lift"))]
+    probe: Probe,
     /// The robot does not see where objects are, so that the palm comes from anywhere.
     #[arg(long)]
     blind: bool,
@@ -90,11 +93,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let job = Job { arguments, hand, options, out, stop: &stop };
     let learned = job.learn()?;
     learned.model.save(&job.model_path())?;
-    let probe = probe_of(&learned.model).context("expected a model with a promise")?;
-    let score = job.judge(&learned.model, probe)?;
-    job.start(&learned, probe, &score)?;
+    let look = look_of(&learned.model).context("expected a model with a promise")?;
+    let score = job.judge(&learned.model, look.1)?;
+    job.start(&learned, look, &score)?;
     if let Some(why) = learned.why_not {
-        bail!("the bound of {} is not reached: {why}", percent(Some(arguments.max_drops)));
+        let (asked, n) = (percent(Some(arguments.max_drops)), learned.n_lifts);
+        bail!("the bound of {asked} is not reached: {why}; --lifts {} goes on from these {n} lifts", 2 * n);
     }
     // The share of drops is at least what remains of the largest share that may be kept.
     let least_drops = 1.0 - drops_at_most(score.n_false_positive as u64, score.n_true_positive as u64);
@@ -139,39 +143,26 @@ impl Job<'_> {
                 continue;
             }
             let error = match self.train(&recordings, max_drops) {
-                Ok(model) => {
-                    self.say(&format!("{n_lifts} lifts: the bound of {} is reached", percent(Some(max_drops))))?;
-                    return Ok(Learned { model, n_lifts, bound: max_drops, why_not: None });
-                }
+                Ok(model) => return Ok(Learned { model, n_lifts, bound: max_drops, why_not: None }),
                 Err(TrainingError::Dataset(error)) => return Err(error.into()),
                 Err(error) => error,
             };
-            if is_last {
-                return self.with_weaker_bound(&recordings, n_lifts, error);
+            let best = error.best_bound().unwrap_or(1.0);
+            let why = format!("{:#}", anyhow::Error::from(error));
+            if !is_last {
+                let so_far = if best < 1.0 { format!("the bound is {} so far", percent(Some(best))) } else { why };
+                print_diagnostic(&format!("{n_lifts} lifts: {so_far}; more lifts follow"));
+                continue;
             }
-            let so_far = match error.best_bound() {
-                Some(bound) => format!("at most {} of the lifts drop so far", percent(Some(bound))),
-                None => format!("{:#}", anyhow::Error::from(error)),
-            };
-            self.say(&format!("{n_lifts} lifts: {so_far}; more lifts follow"))?;
+            if best > WORST_BOUND {
+                bail!("no model is written: {why}; --lifts {} goes on from these {n_lifts} lifts", 2 * n_lifts);
+            }
+            // The model promises the bound that these lifts allow.
+            let bound = (100.0 * best).ceil() / 100.0;
+            let model = self.train(&recordings, bound)?;
+            return Ok(Learned { model, n_lifts, bound, why_not: Some(why) });
         }
         bail!("no lift was made")
-    }
-
-    /// Trains a model that promises the bound which these lifts allow.
-    fn with_weaker_bound(
-        &self,
-        recordings: &[PathBuf],
-        n_lifts: usize,
-        error: TrainingError,
-    ) -> anyhow::Result<Learned> {
-        let best = error.best_bound();
-        let why = format!("{:#}; --lifts {} goes on from the {n_lifts} lifts", anyhow::Error::from(error), 2 * n_lifts);
-        let Some(best) = best.filter(|best| *best <= WORST_BOUND) else { bail!("no model is written: {why}") };
-        let bound = (100.0 * best).ceil() / 100.0;
-        let model = self.train(recordings, bound)?;
-        self.say(&format!("{n_lifts} lifts: a bound of {} is reached", percent(Some(bound))))?;
-        Ok(Learned { model, n_lifts, bound, why_not: Some(why) })
     }
 
     fn simulate(&self, objects: &str, folder: &Path, n_lifts: usize, nth: u64) -> anyhow::Result<()> {
@@ -182,7 +173,15 @@ impl Job<'_> {
 
     fn train(&self, recordings: &[PathBuf], max_drops: f64) -> Result<Model, TrainingError> {
         print_diagnostic("training …");
-        let read = Examples::read(&self.hand, recordings, |_, _| {})?;
+        let mut read = Examples::read(&self.hand, recordings, |_, _| {})?;
+        for example in &mut read.examples {
+            if self.arguments.probe == Probe::None {
+                example.squeezed = None;
+            }
+            if self.arguments.probe != Probe::TestLift {
+                example.test_lifted = None;
+            }
+        }
         let options = TrainingOptions { aim: Some(Aim::MaxDrops(max_drops)), ..TrainingOptions::default() };
         train(&self.hand, &read, recordings, &options, |step| {
             if self.stop.load(Ordering::Relaxed) {
@@ -216,13 +215,12 @@ impl Job<'_> {
     }
 
     /// Prints the results and the command that starts the graph, and checks the command as `run --check` does.
-    fn start(&self, learned: &Learned, probe: Probe, score: &Score) -> anyhow::Result<()> {
+    fn start(&self, learned: &Learned, (_, probe, param, words): Look, score: &Score) -> anyhow::Result<()> {
         let mut dataflow = PathBuf::from(DATAFLOW.0);
         if !dataflow.is_file() {
             dataflow = self.out.join(DATAFLOW.0);
             write_out(&dataflow, DATAFLOW.1)?;
         }
-        let (param, look) = words(probe);
         let (model, report) = (self.model_path(), self.out.join(REPORT));
         let mut settings =
             vec![("hand", self.arguments.hand.display().to_string()), ("model", model.display().to_string())];
@@ -244,7 +242,7 @@ impl Job<'_> {
         } else {
             let bound = percent(Some(learned.bound));
             print_line(&format!(
-                "decided {look}, at most {bound} of the lifts of new objects drop (95 % confidence, in simulation)"
+                "decided {words}, at most {bound} of the lifts of new objects drop (95 % confidence, in simulation)"
             ))?;
             print_line(&format!(
                 "judged on {} lifts of objects that had no part in it: {} of them keep the object; the model makes {}, of which {} do",
@@ -261,15 +259,6 @@ impl Job<'_> {
 
     fn model_path(&self) -> PathBuf {
         self.out.join("model.json")
-    }
-
-    /// Prints a line for people. With `--json`, stdout is for the results.
-    fn say(&self, line: &str) -> std::io::Result<()> {
-        if self.arguments.json {
-            print_diagnostic(line);
-            return Ok(());
-        }
-        print_line(line)
     }
 }
 
@@ -312,26 +301,20 @@ fn options(arguments: &Arguments) -> anyhow::Result<SimulatorOptions> {
     Ok(options)
 }
 
-/// The probe after which the model keeps its bound: the one that feels most.
-fn probe_of(model: &Model) -> Option<Probe> {
-    let looks =
-        [(Phase::TestLifted, Probe::TestLift), (Phase::Squeezed, Probe::Squeeze), (Phase::Settled, Probe::None)];
-    for (look, probe) in looks {
-        let of_look = model.training.policies.iter().find(|policy| policy.look == look.as_str());
-        if of_look.is_some_and(|policy| policy.promise.is_some()) {
-            return Some(probe);
-        }
-    }
-    None
-}
+/// A look that may decide: its phase, the arbiter's param `probe`, and words for it.
+type Look = (Phase, Probe, &'static str, &'static str);
 
-/// The value of the arbiter's param, and when it decides.
-fn words(probe: Probe) -> (&'static str, &'static str) {
-    match probe {
-        Probe::None => ("none", "when the hand has settled"),
-        Probe::Squeeze => ("squeeze", "after a squeeze"),
-        Probe::TestLift => ("test_lift", "after a test lift"),
-    }
+/// The look that keeps the bound; the one that feels most, if several do.
+fn look_of(model: &Model) -> Option<Look> {
+    let looks = [
+        (Phase::TestLifted, Probe::TestLift, "test_lift", "after a test lift"),
+        (Phase::Squeezed, Probe::Squeeze, "squeeze", "after a squeeze"),
+        (Phase::Settled, Probe::None, "none", "when the hand has settled"),
+    ];
+    let policies = &model.training.policies;
+    let is_promised =
+        |look: &Look| policies.iter().any(|policy| policy.look == look.0.as_str() && policy.promise.is_some());
+    looks.into_iter().find(is_promised)
 }
 
 #[cfg(test)]

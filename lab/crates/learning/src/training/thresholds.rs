@@ -33,46 +33,35 @@ struct Chosen {
     promise: Option<Promise>,
 }
 
-/// Why a look has no policy.
+/// Why a look has no policy, and the least bound on drops that it has; 1 for none.
 struct Refusal {
     why: String,
-    /// The share of drops that its strictest threshold promises; 1 if it promises nothing.
     at_most: f64,
-    /// The share of drops that was allowed.
-    max_drops: f64,
-    /// The share of drops that was found.
-    estimate: f64,
 }
 
-/// Farther than from so many times the grasps, a bound is not foretold.
-const MOST_TIMES: f64 = 20.0;
-
-impl Refusal {
-    /// The reason, and what to do. `n_grasps` were recorded.
-    fn told(&self, n_grasps: usize) -> String {
-        // The bound comes nearer to the estimate with the root of the number of objects, as a rule.
-        let times = ((self.at_most - self.estimate) / (self.max_drops - self.estimate)).powi(2);
-        let more = if self.at_most >= 1.0 {
-            "more grasps of more objects".into()
-        } else if self.estimate < self.max_drops && times <= MOST_TIMES {
-            let hundreds = ((times - 1.0) * n_grasps as f64 / 100.0).ceil().max(1.0);
-            format!("about {:.0} more grasps of more objects, or allow more drops", 100.0 * hundreds)
-        } else {
-            "many times as many grasps, or allow more drops".into()
-        };
-        format!("{}: record {more}", self.why)
+/// How many more grasps a bound needs that is missed after `n_grasps`: it comes nearer to the estimate with the root of the number of
+/// grasps, as a rule. Beyond so many times the grasps nothing is foretold.
+fn more_grasps(found: Bounded, max_drops: f64, n_grasps: usize) -> String {
+    const MOST_TIMES: f64 = 20.0;
+    let times = ((found.at_most - found.estimate) / (max_drops - found.estimate)).powi(2);
+    if found.estimate >= max_drops || times > MOST_TIMES {
+        return "many times as many grasps".into();
     }
+    format!("about {:.0} more grasps of more objects", ((times - 1.0) * n_grasps as f64 / 100.0).ceil() * 100.0)
 }
 
 impl Aim {
     /// Chooses the policy of a look. The error is the reason why the look has none.
-    fn choose(self, policies: &Policies, look: Phase) -> Result<Chosen, Refusal> {
-        let nothing = |why: String| Refusal { why, at_most: 1.0, max_drops: 1.0, estimate: 1.0 };
+    fn choose(self, policies: &Policies, look: Phase, n_grasps: usize) -> Result<Chosen, Refusal> {
         let max_drops = match self {
             Aim::MaxDrops(max_drops) => max_drops,
             Aim::DropSecs(drop_secs) => {
                 let Some(policy) = policies.cheapest(drop_secs) else {
-                    return Err(nothing(format!("no threshold leads to a lift when the hand is {}", look.as_str())));
+                    let why = format!(
+                        "no threshold leads to a lift when the hand is {}: record more grasps of more objects",
+                        look.as_str()
+                    );
+                    return Err(Refusal { why, at_most: 1.0 });
                 };
                 return Ok(Chosen { look, policy, drop_secs, promise: policies.promise(drop_secs) });
             }
@@ -92,20 +81,20 @@ impl Aim {
             promise.drops_of_trials = Bounded { at_most: max_drops, ..promise.drops_of_trials };
             return Ok(Chosen { look, policy, drop_secs, promise: Some(promise) });
         }
-        Err(match policies.promise(DROP_SECS[0]) {
-            None => nothing(format!("nothing is lifted when the hand is {}", look.as_str())),
-            Some(Promise { drops_of_lifts: Bounded { estimate, at_most, n_objects }, .. }) => Refusal {
-                why: format!(
-                    "when the hand is {}, the strictest threshold promises at most {:.1} % of the lifts to drop, from \
-                     {n_objects} objects",
-                    look.as_str(),
-                    100.0 * at_most
-                ),
-                at_most,
-                max_drops,
-                estimate,
-            },
-        })
+        let look = look.as_str();
+        let Some(promise) = policies.promise(DROP_SECS[0]) else {
+            let why = format!("nothing is lifted when the hand is {look}: record more grasps of more objects");
+            return Err(Refusal { why, at_most: 1.0 });
+        };
+        let found = promise.drops_of_lifts;
+        let why = format!(
+            "when the hand is {look}, the strictest threshold promises at most {:.1} % of the lifts to drop, from {} objects: record \
+             {}, or allow more drops",
+            100.0 * found.at_most,
+            found.n_objects,
+            more_grasps(found, max_drops, n_grasps)
+        );
+        Err(Refusal { why, at_most: found.at_most })
     }
 }
 
@@ -144,11 +133,11 @@ pub(super) fn choose_thresholds(
         ));
     }
     let settled = out_of_fold_probabilities(judged)?;
-    let (chosen_looks, refusals) = choose_looks(aim, judged, &settled, probes);
+    let (chosen_looks, refusals) = choose_looks(aim, n_grasps, judged, &settled, probes);
     if chosen_looks.is_empty() || matches!(aim, Aim::DropSecs(_)) && !refusals.is_empty() {
-        let told: Vec<String> = refusals.iter().map(|refusal| refusal.told(n_grasps)).collect();
         let at_most = refusals.iter().map(|refusal| refusal.at_most).fold(1.0, f64::min);
-        return Err(TrainingError::Promise { why: told.join("; "), at_most });
+        let why = refusals.into_iter().map(|refusal| refusal.why).collect::<Vec<_>>().join("; ");
+        return Err(TrainingError::Promise { why, at_most });
     }
     classifier.threshold_probability = NEVER;
     let stable: Vec<bool> = judged.examples.iter().map(|example| example.stable).collect();
@@ -185,7 +174,7 @@ pub(super) fn choose_thresholds(
     }
     classifier.unsure_from_probability = unsure_from;
     for refusal in refusals {
-        progress(&format!("not lifted: {}", refusal.told(n_grasps)));
+        progress(&format!("not lifted: {}", refusal.why));
     }
     Ok(summaries)
 }
@@ -193,6 +182,7 @@ pub(super) fn choose_thresholds(
 /// Chooses the policies of all looks that the model has, and says why looks have none.
 fn choose_looks(
     aim: Aim,
+    n_grasps: usize,
     judged: &OutOfFold<'_>,
     settled: &[f64],
     probes: &mut LearnedProbes,
@@ -203,7 +193,8 @@ fn choose_looks(
         if look != Phase::Settled && probes.after(look).is_none() {
             continue;
         }
-        match aim.choose(&Policies::new(&attempts(judged, settled, probes, look), look, stable_from), look) {
+        let policies = Policies::new(&attempts(judged, settled, probes, look), look, stable_from);
+        match aim.choose(&policies, look, n_grasps) {
             Ok(chosen) => {
                 match (look, aim) {
                     (Phase::Settled, _) => stable_from[0] = chosen.policy.thresholds.lift,
@@ -250,12 +241,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_refusal_says_how_many_more_grasps_to_record() {
-        let told = |at_most, estimate| Refusal { why: "why".into(), at_most, max_drops: 0.1, estimate }.told(600);
+    fn a_bound_that_is_missed_says_how_many_more_grasps_it_needs() {
+        let more = |at_most, estimate| more_grasps(Bounded { estimate, at_most, n_objects: 80 }, 0.1, 600);
         // From 0.13 to 0.1 above 0.05: (8 / 5)^2 - 1 = 1.56 times as many more.
-        assert_eq!(told(0.13, 0.05), "why: record about 1000 more grasps of more objects, or allow more drops");
-        assert_eq!(told(0.13, 0.11), "why: record many times as many grasps, or allow more drops");
-        assert_eq!(told(0.3, 0.09), "why: record many times as many grasps, or allow more drops");
-        assert_eq!(told(1.0, 1.0), "why: record more grasps of more objects");
+        assert_eq!(more(0.13, 0.05), "about 1000 more grasps of more objects");
+        assert_eq!((more(0.13, 0.11), more(0.3, 0.09)), (more(1.0, 0.5), more(1.0, 0.5)));
     }
 }
