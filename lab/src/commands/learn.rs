@@ -37,8 +37,12 @@ const DATAFLOW: (&str, &str) = ("dataflow-live.yaml", include_str!("../../../dat
 const PROMISED_DROPS: f64 = 0.1;
 /// A model that may drop more than this share of its lifts is of no use to a robot, and is not written.
 const WORST_BOUND: f64 = 0.5;
-/// The lifts that are made first. They take minutes, and fewer seldom tell kept objects from dropped ones.
-const FIRST_LIFTS: usize = 500;
+/// The lifts of the first folder.
+const FIRST_LIFTS: usize = 125;
+/// The lifts from which a bound is looked for, if there may be more: fewer seldom tell kept objects from dropped ones.
+const ENOUGH_LIFTS: usize = 500;
+/// The lifts that judge a model.
+const HELD_OUT_LIFTS: usize = 200;
 /// The lifts of a part. An interruption loses those of one part.
 const LIFTS_PER_PART: usize = 100;
 /// The page of the lifts that judge the model.
@@ -58,7 +62,7 @@ pub(super) struct Arguments {
     /// Pad layout (YAML) of the hand.
     hand: PathBuf,
     /// The most lifts: 500 come first, and then as many as there are, again and again.
-    #[arg(long, default_value_t = 8000, value_parser = clap::value_parser!(u64).range(20..=1_000_000))]
+    #[arg(long, default_value_t = 8000, value_parser = clap::value_parser!(u64).range(FIRST_LIFTS as u64..=1_000_000))]
     lifts: u64,
     /// The bound: at most this share of the lifts drops, with 95 % confidence, for new objects like those lifted.
     #[arg(long, value_name = "SHARE", default_value_t = PROMISED_DROPS, value_parser = |text: &str| number_in(text, 1e-4..=WORST_BOUND))]
@@ -138,8 +142,8 @@ impl Job<'_> {
             recordings.extend(recordings_in(&[folder(idx)])?);
             n_lifts += n;
             let is_last = idx + 1 == sizes.len();
-            // An earlier run found these too few.
-            if !is_last && folder(idx + 1).is_dir() {
+            // If there are more, an earlier run found these too few.
+            if !is_last && (n_lifts < ENOUGH_LIFTS || folder(idx + 1).is_dir()) {
                 continue;
             }
             let error = match self.train(&recordings, max_drops) {
@@ -197,8 +201,7 @@ impl Job<'_> {
     /// Judges lifts of objects that had no part in the training, as the graph would, and writes the report.
     fn judge(&self, model: &Model, probe: Probe) -> anyhow::Result<Score> {
         let folder = self.out.join("held-out");
-        let first = sizes(self.arguments.lifts as usize)[0];
-        self.simulate("held-out", &folder, first * 2 / 5, 0)?;
+        self.simulate("held-out", &folder, HELD_OUT_LIFTS, 0)?;
         let recordings = recordings_in(&[folder])?;
         let options = ArbiterOptions { probe, ..ArbiterOptions::default() };
         let evaluated = evaluate(&self.hand, model, &recordings, &options)?;
@@ -262,9 +265,9 @@ impl Job<'_> {
     }
 }
 
-/// The numbers of lifts that are made one after the other, at most `most` in all. Those of a greater `most` begin with the same.
+/// The numbers of lifts that are made one after the other, at most `most` in all. Those of a greater number begin with the same.
 fn sizes(most: usize) -> Vec<usize> {
-    let mut n_lifts = most.min(FIRST_LIFTS);
+    let mut n_lifts = FIRST_LIFTS;
     let mut sizes = vec![n_lifts];
     while 2 * n_lifts <= most {
         sizes.push(n_lifts);
@@ -328,8 +331,7 @@ mod tests {
 
     #[test]
     fn lifts_double_up_to_their_number_and_go_on_from_fewer() {
-        assert_eq!(sizes(8000), [500, 500, 1000, 2000, 4000]);
-        assert_eq!(sizes(1999), sizes(8000)[..2]);
-        assert_eq!(sizes(160), [160]);
+        assert_eq!(sizes(8000), [125, 125, 250, 500, 1000, 2000, 4000]);
+        assert_eq!(sizes(1999), sizes(8000)[..4]);
     }
 }

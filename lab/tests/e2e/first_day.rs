@@ -53,7 +53,7 @@ fn the_commands_of_the_first_day_make_a_graph_that_lifts() {
     // Fewer lifts, at a bound that so few can keep. Of slippery objects as many lifts fail as succeed, so that few are enough to
     // learn from.
     std::fs::write(demo.join("slippery.yaml"), "{friction: 0.4, planner: {n_approaches: 4}}").expect("written");
-    let few = format!("{} --lifts 160 --max-drops 0.5 --options slippery.yaml", learn.trim());
+    let few = format!("{} --lifts 125 --max-drops 0.5 --options slippery.yaml", learn.trim());
     let learned = run_script(&demo, folder.path(), &few);
 
     // Part 3 in two terminals; other tests have sockets of their own.

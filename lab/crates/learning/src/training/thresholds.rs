@@ -134,10 +134,11 @@ pub(super) fn choose_thresholds(
     }
     let settled = out_of_fold_probabilities(judged)?;
     let (chosen_looks, refusals) = choose_looks(aim, n_grasps, judged, &settled, probes);
-    if chosen_looks.is_empty() || matches!(aim, Aim::DropSecs(_)) && !refusals.is_empty() {
-        let at_most = refusals.iter().map(|refusal| refusal.at_most).fold(1.0, f64::min);
-        let why = refusals.into_iter().map(|refusal| refusal.why).collect::<Vec<_>>().join("; ");
-        return Err(TrainingError::Promise { why, at_most });
+    let best = refusals.iter().min_by(|a, b| a.at_most.total_cmp(&b.at_most));
+    if (chosen_looks.is_empty() || matches!(aim, Aim::DropSecs(_)))
+        && let Some(Refusal { why, at_most }) = best
+    {
+        return Err(TrainingError::Promise { why: why.clone(), at_most: *at_most });
     }
     classifier.threshold_probability = NEVER;
     let stable: Vec<bool> = judged.examples.iter().map(|example| example.stable).collect();
