@@ -182,7 +182,7 @@ impl<'a> Check<'a> {
                 MisfitKind::Probe,
                 arbiter,
                 format!("probe is {name}, and {of} never calls {phase} grasps stable: nothing would be lifted"),
-                format!("expected {instead}, or a model with a threshold below 1 (blindgrasp train --threshold)"),
+                format!("expected {instead}, or a model that lifts (blindgrasp learn)"),
             ),
             Some(_) => {}
         }

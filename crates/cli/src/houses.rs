@@ -21,6 +21,7 @@ pub struct House {
 pub const LAB: House = House {
     program: LAB_PROGRAM,
     commands: &[
+        ("learn", "Learn a hand: lift in simulation, train, judge"),
         ("simulate", "Simulate grasps with labels, or list the objects"),
         ("import", "Turn a table (CSV) or lines of frames into a recording"),
         ("train", "Train a model on recordings with labels"),
@@ -46,7 +47,7 @@ pub const HOUSES: [&House; 2] = [&LAB, &NETWORK];
 pub const GROUPS: [(&str, &[&str]); 4] = [
     ("Run", &["run", "ps", "top", "echo", "stop", "set", "swap", "logs", "doctor", "diagnostics"]),
     ("Record", &["record", "replay", "test", "export", "info", "view"]),
-    ("Learn", &["simulate", "import", "train", "evaluate", "predict", "trials", "model", "sensors"]),
+    ("Learn", &["learn", "simulate", "import", "train", "evaluate", "predict", "trials", "model", "sensors"]),
     ("Describe", &["init", "new", "keys", "schema", "completions"]),
 ];
 

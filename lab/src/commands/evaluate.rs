@@ -299,7 +299,7 @@ pub(super) fn command_line() -> String {
 }
 
 /// Prints the definition of stable in the recordings, unless it is the wrench space's in all.
-pub(super) fn print_label(recordings: &[PathBuf]) -> anyhow::Result<()> {
+fn print_label(recordings: &[PathBuf]) -> anyhow::Result<()> {
     label_line(&labels_of(recordings)?).map_or(Ok(()), |label| Ok(print_line(&format!("label: {label}"))?))
 }
 

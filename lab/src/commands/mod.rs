@@ -5,6 +5,7 @@ mod completions;
 mod evaluate;
 mod hand;
 mod import;
+mod learn;
 mod mesh;
 mod model;
 mod new;
@@ -19,7 +20,7 @@ use blindgrasp_session::output::{check_new, check_output, check_page, write_out,
 use blindgrasp_session::text_table::percent;
 
 blindgrasp_cli::program! {
-    Simulate simulate, Import import, Train train, Evaluate evaluate, Trials trials, Model model, Sensors sensors, New new;
+    Learn learn, Simulate simulate, Import import, Train train, Evaluate evaluate, Trials trials, Model model, Sensors sensors, New new;
     hidden Mesh mesh;
     operators crate::operators::SHIPPED; others &[]
 }

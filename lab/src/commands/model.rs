@@ -148,13 +148,19 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
         print_text(&serde_json::to_string_pretty(&model_json(&model)?)?)?;
         return Ok(Outcome::Done);
     }
-    for (name, value) in described(&model) {
+    print_model(&model)?;
+    Ok(Outcome::Done)
+}
+
+/// Prints what a model is made of, for people.
+pub(super) fn print_model(model: &Model) -> std::io::Result<()> {
+    for (name, value) in described(model) {
         print_line(&format!("{name:<16} {value}"))?;
     }
-    for line in probe_lines(&model) {
+    for line in probe_lines(model) {
         print_line(&line)?;
     }
-    Ok(Outcome::Done)
+    Ok(())
 }
 
 fn model_json(model: &Model) -> anyhow::Result<serde_json::Value> {
@@ -241,6 +247,9 @@ fn described(model: &Model) -> Vec<(&'static str, String)> {
     ];
     for (name, line) in optional {
         described.extend(line.map(|line| (name, line)));
+    }
+    for (reason, n) in &training.n_excluded {
+        described.push(("left out", format!("{n} with {reason}")));
     }
     described.extend(own_lifts_lines(model).into_iter().map(|line| ("adapted", line)));
     described

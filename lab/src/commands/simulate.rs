@@ -127,22 +127,34 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let (objects, warnings) = objects_named(&arguments.objects)?;
     print_mesh_warnings(&warnings);
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
-    let info = RecordingInfo {
-        hand: hand.name.clone(),
-        hand_id: hand.id(),
-        made_by: format!("simulation of objects '{}' with {}", arguments.objects, serde_json::to_string(&options)?),
-        version: env!("CARGO_PKG_VERSION").into(),
-    };
     let stop = stop_signal()?;
     let simulation = Simulation { hand: &hand, objects: &objects, options: &options };
-    let job = Job { simulation, info: &info, stop: &stop };
-    let report = if is_file { job.to_file(out, arguments.overwrite)? } else { job.to_folder(out, arguments)? };
+    let job = Job::new(simulation, &arguments.objects, &stop)?;
+    let shard = arguments.shard.unwrap_or((0, 1));
+    let report = if is_file { job.to_file(out, arguments.overwrite)? } else { job.to_folder(out, shard)? };
     match report {
         Some(report) => print_report(arguments.json, out, &report)?,
         None if arguments.json => print_line("null")?,
         None => print_line("this shard has no parts")?,
     }
     Ok(Outcome::Done)
+}
+
+/// Makes the parts of a simulation that its folder does not have.
+///
+/// # Errors
+/// As of the command; it was interrupted.
+pub(super) fn complete_folder(
+    hand: &Hand,
+    objects_name: &str,
+    options: &SimulatorOptions,
+    folder: &Path,
+    stop: &AtomicBool,
+) -> anyhow::Result<()> {
+    let (objects, _) = objects_named(objects_name)?;
+    let simulation = Simulation { hand, objects: &objects, options };
+    Job::new(simulation, objects_name, stop)?.to_folder(folder, (0, 1))?;
+    Ok(())
 }
 
 /// Most warnings of meshes that are printed.
@@ -177,15 +189,28 @@ fn none_is_stable(n: usize) -> String {
 /// Everything that all parts have in common.
 struct Job<'a> {
     simulation: Simulation<'a>,
-    info: &'a RecordingInfo,
+    /// As the user named them.
+    objects: &'a str,
+    info: RecordingInfo,
     stop: &'a AtomicBool,
 }
 
-impl Job<'_> {
+impl<'a> Job<'a> {
+    fn new(simulation: Simulation<'a>, objects: &'a str, stop: &'a AtomicBool) -> anyhow::Result<Self> {
+        let Simulation { hand, options, .. } = simulation;
+        let info = RecordingInfo {
+            hand: hand.name.clone(),
+            hand_id: hand.id(),
+            made_by: format!("simulation of objects '{objects}' with {}", serde_json::to_string(options)?),
+            version: env!("CARGO_PKG_VERSION").into(),
+        };
+        Ok(Job { simulation, objects, info, stop })
+    }
+
     /// Makes one recording of all parts.
     fn to_file(&self, out: &Path, overwrite: bool) -> anyhow::Result<Option<SimulationReport>> {
         check_new(out, &[], overwrite)?;
-        let mut writer = GraspWriter::create(out, self.info)?;
+        let mut writer = GraspWriter::create(out, &self.info)?;
         let bar = progress_bar(self.simulation.options.n_grasps);
         let mut report = SimulationReport::default();
         for part in self.simulation.options.parts() {
@@ -223,12 +248,11 @@ impl Job<'_> {
         Ok(Some(report))
     }
 
-    /// Makes a recording of each part that is missing.
-    fn to_folder(&self, out: &Path, arguments: &Arguments) -> anyhow::Result<Option<SimulationReport>> {
+    /// Makes a recording of each part of a shard that is missing.
+    fn to_folder(&self, out: &Path, (idx, n): (usize, usize)) -> anyhow::Result<Option<SimulationReport>> {
         let Simulation { hand, objects, options } = self.simulation;
         let parts: Vec<Part> = options.parts().collect();
-        let (idx, n) = arguments.shard.unwrap_or((0, 1));
-        let objects = (arguments.objects.as_str(), objects_id(objects));
+        let objects = (self.objects, objects_id(objects));
         let options = serde_json::to_value(options)?;
         Manifest::new((&hand.name, hand.description_id()), objects, options, parts.len()).claim(out)?;
         let mine: Vec<&Part> = parts.iter().filter(|part| part.idx % n == idx).collect();
@@ -239,7 +263,7 @@ impl Job<'_> {
         bar.reset_eta();
         for (n_done, part) in missing.iter().enumerate() {
             let path = part_path(out, part.idx);
-            let mut writer = GraspWriter::create(&path, self.info)?;
+            let mut writer = GraspWriter::create(&path, &self.info)?;
             let done = self.simulate(part, &bar, &mut writer).map_err(|error| match error {
                 SimulateError::Stopped { .. } => anyhow::anyhow!(
                     "interrupted: {} of {} parts are in {}; the same command goes on from there",

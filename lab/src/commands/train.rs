@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 
-use super::evaluate::print_label;
-use super::{Outcome, check_new, completions, number_in, percent, print_line};
+use super::model::print_model;
+use super::{Outcome, check_new, completions, number_in, percent};
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::reading::SELF_CONTACT;
 use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, TrainingSummary, train};
@@ -58,31 +58,19 @@ pub(super) struct Arguments {
     /// The SVM's kernel width.
     #[arg(long, value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
     gamma: Option<f64>,
-    #[command(flatten)]
-    thresholds: ThresholdArguments,
-    /// The seed of K-means and boosting.
-    #[arg(long, default_value_t = TrainingOptions::default().seed)]
-    seed: u64,
-}
-
-/// The probabilities from which a grasp counts as stable: one that is given, or those that are chosen.
-#[derive(Debug, Args)]
-struct ThresholdArguments {
-    /// A grasp counts as stable from this probability on; from 1 minus it on it is unsure, which holds as well. For
-    /// experiments: it promises nothing. The model of the paper's label has 0.5.
-    #[arg(long = "threshold", value_name = "PROBABILITY", default_value_t = TrainingOptions::default().threshold_probability,
-          value_parser = |text: &str| number_in(text, 1e-6..=1.0))]
-    threshold_probability: f64,
     /// Choose the thresholds by the price of a drop: those that take the least time for each kept object, if a drop costs so
     /// many seconds and the hand grasps again until it lifts, judged by folds of objects. Recordings with probes get a
     /// threshold for each probe. 120 is cautious, the models of lifts that come with blindgrasp were trained with 300, and 0 is
     /// for objects that may fall.
-    #[arg(long, value_name = "SECONDS", conflicts_with = "threshold_probability", value_parser = |text: &str| number_in(text, 0.0..=1e6))]
+    #[arg(long, value_name = "SECONDS", value_parser = |text: &str| number_in(text, 0.0..=1e6))]
     drop_secs: Option<f64>,
     /// Choose the thresholds by a bound on drops: at most this share of the lifts drops, with 95 % confidence, for new objects
     /// like those recorded. A stage whose strictest threshold cannot promise this never lifts.
-    #[arg(long, value_name = "SHARE", conflicts_with_all = ["drop_secs", "threshold_probability"], value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
+    #[arg(long, value_name = "SHARE", conflicts_with = "drop_secs", value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
     max_drops: Option<f64>,
+    /// The seed of K-means and boosting.
+    #[arg(long, default_value_t = TrainingOptions::default().seed)]
+    seed: u64,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
@@ -99,70 +87,21 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     let options = TrainingOptions {
         recipe: recipe(arguments)?,
-        threshold_probability: arguments.thresholds.threshold_probability,
-        aim: arguments.thresholds.aim(),
+        aim: arguments.drop_secs.map(Aim::DropSecs).or(arguments.max_drops.map(Aim::MaxDrops)),
         seed: arguments.seed,
     };
-    options.check()?;
     let progress = |what: &str| print_diagnostic(&format!("{what} …"));
     let examples = Examples::read(&hand, &recordings, |n_read, n| {
         progress(&format!("read recording {n_read} of {n}"));
     })?;
     let model = train(&hand, &examples, &recordings, &options, progress)?;
     model.save(&arguments.out)?;
-    report(&model, &recordings, arguments)?;
+    let n_iterations = model.training.n_iterations;
+    if !model.training.converged {
+        print_diagnostic(&format!("blindgrasp: the SVM did not reach its tolerance in {n_iterations} iterations"));
+    }
+    print_model(&model)?;
     Ok(Outcome::Done)
-}
-
-fn report(model: &Model, recordings: &[PathBuf], arguments: &Arguments) -> anyhow::Result<()> {
-    let training = &model.training;
-    print_line(&format!(
-        "{}: {} grasps ({} stable) of {} objects, {} contacts, recipe {}: {}",
-        arguments.out.display(),
-        training.n_grasps,
-        percent(Some(training.n_stable as f64 / training.n_grasps as f64)),
-        training.n_objects,
-        training.n_contacts,
-        training.recipe.name,
-        model.classifier.predictor.summary(),
-    ))?;
-    print_label(recordings)?;
-    let (n_words, n_asked) = (model.features.dictionary.len(), training.recipe.n_words);
-    if n_words < n_asked {
-        print_diagnostic(&format!(
-            "the dictionary has {n_words} words, not {n_asked}: the contacts have no more places in the palm frame"
-        ));
-    }
-    for (reason, n) in &training.n_excluded {
-        print_line(&format!("left out: {n} with {reason}"))?;
-    }
-    if !training.converged {
-        print_diagnostic(&format!(
-            "blindgrasp: the SVM did not reach its tolerance in {} iterations",
-            training.n_iterations
-        ));
-    }
-    print_line(&format!(
-        "cross-validated over {} folds of objects: accuracy {}, false positives {} of the grasps with contact",
-        training.n_folds,
-        percent(Some(training.cross_validated_accuracy)),
-        percent(Some(training.cross_validated_false_positive_share)),
-    ))?;
-    print_line(&format!(
-        "their probabilities: Brier score {:.4}, calibration error {:.4}",
-        training.cross_validated_brier, training.cross_validated_ece
-    ))?;
-    print_line(&threshold_line(&model.classifier))?;
-    for line in probe_lines(model) {
-        print_line(&line)?;
-    }
-    Ok(())
-}
-
-impl ThresholdArguments {
-    fn aim(&self) -> Option<Aim> {
-        self.drop_secs.map(Aim::DropSecs).or(self.max_drops.map(Aim::MaxDrops))
-    }
 }
 
 /// A classifier's thresholds, for people.

@@ -46,7 +46,7 @@ fn training_data() {
     check(&["train", RECORDING, "--words", "0", "--out", &model], 2, &["--words"]);
     check(&["train", RECORDING, "--gamma", "0", "--out", &model], 2, &["--gamma"]);
     check(&["train", RECORDING, "--sigma-m", "0", "--out", &model], 2, &["--sigma-m"]);
-    check(&["train", RECORDING, "--threshold", "nan", "--out", &model], 2, &["--threshold"]);
+    check(&["train", RECORDING, "--max-drops", "nan", "--out", &model], 2, &["--max-drops"]);
     check(&["train", "--out", &model], 2, &["RECORDING"]);
     assert!(!Path::new(&model).exists());
 }

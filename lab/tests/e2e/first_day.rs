@@ -13,8 +13,8 @@ fn blocks(part: &str, language: &str) -> String {
     blocks.collect::<Vec<_>>().join("\n")
 }
 
-/// Runs commands in a folder, in which `blindgrasp` is the program of this build.
-fn run_script(folder: &Path, programs: &Path, script: &str) {
+/// Runs commands in a folder, in which `blindgrasp` is the program of this build, and returns what they print.
+fn run_script(folder: &Path, programs: &Path, script: &str) -> String {
     let path = std::env::var_os("PATH").expect("a PATH");
     let path = std::env::join_paths([programs.to_path_buf()].into_iter().chain(std::env::split_paths(&path)));
     let mut bash = Command::new("bash");
@@ -22,7 +22,9 @@ fn run_script(folder: &Path, programs: &Path, script: &str) {
     // Logs of its graphs are where those of the other tests are.
     bash.envs(blindgrasp().get_envs().filter_map(|(name, value)| Some((name, value?))));
     let output = bash.output().expect("started");
-    assert!(output.status.success(), "{script}\n{}\n{}", text(&output.stdout), text(&output.stderr));
+    let stdout = text(&output.stdout);
+    assert!(output.status.success(), "{script}\n{stdout}\n{}", text(&output.stderr));
+    stdout.to_owned()
 }
 
 #[test]
@@ -36,54 +38,41 @@ fn the_commands_of_the_first_day_make_a_graph_that_lifts() {
     let folder = tempfile::tempdir().expect("a folder");
     symlink(program(), folder.path().join("blindgrasp")).expect("linked");
     let urdf = folder.path().join("trio.urdf");
-    std::fs::write(&urdf, blocks(part(2), "xml")).expect("written");
+    std::fs::write(&urdf, blocks(part(1), "xml")).expect("written");
 
-    // Fewer lifts, at a bound that so few can keep, and a faster recording. On slippery objects as many lifts fail as succeed, so
-    // that few are enough to learn from.
-    let mut replaced = [false; 5];
-    let mut commands = |number: usize| {
-        let mut script = blocks(part(number), "sh");
-        let changes = [
-            ("blindgrasp run dataflow.yaml", "blindgrasp run dataflow.yaml --quiet --set recorded_source.rate=max"),
-            ("--label lift", "--label lift --options slippery.yaml"),
-            ("--grasps 2000", "--grasps 160"),
-            ("--grasps 200 ", "--grasps 24 "),
-            ("--max-drops 0.1", "--max-drops 0.6"),
-        ];
-        for ((what, by), is_replaced) in changes.into_iter().zip(&mut replaced) {
-            *is_replaced |= script.contains(what);
-            script = script.replace(what, by);
-        }
-        script
-    };
-    run_script(
-        folder.path(),
-        folder.path(),
-        &commands(1).replace("run dataflow.yaml", &format!("run dataflow.yaml --name {}", unique_name())),
+    let start = blocks(parts[0], "sh").replace(
+        "blindgrasp run dataflow.yaml",
+        &format!("blindgrasp run dataflow.yaml --quiet --set recorded_source.rate=max --name {}", unique_name()),
     );
+    run_script(folder.path(), folder.path(), &start);
     let demo = folder.path().join("demo");
     std::fs::copy(&urdf, demo.join("trio.urdf")).expect("copied");
+    let hint = run_script(&demo, folder.path(), &blocks(part(1), "sh"));
+    let learn = blocks(part(2), "sh");
+    assert!(hint.contains(learn.trim()), "{hint}");
+    // Fewer lifts, at a bound that so few can keep. Of slippery objects as many lifts fail as succeed, so that few are enough to
+    // learn from.
     std::fs::write(demo.join("slippery.yaml"), "{friction: 0.4, planner: {n_approaches: 4}}").expect("written");
-    for number in 2..=4 {
-        run_script(&demo, folder.path(), &commands(number));
-    }
+    let few = format!("{} --lifts 125 --max-drops 0.5 --options slippery.yaml", learn.trim());
+    let learned = run_script(&demo, folder.path(), &few);
 
-    // Part 5 in two terminals. So few lifts teach nothing about test lifts; other tests have sockets of their own.
-    let live = commands(5);
-    assert_eq!(replaced, [true; 5], "docs/start.md has other commands than this test shortens");
+    // Part 3 in two terminals; other tests have sockets of their own.
+    let live = blocks(part(3), "sh");
     let mut lines = live.lines().filter(|line| !line.trim().is_empty());
     let (run, bridge) = (lines.next().expect("the graph"), lines.next().expect("the bridge"));
     assert_eq!(lines.next(), None, "{live}");
-    let arguments: Vec<&str> = run.split_whitespace().collect();
-    assert_eq!(arguments[..3], ["blindgrasp", "run", "dataflow-live.yaml"], "{run}");
+    // So few lifts may ask for another probe.
+    let known = run.split(" --set probe=").next().expect("the command of the page");
+    let printed = learned.lines().map(str::trim).find(|line| line.starts_with(known)).expect("the same command");
+    let arguments: Vec<&str> = printed.split_whitespace().collect();
     let socket = format!("unix:{}", demo.join("hand.sock").display());
     let address = format!("source.address={socket}");
     let mut command = blindgrasp();
-    command.current_dir(&demo).env("PROBE", "none");
+    command.current_dir(&demo);
     let params = [&arguments[3..], &["--set", &address, "--set", "lift_arbiter.max_age_ms=60000"]].concat();
     let graph = Graph::launch_on(command, &unique_name(), Path::new("dataflow-live.yaml"), &params);
     wait_until(|| graph.said().contains("listening on"), || graph.said());
-    assert!(graph.said().contains("after a test lift") || !graph.said().contains("warning"), "{}", graph.said());
+    assert!(!graph.said().contains("warning"), "{}", graph.said());
     run_script(&demo, folder.path(), &format!("{bridge} --address {socket}"));
     wait_until(|| graph.n_decisions() >= 20, || graph.said());
     let ended = graph.stop();

@@ -167,9 +167,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let shown = in_shell(&layout_path.display().to_string());
     print_text(&format!(
         "\n{}: {} pads, {} cells\nnext:\n  blindgrasp view {shown} --out hand.html      look at it, turn it, close it\n  \
-         blindgrasp simulate --hand {shown} --label lift --protocol planned --stable-fraction natural --objects train \
-         --grasps 600 --out lifts.mcap\n  \
-         blindgrasp train lifts.mcap --hand {shown} --drop-secs 120 --out model.json",
+         blindgrasp learn {shown}      lift in simulation, train, and print how to start",
         layout_path.display(),
         hand.pads.len(),
         hand.n_cells()

@@ -31,7 +31,7 @@ use crate::learners::platt::{PlattError, fit_platt};
 use crate::learners::svm::train_svm;
 use crate::learners::training_range::{learn_training_range, widened_for_other_days};
 use blindgrasp_grasps::dataset::DatasetError;
-use blindgrasp_messages::{Fault, MAX_FEATURES, Phase};
+use blindgrasp_messages::{Fault, Phase};
 use blindgrasp_stages::classifier::boosting::{BoostedTrees, BoostingError, BoostingParams};
 use blindgrasp_stages::classifier::calibration::PlattCalibration;
 use blindgrasp_stages::classifier::svm::SvmError;
@@ -46,13 +46,14 @@ use thresholds::choose_thresholds;
 /// Folds, grouped by object, for calibration and cross-validated figures.
 const N_FOLDS: usize = 5;
 
+/// A grasp counts as stable from this probability on, unless thresholds are chosen for trials.
+const THRESHOLD_PROBABILITY: f64 = 0.5;
+
 /// How a model is trained.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingOptions {
     pub recipe: Recipe,
-    /// A grasp counts as stable from this probability on, and as unstable below 1 minus it; between them it is unsure.
-    pub threshold_probability: f64,
-    /// What the thresholds of all stages are chosen for, in place of that probability.
+    /// What the thresholds of all stages are chosen for, in place of [`THRESHOLD_PROBABILITY`].
     pub aim: Option<Aim>,
     /// Seeds K-means and boosting.
     pub seed: u64,
@@ -60,25 +61,7 @@ pub struct TrainingOptions {
 
 impl Default for TrainingOptions {
     fn default() -> Self {
-        TrainingOptions { recipe: Recipe::default(), threshold_probability: 0.5, aim: None, seed: 1 }
-    }
-}
-
-impl TrainingOptions {
-    /// Refuses options that no training takes, before recordings are read.
-    ///
-    /// # Errors
-    /// Too many words, or a threshold that is no probability.
-    pub fn check(&self) -> Result<(), TrainingError> {
-        let recipe = &self.recipe;
-        if recipe.n_words > MAX_FEATURES {
-            return Err(TrainingError::Data(format!("{} words, expected at most {MAX_FEATURES}", recipe.n_words)));
-        }
-        let threshold = self.threshold_probability;
-        if !(threshold > 0.0 && threshold <= 1.0) {
-            return Err(TrainingError::Data(format!("the threshold is {threshold}, expected more than 0, at most 1")));
-        }
-        Ok(())
+        TrainingOptions { recipe: Recipe::default(), aim: None, seed: 1 }
     }
 }
 
@@ -95,6 +78,13 @@ pub enum TrainingError {
     Boosting(#[from] BoostingError),
     #[error("the calibration")]
     Calibration(#[from] PlattError),
+    /// No look keeps the bound of drops that was asked for.
+    #[error("{why}")]
+    Promise {
+        why: String,
+        /// The least bound that a look has; 1 if none has one.
+        at_most: f64,
+    },
     /// Training failed, perhaps because cells lie where the hand touches nothing.
     #[error(
         "no cell feels {n_unfelt} of the {n_grasps} grasps, and they teach nothing; lay cells where the hand touches objects \
@@ -104,6 +94,17 @@ pub enum TrainingError {
     /// Recordings or options that cannot be trained with.
     #[error("{0}")]
     Data(String),
+}
+
+impl TrainingError {
+    /// The share of drops that more lenient options could promise.
+    pub fn best_bound(&self) -> Option<f64> {
+        match self {
+            TrainingError::Promise { at_most, .. } if *at_most < 1.0 => Some(*at_most),
+            TrainingError::Unfelt { source, .. } => source.best_bound(),
+            _ => None,
+        }
+    }
 }
 
 /// The result of a recipe before calibration.
@@ -125,7 +126,7 @@ pub struct Fitted {
 /// ([`Examples::of_grasps`]), which have the labels that they came with. `progress` gets a description of each step.
 ///
 /// # Errors
-/// As of [`TrainingOptions::check`]; examples of one class only, of fewer objects than folds, or with too few contacts.
+/// Examples of one class only, of fewer objects than folds, or with too few contacts.
 pub fn train(
     hand: &Hand,
     read: &Examples,
@@ -133,7 +134,6 @@ pub fn train(
     options: &TrainingOptions,
     progress: impl FnMut(&str),
 ) -> Result<Model, TrainingError> {
-    options.check()?;
     train_checked(hand, read, recordings, options, progress).map_err(|error| with_unfelt_share(error, read))
 }
 
@@ -166,8 +166,7 @@ fn train_checked(
     if recipe.day_baseline {
         training_range = widened_for_other_days(training_range, &fitted.features);
     }
-    let threshold_probability = options.threshold_probability;
-    let validated = CrossValidated::of(&judged, &calibration, threshold_probability)?;
+    let validated = CrossValidated::of(&judged, &calibration)?;
     let day = day::learn(recipe, &fitted, &examples, options.seed)?;
     if day.is_none() && examples.iter().any(|example| example.day != 0) {
         progress(
@@ -178,16 +177,17 @@ fn train_checked(
     let mut classifier = Classifier {
         predictor: fitted.predictor,
         calibration,
-        threshold_probability,
-        // "Unstable" is to be as certain as "stable".
-        unsure_from_probability: threshold_probability.min(1.0 - threshold_probability),
+        threshold_probability: THRESHOLD_PROBABILITY,
+        unsure_from_probability: THRESHOLD_PROBABILITY,
     };
     let mut probes = learn_probes(hand, &fitted.features, &examples, &folds, options, &mut progress)?;
     if let Some(aim) = options.aim {
         progress("choosing thresholds for trials");
         let of_lifts = !read.labels.contains_key(&Label::WrenchSpace);
         let promises = of_lifts && !recipe.day_baseline;
-        training.policies = choose_thresholds(aim, promises, &judged, &mut classifier, &mut probes, &mut progress)?;
+        let n_grasps = read.grasps.len();
+        training.policies =
+            choose_thresholds(aim, promises, n_grasps, &judged, &mut classifier, &mut probes, &mut progress)?;
     }
     Ok(Model {
         format: FORMAT.into(),
@@ -252,7 +252,7 @@ fn learn_probes(
             match probe {
                 // A policy sets its threshold later; until then it never lifts.
                 Some(_) if options.aim.is_some() => {}
-                Some(probe) => probe.set_threshold(options.threshold_probability),
+                Some(probe) => probe.set_threshold(THRESHOLD_PROBABILITY),
                 None => {
                     progress(&format!("not learned: on new objects, frames after the {name} do no better than a guess"))
                 }
@@ -318,18 +318,14 @@ struct CrossValidated {
 }
 
 impl CrossValidated {
-    fn of(
-        judged: &OutOfFold<'_>,
-        calibration: &PlattCalibration,
-        threshold_probability: f64,
-    ) -> Result<CrossValidated, TrainingError> {
+    fn of(judged: &OutOfFold<'_>, calibration: &PlattCalibration) -> Result<CrossValidated, TrainingError> {
         let probabilities = out_of_fold_probabilities(judged)?;
         let outcomes = labels(&judged.examples);
         let reliability = reliability(&probabilities, &outcomes, N_RELIABILITY_BINS);
         check_skill(calibration, &outcomes, reliability.brier)?;
         let (mut n_right, mut n_false_positives) = (0, 0);
         for (value, stable) in judged.decision_values.iter().zip(&outcomes) {
-            let called_stable = calibration.probability(*value) >= threshold_probability;
+            let called_stable = calibration.probability(*value) >= THRESHOLD_PROBABILITY;
             n_right += usize::from(called_stable == *stable);
             n_false_positives += usize::from(called_stable && !stable);
         }

@@ -33,17 +33,35 @@ struct Chosen {
     promise: Option<Promise>,
 }
 
+/// Why a look has no policy, and the least bound on drops that it has; 1 for none.
+struct Refusal {
+    why: String,
+    at_most: f64,
+}
+
+/// How many more grasps a bound needs that is missed after `n_grasps`: it comes nearer to the estimate with the root of the number of
+/// grasps, as a rule. Beyond so many times the grasps nothing is foretold.
+fn more_grasps(found: Bounded, max_drops: f64, n_grasps: usize) -> String {
+    const MOST_TIMES: f64 = 20.0;
+    let times = ((found.at_most - found.estimate) / (max_drops - found.estimate)).powi(2);
+    if found.estimate >= max_drops || times > MOST_TIMES {
+        return "many times as many grasps".into();
+    }
+    format!("about {:.0} more grasps of more objects", ((times - 1.0) * n_grasps as f64 / 100.0).ceil() * 100.0)
+}
+
 impl Aim {
     /// Chooses the policy of a look. The error is the reason why the look has none.
-    fn choose(self, policies: &Policies, look: Phase) -> Result<Chosen, String> {
+    fn choose(self, policies: &Policies, look: Phase, n_grasps: usize) -> Result<Chosen, Refusal> {
         let max_drops = match self {
             Aim::MaxDrops(max_drops) => max_drops,
             Aim::DropSecs(drop_secs) => {
                 let Some(policy) = policies.cheapest(drop_secs) else {
-                    return Err(format!(
+                    let why = format!(
                         "no threshold leads to a lift when the hand is {}: record more grasps of more objects",
                         look.as_str()
-                    ));
+                    );
+                    return Err(Refusal { why, at_most: 1.0 });
                 };
                 return Ok(Chosen { look, policy, drop_secs, promise: policies.promise(drop_secs) });
             }
@@ -63,16 +81,20 @@ impl Aim {
             promise.drops_of_trials = Bounded { at_most: max_drops, ..promise.drops_of_trials };
             return Ok(Chosen { look, policy, drop_secs, promise: Some(promise) });
         }
-        Err(match policies.promise(DROP_SECS[0]) {
-            None => format!("nothing is lifted when the hand is {}: record more grasps of more objects", look.as_str()),
-            Some(promise) => format!(
-                "when the hand is {}, the strictest threshold promises at most {:.1} % of the lifts to drop, from {} objects: \
-                 record more objects, or allow more drops",
-                look.as_str(),
-                100.0 * promise.drops_of_lifts.at_most,
-                promise.drops_of_lifts.n_objects
-            ),
-        })
+        let look = look.as_str();
+        let Some(promise) = policies.promise(DROP_SECS[0]) else {
+            let why = format!("nothing is lifted when the hand is {look}: record more grasps of more objects");
+            return Err(Refusal { why, at_most: 1.0 });
+        };
+        let found = promise.drops_of_lifts;
+        let why = format!(
+            "when the hand is {look}, the strictest threshold promises at most {:.1} % of the lifts to drop, from {} objects: record \
+             {}, or allow more drops",
+            100.0 * found.at_most,
+            found.n_objects,
+            more_grasps(found, max_drops, n_grasps)
+        );
+        Err(Refusal { why, at_most: found.at_most })
     }
 }
 
@@ -93,10 +115,11 @@ impl Chosen {
 
 /// Chooses the thresholds and sets them. A look without a policy never lifts. Attempts are grasps with contact: those that no
 /// cell feels are attempts of a robot as well, and are not counted. `promises` says whether the labels are outcomes of lifts, for
-/// which a promise can be made.
+/// which a promise can be made; `n_grasps` were recorded.
 pub(super) fn choose_thresholds(
     aim: Aim,
     promises: bool,
+    n_grasps: usize,
     judged: &OutOfFold<'_>,
     classifier: &mut Classifier,
     probes: &mut LearnedProbes,
@@ -110,9 +133,12 @@ pub(super) fn choose_thresholds(
         ));
     }
     let settled = out_of_fold_probabilities(judged)?;
-    let (chosen_looks, refusals) = choose_looks(aim, judged, &settled, probes);
-    if chosen_looks.is_empty() || matches!(aim, Aim::DropSecs(_)) && !refusals.is_empty() {
-        return Err(TrainingError::Data(refusals.join("; ")));
+    let (chosen_looks, refusals) = choose_looks(aim, n_grasps, judged, &settled, probes);
+    let best = refusals.iter().min_by(|a, b| a.at_most.total_cmp(&b.at_most));
+    if (chosen_looks.is_empty() || matches!(aim, Aim::DropSecs(_)))
+        && let Some(Refusal { why, at_most }) = best
+    {
+        return Err(TrainingError::Promise { why: why.clone(), at_most: *at_most });
     }
     classifier.threshold_probability = NEVER;
     let stable: Vec<bool> = judged.examples.iter().map(|example| example.stable).collect();
@@ -149,7 +175,7 @@ pub(super) fn choose_thresholds(
     }
     classifier.unsure_from_probability = unsure_from;
     for refusal in refusals {
-        progress(&format!("not lifted: {refusal}"));
+        progress(&format!("not lifted: {}", refusal.why));
     }
     Ok(summaries)
 }
@@ -157,17 +183,19 @@ pub(super) fn choose_thresholds(
 /// Chooses the policies of all looks that the model has, and says why looks have none.
 fn choose_looks(
     aim: Aim,
+    n_grasps: usize,
     judged: &OutOfFold<'_>,
     settled: &[f64],
     probes: &mut LearnedProbes,
-) -> (Vec<Chosen>, Vec<String>) {
+) -> (Vec<Chosen>, Vec<Refusal>) {
     let (mut chosen_looks, mut refusals) = (Vec::new(), Vec::new());
     let mut stable_from = [NEVER; 2];
     for look in LOOKS {
         if look != Phase::Settled && probes.after(look).is_none() {
             continue;
         }
-        match aim.choose(&Policies::new(&attempts(judged, settled, probes, look), look, stable_from), look) {
+        let policies = Policies::new(&attempts(judged, settled, probes, look), look, stable_from);
+        match aim.choose(&policies, look, n_grasps) {
             Ok(chosen) => {
                 match (look, aim) {
                     (Phase::Settled, _) => stable_from[0] = chosen.policy.thresholds.lift,
@@ -207,4 +235,17 @@ fn attempts(judged: &OutOfFold<'_>, settled: &[f64], probes: &LearnedProbes, loo
         });
     }
     attempts
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bound_that_is_missed_says_how_many_more_grasps_it_needs() {
+        let more = |at_most, estimate| more_grasps(Bounded { estimate, at_most, n_objects: 80 }, 0.1, 600);
+        // From 0.13 to 0.1 above 0.05: (8 / 5)^2 - 1 = 1.56 times as many more.
+        assert_eq!(more(0.13, 0.05), "about 1000 more grasps of more objects");
+        assert_eq!((more(0.13, 0.11), more(0.3, 0.09)), (more(1.0, 0.5), more(1.0, 0.5)));
+    }
 }
