@@ -110,7 +110,7 @@ pub fn find_alike(named: &str, urdf_folder: &Path) -> Result<PathBuf, String> {
     }
     let plain = named.replace('\\', "/").replace("%20", " ");
     let parts: Vec<&str> = plain.split('/').filter(|part| !matches!(*part, "" | "." | "..")).collect();
-    let folder = std::path::absolute(urdf_folder).unwrap_or_else(|_| urdf_folder.into());
+    let folder = absolute(urdf_folder);
     for start in 0..parts.len() {
         for root in folder.ancestors().take(2) {
             if let Some(file) = file_below(root, &parts[start..]) {
@@ -121,6 +121,11 @@ pub fn find_alike(named: &str, urdf_folder: &Path) -> Result<PathBuf, String> {
     found.and_then(|_| {
         Err(format!("{named}: no such file, and none in {} or beside it whose path ends alike", folder.display()))
     })
+}
+
+/// The folder of a file that is named without one is "", the present one.
+fn absolute(folder: &Path) -> PathBuf {
+    std::path::absolute(folder.join(".")).unwrap_or_else(|_| folder.into())
 }
 
 /// The file at this path below a folder; a name in another case is taken if there is none in this one.
@@ -142,7 +147,7 @@ fn file_below(folder: &Path, parts: &[&str]) -> Option<PathBuf> {
 /// Folders in which a package of ROS may be: a folder above `from` or beside one of those that has its name, or whose
 /// `package.xml` names it; or a folder of that name in ROS's `ROS_PACKAGE_PATH` or `AMENT_PREFIX_PATH`.
 pub fn find_package<'a>(package: &'a str, from: &Path) -> impl Iterator<Item = PathBuf> + use<'a> {
-    let from = std::path::absolute(from).unwrap_or_else(|_| from.into());
+    let from = absolute(from);
     let above: Vec<PathBuf> = from.ancestors().map(Path::to_path_buf).collect();
     let by_name = above.clone().into_iter().flat_map(move |folder| {
         let itself = folder.file_name().is_some_and(|name| name == package).then(|| folder.clone());
@@ -285,6 +290,11 @@ mod tests {
         ] {
             assert_eq!(find(named, &urdf), Ok(expected), "{named}");
         }
+        // A URDF that is named without a folder lies in the present one: here that of the crate.
+        let present = std::env::current_dir().expect("a folder");
+        let name = present.file_name().and_then(|name| name.to_str()).expect("a name");
+        let found = find(&format!("package://{name}/Cargo.toml"), Path::new(""));
+        assert_eq!(found, Ok(present.join("Cargo.toml")));
         let error = find("package://nowhere/tip.stl", &urdf).expect_err("no package");
         assert!(error.contains("'nowhere'") && error.contains("AMENT_PREFIX_PATH"), "{error}");
     }
