@@ -10,6 +10,7 @@ use blindgrasp_simulator::pad_grid::pad_grid;
 use blindgrasp_simulator::palm_frame::{
     best_value, idle_pads, odd_joints, opposing_values, pairs_that_meet, palm_fit, self_pressing,
 };
+use blindgrasp_simulator::planner::PlannerOptions;
 use blindgrasp_simulator::touches::{Touch, all_touches, closings};
 use blindgrasp_stages::hand::{BareHand, Hand, Joint, Motion, PALM_FRAME, Pad};
 use nalgebra::{Isometry3, Point3, Vector3};
@@ -22,8 +23,8 @@ const LEAST_GAIN: f64 = 0.05;
 /// The hand closes on so many objects to find where it touches them.
 const N_CLOSINGS: u64 = 48;
 
-/// These grasps are the best of so many approaches. The planner's own number takes four times as long for contacts in the same places.
-const N_APPROACHES: usize = 4;
+/// Ways to fit a draft are compared by grasps that are the best of so many approaches, in a quarter of the time of the planner's own.
+const N_COMPARED: usize = 4;
 
 /// With fewer planned grasps that hold, the hand may be open where it is taken for closed.
 const FEW_HELD: usize = 12;
@@ -128,7 +129,7 @@ impl Draft {
     pub(super) fn laid_pads(&self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<Vec<NewPad>> {
         let mut pads = self.pads(table, arguments, &[])?;
         // The planner comes with the pads to the object, so the pads that lie where it comes are laid twice.
-        for n_approaches in [1, N_APPROACHES] {
+        for n_approaches in [1, PlannerOptions::default().n_approaches] {
             if !arguments.grids.is_empty() {
                 let touches = all_touches(closings(&self.with_pads(&pads), N_CLOSINGS, n_approaches)?);
                 pads = self.pads(table, arguments, &touches)?;
@@ -219,7 +220,7 @@ impl Draft {
     /// How many planned grasps hold their objects.
     fn held(&self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<usize> {
         let hand = self.with_pads(&self.pads(table, arguments, &[])?);
-        let closings = closings(&hand, N_CLOSINGS, N_APPROACHES)?;
+        let closings = closings(&hand, N_CLOSINGS, N_COMPARED)?;
         Ok(closings.iter().filter(|closing| closing.is_held).count())
     }
 
@@ -303,7 +304,7 @@ impl Draft {
     /// contacts.
     pub(super) fn tell_felt(&self, pads: &[NewPad]) -> anyhow::Result<()> {
         let hand = self.with_pads(pads);
-        let closings = closings(&hand, N_CLOSINGS, N_APPROACHES)?;
+        let closings = closings(&hand, N_CLOSINGS, PlannerOptions::default().n_approaches)?;
         let n_felt = closings.iter().filter(|closing| closing.touches.iter().any(|touch| touch.is_felt)).count();
         print_text(&format!(
             "\nclosed on training objects: a cell feels {n_felt} of {} planned grasps",
