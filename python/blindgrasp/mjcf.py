@@ -67,6 +67,15 @@ class _Conversion:
                 f"none of the {self.model.ngeom} shapes can touch others (contype and conaffinity are 0): the links have no "
                 "collision shapes, so give those that touch an object contype 1"
             )
+        model, hinge = self.model, int(self.mujoco.mjtJoint.mjJNT_HINGE)
+        hinges = [joint for joint in range(model.njnt) if int(model.jnt_type[joint]) == hinge and model.jnt_limited[joint]]
+        widest = max((np.abs(model.jnt_range[joint]).max() for joint in hinges), default=np.inf)
+        # A full turn in radians, read as degrees.
+        if np.rad2deg(widest) <= 2 * np.pi:
+            self.told.append(
+                f"no joint turns by more than {np.rad2deg(widest):.2g} degrees: if the ranges are radians, write <compiler "
+                'angle="radian"/> into the file, which a fragment leaves to the file that includes it'
+            )
         self.urdf_path.parent.mkdir(parents=True, exist_ok=True)
         ElementTree.indent(self.robot)
         ElementTree.ElementTree(self.robot).write(self.urdf_path, encoding="utf-8", xml_declaration=True)

@@ -615,6 +615,18 @@ class Mjcf(Folder):
         mimic = ElementTree.parse(urdf).find("joint[@name='b']/mimic")
         self.assertEqual((mimic.get("joint"), float(mimic.get("multiplier"))), ("j1", -1.0))
 
+    def test_radians_that_a_fragment_leaves_to_be_read_as_degrees_are_told(self):
+        from blindgrasp.mjcf import urdf_of
+
+        path = self.folder / "hand.xml"
+        for angle, n_told in [("", 1), ('<compiler angle="radian"/>', 0)]:
+            joint = '<joint range="0 0.8" limited="true"/>'
+            path.write_text(f'<mujoco>{angle}<worldbody><body>{joint}<geom size="0.01"/></body></worldbody></mujoco>')
+            told = urdf_of(path, self.folder / "hand.urdf")
+            self.assertEqual(len(told), n_told, told)
+        path.write_text(path.read_text().replace("0 0.8", "-40 40").replace("radian", "degree"))
+        self.assertEqual(urdf_of(path, self.folder / "hand.urdf"), [])
+
     def test_a_loop_is_told(self):
         from blindgrasp.mjcf import urdf_of
 

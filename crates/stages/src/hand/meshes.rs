@@ -290,6 +290,11 @@ mod tests {
         ] {
             assert_eq!(find(named, &urdf), Ok(expected), "{named}");
         }
+        // A URDF that is named without a folder lies in the present one: here that of the crate.
+        let present = std::env::current_dir().expect("a folder");
+        let name = present.file_name().and_then(|name| name.to_str()).expect("a name");
+        let found = find(&format!("package://{name}/Cargo.toml"), Path::new(""));
+        assert_eq!(found, Ok(present.join("Cargo.toml")));
         let error = find("package://nowhere/tip.stl", &urdf).expect_err("no package");
         assert!(error.contains("'nowhere'") && error.contains("AMENT_PREFIX_PATH"), "{error}");
     }

@@ -234,7 +234,13 @@ fn range(joint: &urdf_xml::Joint) -> Result<(f64, f64), String> {
     };
     let (lower, upper) = joint.limits.ok_or_else(|| format!("is {} and has no <limit lower upper>", joint.kind))?;
     if !(lower >= -most && upper <= most && lower <= upper) {
-        return Err(format!("has the limits {lower}..{upper}, expected lower <= upper, within {most:.2} {unit} of 0"));
+        let [from, to] = [lower, upper].map(f64::to_radians);
+        let is_degrees = most == MAX_LIMIT_RAD && lower <= upper && from >= -most && to <= most;
+        let hint =
+            if is_degrees { format!(": {lower}..{upper} degrees are {from:.4}..{to:.4} rad") } else { String::new() };
+        return Err(format!(
+            "has the limits {lower}..{upper}, expected lower <= upper, within {most:.2} {unit} of 0{hint}"
+        ));
     }
     Ok((lower, upper))
 }

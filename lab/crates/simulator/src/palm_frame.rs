@@ -7,12 +7,13 @@ use std::collections::BTreeSet;
 
 use nalgebra::{Isometry3, Point3, Translation3, Unit, UnitQuaternion, UnitVector3, Vector3};
 use parry3d_f64::shape::SharedShape;
+use rayon::prelude::*;
 
-use crate::mechanism::Mechanism;
+use crate::mechanism::{Mechanism, first_moved};
 use crate::pad_grid::extent;
 use crate::protocol::{Exploration, ProtocolOptions, Start};
 use blindgrasp_objects::Object;
-use blindgrasp_stages::hand::{Hand, JointError, pose_from_isometry};
+use blindgrasp_stages::hand::{Hand, Joint, JointError, Pad, pose_from_isometry};
 
 /// Radii of the balls, metres: those of a golf ball and of an apple.
 const BALL_RADII_M: [f64; 2] = [0.02, 0.035];
@@ -34,6 +35,8 @@ const LEAST_STEP: f64 = 0.005;
 const LEAST_SYMMETRY: f64 = 0.8;
 /// Frames that are moved, of those in each direction.
 const N_MOVED: usize = 2;
+/// Values of a joint that are tried.
+const N_VALUES: usize = 5;
 
 /// A palm frame and how well the hand closes in it.
 #[derive(Debug, Clone)]
@@ -55,15 +58,13 @@ pub fn palm_fit(hand: &Hand) -> Result<PalmFit, JointError> {
         return Ok(PalmFit { link_from_palm: Isometry3::identity(), score: 0.0, is_better: false });
     }
     let own = Trial::of(hand, Isometry3::identity())?;
-    let mut tried: Vec<Trial> = Vec::new();
-    for direction in directions(hand)? {
-        tried.push(Trial::of(hand, frame_along(hand, &direction)?)?);
-    }
+    let tried: Result<Vec<Trial>, JointError> =
+        directions(hand)?.par_iter().map(|direction| Trial::of(hand, frame_along(hand, direction)?)).collect();
+    let mut tried = tried?;
     tried.sort_by(|a, b| b.score.total_cmp(&a.score));
     tried.truncate(N_MOVED);
-    for trial in &mut tried {
-        *trial = trial.moved(hand)?;
-    }
+    let tried: Result<Vec<Trial>, JointError> = tried.par_iter().map(|trial| trial.moved(hand)).collect();
+    let tried = tried?;
     let best = tried.into_iter().max_by(|a, b| a.score.total_cmp(&b.score)).unwrap_or_else(|| own.clone());
     // A hand whose own axis leads out of the palm, and that holds a ball on it, need not be moved aside.
     let looks_the_same_way = (best.link_from_palm * Vector3::z()).z > ALIKE;
@@ -283,8 +284,7 @@ pub fn odd_joints(hand: &Hand) -> Result<OddJoints, JointError> {
             let palm_from_link = &palm_from_links[pad.link_idx];
             let middle = palm_from_link * pad.middle_in_link_m();
             let velocity = mechanism.velocity_of_joint(pad.link_idx, &middle, joint_idx, &palm_from_links);
-            let normal = pad.cells.iter().map(|cell| cell.normal_in_link.into_inner()).sum::<Vector3<f64>>();
-            let normal = palm_from_link.rotation * normal.try_normalize(1e-9).unwrap_or_else(Vector3::z);
+            let normal = palm_from_link.rotation * mean_normal(pad);
             towards += velocity.dot(&normal).abs();
             all += velocity.norm();
         }
@@ -299,22 +299,36 @@ pub fn odd_joints(hand: &Hand) -> Result<OddJoints, JointError> {
     Ok(odd)
 }
 
-/// The value of a joint that is set before the grasp with which the hand closes best on a ball: 0 of a joint that goes about as
-/// far to both sides of it.
+/// The mean normal of a pad's cells, in its link's frame.
+fn mean_normal(pad: &Pad) -> Vector3<f64> {
+    let sum = pad.cells.iter().map(|cell| cell.normal_in_link.into_inner()).sum::<Vector3<f64>>();
+    sum.try_normalize(1e-9).unwrap_or_else(Vector3::z)
+}
+
+/// Whether a joint goes about as far to both sides of 0, as one that spreads fingers does.
+fn is_symmetric(joint: &Joint) -> bool {
+    let (less, more) = (joint.upper.min(-joint.lower), joint.upper.max(-joint.lower));
+    less > 0.0 && less > LEAST_SYMMETRY * more
+}
+
+/// A value of a joint, one of so many from its lower limit to the upper one.
+fn value_at(joint: &Joint, idx: usize) -> f64 {
+    joint.lower + idx as f64 / (N_VALUES - 1) as f64 * (joint.upper - joint.lower)
+}
+
+/// The value of a joint that is set before the grasp with which the hand closes best on a ball. One that spreads fingers keeps
+/// its own.
 ///
 /// # Errors
 /// The hand's joints do not fit together.
 pub fn best_value(hand: &Hand, joint_idx: usize) -> Result<f64, JointError> {
-    const N_VALUES: usize = 5;
     let joint = &hand.joints[joint_idx];
-    let (less, more) = (joint.upper.min(-joint.lower), joint.upper.max(-joint.lower));
-    if less > 0.0 && less > LEAST_SYMMETRY * more {
+    if is_symmetric(joint) {
         return Ok(joint.open());
     }
     let mut best = (Trial::of(hand, Isometry3::identity())?.score, joint.open());
     for idx in 0..N_VALUES {
-        let part = idx as f64 / (N_VALUES - 1) as f64;
-        let value = joint.lower + part * (joint.upper - joint.lower);
+        let value = value_at(joint, idx);
         let trial = Trial::of(&hand.with_open_joint(joint_idx, value), Isometry3::identity())?;
         if trial.score > best.0 + LEAST_STEP {
             best = (trial.score, value);
@@ -322,9 +336,91 @@ pub fn best_value(hand: &Hand, joint_idx: usize) -> Result<f64, JointError> {
     }
     Ok(best.1)
 }
+
+/// The values of joints that are set before the grasp with which pads come face to face as the hand closes, as those of a thumb
+/// that turns in two joints. A finger's only joint keeps its value if it spreads the finger. `None` if no values do better than
+/// those of the open hand.
+///
+/// # Errors
+/// The hand's joints do not fit together.
+pub fn opposing_values(hand: &Hand, joints: &[usize]) -> Result<Option<Vec<(usize, f64)>>, JointError> {
+    let mut hand = hand.clone();
+    let turning = |idx: usize| joints.iter().any(|other| *other != idx && is_same_finger(&hand, idx, *other));
+    let joints: Vec<usize> =
+        joints.iter().copied().filter(|idx| !is_symmetric(&hand.joints[*idx]) || turning(*idx)).collect();
+    let least = opposition(&hand)? + LEAST_GAIN;
+    let mut most = least;
+    // Two joints at a time, until no pair of values does better.
+    loop {
+        let before = most;
+        for (n, first) in joints.iter().enumerate() {
+            for second in &joints[n..] {
+                let mut best = [hand.joints[*first].open, hand.joints[*second].open];
+                for values in 0..N_VALUES * N_VALUES {
+                    hand.joints[*first].open = Some(value_at(&hand.joints[*first], values / N_VALUES));
+                    hand.joints[*second].open = Some(value_at(&hand.joints[*second], values % N_VALUES));
+                    let opposition = opposition(&hand)?;
+                    if opposition > most + LEAST_STEP {
+                        most = opposition;
+                        best = [hand.joints[*first].open, hand.joints[*second].open];
+                    }
+                }
+                [hand.joints[*first].open, hand.joints[*second].open] = best;
+            }
+        }
+        if most == before {
+            break;
+        }
+    }
+    Ok((most > least).then(|| joints.iter().map(|idx| (*idx, hand.joints[*idx].open())).collect()))
+}
+
+/// Whether two joints move one and the same pad.
+fn is_same_finger(hand: &Hand, a: usize, b: usize) -> bool {
+    hand.pads.iter().any(|pad| [a, b].iter().all(|joint_idx| first_moved(hand, pad.link_idx, *joint_idx).is_some()))
+}
+
+/// How well pads come face to face while the hand closes on nothing, each finger stopping where it likes: of the pad that faces
+/// the most others, the sum over these, each 1 if both look at each other over the width of a ball.
+fn opposition(hand: &Hand) -> Result<f64, JointError> {
+    const N_STEPS: usize = 10;
+    // Per pad its middle and normal, posture by posture.
+    let mut faces: Vec<Vec<(Point3<f64>, Vector3<f64>)>> = vec![Vec::new(); hand.pads.len()];
+    for posture in hand.closing_postures(&hand.open_joints(), N_STEPS) {
+        let palm_from_links = hand.palm_from_links(&posture)?;
+        for (pad, faces) in hand.pads.iter().zip(&mut faces) {
+            let palm_from_link = &palm_from_links[pad.link_idx];
+            faces.push((palm_from_link * pad.middle_in_link_m(), palm_from_link.rotation * mean_normal(pad)));
+        }
+    }
+    let mut most: f64 = 0.0;
+    for (pad_idx, of_pad) in faces.iter().enumerate() {
+        for face in of_pad {
+            let mut sum = 0.0;
+            for others in faces.iter().skip(pad_idx + 1).chain(&faces[..pad_idx]) {
+                sum += others.iter().map(|other| facing(face, other)).fold(0.0, f64::max);
+            }
+            most = most.max(sum);
+        }
+    }
+    Ok(most)
+}
+
+/// 1 where two faces look at each other over the width of a ball, 0 where one looks aside or lies elsewhere.
+fn facing((a, normal_a): &(Point3<f64>, Vector3<f64>), (b, normal_b): &(Point3<f64>, Vector3<f64>)) -> f64 {
+    let gap = b - a;
+    let width_m = gap.norm().max(1e-9);
+    let [least_m, most_m] = BALL_RADII_M.map(|radius_m| 2.0 * radius_m);
+    let off_m = (least_m - width_m).max(width_m - most_m).max(0.0);
+    let looks = normal_a.dot(&gap).max(0.0) * (-normal_b.dot(&gap)).max(0.0) / width_m.powi(2);
+    (1.0 - off_m / (2.0 * NEAR_M)).max(0.0) * looks
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::pad_grid::pad_grid;
+    use blindgrasp_stages::hand::BareHand;
     use std::path::Path;
 
     fn built_in(name: &str) -> Hand {
@@ -376,6 +472,55 @@ mod tests {
         assert!(met.contains(&("distal_1".into(), "distal_3".into())), "{met:?}");
         hand.pads.clear();
         assert_eq!(pairs_that_meet(&hand).expect("fits"), BTreeSet::new());
+    }
+
+    /// Two fingers that bend towards +x, and a thumb on an arm beside them that looks away: it comes to face them only if the arm
+    /// turns by a quarter and the thumb by a half.
+    fn hand_with_thumb() -> Hand {
+        let link = |name: &str, parent: &str, place: &str, axis: &str, limits: &str, shape: &str| {
+            format!(
+                "<link name='{name}'>{shape}</link><joint name='{name}_joint' type='revolute'><parent link='{parent}'/><child \
+                 link='{name}'/><origin xyz='{place}'/><axis xyz='{axis}'/><limit {limits}/></joint>"
+            )
+        };
+        let bone = "<collision><origin xyz='0 0 0.04'/><geometry><box size='0.012 0.018 0.08'/></geometry></collision>";
+        let bends = "lower='0' upper='1.2'";
+        let parts = [
+            link("index", "palm", "0 0.012 0.03", "0 1 0", bends, bone),
+            link("middle", "palm", "0 -0.012 0.03", "0 1 0", bends, bone),
+            link("arm", "palm", "0 0 0.03", "0 0 -1", "lower='0' upper='1.5708'", ""),
+            link("twist", "arm", "0 0.06 0", "0 0 1", "lower='0' upper='3.1416'", ""),
+            link("thumb", "twist", "0 0 0", "-1 0 0", bends, &bone.replace("0.012 0.018", "0.018 0.012")),
+        ];
+        let palm = "<link name='palm'><collision><geometry><box size='0.02 0.06 0.04'/></geometry></collision></link>";
+        let urdf = format!("<robot name='hand'>{palm}{}</robot>", parts.concat());
+        let bare = BareHand {
+            padded_links: vec!["index".into(), "middle".into(), "thumb".into()],
+            name: "hand".into(),
+            preshape_joints: vec!["arm_joint".into(), "twist_joint".into()],
+            ..BareHand::default()
+        };
+        let mut hand = Hand::without_cells(Path::new("hand.urdf"), &urdf, &bare).expect("a hand");
+        for name in &bare.padded_links {
+            let link_idx = hand.links.iter().position(|link| link.name == *name).expect("a link");
+            let cells = pad_grid(&Mechanism::new(&hand), link_idx, [3, 2], &[], 0.05).expect("cells");
+            hand.pads.push(Pad { link_idx, first_cell_idx: hand.n_cells(), cells, ..Pad::default() });
+        }
+        hand
+    }
+
+    #[test]
+    fn a_thumb_turns_in_two_joints_to_face_the_fingers() {
+        let hand = hand_with_thumb();
+        let [arm, twist] = ["arm_joint", "twist_joint"].map(|name| hand.joint_idx(name).expect("a joint"));
+        let values = opposing_values(&hand, &[arm, twist]).expect("fits").expect("better values");
+        assert_eq!(values, [(arm, 1.5708), (twist, 3.1416)]);
+        let turned = hand.with_open_joint(arm, 1.5708).with_open_joint(twist, 3.1416);
+        assert_eq!(opposing_values(&turned, &[arm, twist]).expect("fits"), None);
+        // Neither joint does it alone.
+        for joint_idx in [arm, twist] {
+            assert_eq!(opposing_values(&hand, &[joint_idx]).expect("fits"), None, "{joint_idx}");
+        }
     }
 
     #[test]

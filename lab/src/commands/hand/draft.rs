@@ -7,7 +7,9 @@ use anyhow::{Context, bail};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_simulator::mechanism::Mechanism;
 use blindgrasp_simulator::pad_grid::pad_grid;
-use blindgrasp_simulator::palm_frame::{best_value, idle_pads, odd_joints, pairs_that_meet, palm_fit, self_pressing};
+use blindgrasp_simulator::palm_frame::{
+    best_value, idle_pads, odd_joints, opposing_values, pairs_that_meet, palm_fit, self_pressing,
+};
 use blindgrasp_simulator::planner::PlannerOptions;
 use blindgrasp_simulator::touches::{Touch, all_touches, closings};
 use blindgrasp_stages::hand::{BareHand, Hand, Joint, Motion, PALM_FRAME, Pad};
@@ -20,6 +22,12 @@ const LEAST_GAIN: f64 = 0.05;
 
 /// The hand closes on so many objects to find where it touches them.
 const N_CLOSINGS: u64 = 48;
+
+/// Ways to fit a draft are compared by grasps that are the best of so many approaches, in a quarter of the time of the planner's own.
+const N_COMPARED: usize = 4;
+
+/// With fewer planned grasps that hold, the hand may be open where it is taken for closed.
+const FEW_HELD: usize = 12;
 
 /// A joint of which both limits are as far from the open value closes to the upper one. Opened by this part of its range, it closes
 /// to the lower one.
@@ -46,11 +54,23 @@ enum Opening {
     Reversed,
 }
 
+/// A way to fit a draft.
+#[derive(Clone, Copy)]
+struct Way {
+    opening: Opening,
+    /// Joints that do not close bring pads face to face, as far as they can.
+    opposes: bool,
+    /// The palm frame is the link's own.
+    keeps_frame: bool,
+}
+
 /// A draft with a palm frame, how well the hand closes in it, and the lines that tell the choices.
 struct Fitted {
     draft: Draft,
-    opening: Opening,
+    way: Way,
     score: f64,
+    /// Planned grasps that hold their objects, as far as they were counted.
+    n_held: usize,
     told: Vec<String>,
 }
 
@@ -154,33 +174,30 @@ impl Draft {
         if let Some((joint, link)) = wrist(&hand).filter(|(joint, _)| !arguments.preshape.contains(joint)) {
             bail!("joint '{joint}' moves all pads together, as a wrist does: give the hand alone with --base {link}");
         }
-        let mut best = self.fitted(table, arguments, Opening::AsGiven, false)?;
-        let mut others = Vec::new();
+        let given = Way { opening: Opening::AsGiven, opposes: false, keeps_frame: false };
+        let mut best = self.fitted(table, arguments, given)?;
         // Joints with as much way to one limit as to the other may close either way.
         if !self.two_way_joints(arguments).is_empty() {
-            others.extend([Opening::TwoWay(-0.25), Opening::TwoWay(0.25)]);
-        }
-        for opening in others {
-            // Another open hand may leave a grid without cells.
-            let Ok(other) = self.fitted(table, arguments, opening, false) else { continue };
-            if other.score > best.score + LEAST_GAIN {
-                best = other;
+            for opening in [Opening::TwoWay(-0.25), Opening::TwoWay(0.25)] {
+                // Another open hand may leave a grid without cells.
+                let Ok(other) = self.fitted(table, arguments, Way { opening, ..given }) else { continue };
+                if other.score > best.score + LEAST_GAIN {
+                    best = other;
+                }
             }
         }
-        // 0 is the closed hand of many grippers. A jaw that closes on a fixed one may hold things with its back, too.
-        if let Ok(reversed) = self.fitted(table, arguments, Opening::Reversed, false)
-            && reversed.score > LEAST_GAIN
-            && (best.score < LEAST_GAIN
-                || reversed.draft.held(table, arguments)? > best.draft.held(table, arguments)?)
-        {
-            best = reversed;
+        // Balls before the palm do not tell all: 0 is the closed hand of many grippers, a jaw that closes on a fixed one may hold
+        // things with its back, a thumb may lie beside the fingers, and the link's own frame may do better. Planned grasps decide.
+        best.n_held = best.draft.held(table, arguments)?;
+        if best.n_held < FEW_HELD {
+            let reversed = Way { opening: Opening::Reversed, ..best.way };
+            self.try_way(reversed, &mut best, table, arguments)?;
         }
-        // Balls before the palm do not tell all: the link's own frame may do better with objects of other shapes.
+        let opposing = Way { opposes: true, ..best.way };
+        self.try_way(opposing, &mut best, table, arguments)?;
         if best.draft.bare.palm != self.bare.palm {
-            let own = self.fitted(table, arguments, best.opening, true)?;
-            if own.draft.held(table, arguments)? > best.draft.held(table, arguments)? {
-                best = own;
-            }
+            let own = Way { keeps_frame: true, ..best.way };
+            self.try_way(own, &mut best, table, arguments)?;
         }
         for line in &best.told {
             print_diagnostic(line);
@@ -189,10 +206,21 @@ impl Draft {
         Ok(())
     }
 
+    /// Fits the draft in another way, and takes that if more planned grasps hold, or as many and it closes better on balls.
+    fn try_way(&self, way: Way, best: &mut Fitted, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<()> {
+        // Not every hand can be reversed, or has joints that bring its pads face to face.
+        let Ok(mut other) = self.fitted(table, arguments, way) else { return Ok(()) };
+        other.n_held = other.draft.held(table, arguments)?;
+        if other.n_held > best.n_held || other.n_held == best.n_held && other.score > best.score {
+            *best = other;
+        }
+        Ok(())
+    }
+
     /// How many planned grasps hold their objects.
     fn held(&self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<usize> {
         let hand = self.with_pads(&self.pads(table, arguments, &[])?);
-        let closings = closings(&hand, N_CLOSINGS, PlannerOptions::default().n_approaches)?;
+        let closings = closings(&hand, N_CLOSINGS, N_COMPARED)?;
         Ok(closings.iter().filter(|closing| closing.is_held).count())
     }
 
@@ -206,23 +234,20 @@ impl Draft {
         self.hand.joints.iter().filter(is_two_way).map(|joint| joint.name.clone()).collect()
     }
 
-    /// The draft with an open hand, its palm frame (its own, if it is to keep that) and the joints that do not close.
-    fn fitted(
-        &self,
-        table: &[NewPad],
-        arguments: &Arguments,
-        opening: Opening,
-        keeps_frame: bool,
-    ) -> anyhow::Result<Fitted> {
-        let mut fitted = Fitted { draft: self.clone(), opening, score: 0.0, told: Vec::new() };
-        if let Opening::Reversed = opening {
+    /// The draft with an open hand, its palm frame and the joints that do not close.
+    fn fitted(&self, table: &[NewPad], arguments: &Arguments, way: Way) -> anyhow::Result<Fitted> {
+        let mut fitted = Fitted { draft: self.clone(), way, score: 0.0, n_held: 0, told: Vec::new() };
+        if let Opening::Reversed = way.opening {
             fitted.open_reversed(arguments)?;
         }
         let still = fitted.keep_still(table, arguments)?;
-        if let Opening::TwoWay(part) = opening {
+        if let Opening::TwoWay(part) = way.opening {
             fitted.open_two_way(part, arguments)?;
         }
-        if !keeps_frame {
+        if way.opposes {
+            fitted.oppose(&still, table, arguments)?;
+        }
+        if !way.keeps_frame {
             fitted.find_palm_frame(table, arguments)?;
         }
         fitted.set_still(&still, table, arguments)?;
@@ -418,6 +443,18 @@ impl Fitted {
         draft.read()
     }
 
+    /// Sets joints that do not close to the values with which pads come face to face.
+    fn oppose(&mut self, still: &[usize], table: &[NewPad], arguments: &Arguments) -> anyhow::Result<()> {
+        let draft = &mut self.draft;
+        let hand = draft.with_pads(&draft.pads(table, arguments, &[])?).with_moving_pads();
+        let values = opposing_values(&hand, still)?.context("no other values bring pads face to face")?;
+        for (joint_idx, value) in values {
+            let joint = &hand.joints[joint_idx];
+            draft.bare.open.insert(joint.name.clone(), round(value, 1e4).clamp(joint.lower, joint.upper));
+        }
+        draft.read()
+    }
+
     /// Finds the palm frame in which the hand closes best, and takes it unless the user gave one.
     fn find_palm_frame(&mut self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<()> {
         let Fitted { draft, told, score, .. } = self;
@@ -444,14 +481,19 @@ impl Fitted {
         Ok(())
     }
 
-    /// Sets the joints that do not close to the values with which the hand closes best.
+    /// Sets the joints that do not close to the values with which the hand closes best, unless pads are to come face to face.
     fn set_still(&mut self, still: &[usize], table: &[NewPad], arguments: &Arguments) -> anyhow::Result<()> {
-        let Fitted { draft, told, .. } = self;
+        let Fitted { draft, told, way, .. } = self;
         let mut values = Vec::new();
         for idx in still {
+            let joint = &draft.hand.joints[*idx];
+            let name = joint.name.clone();
+            if way.opposes {
+                values.push((name, joint.open()));
+                continue;
+            }
             let hand = draft.with_pads(&draft.pads(table, arguments, &[])?).with_moving_pads();
-            let value = round(best_value(&hand, *idx)?, 1e4);
-            let name = draft.hand.joints[*idx].name.clone();
+            let value = round(best_value(&hand, *idx)?, 1e4).clamp(joint.lower, joint.upper);
             values.push((name.clone(), value));
             draft.bare.open.insert(name, value);
             draft.read()?;
