@@ -58,7 +58,10 @@ mod tests {
         assert_eq!(RobotPromise::of(&counts(0, 0)), None);
         assert_eq!(shown_counts(&counts(0, 0)), Vec::<String>::new());
         let shown = shown_counts(&counts(294, 6));
-        assert_eq!(shown[0], "at most 5.1 % of this robot's lifts drop (95 % confidence if objects come in random order; 6 of 300 did)");
+        assert_eq!(
+            shown[0],
+            "at most 5.1 % of this robot's lifts drop (95 % confidence if objects come in random order; 6 of 300 did)"
+        );
         assert_eq!(shown.len(), 3);
     }
 }

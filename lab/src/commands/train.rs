@@ -153,13 +153,19 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
         ));
         lines.extend(policy.promise.map(|promise| format!("promised for new objects {world}: {promise}")));
     }
-    let [n_unfelt, n_self_contacts] = [Fault::NoContact.as_str(), SELF_CONTACT]
-        .map(|reason| model.training.n_excluded.get(reason).copied().unwrap_or(0));
-    if !model.training.policies.is_empty() && n_unfelt + n_self_contacts > 0 {
+    let excluded = |reason| model.training.n_excluded.get(reason).copied();
+    let (n_unfelt, n_self_contacts) = (excluded(Fault::NoContact.as_str()).unwrap_or(0), excluded(SELF_CONTACT));
+    let n = n_unfelt + n_self_contacts.unwrap_or(0);
+    if !model.training.policies.is_empty() && n > 0 {
+        let kinds = match n_self_contacts {
+            Some(felt) => format!("no cell feels {n_unfelt}, and {felt} are felt only on links that touch each other"),
+            // Models of earlier versions count both as one.
+            None => format!("no cell feels {n_unfelt}, or only on links that touch each other"),
+        };
         lines.push(format!(
-            "attempts without contact, and their time, are not counted: of the {} grasps, no cell feels {n_unfelt}, and \
-             {n_self_contacts} are felt only on links that touch each other; a robot holds such a grasp and tries again",
-            n_unfelt + n_self_contacts + model.training.n_grasps
+            "attempts without contact, and their time, are not counted: of the {} grasps, {kinds}; a robot holds such a grasp and \
+             tries again",
+            n + model.training.n_grasps
         ));
     }
     lines

@@ -456,7 +456,7 @@ fn cells_on_sensor_frames_belong_to_the_finger() {
     std::fs::write(folder.path().join("gripper.urdf"), fingers_urdf(&frames)).expect("written");
     std::fs::write(folder.path().join("cells.csv"), table).expect("written");
     let (_, stderr) = run_in(folder.path(), &other(&["--cells", "cells.csv"]), 0);
-    assert!(stderr.contains("3 pads of the table are on links without collision shapes"), "{stderr}");
+    assert!(stderr.contains("the cells of 3 pads lie on links without collision shapes"), "{stderr}");
     assert!(!stderr.contains("where they feel nothing"), "{stderr}");
     let layout = std::fs::read_to_string(folder.path().join("other/other.yaml")).expect("a layout");
     assert!(layout.contains("{name: \"s1\", link: \"f1\"") && layout.contains("at_m: [-0.006, 0, 0.07]"), "{layout}");

@@ -9,10 +9,10 @@ use parry3d_f64::shape::SharedShape;
 use crate::mechanism::Mechanism;
 use crate::touches::Touch;
 
-/// The part of a face that nothing touched that the cells take, along each of its directions.
+/// Of a face with fewer than [`LEAST_TOUCHES`] touches, the cells take this part along each of its directions.
 const SHARE_OF_FACE: f64 = 0.85;
-/// A face is known by so many touches. With fewer, the cells spread over the whole face.
-const LEAST_TOUCHES: usize = 4;
+/// A face is known by so many touches.
+pub const LEAST_TOUCHES: usize = 4;
 /// Of the touches of a face, this part at each end is not covered: objects seldom come there.
 const SELDOM: f64 = 0.03;
 /// A touch whose normal is within 45° of an axis belongs to the side of that axis.

@@ -1,12 +1,13 @@
 //! A hand on its way to a layout: the palm frame and the joints that are set before a grasp, where the user gave none.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_operator::text::counted;
 use blindgrasp_simulator::mechanism::Mechanism;
-use blindgrasp_simulator::pad_grid::pad_grid;
+use blindgrasp_simulator::pad_grid::{LEAST_TOUCHES, pad_grid};
 use blindgrasp_simulator::palm_frame::{
     best_value, idle_pads, odd_joints, opposing_values, pairs_that_meet, palm_fit, self_pressing,
 };
@@ -120,7 +121,8 @@ impl Draft {
             return Ok(());
         }
         print_diagnostic(&format!(
-            "{n_moved} pads of the table are on links without collision shapes: their cells belong to the links that bear these"
+            "the cells of {} lie on links without collision shapes: they belong to the links to which these are fixed",
+            counted(n_moved, "pad")
         ));
         self.read()
     }
@@ -310,19 +312,34 @@ impl Draft {
             "\nclosed on training objects: a cell feels {n_felt} of {} planned grasps",
             closings.len()
         ))?;
+        // The links without cells on which grasps are not felt.
+        let mut bare: BTreeMap<usize, usize> = BTreeMap::new();
+        for closing in closings.iter().filter(|closing| !closing.touches.iter().any(|touch| touch.is_felt)) {
+            let links: BTreeSet<usize> = closing.touches.iter().map(|touch| touch.link_idx).collect();
+            for link_idx in links.into_iter().filter(|idx| !hand.pads.iter().any(|pad| pad.link_idx == *idx)) {
+                *bare.entry(link_idx).or_default() += 1;
+            }
+        }
+        if let Some((link_idx, n)) = bare.into_iter().max_by_key(|(_, n)| *n).filter(|(_, n)| *n >= LEAST_TOUCHES) {
+            let link = &hand.links[link_idx].name;
+            print_diagnostic(&format!(
+                "{n} grasps that no cell feels touch link '{link}', which has no cells: --grid {link}=3x3 lays some there"
+            ));
+        }
         let touches = all_touches(closings);
         let mut told = BTreeSet::new();
         for pad in &hand.pads {
             let on_link: Vec<&Touch> = touches.iter().filter(|touch| touch.link_idx == pad.link_idx).collect();
             let unfelt: Vec<&&Touch> = on_link.iter().filter(|touch| !touch.is_felt).collect();
-            if 2 * unfelt.len() <= on_link.len() || !told.insert(pad.link_idx) {
+            // Too few contacts say nothing of where others would lie.
+            if unfelt.len() < LEAST_TOUCHES || 2 * unfelt.len() <= on_link.len() || !told.insert(pad.link_idx) {
                 continue;
             }
             let middle =
                 unfelt.iter().map(|touch| touch.point_in_link_m.coords).sum::<Vector3<f64>>() / unfelt.len() as f64;
             let [x, y, z] = [middle.x, middle.y, middle.z].map(|metres| round(metres, 1e3));
             print_diagnostic(&format!(
-                "the cells on link '{}' feel {} of its {} contacts: the others lie around [{x}, {y}, {z}] m in the link's frame; \
+                "the cells on link '{}' feel {} of its {} contacts: those unfelt lie around [{x}, {y}, {z}] m in the link's frame; \
                  lay cells there (--cells), more of them (--grid), or use a link that meets the object first",
                 hand.links[pad.link_idx].name,
                 on_link.len() - unfelt.len(),

@@ -15,7 +15,7 @@ use blindgrasp_stages::hand::{
     BareHand, Cell, Hand, find_mesh, find_mesh_alike, part_below, read_urdf, with_meshes_renamed,
 };
 use clap::Args;
-use nalgebra::{Unit, Vector3};
+use nalgebra::{Point3, Unit, Vector3};
 use serde::Deserialize;
 
 use blindgrasp_cli::houses::NETWORK;
@@ -150,6 +150,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         return Ok(Outcome::Done);
     }
     draft.move_to_bodies(&mut table)?;
+    size_by_neighbours(&mut table)?;
     draft.fit(&table, arguments)?;
     let pads = draft.laid_pads(&table, arguments)?;
     draft.warn(&pads)?;
@@ -296,7 +297,7 @@ fn print_parts(hand: &Hand) -> anyhow::Result<()> {
 /// The columns that a table of cells must have.
 const CELL_COLUMNS: [&str; 7] = ["link", "x", "y", "z", "nx", "ny", "nz"];
 
-/// Cells of the table, pad by pad.
+/// Cells of the table, pad by pad; their sizes are NaN if it has none.
 fn read_table(path: &Path, threshold_newtons: f64) -> anyhow::Result<Vec<NewPad>> {
     let text = read_regular(path).with_context(|| format!("cannot read {}", path.display()))?;
     let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).comment(Some(b'#')).from_reader(text.as_bytes());
@@ -343,23 +344,39 @@ fn read_table(path: &Path, threshold_newtons: f64) -> anyhow::Result<Vec<NewPad>
         }
     }
     if !is_sized {
-        pads.iter_mut().for_each(size_by_neighbours);
-        print_text(
-            "\nno width and height in the table: a cell is 0.8 times as wide and high as the nearest one is away",
-        )?;
+        pads.iter_mut().flat_map(|pad| &mut pad.cells).for_each(|cell| cell.size_m = [f64::NAN; 2]);
     }
     Ok(pads)
 }
 
-fn size_by_neighbours(pad: &mut NewPad) {
-    let places: Vec<_> = pad.cells.iter().map(|cell| cell.position_in_link_m).collect();
-    for (idx, cell) in pad.cells.iter_mut().enumerate() {
-        let others = places.iter().enumerate().filter(|(other, _)| *other != idx);
-        let nearest_m = others.map(|(_, place)| (place - places[idx]).norm()).fold(f64::INFINITY, f64::min);
-        // A cell alone on its pad has no neighbour.
-        let size_m = if nearest_m.is_finite() { 0.8 * nearest_m } else { 0.005 };
-        cell.size_m = [size_m; 2];
+/// Gives sizes to the cells of a table that has none, by the nearest cell on the same link.
+fn size_by_neighbours(pads: &mut [NewPad]) -> anyhow::Result<()> {
+    let mut places: Vec<(String, Point3<f64>)> = Vec::new();
+    for pad in &*pads {
+        places.extend(pad.cells.iter().map(|cell| (pad.link.clone(), cell.position_in_link_m)));
     }
+    let mut idx = 0;
+    let mut is_sized = true;
+    for pad in pads {
+        for cell in &mut pad.cells {
+            let others = places.iter().enumerate().filter(|(other, (link, _))| *other != idx && *link == pad.link);
+            let nearest_m = others.map(|(_, (_, place))| (place - places[idx].1).norm()).fold(f64::INFINITY, f64::min);
+            idx += 1;
+            if !cell.size_m[0].is_nan() {
+                continue;
+            }
+            is_sized = false;
+            // A cell alone on its link has no neighbour.
+            let size_m = if nearest_m.is_finite() { 0.8 * nearest_m } else { 0.005 };
+            cell.size_m = [size_m; 2];
+        }
+    }
+    if !is_sized {
+        print_text(
+            "\nno width and height in the table: a cell is 0.8 times as wide and high as the nearest one is away",
+        )?;
+    }
+    Ok(())
 }
 
 /// The URDF with the names of collision meshes changed to files beside it, and the files to copy there.

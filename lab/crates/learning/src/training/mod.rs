@@ -85,12 +85,6 @@ pub enum TrainingError {
         /// The least bound that a look has; 1 if none has one.
         at_most: f64,
     },
-    /// Training failed, perhaps because cells lie where the hand touches nothing.
-    #[error(
-        "no cell feels {n_unfelt} of the {n_grasps} grasps, and they teach nothing; lay cells where the hand touches objects \
-         (blindgrasp new hand says how many grasps they feel)"
-    )]
-    Unfelt { n_unfelt: usize, n_grasps: usize, source: Box<TrainingError> },
     /// Recordings or options that cannot be trained with.
     #[error("{0}")]
     Data(String),
@@ -101,7 +95,6 @@ impl TrainingError {
     pub fn best_bound(&self) -> Option<f64> {
         match self {
             TrainingError::Promise { at_most, .. } if *at_most < 1.0 => Some(*at_most),
-            TrainingError::Unfelt { source, .. } => source.best_bound(),
             _ => None,
         }
     }
@@ -137,14 +130,18 @@ pub fn train(
     train_checked(hand, read, recordings, options, progress).map_err(|error| with_unfelt_share(error, read))
 }
 
-/// Adds the share of grasps that no cell feels to an error, where that may be its cause.
+/// Adds the share of grasps that no cell feels to a lack of grasps, where that may be its cause.
 fn with_unfelt_share(error: TrainingError, read: &Examples) -> TrainingError {
+    let TrainingError::Data(why) = error else { return error };
     let n_unfelt = read.n_excluded.get(Fault::NoContact.as_str()).copied().unwrap_or(0);
     let n_grasps = read.grasps.len();
     if 4 * n_unfelt <= n_grasps {
-        return error;
+        return TrainingError::Data(why);
     }
-    TrainingError::Unfelt { n_unfelt, n_grasps, source: Box::new(error) }
+    TrainingError::Data(format!(
+        "{why}; no cell feels {n_unfelt} of the {n_grasps} grasps, and they teach nothing: lay cells where the hand touches objects \
+         (blindgrasp new hand says how many grasps they feel)"
+    ))
 }
 
 fn train_checked(
