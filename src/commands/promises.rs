@@ -57,7 +57,10 @@ mod tests {
         assert_eq!(RobotPromise::of(&BTreeMap::from([("lifts/kept".into(), 7)])), None);
         assert_eq!(RobotPromise::of(&counts(0, 0)), None);
         let shown = shown_counts(&counts(294, 6));
-        assert_eq!(shown[0], "at most 5.1 % of this robot's lifts drop (95 % confidence if objects come in random order; 6 of 300 did)");
+        assert_eq!(
+            shown[0],
+            "at most 5.1 % of this robot's lifts drop (95 % confidence if objects come in random order; 6 of 300 did)"
+        );
         assert_eq!(shown.len(), 3);
     }
 }
