@@ -11,7 +11,7 @@ use anyhow::Context;
 use clap::Args;
 use rustix::process::{Signal, getpid, kill_process};
 
-use self::page::{Size, lines};
+use self::page::lines;
 use super::elsewhere::MachineArgument;
 use super::{Outcome, completions, print_line, secs_in, stop_signal};
 use blindgrasp_graph::client::activity::{Look, measure};
@@ -92,7 +92,7 @@ fn watch(arguments: &Arguments, poller: &mut Poller, first: Look, screen: Option
             if arguments.json {
                 print_line(&serde_json::to_string(&measure(&look, Some(&previous)))?)?;
             } else {
-                for line in lines(&look, Some(&previous), Size::UNBOUNDED) {
+                for line in lines(&look, Some(&previous), usize::MAX, usize::MAX) {
                     print_line(&line.text)?;
                 }
                 print_line("")?;
@@ -122,9 +122,14 @@ impl Screen {
 
     fn draw(&self, now: &Look, before: Option<&Look>) -> std::io::Result<()> {
         let size = rustix::termios::tcgetwinsize(std::io::stdout())?;
+        let (n_rows, n_columns) = match (size.ws_row, size.ws_col) {
+            // A terminal on a serial line knows no size.
+            (0, _) | (_, 0) => (24, 80),
+            (n_rows, n_columns) => (n_rows.into(), n_columns.into()),
+        };
         let is_coloured = is_coloured();
         let mut text = CLEARED.to_string();
-        for (idx, line) in lines(now, before, Size::of(size)).into_iter().enumerate() {
+        for (idx, line) in lines(now, before, n_rows, n_columns).into_iter().enumerate() {
             // Without a line break at the end: it would scroll a full screen.
             if idx > 0 {
                 text.push('\n');

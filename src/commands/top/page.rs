@@ -5,37 +5,15 @@ use std::time::Duration;
 use crate::commands::promises::shown_counts;
 use crate::commands::text_table::TextTable;
 use blindgrasp_graph::client::activity::{Look, Measured, MeasuredEdge, MeasuredNode, RUN, measure};
-use blindgrasp_graph::client::words::{
-    clock_offset, node_state_word, peer_state_word, short_rate, short_time, state_word, warnings,
-};
+use blindgrasp_graph::client::words::{node_state_word, short_rate, short_time, state_word, warnings};
 use blindgrasp_graph::control::{DecidedGrasp, GraphState, NodeState};
 use blindgrasp_graph::log::printable;
-use blindgrasp_operator::link_status::{LinkStatus, PeerState};
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::wiring::EdgePolicy;
 use blindgrasp_session::console::{RED, YELLOW};
 
 /// Titles are bold (ECMA-48, Select Graphic Rendition).
 const BOLD: u8 = 1;
-
-/// Room for lines, in characters.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Size {
-    n_rows: usize,
-    n_columns: usize,
-}
-
-impl Size {
-    pub(super) const UNBOUNDED: Size = Size { n_rows: usize::MAX, n_columns: usize::MAX };
-
-    /// A terminal on a serial line knows no size.
-    pub(super) fn of(terminal: rustix::termios::Winsize) -> Size {
-        match (terminal.ws_row, terminal.ws_col) {
-            (0, _) | (_, 0) => Size { n_rows: 24, n_columns: 80 },
-            (n_rows, n_columns) => Size { n_rows: n_rows.into(), n_columns: n_columns.into() },
-        }
-    }
-}
 
 /// A line, and the style of all of it where there are colours.
 #[derive(Debug, Clone, PartialEq)]
@@ -53,15 +31,18 @@ struct Part {
 }
 
 /// The graph now, with rates since the look before, or since its start.
-pub(super) fn lines(now: &Look, before: Option<&Look>, size: Size) -> Vec<Line> {
+pub(super) fn lines(now: &Look, before: Option<&Look>, n_rows: usize, n_columns: usize) -> Vec<Line> {
     let measured = measure(now, before);
-    let name_width = size.n_columns / 2;
-    let mut decisions = decision_part(now);
-    decisions.titles.splice(0..0, decision_lines(&measured));
-    let parts = [head(now, &measured), node_part(&measured, name_width), edge_part(&measured, name_width), decisions];
-    let mut fitting = fitting(parts, size.n_rows);
+    let name_width = n_columns / 2;
+    let parts = [
+        head(now, &measured),
+        node_part(&measured, name_width),
+        edge_part(&measured, name_width),
+        decision_part(now, &measured),
+    ];
+    let mut fitting = fitting(parts, n_rows);
     for line in &mut fitting {
-        line.text = cut(&printable(&line.text), size.n_columns);
+        line.text = cut(&printable(&line.text), n_columns);
     }
     fitting
 }
@@ -100,7 +81,7 @@ fn fitting(parts: [Part; 4], n_lines: usize) -> Vec<Line> {
     lines
 }
 
-/// The state of the graph and its warnings, or where its file is; and the other machines, if there are any.
+/// The state of the graph and its warnings, or where its file is.
 fn head(now: &Look, measured: &Measured) -> Part {
     let cpu = measured.cpu_percent.map_or("-".into(), |percent| format!("{percent:.1} %"));
     let load = measured.load_average.map_or("-".into(), |load| format!("{load:.2}"));
@@ -115,28 +96,12 @@ fn head(now: &Look, measured: &Measured) -> Part {
     );
     let style = if measured.state == GraphState::Degraded { RED } else { BOLD };
     let mut titles = vec![Line { text, style: Some(style) }];
-    titles.extend(measured.link.as_ref().map(link_line));
     let warnings = warnings(&now.status);
     if warnings.is_empty() {
         titles.push(plain(now.status.file.display().to_string()));
     }
     let rows = warnings.into_iter().map(|text| Line { text, style: Some(RED) }).collect();
     Part { titles, rows, noun: "warning" }
-}
-
-/// How the other machines are linked.
-fn link_line(link: &LinkStatus) -> Line {
-    let mut text = format!("{} ↔", link.machine);
-    let mut style = None;
-    for peer in &link.peers {
-        text += &format!("  {} {}", peer.machine, peer_state_word(peer.state));
-        if peer.state != PeerState::Up {
-            style = Some(RED);
-        } else if let Some(round_trip) = peer.round_trip_nanos {
-            text += &format!(" clock {} round trip {}", clock_offset(peer), short_time(round_trip));
-        }
-    }
-    Line { text, style }
 }
 
 fn node_part(measured: &Measured, name_width: usize) -> Part {
@@ -147,9 +112,9 @@ fn node_part(measured: &Measured, name_width: usize) -> Part {
     let mut part = part("node", &table, measured.nodes.iter().map(node_style));
     for (line, node) in part.rows.iter_mut().zip(&measured.nodes) {
         // Behind the table: a node may have many counts, and few nodes have any.
-        for (idx, count) in shown_counts(&node.counts).iter().enumerate() {
-            line.text += if idx == 0 { "  " } else { ", " };
-            line.text += count;
+        let counts = shown_counts(&node.counts).join(", ");
+        if !counts.is_empty() {
+            line.text += &format!("  {counts}");
         }
     }
     part
@@ -221,13 +186,21 @@ fn edge_label(edge: &MeasuredEdge) -> String {
     }
 }
 
-/// How long decisions take, and how many there were.
-fn decision_lines(measured: &Measured) -> [Line; 2] {
-    let decisions = &measured.decisions;
+/// How long decisions take, how many there were, and the last ones, the latest first.
+fn decision_part(now: &Look, measured: &Measured) -> Part {
+    let mut table = TextTable::new(["GRASP", "DECISION", "REASON", "P STABLE", "LATENCY", "AGO", "TRUTH"], 3);
+    let now_nanos = monotonic_nanos();
+    let latest = now.status.decisions.latest.iter().rev();
+    for decided in latest.clone() {
+        table.row(decision_row(decided, now_nanos));
+    }
+    let mut part =
+        part("decision", &table, latest.map(|decided| if decided.is_false_positive() { Some(RED) } else { None }));
     let latency = measured.decision_latency_nanos.map_or("-".into(), |latency| {
         let [p50, p90, p99] = [latency.p50, latency.p90, latency.p99].map(short_time);
         format!("p50 {p50}  p90 {p90}  p99 {p99}")
     });
+    let decisions = &measured.decisions;
     let mut text =
         format!("decided {}/s  LIFT {}  HOLD {}", short_rate(decisions.rate_hz), decisions.n_lift, decisions.n_hold);
     let mut style = None;
@@ -235,18 +208,8 @@ fn decision_lines(measured: &Measured) -> [Line; 2] {
         text += &format!("  FALSE POSITIVES {}", decisions.n_false_positives);
         style = Some(RED);
     }
-    [plain(format!("source to decision  {latency}")), Line { text, style }]
-}
-
-/// The last decisions, the latest first.
-fn decision_part(now: &Look) -> Part {
-    let mut table = TextTable::new(["GRASP", "DECISION", "REASON", "P STABLE", "LATENCY", "AGO", "TRUTH"], 3);
-    let now_nanos = monotonic_nanos();
-    let latest = now.status.decisions.latest.iter().rev();
-    for decided in latest.clone() {
-        table.row(decision_row(decided, now_nanos));
-    }
-    part("decision", &table, latest.map(|decided| if decided.is_false_positive() { Some(RED) } else { None }))
+    part.titles.splice(0..0, [plain(format!("source to decision  {latency}")), Line { text, style }]);
+    part
 }
 
 fn decision_row(decided: &DecidedGrasp, now_nanos: u64) -> Vec<String> {
@@ -306,7 +269,7 @@ mod tests {
     fn shown(n_rows: usize, n_columns: usize, change: fn(&mut Look)) -> Vec<Line> {
         let (before, mut now) = made_looks();
         change(&mut now);
-        lines(&now, Some(&before), Size { n_rows, n_columns })
+        lines(&now, Some(&before), n_rows, n_columns)
     }
 
     fn words(line: &Line) -> Vec<&str> {
@@ -325,8 +288,8 @@ mod tests {
         assert_eq!(words(&lines[3]), ["NODE", "STATE", "PID", "CPU%", "MEMORY", "RESTARTS"]);
         assert_eq!(words(&lines[4]), ["contacts", "running", "4243+", "25.0", "3.0M", "2", "refused", "3"]);
         assert_eq!(words(&lines[5]), ["classifier", "FAILED", "-", "-", "-", "0", "refused", "3"]);
-        assert_eq!(words(&lines[6]), ["EDGE", "RATE/S", "P50", "P99", "DROP", "MISS", "LATE", "QUEUE", "BLOCKED"]);
-        let edge = ["contacts/contacts", "→", "classifier", "999", "205µs", "205µs", "10", "13", "8", "2", "1.5ms"];
+        assert_eq!(words(&lines[6]), ["EDGE", "RATE/S", "P50", "P99", "DROP", "MISS", "LATE", "QUEUE", "…"]);
+        let edge = ["contacts/contacts", "→", "classifier", "999", "205µs", "205µs", "10", "13", "8", "0", "…"];
         assert_eq!(words(&lines[7]), edge);
         assert!(lines[8].text.starts_with("classifier/prediction → run "), "{lines:?}");
         assert_eq!(lines[9].text, "source to decision  p50 205µs  p90 205µs  p99 1.0ms");
