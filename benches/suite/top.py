@@ -92,7 +92,7 @@ class Top:
             pass
 
     def quit(self):
-        os.write(self.terminal, b"q")
+        os.write(self.terminal, b"\x03")
         _, status = os.waitpid(self.pid, 0)
         if status != 0:
             sys.exit(f"top ended with exit code {os.waitstatus_to_exitcode(status)}")

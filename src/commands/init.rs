@@ -111,7 +111,7 @@ const README: &str = "\
 ```sh
 blindgrasp run dataflow.yaml                        # decides the recorded grasps
 blindgrasp run dataflow.yaml --detach --set recorded_source.repeat=forever
-blindgrasp top                                      # what it does, live; q ends top
+blindgrasp top                                      # what it does, live; Ctrl-C ends top
 blindgrasp stop
 ```
 

@@ -73,7 +73,7 @@ fn the_same_program_is_packed_into_the_same_bytes_and_runs_from_them() {
     let has = |name: &str| components.iter().any(|component| component["name"] == name);
     assert!(has("iceoryx2") && has("zenoh") && has("blindgrasp-stages") && has("three"), "{components:?}");
     // It is a dependency of tests alone.
-    assert!(!has("vt100"), "{components:?}");
+    assert!(!has("loom"), "{components:?}");
 }
 
 #[test]

@@ -18,18 +18,24 @@ use blindgrasp_recording::Record;
 const MAX_UNREAD_LINES: usize = 1 << 16;
 
 /// Colours of a terminal (ECMA-48, Select Graphic Rendition).
-const RED: u8 = 31;
+pub const RED: u8 = 31;
 const GREEN: u8 = 32;
-const YELLOW: u8 = 33;
+pub const YELLOW: u8 = 33;
 
-fn paint(text: &str, colour: u8) -> String {
+pub fn paint(text: &str, colour: u8) -> String {
     format!("\x1b[{colour}m{text}\x1b[0m")
+}
+
+/// Whether text on stdout may have colours: stdout is a terminal, and the environment does not say no.
+pub fn is_coloured() -> bool {
+    let variable = |name| std::env::var_os(name).unwrap_or_default();
+    std::io::stdout().is_terminal() && variable("NO_COLOR").is_empty() && variable("TERM") != "dumb"
 }
 
 pub(super) struct Console {
     json: bool,
     is_quiet: bool,
-    /// Actions and mistakes have colours: stdout is a terminal, and the environment does not say no.
+    /// Actions and mistakes have colours.
     is_coloured: bool,
     /// Decisions are made and recorded whether or not stdout is read.
     pub(super) printer: LinePrinter,
@@ -60,10 +66,15 @@ struct OutcomeLine<'a> {
 impl Console {
     pub(super) fn new(json: bool, is_quiet: bool, recorder: Option<Recorder>, tap: Option<Tap>) -> Console {
         let printer = LinePrinter::new(std::io::stdout(), MAX_UNREAD_LINES);
-        let variable = |name| std::env::var_os(name).unwrap_or_default();
-        let is_coloured =
-            std::io::stdout().is_terminal() && variable("NO_COLOR").is_empty() && variable("TERM") != "dumb";
-        Console { json, is_quiet, is_coloured, printer, has_said_that_nobody_reads: false, recorder, tap }
+        Console {
+            json,
+            is_quiet,
+            is_coloured: is_coloured(),
+            printer,
+            has_said_that_nobody_reads: false,
+            recorder,
+            tap,
+        }
     }
 }
 

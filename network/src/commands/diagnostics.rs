@@ -4,7 +4,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::Context as _;
 use blindgrasp_cli::ros2_network::Ros2Network;
-use blindgrasp_graph::client::activity::{Look, Measured, MeasuredEdge, MeasuredNode, Window, measure};
+use blindgrasp_graph::client::activity::{Look, Measured, MeasuredEdge, MeasuredNode, measure};
 use blindgrasp_graph::client::poller::Poller;
 use blindgrasp_graph::client::words::{node_state_word, state_word, warnings};
 use blindgrasp_graph::client::{ClientError, pick_graph};
@@ -152,8 +152,7 @@ fn status(level: u8, graph: &str, part: &str, message: String, values: Vec<(&'st
 
 /// Counts are those since the start of the graph. Rates, and losses that are a warning, are those since the look before.
 fn statuses(now: &Look, before: Option<&Look>) -> Vec<Status> {
-    let window = Window { previous: before.unwrap_or(now), rates_since: before, counts_since: None };
-    let measured = measure(now, window);
+    let measured = measure(now, before);
     let graph = &measured.graph;
     let mut all = vec![of_graph(now, &measured)];
     all.extend(measured.nodes.iter().map(|node| {

@@ -1,31 +1,29 @@
 //! `blindgrasp top`
 
-pub(super) mod screen;
-mod table;
-mod view;
+mod page;
 
-use std::io::IsTerminal;
+use std::io::{IsTerminal, Write};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use clap::Args;
-use ratatui::DefaultTerminal;
-use ratatui::crossterm::event::{self, Event};
+use rustix::process::{Signal, getpid, kill_process};
 
-use self::view::{Condition, Then, View};
+use self::page::lines;
 use super::elsewhere::MachineArgument;
-use super::{Outcome, completions, print_line, secs_in};
-use blindgrasp_graph::client::activity::{Look, Window, measure};
+use super::{Outcome, completions, print_line, secs_in, stop_signal};
+use blindgrasp_graph::client::activity::{Look, measure};
 use blindgrasp_graph::client::poller::Poller;
-use blindgrasp_graph::client::{ClientError, pick_graph, running_graphs};
+use blindgrasp_graph::client::{ClientError, pick_graph};
 use blindgrasp_operator::diagnostics::print_diagnostic;
+use blindgrasp_session::console::{RED, is_coloured, paint};
 
 /// Watch a running graph: its operators, edges and decisions
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp top grasp_gate --interval 0.5\n\n\
-                        Keys: ? shows them, q quits. For scripts: --json, or blindgrasp ps.\n\
+                        Ctrl-C ends it. For scripts: --json, or blindgrasp ps.\n\
                         Exit code 1 if no graph runs, or it does not answer.")]
 pub(super) struct Arguments {
     /// Graph [default: the only one running]
@@ -44,193 +42,147 @@ pub(super) struct Arguments {
     machine: MachineArgument,
 }
 
-/// Keys wait this long for an answer that is due; it usually comes at once.
-const ANSWER_WAIT: Duration = Duration::from_millis(20);
-/// An answer waits this long for keys.
-const KEY_WAIT: Duration = Duration::from_millis(50);
-/// Signals are checked this often.
-const SIGNAL_POLL: Duration = Duration::from_millis(250);
+/// Signals and answers are waited for so long at a time.
+const POLL: Duration = Duration::from_millis(250);
 /// After this time without an answer, the screen says so.
 const SILENT_AFTER: Duration = Duration::from_secs(1);
+/// Control sequences of a terminal (ECMA-48 and DEC): the cursor hidden, the screen cleared from its top.
+const CLEARED: &str = "\x1b[?25l\x1b[H\x1b[J";
+const CURSOR_SHOWN: &str = "\n\x1b[?25h";
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    if !arguments.json && !std::io::stdout().is_terminal() {
-        anyhow::bail!("stdout is no terminal to draw on; use blindgrasp top --json, or blindgrasp ps for one look");
-    }
+    let is_on_terminal = !arguments.json && std::io::stdout().is_terminal();
     if let Some(destination) = arguments.machine.destination()? {
-        return if arguments.json { destination.run() } else { destination.run_on_terminal() };
+        return if is_on_terminal { destination.run_on_terminal() } else { destination.run() };
     }
     let graph = pick_graph(arguments.graph.as_deref())?;
-    let (poller, first) = Poller::connect(&graph)?;
-    let interval = Duration::from_secs_f64(arguments.interval);
-    if arguments.json {
-        print_lines(poller, first, interval, arguments.iterations)?;
-    } else {
-        show(poller, View::new(first, interval), arguments.iterations)?;
+    let (mut poller, first) = Poller::connect(&graph)?;
+    let screen = if is_on_terminal { Some(Screen::open()?) } else { None };
+    let watched = watch(arguments, &mut poller, first, screen.as_ref());
+    // The cursor is shown before anything is said.
+    drop(screen);
+    match watched {
+        Err(error) if matches!(error.downcast_ref(), Some(ClientError::Ended { .. })) => {
+            print_diagnostic(&format!("graph '{graph}' has ended"));
+            Ok(Outcome::Done)
+        }
+        watched => watched.map(|()| Outcome::Done),
     }
-    Ok(Outcome::Done)
 }
 
-fn print_lines(
-    mut poller: Poller,
-    mut previous: Look,
-    interval: Duration,
-    n_intervals: Option<u64>,
-) -> anyhow::Result<()> {
+/// Shows the graph, or prints it where there is no screen.
+fn watch(arguments: &Arguments, poller: &mut Poller, first: Look, screen: Option<&Screen>) -> anyhow::Result<()> {
+    let interval = Duration::from_secs_f64(arguments.interval);
+    if let Some(screen) = screen {
+        screen.draw(&first, None)?;
+    }
+    let mut previous = first;
     let mut due = Instant::now();
-    let mut n_left = n_intervals;
+    let mut n_left = arguments.iterations;
     while n_left != Some(0) {
-        due += interval;
-        std::thread::sleep(due.saturating_duration_since(Instant::now()));
-        let now = match poller.look() {
-            Ok(look) => look,
-            Err(ClientError::Ended { graph }) => {
-                print_diagnostic(&format!("graph '{graph}' has ended"));
-                return Ok(());
+        // From the time when it was due, so that the rhythm keeps; from now, if that is past.
+        due = (due + interval).max(Instant::now());
+        let look = if let Some(screen) = screen {
+            let Some(look) = screen.next_look(poller, due, previous.status.pid)? else { return Ok(()) };
+            screen.draw(&look, Some(&previous))?;
+            look
+        } else {
+            std::thread::sleep(due.saturating_duration_since(Instant::now()));
+            let look = poller.look()?;
+            if arguments.json {
+                print_line(&serde_json::to_string(&measure(&look, Some(&previous)))?)?;
+            } else {
+                for line in lines(&look, Some(&previous), usize::MAX, usize::MAX) {
+                    print_line(&line.text)?;
+                }
+                print_line("")?;
             }
-            Err(error) => return Err(error.into()),
+            look
         };
-        let window = Window { previous: &previous, rates_since: Some(&previous), counts_since: None };
-        print_line(&serde_json::to_string(&measure(&now, window))?)?;
-        previous = now;
+        previous = look;
         n_left = n_left.map(|n_left| n_left - 1);
     }
     Ok(())
 }
 
-/// The terminal in raw mode. It is restored in any case, also by a panic.
+/// The terminal. Its cursor is shown again at any end, also after a panic.
 struct Screen {
-    // Dropped first: it shows the cursor again.
-    terminal: DefaultTerminal,
-    _restore: Restore,
-}
-
-struct Restore;
-
-impl Drop for Restore {
-    fn drop(&mut self) {
-        // The terminal may be gone.
-        let _ = ratatui::try_restore();
-    }
+    must_stop: Arc<AtomicBool>,
+    /// Ctrl-Z was pressed.
+    must_suspend: Arc<AtomicBool>,
 }
 
 impl Screen {
     fn open() -> anyhow::Result<Screen> {
-        let _restore = Restore;
-        let terminal = ratatui::try_init().context("cannot draw on this terminal")?;
-        Ok(Screen { terminal, _restore })
+        let must_suspend = Arc::new(AtomicBool::new(false));
+        signal_hook::flag::register(signal_hook::consts::SIGTSTP, Arc::clone(&must_suspend))
+            .context("cannot listen for signals")?;
+        Ok(Screen { must_stop: stop_signal()?, must_suspend })
     }
 
-    fn draw(&mut self, view: &mut View) -> std::io::Result<()> {
-        let mut n_visible = view.n_visible;
-        self.terminal.draw(|frame| n_visible = screen::draw(frame, view))?;
-        view.n_visible = n_visible;
-        Ok(())
-    }
-}
-
-fn show(mut poller: Poller, mut view: View, n_intervals: Option<u64>) -> anyhow::Result<()> {
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM, signal_hook::consts::SIGHUP] {
-        signal_hook::flag::register(signal, Arc::clone(&stop)).context("cannot listen for signals")?;
-    }
-    let mut screen = Screen::open()?;
-    let mut n_left = n_intervals;
-    let mut asked = Instant::now();
-    screen.draw(&mut view)?;
-    while !stop.load(Ordering::Relaxed) && n_left != Some(0) {
-        let mut is_dirty = false;
-        if poller.waited().is_none() && !view.has_ended() && !view.is_paused && asked.elapsed() >= view.interval {
-            // From the time when it was due, so that the rhythm keeps; from about now, if that is long ago.
-            asked = (asked + view.interval).max(Instant::now() - view.interval / 2);
-            if let Err(error) = poller.ask() {
-                view.condition = ended(&error);
-                is_dirty = true;
-            }
-        }
-        if poller.waited().is_some() && !view.has_ended() {
-            is_dirty |= take_answer(&mut poller, &mut view, &mut n_left);
-        }
-        if is_dirty {
-            screen.draw(&mut view)?;
-        }
-        // Waits for a key, a new size, or the next look.
-        let mut limit = match poller.waited() {
-            _ if n_left == Some(0) => Duration::ZERO,
-            _ if view.has_ended() || view.is_paused => SIGNAL_POLL,
-            Some(_) => KEY_WAIT,
-            None => view.interval.saturating_sub(asked.elapsed()).min(SIGNAL_POLL),
+    fn draw(&self, now: &Look, before: Option<&Look>) -> std::io::Result<()> {
+        let size = rustix::termios::tcgetwinsize(std::io::stdout())?;
+        let (n_rows, n_columns) = match (size.ws_row, size.ws_col) {
+            // A terminal on a serial line knows no size.
+            (0, _) | (_, 0) => (24, 80),
+            (n_rows, n_columns) => (n_rows.into(), n_columns.into()),
         };
-        let mut is_dirty = false;
-        while event::poll(limit).context("cannot read keys")? {
-            limit = Duration::ZERO;
-            is_dirty = true;
-            let Event::Key(key) = event::read().context("cannot read keys")? else { continue };
-            match view.on_key(key) {
-                Then::Nothing => {}
-                Then::Quit => return Ok(()),
-                Then::NextGraph => next_graph(&mut poller, &mut view),
-                Then::Suspend => {
-                    drop(screen);
-                    let _ = rustix::process::kill_process(rustix::process::getpid(), rustix::process::Signal::TSTP);
-                    screen = Screen::open()?;
-                }
+        let is_coloured = is_coloured();
+        let mut text = CLEARED.to_string();
+        for (idx, line) in lines(now, before, n_rows, n_columns).into_iter().enumerate() {
+            // Without a line break at the end: it would scroll a full screen.
+            if idx > 0 {
+                text.push('\n');
+            }
+            match line.style {
+                Some(style) if is_coloured => text.push_str(&paint(&line.text, style)),
+                _ => text.push_str(&line.text),
             }
         }
-        if is_dirty {
-            screen.draw(&mut view)?;
-        }
+        write(&text)
     }
-    Ok(())
-}
 
-/// Takes the answer, if it comes; true if the screen is another one.
-fn take_answer(poller: &mut Poller, view: &mut View, n_left: &mut Option<u64>) -> bool {
-    match poller.answer_within(ANSWER_WAIT) {
-        Ok(Some(look)) => {
-            view.take(look);
-            *n_left = n_left.map(|n_left| n_left - 1);
+    /// The look that is due then; `None` if the command is to stop. The screen says how long the graph has not answered.
+    fn next_look(&self, poller: &mut Poller, due: Instant, pid: u32) -> anyhow::Result<Option<Look>> {
+        while !self.must_stop.load(Ordering::Relaxed) {
+            if self.must_suspend.swap(false, Ordering::Relaxed) {
+                write(CURSOR_SHOWN)?;
+                kill_process(getpid(), Signal::STOP)?;
+            }
+            let left = due.saturating_duration_since(Instant::now());
+            if !left.is_zero() {
+                std::thread::sleep(left.min(POLL));
+                continue;
+            }
+            poller.ask()?;
+            if let Some(look) = poller.answer_within(POLL)? {
+                return Ok(Some(look));
+            }
+            if let Some(waited) = poller.waited()
+                && waited >= SILENT_AFTER
+            {
+                let secs = waited.as_secs();
+                let said = format!(
+                    "NOT ANSWERING for {secs} s: the launcher may be stopped (kill -CONT {pid}) or hang (kill {pid})"
+                );
+                let said = if is_coloured() { paint(&said, RED) } else { said };
+                // In the first line; the cursor goes back to its place.
+                write(&format!("\x1b7\x1b[H\x1b[2K{said}\x1b8"))?;
+            }
         }
-        Ok(None) => return say_if_silent(poller, view),
-        Err(error) => view.condition = ended(&error),
+        Ok(None)
     }
-    true
 }
 
-fn ended(error: &ClientError) -> Condition {
-    let message = match error {
-        ClientError::Ended { graph } => format!("graph '{graph}' has ended; this is its last picture"),
-        other => other.to_string(),
-    };
-    Condition::Ended { message }
-}
-
-/// Notes how long the graph has not answered; true if that has changed.
-fn say_if_silent(poller: &Poller, view: &mut View) -> bool {
-    let Some(waited) = poller.waited().filter(|&waited| waited >= SILENT_AFTER) else { return false };
-    let condition = Condition::Silent { secs: waited.as_secs() };
-    let has_changed = view.condition != condition;
-    view.condition = condition;
-    has_changed
-}
-
-/// Goes on to the next running graph by name; to the same, if it runs anew.
-fn next_graph(poller: &mut Poller, view: &mut View) {
-    let shown = view.now.status.graph.clone();
-    let has_ended = view.has_ended();
-    let mut graphs = running_graphs();
-    let n_before = graphs.partition_point(|graph| *graph <= shown);
-    graphs.rotate_left(n_before);
-    let next = graphs.into_iter().find(|graph| *graph != shown || has_ended);
-    match next.as_deref().map(Poller::connect) {
-        Some(Ok((connected, first))) => {
-            *poller = connected;
-            *view = View::new(first, view.interval);
-        }
-        Some(Err(error)) => view.notice = Some(error.to_string()),
-        None if has_ended => {
-            view.condition = Condition::Ended { message: format!("graph '{shown}' has ended and no other runs") }
-        }
-        None => view.notice = Some("no other graph is running".into()),
+impl Drop for Screen {
+    fn drop(&mut self) {
+        // The terminal may be gone.
+        let _ = write(CURSOR_SHOWN);
     }
+}
+
+fn write(text: &str) -> std::io::Result<()> {
+    let mut stdout = std::io::stdout().lock();
+    stdout.write_all(text.as_bytes())?;
+    stdout.flush()
 }

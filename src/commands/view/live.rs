@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use blindgrasp_graph::client::activity::{Look, Window, measure};
+use blindgrasp_graph::client::activity::{Look, measure};
 use blindgrasp_graph::client::observer::{Observer, Sink};
 use blindgrasp_graph::client::poller::Poller;
 use blindgrasp_graph::client::words::warnings;
@@ -506,8 +506,7 @@ pub(super) fn add_frame(event: &mut Value, hand: &Hand, frame: &TactileFrame, co
 }
 
 fn graph_event(now: &Look, before: Option<&Look>) -> anyhow::Result<String> {
-    let window = Window { previous: before.unwrap_or(now), rates_since: before, counts_since: None };
-    let mut event = serde_json::to_value(measure(now, window))?;
+    let mut event = serde_json::to_value(measure(now, before))?;
     event["warnings"] = json!(warnings(&now.status));
     let params = now.status.nodes.iter().map(|node| (&node.node, &node.params));
     event["params"] = json!(params.collect::<BTreeMap<_, _>>());

@@ -21,15 +21,6 @@ pub struct Look {
     pub load_average: Option<f64>,
 }
 
-/// The intervals of rates, ages and counts; `None` is the graph's start.
-#[derive(Debug, Clone, Copy)]
-pub struct Window<'a> {
-    /// The look before this one; processor time is always taken since then.
-    pub previous: &'a Look,
-    pub rates_since: Option<&'a Look>,
-    pub counts_since: Option<&'a Look>,
-}
-
 /// The activity of a graph, a line of JSON.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Measured {
@@ -120,25 +111,26 @@ impl Look {
     }
 }
 
-/// The activity of a graph up to a look at it.
-pub fn measure(now: &Look, window: Window) -> Measured {
+/// The activity of a graph up to a look at it. Rates and ages are since the look `before`, or since the graph's start;
+/// counts are since its start, processor time and new decisions since the look `before` alone.
+pub fn measure(now: &Look, before: Option<&Look>) -> Measured {
     let status = &now.status;
-    let interval_secs = secs_since(status, window.rates_since);
-    let shares: Vec<f64> = now.usage.keys().filter_map(|pid| cpu_percent(now, window, *pid)).collect();
+    let previous = before.unwrap_or(now);
+    let interval_secs = secs_since(status, before);
+    let shares: Vec<f64> = now.usage.keys().filter_map(|pid| cpu_percent(now, previous, *pid)).collect();
     let nodes = status.nodes.iter().map(|node| MeasuredNode {
         node: node.node.clone(),
         state: node.state,
         pid: node.pid,
         standby_pid: node.standby_pid,
-        cpu_percent: node.pid.and_then(|pid| cpu_percent(now, window, pid)),
+        cpu_percent: node.pid.and_then(|pid| cpu_percent(now, previous, pid)),
         resident_bytes: node.pid.and_then(|pid| Some(now.usage.get(&pid)?.resident_bytes)),
         n_restarts: node.n_restarts,
         n_swaps: node.n_swaps,
         heartbeat_age_millis: node.heartbeat_age_millis,
         counts: node.counts.clone(),
     });
-    let edges = status.edges.iter().map(|edge| measured_edge(edge, status, window, interval_secs));
-    let counted = window.counts_since.map(|look| &look.status.decisions);
+    let edges = status.edges.iter().map(|edge| measured_edge(edge, status, before, interval_secs));
     let decisions = &status.decisions;
     Measured {
         graph: status.graph.clone(),
@@ -149,55 +141,51 @@ pub fn measure(now: &Look, window: Window) -> Measured {
         interval_secs,
         load_average: now.load_average,
         cpu_percent: (!shares.is_empty()).then(|| shares.iter().sum()),
-        launcher_cpu_percent: cpu_percent(now, window, status.pid),
+        launcher_cpu_percent: cpu_percent(now, previous, status.pid),
         nodes: nodes.collect(),
         edges: edges.collect(),
-        decision_latency_nanos: decision_edge(&status.edges).and_then(|edge| ages_in(edge, window)),
+        decision_latency_nanos: decision_edge(&status.edges).and_then(|edge| ages_since(edge, before)),
         decisions: MeasuredDecisions {
-            n_lift: decisions.n_lift.saturating_sub(counted.map_or(0, |before| before.n_lift)),
-            n_hold: decisions.n_hold.saturating_sub(counted.map_or(0, |before| before.n_hold)),
-            n_false_positives: decisions
-                .n_false_positives
-                .saturating_sub(counted.map_or(0, |before| before.n_false_positives)),
-            rate_hz: per_sec(n_decided(now).saturating_sub(window.rates_since.map_or(0, n_decided)), interval_secs),
-            new: new_decisions(now, window.previous),
+            n_lift: decisions.n_lift,
+            n_hold: decisions.n_hold,
+            n_false_positives: decisions.n_false_positives,
+            rate_hz: per_sec(n_decided(now).saturating_sub(before.map_or(0, n_decided)), interval_secs),
+            new: new_decisions(now, previous),
         },
         link: status.link.clone(),
     }
 }
 
 /// The share of one processor that a process has used.
-fn cpu_percent(now: &Look, window: Window, pid: u32) -> Option<f64> {
-    let secs = now.at.saturating_duration_since(window.previous.at).as_secs_f64();
-    let (used, before) = (now.usage.get(&pid)?, window.previous.usage.get(&pid)?);
+fn cpu_percent(now: &Look, previous: &Look, pid: u32) -> Option<f64> {
+    let secs = now.at.saturating_duration_since(previous.at).as_secs_f64();
+    let (used, before) = (now.usage.get(&pid)?, previous.usage.get(&pid)?);
     if secs > 0.0 { Some(100.0 * (used.cpu_secs - before.cpu_secs).max(0.0) / secs) } else { None }
 }
 
-fn measured_edge(edge: &EdgeStatus, status: &GraphStatus, window: Window, interval_secs: f64) -> MeasuredEdge {
-    let before = window.rates_since.and_then(|look| look.edge(&edge.from, &edge.to));
-    let counted = window.counts_since.and_then(|look| look.edge(&edge.from, &edge.to));
-    let since = |count: fn(&EdgeStatus) -> u64| count(edge).saturating_sub(counted.map_or(0, count));
+fn measured_edge(edge: &EdgeStatus, status: &GraphStatus, before: Option<&Look>, interval_secs: f64) -> MeasuredEdge {
+    let received_before = before.and_then(|look| look.edge(&edge.from, &edge.to)).map_or(0, |edge| edge.received);
     MeasuredEdge {
         from: edge.from.clone(),
         to: edge.to.clone(),
         policy: edge.policy,
         capacity: edge.capacity,
-        rate_hz: per_sec(edge.received.saturating_sub(before.map_or(0, |before| before.received)), interval_secs),
-        age_nanos: ages_in(edge, window),
+        rate_hz: per_sec(edge.received.saturating_sub(received_before), interval_secs),
+        age_nanos: ages_since(edge, before),
         n_queued: n_queued(edge, &status.edges),
-        sent: since(|edge| edge.sent),
-        received: since(|edge| edge.received),
-        dropped: since(|edge| edge.dropped),
-        missing: since(|edge| edge.missing),
-        late: since(|edge| edge.late),
-        repeated: since(|edge| edge.repeated),
-        reordered: since(|edge| edge.reordered),
-        blocked_nanos: since(|edge| edge.blocked_nanos),
+        sent: edge.sent,
+        received: edge.received,
+        dropped: edge.dropped,
+        missing: edge.missing,
+        late: edge.late,
+        repeated: edge.repeated,
+        reordered: edge.reordered,
+        blocked_nanos: edge.blocked_nanos,
     }
 }
 
-fn ages_in(edge: &EdgeStatus, window: Window) -> Option<Quantiles> {
-    match window.rates_since.and_then(|look| look.edge(&edge.from, &edge.to)) {
+fn ages_since(edge: &EdgeStatus, before: Option<&Look>) -> Option<Quantiles> {
+    match before.and_then(|look| look.edge(&edge.from, &edge.to)) {
         Some(before) => quantiles(&edge.ages.since(&before.ages)),
         None => quantiles(&edge.ages),
     }
@@ -275,14 +263,10 @@ mod tests {
         status.edges[0].clone()
     }
 
-    fn over<'a>(previous: &'a Look, since: Option<&'a Look>) -> Window<'a> {
-        Window { previous, rates_since: since, counts_since: None }
-    }
-
     #[test]
     fn rates_and_ages_are_of_the_interval_and_counts_of_the_whole_run() {
         let (before, now) = made_looks();
-        let found = measure(&now, over(&before, Some(&before)));
+        let found = measure(&now, Some(&before));
         assert!((found.interval_secs - 2.0).abs() < 1e-9, "{}", found.interval_secs);
         // 1998 received in 2 s; of the 1998 that came, 1980 were up to 0.2 ms old.
         assert!((found.edges[0].rate_hz - 999.0).abs() < 1e-6, "{}", found.edges[0].rate_hz);
@@ -297,16 +281,13 @@ mod tests {
     }
 
     #[test]
-    fn a_window_may_reach_back_to_the_start_and_counts_may_begin_now() {
-        let (before, now) = made_looks();
-        let whole = measure(&now, over(&before, None));
+    fn without_a_look_before_rates_and_ages_are_of_the_whole_run() {
+        let (_, now) = made_looks();
+        let whole = measure(&now, None);
         assert!((whole.edges[0].rate_hz - 2988.0 / 3727.4).abs() < 1e-9);
         // 2988 samples: the rank of p99, 2959, is beyond the 2880 that were younger.
         assert_eq!(whole.edges[0].age_nanos, Some(Quantiles { p50: 204_800, p90: 204_800, p99: 1_024_000 }));
-        let counted = Window { counts_since: Some(&before), ..over(&before, Some(&before)) };
-        let found = measure(&now, counted);
-        assert_eq!((found.edges[0].missing, found.edges[0].late, found.edges[0].dropped), (2, 1, 0));
-        assert_eq!((found.decisions.n_lift, found.decisions.n_hold, found.decisions.n_false_positives), (0, 1, 0));
+        assert_eq!((whole.nodes[0].cpu_percent, whole.decisions.new.len()), (None, 0));
     }
 
     #[test]
@@ -314,10 +295,10 @@ mod tests {
         let (before, mut now) = made_looks();
         now.status.nodes[0].pid = Some(5000);
         now.usage.insert(5000, ProcessUsage { cpu_secs: 0.1, resident_bytes: 1 });
-        let found = measure(&now, over(&before, Some(&before)));
+        let found = measure(&now, Some(&before));
         assert_eq!((found.nodes[0].cpu_percent, found.nodes[0].resident_bytes), (None, Some(1)));
         // No time between two looks is no division by zero.
-        assert_eq!(measure(&now, over(&now, Some(&now))).edges[0].rate_hz, 0.0);
+        assert_eq!(measure(&now, Some(&now)).edges[0].rate_hz, 0.0);
     }
 
     #[test]
@@ -361,7 +342,7 @@ mod tests {
     #[test]
     fn a_line_of_json_has_what_a_script_asks_for() {
         let (before, now) = made_looks();
-        let line = serde_json::to_value(measure(&now, over(&before, Some(&before)))).expect("JSON");
+        let line = serde_json::to_value(measure(&now, Some(&before))).expect("JSON");
         assert_eq!(line["edges"][0]["age_nanos"]["p99"], 204_800);
         assert_eq!(line["nodes"][1]["state"], "failed");
         assert_eq!(line["decisions"]["new"][0]["action"], "hold");
