@@ -10,7 +10,6 @@ mod ports;
 pub mod protocol;
 mod source;
 mod stage;
-mod store;
 
 use std::ffi::{OsStr, OsString};
 use std::path::PathBuf;
