@@ -76,6 +76,8 @@ struct Budget {
     skipped: Option<SampleId>,
     /// The source has no sample twice: a new instance goes on with the next epoch.
     is_live: bool,
+    /// The stages have a partner input.
+    has_partners: bool,
 }
 
 /// A sample on its way. It is `made_by` the process that has decided it.
@@ -94,7 +96,7 @@ impl Sample {
 
 impl Hash for Sample {
     fn hash<H: Hasher>(&self, state: &mut H) {
-        self.0.as_bytes().hash(state);
+        (self.0.epoch, self.0.seq, self.0.made_by).hash(state);
     }
 }
 
@@ -108,10 +110,11 @@ impl engine::Sample for Sample {
     }
 }
 
-/// A worker that answers each sample under its number. Its state is the number of its samples so far, and the last one.
+/// A worker that answers each sample under its number. Its state is its model, the number of its samples so far, and the last one.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Counter {
     has_state: bool,
+    model: u64,
     n_samples: u64,
     last: Option<SampleId>,
     answer: Option<Sample>,
@@ -159,13 +162,18 @@ impl Worker<Sample> for Counter {
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
-        crate::stage::encode_state((self.n_samples, self.last), bytes)
+        crate::stage::encode_state((self.model, self.n_samples, self.last), bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
         let saved = state.map(|bytes| bincode::serde::decode_from_slice(bytes, crate::stage::STATE_FORMAT));
-        ((self.n_samples, self.last), _) = saved.transpose()?.unwrap_or_default();
-        Ok(state.is_some())
+        let ((model, n_samples, last), _): ((u64, _, _), usize) = saved.transpose()?.unwrap_or_default();
+        (self.n_samples, self.last) = if model == self.model { (n_samples, last) } else { (0, None) };
+        Ok(model == self.model)
+    }
+
+    fn has_missed_samples(&mut self) {
+        self.n_samples += 1000;
     }
 
     fn deadline_nanos(&self) -> Option<u64> {
@@ -203,6 +211,8 @@ struct Process {
     /// Of a stage, with the samples that it has put back.
     engine: Option<Engine<Sample, Counter>>,
     put_back: Vec<Sample>,
+    /// The sample that has waited for its partner.
+    waited_for: Option<SampleId>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default)]
@@ -266,6 +276,14 @@ impl Hasher for Fingerprint {
             word[..chunk.len()].copy_from_slice(chunk);
             self.write_u64(u64::from_ne_bytes(word));
         }
+    }
+
+    fn write_u8(&mut self, word: u8) {
+        self.write_u64(word.into());
+    }
+
+    fn write_usize(&mut self, word: usize) {
+        self.write_u64(word as u64);
     }
 
     fn write_u64(&mut self, word: u64) {
@@ -353,6 +371,7 @@ impl Search {
             next: 0,
             engine: None,
             put_back: Vec::new(),
+            waited_for: None,
         };
         world.n_processes[node] += 1;
         if node > SOURCE {
@@ -396,13 +415,7 @@ impl Search {
             return self.begin_with(world, node, Sequencer::resume(answered, answered, counts));
         }
         let mut at = At::new(self, world, node);
-        let mut engine = engine.unwrap_or_else(|| {
-            let has_state = node == STATEFUL;
-            let book = Book::new(vec![Input::new("in", false)], vec![Output::new("out", Numbers::OfWorker)]);
-            let worker = Counter { has_state, n_samples: 0, last: None, answer: None, is_broken: false };
-            let manner = Manner { saves: has_state, answers_each: true, n_batch: 1, has_suspect: false };
-            Engine::begin(&mut at, worker, book, manner, true).expect("it stands by")
-        });
+        let mut engine = engine.unwrap_or_else(|| at.standby(1));
         engine.take_over(&mut at, is_handed_over).expect("it takes over");
         at.process().engine = Some(engine);
     }
@@ -480,11 +493,11 @@ impl Search {
         if let Placing::Deliver(sample) = placing { Some(sample) } else { None }
     }
 
-    /// The world after one store of a stage's active process, and whether it has tried to take a sample.
-    fn advance(&self, world: &World, node: usize, choice: Choice) -> (World, Progress, bool) {
+    /// The world after one store of a stage's active process.
+    fn advance(&self, world: &World, node: usize, choice: Choice) -> (World, Progress) {
         let mut next = world.clone();
         let mut at = At { choice, ..At::new(self, &mut next, node) };
-        let Some(mut engine) = at.process().engine.take() else { return (next, Progress::Idle, false) };
+        let Some(mut engine) = at.process().engine.take() else { return (next, Progress::Idle) };
         let progress = loop {
             let progress = engine.advance(&mut at, false).expect("it goes on");
             if progress != Progress::Moved || at.has_stored {
@@ -492,32 +505,36 @@ impl Search {
             }
         };
         at.process().engine = Some(engine);
-        let has_tried = at.has_tried;
-        (next, progress, has_tried)
+        (next, progress)
     }
 
     /// The worlds after one store of a stage's active process.
     fn step_of_stage(&self, world: &World, node: usize) -> Vec<World> {
-        let (next, progress, has_tried) = self.advance(world, node, Choice::Nothing);
-        if progress == Progress::GaveWay && next.nodes[node] == world.nodes[node] {
-            return self.wait_long(world, node).into_iter().collect();
+        let mut worlds = Vec::new();
+        let (next, progress) = self.advance(world, node, Choice::Nothing);
+        match progress {
+            Progress::GaveWay if !has_counted(&next, node) && next.broken.is_none() => {
+                worlds.extend(self.wait_long(world, node));
+            }
+            // Only now it looks at its queues.
+            Progress::Idle => {
+                for choice in self.choices(world, node) {
+                    worlds.push(self.advance(world, node, Choice::Queue(choice)).0);
+                }
+            }
+            _ => worlds.push(next),
         }
-        if !has_tried || progress == Progress::Moved {
-            return vec![next];
-        }
-        let choices = self.choices(world, node).into_iter();
-        choices.map(|choice| self.advance(world, node, Choice::Queue(choice)).0).collect()
+        worlds
     }
 
     /// Whether a process can hand over: between two samples, or while it waits for room.
     fn is_idle(&self, world: &World, node: usize) -> bool {
         let Some(process) = &world.nodes[node].active else { return false };
-        let Some(engine) = &process.engine else { return !process.has_counted };
-        if process.has_counted || engine.is_between_samples() {
+        if process.has_counted || process.engine.as_ref().is_none_or(Engine::is_between_samples) {
             return !process.has_counted;
         }
-        let (next, progress, _) = self.advance(world, node, Choice::Nothing);
-        progress == Progress::GaveWay && next.nodes[node] == world.nodes[node]
+        let (next, progress) = self.advance(world, node, Choice::Nothing);
+        progress == Progress::GaveWay && !has_counted(&next, node)
     }
 
     /// The worlds after one step of a node's active process.
@@ -659,7 +676,7 @@ impl Search {
             // Time passes: early samples are delivered, and those before them are missing.
             for node in [STATELESS, STATEFUL] {
                 if world.nodes[node].active.is_some() {
-                    let (next, progress, _) = self.advance(world, node, Choice::Later);
+                    let (next, progress) = self.advance(world, node, Choice::Later);
                     worlds.extend(if progress == Progress::Moved { Some(next) } else { None });
                 }
             }
@@ -863,6 +880,10 @@ impl Search {
     }
 }
 
+fn has_counted(world: &World, node: usize) -> bool {
+    world.nodes[node].active.as_ref().is_some_and(|process| process.has_counted)
+}
+
 /// The sample that a port delivers next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Choice {
@@ -880,16 +901,25 @@ struct At<'a> {
     world: &'a mut World,
     node: usize,
     choice: Choice,
-    /// It has tried to take a sample.
-    has_tried: bool,
     /// It has done something that outlives its process.
     has_stored: bool,
+    /// The answers that a standby has sent for comparison.
+    beside: Vec<SampleId>,
 }
 
 impl<'a> At<'a> {
     fn new(search: &'a Search, world: &'a mut World, node: usize) -> At<'a> {
         let choice = Choice::Nothing;
-        At { search, world, node, choice, has_tried: false, has_stored: false }
+        At { search, world, node, choice, has_stored: false, beside: Vec::new() }
+    }
+
+    /// A stage that stands by.
+    fn standby(&mut self, model: u64) -> Engine<Sample, Counter> {
+        let has_state = self.node == STATEFUL;
+        let book = Book::new(vec![Input::new("in", false)], vec![Output::new("out", Numbers::OfWorker)]);
+        let worker = Counter { has_state, model, n_samples: 0, last: None, answer: None, is_broken: false };
+        let manner = Manner { saves: has_state, answers_each: true, n_batch: 1, has_suspect: false };
+        Engine::begin(self, worker, book, manner, true).expect("it stands by")
     }
 
     fn process(&mut self) -> &mut Process {
@@ -910,7 +940,7 @@ impl Site for At<'_> {
     const STATE_BYTES: usize = STATE_BYTES;
 
     fn receive(&mut self, _: usize) -> Result<Option<Received<Sample>>, PortError> {
-        (self.has_tried, self.has_stored) = (true, true);
+        self.has_stored = true;
         let Some(sample) = self.search.deliver(self.world, self.node, self.choice) else { return Ok(None) };
         Ok(Some(Received { sample, counts: self.process().sequencer.counts(), late: None }))
     }
@@ -929,7 +959,10 @@ impl Site for At<'_> {
         self.search.begin_with(self.world, self.node, Sequencer::resume(last, last, counts));
     }
 
-    fn look_on_from(&mut self, _: usize, _: SampleId) {}
+    fn look_on_from(&mut self, _: usize, last: SampleId) {
+        let sequencer = Sequencer::resume(Some(last), Some(last), InputCounts::default());
+        self.search.begin_with(self.world, self.node, sequencer);
+    }
 
     fn commit(&mut self, _: usize, key: SampleId, counts: &InputCounts) {
         self.has_stored = true;
@@ -1005,7 +1038,8 @@ impl Site for At<'_> {
         Ok(())
     }
 
-    fn send_beside(&mut self, _: usize, _: SampleId, _: &[u8], _: &[u8]) -> Result<(), PortError> {
+    fn send_beside(&mut self, _: usize, key: SampleId, _: &[u8], _: &[u8]) -> Result<(), PortError> {
+        self.beside.push(key);
         Ok(())
     }
 
@@ -1017,8 +1051,11 @@ impl Site for At<'_> {
         Ok(())
     }
 
-    fn choose_partners(&mut self, _: &Header, _: bool, _: bool) -> Result<bool, PortError> {
-        Ok(true)
+    /// Each sample waits for its partner once.
+    fn choose_partners(&mut self, main: &Header, _: bool, _: bool) -> Result<bool, PortError> {
+        let key = Some(sample_id(main));
+        let has_partners = self.search.budget.has_partners;
+        Ok(!has_partners || std::mem::replace(&mut self.process().waited_for, key) == key)
     }
 
     fn partners_have_answered(&mut self, _: Option<SampleId>) {}
@@ -1091,6 +1128,7 @@ const KILLS: Budget = Budget {
     kills_reader: false,
     skipped: None,
     is_live: false,
+    has_partners: false,
 };
 const SWAP: Budget = Budget { n_kills: 1, n_swaps: 1, ..KILLS };
 const LATE: Budget = Budget { n_kills: 1, n_late: 1, ..KILLS };
@@ -1115,6 +1153,85 @@ fn assert_whole(budgets: &[Budget]) {
 fn kills_swaps_and_late_connections_lose_and_repeat_nothing() {
     let swap_of = |node| Budget { node: Some(node), ..SWAP };
     assert_whole(&[Budget { n_kills: 1, ..KILLS }, swap_of(SOURCE), swap_of(STATELESS), swap_of(STATEFUL), LATE]);
+}
+
+#[test]
+fn a_sample_that_waits_for_its_partner_is_not_lost() {
+    let partners = |node| Budget { n_kills: 0, n_swaps: 1, node: Some(node), has_partners: true, ..KILLS };
+    assert_whole(&[partners(STATELESS), partners(STATEFUL)]);
+}
+
+/// A stage with state in a world of its own, and what an instance of it with that model has saved there.
+fn saved_by(at: &mut At<'_>, model: u64, seq: u64, n_samples: u64) -> Vec<u8> {
+    let mut engine = at.standby(model);
+    let key = id(3, seq);
+    (engine.worker.n_samples, engine.worker.last) = (n_samples, Some(key));
+    let mut book = Book::new(vec![Input::new("in", false)], vec![]);
+    book.inputs[0].last = Some(key);
+    let sent = book.save(at, Yields::ToOthers, |bytes| engine.worker.state(bytes));
+    assert_eq!(sent.expect("saved"), Sent::Yes);
+    at.world.saved.take().expect("a state")
+}
+
+#[test]
+fn a_stage_whose_replacement_fails_goes_on_with_what_it_has_learned() {
+    let search = Search::new(Without::Nothing, KILLS);
+    let mut world = search.begin();
+    let mut at = At::new(&search, &mut world, STATEFUL);
+    let own = saved_by(&mut at, 1, 10, 304);
+    let other = saved_by(&mut at, 2, 90, 7);
+    let newer = saved_by(&mut at, 1, 90, 310);
+    for (found, was_active, expected) in [
+        // Its replacement had another model, or no state, which drops the saved one. It has missed samples.
+        (Some(&other), true, (Some(90), 1304)),
+        (None, true, (None, 1304)),
+        // Its replacement has gone on with its state.
+        (Some(&newer), true, (Some(90), 310)),
+        // It has not been active before.
+        (Some(&other), false, (Some(90), 0)),
+        (None, false, (None, 0)),
+    ] {
+        let mut engine = at.standby(1);
+        if was_active {
+            at.world.saved = Some(own.clone());
+            engine.take_over(&mut at, true).expect("active");
+            engine.hand_over(&mut at);
+        }
+        at.world.slots.answered[STATEFUL] = None;
+        at.world.saved = found.cloned();
+        engine.take_over(&mut at, false).expect("active again");
+        assert_eq!((engine.next_seq().map(|seq| seq - 1), engine.worker.n_samples), expected);
+    }
+}
+
+#[test]
+fn a_saved_state_is_old_if_another_operator_has_answered_samples_since() {
+    let search = Search::new(Without::Nothing, KILLS);
+    let mut world = search.begin();
+    let mut at = At::new(&search, &mut world, STATEFUL);
+    let saved = saved_by(&mut at, 1, 7, 304);
+    for (answered, n_samples) in [(6, 304), (7, 304), (8, 0)] {
+        at.world.slots.answered[STATEFUL] = Some(id(3, answered));
+        at.world.saved = Some(saved.clone());
+        assert_eq!(at.standby(1).worker.n_samples, n_samples, "{answered}");
+    }
+}
+
+/// The queue of a standby has overflowed: it goes on from the state that the active instance has saved since.
+#[test]
+fn a_standby_that_has_missed_samples_looks_on_again() {
+    let search = Search::new(Without::Nothing, KILLS);
+    let mut world = search.begin();
+    let mut at = At::new(&search, &mut world, STATEFUL);
+    let (first, later) = (saved_by(&mut at, 1, 0, 1), saved_by(&mut at, 1, 4, 5));
+    at.world.saved = Some(first);
+    let mut engine = at.standby(1);
+    at.world.saved = Some(later);
+    at.process().queues = vec![(0, [5, 6].map(|seq| Sample::new(id(3, seq))).into())];
+    at.choice = Choice::Queue(0);
+    engine.look_on(&mut at).expect("it looks on");
+    engine.look_on(&mut at).expect("it looks on");
+    assert_eq!((engine.worker.n_samples, at.beside), (7, vec![id(3, 5), id(3, 6)]));
 }
 
 /// F1, F3: the only instance that has samples ends together with their reader, and a sample is left without an answer.

@@ -201,24 +201,12 @@ impl Book {
 
     /// Drops the answers that all readers have answered, and writes down places and answers.
     fn write_down<S: Site>(&mut self, site: &S) -> anyhow::Result<()> {
-        let Scratch { bytes, entries } = &mut self.scratch;
-        bytes.clear();
-        bytes.extend_from_slice(MAGIC);
-        encode_state((self.inputs.len() as u64, self.outputs.len() as u64, self.is_done), &mut *bytes)?;
-        for input in &self.inputs {
-            encode_state((&*input.name, input.last, input.counts), &mut *bytes)?;
-        }
         for (idx, output) in self.outputs.iter_mut().enumerate() {
             let forgotten = output.kept.forget(site.has_readers(idx), site.answered_by_readers(idx));
-            entries.extend(forgotten.map(|entry| entry.bytes));
-            let kept = output.kept.entries();
-            encode_state((&*output.name, output.last, kept.len() as u64), &mut *bytes)?;
-            for entry in kept {
-                encode_state((entry.n_head_bytes as u64, entry.bytes.len() as u64), &mut *bytes)?;
-                bytes.extend_from_slice(&entry.bytes);
-            }
+            self.scratch.entries.extend(forgotten.map(|entry| entry.bytes));
         }
-        Ok(())
+        self.scratch.bytes.clear();
+        encode(&self.inputs, &self.outputs, self.is_done, &mut self.scratch.bytes)
     }
 
     /// Takes over what the node's active instance has saved last: the worker's state, or `None` if nothing was saved that this
@@ -307,6 +295,23 @@ fn unix_nanos() -> u64 {
     now.tv_sec as u64 * 1_000_000_000 + now.tv_nsec as u64
 }
 
+fn encode(inputs: &[Input], outputs: &[Output], is_done: bool, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
+    bytes.extend_from_slice(MAGIC);
+    encode_state((inputs.len() as u64, outputs.len() as u64, is_done), &mut *bytes)?;
+    for input in inputs {
+        encode_state((&*input.name, input.last, input.counts), &mut *bytes)?;
+    }
+    for output in outputs {
+        let kept = output.kept.entries();
+        encode_state((&*output.name, output.last, kept.len() as u64), &mut *bytes)?;
+        for entry in kept {
+            encode_state((entry.n_head_bytes as u64, entry.bytes.len() as u64), &mut *bytes)?;
+            bytes.extend_from_slice(&entry.bytes);
+        }
+    }
+    Ok(())
+}
+
 fn read(bytes: &[u8]) -> anyhow::Result<Found<'_>> {
     read_whole(bytes).context("the node's saved state cannot be read: an operator of another version has saved it")
 }
@@ -365,5 +370,39 @@ mod tests {
 
     impl std::hash::Hash for Scratch {
         fn hash<H: std::hash::Hasher>(&self, _: &mut H) {}
+    }
+
+    fn id(seq: u64) -> SampleId {
+        SampleId { epoch: 3, seq }
+    }
+
+    #[test]
+    fn the_next_instance_sends_what_readers_lack_as_it_was() {
+        let output = |name, known| Output { known, ..Output::new(name, Numbers::Counted) };
+        let counts = InputCounts { n_received: 8, ..InputCounts::default() };
+        let left = Input { last: Some(id(7)), counts, ..Input::new("left", false) };
+        let mut book = Book::new(vec![left], vec![output("b", None), output("a", None)]);
+        for (to, seq) in [(0, 0), (0, 1), (0, 2), (1, 9)] {
+            let header = Header { epoch: 3, seq, ..Header::default() };
+            book.keep(to, &header, &[0; size_of::<Header>()], b"items");
+        }
+        let mut bytes = Vec::new();
+        encode(&book.inputs, &book.outputs, true, &mut bytes).expect("encoded");
+        let n_bytes = bytes.len();
+        bytes.extend_from_slice(b"mine");
+        // Readers of b have 0, those of a have nothing; the operator has another input now.
+        let inputs = vec![Input::new("new", false), Input::new("left", false)];
+        let mut next = Book::new(inputs, vec![output("a", None), output("b", Some(id(0)))]);
+        let found = read(&bytes).expect("read");
+        assert_eq!(found.state, b"mine");
+        next.take_in(found);
+        assert!(next.is_done);
+        assert_eq!((next.inputs[0].last, next.inputs[1].last, next.inputs[1].counts), (None, Some(id(7)), counts));
+        let [a, b] = &next.outputs[..] else { panic!("two outputs") };
+        assert_eq!((a.kept.first_sent(), a.last, a.kept.entries().len()), (None, Some(id(9)), 1));
+        assert_eq!((b.kept.next(), b.last), (book.outputs[0].kept.entries().get(1), Some(id(2))));
+        for n_bytes_kept in 0..n_bytes {
+            assert!(read(&bytes[..n_bytes_kept]).is_err(), "{n_bytes_kept}");
+        }
     }
 }
