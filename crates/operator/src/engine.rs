@@ -8,7 +8,7 @@
 use std::collections::VecDeque;
 
 use blindgrasp_messages::Header;
-use blindgrasp_messages::zerocopy::FromBytes as _;
+use blindgrasp_messages::zerocopy::{FromBytes as _, IntoBytes as _};
 use serde_json::{Map, Value};
 
 use crate::cursors::SampleId;
@@ -559,7 +559,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
     ) -> anyhow::Result<()> {
         for idx in 0..n_answers {
             let (output, head, _) = self.worker.answer(idx);
-            let (own, _) = Header::read_from_prefix(head).expect("a head begins with its header");
+            let own = header_of(head);
             let numbers = self.book.outputs[output].numbers;
             let mut header = match to {
                 Some((_, answered)) if numbers != Numbers::OfWorker || own == Header::default() => *answered,
@@ -636,7 +636,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         if self.manner.saves {
             for idx in 0..n_answers {
                 let (output, head, items) = self.worker.answer(idx);
-                let (header, _) = Header::read_from_prefix(head).expect("a head begins with its header");
+                let header = header_of(head);
                 self.book.keep(output, &header, head, items);
             }
             pending.n_answers = 0;
@@ -661,7 +661,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
             return Ok(Progress::GaveWay);
         }
         let (head, items) = entry.parts();
-        let (header, _) = Header::read_from_prefix(head).expect("a head begins with its header");
+        let header = header_of(head);
         let head = self.worker.before_sending_saved((output, head, items), site.arrival_nanos(&header))?;
         site.send(output, entry.key, head, items)?;
         kept.has_sent_next();
@@ -672,7 +672,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
     fn send_next<S: Site<Sample = T>>(&mut self, site: &mut S) -> anyhow::Result<Progress> {
         let Some(pending) = &mut self.pending else { return Ok(Progress::Moved) };
         let (output, head, _) = self.worker.answer(pending.n_sent);
-        let (header, _) = Header::read_from_prefix(head).expect("a head begins with its header");
+        let header = header_of(head);
         let key = sample_id(&header);
         let known = self.book.outputs[output].known;
         // One output may be ahead of another: its readers have this answer.
@@ -704,11 +704,8 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         if self.manner.saves {
             return self.book.inputs[input].last;
         }
-        let outputs = 0..self.book.outputs.len();
-        let answered =
-            outputs.filter(|output| site.has_readers(*output)).map(|output| site.answered_by_readers(output));
-        let least = answered.reduce(|a, b| if a.is_some_and(|a| site.is_after(input, a, b)) { b } else { a });
-        least.unwrap_or(self.last)
+        let outputs = (0..self.book.outputs.len()).filter(|output| site.has_readers(*output));
+        least(site, input, outputs.map(|output| site.answered_by_readers(output))).unwrap_or(self.last)
     }
 
     /// Tells the worker of the end of the stream, of a cut or of silence; false if nothing came of it.
@@ -795,8 +792,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
 
     /// Goes on after the last sample whose answers all readers of all outputs have.
     fn begin_after_readers<S: Site<Sample = T>>(&mut self, site: &mut S) {
-        let known = self.book.outputs.iter().map(|output| output.known);
-        let least = known.reduce(|a, b| if a.is_some_and(|a| site.is_after(0, a, b)) { b } else { a }).flatten();
+        let least = least(site, 0, self.book.outputs.iter().map(|output| output.known)).flatten();
         let input = &mut self.book.inputs[0];
         input.last = least;
         if self.manner.saves {
@@ -885,7 +881,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         self.number_answers(site, Some((input, &header)), n_answers)?;
         for idx in 0..n_answers {
             let (output, head, items) = self.worker.answer(idx);
-            let (header, _) = Header::read_from_prefix(head).expect("a head begins with its header");
+            let header = header_of(head);
             site.send_beside(output, sample_id(&header), head, items)?;
         }
         self.n_looked_on += 1;
@@ -894,6 +890,22 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         }
         Ok(())
     }
+}
+
+/// The place that is furthest behind, if there is one.
+fn least<S: Site>(site: &S, input: usize, places: impl Iterator<Item = Option<SampleId>>) -> Option<Option<SampleId>> {
+    places.reduce(|a, b| if a.is_some_and(|a| site.is_after(input, a, b)) { b } else { a })
+}
+
+/// The header with which the bytes of a head begin.
+pub(crate) fn header_of(head: &[u8]) -> Header {
+    Header::read_from_prefix(head).expect("a head begins with its header").0
+}
+
+/// The bytes of a head with another header.
+pub(crate) fn with_header(mut head: Vec<u8>, header: &Header) -> Vec<u8> {
+    header.write_to_prefix(&mut head).expect("a head begins with its header");
+    head
 }
 
 /// The name of a sample for the launcher, which knows nothing of inputs: two inputs may have samples of one number.

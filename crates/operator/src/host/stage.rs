@@ -7,7 +7,6 @@
 use std::collections::VecDeque;
 
 use blindgrasp_messages::Header;
-use blindgrasp_messages::zerocopy::{FromBytes as _, IntoBytes as _};
 use serde_json::{Map, Value};
 
 use super::child::Program;
@@ -15,7 +14,7 @@ use super::ports::{self, HostedOutput, PartnerPort, output_of};
 use super::protocol::{Ask, Hears, MORE, Part, Ready, Work};
 use super::{child, listen, log};
 use crate::description::OperatorDescription;
-use crate::engine::{Answer, Hearing, Manner, Taken, Worker};
+use crate::engine::{Answer, Hearing, Manner, Taken, Worker, header_of, with_header};
 use crate::monotonic_nanos;
 use crate::operator::Operator;
 use crate::port::UntypedSample;
@@ -299,15 +298,4 @@ impl Worker<UntypedSample> for ProgramWorker {
     fn has_had_turn(&mut self) {
         log(&self.operator, self.child.lines());
     }
-}
-
-/// The header with which the bytes of a head begin.
-pub(super) fn header_of(head: &[u8]) -> Header {
-    Header::read_from_prefix(head).map_or_else(|_| Header::default(), |(header, _)| header)
-}
-
-/// The bytes of a head with another header.
-pub(super) fn with_header(mut head: Vec<u8>, header: &Header) -> Vec<u8> {
-    header.write_to_prefix(&mut head).expect("a head begins with its header");
-    head
 }
