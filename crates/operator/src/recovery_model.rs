@@ -527,14 +527,17 @@ impl Search {
         worlds
     }
 
-    /// Whether a process can hand over: between two samples, or while it waits for room.
-    fn is_idle(&self, world: &World, node: usize) -> bool {
-        let Some(process) = &world.nodes[node].active else { return false };
-        if process.has_counted || process.engine.as_ref().is_none_or(Engine::is_between_samples) {
-            return !process.has_counted;
+    /// The world in which a process can hand over: it is between two samples, or waits for room.
+    fn at_rest(&self, world: &World, node: usize) -> Option<World> {
+        let process = world.nodes[node].active.as_ref()?;
+        if process.has_counted {
+            return None;
+        }
+        if process.engine.as_ref().is_none_or(Engine::is_between_samples) {
+            return Some(world.clone());
         }
         let (next, progress) = self.advance(world, node, Choice::Nothing);
-        progress == Progress::GaveWay && !has_counted(&next, node)
+        if progress == Progress::GaveWay && !has_counted(&next, node) { Some(next) } else { None }
     }
 
     /// The worlds after one step of a node's active process.
@@ -629,7 +632,7 @@ impl Search {
     }
 
     fn swap(&self, world: &World, node: usize) -> Option<World> {
-        let mut next = world.clone();
+        let mut next = self.at_rest(world, node)?;
         let mut at = At::new(self, &mut next, node);
         if let Some(mut engine) = at.process().engine.take() {
             engine.hand_over(&mut at);
@@ -712,7 +715,7 @@ impl Search {
                     worlds.extend(ends.into_iter().map(|next| World { n_kills: world.n_kills + 1, ..next }));
                 }
             }
-            if world.n_swaps < self.budget.n_swaps && is_meant && !is_alive[0] && self.is_idle(world, node) {
+            if world.n_swaps < self.budget.n_swaps && is_meant && !is_alive[0] {
                 worlds.extend(self.swap(world, node));
             }
             if world.n_late < self.budget.n_late && node > SOURCE {
