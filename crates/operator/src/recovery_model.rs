@@ -508,21 +508,32 @@ impl Search {
         (next, progress)
     }
 
+    /// Whether a stage has no work besides samples that have just come. It saves half of the time to know that.
+    fn has_nothing_but_queues(&self, process: &Process) -> bool {
+        let is_between = process.engine.as_ref().is_some_and(Engine::is_between_samples);
+        is_between && process.sequencer.n_held() == 0 && !self.budget.has_partners
+    }
+
     /// The worlds after one store of a stage's active process.
     fn step_of_stage(&self, world: &World, node: usize) -> Vec<World> {
         let mut worlds = Vec::new();
-        let (next, progress) = self.advance(world, node, Choice::Nothing);
-        match progress {
-            Progress::GaveWay if !has_counted(&next, node) && next.broken.is_none() => {
-                worlds.extend(self.wait_long(world, node));
+        let (next, progress) = match &world.nodes[node].active {
+            Some(process) if self.has_nothing_but_queues(process) => (None, Progress::Idle),
+            _ => {
+                let (next, progress) = self.advance(world, node, Choice::Nothing);
+                (Some(next), progress)
             }
+        };
+        let is_waiting = next.as_ref().is_some_and(|next| !has_counted(next, node) && next.broken.is_none());
+        match progress {
+            Progress::GaveWay if is_waiting => worlds.extend(self.wait_long(world, node)),
             // Only now it looks at its queues.
             Progress::Idle => {
                 for choice in self.choices(world, node) {
                     worlds.push(self.advance(world, node, Choice::Queue(choice)).0);
                 }
             }
-            _ => worlds.push(next),
+            _ => worlds.extend(next),
         }
         worlds
     }
