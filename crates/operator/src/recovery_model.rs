@@ -8,6 +8,7 @@
 
 use std::collections::{HashSet, VecDeque};
 use std::hash::{Hash, Hasher};
+use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use blindgrasp_messages::Header;
@@ -208,8 +209,8 @@ struct Process {
     sample: Option<Sample>,
     /// Of a source: the next of its samples.
     next: usize,
-    /// Of a stage, with the samples that it has put back.
-    engine: Option<Engine<Sample, Counter>>,
+    /// Of a stage, with the samples that it has put back. Most steps leave it as it is, so that worlds share it.
+    engine: Option<Rc<Engine<Sample, Counter>>>,
     put_back: Vec<Sample>,
     /// The sample that has waited for its partner.
     waited_for: Option<SampleId>,
@@ -397,7 +398,7 @@ impl Search {
         let (slots, written) = (&world.slots, world.slots.written.get(node).copied().flatten());
         let Some(process) = &mut world.nodes[node].active else { return };
         process.has_counted = false;
-        let engine = process.engine.take();
+        let engine = process.engine.take().map(Rc::unwrap_or_clone);
         if node == SOURCE {
             let known = process.credit.begin(is_handed_over, slots, written);
             let known = match written {
@@ -417,7 +418,7 @@ impl Search {
         let mut at = At::new(self, world, node);
         let mut engine = engine.unwrap_or_else(|| at.standby(1));
         engine.take_over(&mut at, is_handed_over).expect("it takes over");
-        at.process().engine = Some(engine);
+        at.process().engine = Some(Rc::new(engine));
     }
 
     /// As a port, which begins anew.
@@ -497,20 +498,21 @@ impl Search {
     fn advance(&self, world: &World, node: usize, choice: Choice) -> (World, Progress) {
         let mut next = world.clone();
         let mut at = At { choice, ..At::new(self, &mut next, node) };
-        let Some(mut engine) = at.process().engine.take() else { return (next, Progress::Idle) };
+        let Some(engine) = at.process().engine.take() else { return (next, Progress::Idle) };
+        let mut engine = Rc::unwrap_or_clone(engine);
         let progress = loop {
             let progress = engine.advance(&mut at, false).expect("it goes on");
             if progress != Progress::Moved || at.has_stored {
                 break progress;
             }
         };
-        at.process().engine = Some(engine);
+        at.process().engine = Some(Rc::new(engine));
         (next, progress)
     }
 
     /// Whether a stage has no work besides samples that have just come. It saves half of the time to know that.
     fn has_nothing_but_queues(&self, process: &Process) -> bool {
-        let is_between = process.engine.as_ref().is_some_and(Engine::is_between_samples);
+        let is_between = process.engine.as_ref().is_some_and(|engine| engine.is_between_samples());
         is_between && process.sequencer.n_held() == 0 && !self.budget.has_partners
     }
 
@@ -544,7 +546,7 @@ impl Search {
         if process.has_counted {
             return None;
         }
-        if process.engine.as_ref().is_none_or(Engine::is_between_samples) {
+        if process.engine.as_ref().is_none_or(|engine| engine.is_between_samples()) {
             return Some(world.clone());
         }
         let (next, progress) = self.advance(world, node, Choice::Nothing);
@@ -645,9 +647,10 @@ impl Search {
     fn swap(&self, world: &World, node: usize) -> Option<World> {
         let mut next = self.at_rest(world, node)?;
         let mut at = At::new(self, &mut next, node);
-        if let Some(mut engine) = at.process().engine.take() {
+        if let Some(engine) = at.process().engine.take() {
+            let mut engine = Rc::unwrap_or_clone(engine);
             engine.hand_over(&mut at);
-            at.process().engine = Some(engine);
+            at.process().engine = Some(Rc::new(engine));
         }
         let old = next.nodes[node].active.take()?;
         next.n_swaps += 1;
@@ -1171,7 +1174,7 @@ fn kills_swaps_and_late_connections_lose_and_repeat_nothing() {
 
 #[test]
 fn a_sample_that_waits_for_its_partner_is_not_lost() {
-    let partners = |node| Budget { n_kills: 0, n_swaps: 1, node: Some(node), has_partners: true, ..KILLS };
+    let partners = |node| Budget { n_kills: 1, node: Some(node), has_partners: true, ..KILLS };
     assert_whole(&[partners(STATELESS), partners(STATEFUL)]);
 }
 
