@@ -287,6 +287,8 @@ pub(crate) struct Engine<T, W> {
     pending: Option<Pending<T>>,
     /// What was saved when it handed over, in case that its replacement fails.
     handed_over: Option<Vec<u8>>,
+    /// It stands by and has not been active: it reads along with readers of its own.
+    looks_on: bool,
     /// As a standby, it reads along after samples that a saved state includes.
     has_begun_from_state: bool,
     n_looked_on: u64,
@@ -326,6 +328,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
             batch: (0, VecDeque::new()),
             pending: None,
             handed_over: None,
+            looks_on: is_standby,
             has_begun_from_state: false,
             n_looked_on: 0,
             n_one_by_one: if manner.has_suspect { MAX_BATCH } else { 0 },
@@ -769,6 +772,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         // Those of a standby are its own copies.
         self.back.iter_mut().for_each(VecDeque::clear);
         site.begin_active();
+        self.looks_on = false;
         self.is_cut_off = false;
         for (idx, output) in self.book.outputs.iter_mut().enumerate() {
             output.known = site.begin(idx, is_handed_over);
@@ -845,7 +849,9 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
     /// An error of the worker or of a port.
     pub(crate) fn look_on<S: Site<Sample = T>>(&mut self, site: &mut S) -> anyhow::Result<()> {
         for input in 0..self.back.len() {
-            while !site.is_interrupted() && !site.should_stop() {
+            // After it has handed over, the samples are for the time when it is active again.
+            while self.looks_on && !self.book.inputs[input].is_feedback && !site.is_interrupted() && !site.should_stop()
+            {
                 let Some(taken) = self.receive(site, input)? else { break };
                 site.beat();
                 if self.has_begun_from_state && taken.counts.n_missing > 0 {

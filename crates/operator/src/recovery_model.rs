@@ -1248,7 +1248,22 @@ fn a_standby_that_has_missed_samples_looks_on_again() {
     at.choice = Choice::Queue(0);
     engine.look_on(&mut at).expect("it looks on");
     engine.look_on(&mut at).expect("it looks on");
-    assert_eq!((engine.worker.n_samples, at.beside), (7, vec![id(3, 5), id(3, 6)]));
+    assert_eq!((engine.worker.n_samples, &at.beside[..]), (7, &[id(3, 5), id(3, 6)][..]));
+}
+
+/// It may be active again, and the samples that it has not answered exist nowhere else.
+#[test]
+fn an_instance_that_has_handed_over_takes_no_samples() {
+    let search = Search::new(Without::Nothing, KILLS);
+    let mut world = search.begin();
+    let mut at = At::new(&search, &mut world, STATELESS);
+    let mut engine = at.standby(1);
+    engine.take_over(&mut at, true).expect("active");
+    engine.hand_over(&mut at);
+    at.process().queues = vec![(0, [Sample::new(SAMPLES[0])].into())];
+    at.choice = Choice::Queue(0);
+    engine.look_on(&mut at).expect("it stands by");
+    assert_eq!((at.process().queues[0].1.len(), at.beside.len()), (1, 0));
 }
 
 /// F1, F3: the only instance that has samples ends together with their reader, and a sample is left without an answer.
