@@ -43,9 +43,7 @@ HAND = Description(
 )
 NAG = Description("nag", "Answers silence", ("tactile", TactileFrame), ("prediction", Prediction), answers_each=False)
 PLAIN = Description("plain", "Judges without a state", ("feature", GraspFeature), ("prediction", Prediction))
-KEEPER = Description(
-    "keeper", "Keeps a state", ("feature", GraspFeature), ("prediction", Prediction), answers_each=False
-)
+KEEPER = Description("keeper", "Keeps a state", ("feature", GraspFeature), ("prediction", Prediction))
 MORTAL = Description("mortal", "Dies of a sample", ("feature", GraspFeature), ("prediction", Prediction))
 # The grasp to which the answers of nag belong.
 NAGS = 1_000_000
@@ -148,9 +146,7 @@ def keeper(_params):
         kept = state
 
     def answer(head, _items):
-        made = PredictionHead(grasp_id=head.grasp_id, phase=head.phase, fault=head.fault)
-        made.header = head.header
-        return made
+        return PredictionHead(grasp_id=head.grasp_id, phase=head.phase, fault=head.fault)
 
     return Stage(answer, state=lambda: kept, restore=restore)
 

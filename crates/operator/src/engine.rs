@@ -569,12 +569,17 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
                 _ => own,
             };
             header.made_by = site.made_by(to.map_or(own.made_by, |(_, answered)| answered.made_by));
-            if let Numbers::OfInput(expected) = numbers
+            let expected = match numbers {
+                Numbers::OfSample => Some(Some(0)),
+                Numbers::OfInput(expected) => Some(expected),
+                Numbers::OfWorker | Numbers::Counted => None,
+            };
+            if let Some(expected) = expected
                 && (expected.is_none() || to.map(|(input, _)| input) != expected)
             {
                 let found = to.map_or("silence", |(input, _)| &*self.book.inputs[input].name);
                 let name = &self.book.outputs[output].name;
-                anyhow::bail!("it answered {found} on the output {name}, which answers another input");
+                anyhow::bail!("it answered {found} on the output {name}, which answers the samples of another input");
             }
             if numbers == Numbers::Counted {
                 let next = self.book.next_key(output);
@@ -589,9 +594,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
     fn require_answers(&self, input: usize, n_answers: usize) -> anyhow::Result<()> {
         for (idx, output) in self.book.outputs.iter().enumerate() {
             let promise = match output.numbers {
-                Numbers::OfSample => {
-                    "a stage without state answers every sample, with a fault where it has nothing to say"
-                }
+                Numbers::OfSample => "it answers each sample, with a fault where it has nothing to say",
                 Numbers::OfInput(answered) if answered == Some(input) => "it promised one to each sample",
                 _ => continue,
             };

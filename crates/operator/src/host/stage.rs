@@ -1,8 +1,8 @@
 //! A hosted operator that answers samples.
 //!
-//! It is one of two kinds. One without state and with one input answers each sample on each output under the number of the
-//! sample: nothing is saved, and after a restart it answers again what readers may lack. Any other is saved after each sample,
-//! with its answers and the places of all its inputs, before the answers are sent.
+//! It is one of two kinds. One without state that answers each sample on each output under the number of the sample saves
+//! nothing, and after a restart it answers again what readers may lack. Any other is saved after each sample, with its answers
+//! and the places of all its inputs, before the answers are sent.
 
 use std::collections::VecDeque;
 
@@ -69,16 +69,21 @@ pub(super) fn run(
     // An optional input that is not connected changes nothing of how answers are numbered.
     let has_one_input = description.inputs.iter().filter(|port| !port.partner).count() == 1 && ports.inputs.len() == 1;
     let n_outputs = ports.outputs.len();
-    let is_alike = !ready.has_state && has_one_input && n_outputs > 0 && (description.answers_each || n_outputs == 1);
+    let answers_each = description.answers_each || !ready.has_state && n_outputs == 1;
+    let is_each = answers_each && has_one_input && n_outputs > 0;
     for output in &mut ports.book.outputs {
-        if is_alike {
+        if is_each {
             output.numbers = Numbers::OfSample;
         } else if has_one_input && n_outputs == 1 {
             output.numbers = Numbers::OfWorker;
         }
     }
-    let manner =
-        Manner { saves: !is_alike, answers_each: false, n_batch: ready.batch, has_suspect: operator.has_suspect() };
+    let manner = Manner {
+        saves: ready.has_state || !is_each,
+        answers_each: is_each,
+        n_batch: ready.batch,
+        has_suspect: operator.has_suspect(),
+    };
     let worker = ProgramWorker {
         operator: operator.clone(),
         child,
