@@ -595,14 +595,14 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         for (idx, output) in self.book.outputs.iter().enumerate() {
             let promise = match output.numbers {
                 Numbers::OfSample => "it answers each sample, with a fault where it has nothing to say",
-                Numbers::OfInput(answered) if answered == Some(input) => "it promised one to each sample",
+                Numbers::OfInput(answered) if answered == Some(input) => "it has promised that",
                 _ => continue,
             };
             let n_found = (0..n_answers).filter(|answer| self.worker.answer(*answer).0 == idx).count();
             if n_found != 1 {
                 let (name, input) = (&output.name, &self.book.inputs[input].name);
                 anyhow::bail!(
-                    "it gave {n_found} answers to a sample of {input} on the output {name}, expected one: {promise}"
+                    "it gave {n_found} answers on the output {name}, expected one to each sample of {input}: {promise}"
                 );
             }
         }
