@@ -594,7 +594,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
     fn require_answers(&self, input: usize, n_answers: usize) -> anyhow::Result<()> {
         for (idx, output) in self.book.outputs.iter().enumerate() {
             let promise = match output.numbers {
-                Numbers::OfSample => "it answers each sample, with a fault where it has nothing to say",
+                Numbers::OfSample => "a fault where it has nothing to say, or a state and answers_each false",
                 Numbers::OfInput(answered) if answered == Some(input) => "it has promised that",
                 _ => continue,
             };
