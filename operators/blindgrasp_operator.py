@@ -85,8 +85,8 @@ class Description:
     params: Sequence[Param] = ()
     version: str = "0.1.0"
     answers_each: bool | None = None
-    """It answers each sample with one of the same number on each output, and has no state. The default is True for an operator
-    with one input and an output. Set it to False for a stage with `state`."""
+    """It answers each sample with one of the same number on each output. The default is True for an operator with one input
+    and an output. Set it to False for a stage with `state` that does not answer each."""
     inputs: Sequence[tuple] = ()
     outputs: Sequence[tuple] = ()
     uses_network: bool = False

@@ -3,8 +3,8 @@
 
 senses: gives frames the senses of a partner input. watch: has no output, an optional input, and a state; it fails if a sample
 is not there once and in order. hand: a source with a feedback input that sends the frames of a grasp when the grasp before is
-decided. nag: answers silence and the end of the stream. plain: a classifier without a state. mortal: dies of one
-sample, of several that it gets at once.
+decided. nag: answers silence and the end of the stream. plain: a classifier without a state. keeper: one that keeps the
+state of the classifier in Rust. mortal: dies of one sample, of several that it gets at once.
 """
 
 import json
@@ -43,6 +43,7 @@ HAND = Description(
 )
 NAG = Description("nag", "Answers silence", ("tactile", TactileFrame), ("prediction", Prediction), answers_each=False)
 PLAIN = Description("plain", "Judges without a state", ("feature", GraspFeature), ("prediction", Prediction))
+KEEPER = Description("keeper", "Keeps a state", ("feature", GraspFeature), ("prediction", Prediction))
 MORTAL = Description("mortal", "Dies of a sample", ("feature", GraspFeature), ("prediction", Prediction))
 # The grasp to which the answers of nag belong.
 NAGS = 1_000_000
@@ -135,6 +136,21 @@ def plain(_params):
     return Stage(lambda head, _items: PredictionHead(grasp_id=head.grasp_id, phase=head.phase, fault=head.fault))
 
 
+def keeper(_params):
+    kept = b""
+
+    def restore(state):
+        nonlocal kept
+        if not state:
+            raise ValueError("it has no state to keep")
+        kept = state
+
+    def answer(head, _items):
+        return PredictionHead(grasp_id=head.grasp_id, phase=head.phase, fault=head.fault)
+
+    return Stage(answer, state=lambda: kept, restore=restore)
+
+
 def mortal(_params):
     """Answers several samples at once, and none of them if sample 100 is among them."""
 
@@ -148,5 +164,5 @@ def mortal(_params):
 
 if __name__ == "__main__":
     roles = {"senses": (SENSES, senses), "watch": (WATCH, watch), "hand": (HAND, hand), "nag": (NAG, nag),
-             "plain": (PLAIN, plain), "mortal": (MORTAL, mortal)}
+             "plain": (PLAIN, plain), "keeper": (KEEPER, keeper), "mortal": (MORTAL, mortal)}
     run(*roles[sys.argv[1]])

@@ -206,6 +206,29 @@ fn a_program_without_a_state_leaves_none_to_the_stage_that_takes_its_place() {
     assert_each_once(&ended);
 }
 
+/// What one instance has saved, one in another language reads: its place, its answers, and the bytes of its state.
+#[test]
+fn a_stage_with_state_is_swapped_between_rust_and_python_and_back() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let graph = Graph::fast();
+    let lifts = format!("model={}", project().join("models/barrett-bh8-280-lifts.json").display());
+    let to_rust = ["classifier", "--run", "classifier", "--set", &lifts, "--probation", "0", "--allow-mismatch"];
+    swap(&graph, &["encoder", "classifier", "--set", &lifts, "--probation", "0"], 0);
+    graph.wait_for_decisions(A_FEW_GRASPS);
+    let program = role(folder.path());
+    // It fails if it finds no state; so does the classifier if it cannot read its own.
+    let to_keeper = ["classifier", "--run", utf8(&program), "--probation", "0", "--allow-mismatch", "--args", "keeper"];
+    for swap_to in [&to_keeper[..], &to_rust, &to_keeper] {
+        swap(&graph, swap_to, 0);
+        graph.wait_for_decisions(A_FEW_GRASPS);
+        graph.kill("classifier");
+        graph.wait_for_decisions(A_FEW_GRASPS);
+    }
+    let ended = graph.stop();
+    assert_eq!((ended.code, &ended.summary["samples_lost"]), (Some(0), &0.into()), "{}", ended.stderr);
+    assert_each_once(&ended);
+}
+
 /// A classifier that says something else than it should.
 const BROKEN: &str = r#"
 import os, struct, sys

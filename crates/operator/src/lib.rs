@@ -52,6 +52,7 @@ pub mod cursors;
 pub mod description;
 mod descriptors;
 pub mod diagnostics;
+mod engine;
 pub mod host;
 mod identity;
 pub mod link_status;
@@ -66,7 +67,9 @@ pub mod private_service;
 #[cfg(test)]
 mod recovery_model;
 mod reports;
+mod runner;
 pub mod sandbox;
+mod saved;
 pub mod sequencer;
 pub mod source;
 pub mod stage;

@@ -234,14 +234,6 @@ impl Operator {
         Ok(self.enlist(Publisher::open_growing(&self.0.node, &self.0.cursors, wired(&self.0.wiring.outputs, port)?)?))
     }
 
-    /// As [`Operator::shadow`], for messages whose largest number of items is unknown.
-    ///
-    /// # Errors
-    /// The wiring lacks the port, or iceoryx2 refuses it.
-    pub(crate) fn growing_shadow<M: Message>(&self, port: &str) -> Result<ShadowPublisher<M>, OperatorError> {
-        Ok(ShadowPublisher::open_growing(&self.0.node, &self.0.cursors, wired(&self.0.wiring.outputs, port)?)?)
-    }
-
     /// Whether an input is connected.
     pub(crate) fn has_input(&self, port: &str) -> bool {
         self.0.wiring.inputs.contains_key(port)
@@ -309,8 +301,13 @@ impl Operator {
     ///
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
-    pub fn shadow<M: Message>(&self, port: &str, max_items: usize) -> Result<ShadowPublisher<M>, OperatorError> {
-        Ok(ShadowPublisher::open(&self.0.node, &self.0.cursors, wired(&self.0.wiring.outputs, port)?, max_items)?)
+    pub(crate) fn shadow<M: Message>(
+        &self,
+        port: &str,
+        max_items: Option<usize>,
+    ) -> Result<ShadowPublisher, OperatorError> {
+        let wiring = wired(&self.0.wiring.outputs, port)?;
+        Ok(ShadowPublisher::open::<M>(&self.0.node, &self.0.cursors, wiring, max_items)?)
     }
 
     /// Takes the memory for [`Operator::save_state`].
@@ -337,10 +334,15 @@ impl Operator {
         self.0.cursors.state(self.0.wiring.state_region)
     }
 
+    /// Whether each sample is answered by one of the same number.
+    pub(crate) fn answers_each(&self) -> bool {
+        self.0.wiring.answers_each
+    }
+
     /// Drops the node's saved state, because its active instance has none: an instance with a state that comes later must not
     /// go on with an old one. Where answers have numbers of their own, the state is kept with them.
     pub(crate) fn forget_state(&self) {
-        if self.0.wiring.answers_each {
+        if self.answers_each() {
             self.0.cursors.forget_state(self.0.wiring.state_region);
         }
     }

@@ -259,6 +259,10 @@ impl Partners {
         Partners { inputs: operator.partners(), waiting: None, n_without: 0 }
     }
 
+    pub(crate) fn are_there(&self) -> bool {
+        !self.inputs.is_empty()
+    }
+
     pub(crate) fn connect(&self) -> Result<(), PortError> {
         self.inputs.iter().try_for_each(|input| input.borrow_mut().connect())
     }
@@ -288,7 +292,7 @@ impl Partners {
 
     /// Chooses the partners of a main sample; false if it must wait for one. At the end of the stream, none comes any more.
     pub(crate) fn choose(&mut self, main: &Header, is_active: bool, is_ending: bool) -> Result<bool, PortError> {
-        if self.inputs.is_empty() {
+        if !self.are_there() {
             return Ok(true);
         }
         self.take_in(is_active, is_ending)?;

@@ -2,27 +2,35 @@
 //! state, a sink. Processes are killed between any two of their stores, nodes are swapped, connections come about late, dead
 //! publishers take their samples with them, and the source changes its epoch.
 //!
-//! The decisions are those of the operators: [`Credit`], [`Sequencer`], [`Written`], [`Kept`] and [`Retained`] are called here
-//! as there. Each fix of a loss can be left out; the search then finds the loss.
+//! The decisions are those of the operators: the stages are driven by their [`Engine`], and [`Credit`], [`Sequencer`],
+//! [`Written`] and [`Retained`] are called here as there. Each fix of a loss that lies in a port can be left out; the search then
+//! finds the loss.
 
 use std::collections::{HashSet, VecDeque};
 use std::hash::{Hash, Hasher};
+use std::rc::Rc;
 use std::time::{Duration, Instant};
+
+use blindgrasp_messages::Header;
+use blindgrasp_messages::zerocopy::{FromBytes as _, IntoBytes as _};
+use serde_json::{Map, Value};
 
 use crate::credit::{Credit, Places};
 use crate::cursors::SampleId;
-use crate::outbox::{Kept, Keyed};
+use crate::engine::{self, Answer, Engine, Hearing, Manner, Progress, Received, Site, Taken, Worker, Yields};
 use crate::partner::Retained;
+use crate::port::{PortError, Sent, sample_id};
+use crate::saved::{Book, Input, Numbers, Output};
 use crate::sequencer::{Placing, Sequencer};
-use crate::wiring::{ConsumerWiring, InputCounts, ReaderWiring};
+use crate::wiring::{Clock, ConsumerWiring, InputCounts, ReaderWiring};
 use crate::written::Written;
 
 /// The samples of the source. The epochs are not in the order of their values.
 const SAMPLES: [SampleId; 3] = [id(8, 0), id(3, 0), id(3, 1)];
 /// The samples that a reader may leave unanswered, and that a publisher keeps.
 const CAPACITY: usize = 2;
-/// The answers that fit beside a state.
-const N_SAVED: usize = 1;
+/// The largest state: places, and one answer.
+const STATE_BYTES: usize = 250;
 
 const SOURCE: usize = 0;
 const STATELESS: usize = 1;
@@ -69,18 +77,116 @@ struct Budget {
     skipped: Option<SampleId>,
     /// The source has no sample twice: a new instance goes on with the next epoch.
     is_live: bool,
+    /// The stages have a partner input.
+    has_partners: bool,
 }
 
-/// A sample on its way, with the process that has decided it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-struct Sample {
-    key: SampleId,
-    decided_by: u8,
-}
+/// A sample on its way. It is `made_by` the process that has decided it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Sample(Header);
 
-impl Keyed for Sample {
+impl Sample {
+    fn new(key: SampleId) -> Sample {
+        Sample(Header { epoch: key.epoch, seq: key.seq, ..Header::default() })
+    }
+
     fn key(&self) -> SampleId {
-        self.key
+        sample_id(&self.0)
+    }
+}
+
+impl Hash for Sample {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        (self.0.epoch, self.0.seq, self.0.made_by).hash(state);
+    }
+}
+
+impl engine::Sample for Sample {
+    fn header(&self) -> &Header {
+        &self.0
+    }
+
+    fn copied(self) -> Self {
+        self
+    }
+}
+
+/// A worker that answers each sample under its number. Its state is its model, the number of its samples so far, and the last one.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+struct Counter {
+    has_state: bool,
+    model: u64,
+    n_samples: u64,
+    last: Option<SampleId>,
+    answer: Option<Sample>,
+    /// It was given a sample twice.
+    is_broken: bool,
+}
+
+impl Worker<Sample> for Counter {
+    fn has_state(&self) -> bool {
+        self.has_state
+    }
+
+    fn ask(&mut self, _: usize, samples: &[Taken<Sample>]) -> anyhow::Result<bool> {
+        let sample = samples[0].sample;
+        let place = |key: Option<SampleId>| key.and_then(|key| SAMPLES.iter().position(|sample| *sample == key));
+        self.is_broken |= self.has_state && place(Some(sample.key())) <= place(self.last);
+        (self.n_samples, self.last) = (self.n_samples + 1, Some(sample.key()));
+        self.answer = Some(sample);
+        Ok(true)
+    }
+
+    fn next(&mut self) -> usize {
+        usize::from(self.answer.is_some())
+    }
+
+    fn hear(&mut self, _: Hearing, _: u64) -> anyhow::Result<Option<usize>> {
+        Ok(None)
+    }
+
+    fn answer(&self, _: usize) -> Answer<'_> {
+        (0, self.answer.as_ref().expect("an answer").0.as_bytes(), &[])
+    }
+
+    fn set_header(&mut self, _: usize, header: &Header) {
+        self.answer = Some(Sample(*header));
+    }
+
+    fn before_sending(&mut self, idx: usize, _: u64) -> anyhow::Result<Answer<'_>> {
+        Ok(self.answer(idx))
+    }
+
+    fn before_sending_saved(&mut self, (_, head, _): Answer<'_>, _: u64) -> anyhow::Result<&[u8]> {
+        self.answer = Some(Sample(Header::read_from_bytes(head).expect("a header")));
+        Ok(self.answer(0).1)
+    }
+
+    fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
+        crate::stage::encode_state((self.model, self.n_samples, self.last), bytes)
+    }
+
+    fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
+        let saved = state.map(|bytes| bincode::serde::decode_from_slice(bytes, crate::stage::STATE_FORMAT));
+        let ((model, n_samples, last), _): ((u64, _, _), usize) = saved.transpose()?.unwrap_or_default();
+        (self.n_samples, self.last) = if model == self.model { (n_samples, last) } else { (0, None) };
+        Ok(model == self.model)
+    }
+
+    fn has_missed_samples(&mut self) {
+        self.n_samples += 1000;
+    }
+
+    fn deadline_nanos(&self) -> Option<u64> {
+        None
+    }
+
+    fn set(&mut self, _: &Map<String, Value>) -> anyhow::Result<anyhow::Result<()>> {
+        Ok(Ok(()))
+    }
+
+    fn look(&mut self) -> anyhow::Result<()> {
+        Ok(())
     }
 }
 
@@ -97,14 +203,17 @@ struct Process {
     sequencer: Sequencer<Sample>,
     /// It has done nothing yet.
     is_new: bool,
-    /// Its place between two stores.
-    place: u8,
-    /// The sample that it works on.
+    /// It has counted a sample and not sent it yet.
+    has_counted: bool,
+    /// Of a sink: the sample that it works on.
     sample: Option<Sample>,
     /// Of a source: the next of its samples.
     next: usize,
-    /// Of a stage with state.
-    kept: Kept<Sample>,
+    /// Of a stage, with the samples that it has put back. Most steps leave it as it is, so that worlds share it.
+    engine: Option<Rc<Engine<Sample, Counter>>>,
+    put_back: Vec<Sample>,
+    /// The sample that has waited for its partner.
+    waited_for: Option<SampleId>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Default)]
@@ -146,8 +255,8 @@ struct World {
     nodes: [Node; 4],
     slots: Slots,
     counts: [InputCounts; 4],
-    /// The saved state of the stage with state: the last sample that it includes, its counts, and its answers.
-    saved: Option<(Option<SampleId>, InputCounts, VecDeque<Sample>)>,
+    /// The saved state of the stage with state.
+    saved: Option<Vec<u8>>,
     heard: Vec<Sample>,
     decided: Vec<Sample>,
     /// The processes that each node has had.
@@ -168,6 +277,14 @@ impl Hasher for Fingerprint {
             word[..chunk.len()].copy_from_slice(chunk);
             self.write_u64(u64::from_ne_bytes(word));
         }
+    }
+
+    fn write_u8(&mut self, word: u8) {
+        self.write_u64(word.into());
+    }
+
+    fn write_usize(&mut self, word: usize) {
+        self.write_u64(word as u64);
     }
 
     fn write_u64(&mut self, word: u64) {
@@ -250,10 +367,12 @@ impl Search {
             unconnected: None,
             is_new: self.budget.n_late > 0,
             sequencer: Sequencer::onlooker(),
-            place: 0,
+            has_counted: false,
             sample: None,
             next: 0,
-            kept: Kept::default(),
+            engine: None,
+            put_back: Vec::new(),
+            waited_for: None,
         };
         world.n_processes[node] += 1;
         if node > SOURCE {
@@ -262,51 +381,53 @@ impl Search {
                 process.queues.push((publisher.id, publisher.history.clone()));
             }
         }
-        self.take_over(world, node, &mut process, is_handed_over);
+        let id = process.id;
+        world.nodes[node].active = Some(process);
+        self.take_over(world, node, is_handed_over);
         // Its readers connect to it.
         if node < SINK {
             let readers = &mut world.nodes[node + 1];
             for reader in readers.old.iter_mut().chain(&mut readers.active) {
-                reader.queues.push((process.id, VecDeque::new()));
+                reader.queues.push((id, VecDeque::new()));
             }
         }
-        world.nodes[node].active = Some(process);
     }
 
-    /// As a stage, a source or a sink takes over.
-    fn take_over(&self, world: &mut World, node: usize, process: &mut Process, is_handed_over: bool) {
-        let taken = process.sample.take();
-        process.place = 0;
-        let known = if node == SINK {
-            world.slots.answered[SINK]
-        } else {
-            process.credit.begin(is_handed_over, &world.slots, world.slots.written[node])
-        };
-        let counts = world.counts[node];
-        let sequencer = match node {
-            SOURCE => {
-                let known = match world.slots.written[SOURCE] {
-                    Some(written) if self.budget.is_live && !is_handed_over => {
-                        SAMPLES.iter().rposition(|key| key.epoch == written.last.epoch)
-                    }
-                    _ => known.and_then(|known| SAMPLES.iter().position(|key| *key == known)),
-                };
-                process.next = known.map_or(0, |known| known + 1);
-                return;
-            }
-            STATEFUL => {
-                let (last, counts, answers) = world.saved.clone().unwrap_or_default();
-                (world.slots.answered[node], world.counts[node]) = (last, counts);
-                process.kept = Kept::restored(answers, known);
-                process.place = 1;
-                Sequencer::resume(last, last, counts)
-            }
-            _ => Sequencer::resume(known, world.slots.answered[node], counts),
-        };
+    /// The active process, which has just come or come back, takes over: a stage by its engine, a source or a sink here.
+    fn take_over(&self, world: &mut World, node: usize, is_handed_over: bool) {
+        let (slots, written) = (&world.slots, world.slots.written.get(node).copied().flatten());
+        let Some(process) = &mut world.nodes[node].active else { return };
+        process.has_counted = false;
+        let engine = process.engine.take().map(Rc::unwrap_or_clone);
+        if node == SOURCE {
+            let known = process.credit.begin(is_handed_over, slots, written);
+            let known = match written {
+                Some(written) if self.budget.is_live && !is_handed_over => {
+                    SAMPLES.iter().rposition(|key| key.epoch == written.last.epoch)
+                }
+                _ => known.and_then(|known| SAMPLES.iter().position(|key| *key == known)),
+            };
+            process.next = known.map_or(0, |known| known + 1);
+            return;
+        }
+        if node == SINK {
+            process.put_back.extend(process.sample.take());
+            let (answered, counts) = (slots.answered[SINK], world.counts[SINK]);
+            return self.begin_with(world, node, Sequencer::resume(answered, answered, counts));
+        }
+        let mut at = At::new(self, world, node);
+        let mut engine = engine.unwrap_or_else(|| at.standby(1));
+        engine.take_over(&mut at, is_handed_over).expect("it takes over");
+        at.process().engine = Some(Rc::new(engine));
+    }
+
+    /// As a port, which begins anew.
+    fn begin_with(&self, world: &mut World, node: usize, sequencer: Sequencer<Sample>) {
         let written = self.known_to_reader(world, node);
         let sequencer = sequencer.beginning_at(self.now, written.map(|written| written.last));
+        let Some(process) = &mut world.nodes[node].active else { return };
         let before = std::mem::replace(&mut process.sequencer, sequencer);
-        let put_back = taken.map(|sample| (sample.key, sample));
+        let put_back = std::mem::take(&mut process.put_back).into_iter().map(|sample| (sample.key(), sample));
         process.sequencer.hold_again(before, put_back, written.as_ref(), self.now);
     }
 
@@ -320,20 +441,22 @@ impl Search {
         } else {
             world.slots.written[node] = next.or(world.slots.written[node]);
         }
+        world.nodes[node].active.iter_mut().for_each(|process| process.has_counted = true);
     }
 
     /// The second step.
     fn push(&self, world: &mut World, node: usize, sample: Sample) {
         if node == STATEFUL && !world.decided.contains(&sample) {
             world.decided.push(sample);
-            world.decided.sort_by_key(|sample| (sample.key.epoch, sample.key.seq, sample.decided_by));
+            world.decided.sort_by_key(|sample| (sample.0.epoch, sample.0.seq, sample.0.made_by));
         }
         let Some(process) = &mut world.nodes[node].active else { return };
         process.history.push_back(sample);
         if process.history.len() > CAPACITY {
             process.history.pop_front();
         }
-        process.credit.has_sent(sample.key);
+        process.credit.has_sent(sample.key());
+        process.has_counted = false;
         let publisher = process.id;
         let readers = &mut world.nodes[node + 1];
         for reader in readers.old.iter_mut().chain(&mut readers.active) {
@@ -344,125 +467,130 @@ impl Search {
         }
     }
 
-    /// The worlds after a node has tried to take a sample.
-    fn take(&self, world: &World, node: usize) -> Vec<World> {
-        let mut worlds = Vec::new();
-        let Some(process) = &world.nodes[node].active else { return worlds };
-        let mut next = world.clone();
-        if let Some(active) = &mut next.nodes[node].active
-            && let Some(sample) = active.sequencer.next_in_order()
-        {
-            active.sample = Some(sample);
-            return vec![next];
-        }
+    /// The queues from which the active process of a node may take a sample.
+    fn choices(&self, world: &World, node: usize) -> Vec<usize> {
+        let Some(process) = &world.nodes[node].active else { return Vec::new() };
+        let choices = process.queues.iter().enumerate().filter(|(_, (_, queue))| !queue.is_empty());
+        choices.map(|(at, _)| at).collect()
+    }
+
+    /// As a port delivers a sample: the next in order, of those in a queue, or after a long time.
+    fn deliver(&self, world: &mut World, node: usize, choice: Choice) -> Option<Sample> {
         let written = self.known_to_reader(world, node);
         let has_others = world.nodes[node - 1].active.is_some() && world.nodes[node - 1].old.is_some();
-        for (at, (publisher, queue)) in process.queues.iter().enumerate() {
-            if queue.is_empty() {
-                continue;
+        let process = world.nodes[node].active.as_mut()?;
+        if let Some(sample) = process.sequencer.next_in_order() {
+            return Some(sample);
+        }
+        let queue = match choice {
+            Choice::Nothing => return None,
+            Choice::Later => return process.sequencer.next_overdue(self.now + Duration::from_secs(3600)),
+            Choice::Queue(queue) => queue,
+        };
+        let publisher = u128::from(process.queues[queue].0);
+        let sample = process.queues[queue].1.pop_front()?;
+        let key = sample.key();
+        let placing = process.sequencer.push(sample, key, publisher, written.as_ref(), || has_others, || self.now);
+        if let Placing::Deliver(sample) = placing { Some(sample) } else { None }
+    }
+
+    /// The world after one store of a stage's active process.
+    fn advance(&self, world: &World, node: usize, choice: Choice) -> (World, Progress) {
+        let mut next = world.clone();
+        let mut at = At { choice, ..At::new(self, &mut next, node) };
+        let Some(engine) = at.process().engine.take() else { return (next, Progress::Idle) };
+        let mut engine = Rc::unwrap_or_clone(engine);
+        let progress = loop {
+            let progress = engine.advance(&mut at, false).expect("it goes on");
+            if progress != Progress::Moved || at.has_stored {
+                break progress;
             }
-            let mut next = world.clone();
-            let Some(active) = &mut next.nodes[node].active else { continue };
-            let Some(sample) = active.queues[at].1.pop_front() else { continue };
-            let publisher = u128::from(*publisher);
-            let placing =
-                active.sequencer.push(sample, sample.key, publisher, written.as_ref(), || has_others, || self.now);
-            if let Placing::Deliver(sample) = placing {
-                active.sample = Some(sample);
+        };
+        at.process().engine = Some(Rc::new(engine));
+        (next, progress)
+    }
+
+    /// Whether a stage has no work besides samples that have just come. It saves half of the time to know that.
+    fn has_nothing_but_queues(&self, process: &Process) -> bool {
+        let is_between = process.engine.as_ref().is_some_and(|engine| engine.is_between_samples());
+        is_between && process.sequencer.n_held() == 0 && !self.budget.has_partners
+    }
+
+    /// The worlds after one store of a stage's active process.
+    fn step_of_stage(&self, world: &World, node: usize) -> Vec<World> {
+        let mut worlds = Vec::new();
+        let (next, progress) = match &world.nodes[node].active {
+            Some(process) if self.has_nothing_but_queues(process) => (None, Progress::Idle),
+            _ => {
+                let (next, progress) = self.advance(world, node, Choice::Nothing);
+                (Some(next), progress)
             }
-            worlds.push(next);
+        };
+        let is_waiting = next.as_ref().is_some_and(|next| !has_counted(next, node) && next.broken.is_none());
+        match progress {
+            Progress::GaveWay if is_waiting => worlds.extend(self.wait_long(world, node)),
+            // Only now it looks at its queues.
+            Progress::Idle => {
+                for choice in self.choices(world, node) {
+                    worlds.push(self.advance(world, node, Choice::Queue(choice)).0);
+                }
+            }
+            _ => worlds.extend(next),
         }
         worlds
+    }
+
+    /// The world in which a process can hand over: it is between two samples, or waits for room.
+    fn at_rest(&self, world: &World, node: usize) -> Option<World> {
+        let process = world.nodes[node].active.as_ref()?;
+        if process.has_counted {
+            return None;
+        }
+        if process.engine.as_ref().is_none_or(|engine| engine.is_between_samples()) {
+            return Some(world.clone());
+        }
+        let (next, progress) = self.advance(world, node, Choice::Nothing);
+        if progress == Progress::GaveWay && !has_counted(&next, node) { Some(next) } else { None }
     }
 
     /// The worlds after one step of a node's active process.
     fn step(&self, world: &World, node: usize) -> Vec<World> {
         let Some(process) = &world.nodes[node].active else { return Vec::new() };
         let mut next = world.clone();
-        match (node, process.place, process.sample) {
-            (SOURCE, 0, _) => {
+        match (node, process.sample) {
+            (STATELESS | STATEFUL, _) => return self.step_of_stage(world, node),
+            (SOURCE, _) => {
                 let Some(key) = SAMPLES.get(process.next) else { return Vec::new() };
-                if !self.has_room(&mut next, node, *key) {
+                if process.has_counted {
+                    self.push(&mut next, node, Sample::new(*key));
+                    next.nodes[node].active.iter_mut().for_each(|process| process.next += 1);
+                } else if self.has_room(&mut next, node, *key) {
+                    self.count(&mut next, node, *key);
+                } else {
                     return self.wait_long(world, node).into_iter().collect();
                 }
-                self.count(&mut next, node, *key);
-                self.move_on(&mut next, node, 1);
             }
-            (SOURCE, ..) => {
-                self.push(&mut next, node, Sample { key: SAMPLES[process.next], decided_by: 0 });
-                self.move_on(&mut next, node, 0);
-                next.nodes[node].active.iter_mut().for_each(|process| process.next += 1);
-            }
-            (STATELESS | SINK, 0, None) => return self.take(world, node),
-            (SINK, _, Some(sample)) => {
+            (_, Some(sample)) => {
                 next.heard.push(sample);
-                self.commit(&mut next, node, sample.key);
+                let counts = process.sequencer.counts();
+                self.commit(&mut next, node, sample.key(), &counts);
+                next.nodes[node].active.iter_mut().for_each(|process| process.sample = None);
             }
-            (STATELESS, 0, Some(sample)) if self.budget.skipped == Some(sample.key) => {
-                self.commit(&mut next, node, sample.key);
-            }
-            (STATELESS, 0, Some(sample)) => {
-                if !self.has_room(&mut next, node, sample.key) {
-                    return self.wait_long(world, node).into_iter().collect();
-                }
-                self.count(&mut next, node, sample.key);
-                self.move_on(&mut next, node, 1);
-            }
-            (STATELESS, 1, Some(sample)) => {
-                self.push(&mut next, node, sample);
-                self.move_on(&mut next, node, 2);
-            }
-            (STATELESS, _, Some(sample)) => self.commit(&mut next, node, sample.key),
-            (STATEFUL, 0, None) => return self.take(world, node),
-            (STATEFUL, 0, Some(sample)) => return self.save(world, sample).into_iter().collect(),
-            // It sends its answers, each in two steps, and then commits the sample.
-            (STATEFUL, 1, _) => {
-                let Some(answer) = process.kept.next().copied() else {
-                    match process.sample {
-                        Some(sample) => self.commit(&mut next, node, sample.key),
-                        None => self.move_on(&mut next, node, 0),
+            (_, None) => {
+                let mut worlds = Vec::new();
+                let choices = self.choices(world, node).into_iter().map(Choice::Queue);
+                for choice in choices.chain([Choice::Nothing]) {
+                    let mut next = world.clone();
+                    let sample = self.deliver(&mut next, node, choice);
+                    next.nodes[node].active.iter_mut().for_each(|process| process.sample = sample);
+                    if sample.is_some() || choice != Choice::Nothing {
+                        worlds.push(next);
                     }
-                    return vec![next];
-                };
-                if !self.has_room(&mut next, node, answer.key) {
-                    return self.wait_long(world, node).into_iter().collect();
                 }
-                self.count(&mut next, node, answer.key);
-                self.move_on(&mut next, node, 2);
+                return worlds;
             }
-            (STATEFUL, ..) => {
-                let Some(answer) = process.kept.next().copied() else { return Vec::new() };
-                self.push(&mut next, node, answer);
-                self.move_on(&mut next, node, 1);
-                next.nodes[node].active.iter_mut().for_each(|process| process.kept.has_sent_next());
-            }
-            _ => return Vec::new(),
         }
         vec![next]
-    }
-
-    /// Computes an answer and saves it; `None` while there is no room.
-    fn save(&self, world: &World, sample: Sample) -> Option<World> {
-        let mut next = world.clone();
-        let written = world.slots.written[STATEFUL];
-        let process = next.nodes[STATEFUL].active.as_mut()?;
-        let answered = process.credit.answered_by_readers(&world.slots, written);
-        drop(process.kept.forget(true, answered));
-        process.kept.push(Sample { decided_by: process.id, ..sample });
-        if self.without == Without::KeepsAnswers {
-            process.kept = Kept::default();
-            process.kept.push(Sample { decided_by: process.id, ..sample });
-        }
-        if process.kept.entries().len() > N_SAVED {
-            if self.without == Without::WaitsForRoom {
-                next.broken = Some("a stage with state fails: its answers do not fit".into());
-                return Some(next);
-            }
-            return None;
-        }
-        process.place = 1;
-        next.saved = Some((Some(sample.key), process.sequencer.counts(), process.kept.entries().clone()));
-        Some(next)
     }
 
     fn has_room(&self, world: &mut World, node: usize, key: SampleId) -> bool {
@@ -472,18 +600,10 @@ impl Search {
         active.is_some_and(|process| process.credit.first_without_room(slots, written, key).is_none())
     }
 
-    fn move_on(&self, world: &mut World, node: usize, place: u8) {
-        world.nodes[node].active.iter_mut().for_each(|process| process.place = place);
-    }
-
     /// Marks a sample as answered.
-    fn commit(&self, world: &mut World, node: usize, key: SampleId) {
-        let is_ahead = Written::is_after(self.known_to_reader(world, node), key, world.slots.answered[node]);
-        if let Some(process) = &mut world.nodes[node].active {
-            world.counts[node] = process.sequencer.counts();
-            (process.place, process.sample) = (0, None);
-        }
-        if is_ahead {
+    fn commit(&self, world: &mut World, node: usize, key: SampleId, counts: &InputCounts) {
+        world.counts[node] = *counts;
+        if Written::is_after(self.known_to_reader(world, node), key, world.slots.answered[node]) {
             world.slots.answered[node] = Some(key);
         }
     }
@@ -516,16 +636,22 @@ impl Search {
         self.start(&mut next, node, false);
         worlds.push(next);
         let mut next = world.clone();
-        if let Some(mut old) = next.nodes[node].old.take() {
-            self.take_over(&mut next, node, &mut old, false);
+        if let Some(old) = next.nodes[node].old.take() {
             next.nodes[node].active = Some(old);
+            self.take_over(&mut next, node, false);
             worlds.push(next);
         }
         worlds
     }
 
     fn swap(&self, world: &World, node: usize) -> Option<World> {
-        let mut next = world.clone();
+        let mut next = self.at_rest(world, node)?;
+        let mut at = At::new(self, &mut next, node);
+        if let Some(engine) = at.process().engine.take() {
+            let mut engine = Rc::unwrap_or_clone(engine);
+            engine.hand_over(&mut at);
+            at.process().engine = Some(Rc::new(engine));
+        }
         let old = next.nodes[node].active.take()?;
         next.n_swaps += 1;
         let has_sent_all = node == SINK || old.credit.has_sent_all(world.slots.written[node]);
@@ -541,7 +667,7 @@ impl Search {
         let Some(last) = old.history.back() else { return true };
         let Some(written) = world.slots.written.get(node).copied().flatten() else { return true };
         let readers = if node == SOURCE { node + 1..STATEFUL + 1 } else { node + 1..node + 2 };
-        readers.into_iter().all(|slot| world.slots.answered[slot].is_some_and(|key| written.is_past(key, last.key)))
+        readers.into_iter().all(|slot| world.slots.answered[slot].is_some_and(|key| written.is_past(key, last.key())))
     }
 
     /// All worlds that may come next, and whether something moves by itself in one of them.
@@ -565,18 +691,18 @@ impl Search {
         let mut moves = !worlds.is_empty();
         if !moves {
             // Time passes: early samples are delivered, and those before them are missing.
-            let later = self.now + Duration::from_secs(3600);
-            for node in 1..4 {
-                let mut next = world.clone();
-                if let Some(process) = &mut next.nodes[node].active
-                    && process.sample.is_none()
-                    && let Some(sample) = process.sequencer.next_overdue(later)
-                {
-                    process.sample = Some(sample);
-                    worlds.push(next);
-                    moves = true;
+            for node in [STATELESS, STATEFUL] {
+                if world.nodes[node].active.is_some() {
+                    let (next, progress) = self.advance(world, node, Choice::Later);
+                    worlds.extend(if progress == Progress::Moved { Some(next) } else { None });
                 }
             }
+            let mut next = world.clone();
+            if let Some(sample) = self.deliver(&mut next, SINK, Choice::Later) {
+                next.nodes[SINK].active.iter_mut().for_each(|process| process.sample = Some(sample));
+                worlds.push(next);
+            }
+            moves = !worlds.is_empty();
         }
         for node in 0..4 {
             let is_meant = self.budget.node.is_none_or(|only| only == node);
@@ -603,12 +729,7 @@ impl Search {
                     worlds.extend(ends.into_iter().map(|next| World { n_kills: world.n_kills + 1, ..next }));
                 }
             }
-            // A node is swapped between two samples, or while it waits for room.
-            let is_idle = world.nodes[node]
-                .active
-                .as_ref()
-                .is_some_and(|process| process.place == 0 || (node == STATEFUL && process.place == 1));
-            if world.n_swaps < self.budget.n_swaps && is_meant && is_idle && !is_alive[0] {
+            if world.n_swaps < self.budget.n_swaps && is_meant && !is_alive[0] {
                 worlds.extend(self.swap(world, node));
             }
             if world.n_late < self.budget.n_late && node > SOURCE {
@@ -678,12 +799,18 @@ impl Search {
         let key = |key: Option<SampleId>| key.map_or("-".into(), |key| format!("{}.{}", key.epoch, key.seq));
         let process = |process: &Process| {
             let queues = process.queues.iter().map(|(id, queue)| {
-                let keys: Vec<String> = queue.iter().map(|sample| key(Some(sample.key))).collect();
+                let keys: Vec<String> = queue.iter().map(|sample| key(Some(sample.key()))).collect();
                 format!("from {id}: {}", keys.join(" "))
             });
             let queues: Vec<String> = queues.collect();
-            let at = key(process.sample.map(|sample| sample.key));
-            format!("process {} in place {} at {at}, {}", process.id, process.place, queues.join(", "))
+            let at = key(process.sample.map(|sample| sample.key()));
+            let engine = &process.engine;
+            format!(
+                "process {} at {at}, counted {}, {}: {engine:?}",
+                process.id,
+                process.has_counted,
+                queues.join(", ")
+            )
         };
         let mut world = self.begin();
         for choice in path {
@@ -700,7 +827,7 @@ impl Search {
 
     /// The broken promise of a world, if there is one.
     fn broken(&self, world: &World) -> Option<String> {
-        let numbers: Vec<SampleId> = world.heard.iter().map(|sample| sample.key).collect();
+        let numbers: Vec<SampleId> = world.heard.iter().map(|sample| sample.key()).collect();
         let mut expected = self.answered_samples();
         let is_right = if self.budget.is_live {
             numbers.iter().all(|key| expected.any(|expected| expected == *key))
@@ -710,7 +837,11 @@ impl Search {
         if !is_right {
             return Some(format!("the sink has heard {numbers:?}"));
         }
-        if world.decided.windows(2).any(|pair| pair[0].key == pair[1].key) {
+        let mut engines = world.nodes.iter().filter_map(|node| node.active.as_ref()?.engine.as_ref());
+        if engines.any(|engine| engine.worker.is_broken) {
+            return Some("a state includes a sample twice".into());
+        }
+        if world.decided.windows(2).any(|pair| pair[0].key() == pair[1].key()) {
             return Some(format!("a sample was decided twice: {:?}", world.decided));
         }
         let n_missing = if self.budget.is_live { u64::MAX } else { self.budget.skipped.is_some().into() };
@@ -735,8 +866,8 @@ impl Search {
         }
         let last = SAMPLES[SAMPLES.len() - 1];
         let source = world.nodes[SOURCE].active.as_ref();
-        let was_sent = source.and_then(|source| source.history.back()).is_some_and(|sample| sample.key == last);
-        let was_heard = world.heard.last().is_some_and(|sample| sample.key == last);
+        let was_sent = source.and_then(|source| source.history.back()).is_some_and(|sample| sample.key() == last);
+        let was_heard = world.heard.last().is_some_and(|sample| sample.key() == last);
         source.is_some_and(|source| source.next == SAMPLES.len()) && was_heard >= was_sent
     }
 
@@ -766,6 +897,245 @@ impl Search {
     }
 }
 
+fn has_counted(world: &World, node: usize) -> bool {
+    world.nodes[node].active.as_ref().is_some_and(|process| process.has_counted)
+}
+
+/// The sample that a port delivers next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Choice {
+    /// None that has just come.
+    Nothing,
+    /// The first of a queue.
+    Queue(usize),
+    /// One that has waited too long.
+    Later,
+}
+
+/// A stage in a world.
+struct At<'a> {
+    search: &'a Search,
+    world: &'a mut World,
+    node: usize,
+    choice: Choice,
+    /// It has done something that outlives its process.
+    has_stored: bool,
+    /// The answers that a standby has sent for comparison.
+    beside: Vec<SampleId>,
+}
+
+impl<'a> At<'a> {
+    fn new(search: &'a Search, world: &'a mut World, node: usize) -> At<'a> {
+        let choice = Choice::Nothing;
+        At { search, world, node, choice, has_stored: false, beside: Vec::new() }
+    }
+
+    /// A stage that stands by.
+    fn standby(&mut self, model: u64) -> Engine<Sample, Counter> {
+        let has_state = self.node == STATEFUL;
+        let book = Book::new(vec![Input::new("in", false)], vec![Output::new("out", Numbers::OfWorker)]);
+        let worker = Counter { has_state, model, n_samples: 0, last: None, answer: None, is_broken: false };
+        let manner = Manner { saves: has_state, answers_each: true, n_batch: 1, has_suspect: false };
+        Engine::begin(self, worker, book, manner, true).expect("it stands by")
+    }
+
+    fn process(&mut self) -> &mut Process {
+        self.world.nodes[self.node].active.as_mut().expect("an active process")
+    }
+
+    fn credit(&self) -> &Credit {
+        &self.world.nodes[self.node].active.as_ref().expect("an active process").credit
+    }
+
+    fn written(&self) -> Option<Written> {
+        self.world.slots.written[self.node]
+    }
+}
+
+impl Site for At<'_> {
+    type Sample = Sample;
+    const STATE_BYTES: usize = STATE_BYTES;
+
+    fn receive(&mut self, _: usize) -> Result<Option<Received<Sample>>, PortError> {
+        self.has_stored = true;
+        let Some(sample) = self.search.deliver(self.world, self.node, self.choice) else { return Ok(None) };
+        Ok(Some(Received { sample, counts: self.process().sequencer.counts(), late: None }))
+    }
+
+    fn put_back(&mut self, _: usize, sample: Sample) {
+        self.process().put_back.push(sample);
+    }
+
+    fn take_over(&mut self, _: usize, answered: Option<SampleId>) {
+        let (counted, counts) = self.place(0);
+        self.search.begin_with(self.world, self.node, Sequencer::resume(answered, counted, counts));
+    }
+
+    fn take_over_at(&mut self, _: usize, last: Option<SampleId>, counts: InputCounts) {
+        (self.world.slots.answered[self.node], self.world.counts[self.node]) = (last, counts);
+        self.search.begin_with(self.world, self.node, Sequencer::resume(last, last, counts));
+    }
+
+    fn look_on_from(&mut self, _: usize, last: SampleId) {
+        let sequencer = Sequencer::resume(Some(last), Some(last), InputCounts::default());
+        self.search.begin_with(self.world, self.node, sequencer);
+    }
+
+    fn commit(&mut self, _: usize, key: SampleId, counts: &InputCounts) {
+        self.has_stored = true;
+        self.search.commit(self.world, self.node, key, counts);
+    }
+
+    fn is_caught_up(&self, _: usize) -> bool {
+        false
+    }
+
+    fn is_cut_off(&self, _: usize) -> bool {
+        false
+    }
+
+    fn place(&self, _: usize) -> (Option<SampleId>, InputCounts) {
+        (self.world.slots.answered[self.node], self.world.counts[self.node])
+    }
+
+    fn is_after(&self, _: usize, key: SampleId, other: Option<SampleId>) -> bool {
+        Written::is_after(self.search.known_to_reader(self.world, self.node), key, other)
+    }
+
+    fn is_hurried(&self, _: usize) -> bool {
+        false
+    }
+
+    fn begin_active(&mut self) {}
+
+    fn begin(&mut self, _: usize, is_handed_over: bool) -> Option<SampleId> {
+        let (written, node) = (self.written(), self.node);
+        let (nodes, slots) = (&mut self.world.nodes, &self.world.slots);
+        nodes[node].active.as_mut()?.credit.begin(is_handed_over, slots, written)
+    }
+
+    fn last_sent(&self, _: usize) -> Option<SampleId> {
+        self.written().map(|written| written.last)
+    }
+
+    fn has_readers(&self, _: usize) -> bool {
+        true
+    }
+
+    fn answered_by_readers(&self, output: usize) -> Option<SampleId> {
+        if self.search.without == Without::KeepsAnswers {
+            return self.last_sent(output);
+        }
+        self.credit().answered_by_readers(&self.world.slots, self.written())
+    }
+
+    /// The first of two steps of sending. The process may end before the second.
+    fn wait_for_room(&mut self, _: usize, key: SampleId) -> Result<Sent, PortError> {
+        if self.process().has_counted {
+            return Ok(Sent::Yes);
+        }
+        if self.search.has_room(self.world, self.node, key) {
+            self.search.count(self.world, self.node, key);
+        }
+        Ok(Sent::GaveWay)
+    }
+
+    fn wait_for_answers(&mut self, _: usize, key: SampleId, _: Yields) -> Result<Sent, PortError> {
+        if self.search.without == Without::WaitsForRoom {
+            self.world.broken = Some("a stage with state fails: its answers do not fit".into());
+        }
+        let are_behind = !self.credit().readers_that_lack(key, &self.world.slots, self.written()).is_empty();
+        Ok(if are_behind { Sent::GaveWay } else { Sent::Yes })
+    }
+
+    fn send(&mut self, _: usize, _: SampleId, head: &[u8], _: &[u8]) -> Result<(), PortError> {
+        self.has_stored = true;
+        let header = Header::read_from_bytes(head).expect("a header");
+        self.search.push(self.world, self.node, Sample(header));
+        Ok(())
+    }
+
+    fn send_beside(&mut self, _: usize, key: SampleId, _: &[u8], _: &[u8]) -> Result<(), PortError> {
+        self.beside.push(key);
+        Ok(())
+    }
+
+    fn delay_bells(&mut self, _: usize, _: bool) {}
+
+    fn ring_if_due(&self, _: usize) {}
+
+    fn take_in_partners(&mut self, _: bool) -> Result<(), PortError> {
+        Ok(())
+    }
+
+    /// Each sample waits for its partner once.
+    fn choose_partners(&mut self, main: &Header, _: bool, _: bool) -> Result<bool, PortError> {
+        let key = Some(sample_id(main));
+        let has_partners = self.search.budget.has_partners;
+        Ok(!has_partners || std::mem::replace(&mut self.process().waited_for, key) == key)
+    }
+
+    fn partners_have_answered(&mut self, _: Option<SampleId>) {}
+
+    fn has_partners(&self) -> bool {
+        false
+    }
+
+    fn partners_are_caught_up(&self) -> bool {
+        true
+    }
+
+    fn save_state(&mut self, bytes: &[u8]) -> anyhow::Result<()> {
+        anyhow::ensure!(bytes.len() <= STATE_BYTES, "a state of {} bytes", bytes.len());
+        self.has_stored = true;
+        self.world.saved = Some(bytes.to_vec());
+        Ok(())
+    }
+
+    fn saved_state(&self) -> Option<Vec<u8>> {
+        self.world.saved.clone()
+    }
+
+    fn forget_state(&mut self) {}
+
+    fn is_interrupted(&self) -> bool {
+        false
+    }
+
+    fn should_stop(&self) -> bool {
+        false
+    }
+
+    fn beat(&self) {}
+
+    fn works_on(&self, _: Option<SampleId>) {}
+
+    fn skips(&self, sample: SampleId) -> bool {
+        self.node == STATELESS && self.search.budget.skipped == Some(sample)
+    }
+
+    fn is_unfit(&self, _: u64, _: u64) {}
+
+    fn warm(&self, _: u64) {}
+
+    fn made_by(&self, made_by: u64) -> u64 {
+        let process = self.world.nodes[self.node].active.as_ref();
+        if self.node == STATEFUL { process.map_or(0, |process| u64::from(process.id)) } else { made_by }
+    }
+
+    fn clock(&self) -> Clock {
+        Clock::Recording
+    }
+
+    fn arrival_nanos(&self, _: &Header) -> u64 {
+        0
+    }
+
+    fn now_nanos(&self) -> u64 {
+        0
+    }
+}
+
 const KILLS: Budget = Budget {
     n_kills: 2,
     n_swaps: 0,
@@ -775,6 +1145,7 @@ const KILLS: Budget = Budget {
     kills_reader: false,
     skipped: None,
     is_live: false,
+    has_partners: false,
 };
 const SWAP: Budget = Budget { n_kills: 1, n_swaps: 1, ..KILLS };
 const LATE: Budget = Budget { n_kills: 1, n_late: 1, ..KILLS };
@@ -799,6 +1170,100 @@ fn assert_whole(budgets: &[Budget]) {
 fn kills_swaps_and_late_connections_lose_and_repeat_nothing() {
     let swap_of = |node| Budget { node: Some(node), ..SWAP };
     assert_whole(&[Budget { n_kills: 1, ..KILLS }, swap_of(SOURCE), swap_of(STATELESS), swap_of(STATEFUL), LATE]);
+}
+
+#[test]
+fn a_sample_that_waits_for_its_partner_is_not_lost() {
+    let partners = |node| Budget { n_kills: 1, node: Some(node), has_partners: true, ..KILLS };
+    assert_whole(&[partners(STATELESS), partners(STATEFUL)]);
+}
+
+/// A stage with state in a world of its own, and what an instance of it with that model has saved there.
+fn saved_by(at: &mut At<'_>, model: u64, seq: u64, n_samples: u64) -> Vec<u8> {
+    let mut engine = at.standby(model);
+    let key = id(3, seq);
+    (engine.worker.n_samples, engine.worker.last) = (n_samples, Some(key));
+    let mut book = Book::new(vec![Input::new("in", false)], vec![]);
+    book.inputs[0].last = Some(key);
+    let sent = book.save(at, Yields::ToOthers, |bytes| engine.worker.state(bytes));
+    assert_eq!(sent.expect("saved"), Sent::Yes);
+    at.world.saved.take().expect("a state")
+}
+
+#[test]
+fn a_stage_whose_replacement_fails_goes_on_with_what_it_has_learned() {
+    let search = Search::new(Without::Nothing, KILLS);
+    let mut world = search.begin();
+    let mut at = At::new(&search, &mut world, STATEFUL);
+    let own = saved_by(&mut at, 1, 10, 304);
+    let other = saved_by(&mut at, 2, 90, 7);
+    let newer = saved_by(&mut at, 1, 90, 310);
+    for (found, was_active, expected) in [
+        // Its replacement had another model, or no state, which drops the saved one. It has missed samples.
+        (Some(&other), true, (Some(90), 1304)),
+        (None, true, (None, 1304)),
+        // Its replacement has gone on with its state.
+        (Some(&newer), true, (Some(90), 310)),
+        // It has not been active before.
+        (Some(&other), false, (Some(90), 0)),
+        (None, false, (None, 0)),
+    ] {
+        let mut engine = at.standby(1);
+        if was_active {
+            at.world.saved = Some(own.clone());
+            engine.take_over(&mut at, true).expect("active");
+            engine.hand_over(&mut at);
+        }
+        at.world.slots.answered[STATEFUL] = None;
+        at.world.saved = found.cloned();
+        engine.take_over(&mut at, false).expect("active again");
+        assert_eq!((engine.next_seq().map(|seq| seq - 1), engine.worker.n_samples), expected);
+    }
+}
+
+#[test]
+fn a_saved_state_is_old_if_another_operator_has_answered_samples_since() {
+    let search = Search::new(Without::Nothing, KILLS);
+    let mut world = search.begin();
+    let mut at = At::new(&search, &mut world, STATEFUL);
+    let saved = saved_by(&mut at, 1, 7, 304);
+    for (answered, n_samples) in [(6, 304), (7, 304), (8, 0)] {
+        at.world.slots.answered[STATEFUL] = Some(id(3, answered));
+        at.world.saved = Some(saved.clone());
+        assert_eq!(at.standby(1).worker.n_samples, n_samples, "{answered}");
+    }
+}
+
+/// The queue of a standby has overflowed: it goes on from the state that the active instance has saved since.
+#[test]
+fn a_standby_that_has_missed_samples_looks_on_again() {
+    let search = Search::new(Without::Nothing, KILLS);
+    let mut world = search.begin();
+    let mut at = At::new(&search, &mut world, STATEFUL);
+    let (first, later) = (saved_by(&mut at, 1, 0, 1), saved_by(&mut at, 1, 4, 5));
+    at.world.saved = Some(first);
+    let mut engine = at.standby(1);
+    at.world.saved = Some(later);
+    at.process().queues = vec![(0, [5, 6].map(|seq| Sample::new(id(3, seq))).into())];
+    at.choice = Choice::Queue(0);
+    engine.look_on(&mut at).expect("it looks on");
+    engine.look_on(&mut at).expect("it looks on");
+    assert_eq!((engine.worker.n_samples, &at.beside[..]), (7, &[id(3, 5), id(3, 6)][..]));
+}
+
+/// It may be active again, and the samples that it has not answered exist nowhere else.
+#[test]
+fn an_instance_that_has_handed_over_takes_no_samples() {
+    let search = Search::new(Without::Nothing, KILLS);
+    let mut world = search.begin();
+    let mut at = At::new(&search, &mut world, STATELESS);
+    let mut engine = at.standby(1);
+    engine.take_over(&mut at, true).expect("active");
+    engine.hand_over(&mut at);
+    at.process().queues = vec![(0, [Sample::new(SAMPLES[0])].into())];
+    at.choice = Choice::Queue(0);
+    engine.look_on(&mut at).expect("it stands by");
+    assert_eq!((at.process().queues[0].1.len(), at.beside.len()), (1, 0));
 }
 
 /// F1, F3: the only instance that has samples ends together with their reader, and a sample is left without an answer.

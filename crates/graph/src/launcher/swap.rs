@@ -302,14 +302,9 @@ impl Launcher {
             // Without a state it answers each sample by definition.
             let has_state = self.members[target.idx].standby.as_ref().is_some_and(|process| process.has_state);
             if has_state && !target.node.description.answers_each && self.plan.relies_on_each_answer(id) {
-                let remedy = if target.node.description.hosted {
-                    "a program in another language with a state cannot take its place in a running graph"
-                } else {
-                    "expected \"answers_each\": true in its description"
-                };
                 return Some(format!(
                     "the replacement of '{id}' has a state and does not say that it answers each sample, on which the nodes \
-                     before '{id}' rely: {remedy}; start the graph with it instead"
+                     before '{id}' rely: expected \"answers_each\": true in its description; start the graph with it instead"
                 ));
             }
         }

@@ -10,7 +10,6 @@ mod ports;
 pub mod protocol;
 mod source;
 mod stage;
-mod store;
 
 use std::ffi::{OsStr, OsString};
 use std::path::PathBuf;
@@ -142,11 +141,6 @@ fn check(description: &OperatorDescription, ready: &Ready) -> Result<(), String>
             "it has {n_main} inputs besides partners: expected one, whose samples the partners belong to"
         ));
     }
-    if ready.has_state && description.answers_each {
-        return Err(
-            "its stage has a state: its description needs answers_each false (in Python: answers_each=False)".into()
-        );
-    }
     if description.answers_each && n_main != 1 {
         return Err(format!("it has {n_main} inputs and answers each sample: expected one input"));
     }
@@ -207,7 +201,6 @@ mod tests {
         let stateful = || Ready { has_state: true, ..Ready::default() };
         refused(&description(1), source(), "expected a stage");
         refused(&description(0), Ready::default(), "expected that its program is a source");
-        refused(&description(1).answers_each(), stateful(), "answers_each=False");
         refused(&description(2).answers_each(), Ready::default(), "expected one input");
         refused(&description(2).partner_input("p", "t", ""), Ready::default(), "besides partners: expected one");
         refused(&description(0), Ready { resumes: true, has_state: true, ..source() }, "has `resume` and a state");
@@ -216,6 +209,7 @@ mod tests {
         refused(&description(1), Ready { max_items: [("z".into(), 1)].into(), ..Ready::default() }, "limits the items");
         for (description, ready) in [
             (description(1).answers_each(), Ready::default()),
+            (description(1).answers_each(), stateful()),
             (description(2), stateful()),
             (description(0), source()),
             (description(0).feedback_input("f", "t", ""), source()),

@@ -1,144 +1,51 @@
 //! Ports whose type of message is known by its name alone: samples are bytes here.
 
-use std::collections::VecDeque;
-use std::time::{Duration, Instant};
-
 use anyhow::Context as _;
 use blindgrasp_messages::zerocopy::IntoBytes as _;
-use blindgrasp_messages::{Header, MESSAGE_TYPES, Message, WithMessage, with_message};
+use blindgrasp_messages::{MESSAGE_TYPES, Message, WithMessage, with_message};
 
-use crate::cursors::SampleId;
+use super::protocol::Part;
 use crate::operator::{Operator, OperatorError};
-use crate::outbox::Keyed;
 use crate::partner::Partner;
-use crate::port::bytes::{head_of, items_of};
-use crate::port::{PortError, PortSample, Publisher, Sent, ShadowPublisher, Subscriber, sample_id};
-use crate::wiring::{Clock, InputCounts, OnLate};
+use crate::port::bytes::Layout;
+use crate::runner::{InputPort, OutputPort};
 
-/// A sample that was received.
-#[derive(Debug, Clone)]
-pub(super) struct RawSample {
-    pub(super) header: Header,
-    pub(super) head: Vec<u8>,
-    pub(super) items: Vec<u8>,
-    /// The counts of its input at the time, itself included.
-    pub(super) counts: InputCounts,
-    /// The consequence of its lateness, and its age in nanoseconds.
-    pub(super) late: Option<(OnLate, u64)>,
+/// An output for the answers of a program.
+pub(super) struct HostedOutput {
+    /// Its number in the description.
+    pub(super) idx: usize,
+    pub(super) name: String,
+    pub(super) layout: Layout,
+    pub(super) max_items: Option<usize>,
 }
 
-impl RawSample {
-    pub(super) fn key(&self) -> SampleId {
-        sample_id(&self.header)
+/// The output that a part of an answer is for, if its lengths are right.
+///
+/// # Errors
+/// There is no such output, or a length is that of another message.
+pub(super) fn output_of(outputs: &[HostedOutput], part: &Part) -> anyhow::Result<usize> {
+    let Some((idx, output)) = outputs.iter().enumerate().find(|(_, output)| output.idx == part.port) else {
+        anyhow::bail!(
+            "it answered on the output number {}, expected 0 to {}",
+            part.port,
+            outputs.len().saturating_sub(1)
+        );
+    };
+    let Some(n_items) = output.layout.n_items(part.head.len(), part.items.len()) else {
+        anyhow::bail!(
+            "its sample for the output {} has a head of {} bytes and items of {}, expected the lengths of its message",
+            output.name,
+            part.head.len(),
+            part.items.len()
+        );
+    };
+    if let Some(max_items) = output.max_items.filter(|max_items| n_items > *max_items) {
+        anyhow::bail!(
+            "its sample for the output {} has {n_items} items, expected at most max_items={max_items}",
+            output.name
+        );
     }
-}
-
-/// The receiving end of an edge.
-pub(super) trait InputPort {
-    fn connect(&mut self) -> Result<bool, PortError>;
-    fn receive(&mut self) -> Result<Option<RawSample>, PortError>;
-    /// Keeps samples that were not answered, the first one first.
-    fn put_back(&mut self, samples: Vec<RawSample>);
-    fn take_over(&mut self, answered: Option<SampleId>);
-    fn take_over_at(&mut self, last: Option<SampleId>, counts: InputCounts);
-    fn look_on_from(&mut self, last: SampleId);
-    fn commit(&self, sample: &RawSample);
-    fn is_caught_up(&self) -> bool;
-    fn is_cut_off(&self) -> bool;
-    fn hold_deadline(&self) -> Option<Instant>;
-    /// The last sample that any instance has answered, with its counts.
-    fn place(&self) -> (Option<SampleId>, InputCounts);
-    /// Whether its writer has sent a sample after another one.
-    fn is_after(&self, key: SampleId, other: Option<SampleId>) -> bool;
-}
-
-struct Input<M: Message> {
-    subscriber: Subscriber<M>,
-    /// A late sample expires, where the file asks for that: it has the machine's clock.
-    may_expire: bool,
-    back: VecDeque<RawSample>,
-}
-
-impl<M: Message> Input<M> {
-    /// Gives the samples that were not answered to the subscriber, which finds their places again.
-    fn begin_anew(&mut self) {
-        for sample in self.back.drain(..) {
-            if let (Some(head), Some(items)) = (head_of::<M>(&sample.head), items_of::<M>(&sample.items)) {
-                self.subscriber.put_back(PortSample::of_copy(&head, &items));
-            }
-        }
-    }
-}
-
-impl<M: Message> InputPort for Input<M> {
-    fn connect(&mut self) -> Result<bool, PortError> {
-        self.subscriber.connect()
-    }
-
-    fn receive(&mut self) -> Result<Option<RawSample>, PortError> {
-        if let Some(sample) = self.back.pop_front() {
-            return Ok(Some(sample));
-        }
-        let Some(sample) = self.subscriber.receive()? else { return Ok(None) };
-        let mut head = *sample.head();
-        let late = self.subscriber.lateness();
-        if self.may_expire && late.is_some_and(|(on_late, _)| on_late != OnLate::Count) {
-            // The least that says so: see `Header::valid_until_nanos`.
-            M::header_mut(&mut head).valid_nanos = 1;
-        }
-        Ok(Some(RawSample {
-            header: *M::header(&head),
-            head: head.as_bytes().to_vec(),
-            items: sample.items().as_bytes().to_vec(),
-            counts: self.subscriber.counts(),
-            late,
-        }))
-    }
-
-    fn put_back(&mut self, samples: Vec<RawSample>) {
-        for sample in samples.into_iter().rev() {
-            self.back.push_front(sample);
-        }
-    }
-
-    fn take_over(&mut self, answered: Option<SampleId>) {
-        self.begin_anew();
-        self.subscriber.take_over(answered);
-    }
-
-    fn take_over_at(&mut self, last: Option<SampleId>, counts: InputCounts) {
-        self.begin_anew();
-        self.subscriber.take_over_at(last, counts);
-    }
-
-    fn look_on_from(&mut self, last: SampleId) {
-        self.begin_anew();
-        self.subscriber.look_on_from(last);
-    }
-
-    fn commit(&self, sample: &RawSample) {
-        self.subscriber.commit_with(&sample.header, &sample.counts);
-    }
-
-    fn is_caught_up(&self) -> bool {
-        self.subscriber.is_caught_up()
-    }
-
-    fn is_cut_off(&self) -> bool {
-        self.subscriber.is_cut_off()
-    }
-
-    fn hold_deadline(&self) -> Option<Instant> {
-        self.subscriber.hold_deadline()
-    }
-
-    fn place(&self) -> (Option<SampleId>, InputCounts) {
-        self.subscriber.place()
-    }
-
-    fn is_after(&self, key: SampleId, other: Option<SampleId>) -> bool {
-        self.subscriber.is_after(key, other)
-    }
+    Ok(idx)
 }
 
 /// The partner of the sample that is answered just now.
@@ -154,171 +61,17 @@ impl<M: Message> PartnerPort for Partner<M> {
     }
 }
 
-/// A sample to send.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct RawAnswer {
-    pub(super) header: Header,
-    pub(super) head: Vec<u8>,
-    pub(super) items: Vec<u8>,
-}
-
-impl Keyed for RawAnswer {
-    fn key(&self) -> SampleId {
-        sample_id(&self.header)
-    }
-}
-
-/// A change of the bytes of a head right before it is sent; false if it cannot be sent.
-pub(super) type Check<'a> = &'a mut dyn FnMut(&Header, &mut Vec<u8>, &[u8]) -> bool;
-
-/// The sending end of an edge.
-pub(super) trait OutputPort {
-    fn send(
-        &mut self,
-        answer: &RawAnswer,
-        should_yield: &mut dyn FnMut() -> bool,
-        check: Option<Check<'_>>,
-    ) -> Result<Sent, PortError>;
-    /// Sends for comparison, as a standby.
-    fn send_beside(&self, answer: &RawAnswer) -> Result<(), PortError>;
-    /// Gives up the port for comparison.
-    fn end_comparison(&mut self);
-    fn look_for_readers(&mut self) -> Result<(), PortError>;
-    /// Takes over; returns the last sample that need not be sent again.
-    fn begin(&mut self, is_handed_over: bool) -> Option<SampleId>;
-    /// As [`OutputPort::begin`], without taking over.
-    fn known(&self, is_handed_over: bool) -> Option<SampleId>;
-    fn last(&self) -> Option<SampleId>;
-    fn has_readers(&self) -> bool;
-    fn answered_by_readers(&self) -> Option<SampleId>;
-    fn wait_limit(&self) -> Duration;
-    fn has_waited(&self, time: Duration);
-    fn give_up_attached_that_lack(&self, key: SampleId, waited: Duration) -> bool;
-    /// The header in the bytes of a head.
-    fn header_of(&self, head: &[u8]) -> Option<Header>;
-    /// The bytes of a head with another header.
-    fn with_header(&self, head: &[u8], header: Header) -> Vec<u8>;
-    /// Whether the lengths are those of this message, and the number of items.
-    fn n_items(&self, head: &[u8], items: &[u8]) -> Option<usize>;
-    /// The greatest length of a head with so many items.
-    fn n_bytes(&self, n_items: usize) -> usize;
-}
-
-struct Output<M: Message> {
-    publisher: Publisher<M>,
-    shadow: Option<ShadowPublisher<M>>,
-}
-
-impl<M: Message> Output<M> {
-    fn parts(answer: &RawAnswer) -> Option<(M::Head, Vec<M::Item>)> {
-        Some((head_of::<M>(&answer.head)?, items_of::<M>(&answer.items)?))
-    }
-}
-
-impl<M: Message> OutputPort for Output<M> {
-    fn send(
-        &mut self,
-        answer: &RawAnswer,
-        should_yield: &mut dyn FnMut() -> bool,
-        check: Option<Check<'_>>,
-    ) -> Result<Sent, PortError> {
-        // Lengths were checked when the answer came.
-        let Some((head, items)) = Self::parts(answer) else { return Ok(Sent::Yes) };
-        self.publisher.send_checked(head, &items, should_yield, |head| {
-            let Some(check) = check else { return true };
-            let header = *M::header(head);
-            let mut bytes = head.as_bytes().to_vec();
-            if !check(&header, &mut bytes, &answer.items) {
-                return false;
-            }
-            let Some(changed) = head_of::<M>(&bytes) else { return false };
-            *head = changed;
-            *M::header_mut(head) = header;
-            true
-        })
-    }
-
-    fn send_beside(&self, answer: &RawAnswer) -> Result<(), PortError> {
-        if let (Some(shadow), Some((head, items))) = (&self.shadow, Self::parts(answer)) {
-            shadow.send(&head, &items)?;
-        }
-        Ok(())
-    }
-
-    fn end_comparison(&mut self) {
-        self.shadow = None;
-    }
-
-    fn look_for_readers(&mut self) -> Result<(), PortError> {
-        self.publisher.look_for_readers()
-    }
-
-    fn begin(&mut self, is_handed_over: bool) -> Option<SampleId> {
-        self.publisher.begin(is_handed_over)
-    }
-
-    fn known(&self, is_handed_over: bool) -> Option<SampleId> {
-        self.publisher.known(is_handed_over)
-    }
-
-    fn last(&self) -> Option<SampleId> {
-        self.publisher.last()
-    }
-
-    fn has_readers(&self) -> bool {
-        self.publisher.has_readers()
-    }
-
-    fn answered_by_readers(&self) -> Option<SampleId> {
-        self.publisher.answered_by_readers()
-    }
-
-    fn wait_limit(&self) -> Duration {
-        self.publisher.wait_limit()
-    }
-
-    fn has_waited(&self, time: Duration) {
-        self.publisher.has_waited(time);
-    }
-
-    fn give_up_attached_that_lack(&self, key: SampleId, waited: Duration) -> bool {
-        self.publisher.give_up_attached_that_lack(key, waited)
-    }
-
-    fn header_of(&self, head: &[u8]) -> Option<Header> {
-        head_of::<M>(head).map(|head| *M::header(&head))
-    }
-
-    fn with_header(&self, head: &[u8], header: Header) -> Vec<u8> {
-        let Some(mut head) = head_of::<M>(head) else { return head.to_vec() };
-        *M::header_mut(&mut head) = header;
-        head.as_bytes().to_vec()
-    }
-
-    fn n_items(&self, head: &[u8], items: &[u8]) -> Option<usize> {
-        let is_whole = head.len() == size_of::<M::Head>() && items.len().is_multiple_of(size_of::<M::Item>());
-        is_whole.then(|| items.len() / size_of::<M::Item>())
-    }
-
-    fn n_bytes(&self, n_items: usize) -> usize {
-        size_of::<M::Head>() + n_items * size_of::<M::Item>()
-    }
-}
-
-/// Opens an input port.
+/// Opens an input port, with a second reader for a standby.
 ///
 /// # Errors
 /// The type is unknown, the wiring lacks the port, or iceoryx2 refuses it.
-pub(super) fn open_input(operator: &Operator, port: &str, type_name: &str) -> anyhow::Result<Box<dyn InputPort>> {
-    opened(type_name, OpenInput { operator, port, is_onlooker: false })
-}
-
-/// Opens a second reader of an input, for a standby.
-///
-/// # Errors
-/// As [`open_input`].
-pub(super) fn open_onlooker(operator: &Operator, port: &str, type_name: &str) -> anyhow::Result<Box<dyn InputPort>> {
-    opened(type_name, OpenInput { operator, port, is_onlooker: true })
+pub(super) fn open_input(
+    operator: &Operator,
+    port: &str,
+    type_name: &str,
+    has_onlooker: bool,
+) -> anyhow::Result<InputPort> {
+    opened(type_name, OpenInput { operator, port, has_onlooker })
 }
 
 /// Opens a partner input.
@@ -339,7 +92,7 @@ pub(super) fn open_output(
     type_name: &str,
     max_items: Option<usize>,
     is_compared: bool,
-) -> anyhow::Result<Box<dyn OutputPort>> {
+) -> anyhow::Result<(OutputPort, Layout)> {
     opened(type_name, OpenOutput { operator, port, max_items, is_compared })
 }
 
@@ -352,17 +105,14 @@ fn opened<T, W: WithMessage<Output = Result<T, OperatorError>>>(type_name: &str,
 struct OpenInput<'a> {
     operator: &'a Operator,
     port: &'a str,
-    is_onlooker: bool,
+    has_onlooker: bool,
 }
 
 impl WithMessage for OpenInput<'_> {
-    type Output = Result<Box<dyn InputPort>, OperatorError>;
+    type Output = Result<InputPort, OperatorError>;
 
     fn with<M: Message>(self) -> Self::Output {
-        let subscriber: Subscriber<M> =
-            if self.is_onlooker { self.operator.onlooker(self.port)? } else { self.operator.subscriber(self.port)? };
-        let may_expire = self.operator.clock() == Clock::Machine;
-        Ok(Box::new(Input { subscriber, may_expire, back: VecDeque::new() }))
+        InputPort::open::<M>(self.operator, self.port, self.has_onlooker)
     }
 }
 
@@ -387,19 +137,10 @@ struct OpenOutput<'a> {
 }
 
 impl WithMessage for OpenOutput<'_> {
-    type Output = Result<Box<dyn OutputPort>, OperatorError>;
+    type Output = Result<(OutputPort, Layout), OperatorError>;
 
     fn with<M: Message>(self) -> Self::Output {
-        let OpenOutput { operator, port, max_items, is_compared } = self;
-        let publisher = match max_items {
-            Some(max_items) => operator.publisher::<M>(port, max_items)?,
-            None => operator.growing_publisher::<M>(port)?,
-        };
-        let shadow = match max_items {
-            _ if !is_compared => None,
-            Some(max_items) => Some(operator.shadow::<M>(port, max_items)?),
-            None => Some(operator.growing_shadow::<M>(port)?),
-        };
-        Ok(Box::new(Output { publisher, shadow }))
+        let port = OutputPort::open::<M>(self.operator, self.port, self.max_items, self.is_compared)?;
+        Ok((port, Layout::of::<M>()))
     }
 }

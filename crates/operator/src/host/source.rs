@@ -7,19 +7,22 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
+use blindgrasp_messages::Header;
 use serde_json::{Map, Value};
 
 use super::child::Program;
 use super::listen;
-use super::ports::RawAnswer;
+use super::ports::{HostedOutput, output_of};
 use super::protocol::{Ask, FINISHED, NOTHING_YET, Part, Ready, Resume, Work};
-use super::stage::{next_key, open_inputs, open_outputs, output_of};
-use super::store::{Input, Output, Store, is_at_most, look_for_readers};
+use super::stage::HostedPorts;
 use crate::cursors::SampleId;
 use crate::description::OperatorDescription;
+use crate::engine::{Received, Site as _, Yields, header_of, with_header};
 use crate::monotonic_nanos;
 use crate::operator::Operator;
-use crate::port::Sent;
+use crate::port::{Sent, sample_id};
+use crate::runner::Ports;
+use crate::saved::{Book, is_at_most};
 use crate::source::{self, Source, Step};
 
 const DEFAULT_PAUSE: Duration = Duration::from_millis(5);
@@ -27,13 +30,15 @@ const DEFAULT_PAUSE: Duration = Duration::from_millis(5);
 const LONGEST_PAUSE: Duration = Duration::from_secs(60);
 
 struct HostedSource {
-    operator: Operator,
     child: Program,
     ready: Ready,
-    inputs: Vec<Input>,
-    outputs: Vec<Output>,
-    /// Of a source whose samples come once.
-    store: Option<Store>,
+    site: Ports,
+    book: Book,
+    /// The numbers of the inputs in the description.
+    inputs: Vec<usize>,
+    outputs: Vec<HostedOutput>,
+    /// Its samples come once.
+    saves: bool,
     /// The state of the program after the last message.
     state: Vec<u8>,
     pause: Duration,
@@ -58,16 +63,17 @@ pub(super) fn run(
     ready: Ready,
     child: Program,
 ) -> anyhow::Result<()> {
-    let (inputs, _) = open_inputs(operator, description)?;
-    let outputs = open_outputs(operator, description, &ready, false)?;
-    let store = if ready.resumes { None } else { Some(Store::new(operator)?) };
+    let HostedPorts { site, book, inputs, outputs, .. } = HostedPorts::open(operator, description, &ready, false)?;
+    let saves = !ready.resumes;
     let mut n_next_bytes = 0;
-    if store.is_some() {
+    if saves {
+        operator.reserve_state()?;
         for output in &outputs {
             // Without a limit, a sample that is too large is found when it comes.
-            n_next_bytes += output.max_bytes().unwrap_or(0);
+            n_next_bytes +=
+                output.max_items.map_or(0, |n_items| Book::n_bytes_saved(output.layout.n_bytes_of(n_items)));
         }
-        let n_most = Store::room(&inputs, &outputs);
+        let n_most = book.room();
         if n_next_bytes > n_most {
             anyhow::bail!(
                 "its samples may take {n_next_bytes} bytes, expected at most {n_most}: more cannot be saved until readers have \
@@ -78,12 +84,13 @@ pub(super) fn run(
     let pause = ready.pause_secs.and_then(|secs| Duration::try_from_secs_f64(secs).ok()).unwrap_or(DEFAULT_PAUSE);
     let identity = ready.identity.clone();
     let mut source = HostedSource {
-        operator: operator.clone(),
         child,
         ready,
+        site,
+        book,
         inputs,
         outputs,
-        store,
+        saves,
         state: Vec::new(),
         pause: pause.min(LONGEST_PAUSE),
         ask_at: None,
@@ -103,49 +110,44 @@ impl Source for HostedSource {
     fn resume(&mut self, is_handed_over: bool) -> anyhow::Result<bool> {
         self.came.clear();
         self.ask_at = None;
-        for output in &mut self.outputs {
-            output.known = output.port.begin(is_handed_over);
+        for (idx, output) in self.book.outputs.iter_mut().enumerate() {
+            output.known = self.site.begin(idx, is_handed_over);
         }
-        match &mut self.store {
-            None => {
-                self.is_done = false;
-                for input in &mut self.inputs {
-                    let (last, _) = input.port.place();
-                    input.port.take_over(last);
-                }
-                let mut places = Resume::new();
-                for output in &self.outputs {
-                    places.insert(output.name.clone(), output.known.map(|known| (known.epoch, known.seq)));
-                }
-                self.child.ask_json(Ask::Resume, &places)?;
-                self.child.answer(Ask::Resume)?.done()?;
+        if self.saves {
+            let state = self.book.restore(&self.site, true)?;
+            self.is_done = self.book.is_done;
+            for (idx, input) in self.book.inputs.iter().enumerate() {
+                self.site.take_over_at(idx, input.last, input.counts);
             }
-            Some(store) => {
-                let restored = store.restore(&mut self.inputs, &mut self.outputs, is_handed_over, true)?;
-                self.is_done = restored.is_done;
-                for input in &mut self.inputs {
-                    input.port.take_over_at(input.last, input.counts);
-                }
-                if self.ready.has_state {
-                    self.state = super::restore(&mut self.child, restored.state.as_deref())?.state;
-                }
+            if self.ready.has_state {
+                self.state = super::restore(&mut self.child, state.as_deref())?.state;
             }
+            return Ok(true);
         }
+        self.is_done = false;
+        for idx in 0..self.inputs.len() {
+            let (last, _) = self.site.place(idx);
+            self.site.take_over(idx, last);
+        }
+        let mut places = Resume::new();
+        for output in &self.book.outputs {
+            places.insert(output.name.to_string(), output.known.map(|known| (known.epoch, known.seq)));
+        }
+        self.child.ask_json(Ask::Resume, &places)?;
+        self.child.answer(Ask::Resume)?.done()?;
         Ok(true)
     }
 
     fn step(&mut self) -> anyhow::Result<Step> {
         let step = self.take_step();
-        super::log(&self.operator, self.child.lines());
+        super::log(&self.site.operator, self.child.lines());
         step
     }
 
     fn look(&mut self) -> anyhow::Result<()> {
-        look_for_readers(&mut self.outputs)?;
-        for input in &mut self.inputs {
-            input.port.connect()?;
-        }
-        listen(&self.operator, &mut self.child)?;
+        self.site.look_for_readers()?;
+        self.site.connect()?;
+        listen(&self.site.operator, &mut self.child)?;
         Ok(())
     }
 
@@ -172,7 +174,7 @@ impl Source for HostedSource {
     }
 
     fn next_seq(&self) -> Option<u64> {
-        self.outputs.first()?.port.last().map(|last| last.seq + 1)
+        if self.outputs.is_empty() { None } else { self.site.last_sent(0).map(|last| last.seq + 1) }
     }
 }
 
@@ -199,12 +201,7 @@ impl Came {
 impl HostedSource {
     /// Takes in feedback, and sends the next sample.
     fn take_step(&mut self) -> anyhow::Result<Step> {
-        if let Some(store) = &self.store
-            && store.send(&mut self.outputs, false, |_, _, _, _| true)? == Sent::GaveWay
-        {
-            return Ok(Step::GaveWay);
-        }
-        if !self.receive()? {
+        if self.send_saved()? == Sent::GaveWay || !self.receive()? {
             return Ok(Step::GaveWay);
         }
         if self.is_done {
@@ -216,11 +213,9 @@ impl HostedSource {
             return Ok(Step::Wait(self.ask_at));
         }
         self.ask_at = None;
-        if let Some(store) = &self.store {
-            let n_bytes = self.n_next_bytes + self.state.len();
-            if store.wait_for_room(&self.inputs, &mut self.outputs, n_bytes)? == Sent::GaveWay {
-                return Ok(Step::GaveWay);
-            }
+        let n_bytes = self.n_next_bytes + self.state.len();
+        if self.saves && self.book.wait_for_room(&mut self.site, n_bytes)? == Sent::GaveWay {
+            return Ok(Step::GaveWay);
         }
         self.child.ask(Ask::Next, monotonic_nanos(), 0, &[], std::iter::empty())?;
         let work = self.child.answer(Ask::Next)?.done()?;
@@ -238,16 +233,18 @@ impl HostedSource {
             self.ask_at = Some(Instant::now() + self.pause);
             return Ok(Step::Wait(self.ask_at));
         }
-        let sent = if self.store.is_some() { self.save_and_send(work)? } else { self.send_again(&work.parts)? };
+        let sent = if self.saves { self.save_and_send(work)? } else { self.send_again(&work.parts)? };
         Ok(Step::from(sent))
     }
 
     /// Takes in the samples of feedback inputs; false if it was asked to give way.
     fn receive(&mut self) -> anyhow::Result<bool> {
         for idx in 0..self.inputs.len() {
-            while let Some(sample) = self.inputs[idx].port.receive()? {
-                self.operator.beat();
-                let own = std::iter::once((self.inputs[idx].idx, &sample.head[..], &sample.items[..]));
+            while let Some(Received { sample, counts, .. }) = self.site.receive(idx)? {
+                self.site.beat();
+                let key = sample_id(sample.header());
+                let (head, items) = sample.parts();
+                let own = std::iter::once((self.inputs[idx], head, items));
                 self.child.ask(Ask::Sample, monotonic_nanos(), 0, &[], own)?;
                 let work = self.child.answer(Ask::Sample)?.done()?;
                 if !work.parts.is_empty() {
@@ -255,49 +252,69 @@ impl HostedSource {
                         "its program answered feedback with a sample: expected that it gives its samples when asked for the next"
                     );
                 }
-                let input = &mut self.inputs[idx];
-                if !is_at_most(sample.key(), input.last) {
-                    input.last = Some(sample.key());
+                let input = &mut self.book.inputs[idx];
+                if !is_at_most(key, input.last) {
+                    input.last = Some(key);
                 }
-                input.counts = sample.counts;
+                input.counts = counts;
                 self.ask_at = None;
-                if let Some(store) = &mut self.store {
-                    if self.ready.has_state {
-                        self.state = work.state;
-                    }
-                    if store.save(&self.inputs, &mut self.outputs, &self.state, true)? == Sent::GaveWay {
-                        self.inputs[idx].port.put_back(vec![sample]);
-                        return Ok(false);
-                    }
+                self.take_state(work.state);
+                if self.save(Yields::ToOthers)? == Sent::GaveWay {
+                    self.site.put_back(idx, sample);
+                    return Ok(false);
                 }
-                self.inputs[idx].port.commit(&sample);
+                self.site.commit(idx, key, &counts);
             }
         }
         Ok(true)
     }
 
+    fn take_state(&mut self, state: Vec<u8>) {
+        if self.ready.has_state {
+            self.state = state;
+        }
+    }
+
+    fn save(&mut self, yields: Yields) -> anyhow::Result<Sent> {
+        if !self.saves {
+            return Ok(Sent::Yes);
+        }
+        let state = &self.state;
+        self.book.save(&mut self.site, yields, |bytes| {
+            bytes.extend_from_slice(state);
+            Ok(())
+        })
+    }
+
+    /// Sends the saved samples that were not sent.
+    fn send_saved(&mut self) -> anyhow::Result<Sent> {
+        while let Some(output) = self.book.unsent() {
+            let kept = &mut self.book.outputs[output].kept;
+            let Some(entry) = kept.next() else { break };
+            if self.site.wait_for_room(output, entry.key)? == Sent::GaveWay {
+                return Ok(Sent::GaveWay);
+            }
+            let (head, items) = entry.parts();
+            self.site.send(output, entry.key, head, items)?;
+            kept.has_sent_next();
+        }
+        Ok(Sent::Yes)
+    }
+
     fn end(&mut self, work: Work) -> anyhow::Result<Step> {
-        match &mut self.store {
-            None => {
-                // An end before the sample after which it was to go on: it is not the same stream.
-                if let Some((output, known)) = self.outputs.iter().find_map(|output| Some((output, output.known?))) {
-                    anyhow::bail!(
-                        "it ended without sample {} of the output {}, which readers have: expected that after `resume`, \
-                         `next` gives that sample or one before it, and then the same samples again",
-                        known.seq,
-                        output.name
-                    );
-                }
-            }
-            Some(store) => {
-                store.has_ended();
-                if self.ready.has_state {
-                    self.state = work.state;
-                }
-                if store.save(&self.inputs, &mut self.outputs, &self.state, true)? == Sent::GaveWay {
-                    return Ok(Step::GaveWay);
-                }
-            }
+        // An end before the sample after which it was to go on: it is not the same stream.
+        let known = self.book.outputs.iter().find_map(|output| Some((&output.name, output.known?)));
+        if let (false, Some((name, known))) = (self.saves, known) {
+            anyhow::bail!(
+                "it ended without sample {} of the output {name}, which readers have: expected that after `resume`, `next` gives \
+                 that sample or one before it, and then the same samples again",
+                known.seq
+            );
+        }
+        self.book.is_done = true;
+        self.take_state(work.state);
+        if self.save(Yields::ToOthers)? == Sent::GaveWay {
+            return Ok(Step::GaveWay);
         }
         self.is_done = true;
         Ok(Step::Next)
@@ -307,35 +324,29 @@ impl HostedSource {
     fn save_and_send(&mut self, work: Work) -> anyhow::Result<Sent> {
         for part in work.parts {
             let idx = output_of(&self.outputs, &part)?;
-            let output = &mut self.outputs[idx];
-            if let Some(last) = &mut output.last {
+            if let Some(last) = &mut self.book.outputs[idx].last {
                 last.seq += u64::from(part.n_lost);
             }
-            let mut header = output.port.header_of(&part.head).unwrap_or_default();
-            let next = next_key(&self.outputs, idx);
-            (header.epoch, header.seq, header.origin_nanos) = (next.epoch, next.seq, monotonic_nanos());
-            let output = &mut self.outputs[idx];
-            let head = output.port.with_header(&part.head, header);
-            output.keep(RawAnswer { header, head, items: part.items });
+            let next = self.book.next_key(idx);
+            let origin_nanos = monotonic_nanos();
+            let header = Header { epoch: next.epoch, seq: next.seq, origin_nanos, ..header_of(&part.head) };
+            self.book.keep(idx, &header, &part.head, &part.items);
         }
-        if self.ready.has_state {
-            self.state = work.state;
-        }
-        let Some(store) = &mut self.store else { return Ok(Sent::Yes) };
+        self.take_state(work.state);
         // A device cannot give a reading again: it is saved before another instance takes over, which then sends it.
-        if store.save(&self.inputs, &mut self.outputs, &self.state, false)? == Sent::GaveWay {
+        if self.save(Yields::AtTheEnd)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
-        Ok(store.send(&mut self.outputs, false, |_, _, _, _| true)?)
+        self.send_saved()
     }
 
     /// Sends samples unless readers have them.
     fn send_again(&mut self, parts: &[Part]) -> anyhow::Result<Sent> {
         for part in parts {
             let idx = output_of(&self.outputs, part)?;
-            let output = &mut self.outputs[idx];
-            let mut header = output.port.header_of(&part.head).unwrap_or_default();
-            let key = SampleId { epoch: header.epoch, seq: header.seq };
+            let output = &mut self.book.outputs[idx];
+            let mut header = header_of(&part.head);
+            let key = sample_id(&header);
             let came = self.came.entry(idx).or_default();
             if let Some(before) = came.last
                 && is_at_most(key, Some(before))
@@ -361,13 +372,11 @@ impl HostedSource {
                     continue;
                 }
             }
-            header.origin_nanos = monotonic_nanos();
-            let head = output.port.with_header(&part.head, header);
-            let answer = RawAnswer { header, head, items: part.items.clone() };
-            let operator = &self.operator;
-            if output.port.send(&answer, &mut || operator.should_yield(), None)? == Sent::GaveWay {
+            if self.site.wait_for_room(idx, key)? == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
             }
+            header.origin_nanos = monotonic_nanos();
+            self.site.send(idx, key, &with_header(part.head.clone(), &header), &part.items)?;
         }
         Ok(Sent::Yes)
     }

@@ -1,7 +1,7 @@
 //! The bytes of a sample in shared memory: its head, and behind it its items.
 
 use blindgrasp_messages::Message;
-use blindgrasp_messages::zerocopy::{FromBytes as _, IntoBytes as _};
+use blindgrasp_messages::zerocopy::IntoBytes as _;
 use iceoryx2::prelude::ZeroCopySend;
 
 /// The unit in which iceoryx2 lends memory: heads and items need no greater alignment. (Of single bytes that are aligned,
@@ -19,27 +19,38 @@ pub(crate) struct Envelope {
 
 /// The bytes that a message's head and each of its items take.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Layout {
+pub(crate) struct Layout {
     pub(super) type_name: &'static str,
-    n_head_bytes: usize,
+    pub(super) n_head_bytes: usize,
     n_bytes_per_item: usize,
 }
 
 impl Layout {
-    pub(super) const fn of<M: Message>() -> Layout {
+    pub(crate) const fn of<M: Message>() -> Layout {
         Layout { type_name: M::TYPE_NAME, n_head_bytes: head_len::<M>(), n_bytes_per_item: size_of::<M::Item>() }
+    }
+
+    /// The bytes that a sample with so many items takes.
+    pub(crate) const fn n_bytes_of(&self, n_items: usize) -> usize {
+        self.n_head_bytes + n_items * self.n_bytes_per_item
     }
 
     /// The words that a sample with so many items takes.
     pub(super) const fn n_words(&self, n_items: usize) -> usize {
-        n_words(self.n_head_bytes + n_items * self.n_bytes_per_item)
+        n_words(self.n_bytes_of(n_items))
+    }
+
+    /// The number of items in parts of these lengths; `None` if they are those of another message.
+    pub(crate) fn n_items(&self, n_head_bytes: usize, n_item_bytes: usize) -> Option<usize> {
+        let is_whole = n_head_bytes == self.n_head_bytes && n_item_bytes.is_multiple_of(self.n_bytes_per_item);
+        is_whole.then(|| n_item_bytes / self.n_bytes_per_item)
     }
 
     /// The length of a sample with this envelope in so many words; `None` if it is no sample of this message.
     pub(super) fn n_bytes(&self, envelope: Envelope, n_words: usize) -> Option<usize> {
         let [head, items] = [envelope.n_head_bytes, envelope.n_item_bytes].map(|n_bytes| n_bytes as usize);
-        let is_whole = head == self.n_head_bytes && items.is_multiple_of(self.n_bytes_per_item);
-        (is_whole && head + items <= n_words * size_of::<Word>()).then_some(head + items)
+        self.n_items(head, items)?;
+        (head + items <= n_words * size_of::<Word>()).then_some(head + items)
     }
 }
 
@@ -62,7 +73,11 @@ pub(super) struct Parts<'a> {
 
 impl<'a> Parts<'a> {
     pub(super) fn of<M: Message>(head: &'a M::Head, items: &'a [M::Item]) -> Parts<'a> {
-        Parts { head: head.as_bytes(), items: items.as_bytes() }
+        Parts::of_bytes(head.as_bytes(), items.as_bytes())
+    }
+
+    pub(super) fn of_bytes(head: &'a [u8], items: &'a [u8]) -> Parts<'a> {
+        Parts { head, items }
     }
 
     pub(super) fn n_bytes(&self) -> usize {
@@ -85,39 +100,11 @@ impl<'a> Parts<'a> {
     }
 }
 
-/// A head of these bytes; `None` if it has another length.
-pub(crate) fn head_of<M: Message>(bytes: &[u8]) -> Option<M::Head> {
-    M::Head::read_from_bytes(bytes).ok()
-}
-
-/// The items of these bytes; `None` if they are no whole number of items.
-pub(crate) fn items_of<M: Message>(bytes: &[u8]) -> Option<Vec<M::Item>> {
-    if !bytes.len().is_multiple_of(size_of::<M::Item>()) {
-        return None;
-    }
-    let mut items = vec![M::Item::default(); bytes.len() / size_of::<M::Item>()];
-    items.as_mut_bytes().copy_from_slice(bytes);
-    Some(items)
-}
-
 #[cfg(test)]
 mod tests {
-    use blindgrasp_messages::{Header, Phase, TactileFrame};
+    use blindgrasp_messages::TactileFrame;
 
     use super::*;
-
-    #[test]
-    fn heads_and_items_are_read_back_from_their_bytes_and_other_lengths_are_refused() {
-        let frame = TactileFrame { phase: Phase::Settled, cells_newtons: vec![0.25, 3.0], ..TactileFrame::default() };
-        let (head, items) = frame.to_parts(Header { seq: 7, ..Header::default() });
-        let bytes = head.as_bytes();
-        let read = head_of::<TactileFrame>(bytes).expect("a head");
-        let items = items_of::<TactileFrame>(items.as_bytes()).expect("items");
-        assert_eq!(read.header, head.header);
-        assert_eq!(TactileFrame::from_parts(&read, &items).expect("a frame"), frame);
-        assert!(head_of::<TactileFrame>(&bytes[1..]).is_none());
-        assert!(items_of::<TactileFrame>(&[0; 15]).is_none());
-    }
 
     #[test]
     fn a_sample_of_other_lengths_is_refused() {

@@ -23,10 +23,10 @@ mod subscriber;
 use crate::cursors::SampleId;
 use blindgrasp_messages::Header;
 
-pub(crate) use publisher::{LONGEST_TRY, LOOK_PAUSE, RETRY_PAUSE};
-pub use publisher::{Publisher, Sent, ShadowPublisher, UntypedPublisher};
+pub(crate) use publisher::ShadowPublisher;
+pub use publisher::{Publisher, Sent, UntypedPublisher};
 pub use sample::PortSample;
-use sample::UntypedSample;
+pub(crate) use sample::UntypedSample;
 pub use subscriber::{Subscriber, UntypedSubscriber};
 
 /// Why a port does not work. The sources are errors of iceoryx2.

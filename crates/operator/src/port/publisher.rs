@@ -25,11 +25,11 @@ use blindgrasp_messages::{Header, Message};
 /// A waiting publisher yields so often before it sleeps between tries.
 const N_YIELDS: u32 = 64;
 /// A waiting publisher then sleeps so long between tries.
-pub(crate) const RETRY_PAUSE: Duration = Duration::from_micros(50);
+const RETRY_PAUSE: Duration = Duration::from_micros(50);
 /// A waiting publisher looks so often for readers that have come back.
-pub(crate) const LOOK_PAUSE: Duration = Duration::from_millis(1);
+const LOOK_PAUSE: Duration = Duration::from_millis(1);
 /// A longer pause between two tries counts as this much: while the whole machine stands still, no attached reader is slow.
-pub(crate) const LONGEST_TRY: Duration = Duration::from_millis(5);
+const LONGEST_TRY: Duration = Duration::from_millis(5);
 /// A publisher that grows has room for so many items at first.
 const N_FIRST_ITEMS: usize = 64;
 
@@ -197,27 +197,17 @@ impl<M: Message> Publisher<M> {
         items: &[M::Item],
         should_yield: &mut dyn FnMut() -> bool,
     ) -> Result<Sent, PortError> {
-        self.send_checked(head, items, should_yield, |_| true)
-    }
-
-    /// As [`Publisher::send`]; `check` may change the head at the last moment, when the readers have room. If it returns
-    /// false, nothing is sent ([`Sent::GaveWay`]).
-    ///
-    /// # Errors
-    /// As [`Publisher::send`].
-    pub(crate) fn send_checked(
-        &mut self,
-        mut head: M::Head,
-        items: &[M::Item],
-        should_yield: &mut dyn FnMut() -> bool,
-        check: impl FnOnce(&mut M::Head) -> bool,
-    ) -> Result<Sent, PortError> {
         let key = sample_id(M::header(&head));
-        if self.port.wait_for_room(key, should_yield)? == Sent::GaveWay || !check(&mut head) {
+        if self.port.wait_for_room(key, should_yield)? == Sent::GaveWay {
             return Ok(Sent::GaveWay);
         }
         self.port.send_now(key, &Parts::of::<M>(&head, items))?;
         Ok(Sent::Yes)
+    }
+
+    /// The port without the type of its message.
+    pub(crate) fn into_untyped(self) -> UntypedPublisher {
+        self.port
     }
 }
 
@@ -295,11 +285,6 @@ impl UntypedPublisher {
         known
     }
 
-    /// As [`UntypedPublisher::begin`], without taking over.
-    pub(crate) fn known(&self, is_handed_over: bool) -> Option<SampleId> {
-        self.credit.known(is_handed_over, &*self.cursors, self.written())
-    }
-
     /// The last sample that every lossless reader, and those behind it, have answered; `None` if there is none, or no such
     /// reader.
     pub fn answered_by_readers(&self) -> Option<SampleId> {
@@ -329,6 +314,11 @@ impl UntypedPublisher {
     /// The number of samples that the node has sent, each counted once.
     pub fn n_sent(&self) -> u64 {
         self.slot().n_sent()
+    }
+
+    /// As [`UntypedPublisher::send_now`], of a head and items in bytes.
+    pub(crate) fn send_bytes(&mut self, key: SampleId, head: &[u8], items: &[u8]) -> Result<(), PortError> {
+        self.send_now(key, &Parts::of_bytes(head, items))
     }
 
     /// Counts a sample and sends it. The readers have room for it.
@@ -402,30 +392,16 @@ impl UntypedPublisher {
         }
     }
 
-    /// How long the publisher waits for its readers before it fails.
-    pub(crate) fn wait_limit(&self) -> Duration {
-        self.wait_limit
-    }
-
-    /// Counts time for which the node waited for its readers.
-    pub(crate) fn has_waited(&self, time: Duration) {
-        self.slot().add_blocked(time.as_nanos() as u64);
-    }
-
-    /// Whether attached readers alone have not answered a sample that was sent. Those that have had longer than their time are
-    /// given up.
-    pub(crate) fn give_up_attached_that_lack(&self, key: SampleId, waited: Duration) -> bool {
-        let behind = self.credit.readers_that_lack(key, &*self.cursors, self.written());
-        if behind.is_empty() || behind.iter().any(|reader| reader.attached_slots.is_empty()) {
-            return false;
-        }
-        for reader in behind {
-            gives_up(reader, waited, &self.cursors);
-        }
-        true
-    }
-
-    fn wait_for_room(&mut self, key: SampleId, should_yield: &mut dyn FnMut() -> bool) -> Result<Sent, PortError> {
+    /// Waits until every lossless reader has room for a sample. While it waits it calls `should_yield` now and then, and gives
+    /// up when that returns true.
+    ///
+    /// # Errors
+    /// A reader had no room for longer than the limit, or an error of iceoryx2.
+    pub(crate) fn wait_for_room(
+        &mut self,
+        key: SampleId,
+        should_yield: &mut dyn FnMut() -> bool,
+    ) -> Result<Sent, PortError> {
         if self.has_room(key) {
             return Ok(Sent::Yes);
         }
@@ -468,7 +444,11 @@ impl UntypedPublisher {
             if behind.iter().any(|reader| reader.is_among(&publisher.own_readers)) {
                 return Wait::InVain;
             }
-            publisher.give_up_attached_that_lack(key, waited);
+            if behind.iter().all(|reader| !reader.attached_slots.is_empty()) {
+                for reader in behind {
+                    gives_up(reader, waited, &publisher.cursors);
+                }
+            }
             Wait::On
         })
     }
@@ -537,54 +517,30 @@ fn gives_up(reader: &Reader, waited: Duration, cursors: &SharedCursors) -> bool 
 }
 
 /// The output of a standby, for comparison. It waits for no reader.
-pub struct ShadowPublisher<M: Message> {
-    sender: Sender,
-    message: PhantomData<M>,
-}
+pub(crate) struct ShadowPublisher(Sender);
 
-impl<M: Message> ShadowPublisher<M> {
-    /// Opens the port.
+impl ShadowPublisher {
+    /// Opens the port, as [`Publisher::open`] or, without a limit of items, [`Publisher::open_growing`].
     ///
     /// # Errors
     /// An error of iceoryx2.
-    pub fn open(
+    pub(crate) fn open<M: Message>(
         node: &Node<PrivateService>,
         cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
-        max_items: usize,
+        max_items: Option<usize>,
     ) -> Result<Self, PortError> {
-        Self::open_with(node, cursors, wiring, &Room::of::<M>(max_items))
+        let room = max_items.map_or_else(Room::growing::<M>, Room::of::<M>);
+        Ok(ShadowPublisher(Sender::open(node, cursors, &[COMPARE_BELL], &wiring.shadow, &room)?))
     }
 
-    /// As [`ShadowPublisher::open`], for messages whose largest number of items is unknown.
+    /// Sends a sample to the readers that are there.
     ///
     /// # Errors
     /// An error of iceoryx2.
-    pub(crate) fn open_growing(
-        node: &Node<PrivateService>,
-        cursors: &Arc<SharedCursors>,
-        wiring: &OutputWiring,
-    ) -> Result<Self, PortError> {
-        Self::open_with(node, cursors, wiring, &Room::growing::<M>())
-    }
-
-    fn open_with(
-        node: &Node<PrivateService>,
-        cursors: &Arc<SharedCursors>,
-        wiring: &OutputWiring,
-        room: &Room,
-    ) -> Result<Self, PortError> {
-        let sender = Sender::open(node, cursors, &[COMPARE_BELL], &wiring.shadow, room)?;
-        Ok(ShadowPublisher { sender, message: PhantomData })
-    }
-
-    /// Sends a message to the readers that are there.
-    ///
-    /// # Errors
-    /// An error of iceoryx2.
-    pub fn send(&self, head: &M::Head, items: &[M::Item]) -> Result<(), PortError> {
-        self.sender.send(M::header(head).seq, &Parts::of::<M>(head, items))?;
-        self.sender.ring();
+    pub(crate) fn send_bytes(&self, key: SampleId, head: &[u8], items: &[u8]) -> Result<(), PortError> {
+        self.0.send(key.seq, &Parts::of_bytes(head, items))?;
+        self.0.ring();
         Ok(())
     }
 }

@@ -6,7 +6,7 @@ use blindgrasp_messages::zerocopy::{FromBytes as _, IntoBytes as _};
 use blindgrasp_messages::{Header, Message, PlainBytes};
 use iceoryx2::sample::Sample;
 
-use super::bytes::{Envelope, Layout, Parts, Word, head_len};
+use super::bytes::{Envelope, Layout, Word};
 use super::sample_id;
 use crate::cursors::SampleId;
 use crate::private_service::PrivateService;
@@ -16,6 +16,7 @@ pub(crate) struct UntypedSample {
     place: Place,
     /// Checked once: a writer could change what its envelope says.
     n_bytes: usize,
+    n_head_bytes: usize,
 }
 
 enum Place {
@@ -28,7 +29,7 @@ impl UntypedSample {
     /// `None` if it is no sample of this message.
     pub(super) fn lent(sample: Sample<PrivateService, [Word], Envelope>, layout: &Layout) -> Option<Self> {
         let n_bytes = layout.n_bytes(*sample.user_header(), sample.payload().len())?;
-        Some(UntypedSample { place: Place::Lent(sample), n_bytes })
+        Some(UntypedSample { place: Place::Lent(sample), n_bytes, n_head_bytes: layout.n_head_bytes })
     }
 
     fn words(&self) -> &[Word] {
@@ -39,19 +40,19 @@ impl UntypedSample {
     }
 
     /// Head and items.
-    fn bytes(&self) -> &[u8] {
-        &self.words().as_bytes()[..self.n_bytes]
+    pub(crate) fn parts(&self) -> (&[u8], &[u8]) {
+        self.words().as_bytes()[..self.n_bytes].split_at(self.n_head_bytes)
     }
 
     /// The header, with which each head begins.
-    pub(super) fn header(&self) -> &Header {
+    pub(crate) fn header(&self) -> &Header {
         self.beginning()
     }
 
     /// What the bytes begin with: a header, or a head of the message.
-    fn beginning<T: PlainBytes>(&self) -> &T {
+    pub(crate) fn beginning<T: PlainBytes>(&self) -> &T {
         const { assert!(align_of::<T>() <= align_of::<Word>()) };
-        let (beginning, _) = T::ref_from_prefix(self.bytes()).expect("the length was checked when the sample came");
+        let (beginning, _) = T::ref_from_prefix(self.parts().0).expect("the length was checked when the sample came");
         beginning
     }
 
@@ -61,8 +62,13 @@ impl UntypedSample {
 
     /// The sample in memory of this process, so that its publisher gets its own back. For each sample that a publisher must
     /// be able to lend at a time, iceoryx2 reserves 3.6 KB in each of its subscribers.
-    pub(super) fn copied(self) -> Self {
-        UntypedSample { place: Place::Copied(self.words().to_vec()), n_bytes: self.n_bytes }
+    pub(crate) fn copied(self) -> Self {
+        UntypedSample { place: Place::Copied(self.words().to_vec()), ..self }
+    }
+
+    /// The items of the message.
+    pub(crate) fn items<T: PlainBytes>(&self) -> &[T] {
+        <[T]>::ref_from_bytes(self.parts().1).expect("the length was checked when the sample came")
     }
 }
 
@@ -77,25 +83,12 @@ impl<M: Message> PortSample<M> {
         PortSample { sample, message: PhantomData }
     }
 
-    /// A sample that was received before, from a copy.
-    pub(crate) fn of_copy(head: &M::Head, items: &[M::Item]) -> Self {
-        let parts = Parts::of::<M>(head, items);
-        let mut words = vec![0; parts.n_words()];
-        parts.write(&mut words);
-        PortSample::of_untyped(UntypedSample { place: Place::Copied(words), n_bytes: parts.n_bytes() })
-    }
-
-    pub(super) fn into_untyped(self) -> UntypedSample {
-        self.sample
-    }
-
     pub fn head(&self) -> &M::Head {
         self.sample.beginning()
     }
 
     pub fn items(&self) -> &[M::Item] {
-        let items = &self.sample.bytes()[head_len::<M>()..];
-        <[M::Item]>::ref_from_bytes(items).expect("the length was checked when the sample came")
+        self.sample.items()
     }
 }
 
@@ -103,14 +96,19 @@ impl<M: Message> PortSample<M> {
 mod tests {
     use blindgrasp_messages::{Phase, TactileFrame};
 
+    use super::super::bytes::Parts;
     use super::*;
 
     #[test]
     fn a_copy_has_the_head_and_the_items() {
         let frame = TactileFrame { phase: Phase::Settled, cells_newtons: vec![0.25, 3.0], ..TactileFrame::default() };
         let (head, items) = frame.to_parts(Header { seq: 7, ..Header::default() });
-        let sample = PortSample::<TactileFrame>::of_copy(&head, &items);
-        let sample = PortSample::<TactileFrame>::of_untyped(sample.into_untyped().copied());
+        let parts = Parts::of::<TactileFrame>(&head, &items);
+        let mut words = vec![0; parts.n_words()];
+        parts.write(&mut words);
+        let (n_bytes, n_head_bytes) = (parts.n_bytes(), size_of_val(&head));
+        let sample = UntypedSample { place: Place::Copied(words), n_bytes, n_head_bytes }.copied();
+        let sample = PortSample::<TactileFrame>::of_untyped(sample);
         assert_eq!(TactileFrame::from_parts(sample.head(), sample.items()).expect("a frame"), frame);
         assert_eq!(sample.sample.key(), SampleId { epoch: 0, seq: 7 });
     }

@@ -75,14 +75,9 @@ impl<M: Message> Subscriber<M> {
         Ok(self.port.receive()?.map(PortSample::of_untyped))
     }
 
-    /// Keeps a sample that was not answered, in case that this reader goes on.
-    pub fn put_back(&mut self, sample: PortSample<M>) {
-        self.port.put_back.push_back(sample.into_untyped());
-    }
-
-    /// A sample that was kept without an answer.
-    pub(crate) fn take_back(&mut self) -> Option<PortSample<M>> {
-        self.port.put_back.pop_front().map(PortSample::of_untyped)
+    /// The port without the type of its message.
+    pub(crate) fn into_untyped(self) -> UntypedSubscriber {
+        self.port
     }
 }
 
@@ -105,7 +100,7 @@ pub struct UntypedSubscriber {
     received_nanos: Option<u64>,
     /// Whether samples wait for those before them. On an edge that may drop samples, they don't.
     may_hold: bool,
-    /// Samples that were taken and not answered, the first one first.
+    /// Samples that were taken and not answered, and wait until this reader begins anew.
     put_back: VecDeque<UntypedSample>,
     sequencer: Sequencer<UntypedSample>,
     /// The number of samples that its writer had sent before an attached reader began.
@@ -267,8 +262,13 @@ impl UntypedSubscriber {
         self.subscriber.has_samples().unwrap_or(false)
     }
 
+    /// Keeps a sample that was not answered, in case that this reader goes on.
+    pub(crate) fn put_back(&mut self, sample: UntypedSample) {
+        self.put_back.push_back(sample);
+    }
+
     /// The next sample in order, if one is there.
-    fn receive(&mut self) -> Result<Option<UntypedSample>, PortError> {
+    pub(crate) fn receive(&mut self) -> Result<Option<UntypedSample>, PortError> {
         if let Some(sample) = self.sequencer.next_in_order() {
             return Ok(Some(self.delivered(sample)));
         }
@@ -353,12 +353,7 @@ impl UntypedSubscriber {
     /// Marks all samples up to this one as answered: its writer may overwrite them, and an instance that takes over goes on
     /// after them.
     pub fn commit(&self, header: &Header) {
-        self.commit_with(header, &self.sequencer.counts());
-    }
-
-    /// As [`UntypedSubscriber::commit`], with the counts of the time at which it received this sample.
-    pub(crate) fn commit_with(&self, header: &Header, counts: &InputCounts) {
-        self.commit_late(sample_id(header), counts);
+        self.commit_late(sample_id(header), &self.sequencer.counts());
     }
 
     /// As [`UntypedSubscriber::commit`], for a reader that answers long after it has received; with the counts of the time at which
