@@ -629,12 +629,14 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
     fn pend<S: Site<Sample = T>>(&mut self, site: &S, sample: Option<(usize, Taken<T>)>, n_answers: usize) {
         if let Some((input, taken)) = &sample {
             let key = sample_id(&taken.header);
-            let place = &mut self.book.inputs[*input];
-            // A sample that goes back in order is answered, but does not move the cursor.
-            if site.is_after(*input, key, place.last) {
-                place.last = Some(key);
+            if self.manner.saves {
+                let place = &mut self.book.inputs[*input];
+                // A sample that goes back in order is answered, but does not move the cursor.
+                if site.is_after(*input, key, place.last) {
+                    place.last = Some(key);
+                }
+                place.counts = taken.counts;
             }
-            place.counts = taken.counts;
             self.last = Some(key);
             self.is_cut_off = false;
         }
@@ -776,7 +778,8 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         self.back.iter_mut().for_each(VecDeque::clear);
         site.begin_active();
         self.looks_on = false;
-        self.is_cut_off = false;
+        // What it has heard may have been of another time.
+        (self.is_cut_off, self.has_heard_end) = (false, false);
         for (idx, output) in self.book.outputs.iter_mut().enumerate() {
             output.known = site.begin(idx, is_handed_over);
         }
@@ -801,8 +804,15 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
     fn begin_after_readers<S: Site<Sample = T>>(&mut self, site: &mut S) {
         let least = least(site, 0, self.book.outputs.iter().map(|output| output.known)).flatten();
         let input = &mut self.book.inputs[0];
-        input.last = least;
+        let before = std::mem::replace(&mut input.last, least);
         if self.manner.saves {
+            // Samples that are answered again are counted once.
+            if let (Some(before), Some(least)) = (before, least)
+                && before.epoch == least.epoch
+            {
+                let n_again = before.seq.saturating_sub(least.seq);
+                input.counts.n_received = input.counts.n_received.saturating_sub(n_again);
+            }
             site.take_over_at(0, least, input.counts);
         } else {
             site.take_over(0, least);

@@ -153,7 +153,9 @@ impl Book {
         state: impl Fn(&mut Vec<u8>) -> anyhow::Result<()>,
     ) -> anyhow::Result<Sent> {
         loop {
-            self.write_down(site)?;
+            self.forget(site);
+            self.scratch.bytes.clear();
+            encode(&self.inputs, &self.outputs, self.is_done, &mut self.scratch.bytes)?;
             state(&mut self.scratch.bytes)?;
             let first = if self.scratch.bytes.len() > S::STATE_BYTES { self.first_sent() } else { None };
             let Some((output, first)) = first else {
@@ -173,8 +175,11 @@ impl Book {
     /// A reader stands still.
     pub(crate) fn wait_for_room<S: Site>(&mut self, site: &mut S, n_bytes: usize) -> anyhow::Result<Sent> {
         loop {
-            self.write_down(site)?;
-            if self.scratch.bytes.len() + n_bytes <= S::STATE_BYTES {
+            self.forget(site);
+            let kept = self.outputs.iter().flat_map(|output| output.kept.entries());
+            let n_kept: usize = kept.map(|entry| ENTRY_BYTES + entry.bytes.len()).sum();
+            let n_ports = 1 + self.inputs.len() + self.outputs.len();
+            if n_kept + n_bytes + PORT_BYTES * n_ports <= S::STATE_BYTES {
                 return Ok(Sent::Yes);
             }
             let Some((output, first)) = self.first_sent() else { return Ok(Sent::Yes) };
@@ -199,14 +204,12 @@ impl Book {
         found
     }
 
-    /// Drops the answers that all readers have answered, and writes down places and answers.
-    fn write_down<S: Site>(&mut self, site: &S) -> anyhow::Result<()> {
+    /// Drops the answers that all readers have answered.
+    fn forget<S: Site>(&mut self, site: &S) {
         for (idx, output) in self.outputs.iter_mut().enumerate() {
             let forgotten = output.kept.forget(site.has_readers(idx), site.answered_by_readers(idx));
             self.scratch.entries.extend(forgotten.map(|entry| entry.bytes));
         }
-        self.scratch.bytes.clear();
-        encode(&self.inputs, &self.outputs, self.is_done, &mut self.scratch.bytes)
     }
 
     /// Takes over what the node's active instance has saved last: the worker's state, or `None` if nothing was saved that this
@@ -248,9 +251,9 @@ impl Book {
             (input.last, input.counts) = found.inputs.get(&*input.name).copied().unwrap_or_default();
         }
         for output in &mut self.outputs {
-            if let Some((last, entries)) = found.outputs.remove(&*output.name) {
-                (output.last, output.kept) = (last, Kept::restored(entries, output.known));
-            }
+            let saved = found.outputs.remove(&*output.name);
+            let (last, entries) = saved.unwrap_or((output.last, VecDeque::new()));
+            (output.last, output.kept) = (last, Kept::restored(entries, output.known));
         }
     }
 
