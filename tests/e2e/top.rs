@@ -15,8 +15,8 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{Winsize, tcsetwinsize};
 
 const CLEARED: &str = "\x1b[H\x1b[J";
-const HIDDEN: &str = "\x1b[?25l";
-const SHOWN: &str = "\x1b[?25h";
+const HIDDEN: &str = "\x1b[?7l\x1b[?25l";
+const SHOWN: &str = "\x1b[?7h\x1b[?25h";
 
 /// `top` on a terminal of its own.
 struct OnTerminal {

@@ -80,7 +80,7 @@ pub(super) struct Arguments {
     #[arg(short, long)]
     out: Option<PathBuf>,
     /// Seed of the lifts.
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(0..=i64::MAX as u64))]
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1_000_000_000))]
     seed: u64,
     /// Print the results as JSON.
     #[arg(long)]
@@ -96,19 +96,24 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let stop = stop_signal()?;
     let job = Job { arguments, hand, options, out, stop: &stop };
     let learned = job.learn()?;
-    learned.model.save(&job.model_path())?;
     let look = look_of(&learned.model).context("expected a model with a promise")?;
     let score = job.judge(&learned.model, look.1)?;
+    // The share of drops is at least what remains of the largest share that may be kept.
+    let least_drops = 1.0 - drops_at_most(score.n_false_positive as u64, score.n_true_positive as u64);
+    if least_drops > learned.bound {
+        let (n, bound) = (score.n_false_positive, percent(Some(learned.bound)));
+        bail!(
+            "no model is written: {n} drops of {} lifts of held-out objects refute the bound of {bound}; --lifts {} learns from more, \
+             and a greater --max-drops promises less",
+            score.n_lift,
+            2 * learned.n_lifts
+        );
+    }
+    learned.model.save(&job.model_path())?;
     job.start(&learned, look, &score)?;
     if let Some(why) = learned.why_not {
         let (asked, n) = (percent(Some(arguments.max_drops)), learned.n_lifts);
         bail!("the bound of {asked} is not reached: {why}; --lifts {} goes on from these {n} lifts", 2 * n);
-    }
-    // The share of drops is at least what remains of the largest share that may be kept.
-    let least_drops = 1.0 - drops_at_most(score.n_false_positive as u64, score.n_true_positive as u64);
-    if least_drops > learned.bound {
-        let n = score.n_false_positive;
-        bail!("{n} drops of {} lifts refute the bound: learn from other lifts (--seed, --out)", score.n_lift);
     }
     Ok(Outcome::Done)
 }
@@ -118,6 +123,8 @@ struct Learned {
     model: Model,
     n_lifts: usize,
     bound: f64,
+    /// So often the lifts of the time were tested for a bound.
+    n_looks: usize,
     /// Why this is not the bound that was asked for.
     why_not: Option<String>,
 }
@@ -136,7 +143,7 @@ impl Job<'_> {
         let max_drops = self.arguments.max_drops;
         let sizes = sizes(self.arguments.lifts as usize);
         let folder = |idx: usize| self.out.join(format!("lifts-{}", idx + 1));
-        let (mut recordings, mut n_lifts) = (Vec::new(), 0);
+        let (mut recordings, mut n_lifts, mut n_looks) = (Vec::new(), 0, 0);
         for (idx, n) in sizes.iter().enumerate() {
             self.simulate("train", &folder(idx), *n, 1 + idx as u64)?;
             recordings.extend(recordings_in(&[folder(idx)])?);
@@ -146,9 +153,14 @@ impl Job<'_> {
             if !is_last && (n_lifts < ENOUGH_LIFTS || folder(idx + 1).is_dir()) {
                 continue;
             }
+            n_looks += 1;
             let error = match self.train(&recordings, max_drops) {
-                Ok(model) => return Ok(Learned { model, n_lifts, bound: max_drops, why_not: None }),
+                Ok(model) => return Ok(Learned { model, n_lifts, bound: max_drops, n_looks, why_not: None }),
                 Err(TrainingError::Dataset(error)) => return Err(error.into()),
+                // More lifts of this hand would be like these.
+                Err(TrainingError::Data(why)) if n_lifts >= ENOUGH_LIFTS => {
+                    bail!("no model is written after {n_lifts} lifts: {why}")
+                }
                 Err(error) => error,
             };
             let best = error.best_bound().unwrap_or(1.0);
@@ -164,13 +176,14 @@ impl Job<'_> {
             // The model promises the bound that these lifts allow.
             let bound = (100.0 * best).ceil() / 100.0;
             let model = self.train(&recordings, bound)?;
-            return Ok(Learned { model, n_lifts, bound, why_not: Some(why) });
+            return Ok(Learned { model, n_lifts, bound, n_looks: n_looks + 1, why_not: Some(why) });
         }
         bail!("no lift was made")
     }
 
     fn simulate(&self, objects: &str, folder: &Path, n_lifts: usize, nth: u64) -> anyhow::Result<()> {
-        let seed = self.arguments.seed + nth;
+        // The seeds of neighbours would give the same lifts in part.
+        let seed = (self.arguments.seed - 1) * 1000 + 1 + nth;
         let options = SimulatorOptions { n_grasps: n_lifts, seed, ..self.options.clone() };
         complete_folder(&self.hand, objects, &options, folder, self.stop)
     }
@@ -222,30 +235,33 @@ impl Job<'_> {
         let mut dataflow = PathBuf::from(DATAFLOW.0);
         if !dataflow.is_file() {
             dataflow = self.out.join(DATAFLOW.0);
+        }
+        if !dataflow.is_file() {
             write_out(&dataflow, DATAFLOW.1)?;
         }
         let (model, report) = (self.model_path(), self.out.join(REPORT));
-        let mut settings =
-            vec![("hand", self.arguments.hand.display().to_string()), ("model", model.display().to_string())];
-        if probe != Probe::TestLift {
-            settings.push(("probe", param.into()));
-        }
-        if learned.bound != PROMISED_DROPS {
-            settings.push(("promised_drops", learned.bound.to_string()));
-        }
+        let settings = [
+            ("hand", self.arguments.hand.display().to_string()),
+            ("model", model.display().to_string()),
+            ("probe", param.into()),
+            ("promised_drops", learned.bound.to_string()),
+        ];
         let mut line = format!("blindgrasp run {}", in_shell(&dataflow.display().to_string()));
         for (param, text) in &settings {
             line += &format!(" --set {param}={}", in_shell(text));
         }
         if self.arguments.json {
             print_text(&serde_json::to_string_pretty(&json!({
-                "n_lifts": learned.n_lifts, "promised_drops": learned.bound, "probe": probe, "judged": score,
+                "n_lifts": learned.n_lifts, "promised_drops": learned.bound, "n_looks": learned.n_looks,
+                "why_not_max_drops": learned.why_not, "probe": probe, "judged": score,
                 "model": model, "report": report, "run": line,
             }))?)?;
         } else {
             let bound = percent(Some(learned.bound));
             print_line(&format!(
-                "decided {words}, at most {bound} of the lifts of new objects drop (95 % confidence, in simulation)"
+                "decided {words}, at most {bound} of the lifts of new objects drop (in simulation, 95 % confidence for one look at the \
+                 bound; this was look {})",
+                learned.n_looks
             ))?;
             print_line(&format!(
                 "judged on {} lifts of objects that had no part in it: {} of them keep the object; the model makes {}, of which {} do",

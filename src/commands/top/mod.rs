@@ -47,8 +47,9 @@ const POLL: Duration = Duration::from_millis(250);
 /// After this time without an answer, the screen says so.
 const SILENT_AFTER: Duration = Duration::from_secs(1);
 /// Control sequences of a terminal (ECMA-48 and DEC): the cursor hidden, the screen cleared from its top.
-const CLEARED: &str = "\x1b[?25l\x1b[H\x1b[J";
-const CURSOR_SHOWN: &str = "\n\x1b[?25h";
+/// Lines that are too long are cut by the terminal, also where characters are wide.
+const CLEARED: &str = "\x1b[?7l\x1b[?25l\x1b[H\x1b[J";
+const CURSOR_SHOWN: &str = "\n\x1b[?7h\x1b[?25h";
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let is_on_terminal = !arguments.json && std::io::stdout().is_terminal();

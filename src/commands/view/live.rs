@@ -133,7 +133,7 @@ fn watch(mut connection: Connection, viewer: &Viewer, shadow: Option<&Path>, sto
     // A graph that goes on has no end to wait for.
     drop(if let Ok(true) = followed { observer.finish() } else { observer.leave() });
     page.show_decision();
-    page.show_frame();
+    page.show_frame(true);
     page.show_log();
     if followed? {
         bail!("graph '{}' has ended; waiting for it", connection.graph());
@@ -171,7 +171,7 @@ impl GraphPage<'_> {
             self.show_decision();
             if Instant::now() >= frame_due {
                 frame_due = Instant::now() + TICK;
-                self.show_frame();
+                self.show_frame(false);
             }
             if Instant::now() >= graph_due {
                 graph_due = Instant::now() + GRAPH_PAUSE;
@@ -214,12 +214,12 @@ impl GraphPage<'_> {
         }
     }
 
-    /// Shows the samples since the last tick.
-    fn show_frame(&self) {
+    /// Shows the samples since the last tick. Decisions wait for their frames, unless no more come.
+    fn show_frame(&self, is_last: bool) {
         let mut latest = self.latest();
         let mut taken = std::mem::take(&mut *latest);
         for mut decided in std::mem::take(&mut taken.decisions) {
-            if taken.is_before_frame_of(&decided) && latest.decisions.len() < MAX_WAITING {
+            if !is_last && taken.is_before_frame_of(&decided) && latest.decisions.len() < MAX_WAITING {
                 latest.decisions.push(decided);
             } else {
                 taken.find_grounds(&mut decided, self.hand.as_ref(), &self.model);
@@ -379,9 +379,7 @@ impl Latest {
                 if sample.message.phase == Phase::Settled {
                     let key = (sample.header.epoch, sample.message.grasp_id);
                     self.settled.insert(key, sample.message.clone());
-                    if self.settled.len() > MAX_WAITING {
-                        self.settled.pop_first();
-                    }
+                    cut_to(&mut self.settled, MAX_WAITING, key.0);
                 }
                 self.feature = Some(sample.message);
             }
@@ -402,9 +400,7 @@ impl Latest {
                 let key = (sample.header.epoch, sample.message.grasp_id);
                 self.truths.insert(key, sample.message.stable);
                 self.new_truths.push((key, sample.message.stable));
-                if self.truths.len() > MAX_TRUTHS {
-                    self.truths.pop_first();
-                }
+                cut_to(&mut self.truths, MAX_TRUTHS, key.0);
             }
             _ => {}
         }
@@ -438,6 +434,14 @@ impl Latest {
 }
 
 /// Numbers are texts: JavaScript has no integers beyond 2^53.
+/// Removes a grasp if there are more than so many: one of an earlier run of the source than `epoch`, or the first.
+fn cut_to<T>(of_grasps: &mut BTreeMap<GraspKey, T>, most: usize, epoch: u64) {
+    if of_grasps.len() > most {
+        let earlier = of_grasps.keys().find(|key| key.0 != epoch).or(of_grasps.keys().next()).copied();
+        earlier.map(|key| of_grasps.remove(&key));
+    }
+}
+
 fn decision_event(decided: &Decided, truths: &BTreeMap<GraspKey, bool>) -> Value {
     let mut event = shadow_event(&decided.decision);
     event["epoch"] = decided.key.0.to_string().into();

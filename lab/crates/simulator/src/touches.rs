@@ -1,5 +1,6 @@
 //! Where a hand touches objects as it closes on them, and whether its cells feel it: the places where cells are of use.
 
+use std::ops::Range;
 use std::sync::OnceLock;
 
 use blindgrasp_objects::{Object, SelectionError, select};
@@ -46,18 +47,18 @@ pub enum TouchesError {
     Objects(#[from] SelectionError),
 }
 
-/// So many closings on training objects, of which each is planned as the best of `n_approaches`. Those without a contact are
-/// left out.
+/// Closings on training objects, the candidates of a simulation, of which each is planned as the best of `n_approaches`. Those
+/// without a contact are left out.
 ///
 /// # Errors
 /// The hand's joints do not fit together.
-pub fn closings(hand: &Hand, n_closings: u64, n_approaches: usize) -> Result<Vec<Closing>, TouchesError> {
+pub fn closings(hand: &Hand, candidates: Range<u64>, n_approaches: usize) -> Result<Vec<Closing>, TouchesError> {
     let objects = training_objects()?;
     let mechanism = Mechanism::new(hand);
     let mut options = SimulatorOptions::default();
     options.planner.n_approaches = n_approaches;
     let closings: Result<Vec<Option<Closing>>, JointError> =
-        (0..n_closings).into_par_iter().map(|candidate| closing(&mechanism, objects, &options, candidate)).collect();
+        candidates.into_par_iter().map(|candidate| closing(&mechanism, objects, &options, candidate)).collect();
     Ok(closings?.into_iter().flatten().collect())
 }
 

@@ -133,7 +133,7 @@ impl Draft {
         // The planner comes with the pads to the object, so the pads that lie where it comes are laid twice.
         for n_approaches in [1, PlannerOptions::default().n_approaches] {
             if !arguments.grids.is_empty() {
-                let touches = all_touches(closings(&self.with_pads(&pads), N_CLOSINGS, n_approaches)?);
+                let touches = all_touches(closings(&self.with_pads(&pads), 0..N_CLOSINGS, n_approaches)?);
                 pads = self.pads(table, arguments, &touches)?;
             }
         }
@@ -213,7 +213,8 @@ impl Draft {
         // Not every hand can be reversed, or has joints that bring its pads face to face.
         let Ok(mut other) = self.fitted(table, arguments, way) else { return Ok(()) };
         other.n_held = other.draft.held(table, arguments)?;
-        if other.n_held > best.n_held || other.n_held == best.n_held && other.score > best.score {
+        let is_as_good = way.keeps_frame || other.score > best.score;
+        if other.n_held > best.n_held || other.n_held == best.n_held && is_as_good {
             *best = other;
         }
         Ok(())
@@ -222,7 +223,7 @@ impl Draft {
     /// How many planned grasps hold their objects.
     fn held(&self, table: &[NewPad], arguments: &Arguments) -> anyhow::Result<usize> {
         let hand = self.with_pads(&self.pads(table, arguments, &[])?);
-        let closings = closings(&hand, N_CLOSINGS, N_COMPARED)?;
+        let closings = closings(&hand, 0..N_CLOSINGS, N_COMPARED)?;
         Ok(closings.iter().filter(|closing| closing.is_held).count())
     }
 
@@ -306,12 +307,20 @@ impl Draft {
     /// contacts.
     pub(super) fn tell_felt(&self, pads: &[NewPad]) -> anyhow::Result<()> {
         let hand = self.with_pads(pads);
-        let closings = closings(&hand, N_CLOSINGS, PlannerOptions::default().n_approaches)?;
+        // The cells and the frame were chosen by the first ones.
+        let closings = closings(&hand, N_CLOSINGS..2 * N_CLOSINGS, PlannerOptions::default().n_approaches)?;
         let n_felt = closings.iter().filter(|closing| closing.touches.iter().any(|touch| touch.is_felt)).count();
+        let n_held = closings.iter().filter(|closing| closing.is_held).count();
+        let n_touching = closings.len();
         print_text(&format!(
-            "\nclosed on training objects: a cell feels {n_felt} of {} planned grasps",
-            closings.len()
+            "\nof {N_CLOSINGS} planned grasps of other training objects, {n_touching} touch the object, a cell feels {n_felt}, and \
+             {n_held} hold it"
         ))?;
+        if n_held == 0 {
+            print_diagnostic(
+                "no planned grasp holds: expected fingers that close towards each other (--open, --preshape, --palm-pose)",
+            );
+        }
         // The links without cells on which grasps are not felt.
         let mut bare: BTreeMap<usize, usize> = BTreeMap::new();
         for closing in closings.iter().filter(|closing| !closing.touches.iter().any(|touch| touch.is_felt)) {

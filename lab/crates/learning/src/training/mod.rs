@@ -132,16 +132,24 @@ pub fn train(
 
 /// Adds the share of grasps that no cell feels to a lack of grasps, where that may be its cause.
 fn with_unfelt_share(error: TrainingError, read: &Examples) -> TrainingError {
-    let TrainingError::Data(why) = error else { return error };
+    let with_share = |why: String| told_with_share(why, read);
+    match error {
+        TrainingError::Data(why) => TrainingError::Data(with_share(why)),
+        TrainingError::Promise { why, at_most } => TrainingError::Promise { why: with_share(why), at_most },
+        other => other,
+    }
+}
+
+fn told_with_share(why: String, read: &Examples) -> String {
     let n_unfelt = read.n_excluded.get(Fault::NoContact.as_str()).copied().unwrap_or(0);
     let n_grasps = read.grasps.len();
     if 4 * n_unfelt <= n_grasps {
-        return TrainingError::Data(why);
+        return why;
     }
-    TrainingError::Data(format!(
+    format!(
         "{why}; no cell feels {n_unfelt} of the {n_grasps} grasps, and they teach nothing: lay cells where the hand touches objects \
          (blindgrasp new hand says how many grasps they feel)"
-    ))
+    )
 }
 
 fn train_checked(
