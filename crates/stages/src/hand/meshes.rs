@@ -98,7 +98,7 @@ pub fn find(named: &str, urdf_folder: &Path) -> Result<PathBuf, String> {
     })
 }
 
-/// The file that a URDF names, as [`find`] does; or, for a path of another computer or system, the file in the URDF's folder or
+/// The file that a URDF names, as [`find`] does. For a path of another computer or system, it is the file in the URDF's folder or
 /// beside it with the longest same end of its path, in whatever case.
 ///
 /// # Errors

@@ -22,8 +22,8 @@ const AROUND_TOUCHES_M: f64 = 0.003;
 /// A cell that looks farther aside than this from the side that it is on is left out: it lies on a flank. 65°.
 const LEAST_FACING: f64 = 0.42;
 
-/// Cells in a grid of `rows` × `columns` on a link: on the side towards which it moves as the open hand closes; of a link that does
-/// not move, on the side that was touched most, or that of the palm's +z. The grid covers the part of that side that was
+/// Cells in a grid of `rows` × `columns` on a link, on the side towards which it moves as the open hand closes. A link that does
+/// not move has them on the side that was touched most, or that of the palm's +z. The grid covers the part of that side that was
 /// touched, up to the link's edges. Its rows follow the longer direction of the side, outwards. Each cell lies on the link's
 /// collision shapes, where a line against the direction of closing meets them. A row is as wide as the face under it. Cells that
 /// would lie beside the shapes, or on their flanks, are left out.
