@@ -123,9 +123,9 @@ fn width_of_face([least, most]: [f64; 2], has_face: impl Fn(f64) -> bool) -> Opt
     Some([least + slice_m * first as f64, least + slice_m * (last + 1) as f64])
 }
 
-/// The mean direction in the link's frame in which its middle moves until the hand is half closed, along the nearest axis of
-/// the frame, so that a grid lies flat on a box; of a link that does not move the axis of most touches, or the palm's +z. Of the
-/// joints that move the link, the nearest one that closes counts: those above it may spread the finger.
+/// The mean direction in the link's frame in which its middle moves until the hand is half closed, along the nearest axis of the
+/// frame, so that a grid lies flat on a box. Of a link that does not move it is the axis of most touches, or the palm's +z. Of
+/// the joints that move the link, the nearest one that closes counts: those above it may spread the finger.
 fn inner_direction(
     mechanism: &Mechanism<'_>,
     link_idx: usize,

@@ -82,8 +82,8 @@ pub fn idle_pads(hand: &Hand) -> Result<Vec<usize>, JointError> {
     Ok((0..hand.pads.len()).filter(|pad_idx| !trial.near.contains(pad_idx)).collect())
 }
 
-/// The part of the postures between the open and the closed hand in which links press on each other, and of the pairs that do
-/// so the one that does it most often, by the links' indices.
+/// The part of the postures between the open and the closed hand in which links press on each other. Of the pairs that do so
+/// comes the one that does it most often, by the links' indices.
 ///
 /// # Errors
 /// The hand's joints do not fit together.

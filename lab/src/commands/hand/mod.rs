@@ -72,8 +72,8 @@ pub(super) struct Arguments {
     /// The link in whose frame contacts are given, +z out of the palm [default: the root].
     #[arg(long, value_name = "LINK")]
     palm: Option<String>,
-    /// Pose of the palm frame in that link, if its own +z does not point out of the palm: metres and radians [default: the
-    /// link's own frame, or one in which the hand closes better on a ball, which is told].
+    /// Pose of the palm frame in that link, if its own +z does not point out of the palm. In metres and radians [default:
+    /// the link's own frame, or one in which the hand closes better on a ball, which is told].
     #[arg(
         long,
         value_name = "X,Y,Z,ROLL,PITCH,YAW",
