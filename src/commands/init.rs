@@ -127,7 +127,8 @@ blindgrasp stop
 | `recordings/` | 240 simulated grasps of objects that the model has not been trained on |
 | `docs/` | the schema of the dataflow files, with which an editor completes and checks them |
 
-Next: `blindgrasp new operator NAME` makes an operator of your own, `blindgrasp learn HAND.yaml` a model of your hand; `blindgrasp --help` lists the rest.
+Next: `blindgrasp new operator NAME` makes an operator of your own, `blindgrasp learn HAND.yaml` a model of your
+hand; `blindgrasp --help` lists the rest.
 ";
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
