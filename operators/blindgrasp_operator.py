@@ -165,14 +165,14 @@ class Stage:
     """Called with the new values of live parameters before `start`'s params are updated; an exception refuses them."""
     state: Callable[[], bytes] | None = None
     """With state: the bytes on which the next answer depends, saved after each sample. With the answers that readers may still
-    need, they may take 64 KiB. `answer` may then return None for no answer. With one input and one output, an answer may have a
-    header of its own; without one it gets that of the sample."""
+    need, they may take 64 KiB. With `answers_each=False`, `answer` may return None, and with one input and one output give a
+    header of its own; without one the answer gets that of the sample."""
     restore: Callable[[bytes | None], None] | None = None
     """With state: takes over the bytes that `state` returned, here or in another process, or begins anew."""
     deadline: Callable[[], int | None] | None = None
     """The time (CLOCK_BOOTTIME, nanoseconds) at which `on_silence` is called if no sample comes before."""
     on_silence: Callable[[int], Any] | None = None
-    """Gets the time, and returns what `answer` returns. Its answers need headers, and the stage a state."""
+    """Gets the time, and returns what `answer` returns. Its answers need headers, and the stage a state and `answers_each=False`."""
     on_end: Callable[[], Any] | None = None
     """Called when the stream is over; otherwise as `on_silence`."""
     on_cut_off: Callable[[], Any] | None = None

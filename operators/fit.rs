@@ -222,7 +222,7 @@ impl<'a> Check<'a> {
                 classifier.node,
                 path_of(classifier, "model").display()
             ),
-            help: "expected a model that was trained on lifts (simulate --label lift)".into(),
+            help: "expected a model that was trained on lifts (blindgrasp learn)".into(),
         });
     }
 

@@ -1,10 +1,10 @@
 //! Takes the place of the hardware: publishes the tactile frames of a recording, and what it knows to be true of its
 //! grasps. With the name of a stage's output as an argument it publishes the samples of that stage, and takes its place.
 //!
-//! Samples keep their recorded numbers and times, so that a recording gives the same samples on every edge at any rate.
-//! A small recording that is damaged anywhere is refused before the first sample goes out; a large one, when the damage
-//! is reached. Topics that are not played are not decoded, and of a large recording, parts that are not played are not even
-//! looked at, where the file's index allows it; `blindgrasp info` and `blindgrasp test` check all of a recording. A source
+//! Samples keep their recorded numbers and times, so that a recording gives the same samples on every edge at any rate. A
+//! small recording that is damaged anywhere is refused before the first sample goes out; a large one, when the damage is
+//! reached. Topics that are not played are not decoded, and of a large recording, parts that are not played are not even
+//! looked at, where the file's index allows it. `blindgrasp info` and `blindgrasp test` check all of a recording. A source
 //! that is started again after a crash, or swapped in, goes on where its readers are.
 
 use std::collections::BTreeMap;

@@ -47,7 +47,7 @@ const CAPACITY: usize = 64;
 /// The longest nap of the graph's source.
 const NAP: Duration = Duration::from_millis(20);
 const READY_POLL: Duration = Duration::from_millis(1);
-/// As in the graph. A listener of iceoryx2 0.10 must not wait without limit: when a notification comes just as it takes in
+/// As in the graph. A listener of iceoryx2 0.10 must not wait without limit. When a notification comes just as it takes in
 /// the one before, it can be left waiting, and all further notifications then count as sent already.
 const WAIT: Duration = Duration::from_millis(20);
 /// Without a decision for so long, something is broken.

@@ -1,8 +1,8 @@
 //! What the stages alone cost: times their functions on a recording's frames, for `scripts/benchsuite runtime`.
 //!
-//! `stage_times RECORDING MODEL RATE_HZ` prints JSON: over the frames at which the arbiter decides, the median of each
-//! stage's time and of their sum, frames being RATE_HZ apart as in a graph at that rate: what a stage costs depends on how
-//! long ago it last ran. `frame_nanos` is the time of the whole loop a frame; at the rate inf, it waits for nothing.
+//! `stage_times RECORDING MODEL RATE_HZ` prints JSON: the median of each stage's time and of their sum, over the frames at
+//! which the arbiter decides. Frames are RATE_HZ apart as in a graph at that rate. What a stage costs depends on how long
+//! ago it last ran. `frame_nanos` is the time of the whole loop a frame; at the rate inf, it waits for nothing.
 
 use std::path::Path;
 use std::time::{Duration, Instant};

@@ -1,7 +1,7 @@
 """Frames that a bridge sends to a tactile_source over TCP at a fixed rate: how many are lost and how long they take.
 
 This process is the bridge: it stamps each frame with CLOCK_MONOTONIC right before its write to a loopback socket. A
-reader of /tactile (examples/tactile_latency.rs) takes the same clock when it has the frame. What is measured is all
+reader of /tactile (benches/programs/tactile_latency.rs) takes the same clock when it has the frame. What is measured is all
 between: the write, the kernel, the source's reading, parsing, checking and publishing, the reader's wake-up. "From the
 source" counts from the source's publishing only.
 """

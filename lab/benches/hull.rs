@@ -1,7 +1,7 @@
 //! Times our 6-D hull on the wrenches of simulated grasps, one thread.
 //!
-//! `cargo bench -p blindgrasp-lab --bench hull -- [--json] [--grasps N] [--seed N]` prints the machine and the time per hull.
-//! `-- --serve` is for `scripts/benchsuite hull`, which times Qhull beside it: it prints the wrenches, grasp by grasp, as one line of
+//! `cargo bench -p blindgrasp-lab --bench hull -- [--json] [--grasps N] [--seed N]` prints the machine and the time per hull. `--
+//! --serve` is for `scripts/benchsuite hull`, which times Qhull beside it. It prints the wrenches, grasp by grasp, as one line of
 //! JSON, then answers each line `FIRST END` with the times and qualities of those grasps.
 
 use std::io::{BufRead, Write};

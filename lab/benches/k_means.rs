@@ -1,7 +1,7 @@
 //! Times K-means over contact positions, for `scripts/benchsuite k-means`, which times scikit-learn's beside it.
 //!
-//! `cargo bench -p blindgrasp-lab --bench k_means -- contacts N OUT RECORDING …` writes the first N contact positions of the grasps of
-//! recordings, taken as training takes them, as little-endian doubles x, y, z; `-- learn POSITIONS N_CLUSTERS N_INIT
+//! `cargo bench -p blindgrasp-lab --bench k_means -- contacts N OUT RECORDING …` writes the first N contact positions of the
+//! grasps of recordings, taken as training takes them, as little-endian doubles x, y, z. `-- learn POSITIONS N_CLUSTERS N_INIT
 //! TOLERANCE MAX_ITER SEED` learns words from such a file. Results are lines of JSON on stdout.
 
 use std::path::Path;

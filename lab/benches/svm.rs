@@ -1,9 +1,9 @@
 //! Times training and prediction of our support vector machine, for `scripts/benchsuite svm`, which times LIBSVM beside it.
 //!
 //! `cargo bench -p blindgrasp-lab --bench svm -- features RECORDING MODEL N OUT` writes the features of N grasps, by the model's
-//! dictionary, as LIBSVM's problem file; `-- train PROBLEM C GAMMA TOLERANCE OUT` trains on one and writes LIBSVM's
-//! model file, and beside it the machine as blindgrasp's JSON; `-- predict JSON PROBLEM` times single decision values; `-- export MODEL OUT` writes
-//! a model's machine and calibration as LIBSVM's model file. Results are lines of JSON on stdout.
+//! dictionary, as LIBSVM's problem file. `-- train PROBLEM C GAMMA TOLERANCE OUT` trains on one and writes LIBSVM's model file,
+//! and beside it the machine as blindgrasp's JSON. `-- predict JSON PROBLEM` times single decision values. `-- export MODEL OUT`
+//! writes a model's machine and calibration as LIBSVM's model file. Results are lines of JSON on stdout.
 
 use std::fmt::Write;
 use std::path::Path;

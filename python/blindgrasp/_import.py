@@ -53,7 +53,7 @@ def from_table(
     `joints` is one posture for all grasps in their place. `label` is the column that says how the grasp ended:
     `stable_value` is one of its two values. `group` is the column of the object, `class_column` of its class, `day` and
     `day_column` name the session, and `phase_column` the phase of a frame. `frames` is how often the reading of a grasp
-    that is one row is repeated (3). docs/real-data.md has the rules.
+    that is one row is repeated (3). docs/learning.md has the rules.
 
     Raises ProgramError if the program refuses the table; line 2 in its text is the first row. Warns of what it warns of.
     """

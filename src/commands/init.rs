@@ -111,7 +111,7 @@ const README: &str = "\
 ```sh
 blindgrasp run dataflow.yaml                        # decides the recorded grasps
 blindgrasp run dataflow.yaml --detach --set recorded_source.repeat=forever
-blindgrasp top                                      # what it does, live; Ctrl-C ends top
+blindgrasp top                                      # rates, latencies, decisions; Ctrl-C ends it
 blindgrasp stop
 ```
 
@@ -127,8 +127,8 @@ blindgrasp stop
 | `recordings/` | 240 simulated grasps of objects that the model has not been trained on |
 | `docs/` | the schema of the dataflow files, with which an editor completes and checks them |
 
-Next: `blindgrasp new operator NAME` makes an operator of your own, `blindgrasp train RECORDING --out models/mine.json`
-a model; `blindgrasp --help` lists the rest.
+Next: `blindgrasp new operator NAME` makes an operator of your own, `blindgrasp learn HAND.yaml` a model of your
+hand; `blindgrasp --help` lists the rest.
 ";
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {

@@ -1,4 +1,4 @@
-//! Mistakes of users: each gives one clear error that names the file and what was expected.
+//! Mistakes of users: each gives one clear error that names the file and the expected content.
 
 use crate::common::mistakes::{Folder, check, read};
 use crate::common::{HAND, MODEL, RECORDING, json_of, project, unique_name};

@@ -477,7 +477,7 @@ fn a_sample_that_kills_a_program_among_others_is_left_out_alone() {
 }
 
 /// Swaps these nodes, contacts among them, right after contacts and encoder were started again, when the samples before them
-/// have not come again: what the dead contacts had sent, the new ones have not sent yet. The swap may succeed or fail.
+/// have not come again. What the dead contacts had sent, the new ones have not sent yet. The swap may succeed or fail.
 fn swap_before_all_is_sent_again(nodes: &[&str]) {
     let folder = tempfile::tempdir().expect("a folder");
     let graph = paused(&patient(folder.path(), &[]), 100, &["--wait-limit", "20"]);

@@ -76,8 +76,8 @@ fn another_user_cannot_touch_a_running_graph() {
     graph.stop().assert_undisturbed("beside another user");
 }
 
-/// What another user tries while a graph starts, and an operator of it is started again and swapped: to see names of its files,
-/// and to put a pipe, a link and a large sparse file where the graph could open them.
+/// What another user tries while a graph starts, and an operator of it is started again and swapped. It tries to see names of
+/// its files, and to put a pipe, a link and a large sparse file where the graph could open them.
 const PLANTER: &str = "
 while [ -e \"$1\" ]; do
     for graph in /dev/shm/blindgrasp_$2.*; do

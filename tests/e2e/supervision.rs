@@ -122,7 +122,7 @@ fn a_hung_operator_is_found_by_its_heartbeat_and_a_stopped_launcher_restarts_non
     assert!([6, 7].contains(&ended.summary["restarts"].as_u64().expect("a count")), "{}", ended.stderr);
 }
 
-/// A node hangs, so that its queue fills, and then the nodes before it die as well: their memory has all samples that it has not
+/// A node hangs, so that its queue fills, and then the nodes before it die as well. Their memory has all samples that it has not
 /// answered, and those that it has answered may not have reached the node behind it.
 #[test]
 fn a_node_that_hangs_and_neighbours_that_are_killed_meanwhile_lose_nothing() {

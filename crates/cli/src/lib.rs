@@ -31,7 +31,7 @@ use blindgrasp_operator::text::{HarmlessWriter, harmless};
 use clap::{Command, FromArgMatches};
 
 /// A program's command line and its `main`: the subcommands, each a module with `Arguments` and `run`, of which those behind
-/// `hidden` are in no help; the operators that it runs; the other houses, whose commands it lists.
+/// `hidden` are in no help. It also has the operators that it runs, and the other houses, whose commands it lists.
 #[macro_export]
 macro_rules! program {
     (

@@ -28,8 +28,8 @@ const OBSERVER_CAPACITY: usize = 256;
 /// This many readers, such as recorders, may be attached to a graph at a time without missing a sample.
 pub const N_ATTACHED: usize = 2;
 
-/// A writer waits this long for an attached reader that is a whole capacity behind: well below the 100 ms after which a live
-/// hand's frames are late, so that recording a graph cannot disturb it.
+/// A writer waits this long for an attached reader that is a whole capacity behind. That is well below the 100 ms after
+/// which a live hand's frames are late, so that recording a graph cannot disturb it.
 pub const ATTACHED_LIMIT_MILLIS: u64 = 20;
 /// A writer waits this long for the launching command, whose disk may be slow, but not for one that was stopped.
 const OBSERVER_LIMIT_MILLIS: u64 = 1000;
@@ -352,9 +352,9 @@ impl Plan {
     }
 
     /// The slots whose bells a port's writer rings: those of all instances of its readers' processes, and of commands that read
-    /// it. A bell may let its reader run at once, before the next one is rung: lossless readers come first, then the launching
-    /// command, then readers with `latest`, such as those that publish to a network and take longer. The bell of an instance
-    /// that is not there stays rung, and costs nothing.
+    /// it. A bell may let its reader run at once, before the next one is rung. So lossless readers come first, then the
+    /// launching command, then readers with `latest`, such as those that publish to a network and take longer. The bell of an
+    /// instance that is not there stays rung, and costs nothing.
     fn bells(&self, port: &Port) -> Vec<usize> {
         let slots_of = |nodes: &BTreeSet<&String>| -> Vec<usize> {
             let firsts = nodes.iter().filter_map(|node| self.instance_slots.get(*node));

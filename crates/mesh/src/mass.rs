@@ -142,7 +142,7 @@ struct Crossing {
 
 /// Moments of the space that columns along the shortest side of the box find occupied.
 ///
-/// The columns stand in a square lattice, turned by an angle that no wall of an object is likely to have: in a lattice
+/// The columns stand in a square lattice, turned by an angle that no wall of an object is likely to have. In a lattice
 /// along the box, a thin wall along the box would fall between the columns or count for all of them. Across the columns,
 /// corners are rounded to whole numbers, so that each ray passes a shared edge on exactly one side.
 fn occupied_moments(surface: &[[Point3<f64>; 3]], about: &Point3<f64>, [least, most]: [Point3<f64>; 2]) -> Moments {

@@ -42,8 +42,8 @@ pub(crate) fn balance(uses_of_edge: &[EdgeUse]) -> i64 {
 
 /// Triangles that close the holes of a surface: a fan over each rim from the rim's mean point.
 ///
-/// The edges that do not cancel form closed rims for any surface (a boundary has no boundary), so that surface and
-/// caps together always wind around each point a whole number of times, also for edges shared by many triangles.
+/// The edges that do not cancel form closed rims for any surface (a boundary has no boundary). So surface and caps
+/// together always wind around each point a whole number of times, also for edges shared by many triangles.
 pub(crate) fn caps(mesh: &Mesh, triangles: impl IntoIterator<Item = [u32; 3]>) -> Vec<[Point3<f64>; 3]> {
     let uses = edge_uses(triangles);
     let rim: Vec<([u32; 2], i64)> = by_edge(&uses)

@@ -1,8 +1,8 @@
 //! `message!` and its parts: one declaration gives a message all its shapes.
 //!
 //! A field of the owned struct is declared as in any struct. Before it may stand, in this order: doc comments; its
-//! comment in the ROS 2 definition, `#[ros = "…"]`, which is documentation as well; an attribute of serde; and the
-//! greatest length of its list or greatest value of its number, `#[max(…)]`.
+//! comment in the ROS 2 definition, `#[ros = "…"]`, which is documentation as well. Then come an attribute of serde and
+//! the greatest length of its list or greatest value of its number, `#[max(…)]`.
 //!
 //! A field of the head has the owned field's name and its type in shared memory ([`Raw`]). `n: u32 => list` is the
 //! number of items that belong to a list or a text of the message, and `name: u32 = 0` is always that number. The last

@@ -17,9 +17,9 @@
 //! ```
 //!
 //! A declaration gives a message all its shapes. In shared memory a message is a fixed-size `…Head` (`repr(C)` without
-//! padding, beginning with [`Header`]) and behind it a slice of [`Message::Item`]s, so that the memory taken is that of
-//! the hand in use and not that of the largest one. Elsewhere it is an owned struct: recordings
-//! (CDR with a ROS 2 definition), the bridge between machines (bincode) and JSON serialise it with serde.
+//! padding, beginning with [`Header`]) and behind it a slice of [`Message::Item`]s. So the memory taken is that of the
+//! hand in use and not that of the largest one. Elsewhere it is an owned struct: recordings (CDR with a ROS 2
+//! definition), the bridge between machines (bincode) and JSON serialise it with serde.
 //! `operators/blindgrasp_messages.py` is generated from the same declarations.
 //!
 //! A message in shared memory may come from a process of a stranger. Therefore no bit pattern of a head is invalid as

@@ -18,8 +18,9 @@ message! {
         pub held: bool,
         #[ros = "Whether epsilon and volume are known."]
         pub has_quality: bool,
-        /// How far the object's centre of mass moved in the hand since the hand had settled; of a dropped object, until it
-        /// was lost; after a test lift without a lift, until it was set down; otherwise 0 if it was not lifted.
+        /// How far the object's centre of mass moved in the hand since the hand had settled. Of a dropped object it
+        /// counts until that was lost; after a test lift without a lift, until it was set down. Otherwise it is 0 if the
+        /// object was not lifted.
         pub slip_m: f64,
         /// How far the object turned in the hand.
         pub turn_rad: f64,

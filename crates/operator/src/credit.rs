@@ -256,7 +256,7 @@ impl Credit {
     }
 
     /// Notes, after a long wait, that samples which an earlier instance has sent exist nowhere any more if there is no other
-    /// publisher: the next epoch may begin without the readers' answers to them, which readers count as missing. If this
+    /// publisher. The next epoch may begin without the readers' answers to them, which readers count as missing. If this
     /// publisher can begin again, it sends them: see [`Credit::lost_predecessor`].
     pub(crate) fn has_waited_long(&mut self, places: &impl Places, written: Option<Written>, n_publishers: usize) {
         let last = written.map(|written| written.last);
@@ -295,8 +295,8 @@ impl Credit {
         self.own_last.is_some_and(|last| last.epoch == key.epoch && key.seq <= last.seq)
     }
 
-    /// The last sample that need not be sent again by an instance that takes over with this publisher: if another one has
-    /// handed over, the last that was sent, otherwise the last that the readers have answered.
+    /// The last sample that need not be sent again by an instance that takes over with this publisher. If another one has
+    /// handed over, it is the last that was sent, otherwise the last that the readers have answered.
     pub(crate) fn known(
         &self,
         is_handed_over: bool,
@@ -321,7 +321,7 @@ impl Credit {
         known
     }
 
-    /// The last sample that every lossless reader has answered, and every reader of an answer to it: an instance that takes
+    /// The last sample that every lossless reader has answered, and every reader of an answer to it. An instance that takes
     /// over goes on after it, so that no sample is lost that died with its publisher.
     fn answered(&self, places: &impl Places, written: Option<Written>) -> Option<SampleId> {
         let written = written?;

@@ -3,7 +3,7 @@
 //! Each port has a slot, and each instance of a node. The active instance of a node writes the slots of its ports after
 //! each sample; the slots outlive it, so an instance that takes over knows where it left off. A slot is committed as a
 //! whole: a process that is killed at any moment leaves the record before or the record after, and nothing between. Writers
-//! read the cursors of their readers: a lossless writer never gets further ahead of a reader than its history reaches back,
+//! read the cursors of their readers. A lossless writer never gets further ahead of a reader than its history reaches back,
 //! so no sample that a reader has not answered can be lost when a process is killed.
 //!
 //! The slot of an input is followed by [`N_AGE_SLOTS`] slots with the [histogram](crate::ages) of the ages of its samples on
@@ -591,7 +591,7 @@ mod tests {
     const N_PREEMPTIONS: usize = 3;
 
     /// The interleavings and orders of memory that the Rust memory model allows, x86 or ARM, of a writer that is killed after
-    /// any of its stores, its successor, and a reader beside them: the reader sees whole records, in order.
+    /// any of its stores, its successor, and a reader beside them. The reader sees whole records, in order.
     #[test]
     fn no_reader_sees_a_record_that_was_not_committed_as_a_whole() {
         for n_stores in 0..=3 {

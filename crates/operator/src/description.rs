@@ -45,8 +45,8 @@ pub struct OperatorDescription {
     #[serde(default)]
     pub params: Vec<ParamDescription>,
     /// It answers each sample of its first input with one of the same number, whether it has a state or not. The node before
-    /// it keeps the samples that readers behind it have not answered: so an instance with a state can take the place of one
-    /// without, and the other way round, and it can be killed together with its neighbours.
+    /// it keeps the samples that readers behind it have not answered. So an instance with a state can take the place of one
+    /// without, and the other way round, and can be killed together with its neighbours.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub answers_each: bool,
     /// It opens sockets of the network while it runs: its sandbox leaves it those.

@@ -1,7 +1,7 @@
 //! Whether a process of the network runs out of descriptors.
 //!
 //! Where a stranger makes connections without a certificate until none is left, the library that accepts TLS connections
-//! (tls-listener 0.11) looks at the new ones only, and never again at those that hold the descriptors: nobody comes in any
+//! (tls-listener 0.11) looks at the new ones only, and never again at those that hold the descriptors. Nobody comes in any
 //! more, also when the stranger has long gone. A new process begins without them.
 
 use std::fs::File;

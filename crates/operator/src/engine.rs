@@ -1,5 +1,5 @@
-//! The rules of a node that answers samples: which one is taken next, how its answers are numbered, kept, saved, sent and
-//! committed, how the node gives way, hands over, takes over, and reads along as a standby.
+//! The rules of a node that answers samples: which one is next, and how answers are numbered, kept, saved, sent and
+//! committed. A node also gives way, hands over, takes over, and reads along as a standby.
 //!
 //! They are one machine without ports, memory or clock. A [`Worker`] computes the answers: a stage in Rust, or a program of
 //! another language. All else is reached through a [`Site`]: the ports of an operator ([`runner`](crate::runner)), or a world of
@@ -579,7 +579,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
             {
                 let found = to.map_or("silence", |(input, _)| &*self.book.inputs[input].name);
                 let name = &self.book.outputs[output].name;
-                anyhow::bail!("it answered {found} on the output {name}, which answers the samples of another input");
+                anyhow::bail!("it answered {found} on the output {name}, which answers the samples of one input alone");
             }
             if numbers == Numbers::Counted {
                 let next = self.book.next_key(output);
@@ -778,7 +778,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         self.back.iter_mut().for_each(VecDeque::clear);
         site.begin_active();
         self.looks_on = false;
-        // What it has heard may have been of another time.
+        // It may have heard of an end or a cut of another time.
         (self.is_cut_off, self.has_heard_end) = (false, false);
         for (idx, output) in self.book.outputs.iter_mut().enumerate() {
             output.known = site.begin(idx, is_handed_over);
@@ -834,9 +834,9 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         Ok(())
     }
 
-    /// Takes over what was saved, and gives the worker its state; false if there is nothing to go on with. Where its replacement,
-    /// which has failed, has left no state that the worker can use, that goes on with the state with which it handed over; the
-    /// places stay those of the replacement.
+    /// Takes over what was saved, and gives the worker its state; false if there is nothing to go on with. If its
+    /// failed replacement has left no state that the worker can use, the worker goes on with the state with which it handed
+    /// over. The places stay those of the replacement.
     fn restore<S: Site<Sample = T>>(&mut self, site: &S) -> anyhow::Result<bool> {
         let saved = if self.manner.saves { self.book.restore(site, false)? } else { None };
         let Some(own) = self.handed_over.take() else {

@@ -1,4 +1,4 @@
-//! The other machines of a graph as one machine sees them: the link reports this, `ps` and `top` show it.
+//! The other machines of a graph as one machine sees them: the link reports this, and `ps` shows it.
 
 use std::collections::BTreeMap;
 

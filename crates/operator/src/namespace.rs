@@ -1,6 +1,6 @@
 //! A running graph's own folder in shared memory.
 //!
-//! All files of a graph lie in one folder that only its user can enter: another user can neither make a file under a name that
+//! All files of a graph lie in one folder that only its user can enter. Another user can neither make a file under a name that
 //! a process of the graph opens, nor see its names. The folder is locked while the launcher lives, and goes with the graph, or
 //! after it was killed.
 
@@ -352,7 +352,7 @@ fn config(domain: &NamespaceWiring) -> Result<Config, NamespaceError> {
 }
 
 /// Takes the memory of a graph's files. The kernel gives memory to a file in shared memory when it is written to for the first
-/// time, and kills a process that writes when there is none left; no other program can take memory that the graph has taken.
+/// time, and kills a process that writes when there is none left. No other program can take memory that the graph has taken.
 ///
 /// # Errors
 /// Shared memory has too little room. The part that was taken stays taken.

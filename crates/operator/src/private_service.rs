@@ -1,7 +1,7 @@
 //! The variant of iceoryx2's services that graphs use: all its files lie in the graph's folder.
 //!
 //! `iceoryx2::prelude::ipc` has its memory in POSIX shared memory, whose names all users of the computer share, and opens what
-//! is there under a name, also if another user made it: the file could be a forged connection. Files in a folder of mode 0700
+//! is there under a name, also if another user made it. The file could be a forged connection. Files in a folder of mode 0700
 //! on the same file system (tmpfs) are the same memory under names that no other user can make, see or open.
 
 use std::fmt::Debug;

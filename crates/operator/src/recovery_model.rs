@@ -1,10 +1,9 @@
-//! A search through the histories of a chain of operators (docs/operators.md): a source, a stage without state, a stage with
+//! A search through the histories of a chain of operators (docs/runtime.md): a source, a stage without state, a stage with
 //! state, a sink. Processes are killed between any two of their stores, nodes are swapped, connections come about late, dead
 //! publishers take their samples with them, and the source changes its epoch.
 //!
 //! The decisions are those of the operators: the stages are driven by their [`Engine`], and [`Credit`], [`Sequencer`],
-//! [`Written`] and [`Retained`] are called here as there. Each fix of a loss that lies in a port can be left out; the search then
-//! finds the loss.
+//! [`Written`] and [`Retained`] are called here as there. Seven rules can be left out; the search then finds a loss.
 
 use std::collections::{HashSet, VecDeque};
 use std::hash::{Hash, Hasher};
@@ -41,7 +40,7 @@ const fn id(epoch: u64, seq: u64) -> SampleId {
     SampleId { epoch, seq }
 }
 
-/// A fix that is left out.
+/// A rule that is left out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Without {
     Nothing,

@@ -7,9 +7,8 @@
 //!
 //! Landlock decides by the place of a file. It grants no process the making of links and pipes, so a process without a sandbox,
 //! such as the launcher, meets none under a name that an operator could make. The filter of system calls names those that are
-//! allowed (`calls`): another process, namespace, keyring, memory of System V or right of a file is out of reach,
-//! and so is a call that a newer kernel brings. A file that it makes is its user's alone, because it gives up changing the
-//! umask.
+//! allowed (`calls`). Another process, namespace, keyring, memory of System V or right of a file is out of reach, and so is a
+//! call that a newer kernel brings. A file that it makes is its user's alone, because it gives up changing the umask.
 //!
 //! Both restrict threads and those that they start. Threads that an operator starts before it is ready can read files for as
 //! long as they live; the thread that listens to the launcher gives it up with its first command.

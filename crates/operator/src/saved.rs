@@ -1,4 +1,4 @@
-//! What a node saves for the instance that takes over: how far it has come, by port name, the answers that readers may still
+//! The saved state of a node, for the instance that takes over: how far it has come, by port name, the answers that readers may still
 //! need, and the bytes of its worker's own state.
 //!
 //! It is saved as a whole, before the answers are sent: a kill at any moment neither loses an answer nor makes another one
@@ -90,7 +90,7 @@ struct Scratch {
     entries: Vec<Vec<u8>>,
 }
 
-/// What was saved, as it is read.
+/// A saved state as it is read.
 struct Found<'a> {
     inputs: BTreeMap<String, (Option<SampleId>, InputCounts)>,
     outputs: BTreeMap<String, (Option<SampleId>, VecDeque<Entry>)>,
@@ -217,9 +217,9 @@ impl Book {
     /// answered.
     ///
     /// # Errors
-    /// What was saved is of another version.
+    /// Another version has saved it.
     pub(crate) fn restore<S: Site>(&mut self, site: &S, is_source: bool) -> anyhow::Result<Option<Vec<u8>>> {
-        // The places come first: for a standby, the active instance goes on meanwhile, and what it has saved is never behind them.
+        // The places come first: for a standby, the active instance goes on meanwhile, and its saved state is never behind them.
         let answered: Vec<_> = (0..self.inputs.len()).map(|idx| site.place(idx)).collect();
         let sent: Vec<_> = (0..self.outputs.len()).map(|idx| site.last_sent(idx)).collect();
         self.is_done = false;

@@ -15,7 +15,7 @@ use crate::written::Written;
 /// An early sample waits at most this long for those before it: longer than a writer needs to notice that its predecessor has
 /// ended ([`TICK`](crate::operator::TICK)).
 pub const HOLD_LIMIT: Duration = Duration::from_millis(250);
-/// A reader that has just begun waits so long for samples that were sent before: each publisher gives it those that it kept once
+/// A reader that has just begun waits so long for samples that were sent before. Each publisher gives it those that it kept once
 /// it has noticed the reader, and on a busy machine one publisher can be much later than another.
 pub const START_HOLD_LIMIT: Duration = Duration::from_secs(2);
 /// The number of publishers whose last sample is remembered: more than there can be at a time.

@@ -79,8 +79,8 @@ pub trait Stage {
         Ok(())
     }
 
-    /// Takes over a state that another instance has written, or begins anew. False if it cannot go on with all of that state,
-    /// for example because another model has written it, or if there is none.
+    /// Takes over a state that another instance has written, or begins anew. False if it cannot go on with all of that state
+    /// (another model has written it, for example), or if there is none.
     ///
     /// # Errors
     /// The state cannot be decoded.

@@ -49,7 +49,7 @@ pub struct RepairReport {
     /// Recovered messages of each topic.
     pub n_recovered: BTreeMap<String, u64>,
     /// Recovered messages of each topic that damage may have changed, because no checksum covers them or their channel
-    /// and schema: they lie outside chunks, or in a chunk that is cut off or has no checksum.
+    /// and schema. They lie outside chunks, or in a chunk that is cut off or has no checksum.
     pub n_unverified: BTreeMap<String, u64>,
     /// Lost messages of each topic, as far as the rest of the file tells.
     pub n_lost: BTreeMap<String, u64>,

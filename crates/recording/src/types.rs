@@ -11,7 +11,7 @@ use blindgrasp_messages::{ContactSet, Header, Record, Recorded, Sense, Stamped, 
 const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
 /// How data that zstd has compressed begin.
 const ZSTD_BEGIN: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
-/// What is wrong with messages that rosbag2 has compressed one by one. They are whole, so that a repair changes nothing.
+/// The fault of messages that rosbag2 has compressed one by one. They are whole, so that a repair changes nothing.
 pub(super) const COMPRESSED: &str = "each message is compressed by itself (--compression-mode message), which MCAP does not know: \
                                      write the bag anew with ros2 bag convert and without compression_mode";
 /// How messages and their definitions are encoded, in MCAP's words.

@@ -21,7 +21,7 @@ pub enum UpdateError {
     OtherTopic { topic: String, schema: String },
 }
 
-/// Writes the recording anew and says what it wrote: the edges of the replay take the place of the recorded ones; the
+/// Writes the recording anew and says what it wrote. The edges of the replay take the place of the recorded ones; the
 /// played topic, labels, scenes, metadata, and the edges of stages that did not run stay. Topics for viewers are left out:
 /// they follow from the samples.
 ///

@@ -1,4 +1,4 @@
-//! `record --keep`: a flight recorder. It holds the last seconds of every edge in memory, and writes them to a file of their own
+//! `record --keep`: a flight recorder. It holds the last seconds of every edge in memory. It writes them to a file of their own
 //! when a lift has dropped its object, when a fault holds a grasp, or when somebody asks for it.
 //!
 //! A file holds whole grasps from its first frame on, so that `blindgrasp test` repeats it: a grasp is kept until the next one

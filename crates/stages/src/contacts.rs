@@ -40,12 +40,12 @@ pub struct ContactSummary {
 /// * `joints`, `cells_newtons` - one per joint and cell of the hand, in its order.
 ///
 /// A cell is active when its force exceeds its noise threshold. A joint outside its range (degrees instead of radians,
-/// say), or a force that is negative, not finite or beyond any hand, makes the whole frame invalid, because the
-/// sensor's other readings are then doubtful too.
+/// say), or a force that is negative, not finite or beyond any hand, makes the whole frame invalid. The sensor's other
+/// readings are then doubtful too.
 ///
 /// The active cells of a pad whose link touches no other link are contacts. If its link touches others, its cells within 5 mm
-/// of these are none, and the rest are contacts only if one of another pad opposes them, which itself is a contact and
-/// is not on a link that touches this one. So fingers that press each other on nothing feel no object.
+/// of these are none. The rest are contacts only if one of another pad opposes them, which itself is a contact and is not on
+/// a link that touches this one. So fingers that press each other on nothing feel no object.
 pub fn contacts_from_frame(
     hand: &Hand,
     hand_id: u64,
@@ -56,7 +56,7 @@ pub fn contacts_from_frame(
     ContactFinder::default().find(hand, hand_id, joints, cells_newtons, contacts)
 }
 
-/// Moves the joints that read beyond their limits, by at most [`LIMIT_TOLERANCE_RAD`], to the limits: a joint does not go
+/// Moves the joints that read beyond their limits, by at most [`LIMIT_TOLERANCE_RAD`], to the limits. A joint does not go
 /// beyond its stop, and no later stage should see an encoder's zero as an unusual posture. Others stay as they are.
 pub fn clip_to_limits(hand: &Hand, joints: &mut [f64]) {
     for (value, joint) in joints.iter_mut().zip(&hand.joints) {

@@ -1,9 +1,9 @@
 //! Judges a grasp by the other grasps of its recording day.
 //!
 //! Skins drift: on the fingertips of a BioTac SP hand, the mean of an electrode moves by more than a standard deviation from one
-//! day to another, and a threshold that was right on one day is wrong on the next. A model can do one of two things about it
-//! ([`DayModel`]): judge each value relative to the mean and the deviation of the day's earlier grasps, without labels; or hold
-//! while the day is unlike the days that it was trained on.
+//! day to another. A threshold that was right on one day is wrong on the next. A model can do one of two things about it
+//! ([`DayModel`]): judge each value relative to the mean and the deviation of the day's earlier grasps, without labels. Or it
+//! can hold while the day is unlike the days that it was trained on.
 //!
 //! Pure: no clock, no I/O. [`DayMemory`] is the state. A grasp is judged by earlier grasps alone, never by itself.
 
@@ -174,8 +174,8 @@ pub struct LabelledGrasp {
 }
 
 /// The covariance of two corrections is this variance times exp(-rate × d²), where d² is the mean squared difference of the two
-/// grasps' values in units of `variances`; plus that of an offset, the same for all grasps, and of a slope, in proportion to the
-/// log-odds. Chosen on the training tables of the BioTac SP set, one left out in turn.
+/// grasps' values in units of `variances`. To it comes that of an offset, the same for all grasps, and of a slope, in
+/// proportion to the log-odds. Chosen on the training tables of the BioTac SP set, one left out in turn.
 const KERNEL_VARIANCE: f64 = 8.0;
 const KERNEL_RATE: f64 = 3.0;
 const OFFSET_DEVIATION: f64 = 0.5;

@@ -65,9 +65,9 @@ pub enum Block {
     /// The angle by which each coupled joint has gone beyond its coupling, radians. It shows contacts that no cell
     /// feels.
     Breakaways,
-    /// For each pad: its load, its number of contacts, the greatest force, the centre of its load in the palm frame,
-    /// its mean normal in the palm frame, the spread of the load in the palm frame, the centre of its load in the frame
-    /// of its link; each weighted by force; newtons and metres. All 0 for a pad without contact.
+    /// For each pad: its load, its number of contacts, the greatest force. In the palm frame come the centre of its
+    /// load, its mean normal and the spread of the load; then the centre of its load in the frame of its link. Each is
+    /// weighted by force; newtons and metres. All 0 for a pad without contact.
     Pads,
     /// The direction of gravity in the palm frame, a unit vector. It needs the sense gravity.
     Gravity,
@@ -185,9 +185,9 @@ impl FeatureExtractor {
     /// Writes the feature of a frame to `values`, and returns the number of pads with contact.
     ///
     /// # Errors
-    /// The fault, with `values` empty: no contact ([`Fault::NoContact`]: there is no feature), not as many joints as
-    /// the hand has ([`Fault::WrongLength`]), an impossible number, pad or cell ([`Fault::InvalidValue`]), or a sense that
-    /// a block needs and the frame does not have ([`Fault::MissingReading`]).
+    /// The fault, with `values` empty: no contact ([`Fault::NoContact`]: there is no feature), or not as many joints as
+    /// the hand has ([`Fault::WrongLength`]). Others are an impossible number, pad or cell ([`Fault::InvalidValue`]), or a
+    /// sense that a block needs and the frame does not have ([`Fault::MissingReading`]).
     pub fn extract(&self, reading: &FeltReading<'_>, values: &mut Vec<f64>) -> Result<u32, Fault> {
         values.clear();
         let outcome = self.check(reading).and_then(|()| self.write_blocks(reading, values));

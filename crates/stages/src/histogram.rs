@@ -11,8 +11,8 @@ use blindgrasp_messages::{Contact, Fault, MAX_PADS};
 /// contacts on the same pad (Eq. 2), divided by the number of pads with contact (Eq. 4). `sigma_m` is σ in metres.
 ///
 /// # Errors
-/// The fault, with `values` empty: no contact ([`Fault::NoContact`]: there is no feature), or a contact whose position
-/// is not finite, whose force is not positive and finite, or whose pad index is beyond any hand
+/// The fault, with `values` empty: no contact ([`Fault::NoContact`]: there is no feature). Another one is a contact
+/// whose position is not finite, whose force is not positive and finite, or whose pad index is beyond any hand
 /// ([`Fault::InvalidValue`]).
 pub fn histogram(
     dictionary: &Dictionary,

@@ -31,7 +31,7 @@ pub struct Judge {
     found_before: Findings,
 }
 
-/// What speaks against the last grasp of which something does.
+/// The grounds against the last grasp that has any.
 #[derive(Debug, Default)]
 struct Findings {
     grasp_id: u64,

@@ -5,9 +5,9 @@
 //!
 //! * LIFT, when `votes` consecutive settled predictions of different times, made by the same operators, say stable and no
 //!   earlier prediction of the grasp raised a doubt; with a probe, the predictions after the probe;
-//! * HOLD, when `votes` consecutive settled predictions say unstable, or as many say that the model is unsure; at once, when
-//!   a settled prediction is faulty; at the first settled prediction, when an earlier one of the grasp raised a doubt; and at
-//!   the grasp's end, when it is not decided by then.
+//! * HOLD, when `votes` consecutive settled predictions say unstable, or as many say that the model is unsure. A settled
+//!   prediction that is faulty holds at once, and a doubt of an earlier one of the grasp at the first settled prediction. A
+//!   grasp that is not decided by its end is held then.
 //!
 //! A wrong "stable" drops the object. So there is one path to LIFT, the `Vote::Stable` of `OpenGrasp::vote`, and every other
 //! path ends in HOLD with its reason. With the option `probe`, settled predictions that are not unstable ask for a

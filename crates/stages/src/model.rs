@@ -364,8 +364,8 @@ impl Model {
     ///
     /// # Errors
     /// The fault: the frame's own, [`Fault::WrongModel`] if the model does not judge this phase, that of the phase before,
-    /// [`Fault::MissingReading`] if that did not come, [`Fault::NoBaseline`] and [`Fault::UnlikeDay`] if the day forbids a
-    /// judgement, and as of [`Classifier::classify`].
+    /// [`Fault::MissingReading`] if that did not come. Also [`Fault::NoBaseline`] and [`Fault::UnlikeDay`] if the day
+    /// forbids a judgement, and as of [`Classifier::classify`].
     pub fn judge(
         &self,
         memory: &mut Memory,

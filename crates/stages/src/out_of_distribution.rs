@@ -1,12 +1,12 @@
 //! Checks whether a grasp is like the training grasps of the model. The classifier's result for another grasp means
 //! nothing.
 //!
-//! It compares a few quantities, which a person can check on the robot, with their limits: joint angles, breakaways of
-//! coupled joints, the load of each pad and its spread, the distance of contacts from the dictionary's words, and the
-//! mass of the histogram. The limits are the range of the training grasps, widened by the resolution of each quantity and
-//! by a margin that is the same for all in units of their standard deviations, and cut to the values that are possible.
-//! docs/trust.md says what this finds. Distances in the space of all quantities (Mahalanobis, nearest neighbours, K-means)
-//! found less.
+//! It compares a few quantities, which a person can check on the robot, with their limits. They are joint angles,
+//! breakaways of coupled joints, the load of each pad and its spread, the distance of contacts from the dictionary's
+//! words, and the mass of the histogram. The limits are the range of the training grasps, widened by the resolution of
+//! each quantity and by a margin that is the same for all in units of their standard deviations. They are cut to the
+//! values that are possible. docs/trust.md says what this finds. Distances in the space of all quantities (Mahalanobis,
+//! nearest neighbours, K-means) found less.
 //!
 //! Pure: no clock, no I/O, no state, and no allocation in [`TrainingRange::check`].
 

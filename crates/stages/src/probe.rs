@@ -1,8 +1,8 @@
 //! Judges a grasp after a probe: from the reading that decides and from the readings before it.
 //!
 //! A probe is a small movement that shows more of a grasp: the hand tightens to the force of a lift, and then the arm may lift
-//! by a few millimetres and rest. The load that arrives on the fingers, moves over their cells or goes away again says
-//! more about the lift than the settled grasp does (Chebotar et al., "Self-supervised regrasping using spatio-temporal tactile
+//! by a few millimetres and rest. The load that arrives on the fingers, moves over their cells or goes away again says more
+//! about the lift than the settled grasp does. (Chebotar et al., "Self-supervised regrasping using spatio-temporal tactile
 //! features and reinforcement learning", 2016, predict from the early lift). [`ProbeModel`] takes the feature of the frame,
 //! that of the last frame of the phase before, their difference, and loads relative to the hand's own grip.
 //!
@@ -179,7 +179,7 @@ impl GraspHistory {
     }
 
     /// Writes the values from which a frame of the grasp is judged: the feature of the phase before, the frame's own, how it
-    /// differs, and of each signal while the hand moved in between its greatest and least value, the sum of its steps and
+    /// differs. Of each signal while the hand moved in between come its greatest and least value, the sum of its steps and
     /// the greatest one, and its values relative to the grip.
     ///
     /// # Errors
@@ -231,9 +231,9 @@ fn lifting_verdict(part: f64) -> Verdict {
 const TIGHTEN_BELOW: f64 = 0.85;
 const SET_DOWN_BELOW: f64 = 0.5;
 
-/// A signal relative to the hand's own grip, from the signal before and now, each with the sum of all signals: its shares of the
-/// sums, its part now of before and now, and how far it travelled for each newton of these. 0 of nothing. Skins differ in
-/// their gain, and in how much force they lose between cells; these values do not.
+/// A signal relative to the hand's own grip, from the signal before and now, each with the sum of all signals. It is told as its
+/// shares of the sums, its part now of before and now, and how far it travelled for each newton of these. 0 of nothing. Skins
+/// differ in their gain, and in how much force they lose between cells; these values do not.
 fn shares((before, all_before): (f64, f64), (now, all_now): (f64, f64), travelled: f64) -> [f64; N_SHARES] {
     let part = |of: f64, whole: f64| if whole.abs() > LEAST_NEWTONS { of / whole } else { 0.0 };
     let both = before.abs() + now.abs();

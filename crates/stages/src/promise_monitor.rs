@@ -1,10 +1,10 @@
 //! Watches whether lifts drop their objects more often than was promised.
 //!
-//! The evidence is a mixture of Shiryaev-Roberts statistics: after each lift R becomes (1 + R) q / p for a drop and
-//! (1 + R) (1 - q) / (1 - p) for an object that was kept, where p is the promised share and q a greater one. While no lift drops
-//! with a greater probability than p, whatever came before it, the expectation of R after n lifts is at most n. So the mean
-//! number of lifts until the promise is withdrawn wrongly is at least `WITHDRAWN_FROM`. Good lifts of the past do not make up
-//! for drops, because the sum allows for a change at each lift (Pollak, "Optimal detection of a change in distribution", 1985).
+//! The evidence is a mixture of Shiryaev-Roberts statistics. After each lift R becomes (1 + R) q / p for a drop and (1 + R) (1 -
+//! q) / (1 - p) for an object that was kept. Here p is the promised share and q a greater one. While no lift drops with a
+//! greater probability than p, whatever came before it, the expectation of R after n lifts is at most n. So the mean number of
+//! lifts until the promise is withdrawn wrongly is at least `WITHDRAWN_FROM`. Good lifts of the past do not make up for drops,
+//! because the sum allows for a change at each lift (Pollak, "Optimal detection of a change in distribution", 1985).
 //!
 //! [`drops_at_most`] is the promise that the outcomes themselves allow.
 
@@ -78,14 +78,14 @@ pub const CONFIDENCE: f64 = 0.95;
 /// The bets of [`drops_at_most`]: on these parts of the share that is tested.
 const PARTS: [f64; 6] = [0.0, 0.2, 0.35, 0.5, 0.65, 0.8];
 
-/// The largest share of the lifts that may drop, given how so many of them ended: with a probability of [`CONFIDENCE`] it is at
+/// The largest share of the lifts that may drop, given how so many of them ended. With a probability of [`CONFIDENCE`] it is at
 /// least the true share after every lift, so it may be looked at whenever one likes. Lifts are taken for draws of the same
 /// mixture of objects.
 ///
 /// It is a confidence sequence by betting (Waudby-Smith and Ramdas, "Estimating means of bounded random variables by betting",
-/// 2024). For a share m, six bets start with equal capital, each on a part w of m: a drop multiplies its capital by w, an object
+/// 2024). For a share m, six bets start with equal capital, each on a part w of m. A drop multiplies its capital by w, an object
 /// that was kept by (1 - w m) / (1 - m). While lifts drop with a probability of m or more, the capital of all together is
-/// expected to grow by nothing, so it is seldom ever 20 times as large (Ville's inequality); shares where it is are ruled out.
+/// expected to grow by nothing, so it is seldom ever 20 times as large (Ville's inequality). Shares where it is are ruled out.
 pub fn drops_at_most(n_kept: u64, n_dropped: u64) -> f64 {
     let n = n_kept + n_dropped;
     if n == 0 {

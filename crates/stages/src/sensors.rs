@@ -3,7 +3,7 @@
 //!
 //! Evidence grows over frames and grasps. Each [`SensorFault`] has a likelihood ratio: how much more probable a reading is with
 //! the fault than without. The ratios of successive readings are multiplied, with a small prior at each grasp for a fault that
-//! begins there (the Shiryaev-Roberts procedure; Moustakides, Polunchenko & Tartakovsky, "A numerical approach to performance
+//! begins there. (The Shiryaev-Roberts procedure; Moustakides, Polunchenko & Tartakovsky, "A numerical approach to performance
 //! analysis of quickest change-point detection procedures", Statistica Sinica 21, 2011). The priors of all faults sum to 1. If
 //! each ratio is at most 1 in the mean over healthy grasps, a hand that is healthy is suspected once in [`ALARM`] grasps or less.
 //!
@@ -407,11 +407,11 @@ impl GraspSummary {
         self.closing_rad.iter().rposition(moving).map_or(0.0, |idx| idx as f64 + 1.0)
     }
 
-    /// Writes the values that tell a healthy grasp from others, [`n_values`] of them: of each joint its angle in the settled and
-    /// in the open hand, its breakaway, and when it stalled; of each pad its load, contacts, greatest force, centre in the palm
-    /// frame, its share of the load, when it first felt the object, when its force began to rise, by itself and after each of
-    /// the two joints before it had stalled (by its speed, and by its last moving frame), and the level of the open hand; of each two pads the distance of their centres.
-    /// Moments are in closing frames.
+    /// Writes the values that tell a healthy grasp from others, [`n_values`] of them. Of each joint these are its angle in the
+    /// settled and in the open hand, its breakaway, and when it stalled. Of each pad they are its load, contacts, greatest force,
+    /// centre in the palm frame, its share of the load, and when it first felt the object. Then come when its force began to
+    /// rise, by itself and after each of the two joints before it had stalled (by its speed, and by its last moving frame). The
+    /// level of the open hand ends them. Of each two pads it is the distance of their centres. Moments are in closing frames.
     pub fn values(&self, hand: &Hand, joints: &[f64], contacts: &[Contact], values: &mut Vec<f64>) {
         values.clear();
         for (idx, (angle, joint)) in joints.iter().zip(&hand.joints).enumerate() {

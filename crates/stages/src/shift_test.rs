@@ -1,9 +1,9 @@
 //! Notices that the readings of a robot have changed: another skin, another gain.
 //!
 //! Outcomes of lifts before such a change say little of the lifts after it. The test is conformal (Vovk, Gammerman and Shafer,
-//! "Algorithmic Learning in a Random World", 2005, chapter 7): while grasps come in random order, each rank of a new grasp
-//! among the earlier ones is as probable as any other. A gambler bets on extreme ranks, and the Shiryaev-Roberts statistic
-//! R becomes (1 + R) times his gain; its mean after n grasps is n at most. So the mean number of grasps until a false alarm is
+//! "Algorithmic Learning in a Random World", 2005, chapter 7). While grasps come in random order, each rank of a new grasp
+//! among the earlier ones is as probable as any other. A gambler bets on extreme ranks, and the Shiryaev-Roberts statistic R
+//! becomes (1 + R) times his gain; its mean after n grasps is n at most. So the mean number of grasps until a false alarm is
 //! [`NOTICED_FROM`] at least, whatever the readings are like. Grasps of one object after another are not in random order.
 //!
 //! Pure: no clock, no input or output. [`ShiftTest`] is the state.
@@ -22,8 +22,8 @@ const EXPONENT: f64 = 0.35;
 
 const N_NUMBERS: usize = 3;
 
-/// The numbers of a settled grasp that the test compares: the logarithm of the load of all pads, the number of contacts of a pad
-/// that touches, and the logarithm of the load of a contact.
+/// The numbers of a settled grasp that the test compares. They are the logarithm of the load of all pads, the number of contacts
+/// of a pad that touches, and the logarithm of the load of a contact.
 pub(crate) type Numbers = [f32; N_NUMBERS];
 
 /// The numbers of a grasp; `None` if the feature does not have them, or nothing is touched.

@@ -35,7 +35,7 @@ pub fn find_contacts<'a>(
     }
 }
 
-/// What makes the frame faulty that [`find_contacts`] has just read, for people: joint, cell or links by their names.
+/// The cause of the fault in the frame that [`find_contacts`] has just read, for people: joint, cell or links by their names.
 pub fn explain_fault(
     hand: &Hand,
     finder: &ContactFinder,

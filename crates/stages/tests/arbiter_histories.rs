@@ -119,8 +119,9 @@ impl Input {
     }
 }
 
-/// How far apart the last input may be from the one before it in its grasp: the option, or three times the third smallest of the
-/// nine distances before, of inputs that followed each other in its epoch, if that is more, at most 1 s.
+/// How far apart the last input may be from the one before it in its grasp: the option, or, if that is more, three times a steady
+/// pace, at most 1 s. The pace is the third smallest of the nine distances before, of inputs that followed each other in its
+/// epoch.
 fn gap_limit_nanos(before: &[Input], epoch: u64, options: &ArbiterOptions) -> u64 {
     let samples: Vec<&Input> = before.iter().filter(|input| input.is_sample()).collect();
     let mut distances = Vec::new();

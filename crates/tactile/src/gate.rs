@@ -19,8 +19,8 @@
 //!
 //! **A wrong number.** A line may change a digit of a frame. A frame whose `grasp_id` is not the last one or the next one
 //! waits for the frame after it, which must have the same. If the `seq` or the stamp of a frame jumps, the filter keeps its
-//! state from before for three frames: if one of them fits that state and not the jump, the filter goes back to it.
-//! A wrong number leaves a gap, so that the grasp is held.
+//! state from before for three frames. If one of them fits that state and not the jump, the filter goes back to it. A wrong
+//! number leaves a gap, so that the grasp is held.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

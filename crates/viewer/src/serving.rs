@@ -1,5 +1,5 @@
 //! The connections of the page's server. Every user of the machine can make some, so their number and the time for a request's
-//! head are limited; a connection that has borne the token of the page's owner is never closed for another one.
+//! head are limited. A connection that has borne the token of the page's owner is never closed for another one.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -38,9 +38,9 @@ enum Command {
 /// Correct a model by the robot's own outcomes: lifts, or labelled grasps of one day.
 ///
 /// Recordings of lifts that end with a frame of the phase kept or dropped correct the probabilities of the look that decides, and
-/// widen limits that held the robot's own grasps; objects are the unit of the cross-fit. A model that looks at days (--day-baseline,
-/// import --day) is corrected for the day of the recordings; other days are judged as before. The thresholds stay. Use the new
-/// model in place of the old one: blindgrasp run --set model=NEW, or blindgrasp swap.
+/// widen limits that held the robot's own grasps. Objects are the unit of the cross-fit. A model that looks at days
+/// (--day-baseline, import --day) is corrected for the day of the recordings; other days are judged as before. The thresholds stay.
+/// Use the new model in place of the old one: blindgrasp run --set model=NEW, or blindgrasp swap.
 #[derive(Debug, Args)]
 #[command(
     after_help = "Example: blindgrasp model adapt models/barrett-bh8-280-lifts.json my-lifts.mcap --out mine.json"

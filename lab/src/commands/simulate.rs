@@ -56,7 +56,7 @@ pub(super) struct Arguments {
     #[arg(long)]
     seed: Option<u64>,
     /// Meaning of stable: wrench-space, epsilon > 0.07 and volume > 0.1; lift, kept while lifted and shaken in physics,
-    /// which takes a second of CPU time a candidate [default: wrench-space].
+    /// which takes 0.3 to 0.6 s of CPU time [default: wrench-space].
     #[arg(long, value_parser = label)]
     label: Option<Label>,
     /// Physics engine of lifts: rapier, the built-in one; mujoco (pip install 'blindgrasp[mujoco]') [default: rapier].
@@ -181,8 +181,8 @@ const MANY_UNSTABLE: usize = 50;
 fn none_is_stable(n: usize) -> String {
     format!(
         "none of the first {n} grasps is stable, but stable ones are asked for: --stable-fraction natural keeps grasps as they \
-         come, --label lift and --thresholds call others stable; blindgrasp view --hand draws the hand: does it close on what lies \
-         before +z of its palm frame?"
+         come, --label lift and --thresholds call others stable; blindgrasp view HAND.yaml --out hand.html draws the hand: does it \
+         close on what lies before +z of its palm frame?"
     )
 }
 

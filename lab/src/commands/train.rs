@@ -58,8 +58,8 @@ pub(super) struct Arguments {
     /// The SVM's kernel width.
     #[arg(long, value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
     gamma: Option<f64>,
-    /// Choose the thresholds by the price of a drop: those that take the least time for each kept object, if a drop costs so
-    /// many seconds and the hand grasps again until it lifts, judged by folds of objects. Recordings with probes get a
+    /// Choose the thresholds by the price of a drop. They are those that take the least time for each kept object, if a drop
+    /// costs so many seconds and the hand grasps again until it lifts, judged by folds of objects. Recordings with probes get a
     /// threshold for each probe. 120 is cautious, the models of lifts that come with blindgrasp were trained with 300, and 0 is
     /// for objects that may fall.
     #[arg(long, value_name = "SECONDS", value_parser = |text: &str| number_in(text, 0.0..=1e6))]

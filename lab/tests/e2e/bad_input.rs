@@ -1,4 +1,4 @@
-//! Mistakes of users of the lab: each gives one clear error that names the file and what was expected.
+//! Mistakes of users of the lab: each gives one clear error that names the file and the expected content.
 
 use std::path::Path;
 

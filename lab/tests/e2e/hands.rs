@@ -238,8 +238,9 @@ fn finger_dae() -> String {
     )
 }
 
-/// A hand of three fingers and a thumb, whose fingers run along +z of the palm and close towards +x, as many makers write it:
-/// in the encoding of their country, with joints that mimic joints that mimic others, with joints and shapes that are none.
+/// A hand of three fingers and a thumb, whose fingers run along +z of the palm and close towards +x, as many makers write it.
+/// It is in the encoding of their country, with joints that mimic joints that mimic others, with joints and shapes that are
+/// none.
 fn makers_urdf() -> Vec<u8> {
     let link = |name: &str| {
         format!(

@@ -36,8 +36,8 @@ pub(super) struct Arguments {
     /// Check the file and print the graph; start nothing
     ///
     /// Asks each program for its ports and parameters, and prints nodes and edges with every value filled in. The
-    /// programs of the file are run for that, with --describe: use only files that you trust. With --machine, the programs and files of other machines need not be here. With --json: {"graph": …}, with
-    /// "crossing" edges where the file names machines, or {"errors": […]}.
+    /// programs of the file are run for that, with --describe: use only files that you trust. With --machine, the programs and files of
+    /// other machines need not be here. With --json: {"graph": …}, with "crossing" edges where the file names machines, or {"errors": […]}.
     #[arg(long, conflicts_with_all = ["record", "detach", "stay", "metrics", "view"])]
     check: bool,
     /// Name of the running graph [default: the file's]

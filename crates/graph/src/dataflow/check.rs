@@ -70,11 +70,10 @@ impl Operator {
 
 /// Checks a dataflow file against its operators' descriptions.
 ///
-/// `operators` are those that a bare name can mean. `overrides` take the place of values in
-/// the file. `scope` says whether all programs and files must be there, or those of one machine's nodes. `describe`
-/// asks a program with its arguments for its description (`--describe` after them, then
-/// [`OperatorDescription::from_json`]) and is called once for each program with the same arguments; its error follows
-/// "program '…' cannot be used: " in a diagnostic.
+/// `operators` are those that a bare name can mean. `overrides` take the place of values in the file. `scope` says
+/// whether all programs and files must be there, or those of one machine's nodes. `describe` asks a program with its
+/// arguments for its description (`--describe` after them, then [`OperatorDescription::from_json`]) and is called once
+/// for each program with the same arguments. Its error follows "program '…' cannot be used: " in a diagnostic.
 ///
 /// # Errors
 /// Every mistake of the file and the overrides that does not follow from another mistake.

@@ -2,8 +2,8 @@
 //!
 //! A dataflow file (YAML, version 1) names the nodes of a graph, the operator that each runs, where each input comes
 //! from, and each node's params. [`load`] reads it, [`check()`] compares it with the descriptions of the operators
-//! ([`OperatorDescription`], the answer to `--describe`) and returns a [`Graph`] in which every program,
-//! edge and param is settled, or every mistake at once, each with its line and column.
+//! ([`OperatorDescription`], the answer to `--describe`). It returns a [`Graph`] in which every program, edge and param
+//! is settled, or every mistake at once, each with its line and column.
 //!
 //! ```yaml
 //! version: 1

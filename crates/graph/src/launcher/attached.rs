@@ -1,7 +1,7 @@
 //! Attached readers: clients that read a running graph's edges and must miss nothing, like a recorder.
 //!
 //! The plan has slots for them in every writer's list, given up until a reader takes them. The launcher only assigns
-//! the slots: the reader begins by itself once its ports are open, and a writer gives up a reader that keeps it waiting
+//! the slots. The reader begins by itself once its ports are open, and a writer gives up a reader that keeps it waiting
 //! ([`ATTACHED_LIMIT_MILLIS`](crate::plan::ATTACHED_LIMIT_MILLIS)), so that no reader can stop the graph. The end of a
 //! reader's connection frees its slots.
 

@@ -1,8 +1,8 @@
 //! Starts, supervises and stops a graph's processes. It never touches samples.
 //!
-//! Each operator is a process in a process group of its own, so that Ctrl-C reaches the launcher alone, which then
-//! stops the graph in its order: sources first, each operator drained before the next is asked, so that everything in
-//! flight is decided. Ports close only after the last one is drained. An operator that doesn't end in time is killed.
+//! Each operator is a process in a process group of its own, so that Ctrl-C reaches the launcher alone. It then stops
+//! the graph in its order: sources first, each operator drained before the next is asked, so that everything in flight
+//! is decided. Ports close only after the last one is drained. An operator that doesn't end in time is killed.
 //!
 //! An operator that dies, or gives no sign of life for longer than it may, is started again and goes on where the cursors
 //! say (`supervision`). One that keeps dying is given up: its writers wait for it no longer, and the graph goes on
@@ -261,7 +261,7 @@ struct Member {
     counts: BTreeMap<String, u64>,
 }
 
-/// Raises the limit of descriptors of this process and of those that it starts as far as it may: connections of strangers to
+/// Raises the limit of descriptors of this process and of those that it starts as far as it may. Connections of strangers to
 /// the link take some, and the usual limit (1024) is for programs that call select().
 fn raise_descriptor_limit() {
     let limit = getrlimit(Resource::Nofile);

@@ -2,9 +2,9 @@
 //! (`SCHED_BATCH`).
 //!
 //! A stage that wakes the next one has microseconds of work left. If the woken stage interrupts it, the kernel moves the
-//! interrupted one to another core, and soon every third hop wakes a sleeping core: 27 µs instead of 5 on a virtual machine
-//! of two cores. So operators wait, as long as that costs little. Where other programs fill the cores, or the operators
-//! themselves compute for long, an operator that waits would wait for milliseconds, so it interrupts them.
+//! interrupted one to another core, and soon every third hop wakes a sleeping core. That takes 27 µs instead of 5 on a
+//! virtual machine of two cores. So operators wait, as long as that costs little. Where other programs fill the cores, or
+//! the operators themselves compute for long, an operator that waits would wait for milliseconds, so it interrupts them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};

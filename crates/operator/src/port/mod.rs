@@ -4,12 +4,12 @@
 //! once ([`UntypedPublisher`], [`UntypedSubscriber`]). [`Publisher`] and [`Subscriber`] give the bytes their type; the name of the
 //! type is compared when a port opens, and the lengths when a sample comes.
 //!
-//! A port is a publish-subscribe service, with safe overflow, whose readers are woken by bells in the cursors: iceoryx2 itself never
-//! blocks, and a reader that is behind keeps its newest samples. Credit makes an edge lossless: the publisher reads on
-//! the [cursors](crate::cursors) how far each reader of a lossless edge has come, and waits, for a bounded time, before it
-//! overtakes a reader by more than its capacity. Its history reaches back as far, so a reader that comes back after a
-//! crash, or takes over in a swap, still finds all samples that are not answered. Nobody waits for a reader on a `latest`
-//! edge, a tool or a standby: such a reader can be as slow as it likes.
+//! A port is a publish-subscribe service, with safe overflow, whose readers are woken by bells in the cursors: iceoryx2 itself
+//! never blocks, and a reader that is behind keeps its newest samples. Credit makes an edge lossless. The publisher reads on the
+//! [cursors](crate::cursors) how far each reader of a lossless edge has come, and waits, for a bounded time, before it overtakes a
+//! reader by more than its capacity. Its history reaches back as far, so a reader that comes back after a crash, or takes over in a
+//! swap, still finds all samples that are not answered. Nobody waits for a reader on a `latest` edge, a tool or a standby: such a
+//! reader can be as slow as it likes.
 //!
 //! A trap of iceoryx2 0.10: a subscriber that exists but has not looked for its publishers yet gets samples up to its
 //! buffer's size, and later ones are dropped without an error. Within the credit that cannot happen.

@@ -25,7 +25,7 @@ pub struct DrawnGraph {
 pub struct DrawnGroup {
     /// What it is called.
     pub name: String,
-    /// What else is said of it, beside the name.
+    /// A text behind the name.
     pub note: String,
 }
 
@@ -49,7 +49,7 @@ pub struct DrawnEdge {
     pub from: usize,
     /// To which node.
     pub to: usize,
-    /// What is said of it.
+    /// Lines beside the arrow.
     pub notes: Vec<String>,
     /// Whether samples may give way to newer ones: dashed.
     pub is_dashed: bool,

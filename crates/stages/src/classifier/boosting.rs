@@ -216,8 +216,8 @@ fn next_idx(split: TreeNode, sample: &[f64]) -> usize {
 }
 
 impl BoostedTrees {
-    /// What each value of a sample does to the decision value: at each split that asks for it, how far the sample's side lies
-    /// from the mean of both sides (Saabas, "Interpreting random forests", 2014, with equal weights of the sides).
+    /// The effect of each value of a sample on the decision value (Saabas, "Interpreting random forests", 2014, with equal
+    /// weights of the sides). Each split that asks for it adds how far the sample's side lies from the mean of both sides.
     pub fn contributions(&self, sample: &[f64]) -> Vec<f64> {
         let mut contributions = vec![0.0; self.n_features];
         for tree in &self.trees {

@@ -98,7 +98,7 @@ pub fn find(named: &str, urdf_folder: &Path) -> Result<PathBuf, String> {
     })
 }
 
-/// The file that a URDF names, as [`find`] does; or, for a path of another computer or system, the file in the URDF's folder or
+/// The file that a URDF names, as [`find`] does. For a path of another computer or system, it is the file in the URDF's folder or
 /// beside it with the longest same end of its path, in whatever case.
 ///
 /// # Errors
@@ -145,7 +145,7 @@ fn file_below(folder: &Path, parts: &[&str]) -> Option<PathBuf> {
 }
 
 /// Folders in which a package of ROS may be: a folder above `from` or beside one of those that has its name, or whose
-/// `package.xml` names it; or a folder of that name in ROS's `ROS_PACKAGE_PATH` or `AMENT_PREFIX_PATH`.
+/// `package.xml` names it. A folder of that name in ROS's `ROS_PACKAGE_PATH` or `AMENT_PREFIX_PATH` is one as well.
 pub fn find_package<'a>(package: &'a str, from: &Path) -> impl Iterator<Item = PathBuf> + use<'a> {
     let from = absolute(from);
     let above: Vec<PathBuf> = from.ancestors().map(Path::to_path_buf).collect();

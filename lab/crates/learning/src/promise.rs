@@ -1,10 +1,10 @@
 //! Upper bounds for the share of lifts that drop and of trials that end in a drop, for new objects.
 //!
 //! Grasps of one object succeed or fail together, so the object is the unit. Its loss is a number from 0 to 1, and the bound is
-//! the smallest mean that a test at the level 1 - confidence rejects: the exact binomial test if each object's loss is 0 or 1,
-//! otherwise a test by betting (Waudby-Smith and Ramdas, "Estimating means of bounded random variables by betting", 2024). The
-//! bounds hold for any number of objects, without a normal approximation. They need objects that are drawn like the new ones and
-//! that had no part in training or in the choice of a threshold.
+//! the smallest mean that a test at the level 1 - confidence rejects. That is the exact binomial test if each object's loss is 0
+//! or 1, otherwise a test by betting (Waudby-Smith and Ramdas, "Estimating means of bounded random variables by betting", 2024).
+//! The bounds hold for any number of objects, without a normal approximation. They need objects that are drawn like the new ones
+//! and that had no part in training or in the choice of a threshold.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;

@@ -12,10 +12,10 @@
 //!
 //! The catalogue has 24 classes of thirty objects, built from a few sizes each: vessels are hollow, mugs have handles
 //! that fingers go through. It is the same everywhere. Objects are metres, upright along +z or (tools, cutlery) long
-//! along z with the working end up; they stand on z = 0, but exact boxes, books and balls, which have their centre at the
-//! origin. Fronts face -y, handles +x. A curved surface is cut into triangles that are off by 0.15 mm
-//! (0.2 mm in a few places; coarser deep inside vessels). Every
-//! third object of a class (`-02`, `-05`, ... `-29`) is held out: it is never used for training.
+//! along z with the working end up. They stand on z = 0, but exact boxes, books and balls, which have their centre at the
+//! origin. Fronts face -y, handles +x. A curved surface is cut into triangles that are off by 0.15 mm (0.2 mm in a few
+//! places; coarser deep inside vessels). Every third object of a class (`-02`, `-05`, ... `-29`) is held out: it is never
+//! used for training.
 
 mod classes;
 pub mod folder;

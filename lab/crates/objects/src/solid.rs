@@ -82,7 +82,7 @@ impl Solid {
     }
 
     /// A vessel turned about z: `outer` runs from the bottom (on the axis, or off it where a foot ring's hollow has been
-    /// put before it) up to the rim; the inner side keeps `wall_mm` off what is higher than `foot_mm` and ends in a flat
+    /// put before it) up to the rim. The inner side keeps `wall_mm` off what is higher than `foot_mm` and ends in a flat
     /// floor, or follows the outer side where that is higher. Deep inside, where fingers seldom get, it is coarser.
     pub(super) fn vessel(outer: &[Point], foot_mm: f64, wall_mm: f64, floor_mm: f64) -> Solid {
         let above_foot = outer.iter().rposition(|point| point[1] < foot_mm).map_or(0, |idx| idx + 1);

@@ -134,7 +134,7 @@ fn surfaces_are_closed_and_face_outwards() {
     assert!(large.is_empty(), "{large:#?}");
 }
 
-/// Two triangles of a curved surface that meet at a small angle θ stand for an arc; with heights h over their common
+/// Two triangles of a curved surface that meet at a small angle θ stand for an arc. With heights h over their common
 /// edge it bends by θ over h, and its sagitta over either triangle is about θh/8.
 #[test]
 fn triangles_follow_curved_surfaces() {

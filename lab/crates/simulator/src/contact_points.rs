@@ -2,7 +2,7 @@
 //! where its links touch each other, one point each.
 //!
 //! Every link of the hand counts, pad or not. A link's touching patch (a point, a line, a face on a face) is found by
-//! tilting the link a little about its nearest point, in eight directions: the nearest points then run to the ends of
+//! tilting the link a little about its nearest point, in eight directions. The nearest points then run to the ends of
 //! the patch. Of those, the points farthest from each other stay.
 
 use nalgebra::{Isometry3, Point3, UnitQuaternion, UnitVector3, Vector3};

@@ -266,7 +266,7 @@ impl<'a> PlacedShape<'a> {
     }
 
     /// How far the object, placed at `palm_from_object`, must be raised along the palm's +z to keep the distance from this
-    /// shape when it comes down from above; `at_least_z` if that is more, as where it passes by.
+    /// shape when it comes down from above. It is `at_least_z` if that is more, as where it passes by.
     pub(super) fn stop_z(
         &self,
         palm_from_link: &Isometry3<f64>,

@@ -11,12 +11,12 @@
 //!
 //! A new point that lies on a plane within the tolerance extends that plane by simplices and leaves its equation alone;
 //! simplices over ridges between the same two planes share one new plane. No equation is ever taken from a sliver that only
-//! rounding made, which is where naive hulls break: the new plane is a mean of the ridge's two, so weighted that it goes
+//! rounding made, which is where naive hulls break. The new plane is a mean of the ridge's two, so weighted that it goes
 //! through the point, or, where that misses the simplex's vertices, the plane of the best determined of its simplices.
 //!
 //! A finished hull is checked: every point below every plane, every vertex on its planes, no fold in the surface. A
 //! hull that fails a check, or whose topology broke on the way, is built again with another tolerance, and after those
-//! from points moved at random (a joggle); it says so, and how far it may be off. The module does not merge planes that
+//! from points moved at random (a joggle). It says so, and how far it may be off. The module does not merge planes that
 //! meet at an angle within rounding, as Qhull does; they stay two that agree within the tolerance.
 
 use std::cell::RefCell;
@@ -135,7 +135,7 @@ const JOGGLE_SEED: u64 = 0x6a6f_6767_6c65;
 /// Seed of the points' random words.
 const WORD_SEED: u64 = 0x776f_7264;
 
-/// A finished hull may miss the tolerance by this factor: a point is dropped against planes whose successors, through
+/// A finished hull may miss the tolerance by this factor. A point is dropped against planes whose successors, through
 /// vertices that were themselves on a plane only within the tolerance, need not be the same to the last bit.
 const CHECK_SLACK: f64 = 4.0;
 
@@ -516,7 +516,7 @@ impl Surface {
         Ok(known)
     }
 
-    /// The plane over a ridge as a mean of the ridge's two planes, so weighted that it goes through the apex: both
+    /// The plane over a ridge as a mean of the ridge's two planes, so weighted that it goes through the apex. Both
     /// weights are positive, which makes it well determined where the simplex is a sliver. `None` when the simplex'
     /// vertices are not on it, by what the two planes' own errors add up to.
     fn blended_plane(&self, visible: u32, hidden: u32, vertices: &[u32; DIM]) -> Option<Plane> {

@@ -21,7 +21,7 @@ pub struct SimulatorOptions {
     pub n_grasps: usize,
     /// Seed of everything random.
     pub seed: u64,
-    /// The meaning of stable. A lift takes about a second of CPU time a candidate.
+    /// The meaning of stable. A lift takes 0.3 to 0.6 s of CPU time a candidate.
     #[serde(skip_serializing_if = "Label::is_default")]
     pub label: Label,
     /// The least epsilon and volume of a stable grasp, with label `wrench-space`.

@@ -22,8 +22,8 @@ const AROUND_TOUCHES_M: f64 = 0.003;
 /// A cell that looks farther aside than this from the side that it is on is left out: it lies on a flank. 65°.
 const LEAST_FACING: f64 = 0.42;
 
-/// Cells in a grid of `rows` × `columns` on a link: on the side towards which it moves as the open hand closes; of a link that does
-/// not move, on the side that was touched most, or that of the palm's +z. The grid covers the part of that side that was
+/// Cells in a grid of `rows` × `columns` on a link, on the side towards which it moves as the open hand closes. A link that does
+/// not move has them on the side that was touched most, or that of the palm's +z. The grid covers the part of that side that was
 /// touched, up to the link's edges. Its rows follow the longer direction of the side, outwards. Each cell lies on the link's
 /// collision shapes, where a line against the direction of closing meets them. A row is as wide as the face under it. Cells that
 /// would lie beside the shapes, or on their flanks, are left out.
@@ -123,9 +123,9 @@ fn width_of_face([least, most]: [f64; 2], has_face: impl Fn(f64) -> bool) -> Opt
     Some([least + slice_m * first as f64, least + slice_m * (last + 1) as f64])
 }
 
-/// The mean direction in the link's frame in which its middle moves until the hand is half closed, along the nearest axis of
-/// the frame, so that a grid lies flat on a box; of a link that does not move the axis of most touches, or the palm's +z. Of the
-/// joints that move the link, the nearest one that closes counts: those above it may spread the finger.
+/// The mean direction in the link's frame in which its middle moves until the hand is half closed, along the nearest axis of the
+/// frame, so that a grid lies flat on a box. Of a link that does not move it is the axis of most touches, or the palm's +z. Of
+/// the joints that move the link, the nearest one that closes counts: those above it may spread the finger.
 fn inner_direction(
     mechanism: &Mechanism<'_>,
     link_idx: usize,

@@ -82,8 +82,8 @@ pub fn idle_pads(hand: &Hand) -> Result<Vec<usize>, JointError> {
     Ok((0..hand.pads.len()).filter(|pad_idx| !trial.near.contains(pad_idx)).collect())
 }
 
-/// The part of the postures between the open and the closed hand in which links press on each other, and of the pairs that do
-/// so the one that does it most often, by the links' indices.
+/// The part of the postures between the open and the closed hand in which links press on each other. Of the pairs that do so
+/// comes the one that does it most often, by the links' indices.
 ///
 /// # Errors
 /// The hand's joints do not fit together.
@@ -380,8 +380,8 @@ fn is_same_finger(hand: &Hand, a: usize, b: usize) -> bool {
     hand.pads.iter().any(|pad| [a, b].iter().all(|joint_idx| first_moved(hand, pad.link_idx, *joint_idx).is_some()))
 }
 
-/// How well pads come face to face while the hand closes on nothing, each finger stopping where it likes: of the pad that faces
-/// the most others, the sum over these, each 1 if both look at each other over the width of a ball.
+/// How well pads come face to face while the hand closes on nothing, each finger stopping where it likes. The pad that faces
+/// the most others counts: the sum over these, each 1 if both look at each other over the width of a ball.
 fn opposition(hand: &Hand) -> Result<f64, JointError> {
     const N_STEPS: usize = 10;
     // Per pad its middle and normal, posture by posture.
@@ -474,7 +474,7 @@ mod tests {
         assert_eq!(pairs_that_meet(&hand).expect("fits"), BTreeSet::new());
     }
 
-    /// Two fingers that bend towards +x, and a thumb on an arm beside them that looks away: it comes to face them only if the arm
+    /// Two fingers that bend towards +x, and a thumb on an arm beside them that looks away. It comes to face them only if the arm
     /// turns by a quarter and the thumb by a half.
     fn hand_with_thumb() -> Hand {
         let link = |name: &str, parent: &str, place: &str, axis: &str, limits: &str, shape: &str| {

@@ -139,9 +139,9 @@ fn surface_point(object: &Object, from_centre: &UnitVector3<f64>) -> (Point3<f64
     }
 }
 
-/// Mean over the pads of the distance to the object, in units of the scale and at most 1, and of 1 - cos of the angle
-/// between the pad's normal and the direction to the object: GraspIt!'s contact energy, at the closed hand, but that a
-/// pad which is not near counts the same however far it is.
+/// Mean over the pads of the distance to the object, in units of the scale and at most 1. To it comes the mean of 1 -
+/// cos of the angle between the pad's normal and the direction to the object. It is GraspIt!'s contact energy, at the
+/// closed hand, but that a pad which is not near counts the same however far it is.
 pub(crate) fn energy(
     hand: &Hand,
     object: &Object,

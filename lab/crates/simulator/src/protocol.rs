@@ -4,14 +4,14 @@
 //! URDF's mimic joints). Such fingers push the object, without turning it, until one that comes from the other side touches it,
 //! so that a gripper centres the object.
 //!
-//! The hand is taken from its description, not assumed to be a Barrett hand: preshape joints without an open value are drawn;
-//! the other joints close from their open values towards their closed limits, all leaders at the same speed and followers at
+//! The hand is taken from its description, not assumed to be a Barrett hand: preshape joints without an open value are drawn.
+//! The other joints close from their open values towards their closed limits, all leaders at the same speed and followers at
 //! their ratio. One rule makes break-away: **a link that is stopped stops every joint that moves it**. A stopped proximal link
 //! stops its joint, and the follower goes on alone; a stopped distal link stops the whole finger. A joint's limit stops that
 //! joint only.
 //!
 //! A link is stopped by the object, or by another link of the hand that it comes nearer to than a clearance, if its own
-//! motion goes that way: a finger that touches from the start with the side it closes to stays open, one that touches
+//! motion goes that way. A finger that touches from the start with the side it closes to stays open, one that touches
 //! with its back closes. The reference link must not be moved by a closing joint.
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
@@ -210,8 +210,8 @@ impl Mechanism<'_> {
         Ok(Exploration { palm_from_object, open_joints, joints, end })
     }
 
-    /// The way by which fingers of one motor push the object, until a finger that comes from the other side holds it: in the
-    /// mean direction of the fingers that touch it, by half the distance to the nearest one that moves against them. `None`
+    /// The way by which fingers of one motor push the object, until a finger that comes from the other side holds it. It goes in
+    /// the mean direction of the fingers that touch it, by half the distance to the nearest one that moves against them. `None`
     /// where no finger touches, where those that do would push against each other, where no other is near, or where the motor is
     /// at its limit.
     fn push(

@@ -2,10 +2,10 @@
 //!
 //! A simulation consists of parts of a few hundred grasps. A candidate is a pure function of the seed, its part and its
 //! number in the part, and candidates are kept in the order of their numbers. So a part depends on nothing but the options
-//! and its index: the same seed gives the same grasps with any number of threads and machines, and an interrupted run
-//! goes on with the next part. The thresholds of stability are never moved to reach the asked-for fraction; candidates of
-//! the commoner kind are dropped, and [`SimulationReport`] counts them. The order of stable and unstable grasps is drawn,
-//! so that a grasp's number does not depend on its label.
+//! and its index. The same seed gives the same grasps with any number of threads and machines, and an interrupted run goes
+//! on with the next part. The thresholds of stability are never moved to reach the asked-for fraction; candidates of the
+//! commoner kind are dropped, and [`SimulationReport`] counts them. The order of stable and unstable grasps is drawn, so
+//! that a grasp's number does not depend on its label.
 //!
 //! A grasp that touches the object counts, even if no cell feels it: the arbiter then has to hold.
 

@@ -1,16 +1,15 @@
 //! The soft finger: the patch of a rubber link on the object, the torque about the normal that it resists, and the forces
 //! on its cells.
 //!
-//! The rubber is an elastic mattress (Ciocarlie, Miller & Allen 2005): pressure is proportional to the local
-//! indentation, so the patch is an ellipse of the relative curvature, and the pressure over it is taken as
-//! p = 3N / (2πab) · √(1 - x²/a² - y²/b²). All links are rubber, those without a pad with a flat surface.
+//! The rubber is an elastic mattress (Ciocarlie, Miller & Allen 2005). Pressure is proportional to the local
+//! indentation, so the patch is an ellipse of the relative curvature. The pressure over it is taken as p = 3N / (2πab)
+//! · √(1 - x²/a² - y²/b²). All links are rubber, those without a pad with a flat surface.
 //!
-//! Deviations and limits: relative curvature is the sum of the two surfaces' curvature matrices, which is Johnson's
-//! formula without its case analysis. A semi-axis ends at half the pad's width, 10 mm on a bare link (flat on
-//! flat, where the mattress would spread without limit), and the indentation for the same load is solved anew for the
-//! shortened ellipse. The part of a patch that reaches beyond its link is cut off, and the rest carries the load. The indentation
-//! ends at the mattress's thickness (an edge or a corner, relative radius below
-//! about 0.35 mm at 5 N).
+//! Deviations and limits: relative curvature is the sum of the two surfaces' curvature matrices, which is Johnson's formula
+//! without its case analysis. A semi-axis ends at half the pad's width, 10 mm on a bare link (flat on flat, where the mattress
+//! would spread without limit). The indentation for the same load is solved anew for the shortened ellipse. The part of a patch
+//! that reaches beyond its link is cut off, and the rest carries the load. The indentation ends at the mattress's thickness (an
+//! edge or a corner, relative radius below about 0.35 mm at 5 N).
 
 use std::sync::LazyLock;
 
@@ -135,10 +134,10 @@ pub fn patch(
     Patch { semi_axes_m, first_axis: axis, indentation_m }
 }
 
-/// Curvature of an object's surface (1/m, in the basis of the tangents; convex is positive, concave directions count
-/// as flat): z = ax² + by² + cxy by least squares, over points 3 and 6 mm around the contact: about as far as a patch
-/// reaches, which cannot tell the facets of a mesh from the round they stand for either. An edge or a corner comes out as
-/// sharp as these points can tell (about 1/(3 mm)).
+/// Curvature of an object's surface (1/m, in the basis of the tangents; convex is positive, concave directions count as
+/// flat). It is z = ax² + by² + cxy by least squares, over points 3 and 6 mm around the contact. That is about as far as
+/// a patch reaches, which cannot tell the facets of a mesh from the round they stand for either. An edge or a corner
+/// comes out as sharp as these points can tell (about 1/(3 mm)).
 pub fn object_curvature(shape: &dyn Shape, palm_from_object: &Isometry3<f64>, frame: &ContactFrame) -> Matrix2<f64> {
     const RINGS_M: [f64; 2] = [0.003, 0.006];
     /// Rays start this far outside, and end as far inside.

@@ -1,8 +1,8 @@
 //! The sensor: readings of cells and joint encoders from true forces and angles.
 //!
-//! Noise, offset-corrected counts that are never negative, saturation; by option gains and offsets that differ from cell to
-//! cell or that all cells share, crosstalk between cells, skins that spread force and lag behind it, dead cells and stuck ones,
-//! encoders at motor or joint with a wrong zero. Not modelled: hysteresis.
+//! Noise, offset-corrected counts that are never negative, saturation. By option come gains and offsets that differ from cell
+//! to cell or that all cells share, crosstalk between cells, and skins that spread force and lag behind it. So do dead cells
+//! and stuck ones, and encoders at motor or joint with a wrong zero. Not modelled: hysteresis.
 
 use nalgebra::Vector3;
 use rand::{RngExt, SeedableRng};

@@ -1,8 +1,8 @@
 //! The grasp wrench space and its two qualities, epsilon and volume: the ground truth of a grasp's stability.
 //!
-//! The L1 grasp wrench space (Ferrari & Canny 1992) is the convex hull of all contacts' edge wrenches together, as in
-//! Dang & Allen, section III: it is not divided by the number of contacts, and the origin is not added. Finding the contacts,
-//! their friction and their torsional radius is not part of this module.
+//! The L1 grasp wrench space (Ferrari & Canny 1992) is the convex hull of all contacts' edge wrenches together, as in Dang &
+//! Allen, section III. It is not divided by the number of contacts, and the origin is not added. Finding the contacts, their
+//! friction and their torsional radius is not part of this module.
 
 use std::f64::consts::FRAC_PI_4;
 

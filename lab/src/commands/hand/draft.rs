@@ -188,8 +188,9 @@ impl Draft {
                 }
             }
         }
-        // Balls before the palm do not tell all: 0 is the closed hand of many grippers, a jaw that closes on a fixed one may hold
-        // things with its back, a thumb may lie beside the fingers, and the link's own frame may do better. Planned grasps decide.
+        // Balls before the palm do not tell all. 0 is the closed hand of many grippers, and a jaw that closes on a fixed one may
+        // hold things with its back. A thumb may lie beside the fingers, and the link's own frame may do better. Planned grasps
+        // decide.
         best.n_held = best.draft.held(table, arguments)?;
         if best.n_held < FEW_HELD {
             let reversed = Way { opening: Opening::Reversed, ..best.way };

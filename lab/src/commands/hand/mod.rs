@@ -72,8 +72,8 @@ pub(super) struct Arguments {
     /// The link in whose frame contacts are given, +z out of the palm [default: the root].
     #[arg(long, value_name = "LINK")]
     palm: Option<String>,
-    /// Pose of the palm frame in that link, if its own +z does not point out of the palm: metres and radians [default: the
-    /// link's own frame, or one in which the hand closes better on a ball, which is told].
+    /// Pose of the palm frame in that link, if its own +z does not point out of the palm. In metres and radians [default:
+    /// the link's own frame, or one in which the hand closes better on a ball, which is told].
     #[arg(
         long,
         value_name = "X,Y,Z,ROLL,PITCH,YAW",
@@ -82,7 +82,8 @@ pub(super) struct Arguments {
         allow_negative_numbers = true
     )]
     palm_pose: Vec<f64>,
-    /// The value of a joint of the open hand [default: 0]. The hand closes towards the limit that is farther from it.
+    /// The value of a joint of the open hand [default: 0, or a value with which the hand closes better, which is told]. The hand
+    /// closes towards the limit that is farther from it.
     #[arg(long, value_name = "JOINT=VALUE,…", value_delimiter = ',', value_parser = joint)]
     open: Vec<(String, f64)>,
     /// Joints that are set before a grasp and do not close [default: those that move no pad towards an object, which are told].

@@ -1,8 +1,8 @@
 //! The proof of a hello's sender: signatures with the private keys of the machines' certificates.
 //!
-//! Zenoh checks certificates as well, once per connection and by its own rules. A link does not depend on them: each
+//! Zenoh checks certificates as well, once per connection and by its own rules. A link does not depend on them. Each
 //! hello carries the sender's certificates and a signature over the namespace, the graph, both machines and the whole
-//! frame, and so over the key with which the machines agree on the keys of all other frames
+//! frame. So it is also over the key with which the machines agree on the keys of all other frames
 //! ([`agreement`](super::agreement)).
 
 use std::borrow::Cow;

@@ -4,7 +4,7 @@
 //! writer's machine reads the port like any other consumer, and the link on the reader's machine publishes the samples
 //! as the writer itself would. Operators do not notice the link.
 //!
-//! A **channel** is an output port whose samples go to one other machine. Zenoh may lose, delay and repeat messages; a
+//! A **channel** is an output port whose samples go to one other machine. Zenoh may lose, delay and repeat messages. A
 //! channel does not lose or repeat samples: the receiving link requests samples from some sample on, and the sending
 //! link keeps them until the receiver's readers have answered them ([`outgoing`], [`incoming`]).
 //!

@@ -30,7 +30,7 @@ const ROUTER_MILLIS: u64 = 2000;
 const MAX_MESSAGE_BYTES: usize = 2 * MAX_FRAME_BYTES;
 /// Two machines that both listen and dial may have two links.
 const MAX_LINKS: usize = 2;
-/// Maximum number of connections beyond one for each other machine of the file: a restarted machine comes back before
+/// Maximum number of connections beyond one for each other machine of the file. A restarted machine comes back before
 /// Zenoh has noticed the end of its old connection, and one certificate must not take all places.
 const MORE_SESSIONS: usize = 8;
 

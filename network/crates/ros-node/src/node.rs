@@ -563,7 +563,7 @@ mod tests {
         assert!(tokens[0].ends_with("/:1:,10:,:,:,,"), "{}", tokens[0]);
     }
 
-    /// A publisher as in Lyrical, after rmw_zenoh's pull request 930: its token has a further part behind the qualities, and
+    /// A publisher as in Lyrical, after rmw_zenoh's pull request 930. Its token has a further part behind the qualities, and
     /// it sends the same message on keys below the topic's own to subscribers whose tokens have one.
     #[test]
     fn a_publisher_of_lyrical_is_heard_once() {

@@ -204,9 +204,9 @@ fn rbf(gamma: f64, left: &[f64], right: &[f64]) -> f64 {
 /// ‖left - right‖². Eight sums side by side let the compiler use vector instructions, which a
 /// single one forbids because it fixes the order of additions.
 ///
-/// Squared norms computed beforehand would leave only a scalar product to do, but `‖x‖² + ‖z‖² - 2
-/// x·z` cancels for samples far from the origin, and training on 24,640 samples of 64 features was
-/// no faster with it (23 s against 21 s, 2 cores).
+/// Squared norms computed beforehand would leave only a scalar product to do, but `‖x‖² + ‖z‖² - 2 x·z` cancels for
+/// samples far from the origin. Training on 24,640 samples of 64 features was no faster with it (23 s against 21 s, 2
+/// cores).
 fn squared_distance(left: &[f64], right: &[f64]) -> f64 {
     let (left_blocks, left_rest) = left.as_chunks::<8>();
     let (right_blocks, right_rest) = right.as_chunks::<8>();

@@ -90,9 +90,9 @@ const SUFFICIENT_DECREASE: f64 = 1e-4;
 /// Added to the diagonal of the Hessian per sample, which is singular when all decision values are
 /// equal.
 const RIDGE: f64 = 1e-12;
-/// The gradient per sample at which the fit stops. Lin, Lin and Weng stop at 1e-5 for the whole
-/// sum; Newton's method gets from there to just above rounding in a step or two, and then the
-/// result no longer depends on the order of the samples.
+/// The gradient per sample at which the fit stops. Lin, Lin and Weng stop at 1e-5 for the whole sum. Newton's method
+/// gets from there to just above rounding in a step or two, and then the result no longer depends on the order of the
+/// samples.
 const GRADIENT_TOLERANCE: f64 = 1e-12;
 /// The gradient per sample that is still accepted when rounding keeps the line search from
 /// descending further.

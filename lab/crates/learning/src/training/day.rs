@@ -86,8 +86,8 @@ fn statistics_of(rows: &[f64], n_values: usize, idxs: impl Iterator<Item = usize
     statistics
 }
 
-/// The part of a model that is about days; `None` if no baseline is asked for, and the recordings do not say days or each day
-/// has one object, so that a day cannot be told from an object.
+/// The part of a model that is about days. It is `None` if no baseline is asked for, and the recordings do not say days or
+/// each day has one object, so that a day cannot be told from an object.
 ///
 /// # Errors
 /// An example without a feature.

@@ -122,7 +122,8 @@ pub struct Tallies {
     /// By thing, in the order in which they first came.
     pub things: Vec<Tally>,
     /// Lifts that held, and of how many, by what the wrench space of the grasp said: stable by the paper's label (epsilon
-    /// greater than 0.07 and volume greater than 0.1); no more than force closure (epsilon greater than 0); not even that.
+    /// greater than 0.07 and volume greater than 0.1). The others have no more than force closure (epsilon greater than
+    /// 0), or not even that.
     pub held_by_closure: [[usize; 2]; 3],
     /// Attempts with a probe.
     pub n_probes: usize,

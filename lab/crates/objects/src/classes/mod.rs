@@ -1,7 +1,7 @@
 //! The classes: how each makes an object from a number.
 //!
 //! Sizes are of things one can buy, in millimetres as on a drawing. Densities are of a part as it is built here, so
-//! that masses are plausible: a filled bottle weighs what its content does, a plastic case with its inside about half
+//! that masses are plausible. A filled bottle weighs what its content does, a plastic case with its inside about half
 //! of the plastic; walls that are real walls have the density of their material.
 
 mod containers;
@@ -55,7 +55,7 @@ pub(super) const CLASSES: [Class; 24] = [
 ];
 
 /// The sizes of one object. Each size in turn is spread over its range in as many layers as a class has objects, one
-/// object in each (a Latin hypercube), shuffled by a generator seeded by class and turn: the same everywhere.
+/// object in each (a Latin hypercube). They are shuffled by a generator seeded by class and turn: the same everywhere.
 pub(super) struct Draw {
     seed: u64,
     idx: usize,

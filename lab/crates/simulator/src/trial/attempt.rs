@@ -331,9 +331,9 @@ impl<'a> Attempt<'a> {
         self.next_nanos += self.options.protocol.frame_nanos;
     }
 
-    /// Lowers the arm again after a test lift, or in the middle of a lift. Returns by how much the target's centre of
-    /// mass has moved, and the target turned, in the hand since it settled: metres, radians; 0 if the hand did not touch it
-    /// before the test lift, which then has moved nothing.
+    /// Lowers the arm again after a test lift, or in the middle of a lift. Returns by how much the target's centre of mass
+    /// has moved, and the target turned, in the hand since it settled: metres, radians. Both are 0 if the hand did not
+    /// touch it before the test lift, which then has moved nothing.
     pub fn set_down(&mut self) -> (f64, f64) {
         let (protocol, step_secs) = (&self.options.protocol, self.options.physics.step_secs);
         let begin = self.lifted;

@@ -148,8 +148,8 @@ pub(super) fn stand_newtons(engine: &dyn Engine) -> f64 {
 }
 
 /// Force and torque about the palm's origin with which the target loads the wrist, in the palm frame, given the place of
-/// its centre of mass and its `acceleration` against the palm: its weight and inertia, less what the stand carries. The
-/// stand's friction and the target's turning are left out.
+/// its centre of mass and its `acceleration` against the palm. That is its weight and inertia, less what the stand
+/// carries. The stand's friction and the target's turning are left out.
 pub(super) fn load_on_wrist(
     engine: &dyn Engine,
     mass_kg: f64,

@@ -2,10 +2,10 @@
 //!
 //! While a finger closes, its leader is driven at constant speed and its followers at their ratio. A joint that lags
 //! behind at its torque limit is blocked, and the rule is the simulator's (`grasp::protocol`): **a blocked link stops
-//! every joint that moves it**, so a blocked leader stays and the follower goes on alone, and a blocked follower stops
-//! the whole finger. A stopped joint keeps its torque; its gear holds against more than its motor can push
-//! (a worm drive is not driven backwards). Before the arm lifts, the motors press with their full force; a link that broke
-//! away has none, and only its gear holds it.
+//! every joint that moves it**. So a blocked leader stays and the follower goes on alone, and a blocked follower stops the
+//! whole finger. A stopped joint keeps its torque; its gear holds against more than its motor can push (a worm drive is
+//! not driven backwards). Before the arm lifts, the motors press with their full force; a link that broke away has none,
+//! and only its gear holds it.
 //!
 //! A joint that other joints mimic is one motor with several axles: the two jaws of a gripper, the bars of a parallel
 //! linkage. Each axle has a gear of its own, and the motor feels all of them.
@@ -382,10 +382,10 @@ impl LinkBodies<'_> {
         closest.is_some_and(|closest| closest.points.distance_m <= 0.0)
     }
 
-    /// For each link its collision group, and those of the links that it may touch: all but those that it overlaps in the open
-    /// hand, which are built into each other, and those on the palm that a joint joins to it. The engine itself disables the
-    /// contacts of other joined links. A contact takes two links that may touch each other, so one of them is enough to rule it
-    /// out. Links that are left out by the same links share a group. `None` if there are too few groups.
+    /// For each link its collision group, and those of the links that it may touch. These are all but those that it overlaps in
+    /// the open hand, which are built into each other, and those on the palm that a joint joins to it. The engine itself
+    /// disables the contacts of other joined links. A contact takes two links that may touch each other, so one of them is
+    /// enough to rule it out. Links that are left out by the same links share a group. `None` if there are too few groups.
     fn groups(&self, mechanism: &Mechanism<'_>, palm_from_links: &[Isometry3<f64>]) -> Option<Vec<(Group, Group)>> {
         let n_links = self.bodies.len();
         let with_shapes: Vec<usize> = (0..n_links).filter(|idx| !self.hand.links[*idx].shapes.is_empty()).collect();
@@ -451,8 +451,8 @@ impl LinkBodies<'_> {
     }
 }
 
-/// The motor's torque or force for each newton at the fingertips that a joint with several links moves: the sum of the
-/// speeds of the fingers, each that of the fastest middle of a pad, per speed of the joint.
+/// The motor's torque or force for each newton at the fingertips that a joint with several links moves. It is the sum
+/// of the speeds of the fingers, each that of the fastest middle of a pad, per speed of the joint.
 fn lever(mechanism: &Mechanism<'_>, joint_idx: usize, palm_from_links: &[Isometry3<f64>]) -> f64 {
     let hand = mechanism.hand;
     let mut fingers: Vec<(usize, f64)> = Vec::new();

@@ -19,8 +19,8 @@ pub(super) fn hull(object: &Object) -> SharedShape {
     SharedShape::convex_hull(&corners).unwrap_or_else(|| object.shape.clone())
 }
 
-/// The turn from the object's frame to one with z up in which it stands: none if it stands as it is, and otherwise that
-/// onto the face on which it can be tilted the farthest.
+/// The turn from the object's frame to one with z up in which it stands. It is none if it stands as it is, and
+/// otherwise that onto the face on which it can be tilted the farthest.
 pub(super) fn rest_rotation(hull: &SharedShape, centre_of_mass_m: &Point3<f64>) -> UnitQuaternion<f64> {
     let Some(hull) = hull.as_convex_polyhedron() else { return UnitQuaternion::identity() };
     let down = -Vector3::z_axis();

@@ -2,10 +2,10 @@
 //!
 //! Positions are split in half along their widest axis, again and again, until [`BLOCK`] are left (a k-d tree of which
 //! only the leaves and [`CHUNK`]s of leaves are kept). To the positions in a box only those words can be nearest that
-//! are not farther than some other word from all of the box: some three of 64 for a block, whose distances are then
-//! computed side by side. This is the filtering of Kanungo et al. (An efficient k-means clustering algorithm, 2002,
-//! section 2); it leaves nothing out that a search of all words would find. Positions that coincide, as those of the
-//! palm's cells do, end up in blocks of one word. A dictionary of 120,000 contacts takes 0.25 s so, and 3.0 s by
+//! are not farther than some other word from all of the box. These are some three of 64 for a block, whose distances
+//! are then computed side by side. This is the filtering of Kanungo et al. (An efficient k-means clustering algorithm,
+//! 2002, section 2); it leaves nothing out that a search of all words would find. Positions that coincide, as those of
+//! the palm's cells do, end up in blocks of one word. A dictionary of 120,000 contacts takes 0.25 s so, and 3.0 s by
 //! comparing all words (4 restarts, 2 cores); its words differ in the last bit then, and with them a model made again.
 //!
 //! Blocks and their order follow from the set of positions alone, whatever order they come in.
@@ -171,7 +171,7 @@ impl Bounds {
 
     /// Leaves the words that are, somewhere in the box, at least as near as the word `best` nearest to its centre c.
     ///
-    /// At c + v, a word w is farther than `best` by `‖w - c‖² - ‖best - c‖² - 2 v·(w - best)` in squared distance; this
+    /// At c + v, a word w is farther than `best` by `‖w - c‖² - ‖best - c‖² - 2 v·(w - best)` in squared distance. This
     /// is least in the corner where v has the signs of `w - best`.
     fn rule_out(&self, candidates: &mut Vec<Candidate>) {
         let centre: [f64; 3] = std::array::from_fn(|axis| 0.5 * (self.low[axis] + self.high[axis]));

@@ -141,9 +141,8 @@ fn lloyd(blocks: &[Block], mut words: Vec<[f64; 3]>, max_iter: usize, max_square
     KMeans { inertia: inertia(blocks, &words), dictionary: Dictionary { words_m: words }, n_iter }
 }
 
-/// Moves each word to the mean of its cluster, and the word of an empty cluster to the position
-/// farthest from all others, where it lowers the inertia most; the next assignment gives it its
-/// members.
+/// Moves each word to the mean of its cluster, and the word of an empty cluster to the position farthest from all
+/// others, where it lowers the inertia most. The next assignment gives it its members.
 fn update_words(blocks: &[Block], words: &[[f64; 3]], clusters: &Clusters) -> Vec<[f64; 3]> {
     let mut moved = words.to_vec();
     let mut placed = Vec::with_capacity(words.len());
@@ -317,8 +316,8 @@ mod tests {
         let clusters = assign(&blocks, &words);
         assert_eq!(clusters.counts, [2, 0, 3, 0]);
         let moved = update_words(&blocks, &words, &clusters);
-        // The mean of 1.0, 1.1 and 9.0 is 3.7: the farthest is 9.0 (5.3 away), then 1.0 (0.9 from
-        // 0.1 and 2.7 from 3.7) and 1.1 (1.0 from 0.1), of which 1.1 is the farther one.
+        // The mean of 1.0, 1.1 and 9.0 is 3.7. The farthest is 9.0 (5.3 away), then 1.0 (0.9 from 0.1 and 2.7 from 3.7)
+        // and 1.1 (1.0 from 0.1), of which 1.1 is the farther one.
         assert_eq!((moved[1], moved[3]), ([9.0, 0.0, 0.0], [1.1, 0.0, 0.0]));
         assert!((moved[2][0] - 3.7).abs() < 1e-12);
         assert_eq!(farthest_position(&blocks_of(&positions[..1]), &[[0.0; 3]]), None);

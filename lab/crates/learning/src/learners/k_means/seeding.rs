@@ -48,9 +48,9 @@ impl Squared {
     }
 }
 
-/// Greedy k-means++ (Arthur and Vassilvitskii 2007, with 2 + ln k trials a word as in
-/// scikit-learn): each further word is a position drawn in proportion to the squared distance from
-/// the words so far, the best of the trials by the inertia left.
+/// Greedy k-means++ (Arthur and Vassilvitskii 2007, with 2 + ln k trials a word as in scikit-learn). Each further word
+/// is a position drawn in proportion to the squared distance from the words so far, the best of the trials by the
+/// inertia left.
 pub(super) fn seed_words(
     blocks: &[Block],
     n_clusters: usize,

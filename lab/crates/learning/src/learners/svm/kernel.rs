@@ -6,8 +6,8 @@
 //!
 //! `‖x - z‖² = ‖x‖² + ‖z‖² - 2 x·z` leaves scalar products only, each feature of a sample meeting several samples'
 //! while it is in a register. The difference cancels, so it is taken in double precision of features whose mean was
-//! taken away; the kernel of samples x, z is then exact to some 1e-16 γ (‖x‖² + ‖z‖²), far below the single precision
-//! it is kept in (as LIBSVM's is) unless γ times the spread of the features is in the millions.
+//! taken away. The kernel of samples x, z is then exact to some 1e-16 γ (‖x‖² + ‖z‖²). That is far below the single
+//! precision it is kept in (as LIBSVM's is), unless γ times the spread of the features is in the millions.
 
 use rayon::prelude::*;
 

@@ -38,15 +38,13 @@ pub struct SvmReport {
 /// subject to  yᵀα = 0,   0 ≤ α_i ≤ c
 /// ```
 ///
-/// The solver works with β_i = y_i α_i, in which the classes differ only by their bounds (0 ≤ β_i ≤
-/// c for positive and -c ≤ β_i ≤ 0 for negative samples), the constraint is Σ β_i = 0, and the
-/// gradient is g_i = Σ_j K_ij β_j - y_i. That is the decision value before rho, minus the label. β
-/// is optimal if and only if some rho has g_i ≥ rho wherever β_i can still grow and g_i ≤ rho
-/// wherever it can still shrink; the training stops when these are violated by less than
-/// `tolerance` (LIBSVM's rule). Each step moves one pair, β_i up and β_j down by the same amount: i
-/// has the smallest gradient of those that can grow, j brings the largest decrease of the objective
-/// to second order ("WSS 2" of Fan, Chen and Lin, "Working set selection using second order
-/// information for training support vector machines", 2005).
+/// The solver works with β_i = y_i α_i, in which the classes differ only by their bounds (0 ≤ β_i ≤ c for positive and
+/// -c ≤ β_i ≤ 0 for negative samples). The constraint is Σ β_i = 0, and the gradient is g_i = Σ_j K_ij β_j - y_i. That
+/// is the decision value before rho, minus the label. β is optimal if and only if some rho has g_i ≥ rho wherever β_i
+/// can still grow and g_i ≤ rho wherever it can still shrink. The training stops when these are violated by less than
+/// `tolerance` (LIBSVM's rule). Each step moves one pair, β_i up and β_j down by the same amount. i has the smallest
+/// gradient of those that can grow. j brings the largest decrease of the objective to second order. ("WSS 2" of Fan,
+/// Chen and Lin, "Working set selection using second order information for training support vector machines", 2005).
 ///
 /// Not converging is not an error: see [`SvmReport::converged`]. Kernel rows are kept in single
 /// precision, like LIBSVM's, so a `tolerance` below about 1e-6 makes the solution more exact than

@@ -2,7 +2,7 @@
 //!
 //! Sequential minimal optimisation on two levels. The outer one picks a working set: the samples that violate the
 //! optimality conditions most. The inner one moves pairs of the working set only, whose part of the kernel matrix fits
-//! into a cache, until the set is optimal by itself; then the gradient of all samples is brought up to date at once. So
+//! into a cache, until the set is optimal by itself. Then the gradient of all samples is brought up to date at once. So
 //! the many small steps cost as much as the working set is large rather than as there are samples, and kernel rows
 //! become products of matrices.
 
@@ -12,7 +12,7 @@ use blindgrasp_stages::classifier::svm::SvmParams;
 use blindgrasp_stages::classifier::svm::lanes::{InstructionSet, LANES, Lanes, for_instruction_set};
 
 /// Samples of a working set. On 24,640 samples of 64 features at c = 100, 256, 512, 1024 and 2048 took 48, 11, 4.0 and
-/// 3.9 s of processor time; at c = 1, where most samples only move to their bound once, 2.9 to 4.3 s.
+/// 3.9 s of processor time. At c = 1, where most samples only move to their bound once, it took 2.9 to 4.3 s.
 const WORKING_SET: usize = 1024;
 /// Steps on a working set per sample of it, after which it is left as it is.
 const INNER_ITERATIONS_PER_SAMPLE: usize = 100;
@@ -100,9 +100,9 @@ fn violation(problem: &Problem, beta: &[f64], gradient: &[f64]) -> f64 {
     largest - smallest
 }
 
-/// The samples to work on, the most violating pair among them: of those whose β can grow the ones with the smallest
-/// gradients, of those whose β can shrink the ones with the largest, as many of each. Half of the places may be kept by
-/// members of the last set that are free (`lower < β < upper`): they are coupled with each other.
+/// The samples to work on, the most violating pair among them. Of those whose β can grow these are the ones with the
+/// smallest gradients, of those whose β can shrink the ones with the largest, as many of each. Half of the places may
+/// be kept by members of the last set that are free (`lower < β < upper`): they are coupled with each other.
 fn select_working_set(problem: &Problem, beta: &[f64], gradient: &[f64], last: &[usize]) -> Vec<usize> {
     let n_samples = beta.len();
     if n_samples <= WORKING_SET {
@@ -260,8 +260,8 @@ fn update_gradient(inner: &mut Inner<'_>, step: f64, row_i: &[[f32; LANES]], row
     first_of_best(values, chunks, |value, best| value < best)
 }
 
-/// The largest violation of optimality, and the sample to pair with i: of those whose β can shrink, the one for which
-/// moving the pair without regard to bounds lowers the objective most, by (g_j - g_i)² / (2 curvature).
+/// The largest violation of optimality, and the sample to pair with i. Of those whose β can shrink it is the one for
+/// which moving the pair without regard to bounds lowers the objective most, by (g_j - g_i)² / (2 curvature).
 #[inline(always)]
 fn select_shrinking(inner: &Inner<'_>, i: usize) -> (f64, Option<usize>) {
     let gradient_i = Lanes::splat(inner.gradient[i]);
