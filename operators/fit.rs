@@ -252,7 +252,9 @@ impl<'a> Check<'a> {
             ))
         );
         let mut remedies = Vec::new();
-        if let Some(best) = best.filter(|_| is_weaker) {
+        if let Some(best) = best
+            && is_weaker
+        {
             message += &format!("; after a test lift, at most {} (95 % confidence)", percent(best));
             remedies.push("probe: test_lift, if the arm can lift by 10 mm and wait".into());
         }

@@ -57,7 +57,7 @@ fn the_commands_of_the_first_day_make_a_graph_that_lifts() {
     let learned = run_script(&demo, folder.path(), &few);
 
     // Part 3 in two terminals; other tests have sockets of their own.
-    let live = blocks(part(3), "sh");
+    let live = blocks(part(3), "sh").replace(" \\\n    ", " ");
     let mut lines = live.lines().filter(|line| !line.trim().is_empty());
     let (run, bridge) = (lines.next().expect("the graph"), lines.next().expect("the bridge"));
     assert_eq!(lines.next(), None, "{live}");

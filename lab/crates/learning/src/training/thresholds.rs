@@ -125,13 +125,7 @@ pub(super) fn choose_thresholds(
     probes: &mut LearnedProbes,
     progress: &mut impl FnMut(&str),
 ) -> Result<Vec<PolicySummary>, TrainingError> {
-    if matches!(aim, Aim::MaxDrops(_)) && !promises {
-        return Err(TrainingError::Data(
-            "a share of drops can be promised for lifts alone: expected recordings of lifts (simulate --label lift, import), without \
-             --day-baseline"
-                .into(),
-        ));
-    }
+    check_aim(aim, promises)?;
     let settled = out_of_fold_probabilities(judged)?;
     let (chosen_looks, refusals) = choose_looks(aim, n_grasps, judged, &settled, probes);
     let best = refusals.iter().min_by(|a, b| a.at_most.total_cmp(&b.at_most));
@@ -178,6 +172,17 @@ pub(super) fn choose_thresholds(
         progress(&format!("not lifted: {}", refusal.why));
     }
     Ok(summaries)
+}
+
+fn check_aim(aim: Aim, promises: bool) -> Result<(), TrainingError> {
+    if matches!(aim, Aim::MaxDrops(_)) && !promises {
+        return Err(TrainingError::Data(
+            "a share of drops can be promised for lifts alone: expected recordings of lifts (simulate --label lift, import), without \
+             --day-baseline"
+                .into(),
+        ));
+    }
+    Ok(())
 }
 
 /// Chooses the policies of all looks that the model has, and says why looks have none.
