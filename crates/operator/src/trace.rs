@@ -234,7 +234,7 @@ mod tests {
         for text in ["info", "debug,", "info, my_operator=trace", "OFF", ""] {
             assert!(levels_in(text).is_ok(), "{text}");
         }
-        for (text, expected) in [("everything", "'everything' is no level"), ("info,mine=loud", "invalid")] {
+        for (text, expected) in [("everything", "'everything' is no level"), ("info,mine=loud", "level filter")] {
             let error = levels_in(text).expect_err(text);
             assert!(error.contains(expected), "{error}");
         }
