@@ -269,6 +269,7 @@ class Inspire(unittest.TestCase):
         refused = inspire.frames(modbus, 0.001, 1000.0)
         self.assertEqual(next(refused)["cells_newtons"], found[0]["cells_newtons"])
         # It may have closed on an object while it paused.
+        hand.refused = None
         hand.is_paused.set()
         self.assertIn("the hand does not answer", next(frames))
         hand.angle = 300

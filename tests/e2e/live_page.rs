@@ -243,7 +243,7 @@ fn a_browser_pauses_and_looks_at_past_decisions() {
     // The log says the same, once for a grasp.
     let log = run(&["logs", "classifier", "--graph", &name], 0);
     let log = String::from_utf8_lossy(&log.stdout).into_owned();
-    assert!(log.contains(" seems unstable: most against it: "), "{log}");
+    assert!(log.contains(" seems unstable: of pads and joints, most against it: "), "{log}");
     graph.stop();
 }
 

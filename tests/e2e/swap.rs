@@ -120,7 +120,11 @@ fn a_reader_that_is_started_again_waits_for_an_old_instance_that_stands_still() 
     let mut swapping = swapping.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("started");
     wait_until(|| graph.pid_of("classifier") != old, || format!("no probation: {}", graph.said()));
     signal(old, Signal::STOP);
-    let is_back = || graph.node("lift_arbiter")["state"] == "running" && graph.pid_of("lift_arbiter") != arbiter;
+    // It has no process while it waits to be started again.
+    let is_back = || {
+        let node = graph.node("lift_arbiter");
+        node["state"] == "running" && node["pid"].as_i64().is_some_and(|pid| pid != i64::from(arbiter))
+    };
     wait_until(is_back, || format!("not started again: {}", graph.said()));
     std::thread::sleep(Duration::from_millis(300));
     signal(old, Signal::CONT);
