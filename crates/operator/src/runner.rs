@@ -11,8 +11,9 @@ use crate::monotonic_nanos;
 use crate::operator::{Operator, OperatorError, TICK, Task, Turn, run_in_turn};
 use crate::partner::Partners;
 use crate::port::{PortError, Sent, ShadowPublisher, UntypedPublisher, UntypedSample, UntypedSubscriber};
-use crate::saved::Book;
+use crate::saved::{Book, Input};
 use crate::wiring::{Clock, Command, InputCounts};
+use crate::written::Written;
 
 /// A stage that gave way to another one of its group tries again after this time.
 const ROOM_PAUSE: Duration = Duration::from_millis(1);
@@ -124,8 +125,8 @@ impl Site for Ports {
         self.inputs[input].subscriber.take_over(answered);
     }
 
-    fn take_over_at(&mut self, input: usize, last: Option<SampleId>, counts: InputCounts) {
-        self.inputs[input].subscriber.take_over_at(last, counts);
+    fn take_over_at(&mut self, input: usize, saved: &Input) {
+        self.inputs[input].subscriber.take_over_at(saved.last, saved.counted, saved.counts);
     }
 
     fn look_on_from(&mut self, input: usize, last: SampleId) {
@@ -170,8 +171,8 @@ impl Site for Ports {
         self.outputs[output].publisher.begin(is_handed_over)
     }
 
-    fn last_sent(&self, output: usize) -> Option<SampleId> {
-        self.outputs[output].publisher.last()
+    fn written(&self, output: usize) -> Option<Written> {
+        self.outputs[output].publisher.written()
     }
 
     fn has_readers(&self, output: usize) -> bool {
