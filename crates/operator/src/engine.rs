@@ -370,6 +370,11 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
             && site.partners_are_caught_up()
     }
 
+    /// Whether the worker has heard the end, and nothing has come since that is not answered.
+    pub(crate) fn is_over<S: Site<Sample = T>>(&self, site: &S) -> bool {
+        self.has_heard_end && self.is_caught_up(site)
+    }
+
     /// Answers the samples that are there, and tells the worker of silence or the end of the stream.
     ///
     /// # Errors
@@ -397,7 +402,9 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
                 Progress::GaveWay => return Ok(Sent::GaveWay),
                 Progress::Waits => return Ok(Sent::Yes),
                 Progress::Idle => {
-                    if std::mem::replace(&mut has_heard, true) || !self.hear(site, stop)? {
+                    // After silence in this turn, the worker hears the end as well.
+                    let is_at_end = stop && !self.has_heard_end && self.is_caught_up(site);
+                    if std::mem::replace(&mut has_heard, true) && !is_at_end || !self.hear(site, stop)? {
                         return Ok(Sent::Yes);
                     }
                 }
@@ -792,10 +799,15 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         if !self.manner.saves {
             site.forget_state();
         }
+        let has_handed_over = self.handed_over.is_some();
         let is_restored = self.restore(site)?;
+        if has_handed_over && is_restored {
+            // It may be the state of the hand-over: a second failure must not lose it.
+            self.save_if_it_fits(site)?;
+        }
         if !is_restored && (self.manner.answers_each || !self.manner.saves) {
             // The instance before had no state, and has answered each sample under its number.
-            self.begin_after_readers(site)?;
+            self.begin_after_readers(site, has_handed_over)?;
         } else {
             for (idx, input) in self.book.inputs.iter().enumerate() {
                 site.take_over_at(idx, input);
@@ -807,7 +819,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
     }
 
     /// Goes on after the last sample whose answers all readers of all outputs have.
-    fn begin_after_readers<S: Site<Sample = T>>(&mut self, site: &mut S) -> anyhow::Result<()> {
+    fn begin_after_readers<S: Site<Sample = T>>(&mut self, site: &mut S, has_handed_over: bool) -> anyhow::Result<()> {
         let least = least(site, 0, self.book.outputs.iter().map(|output| output.known)).flatten();
         let input = &mut self.book.inputs[0];
         if !self.manner.saves {
@@ -819,8 +831,9 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         if least.is_none_or(|least| !site.is_after(0, least, input.last)) {
             input.last = least;
         }
-        if input.last != input.counted {
-            // Saved before the cursor goes back: the next instance must know which samples are counted.
+        if input.last != input.counted || has_handed_over {
+            // Saved before the cursor goes back: the next instance must know which samples are counted, and after a second
+            // failure the state of the hand-over.
             self.save_if_it_fits(site)?;
         }
         site.take_over_at(0, &self.book.inputs[0]);

@@ -1208,6 +1208,7 @@ fn a_stage_whose_replacement_fails_goes_on_with_what_it_has_learned() {
         let mut engine = at.standby(1);
         if was_active {
             at.world.saved = Some(own.clone());
+            at.world.slots.answered[STATEFUL] = None;
             engine.take_over(&mut at, true).expect("active");
             engine.hand_over(&mut at);
         }
@@ -1215,6 +1216,10 @@ fn a_stage_whose_replacement_fails_goes_on_with_what_it_has_learned() {
         at.world.saved = found.cloned();
         engine.take_over(&mut at, false).expect("active again");
         assert_eq!((engine.next_seq().map(|seq| seq - 1), engine.worker.n_samples), expected);
+        // A second failure does not lose it.
+        if was_active {
+            assert_eq!(at.standby(1).worker.n_samples, expected.1);
+        }
     }
 }
 

@@ -367,11 +367,14 @@ impl<W: Worker<UntypedSample>> Runner<W> {
         } else {
             self.engine.look_on(&mut self.site)?;
         }
-        let is_over = stop && (!self.engine.is_active() || self.engine.is_caught_up(&self.site));
+        let is_over = stop && (!self.engine.is_active() || self.engine.is_over(&self.site));
         if is_over || self.site.operator.should_quit() {
             self.engine.worker.look()?;
             self.site.partners.report(&self.site.operator);
-            self.site.partners.have_ended();
+            // One that has handed over must not overwrite the counts of the other.
+            if self.engine.is_active() {
+                self.site.partners.have_ended();
+            }
             self.site.operator.report_drained();
             self.is_drained = true;
             return self.wait_for_the_end();
@@ -413,6 +416,7 @@ impl<W: Worker<UntypedSample>> Runner<W> {
                 }
                 Command::HandOver => {
                     self.engine.hand_over(&mut self.site);
+                    self.site.partners.have_handed_over();
                     self.site.operator.handed_over();
                 }
                 Command::Set { id, params } => {
@@ -435,7 +439,7 @@ impl<W: Worker<UntypedSample>> Runner<W> {
 
     /// When it must look again, if no sample comes before.
     fn deadline(&self) -> Option<Instant> {
-        let mut deadline = self.site.partners.deadline();
+        let mut deadline = self.site.partners.deadline(self.engine.is_active());
         if self.engine.is_active() {
             if self.site.clock() == Clock::Machine {
                 let silence = self.engine.worker.deadline_nanos().map(crate::instant_of);
