@@ -14,8 +14,9 @@ use serde_json::{Map, Value};
 use crate::cursors::SampleId;
 use crate::identity::stable_hash;
 use crate::port::{PortError, Sent, sample_id};
-use crate::saved::{Book, Numbers, state_in};
+use crate::saved::{Book, Input, Numbers, state_in};
 use crate::wiring::{Clock, InputCounts, OnLate};
+use crate::written::Written;
 
 /// A stage that answers each sample may answer so many before it wakes its readers, while more samples wait for it. That saves
 /// most of the wake-ups.
@@ -79,7 +80,8 @@ pub(crate) trait Site {
     fn put_back(&mut self, input: usize, sample: Self::Sample);
     /// Begins an input anew, as the active instance: see [`Subscriber::take_over`](crate::port::UntypedSubscriber::take_over).
     fn take_over(&mut self, input: usize, answered: Option<SampleId>);
-    fn take_over_at(&mut self, input: usize, last: Option<SampleId>, counts: InputCounts);
+    /// Begins an input anew at its saved place.
+    fn take_over_at(&mut self, input: usize, saved: &Input);
     /// Begins an input anew, as a standby that has its state from after this sample.
     fn look_on_from(&mut self, input: usize, last: SampleId);
     fn commit(&mut self, input: usize, key: SampleId, counts: &InputCounts);
@@ -95,7 +97,8 @@ pub(crate) trait Site {
     fn begin_active(&mut self);
     /// Takes over an output; returns the last sample that need not be sent again.
     fn begin(&mut self, output: usize, is_handed_over: bool) -> Option<SampleId>;
-    fn last_sent(&self, output: usize) -> Option<SampleId>;
+    /// How far the instances of the node have come with an output.
+    fn written(&self, output: usize) -> Option<Written>;
     fn has_readers(&self, output: usize) -> bool;
     fn answered_by_readers(&self, output: usize) -> Option<SampleId>;
     fn wait_for_room(&mut self, output: usize, key: SampleId) -> Result<Sent, PortError>;
@@ -367,6 +370,11 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
             && site.partners_are_caught_up()
     }
 
+    /// Whether the worker has heard the end, and nothing has come since that is not answered.
+    pub(crate) fn is_over<S: Site<Sample = T>>(&self, site: &S) -> bool {
+        self.has_heard_end && self.is_caught_up(site)
+    }
+
     /// Answers the samples that are there, and tells the worker of silence or the end of the stream.
     ///
     /// # Errors
@@ -394,7 +402,9 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
                 Progress::GaveWay => return Ok(Sent::GaveWay),
                 Progress::Waits => return Ok(Sent::Yes),
                 Progress::Idle => {
-                    if std::mem::replace(&mut has_heard, true) || !self.hear(site, stop)? {
+                    // After silence in this turn, the worker hears the end as well.
+                    let is_at_end = stop && !self.has_heard_end && self.is_caught_up(site);
+                    if std::mem::replace(&mut has_heard, true) && !is_at_end || !self.hear(site, stop)? {
                         return Ok(Sent::Yes);
                     }
                 }
@@ -635,6 +645,9 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
                 if site.is_after(*input, key, place.last) {
                     place.last = Some(key);
                 }
+                if site.is_after(*input, key, place.counted) {
+                    place.counted = Some(key);
+                }
                 place.counts = taken.counts;
             }
             self.last = Some(key);
@@ -786,13 +799,18 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         if !self.manner.saves {
             site.forget_state();
         }
+        let has_handed_over = self.handed_over.is_some();
         let is_restored = self.restore(site)?;
+        if has_handed_over && is_restored {
+            // It may be the state of the hand-over: a second failure must not lose it.
+            self.save_if_it_fits(site)?;
+        }
         if !is_restored && (self.manner.answers_each || !self.manner.saves) {
             // The instance before had no state, and has answered each sample under its number.
-            self.begin_after_readers(site);
+            self.begin_after_readers(site, has_handed_over)?;
         } else {
             for (idx, input) in self.book.inputs.iter().enumerate() {
-                site.take_over_at(idx, input.last, input.counts);
+                site.take_over_at(idx, input);
             }
         }
         self.last = self.book.inputs.first().and_then(|input| input.last);
@@ -801,22 +819,31 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
     }
 
     /// Goes on after the last sample whose answers all readers of all outputs have.
-    fn begin_after_readers<S: Site<Sample = T>>(&mut self, site: &mut S) {
+    fn begin_after_readers<S: Site<Sample = T>>(&mut self, site: &mut S, has_handed_over: bool) -> anyhow::Result<()> {
         let least = least(site, 0, self.book.outputs.iter().map(|output| output.known)).flatten();
         let input = &mut self.book.inputs[0];
-        let before = std::mem::replace(&mut input.last, least);
-        if self.manner.saves {
-            // Samples that are answered again are counted once.
-            if let (Some(before), Some(least)) = (before, least)
-                && before.epoch == least.epoch
-            {
-                let n_again = before.seq.saturating_sub(least.seq);
-                input.counts.n_received = input.counts.n_received.saturating_sub(n_again);
-            }
-            site.take_over_at(0, least, input.counts);
-        } else {
+        if !self.manner.saves {
+            input.last = least;
             site.take_over(0, least);
+            return Ok(());
         }
+        // Readers are ahead if the instance before has sent an answer and not committed its sample, which is not counted then.
+        if least.is_none_or(|least| !site.is_after(0, least, input.last)) {
+            input.last = least;
+        }
+        if input.last != input.counted || has_handed_over {
+            // Saved before the cursor goes back: the next instance must know which samples are counted, and after a second
+            // failure the state of the hand-over.
+            self.save_if_it_fits(site)?;
+        }
+        site.take_over_at(0, &self.book.inputs[0]);
+        Ok(())
+    }
+
+    fn save_if_it_fits<S: Site<Sample = T>>(&mut self, site: &mut S) -> anyhow::Result<()> {
+        let worker = &self.worker;
+        self.book.save_if_it_fits(site, &|bytes| worker.state(bytes))?;
+        Ok(())
     }
 
     /// Reads along after the last samples that the saved state includes.

@@ -238,7 +238,8 @@ pub(crate) trait PairedInput {
     /// Whether all samples that its writer has sent were received.
     fn is_caught_up(&self) -> bool;
 
-    fn hold_deadline(&self) -> Option<Instant>;
+    /// When an early sample that it reads is due.
+    fn hold_deadline(&self, is_active: bool) -> Option<Instant>;
 
     /// The port, and how many main samples were answered without a partner.
     fn n_without(&self) -> (&str, u64);
@@ -281,6 +282,11 @@ impl Partners {
         self.inputs.iter().for_each(|input| input.borrow_mut().commit(main));
     }
 
+    /// No sample waits any more: another instance answers it.
+    pub(crate) fn have_handed_over(&mut self) {
+        self.waiting = None;
+    }
+
     /// No sample will be answered any more.
     pub(crate) fn have_ended(&self) {
         self.inputs.iter().for_each(|input| input.borrow_mut().commit_all());
@@ -307,8 +313,8 @@ impl Partners {
         Ok(self.waiting.is_none())
     }
 
-    pub(crate) fn deadline(&self) -> Option<Instant> {
-        let held = self.inputs.iter().filter_map(|input| input.borrow().hold_deadline()).min();
+    pub(crate) fn deadline(&self, is_active: bool) -> Option<Instant> {
+        let held = self.inputs.iter().filter_map(|input| input.borrow().hold_deadline(is_active)).min();
         self.waiting.map(|waiting| waiting.2).into_iter().chain(held).min()
     }
 
@@ -446,8 +452,8 @@ impl<M: Message> PairedInput for PartnerInput<M> {
         }
     }
 
-    fn hold_deadline(&self) -> Option<Instant> {
-        self.subscriber.hold_deadline()
+    fn hold_deadline(&self, is_active: bool) -> Option<Instant> {
+        if is_active { self.subscriber.hold_deadline() } else { self.onlooker.as_ref()?.hold_deadline() }
     }
 
     fn n_without(&self) -> (&str, u64) {

@@ -29,7 +29,7 @@ const SAMPLES: [SampleId; 3] = [id(8, 0), id(3, 0), id(3, 1)];
 /// The samples that a reader may leave unanswered, and that a publisher keeps.
 const CAPACITY: usize = 2;
 /// The largest state: places, and one answer.
-const STATE_BYTES: usize = 250;
+const STATE_BYTES: usize = 270;
 
 const SOURCE: usize = 0;
 const STATELESS: usize = 1;
@@ -945,10 +945,6 @@ impl<'a> At<'a> {
     fn credit(&self) -> &Credit {
         &self.world.nodes[self.node].active.as_ref().expect("an active process").credit
     }
-
-    fn written(&self) -> Option<Written> {
-        self.world.slots.written[self.node]
-    }
 }
 
 impl Site for At<'_> {
@@ -970,9 +966,10 @@ impl Site for At<'_> {
         self.search.begin_with(self.world, self.node, Sequencer::resume(answered, counted, counts));
     }
 
-    fn take_over_at(&mut self, _: usize, last: Option<SampleId>, counts: InputCounts) {
-        (self.world.slots.answered[self.node], self.world.counts[self.node]) = (last, counts);
-        self.search.begin_with(self.world, self.node, Sequencer::resume(last, last, counts));
+    fn take_over_at(&mut self, _: usize, saved: &Input) {
+        (self.world.slots.answered[self.node], self.world.counts[self.node]) = (saved.last, saved.counts);
+        let sequencer = Sequencer::resume(saved.last, saved.counted, saved.counts);
+        self.search.begin_with(self.world, self.node, sequencer);
     }
 
     fn look_on_from(&mut self, _: usize, last: SampleId) {
@@ -1007,14 +1004,14 @@ impl Site for At<'_> {
 
     fn begin_active(&mut self) {}
 
-    fn begin(&mut self, _: usize, is_handed_over: bool) -> Option<SampleId> {
-        let (written, node) = (self.written(), self.node);
+    fn begin(&mut self, output: usize, is_handed_over: bool) -> Option<SampleId> {
+        let (written, node) = (self.written(output), self.node);
         let (nodes, slots) = (&mut self.world.nodes, &self.world.slots);
         nodes[node].active.as_mut()?.credit.begin(is_handed_over, slots, written)
     }
 
-    fn last_sent(&self, _: usize) -> Option<SampleId> {
-        self.written().map(|written| written.last)
+    fn written(&self, _: usize) -> Option<Written> {
+        self.world.slots.written[self.node]
     }
 
     fn has_readers(&self, _: usize) -> bool {
@@ -1023,9 +1020,9 @@ impl Site for At<'_> {
 
     fn answered_by_readers(&self, output: usize) -> Option<SampleId> {
         if self.search.without == Without::KeepsAnswers {
-            return self.last_sent(output);
+            return self.written(output).map(|written| written.last);
         }
-        self.credit().answered_by_readers(&self.world.slots, self.written())
+        self.credit().answered_by_readers(&self.world.slots, self.written(output))
     }
 
     /// The first of two steps of sending. The process may end before the second.
@@ -1039,11 +1036,11 @@ impl Site for At<'_> {
         Ok(Sent::GaveWay)
     }
 
-    fn wait_for_answers(&mut self, _: usize, key: SampleId, _: Yields) -> Result<Sent, PortError> {
+    fn wait_for_answers(&mut self, output: usize, key: SampleId, _: Yields) -> Result<Sent, PortError> {
         if self.search.without == Without::WaitsForRoom {
             self.world.broken = Some("a stage with state fails: its answers do not fit".into());
         }
-        let are_behind = !self.credit().readers_that_lack(key, &self.world.slots, self.written()).is_empty();
+        let are_behind = !self.credit().readers_that_lack(key, &self.world.slots, self.written(output)).is_empty();
         Ok(if are_behind { Sent::GaveWay } else { Sent::Yes })
     }
 
@@ -1183,7 +1180,7 @@ fn saved_by(at: &mut At<'_>, model: u64, seq: u64, n_samples: u64) -> Vec<u8> {
     let key = id(3, seq);
     (engine.worker.n_samples, engine.worker.last) = (n_samples, Some(key));
     let mut book = Book::new(vec![Input::new("in", false)], vec![]);
-    book.inputs[0].last = Some(key);
+    (book.inputs[0].last, book.inputs[0].counted) = (Some(key), Some(key));
     let sent = book.save(at, Yields::ToOthers, |bytes| engine.worker.state(bytes));
     assert_eq!(sent.expect("saved"), Sent::Yes);
     at.world.saved.take().expect("a state")
@@ -1210,6 +1207,7 @@ fn a_stage_whose_replacement_fails_goes_on_with_what_it_has_learned() {
         let mut engine = at.standby(1);
         if was_active {
             at.world.saved = Some(own.clone());
+            at.world.slots.answered[STATEFUL] = None;
             engine.take_over(&mut at, true).expect("active");
             engine.hand_over(&mut at);
         }
@@ -1217,6 +1215,45 @@ fn a_stage_whose_replacement_fails_goes_on_with_what_it_has_learned() {
         at.world.saved = found.cloned();
         engine.take_over(&mut at, false).expect("active again");
         assert_eq!((engine.next_seq().map(|seq| seq - 1), engine.worker.n_samples), expected);
+        // A second failure does not lose it.
+        if was_active {
+            assert_eq!(at.standby(1).worker.n_samples, expected.1);
+        }
+    }
+}
+
+/// A stage that finds no state answers again what readers lack, also if it is killed meanwhile. Readers may be ahead of its
+/// cursor, because an answer is sent before its sample is committed.
+#[test]
+fn samples_that_are_answered_again_are_counted_once() {
+    let search = Search::new(Without::Nothing, KILLS);
+    let samples: VecDeque<Sample> = (0..6).map(|seq| Sample::new(id(3, seq))).collect();
+    for (answered, known) in [(Some(4), Some(2)), (Some(4), Some(5)), (Some(4), None), (None, Some(0)), (None, None)] {
+        for n_steps in [0, 1, 2, 4, 8] {
+            let mut world = search.begin();
+            let mut at = At { choice: Choice::Queue(0), ..At::new(&search, &mut world, STATEFUL) };
+            at.world.slots.written[STATELESS] = Some(Written { last: id(3, 5), first_seq: 0, before: None });
+            at.world.slots.written[STATEFUL] = known.or(answered).and_then(|seq| Written::with(None, id(3, seq)));
+            at.world.slots.answered[STATEFUL] = answered.map(|seq| id(3, seq));
+            at.world.slots.answered[SINK] = known.map(|seq| id(3, seq));
+            at.world.counts[STATEFUL].n_received = answered.map_or(0, |seq| seq + 1);
+            for n_steps in [n_steps, 100] {
+                let mut engine = at.standby(1);
+                (at.process().queues, at.process().has_counted) = (vec![(0, samples.clone())], false);
+                at.choice = Choice::Queue(0);
+                engine.take_over(&mut at, false).expect("active");
+                for _ in 0..n_steps {
+                    if at.process().queues[0].1.is_empty() {
+                        at.choice = Choice::Nothing;
+                    }
+                    engine.advance(&mut at, false).expect("it goes on");
+                    at.world.slots.answered[SINK] = at.written(0).map(|written| written.last);
+                }
+            }
+            let counts = InputCounts { n_received: 6, ..InputCounts::default() };
+            assert_eq!(at.world.counts[STATEFUL], counts, "{answered:?}, {known:?}, {n_steps}");
+            assert_eq!(at.world.slots.answered[STATEFUL], Some(id(3, 5)), "{answered:?}, {known:?}, {n_steps}");
+        }
     }
 }
 

@@ -11,8 +11,9 @@ use crate::monotonic_nanos;
 use crate::operator::{Operator, OperatorError, TICK, Task, Turn, run_in_turn};
 use crate::partner::Partners;
 use crate::port::{PortError, Sent, ShadowPublisher, UntypedPublisher, UntypedSample, UntypedSubscriber};
-use crate::saved::Book;
+use crate::saved::{Book, Input};
 use crate::wiring::{Clock, Command, InputCounts};
+use crate::written::Written;
 
 /// A stage that gave way to another one of its group tries again after this time.
 const ROOM_PAUSE: Duration = Duration::from_millis(1);
@@ -124,8 +125,8 @@ impl Site for Ports {
         self.inputs[input].subscriber.take_over(answered);
     }
 
-    fn take_over_at(&mut self, input: usize, last: Option<SampleId>, counts: InputCounts) {
-        self.inputs[input].subscriber.take_over_at(last, counts);
+    fn take_over_at(&mut self, input: usize, saved: &Input) {
+        self.inputs[input].subscriber.take_over_at(saved.last, saved.counted, saved.counts);
     }
 
     fn look_on_from(&mut self, input: usize, last: SampleId) {
@@ -170,8 +171,8 @@ impl Site for Ports {
         self.outputs[output].publisher.begin(is_handed_over)
     }
 
-    fn last_sent(&self, output: usize) -> Option<SampleId> {
-        self.outputs[output].publisher.last()
+    fn written(&self, output: usize) -> Option<Written> {
+        self.outputs[output].publisher.written()
     }
 
     fn has_readers(&self, output: usize) -> bool {
@@ -366,11 +367,14 @@ impl<W: Worker<UntypedSample>> Runner<W> {
         } else {
             self.engine.look_on(&mut self.site)?;
         }
-        let is_over = stop && (!self.engine.is_active() || self.engine.is_caught_up(&self.site));
+        let is_over = stop && (!self.engine.is_active() || self.engine.is_over(&self.site));
         if is_over || self.site.operator.should_quit() {
             self.engine.worker.look()?;
             self.site.partners.report(&self.site.operator);
-            self.site.partners.have_ended();
+            // One that has handed over must not overwrite the counts of the other.
+            if self.engine.is_active() {
+                self.site.partners.have_ended();
+            }
             self.site.operator.report_drained();
             self.is_drained = true;
             return self.wait_for_the_end();
@@ -412,6 +416,7 @@ impl<W: Worker<UntypedSample>> Runner<W> {
                 }
                 Command::HandOver => {
                     self.engine.hand_over(&mut self.site);
+                    self.site.partners.have_handed_over();
                     self.site.operator.handed_over();
                 }
                 Command::Set { id, params } => {
@@ -434,7 +439,7 @@ impl<W: Worker<UntypedSample>> Runner<W> {
 
     /// When it must look again, if no sample comes before.
     fn deadline(&self) -> Option<Instant> {
-        let mut deadline = self.site.partners.deadline();
+        let mut deadline = self.site.partners.deadline(self.engine.is_active());
         if self.engine.is_active() {
             if self.site.clock() == Clock::Machine {
                 let silence = self.engine.worker.deadline_nanos().map(crate::instant_of);

@@ -17,9 +17,10 @@ use crate::outbox::{Entry, Kept};
 use crate::port::{Sent, sample_id};
 use crate::stage::{STATE_FORMAT, encode_state};
 use crate::wiring::InputCounts;
+use crate::written::Written;
 
 /// The beginning of what is saved. Sources in Rust save bytes of their own, which do not begin like this.
-const MAGIC: &[u8] = b"bg-node1";
+const MAGIC: &[u8] = b"bg-node2";
 /// An upper bound of the bytes that are saved for each port besides its answers, and for the rest.
 const PORT_BYTES: usize = 256;
 /// The numbers that are saved with an answer: the lengths of its head and of both.
@@ -33,11 +34,13 @@ pub(crate) struct Input {
     /// The last sample that was answered, with the counts of that time.
     pub(crate) last: Option<SampleId>,
     pub(crate) counts: InputCounts,
+    /// The counts include the samples up to here. It is after `last` while samples are answered again.
+    pub(crate) counted: Option<SampleId>,
 }
 
 impl Input {
     pub(crate) fn new(name: &str, is_feedback: bool) -> Input {
-        Input { name: name.into(), is_feedback, last: None, counts: InputCounts::default() }
+        Input { name: name.into(), is_feedback, last: None, counts: InputCounts::default(), counted: None }
     }
 }
 
@@ -92,7 +95,7 @@ struct Scratch {
 
 /// A saved state as it is read.
 struct Found<'a> {
-    inputs: BTreeMap<String, (Option<SampleId>, InputCounts)>,
+    inputs: BTreeMap<String, (Option<SampleId>, InputCounts, Option<SampleId>)>,
     outputs: BTreeMap<String, (Option<SampleId>, VecDeque<Entry>)>,
     is_done: bool,
     state: &'a [u8],
@@ -152,21 +155,37 @@ impl Book {
         yields: Yields,
         state: impl Fn(&mut Vec<u8>) -> anyhow::Result<()>,
     ) -> anyhow::Result<Sent> {
-        loop {
-            self.forget(site);
-            self.scratch.bytes.clear();
-            encode(&self.inputs, &self.outputs, self.is_done, &mut self.scratch.bytes)?;
-            state(&mut self.scratch.bytes)?;
-            let first = if self.scratch.bytes.len() > S::STATE_BYTES { self.first_sent() } else { None };
-            let Some((output, first)) = first else {
+        while !self.save_if_it_fits(site, &state)? {
+            let Some((output, first)) = self.first_sent() else {
+                // The site says how long it may be.
                 site.save_state(&self.scratch.bytes)?;
-                self.scratch.bytes.clear();
-                return Ok(Sent::Yes);
+                break;
             };
-            if site.wait_for_answers(output, first, yields)? == Sent::GaveWay {
+            if self.wait_for_answers(site, output, first, yields)? == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
             }
         }
+        Ok(Sent::Yes)
+    }
+
+    /// As [`Book::save`], without waiting; false if state and answers take too much.
+    ///
+    /// # Errors
+    /// The state cannot be encoded.
+    pub(crate) fn save_if_it_fits<S: Site>(
+        &mut self,
+        site: &mut S,
+        state: &impl Fn(&mut Vec<u8>) -> anyhow::Result<()>,
+    ) -> anyhow::Result<bool> {
+        self.forget(site);
+        self.scratch.bytes.clear();
+        encode(&self.inputs, &self.outputs, self.is_done, &mut self.scratch.bytes)?;
+        state(&mut self.scratch.bytes)?;
+        let fits = self.scratch.bytes.len() <= S::STATE_BYTES;
+        if fits {
+            site.save_state(&self.scratch.bytes)?;
+        }
+        Ok(fits)
     }
 
     /// Waits until so many bytes may be saved. `GaveWay` if it was asked to, or to stop.
@@ -183,10 +202,33 @@ impl Book {
                 return Ok(Sent::Yes);
             }
             let Some((output, first)) = self.first_sent() else { return Ok(Sent::Yes) };
-            if site.wait_for_answers(output, first, Yields::OrToStop)? == Sent::GaveWay {
+            if self.wait_for_answers(site, output, first, Yields::OrToStop)? == Sent::GaveWay {
                 return Ok(Sent::GaveWay);
             }
         }
+    }
+
+    /// Waits until the readers have answered a kept answer, and drops it.
+    fn wait_for_answers<S: Site>(
+        &mut self,
+        site: &mut S,
+        output: usize,
+        first: SampleId,
+        yields: Yields,
+    ) -> anyhow::Result<Sent> {
+        let n_kept = self.outputs[output].kept.entries().len();
+        if site.wait_for_answers(output, first, yields)? == Sent::GaveWay {
+            return Ok(Sent::GaveWay);
+        }
+        self.forget(site);
+        let Output { name, kept, .. } = &self.outputs[output];
+        let SampleId { epoch, seq } = first;
+        anyhow::ensure!(
+            kept.entries().len() < n_kept,
+            "the readers of output {name} have answered sample {seq} of epoch {epoch}, but it is still kept, and the state has no \
+             room: this is an error in blindgrasp"
+        );
+        Ok(Sent::Yes)
     }
 
     /// Of the output whose answers take most, the first answer that was sent.
@@ -207,7 +249,7 @@ impl Book {
     /// Drops the answers that all readers have answered.
     fn forget<S: Site>(&mut self, site: &S) {
         for (idx, output) in self.outputs.iter_mut().enumerate() {
-            let forgotten = output.kept.forget(site.has_readers(idx), site.answered_by_readers(idx));
+            let forgotten = output.kept.forget(site.has_readers(idx), site.answered_by_readers(idx), site.written(idx));
             self.scratch.entries.extend(forgotten.map(|entry| entry.bytes));
         }
     }
@@ -221,7 +263,7 @@ impl Book {
     pub(crate) fn restore<S: Site>(&mut self, site: &S, is_source: bool) -> anyhow::Result<Option<Vec<u8>>> {
         // The places come first: for a standby, the active instance goes on meanwhile, and its saved state is never behind them.
         let answered: Vec<_> = (0..self.inputs.len()).map(|idx| site.place(idx)).collect();
-        let sent: Vec<_> = (0..self.outputs.len()).map(|idx| site.last_sent(idx)).collect();
+        let sent: Vec<_> = (0..self.outputs.len()).map(|idx| site.written(idx)).collect();
         self.is_done = false;
         let saved = site.saved_state();
         let found = match saved.as_deref() {
@@ -231,29 +273,30 @@ impl Book {
         if let Some(found) = found {
             if !self.is_old(&found, site, &answered, &sent, is_source) {
                 let state = found.state.to_vec();
-                self.take_in(found);
+                self.take_in(found, &sent);
                 return Ok(Some(state));
             }
             tracing::info!("the saved state is older than the last samples of this node: it is not used");
         }
         for (input, (last, counts)) in self.inputs.iter_mut().zip(answered) {
-            (input.last, input.counts) = (last, counts);
+            (input.last, input.counts, input.counted) = (last, counts, last);
         }
-        for (output, last) in self.outputs.iter_mut().zip(sent) {
-            (output.last, output.kept) = (last, Kept::default());
+        for (output, written) in self.outputs.iter_mut().zip(sent) {
+            (output.last, output.kept) = (written.map(|written| written.last), Kept::default());
         }
         Ok(None)
     }
 
-    fn take_in(&mut self, mut found: Found<'_>) {
+    fn take_in(&mut self, mut found: Found<'_>, sent: &[Option<Written>]) {
         self.is_done = found.is_done;
         for input in &mut self.inputs {
-            (input.last, input.counts) = found.inputs.get(&*input.name).copied().unwrap_or_default();
+            let saved = found.inputs.get(&*input.name).copied();
+            (input.last, input.counts, input.counted) = saved.unwrap_or_default();
         }
-        for output in &mut self.outputs {
+        for (output, written) in self.outputs.iter_mut().zip(sent) {
             let saved = found.outputs.remove(&*output.name);
             let (last, entries) = saved.unwrap_or((output.last, VecDeque::new()));
-            (output.last, output.kept) = (last, Kept::restored(entries, output.known));
+            (output.last, output.kept) = (last, Kept::restored(entries, output.known, *written));
         }
     }
 
@@ -263,11 +306,11 @@ impl Book {
         found: &Found<'_>,
         site: &S,
         answered: &[(Option<SampleId>, InputCounts)],
-        sent: &[Option<SampleId>],
+        sent: &[Option<Written>],
         is_source: bool,
     ) -> bool {
         for (idx, (input, (place, _))) in self.inputs.iter().zip(answered).enumerate() {
-            let last = found.inputs.get(&*input.name).and_then(|(last, _)| *last);
+            let last = found.inputs.get(&*input.name).and_then(|(last, ..)| *last);
             if place.is_some_and(|place| site.is_after(idx, place, last)) {
                 return true;
             }
@@ -275,7 +318,7 @@ impl Book {
         is_source
             && self.outputs.iter().zip(sent).any(|(output, sent)| {
                 let last = found.outputs.get(&*output.name).and_then(|(last, _)| *last);
-                sent.is_some_and(|sent| !is_at_most(sent, last))
+                sent.is_some_and(|sent| !is_at_most(sent.last, last))
             })
     }
 }
@@ -302,7 +345,7 @@ fn encode(inputs: &[Input], outputs: &[Output], is_done: bool, bytes: &mut Vec<u
     bytes.extend_from_slice(MAGIC);
     encode_state((inputs.len() as u64, outputs.len() as u64, is_done), &mut *bytes)?;
     for input in inputs {
-        encode_state((&*input.name, input.last, input.counts), &mut *bytes)?;
+        encode_state((&*input.name, input.last, input.counts, input.counted), &mut *bytes)?;
     }
     for output in outputs {
         let kept = output.kept.entries();
@@ -324,8 +367,8 @@ fn read_whole(bytes: &[u8]) -> Option<Found<'_>> {
     let (n_inputs, n_outputs, is_done): (u64, u64, bool) = take(&mut rest)?;
     let (mut inputs, mut outputs) = (BTreeMap::new(), BTreeMap::new());
     for _ in 0..n_inputs {
-        let (name, last, counts) = take(&mut rest)?;
-        inputs.insert(name, (last, counts));
+        let (name, last, counts, counted) = take(&mut rest)?;
+        inputs.insert(name, (last, counts, counted));
     }
     for _ in 0..n_outputs {
         let (name, last, n_answers): (String, Option<SampleId>, u64) = take(&mut rest)?;
@@ -383,7 +426,7 @@ mod tests {
     fn the_next_instance_sends_what_readers_lack_as_it_was() {
         let output = |name, known| Output { known, ..Output::new(name, Numbers::Counted) };
         let counts = InputCounts { n_received: 8, ..InputCounts::default() };
-        let left = Input { last: Some(id(7)), counts, ..Input::new("left", false) };
+        let left = Input { last: Some(id(7)), counts, counted: Some(id(9)), ..Input::new("left", false) };
         let mut book = Book::new(vec![left], vec![output("b", None), output("a", None)]);
         for (to, seq) in [(0, 0), (0, 1), (0, 2), (1, 9)] {
             let header = Header { epoch: 3, seq, ..Header::default() };
@@ -398,9 +441,9 @@ mod tests {
         let mut next = Book::new(inputs, vec![output("a", None), output("b", Some(id(0)))]);
         let found = read(&bytes).expect("read");
         assert_eq!(found.state, b"mine");
-        next.take_in(found);
+        next.take_in(found, &[None, Some(Written { last: id(0), first_seq: 0, before: None })]);
         assert!(next.is_done);
-        assert_eq!((next.inputs[0].last, next.inputs[1].last, next.inputs[1].counts), (None, Some(id(7)), counts));
+        assert_eq!((next.inputs[0].last, &next.inputs[1]), (None, &book.inputs[0]));
         let [a, b] = &next.outputs[..] else { panic!("two outputs") };
         assert_eq!((a.kept.first_sent(), a.last, a.kept.entries().len()), (None, Some(id(9)), 1));
         assert_eq!((b.kept.next(), b.last), (book.outputs[0].kept.entries().get(1), Some(id(2))));

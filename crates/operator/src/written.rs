@@ -62,6 +62,15 @@ impl Written {
         self.last.epoch == epoch || self.before.is_some_and(|before| before.epoch == epoch)
     }
 
+    /// Whether a sample of the writer's epoch, or of the one before, was sent.
+    pub fn has_sent(&self, key: SampleId) -> bool {
+        match self.place(key) {
+            Place::Older => false,
+            Place::Before(_) => true,
+            Place::Current(seq) => seq <= self.last.seq,
+        }
+    }
+
     /// Whether a reader that has come to `reached` has passed a sample that was sent. If both are of older epochs than the
     /// writer remembers, that is only known within one of them.
     pub fn is_past(&self, reached: SampleId, key: SampleId) -> bool {

@@ -117,7 +117,7 @@ impl Source for HostedSource {
             let state = self.book.restore(&self.site, true)?;
             self.is_done = self.book.is_done;
             for (idx, input) in self.book.inputs.iter().enumerate() {
-                self.site.take_over_at(idx, input.last, input.counts);
+                self.site.take_over_at(idx, input);
             }
             if self.ready.has_state {
                 self.state = super::restore(&mut self.child, state.as_deref())?.state;
@@ -174,7 +174,7 @@ impl Source for HostedSource {
     }
 
     fn next_seq(&self) -> Option<u64> {
-        if self.outputs.is_empty() { None } else { self.site.last_sent(0).map(|last| last.seq + 1) }
+        if self.outputs.is_empty() { None } else { self.site.written(0).map(|written| written.last.seq + 1) }
     }
 }
 

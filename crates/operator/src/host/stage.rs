@@ -74,7 +74,7 @@ pub(super) fn run(
     for output in &mut ports.book.outputs {
         if is_each {
             output.numbers = Numbers::OfSample;
-        } else if has_one_input && n_outputs == 1 {
+        } else if has_one_input && n_outputs == 1 && output.numbers == Numbers::Counted {
             output.numbers = Numbers::OfWorker;
         }
     }

@@ -203,11 +203,11 @@ impl UntypedSubscriber {
         }
     }
 
-    /// Goes on after `last`, the last sample that a saved state includes, with the counts of that time.
-    pub fn take_over_at(&mut self, last: Option<SampleId>, counts: InputCounts) {
+    /// Goes on after `last`, the last sample that a saved state includes, with counts that include the samples up to `counted`.
+    pub fn take_over_at(&mut self, last: Option<SampleId>, counted: Option<SampleId>, counts: InputCounts) {
         if let Some((cursors, slot)) = &self.cursors {
             cursors.input(*slot).place_at(last, &counts);
-            self.begin_with(Sequencer::resume(last, last, counts));
+            self.begin_with(Sequencer::resume(last, counted, counts));
         }
     }
 
