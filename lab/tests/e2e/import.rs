@@ -355,6 +355,7 @@ fn a_cell_may_be_missing_where_the_layout_says_so() {
     assert_eq!(report["n_grasps"], 4);
     let cells = folder.exported("/tactile").pop().expect("a frame")["data"]["cells_newtons"].clone();
     assert_eq!(cells, json!([0.0, 0.0, 2.0]));
+    std::fs::remove_file(folder.at("out.mcap")).expect("there");
     folder.refuse(format!("{TABLE}cup,,yes,0.5,1,\n"), &[], 1, &["column 'r_1': expected a number", "found nothing"]);
 }
 
