@@ -870,6 +870,13 @@ impl Search {
         source.is_some_and(|source| source.next == SAMPLES.len()) && was_heard >= was_sent
     }
 
+    /// Whether each node has counted each sample that was sent to it. Of a live source, some may be lost with it.
+    fn has_counted_all(&self, world: &World) -> bool {
+        let n_answered = self.answered_samples().count() as u64;
+        let n_received = world.counts.map(|counts| counts.n_received);
+        self.budget.is_live || n_received[1..] == [SAMPLES.len() as u64, n_answered, n_answered]
+    }
+
     /// The number of worlds that can be reached.
     ///
     /// # Errors
@@ -885,6 +892,9 @@ impl Search {
             let (next, moves) = self.next(&world);
             if !moves && !self.is_done(&world) {
                 return Err((format!("stuck after {:?}", world.heard), path));
+            }
+            if !moves && !self.has_counted_all(&world) {
+                return Err((format!("samples were received and not counted: {:?}", world.counts), path));
             }
             for (idx, next) in next.into_iter().enumerate() {
                 if found.insert(fingerprint(&next)) {
