@@ -254,7 +254,7 @@ impl HostedSource {
                 }
                 let input = &mut self.book.inputs[idx];
                 if !is_at_most(key, input.last) {
-                    input.last = Some(key);
+                    (input.last, input.counted) = (Some(key), Some(key));
                 }
                 input.counts = counts;
                 self.ask_at = None;
