@@ -514,8 +514,11 @@ mod tests {
         let hand = hand_with_thumb();
         let [arm, twist] = ["arm_joint", "twist_joint"].map(|name| hand.joint_idx(name).expect("a joint"));
         let values = opposing_values(&hand, &[arm, twist]).expect("fits").expect("better values");
-        assert_eq!(values, [(arm, 1.5708), (twist, 3.1416)]);
-        let turned = hand.with_open_joint(arm, 1.5708).with_open_joint(twist, 3.1416);
+        // As they are printed.
+        let [quarter, half] =
+            [std::f64::consts::FRAC_PI_2, std::f64::consts::PI].map(|turn| (1e4 * turn).round() / 1e4);
+        assert_eq!(values, [(arm, quarter), (twist, half)]);
+        let turned = hand.with_open_joint(arm, quarter).with_open_joint(twist, half);
         assert_eq!(opposing_values(&turned, &[arm, twist]).expect("fits"), None);
         // Neither joint does it alone.
         for joint_idx in [arm, twist] {
