@@ -73,8 +73,11 @@ fn the_commands_of_the_first_day_make_a_graph_that_lifts() {
     let graph = Graph::launch_on(command, &unique_name(), Path::new("dataflow-live.yaml"), &params);
     wait_until(|| graph.said().contains("listening on"), || graph.said());
     assert!(!graph.said().contains("warning"), "{}", graph.said());
-    run_script(&demo, folder.path(), &format!("{bridge} --address {socket}"));
-    wait_until(|| graph.n_decisions() >= 20, || graph.said());
+    // The first grasps: the bridge plays them as slowly as they were.
+    let some = bridge.replace(" | python3", " | head -n 2000 | python3");
+    assert_ne!(some, bridge);
+    run_script(&demo, folder.path(), &format!("{some} --address {socket}"));
+    wait_until(|| graph.n_decisions() >= 6, || graph.said());
     let ended = graph.stop();
     let n_lifts = ended.decisions.iter().filter(|decision| decision["action"] == "lift").count();
     assert!(n_lifts > 0, "{:?}", ended.decisions);

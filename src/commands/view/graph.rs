@@ -229,13 +229,5 @@ fn drawn_edge(edge: &PictureEdge, from: usize, to: usize) -> DrawnEdge {
     notes.extend(edge.deadline_millis.map(|millis| format!("within {millis} ms")));
     let is_dashed = edge.policy == EdgePolicy::Latest;
     let carrier = edge.crossing.is_some().then(|| "Zenoh".to_owned());
-    DrawnEdge {
-        from,
-        to,
-        notes: harmless(notes),
-        is_dashed,
-        is_feedback: edge.feedback,
-        carrier,
-        ..DrawnEdge::default()
-    }
+    DrawnEdge { from, to, notes: harmless(notes), is_dashed, is_feedback: edge.feedback, carrier }
 }

@@ -383,10 +383,8 @@ impl Latest {
                 }
                 self.feature = Some(sample.message);
             }
-            Record::Prediction(sample) if is_shown => {
-                if self.probabilities.len() < MAX_PROBABILITIES {
-                    self.probabilities.push(sample.message.probability_stable);
-                }
+            Record::Prediction(sample) if is_shown && self.probabilities.len() < MAX_PROBABILITIES => {
+                self.probabilities.push(sample.message.probability_stable);
             }
             // Several a second, and nothing to look at.
             Record::Decision(sample) if sample.message.action == Action::GoOn => {}
