@@ -1,7 +1,7 @@
 //! An operator that answers samples: it reads one input, perhaps with [partners](crate::partner), and writes one output.
 //!
 //! The stage itself knows nothing of processes. [`run`] makes it an operator that can be killed and swapped, by the rules of
-//! the [`engine`](crate::engine).
+//! the module `engine`.
 
 use std::collections::BTreeMap;
 

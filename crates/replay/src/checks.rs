@@ -254,7 +254,7 @@ impl Decisions {
     }
 
     /// The decisions as expectations of later replays: a lift that dropped its object should have been held. With labels,
-    /// false positives are expected as they are, and of [`FEWEST_FOR_ACCURACY`] or more the accuracy, of fewer the right lifts;
+    /// false positives are expected as they are, and of 20 or more the accuracy, of fewer the right lifts;
     /// without labels, every decision.
     pub fn to_expectations(&self) -> Expectations {
         let mut expected = Expectations::default();

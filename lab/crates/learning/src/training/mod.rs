@@ -53,7 +53,7 @@ const THRESHOLD_PROBABILITY: f64 = 0.5;
 #[derive(Debug, Clone, PartialEq)]
 pub struct TrainingOptions {
     pub recipe: Recipe,
-    /// What the thresholds of all stages are chosen for, in place of [`THRESHOLD_PROBABILITY`].
+    /// The aim of the thresholds of all stages; without one, they are a probability of 0.5.
     pub aim: Option<Aim>,
     /// Seeds K-means and boosting.
     pub seed: u64,
