@@ -18,7 +18,7 @@ use clap::{Args, ValueEnum};
 use super::Outcome;
 use blindgrasp_cli::joint;
 
-/// Show a graph or recording in a browser; draw a file, grasp or hand.
+/// Show a graph or recording in a browser; draw a grasp or a hand.
 ///
 /// The programs of a dataflow file are run with --describe: use only files that you trust.
 #[derive(Debug, Args)]
