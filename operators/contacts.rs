@@ -11,6 +11,7 @@ use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
 use blindgrasp_stages::contacts::{ContactFinder, ContactSummary};
 use blindgrasp_stages::day::GraspPlace;
+use blindgrasp_stages::glitches::GlitchFilter;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::sensors::{Described, SensorCheck, SensorFault, SensorMemory};
 use blindgrasp_stages::steps::{contact_set, explain_fault, find_contacts};
@@ -46,7 +47,9 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         watch = Some(Watch { operator: operator.clone(), check, memory, reported });
     }
     let max_contacts = hand.n_cells();
-    let stage = FindContacts { hand, finder: ContactFinder::default(), watch, told: None };
+    let flickering = Flickering { operator: operator.clone(), grasp: None, n_grasps: 0, has_counted: true };
+    let (finder, filter) = Default::default();
+    let stage = FindContacts { hand, finder, filter, watch, told: None, flickering };
     stage::run(operator, "tactile", "contacts", max_contacts, identity, stage)
 }
 
@@ -72,10 +75,37 @@ pub(crate) fn hand_of(path: &Path) -> anyhow::Result<(Hand, BTreeMap<String, Str
 struct FindContacts {
     hand: Hand,
     finder: ContactFinder,
+    filter: GlitchFilter,
     /// The watch over the sensors, which remembers their readings.
     watch: Option<Watch>,
     /// The last grasp of which a faulty frame was explained.
     told: Option<u64>,
+    flickering: Flickering,
+}
+
+/// The grasps in which cells were found to flicker, since the program started.
+struct Flickering {
+    operator: Operator,
+    grasp: Option<u64>,
+    n_grasps: u64,
+    /// The launcher knows the count.
+    has_counted: bool,
+}
+
+impl Flickering {
+    /// Counts a grasp once, and says of the first one that its cells flicker.
+    fn note(&mut self, grasp_id: u64, filter: &GlitchFilter, hand: &Hand) {
+        if self.grasp == Some(grasp_id) {
+            return;
+        }
+        let Some(found) = filter.flicker(hand) else { return };
+        self.grasp = Some(grasp_id);
+        if self.n_grasps == 0 {
+            tracing::warn!("grasp {grasp_id}: {found}");
+        }
+        self.n_grasps += 1;
+        self.has_counted = false;
+    }
 }
 
 /// Finds faulty sensors.
@@ -140,13 +170,17 @@ impl Stage for FindContacts {
     type Out = ContactSet;
 
     fn has_state(&self) -> bool {
-        self.watch.is_some()
+        self.watch.is_some() || self.hand.median_filter
     }
 
     fn answer(&mut self, head: &TactileFrameHead, items: &[f64], _now_nanos: u64, answers: &mut Answers<ContactSet>) {
-        let (mut summary, parts) = find_contacts(&self.hand, &mut self.finder, head, items, answers.items());
+        let memory = (&mut self.finder, &mut self.filter);
+        let (mut summary, parts) = find_contacts(&self.hand, memory, head, items, answers.items());
         // Once for each grasp: its frames mostly have one fault. A hand that closes may have no contact yet.
         let is_at_rest = Phase::from_code(head.phase).is_ok_and(Phase::decides);
+        if is_at_rest {
+            self.flickering.note(head.grasp_id, &self.filter, &self.hand);
+        }
         if self.told != Some(head.grasp_id)
             && Phase::from_code(head.phase).is_ok_and(|phase| !phase.is_over())
             && (is_at_rest || summary.fault != Fault::NoContact)
@@ -167,6 +201,10 @@ impl Stage for FindContacts {
     }
 
     fn look(&mut self) {
+        let Flickering { operator, n_grasps, has_counted, .. } = &mut self.flickering;
+        if !std::mem::replace(has_counted, true) {
+            operator.has_counted(BTreeMap::from([("flickering_grasps".into(), *n_grasps)]));
+        }
         if let Some(watch) = &mut self.watch
             && std::mem::take(&mut watch.reported.has_counted)
         {
@@ -175,6 +213,9 @@ impl Stage for FindContacts {
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
+        if self.hand.median_filter {
+            encode_state(&self.filter, bytes)?;
+        }
         match &self.watch {
             Some(Watch { memory, reported, .. }) => encode_state((memory, reported.grasp, &reported.counts), bytes),
             None => Ok(()),
@@ -182,8 +223,16 @@ impl Stage for FindContacts {
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
+        let mut bytes = state;
+        self.filter = GlitchFilter::default();
+        if self.hand.median_filter
+            && let Some(all) = bytes
+        {
+            let (filter, n_read) = bincode::serde::decode_from_slice(all, STATE_FORMAT)?;
+            (self.filter, bytes) = (filter, Some(&all[n_read..]));
+        }
         if let Some(watch) = &mut self.watch {
-            let restored = match state {
+            let restored = match bytes {
                 Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
                 None => (SensorMemory::default(), None, BTreeMap::new()),
             };

@@ -252,7 +252,7 @@ fn pads_on_the_object(hand: &Hand, touching: &[(usize, usize)], contacts: &[Cont
 }
 
 /// Whether all are from 0 to [`MAX_CELL_NEWTONS`]. NaN is not.
-fn are_forces(cells_newtons: &[f64]) -> bool {
+pub(crate) fn are_forces(cells_newtons: &[f64]) -> bool {
     let is_force = |force: &f64| (*force >= 0.0) & (*force <= MAX_CELL_NEWTONS);
     cells_newtons.chunks(BLOCK).all(|block| block.iter().fold(true, |all, force| all & is_force(force)))
 }

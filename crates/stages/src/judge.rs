@@ -3,6 +3,7 @@
 use blindgrasp_messages::{Contact, Fault, Header, LiftDecision, Message, Prediction, Reason, Stamped, TactileFrame};
 
 use crate::contacts::ContactFinder;
+use crate::glitches::GlitchFilter;
 use crate::hand::Hand;
 use crate::lift_arbiter::{ArbiterOptions, LiftArbiter, Probe, Staleness};
 use crate::model::{Memory, Model, OtherHand};
@@ -20,6 +21,7 @@ pub struct Judge {
     model: Model,
     dictionary_id: u64,
     finder: ContactFinder,
+    filter: GlitchFilter,
     memory: Memory,
     arbiter: LiftArbiter,
     /// The number of the next frame of [`Judge::frame`].
@@ -41,6 +43,8 @@ struct Findings {
     invalid: Option<String>,
     /// Why its last frame at rest has no contact although cells feel.
     self_contact: Option<String>,
+    /// That its cells flicker.
+    flicker: Option<String>,
 }
 
 /// The judgement of a frame.
@@ -75,6 +79,7 @@ impl Judge {
             hand,
             model,
             finder: ContactFinder::default(),
+            filter: GlitchFilter::default(),
             memory: Memory::default(),
             arbiter: LiftArbiter::new(options),
             next_seq: 0,
@@ -121,7 +126,8 @@ impl Judge {
     fn judge(&mut self, header: Header, frame: &TactileFrame) -> Judged {
         self.next_seq = header.seq.wrapping_add(1);
         let (head, items) = frame.to_parts(header);
-        let (summary, parts) = steps::find_contacts(&self.hand, &mut self.finder, &head, &items, &mut self.contacts);
+        let memory = (&mut self.finder, &mut self.filter);
+        let (summary, parts) = steps::find_contacts(&self.hand, memory, &head, &items, &mut self.contacts);
         let contacts = steps::contact_set(&self.hand, &head, summary, parts.as_ref());
         let feature = steps::encode(&self.model, self.dictionary_id, &contacts, &self.contacts, &mut self.values);
         if self.found.grasp_id != frame.grasp_id {
@@ -136,6 +142,9 @@ impl Judge {
             } else if found.invalid.is_none() {
                 found.invalid = why;
             }
+        }
+        if frame.phase.decides() && self.found.flicker.is_none() {
+            self.found.flicker = self.filter.flicker(&self.hand);
         }
         if feature.fault == Fault::OutOfDistribution.code() && frame.phase.decides() {
             self.found.violations = steps::violations(&self.model, &contacts, &self.contacts);
@@ -161,6 +170,16 @@ impl Judge {
         let is_of_last_frame = decision.grasp_id == self.found.grasp_id;
         // A grasp may be held when the next one begins.
         let found = if is_of_last_frame { &self.found } else { &self.found_before };
+        let mut why = self.explain_reason(decision, found, is_of_last_frame);
+        if matches!(decision.reason, Reason::Unstable | Reason::NoAgreement | Reason::OutOfDistribution)
+            && decision.grasp_id == found.grasp_id
+        {
+            why.extend(found.flicker.clone());
+        }
+        why
+    }
+
+    fn explain_reason(&self, decision: &LiftDecision, found: &Findings, is_of_last_frame: bool) -> Vec<String> {
         match decision.reason {
             Reason::Stale => self.arbiter.staleness(decision.grasp_id).iter().map(Staleness::to_string).collect(),
             _ if decision.grasp_id != found.grasp_id => Vec::new(),
@@ -195,6 +214,7 @@ impl Judge {
 
     fn forget_grasps(&mut self) {
         self.arbiter = LiftArbiter::new(*self.arbiter.options());
+        self.filter = GlitchFilter::default();
         self.next_seq = 0;
         (self.found, self.found_before) = Default::default();
     }

@@ -45,6 +45,7 @@ pub mod day;
 mod decided;
 pub mod dictionary;
 pub mod encoder;
+pub mod glitches;
 pub mod hand;
 pub mod histogram;
 mod judge;

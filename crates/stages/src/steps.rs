@@ -11,6 +11,7 @@ use blindgrasp_messages::{
 use crate::contacts::{ContactFinder, ContactSummary, clip_to_limits, invalid_reading};
 use crate::day::GraspPlace;
 use crate::encoder::FeltReading;
+use crate::glitches::GlitchFilter;
 use crate::hand::Hand;
 use crate::model::{Memory, Model};
 use crate::out_of_distribution::Violation;
@@ -18,7 +19,7 @@ use crate::out_of_distribution::Violation;
 /// Finds the contacts of a frame. It also returns the frame's parts, if they can be read.
 pub fn find_contacts<'a>(
     hand: &Hand,
-    finder: &mut ContactFinder,
+    (finder, filter): (&mut ContactFinder, &mut GlitchFilter),
     head: &TactileFrameHead,
     items: &'a [f64],
     contacts: &mut Vec<Contact>,
@@ -26,7 +27,12 @@ pub fn find_contacts<'a>(
     match head.split(items) {
         Ok(parts) => {
             let FrameParts { joints, cells_newtons, .. } = parts;
-            (finder.find(hand, head.header.hand_id, joints, cells_newtons, contacts), Some(parts))
+            let place = (head.header.epoch, head.grasp_id);
+            let steady = match Phase::from_code(head.phase) {
+                Ok(phase) => filter.steady(hand, place, phase, cells_newtons),
+                Err(_) => cells_newtons,
+            };
+            (finder.find(hand, head.header.hand_id, joints, steady, contacts), Some(parts))
         }
         Err(_) => {
             contacts.clear();
@@ -176,8 +182,8 @@ mod tests {
         let joints = stops.iter().map(|stop| stop + 0.01).collect();
         let frame = TactileFrame { joints, cells_newtons: vec![1.0; hand.n_cells()], ..TactileFrame::default() };
         let (head, items) = frame.to_parts(Header::default());
-        let (mut finder, mut contacts) = (ContactFinder::default(), Vec::new());
-        let (summary, parts) = find_contacts(&hand, &mut finder, &head, &items, &mut contacts);
+        let (mut finder, mut filter, mut contacts) = (ContactFinder::default(), GlitchFilter::default(), Vec::new());
+        let (summary, parts) = find_contacts(&hand, (&mut finder, &mut filter), &head, &items, &mut contacts);
         let set = contact_set(&hand, &head, summary, parts.as_ref());
         stops[0] = 0.51;
         assert_eq!(set.joints(), Ok(&stops[..]));

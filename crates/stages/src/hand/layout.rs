@@ -41,6 +41,8 @@ pub(super) struct Layout {
     edge_radius_m: f64,
     #[serde(default)]
     cell_unit: CellUnit,
+    #[serde(default)]
+    median_filter: bool,
     pads: Vec<LayoutPad>,
     layouts: BTreeMap<String, Vec<LayoutCell>>,
 }
@@ -116,6 +118,7 @@ impl Layout {
             self_collision_margin_m: default_self_collision_margin_m(),
             edge_radius_m: 0.0,
             cell_unit: CellUnit::default(),
+            median_filter: false,
             pads: Vec::new(),
             layouts: BTreeMap::new(),
         }
@@ -175,6 +178,7 @@ impl Layout {
             ignored_shapes: tree.ignored_shapes,
             fixed_joints: tree.fixed_joints,
             cell_unit: self.cell_unit,
+            median_filter: self.median_filter,
             id: 0,
             description_id: 0,
             reference_link_idx,

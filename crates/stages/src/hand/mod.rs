@@ -51,6 +51,8 @@ pub struct Hand {
     pub fixed_joints: Vec<String>,
     /// The unit of the cells' readings.
     pub cell_unit: CellUnit,
+    /// Whether the median of three frames counts of each cell: see [`crate::glitches`].
+    pub median_filter: bool,
     /// The noise threshold of each cell, through all pads: in a row, because each frame is compared with all of them.
     noise_thresholds_newtons: Vec<f64>,
     id: u64,

@@ -16,6 +16,7 @@ use blindgrasp_simulator::tactile_sensor::gaussian;
 use blindgrasp_stages::classifier::boosting::{BoostedTrees, BoostingError, BoostingParams};
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::day::GraspPlace;
+use blindgrasp_stages::glitches::GlitchFilter;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::ModelHand;
 use blindgrasp_stages::sensors::{
@@ -154,8 +155,10 @@ pub fn damaged(
 fn values(hand: &Hand, grasp: &SensorGrasp) -> Option<Vec<f64>> {
     let mut summary = GraspSummary::default();
     let mut contacts: Vec<Contact> = Vec::new();
+    let mut filter = GlitchFilter::default();
     for frame in &grasp.frames {
-        contacts_from_frame(hand, 0, &frame.joints, &frame.cells_newtons, &mut contacts);
+        let steady = filter.steady(hand, (0, 0), frame.phase, &frame.cells_newtons);
+        contacts_from_frame(hand, 0, &frame.joints, steady, &mut contacts);
         summary.add(hand, frame.phase, &frame.joints, &contacts, &frame.cells_newtons);
         if frame.phase == Phase::Settled {
             let mut values = Vec::new();
@@ -364,9 +367,11 @@ pub fn alarms(check: &SensorCheck, hand: &Hand, grasps: &[SensorGrasp]) -> Vec<O
     let mut of_grasp = |(number, grasp): (usize, &SensorGrasp)| {
         let place = GraspPlace { epoch: 0, grasp_id: number as u64, day: 0 };
         let mut found = None;
+        let mut filter = GlitchFilter::default();
         for frame in &grasp.frames {
             let readings = (&frame.joints[..], &frame.cells_newtons[..]);
-            let summary = contacts_from_frame(hand, 0, readings.0, readings.1, &mut contacts);
+            let steady = filter.steady(hand, (0, 0), frame.phase, readings.1);
+            let summary = contacts_from_frame(hand, 0, readings.0, steady, &mut contacts);
             // An encoder that was damaged may read beyond its joint's stops: the contacts stage refuses the frame.
             if matches!(summary.fault, Fault::None | Fault::NoContact) {
                 found = check.watch(hand, &mut memory, (place, frame.phase), readings, &contacts).or(found);

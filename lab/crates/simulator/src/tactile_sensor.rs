@@ -35,6 +35,9 @@ pub struct SensorOptions {
     pub dead_fraction: f64,
     /// The part of the cells that always reads the largest count. 0.
     pub stuck_fraction: f64,
+    /// The part of the readings that are spikes, and the standard deviation of a spike, half of a normal distribution. 0; 0.4 N.
+    pub spike_fraction: f64,
+    pub spike_newtons: f64,
     /// Whether all grasps share gains, offsets, dead and stuck cells and the encoders' zeros, or each draws its own. All share
     /// them.
     pub faults_of: FaultsOf,
@@ -81,6 +84,8 @@ impl Default for SensorOptions {
             lag_secs: 0.0,
             dead_fraction: 0.0,
             stuck_fraction: 0.0,
+            spike_fraction: 0.0,
+            spike_newtons: 0.4,
             faults_of: FaultsOf::Hand,
             counts_per_newton_per_cm2: 256.0,
             largest_count: 4095,
@@ -106,6 +111,8 @@ impl SensorOptions {
         share("crosstalk", self.crosstalk)?;
         share("dead_fraction", self.dead_fraction)?;
         share("stuck_fraction", self.stuck_fraction)?;
+        share("spike_fraction", self.spike_fraction)?;
+        not_negative("spike_newtons", self.spike_newtons)?;
         share("dead_fraction + stuck_fraction", self.dead_fraction + self.stuck_fraction)?;
         positive("counts_per_newton_per_cm2", self.counts_per_newton_per_cm2)?;
         require("largest_count", self.largest_count, self.largest_count >= 1, "1 or more")?;
@@ -200,6 +207,13 @@ impl Sensor {
         }
         for (newtons, offset) in pressed_newtons.iter_mut().zip(&self.offsets_newtons) {
             *newtons += offset;
+        }
+        if options.spike_fraction > 0.0 {
+            for newtons in &mut pressed_newtons {
+                if rng.random::<f64>() < options.spike_fraction {
+                    *newtons += (options.spike_newtons * gaussian(rng)).abs();
+                }
+            }
         }
         hand.cells()
             .zip(&self.cells)
@@ -326,6 +340,25 @@ mod tests {
             .collect();
         let sigma = (squares.iter().sum::<f64>() / squares.len() as f64).sqrt();
         assert!((sigma - 0.05).abs() < 0.002, "{sigma}");
+    }
+
+    #[test]
+    fn spikes_have_the_stated_share_and_size() {
+        let quiet = SensorOptions { noise_newtons: 0.0, spike_fraction: 0.03, ..SensorOptions::default() };
+        let (hand, sensor, mut rng) = sensor(&quiet);
+        let (mut squares, mut n_spikes, mut n_readings) = (0.0, 0, 0);
+        for _ in 0..200 {
+            for newtons in sensor.read_cells(&hand, &vec![2.0; hand.n_cells()], &quiet, &mut rng) {
+                n_readings += 1;
+                if newtons > 2.02 {
+                    n_spikes += 1;
+                    squares += (newtons - 2.0).powi(2);
+                }
+            }
+        }
+        let share = f64::from(n_spikes) / f64::from(n_readings);
+        let sigma = (squares / f64::from(n_spikes)).sqrt();
+        assert!((0.025..0.032).contains(&share) && (0.35..0.45).contains(&sigma), "{share}, {sigma} N");
     }
 
     #[test]

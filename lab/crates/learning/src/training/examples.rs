@@ -9,6 +9,7 @@ use blindgrasp_grasps::reading::{Felt, SeenReadings, Settled, check_classes, not
 use blindgrasp_messages::{Contact, Fault, GraspTruth, OwnedSenses, Phase, Stamped, TactileFrame};
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_stages::encoder::{FeltReading, wrist_values};
+use blindgrasp_stages::glitches::without_glitches;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::training_summary::{ReadingId, TrainedOn};
@@ -67,13 +68,15 @@ struct FeltGrasp {
 
 impl FeltGrasp {
     /// `None` if the hand never settled.
-    fn of(hand: &Hand, frames: &[Stamped<TactileFrame>]) -> Option<FeltGrasp> {
+    fn of(hand: &Hand, mut frames: Vec<Stamped<TactileFrame>>) -> Option<FeltGrasp> {
+        let cells = frames.iter_mut().map(|frame| (frame.message.phase, &mut frame.message.cells_newtons));
+        without_glitches(hand, cells);
         let is_of = |phase: Phase| move |frame: &&Stamped<TactileFrame>| frame.message.phase == phase;
         let squeezed = frames.iter().rev().find(is_of(Phase::Squeezed)).map(|frame| Felt::of(hand, frame));
         let test_lifted = frames.iter().find(is_of(Phase::TestLifted)).map(|frame| Felt::of(hand, frame));
         let moving = [Phase::Squeezing, Phase::TestLifting]
             .map(|phase| frames.iter().filter(is_of(phase)).map(|frame| Signals::of(hand, frame)).collect::<Vec<_>>());
-        Some(FeltGrasp { settled: Settled::of(hand, frames)?, squeezed, test_lifted, moving })
+        Some(FeltGrasp { settled: Settled::of(hand, &frames)?, squeezed, test_lifted, moving })
     }
 }
 
@@ -128,7 +131,7 @@ impl Examples {
             *self.labels.entry(label).or_default() += 1;
         }
         self.made_by.push(reader.info().made_by.clone());
-        let grasps = read_grasps(path, hand, |_, frames| FeltGrasp::of(hand, &frames))?;
+        let grasps = read_grasps(path, hand, |_, frames| FeltGrasp::of(hand, frames))?;
         self.add_grasps(grasps, recording_idx, seen);
         Ok(())
     }
@@ -144,7 +147,7 @@ impl Examples {
     ) -> Result<Examples, TrainingError> {
         let felt = grasps.into_iter().map(|(frames, truth)| Grasp {
             grasp_id: truth.grasp_id,
-            value: FeltGrasp::of(hand, &frames),
+            value: FeltGrasp::of(hand, frames),
             truth: Some(truth),
         });
         let mut examples = Examples::default();
