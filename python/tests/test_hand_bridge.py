@@ -1,4 +1,4 @@
-"""Tests of examples/bridges/ros2.py and line_protocol.py with stand-ins for rclpy and for the source that they feed."""
+"""Tests of the node `hand` of examples/blindgrasp_ros and of line_protocol.py with stand-ins for rclpy and for the source that they feed."""
 
 import contextlib
 import importlib.util
@@ -19,11 +19,10 @@ from pathlib import Path
 from types import SimpleNamespace as Message
 from unittest import mock
 
-BRIDGES = Path(__file__).resolve().parents[2] / "examples/bridges"
-sys.path.insert(0, str(BRIDGES))
-SPEC = importlib.util.spec_from_file_location("ros2_bridge", BRIDGES / "ros2.py")
-bridge = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(bridge)
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+BRIDGES = EXAMPLES / "bridges"
+sys.path.insert(0, str(EXAMPLES / "blindgrasp_ros"))
+from blindgrasp_ros import hand as bridge  # noqa: E402
 
 HAND = {"hand": "gripper", "n_joints": 2, "n_cells": 4, "joints": ["jaw", "wrist"]}
 TABLE = {

@@ -18,6 +18,7 @@ mod ps;
 mod record;
 mod recording_arguments;
 mod replay;
+mod ros_messages;
 mod run;
 mod schema;
 mod set;

@@ -1,11 +1,10 @@
-#!/usr/bin/env python3
 """Feeds a running graph's tactile_source with frames from topics of ROS 2, in any RMW and any distribution since Humble.
 
     blindgrasp run dataflow-live.yaml
-    python3 examples/bridges/ros2.py my_hand_topics.yaml
+    ros2 run blindgrasp_ros hand my_hand_topics.yaml
 
-It runs where ROS 2 is sourced and needs only rclpy. A table says which topics the hand has; this folder has those of a Unitree
-Dex3-1, of uSkin sensors and of Robotiq's TSF-85:
+It needs only rclpy. A table says which topics the hand has; examples/bridges has those of a Unitree Dex3-1, of uSkin sensors and of
+Robotiq's TSF-85:
 
     joints: {topic: /joint_states, map: {jaw: {from: finger_joint, scale: -0.5, offset: 0.04}}}
     cells:                     # pad after pad, in the order of `blindgrasp info HAND.yaml`
@@ -38,7 +37,7 @@ import re
 import sys
 import time
 
-import line_protocol
+from blindgrasp_ros import line_protocol
 
 WORDS = ("open", "closing", "settled", "squeezing", "squeezed", "test_lifting", "test_lifted", "lifting", "ended", "kept", "dropped")
 # Angles older than this are missed: joint_states often comes at 10 to 30 Hz. Messages that waited for longer make no frame.
@@ -394,7 +393,7 @@ def bridge(table, address, hand=None):
         rclpy.try_shutdown()
 
 
-def main():
+def work():
     options = line_protocol.options(__doc__)
     options.add_argument("table", help="the topics (YAML)")
     # rclpy reads what follows --ros-args.
@@ -410,5 +409,9 @@ def main():
         sys.exit(f"{arguments.table}: {error}")
 
 
+def main():
+    line_protocol.run(work)
+
+
 if __name__ == "__main__":
-    line_protocol.run(main)
+    main()
