@@ -188,7 +188,7 @@ class Launch(unittest.TestCase):
 
     def test_the_options_start_their_nodes(self):
         self.assertEqual(self.started(), [["node", "decisions", "live_gate"]])
-        started = self.started(dataflow="flow.yaml", graph="g", table="t.yaml", address="unix:/s", gate="lift")
+        started = self.started(run="flow.yaml", graph="g", table="t.yaml", address="unix:/s", gate="lift")
         run = ["run", "blindgrasp", "run", "flow.yaml", "--name", "g"]
         hand = ["node", "hand", "t.yaml", "--address", "unix:/s"]
         self.assertEqual(started, [["node", "decisions", "g"], run, hand, ["node", "lift_gate"]])

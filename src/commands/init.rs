@@ -32,11 +32,10 @@ pub(super) struct Arguments {
 }
 
 /// The project's files: those that this repository's own default graph consists of.
-const FILES: [File; 11] = [
+const FILES: [File; 10] = [
     ("dataflow.yaml", include_bytes!("../../dataflow.yaml")),
     ("dataflow-live.yaml", include_bytes!("../../dataflow-live.yaml")),
     ("tactile_bridge.py", include_bytes!("../../examples/tactile_bridge.py")),
-    ("dataflow-ros2.yaml", include_bytes!("../../dataflow-ros2.yaml")),
     ("dataflow-machines.yaml", include_bytes!("../../dataflow-machines.yaml")),
     ("hands/barrett-bh8-280.yaml", include_bytes!("../../hands/barrett-bh8-280.yaml")),
     ("hands/barrett-bh8-280.urdf", include_bytes!("../../hands/barrett-bh8-280.urdf")),
@@ -137,7 +136,6 @@ blindgrasp stop
 | `dataflow.yaml` | the graph: which operators run, what they read, their parameters |
 | `dataflow-live.yaml` | the graph for a hand that lifts, with its model: a bridge sends the frames; `blindgrasp trials` tries it in simulated physics |
 | `tactile_bridge.py` | a bridge to begin with: `blindgrasp export recordings/held-out.mcap --topic /tactile \\| ./tactile_bridge.py` |
-| `dataflow-ros2.yaml` | the graph for a hand of a robot in ROS 2; `init --ros2` adds the nodes that run there |
 | `dataflow-machines.yaml` | the same graph on two machines |
 | `hands/` | the Barrett hand BH8-280: kinematics (URDF) and pad layout; describe your own beside it. `init --hand NAME` adds another one, with its bridge in `bridges/` |
 | `models/` | models of that hand: by the paper's label for `dataflow.yaml`, and of lifts (`…-lifts.json`) for an arm |

@@ -5,7 +5,7 @@ from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch_ros.actions import Node
 
 ARGUMENTS = {
-    "dataflow": ("", "the dataflow file of the graph; without one, the graph is run elsewhere"),
+    "run": ("", "the dataflow file of the graph; without one, the graph is run elsewhere"),
     "graph": ("live_gate", "the name of the graph"),
     "table": ("", "the topics of the hand (YAML); without one, another bridge sends the frames"),
     "address": ("", "of tactile_source, if it is not its usual socket"),
@@ -28,8 +28,8 @@ def actions(context):
         return [f"--{name.replace('_', '-')}", given[name]] if given[name] else []
 
     started = [node("decisions", given["graph"])]
-    if given["dataflow"]:
-        command = ["blindgrasp", "run", given["dataflow"], "--name", given["graph"]]
+    if given["run"]:
+        command = ["blindgrasp", "run", given["run"], "--name", given["graph"]]
         # Nothing lifts without the graph.
         started.append(ExecuteProcess(cmd=command, output="screen", on_exit=Shutdown(reason="the graph has ended")))
     if given["table"]:

@@ -1,18 +1,15 @@
-//! The programs for ROS 2 with an installation of it: rclpy, Fast DDS and the generators of messages of Kilted, as PyPI has
+//! The package blindgrasp_ros with an installation of ROS 2: rclpy, Fast DDS and the generators of messages of Kilted, as PyPI has
 //! them for x86-64.
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, ChildStdout, Command, Stdio};
 
 use serde_json::{Value, json};
 
 use crate::common::live::{free_port, grasps, live_dataflow};
 use crate::common::python::python;
-use crate::common::{Graph, project, skipped, undisturbed, unique_name, wait_until};
-use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, Recorded, TactileFrame};
-use blindgrasp_ros::definition::Definition;
-use blindgrasp_ros::standard;
+use crate::common::{Graph, program, project, skipped, undisturbed, unique_name, wait_until};
 use blindgrasp_stages::hand::Hand;
 
 const N_GRASPS: u64 = 3;
@@ -44,6 +41,41 @@ for line in sys.stdin:
     decisions.publish(decision)
 ";
 
+/// Prints each decision, the first message of each other topic, the level of the graph's state when it is another, and for each
+/// line of stdin an answer of the service.
+const LISTENER: &str = "
+import json, sys, threading, rclpy
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from blindgrasp_msgs.msg import ContactSet, Decision
+from blindgrasp_msgs.srv import Decide
+from diagnostic_msgs.msg import DiagnosticArray
+from sensor_msgs.msg import JointState, PointCloud2
+from visualization_msgs.msg import MarkerArray
+rclpy.init()
+node = rclpy.create_node('listener')
+said = {}
+def tell(key, value):
+    if said.get(key) != value:
+        said[key] = value
+        print(json.dumps({key: value}), flush=True)
+latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+words = lambda it: [it.grasp_id, it.action, it.reason]
+node.create_subscription(Decision, '/blindgrasp/decision', lambda it: tell('decision', words(it)), latched)
+for kind, topic, size in [(JointState, 'joint_states', lambda it: len(it.name)), (PointCloud2, 'cell_points', lambda it: it.width),
+                          (MarkerArray, 'hand_markers', lambda it: len(it.markers) > 10), (ContactSet, 'contacts', lambda it: True)]:
+    take = lambda it, topic=topic, size=size: tell(topic, size(it))
+    node.create_subscription(kind, '/blindgrasp/' + topic, take, qos_profile_sensor_data)
+def diagnose(it):
+    tell('state', [status.level[0] for status in it.status if status.name.endswith(': graph')])
+node.create_subscription(DiagnosticArray, '/diagnostics', diagnose, 10)
+client = node.create_client(Decide, '/blindgrasp/decide')
+threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
+for line in sys.stdin:
+    client.wait_for_service()
+    answer = client.call(Decide.Request(timeout_secs=float(line)))
+    print(json.dumps({'decided': [answer.decided, *words(answer.decision)]}), flush=True)
+";
+
 /// The controller of a gripper, which reaches each goal but 0.02.
 const CONTROLLER: &str = "
 import time, rclpy
@@ -62,11 +94,15 @@ rclpy.spin(node)
 ";
 /// In place of a graph: the same decision about one grasp after the other.
 const DECISIONS: &str = "
-import itertools, json, sys, time
+import itertools, sys, time, rclpy
+from blindgrasp_msgs.msg import Decision
+rclpy.init()
+decisions = rclpy.create_node('arbiter').create_publisher(Decision, '/blindgrasp/decision', 10)
 for grasp_id in itertools.count():
     time.sleep(0.2)
-    until = time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 600_000_000_000
-    print(json.dumps({'grasp_id': grasp_id, 'action': sys.argv[1], 'reason': 'stable', 'valid_until_nanos': until}), flush=True)
+    decision = Decision(grasp_id=grasp_id, action=getattr(Decision, sys.argv[1]), reason='stable')
+    decision.valid_until.sec = int(time.time()) + 600
+    decisions.publish(decision)
 ";
 /// MoveIt's part: goals, one after the other, and how each ended.
 const GOALS: &str = "
@@ -91,9 +127,17 @@ for position in map(float, sys.argv[1:]):
 struct Node(Child);
 
 impl Node {
+    /// A node of the package.
+    fn of_package(name: &str, arguments: &[&str], domain: u32, built: Option<&Path>) -> Node {
+        let module = format!("blindgrasp_ros.{name}");
+        Node::start(&[&["-m", &module], arguments].concat(), domain, built)
+    }
+
     /// It is in a domain of ROS that other tests do not use, on this machine alone.
     fn start(arguments: &[&str], domain: u32, built: Option<&Path>) -> Node {
         let mut command = Command::new(python());
+        let package = project().join("examples/blindgrasp_ros");
+        command.env("PYTHONPATH", &package);
         command.args(arguments).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
         command.env("ROS_DOMAIN_ID", domain.to_string()).env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST");
         command.env("PYTHONDONTWRITEBYTECODE", "1");
@@ -102,15 +146,40 @@ impl Node {
             let libraries = prefixes.clone().map(|prefix| prefix.join("lib"));
             command.env("AMENT_PREFIX_PATH", std::env::join_paths(&prefixes).expect("paths"));
             command.env("LD_LIBRARY_PATH", std::env::join_paths(libraries).expect("paths"));
-            command.env("PYTHONPATH", packages_of(built));
+            let paths = std::env::join_paths([package, packages_of(built)]);
+            command.env("PYTHONPATH", paths.expect("paths"));
         }
         Node(command.spawn().expect("started"))
+    }
+
+    fn lines(&mut self) -> Lines {
+        Lines(BufReader::new(self.0.stdout.take().expect("stdout")))
     }
 
     /// It ends as any program when it is asked to, without a traceback.
     fn stop(mut self) {
         crate::common::signal(self.0.id() as i32, rustix::process::Signal::TERM);
         assert!(self.0.wait().expect("ended").success());
+    }
+}
+
+/// Lines of JSON.
+struct Lines(BufReader<ChildStdout>);
+
+impl Lines {
+    /// The lines up to one with this value, the last of them.
+    fn until(&mut self, key: &str, expected: &Value) {
+        let mut seen = Vec::new();
+        loop {
+            let mut line = String::new();
+            self.0.read_line(&mut line).expect("read");
+            let found: Value =
+                serde_json::from_str(&line).unwrap_or_else(|error| panic!("{line:?}, after {seen:?}: {error}"));
+            if found.get(key) == Some(expected) {
+                return;
+            }
+            seen.push(found);
+        }
     }
 }
 
@@ -145,11 +214,42 @@ fn domain(n: u32) -> u32 {
     1 + 30 * n + std::process::id() % 30
 }
 
+/// The nodes of the package, with messages that are compiled once. PyPI has no `control_msgs`: its action is compiled from its
+/// definition.
 #[test]
-fn nodes_of_an_installation_of_ros_2_are_read_by_the_bridge() {
-    if !holds("True") {
-        return skipped("PyPI has no ROS 2 for this machine");
+fn robots_of_dds_are_gated_by_the_package_of_ros_2() {
+    if let Some(missing) = missing_for_packages() {
+        return skipped(missing);
     }
+    let folder = tempfile::tempdir().expect("a folder");
+    let package = folder.path().join("control_msgs");
+    let messages = project().join("examples/blindgrasp_msgs");
+    for folder in ["msg", "action"] {
+        std::fs::create_dir_all(package.join(folder)).expect("made");
+    }
+    for file in ["CMakeLists.txt", "package.xml"] {
+        let text = std::fs::read_to_string(messages.join(file)).expect("readable");
+        let text = text.replace("blindgrasp_msgs", "control_msgs").replace("builtin_interfaces", "action_msgs");
+        std::fs::write(package.join(file), text.replace("srv/*.srv", "action/*.action")).expect("written");
+    }
+    std::fs::write(package.join("msg/GripperCommand.msg"), "float64 position\nfloat64 max_effort\n").expect("written");
+    let state = "float64 position\nfloat64 effort\nbool stalled\nbool reached_goal\n";
+    let action = format!("GripperCommand command\n---\n{state}---\n{state}");
+    std::fs::write(package.join("action/GripperCommand.action"), action).expect("written");
+    let built = folder.path().join("built");
+    compile(&messages, &folder.path().join("build"), &built);
+    compile(&package, &folder.path().join("build_control"), &built);
+    std::thread::scope(|scope| {
+        scope.spawn(|| no_lift_outlives_the_graph_or_its_node(&built));
+        scope.spawn(|| the_gate_of_the_arm_lifts_on_a_fresh_lift_alone(&built));
+        scope.spawn(|| the_gate_of_the_gripper_lets_only_a_lift_succeed(&built));
+    });
+}
+
+/// Frames come from topics, and decisions go to a topic. When the graph ends, and when the node of decisions is killed, no LIFT
+/// stays.
+fn no_lift_outlives_the_graph_or_its_node(built: &Path) {
+    let domain = domain(0);
     let folder = tempfile::tempdir().expect("a folder");
     let table = folder.path().join("topics.yaml");
     std::fs::write(&table, TABLE).expect("written");
@@ -158,12 +258,18 @@ fn nodes_of_an_installation_of_ros_2_are_read_by_the_bridge() {
     let graph = Graph::launch(&unique_name(), &live_dataflow(folder.path(), &params), &PATIENT);
     wait_until(|| graph.said().contains("listening on"), || graph.said());
     let address = format!("127.0.0.1:{port}");
-    let program = project().join("examples/bridges/ros2.py").display().to_string();
-    let table = table.to_str().expect("UTF-8");
-    let bridge = Node::start(&[&program, table, "--address", &address], domain(0), None);
+    let hand = Node::of_package("hand", &[table.to_str().expect("UTF-8"), "--address", &address], domain, None);
+    let of_graph = [&graph.name, "--program", program(), "--outputs", "decision", "tactile", "contacts"];
+    let mut decisions = Node::of_package("decisions", &of_graph, domain, Some(built));
+    let mut listener = Node::start(&["-c", LISTENER], domain, Some(built));
+    let mut heard = listener.lines();
+    let no_graph = json!([0, 0, "no_graph"]);
+    heard.until("decision", &no_graph);
+    // The state of the graph comes from the same connection as its samples.
+    heard.until("state", &json!([0]));
 
     let driver = project().join("tests/ros2_driver.py").display().to_string();
-    let mut driver = Node::start(&[&driver], domain(0), None);
+    let mut driver = Node::start(&[&driver], domain, None);
     let mut answers = BufReader::new(driver.0.stdout.take().expect("stdout"));
     let mut stdin = driver.0.stdin.take().expect("stdin");
     let mut say = |said: &Value, expected: &str| {
@@ -172,8 +278,8 @@ fn nodes_of_an_installation_of_ros_2_are_read_by_the_bridge() {
         answers.read_line(&mut answer).expect("read");
         assert_eq!(answer.trim_end(), expected);
     };
-    let hand = Hand::load(&project().join("hands/barrett-bh8-280.yaml")).expect("a hand");
-    let names: Vec<&str> = hand.joints.iter().map(|joint| joint.name.as_str()).collect();
+    let layout = Hand::load(&project().join("hands/barrett-bh8-280.yaml")).expect("a hand");
+    let names: Vec<&str> = layout.joints.iter().map(|joint| joint.name.as_str()).collect();
     say(&json!(names), "matched");
     let accepted = || graph.node("tactile_source")["counts"]["frames"].as_u64().unwrap_or(0);
     for frame in grasps(N_GRASPS) {
@@ -191,41 +297,40 @@ fn nodes_of_an_installation_of_ros_2_are_read_by_the_bridge() {
         wait_until(&mut has_come, || format!("frame {n_before} has not come: {}", graph.said()));
     }
     wait_until(|| graph.n_decisions() as u64 == N_GRASPS, || graph.said());
-    let decided = graph.lines();
-    for (line, (action, reason)) in decided.iter().zip(&undisturbed()[..N_GRASPS as usize]) {
+    let mut last = Value::Null;
+    for (line, (action, reason)) in graph.lines().iter().zip(&undisturbed()[..N_GRASPS as usize]) {
         assert_eq!((&line["action"], &line["reason"]), (&json!(action), &json!(reason)), "{line}");
+        last = json!([line["grasp_id"], u8::from(action == "lift"), reason]);
+        heard.until("decision", &last);
     }
-    bridge.stop();
+    let mut asks = listener.0.stdin.take().expect("stdin");
+    writeln!(asks, "1").expect("written");
+    let words = last.as_array().expect("a list");
+    heard.until("decided", &json!([true, words[0], words[1], words[2]]));
+    // A node that comes later gets the last decision, and topics of the hand.
+    let mut late = Node::start(&["-c", LISTENER], domain, Some(built));
+    late.lines().until("decision", &last);
+    drop(late);
+
     graph.stop();
+    heard.until("decision", &no_graph);
+    heard.until("state", &json!([2]));
+    let mut late = Node::start(&["-c", LISTENER], domain, Some(built));
+    late.lines().until("decision", &no_graph);
+    let mut asks_late = late.0.stdin.take().expect("stdin");
+    writeln!(asks_late, "0.1").expect("written");
+    writeln!(asks, "0.1").expect("written");
+    heard.until("decided", &json!([false, 0, 0, ""]));
+    decisions.0.kill().expect("killed");
+    decisions.0.wait().expect("ended");
+    hand.stop();
 }
 
-/// The package of messages compiles, its types have the hashes that blindgrasp sends, and the example node lifts what it should.
-#[test]
-fn the_package_of_messages_compiles_and_the_gate_of_the_arm_reads_them() {
-    if let Some(missing) = missing_for_packages() {
-        return skipped(missing);
-    }
-    let folder = tempfile::tempdir().expect("a folder");
-    let built = compile(&project().join("examples/blindgrasp_msgs"), folder.path());
-
-    let decision = std::fs::read_to_string(project().join("network/src/operators/Decision.msg")).expect("readable");
-    let decision = standard::with_parts(&decision, &["builtin_interfaces/Time"]);
-    for (name, definition) in [
-        (TactileFrame::SCHEMA, TactileFrame::definition()),
-        (ContactSet::SCHEMA, ContactSet::definition()),
-        (GraspFeature::SCHEMA, GraspFeature::definition()),
-        (Prediction::SCHEMA, Prediction::definition()),
-        ("blindgrasp_msgs/msg/Decision", decision),
-    ] {
-        let ours = Definition::parse(name, &definition).expect("a definition").hash();
-        assert_eq!(hash_of(&built, name), ours, "{name}");
-    }
-
-    // Other tests may run their nodes at the same time.
+/// The gate of the arm lifts what it should.
+fn the_gate_of_the_arm_lifts_on_a_fresh_lift_alone(built: &Path) {
     let domain = domain(1);
-    let gate = project().join("examples/ros2_lift_gate.py").display().to_string();
-    let mut gate = Node::start(&[&gate], domain, Some(&built));
-    let mut arbiter = Node::start(&["-c", ARBITER], domain, Some(&built));
+    let mut gate = Node::of_package("lift_gate", &[], domain, Some(built));
+    let mut arbiter = Node::start(&["-c", ARBITER], domain, Some(built));
     let mut stdin = arbiter.0.stdin.take().expect("stdin");
     let mut answers = BufReader::new(gate.0.stderr.take().expect("stderr"));
     for (decision, expected) in [
@@ -247,43 +352,18 @@ fn the_package_of_messages_compiles_and_the_gate_of_the_arm_reads_them() {
     gate.stop();
 }
 
-/// MoveIt's goals reach the gripper's controller, and one that closes on an object succeeds only if a LIFT follows. The action is
-/// compiled from its definition, because PyPI has no `control_msgs`.
-#[test]
-fn the_gate_of_the_gripper_passes_goals_on_and_lets_only_a_lift_succeed() {
-    if let Some(missing) = missing_for_packages() {
-        return skipped(missing);
-    }
-    let folder = tempfile::tempdir().expect("a folder");
-    let package = folder.path().join("control_msgs");
-    let example = project().join("examples/blindgrasp_msgs");
-    for folder in ["msg", "action"] {
-        std::fs::create_dir_all(package.join(folder)).expect("made");
-    }
-    for file in ["CMakeLists.txt", "package.xml"] {
-        let text = std::fs::read_to_string(example.join(file)).expect("readable");
-        let text = text.replace("blindgrasp_msgs", "control_msgs").replace("builtin_interfaces", "action_msgs");
-        std::fs::write(package.join(file), text.replace("srv/*.srv", "action/*.action")).expect("written");
-    }
-    std::fs::write(package.join("msg/GripperCommand.msg"), "float64 position\nfloat64 max_effort\n").expect("written");
-    let state = "float64 position\nfloat64 effort\nbool stalled\nbool reached_goal\n";
-    let action = format!("GripperCommand command\n---\n{state}---\n{state}");
-    std::fs::write(package.join("action/GripperCommand.action"), action).expect("written");
-    let built = compile(&package, folder.path());
-
-    let mut controller = Node::start(&["-c", CONTROLLER], domain(2), Some(&built));
-    let gate = project().join("examples/ros2_gripper_gate.py").display().to_string();
-    let graph = folder.path().join("graph.py");
-    std::fs::write(&graph, DECISIONS).expect("written");
-    let (python, graph) = (python().display().to_string(), graph.display().to_string());
-    let start_gate = |action: &str| {
-        let of_gate = [&gate, "--controller", "/gripper/cmd", "--grasps-below", "0.03", "--wait", "50"];
-        Node::start(&[&of_gate[..], &[&python, &graph, action]].concat(), domain(2), Some(&built))
+/// MoveIt's goals reach the gripper's controller, and one that closes on an object succeeds only if a LIFT follows.
+fn the_gate_of_the_gripper_lets_only_a_lift_succeed(built: &Path) {
+    let mut controller = Node::start(&["-c", CONTROLLER], domain(2), Some(built));
+    let start_gate = || {
+        let of_gate = ["--controller", "/gripper/cmd", "--grasps-below", "0.03", "--wait", "50"];
+        Node::of_package("gripper_gate", &of_gate, domain(2), Some(built))
     };
     // A hand that opens needs no decision; 4 is a goal that succeeded, and 6 one that was aborted.
-    for (action, expected) in [("lift", ["0.08 4", "0.01 4"]), ("hold", ["0.08 4", "0.01 6"])] {
-        let gate = start_gate(action);
-        let mut moveit = Node::start(&["-c", GOALS, "0.08", "0.01"], domain(2), Some(&built));
+    for (action, expected) in [("LIFT", ["0.08 4", "0.01 4"]), ("HOLD", ["0.08 4", "0.01 6"])] {
+        let _arbiter = Node::start(&["-c", DECISIONS, action], domain(2), Some(built));
+        let gate = start_gate();
+        let mut moveit = Node::start(&["-c", GOALS, "0.08", "0.01"], domain(2), Some(built));
         let mut ends = BufReader::new(moveit.0.stdout.take().expect("stdout"));
         for expected in expected {
             let mut end = String::new();
@@ -293,8 +373,9 @@ fn the_gate_of_the_gripper_passes_goals_on_and_lets_only_a_lift_succeed() {
         gate.stop();
     }
     // It also ends while the controller moves the hand.
-    let gate = start_gate("lift");
-    let _moveit = Node::start(&["-c", GOALS, "0.02"], domain(2), Some(&built));
+    let _arbiter = Node::start(&["-c", DECISIONS, "LIFT"], domain(2), Some(built));
+    let gate = start_gate();
+    let _moveit = Node::start(&["-c", GOALS, "0.02"], domain(2), Some(built));
     let mut said = String::new();
     BufReader::new(controller.0.stdout.take().expect("stdout")).read_line(&mut said).expect("read");
     assert_eq!(said.trim_end(), "closing");
@@ -310,9 +391,9 @@ fn missing_for_packages() -> Option<&'static str> {
     if compiler.is_ok_and(|status| status.success()) { None } else { Some("c++ is missing") }
 }
 
-/// Compiles a package as `colcon build` does, below `folder`; returns where it is installed.
-fn compile(package: &Path, folder: &Path) -> PathBuf {
-    let (build, built, prefix) = (folder.join("build"), folder.join("built"), environment());
+/// Compiles a package as `colcon build` does, and installs it in `built`.
+fn compile(package: &Path, build: &Path, built: &Path) {
+    let prefix = environment();
     let cmake = |arguments: &[String]| {
         let mut command = Command::new(prefix.join("bin/cmake"));
         let others = std::env::var_os("PATH").unwrap_or_default();
@@ -332,15 +413,4 @@ fn compile(package: &Path, folder: &Path) -> PathBuf {
         "-DBUILD_TESTING=OFF".into(),
     ]);
     cmake(&["--build".into(), build.display().to_string(), "--target".into(), "install".into()]);
-    built
-}
-
-/// The hash that the generators of ROS 2 gave a type.
-fn hash_of(built: &Path, name: &str) -> String {
-    let (package, rest) = name.split_once('/').expect("a package");
-    let text = std::fs::read_to_string(built.join(format!("share/{package}/{rest}.json"))).expect("readable");
-    let described: Value = serde_json::from_str(&text).expect("JSON");
-    let hashes = described["type_hashes"].as_array().expect("hashes");
-    let ours = hashes.iter().find(|hash| hash["type_name"] == name).expect("its hash");
-    ours["hash_string"].as_str().expect("a hash").to_owned()
 }

@@ -12,36 +12,25 @@ pub struct Rights {
     pub takes: Vec<String>,
     /// Keys under which samples are sent.
     pub sends: Vec<String>,
-    /// Keys of services that are answered.
-    pub answers: Vec<String>,
 }
 
-/// The tokens by which nodes of ROS 2 show themselves.
-const ROS_TOKENS: &str = "@ros2_lv/**";
 /// All keys that others may ask about: `**` does not match a part that begins with `@`.
-const ALL_KEYS: [&str; 3] = ["**", "**/@adv/**", ROS_TOKENS];
+const ALL_KEYS: [&str; 2] = ["**", "**/@adv/**"];
 
 /// The part `access_control` of Zenoh's configuration. With TLS, `names` are the common names of the certificates that take
 /// part.
 pub(super) fn access_control(rights: &Rights, names: Option<&[String]>) -> Value {
-    let Rights { takes, sends, answers } = rights;
-    // What publishers keep for subscribers that come later, and the tokens of such publishers.
-    let [taken, sent] = [takes, sends].map(|keys| keys.iter().map(|key| format!("{key}/@adv/**")).collect::<Vec<_>>());
-    let all_keys = ALL_KEYS.map(String::from).to_vec();
-    let wanted: [(&str, &[&str], Vec<String>); 13] = [
+    let Rights { takes, sends } = rights;
+    // The last samples of publishers that keep them for readers that come later, and the tokens of such publishers.
+    let kept: Vec<String> = sends.iter().map(|key| format!("{key}/@adv/**")).collect();
+    let asked: Vec<String> = if sends.is_empty() { vec![] } else { ALL_KEYS.map(String::from).to_vec() };
+    let wanted: [(&str, &[&str], Vec<String>); 6] = [
         ("egress", &["declare_subscriber"], takes.clone()),
-        ("egress", &["query"], [takes.as_slice(), &taken].concat()),
-        ("egress", &["declare_liveliness_subscriber", "liveliness_query"], taken.clone()),
         ("ingress", &["put"], takes.clone()),
-        ("ingress", &["reply"], [takes.as_slice(), &taken].concat()),
-        ("ingress", &["declare_queryable", "liveliness_token"], taken),
         ("egress", &["put"], sends.clone()),
-        ("egress", &["reply"], [sends.as_slice(), &sent, answers].concat()),
-        ("egress", &["declare_queryable"], [sent.as_slice(), answers].concat()),
-        ("egress", &["liveliness_token"], [sent.as_slice(), &[ROS_TOKENS.into()]].concat()),
-        ("ingress", &["declare_liveliness_subscriber", "liveliness_query"], all_keys.clone()),
-        ("ingress", &["declare_subscriber"], if sends.is_empty() { vec![] } else { all_keys.clone() }),
-        ("ingress", &["query"], if sends.is_empty() && answers.is_empty() { vec![] } else { all_keys }),
+        ("egress", &["reply"], [sends.as_slice(), &kept].concat()),
+        ("egress", &["declare_queryable", "liveliness_token"], kept),
+        ("ingress", &["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"], asked),
     ];
     let rules: Vec<Value> = wanted
         .iter()
