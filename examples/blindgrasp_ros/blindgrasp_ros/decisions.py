@@ -128,10 +128,12 @@ def follow(command, take, has_ended):
         with subprocess.Popen(dying, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as child:
             for line in child.stdout:
                 try:
-                    take(json.loads(line))
+                    found = json.loads(line)
                 except ValueError:
                     # A warning, an error, or a line that was cut off.
                     said = line.strip()
+                    continue
+                take(found)
         has_ended(said)
         time.sleep(RETRY_S)
 

@@ -37,10 +37,10 @@ fn cdr_of(frame: &Stamped<TactileFrame>) -> String {
 struct Peer(Child, BufReader<std::process::ChildStdout>);
 
 impl Peer {
-    /// Runs a program in Python, with a port and more words.
-    fn of_script(script: &str, port: u16, words: &[&str]) -> Peer {
+    /// Runs a program in Python, with a port.
+    fn of_script(script: &str, port: u16) -> Peer {
         let mut command = Command::new(python());
-        command.args(["-c", script, &port.to_string()]).args(words).stdin(Stdio::piped()).stdout(Stdio::piped());
+        command.args(["-c", script, &port.to_string()]).stdin(Stdio::piped()).stdout(Stdio::piped());
         let mut child = command.spawn().expect("started");
         let stdout = BufReader::new(child.stdout.take().expect("stdout"));
         Peer(child, stdout)
@@ -185,7 +185,7 @@ time.sleep(60)
 ";
     let folder = tempfile::tempdir().expect("a folder");
     let port = free_port();
-    let mut peer = Peer::of_script(CLIENT, port, &[]);
+    let mut peer = Peer::of_script(CLIENT, port);
     let mut stdin = peer.0.stdin.take().expect("stdin");
     assert_eq!(peer.line(), Value::Null);
     let connect = format!("connect: tcp/127.0.0.1:{port}");
