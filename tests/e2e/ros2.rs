@@ -1,6 +1,7 @@
 //! The package blindgrasp_ros with an installation of ROS 2: rclpy, Fast DDS and the generators of messages of Kilted, as PyPI has
 //! them for x86-64.
 
+use std::collections::{BTreeMap, VecDeque};
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Stdio};
@@ -95,9 +96,12 @@ rclpy.spin(node)
 /// In place of a graph: the same decision about one grasp after the other.
 const DECISIONS: &str = "
 import itertools, sys, time, rclpy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from blindgrasp_msgs.msg import Decision
 rclpy.init()
-decisions = rclpy.create_node('arbiter').create_publisher(Decision, '/blindgrasp/decision', 10)
+qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+node = rclpy.create_node('arbiter')
+decisions = node.create_publisher(Decision, '/blindgrasp/decision', qos)
 for grasp_id in itertools.count():
     time.sleep(0.2)
     decision = Decision(grasp_id=grasp_id, action=getattr(Decision, sys.argv[1]), reason='stable')
@@ -153,7 +157,7 @@ impl Node {
     }
 
     fn lines(&mut self) -> Lines {
-        Lines(BufReader::new(self.0.stdout.take().expect("stdout")))
+        Lines { reader: BufReader::new(self.0.stdout.take().expect("stdout")), values: BTreeMap::new() }
     }
 
     /// It ends as any program when it is asked to, without a traceback.
@@ -163,22 +167,30 @@ impl Node {
     }
 }
 
-/// Lines of JSON.
-struct Lines(BufReader<ChildStdout>);
+/// Lines of JSON, each with a value of a key.
+struct Lines {
+    reader: BufReader<ChildStdout>,
+    /// The values that were not waited for yet.
+    values: BTreeMap<String, VecDeque<Value>>,
+}
 
 impl Lines {
-    /// The lines up to one with this value, the last of them.
+    /// Waits for this value of a key.
     fn until(&mut self, key: &str, expected: &Value) {
-        let mut seen = Vec::new();
         loop {
-            let mut line = String::new();
-            self.0.read_line(&mut line).expect("read");
-            let found: Value =
-                serde_json::from_str(&line).unwrap_or_else(|error| panic!("{line:?}, after {seen:?}: {error}"));
-            if found.get(key) == Some(expected) {
-                return;
+            let values = self.values.entry(key.into()).or_default();
+            while let Some(found) = values.pop_front() {
+                if found == *expected {
+                    return;
+                }
             }
-            seen.push(found);
+            let mut line = String::new();
+            self.reader.read_line(&mut line).expect("read");
+            let found: BTreeMap<String, Value> =
+                serde_json::from_str(&line).unwrap_or_else(|error| panic!("{line:?} before {key} {expected}: {error}"));
+            for (key, value) in found {
+                self.values.entry(key).or_default().push_back(value);
+            }
         }
     }
 }
@@ -317,10 +329,9 @@ fn no_lift_outlives_the_graph_or_its_node(built: &Path) {
     heard.until("state", &json!([2]));
     let mut late = Node::start(&["-c", LISTENER], domain, Some(built));
     late.lines().until("decision", &no_graph);
-    let mut asks_late = late.0.stdin.take().expect("stdin");
-    writeln!(asks_late, "0.1").expect("written");
     writeln!(asks, "0.1").expect("written");
     heard.until("decided", &json!([false, 0, 0, ""]));
+    // Nothing is kept for later nodes, and no reader of the graph stays, when the node is killed.
     decisions.0.kill().expect("killed");
     decisions.0.wait().expect("ended");
     hand.stop();
