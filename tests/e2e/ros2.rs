@@ -14,8 +14,8 @@ use crate::common::{Graph, program, project, skipped, undisturbed, unique_name, 
 use blindgrasp_stages::hand::Hand;
 
 const N_GRASPS: u64 = 3;
-/// Each frame is waited for.
-const PATIENT: [&str; 2] = ["--set", "lift_arbiter.max_gap_ms=20000"];
+/// Each frame is waited for, and the service is asked for a decision that is still valid.
+const PATIENT: [&str; 4] = ["--set", "lift_arbiter.max_gap_ms=20000", "--set", "lift_arbiter.max_age_ms=600000"];
 /// The cells and the angles of the driver have one time each, and its phases come in time.
 const TABLE: &str = "
 cells:
@@ -252,15 +252,14 @@ fn robots_of_dds_are_gated_by_the_package_of_ros_2() {
     compile(&messages, &folder.path().join("build"), &built);
     compile(&package, &folder.path().join("build_control"), &built);
     std::thread::scope(|scope| {
-        scope.spawn(|| no_lift_outlives_the_graph_or_its_node(&built));
+        scope.spawn(|| no_lift_outlives_the_graph(&built));
         scope.spawn(|| the_gate_of_the_arm_lifts_on_a_fresh_lift_alone(&built));
         scope.spawn(|| the_gate_of_the_gripper_lets_only_a_lift_succeed(&built));
     });
 }
 
-/// Frames come from topics, and decisions go to a topic. When the graph ends, and when the node of decisions is killed, no LIFT
-/// stays.
-fn no_lift_outlives_the_graph_or_its_node(built: &Path) {
+/// Frames come from topics, and decisions go to a topic. When the graph ends, no LIFT stays.
+fn no_lift_outlives_the_graph(built: &Path) {
     let domain = domain(0);
     let folder = tempfile::tempdir().expect("a folder");
     let table = folder.path().join("topics.yaml");
@@ -272,14 +271,47 @@ fn no_lift_outlives_the_graph_or_its_node(built: &Path) {
     let address = format!("127.0.0.1:{port}");
     let hand = Node::of_package("hand", &[table.to_str().expect("UTF-8"), "--address", &address], domain, None);
     let of_graph = [&graph.name, "--program", program(), "--outputs", "decision", "tactile", "contacts"];
-    let mut decisions = Node::of_package("decisions", &of_graph, domain, Some(built));
+    let decisions = Node::of_package("decisions", &of_graph, domain, Some(built));
     let mut listener = Node::start(&["-c", LISTENER], domain, Some(built));
     let mut heard = listener.lines();
     let no_graph = json!([0, 0, "no_graph"]);
     heard.until("decision", &no_graph);
-    // The state of the graph comes from the same connection as its samples.
+    // The first state comes a second after the node has begun to read the graph's samples.
     heard.until("state", &json!([0]));
+    send_frames(&graph, domain);
+    wait_until(|| graph.n_decisions() as u64 == N_GRASPS, || graph.said());
+    let mut last = Value::Null;
+    for (line, (action, reason)) in graph.lines().iter().zip(&undisturbed()[..N_GRASPS as usize]) {
+        assert_eq!((&line["action"], &line["reason"]), (&json!(action), &json!(reason)), "{line}");
+        last = json!([line["grasp_id"], u8::from(action == "lift"), reason]);
+        heard.until("decision", &last);
+    }
+    for (topic, shows) in [("joint_states", json!(7)), ("cell_points", json!(96)), ("hand_markers", json!(true))] {
+        heard.until(topic, &shows);
+    }
+    heard.until("contacts", &json!(true));
+    let mut asks = listener.0.stdin.take().expect("stdin");
+    writeln!(asks, "1").expect("written");
+    let words = last.as_array().expect("a list");
+    heard.until("decided", &json!([true, words[0], words[1], words[2]]));
+    // A node that comes later gets the last decision.
+    let mut late = Node::start(&["-c", LISTENER], domain, Some(built));
+    late.lines().until("decision", &last);
+    drop(late);
 
+    graph.stop();
+    heard.until("decision", &no_graph);
+    heard.until("state", &json!([2]));
+    let mut late = Node::start(&["-c", LISTENER], domain, Some(built));
+    late.lines().until("decision", &no_graph);
+    writeln!(asks, "0.1").expect("written");
+    heard.until("decided", &json!([false, 0, 0, ""]));
+    decisions.stop();
+    hand.stop();
+}
+
+/// The driver of a hand sends the frames of the first grasps, each until the graph has accepted one.
+fn send_frames(graph: &Graph, domain: u32) {
     let driver = project().join("tests/ros2_driver.py").display().to_string();
     let mut driver = Node::start(&[&driver], domain, None);
     let mut answers = BufReader::new(driver.0.stdout.take().expect("stdout"));
@@ -308,33 +340,6 @@ fn no_lift_outlives_the_graph_or_its_node(built: &Path) {
         };
         wait_until(&mut has_come, || format!("frame {n_before} has not come: {}", graph.said()));
     }
-    wait_until(|| graph.n_decisions() as u64 == N_GRASPS, || graph.said());
-    let mut last = Value::Null;
-    for (line, (action, reason)) in graph.lines().iter().zip(&undisturbed()[..N_GRASPS as usize]) {
-        assert_eq!((&line["action"], &line["reason"]), (&json!(action), &json!(reason)), "{line}");
-        last = json!([line["grasp_id"], u8::from(action == "lift"), reason]);
-        heard.until("decision", &last);
-    }
-    let mut asks = listener.0.stdin.take().expect("stdin");
-    writeln!(asks, "1").expect("written");
-    let words = last.as_array().expect("a list");
-    heard.until("decided", &json!([true, words[0], words[1], words[2]]));
-    // A node that comes later gets the last decision, and topics of the hand.
-    let mut late = Node::start(&["-c", LISTENER], domain, Some(built));
-    late.lines().until("decision", &last);
-    drop(late);
-
-    graph.stop();
-    heard.until("decision", &no_graph);
-    heard.until("state", &json!([2]));
-    let mut late = Node::start(&["-c", LISTENER], domain, Some(built));
-    late.lines().until("decision", &no_graph);
-    writeln!(asks, "0.1").expect("written");
-    heard.until("decided", &json!([false, 0, 0, ""]));
-    // Nothing is kept for later nodes, and no reader of the graph stays, when the node is killed.
-    decisions.0.kill().expect("killed");
-    decisions.0.wait().expect("ended");
-    hand.stop();
 }
 
 /// The gate of the arm lifts what it should.
