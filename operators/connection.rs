@@ -4,10 +4,10 @@ use std::net::IpAddr;
 use std::path::PathBuf;
 
 use blindgrasp_graph::link::config::{KeyFiles, ROUTER_COMMON_NAME, key_files};
+use blindgrasp_graph::link::network::{Keys, Network, NetworkError};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_ros::network::{Keys, Network, NetworkError};
 use serde::Deserialize;
 
 /// The port of Zenoh.

@@ -22,6 +22,7 @@ mod ros_messages;
 mod run;
 mod schema;
 mod set;
+mod standard_messages;
 mod stop;
 mod swap;
 mod test;

@@ -10,6 +10,8 @@ use blindgrasp_recording::cdr;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_viewer::Channel;
 
+use super::standard_messages::definition_of;
+
 /// The hand is drawn at most so often: its markers are large.
 const MARKER_PAUSE: Duration = Duration::from_millis(33);
 const POINTS: &str = "/contact_points";
@@ -52,7 +54,7 @@ impl RosMessages {
             (MARKERS, "visualization_msgs/msg/MarkerArray"),
         ];
         for (topic, schema) in &standard[..if hand.is_some() { 4 } else { 1 }] {
-            let definition = blindgrasp_ros::standard::text(schema).unwrap_or_default();
+            let definition = definition_of(schema).unwrap_or_default();
             channels.push(Channel { topic: (*topic).into(), schema: (*schema).into(), definition });
         }
         let joint_names = hand.iter().flat_map(|hand| &hand.joints).map(|joint| joint.name.clone()).collect();

@@ -8,13 +8,13 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::bail;
 use blindgrasp_bridge::outside::{KeyPublisher, Quality};
+use blindgrasp_graph::link::network::NetworkError;
 use blindgrasp_messages::{Header, Message, Stamped};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::port::Subscriber;
 use blindgrasp_operator::source::{self, Source, Step};
-use blindgrasp_ros::network::NetworkError;
 use zenoh::Session;
 
 /// The pause between two attempts to reach the router.

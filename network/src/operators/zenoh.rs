@@ -2,6 +2,7 @@
 
 use anyhow::ensure;
 use blindgrasp_bridge::outside::{Quality, Rights, open};
+use blindgrasp_graph::link::network::Network;
 use blindgrasp_messages::{
     ContactSet, GraspFeature, Header, LiftDecision, Message, Prediction, Recorded, Stamped, TactileFrame,
 };
@@ -11,7 +12,6 @@ use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operators::beginning::FileNode;
 use blindgrasp_operators::connection::{ConnectionParams, warn_if_open, with_connection_params};
-use blindgrasp_ros::network::Network;
 use serde::{Deserialize, Serialize};
 
 use super::publishing::{Encode, Forward, Outside, check_inputs, edge, publish};

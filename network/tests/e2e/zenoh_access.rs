@@ -6,7 +6,7 @@ use std::process::{Command, Stdio};
 use blindgrasp_bridge::keys::revoke;
 use blindgrasp_bridge::outside::{Rights, open};
 use blindgrasp_graph::link::config::{KeyFiles, key_files};
-use blindgrasp_ros::network::{Keys, Network};
+use blindgrasp_graph::link::network::{Keys, Network};
 use serde_json::{Value, json};
 use time::OffsetDateTime;
 use zenoh::{Session, Wait};

@@ -2,7 +2,7 @@
 
 mod access;
 
-use blindgrasp_ros::network::{Keys, Network, NetworkError};
+use blindgrasp_graph::link::network::{Keys, Network, NetworkError};
 use serde_json::json;
 use zenoh::bytes::Encoding;
 use zenoh::qos::{CongestionControl, Priority};

@@ -60,7 +60,7 @@ const TYPES: [Standard; 3] = [
 ];
 
 /// The definition of a standard type, with those of the types in it.
-pub fn text(name: &str) -> Option<String> {
+pub(super) fn definition_of(name: &str) -> Option<String> {
     let (_, fields, parts) = TYPES.iter().find(|(known, ..)| *known == name)?;
     let mut text = (*fields).to_owned();
     for (part, fields) in PARTS.iter().filter(|(part, _)| parts.contains(part)) {
