@@ -7,7 +7,7 @@ use std::hash::{BuildHasher, RandomState};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::bail;
-use blindgrasp_bridge::outside::{KeyPublisher, Quality};
+use blindgrasp_bridge::outside::KeyPublisher;
 use blindgrasp_graph::link::network::NetworkError;
 use blindgrasp_messages::{Header, Message, Stamped};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -82,25 +82,26 @@ pub(super) enum Forwarded {
 struct Edge<M: Message> {
     name: &'static str,
     subscriber: Subscriber<M>,
-    quality: Quality,
+    is_kept: bool,
     encode: Encode<M>,
     publisher: Option<KeyPublisher>,
 }
 
-/// The input `name`, whose samples go to the key `PREFIX/name`, if it is connected.
+/// The input `name`, whose samples go to the key `PREFIX/name`, if it is connected. Others than `is_kept` ones are dropped where
+/// the network has no room.
 pub(super) fn edge<M: Message>(
     operator: &Operator,
     name: &'static str,
-    quality: Quality,
+    is_kept: bool,
     encode: Encode<M>,
 ) -> anyhow::Result<Option<Box<dyn Forward>>> {
     let Some(subscriber) = operator.optional_subscriber::<M>(name)? else { return Ok(None) };
-    Ok(Some(Box::new(Edge { name, subscriber, quality, encode, publisher: None })))
+    Ok(Some(Box::new(Edge { name, subscriber, is_kept, encode, publisher: None })))
 }
 
 impl<M: Message> Forward for Edge<M> {
     fn open(&mut self, session: &Session, prefix: &str) -> Result<(), NetworkError> {
-        self.publisher = Some(KeyPublisher::new(session, &format!("{prefix}/{}", self.name), self.quality)?);
+        self.publisher = Some(KeyPublisher::new(session, &format!("{prefix}/{}", self.name), self.is_kept)?);
         Ok(())
     }
 

@@ -1,7 +1,7 @@
 //! Publishes samples of the graph as JSON on keys of Zenoh. It reads nothing from the network.
 
 use anyhow::ensure;
-use blindgrasp_bridge::outside::{Quality, Rights, open};
+use blindgrasp_bridge::outside::{Rights, open};
 use blindgrasp_graph::link::network::Network;
 use blindgrasp_messages::{
     ContactSet, GraspFeature, Header, LiftDecision, Message, Prediction, Recorded, Stamped, TactileFrame,
@@ -94,7 +94,7 @@ fn json_edge<M: Message + Serialize>(
     name: &'static str,
 ) -> anyhow::Result<Option<Box<dyn Forward>>> {
     let encode: Encode<M> = Box::new(|Stamped { header, message }, data| write_json(header, None, message, data));
-    edge(operator, name, Quality::Sensor, encode)
+    edge(operator, name, false, encode)
 }
 
 /// The input of decisions: none is published as a lift once its time is over.
@@ -105,7 +105,7 @@ fn decision_edge(operator: &Operator) -> anyhow::Result<Option<Box<dyn Forward>>
         decision.expire(until_nanos, now_nanos);
         write_json(header, Some(until_nanos.unwrap_or(0).saturating_sub(now_nanos)), &decision, data)
     });
-    edge(operator, "decision", Quality::KeepLast, encode)
+    edge(operator, "decision", true, encode)
 }
 
 fn write_json(

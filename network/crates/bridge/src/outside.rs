@@ -5,9 +5,9 @@ mod access;
 use blindgrasp_graph::link::network::{Keys, Network, NetworkError};
 use serde_json::json;
 use zenoh::bytes::Encoding;
+use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Config, Session, Wait};
-use zenoh_ext::{AdvancedPublisher, AdvancedPublisherBuilderExt as _, CacheConfig};
 
 pub use access::Rights;
 use access::access_control;
@@ -84,35 +84,23 @@ pub fn open(network: &Network, rights: &Rights) -> Result<Session, NetworkError>
     zenoh::open(config).wait().map_err(refused)
 }
 
-/// Whether none of its samples is dropped where the network has no room, and a reader that comes later gets the last one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Quality {
-    Sensor,
-    KeepLast,
-}
-
 /// Sends samples to a key.
 pub struct KeyPublisher {
-    publisher: AdvancedPublisher<'static>,
+    publisher: Publisher<'static>,
 }
 
 impl KeyPublisher {
-    /// A publisher of JSON.
+    /// A publisher of JSON. Where the network has no room, it waits with a sample if these are kept, and drops any other.
     ///
     /// # Errors
     /// It is no key, or Zenoh refuses it.
-    pub fn new(session: &Session, key: &str, quality: Quality) -> Result<KeyPublisher, NetworkError> {
-        let builder = session.declare_publisher(key.to_owned()).encoding(Encoding::APPLICATION_JSON);
-        let builder = match quality {
-            Quality::Sensor => builder.congestion_control(CongestionControl::Drop).advanced(),
-            Quality::KeepLast => builder
-                .congestion_control(CongestionControl::Block)
-                .priority(Priority::InteractiveHigh)
-                .express(true)
-                .advanced()
-                .cache(CacheConfig::default().max_samples(1))
-                .publisher_detection(),
-        };
+    pub fn new(session: &Session, key: &str, is_kept: bool) -> Result<KeyPublisher, NetworkError> {
+        let mut builder = session.declare_publisher(key.to_owned()).encoding(Encoding::APPLICATION_JSON);
+        builder = builder.congestion_control(CongestionControl::Drop);
+        if is_kept {
+            builder =
+                builder.congestion_control(CongestionControl::Block).priority(Priority::InteractiveHigh).express(true);
+        }
         Ok(KeyPublisher { publisher: builder.wait().map_err(of_zenoh)? })
     }
 

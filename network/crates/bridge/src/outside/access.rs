@@ -14,30 +14,23 @@ pub struct Rights {
     pub sends: Vec<String>,
 }
 
-/// All keys that others may ask about: `**` does not match a part that begins with `@`.
-const ALL_KEYS: [&str; 2] = ["**", "**/@adv/**"];
-
 /// The part `access_control` of Zenoh's configuration. With TLS, `names` are the common names of the certificates that take
 /// part.
 pub(super) fn access_control(rights: &Rights, names: Option<&[String]>) -> Value {
     let Rights { takes, sends } = rights;
-    // The last samples of publishers that keep them for readers that come later, and the tokens of such publishers.
-    let kept: Vec<String> = sends.iter().map(|key| format!("{key}/@adv/**")).collect();
-    let asked: Vec<String> = if sends.is_empty() { vec![] } else { ALL_KEYS.map(String::from).to_vec() };
-    let wanted: [(&str, &[&str], Vec<String>); 6] = [
-        ("egress", &["declare_subscriber"], takes.clone()),
-        ("ingress", &["put"], takes.clone()),
-        ("egress", &["put"], sends.clone()),
-        ("egress", &["reply"], [sends.as_slice(), &kept].concat()),
-        ("egress", &["declare_queryable", "liveliness_token"], kept),
-        ("ingress", &["declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"], asked),
+    let asked = if sends.is_empty() { vec![] } else { vec!["**".to_owned()] };
+    let wanted = [
+        ("egress", "declare_subscriber", takes),
+        ("ingress", "put", takes),
+        ("egress", "put", sends),
+        ("ingress", "declare_subscriber", &asked),
     ];
     let rules: Vec<Value> = wanted
         .iter()
         .filter(|(_, _, keys)| !keys.is_empty())
         .enumerate()
-        .map(|(idx, (flow, messages, keys))| {
-            json!({"id": idx.to_string(), "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys})
+        .map(|(idx, (flow, message, keys))| {
+            json!({"id": idx.to_string(), "permission": "allow", "flows": [flow], "messages": [message], "key_exprs": keys})
         })
         .collect();
     let ids: Vec<&Value> = rules.iter().map(|rule| &rule["id"]).collect();
