@@ -22,7 +22,9 @@ def actions(context):
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
 
     def node(executable, *arguments):
-        return Node(package="blindgrasp_ros", executable=executable, arguments=list(arguments), output="screen")
+        arguments = list(arguments)
+        # A node of decisions that starts again says first that none is valid.
+        return Node(package="blindgrasp_ros", executable=executable, arguments=arguments, output="screen", respawn=True, respawn_delay=1.0)
 
     def option(name):
         return [f"--{name.replace('_', '-')}", given[name]] if given[name] else []
