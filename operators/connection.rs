@@ -4,13 +4,13 @@ use std::net::IpAddr;
 use std::path::PathBuf;
 
 use blindgrasp_graph::link::config::{KeyFiles, ROUTER_COMMON_NAME, key_files};
+use blindgrasp_graph::link::network::{Keys, Network, NetworkError};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_ros::network::{Keys, MAX_DOMAIN, Network, RosError};
 use serde::Deserialize;
 
-/// The router of rmw_zenoh.
+/// The port of Zenoh.
 const ROUTER: &str = "tcp/localhost:7447";
 /// The name of this program's files in a folder of keys.
 const KEY_NAME: &str = "ros2";
@@ -18,7 +18,7 @@ const KEY_NAME: &str = "ros2";
 /// A connection: the router on this machine by default.
 #[derive(Debug, Deserialize, Clone, Default)]
 pub struct ConnectionParams {
-    /// A router or node, like `tcp/localhost:7447`.
+    /// A router or program, like `tcp/localhost:7447`.
     pub connect: Option<String>,
     /// An endpoint at which others connect.
     pub listen: Option<String>,
@@ -31,7 +31,7 @@ pub struct ConnectionParams {
 /// Adds the parameters of a connection.
 pub fn with_connection_params(description: OperatorDescription) -> OperatorDescription {
     description
-        .optional_param("connect", ParamKind::String {}, "A Zenoh router or node, like tcp/localhost:7447, the default")
+        .optional_param("connect", ParamKind::String {}, "A router or program of Zenoh, like tcp/localhost:7447, the default")
         .optional_param("listen", ParamKind::String {}, "An endpoint at which others connect, like tcp/127.0.0.1:7448")
         .optional_param(
             "keys",
@@ -46,28 +46,12 @@ pub fn with_connection_params(description: OperatorDescription) -> OperatorDescr
         )
 }
 
-/// Adds the parameters of a connection to ROS 2.
-pub fn with_network_params(description: OperatorDescription) -> OperatorDescription {
-    with_connection_params(description)
-        .optional_param(
-            "convention",
-            ParamKind::Choice { values: vec!["rmw_zenoh".into(), "ros2dds".into()] },
-            "The speaker of Zenoh: the nodes, by rmw_zenoh (default), or a zenoh-bridge-ros2dds for nodes of DDS",
-        )
-        .optional_param(
-            "domain",
-            ParamKind::Integer { min: Some(0), max: Some(MAX_DOMAIN.into()) },
-            "The ROS domain, 0 by default",
-        )
-        .optional_param("namespace", ParamKind::String {}, "Before the names of topics, /blindgrasp by default")
-}
-
 impl ConnectionParams {
     /// The network.
     ///
     /// # Errors
     /// An endpoint is not valid, or the keys are of no use to it.
-    pub fn network(&self) -> Result<Network, RosError> {
+    pub fn network(&self) -> Result<Network, NetworkError> {
         let keys = self.keys.as_deref().map(|folder| {
             let KeyFiles { authority, certificate, private_key } = key_files(folder, KEY_NAME);
             Keys { authority, certificate, private_key }
@@ -78,13 +62,13 @@ impl ConnectionParams {
             (None, None) => vec![ROUTER.to_owned()],
         };
         if keys.is_none() && self.from.is_some() {
-            return Err(RosError::Keys(
+            return Err(NetworkError::Keys(
                 "'from' without keys: names come from certificates, so give 'keys' as well".into(),
             ));
         }
         let has_tls = connect.iter().chain(&self.listen).any(|endpoint| endpoint.starts_with("tls/"));
         if keys.is_some() && !has_tls {
-            return Err(RosError::Keys(
+            return Err(NetworkError::Keys(
                 "keys without an endpoint that uses them: expected 'connect' or 'listen' like tls/HOST:PORT, or no keys".into(),
             ));
         }
@@ -95,7 +79,7 @@ impl ConnectionParams {
             (None, None) => vec![],
         };
         if names.iter().any(String::is_empty) {
-            return Err(RosError::Keys(
+            return Err(NetworkError::Keys(
                 "'from' has an empty name: expected names of certificates, like ros2,arm".into(),
             ));
         }
@@ -131,7 +115,7 @@ mod tests {
 
     use super::*;
 
-    fn params(yaml: &serde_json::Value) -> Result<Network, RosError> {
+    fn params(yaml: &serde_json::Value) -> Result<Network, NetworkError> {
         serde_json::from_value::<ConnectionParams>(yaml.clone()).expect("params").network()
     }
 

@@ -274,19 +274,14 @@ impl<'a> Check<'a> {
     fn network(&mut self, part: &Part) {
         let driver = part.params.get("driver").and_then(Value::as_str).unwrap_or_default();
         let speaks_zenoh = match part.operator.as_str() {
-            "ros2" | "zenoh" => true,
-            "tactile_source" => matches!(driver, "ros2" | "zenoh"),
+            "zenoh" => true,
+            "tactile_source" => driver == "zenoh",
             _ => return,
         };
         if !speaks_zenoh {
             if part.params.contains_key("keys") {
                 let message = format!("its keys protect nothing: the driver {driver} has no TLS");
-                self.refuse(
-                    MisfitKind::Network,
-                    part,
-                    message,
-                    "leave out keys, or use the driver zenoh or ros2".into(),
-                );
+                self.refuse(MisfitKind::Network, part, message, "leave out keys, or use the driver zenoh".into());
             }
             return;
         }
@@ -510,7 +505,7 @@ mod tests {
     fn keys_that_protect_nothing_are_refused_and_a_list_of_revoked_certificates_is_warned_of() {
         let fit = |operator: &str, params: &[(&str, &str)]| check_fit(&[part(operator, params, &[])]);
         for (operator, params) in [
-            ("ros2", &[("keys", "/k")][..]),
+            ("zenoh", &[("keys", "/k")][..]),
             ("zenoh", &[("keys", "/k"), ("listen", "tcp/127.0.0.1:1")]),
             ("tactile_source", &[("driver", "zenoh"), ("keys", "/k"), ("connect", "tcp/127.0.0.1:1")]),
             ("tactile_source", &[("driver", "listen"), ("keys", "/k")]),

@@ -11,17 +11,13 @@ pub const NETWORK_PROGRAM: &str = "blindgrasp-network";
 pub const CHECK: &str = "--check";
 
 /// Their names, each with its program.
-pub const OTHER_HOUSES: [(&str, &str); 4] = [
-    ("simulated_hand", LAB_PROGRAM),
-    ("ros2", NETWORK_PROGRAM),
-    ("zenoh", NETWORK_PROGRAM),
-    (LINK_OPERATOR, NETWORK_PROGRAM),
-];
+pub const OTHER_HOUSES: [(&str, &str); 3] =
+    [("simulated_hand", LAB_PROGRAM), ("zenoh", NETWORK_PROGRAM), (LINK_OPERATOR, NETWORK_PROGRAM)];
 
 /// The other program that runs an operator with these params; `None` for one of the robot's and for an unknown name.
 pub fn house_of(name: &str, params: Option<&Map<String, Value>>) -> Option<&'static str> {
     let driver = params.and_then(|params| params.get("driver")?.as_str());
-    if name == "tactile_source" && matches!(driver, Some("ros2" | "zenoh")) {
+    if name == "tactile_source" && driver == Some("zenoh") {
         return Some(NETWORK_PROGRAM);
     }
     OTHER_HOUSES.iter().find(|(other, _)| *other == name).map(|(_, program)| *program)
@@ -47,7 +43,7 @@ mod tests {
     #[test]
     fn the_driver_of_a_source_says_whose_it_is() {
         let house = |params: Value| house_of("tactile_source", params.as_object());
-        assert_eq!(house(json!({"driver": "ros2"})), Some(NETWORK_PROGRAM));
+        assert_eq!(house(json!({"driver": "zenoh"})), Some(NETWORK_PROGRAM));
         assert_eq!(house(json!({"driver": "listen"})), None);
         assert_eq!((house_of("tactile_source", None), house_of("contacts", None)), (None, None));
         assert_eq!(house_of("simulated_hand", None), Some(LAB_PROGRAM));

@@ -4,7 +4,7 @@
 //! arbiter holds the grasp it belonged to. The source finds a lost sender again by itself. A source that is started again
 //! after a crash, or swapped in, goes on with the numbers and grasps of the one before, after a gap.
 //!
-//! The drivers ros2 and zenoh are those of the network's program, which runs the same source with them.
+//! The driver zenoh is that of the network's program, which runs the same source with it.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -32,10 +32,10 @@ use serde::Deserialize;
 use serde_json::{Map, Value};
 
 use crate::beginning::FileNode;
-use crate::connection::{with_connection_params, with_network_params};
+use crate::connection::with_connection_params;
 use crate::houses::NETWORK_PROGRAM;
 
-const DRIVERS: [&str; 5] = ["listen", "connect", "serial", "ros2", "zenoh"];
+const DRIVERS: [&str; 4] = ["listen", "connect", "serial", "zenoh"];
 const DEFAULT_BAUD: u32 = 115_200;
 /// The parameters that the source has with each driver.
 const COMMON_PARAMS: [&str; 5] = ["driver", "hand", "max_delay_ms", "day", "zero_when_open"];
@@ -128,54 +128,7 @@ pub fn describe() -> OperatorDescription {
             "Whether the mean reading of each cell while the hand is open is its zero, for sensors whose readings drift",
         )
         .optional_param("key", ParamKind::String {}, "zenoh: the key expression of the frames, like hand/frames");
-    with_ros2_params(with_network_params(description))
-}
-
-fn with_ros2_params(mut description: OperatorDescription) -> OperatorDescription {
-    for (name, summary) in [
-        ("joints_topic", "ros2: sensor_msgs/msg/JointState, /joint_states by default"),
-        ("joint_prefix", "ros2: before the hand's names of its joints, like left_"),
-        ("cells_topic", "ros2: the readings of all cells, pad after pad in the hand's order"),
-        ("cells_type", "ros2: the type of cells_topic, std_msgs/msg/Float64MultiArray by default"),
-        ("cells_field", "ros2: the field with the readings, data by default, like taxels.force"),
-        ("phase_topic", "ros2: std_msgs/msg/String with the phase; inferred from the fingers' motion without it"),
-        ("wrench_topic", "ros2: geometry_msgs/msg/WrenchStamped of the wrist, in the palm frame"),
-        ("imu_topic", "ros2: sensor_msgs/msg/Imu of the palm, in the palm frame"),
-        (
-            "gravity_frame",
-            "ros2: a frame of /tf whose z axis points upwards, like world: gravity in the palm frame comes from it",
-        ),
-        ("palm_frame", "ros2: the palm frame in /tf, the hand's palm link by default"),
-        ("tf_topic", "ros2: tf2_msgs/msg/TFMessage, /tf by default"),
-    ] {
-        description = description.optional_param(name, ParamKind::String {}, summary);
-    }
-    description
-        .optional_param(
-            "joint_map",
-            file(true),
-            "ros2: the joints whose values or names differ on joints_topic (YAML): {JOINT: {from: NAME, scale: 1, offset: 0}}",
-        )
-        .optional_param(
-            "cells_definition",
-            file(true),
-            "ros2: the definition of cells_type (ros2msg), if it is no standard one",
-        )
-        .optional_param(
-            "tolerance_ms",
-            millis(0.1),
-            "ros2: the greatest distance in time of cells and joint angles, 20 by default",
-        )
-        .optional_param(
-            "moving_rad_per_s",
-            ParamKind::Number { above: Some(0.0), min: None, max: None, words: vec![] },
-            "ros2: a joint that is slower stands still, where the phase is inferred; 0.05 by default",
-        )
-        .optional_param(
-            "still_ms",
-            millis(1.0),
-            "ros2: fingers that stood still for so long are settled; 200 by default",
-        )
+    with_connection_params(description)
 }
 
 pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
@@ -269,7 +222,6 @@ fn params_of(driver: &str) -> Vec<String> {
     let connection = match driver {
         "listen" | "connect" => return vec!["address".into(), "idle_limit_ms".into()],
         "serial" => return vec!["device".into(), "baud".into(), "idle_limit_ms".into()],
-        "ros2" => with_network_params(connection),
         "zenoh" => with_connection_params(connection),
         _ => connection,
     };
@@ -531,14 +483,14 @@ impl RefusalLog {
 mod tests {
     use super::*;
 
-    /// The summaries tell the params of the driver ros2 from others.
+    /// The summaries tell the params of the driver zenoh from others.
     #[test]
     fn each_param_is_of_a_driver_or_of_all() {
         let of_drivers = DRIVERS.map(params_of).concat();
         for param in describe().params {
             assert!(COMMON_PARAMS.contains(&param.name.as_str()) || of_drivers.contains(&param.name), "{}", param.name);
         }
-        assert!(params_of("ros2").contains(&"still_ms".into()) && !params_of("ros2").contains(&"key".into()));
+        assert!(params_of("zenoh").contains(&"key".into()) && !params_of("serial").contains(&"key".into()));
         let refused = refuse_unused("listen", &Map::from_iter([("keys".into(), "/k".into())]));
         let message = "param 'keys' is of no use to driver listen, which takes address, idle_limit_ms: leave it out";
         assert_eq!(refused.expect_err("refused").to_string(), message);

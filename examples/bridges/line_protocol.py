@@ -151,8 +151,7 @@ class Source:
 
 
 class MotionPhase:
-    """The phase by the fingers' motion, as the driver `ros2` of blindgrasp finds it (network/src/drivers/phases.rs), but for the
-    beginning: the hand must open first."""
+    """The phase by the fingers' motion, for hands that do not tell it. The hand must open first."""
 
     WINDOW_NANOS = 50_000_000
     # After such a silence nobody knows what the hand did.

@@ -6,7 +6,7 @@
 
 The fingertips send their packets by USB; the gripper is asked for its state by Modbus RTU, and nothing is written to it:
 another program closes it. Where that program holds the port, run the maker's ROS 2 drivers and
-`ros2.py robotiq-2f85-tsf85.yaml` in place of this bridge. The phase comes from the gripper's own word for an object (gOBJ).
+`ros2 run blindgrasp_ros hand robotiq-2f85-tsf85.yaml` in place of this bridge. The phase comes from the gripper's own word for an object (gOBJ).
 
 Packets are those of the maker's SDK (robotiq/tactile_sensors), registers those of the gripper's manual. Neither gives newtons
 for the readings, so --newtons-per-count is assumed until you measure it.

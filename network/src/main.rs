@@ -1,4 +1,4 @@
-//! `blindgrasp-network`: the program of other machines and ROS 2. `blindgrasp` hands over to it.
+//! `blindgrasp-network`: the program of other machines and Zenoh. `blindgrasp` hands over to it.
 
 mod commands;
 mod drivers;

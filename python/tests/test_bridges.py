@@ -27,11 +27,11 @@ from ruamel.yaml import YAML
 
 PROJECT = Path(__file__).resolve().parents[2]
 BRIDGES = PROJECT / "examples/bridges"
-sys.path.insert(0, str(BRIDGES))
+sys.path[:0] = [str(BRIDGES), str(PROJECT / "examples/blindgrasp_ros")]
 import inspire_rh56dftp as inspire  # noqa: E402
 import line_protocol  # noqa: E402
 import robotiq_2f85_tsf85 as robotiq  # noqa: E402
-import ros2  # noqa: E402
+from blindgrasp_ros import hand as ros_hand  # noqa: E402
 
 DATAFLOW = """
 version: 1
@@ -393,7 +393,7 @@ class Robotiq(unittest.TestCase):
 
 
 class Tables(unittest.TestCase):
-    """The tables for ros2.py fit the layouts."""
+    """The tables for ROS 2 fit the layouts."""
 
     def test_joints_and_cells(self):
         pads = lambda n, size, **parts: [Message(**{name: [of_cell] * size for name, of_cell in parts.items()})] * n
@@ -406,7 +406,7 @@ class Tables(unittest.TestCase):
             layout = YAML(typ="safe").load(PROJECT / f"hands/{hand}.yaml")
             table = YAML(typ="safe").load(BRIDGES / f"{hand}.yaml")
             # An unknown joint is an error.
-            frames = ros2.Frames(table, {"joints": layout["joints"]})
+            frames = ros_hand.Frames(table, {"joints": layout["joints"]})
             frames.take_cells(0, message, 1)
             [(cells, _)] = frames.cells
             n_cells = cells_of(hand).total()

@@ -1,4 +1,4 @@
-"""Tests of examples/bridges/ros2.py and line_protocol.py with stand-ins for rclpy and for the source that they feed."""
+"""Tests of the node `hand` of examples/blindgrasp_ros and of line_protocol.py with stand-ins for rclpy and for the source that they feed."""
 
 import contextlib
 import importlib.util
@@ -8,6 +8,7 @@ import math
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -19,11 +20,10 @@ from pathlib import Path
 from types import SimpleNamespace as Message
 from unittest import mock
 
-BRIDGES = Path(__file__).resolve().parents[2] / "examples/bridges"
-sys.path.insert(0, str(BRIDGES))
-SPEC = importlib.util.spec_from_file_location("ros2_bridge", BRIDGES / "ros2.py")
-bridge = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(bridge)
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+BRIDGES = EXAMPLES / "bridges"
+sys.path.insert(0, str(EXAMPLES / "blindgrasp_ros"))
+from blindgrasp_ros import hand as bridge  # noqa: E402
 
 HAND = {"hand": "gripper", "n_joints": 2, "n_cells": 4, "joints": ["jaw", "wrist"]}
 TABLE = {
@@ -175,13 +175,71 @@ class Frames(unittest.TestCase):
         self.frames.take_joints(joints(later), later, sender="simulation")
         self.assertIsNotNone(self.send(later))
 
+    def test_a_frame_has_the_senses_that_the_table_names(self):
+        table = {**TABLE, "wrench": {"topic": "/wrench"}, "imu": {"topic": "/imu"}}
+        self.frames = bridge.Frames(table, HAND)
+        self.frames.take_joints(joints(self.t), self.t)
+        vector = lambda *values: Message(**dict(zip("xyz", values)))
+        wrench = Message(header=header(self.t), wrench=Message(force=vector(1.0, 2.0, 3.0), torque=vector(4.0, 5.0, 6.0)))
+        self.assertIsNone(self.send(self.t))
+        self.frames.take_wrench(wrench, self.t)
+        self.frames.take_imu(Message(header=header(self.t), linear_acceleration=vector(0.0, 0.0, 9.8)), self.t)
+        frame = self.send(self.t)
+        self.assertEqual((frame["wrist_wrench"], frame["gravity_m_per_s2"]), ([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [-0.0, -0.0, -9.8]))
+        self.assertIsNone(self.send(self.t + 30 * MILLI))
+        self.assertEqual(self.frames.dropped["no message on /wrench within 20 ms (tolerance_ms)"], 2)
+
+    def test_transforms_tell_gravity_while_they_are_new(self):
+        self.frames = bridge.Frames({**TABLE, "gravity": {"frame": "world", "palm": "palm"}}, HAND)
+        turned = 0.5**0.5
+
+        def transform(parent, child, nanos, x=0.0, z=0.0):
+            rotation = Message(x=x, y=0.0, z=z, w=turned)
+            kept = Message(header=Message(stamp=header(nanos).stamp, frame_id=parent), child_frame_id=child)
+            kept.transform = Message(rotation=rotation)
+            return Message(transforms=[kept])
+
+        def gravity(at):
+            self.frames.take_joints(joints(at), at)
+            frame = self.send(at)
+            return frame and [round(value, 6) + 0.0 for value in frame["gravity_m_per_s2"]]
+
+        # The arm is turned by 90 degrees about x; the palm is fixed to it, turned by 90 degrees about z.
+        self.frames.take_transforms(transform("arm", "palm", 0, z=turned), self.t, "b", True)
+        self.assertIsNone(gravity(self.t))
+        self.frames.take_transforms(transform("world", "arm", self.t, x=turned), self.t, "a", False)
+        self.assertEqual(gravity(self.t + 100 * MILLI), [-9.81, 0.0, 0.0])
+        self.assertIsNone(gravity(self.t + 1000 * MILLI))
+        self.assertEqual(self.frames.dropped["no transforms from palm up to world, each from one node and within 100 ms"], 2)
+        later = self.t + 1000 * MILLI
+        self.frames.take_transforms(transform("world", "arm", later, x=turned), later, "c", False)
+        self.assertIsNone(gravity(later))
+        self.assertEqual(self.frames.dropped["two nodes send the transform of arm: stop one"], 1)
+        later += 2000 * MILLI
+        self.frames.take_transforms(transform("world", "arm", later, x=turned), later, "c", False)
+        self.assertEqual(gravity(later), [-9.81, 0.0, 0.0])
+
+    def test_cells_come_as_pixels_and_points(self):
+        image = Message(encoding="16UC1", is_bigendian=0, height=2, width=2, step=6, data=[1, 0, 2, 1, 9, 9, 3, 0, 4, 0])
+        self.assertEqual(bridge.packed(image, "data"), [1.0, 258.0, 3.0, 4.0])
+        fields = [Message(name="x", offset=0, datatype=7), Message(name="force", offset=4, datatype=8)]
+        data = b"".join(struct.pack(">fd", 9.0, force) for force in (0.5, -1.5))
+        cloud = Message(fields=fields, is_bigendian=True, height=1, width=2, point_step=12, row_step=24, data=data)
+        self.assertEqual(bridge.packed(cloud, "force"), [0.5, -1.5])
+        for field, data in [("other", data), ("force", data[:-1])]:
+            with self.assertRaisesRegex(ValueError, "a field of the PointCloud2|23 bytes for 1 x 2"):
+                bridge.packed(Message(**{**vars(cloud), "data": data}), field)
+        self.frames = bridge.Frames({"cells": [{"topic": "/skin", "type": "sensor_msgs/msg/Image", "scale": 0.5}]}, HAND)
+        self.frames.take_cells(0, image, self.t)
+        self.assertEqual(self.frames.cells[0][0], [0.5, 129.0, 1.5, 2.0])
+
     def test_mistakes_in_the_table_are_told(self):
         cells = {"topic": "/left"}
         for table, expected in [
             ([], "the table: [], expected a mapping with joints, cells"),
             ({}, "the table: `cells` is missing"),
             ({"cells": cells}, "the table: cells: {'topic': '/left'}, expected a list of topics"),
-            ({"cells": [cells], "tolerence_ms": 1}, "the table: unknown key `tolerence_ms`, expected joints, cells, phase, tolerance_ms"),
+            ({"cells": [cells], "tolerence_ms": 1}, "the table: unknown key `tolerence_ms`, expected joints, cells, phase, wrench, imu, gravity, tolerance_ms"),
             ({"cells": [cells, {**cells, "scael": 0.01}]}, "cells[1]: unknown key `scael`, expected topic, type, field"),
             ({"cells": [{"type": "my_msgs/msg/Touch"}]}, "cells[0]: `topic` is missing"),
             ({"cells": [{**cells, "type": "my_msgs/Touch"}]}, "cells[0]: type: 'my_msgs/Touch', expected a type such as"),

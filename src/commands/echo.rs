@@ -1,5 +1,7 @@
 //! `blindgrasp echo`
 
+use std::fmt::Write as _;
+use std::hash::{BuildHasher, RandomState};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -9,11 +11,14 @@ use clap::Args;
 
 use super::elsewhere::MachineArgument;
 use super::export::json_line;
+use super::ros_messages::RosMessages;
+use super::view::live::hand_of;
 use super::{Outcome, completions, secs_in, stop_signal};
 use blindgrasp_graph::client::observer::{Observer, Sink};
 use blindgrasp_graph::client::{Connection, Heard, pick_graph};
-use blindgrasp_messages::Record;
+use blindgrasp_messages::{Record, with_sample};
 use blindgrasp_operator::diagnostics::{LinePrinter, print_diagnostic};
+use serde_json::json;
 
 const POLL: Duration = Duration::from_millis(20);
 /// This many lines wait for the reader of stdout.
@@ -40,6 +45,12 @@ pub(super) struct Arguments {
     /// Graph [default: the only one running]
     #[arg(short, long, add = completions::graphs())]
     graph: Option<String>,
+    /// Print messages of ROS 2, as blindgrasp_ros publishes them
+    ///
+    /// A line is {"topic", "type", "cdr"}, the message in hexadecimal. A decision is {"decision": {…}, "valid_until_nanos"}: nobody
+    /// may act upon it later (CLOCK_BOOTTIME).
+    #[arg(long)]
+    cdr: bool,
     #[command(flatten)]
     machine: MachineArgument,
 }
@@ -48,6 +59,9 @@ pub(super) struct Arguments {
 struct Echo {
     printer: LinePrinter,
     n_left: Arc<AtomicU64>,
+    messages: Option<RosMessages>,
+    /// The key of the hashes that stand for the graph's epochs.
+    epochs: RandomState,
 }
 
 impl Sink for Echo {
@@ -57,8 +71,34 @@ impl Sink for Echo {
             self.n_left.store(0, Ordering::Relaxed);
         }
         if self.n_left.load(Ordering::Relaxed) > 0 {
-            self.printer.print(&json_line(topic, &record)?);
+            self.print(topic, record)?;
             self.n_left.fetch_sub(1, Ordering::Relaxed);
+        }
+        Ok(())
+    }
+}
+
+impl Echo {
+    fn print(&mut self, topic: &str, mut record: Record) -> anyhow::Result<()> {
+        let Some(messages) = &mut self.messages else {
+            self.printer.print(&json_line(topic, &record)?);
+            return Ok(());
+        };
+        if let Record::Decision(sample) = &record {
+            let until_nanos = sample.header.valid_until_nanos();
+            self.printer.print(&json!({"decision": sample.message, "valid_until_nanos": until_nanos}).to_string());
+            return Ok(());
+        }
+        // Others can read the topics, and a user of this machine who forges samples needs the epoch.
+        with_sample!(&mut record, sample => sample.header.epoch = self.epochs.hash_one(sample.header.epoch));
+        for (channel, data) in messages.of(topic, &record, |_| true) {
+            let channel = &messages.channels[channel];
+            let mut line = format!(r#"{{"topic":"{}","type":"{}","cdr":""#, channel.topic, channel.schema);
+            for byte in data {
+                write!(line, "{byte:02x}")?;
+            }
+            line.push_str("\"}");
+            self.printer.print(&line);
         }
         Ok(())
     }
@@ -74,7 +114,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let attachment = connection.attach(&arguments.edges, false)?;
     let n_left = Arc::new(AtomicU64::new(arguments.samples.unwrap_or(u64::MAX)));
     let printer = LinePrinter::new(std::io::stdout(), MAX_UNREAD_LINES);
-    let echo = Echo { printer, n_left: Arc::clone(&n_left) };
+    let messages = arguments.cdr.then(|| RosMessages::new(&attachment.edges, hand_of(&attachment.graph).as_ref()));
+    let echo = Echo { printer, n_left: Arc::clone(&n_left), messages, epochs: RandomState::new() };
     let observer = Observer::start_attached(&attachment.domain, attachment.observed(), echo);
     let observer = observer.context("cannot read the graph's edges")?;
     let end = arguments.for_secs.map(|secs| Instant::now() + Duration::from_secs_f64(secs));

@@ -23,7 +23,7 @@ pub(super) struct Arguments {
     /// Add the files of another built-in hand, and its bridge.
     #[arg(long, value_name = "NAME", value_parser = PossibleValuesParser::new(builtin_names()))]
     hand: Option<String>,
-    /// Add the nodes for a robot in ROS 2: the bridge, the gates of arm and gripper, and the package of messages.
+    /// Add the packages for a robot in ROS 2: nodes, and messages.
     #[arg(long)]
     ros2: bool,
     /// Print JSON: {"folder", "files"}.
@@ -32,11 +32,10 @@ pub(super) struct Arguments {
 }
 
 /// The project's files: those that this repository's own default graph consists of.
-const FILES: [File; 11] = [
+const FILES: [File; 10] = [
     ("dataflow.yaml", include_bytes!("../../dataflow.yaml")),
     ("dataflow-live.yaml", include_bytes!("../../dataflow-live.yaml")),
     ("tactile_bridge.py", include_bytes!("../../examples/tactile_bridge.py")),
-    ("dataflow-ros2.yaml", include_bytes!("../../dataflow-ros2.yaml")),
     ("dataflow-machines.yaml", include_bytes!("../../dataflow-machines.yaml")),
     ("hands/barrett-bh8-280.yaml", include_bytes!("../../hands/barrett-bh8-280.yaml")),
     ("hands/barrett-bh8-280.urdf", include_bytes!("../../hands/barrett-bh8-280.urdf")),
@@ -60,25 +59,42 @@ const BRIDGES: [(&str, &[File]); 4] = [
         &[
             ("bridges/robotiq_2f85_tsf85.py", include_bytes!("../../examples/bridges/robotiq_2f85_tsf85.py")),
             ("bridges/robotiq-2f85-tsf85.yaml", include_bytes!("../../examples/bridges/robotiq-2f85-tsf85.yaml")),
-            ROS2,
             LINES,
         ],
     ),
     (
         "unitree-dex3-1",
-        &[("bridges/unitree-dex3-1.yaml", include_bytes!("../../examples/bridges/unitree-dex3-1.yaml")), ROS2, LINES],
+        &[("bridges/unitree-dex3-1.yaml", include_bytes!("../../examples/bridges/unitree-dex3-1.yaml"))],
     ),
-    ("uskin", &[("bridges/uskin.yaml", include_bytes!("../../examples/bridges/uskin.yaml")), ROS2, LINES]),
+    ("uskin", &[("bridges/uskin.yaml", include_bytes!("../../examples/bridges/uskin.yaml"))]),
 ];
 const LINES: File = ("bridges/line_protocol.py", include_bytes!("../../examples/bridges/line_protocol.py"));
-const ROS2: File = ("bridges/ros2.py", include_bytes!("../../examples/bridges/ros2.py"));
 
-/// The nodes of ROS 2. They and the bridge have the places in a project that the documents name.
-const ROS2_FILES: [File; 18] = [
-    ROS2,
-    LINES,
-    ("ros2_lift_gate.py", include_bytes!("../../examples/ros2_lift_gate.py")),
-    ("ros2_gripper_gate.py", include_bytes!("../../examples/ros2_gripper_gate.py")),
+/// The packages of ROS 2: nodes and messages.
+const ROS2_FILES: [File; 25] = [
+    ("blindgrasp_ros/blindgrasp_ros/line_protocol.py", LINES.1),
+    ("blindgrasp_ros/launch/gate.launch.py", include_bytes!("../../examples/blindgrasp_ros/launch/gate.launch.py")),
+    ("blindgrasp_ros/package.xml", include_bytes!("../../examples/blindgrasp_ros/package.xml")),
+    ("blindgrasp_ros/resource/blindgrasp_ros", include_bytes!("../../examples/blindgrasp_ros/resource/blindgrasp_ros")),
+    ("blindgrasp_ros/setup.cfg", include_bytes!("../../examples/blindgrasp_ros/setup.cfg")),
+    ("blindgrasp_ros/setup.py", include_bytes!("../../examples/blindgrasp_ros/setup.py")),
+    (
+        "blindgrasp_ros/blindgrasp_ros/__init__.py",
+        include_bytes!("../../examples/blindgrasp_ros/blindgrasp_ros/__init__.py"),
+    ),
+    (
+        "blindgrasp_ros/blindgrasp_ros/decisions.py",
+        include_bytes!("../../examples/blindgrasp_ros/blindgrasp_ros/decisions.py"),
+    ),
+    (
+        "blindgrasp_ros/blindgrasp_ros/gripper_gate.py",
+        include_bytes!("../../examples/blindgrasp_ros/blindgrasp_ros/gripper_gate.py"),
+    ),
+    ("blindgrasp_ros/blindgrasp_ros/hand.py", include_bytes!("../../examples/blindgrasp_ros/blindgrasp_ros/hand.py")),
+    (
+        "blindgrasp_ros/blindgrasp_ros/lift_gate.py",
+        include_bytes!("../../examples/blindgrasp_ros/blindgrasp_ros/lift_gate.py"),
+    ),
     ("blindgrasp_msgs/CMakeLists.txt", include_bytes!("../../examples/blindgrasp_msgs/CMakeLists.txt")),
     ("blindgrasp_msgs/package.xml", include_bytes!("../../examples/blindgrasp_msgs/package.xml")),
     ("blindgrasp_msgs/msg/Contact.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Contact.msg")),
@@ -120,7 +136,6 @@ blindgrasp stop
 | `dataflow.yaml` | the graph: which operators run, what they read, their parameters |
 | `dataflow-live.yaml` | the graph for a hand that lifts, with its model: a bridge sends the frames; `blindgrasp trials` tries it in simulated physics |
 | `tactile_bridge.py` | a bridge to begin with: `blindgrasp export recordings/held-out.mcap --topic /tactile \\| ./tactile_bridge.py` |
-| `dataflow-ros2.yaml` | the graph for a hand of a robot in ROS 2; `init --ros2` adds the nodes that run there |
 | `dataflow-machines.yaml` | the same graph on two machines |
 | `hands/` | the Barrett hand BH8-280: kinematics (URDF) and pad layout; describe your own beside it. `init --hand NAME` adds another one, with its bridge in `bridges/` |
 | `models/` | models of that hand: by the paper's label for `dataflow.yaml`, and of lifts (`…-lifts.json`) for an arm |
@@ -136,9 +151,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let mut files: Vec<(String, &[u8])> = FILES.iter().map(|(name, content)| ((*name).to_owned(), *content)).collect();
     // The dataflow files name it, for editors.
     files.push(("docs/dataflow.schema.json".into(), SCHEMA.as_bytes()));
-    let of_ros2: &[File] = if arguments.ros2 { &ROS2_FILES } else { &[] };
+    let of_hand: Vec<_> = arguments.hand.iter().flat_map(|hand| of_hand(hand)).collect();
+    // The table of a hand's topics is for a node of the package.
+    let has_table = of_hand.iter().any(|(name, _)| name.starts_with("bridges/") && name.ends_with(".yaml"));
+    let of_ros2: &[File] = if arguments.ros2 || has_table { &ROS2_FILES } else { &[] };
     let of_ros2 = of_ros2.iter().map(|(name, content)| ((*name).to_owned(), *content));
-    for file in arguments.hand.iter().flat_map(|hand| of_hand(hand)).chain(of_ros2) {
+    for file in of_hand.into_iter().chain(of_ros2) {
         if files.iter().all(|(name, _)| *name != file.0) {
             files.push(file);
         }

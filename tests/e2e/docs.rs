@@ -50,8 +50,7 @@ fn files_in_commands(text: &str) -> Vec<String> {
             let is_below = ["recordings/", "hands/", "bridges/"].iter().any(|folder| word.starts_with(folder));
             // Files that the commands before make.
             let is_made = ["recordings/robot", "recordings/run."].iter().any(|made| word.starts_with(made));
-            let is_program =
-                ["tactile_bridge", "ros2_"].iter().any(|name| word.starts_with(name)) && word.ends_with(".py");
+            let is_program = word.starts_with("tactile_bridge") && word.ends_with(".py");
             (is_below && !is_made) || is_program || word.starts_with("dataflow")
         };
         files.extend(words.filter(is_file).map(str::to_owned));

@@ -3,6 +3,10 @@
 use std::io::{BufRead, BufReader};
 use std::process::Stdio;
 
+use blindgrasp_messages::TactileFrame;
+use blindgrasp_recording::cdr;
+use serde_json::Value;
+
 use crate::common::{FAST_FOREVER, Graph, blindgrasp, fails, json_lines, project, run, text, unique_name};
 
 #[test]
@@ -28,6 +32,21 @@ fn the_samples_of_a_running_graph_are_printed_as_they_are() {
     for topic in ["/tactile", "/contacts", "/feature", "/prediction", "/decision", "/truth"] {
         assert!(lines.iter().any(|line| line["topic"] == topic), "{topic}");
     }
+    // Messages of ROS 2, whose readers do not learn the epoch, and decisions with the end of their time.
+    let epoch = lines.iter().find(|line| line["topic"] == "/tactile").expect("a frame")["epoch"].clone();
+    let messages = json_lines(&echo(&["--cdr", "--for", "0.5"]).stdout);
+    let hex_of =
+        |topic: &str| messages.iter().find(|line| line["topic"] == topic).and_then(|line| line["cdr"].as_str());
+    for topic in ["/contacts", "/joint_states", "/cell_points", "/contact_points", "/hand_markers"] {
+        assert!(hex_of(topic).is_some_and(|hex| hex.starts_with("00010000")), "{topic}");
+    }
+    let hex = hex_of("/tactile").expect("a frame");
+    let byte = |at: usize| u8::from_str_radix(&hex[at..at + 2], 16).expect("a byte");
+    let bytes: Vec<u8> = (0..hex.len()).step_by(2).map(byte).collect();
+    let frame = cdr::decode::<TactileFrame>(&bytes).expect("a message");
+    assert!(frame.message.joints.len() == 7 && epoch != frame.header.epoch, "{epoch}");
+    let is_decision = |line: &&Value| line["decision"]["action"].is_string() && line.get("valid_until_nanos").is_some();
+    assert!(messages.iter().any(|line| is_decision(&line)) && hex_of("/decision").is_none());
     // A name that only one output has is enough, as is its node.
     for name in ["decision", "/decision", "lift_arbiter"] {
         let lines = json_lines(&echo(&["-n", "2", name]).stdout);

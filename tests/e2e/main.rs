@@ -34,6 +34,7 @@ mod record;
 mod recording_files;
 mod regression;
 mod replay;
+mod ros2;
 mod sandbox;
 mod scaffold;
 mod schema;

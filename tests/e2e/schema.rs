@@ -29,7 +29,7 @@ fn errors(folder: &Path, contents: &[&str]) -> Vec<Vec<String>> {
 #[test]
 fn the_schema_accepts_good_files_and_names_mistakes() {
     let folder = tempfile::tempdir().expect("a folder");
-    let shipped = ["dataflow", "dataflow-live", "dataflow-machines", "dataflow-ros2"];
+    let shipped = ["dataflow", "dataflow-live", "dataflow-machines"];
     let mut files: Vec<String> =
         shipped.map(|name| std::fs::read_to_string(project().join(format!("{name}.yaml"))).expect("a file")).into();
     let good = &files[0];

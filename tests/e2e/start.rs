@@ -62,7 +62,7 @@ fn commands_of_other_programs_are_handed_over_or_say_what_to_install() {
     for (words, missing) in [
         (&["simulate", "--list"][..], "blindgrasp-lab"),
         (&["keys", "folder"], "blindgrasp-network"),
-        (&["run", "--check", "dataflow-ros2.yaml"], "blindgrasp-network"),
+        (&["run", "--check", "dataflow-live.yaml", "--set", "source.driver=zenoh"], "blindgrasp-network"),
     ] {
         let mut command = Command::new(&program_alone);
         let output = command.args(words).current_dir(crate::common::project()).output().expect("started");

@@ -1,5 +1,5 @@
 //! The three programs: `blindgrasp` for a robot, `blindgrasp-lab` for data and models, `blindgrasp-network` for other machines
-//! and ROS 2. People, launchers and scripts call `blindgrasp`, which hands over to the others.
+//! and Zenoh. People, launchers and scripts call `blindgrasp`, which hands over to the others.
 
 use std::borrow::Cow;
 use std::ffi::{OsStr, OsString};
@@ -33,19 +33,14 @@ pub const LAB: House = House {
     ],
 };
 
-pub const NETWORK: House = House {
-    program: NETWORK_PROGRAM,
-    commands: &[
-        ("diagnostics", "Publish a graph's state to ROS 2, on /diagnostics"),
-        ("keys", "Make keys and certificates for several machines"),
-    ],
-};
+pub const NETWORK: House =
+    House { program: NETWORK_PROGRAM, commands: &[("keys", "Make keys and certificates for several machines")] };
 
 pub const HOUSES: [&House; 2] = [&LAB, &NETWORK];
 
 /// The commands of all houses in the groups and the order of the help.
 pub const GROUPS: [(&str, &[&str]); 4] = [
-    ("Run", &["run", "ps", "top", "echo", "stop", "set", "swap", "logs", "doctor", "diagnostics"]),
+    ("Run", &["run", "ps", "top", "echo", "stop", "set", "swap", "logs", "doctor"]),
     ("Record", &["record", "replay", "test", "export", "info", "view"]),
     ("Learn", &["learn", "simulate", "import", "train", "evaluate", "predict", "trials", "model", "sensors"]),
     ("Describe", &["init", "new", "keys", "schema", "completions"]),

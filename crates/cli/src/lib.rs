@@ -2,7 +2,7 @@
 //!
 //! * [`houses`] - which program has which command, and the hand-over from `blindgrasp` to the two others.
 //! * [`help`], [`hints`], [`completions`], [`man`] - the command line explained: to a person, after a mistake, to a shell, on paper.
-//! * [`operator`] - the process of an operator. [`ros2_network`] - the options of a network of ROS 2.
+//! * [`operator`] - the process of an operator.
 //! * [`graph_file`] - dataflow files with the operators that come with blindgrasp, checked. [`frame_lines`] - frames as lines of JSON.
 
 pub mod completions;
@@ -13,7 +13,6 @@ pub mod hints;
 pub mod houses;
 pub mod man;
 pub mod operator;
-pub mod ros2_network;
 pub mod testing;
 
 use std::ffi::OsString;

@@ -2,6 +2,9 @@
 //! hand: layouts, definitions, recordings and the wire stay as they were. A message that gets another version is
 //! captured again with `BLINDGRASP_REMAKE=1`, and the difference is read.
 
+use std::collections::BTreeSet;
+use std::path::Path;
+
 use serde_json::{Map, Value, json};
 
 use crate::shared_memory::IntoBytes as _;
@@ -236,4 +239,33 @@ fn unknown_codes_and_lengths_that_cannot_be_are_refused() {
     assert_eq!(error, "object is not UTF-8");
     let long = GraspTruth { class: "a".repeat(MAX_NAME_BYTES + 1), ..GraspTruth::default() };
     assert_eq!(long.check().expect_err("too long").to_string(), "class has length 65, expected 0 to 64");
+}
+
+fn described<M: Recorded>() -> (&'static str, String) {
+    (M::SCHEMA, M::definition())
+}
+
+/// The package of messages for ROS 2 has the definitions of this version. With BLINDGRASP_REMAKE the files are written. Labels are
+/// not among them: a field is called `class`, which no program in C++ can have, and no topic carries them.
+#[test]
+fn the_package_of_messages_is_that_of_this_version() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/blindgrasp_msgs/msg");
+    let line = format!("{}\nMSG: blindgrasp_msgs/", "=".repeat(80));
+    let mut names = BTreeSet::from(["Decision".to_owned()]);
+    for (schema, definition) in of_each_type!(described) {
+        if schema == GraspTruth::SCHEMA {
+            continue;
+        }
+        let own = schema.rsplit('/').next().unwrap_or_default();
+        for section in format!("{own}\n{definition}").split(&line) {
+            let (name, fields) = section.split_once('\n').expect("a name and fields");
+            let path = folder.join(format!("{name}.msg"));
+            if std::env::var_os("BLINDGRASP_REMAKE").is_some() {
+                std::fs::write(&path, fields).expect("written");
+            }
+            assert_eq!(std::fs::read_to_string(&path).expect("readable"), fields, "{}", path.display());
+            names.insert(name.to_owned());
+        }
+    }
+    assert_eq!(std::fs::read_dir(folder).expect("a folder").count(), names.len());
 }

@@ -1,14 +1,12 @@
 //! The commands of the network's house, one file each.
 
-mod diagnostics;
 mod keys;
-mod robot_description;
 
-use blindgrasp_cli::{Outcome, completions, data_on_stdout, print_line, secs_in};
+use blindgrasp_cli::{Outcome, print_line};
 use blindgrasp_session::output::write_out;
 
 blindgrasp_cli::program! {
-    Diagnostics diagnostics, Keys keys; hidden RobotDescription robot_description;
+    Keys keys; hidden;
     operators crate::operators::SHIPPED; others &[]
 }
 

@@ -6,10 +6,10 @@ use std::sync::Arc;
 use rustix::event::{PollFd, PollFlags};
 
 use super::inbox::Inbox;
+use blindgrasp_bridge::outside::{Rights, open};
+use blindgrasp_graph::link::network::Network;
 use blindgrasp_messages::TactileFrame;
 use blindgrasp_recording::cdr;
-use blindgrasp_ros::network::Network;
-use blindgrasp_ros_node::node::{Rights, open};
 use blindgrasp_tactile::line_protocol::{max_line_bytes, parse};
 use blindgrasp_tactile::{
     Arrival, DriverError, Event, ExpectedHand, Place, Reading, Refusal, RefusalKind, TactileDriver,

@@ -1,20 +1,16 @@
 //! The operators that speak Zenoh.
 
-mod joint_map;
 mod link;
 mod publishing;
-mod ros2;
-mod ros2_decision;
 mod tactile_source;
 mod zenoh;
 
 use blindgrasp_graph::operators::LINK_OPERATOR;
 use blindgrasp_operators::{Shipped, tactile_source as source};
 
-/// All of them. `tactile_source` is the robot's; here it has the drivers ros2 and zenoh as well.
-pub(crate) const SHIPPED: [Shipped; 4] = [
+/// All of them. `tactile_source` is the robot's; here it has the driver zenoh as well.
+pub(crate) const SHIPPED: [Shipped; 3] = [
     Shipped::new("tactile_source", source::describe, tactile_source::work, tactile_source::check),
-    Shipped::new("ros2", ros2::describe, ros2::work, ros2::check),
     Shipped::new("zenoh", zenoh::describe, zenoh::work, zenoh::check),
     // The launcher adds it and gives it its params.
     Shipped::new(LINK_OPERATOR, link::describe, link::work, |_| Ok(())),

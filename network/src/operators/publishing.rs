@@ -1,4 +1,4 @@
-//! Publishes samples of a graph to programs outside of it, as topics of a ROS 2 node or as JSON on keys of Zenoh.
+//! Publishes samples of a graph to programs outside of it, as JSON on keys of Zenoh.
 //!
 //! The inputs must be `latest`: the network never holds up the graph.
 
@@ -7,14 +7,15 @@ use std::hash::{BuildHasher, RandomState};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::bail;
+use blindgrasp_bridge::outside::KeyPublisher;
+use blindgrasp_graph::link::network::NetworkError;
 use blindgrasp_messages::{Header, Message, Stamped};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::monotonic_nanos;
 use blindgrasp_operator::operator::Operator;
 use blindgrasp_operator::port::Subscriber;
 use blindgrasp_operator::source::{self, Source, Step};
-use blindgrasp_ros::network::RosError;
-use blindgrasp_ros_node::node::{KeyPublisher, MessageType, Quality, RosNode, RosPublisher, Session, topic_name};
+use zenoh::Session;
 
 /// The pause between two attempts to reach the router.
 const RETRY_NANOS: u64 = 1_000_000_000;
@@ -26,7 +27,7 @@ pub(super) fn publish(operator: &Operator, outside: Outside, edges: Vec<Box<dyn 
         outside,
         edges,
         epochs: RandomState::new(),
-        node: None,
+        session: None,
         retry_nanos: 0,
         said: None,
         n_published: 0,
@@ -54,26 +55,15 @@ pub(super) fn check_inputs<'a>(inputs: impl IntoIterator<Item = (&'a str, bool)>
     Ok(())
 }
 
-/// A topic that the samples of an edge make.
-pub(super) struct Topic<M> {
-    pub(super) name: &'static str,
-    /// The type in ROS 2; `None` for JSON.
-    pub(super) message: Option<MessageType>,
-    pub(super) quality: Quality,
-    pub(super) encode: Encode<M>,
-    /// Samples that come sooner after the last one make no message.
-    pub(super) interval_nanos: u64,
-}
-
 pub(super) type Encode<M> = Box<dyn Fn(&Stamped<M>, &mut Vec<u8>) -> Result<(), String>>;
 
-pub(super) fn unix_nanos() -> u64 {
+fn unix_nanos() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64
 }
 
-/// An input and its topics.
+/// An input and its key.
 pub(super) trait Forward {
-    fn open(&mut self, node: &mut Node, namespace: &str) -> Result<(), RosError>;
+    fn open(&mut self, session: &Session, prefix: &str) -> Result<(), NetworkError>;
     fn close(&mut self);
     fn connect(&mut self) -> anyhow::Result<()>;
     /// Publishes the next sample, if there is a session, with a hash of its epoch.
@@ -85,72 +75,38 @@ pub(super) trait Forward {
 pub(super) enum Forwarded {
     NoSample,
     Published,
-    /// There is no session, or the sample cannot be read, or it makes no message of a topic.
+    /// There is no session, or the sample cannot be read or written.
     Unpublished,
 }
 
 struct Edge<M: Message> {
+    name: &'static str,
     subscriber: Subscriber<M>,
-    topics: Vec<Topic<M>>,
-    publishers: Vec<Publisher>,
-    /// One for each topic.
-    states: Vec<TopicState>,
+    is_kept: bool,
+    encode: Encode<M>,
+    publisher: Option<KeyPublisher>,
 }
 
-#[derive(Clone, Default)]
-struct TopicState {
-    /// The time of the last sample that made a message.
-    sent_nanos: Option<u64>,
-    /// The last reason in the log why a sample makes no message.
-    said: Option<String>,
-}
-
-/// The graph as other programs see it.
-pub(super) enum Node {
-    /// Topics of a node, in CDR.
-    Ros(RosNode),
-    /// Keys, with JSON.
-    Json(Session),
-}
-
-enum Publisher {
-    Ros(RosPublisher),
-    Json(KeyPublisher),
-}
-
+/// The input `name`, whose samples go to the key `PREFIX/name`, if it is connected. Others than `is_kept` ones are dropped where
+/// the network has no room.
 pub(super) fn edge<M: Message>(
     operator: &Operator,
-    port: &str,
-    topics: Vec<Topic<M>>,
+    name: &'static str,
+    is_kept: bool,
+    encode: Encode<M>,
 ) -> anyhow::Result<Option<Box<dyn Forward>>> {
-    let subscriber = operator.optional_subscriber::<M>(port)?;
-    Ok(subscriber.map(|subscriber| {
-        let states = vec![TopicState::default(); topics.len()];
-        Box::new(Edge { subscriber, topics, publishers: Vec::new(), states }) as Box<dyn Forward>
-    }))
+    let Some(subscriber) = operator.optional_subscriber::<M>(name)? else { return Ok(None) };
+    Ok(Some(Box::new(Edge { name, subscriber, is_kept, encode, publisher: None })))
 }
 
 impl<M: Message> Forward for Edge<M> {
-    fn open(&mut self, node: &mut Node, namespace: &str) -> Result<(), RosError> {
-        let mut publishers = Vec::with_capacity(self.topics.len());
-        for topic in &self.topics {
-            publishers.push(match (&mut *node, &topic.message) {
-                (Node::Ros(node), Some(message)) => {
-                    Publisher::Ros(node.publisher(&topic_name(namespace, topic.name)?, message, topic.quality)?)
-                }
-                (Node::Ros(_), None) => return Err(RosError::Topic(topic.name.into())),
-                (Node::Json(session), _) => {
-                    let key = format!("{namespace}/{}", topic.name);
-                    Publisher::Json(KeyPublisher::new(session, &key, topic.quality)?)
-                }
-            });
-        }
-        self.publishers = publishers;
+    fn open(&mut self, session: &Session, prefix: &str) -> Result<(), NetworkError> {
+        self.publisher = Some(KeyPublisher::new(session, &format!("{prefix}/{}", self.name), self.is_kept)?);
         Ok(())
     }
 
     fn close(&mut self) {
-        self.publishers.clear();
+        self.publisher = None;
     }
 
     fn connect(&mut self) -> anyhow::Result<()> {
@@ -170,42 +126,23 @@ impl<M: Message> Forward for Edge<M> {
                 return Ok(Forwarded::Unpublished);
             }
         };
-        if self.publishers.is_empty() {
+        let Some(publisher) = &self.publisher else { return Ok(Forwarded::Unpublished) };
+        // Others can read the keys, and a user of this machine who forges samples needs the epoch.
+        let told = Header { epoch: epochs.hash_one(header.epoch), ..header };
+        if let Err(error) = (self.encode)(&Stamped { header: told, message }, data) {
+            print_diagnostic(&format!("sample {} is not published: {error}", header.seq));
             return Ok(Forwarded::Unpublished);
         }
-        // Others can read the topics, and a user of this machine who forges samples needs the epoch.
-        let told = Header { epoch: epochs.hash_one(header.epoch), ..header };
-        let stamped = Stamped { header: told, message };
-        let mut outcome = Forwarded::Published;
-        for ((topic, publisher), state) in self.topics.iter().zip(&mut self.publishers).zip(&mut self.states) {
-            if let Some(sent_nanos) = state.sent_nanos
-                && header.stamp_nanos.wrapping_sub(sent_nanos) < topic.interval_nanos
-            {
-                continue;
-            }
-            state.sent_nanos = Some(header.stamp_nanos);
-            if let Err(error) = (topic.encode)(&stamped, data) {
-                outcome = Forwarded::Unpublished;
-                if state.said.as_ref() != Some(&error) {
-                    print_diagnostic(&format!("sample {} is not published as {}: {error}", header.seq, topic.name));
-                    state.said = Some(error);
-                }
-                continue;
-            }
-            match publisher {
-                Publisher::Ros(publisher) => publisher.publish(data)?,
-                Publisher::Json(publisher) => publisher.publish(data, header.seq, unix_nanos())?,
-            }
-        }
-        Ok(outcome)
+        publisher.publish(data, header.seq, unix_nanos())?;
+        Ok(Forwarded::Published)
     }
 }
 
 /// How the graph becomes known to other programs.
 pub(super) struct Outside {
     /// Opens a session.
-    pub(super) open: Box<dyn Fn() -> Result<Node, RosError>>,
-    /// Before the names of topics or keys.
+    pub(super) open: Box<dyn Fn() -> Result<Session, NetworkError>>,
+    /// Before the names of keys.
     pub(super) prefix: String,
     /// A line for the log, once a session is open.
     pub(super) opened: String,
@@ -217,7 +154,7 @@ struct Publishing<'a> {
     edges: Vec<Box<dyn Forward>>,
     /// The key of the hashes that stand for the graph's epochs.
     epochs: RandomState,
-    node: Option<Node>,
+    session: Option<Session>,
     retry_nanos: u64,
     said: Option<String>,
     n_published: u64,
@@ -226,12 +163,12 @@ struct Publishing<'a> {
 }
 
 impl Publishing<'_> {
-    fn open(&mut self) -> Result<(), RosError> {
-        let mut node = (self.outside.open)()?;
+    fn open(&mut self) -> Result<(), NetworkError> {
+        let session = (self.outside.open)()?;
         for edge in &mut self.edges {
-            edge.open(&mut node, &self.outside.prefix)?;
+            edge.open(&session, &self.outside.prefix)?;
         }
-        self.node = Some(node);
+        self.session = Some(session);
         Ok(())
     }
 
@@ -260,7 +197,7 @@ impl Publishing<'_> {
 
     /// Opens the session, or tries again after a pause. Samples that come meanwhile are counted and not published.
     fn reach(&mut self) {
-        if self.node.is_some() || monotonic_nanos() < self.retry_nanos {
+        if self.session.is_some() || monotonic_nanos() < self.retry_nanos {
             return;
         }
         match self.open() {
@@ -303,7 +240,7 @@ impl Source for Publishing<'_> {
             }
         }
         self.edges.iter_mut().for_each(|edge| edge.close());
-        self.node = None;
+        self.session = None;
         self.report_counts();
     }
 }

@@ -1,6 +1,8 @@
 //! Publishes samples of the graph as JSON on keys of Zenoh. It reads nothing from the network.
 
-use anyhow::Context as _;
+use anyhow::ensure;
+use blindgrasp_bridge::outside::{Rights, open};
+use blindgrasp_graph::link::network::Network;
 use blindgrasp_messages::{
     ContactSet, GraspFeature, Header, LiftDecision, Message, Prediction, Recorded, Stamped, TactileFrame,
 };
@@ -10,11 +12,9 @@ use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operators::beginning::FileNode;
 use blindgrasp_operators::connection::{ConnectionParams, warn_if_open, with_connection_params};
-use blindgrasp_ros::network::Network;
-use blindgrasp_ros_node::node::{Quality, Rights, open, topic_name};
 use serde::{Deserialize, Serialize};
 
-use super::publishing::{Encode, Forward, Node, Outside, Topic, check_inputs, edge, publish};
+use super::publishing::{Encode, Forward, Outside, check_inputs, edge, publish};
 
 pub(crate) fn describe() -> OperatorDescription {
     let mut description = OperatorDescription::new("zenoh", "Publishes samples as JSON on keys of Zenoh");
@@ -53,7 +53,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     edges.extend(json_edge::<Prediction>(operator, "prediction")?);
     let opened = format!("publishes on {prefix}/*");
     let rights = Rights { sends: vec![format!("{prefix}/**")], ..Rights::default() };
-    let open = Box::new(move || Ok(Node::Json(open(&network, &rights)?)));
+    let open = Box::new(move || open(&network, &rights));
     publish(operator, Outside { open, prefix, opened }, edges)
 }
 
@@ -66,9 +66,14 @@ pub(crate) fn check(node: &FileNode) -> anyhow::Result<()> {
 fn network_and_prefix(params: Params) -> anyhow::Result<(Network, String)> {
     let network = params.connection.network()?;
     let prefix = params.prefix.unwrap_or_else(|| "blindgrasp".into());
-    // The words of a prefix are those of a topic's name.
-    topic_name("/", &format!("/{prefix}"))
-        .with_context(|| format!("prefix '{prefix}': expected words of letters, digits and _, with / between them"))?;
+    let is_word = |word: &str| {
+        word.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
+            && word.chars().all(|char| char.is_ascii_alphanumeric() || char == '_')
+    };
+    ensure!(
+        prefix.split('/').all(is_word),
+        "prefix '{prefix}': expected words of letters, digits and _, with / between them"
+    );
     Ok((network, prefix))
 }
 
@@ -89,7 +94,7 @@ fn json_edge<M: Message + Serialize>(
     name: &'static str,
 ) -> anyhow::Result<Option<Box<dyn Forward>>> {
     let encode: Encode<M> = Box::new(|Stamped { header, message }, data| write_json(header, None, message, data));
-    edge(operator, name, vec![Topic { name, message: None, quality: Quality::Sensor, encode, interval_nanos: 0 }])
+    edge(operator, name, false, encode)
 }
 
 /// The input of decisions: none is published as a lift once its time is over.
@@ -100,8 +105,7 @@ fn decision_edge(operator: &Operator) -> anyhow::Result<Option<Box<dyn Forward>>
         decision.expire(until_nanos, now_nanos);
         write_json(header, Some(until_nanos.unwrap_or(0).saturating_sub(now_nanos)), &decision, data)
     });
-    let name = "decision";
-    edge(operator, name, vec![Topic { name, message: None, quality: Quality::KeepLast(1), encode, interval_nanos: 0 }])
+    edge(operator, "decision", true, encode)
 }
 
 fn write_json(

@@ -267,14 +267,14 @@ impl ShownLog {
     }
 }
 
-/// The hand of the first node with a pad layout. A layout that cannot be read is said, and the page is without a hand.
-fn hand_of(graph: &Value) -> Option<Hand> {
+/// The hand of the first node with a pad layout. A layout that cannot be read is said, and nothing shows a hand.
+pub(in crate::commands) fn hand_of(graph: &Value) -> Option<Hand> {
     let nodes = graph["nodes"].as_array()?;
     let path = nodes.iter().find_map(|node| node["params"]["hand"].as_str())?;
     match Hand::load(Path::new(path)) {
         Ok(hand) => Some(hand),
         Err(error) => {
-            print_diagnostic(&format!("the page shows no hand: {:#}", anyhow::Error::from(error)));
+            print_diagnostic(&format!("no hand is shown: {:#}", anyhow::Error::from(error)));
             None
         }
     }
@@ -342,7 +342,7 @@ impl Sink for Reader {
         let hand_id = record.header().hand_id;
         let is_shown = hand_id == 0 || self.hand_id.is_none_or(|shown| shown == hand_id);
         if let Some(streams) = &mut self.streams {
-            streams.send(topic, &record, is_shown);
+            streams.send(topic, &record);
         }
         let judged = match (&mut self.shadow, &record) {
             (Some(judge), Record::Tactile(sample)) if is_shown => Some(judge.sample(sample)),

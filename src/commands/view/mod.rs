@@ -5,7 +5,7 @@ mod foxglove;
 mod graph;
 mod grasp;
 mod hand;
-mod live;
+pub(super) mod live;
 mod model;
 mod recorded;
 

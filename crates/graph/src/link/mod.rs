@@ -1,6 +1,8 @@
-//! One machine's part of a graph, and the configuration of the link that joins it to the others.
+//! One machine's part of a graph, and the configuration of the link that joins it to the others. Beside it, the way to programs
+//! that are no part of the graph.
 
 pub mod config;
+pub mod network;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;

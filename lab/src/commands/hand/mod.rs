@@ -4,7 +4,6 @@ mod draft;
 mod xacro;
 
 use std::collections::BTreeMap;
-use std::ffi::OsString;
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
@@ -18,8 +17,6 @@ use clap::Args;
 use nalgebra::{Point3, Unit, Vector3};
 use serde::Deserialize;
 
-use blindgrasp_cli::houses::NETWORK;
-use blindgrasp_cli::ros2_network::Ros2Network;
 use blindgrasp_cli::{check_free, in_shell, joint};
 
 use super::{Outcome, print_line, print_text};
@@ -35,7 +32,7 @@ use draft::Draft;
                   blindgrasp new hand my_gripper --urdf gripper.urdf.xacro --palm hand_base --open finger_joint=0.04 \\\n    \
                   --grid left_finger=4x3 --grid right_finger=4x3\n  \
                   blindgrasp new hand my_hand --urdf my_hand.urdf --cells cells.csv\n  \
-                  blindgrasp new hand my_hand --robot-description --base hand_base --cells cells.csv\n\n\
+                  blindgrasp new hand my_hand --urdf robot.urdf --base hand_base --cells cells.csv\n\n\
                   The table of cells has a column for each of: link, x, y, z (metres, in the link's frame), nx, ny, nz (the normal,\n\
                   out of the pad). It may have: pad, width and height (metres), ax, ay, az (the direction of the width), and\n\
                   threshold (newtons).")]
@@ -43,23 +40,11 @@ pub(super) struct Arguments {
     /// The folder to make; its last part is the hand's name.
     name: PathBuf,
     /// The hand's URDF. A name that ends in .xacro is expanded by the program xacro (from PyPI or ROS).
-    #[arg(long, value_name = "FILE", required_unless_present = "robot_description")]
-    urdf: Option<PathBuf>,
+    #[arg(long, value_name = "FILE")]
+    urdf: PathBuf,
     /// An argument of the xacro file. Can be repeated.
-    #[arg(long, value_name = "NAME:=VALUE", value_parser = xacro::argument, requires = "urdf")]
+    #[arg(long, value_name = "NAME:=VALUE", value_parser = xacro::argument)]
     xacro_arg: Vec<String>,
-    /// The URDF that a robot in ROS 2 publishes on this topic [default: /robot_description]
-    #[arg(
-        long,
-        value_name = "TOPIC",
-        num_args = 0..=1,
-        require_equals = true,
-        default_missing_value = "/robot_description",
-        conflicts_with = "urdf"
-    )]
-    robot_description: Option<String>,
-    #[command(flatten)]
-    network: Ros2Network,
     /// Table of the cells (CSV).
     #[arg(long, value_name = "FILE")]
     cells: Option<PathBuf>,
@@ -179,16 +164,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 
 /// The URDF of the hand, and the file that it is from.
 fn source_urdf(arguments: &Arguments) -> anyhow::Result<(PathBuf, String)> {
-    let (source, urdf) = match (&arguments.urdf, &arguments.robot_description) {
-        (Some(_), _) if !arguments.network.arguments().is_empty() => {
-            bail!("--connect, --keys and --domain are of no use to --urdf: they belong to --robot-description")
-        }
-        (Some(path), _) => (path.clone(), urdf_text(path, &arguments.xacro_arg)?),
-        (None, topic) => {
-            let topic = topic.as_deref().unwrap_or("/robot_description");
-            (PathBuf::from("robot_description.urdf"), described(topic, &arguments.network)?)
-        }
-    };
+    let (source, urdf) = (arguments.urdf.clone(), urdf_text(&arguments.urdf, &arguments.xacro_arg)?);
     let Some(base) = &arguments.base else { return Ok((source, urdf)) };
     let part = part_below(&urdf, base).map_err(|reason| anyhow::anyhow!("--base: {reason}"))?;
     Ok((source, part))
@@ -217,12 +193,6 @@ fn write_folder(
     let hand = Hand::load(&write("yaml", layout)?)?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     Ok(hand)
-}
-
-/// The URDF that a robot publishes, as its `robot_state_publisher` does.
-fn described(topic: &str, network: &Ros2Network) -> anyhow::Result<String> {
-    let topic = [OsString::from("robot-description"), topic.into()];
-    Ok(String::from_utf8(NETWORK.answer(topic.into_iter().chain(network.arguments()))?)?)
 }
 
 /// The text of the URDF. A xacro file is expanded.

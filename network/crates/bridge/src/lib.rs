@@ -16,6 +16,7 @@
 //! * [`peer`] - the state of another machine's link. `uplink`, `downlink` - the local ports of a channel; `spool` - the file of
 //!   the samples that a channel keeps.
 //!   `peer_connection` - the Zenoh side.
+//! * [`outside`] - sessions with programs that are no part of the graph.
 //! * [`operator`] - the process.
 
 pub mod access;
@@ -30,6 +31,7 @@ pub mod incoming;
 pub mod keys;
 pub mod operator;
 pub mod outgoing;
+pub mod outside;
 pub mod peer;
 mod peer_connection;
 pub mod protection;

@@ -1,12 +1,12 @@
-//! Who takes part in the sessions of `tactile_source`, `ros2` and `zenoh`: real Zenoh sessions over loopback.
+//! Who takes part in the sessions of `tactile_source` and `zenoh`: real Zenoh sessions over loopback.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
 
 use blindgrasp_bridge::keys::revoke;
+use blindgrasp_bridge::outside::{Rights, open};
 use blindgrasp_graph::link::config::{KeyFiles, key_files};
-use blindgrasp_ros::network::{Keys, Network};
-use blindgrasp_ros_node::node::{Rights, open};
+use blindgrasp_graph::link::network::{Keys, Network};
 use serde_json::{Value, json};
 use time::OffsetDateTime;
 use zenoh::{Session, Wait};

@@ -1,21 +1,18 @@
-#!/usr/bin/env python3
 """Gates every pick of MoveIt 2 by configuration: a node that is the gripper's controller for MoveIt.
 
-    python3 ros2_gripper_gate.py --controller /gripper_controller/gripper_cmd --grasps-below 0.03 \\
-        blindgrasp run dataflow-ros2.yaml --json
+    ros2 run blindgrasp_ros gripper_gate --controller /gripper_controller/gripper_cmd --grasps-below 0.03
 
 It serves the action `/grasp_gate/gripper_cmd` (control_msgs GripperCommand, or ParallelGripperCommand with --parallel;
 `--name left_gate` serves `/left_gate/gripper_cmd`), and
 passes each goal on to the real controller. A goal whose position is below --grasps-below (or above --grasps-above, for a
 gripper whose value grows as it closes) closes on an object: it succeeds only if the controller has closed the hand and a
-fresh LIFT of blindgrasp follows; everything else aborts it. MoveIt
+fresh LIFT follows on the topic of decisions; everything else aborts it. MoveIt
 executes no step after a controller that does not succeed, so the arm stays. Name the gate in moveit_controllers.yaml:
 
     grasp_gate: {type: GripperCommand, action_ns: gripper_cmd, joints: [finger_joint], default: true}
 
-The rest of the command line starts the graph, whose lines of JSON are the decisions. The graph ends with the node, however that
-ends (setpriv of util-linux), and the node with the graph: it rejects goals then, and its exit code is 1. It needs
-rclpy and control_msgs, in any RMW. The gate makes no test lift: use a model and an arbiter that decide when the hand is
+While no node publishes decisions, goals that close on an object are rejected. It needs rclpy, control_msgs and blindgrasp_msgs, in
+any RMW. The gate makes no test lift: use a model and an arbiter that decide when the hand is
 settled, and read what they promise (`blindgrasp model show`). MoveIt gives a gripper 1.1 times the planned duration and
 0.5 s: set `allowed_goal_duration_margin` of the controller to the seconds that --wait allows.
 
@@ -25,60 +22,48 @@ ros2_controllers say so only after `stall_timeout`, which is 1 s: set it to 0.2.
 
 import argparse
 import collections
-import json
 import math
-import subprocess
 import sys
 import threading
 import time
 
-LIFT = "lift"
 # Seconds between two looks whether a goal was cancelled, or a signal came.
 LOOK_S = 0.05
 # action_msgs/msg/GoalStatus
 SUCCEEDED = 4
-# Decisions after which another one follows.
-UNDECIDED = ("squeeze", "test_lift", "tighten", "set_down", "go_on")
-
-
-def boottime_nanos():
-    """The clock of `valid_until_nanos`."""
-    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+# blindgrasp_msgs/msg/Decision: of these, another decision follows squeeze, test_lift, tighten, set_down and go_on.
+LIFT, UNDECIDED = 1, (3, 4, 5, 6, 7)
+# The reason with which the node of decisions says that a graph has ended: the next one may count grasps anew.
+NO_GRAPH = "no_graph"
 
 
 class Decisions:
-    """The decisions of a graph, line by line, as they come."""
+    """The decisions of a graph, as they come."""
 
-    def __init__(self, lines):
+    def __init__(self):
         self.condition = threading.Condition()
         self.waiting = collections.deque()
         # The number of the newest grasp that was decided, or is being decided.
         self.newest = -1
         self.has_ended = False
-        threading.Thread(target=self.read, args=(lines,), daemon=True).start()
 
-    def read(self, lines):
-        for line in lines:
-            try:
-                decision = json.loads(line)
-            except ValueError:
-                continue
-            if isinstance(decision, dict) and "action" in decision:
-                with self.condition:
-                    self.waiting.append((time.monotonic(), decision))
-                    self.condition.notify_all()
+    def take(self, decision):
         with self.condition:
-            self.has_ended = True
+            if decision.reason == NO_GRAPH:
+                self.waiting.clear()
+                self.newest, self.has_ended = -1, True
+            else:
+                self.waiting.append((time.monotonic(), decision))
             self.condition.notify_all()
 
     def begin(self):
         """Forgets the decisions so far: those of the next grasp have a greater number."""
         with self.condition:
-            ids = [decision.get("grasp_id", -1) for _, decision in self.waiting]
-            self.newest = max([self.newest, *ids])
+            self.newest = max([self.newest, *(decision.grasp_id for _, decision in self.waiting)])
             self.waiting.clear()
+            self.has_ended = False
 
-    def may_lift(self, wait_s, is_cancelled, now_nanos=boottime_nanos):
+    def may_lift(self, wait_s, is_cancelled):
         """Whether the final decision of the newest grasp is a LIFT that is still valid, and the reason.
 
         A hold that came while the hand still closed may be of the grasp before: it counts if nothing follows it.
@@ -89,19 +74,21 @@ class Decisions:
         with self.condition:
             while True:
                 final = [
-                    (decision.get("grasp_id", -1), came, decision)
+                    (decision.grasp_id, came, decision)
                     for came, decision in self.waiting
-                    if decision["action"] not in UNDECIDED and decision.get("grasp_id", -1) > self.newest
+                    if decision.action not in UNDECIDED and decision.grasp_id > self.newest
                 ]
                 if final:
                     _, came, decision = max(final, key=lambda found: found[:2])
-                    if decision["action"] == LIFT:
-                        over_ms = (now_nanos() - decision.get("valid_until_nanos", 0)) / 1e6
+                    if decision.action == LIFT:
+                        # The clocks of two machines must agree (NTP).
+                        until_nanos = decision.valid_until.sec * 1_000_000_000 + decision.valid_until.nanosec
+                        over_ms = (time.time_ns() - until_nanos) / 1e6
                         if over_ms < 0:
-                            return True, decision.get("reason", "")
+                            return True, decision.reason
                         hint = "; a controller that says late that the hand stands needs a shorter stall_timeout" if came < closed else ""
                         return False, f"LIFT was valid until {over_ms:.0f} ms ago{hint}"
-                    why = decision.get("reason", "")
+                    why = decision.reason
                     if came >= closed:
                         return False, why
                 left = deadline - time.monotonic()
@@ -142,19 +129,24 @@ def positions_of(command, is_parallel):
     return list(command.position) if is_parallel else [command.position]
 
 
-def serve(arguments, decisions):
-    """Serves goals until a signal comes, or the graph has ended; whether it was the graph."""
+def serve(arguments):
+    """Serves goals until a signal comes."""
     import control_msgs.action
     import rclpy
+    from blindgrasp_msgs.msg import Decision
     from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
     from rclpy.executors import MultiThreadedExecutor
+    from rclpy.qos import DurabilityPolicy, QoSProfile
 
     # Humble has no ParallelGripperCommand.
     kind = getattr(control_msgs.action, "ParallelGripperCommand" if arguments.parallel else "GripperCommand")
     rclpy.init()
     node = rclpy.create_node(arguments.name)
     controller = ActionClient(node, kind, arguments.controller)
-    gate = Gate(decisions, grasps(arguments), arguments.wait)
+    decisions, is_grasp = Decisions(), grasps(arguments)
+    qos = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(Decision, arguments.decisions, decisions.take, qos)
+    gate = Gate(decisions, is_grasp, arguments.wait)
     busy = threading.Lock()
 
     def wait_for(future, meanwhile=lambda: None):
@@ -169,12 +161,12 @@ def serve(arguments, decisions):
 
     def take(goal):
         positions = positions_of(goal.command, arguments.parallel)
-        if decisions.has_ended:
-            why = "the graph has ended"
-        elif busy.locked():
+        if busy.locked():
             why = "another goal is executed"
         elif not positions or not all(map(math.isfinite, positions)):
             why = f"the positions {positions}, expected finite ones"
+        elif is_grasp(positions[0]) and not node.count_publishers(arguments.decisions):
+            why = f"no node publishes {arguments.decisions}"
         else:
             return GoalResponse.ACCEPT
         node.get_logger().warning(f"goal rejected: {why}")
@@ -229,20 +221,15 @@ def serve(arguments, decisions):
     executor = MultiThreadedExecutor(num_threads=4)
     executor.add_node(node)
     try:
-        while rclpy.ok() and (busy.locked() or not decisions.has_ended):
+        # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
+        while rclpy.ok():
             executor.spin_once(timeout_sec=1.0)
-        # The answers of the last goals still go out.
-        until = time.monotonic() + 0.5
-        while rclpy.ok() and time.monotonic() < until:
-            executor.spin_once(timeout_sec=0.1)
-        return rclpy.ok()
     except KeyboardInterrupt:
-        return False
+        pass
     except Exception:
         # A signal that ends ROS 2 makes rclpy raise one of several errors.
         if rclpy.ok():
             raise
-        return False
     finally:
         rclpy.try_shutdown()
 
@@ -256,25 +243,11 @@ def main():
     options.add_argument("--wait", type=float, default=3.0, help="seconds for a decision after the hand has closed")
     options.add_argument("--parallel", action="store_true", help="ParallelGripperCommand instead of GripperCommand")
     options.add_argument("--name", default="grasp_gate", help="of the node: each gripper has a gate of its own")
-    options.add_argument("graph", nargs=argparse.REMAINDER, help="the command whose lines are the decisions")
+    options.add_argument("--decisions", default="/blindgrasp/decision", help="the topic of decisions")
     # rclpy reads what follows --ros-args.
     own = sys.argv[1 : sys.argv.index("--ros-args")] if "--ros-args" in sys.argv else sys.argv[1:]
-    arguments = options.parse_args(own)
-    if not arguments.graph:
-        options.error("expected the command of the graph, such as: blindgrasp run dataflow-ros2.yaml --json")
-    # The graph gets SIGTERM if this process is killed.
-    graph = subprocess.Popen(["setpriv", "--pdeathsig", "TERM", *arguments.graph], stdout=subprocess.PIPE, text=True)
-    try:
-        has_graph_ended = serve(arguments, Decisions(graph.stdout))
-    finally:
-        graph.terminate()
-        code = graph.wait()
-    if has_graph_ended:
-        sys.exit(f"the graph has ended with the exit code {code}: read what it said, and start the gate again")
+    serve(options.parse_args(own))
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except KeyboardInterrupt:
-        sys.exit(130)
+    main()

@@ -1,16 +1,13 @@
-//! The way to nodes of ROS 2 and to keys of Zenoh: endpoints and keys, checked before there is a connection.
+//! The way to keys of Zenoh: endpoints and certificates, checked before there is a connection.
 
 use std::path::PathBuf;
 
-/// The domains that ROS 2 has.
-pub const MAX_DOMAIN: u32 = 232;
-
-/// The way to the other nodes.
+/// The way to other programs.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Network {
-    /// Endpoints of routers or nodes, like `tcp/localhost:7447`.
+    /// Endpoints of routers or programs, like `tcp/localhost:7447`.
     pub connect: Vec<String>,
-    /// Endpoints at which other nodes connect.
+    /// Endpoints at which others connect.
     pub listen: Vec<String>,
     pub keys: Option<Keys>,
     /// With keys: the common names of the certificates that take part.
@@ -26,7 +23,7 @@ pub struct Keys {
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum RosError {
+pub enum NetworkError {
     #[error("'{0}' is no endpoint: expected tcp/HOST:PORT without keys, or tls/HOST:PORT with keys")]
     Endpoint(String),
     #[error("{0}")]
@@ -34,13 +31,10 @@ pub enum RosError {
     #[error("{endpoints}: {message}")]
     Open { endpoints: String, message: String },
     #[error(
-        "{endpoints}: no router of Zenoh answers{}; start the router: ros2 run rmw_zenoh_cpp rmw_zenohd, or for nodes \
-         of DDS zenoh-bridge-ros2dds",
+        "{endpoints}: no router of Zenoh answers{}; start zenohd, or give another endpoint",
         if *.with_keys { ", or one end refuses the other's certificate" } else { "" }
     )]
     NoRouter { endpoints: String, with_keys: bool },
-    #[error("'{0}' is no name of a topic: expected words of letters, digits and '_', joined by '/'")]
-    Topic(String),
     #[error("Zenoh: {0}")]
     Zenoh(String),
 }
@@ -50,7 +44,7 @@ impl Network {
     ///
     /// # Errors
     /// An endpoint that is not allowed.
-    pub fn check(&self) -> Result<(), RosError> {
+    pub fn check(&self) -> Result<(), NetworkError> {
         let is_valid = |endpoint: &&String| {
             let prefix = if self.keys.is_some() { "tls/" } else { "tcp/" };
             endpoint.strip_prefix(prefix).and_then(|rest| rest.rsplit_once(':')).is_some_and(|(host, port)| {
@@ -59,7 +53,7 @@ impl Network {
         };
         let mut endpoints = self.connect.iter().chain(&self.listen);
         if let Some(bad) = endpoints.find(|endpoint| !is_valid(endpoint)) {
-            return Err(RosError::Endpoint(bad.clone()));
+            return Err(NetworkError::Endpoint(bad.clone()));
         }
         if self.keys.is_none() {
             return Ok(());
@@ -67,10 +61,10 @@ impl Network {
         // Zenoh looks at a certificate once per connection. A connection that this side has made takes a link from outside that
         // bears the other end's number, which is no secret, whatever its certificate.
         if !self.connect.is_empty() && !self.listen.is_empty() {
-            return Err(RosError::Keys("both 'connect' and 'listen' with keys: expected one of them".into()));
+            return Err(NetworkError::Keys("both 'connect' and 'listen' with keys: expected one of them".into()));
         }
         if self.names.is_empty() {
-            return Err(RosError::Keys(
+            return Err(NetworkError::Keys(
                 "no name may take part: expected the common names of certificates, like ros2".into(),
             ));
         }

@@ -1,9 +1,4 @@
-#!/usr/bin/env python3
-"""A ROS 2 node that lifts only on a fresh LIFT of blindgrasp. Needs ROS 2 and the package blindgrasp_msgs.
-
-    RMW_IMPLEMENTATION=rmw_zenoh_cpp python3 ros2_lift_gate.py
-
-With DDS, RMW_IMPLEMENTATION stays as it is, and a zenoh-bridge-ros2dds runs.
+"""A node that lifts only on a fresh LIFT of blindgrasp: ros2 run blindgrasp_ros lift_gate
 
 Put the motion of your arm into `lift`. Nothing else may start it.
 """

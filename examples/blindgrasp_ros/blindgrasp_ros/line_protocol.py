@@ -1,0 +1,1 @@
+../../bridges/line_protocol.py
