@@ -206,7 +206,7 @@ class Recording:
         """A table (pandas) with a row for each grasp.
 
         Its columns are `grasp_id` and `n_frames`; the mean over the settled frames of each joint (`joint_0`, …), cell
-        (`cell_0`, …) and other sense (`gravity_m_per_s2_0`, …); `stable`, `object`, `class`, `epsilon` and `volume` of
+        (`cell_0`, …) and other sense (`gravity_m_per_s2_0`, …); `stable`, `object`, `object_class`, `epsilon` and `volume` of
         the label; `action`, `reason` and `probability_stable` of the decision. A reading that is NaN is in no mean.
         What is not known of a grasp is missing in its row.
 
@@ -292,9 +292,10 @@ class Recording:
             elif key in labels:
                 raise RecordingError(f"{self.path}: grasp {key[1]} has two labels (/truth)")
             else:
-                labels[key] = Label(
-                    message.stable, message.epsilon, message.volume, message.object, getattr(message, "class")
-                )
+                fields = vars(message)
+                # Recordings of earlier versions name it `class`.
+                object_class = fields["object_class"] if "object_class" in fields else fields["class"]
+                labels[key] = Label(message.stable, message.epsilon, message.volume, message.object, object_class)
         return labels, decisions
 
     def _grasp(self, frames: list[Any], labels: dict[Key, Label], decisions: dict[Key, list[Decision]]) -> Grasp:

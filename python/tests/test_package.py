@@ -153,7 +153,7 @@ class Recordings(Folder):
             np.testing.assert_allclose(cells, grasp.cells_newtons[settled].mean(axis=0), atol=1e-12)
             np.testing.assert_allclose(row.filter(like="joint_").to_numpy(float), grasp.joints[settled].mean(axis=0))
             label, decision = grasp.label, grasp.decision
-            found = (row["stable"], row["object"], row["class"], row["epsilon"], row["volume"])
+            found = (row["stable"], row["object"], row["object_class"], row["epsilon"], row["volume"])
             self.assertEqual(found, (label.is_stable, label.object_id, label.object_class, label.epsilon, label.volume))
             found = (row["action"], row["reason"], row["probability_stable"])
             self.assertEqual(found, (decision.action, decision.reason, decision.probability_stable))
@@ -212,7 +212,7 @@ class Recordings(Folder):
         columns = pd.DataFrame(_recording.label_columns([blindgrasp.Label(True, object_id="mug-02"), None]))
         self.assertEqual(columns["stable"].isna().tolist(), [False, True])
         self.assertEqual(columns["object"].isna().tolist(), [False, True])
-        self.assertTrue(columns[["class", "epsilon"]].isna().all(axis=None))
+        self.assertTrue(columns[["object_class", "epsilon"]].isna().all(axis=None))
 
     def test_a_table_without_pandas_is_refused_in_words(self):
         with mock.patch.dict(sys.modules, pandas=None):
@@ -791,7 +791,7 @@ class Pages(Folder):
         # The table has become a recording again.
         table, again = names["table"], blindgrasp.Recording(self.folder / "grasps.mcap").to_frame()
         self.assertEqual(again["stable"].tolist(), table["stable"].tolist())
-        self.assertEqual(again["class"].tolist(), table["class"].tolist())
+        self.assertEqual(again["object_class"].tolist(), table["object_class"].tolist())
         cells = [frame.filter(like="cell_").to_numpy() for frame in (table, again)]
         np.testing.assert_allclose(cells[1], cells[0], atol=1e-12)
 

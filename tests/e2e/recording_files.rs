@@ -59,7 +59,7 @@ fn decision(grasp_id: u64) -> Record {
 }
 
 fn truth(grasp_id: u64) -> Record {
-    let message = GraspTruth { grasp_id, object: "mug".into(), class: "cup".into(), ..GraspTruth::default() };
+    let message = GraspTruth { grasp_id, object: "mug".into(), object_class: "cup".into(), ..GraspTruth::default() };
     Record::Truth(Stamped { header: Header { seq: grasp_id, ..header(grasp_id * 10 + 9) }, message })
 }
 

@@ -138,8 +138,8 @@ mod tests {
         let decision = LiftDecision { grasp_id: 7, action, reason, probability_stable: 0.75 };
         let contacts_of_scene = vec![SceneContact { other_link: -1, ..SceneContact::default() }; 2];
         let scene = GraspScene { joints: vec![0.5; 7], contacts: contacts_of_scene, ..GraspScene::default() };
-        let (object, class) = ("bücher-1".into(), "book".into());
-        let truth = GraspTruth { epsilon: -1.0, object, class, ..GraspTruth::default() };
+        let (object, object_class) = ("bücher-1".into(), "book".into());
+        let truth = GraspTruth { epsilon: -1.0, object, object_class, ..GraspTruth::default() };
         let outcome = LiftOutcome { attempt: 3, lifted: true, thing: "tasse".into(), ..LiftOutcome::default() };
         vec![
             ("/tactile", record(0, frame)),

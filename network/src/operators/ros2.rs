@@ -232,15 +232,14 @@ pub(crate) fn definition_of(name: &str, file: Option<&Path>) -> anyhow::Result<D
 
 #[cfg(test)]
 mod tests {
-    use blindgrasp_messages::{GraspScene, LiftOutcome};
+    use blindgrasp_messages::{GraspScene, GraspTruth, LiftOutcome};
 
     use std::collections::BTreeMap;
 
     use super::super::ros2_decision::DECISION;
     use super::*;
 
-    /// The files of messages: `Header.msg` and so on. Labels are not among them: a field is called `class`, which no program in
-    /// C++ can have, and no topic carries them.
+    /// The files of messages: `Header.msg` and so on.
     fn message_files() -> BTreeMap<String, String> {
         let mut files = BTreeMap::from([("Decision".to_owned(), DECISION.to_owned())]);
         let mut add = |schema: &str, definition: String| {
@@ -258,6 +257,7 @@ mod tests {
         add(LiftDecision::SCHEMA, LiftDecision::definition());
         add(LiftOutcome::SCHEMA, LiftOutcome::definition());
         add(GraspScene::SCHEMA, GraspScene::definition());
+        add(GraspTruth::SCHEMA, GraspTruth::definition());
         files
     }
 

@@ -11,7 +11,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use crate::common::live::{free_port, grasps, live_dataflow};
 use crate::common::python::python;
 use crate::common::{Graph, dataflow, project, run, undisturbed, unique_name, wait_until};
-use blindgrasp_messages::{Action, GraspTruth, Recorded, Stamped, TactileFrame, of_each_type};
+use blindgrasp_messages::{Action, Recorded, Stamped, TactileFrame, of_each_type};
 use blindgrasp_recording::cdr;
 use blindgrasp_ros::definition::Definition;
 use blindgrasp_ros::standard;
@@ -577,9 +577,6 @@ print(json.dumps({name: store.hash_rihs01(name) for name in [*sys.argv[2:], *our
         (M::SCHEMA, M::definition())
     }
     for (name, text) in of_each_type!(ours) {
-        // The package has no labels.
-        if name != GraspTruth::SCHEMA {
-            assert_eq!(found[name], of(name, &text), "{name}");
-        }
+        assert_eq!(found[name], of(name, &text), "{name}");
     }
 }

@@ -167,7 +167,8 @@ fn csv_keeps_lists_that_vary_or_are_empty_and_what_numbers_and_names_may_be() {
     let no_cells = |line: &str| line.contains(",cells_newtons,") || line.ends_with(",[],[],[],[],0");
     assert!(found.lines().all(no_cells), "{found}");
 
-    let truth = GraspTruth { object: "a \"mug\", blue".into(), class: "tassé\nlong".into(), ..GraspTruth::default() };
+    let truth =
+        GraspTruth { object: "a \"mug\", blue".into(), object_class: "tassé\nlong".into(), ..GraspTruth::default() };
     let found = csv_of(&[Record::Truth(stamped(0, truth))]);
     assert!(found.ends_with(",0.0,0.0,false,\"a \"\"mug\"\", blue\",\"tassé\nlong\"\n"), "{found}");
 }

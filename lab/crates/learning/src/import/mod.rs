@@ -465,7 +465,7 @@ impl GraspWriter {
             volume: f64::NAN,
             stable: grasp.stable,
             object: grasp.object,
-            class: grasp.class,
+            object_class: grasp.class,
         };
         let header = Header { seq: self.n_grasps, ..self.header };
         self.recording.write(GraspTruth::TOPIC, &Stamped { header, message: truth })?;

@@ -184,7 +184,7 @@ impl Examples {
                             moving,
                             stable: truth.stable,
                             object: truth.object,
-                            class: truth.class,
+                            class: truth.object_class,
                         }),
                     }
                 }
