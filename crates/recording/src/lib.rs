@@ -20,7 +20,6 @@
 
 mod channels;
 mod chosen;
-pub mod export;
 mod index;
 mod live;
 mod live_file;
@@ -32,6 +31,7 @@ mod source;
 mod split;
 mod summary;
 mod types;
+mod value;
 mod viewer;
 mod writer;
 
@@ -53,6 +53,7 @@ pub use parts::{Manifest, part_path, recordings_in};
 pub use problems::{Oddity, Problem, Problems};
 pub use reader::RecordingReader;
 pub use repair::{RepairReport, repair, repaired_path};
+pub use value::{Value, ValueError, leaves};
 pub use viewer::TOPICS_FOR_VIEWERS;
 pub use writer::RecordingWriter;
 

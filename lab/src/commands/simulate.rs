@@ -115,7 +115,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         |extension: &str| ["csv", "json", "jsonl", "yaml", "html", "bag", "db3"].contains(&extension);
     if out.extension().and_then(|extension| extension.to_str()).is_some_and(is_of_another_kind) && !out.is_dir() {
         bail!(
-            "{}: expected a name that ends in .mcap, or that of a folder; blindgrasp export writes a recording as CSV or JSON",
+            "{}: expected a name that ends in .mcap, or that of a folder; blindgrasp export writes a recording as JSON",
             out.display()
         );
     }
