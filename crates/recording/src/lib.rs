@@ -54,7 +54,7 @@ pub use problems::{Oddity, Problem, Problems};
 pub use reader::RecordingReader;
 pub use repair::{RepairReport, repair, repaired_path};
 pub use value::{Value, ValueError, leaves};
-pub use viewer::TOPICS_FOR_VIEWERS;
+pub use viewer::{LinkPose, ShownHand, TOPICS_FOR_VIEWERS};
 pub use writer::RecordingWriter;
 
 /// The metadata with a recording's [`RecordingInfo`].

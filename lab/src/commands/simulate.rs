@@ -15,6 +15,7 @@ use super::trials::physics;
 use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text, word};
 use blindgrasp_cli::stop_signal;
 use blindgrasp_grasps::dataset::REPORT_METADATA;
+use blindgrasp_grasps::shown_hand::shown_hand;
 use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
 use blindgrasp_objects::{objects_id, objects_named};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -210,7 +211,7 @@ impl<'a> Job<'a> {
     /// Makes one recording of all parts.
     fn to_file(&self, out: &Path, overwrite: bool) -> anyhow::Result<Option<SimulationReport>> {
         check_new(out, &[], overwrite)?;
-        let mut writer = GraspWriter::create(out, &self.info)?;
+        let mut writer = GraspWriter::create(out, &self.info, self.simulation.hand)?;
         let bar = progress_bar(self.simulation.options.n_grasps);
         let mut report = SimulationReport::default();
         for part in self.simulation.options.parts() {
@@ -263,7 +264,7 @@ impl<'a> Job<'a> {
         bar.reset_eta();
         for (n_done, part) in missing.iter().enumerate() {
             let path = part_path(out, part.idx);
-            let mut writer = GraspWriter::create(&path, &self.info)?;
+            let mut writer = GraspWriter::create(&path, &self.info, hand)?;
             let done = self.simulate(part, &bar, &mut writer).map_err(|error| match error {
                 SimulateError::Stopped { .. } => anyhow::anyhow!(
                     "interrupted: {} of {} parts are in {}; the same command goes on from there",
@@ -451,9 +452,11 @@ struct GraspWriter {
 }
 
 impl GraspWriter {
-    fn create(path: &Path, info: &RecordingInfo) -> Result<Self, RecordingError> {
+    fn create(path: &Path, info: &RecordingInfo, hand: &Hand) -> Result<Self, RecordingError> {
         let header = Header { hand_id: info.hand_id, ..Header::default() };
-        Ok(GraspWriter { recording: RecordingWriter::create(path, info)?, header, n_grasps: 0 })
+        let mut recording = RecordingWriter::create(path, info)?;
+        recording.show(shown_hand(hand))?;
+        Ok(GraspWriter { recording, header, n_grasps: 0 })
     }
 
     fn write(&mut self, grasp: SimulatedGrasp) -> Result<(), RecordingError> {
@@ -465,7 +468,8 @@ impl GraspWriter {
         let start_nanos = self.header.stamp_nanos;
         for timed in grasp.frames {
             self.header.stamp_nanos = start_nanos + timed.offset_nanos;
-            self.recording.write(TactileFrame::TOPIC, &Stamped { header: self.header, message: timed.frame })?;
+            let frame = Stamped { header: self.header, message: timed.frame };
+            self.recording.write_frame(TactileFrame::TOPIC, &frame)?;
             self.header.seq += 1;
         }
         self.header.stamp_nanos += PAUSE_NANOS;
