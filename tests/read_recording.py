@@ -128,9 +128,27 @@ def check_contact_points(message, expected):
     assert points == as_floats, f"{points} against {contacts}"
 
 
+def check_transforms(message, expected):
+    """tf2_msgs/TFMessage: a tree with the palm, of one stamp, whose rotations are unit quaternions."""
+    assert stamp_nanos(message.transforms[0]) in expected["/tactile"], message
+    children = {transform.child_frame_id for transform in message.transforms}
+    frames = children | {transform.header.frame_id for transform in message.transforms}
+    assert "palm" in frames and len(frames) == len(message.transforms) + 1, f"{sorted(frames)} is no tree"
+    for transform in message.transforms:
+        rotation = transform.transform.rotation
+        assert math.isclose(math.hypot(rotation.x, rotation.y, rotation.z, rotation.w), 1.0), transform
+
+
+def check_description(message, expected):
+    """std_msgs/String: the URDF."""
+    assert "<robot" in message.data, message.data[:100]
+
+
 STANDARD = {
     "sensor_msgs/msg/JointState": check_joint_states,
     "sensor_msgs/msg/PointCloud2": check_contact_points,
+    "std_msgs/msg/String": check_description,
+    "tf2_msgs/msg/TFMessage": check_transforms,
 }
 
 

@@ -22,6 +22,7 @@ from xml.etree import ElementTree
 import blindgrasp
 import numpy as np
 import pandas as pd
+import yaml
 from blindgrasp import _recording
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -826,6 +827,16 @@ class Program(Folder):
                     blindgrasp.program()
                 (self.folder / "blindgrasp").symlink_to(there)
                 self.assertEqual(blindgrasp.program(), self.folder / "blindgrasp")
+
+
+class Files(unittest.TestCase):
+    def test_all_yaml_files_load_in_pyyaml(self):
+        listed = ["git", "ls-files", "*.yaml", "*.yml"]
+        paths = subprocess.run(listed, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout.split()
+        self.assertIn("dataflow-live.yaml", paths)
+        for path in paths:
+            with self.subTest(path):
+                self.assertIsNotNone(yaml.safe_load((REPOSITORY / path).read_text()))
 
 
 class Pages(Folder):

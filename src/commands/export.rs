@@ -10,6 +10,7 @@ use clap::Args;
 use serde_json::json;
 
 use super::{Outcome, check_new, data_on_stdout, print_line};
+use blindgrasp_cli::shard::Shard;
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::feature_table::{FeatureTableError, write_feature_table};
 use blindgrasp_messages::files::{keep_mode, partial_path, private_file};
@@ -43,6 +44,9 @@ pub(super) struct Arguments {
     /// Write the table of features (CSV) that this model sees of recorded grasps, for other tools to learn from.
     #[arg(long, value_name = "MODEL", requires = "out", conflicts_with = "topic")]
     features: Option<PathBuf>,
+    /// With --features, take only every N-th recording, from the I-th on (0/N to N-1/N).
+    #[arg(long, value_name = "I/N", requires = "features")]
+    shard: Option<Shard>,
     /// Pad layout of the hand, for --features; default: the built-in hand that the first recording names.
     #[arg(long, requires = "features")]
     hand: Option<PathBuf>,
@@ -67,8 +71,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 }
 
 fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::Result<Outcome> {
-    let recordings = recordings_in(&arguments.recordings)?;
-    let first = recordings.first().context("expected a recording")?;
+    let recordings = arguments.shard.unwrap_or_default().of(recordings_in(&arguments.recordings)?);
+    let Some(first) = recordings.first() else {
+        print_line("this shard has no recordings")?;
+        return Ok(Outcome::Done);
+    };
     let file = NewFile::create(out, &[&recordings[..], &[model.to_path_buf()]].concat(), arguments.overwrite)?;
     let (path, model) = (model, Model::load(model)?);
     let hand = hand_of(first, arguments.hand.as_deref())?;

@@ -13,6 +13,7 @@ use serde::Serialize;
 use super::object_list::list;
 use super::trials::physics;
 use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text, word};
+use blindgrasp_cli::shard::Shard;
 use blindgrasp_cli::stop_signal;
 use blindgrasp_grasps::dataset::REPORT_METADATA;
 use blindgrasp_grasps::shown_hand::shown_hand;
@@ -91,8 +92,8 @@ pub(super) struct Arguments {
     #[arg(long)]
     overwrite: bool,
     /// Make only the parts of shard I of N (0/N to N-1/N) of a folder; all shards together complete it.
-    #[arg(long, value_parser = shard, value_name = "I/N")]
-    shard: Option<(usize, usize)>,
+    #[arg(long, value_name = "I/N")]
+    shard: Option<Shard>,
     /// Print the report as JSON.
     #[arg(long)]
     json: bool,
@@ -131,7 +132,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let stop = stop_signal()?;
     let simulation = Simulation { hand: &hand, objects: &objects, options: &options };
     let job = Job::new(simulation, &arguments.objects, &stop)?;
-    let shard = arguments.shard.unwrap_or((0, 1));
+    let shard = arguments.shard.unwrap_or_default();
     let report = if is_file { job.to_file(out, arguments.overwrite)? } else { job.to_folder(out, shard)? };
     match report {
         Some(report) => print_report(arguments.json, out, &report)?,
@@ -250,13 +251,13 @@ impl<'a> Job<'a> {
     }
 
     /// Makes a recording of each part of a shard that is missing.
-    fn to_folder(&self, out: &Path, (idx, n): (usize, usize)) -> anyhow::Result<Option<SimulationReport>> {
+    fn to_folder(&self, out: &Path, shard: Shard) -> anyhow::Result<Option<SimulationReport>> {
         let Simulation { hand, objects, options } = self.simulation;
         let parts: Vec<Part> = options.parts().collect();
         let objects = (self.objects, objects_id(objects));
         let options = serde_json::to_value(options)?;
         Manifest::new((&hand.name, hand.description_id()), objects, options, parts.len()).claim(out)?;
-        let mine: Vec<&Part> = parts.iter().filter(|part| part.idx % n == idx).collect();
+        let mine: Vec<&Part> = parts.iter().filter(|part| shard.has(part.idx)).collect();
         let bar = progress_bar(mine.iter().map(|part| part.n_grasps).sum());
         let (there, missing): (Vec<&Part>, Vec<&Part>) = mine.iter().partition(|part| self.is_there(out, part));
         // Parts made before do not count for the rate.
@@ -432,15 +433,6 @@ impl<'a> AllOptions<'a> {
             thresholds: options.thresholds.is_default().then_some(options.thresholds),
             options,
         }
-    }
-}
-
-/// The index of a shard, and the number of shards.
-fn shard(text: &str) -> Result<(usize, usize), String> {
-    let numbers = text.split_once('/').and_then(|(idx, n)| Some((idx.parse().ok()?, n.parse().ok()?)));
-    match numbers {
-        Some((idx, n)) if idx < n => Ok((idx, n)),
-        _ => Err("expected I/N with I from 0 to N-1, such as 3/16".into()),
     }
 }
 

@@ -48,7 +48,7 @@ impl Setup {
         let node = graph.nodes.iter().find(|node| reports_lifts(node)).with_context(|| {
             format!(
                 "{}: no node reports the outcomes of lifts; expected a source with run: ${{SOURCE:-…}} and the input \
-                 decision?, as in the dataflow-live.yaml that 'blindgrasp init DIR' writes",
+                 \"decision?\", as in the dataflow-live.yaml that 'blindgrasp init DIR' writes",
                 arguments.dataflow.display()
             )
         })?;
