@@ -5,19 +5,20 @@ use std::str::FromStr;
 /// The part of the work of one of several processes, as `--shard I/N` says it. The parts together are the whole.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shard {
-    idx: usize,
-    n: usize,
+    pub idx: u64,
+    pub n: u64,
 }
 
 impl Shard {
     /// Whether the work of this number belongs to it.
     pub fn has(self, number: usize) -> bool {
-        number % self.n == self.idx
+        number as u64 % self.n == self.idx
     }
 
     /// Of all items, its own.
     pub fn of<T>(self, items: Vec<T>) -> Vec<T> {
-        items.into_iter().skip(self.idx).step_by(self.n).collect()
+        let numbered = items.into_iter().enumerate();
+        numbered.filter(|(number, _)| self.has(*number)).map(|(_, item)| item).collect()
     }
 }
 

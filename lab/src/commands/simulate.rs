@@ -155,7 +155,7 @@ pub(super) fn complete_folder(
 ) -> anyhow::Result<()> {
     let (objects, _) = objects_named(objects_name)?;
     let simulation = Simulation { hand, objects: &objects, options };
-    Job::new(simulation, objects_name, stop)?.to_folder(folder, (0, 1))?;
+    Job::new(simulation, objects_name, stop)?.to_folder(folder, Shard::default())?;
     Ok(())
 }
 
