@@ -33,7 +33,7 @@ def sample_of(line):
     """A line's port, head and items, numbered within its epoch."""
     data = line["data"]
     if line["topic"] == "/truth":
-        names = [data["object"].encode(), data["class"].encode()]
+        names = [data["object"].encode(), data["object_class"].encode()]
         fields = {key: data[key] for key in ("grasp_id", "epsilon", "volume", "stable")}
         port, head, items = "truth", GraspTruthHead(n_object_bytes=len(names[0]), **fields), b"".join(names)
     else:

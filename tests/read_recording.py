@@ -1,12 +1,11 @@
-"""Reads a recording with readers that are not ours, and tables that were exported from it, and compares each field of
-each sample with the lines of `blindgrasp export`: floating-point numbers bit by bit.
+"""Reads a recording with readers that are not ours, and compares each field of each sample with the lines of `blindgrasp
+export`: floating-point numbers bit by bit.
 
-    read_recording.py RECORDING.mcap EXPORTED.jsonl TABLES    # a folder with a .csv of each topic
+    read_recording.py RECORDING.mcap EXPORTED.jsonl
 
 Prints what was compared as a line of JSON; the first difference ends it with exit code 1.
 """
 
-import csv
 import json
 import math
 import re
@@ -39,8 +38,11 @@ def words_of(definition):
 def fields_of(message):
     """The names and values of a decoded message's fields, whichever reader decoded it."""
     names = getattr(message, "__slots__", None) or vars(message)
-    # rosbags appends an underscore to what Python reserves.
-    return {name.rstrip("_"): getattr(message, name) for name in names if not name.startswith("_")}
+    found = {name: getattr(message, name) for name in names if not name.startswith("_")}
+    # Earlier versions named a field so that rosbags, as it is reserved in Python, appends an underscore.
+    for earlier in {"class", "class_"} & set(found):
+        found["object_class"] = found.pop(earlier)
+    return found
 
 
 class Comparison:
@@ -126,9 +128,27 @@ def check_contact_points(message, expected):
     assert points == as_floats, f"{points} against {contacts}"
 
 
+def check_transforms(message, expected):
+    """tf2_msgs/TFMessage: a tree with the palm, of one stamp, whose rotations are unit quaternions."""
+    assert stamp_nanos(message.transforms[0]) in expected["/tactile"], message
+    children = {transform.child_frame_id for transform in message.transforms}
+    frames = children | {transform.header.frame_id for transform in message.transforms}
+    assert "palm" in frames and len(frames) == len(message.transforms) + 1, f"{sorted(frames)} is no tree"
+    for transform in message.transforms:
+        rotation = transform.transform.rotation
+        assert math.isclose(math.hypot(rotation.x, rotation.y, rotation.z, rotation.w), 1.0), transform
+
+
+def check_description(message, expected):
+    """std_msgs/String: the URDF."""
+    assert "<robot" in message.data, message.data[:100]
+
+
 STANDARD = {
     "sensor_msgs/msg/JointState": check_joint_states,
     "sensor_msgs/msg/PointCloud2": check_contact_points,
+    "std_msgs/msg/String": check_description,
+    "tf2_msgs/msg/TFMessage": check_transforms,
 }
 
 
@@ -146,7 +166,7 @@ def by_stamp(expected):
 
 def with_mcap(path, expected):
     """Reads with mcap and mcap-ros2-support."""
-    n_samples, n_standard, n_values, identities = Counter(), Counter(), 0, {}
+    n_samples, n_standard, n_values = Counter(), Counter(), 0
     stamped = by_stamp(expected)
     with open(path, "rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
@@ -160,11 +180,13 @@ def with_mcap(path, expected):
             comparison = Comparison(words_of(schema.data.decode()))
             seq = message.header.seq
             comparison.compare(message, expected.line(topic, message.header), f"mcap: {topic}, seq {seq}")
-            identities[topic, seq] = (message.header.epoch, format(message.header.hand_id, "016x"))
+            identity = (message.header.epoch, format(message.header.hand_id, "016x"))
+            line = expected.by_topic[topic][seq]
+            assert identity == (line["epoch"], line["hand_id"]), f"mcap: {topic}, seq {seq}: {identity} against {line}"
             n_values += comparison.n_values
             n_samples[topic] += 1
     expected.check_counts("mcap", n_samples)
-    return {"n_samples": n_samples, "n_standard": n_standard, "n_values": n_values}, identities
+    return {"n_samples": n_samples, "n_standard": n_standard, "n_values": n_values}
 
 
 def with_rosbags(path, expected):
@@ -188,79 +210,10 @@ def with_rosbags(path, expected):
     return {"n_samples": n_samples, "n_standard": n_standard, "n_values": n_values}
 
 
-def table_path(folder, topic):
-    return Path(folder) / f"{topic.strip('/').replace('/', '.')}.csv"
-
-
-def check_row_header(row, line, identity, place):
-    found = (int(row.pop("seq")), int(row.pop("stamp_nanos")), int(row.pop("epoch")), row.pop("hand_id"))
-    assert found == (line["seq"], line["stamp_nanos"], *identity), f"{place}: {found} against {line} {identity}"
-
-
-def no_json(text):
-    raise AssertionError(f"{text} is no JSON")
-
-
-def from_cells(cells, expected):
-    """A row of CSV as the message it was: columns a[0], a[1] are a list again, and what JSON has as a list was JSON."""
-    row = {}
-    for name, cell in cells.items():
-        field, _, idx = name.partition("[")
-        like = expected.get(field)
-        if idx:
-            row.setdefault(field, []).append(float(cell))
-        elif isinstance(like, (list, dict)):
-            row[field] = json.loads(cell, parse_constant=no_json)
-        elif isinstance(like, bool):
-            row[field] = {"true": True, "false": False}[cell]
-        elif isinstance(like, float) or like is None and field in expected:
-            row[field] = float(cell)
-        elif isinstance(like, int):
-            row[field] = int(cell)
-        else:
-            row[field] = cell
-    return row
-
-
-class JsonCells(Comparison):
-    """In JSON in a cell, null is null."""
-
-    def is_same(self, found, expected, name):
-        return expected is None if found is None else super().is_same(found, expected, name)
-
-
-def with_csv(folder, expected, identities):
-    """Reads the CSV tables with Python's own reader."""
-    n_rows, n_values, columns = Counter(), 0, {}
-    for topic, lines in expected.by_topic.items():
-        with open(table_path(folder, topic), newline="", encoding="utf-8") as stream:
-            reader = csv.DictReader(stream, strict=True)
-            for cells, line in zip(reader, lines.values(), strict=True):
-                place = f"csv: {topic}, seq {line['seq']}"
-                assert None not in cells and None not in cells.values(), place
-                row = from_cells(cells, line["data"])
-                check_row_header(row, line, identities[topic, line["seq"]], place)
-                comparison = JsonCells({})
-                comparison.compare(row, line["data"], place)
-                n_values += comparison.n_values
-                n_rows[topic] += 1
-            columns[topic] = reader.fieldnames
-    return {"n_samples": n_rows, "n_values": n_values, "columns": columns}
-
-
 def main():
-    recording, exported, tables = sys.argv[1:]
+    recording, exported = sys.argv[1:]
     expected = Expected(exported)
-    mcap, identities = with_mcap(recording, expected)
-    print(
-        json.dumps(
-            {
-                "mcap": mcap,
-                "rosbags": with_rosbags(recording, expected),
-                "csv": with_csv(tables, expected, identities),
-            }
-        )
-    )
+    print(json.dumps({"mcap": with_mcap(recording, expected), "rosbags": with_rosbags(recording, expected)}))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,8 @@
 
     blindgrasp.from_table(table, "again.mcap", hand="barrett-bh8-280")    # a table of readings as a recording
 
+    blindgrasp.to_parquet("recordings/", "frames.parquet")  # and to_lerobot: all frames, for other tools
+
     predictions = blindgrasp.Model("model.json").predict("run.mcap")
 
     with blindgrasp.run("dataflow.yaml") as graph:        # starts the graph, and ends it
@@ -24,6 +26,7 @@ feature or a probability, so that Python and a robot never disagree.
 from ._graph import ReplayedDecisions, Run, echo, replay, run
 from ._import import from_table
 from ._model import Model, PredictedGrasp, Predictions
+from ._out import to_lerobot, to_parquet
 from ._program import ProgramError, ProgramNotFoundError, program
 from ._recording import Grasp, Recording, RecordingError, read
 from ._types import Decision, Label
@@ -51,4 +54,6 @@ __all__ = [
     "read",
     "replay",
     "run",
+    "to_lerobot",
+    "to_parquet",
 ]

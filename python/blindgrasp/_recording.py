@@ -38,6 +38,8 @@ FOOTER = "<BQQQI"
 FRAMES = "blindgrasp_msgs/msg/TactileFrame"
 LABELS = "blindgrasp_msgs/msg/GraspTruth"
 DECISIONS = "blindgrasp_msgs/msg/LiftDecision"
+PREDICTIONS = "blindgrasp_msgs/msg/Prediction"
+OUTCOMES = "blindgrasp_msgs/msg/LiftOutcome"
 
 # The codes of crates/messages, as operators/blindgrasp_messages.py has them.
 PHASES = (
@@ -93,6 +95,10 @@ class Grasp:
     """What is known to be true of the grasp; None if nothing was recorded."""
     decisions: tuple[Decision, ...] = ()
     """The recorded decisions. Several are recorded of a grasp that was probed, or watched while the arm lifted."""
+    probability_stable: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.empty(0))
+    """(n_frames,): the recorded predictions of the frames, from 0 to 1; NaN where the graph predicted nothing."""
+    outcome: dict[str, Any] | None = None
+    """What became of the grasp, the fields of LiftOutcome in docs/messages.md; None if nothing was recorded."""
 
     def __repr__(self) -> str:
         (n_frames, n_cells), n_joints = self.cells_newtons.shape, self.joints.shape[1]
@@ -111,10 +117,20 @@ class Grasp:
         return before[-1] if before else None
 
 
+@dataclasses.dataclass
+class _Known:
+    """What a recording knows of its grasps, and its predictions by epoch and number of the frame."""
+
+    labels: dict[Key, Label] = dataclasses.field(default_factory=dict)
+    decisions: dict[Key, list[Decision]] = dataclasses.field(default_factory=lambda: defaultdict(list))
+    predictions: dict[Key, float] = dataclasses.field(default_factory=dict)
+    outcomes: dict[Key, dict[str, Any]] = dataclasses.field(default_factory=dict)
+
+
 class Recording:
     """A recording: its metadata at once, and its grasps by iteration or by their places, as often as wanted.
 
-    `topic` is the topic of the frames; labels are read from `/truth` and decisions from `/decision`. Raises
+    `topic` is the topic of the frames; the rest is read from `/truth`, `/decision`, `/prediction` and `/outcome`. Raises
     FileNotFoundError if there is no file, and RecordingError if it is no recording, was cut off, or has no frames on
     that topic. Damage inside is found, and raised, when the grasps are read.
     """
@@ -159,13 +175,13 @@ class Recording:
         return f"Recording({str(self.path)!r}, hand={self.hand!r}, n_frames={self.topics[self.topic]})"
 
     def __iter__(self) -> Iterator[Grasp]:
-        """The grasps in order. The file is read twice: for labels and decisions, then for the frames.
+        """The grasps in order. The file is read twice: for what is known of the grasps, then for the frames.
 
         Raises RecordingError if the file is damaged, or if frames of a grasp lie on both sides of another grasp.
         """
-        labels, decisions = self._labels_and_decisions()
+        known = self._known()
         for frames in self._frames_of_grasps():
-            yield self._grasp(frames, labels, decisions)
+            yield self._grasp(frames, known)
 
     def __len__(self) -> int:
         """The number of grasps.
@@ -206,7 +222,7 @@ class Recording:
         """A table (pandas) with a row for each grasp.
 
         Its columns are `grasp_id` and `n_frames`; the mean over the settled frames of each joint (`joint_0`, …), cell
-        (`cell_0`, …) and other sense (`gravity_m_per_s2_0`, …); `stable`, `object`, `class`, `epsilon` and `volume` of
+        (`cell_0`, …) and other sense (`gravity_m_per_s2_0`, …); `stable`, `object`, `object_class`, `epsilon` and `volume` of
         the label; `action`, `reason` and `probability_stable` of the decision. A reading that is NaN is in no mean.
         What is not known of a grasp is missing in its row.
 
@@ -280,25 +296,33 @@ class Recording:
                     raise self._damaged(error) from error
                 yield channel.topic, decoded
 
-    def _labels_and_decisions(self) -> tuple[dict[Key, Label], dict[Key, list[Decision]]]:
-        labels: dict[Key, Label] = {}
-        decisions: dict[Key, list[Decision]] = defaultdict(list)
-        wanted = (("/truth", LABELS), ("/decision", DECISIONS))
+    def _known(self) -> _Known:
+        known = _Known()
+        labels = known.labels
+        wanted = (("/truth", LABELS), ("/decision", DECISIONS), ("/prediction", PREDICTIONS), ("/outcome", OUTCOMES))
         topics = [topic for topic, kind in wanted if self._types.get(topic) == kind]
         for topic, message in self._messages(topics) if topics else ():
             key = _key(message)
             if topic == "/decision":
-                decisions[key].append(_decision(message))
+                known.decisions[key].append(_decision(message))
+            elif topic == "/prediction":
+                # A prediction has the number of its frame.
+                if message.fault == 0:
+                    known.predictions[message.header.epoch, message.header.seq] = message.probability_stable
+            elif topic == "/outcome":
+                known.outcomes[key] = {name: value for name, value in vars(message).items() if name != "header"}
             elif key in labels:
                 raise RecordingError(f"{self.path}: grasp {key[1]} has two labels (/truth)")
             else:
-                labels[key] = Label(
-                    message.stable, message.epsilon, message.volume, message.object, getattr(message, "class")
-                )
-        return labels, decisions
+                fields = vars(message)
+                # Recordings of earlier versions name it `class`.
+                object_class = fields["object_class"] if "object_class" in fields else fields["class"]
+                labels[key] = Label(message.stable, message.epsilon, message.volume, message.object, object_class)
+        return known
 
-    def _grasp(self, frames: list[Any], labels: dict[Key, Label], decisions: dict[Key, list[Decision]]) -> Grasp:
+    def _grasp(self, frames: list[Any], known: _Known) -> Grasp:
         key = _key(frames[0])
+        numbers = [(key[0], frame.header.seq) for frame in frames]
         lists = [name for name, value in vars(frames[0]).items() if isinstance(value, np.ndarray)]
         tables = {name: _table([getattr(frame, name) for frame in frames]) for name in lists}
         joints, cells_newtons = tables.pop("joints"), tables.pop("cells_newtons")
@@ -313,8 +337,10 @@ class Recording:
             senses={name: table for name, table in tables.items() if table.shape[1] > 0},
             hand_id=f"{frames[0].header.hand_id:016x}",
             day=frames[0].day,
-            label=labels.get(key),
-            decisions=tuple(decisions.get(key, ())),
+            label=known.labels.get(key),
+            decisions=tuple(known.decisions.get(key, ())),
+            probability_stable=np.array([known.predictions.get(number, np.nan) for number in numbers]),
+            outcome=known.outcomes.get(key),
         )
 
     def _damaged(self, reason: object) -> RecordingError:

@@ -35,7 +35,7 @@ def table_of(columns: dict[str, Any]) -> pandas.DataFrame:
 
 
 def label_columns(labels: Sequence[Label | None]) -> dict[str, Any]:
-    """The columns of labels, named as the tables of `blindgrasp export` name them."""
+    """The columns of labels."""
     import pandas
 
     known = [label or Label(False) for label in labels]
@@ -44,7 +44,7 @@ def label_columns(labels: Sequence[Label | None]) -> dict[str, Any]:
     return {
         "stable": pandas.array([label and label.is_stable for label in labels], dtype=dtype),
         "object": [label.object_id or None for label in known],
-        "class": [label.object_class or None for label in known],
+        "object_class": [label.object_class or None for label in known],
         "epsilon": [label.epsilon for label in known],
         "volume": [label.volume for label in known],
     }
@@ -52,7 +52,7 @@ def label_columns(labels: Sequence[Label | None]) -> dict[str, Any]:
 
 def labels_of(table: Any) -> list[Label | None]:
     """The labels in the columns of `label_columns`; None for each row of a table without them."""
-    names = ["stable", "object", "class", "epsilon", "volume"]
+    names = ["stable", "object", "object_class", "epsilon", "volume"]
     columns = table.reindex(columns=names).astype(object)
     rows = columns.where(columns.notna(), None).to_dict("records")
     return [None if row["stable"] is None else Label.from_json(row | {"stable": bool(row["stable"])}) for row in rows]

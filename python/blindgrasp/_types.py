@@ -36,7 +36,7 @@ class Label:
             epsilon=math.nan if epsilon is None else epsilon,
             volume=math.nan if volume is None else volume,
             object_id=fields.get("object") or "",
-            object_class=fields.get("class") or "",
+            object_class=fields.get("object_class") or "",
         )
 
 

@@ -11,12 +11,13 @@ of several dimensions is read row by row. FEATURE/ELEMENTS takes a part of a fea
 element, a pattern with *, an index from 0, or BEGIN:END:STEP as in Python. FEATURE/2::3 is z of cells that measure x, y, z.
 Joints are in radians (metres if they slide) after --joint-scale and --joint-offset; degrees need --joint-scale 0.0174533.
 
-Label, object, day and --at name a field: a column of the file --episodes, a field of the episodes in meta, or a feature of
+Label, object, class, day and --at name a field: a column of the file --episodes, a field of the episodes in meta, or a feature of
 frames, whichever is found first. A feature counts with its value in the last frame of the episode: next.success must be
 true there if the object was kept. Booleans are the texts true and false. Episodes without a label are left out.
 
 The table has the last frames up to the moment of --at or --settled, as frames of the settled hand. The fingers must have
-closed by then, and the lift must not have begun. A dataset does not say when that is, and it is not checked.
+closed by then, and the lift must not have begun. A dataset does not say when that is, and it is not checked. With --phase
+it has all frames, and the feature says the phase of each, as in datasets of blindgrasp.to_lerobot.
 """
 
 from __future__ import annotations
@@ -48,6 +49,8 @@ MAX_ELEMENTS = 1_000_000
 MAX_TEXT_BYTES = 1 << 30
 # The fields of data_path; a width of any size would take all memory.
 PLACE = r"\{(episode_index|episode_chunk|chunk_index|file_index)(:0?\d{1,2}d)?\}"
+# Names that a table may have, and the options of the import for them.
+NAMED = {"day": "--day-column", "class": "--class"}
 # LeRobot's tolerance of timestamps.
 TOLERANCE_S = 1e-4
 
@@ -160,12 +163,12 @@ class _Conversion:
         known = self.data.known
         self.tasks = self.data.tasks() if given.object == "task" and "task" not in known else None
         self.asked = {"label": given.label, "object": given.object if self.tasks is None else "task_index"}
-        self.asked |= {"day": given.day} if given.day else {}
+        self.asked |= {name: getattr(given, name) for name in NAMED if getattr(given, name)}
         self.asked |= {"at": given.at} if given.at and not _is_number(given.at) else {}
         for option, name in self.asked.items():
             self.data.need(f"--{option}", name, known)
-        self.settled, _, self.settled_value = (given.settled or "timestamp=").rpartition("=")
-        self.data.need("--at, --settled FEATURE=VALUE", self.settled)
+        self.settled, _, self.settled_value = (given.settled or f"{given.phase or 'timestamp'}=").rpartition("=")
+        self.data.need("--at, --phase, --settled FEATURE=VALUE", self.settled)
         self.from_frames = {name for name in self.asked.values() if name not in known}
         names = {name for parts in self.parts.values() for name, _, _ in parts} | self.from_frames
         self.names = sorted(names | {"episode_index", "frame_index", "timestamp", self.settled})
@@ -174,7 +177,8 @@ class _Conversion:
     def write(self, stream) -> None:
         columns = [column for parts in self.parts.values() for _, _, columns in parts for column in columns]
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(["grasp", "object", "label", *(["day"] if self.given.day else []), *columns])
+        more = [name for name in (*NAMED, "phase") if getattr(self.given, name)]
+        writer.writerow(["grasp", "object", "label", *more, *columns])
         n, n_done, told = len(self.data.fields), 0, time.monotonic()
         for path, episodes in self.data.files.items():
             # Columns of images are not read.
@@ -223,13 +227,14 @@ class _Conversion:
                 raise _LeftOut(f"no value of '{self.asked[option]}' (--{option})")
             if not word:
                 raise _Refused(f"expected a name in '{getattr(self.given, option)}' (--{option}), found none")
-        named = [_short(words["object"]), words["label"], *([_short(words["day"])] if "day" in words else [])]
-        lines = []
-        for row in self._settled_rows(value, rows, words.get("at", self.given.at)):
+        named = [_short(words["object"]), words["label"], *(_short(words[name]) for name in NAMED if name in words)]
+        lines, phase = [], self.given.phase
+        for row in rows if phase else self._settled_rows(value, rows, words.get("at", self.given.at)):
             numbers = {kind: self._numbers(value, parts, row) for kind, parts in self.parts.items()}
             if "joints" in numbers:
                 numbers["joints"] = numbers["joints"] * self.scale + self.offset
-            lines.append([episode, *named, *(f"{number:.9g}" for of_kind in numbers.values() for number in of_kind)])
+            phases = [_word(value(phase, row))] if phase else []
+            lines.append([episode, *named, *phases, *(float(number) for of_kind in numbers.values() for number in of_kind)])
         self.labels[words["label"]] += 1
         self.objects[words["object"]] += 1
         return lines
@@ -274,7 +279,8 @@ class _Conversion:
         words += ["--cells", patterns["cells"]]
         words += ["--joint-columns", patterns["joints"]] if given.joints else ["--joints", "NAME=VALUE"]
         words += ["--label", "label", "--stable-value", given.stable_value, "--group", "object"]
-        words += ["--day-column", "day"] if given.day else []
+        for name, option in {**NAMED, "phase": "--phase-column"}.items():
+            words += [option, name] if getattr(given, name) else []
         return shlex.join([*words, "--out", str(given.table.with_suffix(".mcap"))])
 
 
@@ -365,11 +371,13 @@ def main() -> int:
     add("--label", required=True, metavar="FIELD", help="how the grasp ended, one of two values")
     add("--stable-value", default="true", metavar="TEXT", help="the label's value that means kept [default: true]")
     add("--object", default="task", metavar="FIELD", help="the object [default: task, the text of the task]")
+    add("--class", metavar="FIELD", help="the object's class [default: the object]")
     add("--day", metavar="FIELD", help="the recording session, a date or a name")
     add("--episodes", type=Path, metavar="FILE", help="more fields of episodes: CSV with a column episode_index")
     moment = parser.add_mutually_exclusive_group(required=True)
     moment.add_argument("--at", metavar="SECONDS", help="from the episode's start, or its end if negative; or its field")
     moment.add_argument("--settled", metavar="FEATURE=VALUE", help="the last frames of the first run with this value")
+    moment.add_argument("--phase", metavar="FEATURE", help="all frames, each in the phase that this feature says")
     add("--frames", type=int, default=3, metavar="N", help="settled frames of each grasp [default: 3]")
     add("--hand", default="HAND", help="the hand of the command that is printed")
     add("--skip-bad", action="store_true", help="leave out episodes with bad values, and list them")

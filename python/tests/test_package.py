@@ -22,7 +22,10 @@ from xml.etree import ElementTree
 import blindgrasp
 import numpy as np
 import pandas as pd
+import yaml
 from blindgrasp import _recording
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 HELD_OUT = REPOSITORY / "recordings/held-out.mcap"
@@ -153,7 +156,7 @@ class Recordings(Folder):
             np.testing.assert_allclose(cells, grasp.cells_newtons[settled].mean(axis=0), atol=1e-12)
             np.testing.assert_allclose(row.filter(like="joint_").to_numpy(float), grasp.joints[settled].mean(axis=0))
             label, decision = grasp.label, grasp.decision
-            found = (row["stable"], row["object"], row["class"], row["epsilon"], row["volume"])
+            found = (row["stable"], row["object"], row["object_class"], row["epsilon"], row["volume"])
             self.assertEqual(found, (label.is_stable, label.object_id, label.object_class, label.epsilon, label.volume))
             found = (row["action"], row["reason"], row["probability_stable"])
             self.assertEqual(found, (decision.action, decision.reason, decision.probability_stable))
@@ -162,6 +165,64 @@ class Recordings(Folder):
         path = self.folder / "grasps.parquet"
         table.to_parquet(path)
         pd.testing.assert_frame_equal(pd.read_parquet(path), table)
+
+    def with_an_outcome(self):
+        """A copy of ORDINARY with an outcome of grasp 11."""
+        golden = json.loads((REPOSITORY / "crates/messages/golden.json").read_text())
+        outcome = next(message for message in golden if message["topic"] == "/outcome")
+        data = bytearray(b"\x00\x01\x00\x00" + bytes.fromhex(outcome["cdr"]))
+        # The header's epoch is that of the recording.
+        data[20:28] = bytes(8)
+        path = self.folder / "outcome.mcap"
+        with ORDINARY.open("rb") as stream, path.open("wb") as copy:
+            reader, writer = make_reader(stream), Writer(copy)
+            writer.start("ros2")
+            for metadata in reader.iter_metadata():
+                writer.add_metadata(metadata.name, metadata.metadata)
+            writer.add_metadata("graph", {"models": "[one]"})
+            channels = {}
+
+            def add(name, definition, topic, message):
+                if topic not in channels:
+                    schema = writer.register_schema(name, "ros2msg", definition)
+                    channels[topic] = writer.register_channel(topic, "cdr", schema)
+                writer.add_message(channels[topic], message.log_time, message.data, message.publish_time)
+
+            for schema, channel, message in reader.iter_messages(log_time_order=False):
+                add(schema.name, schema.data, channel.topic, message)
+            message.data = bytes(data)
+            add("blindgrasp_msgs/msg/LiftOutcome", "\n".join(outcome["definition"]).encode(), "/outcome", message)
+            writer.finish()
+        return path, outcome["json"]
+
+    def test_all_frames_go_to_parquet_and_come_back(self):
+        recording, outcome = self.with_an_outcome()
+        path, again = self.folder / "frames.parquet", self.folder / "again.mcap"
+        blindgrasp.to_parquet(recording, path, hand="barrett-bh8-280")
+        frames, grasps = pd.read_parquet(path), blindgrasp.read(recording)
+        self.assertEqual(frames["cell_finger_1_3"].tolist(), [cell for grasp in grasps for cell in grasp.cells_newtons[:, 27]])
+        self.assertEqual(frames["seq"].tolist(), [seq for grasp in grasps for seq in grasp.seq])
+        found = {line["seq"]: line["data"] for line in exported(recording, "/prediction")}
+        known = [np.nan if data["fault"] != "none" else data["probability_stable"] for data in found.values()]
+        np.testing.assert_array_equal(frames.sort_values("seq")["predicted"], known)
+        last = frames[frames["grasp_id"] == 11].iloc[0]
+        self.assertEqual((last["model"], last["day"], last["outcome_slip_m"]), ("[one]", 0, outcome["slip_m"]))
+        self.assertEqual((last["outcome_lifted"], last["outcome_held"]), (outcome["lifted"], outcome["held"]))
+        self.assertEqual(grasps[11].outcome, outcome)
+        self.assertTrue(frames[frames["grasp_id"] < 11]["outcome_lifted"].isna().all())
+        columns = {"grasp_column": "grasp_id", "phase_column": "phase", "class_column": "object_class"}
+        blindgrasp.from_table(frames, again, hand="barrett-bh8-280", **columns)
+        for grasp, copied in zip(grasps, blindgrasp.read(again), strict=True):
+            for name in ("joints", "cells_newtons", "phase"):
+                np.testing.assert_array_equal(getattr(copied, name), getattr(grasp, name))
+            names = ("is_stable", "object_id", "object_class")
+            self.assertEqual([getattr(copied.label, name) for name in names], [getattr(grasp.label, name) for name in names])
+
+    def test_recordings_of_two_hands_are_no_data_set(self):
+        for recordings in (self.folder, [ORDINARY, REPOSITORY / "recordings/other-hand.mcap"]):
+            with self.assertRaisesRegex(ValueError, "expected recordings of one hand, found"):
+                blindgrasp.to_parquet(recordings, self.folder / "frames.parquet")
+        self.assertEqual(list(self.folder.iterdir()), [])
 
     def test_the_cells_of_a_table_have_the_names_of_the_pads(self):
         recording = blindgrasp.Recording(ORDINARY)
@@ -212,7 +273,7 @@ class Recordings(Folder):
         columns = pd.DataFrame(_recording.label_columns([blindgrasp.Label(True, object_id="mug-02"), None]))
         self.assertEqual(columns["stable"].isna().tolist(), [False, True])
         self.assertEqual(columns["object"].isna().tolist(), [False, True])
-        self.assertTrue(columns[["class", "epsilon"]].isna().all(axis=None))
+        self.assertTrue(columns[["object_class", "epsilon"]].isna().all(axis=None))
 
     def test_a_table_without_pandas_is_refused_in_words(self):
         with mock.patch.dict(sys.modules, pandas=None):
@@ -768,6 +829,16 @@ class Program(Folder):
                 self.assertEqual(blindgrasp.program(), self.folder / "blindgrasp")
 
 
+class Files(unittest.TestCase):
+    def test_all_yaml_files_load_in_pyyaml(self):
+        listed = ["git", "ls-files", "*.yaml", "*.yml"]
+        paths = subprocess.run(listed, cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout.split()
+        self.assertIn("dataflow-live.yaml", paths)
+        for path in paths:
+            with self.subTest(path):
+                self.assertIsNotNone(yaml.safe_load((REPOSITORY / path).read_text()))
+
+
 class Pages(Folder):
     def test_the_examples_of_the_page_run_as_they_stand(self):
         for name in ("recordings", "models", "hands", "dataflow.yaml"):
@@ -791,7 +862,7 @@ class Pages(Folder):
         # The table has become a recording again.
         table, again = names["table"], blindgrasp.Recording(self.folder / "grasps.mcap").to_frame()
         self.assertEqual(again["stable"].tolist(), table["stable"].tolist())
-        self.assertEqual(again["class"].tolist(), table["class"].tolist())
+        self.assertEqual(again["object_class"].tolist(), table["object_class"].tolist())
         cells = [frame.filter(like="cell_").to_numpy() for frame in (table, again)]
         np.testing.assert_allclose(cells[1], cells[0], atol=1e-12)
 

@@ -8,6 +8,7 @@ use serde_json::json;
 
 use super::{Outcome, print_line};
 use blindgrasp_cli::frame_lines::read_frames;
+use blindgrasp_cli::shard::Shard;
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::decide::{Decided, decide, decide_frames, has_probability};
 use blindgrasp_messages::{GraspTruth, LiftDecision};
@@ -37,6 +38,9 @@ pub(super) struct Arguments {
     /// those after the test lift
     #[arg(long, default_value = "none")]
     probe: ProbeWord,
+    /// Take only every N-th file, from the I-th on (0/N to N-1/N); the lines of all shards are those of the whole
+    #[arg(long, value_name = "I/N", default_value = "0/1", hide_default_value = true)]
+    shard: Shard,
     /// Print JSON, one object a grasp
     #[arg(long)]
     json: bool,
@@ -75,11 +79,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         arguments.model.display()
     );
     let options = ArbiterOptions { probe, ..ArbiterOptions::default() };
-    let mut files = Vec::new();
-    for file in &arguments.files {
-        if file.is_dir() { files.extend(recordings_in(std::slice::from_ref(file))?) } else { files.push(file.clone()) }
-    }
-    for file in &files {
+    for file in &arguments.shard.of(recordings_in(&arguments.files)?) {
         let is_recording = file.extension().is_some_and(|extension| extension == "mcap");
         if is_recording {
             let hand = hand_of(file, arguments.hand.as_deref())?;

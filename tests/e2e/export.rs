@@ -6,8 +6,6 @@ use std::process::Stdio;
 
 use crate::common::python::utf8;
 use crate::common::{MODEL, RECORDING, blindgrasp, json_lines, json_of, project, run, text};
-use blindgrasp_messages::{Header, Prediction, Stamped};
-use blindgrasp_recording::{RecordingInfo, RecordingWriter};
 
 fn names_in(folder: &Path) -> Vec<String> {
     let entries = std::fs::read_dir(folder).expect("readable").flatten();
@@ -38,28 +36,6 @@ fn lines_to_a_file_are_those_to_stdout() {
 }
 
 #[test]
-fn a_table_goes_to_stdout_a_file_or_a_folder() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let at = |name: &str| folder.path().join(name);
-    let csv = ["export", RECORDING, "--format", "csv"];
-    let stdout = run(&[&csv[..], &["--topic", "/truth"]].concat(), 0).stdout;
-    let header = "seq,stamp_nanos,epoch,hand_id,grasp_id,epsilon,volume,stable,object,class";
-    assert_eq!(text(&stdout).lines().next(), Some(header));
-    assert_eq!(text(&stdout).lines().count(), 241);
-
-    run(&[&csv[..], &["--topic", "/truth", "--out", utf8(&at("one.txt"))]].concat(), 0);
-    assert_eq!(std::fs::read(at("one.txt")).expect("written"), stdout);
-    let made = run(&[&csv[..], &["--out", utf8(&at("all"))]].concat(), 0).stdout;
-    assert_eq!(names_in(&at("all")), ["scene.csv", "tactile.csv", "truth.csv"]);
-    assert_eq!(std::fs::read(at("all/truth.csv")).expect("written"), stdout);
-    assert!(text(&made).contains(&format!("{}: 3360 rows\n", at("all/tactile.csv").display())), "{}", text(&made));
-    // Into a folder that is there, over what is there.
-    std::fs::write(at("all/truth.csv"), "of yesterday").expect("written");
-    run(&[&csv[..], &["--topic", "/truth", "--overwrite", "--out", utf8(&at("all"))]].concat(), 0);
-    assert_eq!(std::fs::read(at("all/truth.csv")).expect("written"), stdout);
-}
-
-#[test]
 fn a_column_of_features_says_what_it_is() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("features.csv");
@@ -83,15 +59,11 @@ fn a_column_of_features_says_what_it_is() {
 fn refused_exports_leave_no_file() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| utf8(&folder.path().join(name)).to_string();
-    for format in ["jsonl", "csv"] {
-        let arguments = [RECORDING, "--format", format, "--topic", "/truth", "--topic", "/trut", "--out", &at("x")];
-        refused(&arguments, &["held-out.mcap", "/trut:", "/scene, /tactile, /truth"]);
-        refused(&[RECORDING, "--format", format, "--topic", "/truth", "--out", &at("no/x")], &["no such folder"]);
-        refused(&[RECORDING, "--format", format, "--topic", "/truth", "--out", "/dev/null"], &["/dev/null"]);
-    }
+    let arguments = [RECORDING, "--topic", "/truth", "--topic", "/trut", "--out", &at("x")];
+    refused(&arguments, &["held-out.mcap", "/trut:", "/scene, /tactile, /truth"]);
+    refused(&[RECORDING, "--topic", "/truth", "--out", &at("no/x")], &["no such folder"]);
+    refused(&[RECORDING, "--topic", "/truth", "--out", "/dev/null"], &["/dev/null"]);
     refused(&[RECORDING, "--topic", "/trut"], &["/scene, /tactile, /truth"]);
-    refused(&[RECORDING, "--format", "csv"], &["/scene, /tactile, /truth", "--topic", "--out"]);
-    refused(&[RECORDING, "--format", "csv", "--out", &at("x.csv")], &["x.csv", "folder", "3 topics"]);
     assert!(names_in(folder.path()).is_empty(), "{:?}", names_in(folder.path()));
 }
 
@@ -100,14 +72,9 @@ fn the_recording_is_never_written_over() {
     let folder = tempfile::tempdir().expect("a folder");
     let at = |name: &str| utf8(&folder.path().join(name)).to_string();
     let whole = std::fs::read(project().join(RECORDING)).expect("read");
-    for (name, format, out) in [
-        ("a.mcap", "jsonl", at("a.mcap")),
-        ("truth.csv", "csv", at("truth.csv")),
-        ("truth.csv", "csv", at("")),
-        ("truth.csv.partial", "csv", at("truth.csv")),
-    ] {
+    for (name, out) in [("a.mcap", at("a.mcap")), ("a.partial", at("a"))] {
         std::fs::write(at(name), &whole).expect("copied");
-        refused(&[&at(name), "--format", format, "--topic", "/truth", "--out", &out], &[name, "destroy"]);
+        refused(&[&at(name), "--topic", "/truth", "--out", &out], &[name, "destroy"]);
         assert_eq!(std::fs::read(at(name)).expect("read"), whole, "{name}");
         std::fs::remove_file(at(name)).expect("removed");
     }
@@ -123,15 +90,12 @@ fn a_damaged_recording_leaves_what_was_there() {
     bytes[middle] ^= 0x10;
     std::fs::write(at("damaged.mcap"), bytes).expect("written");
     std::fs::write(at("t"), "of yesterday").expect("written");
-    for format in ["jsonl", "csv"] {
-        let (damaged, out) = (at("damaged.mcap"), at("t"));
-        let arguments = [damaged.as_str(), "--format", format, "--topic", "/truth", "--out", &out];
-        let of_whole = [&[RECORDING], &arguments[1..]].concat();
-        refused(&of_whole, &["t: the file exists", "--overwrite"]);
-        refused(&[&arguments[..], &["--overwrite"]].concat(), &["damaged.mcap"]);
-        assert_eq!(std::fs::read_to_string(&out).expect("there"), "of yesterday");
-    }
     let (damaged, out) = (at("damaged.mcap"), at("t"));
+    let arguments = [damaged.as_str(), "--topic", "/truth", "--out", &out];
+    let of_whole = [&[RECORDING], &arguments[1..]].concat();
+    refused(&of_whole, &["t: the file exists", "--overwrite"]);
+    refused(&[&arguments[..], &["--overwrite"]].concat(), &["damaged.mcap"]);
+    assert_eq!(std::fs::read_to_string(&out).expect("there"), "of yesterday");
     let output = run(&["export", RECORDING, &damaged, "--features", MODEL, "--out", &out, "--overwrite"], 1);
     let errors = text(&output.stderr);
     assert!(errors.contains("damaged.mcap") && !errors.contains("cannot write"), "{errors}");
@@ -140,42 +104,16 @@ fn a_damaged_recording_leaves_what_was_there() {
 }
 
 #[test]
-fn file_names_follow_topics_and_never_collide() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let at = |name: &str| utf8(&folder.path().join(name)).to_string();
-    let record = |name: &str, topics: &[&str]| {
-        let info = RecordingInfo { hand: "h".into(), hand_id: 0, made_by: "a test".into(), version: "0".into() };
-        let mut writer = RecordingWriter::create(&folder.path().join(name), &info).expect("created");
-        for topic in topics {
-            let sample = Stamped { header: Header::default(), message: Prediction::default() };
-            writer.write(topic, &sample).expect("written");
-        }
-        writer.finish().expect("finished");
-        at(name)
-    };
-    let two = record("two.mcap", &["/a/b", "/c"]);
-    run(&["export", &two, "--format", "csv", "--out", &at("two")], 0);
-    assert_eq!(names_in(&folder.path().join("two")), ["a.b.csv", "c.csv"]);
-    let same = record("same.mcap", &["/a/b", "/a.b"]);
-    refused(&[&same, "--format", "csv", "--out", &at("two")], &["/a/b", "/a.b", "a.b.csv"]);
-    let none = record("none.mcap", &[]);
-    refused(&[&none, "--format", "csv", "--out", &at("two")], &["none.mcap", "no samples"]);
-    assert!(run(&["export", &none], 0).stdout.is_empty());
-}
-
-#[test]
 fn a_reader_may_close_the_pipe_early() {
-    for format in ["jsonl", "csv"] {
-        let mut child = blindgrasp()
-            .args(["export", RECORDING, "--topic", "/tactile", "--format", format])
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .expect("started");
-        let mut stdout = child.stdout.take().expect("piped");
-        stdout.read_exact(&mut [0; 10]).expect("read");
-        drop(stdout);
-        let output = child.wait_with_output().expect("waited");
-        assert_eq!((output.status.code(), text(&output.stderr)), (Some(0), String::new()), "{format}");
-    }
+    let mut child = blindgrasp()
+        .args(["export", RECORDING, "--topic", "/tactile"])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("started");
+    let mut stdout = child.stdout.take().expect("piped");
+    stdout.read_exact(&mut [0; 10]).expect("read");
+    drop(stdout);
+    let output = child.wait_with_output().expect("waited");
+    assert_eq!((output.status.code(), text(&output.stderr)), (Some(0), String::new()));
 }

@@ -5,13 +5,14 @@ use std::ffi::OsStr;
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::Arc;
 
 use blindgrasp_messages::{
     Action, Contact, ContactSet, GraspTruth, Header, LiftDecision, Phase, Prediction, Stamped, TactileFrame,
 };
 use blindgrasp_recording::{
     LiveOptions, LiveRecorder, Oddity, Problems, Record, RecordingError, RecordingIndex, RecordingInfo,
-    RecordingReader, RecordingWriter, RepairReport, repair, repaired_path,
+    RecordingReader, RecordingWriter, RepairReport, ShownHand, repair, repaired_path,
 };
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -59,7 +60,7 @@ fn decision(grasp_id: u64) -> Record {
 }
 
 fn truth(grasp_id: u64) -> Record {
-    let message = GraspTruth { grasp_id, object: "mug".into(), class: "cup".into(), ..GraspTruth::default() };
+    let message = GraspTruth { grasp_id, object: "mug".into(), object_class: "cup".into(), ..GraspTruth::default() };
     Record::Truth(Stamped { header: Header { seq: grasp_id, ..header(grasp_id * 10 + 9) }, message })
 }
 
@@ -113,8 +114,15 @@ fn a_live_recording_is_read_as_it_was_written() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("live.mcap");
     let graph = BTreeMap::from([("yaml".to_string(), "name: x\n".to_string())]);
-    let options = LiveOptions {
+    let hand = ShownHand {
         joint_names: (0..7).map(|idx| format!("joint_{idx}")).collect(),
+        layout: "name: x".into(),
+        urdf: "<robot/>".into(),
+        link_poses: Arc::new(|_| Vec::new()),
+    };
+    let options = LiveOptions {
+        hand: Some(hand),
+        attachments: BTreeMap::from([("model.json".to_string(), b"{}".to_vec())]),
         metadata: BTreeMap::from([("graph".to_string(), graph.clone())]),
         ..LiveOptions::default()
     };
@@ -147,7 +155,8 @@ fn a_live_recording_is_read_as_it_was_written() {
     assert_eq!(index.topics["/joint_states"].n_messages, Some(2000));
     assert_eq!(index.topics["/contact_points"].schema, "sensor_msgs/msg/PointCloud2");
     assert!(index.topics["/tactile"].is_ours && !index.topics["/joint_states"].is_ours);
-    assert_eq!(index.n_messages, Some(samples.len() as u64 + 4000));
+    assert_eq!((index.topics["/robot_description"].n_messages, index.topics["/tf"].n_messages), (Some(1), Some(2000)));
+    assert_eq!(index.n_messages, Some(samples.len() as u64 + 6001));
     assert_eq!((index.first_stamp_nanos, index.duration_nanos()), (Some(1_000_000_000), Some(1_999_000_000)));
     assert!(index.n_chunks > 3 && index.n_compressed_bytes < index.n_uncompressed_bytes, "{index:?}");
 

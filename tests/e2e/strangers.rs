@@ -145,7 +145,7 @@ fn recording_of_stranger(path: &Path, hand: &str) {
         match record {
             Record::Truth(mut truth) => {
                 truth.message.object = format!("mug{EVIL}\ngrasp 1 LIFT");
-                truth.message.class = format!("cup{EVIL}\ngrasp 1 LIFT");
+                truth.message.object_class = format!("cup{EVIL}\ngrasp 1 LIFT");
                 writer.write_record(&topic, &Record::Truth(truth)).expect("written");
             }
             record @ Record::Tactile(_) => writer.write_record(&topic, &record).expect("written"),

@@ -134,10 +134,10 @@ fn read_line(
         Header { hand_id, seq: line.seq, stamp_nanos: line.stamp_nanos, epoch: line.epoch, ..Header::default() };
     if line.topic == GraspTruth::TOPIC {
         let truth: TruthLine = serde_json::from_value(line.data)
-            .context("not a label: expected grasp_id, epsilon, volume, stable, object and class")?;
-        let TruthLine { grasp_id, epsilon, volume, stable, object, class } = truth;
+            .context("not a label: expected grasp_id, epsilon, volume, stable, object and object_class")?;
+        let TruthLine { grasp_id, epsilon, volume, stable, object, object_class } = truth;
         let [epsilon, volume] = [epsilon, volume].map(|number| number.unwrap_or(f64::NAN));
-        let message = GraspTruth { grasp_id, epsilon, volume, stable, object, class };
+        let message = GraspTruth { grasp_id, epsilon, volume, stable, object, object_class };
         return Ok(Line::Truth(Stamped { header, message }));
     }
     if line.topic != TactileFrame::TOPIC {
@@ -223,7 +223,9 @@ struct TruthLine {
     volume: Option<f64>,
     stable: bool,
     object: String,
-    class: String,
+    /// Lines of earlier versions name it `class`.
+    #[serde(alias = "class")]
+    object_class: String,
 }
 
 fn numbers(values: Vec<Option<f64>>) -> Vec<f64> {

@@ -4,6 +4,7 @@
 //! * [`help`], [`hints`], [`completions`], [`man`] - the command line explained: to a person, after a mistake, to a shell, on paper.
 //! * [`operator`] - the process of an operator.
 //! * [`graph_file`] - dataflow files with the operators that come with blindgrasp, checked. [`frame_lines`] - frames as lines of JSON.
+//! * [`shard`] - `--shard I/N`.
 
 pub mod completions;
 pub mod frame_lines;
@@ -13,6 +14,7 @@ pub mod hints;
 pub mod houses;
 pub mod man;
 pub mod operator;
+pub mod shard;
 pub mod testing;
 
 use std::ffi::OsString;

@@ -198,6 +198,8 @@ pub struct GraphStatus {
     pub message: Option<String>,
     pub uptime_secs: f64,
     pub log_folder: PathBuf,
+    #[serde(default)]
+    pub iceoryx2: Iceoryx2Config,
     /// The nodes, in the graph's order.
     pub nodes: Vec<NodeStatus>,
     /// The edges, in the graph's order; the launching command reads the edges to `run`.
@@ -209,6 +211,13 @@ pub struct GraphStatus {
     /// Destinations of `ssh` of the other machines for which the dataflow file names one.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub ssh_hosts: BTreeMap<String, String>,
+}
+
+/// The values of iceoryx2's configuration with which its own tools see a graph, as `global.root-path` and `global.prefix`.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Iceoryx2Config {
+    pub root_path: PathBuf,
+    pub prefix: String,
 }
 
 /// The decisions that the launching command has read.

@@ -11,7 +11,8 @@ use blindgrasp_operator::wiring::EdgePolicy;
 use crate::client::activity::{Look, RUN};
 use crate::client::usage::ProcessUsage;
 use crate::control::{
-    DecidedGrasp, DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request,
+    DecidedGrasp, DecisionStatus, EdgeStatus, GraphState, GraphStatus, Iceoryx2Config, NodeState, NodeStatus, Reply,
+    Request,
 };
 
 pub(crate) fn listen(graph: &str) -> ControlSocket {
@@ -53,6 +54,7 @@ pub fn made_status(graph: &str) -> GraphStatus {
         message: Some("classifier was given up after 5 restarts".into()),
         uptime_secs: 3725.4,
         log_folder: "/logs".into(),
+        iceoryx2: Iceoryx2Config::default(),
         nodes: vec![
             NodeStatus {
                 pid: Some(std::process::id()),

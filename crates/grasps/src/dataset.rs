@@ -140,7 +140,7 @@ pub fn reported_truth(recording: &Path, grasp_id: u64, is_kept: bool) -> GraspTr
         volume: f64::NAN,
         stable: is_kept,
         object: format!("lift {grasp_id} of {name}"),
-        class: "not named".into(),
+        object_class: "not named".into(),
     }
 }
 

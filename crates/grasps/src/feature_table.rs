@@ -57,13 +57,13 @@ pub fn write_feature_table(
                     continue;
                 }
             };
-            objects.push((truth.object.clone(), truth.class.clone()));
+            objects.push((truth.object.clone(), truth.object_class.clone()));
             if let Err(fault) = model.features.extract(&settled.felt.reading(), &mut values) {
                 *n_excluded.entry(fault.as_str().into()).or_default() += 1;
                 continue;
             }
             let (recording, stable) = (path.display().to_string(), u8::from(truth.stable).to_string());
-            let row = [recording, grasp_id.to_string(), truth.object, truth.class, stable];
+            let row = [recording, grasp_id.to_string(), truth.object, truth.object_class, stable];
             table.write_record(row.into_iter().chain(identity.clone()).chain(values.iter().map(f64::to_string)))?;
             n_rows += 1;
         }

@@ -220,7 +220,7 @@ impl RecordingsSummary {
             qualities.push((truth.epsilon, truth.volume));
         }
         for group in [
-            self.classes.entry(truth.class.clone()).or_default(),
+            self.classes.entry(truth.object_class.clone()).or_default(),
             self.objects.entry(truth.object.clone()).or_default(),
         ] {
             group.n_grasps += 1;

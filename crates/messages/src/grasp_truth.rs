@@ -19,12 +19,12 @@ message! {
         pub object: String,
         /// The object's class.
         #[max(MAX_NAME_BYTES)]
-        pub class: String,
+        pub object_class: String,
     }
 
     /// The items are the UTF-8 bytes of the object's name, then of its class.
     pub struct GraspTruthHead = "blindgrasp/GraspTruthHead/1" {
         grasp_id: u64, epsilon: f64, volume: f64, stable: u32, n_object_bytes: u32 => object,
     }
-    items: u8 => class;
+    items: u8 => object_class;
 }

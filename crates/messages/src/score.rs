@@ -75,7 +75,7 @@ impl Evaluation {
         if is_judged(decision.reason) {
             self.score_judged.add(lifted, truth.stable);
         }
-        self.by_class.entry(truth.class.clone()).or_default().add(lifted, truth.stable);
+        self.by_class.entry(truth.object_class.clone()).or_default().add(lifted, truth.stable);
     }
 }
 

@@ -117,7 +117,7 @@ fn shapes() -> Vec<Map<String, Value>> {
             volume: 0.5,
             stable: true,
             object: "bücher-1".into(),
-            class: "book".into(),
+            object_class: "book".into(),
         }),
         sent(&LiftOutcome {
             grasp_id: 11,
@@ -237,8 +237,8 @@ fn unknown_codes_and_lengths_that_cannot_be_are_refused() {
     items[0] = 0xff;
     let error = GraspTruth::from_parts(&head, &items).expect_err("no text").to_string();
     assert_eq!(error, "object is not UTF-8");
-    let long = GraspTruth { class: "a".repeat(MAX_NAME_BYTES + 1), ..GraspTruth::default() };
-    assert_eq!(long.check().expect_err("too long").to_string(), "class has length 65, expected 0 to 64");
+    let long = GraspTruth { object_class: "a".repeat(MAX_NAME_BYTES + 1), ..GraspTruth::default() };
+    assert_eq!(long.check().expect_err("too long").to_string(), "object_class has length 65, expected 0 to 64");
 }
 
 fn described<M: Recorded>() -> (&'static str, String) {

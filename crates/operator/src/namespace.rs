@@ -38,7 +38,7 @@ const FOLDER_PREFIX: &str = "blindgrasp_";
 /// The unit in which the kernel counts the blocks of a file.
 const BLOCK_BYTES: u64 = 512;
 /// The names of all files that iceoryx2 makes begin with this.
-const FILE_PREFIX: &str = "x";
+pub const FILE_PREFIX: &str = "x";
 /// The end of the names of the files that hold samples, which iceoryx2 removes without a look into them.
 const SAMPLES_SUFFIX: &str = ".data";
 /// The names of folders have so much of the graph's name. iceoryx2 has room for about 60 characters before the name of a socket.

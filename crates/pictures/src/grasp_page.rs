@@ -86,7 +86,7 @@ fn facts(placed: &Placed<'_>) -> Vec<(&'static str, String)> {
     let mut label = "not labelled";
     if let Some(truth) = &grasp.truth {
         label = if truth.stable { "stable" } else { "unstable" };
-        facts.push(("class", truth.class.clone()));
+        facts.push(("class", truth.object_class.clone()));
         // NaN where nobody computed them.
         if !truth.epsilon.is_nan() {
             let note = if truth.epsilon < 0.0 { " (no force closure)" } else { "" };

@@ -17,7 +17,7 @@ fn recorded(class: &str) -> (Hand, RecordedGrasp) {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../recordings/held-out.mcap");
     let read = || RecordingReader::open(&path).expect("readable").map(|record| record.expect("readable").1);
     let truth = read().find_map(|record| match record {
-        Record::Truth(truth) if truth.message.class == class && truth.message.stable => Some(truth.message),
+        Record::Truth(truth) if truth.message.object_class == class && truth.message.stable => Some(truth.message),
         _ => None,
     });
     let truth = truth.expect("a grasp");

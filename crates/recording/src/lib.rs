@@ -20,7 +20,6 @@
 
 mod channels;
 mod chosen;
-pub mod export;
 mod index;
 mod live;
 mod live_file;
@@ -32,6 +31,7 @@ mod source;
 mod split;
 mod summary;
 mod types;
+mod value;
 mod viewer;
 mod writer;
 
@@ -53,7 +53,8 @@ pub use parts::{Manifest, part_path, recordings_in};
 pub use problems::{Oddity, Problem, Problems};
 pub use reader::RecordingReader;
 pub use repair::{RepairReport, repair, repaired_path};
-pub use viewer::TOPICS_FOR_VIEWERS;
+pub use value::{Value, ValueError, leaves};
+pub use viewer::{LinkPose, ShownHand, TOPICS_FOR_VIEWERS};
 pub use writer::RecordingWriter;
 
 /// The metadata with a recording's [`RecordingInfo`].
@@ -138,8 +139,8 @@ mod tests {
         let decision = LiftDecision { grasp_id: 7, action, reason, probability_stable: 0.75 };
         let contacts_of_scene = vec![SceneContact { other_link: -1, ..SceneContact::default() }; 2];
         let scene = GraspScene { joints: vec![0.5; 7], contacts: contacts_of_scene, ..GraspScene::default() };
-        let (object, class) = ("bücher-1".into(), "book".into());
-        let truth = GraspTruth { epsilon: -1.0, object, class, ..GraspTruth::default() };
+        let (object, object_class) = ("bücher-1".into(), "book".into());
+        let truth = GraspTruth { epsilon: -1.0, object, object_class, ..GraspTruth::default() };
         let outcome = LiftOutcome { attempt: 3, lifted: true, thing: "tasse".into(), ..LiftOutcome::default() };
         vec![
             ("/tactile", record(0, frame)),

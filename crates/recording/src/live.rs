@@ -10,7 +10,7 @@ use blindgrasp_messages::{Record, with_sample};
 use super::live_file::{LiveFile, WriteFailure, open_locked};
 use super::split::{RecentGrasps, Split, key_of};
 use super::types::encode;
-use super::viewer::{CONTACT_POINTS, JOINT_STATES, contact_points, joint_state};
+use super::viewer::{ShownHand, ViewerMessages};
 use super::writer::info_metadata;
 use super::{END_METADATA_NAME, METADATA_NAME, PART_METADATA_NAME, RecordingError, RecordingInfo};
 
@@ -18,7 +18,7 @@ use super::{END_METADATA_NAME, METADATA_NAME, PART_METADATA_NAME, RecordingError
 const LATE_SAMPLES: Duration = Duration::from_secs(2);
 
 /// How to record.
-#[derive(Debug, Clone, Default)]
+#[derive(Clone, Default)]
 pub struct LiveOptions {
     /// Write over a file of that name.
     pub overwrite: bool,
@@ -26,8 +26,10 @@ pub struct LiveOptions {
     pub rotate_bytes: Option<u64>,
     /// Begin another file when one is this old.
     pub rotate_after: Option<Duration>,
-    /// The hand's joints, in its order, for `/joint_states`; without names there is no such topic.
-    pub joint_names: Vec<String>,
+    /// The hand; without it viewers see contacts alone.
+    pub hand: Option<ShownHand>,
+    /// Files to attach to the first file, by name, beside those of the hand.
+    pub attachments: BTreeMap<String, Vec<u8>>,
     /// Further metadata, by name; each file has all of it.
     pub metadata: BTreeMap<String, BTreeMap<String, String>>,
 }
@@ -64,9 +66,7 @@ pub struct LiveRecorder {
     previous: Option<Previous>,
     n_parts: usize,
     recent: RecentGrasps,
-    /// The first topic of each type is the one that viewers see.
-    joint_topic: Option<String>,
-    contact_topic: Option<String>,
+    viewer: ViewerMessages,
     ended: Option<Ended>,
     /// The last file's metadata about its end.
     ending: Option<&'static str>,
@@ -82,8 +82,6 @@ pub struct LiveRecorder {
 struct Part {
     file: LiveFile,
     begun: Instant,
-    joint_channel: Option<u16>,
-    contact_channel: Option<u16>,
 }
 
 /// The file before the current one, still open for late samples.
@@ -124,14 +122,14 @@ impl LiveRecorder {
             previous: None,
             n_parts: 0,
             recent: RecentGrasps::default(),
-            joint_topic: None,
-            contact_topic: None,
+            viewer: ViewerMessages::default(),
             ended: None,
             ending: None,
             summary: LiveSummary::default(),
             is_last_taken: false,
             data: Vec::new(),
         };
+        recorder.viewer.hand = recorder.options.hand.take();
         if recorder.options.is_split() {
             recorder.clear_old_parts()?;
         }
@@ -223,24 +221,16 @@ impl LiveRecorder {
         let mut written = with_sample!(record, sample => part.file.write(topic, sample, &self.data));
         let is_taken = written.is_ok();
         if is_taken {
-            let names = &self.options.joint_names;
-            written = match record {
-                Record::Tactile(sample)
-                    if !names.is_empty()
-                        && names.len() == sample.message.joints.len()
-                        && is_first(&mut self.joint_topic, topic) =>
-                {
-                    joint_state(&header, names, &sample.message, &mut self.data)
-                        .map_err(|error| invalid(&self.path, error))?;
-                    part.file.write_standard(&mut part.joint_channel, &JOINT_STATES, &header, &self.data)
-                }
-                Record::Contacts(sample) if is_first(&mut self.contact_topic, topic) => {
-                    contact_points(&header, &sample.message, &mut self.data)
-                        .map_err(|error| invalid(&self.path, error))?;
-                    part.file.write_standard(&mut part.contact_channel, &CONTACT_POINTS, &header, &self.data)
-                }
-                _ => Ok(()),
+            let messages = match record {
+                Record::Tactile(frame) => self.viewer.of_frame(topic, frame, part.file.is_first_frame()),
+                Record::Contacts(contacts) => self.viewer.of_contacts(topic, contacts),
+                _ => Ok(Vec::new()),
             };
+            for (standard, data) in messages.map_err(|error| invalid(&self.path, error))? {
+                if written.is_ok() {
+                    written = part.file.write_standard(standard, &header, &data);
+                }
+            }
         }
         let Err(failure) = written else { return Ok(()) };
         self.is_last_taken = is_taken;
@@ -287,9 +277,14 @@ impl LiveRecorder {
         if self.options.is_split() {
             metadata.push((PART_METADATA_NAME, &part));
         }
-        let file = LiveFile::create(&path, self.options.overwrite, &metadata)?;
+        let mut attachments: Vec<(&str, &[u8])> = Vec::new();
+        if self.n_parts == 0 {
+            attachments.extend(self.options.attachments.iter().map(|(name, data)| (name.as_str(), data.as_slice())));
+            attachments.extend(self.viewer.hand.iter().flat_map(ShownHand::files));
+        }
+        let file = LiveFile::create(&path, self.options.overwrite, &metadata, &attachments)?;
         self.n_parts += 1;
-        Ok(Part { file, begun: Instant::now(), joint_channel: None, contact_channel: None })
+        Ok(Part { file, begun: Instant::now() })
     }
 
     fn part_path(&self, part_idx: usize) -> PathBuf {
@@ -411,10 +406,6 @@ impl Ended {
             None => RecordingError::Damaged { path, message: reason },
         }
     }
-}
-
-fn is_first(first: &mut Option<String>, topic: &str) -> bool {
-    first.get_or_insert_with(|| topic.into()) == topic
 }
 
 fn is_full(error: &std::io::Error) -> bool {

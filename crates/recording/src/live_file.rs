@@ -14,8 +14,8 @@ use rustix::fs::FallocateFlags;
 use rustix::io::Errno;
 
 use super::RecordingError;
-use super::viewer::StandardType;
-use super::writer::{add_channel, append, lock, write_error, write_options};
+use super::viewer::{JOINT_STATES, StandardType};
+use super::writer::{add_channel, add_standard, append, attach, lock, write_error, write_options};
 
 /// A chunk is closed at this many bytes before compression: little is lost with a killed process, and zstd still
 /// compresses well.
@@ -41,7 +41,7 @@ pub(super) struct LiveFile {
     /// The same open file, and its lock.
     file: File,
     channels: BTreeMap<String, LiveChannel>,
-    n_standard_channels: u64,
+    standard_channels: BTreeMap<&'static str, u16>,
     chunk_begun: Option<Instant>,
     /// Upper bound of the open chunk's bytes; 0 without an open chunk.
     n_chunk_bytes: u64,
@@ -80,6 +80,7 @@ impl LiveFile {
         path: &Path,
         overwrite: bool,
         metadata: &[(&str, &BTreeMap<String, String>)],
+        attachments: &[(&str, &[u8])],
     ) -> Result<Self, RecordingError> {
         let io = |source| RecordingError::Io { path: path.into(), source };
         let file = open_locked(path, overwrite)?;
@@ -95,7 +96,7 @@ impl LiveFile {
             writer,
             file,
             channels: BTreeMap::new(),
-            n_standard_channels: 0,
+            standard_channels: BTreeMap::new(),
             chunk_begun: None,
             n_chunk_bytes: 0,
             n_chunks: 0,
@@ -107,10 +108,18 @@ impl LiveFile {
             let n_bytes: usize = metadata.iter().map(|(key, value)| key.len() + value.len() + 8).sum();
             live.n_definition_bytes += (n_bytes + 2 * name.len() + 64) as u64;
         }
-        let begun = live.reserve(CHUNK_BYTES).and_then(|()| {
+        let mut n_attached_bytes = 0;
+        for (name, data) in attachments {
+            live.n_definition_bytes += (2 * name.len() + 256) as u64;
+            n_attached_bytes += data.len() as u64;
+        }
+        let begun = live.reserve(CHUNK_BYTES + n_attached_bytes).and_then(|()| {
             for (name, metadata) in metadata {
                 let metadata = Metadata { name: (*name).into(), metadata: (*metadata).clone() };
                 live.writer.write_metadata(&metadata).map_err(|error| write_error(path, error))?;
+            }
+            for (name, data) in attachments {
+                attach(&mut live.writer, name, data).map_err(|error| write_error(path, error))?;
             }
             live.writer.flush().map_err(|error| write_error(path, error))?;
             live.n_file_bytes = live.file.stream_position().map_err(io)?;
@@ -180,22 +189,22 @@ impl LiveFile {
         Ok(())
     }
 
-    /// Appends a message of a standard type; `id` is its channel, once there is one.
+    /// Whether it has no message for viewers that goes with frames.
+    pub(super) fn is_first_frame(&self) -> bool {
+        !self.standard_channels.contains_key(JOINT_STATES.topic)
+    }
+
+    /// Appends a message of a standard type.
     pub(super) fn write_standard(
         &mut self,
-        id: &mut Option<u16>,
         standard: &StandardType,
         header: &Header,
         data: &[u8],
     ) -> Result<(), WriteFailure> {
-        self.make_room(standard.topic, id.is_none().then_some(standard.definition), data)?;
-        let id = match *id {
-            Some(id) => id,
-            None => {
-                self.n_standard_channels += 1;
-                *id.insert(self.add_channel(standard.topic, standard.schema, standard.definition)?)
-            }
-        };
+        let is_new = !self.standard_channels.contains_key(standard.topic);
+        self.make_room(standard.topic, is_new.then_some(standard.definition), data)?;
+        let id = add_standard(&mut self.writer, &mut self.standard_channels, standard)
+            .map_err(|error| write_error(&self.path, error))?;
         self.append(id, header, data)
     }
 
@@ -272,7 +281,7 @@ impl LiveFile {
     /// Reserves room for a chunk and for the summary behind it, so that the file can always be completed.
     fn reserve(&mut self, n_chunk_bytes: u64) -> Result<(), WriteFailure> {
         let Some(reserved_to) = self.reserved_to else { return Ok(()) };
-        let n_channels = self.channels.len() as u64 + self.n_standard_channels + 1;
+        let n_channels = self.channels.len() as u64 + self.standard_channels.len() as u64 + 1;
         let n_summary_bytes =
             4096 + self.n_definition_bytes + (self.n_chunks + 2) * (128 + 10 * n_channels) + 10 * n_channels;
         let needed = self.n_file_bytes + n_chunk_bytes + CHUNK_OVERHEAD + n_summary_bytes;

@@ -132,28 +132,47 @@ pub fn part_path(folder: &Path, part_idx: usize) -> PathBuf {
 }
 
 /// The recordings that `paths` name: files as they are, folders as the recordings in them, in the order of their names.
+/// Folders with parts of one simulation count as one folder.
 ///
 /// # Errors
-/// A folder without a recording, or with a simulation that is not complete.
+/// A folder without a recording, or folders with a simulation that is not complete.
 pub fn recordings_in(paths: &[PathBuf]) -> Result<Vec<PathBuf>, RecordingError> {
     let mut all = Vec::new();
+    let mut simulations: Vec<(Manifest, Vec<&PathBuf>)> = Vec::new();
+    for path in paths {
+        if path.is_dir()
+            && let Some(manifest) = Manifest::read(path)?
+        {
+            match simulations.iter_mut().find(|(known, _)| *known == manifest) {
+                Some((_, folders)) => folders.push(path),
+                None => simulations.push((manifest, vec![path])),
+            }
+        }
+    }
     for path in paths {
         if !path.is_dir() {
             all.push(path.clone());
             continue;
         }
         let invalid = |message: String| RecordingError::Invalid { path: path.clone(), message };
-        if let Some(manifest) = Manifest::read(path)? {
-            let parts: Vec<_> = (0..manifest.n_parts).map(|idx| part_path(path, idx)).collect();
-            let n_missing = parts.iter().filter(|part| !part.is_file()).count();
+        if let Some((manifest, folders)) = simulations.iter().find(|(_, folders)| folders.contains(&path)) {
+            if folders[0] != path {
+                continue;
+            }
+            let mut n_missing = 0;
+            for idx in 0..manifest.n_parts {
+                match folders.iter().map(|folder| part_path(folder, idx)).find(|part| part.is_file()) {
+                    Some(part) => all.push(part),
+                    None => n_missing += 1,
+                }
+            }
             if n_missing > 0 {
                 return Err(invalid(format!(
-                    "{n_missing} of the simulation's {} parts are missing: repeat the simulate command to add them, or \
-                     name the files that are there",
+                    "{n_missing} of the simulation's {} parts are missing: repeat the simulate command to add them, name the \
+                     other folders with its parts as well, or name the files that are there",
                     manifest.n_parts
                 )));
             }
-            all.extend(parts);
             continue;
         }
         let io = |source| RecordingError::Io { path: path.clone(), source };
@@ -232,6 +251,22 @@ mod tests {
         std::fs::write(part_path(&path, 0), "").expect("written");
         let found = recordings_in(&[path.clone(), "other.mcap".into()]).expect("complete");
         assert_eq!(found, [part_path(&path, 0), part_path(&path, 1), "other.mcap".into()]);
+    }
+
+    #[test]
+    fn two_folders_that_are_whole_together_are_one() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let [one, two, other] = ["one", "two", "other"].map(|name| folder.path().join(name));
+        for (path, seed) in [(&one, 1), (&two, 1), (&other, 2)] {
+            manifest(seed).claim(path).expect("new");
+        }
+        std::fs::write(part_path(&one, 1), "").expect("written");
+        std::fs::write(part_path(&two, 0), "").expect("written");
+        std::fs::write(part_path(&other, 0), "").expect("written");
+        let found = recordings_in(&[one.clone(), "a.mcap".into(), two.clone()]).expect("whole");
+        assert_eq!(found, [part_path(&two, 0), part_path(&one, 1), "a.mcap".into()]);
+        let error = recordings_in(&[one, other]).expect_err("two simulations").to_string();
+        assert!(error.contains("1 of the simulation's 2 parts are missing"), "{error}");
     }
 
     #[test]

@@ -5,7 +5,9 @@ use std::sync::LazyLock;
 use cdr_encoding::{from_bytes, to_writer};
 use serde::Serialize;
 
-use blindgrasp_messages::{ContactSet, Header, Record, Recorded, Sense, Stamped, TactileFrame, of_each_type};
+use blindgrasp_messages::{
+    ContactSet, GraspTruth, Header, Record, Recorded, Sense, Stamped, TactileFrame, of_each_type,
+};
 
 /// Plain CDR, little-endian: how ROS 2 marks the bytes that follow.
 const CDR_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];
@@ -18,8 +20,8 @@ pub(super) const COMPRESSED: &str = "each message is compressed by itself (--com
 pub(super) const MESSAGE_ENCODING: &str = "cdr";
 pub(super) const SCHEMA_ENCODING: &str = "ros2msg";
 
-/// One of our message types, as it is or as it was before its last senses: its definition, and what makes samples of
-/// recorded messages.
+/// One of our message types, as it is or as an earlier version had it: its definition, and what makes samples of recorded
+/// messages.
 #[derive(Debug)]
 pub(super) struct OurType {
     /// Its name as a schema.
@@ -47,7 +49,7 @@ impl OurType {
     }
 }
 
-/// Our type of this ROS name, if there is one, and then what it was before its last senses.
+/// Our type of this ROS name, if there is one, and then its earlier versions.
 pub(super) fn our_types(schema: &str) -> impl Iterator<Item = &'static OurType> {
     static TYPES: LazyLock<Vec<OurType>> = LazyLock::new(|| of_each_type!(ours).into_iter().flatten().collect());
     TYPES.iter().filter(move |ours| ours.schema == schema)
@@ -67,6 +69,10 @@ fn ours<M: Recorded>() -> Vec<OurType> {
             definition = definition.replace(&format!("float64[] {}\n", sense.name()), "");
             versions.push(version(&definition, idx + 1));
         }
+    }
+    if M::SCHEMA == GraspTruth::SCHEMA {
+        // The field had a name that no ROS 2 package may have. Its bytes are the same.
+        versions.push(version(&definition.replace("string object_class\n", "string class\n"), 0));
     }
     versions
 }
@@ -127,6 +133,17 @@ mod tests {
         }
         data.push(0);
         ours.decode(&data).expect_err("a byte too many");
+    }
+
+    #[test]
+    fn labels_with_the_earlier_name_of_the_class_are_read() {
+        let earlier = our_types(GraspTruth::SCHEMA).nth(1).expect("an earlier version");
+        assert!(earlier.definition.contains("string class\n") && !earlier.definition.contains("object_class"));
+        let message = GraspTruth { object_class: "cup".into(), ..GraspTruth::default() };
+        let sample = Stamped { header: Header::default(), message };
+        let mut data = Vec::new();
+        encode(&sample, &mut data).expect("encoded");
+        assert_eq!(earlier.decode(&data), Ok(sample.into()));
     }
 
     #[test]

@@ -1,7 +1,10 @@
-//! Standard ROS messages beside ours, so that viewers draw a live recording without plug-ins: joint angles as
-//! `sensor_msgs/msg/JointState`, contacts as `sensor_msgs/msg/PointCloud2`.
+//! Standard ROS messages beside ours, so that viewers draw a recording without plug-ins: the hand's URDF as
+//! `std_msgs/msg/String`, joint angles as `sensor_msgs/msg/JointState`, the links' poses as `tf2_msgs/msg/TFMessage`, and
+//! contacts as `sensor_msgs/msg/PointCloud2`.
 
-use blindgrasp_messages::{ContactSet, Header, TactileFrame};
+use std::sync::Arc;
+
+use blindgrasp_messages::{ContactSet, Header, Stamped, TactileFrame};
 use serde::Serialize;
 
 use super::types::encode;
@@ -21,8 +24,97 @@ pub(super) const JOINT_STATES: StandardType =
 pub(super) const CONTACT_POINTS: StandardType =
     StandardType { topic: "/contact_points", schema: "sensor_msgs/msg/PointCloud2", definition: POINT_CLOUD };
 
-/// The topics of live recordings that are there for viewers. Their content follows from our own topics.
-pub const TOPICS_FOR_VIEWERS: [&str; 2] = [JOINT_STATES.topic, CONTACT_POINTS.topic];
+pub(super) const ROBOT_DESCRIPTION: StandardType =
+    StandardType { topic: "/robot_description", schema: "std_msgs/msg/String", definition: "string data\n" };
+pub(super) const TRANSFORMS: StandardType =
+    StandardType { topic: "/tf", schema: "tf2_msgs/msg/TFMessage", definition: TF_MESSAGE };
+
+/// The topics of recordings that are there for viewers. Their content follows from the hand and our own topics.
+pub const TOPICS_FOR_VIEWERS: [&str; 4] =
+    [JOINT_STATES.topic, CONTACT_POINTS.topic, ROBOT_DESCRIPTION.topic, TRANSFORMS.topic];
+
+/// The hand of a recording as viewers draw it.
+#[derive(Clone)]
+pub struct ShownHand {
+    /// The joints in the hand's order.
+    pub joint_names: Vec<String>,
+    /// The pad layout (YAML).
+    pub layout: String,
+    pub urdf: String,
+    /// The poses of the links for values of the joints.
+    pub link_poses: Arc<dyn Fn(&[f64]) -> Vec<LinkPose> + Send + Sync>,
+}
+
+/// The pose of a link in the frame of its parent.
+pub struct LinkPose {
+    pub parent: String,
+    pub link: String,
+    pub position_m: [f64; 3],
+    pub rotation_xyzw: [f64; 4],
+}
+
+impl ShownHand {
+    /// The files to attach, by name.
+    pub(super) fn files(&self) -> [(&str, &[u8]); 2] {
+        [("hand.yaml", self.layout.as_bytes()), ("hand.urdf", self.urdf.as_bytes())]
+    }
+}
+
+/// The messages for viewers, each with its type.
+pub(super) type ForViewers = Vec<(&'static StandardType, Vec<u8>)>;
+
+/// Makes the messages for viewers. The first topic of each type of ours is the one that viewers see.
+#[derive(Default)]
+pub(super) struct ViewerMessages {
+    pub(super) hand: Option<ShownHand>,
+    joint_topic: Option<String>,
+    contact_topic: Option<String>,
+}
+
+impl ViewerMessages {
+    /// The messages that go with a frame. With the first frame of a file goes the description of the hand.
+    pub(super) fn of_frame(
+        &mut self,
+        topic: &str,
+        frame: &Stamped<TactileFrame>,
+        is_first_of_file: bool,
+    ) -> Result<ForViewers, String> {
+        let mut messages: ForViewers = Vec::new();
+        let Some(hand) = &self.hand else { return Ok(messages) };
+        let Stamped { header, message } = frame;
+        if message.joints.len() != hand.joint_names.len() || !is_first(&mut self.joint_topic, topic) {
+            return Ok(messages);
+        }
+        if is_first_of_file {
+            let mut data = Vec::new();
+            encode(&hand.urdf, &mut data)?;
+            messages.push((&ROBOT_DESCRIPTION, data));
+        }
+        let mut data = Vec::new();
+        joint_state(header, &hand.joint_names, message, &mut data)?;
+        messages.push((&JOINT_STATES, data));
+        let poses = (hand.link_poses)(&message.joints);
+        let transforms = Vec::from_iter(poses.iter().map(|pose| TransformStamped::new(header, pose)));
+        let mut data = Vec::new();
+        encode(&transforms, &mut data)?;
+        messages.push((&TRANSFORMS, data));
+        Ok(messages)
+    }
+
+    /// The messages that go with contacts.
+    pub(super) fn of_contacts(&mut self, topic: &str, contacts: &Stamped<ContactSet>) -> Result<ForViewers, String> {
+        if !is_first(&mut self.contact_topic, topic) {
+            return Ok(Vec::new());
+        }
+        let mut data = Vec::new();
+        contact_points(&contacts.header, &contacts.message, &mut data)?;
+        Ok(vec![(&CONTACT_POINTS, data)])
+    }
+}
+
+fn is_first(first: &mut Option<String>, topic: &str) -> bool {
+    first.get_or_insert_with(|| topic.into()) == topic
+}
 
 /// A definition whose own lines begin with a header.
 macro_rules! with_header {
@@ -80,22 +172,49 @@ uint32 count
 "
 );
 
+const TF_MESSAGE: &str = concat!(
+    "geometry_msgs/TransformStamped[] transforms\n",
+    "================================================================================\n",
+    "MSG: geometry_msgs/TransformStamped\n",
+    with_header!(
+        "\
+string child_frame_id
+geometry_msgs/Transform transform
+================================================================================
+MSG: geometry_msgs/Transform
+geometry_msgs/Vector3 translation
+geometry_msgs/Quaternion rotation
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+"
+    )
+);
+
 const FLOAT32: u8 = 7;
 const FIELDS: [&str; 4] = ["x", "y", "z", "force"];
 const BYTES_PER_POINT: u32 = 16;
 
 /// `std_msgs/Header`; ROS counts seconds in 32 bits with sign.
 #[derive(Serialize)]
-struct StandardHeader {
+struct StandardHeader<'a> {
     sec: i32,
     nanosec: u32,
-    frame_id: &'static str,
+    frame_id: &'a str,
 }
 
 /// `sensor_msgs/JointState`.
 #[derive(Serialize)]
 struct JointState<'a> {
-    header: StandardHeader,
+    header: StandardHeader<'a>,
     name: &'a [String],
     position: &'a [f64],
     velocity: &'a [f64],
@@ -114,7 +233,7 @@ struct PointField {
 /// `sensor_msgs/PointCloud2`.
 #[derive(Serialize)]
 struct PointCloud {
-    header: StandardHeader,
+    header: StandardHeader<'static>,
     height: u32,
     width: u32,
     fields: Vec<PointField>,
@@ -125,12 +244,32 @@ struct PointCloud {
     is_dense: bool,
 }
 
-impl StandardHeader {
-    fn new(header: &Header) -> Self {
+/// `geometry_msgs/TransformStamped`.
+#[derive(Serialize)]
+struct TransformStamped<'a> {
+    header: StandardHeader<'a>,
+    child_frame_id: &'a str,
+    translation: [f64; 3],
+    rotation: [f64; 4],
+}
+
+impl<'a> TransformStamped<'a> {
+    fn new(header: &Header, pose: &'a LinkPose) -> Self {
+        TransformStamped {
+            header: StandardHeader::new(header, &pose.parent),
+            child_frame_id: &pose.link,
+            translation: pose.position_m,
+            rotation: pose.rotation_xyzw,
+        }
+    }
+}
+
+impl<'a> StandardHeader<'a> {
+    fn new(header: &Header, frame_id: &'a str) -> Self {
         StandardHeader {
             sec: i32::try_from(header.stamp_nanos / 1_000_000_000).unwrap_or(i32::MAX),
             nanosec: (header.stamp_nanos % 1_000_000_000) as u32,
-            frame_id: FRAME_ID,
+            frame_id,
         }
     }
 }
@@ -143,7 +282,7 @@ pub fn joint_state(header: &Header, names: &[String], frame: &TactileFrame, data
     if names.len() != frame.joints.len() {
         return Err(format!("{} joint values, the hand has {}", frame.joints.len(), names.len()));
     }
-    let header = StandardHeader::new(header);
+    let header = StandardHeader::new(header, FRAME_ID);
     encode(&JointState { header, name: names, position: &frame.joints, velocity: &[], effort: &[] }, data)
 }
 
@@ -169,7 +308,7 @@ pub fn force_points(
         |(idx, name): (usize, &&'static str)| PointField { name, offset: 4 * idx as u32, datatype: FLOAT32, count: 1 };
     let values = points.flat_map(|(position_m, newtons)| position_m.into_iter().chain([newtons]));
     let cloud = PointCloud {
-        header: StandardHeader::new(header),
+        header: StandardHeader::new(header, FRAME_ID),
         height: 1,
         width,
         fields: FIELDS.iter().enumerate().map(field).collect(),
@@ -203,6 +342,37 @@ mod tests {
         let expected = "0001000005000000070000000500000070616c6d00000000020000000200000061000000060000007468756d62000000\
              02000000000000000000d03f000000000000f8bf0000000000000000";
         assert_eq!(hex(&data), expected);
+    }
+
+    #[test]
+    fn links_are_as_ros_writes_them_and_the_first_frame_describes_the_hand() {
+        let pose = |joints: &[f64]| LinkPose {
+            parent: "palm".into(),
+            link: "tip".into(),
+            position_m: [joints[0], 0.0, 2.0],
+            rotation_xyzw: [0.0, 0.0, 0.0, 1.0],
+        };
+        let hand = ShownHand {
+            joint_names: vec!["a".into()],
+            layout: String::new(),
+            urdf: "<robot/>".into(),
+            link_poses: Arc::new(move |joints| vec![pose(joints)]),
+        };
+        let mut viewer = ViewerMessages { hand: Some(hand), ..ViewerMessages::default() };
+        let message = TactileFrame { joints: vec![0.5], ..TactileFrame::default() };
+        let frame = Stamped { header: Header { stamp_nanos: 5_000_000_007, ..Header::default() }, message };
+        let messages = viewer.of_frame("/tactile", &frame, true).expect("messages");
+        let found: Vec<_> = messages.iter().map(|(standard, data)| (standard.topic, hex(data))).collect();
+        assert_eq!(found[0], ("/robot_description", "00010000090000003c726f626f742f3e00".into()));
+        assert_eq!(found[1].0, "/joint_states");
+        let expected = "000100000100000005000000070000000500000070616c6d00000000040000007469700000000000000000000000e03f\
+             000000000000000000000000000000400000000000000000000000000000000000000000000000000000000000000000\
+             000000000000f03f";
+        let expected: String = expected.split_whitespace().collect();
+        assert_eq!(found[2], ("/tf", expected));
+        let of_next = viewer.of_frame("/tactile", &frame, false).expect("messages");
+        assert_eq!(of_next.len(), 2);
+        assert!(viewer.of_frame("/other", &frame, true).expect("messages").is_empty());
     }
 
     #[test]

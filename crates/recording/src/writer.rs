@@ -7,13 +7,14 @@ use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 
 use mcap::records::{MessageHeader, Metadata};
-use mcap::{Compression, WriteOptions, Writer};
+use mcap::{Attachment, Compression, WriteOptions, Writer};
 
 use blindgrasp_messages::files::{keep_mode, partial_path, private_file};
-use blindgrasp_messages::{Header, Record, Recorded, Stamped, with_sample};
+use blindgrasp_messages::{Header, Record, Recorded, Stamped, TactileFrame, with_sample};
 
 use super::source::with_cause;
 use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING, encode};
+use super::viewer::{ShownHand, StandardType, ViewerMessages};
 use super::{LIBRARY, METADATA_NAME, RecordingError, RecordingInfo};
 
 /// An open recording. The same records give the same bytes.
@@ -25,6 +26,8 @@ pub struct RecordingWriter {
     /// `None` once finished.
     writer: Option<Writer<BufWriter<File>>>,
     channels: BTreeMap<String, WrittenChannel>,
+    viewer: ViewerMessages,
+    standard_channels: BTreeMap<&'static str, u16>,
     /// The sample at hand as CDR; kept for its memory.
     data: Vec<u8>,
 }
@@ -53,9 +56,41 @@ impl RecordingWriter {
                 path: path.into(),
                 writer: Some(writer),
                 channels: BTreeMap::new(),
+                viewer: ViewerMessages::default(),
+                standard_channels: BTreeMap::new(),
                 data: Vec::new(),
             })
             .map_err(|error| write_error(path, error))
+    }
+
+    /// Attaches the files of a hand. Viewers can draw it with the frames of [`RecordingWriter::write_frame`].
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn show(&mut self, hand: ShownHand) -> Result<(), RecordingError> {
+        let Some(writer) = &mut self.writer else { return Ok(()) };
+        for (name, data) in hand.files() {
+            attach(writer, name, data).map_err(|error| write_error(&self.path, error))?;
+        }
+        self.viewer.hand = Some(hand);
+        Ok(())
+    }
+
+    /// Appends a frame to a topic, and what viewers need to draw the hand.
+    ///
+    /// # Errors
+    /// As [`RecordingWriter::write`].
+    pub fn write_frame(&mut self, topic: &str, frame: &Stamped<TactileFrame>) -> Result<(), RecordingError> {
+        self.write(topic, frame)?;
+        let messages = self.viewer.of_frame(topic, frame, self.standard_channels.is_empty());
+        let messages = messages.map_err(|message| RecordingError::Invalid { path: self.path.clone(), message })?;
+        let Some(writer) = &mut self.writer else { return Ok(()) };
+        for (standard, data) in messages {
+            add_standard(writer, &mut self.standard_channels, standard)
+                .and_then(|id| append(writer, id, &frame.header, &data))
+                .map_err(|error| write_error(&self.path, error))?;
+        }
+        Ok(())
     }
 
     /// Appends a sample to a topic.
@@ -126,6 +161,33 @@ pub(super) fn add_channel(
 ) -> mcap::McapResult<u16> {
     let schema_id = writer.add_schema(schema, SCHEMA_ENCODING, definition.as_bytes())?;
     writer.add_channel(schema_id, topic, MESSAGE_ENCODING, &BTreeMap::new())
+}
+
+/// The channel of a standard type, which is declared if the file lacks it.
+pub(super) fn add_standard(
+    writer: &mut Writer<BufWriter<File>>,
+    channels: &mut BTreeMap<&'static str, u16>,
+    standard: &StandardType,
+) -> mcap::McapResult<u16> {
+    if let Some(id) = channels.get(standard.topic) {
+        return Ok(*id);
+    }
+    let id = add_channel(writer, standard.topic, standard.schema, standard.definition)?;
+    channels.insert(standard.topic, id);
+    Ok(id)
+}
+
+/// Attaches a file.
+pub(super) fn attach(writer: &mut Writer<BufWriter<File>>, name: &str, data: &[u8]) -> mcap::McapResult<()> {
+    let media_type = if name.ends_with(".json") { "application/json" } else { "text/plain" };
+    // Equal content gives equal bytes: there is no time.
+    writer.attach(&Attachment {
+        log_time: 0,
+        create_time: 0,
+        name: name.into(),
+        media_type: media_type.into(),
+        data: data.into(),
+    })
 }
 
 /// Appends a message of the sample with this header.

@@ -12,8 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::played::is_played;
 use blindgrasp_messages::{Header, with_sample};
 use blindgrasp_recording::cdr;
-use blindgrasp_recording::export::{Value, ValueError, leaves};
-use blindgrasp_recording::{ChosenSamples, Reach, Record, RecordingError, RecordingReader};
+use blindgrasp_recording::{ChosenSamples, Reach, Record, RecordingError, RecordingReader, Value, ValueError, leaves};
 
 /// A sample counts as re-ordered if it is at most so many samples away in the other recording.
 const WINDOW: usize = 512;

@@ -7,6 +7,7 @@ use std::time::SystemTime;
 use serde_json::{Map, Value, json};
 
 use blindgrasp_grasps::dataset::{TRUTH_METADATA, label_of};
+use blindgrasp_grasps::shown_hand::shown_hand;
 use blindgrasp_messages::{LiftOutcome, Recorded};
 use blindgrasp_recording::{LiveOptions, RecordingInfo, RecordingReader};
 use blindgrasp_stages::hand::Hand;
@@ -18,7 +19,7 @@ const GRAPH_METADATA: &str = "graph";
 
 /// What is to be recorded of a graph, as [`describe_graph`](blindgrasp_graph::recorded_graph::describe_graph) describes it. The hand
 /// is the one that a node has as its parameter `hand`. `is_at_start` says that the graph has sent no sample yet. The options get
-/// the joints of the hand and the metadata.
+/// the hand, the models and the metadata.
 ///
 /// # Errors
 /// The hand cannot be read.
@@ -50,8 +51,13 @@ pub fn of_graph(
         made_by: format!("graph {name}"),
         version: env!("CARGO_PKG_VERSION").into(),
     };
-    let joint_names = hand.map_or_else(Vec::new, |hand| hand.joints.into_iter().map(|joint| joint.name).collect());
-    Ok((info, LiveOptions { joint_names, metadata, ..options }))
+    let mut attachments = BTreeMap::new();
+    for (node, path) in param(graph, "model") {
+        if let Ok(model) = std::fs::read(path) {
+            attachments.insert(format!("model of {node}.json"), model);
+        }
+    }
+    Ok((info, LiveOptions { hand: hand.as_ref().map(shown_hand), attachments, metadata, ..options }))
 }
 
 /// What stable means in the truth that a graph tells: a lift's where a node says what became of lifts, and otherwise what

@@ -123,8 +123,8 @@ impl Reading {
             _ => return None,
         };
         let object = self.object.clone()?;
-        let class = object.clone();
-        Some(GraspTruth { grasp_id, epsilon: f64::NAN, volume: f64::NAN, stable, object, class })
+        let object_class = object.clone();
+        Some(GraspTruth { grasp_id, epsilon: f64::NAN, volume: f64::NAN, stable, object, object_class })
     }
 }
 

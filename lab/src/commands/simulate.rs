@@ -13,8 +13,10 @@ use serde::Serialize;
 use super::object_list::list;
 use super::trials::physics;
 use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text, word};
+use blindgrasp_cli::shard::Shard;
 use blindgrasp_cli::stop_signal;
 use blindgrasp_grasps::dataset::REPORT_METADATA;
+use blindgrasp_grasps::shown_hand::shown_hand;
 use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
 use blindgrasp_objects::{objects_id, objects_named};
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -90,8 +92,8 @@ pub(super) struct Arguments {
     #[arg(long)]
     overwrite: bool,
     /// Make only the parts of shard I of N (0/N to N-1/N) of a folder; all shards together complete it.
-    #[arg(long, value_parser = shard, value_name = "I/N")]
-    shard: Option<(usize, usize)>,
+    #[arg(long, value_name = "I/N")]
+    shard: Option<Shard>,
     /// Print the report as JSON.
     #[arg(long)]
     json: bool,
@@ -115,7 +117,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         |extension: &str| ["csv", "json", "jsonl", "yaml", "html", "bag", "db3"].contains(&extension);
     if out.extension().and_then(|extension| extension.to_str()).is_some_and(is_of_another_kind) && !out.is_dir() {
         bail!(
-            "{}: expected a name that ends in .mcap, or that of a folder; blindgrasp export writes a recording as CSV or JSON",
+            "{}: expected a name that ends in .mcap, or that of a folder; blindgrasp export writes a recording as JSON",
             out.display()
         );
     }
@@ -130,7 +132,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let stop = stop_signal()?;
     let simulation = Simulation { hand: &hand, objects: &objects, options: &options };
     let job = Job::new(simulation, &arguments.objects, &stop)?;
-    let shard = arguments.shard.unwrap_or((0, 1));
+    let shard = arguments.shard.unwrap_or_default();
     let report = if is_file { job.to_file(out, arguments.overwrite)? } else { job.to_folder(out, shard)? };
     match report {
         Some(report) => print_report(arguments.json, out, &report)?,
@@ -153,7 +155,7 @@ pub(super) fn complete_folder(
 ) -> anyhow::Result<()> {
     let (objects, _) = objects_named(objects_name)?;
     let simulation = Simulation { hand, objects: &objects, options };
-    Job::new(simulation, objects_name, stop)?.to_folder(folder, (0, 1))?;
+    Job::new(simulation, objects_name, stop)?.to_folder(folder, Shard::default())?;
     Ok(())
 }
 
@@ -210,7 +212,7 @@ impl<'a> Job<'a> {
     /// Makes one recording of all parts.
     fn to_file(&self, out: &Path, overwrite: bool) -> anyhow::Result<Option<SimulationReport>> {
         check_new(out, &[], overwrite)?;
-        let mut writer = GraspWriter::create(out, &self.info)?;
+        let mut writer = GraspWriter::create(out, &self.info, self.simulation.hand)?;
         let bar = progress_bar(self.simulation.options.n_grasps);
         let mut report = SimulationReport::default();
         for part in self.simulation.options.parts() {
@@ -249,13 +251,13 @@ impl<'a> Job<'a> {
     }
 
     /// Makes a recording of each part of a shard that is missing.
-    fn to_folder(&self, out: &Path, (idx, n): (usize, usize)) -> anyhow::Result<Option<SimulationReport>> {
+    fn to_folder(&self, out: &Path, shard: Shard) -> anyhow::Result<Option<SimulationReport>> {
         let Simulation { hand, objects, options } = self.simulation;
         let parts: Vec<Part> = options.parts().collect();
         let objects = (self.objects, objects_id(objects));
         let options = serde_json::to_value(options)?;
         Manifest::new((&hand.name, hand.description_id()), objects, options, parts.len()).claim(out)?;
-        let mine: Vec<&Part> = parts.iter().filter(|part| part.idx % n == idx).collect();
+        let mine: Vec<&Part> = parts.iter().filter(|part| shard.has(part.idx)).collect();
         let bar = progress_bar(mine.iter().map(|part| part.n_grasps).sum());
         let (there, missing): (Vec<&Part>, Vec<&Part>) = mine.iter().partition(|part| self.is_there(out, part));
         // Parts made before do not count for the rate.
@@ -263,7 +265,7 @@ impl<'a> Job<'a> {
         bar.reset_eta();
         for (n_done, part) in missing.iter().enumerate() {
             let path = part_path(out, part.idx);
-            let mut writer = GraspWriter::create(&path, &self.info)?;
+            let mut writer = GraspWriter::create(&path, &self.info, hand)?;
             let done = self.simulate(part, &bar, &mut writer).map_err(|error| match error {
                 SimulateError::Stopped { .. } => anyhow::anyhow!(
                     "interrupted: {} of {} parts are in {}; the same command goes on from there",
@@ -434,15 +436,6 @@ impl<'a> AllOptions<'a> {
     }
 }
 
-/// The index of a shard, and the number of shards.
-fn shard(text: &str) -> Result<(usize, usize), String> {
-    let numbers = text.split_once('/').and_then(|(idx, n)| Some((idx.parse().ok()?, n.parse().ok()?)));
-    match numbers {
-        Some((idx, n)) if idx < n => Ok((idx, n)),
-        _ => Err("expected I/N with I from 0 to N-1, such as 3/16".into()),
-    }
-}
-
 /// Writes simulated grasps to a recording, with numbers, times and headers.
 struct GraspWriter {
     recording: RecordingWriter,
@@ -451,9 +444,11 @@ struct GraspWriter {
 }
 
 impl GraspWriter {
-    fn create(path: &Path, info: &RecordingInfo) -> Result<Self, RecordingError> {
+    fn create(path: &Path, info: &RecordingInfo, hand: &Hand) -> Result<Self, RecordingError> {
         let header = Header { hand_id: info.hand_id, ..Header::default() };
-        Ok(GraspWriter { recording: RecordingWriter::create(path, info)?, header, n_grasps: 0 })
+        let mut recording = RecordingWriter::create(path, info)?;
+        recording.show(shown_hand(hand))?;
+        Ok(GraspWriter { recording, header, n_grasps: 0 })
     }
 
     fn write(&mut self, grasp: SimulatedGrasp) -> Result<(), RecordingError> {
@@ -465,7 +460,8 @@ impl GraspWriter {
         let start_nanos = self.header.stamp_nanos;
         for timed in grasp.frames {
             self.header.stamp_nanos = start_nanos + timed.offset_nanos;
-            self.recording.write(TactileFrame::TOPIC, &Stamped { header: self.header, message: timed.frame })?;
+            let frame = Stamped { header: self.header, message: timed.frame };
+            self.recording.write_frame(TactileFrame::TOPIC, &frame)?;
             self.header.seq += 1;
         }
         self.header.stamp_nanos += PAUSE_NANOS;

@@ -13,6 +13,7 @@ use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
+use blindgrasp_cli::shard::Shard;
 use blindgrasp_messages::{
     Action, GraspTruth, Header, LiftDecision, LiftOutcome, MAX_NAME_BYTES, Message, Recorded, TactileFrame,
 };
@@ -45,6 +46,7 @@ struct Params {
     hand: Option<PathBuf>,
     things: String,
     trials: u64,
+    shard: String,
     seed: u64,
     gate: String,
     attempts: u32,
@@ -79,6 +81,7 @@ pub(crate) fn describe() -> OperatorDescription {
         )
         .param("things", ParamKind::String {}, Some("paper".into()), "What to lift: a comma-separated list")
         .param("trials", whole(1, 1_000_000), Some(110.into()), "How many trials")
+        .param("shard", ParamKind::String {}, Some("0/1".into()), "I/N: only every N-th trial, from the I-th on")
         .param("seed", whole(0, i64::MAX), Some(0.into()), "The seed of all random numbers")
         .param("gate", gate, Some("on".into()), "off: every settled grasp is lifted, whatever is decided")
         .param(
@@ -152,8 +155,11 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     if operator.saved_state().is_none() {
         check_approaches(&hand, &things, &trial_options, params.seed, params.trials)?;
     }
+    let shard: Shard = params.shard.parse().map_err(|error| anyhow::anyhow!("shard '{}': {error}", params.shard))?;
     let options = RobotOptions {
         n_trials: params.trials,
+        shard_idx: shard.idx,
+        n_shards: shard.n,
         seed: params.seed,
         max_attempts: params.attempts,
         lifts_always: params.gate == "off",

@@ -142,7 +142,7 @@ fn a_table_becomes_a_recording() {
     }
     // Values that a table lacks are NaN, and null in JSON.
     let truths: Vec<Value> = folder.exported("/truth").into_iter().map(|line| line["data"].clone()).collect();
-    let truth = |grasp_id: u64, object: &str, stable: bool| json!({"grasp_id": grasp_id, "epsilon": null, "volume": null, "stable": stable, "object": object, "class": object});
+    let truth = |grasp_id: u64, object: &str, stable: bool| json!({"grasp_id": grasp_id, "epsilon": null, "volume": null, "stable": stable, "object": object, "object_class": object});
     assert_eq!(truths, [truth(7, "cup", true), truth(8, "box", false)]);
     let info = run(&["info", &folder.at("out.mcap"), "--hand", &folder.at("pincer.yaml")], 0);
     let info = text(&info.stdout);
@@ -170,7 +170,7 @@ fn columns_may_hold_angles_and_classes() {
     assert_eq!(frames[0]["data"]["cells_newtons"], json!([1.0, 0.0, 0.5]));
     assert_eq!(frames[0]["data"]["joints"], json!([0.75, 0.0]));
     assert_eq!(frames[3]["data"]["joints"][1], json!(1.0));
-    assert_eq!(folder.exported("/truth")[1]["data"]["class"], "crate");
+    assert_eq!(folder.exported("/truth")[1]["data"]["object_class"], "crate");
 }
 
 /// Frames of two grasps.

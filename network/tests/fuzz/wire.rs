@@ -87,7 +87,7 @@ fn samples(rng: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
     };
     let (joints, cells_newtons, values) = (numbers(rng, 9), numbers(rng, 100), numbers(rng, 300));
     let contacts = vec![Contact { force_newtons: 1.0, ..Contact::default() }; rng.random_range(0..20)];
-    let truth = GraspTruth { object: "bücher".into(), class: "book".into(), ..GraspTruth::default() };
+    let truth = GraspTruth { object: "bücher".into(), object_class: "book".into(), ..GraspTruth::default() };
     let outcome = LiftOutcome { thing: "bücher".into(), group: "book".into(), ..LiftOutcome::default() };
     vec![
         encoded(rng, &TactileFrame { joints: joints.clone(), cells_newtons, ..TactileFrame::default() }),

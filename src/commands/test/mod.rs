@@ -17,7 +17,8 @@ use clap::Args;
 use self::case::{Case, Runner};
 use self::scratch::Scratch;
 use self::sweep::Sweep;
-use super::{Outcome, check_output, stop_requests};
+use super::{Outcome, check_output, print_line, stop_requests};
+use blindgrasp_cli::shard::Shard;
 use blindgrasp_graph::dataflow::Override;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_replay::expectations;
@@ -68,6 +69,9 @@ pub(super) struct Arguments {
     /// Replace the results in the recordings by those of the replay; expectations stay as they are.
     #[arg(long)]
     update: bool,
+    /// Test only every N-th recording, from the I-th on (0/N to N-1/N).
+    #[arg(long, value_name = "I/N", default_value = "0/1", hide_default_value = true)]
+    shard: Shard,
     /// Keep the recording of each replay in this folder, under the recording's name.
     #[arg(long, value_name = "DIR")]
     keep: Option<PathBuf>,
@@ -82,6 +86,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         [] => with_expectations(&arguments.dataflow)?,
         named => named.to_vec(),
     };
+    let recordings = arguments.shard.of(recordings);
+    if recordings.is_empty() {
+        print_line("this shard has no recordings")?;
+        return Ok(Outcome::Done);
+    }
     if let Some(junit) = &arguments.junit {
         let expectations = recordings.iter().map(|recording| expectations::path_of(recording));
         check_output(junit, &recordings.iter().cloned().chain(expectations).collect::<Vec<_>>())?;

@@ -45,7 +45,7 @@
 //! `${NAME}` in a value is the variable of the environment, `${NAME:-TEXT}` with a default, and `$${` is `${`.
 //!
 //! An input may also be only `node/output port`; all keys of a node have a default. An input with a `?` behind its name is left
-//! out if the operator has no such input: `decision?: lift_arbiter/decision` serves several sources.
+//! out if the operator has no such input: `"decision?": lift_arbiter/decision` serves several sources.
 //!
 //! An **operator** is a program; a **node** is one instance of it in the graph. Relative paths are relative to the
 //! file's folder, in an [`Override`] to the current one. A value means what its param's kind says: `no` is a word where

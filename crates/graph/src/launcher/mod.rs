@@ -34,7 +34,9 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use crate::control::{DecisionStatus, EdgeStatus, GraphState, GraphStatus, NodeState, NodeStatus, Reply, Request};
+use crate::control::{
+    DecisionStatus, EdgeStatus, GraphState, GraphStatus, Iceoryx2Config, NodeState, NodeStatus, Reply, Request,
+};
 use crate::dataflow::pins::PinError;
 use crate::dataflow::{Graph, Node, Program};
 use crate::launcher::clients::Clients;
@@ -55,7 +57,7 @@ use crate::plan::{Plan, Port};
 use blindgrasp_operator::cursors::{CursorsError, SampleId, SharedCursors};
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::monotonic_nanos;
-use blindgrasp_operator::namespace::{self, NamespaceError};
+use blindgrasp_operator::namespace::{self, FILE_PREFIX, NamespaceError};
 use blindgrasp_operator::text::did_you_mean;
 use blindgrasp_operator::wiring::{Clock, Command, LogEntry, LogLevel, Report, WaitMode};
 use rustix::io::Errno;
@@ -968,6 +970,7 @@ impl Launcher {
             message: if self.members.iter().any(Member::is_given_up) { self.degraded.clone() } else { None },
             uptime_secs: self.started.elapsed().as_secs_f64(),
             log_folder: self.log_folder.path().into(),
+            iceoryx2: Iceoryx2Config { root_path: self.plan.domain().ports(), prefix: FILE_PREFIX.into() },
             nodes: self.members.iter().map(|member| self.node_status(member)).collect(),
             edges: self.edges(),
             decisions: self.decisions.lock().unwrap_or_else(PoisonError::into_inner).clone(),

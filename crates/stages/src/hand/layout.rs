@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 
 use nalgebra::{Isometry3, UnitVector3, Vector3};
 use parry3d_f64::math::Vector;
@@ -181,6 +182,7 @@ impl Layout {
             median_filter: self.median_filter,
             id: 0,
             description_id: 0,
+            files: Arc::default(),
             reference_link_idx,
             self_collision_margin_m: self.self_collision_margin_m,
             self_collision_pairs: Vec::new(),

@@ -16,6 +16,7 @@ mod urdf_xml;
 use std::collections::BTreeMap;
 use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::open_regular;
@@ -57,6 +58,8 @@ pub struct Hand {
     noise_thresholds_newtons: Vec<f64>,
     id: u64,
     description_id: u64,
+    /// The texts of the pad layout and the URDF.
+    files: Arc<[String; 2]>,
     reference_link_idx: usize,
     self_collision_margin_m: f64,
     /// Pairs of links that may not touch, as indices into `links`.
@@ -517,7 +520,7 @@ impl Hand {
             hull(Path::new(&layout.urdf), mesh, scale, layout.pads_link(link))
         })?;
         let mut hand = layout.into_hand(layout_path, tree, 1)?;
-        let mut description = Sha256::new().chain_update(layout_text).chain_update(urdf);
+        let mut description = Sha256::new().chain_update(layout_text).chain_update(&urdf);
         let shapes = hand.links.iter().flat_map(|link| &link.shapes);
         for corner in shapes.filter_map(|shape| shape.core.as_convex_polyhedron()).flat_map(|hull| hull.points()) {
             corner.to_array().iter().for_each(|number| description.update(number.to_le_bytes()));
@@ -525,6 +528,7 @@ impl Hand {
         hand.description_id = first_bytes(description);
         hand.self_collision_pairs = self_collision::pairs(&hand);
         hand.id = hand.digest();
+        hand.files = Arc::new([layout_text.into(), urdf]);
         Ok(hand)
     }
 
@@ -616,6 +620,11 @@ impl Hand {
     /// never 0.
     pub fn id(&self) -> u64 {
         self.id
+    }
+
+    /// The texts of the pad layout and the URDF that the hand was read from; empty of a hand without cells.
+    pub fn files(&self) -> &[String; 2] {
+        &self.files
     }
 
     /// Identifies the text that the hand was read from, including collision shapes and thresholds.

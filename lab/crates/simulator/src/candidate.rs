@@ -148,7 +148,7 @@ impl CandidateGrasp {
                 volume: quality.volume,
                 stable: options.thresholds.hold(quality),
                 object: object.name.clone(),
-                class: object.class.clone(),
+                object_class: object.class.clone(),
             },
             scene: self.scene(object, options, grasp_id),
         }

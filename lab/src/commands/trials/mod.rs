@@ -15,11 +15,13 @@ use self::setup::Setup;
 use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
 use super::{Outcome, check_page, completions, print_line, print_text, stop_requests, word, write_report};
+use blindgrasp_cli::shard::Shard;
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_learning::trials::late_decisions::LateDecisions;
 use blindgrasp_learning::trials::page::{Made, Strip, strip, telling_records, trials_page};
 use blindgrasp_learning::trials::tables::{Table, TrialsReport, tables};
+use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::LiveOptions;
 use blindgrasp_session::run::Session;
@@ -94,6 +96,13 @@ pub(super) struct Arguments {
     /// Write a report with the tables and pictures of some of the trials (HTML).
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
+    /// Make only every N-th trial, from the I-th on (0/N to N-1/N); --merge makes one report of the JSON of all shards. Trials
+    /// of a graph that learns from its lifts depend on the shards.
+    #[arg(long, value_name = "I/N")]
+    shard: Option<Shard>,
+    /// Make no trials: show the report of all shards, from the files with the JSON of each.
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["shard", "record", "report"])]
+    merge: Vec<PathBuf>,
     /// Print JSON, with every attempt.
     #[arg(long)]
     json: bool,
@@ -123,6 +132,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if arguments.print_options {
         print_text(TrialOptions::DEFAULTS.trim_end())?;
         return Ok(Outcome::Done);
+    }
+    if !arguments.merge.is_empty() {
+        return merge(arguments);
     }
     check_arguments(arguments)?;
     let (targets, warnings) = targets_and_warnings(&arguments.objects)?;
@@ -170,6 +182,19 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
 }
 
+/// Shows the report of all shards.
+fn merge(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    let mut shards = Vec::new();
+    for path in &arguments.merge {
+        let text = read_regular(path).with_context(|| path.display().to_string())?;
+        let report = serde_json::from_str(&text);
+        shards.push(report.with_context(|| format!("{}: expected the JSON of trials --json", path.display()))?);
+    }
+    let report = TrialsReport::merge(shards).map_err(|error| anyhow::anyhow!("--merge: {error}"))?;
+    print_report(arguments, &report)?;
+    Ok(Outcome::Done)
+}
+
 fn check_arguments(arguments: &Arguments) -> anyhow::Result<()> {
     if arguments.record.is_some() && arguments.lift_policy == LiftPolicy::Both {
         bail!(
@@ -187,6 +212,7 @@ fn empty_report(arguments: &Arguments, setup: &Setup) -> TrialsReport {
         n_trials: arguments.trials,
         max_attempts: arguments.attempts,
         seed: arguments.seed,
+        shard: arguments.shard.map(|shard| (shard.idx, shard.n)),
         options: setup.options.clone(),
         model: setup.model.clone(),
         end: "finished".into(),

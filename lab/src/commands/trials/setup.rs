@@ -7,6 +7,7 @@ use anyhow::{Context, bail};
 use super::{Arguments, Way, physics};
 use crate::operators::simulated_hand::DEFAULT_HAND;
 use blindgrasp_cli::graph_file::{OnMisfit, checked, fitting};
+use blindgrasp_cli::shard::Shard;
 use blindgrasp_graph::dataflow::{self, DataflowFile, Graph, Node, Override, Scope};
 use blindgrasp_messages::{LiftOutcome, Recorded};
 use blindgrasp_simulator::trial::{PhysicsEngine, ProbeMove, TrialOptions};
@@ -48,7 +49,7 @@ impl Setup {
         let node = graph.nodes.iter().find(|node| reports_lifts(node)).with_context(|| {
             format!(
                 "{}: no node reports the outcomes of lifts; expected a source with run: ${{SOURCE:-…}} and the input \
-                 decision?, as in the dataflow-live.yaml that 'blindgrasp init DIR' writes",
+                 \"decision?\", as in the dataflow-live.yaml that 'blindgrasp init DIR' writes",
                 arguments.dataflow.display()
             )
         })?;
@@ -66,6 +67,9 @@ impl Setup {
             ("seed", arguments.seed.to_string()),
         ] {
             overrides.push(set(&node.id, param, text));
+        }
+        if let Some(Shard { idx, n }) = arguments.shard {
+            overrides.push(set(&node.id, "shard", format!("{idx}/{n}")));
         }
         let mut model = text_param(&graph, "model").unwrap_or_default();
         if let Some(path) = &arguments.model {
@@ -160,6 +164,7 @@ fn own_option(param: &str) -> Option<&'static str> {
         ("trials", "--trials"),
         ("attempts", "--attempts"),
         ("seed", "--seed"),
+        ("shard", "--shard"),
         ("gate", "--lift-policy"),
     ];
     options.iter().find(|(own, _)| *own == param).map(|(_, option)| *option)

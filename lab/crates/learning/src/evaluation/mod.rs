@@ -116,7 +116,7 @@ fn decided_grasp(recording_idx: usize, decision: &LiftDecision, truth: GraspTrut
         grasp_id: truth.grasp_id,
         fold: None,
         object: truth.object,
-        class: truth.class,
+        class: truth.object_class,
         stable: truth.stable,
         lifted: decision.action == Action::Lift,
         judged: is_judged(decision.reason),

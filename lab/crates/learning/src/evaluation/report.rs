@@ -238,7 +238,7 @@ fn undecided(read: &Examples) -> Vec<JudgedGrasp> {
         recording_idx: *recording_idx,
         grasp_id: truth.grasp_id,
         object: truth.object.clone(),
-        class: truth.class.clone(),
+        class: truth.object_class.clone(),
         stable: truth.stable,
         ..JudgedGrasp::default()
     }));

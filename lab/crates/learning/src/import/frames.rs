@@ -6,6 +6,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::{ImportError, require_forces};
+use blindgrasp_grasps::shown_hand::shown_hand;
 use blindgrasp_messages::{GraspTruth, Header, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::{RecordingInfo, RecordingWriter};
 use blindgrasp_stages::hand::Hand;
@@ -46,6 +47,7 @@ pub fn import_frames(
         version: env!("CARGO_PKG_VERSION").into(),
     };
     let mut recording = RecordingWriter::create(out, &info)?;
+    recording.show(shown_hand(hand))?;
     let mut outcomes = BTreeMap::new();
     let mut senses: Option<BTreeSet<&'static str>> = None;
     // The header of each grasp's first frame.
@@ -64,7 +66,7 @@ pub fn import_frames(
         }
         let has = senses_of(&frame.message);
         senses = Some(senses.map_or(has.clone(), |known| &known & &has));
-        recording.write(TactileFrame::TOPIC, frame)?;
+        recording.write_frame(TactileFrame::TOPIC, frame)?;
     }
     let mut seq = 0;
     for (grasp_id, truth) in truths {

@@ -21,6 +21,7 @@ use self::columns::{Columns, in_one_line, shortened};
 use self::grasps::{Grasps, TableGrasp, TableReading};
 use self::lines::{Lines, RowLimit};
 use crate::file_name;
+use blindgrasp_grasps::shown_hand::shown_hand;
 use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::open_regular;
 use blindgrasp_messages::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Recorded, Stamped, TactileFrame};
@@ -449,8 +450,10 @@ impl GraspWriter {
             made_by: format!("import of {name} with {how}"),
             version: env!("CARGO_PKG_VERSION").into(),
         };
+        let mut recording = RecordingWriter::create(out, &info)?;
+        recording.show(shown_hand(hand))?;
         Ok(GraspWriter {
-            recording: RecordingWriter::create(out, &info)?,
+            recording,
             header: Header { hand_id: hand.id(), ..Header::default() },
             grasp_id: options.first_grasp_id,
             n_frames: if options.grasp.is_some() { 1 } else { options.n_frames },
@@ -465,7 +468,7 @@ impl GraspWriter {
             volume: f64::NAN,
             stable: grasp.stable,
             object: grasp.object,
-            class: grasp.class,
+            object_class: grasp.class,
         };
         let header = Header { seq: self.n_grasps, ..self.header };
         self.recording.write(GraspTruth::TOPIC, &Stamped { header, message: truth })?;
@@ -476,7 +479,7 @@ impl GraspWriter {
             let mut sample = Stamped { header: self.header, message };
             for _ in 0..self.n_frames {
                 sample.header = self.header;
-                self.recording.write(TactileFrame::TOPIC, &sample)?;
+                self.recording.write_frame(TactileFrame::TOPIC, &sample)?;
                 self.header.seq += 1;
                 self.header.stamp_nanos += PERIOD_NANOS;
             }

@@ -187,7 +187,7 @@ impl Examples {
                             moving,
                             stable: truth.stable,
                             object: truth.object,
-                            class: truth.class,
+                            class: truth.object_class,
                         }),
                     }
                 }

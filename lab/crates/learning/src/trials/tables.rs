@@ -1,6 +1,8 @@
 //! Trials as tables: the paper's Tables II, III and IV beside its own figures, and the effect of the decision.
 
-use serde::Serialize;
+use std::collections::BTreeSet;
+
+use serde::{Deserialize, Serialize};
 
 use super::late_decisions::LateDecisions;
 use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
@@ -11,7 +13,7 @@ use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
 use blindgrasp_stages::training_summary::Bounded;
 
 /// A run of trials and its results.
-#[derive(Debug, Clone, Default, Serialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct TrialsReport {
     /// The command as it could be given again.
     pub command: String,
@@ -23,20 +25,26 @@ pub struct TrialsReport {
     pub max_attempts: u32,
     /// Seed of everything random.
     pub seed: u64,
+    /// The shard's index and the number of shards; the records are those of the shard alone.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub shard: Option<(u64, u64)>,
     pub options: TrialOptions,
     /// File of the model that decided.
     pub model: String,
     /// `finished`, or `stopped` before all was done.
     pub end: String,
     /// With the gate: lifted when the graph said so.
+    #[serde(skip_deserializing)]
     pub with_gate: Option<Tallies>,
     /// Every settled grasp lifted.
+    #[serde(skip_deserializing)]
     pub without_gate: Option<Tallies>,
     /// Attempts that were not lifted because the host was slow. `None` without trials by decision.
     pub late: Option<LateDecisions>,
     /// Trials left out because no approach led to the object, of the way that has more of them.
     pub n_left_out: u64,
     /// The effect of the decision; only if there are trials both ways.
+    #[serde(skip_deserializing)]
     pub effect: Option<GateEffect>,
     /// All attempts with the gate.
     pub records_with_gate: Vec<TrialRecord>,
@@ -45,6 +53,61 @@ pub struct TrialsReport {
 }
 
 impl TrialsReport {
+    /// The report of a whole run, from those of all its shards.
+    ///
+    /// # Errors
+    /// A shard that is missing, there twice, not finished, or of another run.
+    pub fn merge(shards: Vec<TrialsReport>) -> Result<TrialsReport, String> {
+        let mut whole: Option<TrialsReport> = None;
+        let mut seen = BTreeSet::new();
+        for report in shards {
+            let Some((idx, n)) = report.shard else {
+                return Err("a report is of no shard: expected those of trials --shard I/N --json".into());
+            };
+            if report.end != "finished" {
+                return Err(format!("shard {idx}/{n} was {} before all was done: make it again", report.end));
+            }
+            if !seen.insert(idx) {
+                return Err(format!("shard {idx}/{n} is there twice"));
+            }
+            let Some(known) = &mut whole else {
+                whole = Some(report);
+                continue;
+            };
+            if !known.is_of_run(&report) {
+                return Err(format!(
+                    "shard {idx}/{n} is of another run: expected the same objects, trials, attempts, seed, options, model, lift \
+                     policy and number of shards"
+                ));
+            }
+            if let (Some(late), Some(more)) = (&mut known.late, report.late) {
+                late.n_stale += more.n_stale;
+                late.n_undecided += more.n_undecided;
+            }
+            known.n_left_out += report.n_left_out;
+            known.records_with_gate.extend(report.records_with_gate);
+            known.records_without_gate.extend(report.records_without_gate);
+        }
+        let mut whole = whole.ok_or("expected the reports of all shards, found none")?;
+        let n = whole.shard.take().map_or(0, |(_, n)| n);
+        if let Some(missing) = (0..n).find(|idx| !seen.contains(idx)) {
+            return Err(format!("expected {n} shards, found {}: {missing}/{n} is missing", seen.len()));
+        }
+        whole.records_with_gate.sort_by_key(|record| (record.trial, record.attempt));
+        whole.records_without_gate.sort_by_key(|record| (record.trial, record.attempt));
+        whole.count();
+        Ok(whole)
+    }
+
+    fn is_of_run(&self, other: &TrialsReport) -> bool {
+        let [ours, theirs] = [self, other].map(|report| {
+            let n_shards = report.shard.map(|(_, n)| n);
+            let numbers = (n_shards, report.n_trials, report.max_attempts, report.seed, report.late.is_some());
+            (numbers, &report.objects, &report.model, &report.options)
+        });
+        ours == theirs
+    }
+
     /// Counts; an empty list of records is a way that was not run.
     pub fn count(&mut self) {
         let (with, without) = (&self.records_with_gate, &self.records_without_gate);
@@ -349,6 +412,37 @@ pub(super) mod tests {
             records(&trials)
         };
         report(made(["h", "-h", "-d", "---"]), made(["h", "d", "h", "d"]))
+    }
+
+    #[test]
+    fn the_reports_of_all_shards_are_that_of_the_whole() {
+        let whole = both();
+        let shard = |idx: u64| {
+            let mut part =
+                TrialsReport { shard: Some((idx, 2)), late: Some(LateDecisions::default()), ..whole.clone() };
+            part.records_with_gate.retain(|record| record.trial % 2 == idx);
+            part.records_without_gate.retain(|record| record.trial % 2 == idx);
+            part.count();
+            // As a file has it.
+            serde_json::from_str::<TrialsReport>(&serde_json::to_string(&part).expect("JSON")).expect("a report")
+        };
+        let merged = TrialsReport::merge(vec![shard(1), shard(0)]).expect("whole");
+        assert_eq!(merged.records_with_gate, whole.records_with_gate);
+        let text = |report: &TrialsReport| tables(report).iter().flat_map(Table::to_text).collect::<Vec<_>>();
+        assert_eq!(text(&merged), text(&whole));
+        let other = TrialsReport { seed: 2, ..shard(0) };
+        let stopped = TrialsReport { end: "stopped".into(), ..shard(0) };
+        for (shards, says) in [
+            (vec![], "found none"),
+            (vec![whole.clone()], "of no shard"),
+            (vec![shard(1)], "0/2 is missing"),
+            (vec![shard(1), shard(1)], "1/2 is there twice"),
+            (vec![shard(1), other], "0/2 is of another run"),
+            (vec![shard(1), stopped], "0/2 was stopped"),
+        ] {
+            let refused = TrialsReport::merge(shards).expect_err(says);
+            assert!(refused.contains(says), "{refused}");
+        }
     }
 
     #[test]

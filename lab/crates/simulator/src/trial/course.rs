@@ -56,7 +56,7 @@ impl Finished {
             volume: quality(outcome.volume),
             stable: outcome.held,
             object: outcome.thing.clone(),
-            class: outcome.group.clone(),
+            object_class: outcome.group.clone(),
         })
     }
 }

@@ -82,7 +82,7 @@ pub(crate) fn try_candidate(
         volume: quality.volume,
         stable: is_stable,
         object: target.object.name,
-        class: target.object.class,
+        object_class: target.object.class,
         ..GraspTruth::default()
     };
     let grasp = SimulatedGrasp { frames, truth, scene };

@@ -29,6 +29,9 @@ const MOST_ASKS: u64 = 50;
 #[derive(Debug, Clone, Copy)]
 pub struct RobotOptions {
     pub n_trials: u64,
+    /// Of all trials, it makes every `n_shards`-th from this one on.
+    pub shard_idx: u64,
+    pub n_shards: u64,
     pub seed: u64,
     /// The most attempts of a trial that is never decided to lift.
     pub max_attempts: u32,
@@ -241,6 +244,9 @@ impl<'a> Robot<'a> {
             }
             let (target, attempt) = self.target_and_attempt(&finished.place)?;
             return self.grasp(finished.place.clone(), target, attempt, Some(finished));
+        }
+        while self.course.next.trial % self.options.n_shards != self.options.shard_idx {
+            self.course.leave_out();
         }
         let place = self.course.next.clone();
         if place.trial >= self.options.n_trials {
@@ -500,8 +506,15 @@ mod tests {
     use super::*;
     use crate::trial::targets::targets_named;
 
-    const OPTIONS: RobotOptions =
-        RobotOptions { n_trials: 1, seed: 0, max_attempts: 2, lifts_always: false, is_watched: false };
+    const OPTIONS: RobotOptions = RobotOptions {
+        n_trials: 1,
+        shard_idx: 0,
+        n_shards: 1,
+        seed: 0,
+        max_attempts: 2,
+        lifts_always: false,
+        is_watched: false,
+    };
 
     fn barrett() -> Hand {
         Hand::load(Path::new("barrett-bh8-280")).expect("a hand")
@@ -569,6 +582,22 @@ mod tests {
         again.resume(first.course().clone(), Some(finished[0].last_seq()));
         let (frames, told) = run(&mut again, hold_the_first);
         assert_eq!((frames[0].header.seq, told), (finished[1].place.first_seq, finished));
+    }
+
+    #[test]
+    fn shards_make_the_trials_of_the_whole() {
+        let hand = barrett();
+        let made = |shard_idx: u64, n_shards: u64| -> Vec<LiftOutcome> {
+            let options = RobotOptions { n_trials: 2, shard_idx, n_shards, lifts_always: true, ..OPTIONS };
+            let targets = targets_named("paper/pencil-cup").expect("targets");
+            let mut robot = Robot::new(&hand, targets, TrialOptions::default(), options);
+            let (_, finished) = run(&mut robot, |_, _| Action::Lift);
+            // Grasps are numbered in each shard.
+            finished.into_iter().map(|finished| LiftOutcome { grasp_id: 0, ..finished.outcome }).collect()
+        };
+        let whole = made(0, 1);
+        assert_eq!(whole.iter().map(|outcome| outcome.trial).collect::<Vec<_>>(), [0, 1]);
+        assert_eq!([made(0, 2), made(1, 2)].concat(), whole);
     }
 
     #[test]

@@ -120,7 +120,7 @@ fn every_message_arrives_bit_by_bit() {
             volume: any_f64(rng),
             stable: rng.random(),
             object: "bücher-1".chars().take(rng.random_range(0..9)).collect(),
-            class: "ü".repeat(rng.random_range(0..=32)),
+            object_class: "ü".repeat(rng.random_range(0..=32)),
         };
         check(rng, &truth);
         let outcome = LiftOutcome {

@@ -8,9 +8,8 @@ use serde::{Serialize, Serializer};
 use crate::Record;
 use blindgrasp_messages::with_sample;
 
-/// A value in a message. As JSON it is what the message is as JSON, in the message's order.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-#[serde(untagged)]
+/// A value in a message.
+#[derive(Debug, Clone, PartialEq)]
 pub enum Value {
     Bool(bool),
     Signed(i64),
@@ -19,12 +18,8 @@ pub enum Value {
     /// A text, the word of an enum, or an identity in hexadecimal digits.
     Text(String),
     List(Vec<Value>),
-    #[serde(serialize_with = "as_map")]
-    Struct(Row),
+    Struct(Vec<(&'static str, Value)>),
 }
-
-/// Values with their names, in order.
-pub type Row = Vec<(&'static str, Value)>;
 
 /// A message has a field that is no number, flag, text, list or struct.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -46,27 +41,9 @@ impl fmt::Display for Value {
             // The fewest digits that read back exactly, with an exponent where plain digits would be many.
             Value::Float(value) => write!(f, "{value:?}"),
             Value::Text(value) => f.write_str(value),
-            Value::List(_) | Value::Struct(_) => {
-                f.write_str(&serde_json::to_string(self).map_err(|_error| fmt::Error)?)
-            }
+            Value::List(_) | Value::Struct(_) => fmt::Debug::fmt(self, f),
         }
     }
-}
-
-/// A sample as a row of a table: the header's fields, then the message's.
-///
-/// # Errors
-/// See [`ValueError`].
-pub fn row(record: &Record) -> Result<Row, ValueError> {
-    let header = record.header();
-    let mut row = vec![
-        ("seq", Value::Unsigned(header.seq)),
-        ("stamp_nanos", Value::Unsigned(header.stamp_nanos)),
-        ("epoch", Value::Unsigned(header.epoch)),
-        ("hand_id", Value::Text(format!("{:016x}", header.hand_id))),
-    ];
-    row.extend(message_fields(record)?);
-    Ok(row)
 }
 
 /// All numbers, flags and texts of a message with their paths, like `contacts[2].position_m[0]`, in the message's order.
@@ -85,20 +62,12 @@ pub fn leaves(record: &Record) -> Result<Vec<(String, Value)>, ValueError> {
             leaf => found.push((path, leaf)),
         }
     }
+    let Value::Struct(fields) = with_sample!(record, sample => sample.message.serialize(ToValue))? else {
+        return Err(ValueError("no fields".into()));
+    };
     let mut found = Vec::new();
-    message_fields(record)?.into_iter().for_each(|(name, value)| add(name.into(), value, &mut found));
+    fields.into_iter().for_each(|(name, value)| add(name.into(), value, &mut found));
     Ok(found)
-}
-
-fn message_fields(record: &Record) -> Result<Row, ValueError> {
-    match with_sample!(record, sample => sample.message.serialize(ToValue))? {
-        Value::Struct(fields) => Ok(fields),
-        other => Err(ValueError(format!("no fields, but {other}"))),
-    }
-}
-
-fn as_map<S: Serializer>(fields: &Row, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.collect_map(fields.iter().map(|(name, value)| (name, value)))
 }
 
 /// A serializer that makes a [`Value`].
@@ -106,7 +75,7 @@ struct ToValue;
 
 struct Items(Vec<Value>);
 
-struct Fields(Row);
+struct Fields(Vec<(&'static str, Value)>);
 
 macro_rules! scalars {
     ($($method:ident($type:ty) $variant:ident;)+) => {$(
@@ -226,5 +195,65 @@ impl SerializeStruct for Fields {
 
     fn end(self) -> Result<Value, ValueError> {
         Ok(Value::Struct(self.0))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use blindgrasp_messages::{Contact, ContactSet, Fault, GraspScene, Header, Phase, SceneContact, Stamped};
+
+    use super::*;
+    use crate::tests::records;
+
+    #[test]
+    fn every_type_is_taken_apart_as_json_has_it() {
+        for (_, record) in records() {
+            let found = leaves(&record).expect("leaves");
+            let names: BTreeSet<&str> = found.iter().filter_map(|(path, _)| path.split(['[', '.']).next()).collect();
+            let json = record.to_json().expect("JSON");
+            let fields = json.as_object().expect("an object").iter();
+            // An empty list has no leaves.
+            let expected: BTreeSet<&str> =
+                fields.filter(|(_, value)| **value != serde_json::json!([])).map(|(name, _)| name.as_str()).collect();
+            assert_eq!(names, expected, "{}", record.type_name());
+        }
+    }
+
+    #[test]
+    fn every_value_of_a_message_has_its_path() {
+        let contact = Contact { position_m: [0.1, -0.0, f64::NAN], pad: 3, ..Contact::default() };
+        let message = ContactSet {
+            grasp_id: 7,
+            phase: Phase::Settled,
+            joints: vec![],
+            contacts: vec![Contact::default(), contact],
+            self_collision: true,
+            fault: Fault::NoContact,
+            ..ContactSet::default()
+        };
+        let found = leaves(&Record::Contacts(Stamped { header: Header::default(), message })).expect("leaves");
+        let shown: Vec<String> = found.iter().map(|(path, leaf)| format!("{path}={leaf}")).collect();
+        let expected = [
+            "grasp_id=7",
+            "phase=settled",
+            "contacts[1].position_m[0]=0.1",
+            "contacts[1].position_m[1]=-0.0",
+            "contacts[1].position_m[2]=NaN",
+            "contacts[1].pad=3",
+            "self_collision=true",
+            "fault=no_contact",
+        ];
+        for line in expected {
+            assert!(shown.iter().any(|shown| shown == line), "{line} in {shown:?}");
+        }
+        // Two numbers, then nine for each contact, then five.
+        assert_eq!(shown.len(), 2 + 2 * 9 + 5);
+
+        let mut message = GraspScene::default();
+        message.contacts.push(SceneContact { other_link: -1, ..SceneContact::default() });
+        let found = leaves(&Record::Scene(Stamped { header: Header::default(), message })).expect("leaves");
+        assert!(found.contains(&("contacts[0].other_link".into(), Value::Signed(-1))), "{found:?}");
     }
 }
