@@ -154,7 +154,7 @@ fn a_version_is_published_only_if_it_is_the_same_everywhere() {
     dated("2026-11-27");
     std::fs::write(clone.join("CITATION.cff"), citation).expect("written");
     // The line of packaging/README.md that names who publishes.
-    let names = "sed -i -e 's#blindgrasp@example.org#me@my.robot#' -e 's#https://example.org/blindgrasp#https://my.robot/it#' \
+    let names = "sed -i -e 's#blindgrasp@example.org#me@example.com#' -e 's#https://example.org/blindgrasp#https://example.com/robot#' \
                  Cargo.toml CITATION.cff $(git ls-files '*package.xml')";
     succeed(Command::new("sh").args(["-c", names]).current_dir(&clone));
     commit();
