@@ -19,8 +19,10 @@
 
     decisions = blindgrasp.replay("run.mcap", "dataflow.yaml")     # the same in a test: the fixture `replay` of pytest
 
-Recordings are read here; all else is done by the program `blindgrasp` (`blindgrasp.program()`). Nothing here computes a
-feature or a probability, so that Python and a robot never disagree.
+    cells = blindgrasp.skin(model, "hand.yaml").read(data)    # the hand's cells in your own MuJoCo model
+
+Recordings and contacts of MuJoCo are read here; all else is done by the program `blindgrasp` (`blindgrasp.program()`).
+Nothing here computes a feature or a probability, so that Python and a robot never disagree.
 """
 
 from ._graph import ReplayedDecisions, Run, echo, replay, run
@@ -29,6 +31,7 @@ from ._model import Model, PredictedGrasp, Predictions
 from ._out import to_lerobot, to_parquet
 from ._program import ProgramError, ProgramNotFoundError, program
 from ._recording import Grasp, Recording, RecordingError, read
+from ._skin import Skin, SkinOptions, skin
 from ._types import Decision, Label
 
 # The version of the program and of all else: Cargo.toml has it as well, and a test compares them.
@@ -47,6 +50,8 @@ __all__ = [
     "RecordingError",
     "ReplayedDecisions",
     "Run",
+    "Skin",
+    "SkinOptions",
     "__version__",
     "echo",
     "from_table",
@@ -54,6 +59,7 @@ __all__ = [
     "read",
     "replay",
     "run",
+    "skin",
     "to_lerobot",
     "to_parquet",
 ]

@@ -7,7 +7,7 @@ import os
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from os import PathLike, fspath
-from typing import Any, Self
+from typing import Any
 
 from ._program import Process, answer_of
 from ._types import WHILE_LIFTING, Decision
@@ -34,7 +34,7 @@ class Run:
         self.stderr = ""
         """All that the program printed to stderr; empty before the block has ended."""
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Run:
         self._process = Process(self._arguments)
         try:
             self._wait_until_it_runs(self._process)

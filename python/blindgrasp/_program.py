@@ -14,7 +14,7 @@ import termios
 import threading
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import IO, Any
 
 PROGRAM_VARIABLE = "BLINDGRASP_PROGRAM"
 
@@ -69,8 +69,8 @@ def _is_executable(path: Path) -> bool:
 class Process:
     """A run of the program that prints a JSON object a line. As a context manager it ends the program.
 
-    Relative paths in its arguments begin at `folder`, or at the current folder. The program has a process group of its
-    own: Ctrl-C reaches it once, from here, and not also from the terminal.
+    Relative paths in its arguments begin at `folder`, or at the current folder. The program has a session of its own:
+    Ctrl-C reaches it once, from here, and not also from the terminal.
     """
 
     def __init__(
@@ -85,13 +85,13 @@ class Process:
             stdout=subprocess.PIPE,
             stderr=self._stderr,
             cwd=folder,
-            process_group=0,
+            start_new_session=True,
         )
         self.pid = self._process.pid
         self._said = ""
         self._may_fail = True
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> Process:
         return self
 
     def __exit__(self, *_: object) -> None:

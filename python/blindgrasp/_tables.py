@@ -66,12 +66,17 @@ def mean_of_rows(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     return means
 
 
-def cell_names(hand: str) -> list[str]:
-    """The pads and numbers of a hand's cells, like `palm_0`, as the program tells them.
+def cells_of(hand: str) -> list[dict[str, Any]]:
+    """A hand's cells with their pads, numbers and places, as the program tells them.
 
     Raises ProgramError if there is no such hand.
     """
     cells = answer_of(["info", hand, "--json"])
     if not isinstance(cells, list):
         raise ValueError(f"{hand} is no hand: expected the name of a built-in hand, or the path of a pad layout (YAML)")
-    return [f"{cell['pad']}_{cell['cell']}" for cell in cells]
+    return cells
+
+
+def cell_names(hand: str) -> list[str]:
+    """The pads and numbers of a hand's cells, like `palm_0`."""
+    return [f"{cell['pad']}_{cell['cell']}" for cell in cells_of(hand)]

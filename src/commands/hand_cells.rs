@@ -5,7 +5,7 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::{Outcome, print_line, print_text};
-use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::hand::{Cell, Hand};
 
 #[derive(Serialize)]
 struct CellRow<'a> {
@@ -13,6 +13,9 @@ struct CellRow<'a> {
     cell: usize,
     position_m: [f64; 3],
     normal: [f64; 3],
+    link: &'a str,
+    #[serde(flatten)]
+    in_link: &'a Cell,
 }
 
 /// Whether the argument is a pad layout, and no recording: its name ends so, or it is the name of a built-in hand.
@@ -26,17 +29,18 @@ pub(super) fn print(hand: &Path, joints: &[(String, f64)], json: bool) -> anyhow
     let hand = Hand::load(hand)?;
     let joints = hand.posture(joints.iter().map(|(name, value)| (name.as_str(), *value)))?;
     let poses = hand.cells_in_palm(&joints)?;
-    let rows: Vec<CellRow<'_>> = hand
-        .cells()
-        .zip(poses)
-        .enumerate()
-        .map(|(idx, ((pad_idx, _), pose))| CellRow {
-            pad: &hand.pads[pad_idx].name,
-            cell: idx - hand.pads[pad_idx].first_cell_idx,
+    let mut rows = Vec::new();
+    for (idx, ((pad_idx, in_link), pose)) in hand.cells().zip(poses).enumerate() {
+        let pad = &hand.pads[pad_idx];
+        rows.push(CellRow {
+            pad: &pad.name,
+            cell: idx - pad.first_cell_idx,
             position_m: pose.position_in_palm_m.coords.into(),
             normal: pose.normal_in_palm.into_inner().into(),
-        })
-        .collect();
+            link: &hand.links[pad.link_idx].name,
+            in_link,
+        });
+    }
     if json {
         print_text(&serde_json::to_string_pretty(&rows)?)?;
         return Ok(Outcome::Done);

@@ -111,7 +111,7 @@ fn a_version_is_published_only_if_it_is_the_same_everywhere() {
     let version = env!("CARGO_PKG_VERSION");
     let changelog = clone.join("CHANGELOG.md");
     let of_this_tree = |name: &str| assert!(std::fs::copy(project().join(name), clone.join(name)).is_ok(), "{name}");
-    ["CHANGELOG.md", "CITATION.cff", "scripts/publish", "scripts/release", "scripts/python-wheel"]
+    ["CHANGELOG.md", "CITATION.cff", "Cargo.toml", "scripts/publish", "scripts/release", "scripts/python-wheel"]
         .into_iter()
         .for_each(of_this_tree);
     let written = std::fs::read_to_string(&changelog).expect("readable");
@@ -140,13 +140,23 @@ fn a_version_is_published_only_if_it_is_the_same_everywhere() {
     let other = citation.replace(&format!("version: {version}"), "version: 9.9.9");
     std::fs::write(clone.join("CITATION.cff"), other).expect("written");
     let said = publish(false);
-    for mistake in ["CITATION.cff has version 9.9.9", "CHANGELOG.md begins with", "that are not committed"] {
+    for mistake in [
+        "CITATION.cff has version 9.9.9",
+        "CHANGELOG.md begins with",
+        "that are not committed",
+        "expected your name and e-mail",
+        "expected its address",
+    ] {
         assert!(said.contains(mistake), "{mistake}: {said}");
     }
     assert!(!out.exists(), "{said}");
 
     dated("2026-11-27");
     std::fs::write(clone.join("CITATION.cff"), citation).expect("written");
+    // The line of packaging/README.md that names who publishes.
+    let names = "sed -i -e 's#blindgrasp@example.org#me@example.com#' -e 's#https://example.org/blindgrasp#https://example.com/robot#' \
+                 Cargo.toml CITATION.cff $(git ls-files '*package.xml')";
+    succeed(Command::new("sh").args(["-c", names]).current_dir(&clone));
     commit();
     let said = publish(true);
     let places = ["blindgrasp-messages", "blindgrasp-stages", "blindgrasp-operators"]
