@@ -513,7 +513,8 @@ fn graph_event(now: &Look, before: Option<&Look>) -> anyhow::Result<String> {
     let params = now.status.nodes.iter().map(|node| (&node.node, &node.params));
     event["params"] = json!(params.collect::<BTreeMap<_, _>>());
     if let Some(node) = now.status.nodes.iter().find(|node| node.params.get("driver") == Some(&"listen".into())) {
-        let usual = tactile_path().map_or(Value::Null, |path| format!("unix:{}", path.display()).into());
+        let usual =
+            tactile_path(&now.status.graph).map_or(Value::Null, |path| format!("unix:{}", path.display()).into());
         event["listens"] = node.params.get("address").cloned().unwrap_or(usual);
     }
     Ok(event.to_string())
