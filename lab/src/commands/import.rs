@@ -203,6 +203,10 @@ fn print_report(
         Joints::Fixed(_) => ("posture, rad", joints.join(", ")),
         Joints::Columns(_) => ("joints", joints.join(", ")),
     });
+    if report.n_missing > 0 {
+        lines
+            .push(("missing", format!("{} have missing readings, which count as 0", counted(report.n_missing, "row"))));
+    }
     if report.n_below_zero > 0 {
         lines.push(("below zero", format!("{} rows have readings below zero, which count as 0", report.n_below_zero)));
     }
