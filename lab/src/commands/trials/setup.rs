@@ -60,8 +60,7 @@ impl Setup {
         let mut judges = Vec::new();
         for judge in &graph.nodes {
             adjust(judge, &mut overrides);
-            let is_set = overrides.iter().any(|set| set.is_of(&judge.id) && set.param == "max_gap_ms");
-            if judge.params.contains_key("max_gap_ms") && !is_set {
+            if has_own_limit(judge, &overrides) {
                 judges.push(judge.id.clone());
             }
         }
@@ -136,6 +135,12 @@ fn adjust(judge: &Node, overrides: &mut Vec<Override>) {
             overrides.push(set(&judge.id, param, text));
         }
     }
+}
+
+/// Whether a node limits gaps as its file says.
+fn has_own_limit(judge: &Node, overrides: &[Override]) -> bool {
+    let is_set = overrides.iter().any(|set| set.is_of(&judge.id) && set.param == "max_gap_ms");
+    judge.params.contains_key("max_gap_ms") && !is_set
 }
 
 /// The options of the node that lifts, and the overrides that give it those of the command.
