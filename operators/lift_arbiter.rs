@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use blindgrasp_messages::{
-    Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Reason, Recorded,
+    Action, Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Recorded,
 };
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
