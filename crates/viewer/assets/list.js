@@ -1,5 +1,6 @@
 // The list of decisions of a running graph or a recording, and the ways to one of them: a click, the arrow keys in the list, its
-// number in the field, n and p anywhere, and the address (#grasp=500, with &epoch=2 if another run of the source has such a number), which follows the page.
+// number in the field, n and p anywhere, and the address, which follows the page: #grasp=500, and &epoch=2 if another run of the
+// source has such a number.
 
 const WRONG = { "false-positive": ": a wrong lift", "false-negative": ": a wrong hold" };
 const graspInAddress = () => /^#grasp=(?<id>\d+)(?:&epoch=(?<epoch>\d+))?$/.exec(location.hash)?.groups ?? null;
