@@ -33,15 +33,16 @@ def frames(rate):
         yield record["data"]
 
 
-def own_sockets():
-    """The addresses at which tactile_source may listen without a param: in those of its folders that are this user's alone."""
+def own_sockets(graph):
+    """The addresses at which the sources of such a graph, or of all (*), may listen without a param: in those of the folders that
+    are this user's alone."""
     for folder in (path for pattern in SOCKET_FOLDERS for path in sorted(glob.glob(pattern))):
         try:
             found = os.lstat(folder)
         except OSError:
             continue
         if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077:
-            yield f"unix:{folder}/tactile.hand"
+            yield from (f"unix:{path}" for path in sorted(glob.glob(f"{folder}/{graph}.hand")))
 
 
 def connect_to(address):
@@ -56,21 +57,27 @@ def connect_to(address):
 
 
 def connect(address):
-    """Connects, as often as it takes, to the address; without one, to the first socket of this user that answers."""
+    """Connects, as often as it takes, to an address or a graph; without one, to the only graph of this user that takes frames."""
     while True:
-        why = f"no folder of this user: {', '.join(SOCKET_FOLDERS)}"
-        for found in [address] if address else own_sockets():
+        why = f"no graph {address or ''} takes frames (NAME.hand in {', '.join(SOCKET_FOLDERS)})"
+        connections = {}
+        for found in [address] if address and ":" in address else own_sockets(address or "*"):
             try:
-                return connect_to(found)
+                connections[found] = connect_to(found)
             except OSError as error:
                 why = f"{found}: {error}"
+        if len(connections) > 1:
+            sys.exit(f"{len(connections)} graphs take frames, at {', '.join(connections)}: name one with --graph NAME")
+        for connection in connections.values():
+            return connection
         print(f"{why}; trying again", file=sys.stderr)
         time.sleep(1)
 
 
 def main():
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--address", help="unix:PATH or HOST:PORT; without it, the source's socket in a folder of this user")
+    options.add_argument("--address", help="unix:PATH or HOST:PORT; without it, that of the only graph")
+    options.add_argument("-g", "--graph", dest="address", metavar="NAME", help="of this machine, which gets the frames")
     options.add_argument("--rate", type=float, default=1.0, help="times the recorded speed")
     arguments = options.parse_args()
 

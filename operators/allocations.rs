@@ -53,8 +53,8 @@ fn describe(_program: &Path, args: &[String]) -> Result<OperatorDescription, Str
 /// iceoryx2 0.10 itself allocates so often for a sample that is sent: 48 bytes that count who holds it.
 const N_BY_ICEORYX2: u64 = 1;
 
-/// So many grasps of the recording touch cells only where links touch each other.
-const N_EXPLAINED: u64 = 14;
+/// So many grasps of the recording have no contact with an object.
+const N_EXPLAINED: u64 = 37;
 
 /// The stages of the default graph as a group in this thread, on the recording of held-out objects.
 #[test]
@@ -126,7 +126,7 @@ fn no_stage_allocates_for_a_sample_once_it_is_warm() {
     }
     assert_eq!((n_frames, n_decisions), (3360, 240));
     // Some times a second, between samples, a stage looks for new readers and reports its counts; and a line of the log explains
-    // a grasp whose contacts are not the object's.
+    // a grasp without contact.
     let n_looks = warm.expect("warm").elapsed().div_duration_f64(TICK).ceil() as u64 + 1;
     for (idx, n) in n_steps_that_allocated.into_iter().enumerate() {
         let n_allowed = n_looks + N_EXPLAINED;

@@ -19,6 +19,9 @@ use serde::Deserialize;
 
 use crate::beginning::FileNode;
 
+/// The shortest time between two lines about faulty frames.
+const LOG_PAUSE_NANOS: u64 = 1_000_000_000;
+
 #[derive(Deserialize)]
 struct Params {
     hand: PathBuf,
@@ -49,7 +52,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let max_contacts = hand.n_cells();
     let flickering = Flickering { operator: operator.clone(), grasp: None, n_grasps: 0, has_counted: true };
     let (finder, filter) = Default::default();
-    let stage = FindContacts { hand, finder, filter, watch, told: None, flickering };
+    let stage = FindContacts { hand, finder, filter, watch, faults: FaultLog::default(), flickering };
     stage::run(operator, "tactile", "contacts", max_contacts, identity, stage)
 }
 
@@ -78,9 +81,18 @@ struct FindContacts {
     filter: GlitchFilter,
     /// The watch over the sensors, which remembers their readings.
     watch: Option<Watch>,
-    /// The last grasp of which a faulty frame was explained.
-    told: Option<u64>,
+    faults: FaultLog,
     flickering: Flickering,
+}
+
+/// Explains faulty frames without filling the log: one of a grasp, whose frames mostly have one fault, and one in a second. The
+/// next line says how many grasps had none.
+#[derive(Default)]
+struct FaultLog {
+    /// The last grasp with a faulty frame.
+    told: Option<u64>,
+    due_nanos: u64,
+    n_more: u64,
 }
 
 /// The grasps in which cells were found to flicker, since the program started.
@@ -125,6 +137,22 @@ struct Reported {
     counts: BTreeMap<String, u64>,
     /// The launcher does not know the counts yet.
     has_counted: bool,
+}
+
+impl FaultLog {
+    fn line(&mut self, grasp_id: u64, why: &str, now_nanos: u64) -> Option<String> {
+        self.told = Some(grasp_id);
+        if now_nanos < self.due_nanos {
+            self.n_more += 1;
+            return None;
+        }
+        self.due_nanos = now_nanos + LOG_PAUSE_NANOS;
+        let mut line = format!("a frame of grasp {grasp_id} cannot be judged: {why}");
+        if self.n_more > 0 {
+            line += &format!("; nor could one of each of {} grasps before it", std::mem::take(&mut self.n_more));
+        }
+        Some(line)
+    }
 }
 
 impl Watch {
@@ -173,21 +201,22 @@ impl Stage for FindContacts {
         self.watch.is_some() || self.hand.median_filter
     }
 
-    fn answer(&mut self, head: &TactileFrameHead, items: &[f64], _now_nanos: u64, answers: &mut Answers<ContactSet>) {
+    fn answer(&mut self, head: &TactileFrameHead, items: &[f64], now_nanos: u64, answers: &mut Answers<ContactSet>) {
         let memory = (&mut self.finder, &mut self.filter);
         let (mut summary, parts) = find_contacts(&self.hand, memory, head, items, answers.items());
-        // Once for each grasp: its frames mostly have one fault. A hand that closes may have no contact yet.
+        // A hand that closes may have no contact yet.
         let is_at_rest = Phase::from_code(head.phase).is_ok_and(Phase::decides);
         if is_at_rest {
             self.flickering.note(head.grasp_id, &self.filter, &self.hand);
         }
-        if self.told != Some(head.grasp_id)
+        if self.faults.told != Some(head.grasp_id)
             && Phase::from_code(head.phase).is_ok_and(|phase| !phase.is_over())
             && (is_at_rest || summary.fault != Fault::NoContact)
             && let Some(why) = explain_fault(&self.hand, &self.finder, &summary, parts.as_ref())
         {
-            self.told = Some(head.grasp_id);
-            print_diagnostic(&format!("a frame of grasp {} cannot be judged: {why}", head.grasp_id));
+            if let Some(line) = self.faults.line(head.grasp_id, &why, now_nanos) {
+                print_diagnostic(&line);
+            }
         }
         let phase = Phase::from_code(head.phase).ok().filter(|phase| !phase.is_over());
         if let (Some(watch), Some(parts), Some(phase)) = (&mut self.watch, &parts, phase)
@@ -239,5 +268,19 @@ impl Stage for FindContacts {
             (watch.memory, watch.reported.grasp, watch.reported.counts) = restored;
         }
         Ok(state.is_some())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn faults_of_many_grasps_are_a_line_in_a_second() {
+        let mut faults = FaultLog::default();
+        assert_eq!(faults.line(7, "why", 5).as_deref(), Some("a frame of grasp 7 cannot be judged: why"));
+        assert_eq!((8..10).find_map(|grasp_id| faults.line(grasp_id, "why", LOG_PAUSE_NANOS)), None);
+        let line = faults.line(10, "why", LOG_PAUSE_NANOS + 5).expect("due");
+        assert_eq!(line, "a frame of grasp 10 cannot be judged: why; nor could one of each of 2 grasps before it");
     }
 }

@@ -8,6 +8,7 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage;
+use blindgrasp_stages::out_of_distribution::Violation;
 use blindgrasp_stages::{Hand, Model, steps};
 use serde::Deserialize;
 
@@ -53,9 +54,8 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         // Once for each grasp: its frames violate the same limits.
         if is_unusual && told != Some(head.grasp_id) && Phase::from_code(head.phase).is_ok_and(Phase::decides) {
             told = Some(head.grasp_id);
-            let violated: Vec<String> =
-                steps::violations(&model, head, contacts).iter().map(ToString::to_string).collect();
-            print_diagnostic(&format!("grasp {} is out of distribution: {}", head.grasp_id, violated.join("; ")));
+            let violated = Violation::most(&steps::violations(&model, head, contacts)).join("; ");
+            print_diagnostic(&format!("grasp {} is out of distribution: {violated}", head.grasp_id));
         }
         feature
     });

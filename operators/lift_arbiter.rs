@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use blindgrasp_messages::{
-    Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Reason, Recorded,
+    Action, Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Recorded,
 };
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
@@ -283,10 +283,9 @@ impl Arbiter {
     /// Answers under the header of the last prediction, but with numbers that count the decisions.
     fn publish(&mut self, answers: &mut Answers<LiftDecision>) {
         for decision in self.decided.drain(..) {
-            if decision.reason == Reason::Stale
-                && let Some(staleness) = self.arbiter.staleness(decision.grasp_id)
-            {
-                tracing::warn!("grasp {} is stale: {staleness}", decision.grasp_id);
+            let why = self.arbiter.explain(decision.grasp_id).join("; ");
+            if decision.action == Action::Hold && !why.is_empty() {
+                tracing::warn!("grasp {} is held, {}: {why}", decision.grasp_id, decision.reason.as_str());
             }
             // By a recording's clock nothing expires.
             let valid_nanos = if self.clock == Clock::Machine { self.arbiter.options().max_age_nanos } else { 0 };

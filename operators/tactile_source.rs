@@ -71,6 +71,8 @@ pub struct AskedDriver<'a> {
     /// All params of the node.
     pub params: &'a Map<String, Value>,
     pub hand: &'a Hand,
+    /// The graph's name; its place is held by a word where a node is only checked.
+    pub graph: &'a str,
     pub has_sandbox: bool,
 }
 
@@ -100,7 +102,7 @@ pub fn describe() -> OperatorDescription {
         .optional_param(
             "address",
             ParamKind::String {},
-            "HOST:PORT, or unix:PATH for programs of this user; listen: unix:/tmp/blindgrasp-UID/tactile.hand by default",
+            "HOST:PORT, or unix:PATH for programs of this user; listen: unix:/tmp/blindgrasp-UID/GRAPH.hand by default",
         )
         .optional_param("device", file(false), "serial: the device")
         .optional_param(
@@ -146,7 +148,8 @@ pub(crate) fn check(node: &FileNode) -> anyhow::Result<()> {
 /// The params are of no use, or the driver or an edge fails.
 pub fn work_with(operator: &Operator, make_driver: MakeDriver) -> anyhow::Result<()> {
     let params = operator.params()?;
-    let SourceParts { params, hand, driver, zeros } = setup(&params, operator.has_sandbox(), make_driver)?;
+    let SourceParts { params, hand, driver, zeros } =
+        setup(&params, operator.graph(), operator.has_sandbox(), make_driver)?;
     let (n_joints, n_cells) = (hand.joints.len(), hand.n_cells());
     operator.reserve_state()?;
     let shape = Shape { n_joints, n_cells };
@@ -180,7 +183,7 @@ pub fn work_with(operator: &Operator, make_driver: MakeDriver) -> anyhow::Result
 /// # Errors
 /// See above.
 pub fn check_with(node: &FileNode, make_driver: MakeDriver) -> anyhow::Result<()> {
-    setup(&node.params, node.has_sandbox, make_driver).map(drop)
+    setup(&node.params, "GRAPH", node.has_sandbox, make_driver).map(drop)
 }
 
 /// The hand, its driver, which is not open yet, and the zeros of its cells.
@@ -191,7 +194,12 @@ struct SourceParts {
     zeros: CellZeros,
 }
 
-fn setup(node_params: &Map<String, Value>, has_sandbox: bool, make_driver: MakeDriver) -> anyhow::Result<SourceParts> {
+fn setup(
+    node_params: &Map<String, Value>,
+    graph: &str,
+    has_sandbox: bool,
+    make_driver: MakeDriver,
+) -> anyhow::Result<SourceParts> {
     let params: Params = parse_params(node_params)?;
     let hand = Hand::load(&params.hand)?;
     let (n_joints, n_cells) = (hand.joints.len(), hand.n_cells());
@@ -199,7 +207,8 @@ fn setup(node_params: &Map<String, Value>, has_sandbox: bool, make_driver: MakeD
         bail!("hand {}: {n_joints} joints and {n_cells} cells, at most {MAX_JOINTS} and {MAX_CELLS}", hand.name);
     }
     refuse_unused(&params.driver, node_params)?;
-    let driver = make_driver(&AskedDriver { name: &params.driver, params: node_params, hand: &hand, has_sandbox })?;
+    let driver =
+        make_driver(&AskedDriver { name: &params.driver, params: node_params, hand: &hand, graph, has_sandbox })?;
     let zeros =
         CellZeros::new(&hand, params.zero_when_open).map_err(|reason| anyhow!("hand {}: {reason}", hand.name))?;
     Ok(SourceParts { params, hand, driver, zeros })
@@ -242,7 +251,7 @@ pub fn robot_driver(asked: &AskedDriver<'_>) -> anyhow::Result<Box<dyn TactileDr
         "listen" => Link::Listen {
             address: match params.address {
                 Some(address) => address,
-                None => format!("unix:{}", control_socket::tactile_path()?.display()),
+                None => format!("unix:{}", control_socket::tactile_path(asked.graph)?.display()),
             },
         },
         "connect" => Link::Connect { address: params.address.with_context(|| lacks("address", "robot.local:7400"))? },

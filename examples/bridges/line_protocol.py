@@ -18,7 +18,8 @@ SOCKET_FOLDERS = ("/run/bgrasp", f"/tmp/blindgrasp-{os.getuid()}", f"/dev/shm/bl
 def options(description):
     """The options that all bridges have."""
     found = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    found.add_argument("--address", help="of tactile_source, unix:PATH or HOST:PORT; without it, its socket in a folder of this user")
+    found.add_argument("--address", help="of tactile_source, unix:PATH or HOST:PORT; without it, that of the only graph")
+    found.add_argument("-g", "--graph", dest="address", metavar="NAME", help="of this machine, whose tactile_source gets the frames")
     found.add_argument("--hand", help="name or identity (hand_id) of the hand whose frames these are; a graph for another one gets none")
     return found
 
@@ -28,15 +29,16 @@ def now_nanos():
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
-def own_sockets():
-    """The addresses at which tactile_source may listen without a param: in those of its folders that are this user's alone."""
+def own_sockets(graph):
+    """The addresses at which the sources of such a graph, or of all (*), may listen without a param: in those of the folders that
+    are this user's alone."""
     for folder in (path for pattern in SOCKET_FOLDERS for path in sorted(glob.glob(pattern))):
         try:
             found = os.lstat(folder)
         except OSError:
             continue
         if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077:
-            yield f"unix:{folder}/tactile.hand"
+            yield from (f"unix:{path}" for path in sorted(glob.glob(f"{folder}/{graph}.hand")))
 
 
 def connect_to(address):
@@ -51,14 +53,19 @@ def connect_to(address):
 
 
 def connect(address):
-    """Connects, as often as it takes, to the address; without one, to the first socket of this user that answers."""
+    """Connects, as often as it takes, to an address or a graph; without one, to the only graph of this user that takes frames."""
     while True:
-        why = f"no folder of this user: {', '.join(SOCKET_FOLDERS)}"
-        for found in [address] if address else own_sockets():
+        why = f"no graph {address or ''} takes frames (NAME.hand in {', '.join(SOCKET_FOLDERS)})"
+        connections = {}
+        for found in [address] if address and ":" in address else own_sockets(address or "*"):
             try:
-                return connect_to(found)
+                connections[found] = connect_to(found)
             except OSError as error:
                 why = f"{found}: {error}"
+        if len(connections) > 1:
+            sys.exit(f"{len(connections)} graphs take frames, at {', '.join(connections)}: name one with --graph NAME")
+        for connection in connections.values():
+            return connection
         print(f"{why}; trying again", file=sys.stderr)
         time.sleep(1)
 
@@ -96,8 +103,11 @@ class Source:
             time.sleep(1)
         if "refused" in hand:
             sys.exit(hand["why"])
+        # If the source goes, the bridge waits for this one: another may be that of another hand.
+        if connection.family == socket.AF_UNIX:
+            self.address = f"unix:{connection.getpeername()}"
         if self.own_hand not in (None, hand["hand"], hand.get("hand_id")):
-            sys.exit(f"the graph is for the hand {hand['hand']}, this bridge for {self.own_hand}: give each graph an address, and its bridge the same")
+            sys.exit(f"the graph is for the hand {hand['hand']}, this bridge for {self.own_hand}: name its graph with --graph NAME")
         print(f"connected: {hand['hand']}, {hand['n_joints']} joints, {hand['n_cells']} cells", file=sys.stderr)
         # Every further line names the fault of a frame.
         threading.Thread(target=self.tell, args=(answers,), daemon=True).start()

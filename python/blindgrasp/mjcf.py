@@ -39,7 +39,12 @@ def urdf_of(model_path: str | os.PathLike[str], urdf_path: str | os.PathLike[str
         import mujoco
     except ImportError as error:
         raise ImportError("the package mujoco is missing: pip install 'blindgrasp[mujoco]'") from error
-    model = mujoco.MjModel.from_xml_path(str(model_path))
+    try:
+        model = mujoco.MjModel.from_xml_path(str(model_path))
+    except ValueError as error:
+        if "Unrecognized XML model type" in str(error):
+            raise ValueError(f"{error}: expected a whole model (<mujoco>); of a part, convert the file that includes it") from error
+        raise
     return _Conversion(mujoco, model, Path(urdf_path)).write()
 
 

@@ -317,17 +317,29 @@ class Reconnects(unittest.TestCase):
             for path in folders[1:]:
                 os.mkdir(path, 0o700)
             os.chmod(folders[1], 0o755)
-            source.bind(f"{folders[3]}/tactile.hand")
+            source.bind(f"{folders[3]}/left.hand")
             source.listen()
+            right = socket.socket(socket.AF_UNIX)
+            right.bind(f"{folders[3]}/right.hand")
             tactile_bridge = importlib.util.spec_from_file_location("tactile_bridge", BRIDGES.parent / "tactile_bridge.py")
             copied = importlib.util.module_from_spec(tactile_bridge)
             tactile_bridge.loader.exec_module(copied)
             self.assertEqual(copied.SOCKET_FOLDERS, bridge.line_protocol.SOCKET_FOLDERS)
             for module in (bridge.line_protocol, copied):
                 with mock.patch.object(module, "SOCKET_FOLDERS", [*folders[:3], f"{folder}/o?n"]):
-                    self.assertEqual([path.split("/")[-2] for path in module.own_sockets()], ["empty", "own"])
+                    found = [f"unix:{folders[3]}/{name}.hand" for name in ("left", "right")]
+                    self.assertEqual(list(module.own_sockets("*")), found)
+                    # The right hand's graph has died.
                     with module.connect(None) as connection:
-                        self.assertEqual(connection.getpeername(), f"{folders[3]}/tactile.hand")
+                        self.assertEqual(connection.getpeername(), f"{folders[3]}/left.hand")
+            right.listen()
+            for module in (bridge.line_protocol, copied):
+                with mock.patch.object(module, "SOCKET_FOLDERS", [f"{folder}/o?n"]):
+                    with module.connect("right") as connection:
+                        self.assertEqual(connection.getpeername(), f"{folders[3]}/right.hand")
+                    with self.assertRaisesRegex(SystemExit, "^2 graphs take frames, at .*: name one with --graph NAME$"):
+                        module.connect(None)
+            right.close()
 
     def test_signals_end_a_bridge_that_waits_for_a_source(self):
         work = "import line_protocol; line_protocol.run(lambda: line_protocol.Source('unix:/nowhere'))"

@@ -704,6 +704,9 @@ class Mjcf(Folder):
         self.assertIn("'f2' and 't' make a loop (connect)", urdf_of(path, self.folder / "hand.urdf")[0])
         path.write_text(re.sub("<geom ", '<geom contype="0" conaffinity="0" ', re.sub(" con(type|affinity)=.[01].", "", MJCF)))
         self.assertIn("shapes can touch others", urdf_of(path, self.folder / "hand.urdf")[0])
+        path.write_text("<mujocoinclude/>")
+        with self.assertRaisesRegex(ValueError, "expected a whole model .*convert the file that includes it"):
+            urdf_of(path, self.folder / "hand.urdf")
         path.write_text("<mujoco><nothing/></mujoco>")
         with self.assertRaises(ValueError):
             urdf_of(path, self.folder / "hand.urdf")

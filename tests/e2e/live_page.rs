@@ -10,7 +10,7 @@ use crate::common::{Graph, RECORDING, blindgrasp, project, run, swap, unique_nam
 use blindgrasp_messages::Action;
 use blindgrasp_recording::{Record, RecordingReader};
 use blindgrasp_stages::hand::Hand;
-use serde_json::Value;
+use serde_json::{Value, json};
 
 /// Plays at the speed of a robot, so that a busy machine keeps up.
 fn launch(name: &str) -> Graph {
@@ -239,6 +239,15 @@ fn a_browser_pauses_and_looks_at_past_decisions() {
     browser.ask(&press(" ", "document"));
     browser.wait_for_frames(5);
     assert_eq!(browser.ask("location.hash"), "");
+    // A decision has its frame as long as it is in the list, also until the list is drawn again.
+    let pushed_out = "(() => {\
+        const { past } = blindgrasp, row = past.list.rows.findLast(({ frame }) => frame);\
+        const decisions = Array.from({ length: 200 }, () => ({ ...row }));\
+        past.push({ at: performance.now(), probabilities: [], shadow: [], decisions });\
+        const before = 'frame' in row;\
+        past.refresh();\
+        return [before, 'frame' in row, past.list.rows.includes(row)]; })()";
+    assert_eq!(browser.ask(pushed_out), json!([true, false, false]));
     assert_eq!(browser.ask("errors"), Value::Array(vec![]));
     // The log says the same, once for a grasp.
     let log = run(&["logs", "classifier", "--graph", &name], 0);
@@ -406,6 +415,12 @@ fn a_browser_shows_the_grasps_of_a_recording() {
     browser
         .ask("(document.getElementById('go-to').value = '99999', document.querySelector('#go button').click(), null)");
     assert_eq!(browser.text("go-answer"), "grasp 99999 is not in the list: its first one is 0, its last one 239");
+    // A number that two runs of the source have is given with the run.
+    browser.ask(
+        "(Object.assign(blindgrasp.player.grasps[50], { grasp_id: '0', epoch: '2' }), location.hash = '#grasp=0&epoch=2', null)",
+    );
+    browser.wait_until("blindgrasp.player.at === 50 && location.hash === '#grasp=0&epoch=2'");
+    browser.ask("(Object.assign(blindgrasp.player.grasps[50], { grasp_id: '50', epoch: '1' }), null)");
     browser.ask(&format!("(location.hash = '#grasp={id}', null)"));
     browser.wait_until(&is_shown(id));
     // It plays to the end of the grasp, and goes on.

@@ -20,8 +20,9 @@ use rustix::fs::{FlockOperation, flock};
 use rustix::io::Errno;
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType};
 
-/// The end of a socket's name.
+/// The end of the name of a graph's socket, and of that of its tactile source.
 const SUFFIX: &str = ".sock";
+const TACTILE_SUFFIX: &str = ".hand";
 /// The [`refusal`] of a socket that a process holds, and of one whose process has died.
 const HELD: Errno = Errno::PROTOTYPE;
 const DEAD: Errno = Errno::CONNREFUSED;
@@ -104,18 +105,18 @@ fn connect_to(path: &Path, kind: SocketType) -> rustix::io::Result<OwnedFd> {
 /// The names under which processes listen, sorted.
 pub fn names() -> Vec<String> {
     let mut names: Vec<String> =
-        sockets().filter(|(_, path)| refusal(path) == Some(HELD)).map(|(name, _)| name).collect();
+        sockets(SUFFIX).filter(|(_, path)| refusal(path) == Some(HELD)).map(|(name, _)| name).collect();
     names.sort();
     names.dedup();
     names
 }
 
-/// The sockets of graphs, also those of dead processes: names and files.
-fn sockets() -> impl Iterator<Item = (String, PathBuf)> {
+/// The sockets with such a name, also those of dead processes: names of graphs, and files.
+fn sockets(suffix: &'static str) -> impl Iterator<Item = (String, PathBuf)> {
     let entries = own_folders().into_iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flatten();
-    entries.filter_map(|entry| {
+    entries.filter_map(move |entry| {
         let entry = entry.ok()?;
-        let name = entry.file_name().to_str()?.strip_suffix(SUFFIX)?.to_string();
+        let name = entry.file_name().to_str()?.strip_suffix(suffix)?.to_string();
         Some((name, entry.path()))
     })
 }
@@ -128,7 +129,8 @@ fn refusal(path: &Path) -> Option<Errno> {
 
 /// The names of processes that were killed, with the files that they have left.
 pub fn dead() -> Vec<(String, PathBuf)> {
-    let mut dead: Vec<(String, PathBuf)> = sockets().filter(|(_, path)| refusal(path) == Some(DEAD)).collect();
+    let all = sockets(SUFFIX).chain(sockets(TACTILE_SUFFIX));
+    let mut dead: Vec<(String, PathBuf)> = all.filter(|(_, path)| refusal(path) == Some(DEAD)).collect();
     dead.sort();
     dead
 }
@@ -146,12 +148,12 @@ pub fn remove_dead() {
     }
 }
 
-/// The socket at which a live tactile source listens by default: other users cannot send frames.
+/// The socket at which the tactile source of a graph listens by default: other users cannot send frames.
 ///
 /// # Errors
 /// The folder cannot be made, or is open to other users.
-pub fn tactile_path() -> Result<PathBuf> {
-    Ok(folder()?.join("tactile.hand"))
+pub fn tactile_path(graph: &str) -> Result<PathBuf> {
+    Ok(folder()?.join(format!("{graph}{TACTILE_SUFFIX}")))
 }
 
 /// The file of a socket by which machines of a graph are linked that are one computer.
@@ -291,9 +293,12 @@ mod tests {
         // A process that is killed leaves the file.
         drop(UnixListener::bind(path_of(&name)).expect("free"));
         assert!(!names().contains(&name) && path_of(&name).exists());
-        assert!(dead().contains(&(name.clone(), path_of(&name))));
+        let of_source = tactile_path(&name).expect("a folder");
+        drop(UnixListener::bind(&of_source).expect("free"));
+        let dead = dead();
+        assert!(dead.contains(&(name.clone(), path_of(&name))) && dead.contains(&(name.clone(), of_source.clone())));
         remove_dead();
-        assert!(!path_of(&name).exists());
+        assert!(!path_of(&name).exists() && !of_source.exists());
         drop(UnixListener::bind(path_of(&name)).expect("free"));
         let left = ControlSocket::bind(&name).expect("nobody listens");
         // A socket that is shut down gives its name away, and leaves it to the next one.

@@ -190,6 +190,11 @@ impl Operator {
         parse_params(&self.0.wiring.params)
     }
 
+    /// The graph's name.
+    pub fn graph(&self) -> &str {
+        &self.0.wiring.graph
+    }
+
     /// A folder of the graph in which no process with a sandbox can make a file. It is removed when the graph has ended.
     pub fn link_folder(&self) -> std::path::PathBuf {
         self.0.wiring.domain.link()

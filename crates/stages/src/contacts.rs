@@ -91,12 +91,19 @@ pub fn invalid_reading(hand: &Hand, joints: &[f64], cells_newtons: &[f64]) -> Op
             1 => found += "; another joint is outside its range, too",
             n_others => found += &format!("; {n_others} other joints are outside their range, too"),
         }
+        if outside().count() > 1 && !is_far {
+            found += ": are the joints in the order of the hand's layout?";
+        }
         return Some(found);
     }
     let (cell_idx, newtons) = cells_newtons.iter().enumerate().find(|(_, newtons)| !are_forces(&[**newtons]))?;
+    let (cell, unit) = (name_of_cell(hand, cell_idx)?, hand.cell_unit.word());
+    Some(format!("{cell} reads {}, expected 0 to {MAX_CELL_NEWTONS} {unit}", short(*newtons)))
+}
+
+fn name_of_cell(hand: &Hand, cell_idx: usize) -> Option<String> {
     let pad = hand.pads.iter().rfind(|pad| pad.first_cell_idx <= cell_idx)?;
-    let (idx, unit) = (cell_idx - pad.first_cell_idx, hand.cell_unit.word());
-    Some(format!("cell {idx} of pad {} reads {}, expected 0 to {MAX_CELL_NEWTONS} {unit}", pad.name, short(*newtons)))
+    Some(format!("cell {} of pad {}", cell_idx - pad.first_cell_idx, pad.name))
 }
 
 /// Whether a value is more than a turn or a metre: a smaller one is more likely a wrong zero than another unit.
@@ -181,8 +188,8 @@ impl ContactFinder {
         ContactSummary { n_pads_in_contact, self_collision: !self.touching.is_empty(), n_self_contacts, fault }
     }
 
-    /// The links that touch each other on which cells of the last frame feel, if it has no contact for this reason: for people.
-    pub fn self_contact(&self, hand: &Hand, cells_newtons: &[f64]) -> Option<String> {
+    /// Why the last frame has no contact, for people: no cell feels, or cells only on links that touch each other.
+    pub fn no_contact(&self, hand: &Hand, cells_newtons: &[f64]) -> Option<String> {
         let thresholds_newtons = hand.noise_thresholds_newtons();
         let mut links_that_feel = Vec::new();
         for pad in &hand.pads {
@@ -196,6 +203,16 @@ impl ContactFinder {
             if links_that_feel.contains(a) || links_that_feel.contains(b) {
                 pairs.push(format!("{} and {}", hand.links[*a].name, hand.links[*b].name));
             }
+        }
+        if links_that_feel.is_empty() {
+            let readings = cells_newtons.iter().enumerate();
+            let (cell_idx, newtons) = readings.max_by(|(_, a), (_, b)| a.total_cmp(b))?;
+            let (cell, unit) = (name_of_cell(hand, cell_idx)?, hand.cell_unit.word());
+            return Some(format!(
+                "no cell feels: the greatest reading is {} {unit}, of {cell}, which feels above {} {unit}",
+                short(*newtons),
+                short(thresholds_newtons[cell_idx])
+            ));
         }
         if pairs.is_empty() {
             return None;
@@ -432,9 +449,13 @@ mod tests {
             assert_eq!(found, (Fault::NoContact, n_pressed, 0));
             let mut finder = ContactFinder::default();
             finder.find(&hand(), 0, &TOUCHING, &pressed, &mut Vec::new());
-            let said = finder.self_contact(&hand(), &pressed).expect("cells feel");
+            let said = finder.no_contact(&hand(), &pressed).expect("cells feel");
             assert!(said.ends_with(": distal_1 and distal_3; distal_2 and distal_3"), "{said}");
-            assert_eq!(finder.self_contact(&hand(), &[0.0; 96]), None);
+            let mut faint = [0.0; 96];
+            faint[25] = 0.04;
+            let said = finder.no_contact(&hand(), &faint).expect("the greatest reading");
+            let expected = "no cell feels: the greatest reading is 0.04 newtons, of cell 1 of pad finger_1, which feels above 0.05 newtons";
+            assert_eq!(said, expected);
         }
     }
 

@@ -5,7 +5,7 @@ use blindgrasp_messages::{Contact, Fault, Header, LiftDecision, Message, Predict
 use crate::contacts::ContactFinder;
 use crate::glitches::GlitchFilter;
 use crate::hand::Hand;
-use crate::lift_arbiter::{ArbiterOptions, LiftArbiter, Probe, Staleness};
+use crate::lift_arbiter::{ArbiterOptions, LiftArbiter, Probe};
 use crate::model::{Memory, Model, OtherHand};
 use crate::out_of_distribution::Violation;
 use crate::own_lifts::{Adapt, OwnLifts};
@@ -41,8 +41,8 @@ struct Findings {
     violations: Vec<Violation>,
     /// The first reading that made a frame invalid.
     invalid: Option<String>,
-    /// Why its last frame at rest has no contact although cells feel.
-    self_contact: Option<String>,
+    /// Why its last frame at rest has no contact.
+    no_contact: Option<String>,
     /// That its cells flicker.
     flicker: Option<String>,
 }
@@ -138,7 +138,7 @@ impl Judge {
             let why = steps::explain_fault(&self.hand, &self.finder, &summary, parts.as_ref());
             let found = &mut self.found;
             if summary.fault == Fault::NoContact {
-                found.self_contact = why;
+                found.no_contact = why;
             } else if found.invalid.is_none() {
                 found.invalid = why;
             }
@@ -181,15 +181,15 @@ impl Judge {
 
     fn explain_reason(&self, decision: &LiftDecision, found: &Findings, is_of_last_frame: bool) -> Vec<String> {
         match decision.reason {
-            Reason::Stale => self.arbiter.staleness(decision.grasp_id).iter().map(Staleness::to_string).collect(),
+            Reason::Stale | Reason::NoAgreement => self.arbiter.explain(decision.grasp_id),
             _ if decision.grasp_id != found.grasp_id => Vec::new(),
             Reason::Invalid => found.invalid.iter().cloned().collect(),
             Reason::Unstable if is_of_last_frame && self.arbiter.options().probe == Probe::None => {
                 let names = self.model.features.value_names(&self.hand);
                 self.model.speak_against(&names, &self.values).into_iter().collect()
             }
-            Reason::NoContact => found.self_contact.iter().cloned().collect(),
-            Reason::OutOfDistribution => found.violations.iter().map(Violation::to_string).collect(),
+            Reason::NoContact => found.no_contact.iter().cloned().collect(),
+            Reason::OutOfDistribution => Violation::most(&found.violations),
             _ => Vec::new(),
         }
     }
@@ -267,7 +267,7 @@ mod tests {
         // The next grasp has another reason.
         let next = TactileFrame { grasp_id: 2, ..frame(Phase::Settled) };
         let decision = judge.frame(20_000_000, &next).pop().expect("decided");
-        assert_eq!((decision.reason, judge.explain(&decision)), (Reason::NoContact, vec![]));
+        assert_eq!((decision.reason, judge.explain(&decision).len()), (Reason::NoContact, 1));
     }
 
     #[test]
@@ -277,7 +277,10 @@ mod tests {
         let decision = judge.frame(0, &felt).pop().expect("decided");
         assert_eq!(decision.reason, Reason::OutOfDistribution);
         let why = judge.explain(&decision).join("\n");
-        assert!(why.contains("contacts of pad finger_1: 24, trained from 0 to "), "{why}");
+        assert!(
+            why.contains("load of pad finger_1, newtons: 24, trained from 0 to ") && why.contains("more quantities"),
+            "{why}"
+        );
     }
 
     #[test]

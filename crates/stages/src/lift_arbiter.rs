@@ -95,8 +95,17 @@ impl Default for ArbiterOptions {
 pub struct LiftArbiter {
     options: ArbiterOptions,
     state: ArbiterState,
-    /// The last grasp that was held as stale, and why.
-    held_stale: Option<(u64, Staleness)>,
+    /// The last grasp that was held as stale or without agreement.
+    held: Option<Held>,
+}
+
+/// What is known of a grasp that was held as stale or without agreement.
+#[derive(Debug, Clone, Copy)]
+struct Held {
+    grasp_id: u64,
+    stale: Option<Staleness>,
+    /// The phase of the probe that was asked for, if no frame of it has come.
+    unanswered: Option<Phase>,
 }
 
 /// The limit that makes a grasp stale, and what was found.
@@ -355,7 +364,7 @@ impl ArbiterOptions {
 impl LiftArbiter {
     /// An arbiter that has seen nothing.
     pub fn new(options: ArbiterOptions) -> Self {
-        LiftArbiter { options, state: ArbiterState { options, ..ArbiterState::default() }, held_stale: None }
+        LiftArbiter { options, state: ArbiterState { options, ..ArbiterState::default() }, held: None }
     }
 
     pub fn state(&self) -> &ArbiterState {
@@ -478,10 +487,19 @@ impl LiftArbiter {
         self.hold(reason)
     }
 
-    /// The limit that a grasp has exceeded which has just been held as stale.
-    pub fn staleness(&self, grasp_id: u64) -> Option<Staleness> {
-        let (of, staleness) = self.held_stale?;
-        if of == grasp_id { Some(staleness) } else { None }
+    /// Why a grasp was held that has just been held as stale or without agreement, sentence by sentence: the limit that it has
+    /// exceeded, and the probe that did not come.
+    pub fn explain(&self, grasp_id: u64) -> Vec<String> {
+        let Some(held) = self.held.filter(|held| held.grasp_id == grasp_id) else { return Vec::new() };
+        let mut said: Vec<String> = held.stale.iter().map(Staleness::to_string).collect();
+        if let Some(phase) = held.unanswered {
+            said.push(format!(
+                "no frame of phase {} came after the probe was asked for: let the hand or arm make it and send its frames, or set \
+                 probe to none",
+                phase.as_str()
+            ));
+        }
+        said
     }
 
     /// How long no prediction may come while a grasp is open.
@@ -587,9 +605,11 @@ impl LiftArbiter {
 
     /// Remembers that the open grasp is decided, and begins to watch it if it is lifted.
     fn close(&mut self, decision: &LiftDecision) {
-        let Some(OpenGrasp { epoch, grasp_id, stale, .. }) = self.state.open.take() else { return };
-        if decision.reason == Reason::Stale {
-            self.held_stale = stale.map(|stale| (grasp_id, stale));
+        let Some(open) = self.state.open.take() else { return };
+        let OpenGrasp { epoch, grasp_id, stale, .. } = open;
+        if matches!(decision.reason, Reason::Stale | Reason::NoAgreement) {
+            let unanswered = open.is_probe_pending.then_some(open.awaited);
+            self.held = Some(Held { grasp_id, stale, unanswered });
         }
         self.state.decided.push((epoch, grasp_id), self.options.n_remembered);
         if decision.action == Action::Lift {
@@ -822,24 +842,25 @@ mod tests {
             }
             reasons
         };
-        let gap = |found_ms: u64, limit_ms: u64| {
-            Some(Staleness::Gap { found_nanos: found_ms * 1_000_000, limit_nanos: limit_ms * 1_000_000 })
+        let gap = |found_ms: &str, limit_ms: &str| {
+            let limit = "(max_gap_ms, or three periods of the source)";
+            vec![format!("two frames are {found_ms} ms apart, expected at most {limit_ms} ms {limit}")]
         };
         assert_eq!(s.arbiter.silence_limit_nanos(), 200_000_000);
-        assert_eq!((reasons(&mut s, "cccc+"), s.arbiter.staleness(0)), (vec![Reason::Stale], gap(125, 100)));
+        assert_eq!((reasons(&mut s, "cccc+"), s.arbiter.explain(0)), (vec![Reason::Stale], gap("125.0", "100.0")));
         // Frames of a decided grasp show the pace as well.
         assert_eq!(reasons(&mut s, "++++"), []);
         s.take('N');
-        assert_eq!((reasons(&mut s, "c+++"), s.arbiter.staleness(1)), (vec![Reason::Stable], None));
+        assert_eq!((reasons(&mut s, "c+++"), s.arbiter.explain(1)), (vec![Reason::Stable], vec![]));
         assert_eq!(s.arbiter.silence_limit_nanos(), 375_000_000);
         s.take('N');
         assert_eq!(reasons(&mut s, "cc+"), []);
         s.header.stamp_nanos += 2 * SLOW_NANOS + 1_000_000;
-        assert_eq!((reasons(&mut s, "+"), s.arbiter.staleness(2)), (vec![Reason::Stale], gap(376, 375)));
+        assert_eq!((reasons(&mut s, "+"), s.arbiter.explain(2)), (vec![Reason::Stale], gap("376.0", "375.0")));
         // Another source has shown no pace.
         s.take('E');
         s.take('N');
-        assert_eq!((reasons(&mut s, "cc+"), s.arbiter.staleness(3)), (vec![Reason::Stale], gap(125, 100)));
+        assert_eq!((reasons(&mut s, "cc+"), s.arbiter.explain(3)), (vec![Reason::Stale], gap("125.0", "100.0")));
     }
 
     #[test]
@@ -887,6 +908,21 @@ mod tests {
         ] {
             stream(ArbiterOptions { probe: Probe::TestLift, ..ArbiterOptions::default() }).takes(history);
         }
+    }
+
+    #[test]
+    fn a_hold_after_a_probe_that_did_not_come_says_so() {
+        let mut s = stream(ArbiterOptions { probe: Probe::TestLift, ..ArbiterOptions::default() });
+        s.takes("+++[0 TestLift Promising]+Nc[0 Hold NoAgreement]");
+        assert!(
+            s.arbiter.explain(0)[0].starts_with("no frame of phase test_lifted came after the probe was asked for: ")
+        );
+        s.takes("+++[1 TestLift Promising]Z[1 Hold Stale]");
+        let [silent, unanswered] = &s.arbiter.explain(1)[..] else { panic!("two sentences") };
+        assert!(silent.starts_with("no frame came for more than ") && unanswered.contains(" test_lifted "), "{silent}");
+        // The probe came, and its frames do not agree.
+        s.takes("N+++[2 TestLift Promising]sqqqlte[2 Hold NoAgreement]");
+        assert_eq!(s.arbiter.explain(2), Vec::<String>::new());
     }
 
     #[test]

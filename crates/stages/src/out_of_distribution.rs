@@ -56,6 +56,35 @@ impl fmt::Display for Violation {
     }
 }
 
+/// The quantities that are told of a grasp; a wrong unit violates all limits.
+const N_TOLD: usize = 3;
+/// A force that is so many times the greatest one of the training is of another unit, as a rule.
+const UNIT_FACTOR: f64 = 20.0;
+
+impl Violation {
+    /// How far the value is outside, in widths of its range.
+    fn excess(&self) -> f64 {
+        let Limits { lower, upper, .. } = self.limits;
+        (self.value - upper).max(lower - self.value) / (upper - lower).max(f64::MIN_POSITIVE)
+    }
+
+    /// The worst violations in words, and the number of the others.
+    pub fn most(violations: &[Violation]) -> Vec<String> {
+        let mut worst: Vec<&Violation> = violations.iter().collect();
+        worst.sort_by(|a, b| b.excess().total_cmp(&a.excess()));
+        let mut said: Vec<String> = worst.iter().take(N_TOLD).map(ToString::to_string).collect();
+        if violations.len() > N_TOLD {
+            said.push(format!("{} more quantities are outside", violations.len() - N_TOLD));
+        }
+        let is_other_unit =
+            |it: &&Violation| it.limits.quantity.ends_with(", newtons") && it.value > UNIT_FACTOR * it.limits.upper;
+        if worst.first().is_some_and(is_other_unit) {
+            said.push("are the readings in another unit, as counts or grams?".into());
+        }
+        said
+    }
+}
+
 /// Four significant digits.
 pub(crate) fn short(value: f64) -> String {
     // Without the sign of a zero.

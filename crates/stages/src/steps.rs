@@ -51,7 +51,7 @@ pub fn explain_fault(
     let FrameParts { joints, cells_newtons, .. } = parts?;
     match summary.fault {
         Fault::WrongLength | Fault::InvalidValue => invalid_reading(hand, joints, cells_newtons),
-        Fault::NoContact => finder.self_contact(hand, cells_newtons),
+        Fault::NoContact => finder.no_contact(hand, cells_newtons),
         _ => None,
     }
 }

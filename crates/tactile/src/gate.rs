@@ -487,7 +487,10 @@ impl FrameFilter {
         }
         match (reading.stamp_nanos, self.stamp_nanos) {
             (Some(stamp), Some(last)) if stamp < last => {
-                Err(format!("stamp_nanos {stamp} is {} ns before the last one's", last - stamp))
+                let secs = (last - stamp) as f64 / 1e9;
+                Err(format!(
+                    "stamp_nanos {stamp} is {secs} s before the last one's: has the sender's clock been set back?"
+                ))
             }
             _ => Ok(()),
         }

@@ -191,7 +191,7 @@ impl RefusalKind {
 #[derive(Debug, thiserror::Error)]
 pub enum DriverError {
     #[error(
-        "cannot listen on {address}: {source}; end what listens there, or give each graph an address of its own, and its \
+        "cannot listen on {address}: {source}; end what listens there, or give each source an address of its own, and its \
          bridge the same one (--set SOURCE.address=unix:PATH, --address unix:PATH)"
     )]
     Listen { address: String, source: std::io::Error },
@@ -247,7 +247,7 @@ impl ExpectedHand {
     pub fn check(&self, reading: Reading) -> Result<Reading, Refusal> {
         match &reading.hand {
             Some(found) if *found != self.hand && *found != self.hand_id => Err(Refusal::malformed(format!(
-                "the frame is of the hand {found}: expected {} (hand_id {}); give each hand's graph and bridge an address of their own",
+                "the frame is of the hand {found}: expected {} (hand_id {}); give the bridge the name of its own hand's graph (--graph NAME)",
                 self.hand, self.hand_id
             ))),
             _ => Ok(reading),

@@ -87,6 +87,18 @@ impl AsFd for Listener {
     }
 }
 
+/// A socket's file goes with it: another graph may never take its name again.
+impl Drop for Listener {
+    fn drop(&mut self) {
+        if let Listener::Unix(listener) = self
+            && let Ok(address) = listener.local_addr()
+            && let Some(path) = address.as_pathname()
+        {
+            let _ = std::fs::remove_file(path);
+        }
+    }
+}
+
 fn bind_path(path: &Path) -> io::Result<UnixListener> {
     let listener = match UnixListener::bind(path) {
         Err(error) if error.kind() == io::ErrorKind::AddrInUse && is_left_over(path) => {

@@ -46,6 +46,10 @@ fn a_socket_file_is_the_users_own_and_one_that_was_left_is_replaced() {
     assert!(self::source(&file).open(0).is_err() && file.exists());
     let mut another = self::source(&path);
     assert!(another.open(0).expect_err("taken").to_string().contains("hand.sock"));
+    drop(another);
+    assert!(path.exists());
+    source.close();
+    assert!(!path.exists());
 }
 
 #[test]

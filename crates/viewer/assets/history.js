@@ -33,8 +33,8 @@ const makeHistory = ({ show, chart }) => {
       isListDue = true;
       if (state.decisions.length > MAX_DECISIONS) {
         const dropped = state.decisions.shift();
-        // Moments keep their decisions, but no frame that cannot be chosen any more. The list of a paused page stays.
-        if (state.at === null || !listed.includes(dropped)) delete dropped.frame;
+        // Moments keep their decisions, but no frame that cannot be chosen any more.
+        if (!listed.includes(dropped)) delete dropped.frame;
       }
     }
     if (state.at !== null && n_kept > MAX_KEPT_NUMBERS) return;
@@ -100,7 +100,7 @@ const makeHistory = ({ show, chart }) => {
     controls();
     // The list may be that of a recording.
     if (decisionList.owner === state) {
-      setAddress(chosen?.grasp_id ?? null);
+      setAddress(chosen, state.decisions);
       list();
       decisionList.mark(chosen);
     }
@@ -125,7 +125,10 @@ const makeHistory = ({ show, chart }) => {
   // The newest first. While the page is paused the rows stay where they are.
   function list() {
     isListDue = false;
-    if (state.at === null || isOver || !listed.length) listed = state.decisions.slice().reverse();
+    if (state.at === null || isOver || !listed.length) {
+      for (const row of listed) if (!state.decisions.includes(row)) delete row.frame;
+      listed = state.decisions.slice().reverse();
+    }
     decisionList.show(listed);
   }
   // Called several times a second.

@@ -1,8 +1,9 @@
 // The list of decisions of a running graph or a recording, and the ways to one of them: a click, the arrow keys in the list, its
-// number in the field, n and p anywhere, and the address (#grasp=500), which follows the page.
+// number in the field, n and p anywhere, and the address, which follows the page: #grasp=500, and &epoch=2 if another run of the
+// source has such a number.
 
 const WRONG = { "false-positive": ": a wrong lift", "false-negative": ": a wrong hold" };
-const graspInAddress = () => /^#grasp=(\d+)$/.exec(location.hash)?.[1] ?? null;
+const graspInAddress = () => /^#grasp=(?<id>\d+)(?:&epoch=(?<epoch>\d+))?$/.exec(location.hash)?.groups ?? null;
 const labelOf = ({ truth }) => (truth === null || truth === undefined ? "not known" : truth ? "stable" : "not stable");
 
 // Rows are decisions, with a text for the first column. `owner` is the history of a graph or the player of a recording: it can
@@ -56,8 +57,8 @@ const makeList = (owner) => {
     if (top < seen.top || bottom > seen.bottom) region.scrollTop += top - seen.top - seen.height / 2;
   }
   // Says why if the grasp is not in the list.
-  function goTo(id) {
-    const { rows } = state, found = rows.find(({ grasp_id }) => grasp_id === id);
+  function goTo({ id, epoch }) {
+    const { rows } = state, found = rows.find((row) => row.grasp_id === id && (epoch === undefined || row.epoch === epoch));
     const all = rows.length === 0 ? "it is empty" : `its first one is ${rows[0].grasp_id}, its last one ${rows.at(-1).grasp_id}`;
     tell("go-answer", found ? "" : `grasp ${id} is not in the list: ${all}`);
     if (found) state.owner.choose(found);
@@ -79,7 +80,7 @@ const makeList = (owner) => {
   });
   byId("go").addEventListener("submit", (event) => {
     event.preventDefault();
-    goTo(byId("go-to").value.trim());
+    goTo({ id: byId("go-to").value.trim() });
   });
   window.addEventListener("hashchange", () => { if (graspInAddress() !== null) goTo(graspInAddress()); });
   document.addEventListener("keydown", (event) => {
@@ -93,8 +94,9 @@ const makeList = (owner) => {
   });
   return state;
 };
-// The address of the grasp that is shown, or of the page.
-const setAddress = (id) => {
-  const hash = id === null ? "" : `#grasp=${id}`;
+// The address of the grasp that is shown, one of the rows, or of the page.
+const setAddress = (shown, rows) => {
+  const hasNamesake = rows.some(({ grasp_id, epoch }) => grasp_id === shown?.grasp_id && epoch !== shown.epoch);
+  const hash = shown === null ? "" : `#grasp=${shown.grasp_id}${hasNamesake ? `&epoch=${shown.epoch}` : ""}`;
   if (location.hash !== hash) history.replaceState(null, "", hash || location.pathname);
 };

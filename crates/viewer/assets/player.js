@@ -44,7 +44,7 @@ const makePlayer = ({ list, surround, isShownHand, showFrame, showDecision, show
     showShadow(null);
     bars();
     list.mark(grasp);
-    setAddress(grasp.id);
+    setAddress(grasp, state.grasps);
     const label = grasp.truth === null ? "" : grasp.truth ? " It was stable." : " It was not stable.";
     const object = grasp.object === "" ? "" : ` Object: ${grasp.object}.`;
     if (grasp.action !== null) showDecision({ ...grasp, why: label + object });

@@ -188,21 +188,19 @@ fn print_report(
     for pad in &report.pads {
         lines.push(("pad", format!("{:<12} {}", pad.pad, range(&pad.columns))));
     }
-    let joints: Vec<_> = match &options.joints {
+    let names = hand.joints.iter().map(|joint| &joint.name);
+    let (what, joints): (_, Vec<_>) = match &options.joints {
         Joints::Fixed(joints) => {
-            hand.joints.iter().zip(joints).map(|(joint, value)| format!("{} {value}", joint.name)).collect()
+            ("posture, rad", names.zip(joints).map(|(name, value)| format!("{name} {value}")).collect())
         }
-        Joints::Columns(_) => hand
-            .joints
-            .iter()
-            .zip(&report.joint_columns)
-            .map(|(joint, name)| format!("{} {name}", joint.name))
-            .collect(),
+        Joints::Columns(_) => {
+            ("joints", names.zip(&report.joint_columns).map(|(name, column)| format!("{name} {column}")).collect())
+        }
     };
-    lines.push(match &options.joints {
-        Joints::Fixed(_) => ("posture, rad", joints.join(", ")),
-        Joints::Columns(_) => ("joints", joints.join(", ")),
-    });
+    lines.push((what, joints.join(", ")));
+    if report.n_missing > 0 {
+        lines.push(("missing", format!("{} rows have missing readings, which count as 0", report.n_missing)));
+    }
     if report.n_below_zero > 0 {
         lines.push(("below zero", format!("{} rows have readings below zero, which count as 0", report.n_below_zero)));
     }

@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::time::Duration;
 
 use anyhow::{Context, bail};
 use clap::Args;
@@ -17,9 +19,11 @@ use blindgrasp_learning::evaluation::evaluate;
 use blindgrasp_learning::evaluation::page::report_page;
 use blindgrasp_learning::evaluation::report::{Origin, report_on_model};
 use blindgrasp_learning::file_name;
+use blindgrasp_learning::promise::least_bound;
 use blindgrasp_learning::training::{Aim, Examples, TrainingError, TrainingOptions, train};
 use blindgrasp_messages::Phase;
 use blindgrasp_messages::score::Score;
+use blindgrasp_objects::objects_named;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_simulator::options::{SimulatorOptions, check_hand};
@@ -37,6 +41,8 @@ const DATAFLOW: (&str, &str) = ("dataflow-live.yaml", include_str!("../../../dat
 const PROMISED_DROPS: f64 = 0.1;
 /// A model that may drop more than this share of its lifts is of no use to a robot, and is not written.
 const WORST_BOUND: f64 = 0.5;
+/// The objects that are lifted for training.
+const TRAIN: &str = "train";
 /// The lifts of the first folder.
 const FIRST_LIFTS: usize = 125;
 /// The lifts from which a bound is looked for, if there may be more: fewer seldom tell kept objects from dropped ones.
@@ -45,6 +51,8 @@ const ENOUGH_LIFTS: usize = 500;
 const HELD_OUT_LIFTS: usize = 200;
 /// The lifts of a part. An interruption loses those of one part.
 const LIFTS_PER_PART: usize = 100;
+/// The pause between two looks whether a training is to end.
+const STOP_PAUSE: Duration = Duration::from_millis(100);
 /// The page of the lifts that judge the model.
 const REPORT: &str = "report.html";
 
@@ -90,6 +98,7 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let hand = hand_of(&arguments.hand)?;
     let options = options(arguments)?;
+    check_bound(arguments)?;
     let stem = arguments.hand.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let out = arguments.out.clone().unwrap_or_else(|| format!("{stem}-gate").into());
     std::fs::create_dir_all(&out).with_context(|| format!("cannot make the folder {}", out.display()))?;
@@ -145,7 +154,7 @@ impl Job<'_> {
         let folder = |idx: usize| self.out.join(format!("lifts-{}", idx + 1));
         let (mut recordings, mut n_lifts, mut n_looks) = (Vec::new(), 0, 0);
         for (idx, n) in sizes.iter().enumerate() {
-            self.simulate("train", &folder(idx), *n, 1 + idx as u64)?;
+            self.simulate(TRAIN, &folder(idx), *n, 1 + idx as u64)?;
             recordings.extend(recordings_in(&[folder(idx)])?);
             n_lifts += n;
             let is_last = idx + 1 == sizes.len();
@@ -190,6 +199,26 @@ impl Job<'_> {
 
     fn train(&self, recordings: &[PathBuf], max_drops: f64) -> Result<Model, TrainingError> {
         print_diagnostic("training …");
+        let (training, is_over) = channel::<()>();
+        std::thread::scope(|scope| {
+            scope.spawn(|| self.exit_if_stopped(is_over));
+            let model = self.train_model(recordings, max_drops);
+            drop(training);
+            model
+        })
+    }
+
+    /// Ends the program at a signal, until the sender is gone: a step of a training may take minutes.
+    fn exit_if_stopped(&self, is_over: Receiver<()>) {
+        while is_over.recv_timeout(STOP_PAUSE) == Err(RecvTimeoutError::Timeout) {
+            if self.stop.load(Ordering::Relaxed) {
+                print_diagnostic("interrupted: the lifts are kept, and the same command goes on from them");
+                std::process::exit(1);
+            }
+        }
+    }
+
+    fn train_model(&self, recordings: &[PathBuf], max_drops: f64) -> Result<Model, TrainingError> {
         let mut read = Examples::read(&self.hand, recordings, |_, _| {})?;
         for example in &mut read.examples {
             if self.arguments.probe == Probe::None {
@@ -201,10 +230,6 @@ impl Job<'_> {
         }
         let options = TrainingOptions { aim: Some(Aim::MaxDrops(max_drops)), ..TrainingOptions::default() };
         train(&self.hand, &read, recordings, &options, |step| {
-            if self.stop.load(Ordering::Relaxed) {
-                print_diagnostic("blindgrasp: interrupted: the lifts are kept, and the same command goes on from them");
-                std::process::exit(1);
-            }
             if step.starts_with("not learned") {
                 print_diagnostic(step);
             }
@@ -290,6 +315,22 @@ fn sizes(most: usize) -> Vec<usize> {
         n_lifts *= 2;
     }
     sizes
+}
+
+/// Refuses a bound that the most lifts cannot show, even if none drops.
+fn check_bound(arguments: &Arguments) -> anyhow::Result<()> {
+    let n_lifts: usize = sizes(arguments.lifts as usize).iter().sum();
+    let n_objects = objects_named(TRAIN)?.0.len().min(n_lifts);
+    let least = least_bound(n_objects);
+    if arguments.max_drops < least {
+        bail!(
+            "--max-drops {}: {n_lifts} lifts of {n_objects} objects, all kept, show that at most {:.2} % drop; expected {:.4} or more",
+            arguments.max_drops,
+            100.0 * least,
+            (1e4 * least).ceil() / 1e4
+        );
+    }
+    Ok(())
 }
 
 /// The hand, whose file the graph will read.

@@ -94,6 +94,11 @@ fn a_file_of_another_kind_names_the_command_that_takes_it() {
     check(&["simulate", "--hand", RECORDING, "--out", &out], 1, &["not a pad layout", "found a recording"]);
     check(&["simulate", "--out", &folder.at("out.csv")], 1, &["out.csv", ".mcap", "blindgrasp export"]);
     check(&["new", "hand", &folder.at("mine"), "--urdf", &table], 1, &["not a URDF", "found a table"]);
+    let robot = "<robot><link name='a'/><link name='b'/><joint name='j' type='revolute'><parent link='a'/><child link='b'/>\
+                 <limit lower='0' upper='1'/></joint></robot>";
+    let bare = folder.write("bare.urdf", robot);
+    let listed = run(&["new", "hand", &folder.at("mine"), "--urdf", &bare], 0);
+    assert!(text(&listed.stderr).contains("no link has a collision shape"), "{}", text(&listed.stderr));
     // Values in another unit.
     check(&["train", RECORDING, "--max-drops", "5%", "--out", &out], 2, &["a number from", "5 % are 0.05"]);
     check(&["simulate", "--grasps", "many", "--out", &out], 2, &["'many'", "a whole number"]);

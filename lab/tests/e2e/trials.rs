@@ -121,11 +121,12 @@ fn ctrl_c_shows_the_trials_so_far() {
     let mut child = command.args(&arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("started");
     let mut stderr = std::io::BufReader::new(child.stderr.take().expect("piped"));
     let mut said = String::new();
-    // It comes when ten trials are done. The arbiter warns of grasps whose arm does not wait for it.
+    // It comes when ten trials are done.
     while !said.contains("10 of 1000000 trials, every grasp lifted") {
         let n_bytes = std::io::BufRead::read_line(&mut stderr, &mut said).expect("a line");
         assert!(n_bytes > 0, "{said}");
     }
+    assert!(!said.contains("ms apart"), "{said}");
     signal(i32::try_from(child.id()).expect("a pid"), Signal::INT);
     std::thread::spawn(move || std::io::copy(&mut stderr, &mut std::io::sink()));
     let output = child.wait_with_output().expect("ended");

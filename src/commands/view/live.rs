@@ -280,8 +280,8 @@ pub(in crate::commands) fn hand_of(graph: &Value) -> Option<Hand> {
     }
 }
 
-/// A grasp: the hash of the source's epoch, and its number.
-type GraspKey = (u64, u64);
+/// A grasp: the source's epoch, or its hash on the page of a graph, and its number.
+pub(super) type GraspKey = (u64, u64);
 
 /// A frame with the hash of its epoch, and its stamp.
 #[derive(Clone)]
@@ -431,7 +431,6 @@ impl Latest {
     }
 }
 
-/// Numbers are texts: JavaScript has no integers beyond 2^53.
 /// Removes a grasp if there are more than so many: one of an earlier run of the source than `epoch`, or the first.
 fn cut_to<T>(of_grasps: &mut BTreeMap<GraspKey, T>, most: usize, epoch: u64) {
     if of_grasps.len() > most {
@@ -440,6 +439,7 @@ fn cut_to<T>(of_grasps: &mut BTreeMap<GraspKey, T>, most: usize, epoch: u64) {
     }
 }
 
+/// Numbers are texts: JavaScript has no integers beyond 2^53.
 fn decision_event(decided: &Decided, truths: &BTreeMap<GraspKey, bool>) -> Value {
     let mut event = shadow_event(&decided.decision);
     event["epoch"] = decided.key.0.to_string().into();
@@ -513,7 +513,8 @@ fn graph_event(now: &Look, before: Option<&Look>) -> anyhow::Result<String> {
     let params = now.status.nodes.iter().map(|node| (&node.node, &node.params));
     event["params"] = json!(params.collect::<BTreeMap<_, _>>());
     if let Some(node) = now.status.nodes.iter().find(|node| node.params.get("driver") == Some(&"listen".into())) {
-        let usual = tactile_path().map_or(Value::Null, |path| format!("unix:{}", path.display()).into());
+        let usual =
+            tactile_path(&now.status.graph).map_or(Value::Null, |path| format!("unix:{}", path.display()).into());
         event["listens"] = node.params.get("address").cloned().unwrap_or(usual);
     }
     Ok(event.to_string())

@@ -1,6 +1,6 @@
 //! The page of a recording: its grasps with their decisions, each frame by frame.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -21,7 +21,7 @@ use serde_json::{Value, json};
 use super::super::{Outcome, print_line, stop_signal};
 use super::GraspArguments;
 use super::grasp::{find_mesh, judge_of};
-use super::live::{add_frame, shadow_event};
+use super::live::{GraspKey, add_frame, shadow_event};
 
 const POLL: Duration = Duration::from_millis(100);
 /// Of a grasp with more frames, every nth is shown: a robot may hold an object for minutes.
@@ -38,6 +38,8 @@ const BEHIND_NANOS: u64 = 60_000_000_000;
 struct Listed {
     /// Its number, as text: JavaScript has no integers beyond 2^53.
     id: String,
+    /// The number of its run of the source in the recording.
+    epoch: String,
     n_frames: u64,
     action: Option<Action>,
     reason: Option<&'static str>,
@@ -68,7 +70,7 @@ pub(super) fn show(
     }
     let first = match arguments.grasp {
         None => 0,
-        Some(id) => list.keys().position(|known| *known == id).ok_or_else(|| {
+        Some(id) => list.keys().position(|(_, known)| *known == id).ok_or_else(|| {
             anyhow::anyhow!("{} has no grasp {id}: it has {}", recording.display(), counted(list.len(), "grasp"))
         })?,
     };
@@ -92,16 +94,17 @@ pub(super) fn show(
     Ok(Outcome::Done)
 }
 
-/// The grasps of a recording by number.
-fn list(recording: &Path) -> anyhow::Result<BTreeMap<u64, Listed>> {
+/// The grasps of a recording by the epoch of their source, and number.
+fn list(recording: &Path) -> anyhow::Result<BTreeMap<GraspKey, Listed>> {
     let wanted =
         |_: &str, schema: &str| [TactileFrame::SCHEMA, GraspTruth::SCHEMA, LiftDecision::SCHEMA].contains(&schema);
     let mut samples = ChosenSamples::open(recording, Box::new(wanted), Reach::ByIndex)?;
-    let mut list: BTreeMap<u64, Listed> = BTreeMap::new();
+    let mut list: BTreeMap<GraspKey, Listed> = BTreeMap::new();
     while let Some(sample) = samples.advance()? {
         let stamp = sample.header.stamp_nanos;
-        let grasp = list.entry(sample.grasp_id).or_insert_with(|| Listed {
+        let grasp = list.entry((sample.header.epoch, sample.grasp_id)).or_insert_with(|| Listed {
             id: sample.grasp_id.to_string(),
+            epoch: String::new(),
             n_frames: 0,
             action: None,
             reason: None,
@@ -131,6 +134,10 @@ fn list(recording: &Path) -> anyhow::Result<BTreeMap<u64, Listed>> {
         }
     }
     list.retain(|_, grasp| grasp.n_frames > 0);
+    let epochs: BTreeSet<u64> = list.keys().map(|(epoch, _)| *epoch).collect();
+    for ((epoch, _), grasp) in &mut list {
+        grasp.epoch = (1 + epochs.range(..epoch).count()).to_string();
+    }
     Ok(list)
 }
 
@@ -139,7 +146,7 @@ struct ShownReading {
     recording: PathBuf,
     objects: Option<PathBuf>,
     hand: Hand,
-    list: BTreeMap<u64, Listed>,
+    list: BTreeMap<GraspKey, Listed>,
     /// Judges the grasps as well.
     shadow: Option<Judge>,
 }
@@ -156,12 +163,12 @@ struct Samples {
 impl ShownReading {
     /// The frames of a grasp, with contacts and probability where the recording has them, and the object.
     fn grasp(&mut self, idx: usize) -> anyhow::Result<String> {
-        let Some((id, listed)) = self.list.iter().nth(idx) else {
+        let Some((key, listed)) = self.list.iter().nth(idx) else {
             bail!("the recording has {}", counted(self.list.len(), "grasp"))
         };
         let most = MAX_FRAMES.min(MAX_READINGS / self.hand.n_cells().max(1) as u64).max(1);
         let step = listed.n_frames.div_ceil(most).max(1);
-        let Samples { frames, contacts, probabilities, object } = self.samples(*id, listed, step)?;
+        let Samples { frames, contacts, probabilities, object } = self.samples(*key, listed, step)?;
         // Of a thinned out grasp, the gaps would decide.
         let shadow = match &mut self.shadow {
             Some(judge) if step == 1 => Some(decide_alone(judge, &frames)),
@@ -185,7 +192,7 @@ impl ShownReading {
     }
 
     /// Every `step`th frame of a grasp, and what belongs to these.
-    fn samples(&self, id: u64, listed: &Listed, step: u64) -> anyhow::Result<Samples> {
+    fn samples(&self, key: GraspKey, listed: &Listed, step: u64) -> anyhow::Result<Samples> {
         let mesh = if listed.object.is_empty() { None } else { find_mesh(&listed.object, self.objects.as_deref())? };
         let mut samples = ChosenSamples::open(&self.recording, Box::new(|_, _| true), Reach::ByIndex)?;
         samples.skip_to(listed.stamps_nanos[0]);
@@ -195,7 +202,7 @@ impl ShownReading {
             if n_frames == listed.n_frames && is_past {
                 break;
             }
-            if sample.grasp_id != id {
+            if (sample.header.epoch, sample.grasp_id) != key {
                 continue;
             }
             n_frames += u64::from(sample.schema == TactileFrame::SCHEMA);
@@ -233,8 +240,27 @@ fn decided_at(frames: &[Stamped<TactileFrame>], decided_nanos: Option<u64>) -> O
 #[cfg(test)]
 mod tests {
     use blindgrasp_messages::Header;
+    use blindgrasp_recording::{RecordingInfo, RecordingWriter};
 
     use super::*;
+
+    #[test]
+    fn grasps_of_two_runs_of_a_source_are_two() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("two.mcap");
+        let info = RecordingInfo { hand: "h".into(), hand_id: 0, made_by: "test".into(), version: "0".into() };
+        let mut writer = RecordingWriter::create(&path, &info).expect("created");
+        for (epoch, stamp_nanos) in [(7, 1), (7, 2), (9, 3)] {
+            let header = Header { epoch, stamp_nanos, ..Header::default() };
+            let message = TactileFrame { grasp_id: 5, ..TactileFrame::default() };
+            writer.write(TactileFrame::TOPIC, &Stamped { header, message }).expect("written");
+        }
+        writer.finish().expect("finished");
+        let list = list(&path).expect("two grasps");
+        let found: Vec<_> =
+            list.iter().map(|(key, grasp)| (*key, &grasp.epoch[..], &grasp.id[..], grasp.n_frames)).collect();
+        assert_eq!(found, [((7, 5), "1", "5", 2), ((9, 5), "2", "5", 1)]);
+    }
 
     #[test]
     fn the_frame_that_decided_is_the_last_one_up_to_the_decision() {

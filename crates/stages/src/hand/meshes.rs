@@ -108,7 +108,7 @@ pub fn find_alike(named: &str, urdf_folder: &Path) -> Result<PathBuf, String> {
     if found.as_ref().is_ok_and(|file| file.is_file()) {
         return found;
     }
-    let plain = named.replace('\\', "/").replace("%20", " ");
+    let plain = unescaped(named).replace('\\', "/");
     let parts: Vec<&str> = plain.split('/').filter(|part| !matches!(*part, "" | "." | "..")).collect();
     let folder = absolute(urdf_folder);
     for start in 0..parts.len() {
@@ -121,6 +121,24 @@ pub fn find_alike(named: &str, urdf_folder: &Path) -> Result<PathBuf, String> {
     found.and_then(|_| {
         Err(format!("{named}: no such file, and none in {} or beside it whose path ends alike", folder.display()))
     })
+}
+
+/// The text with the bytes that it has as in an address: %20 for a blank, %2F for a slash.
+fn unescaped(text: &str) -> String {
+    let (mut plain, mut idx) = (Vec::new(), 0);
+    while idx < text.len() {
+        let mut byte = text.as_bytes()[idx];
+        if byte == b'%'
+            && let Some(digits) = text.get(idx + 1..idx + 3)
+            && let Ok(code) = u8::from_str_radix(digits, 16)
+        {
+            byte = code;
+            idx += 2;
+        }
+        plain.push(byte);
+        idx += 1;
+    }
+    String::from_utf8_lossy(&plain).into_owned()
 }
 
 /// The absolute path of a folder, which is empty for a file that is named without one.
@@ -241,7 +259,7 @@ mod tests {
         for (named, expected) in [
             ("m/tip one.stl", &near),
             ("m\\tip one.stl", &near),
-            ("m/tip%20one.stl", &near),
+            ("m%2Ftip%20one%2estl", &near),
             ("M/Tip One.STL", &near),
             ("package:///m/tip one.stl", &near),
             ("/home/someone/ws/src/trio/m/tip one.stl", &near),

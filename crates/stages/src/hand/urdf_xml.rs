@@ -118,6 +118,8 @@ impl UrdfReading {
         if self.path.is_empty() && (name != "robot" || self.robot.is_some()) {
             let converter = if name == "mujoco" {
                 ": make a URDF of it with python3 -P -m blindgrasp.mjcf FILE.xml FILE.urdf"
+            } else if name == "mujocoinclude" {
+                ": a part of a MuJoCo model; convert the file that includes it with python3 -P -m blindgrasp.mjcf FILE.xml FILE.urdf"
             } else {
                 ""
             };
@@ -369,6 +371,7 @@ mod tests {
             ("a robot", "found none"),
             ("<hand/>", "one <robot>, found <hand>"),
             ("<robot/><robot/>", "one <robot>, found <robot>"),
+            ("<mujocoinclude/>", "a part of a MuJoCo model; convert the file that includes it"),
             ("<mujoco/>", "found <mujoco>: make a URDF of it with python3 -P -m blindgrasp.mjcf"),
             ("<robot>\n<link name='a'>", "cut off: it ends inside of <link>"),
             ("<robot>\n<!-- ", "line 2: not a URDF, or cut off"),

@@ -23,6 +23,11 @@ pub struct ObjectTrials {
     pub dropped: f64,
 }
 
+/// The bound for new objects after lifts of so many, none of which dropped: the least that they can show.
+pub fn least_bound(n_objects: usize) -> f64 {
+    1.0 - (1.0 - CONFIDENCE).powf(1.0 / n_objects as f64)
+}
+
 /// The bounds for new objects; `None` if no object was lifted.
 pub fn promise(objects: &[ObjectTrials]) -> Option<Promise> {
     let lifted: Vec<ObjectTrials> = objects.iter().copied().filter(|object| object.lifted > 0.0).collect();
@@ -125,7 +130,7 @@ mod tests {
     fn one_trial_for_each_object_gives_the_exact_binomial_bound() {
         // Clopper-Pearson's one-sided bounds: 1 - 0.05^(1/n) without a drop; scipy's beta.ppf(0.95, k + 1, n - k) otherwise.
         let none = promise(&single(59, 0, 0)).expect("lifts");
-        assert!((none.drops_of_lifts.at_most - (1.0 - 0.05_f64.powf(1.0 / 59.0))).abs() < 1e-9, "{none:?}");
+        assert!((none.drops_of_lifts.at_most - least_bound(59)).abs() < 1e-9, "{none:?}");
         let some = promise(&single(202, 8, 30)).expect("lifts");
         assert!((some.drops_of_lifts.at_most - 0.067_685).abs() < 1e-5, "{some:?}");
         assert_eq!((some.drops_of_lifts.n_objects, some.drops_of_trials.n_objects), (210, 240));

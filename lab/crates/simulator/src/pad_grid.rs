@@ -40,7 +40,7 @@ pub fn pad_grid(
     let hand = mechanism.hand;
     let link = &hand.links[link_idx];
     if link.shapes.is_empty() {
-        return Err("it has no collision shape on which cells could lie".into());
+        return Err("it has no <collision> in the URDF, on which cells could lie".into());
     }
     let inner = inner_direction(mechanism, link_idx, touches).map_err(|error| error.to_string())?;
     let (along, across) = face_directions(hand, link_idx, &inner);

@@ -262,6 +262,12 @@ fn print_parts(hand: &Hand) -> anyhow::Result<()> {
     for ignored in &hand.ignored_shapes {
         print_diagnostic(&format!("a collision shape is left out: {ignored}"));
     }
+    if hand.links.iter().all(|link| link.shapes.is_empty()) {
+        print_diagnostic(
+            "no link has a collision shape, with which fingers touch objects in simulation: give each link that touches objects a \
+             <collision> in the URDF (mostly with the <geometry> of its <visual>), then call this command again",
+        );
+    }
     Ok(())
 }
 

@@ -19,6 +19,8 @@ use blindgrasp_stages::model::Model;
 const SOURCE: &str = "simulated_hand";
 /// While the hand waits for a decision nothing moves, and a simulation on a busy machine may take its time.
 const LEAST_MAX_AGE_MS: f64 = 5000.0;
+/// The limit of gaps where every grasp is lifted: the arm goes on without the decision, so none should be called stale.
+const NO_MAX_GAP_MS: &str = "3600000";
 
 /// A dataflow file and what it is run with.
 pub(super) struct Setup {
@@ -26,6 +28,8 @@ pub(super) struct Setup {
     overrides: Vec<Override>,
     /// The node that lifts.
     pub(super) node: String,
+    /// The nodes that limit gaps, unless the user set the limit.
+    judges: Vec<String>,
     /// The hand of the node that lifts.
     pub(super) hand: Hand,
     pub(super) options: TrialOptions,
@@ -54,8 +58,12 @@ impl Setup {
             )
         })?;
         let mut overrides = arguments.overrides.clone();
+        let mut judges = Vec::new();
         for judge in &graph.nodes {
             adjust(judge, &mut overrides);
+            if has_own_limit(judge, &overrides) {
+                judges.push(judge.id.clone());
+            }
         }
         if let Some(set) = overrides.iter().find(|set| set.is_of(&node.id) && own_option(&set.param).is_some()) {
             bail!("--set {set}: use {} instead", own_option(&set.param).unwrap_or_default());
@@ -96,7 +104,7 @@ impl Setup {
             overrides.push(set(&node.id, "watch", "on".into()));
         }
         let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());
-        Ok(Setup { node: node.id.clone(), file, overrides, hand, options, model, prior, probe })
+        Ok(Setup { node: node.id.clone(), judges, file, overrides, hand, options, model, prior, probe })
     }
 
     /// The checked graph of a way.
@@ -104,6 +112,9 @@ impl Setup {
         let mut overrides = self.overrides.clone();
         let text = if way.obeys { "on" } else { "off" };
         overrides.push(Override { node: Some(self.node.clone()), param: "gate".into(), text: text.into() });
+        if !way.obeys {
+            overrides.extend(self.judges.iter().map(|judge| set(judge, "max_gap_ms", NO_MAX_GAP_MS.into())));
+        }
         fitting(&self.file, &overrides, Scope::Everything, OnMisfit::Refuse)
     }
 }
@@ -128,6 +139,12 @@ fn adjust(judge: &Node, overrides: &mut Vec<Override>) {
             overrides.push(set(&judge.id, param, text));
         }
     }
+}
+
+/// Whether a node limits gaps as its file says.
+fn has_own_limit(judge: &Node, overrides: &[Override]) -> bool {
+    let is_set = overrides.iter().any(|set| set.is_of(&judge.id) && set.param == "max_gap_ms");
+    judge.params.contains_key("max_gap_ms") && !is_set
 }
 
 /// The options of the node that lifts, and the overrides that give it those of the command.

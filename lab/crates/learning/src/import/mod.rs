@@ -105,6 +105,8 @@ pub struct ImportReport {
     pub n_rows: usize,
     /// Rows with a reading below zero, which counts as 0.
     pub n_below_zero: usize,
+    /// Rows with a missing reading, which counts as 0.
+    pub n_missing: usize,
     /// Recorded frames.
     pub n_frames: u64,
     pub n_grasps: usize,
@@ -239,7 +241,8 @@ fn import_rows(
         let row = match record {
             Ok(record) => {
                 name = rows.columns.grasp.map(|idx| record[idx].to_string());
-                report.n_below_zero += usize::from(rows.is_below_zero(&record));
+                report.n_below_zero += usize::from(rows.has(&record, is_below_zero));
+                report.n_missing += usize::from(rows.has(&record, is_missing));
                 rows.read(&record, line).map_err(|problem| BadRow { line, problem })
             }
             Err(error) => Err(bad_row(&error, line).ok_or_else(|| table_error(table, error, line))?),
@@ -274,6 +277,14 @@ fn require_forces(hand: &Hand) -> Result<(), String> {
         )),
         None => Ok(()),
     }
+}
+
+fn is_below_zero(reading: &str) -> bool {
+    reading.parse().is_ok_and(|reading: f64| reading < 0.0)
+}
+
+fn is_missing(reading: &str) -> bool {
+    matches!(reading, "" | "null") || reading.parse().is_ok_and(f64::is_nan)
 }
 
 /// Reads rows. Errors do not name the line.
@@ -345,7 +356,7 @@ impl RowReader<'_> {
         may_be_missing: bool,
     ) -> Result<f64, String> {
         let reading: Option<f64> = record[idx].parse().ok();
-        let is_missing = matches!(&record[idx], "" | "null") || reading.is_some_and(f64::is_nan);
+        let is_missing = is_missing(&record[idx]);
         if is_missing && may_be_missing {
             return Ok(0.0);
         }
@@ -365,12 +376,9 @@ impl RowReader<'_> {
         Err(format!("column '{column}': expected a number from 0 to {MAX_CELL_NEWTONS}, found {found}{advice}"))
     }
 
-    /// Whether a row has a reading below zero, which counts as 0 if the row can be used.
-    fn is_below_zero(&self, record: &csv::StringRecord) -> bool {
-        self.columns
-            .cells
-            .iter()
-            .any(|idx| record.get(*idx).and_then(|cell| cell.parse().ok()).is_some_and(|cell: f64| cell < 0.0))
+    /// Whether a row has such a reading, which counts as 0 if the row can be used.
+    fn has(&self, record: &csv::StringRecord, is_such: fn(&str) -> bool) -> bool {
+        self.columns.cells.iter().any(|idx| record.get(*idx).is_some_and(is_such))
     }
 
     fn joint_value(&self, record: &csv::StringRecord, joint_idx: usize) -> Result<f64, String> {
