@@ -77,7 +77,7 @@ pub(crate) fn describe() -> OperatorDescription {
         )
         .live_param(
             "lifts_per_object",
-            ParamKind::Integer { min: Some(1), max: Some(1000) },
+            ParamKind::Integer { min: Some(1), max: Some(100) },
             Some(default.lifts_per_object.into()),
             "How many times in a row the robot lifts an object at most: so many outcomes count once in the bound of this robot's \
              drops; 1 for objects in random order",

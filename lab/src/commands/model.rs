@@ -195,13 +195,23 @@ fn curve_lines(policy: &PolicySummary, own: f64, drop_costs: Option<f64>) -> Vec
             "no curve of thresholds when {look}: the model was adapted, or an earlier version trained it (blindgrasp train)"
         )];
     }
-    let cost = |point: &ThresholdPoint| drop_costs.map_or(0.0, |drop_costs| point.attempts_per_kept(drop_costs));
-    let cheapest = policy.curve.iter().min_by(|a, b| cost(a).total_cmp(&cost(b))).filter(|_| drop_costs.is_some());
-    let mut lines =
-        vec![format!("threshold when {look}      kept    recall  attempts a lift  given up  drops at most (95 %)")];
+    let mut cheapest = None;
+    if let Some(drop_costs) = drop_costs {
+        let cost = |point: &&ThresholdPoint| point.attempts_per_kept(drop_costs);
+        cheapest = policy.curve.iter().min_by(|a, b| cost(a).total_cmp(&cost(b)));
+    }
+    let mut lines = vec![format!(
+        "{:<27} {:>8} {:>9} {:>16} {:>9} {:>20}",
+        format!("threshold when {look}"),
+        "kept",
+        "recall",
+        "attempts a lift",
+        "given up",
+        "drops at most (95 %)"
+    )];
     for point in &policy.curve {
         let mut line = format!(
-            "{:<25} {:>8} {:>9} {:>16.2} {:>9} {:>20}",
+            "{:<27} {:>8} {:>9} {:>16.2} {:>9} {:>20}",
             format!("{:.4}", point.threshold_probability),
             percent(Some(point.kept)),
             percent(Some(point.recall)),
@@ -218,8 +228,8 @@ fn curve_lines(policy: &PolicySummary, own: f64, drop_costs: Option<f64>) -> Vec
         lines.push(line);
     }
     if let Some(point) = cheapest {
-        // It is rounded down, so that it does not pass the grasps at the threshold.
-        let threshold = (1e4 * point.threshold_probability).floor() / 1e4;
+        // It is rounded down, so that it does not pass the grasps at the threshold; 0 would be the model's own.
+        let threshold = ((1e4 * point.threshold_probability).floor() / 1e4).max(1e-4);
         lines.push(format!("to choose it: blindgrasp set lift_arbiter.min_probability_stable={threshold}"));
     }
     lines

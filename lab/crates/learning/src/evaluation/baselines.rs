@@ -32,8 +32,8 @@ pub struct Rule {
 
 impl Baselines {
     /// Judges the examples that have the look; `None` if all of them are stable, or none, and for a model that looks at days, which
-    /// judges no grasp alone. `joints` has for each example the
-    /// probability by a model of the joint angles alone that has not learned from its object; it may be empty.
+    /// judges no grasp alone. `joints` has for each example the probability by a model of the joint angles alone that has not
+    /// learned from its object; it may be empty.
     pub fn new(model: &Model, examples: &[Example], joints: &[f64]) -> Option<Baselines> {
         if model.day.is_some() {
             return None;
